@@ -1,0 +1,19 @@
+"""The one error that a user's input can cause; the command line turns it into one message and exit status 2."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class InputError(ValueError):
+    """Wrong input: the message says what is wrong, in which file, key, row or joint, and what would be right."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Text that names the known word nearest to `name`, or lists all of them: `"; did you mean 'joint_3'?"`."""
+    words = [str(word) for word in known]
+    close = difflib.get_close_matches(str(name), words, n=1, cutoff=0.5)
+    if close:
+        return f"; did you mean '{close[0]}'?"
+    return f"; known: {', '.join(words)}" if words else ""

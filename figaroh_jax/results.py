@@ -1,0 +1,110 @@
+"""What a diagnosis answers: plain immutable records, the same for the report, the terminal and `answer.json`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+__all__ = ["Candidate", "Cause", "Diagnosis", "Estimate", "Experiment", "Gain", "Name", "Trace", "Verdict"]
+
+Verdict = Literal["nothing", "named", "named+rest", "unknown"]
+
+
+class Name(NamedTuple):
+    """An effect at a place: `at` holds joint, link or frame names in model order, empty for the whole robot."""
+
+    effect: str
+    at: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.effect} ({', '.join(self.at)})" if self.at else self.effect
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Value and one standard deviation, in `unit`."""
+
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Error on data not used for the fit, before and after the cause was put in."""
+
+    before: float
+    after: float
+    unit: str = "relative RMS"
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A named cause, how large it is, what it gains and what cannot be told from it."""
+
+    name: Name
+    parameters: dict[str, Estimate]
+    confidence: float
+    gain: Gain
+    ambiguous_with: tuple[Name, ...] = ()
+    note: str = ""  # e.g. what MJCF and URDF cannot express
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """What the data can say of one effect at one place, before any verdict."""
+
+    name: Name
+    identifiable: float  # share of the effect outside the span of the baseline, 0..1
+    detectable: float  # smallest RMS torque (N m or N) that this data would show (D = 4); inf: never
+    nearest: Name | None  # the effect with the smallest angle to this one
+    angle: float  # that angle, degrees
+    score: float  # Wilson-Hilferty z of the first screening
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """The motion that would separate causes which this data cannot tell apart."""
+
+    text: str
+    separates: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One recording as the report shows it: measured torque and the model's, before and after (N m or N)."""
+
+    name: str
+    role: Literal["fit", "holdout"]
+    time: Float[np.ndarray, " samples"]
+    position: Float[np.ndarray, "samples nv"]
+    velocity: Float[np.ndarray, "samples nv"]
+    measured: Float[np.ndarray, "samples nv"] | None  # None: a holdout recording without torque
+    before: Float[np.ndarray, "samples nv"]
+    after: Float[np.ndarray, "samples nv"]
+    shares: dict[str, Float[np.ndarray, "samples nv"]] = field(default_factory=dict)  # torque of each cause
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Verdict, causes in the order found, and everything the report needs to show why."""
+
+    verdict: Verdict
+    causes: tuple[Cause, ...]
+    p_value: float
+    joints: tuple[str, ...]
+    before: Float[np.ndarray, " nv"]  # RMS residual of the baseline per joint, N m or N
+    after: Float[np.ndarray, " nv"]  # RMS residual of the extended model
+    noise: Float[np.ndarray, " nv"]  # RMS of the noise
+    holdout: Gain  # whole error on data not fitted, before and after all causes
+    holdout_scheme: str  # how that data was held out, in words
+    experiment: Experiment | None
+    candidates: tuple[Candidate, ...]
+    traces: tuple[Trace, ...]
+    baseline: Any  # extended.ExtendedModel: rigid body with friction, as fitted before anything was named
+    model: Any  # extended.ExtendedModel with the causes put in
+    rest: str = ""  # description of a misfit that has no name: joint, power, strongest dependence
+    notes: tuple[str, ...] = ()  # what was dropped or assumed while reading the data
