@@ -64,9 +64,15 @@ class Motion(eqx.Module):
     position: Float[Array, "samples nv"]  # rad or m
     velocity: Float[Array, "samples nv"]
     acceleration: Float[Array, "samples nv"]
-    direction: Float[Array, "samples nv"]  # sign of the velocity, smooth within one sample (`smooth_sign`)
     load: Float[Array, "samples nv"]  # torque of the rigid body, N m or N
     total: Float[Array, "samples nv"]  # torque of the whole current model, friction included
+    dt: Float[Array, ""] | float  # sampling period, s; 0 for instants that are not a record
+    width: Float[Array, " nv"]  # half width of a reversal of the joints' dry friction, rad/s or m/s
+
+    @property
+    def direction(self) -> Float[Array, "samples nv"]:
+        """Sign of the velocity, smooth within one sample (`smooth_sign`)."""
+        return smooth_sign(self.velocity, self.acceleration, self.dt, self.width)
 
 
 def amplitude(unit: str) -> Any:
@@ -149,11 +155,11 @@ class Effect(eqx.Module):
 
 
 def smooth_sign(
-    velocity: Float[Array, "samples nv"],
-    acceleration: Float[Array, "samples nv"],
-    dt: float,
-    width: Float[Array, " nv"] | float = 0.0,
-) -> Float[Array, "samples nv"]:
+    velocity: Float[Array, "samples *rows"],
+    acceleration: Float[Array, "samples *rows"],
+    dt: Float[Array, ""] | float,
+    width: Float[Array, "*rows"] | float = 0.0,
+) -> Float[Array, "samples *rows"]:
     """Sign of the velocity averaged over one sample: clip(v / (|a| dt / 2 + width), -1, 1).
 
     `width` (rad/s or m/s) is the half width of the reversal where the friction of the joint itself is smooth.
