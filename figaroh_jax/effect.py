@@ -74,6 +74,12 @@ class Motion(eqx.Module):
         """Sign of the velocity, smooth within one sample (`smooth_sign`)."""
         return smooth_sign(self.velocity, self.acceleration, self.dt, self.width)
 
+    def reversal(
+        self, velocity: Float[Array, " samples"], acceleration: Float[Array, " samples"], width: Float[Array, ""]
+    ) -> Float[Array, " samples"]:
+        """Smooth sign of another velocity, e.g. that of a motor between two joints."""
+        return smooth_sign(velocity, acceleration, self.dt, width)
+
 
 def amplitude(unit: str) -> Any:
     """Declare a parameter in which the torque is linear."""

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from .effect import Effect, Motion, Native, Scalar, amplitude, shape, smooth_sign
+from .effect import Effect, Motion, Native, Scalar, amplitude, shape
 from .errors import InputError, nearest
 from .model import RobotModel
 
@@ -119,7 +119,7 @@ class CoupledTransmission(Effect):
     def torque(self, motion: Motion) -> Float[Array, "samples 2"]:
         v, a = motion.velocity[:, self.at], motion.acceleration[:, self.at]
         relative = jnp.stack([jnp.ones(()), jnp.asarray(self.sign)])  # of the motor to each joint
-        reversal = smooth_sign(v @ relative, a @ relative, motion.dt, motion.width[self.at].mean())
+        reversal = motion.reversal(v @ relative, a @ relative, jnp.asarray(motion.width)[self.at].mean())
         linear = self.sign * (self.inertia * a[:, ::-1] + self.damping * v[:, ::-1])
         return linear + self.friction * reversal[:, None] * relative
 
