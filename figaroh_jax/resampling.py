@@ -1,0 +1,123 @@
+"""From one time base to another: uneven stamps to a grid, one rate to another, rows back to a recording's stamps.
+
+Rates change through one band-limited interpolation (a sinc under a Kaiser window, 100 dB), symmetric in time and
+therefore without phase. Signals are (samples, columns), times in seconds, rates in hertz.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+__all__ = ["Grid", "band_limited", "differentiate", "even_grid", "sampling_rate", "to_recording_times"]
+
+EVEN = 0.02  # stamps within this share of a step of a straight line count as even
+GAP_STEPS = 5
+STOP_BAND = 100.0  # dB
+BETA = 0.1102 * (STOP_BAND - 8.7)  # Kaiser 1974
+LENGTH = (STOP_BAND - 7.95) / (2.285 * 2 * np.pi)  # kernel length times transition width
+
+
+class Grid(NamedTuple):
+    """Columns on an even grid from `start`, with the gaps (begin, end) that the stamps left."""
+
+    start: float
+    rate: float
+    columns: tuple[Float[np.ndarray, "samples _"], ...]
+    gaps: tuple[tuple[float, float], ...]
+
+
+def sampling_rate(time: Float[np.ndarray, " samples"]) -> float:
+    """Rate in Hz: of the mean step where the stamps are even, else of the median step."""
+    steps = np.diff(time)
+    return float(1 / (steps.mean() if _is_even(time) else np.median(steps)))
+
+
+def _is_even(time: Float[np.ndarray, " samples"]) -> bool:
+    line = np.linspace(time[0], time[-1], len(time))
+    return bool(np.abs(time - line).max() <= EVEN * (time[-1] - time[0]) / (len(time) - 1))
+
+
+def even_grid(time: Float[np.ndarray, " samples"], smooth: Float[np.ndarray, "samples nv"], *rough) -> Grid:
+    """Put columns on an even grid of the median step: `smooth` by cubic splines, each of `rough` linearly.
+
+    Columns whose stamps are even already are passed on as they are.
+    """
+    rate = sampling_rate(time)
+    if _is_even(time):
+        return Grid(float(time[0]), rate, (smooth, *rough), ())
+    from scipy.interpolate import CubicSpline
+
+    steps = np.diff(time)
+    grid = np.arange(time[0], time[-1] + 1e-9, 1 / rate)
+    gaps = np.flatnonzero(steps > GAP_STEPS / rate)
+    columns = [CubicSpline(time, smooth)(grid)]
+    columns += [np.column_stack([np.interp(grid, time, column) for column in x.T]) for x in rough]
+    return Grid(float(time[0]), rate, tuple(columns), tuple((float(time[k]), float(time[k + 1])) for k in gaps))
+
+
+def band_limited(
+    x: Float[np.ndarray, "samples cols"],
+    at: Float[np.ndarray, " times"],
+    *,
+    start: float,
+    rate: float,
+    passed: float,
+    stopped: float,
+) -> Float[np.ndarray, "times cols"]:
+    """Values at the times `at` of a signal sampled at `rate` from `start`, flat to `passed` Hz, nothing from `stopped`.
+
+    Beyond its ends the signal is extended by point reflection.
+    """
+    length = LENGTH / (stopped - passed)
+    half = min(int(np.ceil(length / 2 * rate)), len(x) - 1)
+    extended = np.concatenate([2 * x[:1] - x[half:0:-1], x, 2 * x[-1:] - x[-2 : -half - 2 : -1]])
+    where = (np.asarray(at) - start) * rate
+    nearest = np.clip(np.rint(where).astype(int), 0, len(x) - 1)
+    taps = nearest[:, None] + np.arange(-half, half + 1)
+    weights = _kernel((taps - where[:, None]) / rate, (passed + stopped) / 2, length)
+    return np.stack([np.einsum("tk,tk->t", extended[taps + half, j], weights) for j in range(x.shape[1])], axis=1)
+
+
+def _kernel(lag: Float[np.ndarray, "times taps"], cutoff: float, length: float) -> Float[np.ndarray, "times taps"]:
+    from scipy.special import i0
+
+    window = i0(BETA * np.sqrt(np.clip(1 - (2 * lag / length) ** 2, 0, None))) * (np.abs(lag) <= length / 2)
+    kernel = np.sinc(2 * cutoff * lag) * window
+    return kernel / kernel.sum(axis=1, keepdims=True)
+
+
+def to_recording_times(
+    row_time: Float[np.ndarray, " rows"], values: Float[np.ndarray, "rows cols"], time: Float[np.ndarray, " samples"]
+) -> Float[np.ndarray, "samples cols"]:
+    """Values on evenly spaced rows brought to a recording's own stamps; the end values are held outside.
+
+    Exact for content below 0.3 of the row rate, which is where the default preprocessing puts the cutoff.
+    """
+    rate = (len(row_time) - 1) / (row_time[-1] - row_time[0])
+    at = np.clip(time, row_time[0], row_time[-1])
+    start = float(row_time[0])
+    return band_limited(values, at, start=start, rate=float(rate), passed=0.3 * rate, stopped=0.7 * rate)
+
+
+def differentiate(x: Float[np.ndarray, "samples cols"], dt: float, order: int = 1) -> Float[np.ndarray, "samples cols"]:
+    """First or second time derivative at the samples themselves, by five-point differences.
+
+    Inside (8 (x[+1] - x[-1]) - (x[+2] - x[-2])) / (12 dt) and its second-order kin; the two samples at either end use
+    the five outermost ones. Exact for polynomials up to degree four at every sample.
+    """
+    offsets = np.arange(5)
+    result = np.empty_like(x)
+    result[2:-2] = sum(c * x[k : len(x) - 4 + k] for k, c in enumerate(_stencil(offsets - 2, order)))
+    for row in (0, 1):
+        result[row] = _stencil(offsets - row, order) @ x[:5]
+        result[-1 - row] = _stencil(offsets - 4 + row, order) @ x[-5:]
+    return result / dt**order
+
+
+def _stencil(offsets: np.ndarray, order: int) -> Float[np.ndarray, "5"]:
+    """Weights on five samples that give the derivative of every polynomial up to degree four at offset zero."""
+    powers = np.vander(offsets.astype(float), 5, increasing=True).T
+    return np.linalg.solve(powers, np.eye(5)[order] * order)
