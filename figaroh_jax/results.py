@@ -108,3 +108,9 @@ class Diagnosis:
     model: Any  # extended.ExtendedModel with the causes put in
     rest: str = ""  # description of a misfit that has no name: joint, power, strongest dependence
     notes: tuple[str, ...] = ()  # what was dropped or assumed while reading the data
+    prismatic: tuple[bool, ...] = ()  # per joint; empty: every joint is revolute
+
+    @property
+    def torque_units(self) -> tuple[str, ...]:
+        """Unit of torque and residual of each joint: "N m", or "N" at a prismatic one."""
+        return tuple("N" if straight else "N m" for straight in self.prismatic or (False,) * len(self.joints))
