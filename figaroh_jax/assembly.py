@@ -1,0 +1,248 @@
+"""From the links and joints of a file to a `RobotModel`: one tree, fixed and locked joints merged into their parents.
+
+Readers of file formats describe links and joints in the order of the file (`LinkPart`, `JointPart`); `assemble` checks
+that they form one tree and builds the model. Frames: a link's frame is that of the joint that carries it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from . import inertia
+from .errors import InputError, nearest
+from .model import Frame, Joint, RobotModel
+
+__all__ = ["JointPart", "LinkPart", "assemble"]
+
+
+class LinkPart(NamedTuple):
+    """A link of the file."""
+
+    name: str
+    inertia: Float[np.ndarray, "10"]  # at and in the link's frame
+
+
+class JointPart(NamedTuple):
+    """A joint of the file; the child link's frame is the joint's."""
+
+    name: str
+    kind: str  # "revolute", "prismatic" or "fixed"
+    parent: str  # name of the link that carries it
+    child: str  # name of the link that it moves
+    placement: Float[np.ndarray, "4 4"]  # in the parent link's frame, at zero
+    axis: Float[np.ndarray, "3"]  # of any length above zero, in the joint frame
+    limit: tuple[float, float, float, float] = (-np.inf, np.inf, np.inf, np.inf)  # lower, upper, velocity, effort
+    mimic: tuple[str, float, float] | None = None  # joint that it follows, ratio, offset
+
+
+class _Drive(NamedTuple):
+    """What moves a joint: `ratio * position of leader + offset`."""
+
+    leader: str
+    ratio: float
+    offset: float
+
+
+def assemble(
+    source: str,
+    name: str,
+    parts: tuple[Sequence[LinkPart], Sequence[JointPart]],
+    joints: Sequence[str] | None = None,
+    posture: Mapping[str, float] | None = None,
+    gravity: Sequence[float] = (0.0, 0.0, -9.81),
+) -> RobotModel:
+    """Model of the robot `name` whose links and joints are `parts`.
+
+    `joints` names the moving joints in column order; every other joint is locked at `posture` (rad or m, 0 where it
+    says nothing). Without `joints`, all joints move but those that `posture` names, in tree order. Raises `InputError`,
+    prefixed by `source`, for parts that are not one tree and for names that do not exist.
+    """
+    try:
+        root, children = _tree(*parts)
+        drives = {joint.name: _drive(joint, parts[1]) for joint in parts[1] if joint.kind != "fixed"}
+        locked = _locked(drives, [j.name for j in parts[1] if j.kind == "fixed"], joints, posture or {})
+        build = _Build(dict(parts[0]), children, drives, locked)
+        build.grow(root)
+        return build.finish(name, joints, np.asarray(gravity, float))
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None
+
+
+def _tree(links: Sequence[LinkPart], joints: Sequence[JointPart]) -> tuple[str, dict[str, list[JointPart]]]:
+    """Root link, and for each link the joints that it carries."""
+    if not links:
+        raise InputError("the robot has no link")
+    _unique([link.name for link in links], "link")
+    _unique([joint.name for joint in joints], "joint")
+    children: dict[str, list[JointPart]] = {link.name: [] for link in links}
+    carrier: dict[str, JointPart] = {}
+    for joint in joints:
+        for role, link in (("parent", joint.parent), ("child", joint.child)):
+            if link not in children:
+                raise InputError(f"joint '{joint.name}': its {role} link '{link}' does not exist{nearest(link, children)}")
+        if joint.child in carrier:
+            both = f"'{carrier[joint.child].name}' and '{joint.name}'"
+            raise InputError(f"link '{joint.child}' is the child of two joints, {both}; loops are not supported")
+        carrier[joint.child] = joint
+        children[joint.parent].append(joint)
+    roots = [link.name for link in links if link.name not in carrier]
+    if len(roots) > 1:
+        names = ", ".join(f"'{root}'" for root in roots)
+        raise InputError(f"the links {names} have no parent joint; a robot has one root: join them by fixed joints")
+    _refuse_cycle(carrier, links)
+    return roots[0], children
+
+
+def _unique(names: Sequence[str], what: str) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two {what}s are called '{name}'; names must differ")
+
+
+def _refuse_cycle(carrier: Mapping[str, JointPart], links: Sequence[LinkPart]) -> None:
+    sound: set[str] = set()
+    for link in links:
+        path: list[str] = []
+        at = link.name
+        while at in carrier and at not in sound:
+            if at in path:
+                names = ", ".join(f"'{carrier[name].name}'" for name in path[path.index(at) :])
+                raise InputError(f"the joints {names} form a cycle; a robot is a tree")
+            path.append(at)
+            at = carrier[at].parent
+        sound.update(path)
+
+
+def _drive(joint: JointPart, joints: Sequence[JointPart]) -> _Drive:
+    """Follow the mimic joints from `joint` to the independent one."""
+    named = {j.name: j for j in joints}
+    at, ratio, offset, seen = joint, 1.0, 0.0, [joint.name]
+    while at.mimic is not None:
+        target, factor, shift = at.mimic
+        if target not in named:
+            raise InputError(f"joint '{at.name}' mimics '{target}', which does not exist{nearest(target, named)}")
+        if target in seen:
+            raise InputError(f"joint '{joint.name}' mimics itself by way of {' -> '.join([*seen, target])}")
+        if named[target].kind == "fixed":
+            raise InputError(f"joint '{at.name}' mimics '{target}', which is fixed")
+        ratio, offset, at = ratio * factor, offset + ratio * shift, named[target]
+        seen.append(target)
+    return _Drive(at.name, ratio, offset)
+
+
+def _locked(
+    drives: Mapping[str, _Drive], fixed: Sequence[str], joints: Sequence[str] | None, posture: Mapping[str, float]
+) -> dict[str, float]:
+    """Position of every independent joint that does not move."""
+    for name in joints or ():
+        _independent(name, drives, fixed, "joints")
+    _unique(list(joints or ()), "of the moving joints")
+    for name, value in posture.items():
+        _independent(name, drives, fixed, "posture")
+        if not np.isfinite(value):
+            raise InputError(f"posture: joint '{name}' is at {value}; a finite position is expected")
+        if joints is not None and name in joints:
+            raise InputError(f"posture: joint '{name}' is one of the moving joints; only locked joints have a posture")
+    leaders = [name for name, drive in drives.items() if drive.leader == name]
+    moving = set(leaders) - set(posture) if joints is None else set(joints)
+    return {name: float(posture.get(name, 0.0)) for name in leaders if name not in moving}
+
+
+def _independent(name: str, drives: Mapping[str, _Drive], fixed: Sequence[str], key: str) -> None:
+    if name in fixed:
+        raise InputError(f"{key}: joint '{name}' is fixed")
+    if name not in drives:
+        raise InputError(f"{key}: there is no joint '{name}'{nearest(name, drives)}")
+    if drives[name].leader != name:
+        raise InputError(f"{key}: joint '{name}' mimics '{drives[name].leader}'; name that joint instead")
+
+
+class _Build:
+    """The growing model: every list has one entry for a tree joint or a frame."""
+
+    def __init__(
+        self,
+        inertias: dict[str, np.ndarray],
+        children: dict[str, list[JointPart]],
+        drives: dict[str, _Drive],
+        locked: dict[str, float],
+    ) -> None:
+        self.inertias, self.children, self.drives, self.locked = inertias, children, drives, locked
+        self.joints: list[JointPart] = []
+        self.parents: list[int] = []
+        self.placements: list[np.ndarray] = []
+        self.carried: list[np.ndarray] = []
+        self.frames: dict[str, tuple[int, np.ndarray]] = {}
+        self.joint_frames: dict[str, tuple[int, np.ndarray]] = {}
+
+    def grow(self, root: str) -> None:
+        """Walk the tree depth first, in the order of the file."""
+        stack: list[tuple[JointPart | None, str, int, np.ndarray]] = [(None, root, -1, np.eye(4))]
+        while stack:
+            joint, link, body, pose = stack.pop()
+            if joint is not None:
+                body, pose = self._attach(joint, body, pose)
+            if body >= 0:
+                self.carried[body] = self.carried[body] + inertia.transform(self.inertias[link], pose)
+            self.frames[link] = (body, pose)
+            stack += [(child, child.child, body, pose) for child in reversed(self.children[link])]
+
+    def _attach(self, joint: JointPart, body: int, pose: np.ndarray) -> tuple[int, np.ndarray]:
+        """Body and pose in it of the joint's child link."""
+        pose = pose @ joint.placement
+        drive = self.drives.get(joint.name)
+        if drive is None or drive.leader in self.locked:
+            if drive is not None:
+                position = drive.ratio * self.locked[drive.leader] + drive.offset
+                pose = pose @ _displacement(joint, position)
+            self.joint_frames[joint.name] = (body, pose)
+            return body, pose
+        self.joints.append(joint)
+        self.parents.append(body)
+        self.placements.append(pose)
+        self.carried.append(np.zeros(10))
+        self.joint_frames[joint.name] = (len(self.joints) - 1, np.eye(4))
+        return len(self.joints) - 1, np.eye(4)
+
+    def finish(self, name: str, order: Sequence[str] | None, gravity: np.ndarray) -> RobotModel:
+        drives = [self.drives[joint.name] for joint in self.joints]
+        independent = [j.name for j, drive in zip(self.joints, drives, strict=True) if drive.leader == j.name]
+        columns = list(order) if order is not None else independent
+        if not columns:
+            raise InputError("no joint moves; a robot needs one revolute or prismatic joint")
+        limits = {joint.name: joint.limit for joint in self.joints}
+        limit = np.array([limits[column] for column in columns])
+        frames = self.joint_frames | self.frames
+        return RobotModel(
+            placement=np.array(self.placements),
+            axis=np.array([joint.axis / np.linalg.norm(joint.axis) for joint in self.joints]),
+            inertia=np.array(self.carried),
+            ratio=np.array([drive.ratio for drive in drives]),
+            offset=np.array([drive.offset for drive in drives]),
+            gravity=gravity,
+            frame_placement=np.array([pose for _, pose in frames.values()]),
+            position_limit=limit[:, :2],
+            velocity_limit=limit[:, 2],
+            effort_limit=limit[:, 3],
+            joints=tuple(
+                Joint(j.name, j.kind, parent, columns.index(drive.leader), j.child)
+                for j, parent, drive in zip(self.joints, self.parents, drives, strict=True)
+            ),
+            frames=tuple(Frame(frame, parent) for frame, (parent, _) in frames.items()),
+            name=name,
+        )
+
+
+def _displacement(joint: JointPart, position: float) -> np.ndarray:
+    """Pose of a joint that has moved by `position` in the pose that it had at zero."""
+    pose, axis = np.eye(4), joint.axis / np.linalg.norm(joint.axis)
+    if joint.kind == "prismatic":
+        pose[:3, 3] = position * axis
+        return pose
+    k = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    pose[:3, :3] += np.sin(position) * k + (1.0 - np.cos(position)) * k @ k
+    return pose
