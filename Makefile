@@ -1,0 +1,49 @@
+# Every target sets up what it needs in .venv; only Python (>= 3.11) and make have to be there.
+ENOUGH := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
+	$$p -c '$(ENOUGH)' 2>/dev/null && { echo $$p; break; }; done)
+BIN := .venv/bin
+
+.PHONY: demo test test-slow lint types bench format clean
+
+demo: .venv/installed ## the main job on the embedded recording
+	$(BIN)/figaroh-jax demo --out runs/demo
+
+test: .venv/developed ## the tests, without the slow ones
+	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+
+test-slow: .venv/developed ## the slow tests: many hidden effects, many clean recordings
+	$(BIN)/python -m pytest -m slow $(ARGS)
+
+lint: .venv/developed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: .venv/developed
+	$(BIN)/pyright $(ARGS)
+
+bench: .venv/developed ## CPU seconds of import and diagnose; the regressor against Pinocchio and figaroh
+	$(BIN)/python benchmarks/diagnose.py
+	$(BIN)/python benchmarks/regressor.py
+
+format: .venv/developed
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf .venv .cache .pytest_cache .ruff_cache .hypothesis runs build dist
+
+.venv/bin/python:
+	@test -n "$(PYTHON)" || { echo "make: needs Python >= 3.11 with venv (on Debian: apt-get install python3-venv);" \
+		"name it with make PYTHON=/path/to/python3" >&2; exit 2; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade "pip>=25.1"
+
+# A stamp is newer than pyproject.toml once what it names is installed, so a second run installs nothing.
+.venv/installed: pyproject.toml | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@touch $@
+
+.venv/developed: pyproject.toml | .venv/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable . --group dev
+	@touch $@

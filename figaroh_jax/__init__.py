@@ -1,0 +1,77 @@
+"""Names what a robot's simulation gets wrong, extends the model with it and measures the gain.
+
+The names below are loaded when they are first used, so that `import figaroh_jax` costs next to nothing; submodules are
+reached as attributes too (`figaroh_jax.spatial`). Importing changes no setting of JAX.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .config import load_task as load_task
+    from .dataset import Recording as Recording, read_recordings as read_recordings
+    from .diagnosis import diagnose as diagnose, diagnose_task as diagnose_task
+    from .dynamics import (
+        forward_dynamics as forward_dynamics,
+        inverse_dynamics as inverse_dynamics,
+        mass_matrix as mass_matrix,
+    )
+    from .effect import Effect as Effect, Motion as Motion, amplitude as amplitude, shape as shape
+    from .effects import register as register
+    from .errors import InputError as InputError
+    from .export import write_model as write_model
+    from .kinematics import (
+        forward_kinematics as forward_kinematics,
+        frame_jacobian as frame_jacobian,
+        frame_placement as frame_placement,
+    )
+    from .model import Frame as Frame, Joint as Joint, RobotModel as RobotModel
+    from .registry import backend as backend
+    from .regressor import (
+        joint_torque_regressor as joint_torque_regressor,
+        normal_matrix as normal_matrix,
+        packed_regressor as packed_regressor,
+        triangular_factor as triangular_factor,
+    )
+    from .report import write_report as write_report
+    from .results import Cause as Cause, Diagnosis as Diagnosis, Estimate as Estimate, Gain as Gain, Name as Name
+    from .urdf import load_urdf as load_urdf
+
+__version__ = "0.1.0"
+
+_MODULES = {
+    "config": ("load_task",),
+    "dataset": ("Recording", "read_recordings"),
+    "diagnosis": ("diagnose", "diagnose_task"),
+    "dynamics": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
+    "effect": ("Effect", "Motion", "amplitude", "shape"),
+    "effects": ("register",),
+    "errors": ("InputError",),
+    "export": ("write_model",),
+    "kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
+    "model": ("Frame", "Joint", "RobotModel"),
+    "regressor": ("joint_torque_regressor", "normal_matrix", "packed_regressor", "triangular_factor"),
+    "registry": ("backend",),
+    "report": ("write_report",),
+    "results": ("Cause", "Diagnosis", "Estimate", "Gain", "Name"),
+    "urdf": ("load_urdf",),
+}
+_HOME = {name: module for module, names in _MODULES.items() for name in names}
+__all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+        globals()[name] = value
+        return value
+    if not name.startswith("_") and importlib.util.find_spec(f"{__name__}.{name}"):
+        return importlib.import_module(f"{__name__}.{name}")
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])
