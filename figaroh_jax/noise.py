@@ -1,0 +1,126 @@
+"""The noise of the torque rows: its spectrum per joint, from something that is not the baseline's residual.
+
+With repeats the noise is half the difference of two repeats; without, the residual of the richest model, corrected at
+each frequency for what that model has fitted. A smooth log spectrum is fitted by a gamma GLM (Whittle likelihood) and
+inverted into the whitening response that every row and every column then passes. Powers are per row: white noise of
+variance s^2 has the spectrum s^2 at all frequencies.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Shaped
+from numpy.polynomial import legendre
+
+__all__ = ["Spectrum", "fit_spectrum", "leverage", "periodogram", "spectral_line", "whitening"]
+
+FLOOR = 0.05  # of the median power between 1 Hz and the cutoff: bounds what whitening amplifies
+LOWEST = 0.3  # Hz: below, the spectrum follows a power of the frequency alone
+
+
+class Spectrum(NamedTuple):
+    """Power of the noise of each joint before the row filter: log S = basis(f) @ coefficients."""
+
+    coefficients: Float[np.ndarray, "terms nv"]
+    covariance: Float[np.ndarray, "nv terms terms"]
+    nyquist: float  # Hz, of the rows
+
+    def power(self, frequency: Float[np.ndarray, " freqs"]) -> Float[np.ndarray, "freqs nv"]:
+        """Power at `frequency` (Hz), N^2 m^2 or N^2 a row; constant beyond the rows' Nyquist frequency."""
+        return np.exp(_basis(np.minimum(frequency, self.nyquist), self.nyquist) @ self.coefficients)
+
+    def redrawn(self, generator: np.random.Generator) -> Spectrum:
+        """The spectrum with its coefficients drawn from their covariance."""
+        draws = [generator.multivariate_normal(c, s) for c, s in zip(self.coefficients.T, self.covariance, strict=True)]
+        return self._replace(coefficients=np.stack(draws, axis=1))
+
+
+def periodogram(
+    rows: Float[np.ndarray, "samples *series"], rate: float
+) -> tuple[Float[np.ndarray, " freqs"], Float[np.ndarray, "freqs *series"]]:
+    """Frequencies (Hz, without 0) and Hann periodogram of a series, scaled so that white noise gives its variance."""
+    count = rows.shape[0]
+    window = np.hanning(count + 2)[1:-1].reshape(-1, *[1] * (rows.ndim - 1))
+    spectrum = np.fft.rfft((rows - rows.mean(0)) * window, axis=0)
+    power = np.abs(spectrum) ** 2 / (window**2).sum()
+    return np.fft.rfftfreq(count, 1 / rate)[1:], power[1:]
+
+
+def fit_spectrum(
+    frequency: Float[np.ndarray, " freqs"],
+    power: Float[np.ndarray, "freqs nv"],
+    gain: Float[np.ndarray, " freqs"],
+    degrees: Float[np.ndarray, " freqs"],
+    nyquist: float,
+) -> Spectrum:
+    """Smooth spectrum of noise that has passed a filter of power gain `gain`.
+
+    Gamma GLM with log link: log S = log gain + a0 + a1 log(f + .05) + Legendre polynomials 2 to 5 of log f above
+    .3 Hz, by iteratively reweighted least squares. `degrees` counts the periodograms averaged at each frequency.
+    """
+    used = gain > 1e-3
+    basis, weight = _basis(frequency[used], nyquist), degrees[used]
+    observed = np.maximum(power[used] / gain[used, None], 1e-300)
+    curvature = basis.T @ (weight[:, None] * basis) + np.diag([1e-9, 1e-2] + [1e-1] * (basis.shape[1] - 2))
+    inverse = np.linalg.inv(curvature)
+    level = np.average(observed, axis=0, weights=weight)
+    coefficients = np.zeros((basis.shape[1], power.shape[1]))
+    coefficients[0] = np.log(level)
+    for _ in range(30):
+        ratio = np.minimum(observed / np.exp(basis @ coefficients), 20.0)
+        coefficients += inverse @ (basis.T @ (weight[:, None] * (ratio - 1)))
+    covariance = np.broadcast_to(inverse, (power.shape[1], *inverse.shape))
+    return Spectrum(coefficients, covariance, nyquist)
+
+
+def whitening(
+    spectrum: Spectrum, frequency: Float[np.ndarray, " freqs"], gain: Float[np.ndarray, " freqs"], cutoff: float
+) -> Float[np.ndarray, "freqs nv"]:
+    """Zero-phase response that makes the filtered noise white: 1/sqrt(gain S + floor).
+
+    The floor is 5 % of the median filtered power between 1 Hz and the cutoff, so that the band which the row filter
+    has emptied is not blown up.
+    """
+    filtered = gain[:, None] * spectrum.power(frequency)
+    band = (frequency >= min(1.0, cutoff / 4)) & (frequency <= 0.8 * cutoff)
+    floor = FLOOR * np.median(filtered[band], axis=0)
+    return 1 / np.sqrt(filtered + floor)
+
+
+def leverage(basis: Float[np.ndarray, "samples nv columns"]) -> Float[np.ndarray, "freqs nv"]:
+    """Share of white noise that a projection on orthonormal `basis` takes away at each frequency and joint."""
+    count = basis.shape[0]
+    power = np.abs(np.fft.rfft(basis, axis=0)[1:]) ** 2
+    return power.sum(-1) / count * 2 / 2
+
+
+def spectral_line(
+    residual: Float[np.ndarray, "recordings samples nv"], rate: float, cutoff: float
+) -> tuple[float, float, int]:
+    """p-value, frequency (Hz) and joint of the strongest line in time, over a running median of 41 bins."""
+    powers = [periodogram(rows, rate) for rows in residual]
+    frequency, power = powers[0][0], np.mean([p for _, p in powers], axis=0)
+    used = (frequency > LOWEST) & (frequency < min(0.9 * cutoff, 0.6 * rate / 2))
+    if used.sum() < 41:
+        return 1.0, 0.0, 0
+    padded = np.pad(power, ((20, 20), (0, 0)), mode="reflect")
+    level = np.median(np.lib.stride_tricks.sliding_window_view(padded, 41, axis=0), axis=-1)
+    shape = float(len(powers))
+    ratio = np.where(used[:, None], power / np.maximum(level, 1e-300), 0)
+    row, joint = np.unravel_index(np.argmax(ratio), ratio.shape)
+    from scipy.special import gammaincc, gammaincinv  # scipy is slow to import
+
+    scale = gammaincinv(shape, 0.5)  # the median of a gamma variable of unit scale
+    # a Hann window spreads a line over three bins and correlates neighbours: fewer independent bins, so this is safe
+    tail = gammaincc(shape, ratio[row, joint] * scale)
+    return float(min(1.0, tail * used.sum() * power.shape[1])), float(frequency[row]), int(joint)
+
+
+def _basis(frequency: Shaped[np.ndarray, " freqs"], nyquist: float) -> Float[np.ndarray, "freqs terms"]:
+    span = np.log(nyquist / LOWEST)
+    x = np.clip(2 * np.log(np.maximum(frequency, LOWEST) / LOWEST) / span - 1, -1, 1)
+    polynomials = legendre.legvander(x, 5)[:, 2:]
+    start = legendre.legvander(np.array([-1.0]), 5)[:, 2:]
+    return np.column_stack([np.ones_like(x), np.log(frequency + 0.05), polynomials - start])

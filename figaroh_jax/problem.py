@@ -1,0 +1,207 @@
+"""The current model against the recordings: its raw regressor, its prior, its noise, its whitened rows.
+
+A `Problem` is the data, fixed for a diagnosis. A `State` is a model of it: baseline effects and the causes accepted so
+far, with the regressor at every sample. `whitened` gives the rows in which everything is decided.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int
+
+from .design import joint_columns, kind, shifted
+from .dynamics import inverse_dynamics
+from .effect import Effect, Motion
+from .effects import find
+from .evidence import Prior, Rows, instruments
+from .inertia import to_com
+from .model import RobotModel
+from .records import Records, filter_rows
+from .regressor import joint_torque_regressor
+
+__all__ = ["Layout", "Problem", "State", "baseline", "extended_state", "whitened"]
+
+FRICTION_PRECISION = 1e-6
+
+
+class Layout(eqx.Module):
+    """Which rows repeat, belong together or are left out together; T = recordings x rows."""
+
+    partner: Int[np.ndarray, "partners T"]
+    paired: Float[np.ndarray, "nv T"]
+    block: Int[np.ndarray, " T"]
+    fold: Int[np.ndarray, " T"]
+    repeats: bool = eqx.field(static=True)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Recordings to fit and what is believed of the robot before."""
+
+    model: RobotModel
+    records: Records
+    layout: Layout
+    trust: float
+    width: Float[np.ndarray, " nv"]  # half width of the friction's reversal, rad/s or m/s
+
+    @cached_property
+    def torque(self) -> Float[np.ndarray, "n M nv"]:
+        """Rows of the measured torque, not whitened, N m or N."""
+        return np.asarray(_rows(self.records, jnp.asarray(self.records.torque), jnp.ones(self.records.shape[3])))
+
+    @cached_property
+    def gain(self) -> Float[np.ndarray, " F"]:
+        """Power gain of the row filter."""
+        return np.asarray(self.records.low_pass) ** 2
+
+
+@dataclass(frozen=True)
+class State:
+    """A model of the data: effects with columns in order, sensor effects, regressor at the samples, coefficients."""
+
+    terms: tuple[Effect, ...]  # each with a leading axis of places
+    sensors: tuple[Effect, ...]
+    X: Float[np.ndarray, "nN nv P"]
+    prior: Prior
+    theta: Float[np.ndarray, " P"]
+    motion: Motion  # as measured, with load and total torque of `theta`
+
+    def response(self, omega: Float[Array, " F"]) -> Complex[Array, " F"]:
+        """Response of the torque sensor of all sensor effects together."""
+        out = jnp.ones(omega.shape, dtype=complex)
+        for effect in self.sensors:
+            if kind(effect) == "response":
+                out = out * effect.torque_response(omega)
+        return out
+
+
+def baseline(problem: Problem, names: Sequence[str], given: Sequence[Effect] = ()) -> State:
+    """Rigid body with its prior and the named effects at every joint, then the `given` ones."""
+    joints = np.arange(problem.model.nv)[:, None]
+    terms = []
+    for name in names:
+        effect = find(name)
+        terms.append(effect(joints, **{p: np.zeros(len(joints)) for p in effect.parameters()}))
+    motion = measured_motion(problem.model, problem.records, problem.width)
+    rigid, theta, precision = _rigid(problem, motion), *rigid_prior(problem.model, problem.trust)
+    state = State((), (), rigid, Prior(theta, precision), theta, motion)
+    for term in [*terms, *(batched(effect) for effect in given)]:
+        state = with_term(problem, state, term)
+    return state
+
+
+def rigid_prior(
+    model: RobotModel, trust: float
+) -> tuple[Float[np.ndarray, " 10nj"], Float[np.ndarray, " 10nj"]]:
+    """Nominal inertial parameters and their precision: one sigma is `trust` times m, m L (three times), J (six times).
+
+    L = max(0.05 m, |c|) and J = tr(I)/3 + 0.3 m L^2 give each link its own scale; a massless link gets that of one
+    thousandth of the heaviest.
+    """
+    nominal = np.asarray(model.inertia)
+    mass, com, inertia = (np.asarray(part) for part in to_com(nominal))
+    floor = 1e-3 * max(float(mass.max(initial=0.0)), 1e-3)
+    mass = np.maximum(mass, floor)
+    length = np.maximum(0.05, np.linalg.norm(com, axis=1))
+    turning = np.trace(inertia, axis1=1, axis2=2) / 3 + 0.3 * mass * length**2
+    scale = np.column_stack([mass, *[mass * length] * 3, *[turning] * 6])
+    return nominal.reshape(-1), 1 / (trust * scale.reshape(-1)) ** 2
+
+
+def batched(effect: Effect) -> Effect:
+    """The effect with a leading axis of one place."""
+    return jax.tree.map(lambda x: np.asarray(x)[None], effect)
+
+
+def with_term(problem: Problem, state: State, term: Effect) -> State:
+    """The state with one more effect (leading axis of places) whose torque is linear in its amplitudes."""
+    own = np.asarray(_term_columns(term, state.motion))
+    count = own.shape[-1]
+    prior = Prior(
+        np.append(state.prior.mean, np.zeros(count)),
+        np.append(state.prior.precision, np.full(count, FRICTION_PRECISION)),
+    )
+    X = np.concatenate([state.X, own], axis=2)
+    theta = np.append(state.theta, np.zeros(count))
+    return replace(state, terms=(*state.terms, term), X=X, prior=prior, theta=theta)
+
+
+def extended_state(problem: Problem, state: State, effect: Effect) -> State:
+    """The state with one more cause of whatever kind."""
+    if kind(effect) == "columns":
+        return with_term(problem, state, batched(effect))
+    grown = replace(state, sensors=(*state.sensors, effect))
+    if kind(effect) == "response":
+        return grown
+    moved = _rigid(problem, link_motion(problem, grown))
+    return replace(grown, X=np.concatenate([moved, state.X[:, :, moved.shape[2] :]], axis=2))
+
+
+def link_motion(problem: Problem, state: State) -> Motion:
+    """True motion of the links: as measured, less the errors of the position sensors."""
+    motion = state.motion
+    for effect in state.sensors:
+        if kind(effect) == "position":
+            motion = _shifted(effect, motion, problem.records)
+    return motion
+
+
+def solved(problem: Problem, state: State, theta: Float[np.ndarray, " P"]) -> State:
+    """The state with coefficients `theta`, and with the load and the torque that follow from them."""
+    links = 10 * len(problem.model.joints)
+    load = state.X[:, :, :links] @ theta[:links]
+    motion = eqx.tree_at(lambda m: (m.load, m.total), state.motion, (load, state.X @ theta))
+    return replace(state, theta=theta, motion=motion)
+
+
+def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> Rows:
+    """Whitened rows of the measured torque and of the state's regressor, with their instruments."""
+    records, layout = problem.records, problem.layout
+    n, samples, _, nv = records.shape
+    weight = jnp.asarray(records.weight)
+    y = _rows(records, jnp.asarray(records.torque), jnp.asarray(whitening)) * weight
+    response = jnp.asarray(whitening) * state.response(records.omega)[:, None]
+    X = _rows(records, jnp.asarray(state.X.reshape(n, samples, nv, -1)), response) * weight[..., None]
+    y = np.moveaxis(np.asarray(y).reshape(-1, nv), 0, 1)
+    X = np.moveaxis(np.asarray(X).reshape(-1, nv, X.shape[-1]), 0, 1)
+    Xi = X
+    if layout.repeats:
+        Xi = np.stack([instruments(x.T, layout.partner, p).T for x, p in zip(X, layout.paired, strict=True)])
+    return Rows(y, np.ascontiguousarray(X), np.ascontiguousarray(Xi), *_row_layout(layout))
+
+
+def _row_layout(layout: Layout) -> tuple[np.ndarray, ...]:
+    return layout.paired, layout.partner, layout.block, layout.fold
+
+
+@eqx.filter_jit
+def measured_motion(model: RobotModel, records: Records, width: Float[Array, " nv"]) -> Motion:
+    """All samples of all recordings as one motion, with the load of the nominal robot."""
+    q, v, a = (records.flat(jnp.asarray(x)) for x in (records.position, records.velocity, records.acceleration))
+    load = inverse_dynamics(model, q, v, a)
+    return Motion(model, records.flat(jnp.asarray(records.time)), q, v, a, load, load, records.dt, width)
+
+
+@eqx.filter_jit
+def _rows(records: Records, columns: Array, response: Array) -> Array:
+    return filter_rows(records, columns, jnp.broadcast_to(response, (records.omega.shape[0], records.shape[3])))
+
+
+_shifted = eqx.filter_jit(shifted)
+
+
+@eqx.filter_jit
+def _term_columns(term: Effect, motion: Motion) -> Float[Array, "nN nv columns"]:
+    columns = jax.vmap(lambda effect: joint_columns(effect, motion))(term)
+    return jnp.moveaxis(columns, 0, 2).reshape(*columns.shape[1:3], -1)
+
+
+def _rigid(problem: Problem, motion: Motion) -> Float[np.ndarray, "nN nv 10nj"]:
+    return np.asarray(joint_torque_regressor(problem.model, motion.position, motion.velocity, motion.acceleration))

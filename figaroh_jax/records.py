@@ -1,0 +1,139 @@
+"""Recordings on one clock, stacked and padded to one shape, and the one linear filter that every torque row passes.
+
+Everything that is compared with the measured torque (the torque itself, each regressor column) goes through
+`filter_rows`: the squared response of the row filter, a further response (whitening, delay, lag), the rows kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int, Shaped
+
+from .signals import Signals
+
+__all__ = ["Records", "filter_rows", "stack"]
+
+REACH = 12.0  # impulse response of the row filter that is kept beyond each end, in 1/cutoff
+
+
+class Records(eqx.Module):
+    """`n` recordings of at most `N` samples at one period, and of at most `M` rows; short ones are padded."""
+
+    time: Float[Array, "n N"]  # s
+    position: Float[Array, "n N nv"]  # rad or m, low-passed
+    velocity: Float[Array, "n N nv"]
+    acceleration: Float[Array, "n N nv"]
+    torque: Float[Array, "n N nv"]  # N m or N, as measured
+    source: Int[Array, "n L"]  # sample that stands at each place of the extended record
+    pivot: Int[Array, "n L"]  # sample about which it is reflected, where it is
+    reflected: Float[Array, "n L"]  # 1 where it is
+    kept: Int[Array, "n M"]  # place of each row in the extended record
+    weight: Float[Array, "n M nv"]  # 1: a row, 0: trimmed, gated, in a gap or padding
+    low_pass: Float[Array, " F"]  # response of the row filter
+    omega: Float[Array, " F"]  # rad/s
+    dt: Float[Array, ""] | float  # s, of the samples
+    rate: Float[Array, ""] | float  # Hz, of the rows
+    cutoff: Float[Array, ""] | float  # Hz
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Recordings, samples, rows, coordinates."""
+        n, samples, nv = self.position.shape
+        return n, samples, self.kept.shape[1], nv
+
+    def flat(self, signal: Shaped[Array, "n N *rest"]) -> Shaped[Array, "nN *rest"]:
+        """The samples of all recordings on one axis."""
+        return signal.reshape(-1, *signal.shape[2:])
+
+    def row_samples(self) -> Int[np.ndarray, "n M"]:
+        """Sample of each row."""
+        return np.take_along_axis(np.asarray(self.source), np.asarray(self.kept), axis=1)
+
+
+def filter_rows(
+    records: Records,
+    columns: Float[Array, "n N *rest"],
+    response: Shaped[Array, "F *series"] | None = None,
+) -> Float[Array, "n M *rest"]:
+    """Rows of `columns`: low-passed without phase, times `response`, at the rows' samples.
+
+    `response` (real or complex, over `records.omega`) has the trailing axes of `columns` or leads them.
+    """
+    n, _, *rest = columns.shape
+    flat = columns.reshape(n, columns.shape[1], -1)
+
+    def extend(x: Float[Array, "N k"], source: Array, pivot: Array, reflected: Array) -> Float[Array, "L k"]:
+        return x[source] * (1 - 2 * reflected[:, None]) + 2 * x[pivot] * reflected[:, None]
+
+    extended = jax.vmap(extend)(flat, records.source, records.pivot, records.reflected)
+    factor: Shaped[Array, " F k"] = records.low_pass[:, None]
+    if response is not None:
+        series = response.reshape(*response.shape, *[1] * (1 + len(rest) - response.ndim))
+        factor = factor * jnp.broadcast_to(series, (response.shape[0], *rest)).reshape(response.shape[0], -1)
+    spectrum: Complex[Array, "n F k"] = jnp.fft.rfft(extended, axis=1) * factor
+    filtered = jnp.fft.irfft(spectrum, records.source.shape[1], axis=1)
+    rows = jnp.take_along_axis(filtered, records.kept[:, :, None], axis=1)
+    return rows.reshape(n, -1, *rest)
+
+
+def stack(signals: Sequence[Signals]) -> Records:
+    """The recordings as one; they must share period, row rate and cutoff (`signals.prepare_all` sees to that)."""
+    from scipy.fft import next_fast_len  # scipy is slow to import
+
+    first = signals[0]
+    reach = int(np.ceil(max(REACH / first.cutoff, 0.5) / first.dt))
+    samples = max(s.time.size for s in signals)
+    count = max(s.rows.kept for s in signals)
+    length = next_fast_len(samples + 2 * reach, real=True)
+    extended = [_extension(s.time.size, reach, length) for s in signals]
+    omega = 2 * np.pi * np.fft.rfftfreq(length, first.dt)
+    return Records(
+        time=_padded([s.time for s in signals], samples),
+        position=_padded([s.position for s in signals], samples),
+        velocity=_padded([s.velocity for s in signals], samples, hold=False),
+        acceleration=_padded([s.acceleration for s in signals], samples, hold=False),
+        torque=_padded([np.zeros_like(s.position) if s.torque is None else s.torque for s in signals], samples),
+        source=np.stack([e[0] for e in extended]),
+        pivot=np.stack([e[1] for e in extended]),
+        reflected=np.stack([e[2] for e in extended]),
+        kept=_padded([s.rows.index + reach for s in signals], count),
+        weight=_padded([s.rows.weight for s in signals], count, hold=False),
+        low_pass=butterworth_power(omega, first.cutoff, first.dt),
+        omega=omega,
+        dt=first.dt,
+        rate=1 / (first.dt * first.rows.step),
+        cutoff=first.cutoff,
+    )
+
+
+def butterworth_power(omega: Float[np.ndarray, " F"], cutoff: float, dt: float) -> Float[np.ndarray, " F"]:
+    """Squared magnitude of a digital Butterworth low pass of order 4: 1 / (1 + (tan(w dt/2) / tan(wc dt/2))^8)."""
+    ratio = np.tan(np.minimum(omega * dt / 2, np.pi / 2 - 1e-9)) / np.tan(np.pi * cutoff * dt)
+    return 1 / (1 + ratio**8)
+
+
+def _extension(
+    samples: int, reach: int, length: int
+) -> tuple[Int[np.ndarray, " L"], Int[np.ndarray, " L"], Float[np.ndarray, " L"]]:
+    """Odd reflection of `reach` samples at both ends; what is left of `length` holds the two outermost values."""
+    place = np.arange(length) - reach
+    end = samples - 1
+    past = np.clip(place, -min(reach, end), end + min(reach, end))
+    past = np.where(place > end + (length - samples - reach) // 2 + reach // 2, -min(reach, end), past)
+    before, after = past < 0, past > end
+    source = np.where(before, -past, np.where(after, 2 * end - past, past))
+    return source, np.where(after, end, 0), (before | after).astype(float)
+
+
+def _padded(arrays: Sequence[np.ndarray], length: int, hold: bool = True) -> np.ndarray:
+    """The arrays stacked; short ones hold their last value, or are zero from their end."""
+    out = []
+    for array in arrays:
+        widths = [(0, length - len(array))] + [(0, 0)] * (array.ndim - 1)
+        out.append(np.pad(array, widths, mode="edge") if hold else np.pad(array, widths))
+    return np.stack(out)

@@ -1,0 +1,193 @@
+"""Which of all candidates the residual points to: scores of the whole catalogue and one family-wise p-value.
+
+Naming starts here and never ends here: columns that are right to first order find, exact models decide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .design import candidates, effect_rows, kind
+from .effect import Effect, Motion
+from .effects import CATALOGUE, LinkEffect
+from .evidence import Columns, Linear, Rows, Score, block_scores, score, score_parts
+from .model import RobotModel
+from .noise import Spectrum
+from .problem import Problem, State
+from .records import Records
+from .results import Name
+
+__all__ = ["Group", "Screen", "catalogue", "family_p", "screen"]
+
+DRAWS = 400
+CHUNK = 50  # draws held at once
+ALTERNATIVES = ({"torque_delay", "torque_lag"},)  # once one is in, the other is not tried
+
+
+class Group(NamedTuple):
+    """One effect at one place: `effect` has a leading axis, the grid of its shape."""
+
+    name: Name
+    effect: Effect
+    columns: Columns
+
+
+class Screen(NamedTuple):
+    """Scores of all groups, and what they were computed from."""
+
+    groups: list[Group]
+    scores: list[Score]
+
+    def best(self, rows: Rows) -> list[tuple[float, int, int]]:
+        """Rank (Q less its penalties), group and grid point, best first."""
+        out = []
+        for index, result in enumerate(self.scores):
+            point = int(np.argmax(result.Q))
+            penalty = result.rank[point] * np.log(rows.count) + 2 * np.log(len(result.Q))
+            out.append((float(result.Q[point] - penalty), index, point))
+        return sorted(out, reverse=True)
+
+
+def catalogue(
+    problem: Problem, state: State, rows: Rows, whitening: Float[np.ndarray, "F nv"], forbid: Collection[str]
+) -> list[Group]:
+    """Whitened columns of every effect that may be named, at every place and grid point."""
+    taken = {(type(e).name, tuple(at)) for term in state.terms for e, at in _places_of(term)}
+    taken |= {(effect.name, tuple(np.asarray(effect.at))) for effect in state.sensors}
+    closed = {name for pair in ALTERNATIVES if any(t[0] in pair for t in taken) for name in pair}
+    wanted = {n: e for n, e in CATALOGUE.items() if n not in forbid and n not in closed}
+    batches = {name: candidates(effect, problem.model) for name, effect in wanted.items()}
+    free = {n: b for n, b in batches.items() if not isinstance(b, LinkEffect) and b.at.shape[0]}
+    response = jnp.asarray(whitening) * state.response(problem.records.omega)[:, None]
+    computed = _all_rows(free, state.motion, problem.records, response)
+    groups = []
+    for name, batch in batches.items():
+        for place in range(batch.at.shape[0]):
+            one = jax.tree.map(lambda x, p=place: np.asarray(x)[p], batch)
+            at = tuple(int(i) for i in one.at[0])
+            if (name, at) in taken:
+                continue
+            if name in free:
+                own = len(at) and kind(batch) == "columns"
+                Z = np.asarray(computed[name][place])
+                columns = Columns(at if own else tuple(range(problem.model.nv)), Z.reshape(*Z.shape[:3], -1))
+            else:
+                columns = _link_columns(rows, at[0], problem.model)
+            groups.append(Group(Name(name, place_names(problem.model, batch, at)), one, columns))
+    return [group for group in groups if np.abs(group.columns.Z).max() > 0]
+
+
+def place_names(model: RobotModel, effect: Effect | type[Effect], at: tuple[int, ...]) -> tuple[str, ...]:
+    """Names of the joints or of the link at the indices."""
+    names = model.link_names if effect.acts_on == "link" else model.joint_names
+    return tuple(names[i] for i in at)
+
+
+def screen(rows: Rows, linear: Linear, groups: list[Group]) -> Screen:
+    """Scores of all groups with the current model projected out."""
+    return Screen(groups, [score(rows, linear, group.columns) for group in groups])
+
+
+def family_p(
+    problem: Problem,
+    rows: Rows,
+    linear: Linear,
+    found: Screen,
+    spectrum: Spectrum,
+    whitening: Float[np.ndarray, "F nv"],
+    generator: np.random.Generator,
+) -> float:
+    """Chance that noise alone gives some candidate of the whole catalogue a score as large as the largest.
+
+    The larger of two nulls: noise drawn from the spectrum (its coefficients redrawn each time), and fair signs of
+    whole blocks of the residual, the prior's rows among the blocks.
+    """
+    highest = max(float(result.z.max()) for result in found.scores)
+    flips = _flipped(rows, linear, found, generator)
+    drawn = _drawn(problem, rows, linear, found, spectrum, whitening, generator)
+    return max((1 + np.sum(null >= highest)) / (DRAWS + 1) for null in (flips, drawn))
+
+
+def _flipped(rows: Rows, linear: Linear, found: Screen, generator: np.random.Generator) -> Float[np.ndarray, " draws"]:
+    highest = np.full(DRAWS, -np.inf)
+    signs: np.ndarray | None = None
+    for group, result in zip(found.groups, found.scores, strict=True):
+        parts = block_scores(rows, linear, group.columns, result)
+        if signs is None:
+            signs = generator.choice([-1.0, 1.0], (DRAWS, len(parts)))
+        highest = np.maximum(highest, _largest(np.tensordot(signs, parts, 1), result))
+    return highest
+
+
+def _drawn(
+    problem: Problem,
+    rows: Rows,
+    linear: Linear,
+    found: Screen,
+    spectrum: Spectrum,
+    whitening: Float[np.ndarray, "F nv"],
+    generator: np.random.Generator,
+) -> Float[np.ndarray, " draws"]:
+    prior = np.sqrt(np.maximum(np.diag(linear.moment) - (rows.Xi.reshape(-1, rows.Xi.shape[-1]) ** 2).sum(0), 0))
+    highest = []
+    for _ in range(DRAWS // CHUNK):
+        noise = draw_noise(problem, spectrum, whitening, CHUNK, generator)
+        pulls = prior * generator.standard_normal((CHUNK, len(prior)))
+        best = np.full(CHUNK, -np.inf)
+        for group, result in zip(found.groups, found.scores, strict=True):
+            parts = score_parts(rows, linear, group.columns, result, noise)
+            best = np.maximum(best, _largest(parts + np.einsum("dp,gpk->dgk", pulls, result.H), result))
+        highest.append(best)
+    return np.concatenate(highest)
+
+
+def draw_noise(
+    problem: Problem,
+    spectrum: Spectrum,
+    whitening: Float[np.ndarray, "F nv"],
+    draws: int,
+    generator: np.random.Generator,
+) -> Float[np.ndarray, "draws nv T"]:
+    """Whitened rows of noise with the spectrum, its coefficients redrawn from their covariance."""
+    records = problem.records
+    n, _, count, nv = records.shape
+    frequency = np.fft.rfftfreq(count, 1 / float(records.rate))
+    known = np.asarray(records.omega) / (2 * np.pi)
+    response = [np.interp(frequency, known, np.asarray(records.low_pass) * whitening[:, j]) for j in range(nv)]
+    shape = np.sqrt(spectrum.redrawn(generator).power(frequency)) * np.stack(response, axis=1)
+    white = np.fft.rfft(generator.standard_normal((draws, n, count, nv)), axis=2)
+    rows = np.fft.irfft(white * shape, count, axis=2) * records.weight
+    return np.moveaxis(rows.reshape(draws, -1, nv), 1, 2)
+
+
+def _largest(scores: Float[np.ndarray, "draws grid k"], result: Score) -> Float[np.ndarray, " draws"]:
+    from .evidence import wilson_hilferty
+
+    white = np.einsum("gij,dgj->dgi", result.root, scores)
+    return wilson_hilferty((white**2).sum(-1), np.broadcast_to(result.rank, white.shape[:2])).max(1)
+
+
+def _link_columns(rows: Rows, link: int, model: RobotModel) -> Columns:
+    Z = np.swapaxes(rows.X[:, :, 10 * link : 10 * link + 10], 1, 2)
+    return Columns(tuple(range(model.nv)), np.moveaxis(Z, 1, 0)[None])
+
+
+def _places_of(term: Effect) -> list[tuple[Effect, tuple[int, ...]]]:
+    return [(term, tuple(int(i) for i in at)) for at in np.asarray(term.at)]
+
+
+@eqx.filter_jit
+def _all_rows(
+    batches: dict[str, Effect], motion: Motion, records: Records, response: Array
+) -> dict[str, Float[Array, "places grid k rows n M"]]:
+    def rows(effect: Effect) -> Float[Array, "k rows n M"]:
+        return effect_rows(effect, motion, records, response)
+
+    return {name: jax.vmap(jax.vmap(rows))(batch) for name, batch in batches.items()}

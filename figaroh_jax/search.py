@@ -1,0 +1,231 @@
+"""One cause after another: shortlist, exact refit, comparison on held-out folds, gates, ambiguity set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from .comparison import Hypothesis, Verdicts, judge, shares_of_wins, t_value
+from .design import kind
+from .effect import Effect
+from .evidence import Linear, Rows, fit
+from .noise import Spectrum
+from .problem import Problem, State, extended_state, solved, whitened
+from .records import filter_rows
+from .refit import Whitened, refit, shapes, with_shape
+from .results import Name
+from .screening import Group, Screen, catalogue, family_p, screen
+
+__all__ = ["Found", "Step", "find_causes", "stand"]
+
+SHORTLIST, SHARE = 6, 0.35  # candidates compared exactly; share of the best rank that they need
+STARTS = 4
+GAIN, CONFIDENT, UNSURE = 0.004, 1.64, 1.7
+MOST = 12
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A candidate with its exact shape, the model of the data with it in, and what the data say of that."""
+
+    name: Name
+    effect: Effect
+    hypothesis: Hypothesis
+    verdicts: Verdicts
+
+
+@dataclass(frozen=True)
+class Found:
+    """A cause that was accepted, and what could not be told from it."""
+
+    name: Name
+    effect: Effect
+    p_value: float
+    heldout: tuple[float, float]  # whitened squares before and after
+    cost: tuple[float, float]
+    t: float
+    confidence: float
+    ambiguous: tuple[Name, ...]
+
+
+@dataclass(frozen=True)
+class Step:
+    """Where a search stands: the state, its rows and fit."""
+
+    state: State
+    rows: Rows
+    linear: Linear
+    verdicts: Verdicts
+
+
+def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> Step:
+    """Rows, fit and held-out squares of a state; the state comes back with its coefficients."""
+    rows = whitened(problem, state, whitening)
+    linear = fit(rows, state.prior)
+    verdicts = judge(rows, Hypothesis(rows.X, state.prior))
+    return Step(solved(problem, state, verdicts.theta), rows, linear, verdicts)
+
+
+def contend(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group, order: np.ndarray) -> Contender:
+    """The candidate with its exact shape, started from its best grid points."""
+    way = kind(group.effect)
+    if way == "response":
+        return _response_contender(problem, step, whitening, group, int(order[0]))
+    starts = order[:STARTS]
+    if shapes(type(group.effect)):
+        if len(starts) < STARTS:
+            starts = np.resize(starts, STARTS)
+        effects = jax.tree.map(lambda x: x[starts], group.effect)
+        effect, Z = refit(effects, step.state.motion, problem.records, _for_refit(problem, step, whitening))
+        Z = Z.reshape(*Z.shape[:2], -1)
+    else:
+        effect = jax.tree.map(lambda x: x[starts[0]], group.effect)
+        Z = group.columns.Z[starts[0]]
+    rows = step.rows
+    full = np.zeros((*rows.y.shape, Z.shape[0]))
+    full[list(group.columns.joints)] = np.moveaxis(Z, 0, 2)
+    if way == "position":
+        (name,) = effect.parameters()
+        hypothesis = Hypothesis(rows.X, step.state.prior, full[..., 0] * float(getattr(effect, name)))
+    else:
+        X = np.concatenate([rows.X, full], axis=2)
+        hypothesis = Hypothesis(X, step.state.prior.extended(Z.shape[0]))
+    verdicts = judge(rows, hypothesis)
+    if way == "columns":
+        names = [n for n, p in effect.parameters().items() if p.linear]
+        effect = with_shape(effect, names, list(verdicts.theta[-len(names) :]))
+    return Contender(group.name, effect, hypothesis, verdicts)
+
+
+def _for_refit(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"]) -> Whitened:
+    n, _, count, nv = problem.records.shape
+    rows = step.rows
+    tall = rows.X.reshape(-1, rows.X.shape[-1])
+    A = tall.T @ tall + np.diag(step.state.prior.precision)
+    residual = rows.y - rows.X @ step.verdicts.theta
+    response = whitening * np.asarray(step.state.response(jnp.asarray(problem.records.omega)))[:, None]
+    return Whitened(residual.reshape(nv, n, count), rows.X.reshape(nv, n, count, -1), np.linalg.inv(A), response)
+
+
+def _response_contender(
+    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group, start: int
+) -> Contender:
+    """Gauss-Newton on the parameter of a response of the torque sensor, all coefficients fitted anew each time."""
+    effect = jax.tree.map(lambda x: x[start], group.effect)
+    ((name, parameter),) = effect.parameters().items()
+    for _ in range(6):
+        state = extended_state(problem, step.state, effect)
+        here = stand(problem, state, whitening)
+        slope = _response_slope(problem, here.state, effect, name, whitening)
+        X = np.concatenate([here.rows.X, slope[..., None]], axis=2)
+        change = judge(here.rows, Hypothesis(X, state.prior.extended(1))).theta[-1]
+        value = float(np.clip(float(getattr(effect, name)) + change, parameter.lower, parameter.upper))
+        done = abs(value - float(getattr(effect, name))) < 1e-7
+        effect = with_shape(effect, [name], [np.float64(value)])
+        if done:
+            break
+    state = extended_state(problem, step.state, effect)
+    here = stand(problem, state, whitening)
+    return Contender(group.name, effect, Hypothesis(here.rows.X, state.prior), here.verdicts)
+
+
+def _response_slope(
+    problem: Problem, state: State, effect: Effect, name: str, whitening: Float[np.ndarray, "F nv"]
+) -> Float[np.ndarray, "nv T"]:
+    """Derivative of the whitened torque of the state in the parameter of its response."""
+    omega = jnp.asarray(problem.records.omega)
+    n, samples, _, nv = problem.records.shape
+    value, slope = jax.jvp(
+        lambda p: with_shape(effect, [name], [p]).torque_response(omega),
+        (jnp.asarray(getattr(effect, name)),),
+        (jnp.ones(()),),
+    )
+    response = (state.response(omega) * slope / value)[:, None] * jnp.asarray(whitening)
+    rows = filter_rows(problem.records, jnp.asarray(state.motion.total).reshape(n, samples, nv), response)
+    return np.moveaxis(np.asarray(rows * problem.records.weight).reshape(-1, nv), 0, 1)
+
+
+def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray]]:
+    """The best groups, each with its grid points in the order of their scores."""
+    ranked = found.best(step.rows)
+    chosen = [r for r in ranked[:SHORTLIST] if r[0] > SHARE * ranked[0][0]] or ranked[:1]
+    return [(found.groups[g], np.argsort(-found.scores[g].Q)) for _, g, _ in chosen]
+
+
+def find_causes(
+    problem: Problem,
+    state: State,
+    spectrum: Spectrum,
+    whitening: Float[np.ndarray, "F nv"],
+    forbid: Collection[str],
+    alpha: float,
+    progress: Callable[[str, float], None] = lambda phase, share: None,
+    generator: np.random.Generator | None = None,
+) -> tuple[Step, list[Found], float, Screen]:
+    """Accept the best cause until none passes the gates; answers the last step, the causes, the first p and screen."""
+    generator = generator or np.random.default_rng(0)
+    step, found = stand(problem, state, whitening), []
+    first_p, first_screen = 1.0, None
+    while len(found) < MOST:
+        progress("screening the catalogue", len(found) / MOST)
+        groups = catalogue(problem, step.state, step.rows, whitening, forbid)
+        screened = screen(step.rows, step.linear, groups)
+        p = family_p(problem, step.rows, step.linear, screened, spectrum, whitening, generator)
+        if first_screen is None:
+            first_p, first_screen = p, screened
+        if p > alpha:
+            break
+        progress("comparing causes on held-out data", len(found) / MOST)
+        accepted = _accept(problem, step, screened, whitening, p, generator, found)
+        if accepted is None:
+            break
+        step = stand(problem, extended_state(problem, step.state, accepted.effect), whitening)
+        found.append(accepted)
+    return step, found, first_p, first_screen or Screen([], [])
+
+
+def _accept(
+    problem: Problem,
+    step: Step,
+    screened: Screen,
+    whitening: Float[np.ndarray, "F nv"],
+    p: float,
+    generator: np.random.Generator,
+    before: list[Found],
+) -> Found | None:
+    """The cause that predicts best where it was not fitted, if it passes the gates; else nothing."""
+    contenders = [contend(problem, step, whitening, *entry) for entry in shortlist(step, screened)]
+    contenders.sort(key=lambda c: c.verdicts.heldout)
+    best = contenders[0]
+    t = t_value(step.verdicts.blocks, best.verdicts.blocks)
+    gain = 1 - best.verdicts.heldout / step.verdicts.heldout
+    if t < CONFIDENT or gain < GAIN or not _recurs(step, contenders, best):
+        return None
+    members = [c for c in contenders[1:] if t_value(c.verdicts.blocks, best.verdicts.blocks) < UNSURE]
+    drop = step.verdicts.cost - best.verdicts.cost
+    members = [c for c in members if c.verdicts.cost - best.verdicts.cost < max(0.1 * drop, 15)]
+    wins = shares_of_wins(np.stack([c.verdicts.blocks for c in contenders]), generator)
+    return Found(
+        best.name,
+        best.effect,
+        p,
+        (step.verdicts.heldout, best.verdicts.heldout),
+        (step.verdicts.cost, best.verdicts.cost),
+        t,
+        float(wins[0]) * (1 - p),
+        tuple(c.name for c in members),
+    )
+
+
+def _recurs(step: Step, contenders: list[Contender], best: Contender) -> bool:
+    """Whether the cause is among the best three in at least two thirds of the folds, ranked without the fold."""
+    ranks = []
+    for fold, without in enumerate(step.verdicts.without):
+        drops = sorted(contenders, key=lambda c: c.verdicts.without[fold] - without)
+        ranks.append(drops.index(best))
+    return float(np.mean(np.array(ranks) < 3)) >= 2 / 3
