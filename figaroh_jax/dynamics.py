@@ -12,6 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .kinematics import Motion, ancestors, gather, in_samples, motion, states, world_axes
@@ -22,7 +23,7 @@ __all__ = ["inverse_dynamics", "joint_torques", "link_wrenches"]
 
 
 def inverse_dynamics(
-    model: RobotModel, q: Float[Array, "*batch nv"], v: Float[Array, "*batch nv"], a: Float[Array, "*batch nv"]
+    model: RobotModel, q: Float[ArrayLike, "*batch nv"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
 ) -> Float[Array, "*batch nv"]:
     r"""Torques (N m; N for a prismatic joint) that give the rigid body the accelerations `a`.
 

@@ -59,7 +59,7 @@ def transform(
 
 
 def from_com(
-    mass: Float[Numbers, "*batch"], com: Float[Numbers, "*batch 3"], inertia: Float[Numbers, "*batch 3 3"]
+    mass: Float[Numbers, "*batch"] | float, com: Float[Numbers, "*batch 3"], inertia: Float[Numbers, "*batch 3 3"]
 ) -> Float[Numbers, "*batch 10"]:
     """Ten parameters from the mass (kg), the centre of mass (m) and the inertia about it (kg m^2), axes as the frame."""
     xp = _space(com)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .errors import InputError
@@ -171,7 +172,7 @@ def world_axes(model: RobotModel, R: Float[Array, "nj 3 3 samples"]) -> Float[Ar
     return rotate(R, jnp.asarray(model.axis, R.dtype)[..., None])
 
 
-def states(model: RobotModel, **arrays: Float[Array, "*batch nv"]) -> list[Float[Array, "*batch nv"]]:
+def states(model: RobotModel, **arrays: Float[ArrayLike, "*batch nv"]) -> list[Float[Array, "*batch nv"]]:
     """The named arrays (`q=`, `v=`, ...) in float64, once their shapes fit the model and each other.
 
     To be called where 64-bit JAX is on. Raises `InputError` naming the array whose shape is wrong.
@@ -194,7 +195,7 @@ def in_samples(kernel: Callable[..., Array], *arrays: Float[Array, "*batch nv"])
     return jnp.moveaxis(answer, -1, 0).reshape(*batch, *answer.shape[:-1])
 
 
-def forward_kinematics(model: RobotModel, q: Float[Array, "*batch nv"]) -> Float[Array, "*batch nj 4 4"]:
+def forward_kinematics(model: RobotModel, q: Float[ArrayLike, "*batch nv"]) -> Float[Array, "*batch nj 4 4"]:
     """Poses `world_T_joint` of all tree joints (m; q in rad, m for a prismatic joint), in float64.
 
     Raises `InputError` where the shape of `q` does not fit the model.

@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float
 
 from .errors import InputError, nearest
@@ -42,16 +43,16 @@ class RobotModel(eqx.Module):
     A tree joint's position is `ratio * q[coordinate] + offset`; ratio is 1 and offset 0 except for mimic joints.
     """
 
-    placement: Float[Array, "nj 4 4"]  # pose of each joint in its parent's joint frame, at zero
-    axis: Float[Array, "nj 3"]  # unit axis in the joint frame
-    inertia: Float[Array, "nj 10"]  # of the link that the joint moves, at and in the joint frame
-    ratio: Float[Array, " nj"]
-    offset: Float[Array, " nj"]
-    gravity: Float[Array, "3"]  # m/s^2, in the world
-    frame_placement: Float[Array, "nf 4 4"]  # pose of each frame in its parent's joint frame
-    position_limit: Float[Array, "nv 2"]  # lower, upper; infinite where the model gives none
-    velocity_limit: Float[Array, " nv"]
-    effort_limit: Float[Array, " nv"]
+    placement: Float[Array | np.ndarray, "nj 4 4"]  # pose of each joint in its parent's joint frame, at zero
+    axis: Float[Array | np.ndarray, "nj 3"]  # unit axis in the joint frame
+    inertia: Float[Array | np.ndarray, "nj 10"]  # of the link that the joint moves, at and in the joint frame
+    ratio: Float[Array | np.ndarray, " nj"]
+    offset: Float[Array | np.ndarray, " nj"]
+    gravity: Float[Array | np.ndarray, "3"]  # m/s^2, in the world
+    frame_placement: Float[Array | np.ndarray, "nf 4 4"]  # pose of each frame in its parent's joint frame
+    position_limit: Float[Array | np.ndarray, "nv 2"]  # lower, upper; infinite where the model gives none
+    velocity_limit: Float[Array | np.ndarray, " nv"]
+    effort_limit: Float[Array | np.ndarray, " nv"]
     joints: tuple[Joint, ...] = eqx.field(static=True)
     frames: tuple[Frame, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True)
