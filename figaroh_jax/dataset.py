@@ -63,7 +63,8 @@ def _check_names(task: Task, model: RobotModel) -> None:
     known = {*model.joint_names, *model.link_names, *(frame.name for frame in model.frames)}
     for joint in task.preprocess.gate:
         if joint not in model.joint_names:
-            raise InputError(f"{task.file}: preprocess.gate: no moving joint '{joint}'{nearest(joint, model.joint_names)}")
+            hint = nearest(joint, model.joint_names)
+            raise InputError(f"{task.file}: preprocess.gate: no moving joint '{joint}'{hint}")
     for k, effect in enumerate(task.baseline.effects):
         for name in effect.at:
             if name not in known:
@@ -162,7 +163,7 @@ def _array(table: Table, source, model: RobotModel, key: str, samples: int | Non
 
 def _time(table: Table, entry: RecordingEntry, key: str, samples: int) -> Float[np.ndarray, " samples"]:
     if samples < 2:
-        raise InputError(f"{table.file}: {samples} sample{'' if samples == 1 else 's'}; a recording is a motion over time")
+        raise InputError(f"{table.file}: {samples} sample{'s'[samples:]}; a recording is a motion over time")
     if entry.time is None:
         return np.arange(samples) / entry.rate
     time = table.vector(entry.time, f"{key}.time")

@@ -72,7 +72,7 @@ def filter_rows(
     record = jnp.moveaxis(jnp.asarray(x), 0, -1)
     spectrum = jnp.fft.rfft(_extend(record, rows.pad, jnp), n=rows.length)
     gain = rows.gain if response is None else rows.gain * response
-    filtered = jnp.fft.irfft(spectrum * gain, n=rows.length)
+    filtered = jnp.fft.irfft(spectrum * jnp.broadcast_to(gain, spectrum.shape), n=rows.length)
     begin = rows.pad + rows.first
     kept = filtered[..., begin : begin + rows.step * (rows.kept - 1) + 1 : rows.step]
     return jnp.moveaxis(kept, -1, 0)

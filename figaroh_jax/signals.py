@@ -96,9 +96,7 @@ def prepare_all(recordings: Sequence[Recording], preprocess: Preprocess) -> tupl
     return tuple(prepared)
 
 
-def prepare(
-    recording: Recording, preprocess: Preprocess, rates: Rates | None = None, *, shift: float = 0.0
-) -> Signals:
+def prepare(recording: Recording, preprocess: Preprocess, rates: Rates | None = None, *, shift: float = 0.0) -> Signals:
     """Even, low-passed, differentiated signals of one recording and the filter that makes its rows.
 
     `rates` are those of `choose_rates`, by default for this recording alone; `shift` (s, less than a row) moves the

@@ -86,8 +86,8 @@ def read_table(file: Path, key: str) -> Table:
     if file.is_dir():
         raise InputError(f"{file} ({key}) is a directory, expected a recording file")
     if not file.is_file():
-        siblings = [p.name for p in file.parent.glob("*") if p.suffix.lower() in FORMATS] if file.parent.is_dir() else []
-        raise InputError(f"{file} ({key}) does not exist{nearest(file.name, sorted(siblings))}")
+        beside = sorted(path.name for path in file.parent.glob("*") if path.suffix.lower() in FORMATS)
+        raise InputError(f"{file} ({key}) does not exist{nearest(file.name, beside)}")
     try:
         if file.stat().st_size == 0:
             raise InputError(f"{file} ({key}) is empty")

@@ -22,7 +22,7 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent, index):
         if self.check_event(yaml.AliasEvent):
             mark = self.peek_event().start_mark
-            raise InputError(f"line {mark.line + 1}: YAML aliases (*name) are not accepted; use `extends` to share keys")
+            raise InputError(f"line {mark.line + 1}: YAML aliases are not accepted; use `extends` to share keys")
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node, deep=False):
@@ -40,9 +40,8 @@ def read_yaml(file: Path, asked_by: str = "") -> dict[str, Any]:
     if file.is_dir():
         raise InputError(f"{name} is a directory, expected a YAML file")
     if not file.is_file():
-        folder = file.parent
-        siblings = sorted(p.name for p in folder.iterdir() if p.suffix in (".yaml", ".yml")) if folder.is_dir() else []
-        raise InputError(f"{name} does not exist{nearest(file.name, siblings)}")
+        beside = sorted(path.name for path in file.parent.glob("*.y*ml"))
+        raise InputError(f"{name} does not exist{nearest(file.name, beside)}")
     try:
         if file.stat().st_size > LARGEST:
             raise InputError(f"{name} is larger than 1 MiB, which no task needs")
@@ -56,7 +55,7 @@ def read_yaml(file: Path, asked_by: str = "") -> dict[str, Any]:
     if content is None:
         raise InputError(f"{name} is empty")
     if not isinstance(content, dict):
-        raise InputError(f"{name} holds a {type(content).__name__}, expected keys and values such as `robot:` and `data:`")
+        raise InputError(f"{name} holds a {type(content).__name__}, expected keys such as `robot:` and `data:`")
     return content
 
 
