@@ -1,0 +1,11 @@
+"""Recordings with known causes hidden in them, made without any code of the library.
+
+Pinocchio (`inverse`) and MuJoCo C (`closed_loop`) are the only physics here, so a law that the library has wrong is
+not wrong in the same way on both sides. `make_case` hides effects of given size, `Case.write` leaves a task on disk.
+"""
+
+from .case import Case, Truth
+from .inverse import CLASSES, EFFECTS, FOREIGN, make_case, observable
+from .robots import available
+
+__all__ = ["CLASSES", "EFFECTS", "FOREIGN", "Case", "Truth", "available", "make_case", "observable"]

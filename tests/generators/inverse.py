@@ -1,0 +1,208 @@
+"""Cases by inverse dynamics (G1): Pinocchio's RNEA along an analytic motion, with hidden effects and sensor noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from scipy.optimize import brentq
+
+from . import robots, scene, sensors
+from .case import Case, Truth
+from .laws import FAMILIES, Draw
+from .motion import PERIOD, Motion, excitation, tracked
+from .scene import Hidden
+
+# Effects that the catalogue of the library must name.
+EFFECTS = (
+    "rotor_inertia",
+    "torque_offset",
+    "coupled_transmission",
+    "asymmetric_coulomb_friction",
+    "asymmetric_viscous_friction",
+    "stribeck_friction",
+    "power_law_friction",
+    "load_dependent_friction",
+    "position_dependent_friction",
+    "torque_ripple",
+    "joint_spring",
+    "gravity_tilt",
+    "payload",
+    "torque_gain",
+    "torque_delay",
+    "joint_elasticity",
+)
+FOREIGN = ("vibration", "cross_joint_product", "bouc_wen_cable", "sticky_tooth")
+
+# Pairs of names that torque data of a moving robot cannot tell apart, at the same place.
+CLASSES = (
+    {"torque_offset", "asymmetric_coulomb_friction"},
+    {"payload", "link_inertia"},
+    {"torque_delay", "torque_lag"},
+)
+TRUSTED = {"payload", "link_inertia", "torque_gain"}  # only seen where the inertials are well known
+AVERAGED = 4  # samples at 1 kHz in one of the recording
+
+Wanted = str | tuple[str, float] | tuple[str, float, tuple[str, ...]]
+
+
+def make_case(
+    effects: Sequence[Wanted] = (),
+    robot: str = "tx40",
+    repeats: int = 2,
+    trajectories: int = 3,
+    noise: float = 1.0,
+    seed: int = 0,
+    *,
+    colour: str = "ar20",
+    encoder_step: float = 1e-5,
+    holdout: bool = False,
+    trusted: bool | None = None,
+    duration: float = PERIOD,
+    **motion: Any,
+) -> Case:
+    """Recordings of `robot` with `effects` hidden: names, (name, size) or (name, size, at); size .05 if left out.
+
+    The size is the RMS of the torque that the effect brings about over the RMS torque of its joint (of its larger row
+    for a pair, root mean square of all rows otherwise). Equal seeds give equal robots, motions and noise whatever is
+    hidden. `noise` scales the noise of both sensors (0: none, and no encoder steps), `colour` is one of
+    `sensors.COLOURS`; `holdout` adds one more trajectory with that role; `trusted` makes the true inertials 1 % off
+    instead of 5 %; `motion` goes to `motion.excitation` (amplitude, speed, harmonics).
+    """
+    wanted = [_wanted(item) for item in effects]
+    trusted = bool(TRUSTED & {name for name, _, _ in wanted}) if trusted is None else trusted
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
+    made = robots.load(robot)
+    model = robots.true_robot(made.model, 0.01 if trusted else 0.05, streams[0])
+    motions = [excitation(model, streams[1], **motion) for _ in range(trajectories + holdout)]
+    time = scene.grid(duration)
+    fit = motions[:trajectories]
+    hidden = [_hide(made, model, fit, time, streams[2], *item) for item in wanted]
+    runs = _runs(made, model, motions, trajectories, repeats, time, hidden, streams[3])
+    recordings = _recordings(runs, streams[3], noise, colour, encoder_step)
+    truth = tuple(Truth(h.effect, h.at, h.parameters(h.scale)) for h in hidden)
+    induced = {h.effect: _size(made, model, fit, time, h) for h in hidden} if noise == 0 else {}
+    trust = 0.02 if trusted else 0.10
+    return Case(robot, made.urdf, made.joints, recordings, truth, trust, seed, induced, made.posture)
+
+
+def observable(truth: Truth) -> set[tuple[str, tuple[str, ...]]]:
+    """Every (effect, at) that is right for the hidden effect: itself and what cannot be told from it."""
+    names = {truth.effect}.union(*(c for c in CLASSES if truth.effect in c))
+    return {(name, truth.at) for name in names}
+
+
+def _wanted(item: Wanted) -> tuple[str, float, tuple[str, ...] | None]:
+    name, size, at, *_ = (*((item,) if isinstance(item, str) else item), None, None)
+    if name not in FAMILIES:
+        raise ValueError(f"no family '{name}'; known: {', '.join(FAMILIES)}")
+    return str(name), 0.05 if size is None else float(size), None if at is None else tuple(at)  # type: ignore[arg-type]
+
+
+def _hide(
+    robot: robots.Robot,
+    model: pin.Model,
+    motions: list[Motion],
+    time: np.ndarray,
+    rng: np.random.Generator,
+    name: str,
+    size: float,
+    at: tuple[str, ...] | None,
+) -> Hidden:
+    """The effect at a random place with random parameters, drawn again until its size is physical there."""
+    for _ in range(40):
+        drawn = FAMILIES[name](Draw(robot, model, motions, rng, at))
+        scaled = _scaled(robot, model, motions, time, drawn, size)
+        if scaled is not None:
+            return scaled
+    raise ValueError(f"'{name}' of size {size} is not physical anywhere on {robot.name}")
+
+
+def _scaled(
+    robot: robots.Robot, model: pin.Model, motions: list[Motion], time: np.ndarray, drawn: Hidden, size: float
+) -> Hidden | None:
+    """The effect with the scale that gives it its size, None where that scale is out of its bounds."""
+    lower, upper = drawn.bounds
+
+    def size_at(scale: float) -> float:
+        return _size(robot, model, motions, time, replace(drawn, scale=scale))
+
+    if drawn.linear:
+        unit = 1e-2 if drawn.change else 1.0  # a body small enough to leave the link one that can exist
+        reached = size_at(unit) / unit
+        scale = size / reached if reached > 1e-9 else np.inf
+    else:
+        scale = _solve(size_at, size, lower, upper)
+    return replace(drawn, scale=float(scale)) if lower < scale < upper else None
+
+
+def _solve(size_at: Callable[[float], float], size: float, lower: float, upper: float) -> float:
+    """Scale at which the size is reached within .5 %: proportional steps, which suit most laws, else bisection."""
+    scale = float(np.sqrt(lower * upper))
+    for _ in range(5):
+        reached = max(size_at(scale), 1e-12)
+        if abs(reached / size - 1) < 5e-3:
+            return scale
+        scale *= size / reached
+        if not lower < scale < upper:
+            break
+    miss = lambda log: np.log(max(size_at(float(np.exp(log))), 1e-12) / size)  # noqa: E731
+    ends = np.log([lower, upper])
+    if miss(ends[0]) > 0 or miss(ends[1]) < 0:
+        return np.inf
+    return float(np.exp(brentq(miss, *ends, xtol=2e-3)))
+
+
+def _size(robot: robots.Robot, model: pin.Model, motions: list[Motion], time: np.ndarray, hidden: Hidden) -> float:
+    pairs = [scene.induced(robot, model, motion, time, hidden) for motion in motions]
+    return scene.relative_size(hidden, pairs)
+
+
+def _runs(
+    robot: robots.Robot,
+    model: pin.Model,
+    motions: list[Motion],
+    trajectories: int,
+    repeats: int,
+    time: np.ndarray,
+    hidden: list[Hidden],
+    rng: np.random.Generator,
+) -> list[dict[str, Any]]:
+    """Runs at the recording's rate, before sensor noise: every trajectory `repeats` times, a held-out one once."""
+    runs = []
+    for number, motion in enumerate(motions):
+        held = number >= trajectories
+        for repeat in range(1 if held else repeats):
+            followed = tracked(motion, rng)
+            q, tau = scene.run(robot, model, followed, time, hidden, rng.uniform())
+            label = chr(ord("A") + number)
+            run = {"time": _averaged(time, time), "position": _averaged(time, q), "torque": _averaged(time, tau)}
+            run["name"] = f"holdout_{label}" if held else f"run_{label}{repeat + 1}"
+            run |= {"repeat": label if repeats > 1 and not held else None, "role": "holdout" if held else "fit"}
+            runs.append(run)
+    return runs
+
+
+def _averaged(time: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Means of four samples at 1 kHz from t = 0 on."""
+    kept = x[np.searchsorted(time, -1e-9) :]
+    kept = kept[: len(kept) // AVERAGED * AVERAGED]
+    return kept.reshape(-1, AVERAGED, *x.shape[1:]).mean(1)
+
+
+def _recordings(
+    runs: list[dict[str, Any]], rng: np.random.Generator, noise: float, colour: str, step: float
+) -> tuple[dict[str, Any], ...]:
+    fit = [run["torque"] for run in runs if run["role"] == "fit"]
+    rms = np.sqrt(np.mean(np.concatenate(fit) ** 2, 0))
+    out = []
+    for run in runs:
+        position, torque = run["position"], run["torque"]
+        if noise > 0:
+            torque = torque + sensors.torque_noise(len(torque), rms, rng, colour, noise)
+            position = sensors.encoder(position, rng, noise, step)
+        out.append(run | {"position": position, "torque": torque})
+    return tuple(out)
