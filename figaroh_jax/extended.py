@@ -9,6 +9,7 @@ total by the product of the `torque_response` forms. Sensors matter to `predict`
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -68,6 +69,8 @@ def extend(
         raise InputError(f"width has shape {np.shape(width)}; robot '{robot.name}' needs one number or {robot.nv}")
     if isinstance(width, (int, float)) or np.shape(width) == ():
         width = np.full(robot.nv, width) if isinstance(width, (int, float)) else jnp.broadcast_to(width, (robot.nv,))
+    # a Python number would be a constant of the compiled programs, and each new value a new compilation
+    effects = jax.tree.map(lambda x: np.float64(x) if isinstance(x, (int, float)) else x, effects)
     return ExtendedModel(robot, (*present, *effects), width)
 
 
@@ -119,29 +122,30 @@ def _forward_dynamics(extended: ExtendedModel, q: Array, v: Array, tau: Array) -
 
 
 def _solve_acceleration(extended: ExtendedModel, q: Array, v: Array, tau: Array) -> Array:
-    def newton(model: ExtendedModel, q: Array, v: Array, tau: Array, a: Array) -> tuple[Array, Array]:
-        def excess(a: Array) -> tuple[Array, Array]:
-            torque = _inverse_dynamics(model, q, v, a) - tau
-            return torque, torque
+    def excess(a: Array) -> Array:
+        return _inverse_dynamics(extended, q, v, a) - tau
 
-        slope, torque = jax.jacfwd(excess, has_aux=True)(a)
-        return jnp.linalg.solve(slope, torque), torque
+    def solve_linear(linear: Callable[[Array], Array], right: Array) -> Array:
+        return jnp.linalg.solve(jax.jacfwd(linear)(right), right)
 
-    # the search is hidden from differentiation; the last step, taken in the open, has the solution's exact derivative
-    hidden = jax.lax.stop_gradient((extended, q, v, tau))
+    return jax.lax.custom_root(excess, jnp.zeros_like(v), _newton, solve_linear)
+
+
+def _newton(excess: Callable[[Array], Array], start: Array) -> Array:
+    def both(a: Array) -> tuple[Array, Array]:
+        value = excess(a)
+        return value, value
 
     def unfinished(state: tuple[Array, Array, Array]) -> Array:
-        _, moved, count = state
-        return (moved > 1e-13) & (count < _NEWTON_STEPS)
+        return (state[1] > 1e-13) & (state[2] < _NEWTON_STEPS)
 
     def improve(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         a, _, count = state
-        step, _ = newton(*hidden, a)
+        slope, value = jax.jacfwd(both, has_aux=True)(a)
+        step = jnp.linalg.solve(slope, value)
         return a - step, jnp.max(jnp.abs(step) / (1 + jnp.abs(a))), count + 1
 
-    a, _, _ = jax.lax.while_loop(unfinished, improve, (jnp.zeros_like(hidden[1]), jnp.asarray(jnp.inf), jnp.asarray(0)))
-    a = jax.lax.stop_gradient(a)
-    return a - newton(extended, q, v, tau, a)[0]
+    return jax.lax.while_loop(unfinished, improve, (start, jnp.asarray(jnp.inf), jnp.asarray(0)))[0]
 
 
 def changed_robot(extended: ExtendedModel) -> RobotModel:
