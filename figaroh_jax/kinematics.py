@@ -8,15 +8,15 @@ positions, velocities and accelerations are those of the joint frame's origin, e
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .errors import InputError
 from .model import Joint, RobotModel
@@ -24,11 +24,17 @@ from .spatial import cross, matmul, rotate
 
 __all__ = [
     "Motion",
+    "add_up",
     "ancestors",
+    "axis_twists",
     "forward_kinematics",
+    "frame_jacobian",
+    "frame_placement",
     "gather",
     "in_samples",
     "motion",
+    "placements",
+    "revolute",
     "states",
     "world_axes",
 ]
@@ -81,42 +87,62 @@ def ancestors(joints: tuple[Joint, ...]) -> np.ndarray:
     return above
 
 
-def _revolute(model: RobotModel) -> np.ndarray:
+def revolute(model: RobotModel) -> Bool[np.ndarray, " nj"]:
+    """Which joints turn; the others slide."""
     return np.array([joint.kind == "revolute" for joint in model.joints], bool)
 
 
 def _local(model: RobotModel, q: Float[Array, "nv samples"]) -> tuple[Array, Array]:
     """Rotation (nj 3 3 samples) and displacement (nj 3 samples) of each joint frame in its parent's (Rodrigues)."""
-    dtype, revolute = q.dtype, _revolute(model)
+    dtype, turns = q.dtype, revolute(model)[:, None]
     placement, axis = jnp.asarray(model.placement, dtype), jnp.asarray(model.axis, dtype)[..., None]
-    angle = _to_joints(model, q, jnp.asarray(model.ratio, dtype)) + jnp.asarray(model.offset, dtype)[:, None]
-    turn, slide = jnp.where(revolute[:, None], angle, 0.0), jnp.where(revolute[:, None], 0.0, angle)
+    position = _to_joints(model, q) + jnp.asarray(model.offset, dtype)[:, None]
+    angle = jnp.where(turns, position, 0.0)[:, None, None]
     r0, p0 = placement[:, :3, :3, None], placement[:, :3, 3, None]
-    r0k = jnp.stack([cross(axis, row) for row in jnp.moveaxis(-r0, 1, 0)], axis=1)
-    r0kk = jnp.stack([cross(axis, row) for row in jnp.moveaxis(-r0k, 1, 0)], axis=1)
-    sin, versine = jnp.sin(turn)[:, None, None], (1.0 - jnp.cos(turn))[:, None, None]
-    rotation = r0 + r0k * sin + r0kk * versine
-    if revolute.all():
+    r0k = _times_skew(r0, axis)
+    rotation = r0 + r0k * jnp.sin(angle) + _times_skew(r0k, axis) * (1.0 - jnp.cos(angle))
+    if turns.all():
         return rotation, jnp.broadcast_to(p0, rotation[:, 0].shape)
-    return rotation, p0 + rotate(r0, axis) * slide[:, None]
+    return rotation, p0 + rotate(r0, axis) * jnp.where(turns, 0.0, position)[:, None]
+
+
+def _times_skew(matrix: Float[Array, "nj 3 3 1"], axis: Float[Array, "nj 3 1"]) -> Float[Array, "nj 3 3 1"]:
+    """Product `matrix @ skew(axis)`: each row crossed with the axis."""
+    return cross(matrix, axis[:, None])
 
 
 def _coordinates(model: RobotModel) -> np.ndarray:
     return np.array([joint.coordinate for joint in model.joints], int)
 
 
-def _to_joints(model: RobotModel, x: Float[Array, "nv samples"], ratio: Float[Array, " nj"]) -> Float[Array, "nj n"]:
-    return ratio[:, None] * x[_coordinates(model)]
+def _to_joints(model: RobotModel, x: Float[Array, "nv samples"]) -> Float[Array, "nj samples"]:
+    return jnp.asarray(model.ratio, x.dtype)[:, None] * x[_coordinates(model)]
 
 
 def gather(model: RobotModel, x: Float[Array, "nj *rest"]) -> Float[Array, "nv *rest"]:
     """Sum of a joint quantity over the joints that share each coordinate, each times its ratio (mimic joints)."""
     coordinates = _coordinates(model)
-    share = jnp.asarray(np.arange(model.nv)[:, None] == coordinates, x.dtype) * jnp.asarray(model.ratio, x.dtype)
+    scaled = jnp.asarray(model.ratio, x.dtype).reshape(-1, *[1] * (x.ndim - 1)) * x
     if len(coordinates) == model.nv:
-        place = np.argsort(coordinates)
-        return (jnp.asarray(model.ratio, x.dtype).reshape(-1, *[1] * (x.ndim - 1)) * x)[place]
-    return jnp.tensordot(share, x, axes=1, precision=jax.lax.Precision.HIGHEST)
+        return scaled[np.argsort(coordinates)]
+    return add_up(np.arange(model.nv)[:, None] == coordinates, scaled)
+
+
+def add_up(which: Bool[np.ndarray, "k n"] | Float[np.ndarray, "k n"], x: Float[Array, "n *rest"]) -> Float[Array, "k *rest"]:
+    """Sums of the entries of `x` that each row of the matrix of 0 and 1 picks."""
+    # highest precision: an accelerator's default would round the operands
+    return jnp.tensordot(jnp.asarray(which, x.dtype), x, axes=1, precision=jax.lax.Precision.HIGHEST)
+
+
+def placements(model: RobotModel, q: Float[Array, "nv samples"]) -> Float[Array, "nj 4 4 samples"]:
+    """Kernel of `forward_kinematics`: poses `world_T_joint` with the samples on the last axis, the dtype that of `q`."""
+
+    def below(above: tuple[Array, Array], rotation: Array, shift: Array) -> tuple[Array, Array]:
+        return matmul(above[0], rotation), above[1] + rotate(above[0], shift)
+
+    R, p = _along_tree(model, below, (jnp.eye(3), jnp.zeros(3)), _local(model, q))
+    bottom = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0], q.dtype)[:, None], (len(R), 1, 4, q.shape[-1]))
+    return jnp.concatenate([jnp.concatenate([R, p[:, :, None]], axis=2), bottom], axis=1)
 
 
 def motion(
@@ -130,40 +156,41 @@ def motion(
     $$c = c_p + \alpha_p \times d + w_p \times (w_p \times d) + (1 - r)(s \ddot q + 2 w_p \times s \dot q)$$
     starting from rest with c = -gravity. Units: rad or m, and their rates in seconds. The dtype is that of `q`.
     """
-    dtype = q.dtype
-    levels, ratio = _levels(model.joints), jnp.asarray(model.ratio, dtype)
-    rotation, shift = _local(model, q)
-    revolute = jnp.asarray(_revolute(model), dtype)[:, None, None]
-    axis = jnp.asarray(model.axis, dtype)
-    rates = [_to_joints(model, x, ratio)[:, None] for x in (v, a)]
-    steps = [x[levels.order] for x in (rotation, shift, axis[..., None], *rates, revolute)]
-    parent = levels.parent
-    if parent is not None:
-        steps.append(jnp.asarray(parent))
-
-    def level(state: Motion, step: list[Array]) -> tuple[Motion, Motion]:
-        above = state if parent is None else Motion(*(x[step[6]] for x in state))
-        below = _below(above, *step[:6])
-        return below, below
-
-    width, samples = levels.order.shape[1], q.shape[-1]
-    zero = jnp.zeros((width, 3, samples), dtype)
-    eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype)[..., None], (width, 3, 3, samples))
-    world = Motion(eye, zero, zero, zero, zero - jnp.asarray(model.gravity, dtype)[:, None])
-    stacked = jax.lax.scan(level, world, steps)[1]
-    return Motion(*(x.reshape(-1, *x.shape[2:])[levels.place] for x in stacked))
+    dtype, zero = q.dtype, jnp.zeros(3)
+    world = Motion(jnp.eye(3), zero, zero, zero, -jnp.asarray(model.gravity, dtype))
+    rates = [_to_joints(model, x)[:, None] for x in (v, a)]
+    constants = jnp.asarray(model.axis, dtype)[..., None], jnp.asarray(revolute(model), dtype)[:, None, None]
+    return _along_tree(model, _below, world, (*_local(model, q), *rates, *constants))
 
 
-def _below(above: Motion, rotation: Array, shift: Array, axis: Array, v: Array, a: Array, revolute: Array) -> Motion:
+def _along_tree(model: RobotModel, below: Callable[..., Any], world: Any, inputs: Sequence[Array]) -> Any:
+    """States of all joints, each `below(state of the parent, *inputs of the joint)`, level by level from the world's."""
+    levels, dtype, samples = _levels(model.joints), inputs[0].dtype, inputs[0].shape[-1]
+    steps = [x[levels.order] for x in inputs]
+
+    def level(state: Any, step: tuple[Array | None, list[Array]]) -> tuple[Any, Any]:
+        parent, inputs = step
+        above = state if parent is None else jax.tree.map(lambda x: x[parent], state)
+        state = below(above, *inputs)
+        return state, state
+
+    width = levels.order.shape[1]
+    first = jax.tree.map(lambda x: jnp.broadcast_to(x.astype(dtype)[..., None], (width, *x.shape, samples)), world)
+    parent = None if levels.parent is None else jnp.asarray(levels.parent)
+    stacked = jax.lax.scan(level, first, (parent, steps))[1]
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[levels.place], stacked)
+
+
+def _below(above: Motion, rotation: Array, shift: Array, v: Array, a: Array, axis: Array, turns: Array) -> Motion:
     R = matmul(above.R, rotation)
     s, d = rotate(R, axis), rotate(above.R, shift)
     sv, sa, coriolis = s * v, s * a, cross(above.w, s * v)
     return Motion(
         R=R,
         p=above.p + d,
-        w=above.w + revolute * sv,
-        al=above.al + revolute * (sa + coriolis),
-        ac=above.ac + cross(above.al, d) + cross(above.w, cross(above.w, d)) + (1.0 - revolute) * (sa + 2.0 * coriolis),
+        w=above.w + turns * sv,
+        al=above.al + turns * (sa + coriolis),
+        ac=above.ac + cross(above.al, d) + cross(above.w, cross(above.w, d)) + (1.0 - turns) * (sa + 2.0 * coriolis),
     )
 
 
@@ -206,11 +233,60 @@ def forward_kinematics(model: RobotModel, q: Float[ArrayLike, "*batch nv"]) -> F
 
 @jax.jit
 def _forward_kinematics(model: RobotModel, q: Array) -> Array:
-    return in_samples(lambda x: _poses(model, x), q)
+    return in_samples(lambda x: placements(model, x), q)
 
 
-def _poses(model: RobotModel, q: Float[Array, "nv samples"]) -> Float[Array, "nj 4 4 samples"]:
-    zero = jnp.zeros_like(q)
-    state = motion(model, q, zero, zero)
-    bottom = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0], q.dtype)[:, None], (len(model.joints), 1, 4, q.shape[-1]))
-    return jnp.concatenate([jnp.concatenate([state.R, state.p[:, :, None]], axis=2), bottom], axis=1)
+def frame_placement(model: RobotModel, q: Float[Array, "*batch nv"], name: str) -> Float[Array, "*batch 4 4"]:
+    """Pose `world_T_frame` of the frame called `name` (a link or a joint of the model), m and rad, in float64.
+
+    Raises `InputError` where there is no such frame or the shape of `q` does not fit the model.
+    """
+    index = model.frame_index(name)
+    with jax.enable_x64(True):
+        return _frame_placement(model, *states(model, q=q), index, model.frames[index].parent)
+
+
+@jax.jit
+def _frame_placement(model: RobotModel, q: Array, index: Array, parent: Array) -> Array:
+    return in_samples(lambda x: _frame_pose(placements(model, x), model, index, parent), q)
+
+
+def _frame_pose(poses: Float[Array, "nj 4 4 samples"], model: RobotModel, index: Array, parent: Array) -> Array:
+    """Pose (4 4 samples); a parent of -1, the world, stands before the joints."""
+    world = jnp.broadcast_to(jnp.eye(4, dtype=poses.dtype)[..., None], (1, *poses.shape[1:]))
+    carrier = jnp.concatenate([world, poses])[parent + 1]
+    return matmul(carrier, jnp.asarray(model.frame_placement, poses.dtype)[index][..., None])
+
+
+def frame_jacobian(model: RobotModel, q: Float[Array, "*batch nv"], name: str) -> Float[Array, "*batch 6 nv"]:
+    """Jacobian of the frame called `name`: its velocity `[linear, angular]` at its origin, in world axes, for each v.
+
+    Local-world-aligned in Pinocchio's words; m or 1 per rad or m, in float64. Raises `InputError` where there is no
+    such frame or the shape of `q` does not fit the model.
+    """
+    index = model.frame_index(name)
+    with jax.enable_x64(True):
+        return _frame_jacobian(model, *states(model, q=q), index, model.frames[index].parent)
+
+
+@jax.jit
+def _frame_jacobian(model: RobotModel, q: Array, index: Array, parent: Array) -> Array:
+    return in_samples(lambda x: _jacobian(model, x, index, parent), q)
+
+
+def _jacobian(model: RobotModel, q: Float[Array, "nv samples"], index: Array, parent: Array) -> Array:
+    poses = placements(model, q)
+    origin = _frame_pose(poses, model, index, parent)[:3, 3]
+    linear, angular = axis_twists(model, poses[:, :3, :3], poses[:, :3, 3] - origin)
+    moved = jnp.asarray(np.pad(ancestors(model.joints), ((0, 0), (1, 0))), q.dtype)[:, parent + 1]
+    columns = jnp.concatenate([linear, angular], axis=1) * moved[:, None, None]
+    return jnp.moveaxis(gather(model, columns), 0, 1)
+
+
+def axis_twists(
+    model: RobotModel, R: Float[Array, "nj 3 3 samples"], p: Float[Array, "nj 3 samples"]
+) -> tuple[Float[Array, "nj 3 samples"], Float[Array, "nj 3 samples"]]:
+    """Linear and angular velocity, at the point from which the joint origins `p` are measured, for a unit joint rate."""
+    s = world_axes(model, R)
+    turns = revolute(model)[:, None, None]
+    return jnp.where(turns, cross(p, s), s), jnp.where(turns, s, 0.0)

@@ -46,16 +46,16 @@ def cross(u: Float[Array, "*a 3 n"], v: Float[Array, "*b 3 m"]) -> Float[Array, 
     return jnp.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=-2)
 
 
-def matmul(a: Float[Array, "*a 3 3 n"], b: Float[Array, "*b 3 3 m"]) -> Float[Array, "..."]:
+def matmul(a: Float[Array, "*a i k n"], b: Float[Array, "*b k j m"]) -> Float[Array, "..."]:
     """Matrix product A B with the samples last."""
-    x, y, z = (a[..., :, k, None, :] * b[..., None, k, :, :] for k in range(3))
-    return x + y + z
+    first, *more = (a[..., :, k, None, :] * b[..., None, k, :, :] for k in range(a.shape[-2]))
+    return sum(more, first)
 
 
-def rotate(rotation: Float[Array, "*a 3 3 n"], vector: Float[Array, "*b 3 m"]) -> Float[Array, "..."]:
-    """Rotated vector R u with the samples last."""
-    x, y, z = (rotation[..., :, k, :] * vector[..., None, k, :] for k in range(3))
-    return x + y + z
+def rotate(rotation: Float[Array, "*a i k n"], vector: Float[Array, "*b k m"]) -> Float[Array, "..."]:
+    """Product of a matrix with a vector, R u, with the samples last."""
+    first, *more = (rotation[..., :, k, :] * vector[..., None, k, :] for k in range(rotation.shape[-2]))
+    return sum(more, first)
 
 
 def rotate_back(rotation: Float[Array, "*a 3 3 n"], vector: Float[Array, "*b 3 m"]) -> Float[Array, "..."]:
