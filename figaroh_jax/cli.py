@@ -1,0 +1,111 @@
+"""The command `figaroh-jax`: a thin layer that reads arguments, sets JAX up and turns errors into messages.
+
+Exit status: 0 the job ran, 2 the input is wrong (one message on standard error), 70 a fault of the program itself,
+130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+
+from .errors import InputError
+
+__all__ = ["main"]
+
+_DESCRIPTION = "Name what a robot's simulation gets wrong, extend the model with it and measure the gain."
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command line (default: the process's own) and return its exit status."""
+    try:
+        args = _parser().parse_args(argv)
+    except SystemExit as asked:  # --help, or wrong usage, which argparse has explained
+        return asked.code if isinstance(asked.code, int) else 2
+    try:
+        return _run(args)
+    except KeyboardInterrupt:
+        return 130
+    except Exception as error:
+        return _explain(error, args.traceback)
+
+
+def _run(args: argparse.Namespace) -> int:
+    _choose_backend(args.backend)
+    _set_up_jax(cache=not args.no_cache)
+    from . import answer, terminal
+    from .runs import REPORT, diagnose_file
+
+    with resources.as_file(resources.files(__package__) / "demo") as demo:
+        task_file = args.task or demo / "task.yaml"
+        out = args.out or Path(f"{args.task.stem if args.task else 'demo'}_diagnosis")
+        with terminal.Progress(quiet=args.quiet) as progress:
+            diagnosis = diagnose_file(task_file, out, progress)
+    if args.json:
+        sys.stdout.write(answer.to_json(diagnosis))
+    else:
+        terminal.show(diagnosis, diagnosis.model.robot.name)
+        print(f"Report: {out / REPORT}")
+    return 0
+
+
+def _explain(error: Exception, with_traceback: bool) -> int:
+    wrong_input = isinstance(error, InputError)
+    if with_traceback:
+        traceback.print_exception(error)
+    kind = "error" if wrong_input else f"internal error: {type(error).__name__}"
+    hint = "" if wrong_input or with_traceback else " (--traceback shows where; please report it)"
+    print(f"figaroh-jax: {kind}: {error}{hint}", file=sys.stderr)
+    return 2 if wrong_input else 70
+
+
+def _parser() -> argparse.ArgumentParser:
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--out", type=Path, metavar="DIR", help="run directory; an earlier run there is replaced")
+    common.add_argument("--json", action="store_true", help="print the answer as JSON in place of the summary")
+    common.add_argument("--quiet", action="store_true", help="no progress on standard error")
+    common.add_argument("--traceback", action="store_true", help="show where an error was raised")
+    common.add_argument("--backend", default="native", metavar="NAME", help="default: native")
+    common.add_argument("--no-cache", action="store_true", help="keep no compiled programs for the next run")
+    parser = argparse.ArgumentParser(prog="figaroh-jax", description=_DESCRIPTION)
+    parser.add_argument("--version", action="version", version=_version())
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    diagnose = commands.add_parser("diagnose", parents=[common], help="the main job, on a task file of yours")
+    diagnose.add_argument("task", type=Path, metavar="TASK.yaml")
+    demo = commands.add_parser("demo", parents=[common], help="the main job on an embedded recording, no file needed")
+    demo.set_defaults(task=None)
+    return parser
+
+
+def _version() -> str:
+    from . import __version__
+
+    return f"figaroh-jax {__version__}"
+
+
+def _choose_backend(name: str) -> None:
+    if name == "native":
+        return
+    from .registry import backend
+
+    backend(name)  # an unknown one is refused there, with the list of those installed
+    raise InputError(f"--backend {name}: a diagnosis needs gradients, which only the backend 'native' gives")
+
+
+def _set_up_jax(cache: bool) -> None:
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    if not cache:
+        jax.config.update("jax_enable_compilation_cache", False)
+    elif jax.config.jax_compilation_cache_dir is None:
+        home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+        folder = Path(home).expanduser() / "figaroh_jax" / "jax"
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

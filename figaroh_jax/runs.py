@@ -1,0 +1,119 @@
+"""A run directory: `answer.json`, `predictions.npz`, `report.html` and `model/`, written whole or not at all."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .errors import InputError
+
+if TYPE_CHECKING:
+    from .config import Task
+    from .results import Diagnosis
+
+__all__ = ["ANSWER", "REPORT", "check_directory", "diagnose_file", "predictions", "whole_directory", "write_run"]
+
+ANSWER, REPORT = "answer.json", "report.html"
+
+
+def diagnose_file(
+    task_file: Path, out: Path, progress: Callable[[str, float], None] = lambda phase, fraction: None
+) -> Diagnosis:
+    """Read a task, diagnose it and write the run directory `out`.
+
+    An earlier run in `out` is replaced; a directory that holds anything else is refused before any work. Wrong input
+    raises `InputError`, and nothing is written.
+    """
+    from .config import load_task
+
+    check_directory(out)
+    task = load_task(task_file)
+    from .diagnosis import diagnose_task
+
+    diagnosis = diagnose_task(task, progress=progress)
+    progress("writing the report", 1.0)
+    write_run(task, diagnosis, out)
+    return diagnosis
+
+
+def write_run(task: Task, diagnosis: Diagnosis, out: Path) -> None:
+    """Write everything that the contract asks of a diagnosis into the directory `out`."""
+    from .answer import to_json, write_predictions
+    from .export import write_model
+    from .report import write_report
+
+    with whole_directory(out) as folder:
+        (folder / ANSWER).write_text(to_json(diagnosis), encoding="utf-8")
+        write_predictions(folder / "predictions.npz", predictions(task, diagnosis))
+        write_report(diagnosis, folder / REPORT, diagnosis.model.robot.name)
+        write_model(diagnosis.model, folder / "model")
+
+
+def predictions(task: Task, diagnosis: Diagnosis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Time (s) and the extended model's torque (N m or N) of each holdout recording, on its own time stamps.
+
+    The recording's motion is prepared as for the fit, but over its whole length, whatever window the fit kept.
+    """
+    from .dataset import read_recordings
+    from .extended import predict
+    from .signals import choose_rates, prepare, to_recording_times
+
+    if all(entry.role == "fit" for entry in task.data):
+        return {}
+    recordings = read_recordings(task, diagnosis.model.robot)
+    rates = choose_rates(recordings, task.preprocess)
+    whole = task.preprocess.model_copy(update={"window": None, "gate": {}})
+    found = {}
+    for recording in recordings:
+        if recording.role == "holdout":
+            motion = prepare(recording, whole, rates)
+            torque = predict(
+                diagnosis.model, motion.time, motion.position, motion.velocity, motion.acceleration, motion.dt
+            )
+            found[recording.name] = recording.time, to_recording_times(motion.time, np.asarray(torque), recording.time)
+    return found
+
+
+def check_directory(out: Path) -> None:
+    """Raise `InputError` unless `out` can become a run directory: absent, empty, or an earlier run."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out {out}: a file stands there; name a directory")
+    if out.is_dir() and any(out.iterdir()) and not (out / ANSWER).is_file():
+        raise InputError(
+            f"--out {out}: the directory holds other things than an earlier run (no {ANSWER}); name another"
+        )
+    existing = next(parent for parent in out.absolute().parents if parent.exists())
+    if not existing.is_dir():
+        raise InputError(f"--out {out}: {existing} is a file, no directory can stand below it")
+
+
+@contextmanager
+def whole_directory(out: Path) -> Iterator[Path]:
+    """A new directory beside `out` that takes its place, and that of an earlier run, once the block has succeeded."""
+    out = out.absolute()
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        beside = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
+    try:
+        new = beside / "new"
+        new.mkdir()
+        yield new
+        earlier = beside / "earlier"
+        if out.exists():
+            out.rename(earlier)
+        try:
+            new.rename(out)
+        except OSError:
+            if earlier.exists():
+                earlier.rename(out)
+            raise
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
