@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from types import TracebackType
-from typing import Self
 
 from rich import progress as bars
 from rich.console import Console, Group, RenderableType
@@ -36,7 +35,7 @@ class Progress:
         )
         self._task = self._progress.add_task("", total=1.0)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Progress:
         self._progress.start()
         return self
 
