@@ -165,7 +165,7 @@ def _time(table: Table, entry: RecordingEntry, key: str, samples: int) -> Float[
     if samples < 2:
         raise InputError(f"{table.file}: {samples} sample{'s'[samples:]}; a recording is a motion over time")
     if entry.time is None:
-        return np.arange(samples) / entry.rate
+        return np.arange(samples) / (entry.rate or 1.0)  # postures may have no clock: they are counted
     time = table.vector(entry.time, f"{key}.time")
     if len(time) != samples:
         raise InputError(f"{table.file}: {key}.time has {len(time)} samples, but position has {samples}")

@@ -11,9 +11,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
-from scipy.fft import next_fast_len
 
-__all__ = ["RowFilter", "filter_rows", "frequencies", "low_pass", "row_filter"]
+__all__ = ["RowFilter", "fast_length", "filter_rows", "frequencies", "low_pass", "row_filter"]
 
 ORDER = 4
 
@@ -52,7 +51,7 @@ def row_filter(samples: int, dt: float, cutoff: float, *, step: int, trim: float
     `cutoff` in Hz; `trim` s are cut at both ends; one sample of every `step` is kept.
     """
     pad = _pad(samples, dt, cutoff)
-    length = int(next_fast_len(samples + 2 * pad, real=True))
+    length = fast_length(samples + 2 * pad)
     first = int(np.ceil(trim / dt - 1e-6))
     kept = max(0, -((2 * first - samples) // step))
     gain = _gain(length, dt, cutoff)
@@ -86,9 +85,16 @@ def frequencies(rows: RowFilter) -> Float[Array, " freqs"]:
 def low_pass(x: Float[np.ndarray, "samples cols"], dt: float, cutoff: float) -> Float[np.ndarray, "samples cols"]:
     """The same low pass on the host, at every sample: `x` every `dt` s, `cutoff` in Hz."""
     pad = _pad(len(x), dt, cutoff)
-    length = int(next_fast_len(len(x) + 2 * pad, real=True))
+    length = fast_length(len(x) + 2 * pad)
     spectrum = np.fft.rfft(_extend(x.T, pad, np), n=length) * _gain(length, dt, cutoff)
     return np.fft.irfft(spectrum, n=length)[:, pad : pad + len(x)].T
+
+
+def fast_length(least: int) -> int:
+    """The smallest length from `least` that a real FFT is quick at."""
+    from scipy.fft import next_fast_len  # scipy is slow to import
+
+    return int(next_fast_len(least, real=True) or least)
 
 
 def _pad(samples: int, dt: float, cutoff: float) -> int:

@@ -17,12 +17,11 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
-from scipy.fft import next_fast_len
 
 from .dataset import Recording
 from .errors import InputError
 from .resampling import Grid, band_limited, differentiate, even_grid, sampling_rate, to_recording_times
-from .rowfilter import RowFilter, filter_rows, frequencies, low_pass, row_filter
+from .rowfilter import RowFilter, fast_length, filter_rows, frequencies, low_pass, row_filter
 
 if TYPE_CHECKING:
     from .config import Preprocess
@@ -241,7 +240,7 @@ def _lag(x: Float[np.ndarray, "n nv"], y: Float[np.ndarray, "m nv"]) -> float:
     x, y = (x - centre) / scale, (y - centre) / scale
     lags = np.arange(1 - len(x), len(y))
     begin, end = np.maximum(0, -lags), np.minimum(len(x), len(y) - lags)
-    size = next_fast_len(len(x) + len(y) - 1)
+    size = fast_length(len(x) + len(y) - 1)
     product = np.fft.irfft(np.conj(np.fft.rfft(x, size, axis=0)) * np.fft.rfft(y, size, axis=0), size, axis=0)
     power_x, power_y = (np.concatenate([[0.0], np.cumsum((z**2).sum(axis=1))]) for z in (x, y))
     power = power_x[end] - power_x[begin] + power_y[end + lags] - power_y[begin + lags]
