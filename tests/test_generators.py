@@ -9,7 +9,18 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from generators import CLASSES, EFFECTS, Case, available, make_case, observable, robots, scene
+from generators import (
+    CLASSES,
+    CLOSED_LOOP_EFFECTS,
+    EFFECTS,
+    Case,
+    available,
+    make_case,
+    make_closed_loop_case,
+    observable,
+    robots,
+    scene,
+)
 from generators.laws import FAMILIES
 from generators.motion import TRACKING
 from scipy.signal import butter, filtfilt
@@ -215,3 +226,40 @@ def test_real_robots_make_cases(robot: str):
     case = make_case(["coupled_transmission"], robot=robot, trajectories=1, repeats=1, seed=1)
     assert case.recordings[0]["torque"].shape == (2500, len(case.joints))
     assert np.isfinite(case.recordings[0]["torque"]).all()
+
+
+def _misfit(case: Case, trusted: bool) -> np.ndarray:
+    """Torque of a closed-loop recording that the true rigid bodies and friction leave, over its RMS, below 15 Hz."""
+    rec, made = case.recordings[0], robots.load(case.robot)
+    stream = np.random.default_rng(np.random.SeedSequence(case.seed).spawn(4)[0])
+    true = robots.true_robot(made.model, 0.01 if trusted else 0.05, stream)
+    low = butter(4, 15, fs=250)
+    q = filtfilt(*low, rec["position"], axis=0)
+    v = np.gradient(q, 0.004, axis=0)
+    a = np.gradient(v, 0.004, axis=0)
+    sign = np.clip(np.gradient(rec["position"], 0.004, axis=0) / 0.005, -1, 1)
+    model = robots.torque(true, q, v, a) + made.viscous * v + made.coulomb * sign
+    rest, model = (filtfilt(*low, x, axis=0)[100:-100] for x in (rec["torque"] - model, model))
+    return np.sqrt((rest**2).mean(0) / (model**2).mean(0))
+
+
+def test_closed_loop_without_effects_obeys_inverse_dynamics_with_friction():
+    case = make_closed_loop_case([], robot="small", trajectories=1, repeats=1, noise=0.0, seed=4, duration=5.0)
+    assert _misfit(case, trusted=False).max() < 0.01
+
+
+@pytest.mark.parametrize("effect", ["stribeck_friction", "torque_ripple", "joint_spring", "torque_gain"])
+def test_closed_loop_effect_has_its_size_at_its_joint_alone(effect: str):
+    case = make_closed_loop_case([effect], robot="small", trajectories=1, repeats=1, noise=0.0, seed=4, duration=10.0)
+    misfit, joint = _misfit(case, hidden_is_trusted(effect)), case.joints.index(case.truth[0].at[0])
+    assert 0.035 < misfit[joint] < 0.07
+    assert np.delete(misfit, joint).max() < 0.01
+
+
+def test_every_closed_loop_effect_changes_the_recording():
+    options = {"robot": "small", "trajectories": 1, "repeats": 1, "noise": 0.0, "seed": 4, "duration": 0.5}
+    for effect in CLOSED_LOOP_EFFECTS:
+        hidden = make_closed_loop_case([effect], **options)
+        clean = make_closed_loop_case([], trusted=hidden_is_trusted(effect), **options)
+        change = np.abs(hidden.recordings[0]["torque"] - clean.recordings[0]["torque"]).max()
+        assert change > 0.01 and np.isfinite(change), effect

@@ -5,7 +5,19 @@ not wrong in the same way on both sides. `make_case` hides effects of given size
 """
 
 from .case import Case, Truth
+from .closed_loop import CLOSED_LOOP_EFFECTS, make_closed_loop_case
 from .inverse import CLASSES, EFFECTS, FOREIGN, make_case, observable
 from .robots import available
 
-__all__ = ["CLASSES", "EFFECTS", "FOREIGN", "Case", "Truth", "available", "make_case", "observable"]
+__all__ = [
+    "CLASSES",
+    "CLOSED_LOOP_EFFECTS",
+    "EFFECTS",
+    "FOREIGN",
+    "Case",
+    "Truth",
+    "available",
+    "make_case",
+    "make_closed_loop_case",
+    "observable",
+]

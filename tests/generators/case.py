@@ -33,6 +33,7 @@ class Case:
     seed: int
     induced: dict[str, float] = field(default_factory=dict)  # effect: RMS of its torque over the joint's RMS torque
     posture: dict[str, float] = field(default_factory=dict)  # joints held still
+    baseline: dict[str, bool] = field(default_factory=dict)  # what the task declares beside friction
 
     def write(self, folder: Path | str, forbid: Sequence[str] = (), cutoff: float = 15, rate: float = 50) -> Path:
         """Write recordings, nominal URDF and `task.yaml` into `folder`; return the path of the task."""
@@ -53,6 +54,8 @@ class Case:
             robot["posture"] = self.posture
         task: dict[str, Any] = {"robot": robot, "data": [_entry(rec) for rec in self.recordings]}
         task["preprocess"] = {"cutoff": cutoff, "rate": rate}
+        if self.baseline:
+            task["baseline"] = self.baseline
         if forbid:
             task["diagnose"] = {"forbid": list(forbid)}
         return task

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.optimize import brentq
 
-from . import robots, scene, sensors
+from . import outside, robots, scene, sensors
 from .case import Case, Truth
 from .laws import FAMILIES, Draw
 from .motion import PERIOD, Motion, excitation, tracked
@@ -35,7 +35,7 @@ EFFECTS = (
     "torque_delay",
     "joint_elasticity",
 )
-FOREIGN = ("vibration", "cross_joint_product", "bouc_wen_cable", "sticky_tooth")
+FOREIGN = outside.FOREIGN
 
 # Pairs of names that torque data of a moving robot cannot tell apart, at the same place.
 CLASSES = (
@@ -72,17 +72,16 @@ def make_case(
     `sensors.COLOURS`; `holdout` adds one more trajectory with that role; `trusted` makes the true inertials 1 % off
     instead of 5 %; `motion` goes to `motion.excitation` (amplitude, speed, harmonics).
     """
-    wanted = [_wanted(item) for item in effects]
-    trusted = bool(TRUSTED & {name for name, _, _ in wanted}) if trusted is None else trusted
+    wanted, trusted = choose(effects, trusted)
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
     made = robots.load(robot)
     model = robots.true_robot(made.model, 0.01 if trusted else 0.05, streams[0])
     motions = [excitation(model, streams[1], **motion) for _ in range(trajectories + holdout)]
     time = scene.grid(duration)
     fit = motions[:trajectories]
-    hidden = [_hide(made, model, fit, time, streams[2], *item) for item in wanted]
+    hidden = [hide(made, model, fit, time, streams[2], *item) for item in wanted]
     runs = _runs(made, model, motions, trajectories, repeats, time, hidden, streams[3])
-    recordings = _recordings(runs, streams[3], noise, colour, encoder_step)
+    recordings = noisy(runs, streams[3], noise, colour, encoder_step)
     truth = tuple(Truth(h.effect, h.at, h.parameters(h.scale)) for h in hidden)
     induced = {h.effect: _size(made, model, fit, time, h) for h in hidden} if noise == 0 else {}
     trust = 0.02 if trusted else 0.10
@@ -95,6 +94,12 @@ def observable(truth: Truth) -> set[tuple[str, tuple[str, ...]]]:
     return {(name, truth.at) for name in names}
 
 
+def choose(effects: Sequence[Wanted], trusted: bool | None) -> tuple[list[tuple[str, float, Any]], bool]:
+    """The wanted effects as (name, size, at), and whether the inertials are to be well known."""
+    wanted = [_wanted(item) for item in effects]
+    return wanted, bool(TRUSTED & {name for name, _, _ in wanted}) if trusted is None else trusted
+
+
 def _wanted(item: Wanted) -> tuple[str, float, tuple[str, ...] | None]:
     name, size, at, *_ = (*((item,) if isinstance(item, str) else item), None, None)
     if name not in FAMILIES:
@@ -102,7 +107,7 @@ def _wanted(item: Wanted) -> tuple[str, float, tuple[str, ...] | None]:
     return str(name), 0.05 if size is None else float(size), None if at is None else tuple(at)  # type: ignore[arg-type]
 
 
-def _hide(
+def hide(
     robot: robots.Robot,
     model: pin.Model,
     motions: list[Motion],
@@ -193,9 +198,10 @@ def _averaged(time: np.ndarray, x: np.ndarray) -> np.ndarray:
     return kept.reshape(-1, AVERAGED, *x.shape[1:]).mean(1)
 
 
-def _recordings(
+def noisy(
     runs: list[dict[str, Any]], rng: np.random.Generator, noise: float, colour: str, step: float
 ) -> tuple[dict[str, Any], ...]:
+    """The runs as their sensors read them: torque noise relative to each joint's RMS, encoder noise and steps."""
     fit = [run["torque"] for run in runs if run["role"] == "fit"]
     rms = np.sqrt(np.mean(np.concatenate(fit) ** 2, 0))
     out = []
