@@ -55,7 +55,7 @@ def simulate(
 
     `command` holds the drives' torques (N m or N) of each step, or is a function of time, position and velocity that
     gives them; a function needs the number of `steps`. With h the torque of everything but dry friction,
-    $h(q, v^+, (v^+ - v)/dt) + J' f = \tau, \quad f_i = F_i \, \mathrm{clip}(J_i v^+ / w_i, -1, 1), \quad q^+ = q + dt\, v^+$
+    $h(q, v^+, (v^+ - v)/dt) + J' f = \tau$, $f_i = F_i \, \mathrm{clip}(J_i v^+ / w_i, -1, 1)$, $q^+ = q + dt\, v^+$,
     where the rows of J are the joints and the motors between joints, w is the width of their reversals (0: they stick)
     and the levels F hold the state at the step's beginning. Dry friction of an effect on the whole robot counts as
     friction of the joints. Differentiable with respect to model, command and start.

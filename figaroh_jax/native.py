@@ -1,0 +1,182 @@
+"""Which effects a model format carries by itself, and as what: the drives that URDF and MJCF can write.
+
+URDF knows a joint's viscous and dry friction. MJCF also knows armature, springs, tendons between joints and constant
+actuator bias. Both carry what changes the robot; gravity is in MJCF alone. Neither takes a negative armature, damping
+or dry friction, so an effect that would leave one is not carried.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from .effect import Effect, Native
+from .extended import ExtendedModel
+from .inertia import from_pseudo_inertia, is_physical, pseudo_inertia, to_com
+from .model import RobotModel
+
+__all__ = ["Carried", "Drives", "Tendon", "carried", "changed_leaves", "drives", "physical_inertia", "place_names"]
+
+Format = Literal["urdf", "mjcf"]
+
+_JOINT = {"urdf": ("damping", "frictionloss"), "mjcf": ("armature", "damping", "frictionloss", "stiffness", "springref")}
+_NOT_NEGATIVE = ("armature", "damping", "frictionloss", "stiffness")
+_SENSORS = {"position_error": "position sensor", "torque_response": "torque sensor"}
+_SMALLEST = 1e-12  # kg, kg m^2: least eigenvalue of a moving body's pseudo-inertia; MuJoCo refuses massless bodies
+
+
+class Tendon(NamedTuple):
+    """Fixed tendon over two joints, with coefficients 1 and `sign`."""
+
+    at: tuple[int, int]
+    sign: float
+    armature: float
+    damping: float
+    frictionloss: float
+
+
+class Drives(NamedTuple):
+    """What a format writes at the joints, one value a coordinate."""
+
+    armature: Float[np.ndarray, " nv"]
+    damping: Float[np.ndarray, " nv"]
+    frictionloss: Float[np.ndarray, " nv"]
+    stiffness: Float[np.ndarray, " nv"]
+    springref: Float[np.ndarray, " nv"]  # rad or m
+    bias: Float[np.ndarray, " nv"]  # torque that the drive gives for nothing, N m or N
+    tendons: tuple[Tendon, ...]
+
+
+class Carried(NamedTuple):
+    """Whether a format carries an effect, and why not."""
+
+    yes: bool
+    why: str = ""
+
+
+def place_names(robot: RobotModel, effect: Effect) -> tuple[str, ...]:
+    """Names of the joints or the link where the effect acts."""
+    names = robot.link_names if effect.acts_on == "link" else robot.joint_names
+    return tuple(names[int(index)] for index in np.ravel(np.asarray(effect.at)))
+
+
+def changed_leaves(before: RobotModel, after: RobotModel) -> tuple[str, ...]:
+    """Names of the robot's arrays that differ."""
+    leaves = ("placement", "axis", "inertia", "ratio", "offset", "gravity", "frame_placement")
+    pairs = ((np.asarray(getattr(model, leaf)) for model in (before, after)) for leaf in leaves)
+    return tuple(leaf for leaf, (a, b) in zip(leaves, pairs, strict=True) if not np.array_equal(a, b))
+
+
+def carried(extended: ExtendedModel, form: Format) -> tuple[Carried, ...]:
+    """For each effect whether the format carries all of it."""
+    robot, answers = extended.robot, []
+    for effect in extended.effects:
+        after = effect.change(robot)
+        answers.append(_alone(effect, changed_leaves(robot, after), form))
+        robot = after
+    while (refused := _negative(extended, tuple(answers), form)) is not None:
+        index, why = refused
+        answers[index] = Carried(False, why)
+    return tuple(answers)
+
+
+def _alone(effect: Effect, leaves: tuple[str, ...], form: Format) -> Carried:
+    for sensor, where in _SENSORS.items():
+        if effect.has(sensor):
+            return Carried(False, f"no element for what the {where} reads")
+    if form == "urdf" and "gravity" in leaves:
+        return Carried(False, "URDF has no gravity")
+    if not effect.has("torque"):
+        return Carried(True)
+    elements = _native(effect)
+    if not elements:
+        return Carried(False, "no native element")
+    for element in elements:
+        if not _known(element, form):
+            return Carried(False, f"no element for the {element.attribute} of the {element.element}")
+        if not np.isfinite(element.value):
+            return Carried(False, f"{element.attribute} would be {element.value}")
+    return Carried(True)
+
+
+def _native(effect: Effect) -> tuple[Native, ...]:
+    try:
+        return effect.native() if effect.has("torque") else ()
+    except ZeroDivisionError:  # a parameter that the format knows only as a ratio, e.g. the rest of a spring of zero
+        return ()
+
+
+def _known(element: Native, form: Format) -> bool:
+    if element.element == "joint":
+        return element.attribute in _JOINT[form]
+    if form == "urdf":
+        return False
+    return element.attribute in ("armature", "damping", "frictionloss", "bias")
+
+
+def drives(extended: ExtendedModel, answers: tuple[Carried, ...]) -> Drives:
+    """The elements of all effects that are carried, summed at each joint."""
+    sums = {name: np.zeros(extended.robot.nv) for name in (*_JOINT["mjcf"], "bias")}
+    tendons = []
+    for effect, answer in zip(extended.effects, answers, strict=True):
+        if not answer.yes:
+            continue
+        at, elements = np.ravel(np.asarray(effect.at)).astype(int), _native(effect)
+        of_joints = {e.attribute: e.value for e in elements if e.element != "tendon"}
+        # the torques of springs add, not their rests
+        of_joints["springref"] = of_joints.get("springref", 0.0) * of_joints.get("stiffness", 0.0)
+        for attribute, value in of_joints.items():
+            sums[attribute][at] += value
+        tendon = {e.attribute: e for e in elements if e.element == "tendon"}
+        if tendon:
+            sign = next(iter(tendon.values())).sign
+            values = [tendon[name].value if name in tendon else 0.0 for name in ("armature", "damping", "frictionloss")]
+            tendons.append(Tendon((int(at[0]), int(at[1])), sign, *values))
+    stiff = sums["stiffness"]
+    sums["springref"] = np.divide(sums["springref"], stiff, out=np.zeros_like(stiff), where=stiff != 0)
+    return Drives(**sums, tendons=tuple(tendons))
+
+
+def _negative(extended: ExtendedModel, answers: tuple[Carried, ...], form: Format) -> tuple[int, str] | None:
+    """An effect that leaves a negative value, with what it leaves; the largest offender where several do."""
+    total = drives(extended, answers)
+    for index, effect in enumerate(extended.effects):
+        for element in _native(effect) if answers[index].yes else ():
+            if element.element == "tendon" and element.value < 0:
+                return index, f"{element.attribute} of the tendon would be {element.value:.4g}, below zero"
+    for attribute in _NOT_NEGATIVE:
+        sums = getattr(total, attribute)
+        for joint in np.flatnonzero(sums < 0):
+            parts = [_part(effect, attribute, joint) if a.yes else 0.0 for effect, a in zip(extended.effects, answers)]
+            name = extended.robot.joint_names[joint]
+            return int(np.argmin(parts)), f"{attribute} of {name} would be {sums[joint]:.4g}, below zero"
+    return None
+
+
+def _part(effect: Effect, attribute: str, joint: int) -> float:
+    if effect.acts_on not in ("joint", "pair") or joint not in np.ravel(np.asarray(effect.at)):
+        return 0.0
+    return sum(e.value for e in _native(effect) if e.element == "joint" and e.attribute == attribute)
+
+
+def physical_inertia(parameters: Float[np.ndarray, "10"], form: Format) -> tuple[Float[np.ndarray, "10"], str]:
+    """The link's ten parameters as the format can hold them, and what had to be changed (empty: nothing).
+
+    URDF takes any mass above zero with a non-negative inertia about the centre of mass. MuJoCo wants a body that can
+    exist: the nearest positive definite pseudo-inertia in the Frobenius norm is written.
+    """
+    parameters = np.asarray(parameters, float)
+    massless = not parameters.any()
+    mass, _, inertia = to_com(parameters)
+    if form == "urdf" and (massless or (mass > 0 and np.linalg.eigvalsh(inertia)[0] >= 0)):
+        return parameters, ""
+    values, vectors = np.linalg.eigh(pseudo_inertia(parameters))
+    floor = max(_SMALLEST, 1e-12 * values[-1])
+    nearest = from_pseudo_inertia(vectors * np.maximum(values, floor) @ vectors.T)
+    if massless:
+        return nearest, f"has no mass; {_SMALLEST:g} kg is written"
+    if form == "mjcf" and is_physical(parameters):
+        return nearest if values[0] < floor else parameters, ""
+    return nearest, f"has an inertia that no body can have; the nearest possible is written ({mass:.4g} kg before)"
