@@ -7,7 +7,7 @@ that they form one tree and builds the model. Frames: a link's frame is that of 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -30,7 +30,7 @@ class JointPart(NamedTuple):
     """A joint of the file; the child link's frame is the joint's."""
 
     name: str
-    kind: str  # "revolute", "prismatic" or "fixed"
+    kind: Literal["revolute", "prismatic", "fixed"]
     parent: str  # name of the link that carries it
     child: str  # name of the link that it moves
     placement: Float[np.ndarray, "4 4"]  # in the parent link's frame, at zero
@@ -83,7 +83,8 @@ def _tree(links: Sequence[LinkPart], joints: Sequence[JointPart]) -> tuple[str, 
     for joint in joints:
         for role, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in children:
-                raise InputError(f"joint '{joint.name}': its {role} link '{link}' does not exist{nearest(link, children)}")
+                known = nearest(link, children)
+                raise InputError(f"joint '{joint.name}': its {role} link '{link}' does not exist{known}")
         if joint.child in carrier:
             both = f"'{carrier[joint.child].name}' and '{joint.name}'"
             raise InputError(f"link '{joint.child}' is the child of two joints, {both}; loops are not supported")
@@ -229,7 +230,7 @@ class _Build:
             velocity_limit=limit[:, 2],
             effort_limit=limit[:, 3],
             joints=tuple(
-                Joint(j.name, j.kind, parent, columns.index(drive.leader), j.child)
+                Joint(j.name, j.kind, parent, columns.index(drive.leader), j.child, drive.leader != j.name)  # pyright: ignore[reportArgumentType] (none is fixed)
                 for j, parent, drive in zip(self.joints, self.parents, drives, strict=True)
             ),
             frames=tuple(Frame(frame, parent) for frame, (parent, _) in frames.items()),

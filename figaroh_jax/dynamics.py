@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from .kinematics import Motion, add_up, ancestors, axis_twists, gather, in_samples, motion, placements, states
 from .inertia import pseudo_inertia
+from .kinematics import Motion, add_up, ancestors, axis_twists, gather, in_samples, motion, placements, states
 from .model import RobotModel
 from .spatial import cross, matmul, rotate, rotate_back
 
@@ -21,14 +21,17 @@ __all__ = ["forward_dynamics", "inverse_dynamics", "joint_torques", "mass_matrix
 
 
 def inverse_dynamics(
-    model: RobotModel, q: Float[ArrayLike, "*batch nv"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
+    model: RobotModel,
+    q: Float[ArrayLike, "*batch nv"],
+    v: Float[ArrayLike, "*batch nv"],
+    a: Float[ArrayLike, "*batch nv"],
 ) -> Float[Array, "*batch nv"]:
     r"""Torques (N m; N for a prismatic joint) that give the rigid body the accelerations `a`.
 
-    Newton-Euler in the world frame: $\tau_j = (p_j \times s_j) \cdot f_j + s_j \cdot n_j$ with f and n the force and the torque
-    about the world's origin of all links that joint j moves. q, v, a in rad, rad/s, rad/s^2 (m for prismatic joints);
-    computed in float64. Torques of joints that share a coordinate add up, each times its ratio. Raises `InputError`
-    where the shapes do not fit the model.
+    Newton-Euler in the world frame: $\tau_j = (p_j \times s_j) \cdot f_j + s_j \cdot n_j$ with f and n the force and
+    the torque about the world's origin of all links that joint j moves. q, v, a in rad, rad/s, rad/s^2 (m for prismatic
+    joints); computed in float64. Torques of joints that share a coordinate add up, each times its ratio. Raises
+    `InputError` where the shapes do not fit the model.
     """
     with jax.enable_x64(True):
         return _inverse_dynamics(model, *states(model, q=q, v=v, a=a))
@@ -70,7 +73,7 @@ def _turn(parameters: Float[Array, "nj 10 1"], u: Float[Array, "nj 3 samples"]) 
     return jnp.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z], axis=1)
 
 
-def mass_matrix(model: RobotModel, q: Float[Array, "*batch nv"]) -> Float[Array, "*batch nv nv"]:
+def mass_matrix(model: RobotModel, q: Float[ArrayLike, "*batch nv"]) -> Float[Array, "*batch nv nv"]:
     r"""Mass matrix of the rigid body (kg m^2; kg m, kg for prismatic joints), symmetric, in float64.
 
     Composite bodies (Featherstone 2008, section 6.2): entry (j, k), j above k or k itself, is the rate of joint j in
@@ -104,7 +107,10 @@ def joint_masses(model: RobotModel, q: Float[Array, "nv samples"]) -> Float[Arra
 
 
 def forward_dynamics(
-    model: RobotModel, q: Float[Array, "*batch nv"], v: Float[Array, "*batch nv"], tau: Float[Array, "*batch nv"]
+    model: RobotModel,
+    q: Float[ArrayLike, "*batch nv"],
+    v: Float[ArrayLike, "*batch nv"],
+    tau: Float[ArrayLike, "*batch nv"],
 ) -> Float[Array, "*batch nv"]:
     """Accelerations (rad/s^2, m/s^2) that the torques `tau` (N m, N) give the rigid body; inverse of inverse_dynamics.
 

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
 from .errors import InputError
 from .model import Joint, RobotModel
@@ -27,6 +27,7 @@ __all__ = [
     "add_up",
     "ancestors",
     "axis_twists",
+    "check_shapes",
     "forward_kinematics",
     "frame_jacobian",
     "frame_placement",
@@ -128,14 +129,14 @@ def gather(model: RobotModel, x: Float[Array, "nj *rest"]) -> Float[Array, "nv *
     return add_up(np.arange(model.nv)[:, None] == coordinates, scaled)
 
 
-def add_up(which: Bool[np.ndarray, "k n"] | Float[np.ndarray, "k n"], x: Float[Array, "n *rest"]) -> Float[Array, "k *rest"]:
+def add_up(which: Shaped[np.ndarray, "k n"], x: Float[Array, "n *rest"]) -> Float[Array, "k *rest"]:
     """Sums of the entries of `x` that each row of the matrix of 0 and 1 picks."""
     # highest precision: an accelerator's default would round the operands
     return jnp.tensordot(jnp.asarray(which, x.dtype), x, axes=1, precision=jax.lax.Precision.HIGHEST)
 
 
 def placements(model: RobotModel, q: Float[Array, "nv samples"]) -> Float[Array, "nj 4 4 samples"]:
-    """Kernel of `forward_kinematics`: poses `world_T_joint` with the samples on the last axis, the dtype that of `q`."""
+    """Kernel of `forward_kinematics`: poses `world_T_joint`, the samples on the last axis, the dtype that of `q`."""
 
     def below(above: tuple[Array, Array], rotation: Array, shift: Array) -> tuple[Array, Array]:
         return matmul(above[0], rotation), above[1] + rotate(above[0], shift)
@@ -164,7 +165,7 @@ def motion(
 
 
 def _along_tree(model: RobotModel, below: Callable[..., Any], world: Any, inputs: Sequence[Array]) -> Any:
-    """States of all joints, each `below(state of the parent, *inputs of the joint)`, level by level from the world's."""
+    """States of all joints from the root on: each is `below(state of the parent, *inputs of the joint)`."""
     levels, dtype, samples = _levels(model.joints), inputs[0].dtype, inputs[0].shape[-1]
     steps = [x[levels.order] for x in inputs]
 
@@ -199,20 +200,22 @@ def world_axes(model: RobotModel, R: Float[Array, "nj 3 3 samples"]) -> Float[Ar
     return rotate(R, jnp.asarray(model.axis, R.dtype)[..., None])
 
 
-def states(model: RobotModel, **arrays: Float[ArrayLike, "*batch nv"]) -> list[Float[Array, "*batch nv"]]:
-    """The named arrays (`q=`, `v=`, ...) in float64, once their shapes fit the model and each other.
-
-    To be called where 64-bit JAX is on. Raises `InputError` naming the array whose shape is wrong.
-    """
-    shape = None
-    for name, array in arrays.items():
-        shape = shape or np.shape(array)
-        if np.shape(array)[-1:] != (model.nv,):
-            joints = ", ".join(model.joint_names)
-            raise InputError(f"{name} has shape {np.shape(array)}; its last axis must hold the {model.nv} joints {joints}")
-        if np.shape(array) != shape:
-            raise InputError(f"{name} has shape {np.shape(array)}, but {next(iter(arrays))} has {shape}; give both alike")
+def states(model: RobotModel, **arrays: Float[ArrayLike, "..."]) -> list[Float[Array, "*batch nv"]]:
+    """The named arrays (`q=`, `v=`, ...) in float64; to be called where 64-bit JAX is on. Raises as `check_shapes`."""
+    check_shapes(model, **arrays)
     return [jnp.asarray(array, jnp.float64) for array in arrays.values()]
+
+
+def check_shapes(model: RobotModel, **arrays: Float[ArrayLike, "..."]) -> None:
+    """Raise `InputError` naming the array (`q=`, `v=`, ...) whose shape does not fit the model or the first array."""
+    first = next(iter(arrays))
+    for name, array in arrays.items():
+        shape, expected = np.shape(array), np.shape(arrays[first])
+        if shape[-1:] != (model.nv,):
+            joints = ", ".join(model.joint_names)
+            raise InputError(f"{name} has shape {shape}; its last axis must hold the {model.nv} joints {joints}")
+        if shape != expected:
+            raise InputError(f"{name} has shape {shape}, but {first} has {expected}; give both alike")
 
 
 def in_samples(kernel: Callable[..., Array], *arrays: Float[Array, "*batch nv"]) -> Float[Array, "..."]:
@@ -236,7 +239,7 @@ def _forward_kinematics(model: RobotModel, q: Array) -> Array:
     return in_samples(lambda x: placements(model, x), q)
 
 
-def frame_placement(model: RobotModel, q: Float[Array, "*batch nv"], name: str) -> Float[Array, "*batch 4 4"]:
+def frame_placement(model: RobotModel, q: Float[ArrayLike, "*batch nv"], name: str) -> Float[Array, "*batch 4 4"]:
     """Pose `world_T_frame` of the frame called `name` (a link or a joint of the model), m and rad, in float64.
 
     Raises `InputError` where there is no such frame or the shape of `q` does not fit the model.
@@ -258,7 +261,7 @@ def _frame_pose(poses: Float[Array, "nj 4 4 samples"], model: RobotModel, index:
     return matmul(carrier, jnp.asarray(model.frame_placement, poses.dtype)[index][..., None])
 
 
-def frame_jacobian(model: RobotModel, q: Float[Array, "*batch nv"], name: str) -> Float[Array, "*batch 6 nv"]:
+def frame_jacobian(model: RobotModel, q: Float[ArrayLike, "*batch nv"], name: str) -> Float[Array, "*batch 6 nv"]:
     """Jacobian of the frame called `name`: its velocity `[linear, angular]` at its origin, in world axes, for each v.
 
     Local-world-aligned in Pinocchio's words; m or 1 per rad or m, in float64. Raises `InputError` where there is no
@@ -286,7 +289,7 @@ def _jacobian(model: RobotModel, q: Float[Array, "nv samples"], index: Array, pa
 def axis_twists(
     model: RobotModel, R: Float[Array, "nj 3 3 samples"], p: Float[Array, "nj 3 samples"]
 ) -> tuple[Float[Array, "nj 3 samples"], Float[Array, "nj 3 samples"]]:
-    """Linear and angular velocity, at the point from which the joint origins `p` are measured, for a unit joint rate."""
+    """Linear and angular velocity that a unit rate of each joint gives the point from which `p` is measured."""
     s = world_axes(model, R)
     turns = revolute(model)[:, None, None]
     return jnp.where(turns, cross(p, s), s), jnp.where(turns, s, 0.0)

@@ -28,6 +28,7 @@ class Joint(NamedTuple):
     parent: int  # index of the joint that carries this one, -1: the world
     coordinate: int  # index of the coordinate that moves it
     link: str  # name of the moved link
+    follows: bool = False  # mimic: the coordinate is named after another joint
 
 
 class Frame(NamedTuple):
@@ -66,8 +67,9 @@ class RobotModel(eqx.Module):
     def joint_names(self) -> tuple[str, ...]:
         """Names of the coordinates, in column order: the joint that drives each (mimic joints follow it)."""
         names = [""] * self.nv
-        for joint in reversed(self.joints):
-            names[joint.coordinate] = joint.name
+        for joint in self.joints:
+            if not joint.follows:
+                names[joint.coordinate] = joint.name
         return tuple(names)
 
     @property

@@ -1,9 +1,8 @@
-"""Rigid motions in space: rotations, rigid transforms and the products of three-vectors.
+"""Products of vectors and matrices in space, the samples on the last axis.
 
-Conventions. A pose is a 4x4 matrix `A_T_B` that maps points of frame B into frame A. Twists and wrenches are
-`[linear, angular]`. Kernels hold samples on the *last* axis: a vector is `[..., 3, samples]` and a matrix
-`[..., 3, 3, samples]`; their products are sums of element products, which every backend fuses, where a batched 3x3
-matrix product would be slow.
+A vector is `[..., 3, samples]` and a matrix `[..., 3, 3, samples]`. The products are sums of element products along the
+samples, which XLA fuses on every device, where a batched 3x3 matrix product would be slow. A pose is a 4x4 matrix
+`A_T_B` that maps points of frame B into frame A.
 """
 
 from __future__ import annotations
@@ -11,32 +10,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["cross", "exp", "log", "matmul", "pose", "rotate", "rotate_back", "skew"]
-
-
-def exp(twist: Float[Array, "*batch 6"]) -> Float[Array, "*batch 4 4"]:
-    """Pose reached by following `twist` (linear m, angular rad, in the moving frame) for unit time."""
-    return jaxlie.SE3.exp(jnp.asarray(twist)).as_matrix()
-
-
-def log(transform: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 6"]:
-    """Twist (linear m, angular rad) whose `exp` is `transform`; rotations by pi have two answers, one is given."""
-    return jaxlie.SE3.from_matrix(jnp.asarray(transform)).log()
-
-
-def skew(vector: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
-    """Matrix of the cross product: `skew(u) @ x == cross(u, x)`."""
-    x, y, z = jnp.moveaxis(jnp.asarray(vector), -1, 0)
-    o = jnp.zeros_like(x)
-    rows = [jnp.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))]
-    return jnp.stack(rows, -2)
-
-
-def pose(rotation: Float[Array, "*batch 3 3"], position: Float[Array, "*batch 3"]) -> Float[Array, "*batch 4 4"]:
-    """Pose with the given rotation and position (m)."""
-    top = jnp.concatenate([rotation, position[..., None]], axis=-1)
-    bottom = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0], top.dtype), (*top.shape[:-2], 1, 4))
-    return jnp.concatenate([top, bottom], axis=-2)
+__all__ = ["cross", "matmul", "rotate", "rotate_back"]
 
 
 def cross(u: Float[Array, "*a 3 n"], v: Float[Array, "*b 3 m"]) -> Float[Array, "..."]:

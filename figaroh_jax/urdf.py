@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,7 +20,12 @@ from .xmlfile import read_xml
 
 __all__ = ["load_urdf"]
 
-_KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": "fixed"}
+_KINDS: dict[str, Literal["revolute", "prismatic", "fixed"]] = {
+    "revolute": "revolute",
+    "continuous": "revolute",
+    "prismatic": "prismatic",
+    "fixed": "fixed",
+}
 _UNSUPPORTED = ("floating", "planar")
 _UNREAD = ("material", "transmission", "gazebo")  # of the robot; of a link: visual, collision
 _NUMBERS = {  # element: attributes, how many numbers each holds, which must be there
@@ -62,7 +67,7 @@ def load_urdf(
 
 def _read(path: str | Path) -> Any:
     """The robot as yourdfpy's dataclasses, from a file whose every number has been checked."""
-    from lxml import etree
+    from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
     root = read_xml(path, "robot")
     for part in [*root.iterchildren(*_UNREAD), *root.iterfind("link/visual"), *root.iterfind("link/collision")]:
@@ -103,7 +108,7 @@ def _check_joint(part: Any, where: str) -> None:
     for end in ("parent", "child"):
         element = part.find(end)
         if element is None or not element.get("link"):
-            raise InputError(f"{where}: names no {end} link; <{end} link=\"...\"/> is expected")
+            raise InputError(f'{where}: names no {end} link; <{end} link="..."/> is expected')
     mimic = part.find("mimic")
     if mimic is not None and not mimic.get("joint"):
         raise InputError(f"{where}: its <mimic> names no joint")

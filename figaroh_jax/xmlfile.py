@@ -19,7 +19,7 @@ def read_xml(path: str | Path, root: str) -> Any:
     declares a document type or entities (the road to exponential expansion and to foreign files), or whose root
     element is not called `root`.
     """
-    from lxml import etree
+    from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
     data = _read(Path(path))
     parser = etree.XMLParser(remove_comments=True, remove_pis=True, resolve_entities=False, no_network=True)
