@@ -335,17 +335,32 @@ def load_robot(task: Task) -> RobotModel:
     return load_urdf(robot.model, joints=robot.joints, posture=dict(robot.posture), gravity=robot.gravity)
 
 
+_EXPECTED = {  # pydantic's kinds of mistakes, in fewer words
+    "greater_than": "more than {gt:g}",
+    "greater_than_equal": "at least {ge:g}",
+    "less_than": "less than {lt:g}",
+    "literal_error": "{expected}",
+    "too_long": "{max_length} values",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "finite_number": "a finite number",
+    "string_type": "text",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "dict_type": "keys and values",
+    "path_type": "the name of a file",
+}
+
+
 def _message(error: Any) -> str:
     """One mistake in the words of the task file."""
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]).lstrip(".")
-    context, given = error.get("ctx", {}), error.get("input")
-    if error["type"] == "missing":
-        return f"the key {key} is missing"
-    if error["type"] == "value_error":
-        text = str(context["error"])
-        return f"{key}: {text}" if key else text
-    if error["type"] == "literal_error":
-        words = context["expected"].replace("'", "").replace(" or ", ", ").split(", ")
-        return f"{key} is {given!r}{nearest(str(given), words)} expected {context['expected']}"
-    said = error["msg"][0].lower() + error["msg"][1:]
-    return f"{key} is {given!r}: {said}"
+    context, kind = error.get("ctx", {}), error["type"]
+    if kind == "missing":
+        return f"{key} is missing"
+    if kind == "value_error":
+        return f"{key}: {context['error']}" if key else str(context["error"])
+    expected = _EXPECTED[kind].format(**context) if kind in _EXPECTED else error["msg"]
+    return f"{key} is {error['input']!r:.80}, expected {expected}"

@@ -18,7 +18,7 @@ from .model import RobotModel
 from .tables import Table, read_table
 
 if TYPE_CHECKING:
-    from .config import Load, RecordingEntry, Task, Transmission
+    from .config import Load, RecordingEntry, Task
 
 __all__ = ["Recording", "read_recordings"]
 
@@ -48,7 +48,7 @@ def read_recordings(task: Task, model: RobotModel) -> tuple[Recording, ...]:
     wrong shapes, time that does not increase, names that the model does not know, a fit recording without torque.
     """
     _check_names(task, model)
-    drive = _Drive(task.transmission, model)
+    drive = _Drive(task, model)
     recordings = tuple(_read(entry, f"data[{k}]", model, drive) for k, entry in enumerate(task.data))
     lacking = next((r for r in recordings if r.role == "fit" and r.torque is None), None)
     if lacking is not None:
@@ -79,25 +79,22 @@ def _check_names(task: Task, model: RobotModel) -> None:
 class _Drive:
     """Motor side to joint side; the identity where the task gives no transmission."""
 
-    def __init__(self, transmission: Transmission | None, model: RobotModel):
-        size = model.nv
-        self.position = self._matrix(transmission and transmission.position, size, "position", model)
-        self.torque = self._matrix(transmission and transmission.torque, size, "torque", model)
-        offset = transmission.offset if transmission else None
-        if offset is not None and len(offset) != size:
-            names = ", ".join(model.joint_names)
-            raise InputError(f"transmission.offset has {len(offset)} entries, expected {size}: {names}")
-        self.offset = np.zeros(size) if offset is None else np.asarray(offset)
+    def __init__(self, task: Task, model: RobotModel):
+        def read(key: str, shape: tuple[int, ...]) -> np.ndarray | None:
+            value = task.transmission and getattr(task.transmission, key)
+            if value is None:
+                return None
+            found = np.asarray(value)
+            if found.shape != shape:
+                names = ", ".join(model.joint_names)
+                place = f"{task.file}: transmission.{key}"
+                raise InputError(f"{place} has shape {found.shape}, expected {shape} for the joints {names}")
+            return found
 
-    @staticmethod
-    def _matrix(rows: list[list[float]] | None, size: int, key: str, model: RobotModel):
-        if rows is None:
-            return None
-        shape = (len(rows), len(rows[0]) if rows else 0)
-        if shape != (size, size):
-            names = ", ".join(model.joint_names)
-            raise InputError(f"transmission.{key} has shape {shape}, expected ({size}, {size}) for the joints {names}")
-        return np.asarray(rows)
+        self.position = read("position", (model.nv, model.nv))
+        self.torque = read("torque", (model.nv, model.nv))
+        offset = read("offset", (model.nv,))
+        self.offset = np.zeros(model.nv) if offset is None else offset
 
     def joint_motion(self, motor: Float[np.ndarray, "samples nv"]) -> Float[np.ndarray, "samples nv"]:
         return motor if self.position is None else np.linalg.solve(self.position, motor.T).T

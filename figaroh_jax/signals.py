@@ -112,7 +112,7 @@ def prepare(recording: Recording, preprocess: Preprocess, rates: Rates | None = 
     rows = row_filter(len(at), dt, rates.cutoff, step=rates.step, trim=trim, start=float(at[0]), nv=nv)
     if rows.kept < FEWEST_ROWS:
         raise InputError(
-            f"{recording.file}: {seconds:.3g} s are too short: {rows.kept} rows at {1 / rates.row:.4g} Hz are left"
+            f"{recording.file}: {seconds:.3g} s are too short: {rows.kept} row(s) at {1 / rates.row:.4g} Hz are left"
             f" after {trim} s are cut at both ends, at least {FEWEST_ROWS} are needed"
         )
     position = low_pass(columns[0], dt, rates.cutoff)

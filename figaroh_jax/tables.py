@@ -168,7 +168,7 @@ def _numbers(values: np.ndarray, file: Path, name: str) -> Float[np.ndarray, "..
         try:
             float(value)
         except (TypeError, ValueError):
-            shown = "an empty cell" if value is None else repr(value)[:40]
+            shown = "an empty cell" if value is None else f"'{value}'"[:40]
             raise InputError(f"{file}: '{name}', row {row} (from 0): {shown} is not a number") from None
     raise InputError(f"{file}: '{name}' holds {values.dtype} values, expected numbers")
 

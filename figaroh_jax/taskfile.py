@@ -1,7 +1,7 @@
 """YAML files read with suspicion, and the inheritance between task files (`extends`).
 
 Aliases are refused (a few lines of them can describe gigabytes), so are keys that stand twice, Python tags, and files
-above 1 MiB. Relative paths become absolute against the folder of the file they stand in, before files are merged.
+above 256 KiB. Relative paths become absolute against the folder of the file they stand in, before files are merged.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from .errors import InputError, nearest
 
 __all__ = ["merge", "read_task", "read_yaml", "where"]
 
-LARGEST = 1 << 20  # bytes
+LARGEST = 1 << 18  # bytes
 
 
 class _Loader(yaml.SafeLoader):
@@ -44,13 +44,15 @@ def read_yaml(file: Path, asked_by: str = "") -> dict[str, Any]:
         raise InputError(f"{name} does not exist{nearest(file.name, beside)}")
     try:
         if file.stat().st_size > LARGEST:
-            raise InputError(f"{name} is larger than 1 MiB, which no task needs")
+            raise InputError(f"{name} is larger than {LARGEST >> 10} KiB, which no task needs")
         content = yaml.load(file.read_text(encoding="utf-8"), _Loader)
     except InputError as error:
         raise error if name in str(error) else InputError(f"{name}, {error}") from None
     except yaml.YAMLError as error:
         raise InputError(f"{name}{_explain(error)}") from error
-    except (OSError, UnicodeDecodeError, RecursionError, ValueError) as error:
+    except RecursionError:
+        raise InputError(f"{name} is nested too deeply") from None
+    except (OSError, UnicodeDecodeError, ValueError) as error:
         raise InputError(f"{name} cannot be read as YAML: {error}") from error
     if content is None:
         raise InputError(f"{name} is empty")

@@ -30,7 +30,7 @@ URDF = """<robot name="bench">
 """
 
 
-def arrays(seconds: float = 4.0, rate: float = 250.0) -> dict[str, np.ndarray]:
+def arrays(seconds: float = 4.0, rate: float = 250.0) -> dict[str, Any]:
     """Time, position, velocity and torque of a smooth motion (the torque is any smooth signal)."""
     t = np.arange(int(seconds * rate)) / rate
     phase = 2 * np.pi * np.outer(t, [0.5, 0.8, 0.6])

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 import yaml
+from tasks import task, write
+
 from figaroh_jax.config import Preprocess, Task, load_robot, load_task
 from figaroh_jax.errors import InputError
-from tasks import task, write
 
 CONTRACT = """
 robot:

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
-from figaroh_jax.config import Task, load_robot, load_task
-from figaroh_jax.dataset import Recording, read_recordings
 from pyarrow import csv, parquet
 from tasks import JOINTS, arrays, task, write
+
+from figaroh_jax.config import Task, load_robot, load_task
+from figaroh_jax.dataset import Recording, read_recordings
 
 
 def recordings(folder: Path, *entries: dict, **keys) -> tuple[Recording, ...]:
@@ -27,6 +28,11 @@ def columns(prefixes: dict[str, str], names: tuple[str, ...]) -> pa.Table:
     for key, prefix in prefixes.items():
         table |= {prefix + name: data[key][:, k] for k, name in enumerate(names)}
     return pa.table(dict(reversed(table.items())))
+
+
+def assert_close(actual: np.ndarray | None, expected: np.ndarray) -> None:
+    assert actual is not None
+    np.testing.assert_allclose(actual, expected, rtol=1e-13, atol=1e-12)
 
 
 def assert_same(one: Recording, other: Recording) -> None:
@@ -57,6 +63,7 @@ def test_a_prefix_finds_its_columns_in_natural_order(tmp_path, names):
 
 
 def assert_same_motion(one: Recording, other: Recording) -> None:
+    assert one.torque is not None and other.torque is not None
     np.testing.assert_array_equal(one.position, other.position)
     np.testing.assert_array_equal(one.torque, other.torque)
 
@@ -91,11 +98,11 @@ def test_degrees_are_of_turning_joints_and_millimetres_of_sliding_ones(tmp_path)
     )
     data = arrays()
     turning = np.array([np.pi / 180, np.pi / 180, 1.0])
-    np.testing.assert_allclose(deg.position, data["q"] * turning, rtol=1e-14)
-    np.testing.assert_allclose(deg.velocity, data["dq"] * turning, rtol=1e-14)
-    np.testing.assert_allclose(deg.command, data["q"] * turning, rtol=1e-14)
-    np.testing.assert_allclose(mm.position, data["q"] * [1, 1, 1e-3], rtol=1e-14)
-    np.testing.assert_allclose(mm.velocity, data["dq"], rtol=1e-14)
+    assert_close(deg.position, data["q"] * turning)
+    assert_close(deg.velocity, data["dq"] * turning)
+    assert_close(deg.command, data["q"] * turning)
+    assert_close(mm.position, data["q"] * [1, 1, 1e-3])
+    assert_close(mm.velocity, data["dq"])
 
 
 def test_roles_repeats_and_a_holdout_without_torque(tmp_path):
@@ -108,14 +115,15 @@ def test_velocity_passes_the_transmission_and_takes_no_offset(tmp_path):
     ratio = [[10.0, 0, 0], [2.0, 20.0, 0], [0, 0, -5.0]]
     (read,) = recordings(tmp_path, {"velocity": "dq"}, transmission={"position": ratio, "offset": [1.0, 2.0, 3.0]})
     data = arrays()
-    np.testing.assert_allclose(read.velocity @ np.array(ratio).T, data["dq"], rtol=0, atol=1e-12)
-    np.testing.assert_allclose((read.position - [1, 2, 3]) @ np.array(ratio).T, data["q"], rtol=0, atol=1e-12)
+    assert read.velocity is not None
+    assert_close(read.velocity @ np.array(ratio).T, data["dq"])
+    assert_close((read.position - [1, 2, 3]) @ np.array(ratio).T, data["q"])
 
 
 def test_amperes_become_newton_metres(tmp_path):
     gains = np.diag([10.0, 8.0, -3.0])
     (read,) = recordings(tmp_path, {"units": {"torque": "A"}}, transmission={"torque": gains.tolist()})
-    np.testing.assert_allclose(read.torque, arrays()["tau"] @ gains, rtol=1e-14)
+    assert_close(read.torque, arrays()["tau"] @ gains)
 
 
 def tx40_task(folder: Path, data_dir: Path) -> Task:
@@ -151,6 +159,6 @@ def test_the_motors_of_the_tx40_become_joints_as_its_readme_says(tmp_path, data_
     q = (np.linalg.inv(rq) @ z["motor_position"].T).T
     q[:, 1] -= np.pi / 2
     q[:, 2] += np.pi / 2
-    np.testing.assert_allclose(recording.position, q, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(recording.torque, (rt @ z["motor_current"].T).T, rtol=0, atol=1e-12)
+    assert_close(recording.position, q)
+    assert_close(recording.torque, (rt @ z["motor_current"].T).T)
     assert recording.time[-1] == pytest.approx(44999 / 5000)
