@@ -166,7 +166,8 @@ def load_model(directory: str | Path) -> ExtendedModel:
     try:
         robot = _restored(content, directory / "robot.urdf")
         effects = [
-            place(find(entry["effect"]), robot, entry["at"], **_numbers(entry["fields"])) for entry in content["effects"]
+            place(find(e["effect"]), robot, e["at"], **{k: float(x) for k, x in e["fields"].items()})
+            for e in content["effects"]
         ]
         return extend(robot, *effects, width=np.array([float(joint["reversal"]) for joint in content["joints"]]))
     except InputError as error:
@@ -175,10 +176,6 @@ def load_model(directory: str | Path) -> ExtendedModel:
         raise InputError(f"{file}: the key {error} is missing; the file is written by figaroh-jax") from None
     except (TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{file}: not as figaroh-jax writes it: {error}") from None
-
-
-def _numbers(fields: Mapping[str, Any]) -> dict[str, float]:
-    return {str(name): float(value) for name, value in fields.items()}
 
 
 def _restored(content: Mapping[str, Any], urdf: Path) -> RobotModel:

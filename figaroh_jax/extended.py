@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -55,7 +56,7 @@ class ExtendedModel(eqx.Module):
 
 
 def extend(
-    model: RobotModel | ExtendedModel, *effects: Effect, width: Float[Array, " nv"] | float | None = None
+    model: RobotModel | ExtendedModel, *effects: Effect, width: Float[Array | np.ndarray, " nv"] | float | None = None
 ) -> ExtendedModel:
     """The model with `effects` added behind those it has.
 
@@ -67,11 +68,10 @@ def extend(
         width = model.width if isinstance(model, ExtendedModel) else 0.0
     if np.shape(width) not in ((), (robot.nv,)):
         raise InputError(f"width has shape {np.shape(width)}; robot '{robot.name}' needs one number or {robot.nv}")
-    if isinstance(width, (int, float)) or np.shape(width) == ():
-        width = np.full(robot.nv, width) if isinstance(width, (int, float)) else jnp.broadcast_to(width, (robot.nv,))
+    space: Any = jnp if isinstance(width, jax.Array) else np
     # a Python number would be a constant of the compiled programs, and each new value a new compilation
     effects = jax.tree.map(lambda x: np.float64(x) if isinstance(x, (int, float)) else x, effects)
-    return ExtendedModel(robot, (*present, *effects), width)
+    return ExtendedModel(robot, (*present, *effects), space.broadcast_to(space.asarray(width), (robot.nv,)))
 
 
 def predict(
@@ -109,16 +109,17 @@ def _predict(extended: ExtendedModel, time: Array, q: Array, v: Array, a: Array,
 
 @jax.jit
 def _inverse_dynamics(extended: ExtendedModel, q: Array, v: Array, a: Array) -> Array:
-    robot, flat = changed_robot(extended), [x.reshape(-1, x.shape[-1]) for x in (q, v, a)]
-    load = inverse_dynamics(robot, *flat)
-    motion = Motion(robot, jnp.zeros(flat[0].shape[0]), *flat, load, load, 0.0, jnp.asarray(extended.width))
-    return with_torque(extended.effects, motion, load).total.reshape(q.shape)
+    robot, shape = changed_robot(extended), q.shape
+    q, v, a = (x.reshape(-1, shape[-1]) for x in (q, v, a))
+    load = inverse_dynamics(robot, q, v, a)
+    motion = Motion(robot, jnp.zeros(q.shape[0]), q, v, a, load, load, 0.0, jnp.asarray(extended.width))
+    return with_torque(extended.effects, motion, load).total.reshape(shape)
 
 
 @jax.jit
 def _forward_dynamics(extended: ExtendedModel, q: Array, v: Array, tau: Array) -> Array:
-    flat = [x.reshape(-1, x.shape[-1]) for x in (q, v, tau)]
-    return jax.vmap(lambda *x: _solve_acceleration(extended, *x))(*flat).reshape(q.shape)
+    flat = (x.reshape(-1, x.shape[-1]) for x in (q, v, tau))
+    return jax.vmap(_solve_acceleration, (None, 0, 0, 0))(extended, *flat).reshape(q.shape)
 
 
 def _solve_acceleration(extended: ExtendedModel, q: Array, v: Array, tau: Array) -> Array:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from .assembly import JointPart, LinkPart, assemble
 from .errors import InputError
@@ -22,6 +24,7 @@ from .xmlfile import read_xml
 __all__ = ["mjcf_text", "read_mjcf"]
 
 _KIND = {"revolute": "hinge", "prismatic": "slide"}
+_BACK: dict[str, Literal["revolute", "prismatic"]] = {"hinge": "revolute", "slide": "prismatic"}
 _FULL = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])  # MuJoCo's order of the six moments
 
 
@@ -34,30 +37,31 @@ def mjcf_text(robot: RobotModel, drives: Drives) -> tuple[str, tuple[str, ...]]:
     bodies = {-1: ET.SubElement(root, "worldbody")}
     warnings = []
     for index, joint in enumerate(robot.joints):
-        body = ET.SubElement(bodies[joint.parent], "body", name=joint.link, **_pose(robot.placement[index]))
+        body = ET.SubElement(bodies[joint.parent], "body", {"name": joint.link} | _pose(robot.placement[index]))
         bodies[index] = body
         inertia, warning = physical_inertia(np.asarray(robot.inertia[index]), "mjcf")
         if warning:
             warnings.append(f"robot.xml: link {joint.link} {warning}")
-        ET.SubElement(body, "inertial", **_inertial(inertia))
-        ET.SubElement(body, "joint", **_joint(robot, index, drives))
+        ET.SubElement(body, "inertial", _inertial(inertia))
+        ET.SubElement(body, "joint", _joint(robot, index, drives))
     for frame, placement in zip(robot.frames, robot.frame_placement, strict=True):
-        ET.SubElement(bodies[frame.parent], "site", name=frame.name, **_pose(placement))
+        ET.SubElement(bodies[frame.parent], "site", {"name": frame.name} | _pose(placement))
     _tendons(root, robot, drives)
     warnings += _followers(root, robot)
     actuators = ET.SubElement(root, "actuator")
-    for coordinate, name in enumerate(robot.joint_names):
-        ET.SubElement(actuators, "general", **_motor(name, robot.effort_limit[coordinate], drives.bias[coordinate]))
+    efforts = np.asarray(robot.effort_limit)
+    for name, limit, bias in zip(robot.joint_names, efforts, drives.bias, strict=True):
+        ET.SubElement(actuators, "general", _motor(name, float(limit), float(bias)))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n", tuple(warnings)
 
 
-def _text(numbers: Float[np.ndarray, " n"]) -> str:
-    return " ".join(repr(float(x)) for x in np.ravel(numbers))
+def _text(numbers: ArrayLike) -> str:
+    return " ".join(repr(float(x)) for x in np.ravel(np.asarray(numbers)))
 
 
-def _pose(placement: Float[np.ndarray, "4 4"]) -> dict[str, str]:
-    placement = np.asarray(placement)
+def _pose(pose: ArrayLike) -> dict[str, str]:
+    placement = np.asarray(pose)
     return {"pos": _text(placement[:3, 3]), "quat": _text(_quaternion(placement[:3, :3]))}
 
 
@@ -114,7 +118,7 @@ def _tendons(root: ET.Element, robot: RobotModel, drives: Drives) -> None:
     for tendon in drives.tendons:
         names = [robot.joint_names[place] for place in tendon.at]
         values = {k: repr(float(getattr(tendon, k))) for k in ("armature", "damping", "frictionloss")}
-        fixed = ET.SubElement(group, "fixed", name="-".join(names) + f"{tendon.sign:+.0f}", **values)
+        fixed = ET.SubElement(group, "fixed", {"name": "-".join(names) + f"{tendon.sign:+.0f}"} | values)
         for name, factor in zip(names, (1.0, tendon.sign), strict=True):
             ET.SubElement(fixed, "joint", joint=name, coef=repr(factor))
 
@@ -148,7 +152,7 @@ def read_mjcf(path: str | Path) -> RobotModel:
     except (AttributeError, TypeError, ValueError, KeyError, IndexError):
         raise InputError(f"{path}: not MJCF as figaroh-jax writes it; other MJCF is not read yet") from None
     order = [name for e in root.iterfind("actuator/general") if (name := e.get("joint"))]
-    return assemble(str(path), root.get("model"), (links, joints), order, None, gravity)
+    return assemble(str(path), root.get("model"), (links, joints), order, None, gravity.tolist())
 
 
 def _numbers(element: ET.Element | None, attribute: str) -> Float[np.ndarray, " n"]:
@@ -182,7 +186,6 @@ def _read_body(
 
 
 def _read_joint(joint: ET.Element, parent: str, body: ET.Element, follow: ET.Element | None) -> JointPart:
-    kind = {mjcf: kind for kind, mjcf in _KIND.items()}[joint.attrib["type"]]
     lower, upper = _numbers(joint, "range") if "range" in joint.attrib else (-np.inf, np.inf)
     mimic = None
     if follow is not None:
@@ -190,7 +193,9 @@ def _read_joint(joint: ET.Element, parent: str, body: ET.Element, follow: ET.Ele
         mimic = (follow.attrib["joint2"], float(ratio), float(offset))
     limit = (float(lower), float(upper), np.inf, np.inf)
     name, link = joint.attrib["name"], body.attrib["name"]
-    return JointPart(name, kind, parent, link, _read_pose(body), _numbers(joint, "axis"), limit, mimic)
+    return JointPart(
+        name, _BACK[joint.attrib["type"]], parent, link, _read_pose(body), _numbers(joint, "axis"), limit, mimic
+    )
 
 
 def _read_inertial(inertial: ET.Element | None) -> Float[np.ndarray, "10"]:

@@ -21,7 +21,10 @@ __all__ = ["Carried", "Drives", "Tendon", "carried", "changed_leaves", "drives",
 
 Format = Literal["urdf", "mjcf"]
 
-_JOINT = {"urdf": ("damping", "frictionloss"), "mjcf": ("armature", "damping", "frictionloss", "stiffness", "springref")}
+_JOINT = {
+    "urdf": ("damping", "frictionloss"),
+    "mjcf": ("armature", "damping", "frictionloss", "stiffness", "springref"),
+}
 _NOT_NEGATIVE = ("armature", "damping", "frictionloss", "stiffness")
 _SENSORS = {"position_error": "position sensor", "torque_response": "torque sensor"}
 _SMALLEST = 1e-12  # kg, kg m^2: least eigenvalue of a moving body's pseudo-inertia; MuJoCo refuses massless bodies
@@ -148,8 +151,9 @@ def _negative(extended: ExtendedModel, answers: tuple[Carried, ...], form: Forma
                 return index, f"{element.attribute} of the tendon would be {element.value:.4g}, below zero"
     for attribute in _NOT_NEGATIVE:
         sums = getattr(total, attribute)
-        for joint in np.flatnonzero(sums < 0):
-            parts = [_part(effect, attribute, joint) if a.yes else 0.0 for effect, a in zip(extended.effects, answers)]
+        for joint in map(int, np.flatnonzero(sums < 0)):
+            pairs = zip(extended.effects, answers, strict=True)
+            parts = [_part(effect, attribute, joint) if answer.yes else 0.0 for effect, answer in pairs]
             name = extended.robot.joint_names[joint]
             return int(np.argmin(parts)), f"{attribute} of {name} would be {sums[joint]:.4g}, below zero"
     return None

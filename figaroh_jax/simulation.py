@@ -81,7 +81,9 @@ def _simulate(
     time = dt * jnp.arange(record.shape[0])
     robot = changed_robot(extended)
 
-    def advance(state: tuple[Array, Array, Array], step: tuple[Array, Array]) -> tuple[tuple[Array, ...], tuple]:
+    def advance(
+        state: tuple[Array, Array, Array], step: tuple[Array, Array]
+    ) -> tuple[tuple[Array, Array, Array], tuple[Array, ...]]:
         q, v, a = state
         tau = step[1] if command is None else jnp.asarray(command(step[0], q, v), jnp.float64)
         after = _step(extended, robot, step[0], q, v, a, tau, dt)

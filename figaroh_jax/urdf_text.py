@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from .inertia import to_com
 from .model import Frame, RobotModel
@@ -124,9 +125,9 @@ def _roll_pitch_yaw(r: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
     return np.array([roll, pitch, yaw])
 
 
-def _bound(value: float) -> str:
-    return repr(float(np.clip(value, -_NO_LIMIT, _NO_LIMIT)))
+def _bound(value: ArrayLike) -> str:
+    return repr(float(np.clip(np.asarray(value), -_NO_LIMIT, _NO_LIMIT)))
 
 
-def _text(numbers: Float[np.ndarray, " n"]) -> str:
-    return " ".join(repr(float(x)) for x in np.ravel(numbers))
+def _text(numbers: ArrayLike) -> str:
+    return " ".join(repr(float(x)) for x in np.ravel(np.asarray(numbers)))
