@@ -131,7 +131,7 @@ def prepare(recording: Recording, preprocess: Preprocess, rates: Rates | None = 
         dt=dt,
         cutoff=rates.cutoff,
         rows=eqx.tree_at(lambda r: r.weight, rows, weight),
-        notes=recording.notes + _gap_notes(recording, grid.gaps),
+        notes=recording.notes + _gap_notes(recording, grid.gaps, rates.cutoff),
     )
 
 
@@ -190,22 +190,27 @@ def _weight(recording: Recording, preprocess: Preprocess, rows: RowFilter, veloc
     """0 for the rows near a gap that the filter cannot bridge, and below a joint's gate; else 1."""
     weight = np.ones((rows.kept, velocity.shape[1]))
     reach = 0.5 / cutoff
-    for begin, end in gaps:
-        if end - begin > 0.25 / cutoff:
-            weight[(rows.row_times > begin - reach) & (rows.row_times < end + reach)] = 0.0
+    for begin, end in _long(gaps, cutoff):
+        weight[(rows.row_times > begin - reach) & (rows.row_times < end + reach)] = 0.0
     for joint, least in preprocess.gate.items():
         column = recording.joints.index(joint)
         weight[np.abs(velocity[rows.index, column]) < least, column] = 0.0
     return weight
 
 
-def _gap_notes(recording: Recording, gaps) -> tuple[str, ...]:
+def _long(gaps, cutoff: float) -> list[tuple[float, float]]:
+    """Gaps that hide a quarter of the fastest period that passes."""
+    return [(begin, end) for begin, end in gaps if end - begin > 0.25 / cutoff]
+
+
+def _gap_notes(recording: Recording, gaps, cutoff: float) -> tuple[str, ...]:
     if not gaps:
         return ()
-    longest = max(gaps, key=lambda gap: gap[1] - gap[0])
+    begin, end = max(gaps, key=lambda gap: gap[1] - gap[0])
+    left_out = len(_long(gaps, cutoff))
     return (
-        f"{recording.name}: {len(gaps)} gap{'s' if len(gaps) > 1 else ''} in the time stamps, the longest"
-        f" {longest[1] - longest[0]:.3g} s at {longest[0]:.4g} s; rows that a gap spoils are left out",
+        f"{recording.name}: {len(gaps)} gap{'s' * (len(gaps) > 1)} in the time stamps, the longest {end - begin:.3g} s"
+        f" at {begin:.4g} s; rows near {left_out} of them are left out, the others are bridged",
     )
 
 
