@@ -76,7 +76,10 @@ def forward_dynamics(
     v: Float[ArrayLike, "*batch nv"],
     tau: Float[ArrayLike, "*batch nv"],
 ) -> Float[np.ndarray, "*batch nv"]:
-    """Accelerations that the torques `tau` give the rigid body."""
+    """Accelerations that the torques `tau` give the rigid body: articulated bodies, or a solve with mimic joints."""
+    if len(model.joints) == model.nv:
+        share = _share(model)
+        return _each(model, lambda *x: share.T @ pin.aba(*x), q=q, v=v, tau=tau)
     bias = inverse_dynamics(model, q, v, np.zeros(np.shape(v)))
     return np.linalg.solve(mass_matrix(model, q), (np.asarray(tau) - bias)[..., None])[..., 0]
 

@@ -1,0 +1,89 @@
+"""Poses, frames and Jacobians against Pinocchio, laws of motion against finite differences."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import figaroh_jax_pinocchio as reference
+import jax.numpy as jnp
+import numpy as np
+import pinocchio as pin
+import pytest
+import robots
+
+from figaroh_jax import kinematics
+from figaroh_jax.errors import InputError
+from figaroh_jax.urdf import load_urdf
+
+
+@pytest.mark.parametrize("name", robots.REAL)
+def test_every_frame_stands_and_moves_as_pinocchios_from_the_urdf_itself(name: str, data_dir: Path) -> None:
+    path = data_dir / robots.REAL[name]
+    model = load_urdf(path)
+    robot = pin.buildModelFromUrdf(str(path))
+    data = robot.createData()
+    q = robots.states(model, 1)[0][0]
+    tree = {joint.name: i for i, joint in enumerate(model.joints)}
+    share, entries = np.zeros((robot.nv, model.nv)), []
+    for row, (joint, word) in enumerate(zip(list(robot.joints)[1:], list(robot.names)[1:], strict=True)):
+        coordinate = model.joints[tree[word]].coordinate
+        share[row, coordinate] = 1.0
+        entries += [np.cos(q[coordinate]), np.sin(q[coordinate])] if joint.nq == 2 else [q[coordinate]]
+    pin.computeJointJacobians(robot, data, np.array(entries))
+    pin.updateFramePlacements(robot, data)
+    for frame in model.frames[:: max(1, len(model.frames) // 8)]:
+        index = robot.getFrameId(frame.name)
+        pose = kinematics.frame_placement(model, q, frame.name)
+        np.testing.assert_allclose(pose, data.oMf[index].homogeneous, rtol=0, atol=1e-10, err_msg=frame.name)
+        jacobian = pin.getFrameJacobian(robot, data, index, pin.LOCAL_WORLD_ALIGNED) @ share
+        ours = kinematics.frame_jacobian(model, q, frame.name)
+        np.testing.assert_allclose(ours, jacobian, rtol=0, atol=1e-10, err_msg=frame.name)
+
+
+@pytest.mark.parametrize("name", robots.INLINE)
+def test_joint_poses_of_tiny_robots_equal_the_reference_backend(name: str, tmp_path: Path) -> None:
+    model = robots.load(robots.INLINE[name], tmp_path)
+    q = robots.states(model, 6)[0].reshape(2, 3, -1)
+    theirs = reference.forward_kinematics(model, q)
+    np.testing.assert_allclose(kinematics.forward_kinematics(model, q), theirs, rtol=0, atol=1e-12)
+
+
+def test_motion_is_the_time_derivative_of_the_poses(tmp_path: Path) -> None:
+    model = robots.load(robots.TREE, tmp_path)
+    q, v, a = (jnp.asarray(x.T) for x in robots.states(model, 3))
+    state = kinematics.motion(model, q, v, a)
+    h = 1e-4
+    poses = [kinematics.placements(model, q + v * t + a * t * t / 2) for t in (-h, 0.0, h)]
+    acceleration = (poses[2] - 2 * poses[1] + poses[0])[:, :3, 3] / h**2 - np.asarray(model.gravity)[:, None]
+    np.testing.assert_allclose(state.ac, acceleration, rtol=0, atol=2e-4 * np.abs(acceleration).max())
+    spin = np.einsum("jabn,jcbn->jacn", (poses[2] - poses[0])[:, :3, :3] / (2 * h), poses[1][:, :3, :3])
+    np.testing.assert_allclose(state.w, np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], 1), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(state.R, poses[1][:, :3, :3], rtol=0, atol=1e-13)
+
+
+def test_jacobian_is_the_derivative_of_the_pose_in_every_coordinate(tmp_path: Path) -> None:
+    """Mimic and prismatic joints included; the frame lies behind a fixed joint."""
+    model = robots.load(robots.TREE, tmp_path)
+    q = robots.states(model, 1)[0][0]
+    jacobian = np.asarray(kinematics.frame_jacobian(model, q, "d"))
+    pose, h = np.asarray(kinematics.frame_placement(model, q, "d")), 1e-6
+    for k in range(model.nv):
+        step = h * np.eye(model.nv)[k]
+        ahead, behind = (np.asarray(kinematics.frame_placement(model, q + s, "d")) for s in (step, -step))
+        rate = (ahead - behind) / (2 * h)
+        spin = rate[:3, :3] @ pose[:3, :3].T
+        twist = np.array([*rate[:3, 3], spin[2, 1], spin[0, 2], spin[1, 0]])
+        np.testing.assert_allclose(jacobian[:, k], twist, rtol=0, atol=1e-8)
+
+
+def test_frames_of_the_world_stand_still(tmp_path: Path) -> None:
+    model = robots.load(robots.TREE, tmp_path)
+    q = robots.states(model, 2)[0]
+    np.testing.assert_array_equal(kinematics.frame_placement(model, q, "base"), np.tile(np.eye(4), (2, 1, 1)))
+    np.testing.assert_array_equal(kinematics.frame_jacobian(model, q, "base"), np.zeros((2, 6, model.nv)))
+
+
+def test_an_unknown_frame_is_refused_with_the_nearest_name(tmp_path: Path) -> None:
+    model = robots.load(robots.TREE, tmp_path)
+    with pytest.raises(InputError, match="no frame 'fingr'; did you mean 'finger'"):
+        kinematics.frame_placement(model, np.zeros(model.nv), "fingr")
