@@ -24,7 +24,7 @@ from .resampling import Grid, band_limited, differentiate, even_grid, sampling_r
 from .rowfilter import RowFilter, fast_length, filter_rows, frequencies, low_pass, row_filter
 
 if TYPE_CHECKING:
-    from .config import Preprocess
+    from .config import Load, Preprocess
 
 __all__ = [
     "Rates",
@@ -62,6 +62,7 @@ class Signals:
     dt: float
     cutoff: float  # Hz
     rows: RowFilter
+    load: Load | None  # known payload carried
     notes: tuple[str, ...]
 
 
@@ -131,6 +132,7 @@ def prepare(recording: Recording, preprocess: Preprocess, rates: Rates | None = 
         dt=dt,
         cutoff=rates.cutoff,
         rows=eqx.tree_at(lambda r: r.weight, rows, weight),
+        load=recording.load,
         notes=recording.notes + _gap_notes(recording, grid.gaps, rates.cutoff),
     )
 

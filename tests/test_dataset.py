@@ -10,8 +10,9 @@ import pytest
 from pyarrow import csv, parquet
 from tasks import JOINTS, arrays, task, write
 
-from figaroh_jax.config import Task, load_robot, load_task
+from figaroh_jax.config import Preprocess, Task, load_robot, load_task
 from figaroh_jax.dataset import Recording, read_recordings
+from figaroh_jax.signals import prepare
 
 
 def recordings(folder: Path, *entries: dict, **keys) -> tuple[Recording, ...]:
@@ -109,6 +110,12 @@ def test_roles_repeats_and_a_holdout_without_torque(tmp_path):
     fit, held = recordings(tmp_path, {"repeat": 1}, {"file": "run2.npz", "role": "holdout", "torque": None})
     assert (fit.role, fit.repeat) == ("fit", "1")
     assert (held.role, held.torque) == ("holdout", None)
+
+
+def test_a_known_load_stays_with_its_recording_and_its_signals(tmp_path):
+    loaded, bare = recordings(tmp_path, {"load": {"frame": "tool0", "mass": 2}}, {})
+    assert loaded.load is not None and loaded.load.mass == 2 and bare.load is None
+    assert prepare(loaded, Preprocess()).load == loaded.load
 
 
 def test_velocity_passes_the_transmission_and_takes_no_offset(tmp_path):
