@@ -45,6 +45,7 @@ class Parameter(NamedTuple):
     upper: float = np.inf
     grid: tuple[float, ...] = ()
     choice: bool = False  # one of the grid's values, never anything between (a sign)
+    hole: tuple[float, float] | None = None  # values that are another effect
 
 
 class Native(NamedTuple):
@@ -86,10 +87,19 @@ def amplitude(unit: str) -> Any:
     return eqx.field(default=0.0, metadata={"parameter": Parameter(unit, True)})
 
 
-def shape(unit: str, grid: Sequence[float], bounds: tuple[float, float] | None = None, choice: bool = False) -> Any:
-    """Declare a parameter in which the torque is not linear; `choice` takes the grid's values alone."""
+def shape(
+    unit: str,
+    grid: Sequence[float],
+    bounds: tuple[float, float] | None = None,
+    choice: bool = False,
+    hole: tuple[float, float] | None = None,
+) -> Any:
+    """Declare a parameter in which the torque is not linear; `choice` takes the grid's values alone.
+
+    It is searched within `bounds` but not in the `hole`, where the effect is another one.
+    """
     lower, upper = bounds or (min(grid), max(grid))
-    parameter = Parameter(unit, False, lower, upper, tuple(grid), choice)
+    parameter = Parameter(unit, False, lower, upper, tuple(grid), choice, hole)
     return eqx.field(default=grid[0], metadata={"parameter": parameter})
 
 

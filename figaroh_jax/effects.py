@@ -184,7 +184,7 @@ class PowerLawFriction(JointEffect):
     equation = "strength |v|^exponent s(v)"
     separated_by = "constant-speed sweeps of {at} from 0.05 rad/s to its maximum speed"
     strength: Scalar = amplitude("N m (s/rad)^exponent")
-    exponent: Scalar = shape("", (0.4, 0.6, 1.5, 2.0, 2.5, 3.0), (0.24, 4.0))
+    exponent: Scalar = shape("", (0.4, 0.6, 1.5, 2.0, 2.5, 3.0), (0.24, 4.0), hole=(0.85, 1.15))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
         speed = jnp.sqrt(self.here(motion.velocity) ** 2 + 1e-12)

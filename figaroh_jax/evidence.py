@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-__all__ = ["Columns", "Linear", "Prior", "Rows", "Score", "fit", "score", "wilson_hilferty"]
+__all__ = ["Bank", "Columns", "Linear", "Prior", "Rows", "Score", "bank", "fit", "projection", "scores"]
 
 CUT = 1e-7  # eigenvalues of the unit-diagonal variance below it: a direction that the baseline has absorbed
 
@@ -66,15 +66,42 @@ class Columns(NamedTuple):
     Z: Float[np.ndarray, "grid k rows T"]
 
 
-class Score(NamedTuple):
-    """Score of a candidate at each grid point, and what its null distribution needs."""
+class Bank(NamedTuple):
+    """Instruments of many candidates, joint by joint: one product serves all of them.
 
-    s: Float[np.ndarray, "grid k"]
-    H: Float[np.ndarray, "grid P k"]
+    Candidate i owns the columns `span[i]`, grid point by grid point; `joint[j]` are the columns that touch joint j.
+    """
+
+    span: list[tuple[int, int, int]]  # first column, grid points, columns a point
+    joint: list[Int[np.ndarray, " columns"]]
+    Zi: list[Float[np.ndarray, "columns T"]]
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return max((first + grid * k for first, grid, k in self.span), default=0)
+
+    def product(self, rows: list[Float[np.ndarray, "T m"]]) -> Float[np.ndarray, "columns m"]:
+        """Every column times one matrix of rows a joint, summed over the joints."""
+        out = np.zeros((self.width, rows[0].shape[1]))
+        for columns, Zi, right in zip(self.joint, self.Zi, rows, strict=True):
+            out[columns] += Zi @ right
+        return out
+
+
+class Score(NamedTuple):
+    """Score of a candidate at each grid point, and what whitens it."""
+
     root: Float[np.ndarray, "grid k k"]  # V^-1/2 on the kept directions, zero elsewhere
     rank: Int[np.ndarray, " grid"]
     Q: Float[np.ndarray, " grid"]
     z: Float[np.ndarray, " grid"]  # Q on one scale for all ranks (Wilson-Hilferty)
+
+    def largest(self, scores: Float[np.ndarray, "draws gridk"]) -> Float[np.ndarray, " draws"]:
+        """Largest z over the grid that other scores of the same columns would have."""
+        grid, k = self.root.shape[:2]
+        white = np.matmul(scores.reshape(-1, grid, 1, k), np.swapaxes(self.root, 1, 2))[:, :, 0]
+        return wilson_hilferty((white**2).sum(-1), np.broadcast_to(self.rank, white.shape[:2])).max(1)
 
 
 def instruments(
@@ -101,61 +128,85 @@ def fit(rows: Rows, prior: Prior) -> Linear:
     return Linear(theta, inverse, residual, moment, prior.precision * (theta - prior.mean))
 
 
-def score(rows: Rows, linear: Linear, columns: Columns) -> Score:
-    """Score s = Zi'r of a candidate and Q = s'V^-1 s, V its variance with the current model projected out."""
-    grid, k = columns.Z.shape[:2]
-    s, XZ, XiZi, ZiZi = (0.0, 0.0, 0.0, 0.0)
-    for place, joint in enumerate(columns.joints):
-        Zi = rows.instrument(columns.Z[:, :, place], joint)
-        flat = Zi.reshape(grid * k, -1)
-        s = s + flat @ linear.residual[joint]
-        XZ = XZ + flat @ rows.X[joint]
-        XiZi = XiZi + flat @ rows.Xi[joint]
-        ZiZi = ZiZi + Zi @ np.swapaxes(Zi, 1, 2)
-    shaped = (grid, k, -1)
-    XZ, XiZi = np.swapaxes(np.reshape(XZ, shaped), 1, 2), np.swapaxes(np.reshape(XiZi, shaped), 1, 2)
-    H = linear.inverse @ XZ
-    mixed = np.swapaxes(XiZi, 1, 2) @ H
-    V = ZiZi - mixed - np.swapaxes(mixed, 1, 2) + np.swapaxes(H, 1, 2) @ linear.moment @ H
-    s = np.reshape(s, (grid, k))
-    root, rank = _whitener(V, ZiZi)
-    Q = (np.squeeze(root @ s[..., None], -1) ** 2).sum(-1)
-    return Score(s, H, root, rank, Q, wilson_hilferty(Q, rank))
+def bank(rows: Rows, candidates: list[Columns]) -> Bank:
+    """The candidates' instruments, arranged by joint."""
+    span, first = [], 0
+    touching: list[list[np.ndarray]] = [[] for _ in rows.y]
+    stored: list[list[np.ndarray]] = [[] for _ in rows.y]
+    for one in candidates:
+        grid, k = one.Z.shape[:2]
+        span.append((first, grid, k))
+        for place, joint in enumerate(one.joints):
+            stored[joint].append(rows.instrument(one.Z[:, :, place].reshape(grid * k, -1), joint))
+            touching[joint].append(np.arange(first, first + grid * k))
+        first += grid * k
+    empty = np.zeros((0, rows.y.shape[1]))
+    joint = [np.concatenate([*t, np.zeros(0, int)]) for t in touching]
+    return Bank(span, joint, [np.concatenate([*z, empty]) for z in stored])
 
 
-def score_parts(
-    rows: Rows, linear: Linear, columns: Columns, score: Score, other: Float[np.ndarray, "draws nv T"]
-) -> Float[np.ndarray, "draws grid k"]:
-    """The score that residual rows `other` would give: Zi'e - H'Xi'e."""
-    grid, k = score.s.shape
-    total = -np.einsum("dp,gpk->dgk", _scores_of_model(rows, other), score.H)
-    for place, joint in enumerate(columns.joints):
-        flat = rows.instrument(columns.Z[:, :, place], joint).reshape(grid * k, -1)
-        total = total + (other[:, joint] @ flat.T).reshape(-1, grid, k)
-    return total
+def projection(rows: Rows, linear: Linear, stock: Bank) -> Float[np.ndarray, "P columns"]:
+    """H = A^-1 X'Zi: what the current model takes up of each candidate column."""
+    return linear.inverse @ stock.product(list(rows.X)).T
 
 
-def block_scores(rows: Rows, linear: Linear, columns: Columns, score: Score) -> Float[np.ndarray, "blocks grid k"]:
-    """The score's share of each block, then of each prior row; they sum to the score."""
-    grid, k = score.s.shape
-    blocks = rows.block.max() + 1
-    member = (rows.block == np.arange(blocks)[:, None]).astype(float)
-    model = np.einsum("bt,jt,jtp->bp", member, linear.residual * rows.paired, rows.Xi, optimize=True)
-    total = -np.einsum("bp,gpk->bgk", model, score.H)
-    for place, joint in enumerate(columns.joints):
-        flat = rows.instrument(columns.Z[:, :, place], joint).reshape(grid * k, -1)
-        total = total + (member @ (flat * linear.residual[joint]).T).reshape(-1, grid, k)
-    prior = linear.pull[:, None, None] * np.moveaxis(score.H, 0, 1)
-    return np.concatenate([total, prior])
+def scores(rows: Rows, linear: Linear, stock: Bank, H: Float[np.ndarray, "P columns"]) -> list[Score]:
+    """Score s = Zi'r of every candidate and Q = s'V^-1 s, V its variance with the current model projected out."""
+    s = stock.product([r[:, None] for r in linear.residual])[:, 0]
+    XiZi, moved = stock.product(list(rows.Xi)).T, linear.moment @ H
+    raw = _own_products(stock)
+    out = []
+    for (first, grid, k), ZiZi in zip(stock.span, raw, strict=True):
+        own = slice(first, first + grid * k)
+        h, xz, mh = (np.moveaxis(m[:, own].reshape(-1, grid, k), 1, 0) for m in (H, XiZi, moved))
+        mixed = np.matmul(np.swapaxes(xz, 1, 2), h)
+        V = ZiZi - mixed - np.swapaxes(mixed, 1, 2) + np.matmul(np.swapaxes(h, 1, 2), mh)
+        root, rank = _whitener(V, ZiZi)
+        Q = (np.matmul(root, s[own].reshape(grid, k, 1)) ** 2).sum((1, 2))
+        out.append(Score(root, rank, Q, wilson_hilferty(Q, rank)))
+    return out
+
+
+def other_scores(
+    rows: Rows, stock: Bank, H: Float[np.ndarray, "P columns"], residual: Float[np.ndarray, "draws nv T"]
+) -> Float[np.ndarray, "draws columns"]:
+    """The scores that other residual rows would give: Zi'e - H'Xi'e."""
+    draws = len(residual)
+    model = (residual * rows.paired).reshape(draws, -1) @ _tall(rows.Xi)
+    return stock.product(list(np.moveaxis(residual, 0, 2))).T - model @ H
+
+
+def block_scores(
+    rows: Rows, linear: Linear, stock: Bank, H: Float[np.ndarray, "P columns"]
+) -> Float[np.ndarray, "blocks columns"]:
+    """The scores' share of each block, then of each prior row; they sum to the scores."""
+    member = (rows.block[:, None] == np.arange(rows.block.max() + 1)).astype(float)
+    own = linear.residual * rows.paired
+    model = sum(member.T @ (x * r[:, None]) for x, r in zip(rows.Xi, own, strict=True))
+    total = stock.product([member * r[:, None] for r in linear.residual]).T - model @ H
+    return np.concatenate([total, linear.pull[:, None] * H])
+
+
+def _own_products(stock: Bank) -> list[Float[np.ndarray, "grid k k"]]:
+    """Zi'Zi of each candidate at each grid point."""
+    out = [np.zeros((grid, k, k)) for _, grid, k in stock.span]
+    starts = np.array([first for first, _, _ in stock.span])
+    for columns, Zi in zip(stock.joint, stock.Zi, strict=True):
+        place = 0
+        while place < len(columns):
+            which = int(np.searchsorted(starts, columns[place], side="right")) - 1
+            _, grid, k = stock.span[which]
+            own = Zi[place : place + grid * k].reshape(grid, k, -1)
+            out[which] += np.matmul(own, np.swapaxes(own, 1, 2))
+            place += grid * k
+    return out
 
 
 def absorbed(rows: Rows, linear: Linear, columns: Columns) -> Float[np.ndarray, "grid"]:
     """Share of the candidate's columns (by power) inside the span of the current model and its prior."""
-    power, left = 0.0, 0.0
-    ZX = sum(np.einsum("gkt,tp->gkp", columns.Z[:, :, i], rows.X[j]) for i, j in enumerate(columns.joints))
+    ZX = sum(columns.Z[:, :, i] @ rows.X[j] for i, j in enumerate(columns.joints))
     power = (columns.Z**2).sum((1, 2, 3))
-    inside = np.einsum("gkp,pq,gkq->g", ZX, linear.inverse, ZX)
-    left = np.maximum(power - inside, 0)
+    left = np.maximum(power - (ZX @ linear.inverse * ZX).sum((1, 2)), 0)
     return 1 - left / np.maximum(power, 1e-300)
 
 
@@ -168,10 +219,6 @@ def wilson_hilferty(Q: Float[np.ndarray, " *n"], rank: Int[np.ndarray, " *n"]) -
 
 def _tall(X: Float[np.ndarray, "nv T P"]) -> Float[np.ndarray, "nvT P"]:
     return X.reshape(-1, X.shape[-1])
-
-
-def _scores_of_model(rows: Rows, other: Float[np.ndarray, "draws nv T"]) -> Float[np.ndarray, "draws P"]:
-    return (other * rows.paired).reshape(len(other), -1) @ _tall(rows.Xi)
 
 
 def _conditioned(A: Float[np.ndarray, "P P"]) -> Float[np.ndarray, "P P"]:

@@ -2,41 +2,53 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Collection
 
 import numpy as np
 from jaxtyping import Float
 
 from . import noise
-from .evidence import Columns, Rows, fit, score
+from .evidence import Prior, Rows, fit
 from .noise import Spectrum
 from .problem import Problem, State, solved, whitened
-from .screening import Group, catalogue
+from .screening import Group, catalogue, screen
 
 __all__ = ["noise_floor"]
 
 ROUNDS = 2
+RICHNESS = 10  # groups of the catalogue in the rich model
 RICH_CUT = 1e-9  # of the unit-diagonal Gram of the rich model
-MOST_OF_ROWS = 0.5  # columns of the rich model, at most this share of a joint's rows
+ENOUGH = 1500  # rows a joint without which a spectrum cannot be told from misfit: then the noise is white
 
 
-def noise_floor(problem: Problem, state: State) -> tuple[Spectrum, Float[np.ndarray, "F nv"]]:
+def noise_floor(
+    problem: Problem, state: State, forbid: Collection[str] = ()
+) -> tuple[Spectrum, Float[np.ndarray, "F nv"]]:
     """Spectrum of the noise, and the whitening response that follows from it.
 
-    From the differences of repeats where there are some, else from the residual of the richest model. The baseline
-    is fitted in between, so that its weights are right; a few rounds settle.
+    From the differences of repeats where there are some; the baseline is fitted in between, so that its weights are
+    right. Else from the residual of a rich model, white where the data are short.
     """
-    scale = np.sqrt((problem.torque**2).mean((0, 1))) * 0.05 + 1e-9
+    rows = plain_rows(problem, state)
+    count = max(1, rows.count // len(rows.y))
+    rough = rows.y - rows.X @ _weighted(rows, state.prior, np.sqrt((rows.y**2).mean(1)))
+    scale = np.sqrt((rough**2).sum(1) / count)
+    if not problem.layout.repeats:
+        spectrum = _from_rich_model(problem, state, scale, forbid, count)
+        return spectrum, _whitening(problem, spectrum)
     response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
     for _ in range(ROUNDS):
-        rows = whitened(problem, state, response)
-        if problem.layout.repeats:
-            state = solved(problem, state, fit(rows, state.prior).theta)
-            spectrum = _from_repeats(problem, state)
-        else:
-            spectrum = _from_rich_model(problem, state, rows, response)
+        state = solved(problem, state, fit(whitened(problem, state, response), state.prior).theta)
+        spectrum = _from_repeats(problem, rows, state)
         response = _whitening(problem, spectrum)
     return spectrum, response
+
+
+def _weighted(rows: Rows, prior: Prior, scale: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " P"]:
+    """Coefficients with the joints weighted by `scale` (N m or N)."""
+    X = (rows.X / scale[:, None, None]).reshape(-1, rows.X.shape[-1])
+    y = (rows.y / scale[:, None]).reshape(-1)
+    return np.linalg.solve(X.T @ X + np.diag(prior.precision + 1e-12), X.T @ y + prior.precision * prior.mean)
 
 
 def _whitening(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, "F nv"]:
@@ -49,10 +61,9 @@ def plain_rows(problem: Problem, state: State) -> Rows:
     return whitened(problem, state, np.ones((len(np.asarray(problem.records.omega)), problem.records.shape[3])))
 
 
-def _from_repeats(problem: Problem, state: State) -> Spectrum:
-    rows = plain_rows(problem, state)
+def _from_repeats(problem: Problem, rows: Rows, state: State) -> Spectrum:
     residual = rows.y - rows.X @ state.theta
-    other = rows.instrument(residual, 0) if len(rows.partner) == 1 else _mean_of_partners(rows, residual)
+    other = _mean_of_partners(rows, residual)
     partners = np.maximum((rows.partner >= 0).sum(0), 1)
     difference = (residual - other) / np.sqrt(1 + 1 / partners)
     return _fit(problem, np.where(rows.paired > 0, difference, 0.0), None)
@@ -63,34 +74,38 @@ def _mean_of_partners(rows: Rows, residual: Float[np.ndarray, "nv T"]) -> Float[
 
 
 def _from_rich_model(
-    problem: Problem, state: State, rows: Rows, response: Float[np.ndarray, "F nv"]
+    problem: Problem, state: State, scale: Float[np.ndarray, " nv"], forbid: Collection[str], count: int
 ) -> Spectrum:
-    """Residual of the baseline with every group of the catalogue at its best grid point."""
-    state = solved(problem, state, fit(rows, state.prior).theta)
-    groups = catalogue(problem, state, rows, response, ())
-    linear = fit(rows, state.prior)
-    best = []
-    for group in groups:
-        result = score(rows, linear, group.columns)
-        point = int(np.argmax(result.Q))
-        best.append((float(result.Q[point]), group, point))
-    basis = _orthonormal(rows, sorted(best, key=lambda item: -item[0]))
+    """Residual of the baseline with the groups of the catalogue that a forward selection takes first."""
+    response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
+    rows = whitened(problem, state, response)
+    groups = catalogue(problem, solved(problem, state, fit(rows, state.prior).theta), rows, response, forbid)
+    blocks, prior = [rows.X], state.prior
+    for _ in range(RICHNESS):
+        scores = screen(rows, fit(rows, prior), groups).scores
+        best = int(np.argmax([result.Q.max() for result in scores]))
+        blocks.append(_full(rows, groups[best], int(np.argmax(scores[best].Q))))
+        X = np.concatenate(blocks, axis=2)
+        rows, prior = rows._replace(X=X, Xi=X), prior.extended(blocks[-1].shape[2])
+    basis = _orthonormal(rows)
     y = rows.y.reshape(-1)
-    residual = (y - basis @ (basis.T @ y)).reshape(rows.y.shape)
-    nv, (n, _, count, _) = len(rows.y), problem.records.shape
-    taken = basis.reshape(nv, n, count, -1)
-    return _fit(problem, residual / np.asarray(response).mean(0)[:, None], np.moveaxis(taken, 0, 2))
+    residual = (y - basis @ (basis.T @ y)).reshape(rows.y.shape) * scale[:, None]
+    if count < ENOUGH:
+        degrees = count - (basis.reshape(len(rows.y), -1, basis.shape[1]) ** 2).sum((1, 2))
+        return noise.white((residual**2).sum(1) / np.maximum(degrees, count / 4), float(problem.records.rate) / 2)
+    n, _, length, nv = problem.records.shape
+    return _fit(problem, residual, np.moveaxis(basis.reshape(nv, n, length, -1), 0, 2))
 
 
-def _orthonormal(rows: Rows, best: list[tuple[float, Group, int]]) -> Float[np.ndarray, "nvT columns"]:
-    blocks = [rows.X]
-    for _, group, point in best:
-        if sum(b.shape[-1] for b in blocks) > MOST_OF_ROWS * rows.count / len(rows.y):
-            break
-        full = np.zeros((*rows.y.shape, group.columns.Z.shape[1]))
-        full[list(group.columns.joints)] = np.moveaxis(group.columns.Z[point], 0, 2)
-        blocks.append(full)
-    tall = np.concatenate(blocks, axis=2).reshape(rows.y.size, -1)
+def _full(rows: Rows, group: Group, point: int) -> Float[np.ndarray, "nv T k"]:
+    """Columns of a group at a grid point, in the rows of all joints."""
+    full = np.zeros((*rows.y.shape, group.columns.Z.shape[1]))
+    full[list(group.columns.joints)] = np.moveaxis(group.columns.Z[point], 0, 2)
+    return full
+
+
+def _orthonormal(rows: Rows) -> Float[np.ndarray, "nvT columns"]:
+    tall = rows.X.reshape(rows.y.size, -1)
     scale = np.sqrt((tall**2).sum(0))
     tall = tall[:, scale > 0] / scale[scale > 0]
     values, vectors = np.linalg.eigh(tall.T @ tall)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 from numpy.polynomial import legendre
 
-__all__ = ["Spectrum", "fit_spectrum", "leverage", "periodogram", "spectral_line", "whitening"]
+__all__ = ["Spectrum", "fit_spectrum", "leverage", "periodogram", "spectral_line", "white", "whitening"]
 
 FLOOR = 0.05  # of the median power between 1 Hz and the cutoff: bounds what whitening amplifies
 LOWEST = 0.3  # Hz: below, the spectrum follows a power of the frequency alone
@@ -75,6 +75,13 @@ def fit_spectrum(
     return Spectrum(coefficients, covariance, nyquist)
 
 
+def white(variance: Float[np.ndarray, " nv"], nyquist: float) -> Spectrum:
+    """The same power at all frequencies: a scale per joint and nothing else."""
+    coefficients = np.zeros((6, len(variance)))
+    coefficients[0] = np.log(variance)
+    return Spectrum(coefficients, np.zeros((len(variance), 6, 6)), nyquist)
+
+
 def whitening(
     spectrum: Spectrum, frequency: Float[np.ndarray, " freqs"], gain: Float[np.ndarray, " freqs"], cutoff: float
 ) -> Float[np.ndarray, "freqs nv"]:
@@ -83,6 +90,8 @@ def whitening(
     The floor is 5 % of the median filtered power between 1 Hz and the cutoff, so that the band which the row filter
     has emptied is not blown up.
     """
+    if not spectrum.covariance.any():
+        return np.broadcast_to(1 / np.sqrt(spectrum.power(frequency[:1])), (len(frequency), spectrum.coefficients.shape[1]))
     filtered = gain[:, None] * spectrum.power(frequency)
     band = (frequency >= min(1.0, cutoff / 4)) & (frequency <= 0.8 * cutoff)
     floor = FLOOR * np.median(filtered[band], axis=0)

@@ -21,7 +21,7 @@ from .records import Records
 
 __all__ = ["Whitened", "bounded_minimum", "profile", "refit"]
 
-STEPS = 25
+STEPS = 12
 RIDGE = 1e-9
 
 
@@ -35,82 +35,84 @@ class Whitened(eqx.Module):
 
 
 def bounded_minimum(
-    function: Callable[[Float[Array, " p"]], Float[Array, ""]],
-    start: Float[Array, " p"],
-    lower: Float[Array, " p"],
-    upper: Float[Array, " p"],
-) -> tuple[Float[Array, " p"], Float[Array, ""]]:
-    """Minimiser and minimum of a smooth function in a box; differentiable function, any transform around it.
+    function: Callable[[Float[np.ndarray, " p"]], tuple[float, Float[np.ndarray, " p"]]],
+    start: Float[np.ndarray, " p"],
+    lower: Float[np.ndarray, " p"],
+    upper: Float[np.ndarray, " p"],
+) -> Float[np.ndarray, " p"]:
+    """Minimiser in a box of a smooth function that answers its value and its gradient, by L-BFGS-B.
 
-    L-BFGS-B of jaxopt, which is no longer maintained: this is the only place that knows it.
+    The only place that knows the minimiser. SciPy's runs on the host around one compiled function; the one native to
+    JAX (jaxopt) compiles its own loop around every function, several seconds each (`benchmarks/README.md`).
     """
-    from jaxopt import LBFGSB
+    from scipy.optimize import minimize  # slow to import
 
-    solver = LBFGSB(function, maxiter=STEPS, tol=1e-7, linesearch="backtracking", maxls=8, jit=True, unroll=False)
-    found = solver.run(start, bounds=(lower, upper))
-    return found.params, function(found.params)
+    options = {"maxiter": STEPS, "ftol": 1e-7, "gtol": 1e-6}
+    return minimize(function, start, jac=True, bounds=list(zip(lower, upper, strict=True)), options=options).x
 
 
-def profile(effect: Effect, motion: Motion, records: Records, whitened: Whitened) -> Float[Array, ""]:
-    """J(p) of the effect at its shape, the change of the penalised sum of squares that it brings."""
+def profile(
+    effect: Effect, motion: Motion, records: Records, whitened: Whitened
+) -> tuple[Float[Array, ""], Float[Array, "k rows n M"]]:
+    """J(p) of the effect at its shape, the change of the penalised sum of squares that it brings; its columns."""
     Z = effect_rows(effect, motion, records, whitened.whitening)
     own = Z.shape[1] != whitened.residual.shape[0]
     residual = whitened.residual[effect.at] if own else whitened.residual
     X = whitened.X[effect.at] if own else whitened.X
-    if kind(effect) != "columns":
-        (name,) = effect.parameters()
-        Z = Z * getattr(effect, name)
     k = Z.shape[0]
     flat = Z.reshape(k, -1)
     s = flat @ residual.reshape(-1)
     C = flat @ X.reshape(flat.shape[1], -1)
     G = flat @ flat.T - C @ whitened.inverse @ C.T
     if kind(effect) != "columns":
-        return G[0, 0] - 2 * s[0]
+        (name,) = effect.parameters()
+        size = getattr(effect, name)
+        return size**2 * G[0, 0] - 2 * size * s[0], Z
     scale = jnp.sqrt(jnp.diagonal(flat @ flat.T) + 1e-300)
     unit = G / (scale[:, None] * scale[None, :]) + RIDGE * jnp.eye(k)
-    return -(s / scale) @ jnp.linalg.solve(unit, s / scale)
+    return -(s / scale) @ jnp.linalg.solve(unit, s / scale), Z
 
 
 @eqx.filter_jit
-def _search(
-    effects: Effect, box: Float[Array, "starts 2 p"], motion: Motion, records: Records, whitened: Whitened
-) -> tuple[Float[Array, "starts p"], Float[Array, " starts"], Float[Array, "starts k rows n M"]]:
+def _profiles(
+    effects: Effect, values: Float[Array, "starts p"], motion: Motion, records: Records, whitened: Whitened
+) -> tuple[Float[Array, " starts"], Float[Array, "starts p"], Float[Array, "starts k rows n M"]]:
+    """Profile, gradient and columns of several starts, each its own effect with its own shape."""
     names = shapes(type(effects))
-    positive = jnp.array([effects.parameters()[name].lower > 0 for name in names])
 
-    def one(effect: Effect, edges: Float[Array, "2 p"]) -> tuple[Array, Array, Array]:
-        def to(x: Array) -> Array:
-            return jnp.where(positive, jnp.log(jnp.where(positive, x, 1.0)), x)
+    def one(effect: Effect, x: Float[Array, " p"]) -> tuple[Array, tuple[Array, Array]]:
+        value, Z = profile(with_shape(effect, names, list(x)), motion, records, whitened)
+        return value, (value, Z)
 
-        low, high = to(edges[0]), to(edges[1])
-
-        def value(u: Float[Array, " p"]) -> Float[Array, ""]:
-            x = low + u * (high - low)
-            x = jnp.where(positive, jnp.exp(jnp.where(positive, x, 0.0)), x)
-            return profile(with_shape(effect, names, list(x)), motion, records, whitened) / scale
-
-        start = (to(jnp.stack([getattr(effect, name) for name in names])) - low) / (high - low)
-        scale = jnp.abs(profile(effect, motion, records, whitened)) + 1e-9
-        best, least = bounded_minimum(value, start, jnp.zeros_like(start), jnp.ones_like(start))
-        x = low + best * (high - low)
-        x = jnp.where(positive, jnp.exp(jnp.where(positive, x, 0.0)), x)
-        Z = effect_rows(with_shape(effect, names, list(x)), motion, records, whitened.whitening)
-        return x, least * scale, Z
-
-    return jax.vmap(one)(effects, box)
+    slope, (value, Z) = jax.vmap(jax.jacfwd(one, argnums=1, has_aux=True))(effects, values)
+    return value, slope, Z
 
 
 def refit(
     effects: Effect, motion: Motion, records: Records, whitened: Whitened
 ) -> tuple[Effect, Float[np.ndarray, "k rows n M"]]:
-    """Best shape over the starts (leading axis of `effects`), each between its neighbours on the grid; its columns."""
+    """Best shape over the starts (leading axis of `effects`), each between its neighbours on the grid; its columns.
+
+    All starts are one box problem: the sum of their profiles, whose gradient is that of each.
+    """
     names = shapes(type(effects))
-    box = np.stack([_box(effects.parameters()[n], np.asarray(getattr(effects, n))) for n in names], axis=-1)
-    found, least, Z = _search(effects, box, motion, records, whitened)
-    best = int(np.argmin(np.where(np.isfinite(least), least, np.inf)))
+    start = np.stack([np.asarray(getattr(effects, name)) for name in names], axis=-1)
+    box = np.stack([_box(effects.parameters()[n], x) for n, x in zip(names, start.T, strict=True)], axis=-1)
+    low, width = box[:, 0], box[:, 1] - box[:, 0]
+    scale = 1.0
+
+    def function(u: Float[np.ndarray, " startsp"]) -> tuple[float, Float[np.ndarray, " startsp"]]:
+        value, slope, _ = _profiles(effects, low + u.reshape(low.shape) * width, motion, records, whitened)
+        return float(value.sum()) / scale, np.asarray(slope * width).reshape(-1) / scale
+
+    first = ((start - low) / width).reshape(-1)
+    scale = abs(function(first)[0]) + 1e-9
+    found = bounded_minimum(function, first, np.zeros_like(first), np.ones_like(first))
+    values = low + found.reshape(low.shape) * width
+    value, _, Z = _profiles(effects, values, motion, records, whitened)
+    best = int(np.argmin(np.where(np.isfinite(value), value, np.inf)))
     one = jax.tree.map(lambda x: np.asarray(x)[best], effects)
-    return with_shape(one, names, list(np.asarray(found[best]))), np.asarray(Z[best])
+    return with_shape(one, names, list(values[best])), np.asarray(Z[best])
 
 
 def with_shape(effect: Effect, names: list[str], values: list[Any]) -> Effect:
@@ -127,4 +129,7 @@ def _box(parameter: Any, starts: Float[np.ndarray, " starts"]) -> Float[np.ndarr
     grid = np.array([parameter.lower, *sorted(parameter.grid), parameter.upper])
     place = np.array([np.argmin(np.abs(grid[1:-1] - x)) + 1 for x in starts])
     low, high = grid[place - 1], grid[place + 1]
-    return np.stack([np.where(low == starts, parameter.lower, low), np.where(high == starts, parameter.upper, high)], 1)
+    if parameter.hole:
+        low = np.where(starts >= parameter.hole[1], np.maximum(low, parameter.hole[1]), low)
+        high = np.where(starts <= parameter.hole[0], np.minimum(high, parameter.hole[0]), high)
+    return np.stack([low, high], axis=1)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from .design import candidates, effect_rows, kind
 from .effect import Effect, Motion
 from .effects import CATALOGUE, LinkEffect
-from .evidence import Columns, Linear, Rows, Score, block_scores, score, score_parts
+from .evidence import Bank, Columns, Linear, Rows, Score, bank, block_scores, other_scores, projection, scores
 from .model import RobotModel
 from .noise import Spectrum
 from .problem import Problem, State
@@ -44,6 +44,8 @@ class Screen(NamedTuple):
 
     groups: list[Group]
     scores: list[Score]
+    stock: Bank
+    H: Float[np.ndarray, "P columns"]
 
     def best(self, rows: Rows) -> list[tuple[float, int, int]]:
         """Rank (Q less its penalties), group and grid point, best first."""
@@ -92,7 +94,9 @@ def place_names(model: RobotModel, effect: Effect | type[Effect], at: tuple[int,
 
 def screen(rows: Rows, linear: Linear, groups: list[Group]) -> Screen:
     """Scores of all groups with the current model projected out."""
-    return Screen(groups, [score(rows, linear, group.columns) for group in groups])
+    stock = bank(rows, [group.columns for group in groups])
+    H = projection(rows, linear, stock)
+    return Screen(groups, scores(rows, linear, stock, H), stock, H)
 
 
 def family_p(
@@ -110,42 +114,25 @@ def family_p(
     whole blocks of the residual, the prior's rows among the blocks.
     """
     highest = max(float(result.z.max()) for result in found.scores)
-    flips = _flipped(rows, linear, found, generator)
-    drawn = _drawn(problem, rows, linear, found, spectrum, whitening, generator)
-    return max((1 + np.sum(null >= highest)) / (DRAWS + 1) for null in (flips, drawn))
-
-
-def _flipped(rows: Rows, linear: Linear, found: Screen, generator: np.random.Generator) -> Float[np.ndarray, " draws"]:
-    highest = np.full(DRAWS, -np.inf)
-    signs: np.ndarray | None = None
-    for group, result in zip(found.groups, found.scores, strict=True):
-        parts = block_scores(rows, linear, group.columns, result)
-        if signs is None:
-            signs = generator.choice([-1.0, 1.0], (DRAWS, len(parts)))
-        highest = np.maximum(highest, _largest(np.tensordot(signs, parts, 1), result))
-    return highest
-
-
-def _drawn(
-    problem: Problem,
-    rows: Rows,
-    linear: Linear,
-    found: Screen,
-    spectrum: Spectrum,
-    whitening: Float[np.ndarray, "F nv"],
-    generator: np.random.Generator,
-) -> Float[np.ndarray, " draws"]:
-    prior = np.sqrt(np.maximum(np.diag(linear.moment) - (rows.Xi.reshape(-1, rows.Xi.shape[-1]) ** 2).sum(0), 0))
-    highest = []
+    parts = block_scores(rows, linear, found.stock, found.H)
+    signs = generator.choice([-1.0, 1.0], (DRAWS, len(parts)))
+    nulls = [_largest(found, signs @ parts)]
+    prior = np.sqrt(np.maximum(np.diag(linear.moment) - (rows.Xi**2).sum((0, 1)), 0))
+    drawn = []
     for _ in range(DRAWS // CHUNK):
         noise = draw_noise(problem, spectrum, whitening, CHUNK, generator)
         pulls = prior * generator.standard_normal((CHUNK, len(prior)))
-        best = np.full(CHUNK, -np.inf)
-        for group, result in zip(found.groups, found.scores, strict=True):
-            parts = score_parts(rows, linear, group.columns, result, noise)
-            best = np.maximum(best, _largest(parts + np.einsum("dp,gpk->dgk", pulls, result.H), result))
-        highest.append(best)
-    return np.concatenate(highest)
+        drawn.append(_largest(found, other_scores(rows, found.stock, found.H, noise) + pulls @ found.H))
+    nulls.append(np.concatenate(drawn))
+    return max((1 + np.sum(null >= highest)) / (DRAWS + 1) for null in nulls)
+
+
+def _largest(found: Screen, drawn: Float[np.ndarray, "draws columns"]) -> Float[np.ndarray, " draws"]:
+    """Largest z of the whole catalogue in each draw."""
+    highest = np.full(len(drawn), -np.inf)
+    for (first, grid, k), result in zip(found.stock.span, found.scores, strict=True):
+        highest = np.maximum(highest, result.largest(drawn[:, first : first + grid * k]))
+    return highest
 
 
 def draw_noise(
@@ -165,13 +152,6 @@ def draw_noise(
     white = np.fft.rfft(generator.standard_normal((draws, n, count, nv)), axis=2)
     rows = np.fft.irfft(white * shape, count, axis=2) * records.weight
     return np.moveaxis(rows.reshape(draws, -1, nv), 1, 2)
-
-
-def _largest(scores: Float[np.ndarray, "draws grid k"], result: Score) -> Float[np.ndarray, " draws"]:
-    from .evidence import wilson_hilferty
-
-    white = np.einsum("gij,dgj->dgi", result.root, scores)
-    return wilson_hilferty((white**2).sum(-1), np.broadcast_to(result.rank, white.shape[:2])).max(1)
 
 
 def _link_columns(rows: Rows, link: int, model: RobotModel) -> Columns:

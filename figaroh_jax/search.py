@@ -23,7 +23,7 @@ from .screening import Group, Screen, catalogue, family_p, screen
 
 __all__ = ["Found", "Step", "find_causes", "stand"]
 
-SHORTLIST, SHARE = 6, 0.35  # candidates compared exactly; share of the best rank that they need
+SHORTLIST, SHARE = 8, 0.35  # candidates compared exactly; share of the best rank that they need
 STARTS = 4
 GAIN, CONFIDENT, UNSURE = 0.004, 1.64, 1.7
 MOST = 12
@@ -201,11 +201,11 @@ def _accept(
     """The cause that predicts best where it was not fitted, if it passes the gates; else nothing."""
     contenders = [contend(problem, step, whitening, *entry) for entry in shortlist(step, screened)]
     contenders.sort(key=lambda c: c.verdicts.heldout)
-    best = contenders[0]
-    t = t_value(step.verdicts.blocks, best.verdicts.blocks)
-    gain = 1 - best.verdicts.heldout / step.verdicts.heldout
-    if t < CONFIDENT or gain < GAIN or not _recurs(step, contenders, best):
+    best = next((c for c in contenders if _passes(step, contenders, c)), None)
+    if best is None:
         return None
+    t = t_value(step.verdicts.blocks, best.verdicts.blocks)
+    contenders = [best, *(c for c in contenders if c is not best)]
     members = [c for c in contenders[1:] if t_value(c.verdicts.blocks, best.verdicts.blocks) < UNSURE]
     drop = step.verdicts.cost - best.verdicts.cost
     members = [c for c in members if c.verdicts.cost - best.verdicts.cost < max(0.1 * drop, 15)]
@@ -220,6 +220,12 @@ def _accept(
         float(wins[0]) * (1 - p),
         tuple(c.name for c in members),
     )
+
+
+def _passes(step: Step, contenders: list[Contender], one: Contender) -> bool:
+    gain = 1 - one.verdicts.heldout / step.verdicts.heldout
+    surely = t_value(step.verdicts.blocks, one.verdicts.blocks) > CONFIDENT
+    return gain > GAIN and surely and _recurs(step, contenders, one)
 
 
 def _recurs(step: Step, contenders: list[Contender], best: Contender) -> bool:
