@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import signal
+
 from figaroh_jax import signals
 from figaroh_jax.config import Preprocess
 from figaroh_jax.dataset import Recording
 from figaroh_jax.errors import InputError
 from figaroh_jax.resampling import differentiate, to_recording_times
 from figaroh_jax.rowfilter import filter_rows, frequencies, low_pass, row_filter
-from scipy import signal
 
 JOINTS = ("a", "b", "c")
 
