@@ -16,7 +16,7 @@ import numpy as np
 FOLDER = Path(__file__).resolve().parents[1] / "figaroh_jax" / "demo"
 SEED = 20240
 DT = 1e-4  # s, of the simulation
-CONTROL = 10  # steps between two commands
+CONTROL = 4  # steps between two commands
 AVERAGED = 40  # steps in one sample of the recording: 250 Hz
 PERIOD, WARM_UP = 10.0, 2.0  # s
 REVERSAL = 0.005  # rad/s, half width of a reversal of dry friction
@@ -101,7 +101,7 @@ def simulate(
     wobble = 3e-4 * np.sin(2 * np.pi * rng.uniform(0.3, 1.5, 4) * time[:, None] + rng.uniform(0, 6, 4))
     forward = feed_forward(q, v, a)
     inertia = np.array([0.25, 0.30, 0.08, 0.015]) + ROTOR
-    stiffness, damping = inertia * 40.0**2, inertia * 80.0
+    stiffness, damping = inertia * 200.0**2, inertia * 400.0
     data.qpos[:], data.qvel[:] = q[0], v[0]
     position, torque = np.empty((2, len(time) * CONTROL, 4))
     for step in range(len(position)):
@@ -125,7 +125,7 @@ def feed_forward(q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         data.qpos[:], data.qvel[:], data.qacc[:] = q[k], v[k], a[k]
         mujoco.mj_inverse(nominal, data)
         out[k] = data.qfrc_inverse
-    return out + VISCOUS * v + COULOMB * np.tanh(v / 0.05)
+    return out + VISCOUS * v + COULOMB * np.clip(v / 0.01, -1, 1)
 
 
 def friction(model: mujoco.MjModel, data: mujoco.MjData, drive: np.ndarray) -> None:

@@ -92,7 +92,7 @@ def _run(made: robots.Robot, model: pin.Model, motion: Motion, hidden: list[Hidd
     time = np.arange(-WARM_UP, duration + 0.1, DT * CONTROL)
     q, v, a = motion.at(time)
     # the controller knows the nominal robot and its friction, not what is hidden
-    forward = robots.torque(made.model, q, v, a) + made.viscous * v + made.coulomb * np.tanh(v / 0.05)
+    forward = robots.torque(made.model, q, v, a) + made.viscous * v + made.coulomb * np.clip(v / 0.02, -1, 1)
     gains = plant.Gains(made.model, structure.armature, motion.centre)
     reading, torque = plant.track(compiled, physics, (q, v), forward, gains)
     fine = -WARM_UP + DT * np.arange(len(torque))

@@ -92,7 +92,7 @@ def _tendon(model: pin.Model, structure: Structure) -> str:
 class Gains:
     """Position and velocity gains that place every joint's error at `frequency` (rad/s), from its mean inertia."""
 
-    def __init__(self, model: pin.Model, armature: Array, centre: Array, frequency: float = 40.0):
+    def __init__(self, model: pin.Model, armature: Array, centre: Array, frequency: float = 120.0):
         inertia = np.diag(pin.crba(model, model.createData(), centre)) + armature
         self.position, self.velocity = inertia * frequency**2, 2 * inertia * frequency
 
