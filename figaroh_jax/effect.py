@@ -164,8 +164,8 @@ class Effect(eqx.Module):
     def joint_torque(self, motion: Motion) -> Float[Array, "samples nv"]:
         """`torque` in the columns of all joints, zero elsewhere."""
         torque = self.torque(motion)
-        if self.acts_on in ("link", "robot"):
-            return torque
+        if self.acts_on in ("link", "robot") or not self.has("torque"):
+            return torque  # a change of the robot is felt at every joint
         columns = torque.reshape(torque.shape[0], -1)
         return jnp.zeros_like(motion.position).at[:, self.at].add(columns)
 

@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .dynamics import inverse_dynamics
@@ -34,17 +35,17 @@ class ExtendedModel(eqx.Module):
 
     robot: RobotModel
     effects: tuple[Effect, ...]
-    width: Float[Array, " nv"]  # half width of a reversal of the joints' dry friction, rad/s or m/s
+    width: Float[Array | np.ndarray, " nv"]  # half width of a reversal of the joints' dry friction, rad/s or m/s
 
     def inverse_dynamics(
-        self, q: Float[Array, "*batch nv"], v: Float[Array, "*batch nv"], a: Float[Array, "*batch nv"]
+        self, q: Float[ArrayLike, "*batch nv"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
     ) -> Float[Array, "*batch nv"]:
         """Torques of the drives (N m or N) that give the true motion q, v, a (rad or m, and their rates)."""
         with jax.enable_x64(True):
             return _inverse_dynamics(self, *states(self.robot, q=q, v=v, a=a))
 
     def forward_dynamics(
-        self, q: Float[Array, "*batch nv"], v: Float[Array, "*batch nv"], tau: Float[Array, "*batch nv"]
+        self, q: Float[ArrayLike, "*batch nv"], v: Float[ArrayLike, "*batch nv"], tau: Float[ArrayLike, "*batch nv"]
     ) -> Float[Array, "*batch nv"]:
         """Accelerations (rad/s^2 or m/s^2) under the drives' torques `tau`: `inverse_dynamics` solved for `a`.
 
@@ -76,10 +77,10 @@ def extend(
 
 def predict(
     extended: ExtendedModel,
-    time: Float[Array, " samples"],
-    position: Float[Array, "samples nv"],
-    velocity: Float[Array, "samples nv"],
-    acceleration: Float[Array, "samples nv"],
+    time: Float[ArrayLike, " samples"],
+    position: Float[ArrayLike, "samples nv"],
+    velocity: Float[ArrayLike, "samples nv"],
+    acceleration: Float[ArrayLike, "samples nv"],
     dt: float,
 ) -> Float[Array, "samples nv"]:
     """What the torque sensors would read (N m or N) while the position sensors read this motion.

@@ -90,7 +90,7 @@ def _inertial(parameters: Float[np.ndarray, "10"]) -> dict[str, str]:
 def _joint(robot: RobotModel, index: int, drives: Drives) -> dict[str, str]:
     joint = robot.joints[index]
     element = {"name": joint.name, "type": _KIND[joint.kind], "axis": _text(robot.axis[index])}
-    if joint.name != robot.joint_names[joint.coordinate]:
+    if joint.follows:
         return element  # its drive is that of the joint that it follows
     limit = np.asarray(robot.position_limit[joint.coordinate])
     if np.isfinite(limit).any() and limit[0] < limit[1]:
@@ -125,7 +125,7 @@ def _tendons(root: ET.Element, robot: RobotModel, drives: Drives) -> None:
 
 def _followers(root: ET.Element, robot: RobotModel) -> list[str]:
     """Mimic joints: equality constraints, which MuJoCo keeps softly."""
-    followers = [i for i, joint in enumerate(robot.joints) if joint.name != robot.joint_names[joint.coordinate]]
+    followers = [i for i, joint in enumerate(robot.joints) if joint.follows]
     if not followers:
         return []
     group = ET.SubElement(root, "equality")

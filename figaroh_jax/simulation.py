@@ -14,6 +14,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from .dynamics import inverse_dynamics
@@ -45,9 +46,9 @@ class Simulation(eqx.Module):
 
 def simulate(
     extended: ExtendedModel,
-    command: Float[Array, "steps nv"] | Command,
-    position: Float[Array, " nv"],
-    velocity: Float[Array, " nv"],
+    command: Float[ArrayLike, "steps nv"] | Command,
+    position: Float[ArrayLike, " nv"],
+    velocity: Float[ArrayLike, " nv"],
     dt: float,
     steps: int | None = None,
 ) -> Simulation:

@@ -94,7 +94,7 @@ def _moving(root: ET.Element, robot: RobotModel, index: int, parent: str, drives
     velocity, effort = robot.velocity_limit[joint.coordinate], robot.effort_limit[joint.coordinate]
     ET.SubElement(element, "limit", bounds | {"velocity": _bound(velocity), "effort": _bound(effort)})
     leader = robot.joint_names[joint.coordinate]
-    if joint.name != leader:
+    if joint.follows:
         ratio, offset = repr(float(robot.ratio[index])), repr(float(robot.offset[index]))
         ET.SubElement(element, "mimic", joint=leader, multiplier=ratio, offset=offset)
         return

@@ -1,0 +1,294 @@
+"""The catalogue: the torque of every effect against its equation in NumPy and Pinocchio, and the forms of an effect."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import equinox as eqx
+import figaroh_jax_pinocchio as reference
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import robots
+
+from figaroh_jax.effect import Effect, Motion, amplitude, columns, joint_unit, place, shape, smooth_sign
+from figaroh_jax.effects import CATALOGUE, find, register
+from figaroh_jax.errors import InputError
+from figaroh_jax.model import RobotModel
+from figaroh_jax.urdf import load_urdf
+
+# three joints, the last one prismatic
+CHAIN = robots.robot(
+    *robots.LINKS[:4],
+    robots.joint("turn", "base", "a", axis="0 1 0"),
+    robots.joint("bend", "a", "b", axis="1 2 -1"),
+    robots.joint("slide", "b", "c", "prismatic", "0 3 4"),
+)
+WIDTH = np.array([0.0, 0.02, 0.01])
+DT = 0.004
+PARAMETERS = {  # of each effect, none of them a default
+    "viscous_friction": {"damping": 2.0},
+    "coulomb_friction": {"force": 3.0},
+    "rotor_inertia": {"inertia": 0.4},
+    "torque_offset": {"offset": -1.5},
+    "coupled_transmission": {"inertia": 0.02, "damping": 0.6, "friction": 1.9, "sign": -1.0},
+    "asymmetric_coulomb_friction": {"difference": 0.8},
+    "asymmetric_viscous_friction": {"difference": 0.7},
+    "stribeck_friction": {"force": 1.2, "speed": 0.3},
+    "power_law_friction": {"strength": 0.9, "exponent": 1.7},
+    "load_dependent_friction": {"ratio": 0.2},
+    "position_dependent_friction": {"cosine": 0.5, "sine": -0.4},
+    "torque_ripple": {"sine": 0.3, "cosine": 0.2, "order": 7.3},
+    "joint_spring": {"stiffness": 4.0, "offset": 1.1},
+    "gravity_tilt": {"x": 0.3, "y": -0.2},
+    "link_inertia": {"mass": 0.2, "mx": 0.01, "my": -0.02, "mz": 0.03, "ixx": 0.004, "ixy": 1e-3, "iyy": 0.005}
+    | {"ixz": -1e-3, "iyz": 2e-3, "izz": 0.006},
+    "payload": {"mass": 0.3, "mx": 0.02, "my": 0.01, "mz": 0.06, "ixx": 0.02, "iyy": 0.02, "izz": 0.01},
+    "torque_gain": {"gain": 0.07},
+    "torque_delay": {"delay": 0.005},
+    "torque_lag": {"time": 0.008},
+    "joint_elasticity": {"compliance": 2e-4},
+}
+AT = {"joint": ["bend"], "pair": ["turn", "bend"], "link": ["b"], "robot": []}
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
+    return robots.load(CHAIN, tmp_path_factory.mktemp("chain"))
+
+
+def moving(model: RobotModel, samples: int = 60) -> Motion:
+    """Random states around rest, some of them inside the reversal of the friction."""
+    rng = np.random.default_rng(3)
+    q, v, a = rng.normal(size=(3, samples, model.nv))
+    v[::5] *= 0.01
+    load = np.asarray(reference.inverse_dynamics(model, q, v, a))
+    total = load + rng.normal(size=load.shape)
+    time, width = jnp.arange(samples) * DT, jnp.asarray(WIDTH)
+    q, v, a, load, total = (jnp.asarray(x) for x in (q, v, a, load, total))
+    return Motion(model, time, q, v, a, load, total, DT, width)
+
+
+def made(name: str, model: RobotModel, **other: float) -> Effect:
+    effect = find(name)
+    return place(effect, model, AT[effect.acts_on], **(PARAMETERS[name] | other))
+
+
+def sign(v: np.ndarray, a: np.ndarray, width: float = 0.02) -> np.ndarray:
+    """The sign averaged over one sample, a straight line from -1 to 1 through the reversal."""
+    return np.clip(v / (abs(a) * DT / 2 + width + 1e-9), -1, 1)
+
+
+def rigid_change(motion: Motion, inertia: np.ndarray | float = 0.0, gravity: np.ndarray | float = 0.0) -> np.ndarray:
+    """Pinocchio's torque with other link parameters or gravity, less that of the model."""
+    model = motion.model
+    new = np.asarray(model.inertia) + inertia, np.asarray(model.gravity) + gravity
+    changed = eqx.tree_at(lambda m: (m.inertia, m.gravity), model, new)
+    state = [np.asarray(x) for x in (motion.position, motion.velocity, motion.acceleration)]
+    return reference.inverse_dynamics(changed, *state) - reference.inverse_dynamics(model, *state)
+
+
+def expected(name: str, motion: Motion, p: dict[str, float]) -> np.ndarray:
+    """Added torque by the equations of the design, section 2.1, at joint `bend` (pair: `turn`, `bend`; link: `b`)."""
+    qs, vs, accelerations, load, total = (
+        np.asarray(x) for x in (motion.position, motion.velocity, motion.acceleration, motion.load, motion.total)
+    )
+    q, v, a = qs[:, 1], vs[:, 1], accelerations[:, 1]
+    s = sign(v, a)
+    if name == "coupled_transmission":
+        u, ua = vs[:, 0] - vs[:, 1], accelerations[:, 0] - accelerations[:, 1]
+        between = p["friction"] * sign(u, ua, 0.01)
+        first = -p["inertia"] * a - p["damping"] * v + between
+        second = -p["inertia"] * accelerations[:, 0] - p["damping"] * vs[:, 0] - between
+        return np.stack([first, second], axis=1)
+    if name in ("link_inertia", "payload"):
+        order = ("mass", "mx", "my", "mz", "ixx", "ixy", "iyy", "ixz", "iyz", "izz")
+        inertia = np.zeros((3, 10))
+        inertia[1] = [p.get(key, 0.0) for key in order]
+        return rigid_change(motion, inertia=inertia)
+    if name == "gravity_tilt":
+        return rigid_change(motion, gravity=np.array([p["x"], p["y"], 0.0]))
+    equations: dict[str, Callable[[], np.ndarray]] = {
+        "viscous_friction": lambda: p["damping"] * v,
+        "coulomb_friction": lambda: p["force"] * s,
+        "rotor_inertia": lambda: p["inertia"] * a,
+        "torque_offset": lambda: np.full(len(v), p["offset"]),
+        "asymmetric_coulomb_friction": lambda: p["difference"] * abs(s),
+        "asymmetric_viscous_friction": lambda: p["difference"] * abs(v),
+        "stribeck_friction": lambda: p["force"] * np.exp(-((abs(v) / p["speed"]) ** 2)) * s,
+        "power_law_friction": lambda: p["strength"] * abs(v) ** p["exponent"] * s,
+        "load_dependent_friction": lambda: p["ratio"] * abs(load[:, 1]) * s,
+        "position_dependent_friction": lambda: s * (p["cosine"] * np.cos(q) + p["sine"] * np.sin(q)),
+        "torque_ripple": lambda: p["sine"] * np.sin(p["order"] * q) + p["cosine"] * np.cos(p["order"] * q),
+        "joint_spring": lambda: p["stiffness"] * (q + p["offset"] / p["stiffness"]),
+        "torque_gain": lambda: p["gain"] * total[:, 1],
+    }
+    return equations[name]()
+
+
+TORQUES = [name for name, effect in CATALOGUE.items() if effect.has("torque") or effect.has("change")]
+SENSORS = [name for name in PARAMETERS if name not in TORQUES]
+
+
+def test_every_effect_of_the_catalogue_is_tested_here():
+    assert set(PARAMETERS) == set(CATALOGUE)
+    assert len(CATALOGUE) >= 16
+
+
+@pytest.mark.parametrize("name", TORQUES)
+def test_torque_equals_the_equation(name: str, model: RobotModel):
+    motion, effect = moving(model), made(name, model)
+    # |v| is rounded off below 1e-6 in the power law, so that its slope stays finite at rest
+    tolerance = 1e-9 if name == "power_law_friction" else 1e-12
+    torque = expected(name, motion, PARAMETERS[name])
+    np.testing.assert_allclose(effect.torque(motion), torque, rtol=0, atol=tolerance)
+    joints = np.zeros((60, 3))
+    columns = {"joint": [1], "pair": [0, 1]}.get(effect.acts_on, [0, 1, 2])
+    joints[:, columns] = torque.reshape(60, -1)
+    np.testing.assert_allclose(effect.joint_torque(motion), joints, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("name", TORQUES)
+def test_columns_are_the_torque_of_a_unit_of_each_amplitude(name: str, model: RobotModel):
+    motion, effect = moving(model), made(name, model)
+    linear = [key for key, parameter in effect.parameters().items() if parameter.linear]
+    found = columns(effect, motion)
+    assert found.shape[0] == len(linear)
+    for key, column in zip(linear, found, strict=True):
+        alone = dict.fromkeys(linear, 0.0) | {key: 1.0}
+        np.testing.assert_allclose(column, made(name, model, **alone).torque(motion), rtol=0, atol=1e-9)
+    amplitudes = np.array([PARAMETERS[name].get(key, 0.0) for key in linear])
+    np.testing.assert_allclose(np.tensordot(amplitudes, found, 1), effect.torque(motion), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", TORQUES)
+def test_gradient_equals_finite_differences_in_every_parameter(name: str, model: RobotModel):
+    motion, effect = moving(model), made(name, model)
+    continuous = [key for key, parameter in effect.parameters().items() if not parameter.choice]
+    weight = jnp.cos(jnp.arange(effect.torque(motion).size) + 0.5)
+
+    def work(values: jax.Array) -> jax.Array:
+        changed = eqx.tree_at(lambda e: [getattr(e, key) for key in continuous], effect, list(values))
+        return weight @ changed.torque(motion).ravel()
+
+    work = jax.jit(work)
+    at = np.array([float(getattr(effect, key)) for key in continuous])
+    step = 1e-5
+    slopes = [float(work(at + step * e) - work(at - step * e)) / (2 * step) for e in np.eye(len(at))]
+    np.testing.assert_allclose(jax.jit(jax.grad(work))(at), slopes, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [name for name in TORQUES if CATALOGUE[name].acts_on in ("joint", "link")])
+def test_places_and_parameters_map_in_one_call(name: str, model: RobotModel):
+    motion, effect = moving(model), made(name, model)
+    many = eqx.tree_at(lambda e: e.at, effect, np.arange(3)[:, None])
+    axes = eqx.tree_at(lambda e: e.at, jax.tree.map(lambda _: None, effect), 0, is_leaf=lambda x: x is None)
+    torques = jax.vmap(lambda e: e.joint_torque(motion), in_axes=(axes,))(many)
+    for joint in range(3):
+        one = eqx.tree_at(lambda e: e.at, effect, np.array([joint]))
+        np.testing.assert_allclose(torques[joint], one.joint_torque(motion), rtol=0, atol=1e-12)
+
+
+def test_gradients_stay_finite_at_rest(model: RobotModel):
+    motion = moving(model)
+    still = eqx.tree_at(lambda m: (m.velocity, m.acceleration), motion, (jnp.zeros((60, 3)), jnp.zeros((60, 3))))
+    for name in TORQUES:
+        effect = made(name, model)
+        slope = jax.grad(lambda e: e.torque(still).sum(), allow_int=True)(effect)
+        values = [float(getattr(slope, key)) for key in effect.parameters()]
+        assert np.isfinite(values).all(), name
+
+
+def test_elasticity_winds_up_with_the_load(model: RobotModel):
+    motion = moving(model)
+    error = made("joint_elasticity", model).position_error(motion)
+    np.testing.assert_allclose(error, 2e-4 * np.asarray(motion.load)[:, 1], rtol=0, atol=1e-15)
+
+
+def test_delay_and_lag_respond_as_their_transfer_functions(model: RobotModel):
+    omega = np.linspace(0.0, 300.0, 40)
+    delay = made("torque_delay", model).torque_response(jnp.asarray(omega))
+    np.testing.assert_allclose(abs(delay), 1.0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.unwrap(np.angle(delay)), -0.005 * omega, rtol=0, atol=1e-12)
+    lag = made("torque_lag", model).torque_response(jnp.asarray(omega))
+    np.testing.assert_allclose(abs(lag), 1 / np.hypot(1, 0.008 * omega), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.angle(lag), -np.arctan(0.008 * omega), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_sensor_effects_add_no_torque(name: str, model: RobotModel):
+    assert not made(name, model).has("torque")
+    np.testing.assert_array_equal(made(name, model).joint_torque(moving(model)), 0.0)
+
+
+def test_sign_is_the_mean_of_the_sign_over_one_sample():
+    """A joint that reverses at constant acceleration: the mean over the sample from -dt/2 to dt/2."""
+    v, a = 0.003, 4.0
+    inside = v + a * np.linspace(-DT / 2, DT / 2, 200_001)
+    np.testing.assert_allclose(
+        smooth_sign(jnp.array([v]), jnp.array([a]), DT)[0], np.sign(inside).mean(), rtol=0, atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_every_effect_says_what_it_is(name: str, model: RobotModel):
+    effect = made(name, model)
+    assert effect.title and effect.equation
+    assert set(effect.units()) == set(effect.physical())
+    for parameter in effect.parameters().values():
+        assert parameter.linear or (parameter.grid and parameter.lower <= min(parameter.grid) <= parameter.upper)
+
+
+def test_units_follow_the_kind_of_the_joint():
+    assert joint_unit("N m s/rad", prismatic=False) == "N m s/rad"
+    assert joint_unit("N m s/rad", prismatic=True) == "N s/m"
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda m: find("stribek_friction"), "did you mean 'stribeck_friction'"),
+        (lambda m: place(find("viscous_friction"), m, ["bent"]), "did you mean 'bend'"),
+        (lambda m: place(find("coupled_transmission"), m, ["turn"]), "takes 2 names"),
+        (lambda m: place(find("viscous_friction"), m, ["turn"], damp=1.0), "has no parameter 'damp'"),
+        (lambda m: made("torque_delay", m).position_error(moving(m)), "no form at the position sensor"),
+    ],
+)
+def test_wrong_names_are_refused_with_the_nearest(call: Callable, message: str, model: RobotModel):
+    with pytest.raises((InputError, NotImplementedError), match=message):
+        call(model)
+
+
+def test_a_registered_effect_is_found_and_a_taken_name_refused(model: RobotModel):
+    class Magnet(Effect):
+        """A magnet that pulls towards a position."""
+
+        name, title, equation, acts_on = "magnet", "a magnet", "pull sin(q - home)", "joint"
+        pull: jax.Array | np.ndarray | float = amplitude("N m")
+        home: jax.Array | np.ndarray | float = shape("rad", (0.0, 1.0, 2.0))
+
+        def torque(self, motion: Motion) -> jax.Array:
+            return jnp.asarray(self.pull * jnp.sin(self.here(motion.position) - self.home))
+
+    try:
+        register(Magnet)
+        magnet = place(find("magnet"), model, ["turn"], pull=2.0, home=0.5)
+        motion = moving(model)
+        torque = 2.0 * np.sin(np.asarray(motion.position)[:, 0] - 0.5)
+        np.testing.assert_allclose(magnet.torque(motion), torque, rtol=0, atol=1e-14)
+
+        class Other(Magnet):
+            name = "magnet"
+
+        with pytest.raises(InputError, match="registered already"):
+            register(Other)
+    finally:
+        CATALOGUE.pop("magnet", None)
+
+
+def test_a_recorded_robot_takes_effects_at_its_names(data_dir: Path):
+    tx40 = load_urdf(data_dir / robots.REAL["tx40"])
+    pair = place(find("coupled_transmission"), tx40, ["joint_5", "joint_6"], friction=1.0)
+    np.testing.assert_array_equal(pair.at, [4, 5])
