@@ -76,8 +76,8 @@ def _tree(links: Sequence[LinkPart], joints: Sequence[JointPart]) -> tuple[str, 
     """Root link, and for each link the joints that it carries."""
     if not links:
         raise InputError("the robot has no link")
-    _unique([link.name for link in links], "link")
-    _unique([joint.name for joint in joints], "joint")
+    _unique([link.name for link in links], "links")
+    _unique([joint.name for joint in joints], "joints")
     children: dict[str, list[JointPart]] = {link.name: [] for link in links}
     carrier: dict[str, JointPart] = {}
     for joint in joints:
@@ -99,9 +99,11 @@ def _tree(links: Sequence[LinkPart], joints: Sequence[JointPart]) -> tuple[str, 
 
 
 def _unique(names: Sequence[str], what: str) -> None:
+    seen: set[str] = set()
     for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"two {what}s are called '{name}'; names must differ")
+        if name in seen:
+            raise InputError(f"two {what} are called '{name}'; names must differ")
+        seen.add(name)
 
 
 def _refuse_cycle(carrier: Mapping[str, JointPart], links: Sequence[LinkPart]) -> None:
