@@ -38,7 +38,7 @@ def to_json(diagnosis: Diagnosis) -> str:
 
 def write_predictions(
     path: Path,
-    predictions: Mapping[str, tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples nv"]]],
+    predictions: Mapping[str, tuple[Float[np.ndarray, "_"], Float[np.ndarray, "_ nv"]]],
 ) -> None:
     """Write `predictions.npz`: `<name>_time` (s) and `<name>_torque` (N m or N) for each held-out recording.
 

@@ -52,11 +52,11 @@ class _Joint(NamedTuple):
 
     @property
     def widest(self) -> float:
-        return max([self.full, *(rms for _, rms in self.shares)])
+        return max([self.full, *(_finite(rms) for _, rms in self.shares)])
 
     @property
     def floor(self) -> float:
-        return round(100.0 * _finite(self.noise) / self.full, 2) if self.full else 0.0
+        return _share(self.noise, self.full)
 
 
 def write_report(diagnosis: Diagnosis, path: Path, title: str) -> None:
@@ -67,7 +67,7 @@ def write_report(diagnosis: Diagnosis, path: Path, title: str) -> None:
 def _page(diagnosis: Diagnosis, title: str) -> str:
     from markupsafe import Markup
 
-    page = resources.files(__package__) / "page"
+    page = resources.files("figaroh_jax") / "page"
     roles = [trace.role for trace in diagnosis.traces]
     gain = diagnosis.holdout
     return _template((page / "report.html").read_text("utf-8")).render(
@@ -79,6 +79,7 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
         joints=_joints(diagnosis),
         recordings=diagnosis.traces,
         shown=roles.index("holdout") if "holdout" in roles else 0,
+        doubted=[cause for cause in diagnosis.causes if cause.ambiguous_with],
         candidates=sorted(diagnosis.candidates, key=_rank),
         css=Markup((page / "report.css").read_text("utf-8")),
         js=Markup((page / "report.js").read_text("utf-8")),
@@ -92,9 +93,10 @@ def _template(text: str) -> Any:
 
     environment = Environment(autoescape=True, undefined=StrictUndefined)
     environment.filters |= {
-        "aside": lambda name, others: wording.aside(name, others),
+        "aside": wording.aside,
         "equation": wording.effect_equation,
         "error": lambda value, unit: _glued(wording.error(value, unit)),
+        "fixed": lambda value, decimals=0: f"{value:.{decimals}f}" if math.isfinite(value) else "–",
         "first_upper": lambda words: words[:1].upper() + words[1:],
         "interval": lambda estimate: _glued(wording.interval(estimate)),
         "meaning": wording.effect_meaning,
@@ -102,6 +104,7 @@ def _template(text: str) -> Any:
         "p_value": lambda value: _glued(wording.p_value(value)),
         "phrase": wording.phrase,
         "place": wording.place,
+        "share": _share,
         "spaced": lambda name: name.replace("_", " "),
         "title_of": wording.effect_title,
         "visible": lambda value: "never" if value == math.inf else wording.number(value, 2),
@@ -127,8 +130,8 @@ def _opened(diagnosis: Diagnosis) -> set[str]:
     named = {joint for cause in diagnosis.causes[:3] for joint in cause.name.at}
     if named & set(diagnosis.joints):
         return named
-    noise = np.maximum(np.asarray(diagnosis.noise), 1e-12)
-    return {diagnosis.joints[int(np.nanargmax(np.asarray(diagnosis.before) / noise))]}
+    misfit, noise = np.nan_to_num(diagnosis.before), np.maximum(np.nan_to_num(diagnosis.noise), 1e-12)
+    return {diagnosis.joints[int(np.argmax(misfit / noise))]}
 
 
 def _shares(diagnosis: Diagnosis) -> dict[str, Float[np.ndarray, " nv"]]:
@@ -138,7 +141,9 @@ def _shares(diagnosis: Diagnosis) -> dict[str, Float[np.ndarray, " nv"]]:
     for trace in diagnosis.traces:
         for name, torque in trace.shares.items():
             samples.setdefault(words.get(name, name), []).append(np.asarray(torque, np.float64))
-    return {name: np.sqrt(np.nanmean(np.concatenate(parts) ** 2, axis=0)) for name, parts in samples.items()}
+    return {
+        name: np.sqrt(np.mean(np.nan_to_num(np.concatenate(parts)) ** 2, axis=0)) for name, parts in samples.items()
+    }
 
 
 def _rank(candidate: Candidate) -> float:
@@ -207,6 +212,11 @@ def _glued(text: str) -> str:
     for mark in (" %", " ±", "± ", "p = ", "p < "):
         text = text.replace(mark, mark.replace(" ", "\N{NO-BREAK SPACE}"))
     return text
+
+
+def _share(value: float, full: float) -> float:
+    """Percentage of `full`, for the length of a bar."""
+    return round(100.0 * _finite(value) / full, 2) if full else 0.0
 
 
 def _finite(value: float) -> float:

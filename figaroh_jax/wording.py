@@ -124,7 +124,7 @@ def unit(text: str) -> str:
 def _fall(diagnosis: Diagnosis) -> str:
     gain = diagnosis.holdout
     before, after = error(gain.before, gain.unit), error(gain.after, gain.unit)
-    return f"on data it was not fitted to, its error falls from {before} to {after}"
+    return f"its error on held-out data falls from {before} to {after}"
 
 
 def _list(causes: Sequence[Cause]) -> str:

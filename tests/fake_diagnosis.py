@@ -53,7 +53,18 @@ def unknown() -> Diagnosis:
     """Something is wrong, and the catalogue has no name for it."""
     rest = "joint_4: 0.31 N m above the noise, strongest against its velocity"
     clean = named()
-    return replace(clean, verdict="unknown", causes=(), after=clean.before, experiment=None, rest=rest)
+    same = tuple(replace(trace, after=trace.before, shares={}) for trace in clean.traces)
+    holdout = Gain(0.1392, 0.1392)
+    return replace(
+        clean,
+        verdict="unknown",
+        causes=(),
+        after=clean.before,
+        holdout=holdout,
+        experiment=None,
+        rest=rest,
+        traces=same,
+    )
 
 
 def nothing() -> Diagnosis:
@@ -111,7 +122,7 @@ def _trace(name: str, role: str, samples: int, rng: np.random.Generator) -> Trac
     time = np.arange(samples) / 100.0
     phase = rng.uniform(0, 2 * np.pi, (3, len(JOINTS)))
     speeds = 2 * np.pi * np.array([0.1, 0.23, 0.37])
-    position = sum(np.sin(w * time[:, None] + p) / (k + 1) for k, (w, p) in enumerate(zip(speeds, phase, strict=True)))
+    position = (np.sin(speeds * time[:, None, None] + phase.T) / np.arange(1, 4)).sum(axis=-1)
     velocity = np.gradient(position, time, axis=0)
     acceleration = np.gradient(velocity, time, axis=0)
     rigid = _SCALE * (0.6 * np.sin(position + 0.4) + 0.1 * acceleration + 0.2 * np.tanh(velocity / 0.02))

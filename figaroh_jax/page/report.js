@@ -37,7 +37,8 @@
     const built = {
       paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", showlegend: false, hovermode: "closest",
       font: { family: getComputedStyle(document.body).fontFamily, color: colour("fine") },
-      margin: { l: 52, r: 8, t: 6, b: 38 }, dragmode: touch ? false : "zoom", shapes: extra.shapes,
+      margin: { l: 52, r: 8, t: touch || printing ? 6 : 26, b: 38 }, dragmode: touch ? false : "zoom", shapes: extra.shapes,
+      modebar: { bgcolor: "rgba(0,0,0,0)", color: colour("noise"), activecolor: colour("ink") },
     };
     for (const [name, value] of Object.entries(extra.axes)) built[name] = { ...axis(value.text), ...value.options };
     return built;
@@ -55,7 +56,8 @@
     const below = { yaxis: "y2", xaxis: "x" };
     const traces = [];
     if (series.measured) traces.push(line("measured", series.measured, "measured", { width: 2.2 }));
-    traces.push(line("simulated before", series.before, "before", { dash: "dot" }), line("simulated after", series.after, "after"));
+    traces.push(line("simulated before", series.before, "before", { dash: "dot" }));
+    traces.push(line("simulated after", series.after, "after"));
     if (series.measured) {
       traces.push({ ...line("residual before", series.residualBefore, "before", { width: 1.2 }), ...below });
       traces.push({ ...line("residual after", series.residualAfter, "after", { width: 1.2 }), ...below });
@@ -69,12 +71,15 @@
 
   const against = (key, joint, series, colour) => {
     if (!series.measured) return [[], layout(colour, { axes: {}, shapes: [] })];
+    const step = printing ? Math.ceil(series[key].length / 400) : 1; // a printer takes minutes over more
+    const thin = (values) => values.filter((_, k) => k % step === 0);
     const points = (name, y, tone, symbol) => ({
-      type: "scatter", mode: "markers", name, x: series[key], y,
-      marker: { color: colour(tone), size: 4, symbol, opacity: 0.6 },
+      type: "scatter", mode: "markers", name, x: thin(series[key]), y: thin(y),
+      marker: { color: colour(tone), size: 4, symbol, opacity: printing ? 1 : 0.6 },
     });
     const traces = [
-      points("before", series.residualBefore, "before", "circle-open"), points("after", series.residualAfter, "after", "circle"),
+      points("before", series.residualBefore, "before", "circle-open"),
+      points("after", series.residualAfter, "after", "circle"),
     ];
     const text = key + ", " + (key === "velocity" ? joint.angle + "/s" : joint.angle);
     const axes = { xaxis: { text, options: {} }, yaxis: { text: "residual, " + joint.unit, options: {} } };
@@ -97,8 +102,10 @@
       plot.closest("figure").hidden = kind !== "time" && !series.measured;
       const make = kind === "time" ? againstTime : against.bind(null, kind);
       const [traces, frame] = make(data.joints[index], series, colour);
-      const options = { displaylogo: false, responsive: !printing, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
-      if (touch) options.displayModeBar = false;
+      const options = {
+        displaylogo: false, responsive: !printing, displayModeBar: touch || printing ? false : "hover",
+        modeBarButtons: [["zoom2d", "pan2d", "resetScale2d", "toImage"]],
+      };
       library.react(plot, traces, frame, options);
       if (printing) library.Plots.resize(plot);
     }

@@ -1,0 +1,249 @@
+"""The report: one self-contained page, everything escaped, readable in a browser at both sizes and in print."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import browser
+import fake_diagnosis
+import numpy as np
+import pytest
+
+from figaroh_jax import report
+from figaroh_jax.results import Diagnosis, Estimate, Gain, Name
+from figaroh_jax.wording import error, interval, phrase, sentence
+
+LAPTOP, PHONE = (1280, 800), (390, 844)
+VARIANTS = {name: getattr(fake_diagnosis, name)() for name in ("named", "partly", "unknown", "nothing")}
+HOSTILE = '</script><img src=x onerror="window.hacked=1">{{ 7 * 7 }}&\'[b]'
+
+
+def _written(diagnosis: Diagnosis, folder: Path, title: str = "tx40") -> Path:
+    path = folder / "report.html"
+    report.write_report(diagnosis, path, title)
+    return path
+
+
+def _own(path: Path) -> str:
+    """The page without the plotting library."""
+    return re.sub(r'(?s)<script type="text/plain" id="plotly">.*?</script>', "", path.read_text("utf-8"))
+
+
+def test_sentence_names_cause_place_and_gain():
+    one = replace(VARIANTS["named"], causes=VARIANTS["named"].causes[:1], holdout=Gain(0.139, 0.0718))
+    assert sentence(one, "tx40") == (
+        "The simulation of tx40 is missing coupling of the transmission at joint_5 + joint_6: "
+        "its error on held-out data falls from 13.9 % to 7.2 %."
+    )
+
+
+def test_sentence_says_which_alternative_remains():
+    assert "rotor inertia at joint_3 (or inertia of a link at link_3)" in sentence(VARIANTS["named"], "tx40")
+
+
+def test_sentence_names_nothing_where_nothing_or_no_name_was_found():
+    assert "nothing is missing" in sentence(VARIANTS["nothing"], "tx40")
+    assert "no effect of the catalogue explains" in sentence(VARIANTS["unknown"], "tx40")
+    assert "still has no name" in sentence(VARIANTS["partly"], "tx40")
+
+
+@pytest.mark.parametrize(
+    ("estimate", "text"),
+    [
+        (Estimate(0.01127, 0.00021, "kg m2"), "0.01127 ± 0.00041 kg m²"),
+        (Estimate(-1.957, 0.5, "N m"), "−1.96 ± 0.98 N m"),
+        (Estimate(123.4, 20.0, "N m/rad"), "123 ± 39 N m/rad"),
+        (Estimate(1.0, 0.0, ""), "1"),
+        (Estimate(0.5, float("nan"), "s"), "0.5 s"),
+        (Estimate(2.5e-9, 1e-10, "rad"), "(2.50 ± 0.20) × 10⁻⁹ rad"),
+        (Estimate(3.2e7, 1e6, "N m/rad"), "(3.20 ± 0.20) × 10⁷ N m/rad"),
+    ],
+)
+def test_interval_shows_the_digits_that_count(estimate: Estimate, text: str):
+    assert interval(estimate) == text
+
+
+def test_relative_errors_are_percentages_and_others_keep_their_unit():
+    assert error(0.00213, "relative RMS") == "0.21 %"
+    assert error(1.5, "N m") == "1.5 N m"
+    assert error(float("nan"), "relative RMS") == "not known"
+
+
+def test_effect_outside_the_catalogue_still_reads_as_words():
+    assert phrase(Name("sticky_cable", ("j1",))) == "sticky cable at j1"
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_page_asks_for_nothing_from_outside(variant: str, tmp_path: Path):
+    own = _own(_written(VARIANTS[variant], tmp_path))
+    assert not re.search(r'(?:src|href)="(?!#|data:)|@import|url\(|https?://', own)
+
+
+def test_page_escapes_every_name_that_a_user_chooses(tmp_path: Path):
+    path = _written(_hostile(), tmp_path, HOSTILE)
+    own = _own(path)
+    assert "<img" not in own and "{{ 7" in own and "49" not in re.findall(r"<h1.*?</h1>", own)[0]
+    assert own.count("</script>") == 2 and path.read_text("utf-8").count("</script>") == 3
+
+
+def test_page_stays_light_beside_the_plotting_library(tmp_path: Path):
+    assert len(_own(_written(VARIANTS["named"], tmp_path))) < 400_000
+
+
+def test_page_survives_numbers_that_are_not_finite(tmp_path: Path):
+    clean = VARIANTS["named"]
+    broken = replace(
+        clean,
+        p_value=float("nan"),
+        noise=np.full(6, np.nan),
+        holdout=Gain(float("nan"), float("inf")),
+        traces=(replace(clean.traces[0], velocity=np.full_like(clean.traces[0].velocity, np.nan)),),
+    )
+    own = re.sub(r"[A-Za-z0-9+/=]{40,}", "", _own(_written(broken, tmp_path)))  # less the packed channels
+    assert not re.search(r"\b(nan|inf|infinity)\b", own, re.IGNORECASE)
+
+
+def test_page_opens_the_joint_with_most_to_explain_where_no_cause_is_named(tmp_path: Path):
+    assert re.findall(r'id="(joint-\d)" data-joint="\d" open', _own(_written(VARIANTS["unknown"], tmp_path))) == [
+        "joint-5"
+    ]
+
+
+def test_page_shows_a_held_out_recording_that_has_no_torque(tmp_path: Path):
+    blind = tuple(replace(trace, measured=None) for trace in VARIANTS["named"].traces)
+    own = _own(_written(replace(VARIANTS["named"], traces=blind), tmp_path))
+    stored = json.loads(re.findall(r'(?s)id="data">(.*?)</script>', own)[0])
+    assert set(stored["recordings"][1][0]) == {"time", "position", "velocity", "before", "after"}
+
+
+def test_thinning_keeps_every_peak():
+    rng = np.random.default_rng(3)
+    signal = rng.standard_normal((10_000, 2))
+    signal[[1234, 8765], [0, 1]] = 50.0
+    rows = report._thinned(signal, 500)
+    assert rows.shape[0] <= 500 and (np.diff(rows, axis=0) >= 0).all()
+    assert 1234 in rows[:, 0] and 8765 in rows[:, 1]
+
+
+def test_packing_keeps_a_channel_to_a_thirty_thousandth_of_its_range():
+    values = np.random.default_rng(4).standard_normal(1000) * 30.0
+    values[7] = np.nan
+    packed = report._packed(values)
+    steps = np.frombuffer(base64.b64decode(packed["d"]), "<i2")
+    assert steps[7] == -32768
+    kept = np.isfinite(values)
+    back = packed["o"] + packed["s"] * steps[kept]
+    np.testing.assert_allclose(back, values[kept], rtol=0, atol=np.ptp(values[kept]) / 60_000)
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[browser.Page]:
+    if browser.find() is None:
+        pytest.skip("no Chromium on this machine: apt-get install chromium runs the report's browser tests")
+    with browser.page(tmp_path_factory.mktemp("profile")) as page:
+        yield page
+
+
+@pytest.mark.parametrize("size", [LAPTOP, PHONE], ids=["laptop", "phone"])
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_browser_shows_the_finding_on_the_first_screen(
+    tab: browser.Page, variant: str, size: tuple[int, int], tmp_path: Path
+):
+    tab.open(_written(VARIANTS[variant], tmp_path), *size, phone=size == PHONE)
+    shown = tab.value("document.getElementById('verdict').textContent")
+    assert shown.replace("\xa0", " ") == sentence(VARIANTS[variant], "tx40")
+    for part in ("#verdict", ".found", ".gain", ".apart", ".next"):
+        bottom = tab.value(f"document.querySelector('{part}').getBoundingClientRect().bottom")
+        assert 0 < bottom <= size[1], f"{part} ends at {bottom}"
+    assert tab.value("document.documentElement.scrollWidth") <= size[0]
+    assert tab.problems == []
+
+
+@pytest.mark.parametrize(
+    ("size", "dark"), [(LAPTOP, False), (PHONE, False), (LAPTOP, True)], ids=["laptop", "phone", "dark"]
+)
+def test_browser_draws_the_plots_of_every_joint(tab: browser.Page, size: tuple[int, int], dark: bool, tmp_path: Path):
+    tab.open(_written(VARIANTS["named"], tmp_path), *size, phone=size == PHONE, dark=dark)
+    _unfold(tab)
+    lines = tab.value("[...document.querySelectorAll('.plot.tall')].map((p) => p.querySelectorAll('.js-line').length)")
+    assert lines == [5] * 6  # measured, two simulated, two residuals
+    points = tab.value(
+        "[...document.querySelectorAll('.plot:not(.tall)')].map((p) => p.querySelectorAll('.point').length)"
+    )
+    assert len(points) == 12 and min(points) == 2 * 900  # before and after, at every sample of the held-out recording
+    assert tab.value("document.documentElement.scrollWidth") <= size[0]
+    assert tab.value("document.getElementById('trouble').hidden")
+    assert tab.problems == []
+
+
+def test_browser_redraws_for_another_recording(tab: browser.Page, tmp_path: Path):
+    tab.open(_written(VARIANTS["named"], tmp_path), *LAPTOP)
+    tab.value("document.querySelector('details.joint[open]').scrollIntoView()")
+    tab.wait("document.querySelector('details.joint[data-drawn]') !== null")
+    last = "Math.max(...document.querySelector('details.joint[data-drawn] .tall').data[0].x)"
+    assert tab.value(last) == pytest.approx(8.99, abs=1e-3)
+    tab.value(
+        "(() => { const s = document.getElementById('recording'); s.value = '0'; "
+        "s.dispatchEvent(new Event('change')); })()"
+    )
+    assert tab.value(last) == pytest.approx(39.99, abs=0.1)
+    assert tab.problems == []
+
+
+def test_browser_draws_predictions_of_a_recording_without_torque(tab: browser.Page, tmp_path: Path):
+    blind = tuple(replace(trace, measured=None) for trace in VARIANTS["named"].traces)
+    tab.open(_written(replace(VARIANTS["named"], traces=blind), tmp_path), *LAPTOP)
+    tab.value("document.querySelector('details.joint[open]').scrollIntoView()")
+    tab.wait("document.querySelector('details.joint[data-drawn]') !== null")
+    drawn = "document.querySelector('details.joint[data-drawn]')"
+    assert tab.value(f"{drawn}.querySelectorAll('.js-line').length") == 2
+    assert tab.value(f"{drawn}.querySelectorAll('figure[hidden]').length") == 2
+    assert tab.problems == []
+
+
+def test_browser_runs_nothing_that_a_name_smuggles_in(tab: browser.Page, tmp_path: Path):
+    tab.open(_written(_hostile(), tmp_path, HOSTILE), *LAPTOP)
+    _unfold(tab)
+    assert tab.value("window.hacked === undefined")
+    assert tab.value("document.getElementById('verdict').textContent").count(HOSTILE) >= 1
+    assert tab.problems == []
+
+
+def test_browser_prints_every_joint(tab: browser.Page, tmp_path: Path):
+    tab.open(_written(VARIANTS["named"], tmp_path), *LAPTOP)
+    assert tab.pdf().startswith(b"%PDF")
+    assert tab.value("document.querySelectorAll('details.joint[data-drawn]').length") == 6
+    assert tab.problems == []
+
+
+def _unfold(tab: browser.Page) -> None:
+    """Open every joint and scroll to it, as a reader would, for the plots are drawn when they come into sight."""
+    for index in range(6):
+        joint = f"document.getElementById('joint-{index}')"
+        tab.value(f"(() => {{ const joint = {joint}; joint.open = true; joint.scrollIntoView(); }})()")
+        tab.wait(f"'drawn' in {joint}.dataset")
+
+
+def _hostile() -> Diagnosis:
+    clean = VARIANTS["named"]
+    joints = (HOSTILE, *clean.joints[1:])
+    cause = replace(
+        clean.causes[0], name=Name(HOSTILE, (HOSTILE,)), note=HOSTILE, ambiguous_with=(Name("x", (HOSTILE,)),)
+    )
+    traces = tuple(replace(trace, name=HOSTILE, shares={HOSTILE: trace.before}) for trace in clean.traces)
+    return replace(
+        clean,
+        verdict="named+rest",
+        joints=joints,
+        causes=(cause,),
+        traces=traces,
+        rest=HOSTILE,
+        notes=(HOSTILE,),
+        holdout_scheme=HOSTILE,
+        candidates=(replace(clean.candidates[0], name=Name(HOSTILE, (HOSTILE,))),),
+    )
