@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 from scipy import linalg, signal
-from tx40 import GEARS, OFFSET, POSITION, TORQUE
+from tx40 import OFFSET, POSITION, TORQUE
 
 import figaroh_jax as fj
 

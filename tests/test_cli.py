@@ -1,0 +1,194 @@
+"""The command line: commands, exit statuses, what goes to which stream, and run directories written whole or not at all.
+
+The diagnosis itself is made up here; `test_demo.py` runs the real one.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+
+import fake_diagnosis
+import jax
+import numpy as np
+import pytest
+
+from figaroh_jax import cli, diagnosis, export
+from figaroh_jax.errors import InputError
+from figaroh_jax.extended import extend
+from figaroh_jax.results import Diagnosis
+from figaroh_jax.runs import whole_directory
+from figaroh_jax.urdf import load_urdf
+
+DEMO = Path(str(resources.files("figaroh_jax") / "demo"))
+FILES = {"answer.json", "predictions.npz", "report.html", "model"}
+
+
+@pytest.fixture
+def made_up(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Diagnosis:
+    """`diagnose_task` answers at once, and the working directory is empty."""
+    answer = replace(fake_diagnosis.named(), model=extend(load_urdf(DEMO / "robot.urdf")))
+
+    def diagnose_task(task, *, progress):
+        progress("screening", 0.5)
+        return answer
+
+    monkeypatch.setattr(diagnosis, "diagnose_task", diagnose_task)
+    monkeypatch.chdir(tmp_path)
+    return answer
+
+
+@pytest.fixture(autouse=True)
+def keep_configuration():
+    values = {name: getattr(jax.config, name) for name in ("jax_enable_compilation_cache", "jax_enable_x64")}
+    yield
+    for name, value in values.items():
+        jax.config.update(name, value)
+
+
+def _diagnose(*options: str) -> int:
+    return cli.main(["diagnose", str(DEMO / "task.yaml"), *options])
+
+
+def test_diagnose_writes_the_files_of_the_contract(made_up: Diagnosis, tmp_path: Path):
+    assert _diagnose("--out", "runs/first") == 0
+    out = tmp_path / "runs" / "first"
+    assert {path.name for path in out.iterdir()} == FILES
+    assert {"robot.urdf", "robot.xml", "effects.yaml"} <= {path.name for path in (out / "model").iterdir()}
+    assert json.loads((out / "answer.json").read_text())["verdict"] == "named"
+    assert [path.name for path in out.parent.iterdir()] == ["first"]  # nothing temporary stays
+
+
+def test_predictions_stand_on_the_time_stamps_of_the_holdout_recording(made_up: Diagnosis, tmp_path: Path):
+    assert _diagnose("--out", "out") == 0
+    with np.load(tmp_path / "out" / "predictions.npz") as found, np.load(DEMO / "unseen.npz") as recorded:
+        assert set(found.files) == {"unseen_time", "unseen_torque"}
+        assert found["unseen_torque"].shape == recorded["tau"].shape
+        assert np.isfinite(found["unseen_torque"]).all()
+        np.testing.assert_allclose(found["unseen_time"], np.arange(len(recorded["tau"])) / 250, rtol=0, atol=1e-12)
+
+
+def test_the_run_directory_is_named_after_the_task(made_up: Diagnosis, tmp_path: Path):
+    assert _diagnose() == 0
+    assert {path.name for path in (tmp_path / "task_diagnosis").iterdir()} == FILES
+
+
+def test_summary_goes_to_stdout_and_progress_to_stderr(made_up: Diagnosis, capsys: pytest.CaptureFixture[str]):
+    assert _diagnose() == 0
+    printed = capsys.readouterr()
+    assert "named" in printed.out and "task_diagnosis/report.html" in printed.out
+    assert "screening" in printed.err
+
+
+def test_quiet_silences_progress(made_up: Diagnosis, capsys: pytest.CaptureFixture[str]):
+    assert _diagnose("--quiet") == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_json_prints_the_answer_and_nothing_else(made_up: Diagnosis, capsys: pytest.CaptureFixture[str]):
+    assert _diagnose("--json") == 0
+    printed = capsys.readouterr().out
+    assert printed == Path("task_diagnosis/answer.json").read_text()
+    assert json.loads(printed)["causes"][0]["effect"] == "coupled_transmission"
+
+
+def test_an_earlier_run_is_replaced_as_a_whole(made_up: Diagnosis, tmp_path: Path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "answer.json").write_text("{}")
+    (out / "stale.txt").write_text("from an earlier version")
+    assert _diagnose("--out", "out") == 0
+    assert {path.name for path in out.iterdir()} == FILES
+
+
+def test_a_directory_with_other_things_is_refused_and_left_alone(made_up: Diagnosis, tmp_path: Path, capsys):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    assert _diagnose("--out", str(tmp_path)) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+    assert "holds other things than an earlier run" in capsys.readouterr().err
+
+
+def test_a_file_in_place_of_the_directory_is_refused(made_up: Diagnosis, tmp_path: Path, capsys):
+    (tmp_path / "out").write_text("")
+    assert _diagnose("--out", "out") == 2
+    assert _diagnose("--out", "out/below") == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_failure_while_writing_leaves_the_earlier_run(made_up: Diagnosis, tmp_path: Path, monkeypatch, capsys):
+    assert _diagnose("--out", "out") == 0
+    before = (tmp_path / "out" / "answer.json").stat().st_ino
+
+    def fail(*_):
+        raise RuntimeError("the disk caught fire")
+
+    monkeypatch.setattr(export, "write_model", fail)
+    assert _diagnose("--out", "out") == 70
+    assert "internal error: RuntimeError: the disk caught fire" in capsys.readouterr().err
+    assert (tmp_path / "out" / "answer.json").stat().st_ino == before
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_wrong_input_gives_one_message_and_status_2(made_up: Diagnosis, tmp_path: Path, capsys):
+    assert cli.main(["diagnose", "no_such_task.yaml"]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("figaroh-jax: error: ") and "no_such_task.yaml" in printed.err
+    assert "Traceback" not in printed.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_traceback_is_shown_on_request(made_up: Diagnosis, capsys):
+    assert cli.main(["diagnose", "no_such_task.yaml", "--traceback"]) == 2
+    assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("argv", [[], ["identify", "task.yaml"], ["diagnose"], ["demo", "--nonsense"]])
+def test_wrong_usage_is_status_2(argv: list[str], capsys):
+    assert cli.main(argv) == 2
+    assert "usage: figaroh-jax" in capsys.readouterr().err
+
+
+def test_an_unknown_command_lists_the_known_ones(capsys):
+    assert cli.main(["identify", "task.yaml"]) == 2
+    message = capsys.readouterr().err
+    assert "identify" in message and "diagnose" in message and "demo" in message
+
+
+@pytest.mark.parametrize("name", ["bullet", "pinocchio"])
+def test_a_backend_that_cannot_diagnose_is_refused(made_up: Diagnosis, name: str, capsys):
+    assert _diagnose("--backend", name) == 2
+    message = capsys.readouterr().err
+    assert name in message and "native" in message
+
+
+def test_an_interrupted_block_leaves_nothing(tmp_path: Path):
+    with pytest.raises(KeyboardInterrupt), whole_directory(tmp_path / "out") as folder:
+        (folder / "half.txt").write_text("half")
+        raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_directory_that_cannot_be_made_is_wrong_input(tmp_path: Path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"), whole_directory(tmp_path / "file" / "out"):
+        pass
+
+
+def test_compiled_programs_are_kept_in_the_users_cache_folder(tmp_path: Path):
+    code = (
+        "import jax; from figaroh_jax import cli; cli._set_up_jax(cache=True);"
+        "print(jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64, jax.numpy.zeros(3).dtype)"
+    )
+    environment = {"XDG_CACHE_HOME": str(tmp_path), "PATH": "/usr/bin"}
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert run.stdout.split() == [str(tmp_path / "figaroh_jax" / "jax"), "True", "float64"]
+
+
+def test_the_package_runs_as_a_module():
+    run = subprocess.run([sys.executable, "-m", "figaroh_jax", "--version"], capture_output=True, text=True)
+    assert (run.returncode, run.stdout[:12], run.stderr) == (0, "figaroh-jax ", "")

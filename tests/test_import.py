@@ -1,0 +1,57 @@
+"""Importing the package is silent, cheap and changes nothing; measured in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+import figaroh_jax as fj
+
+HEAVY = ("jax", "pinocchio", "mujoco", "plotly", "pandas", "yourdfpy", "trimesh", "matplotlib", "pyarrow", "scipy")
+
+
+def _in_new_process(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+
+def test_import_is_silent_and_loads_nothing_heavy():
+    run = _in_new_process(f"import sys, figaroh_jax; assert not [name for name in {HEAVY} if name in sys.modules]")
+    assert run.stdout == run.stderr == ""
+
+
+def test_dynamics_load_no_file_format_backend_or_plot():
+    heavy = ("pinocchio", "mujoco", "plotly", "pandas", "yourdfpy", "trimesh", "matplotlib", "pyarrow", "pydantic")
+    code = "import figaroh_jax as fj, sys; fj.RobotModel, fj.inverse_dynamics, fj.joint_torque_regressor, fj.register"
+    run = _in_new_process(f"{code}; assert not [name for name in {heavy} if name in sys.modules], sys.modules.keys()")
+    assert run.stdout == run.stderr == ""
+
+
+def test_use_leaves_the_configuration_of_jax_as_it_was():
+    run = _in_new_process(
+        "import json, os, jax\n"
+        "def state(): return dict(jax.config.values), dict(os.environ)\n"
+        "before = state()\n"
+        "import figaroh_jax as fj\n"
+        "for name in fj.__all__: getattr(fj, name)\n"
+        "after = state()\n"
+        "print(json.dumps([repr(k) for b, a in zip(before, after) for k in a if a[k] != b.get(k)]))\n"
+    )
+    assert json.loads(run.stdout) == []
+    assert run.stderr == ""
+
+
+@pytest.mark.parametrize("name", fj.__all__)
+def test_every_public_name_is_there_and_documented(name: str):
+    assert getattr(fj, name).__doc__
+
+
+def test_flat_names_are_few_enough_to_know():
+    assert len(fj.__all__) <= 45
+
+
+def test_unknown_name_is_refused():
+    with pytest.raises(AttributeError, match="'figaroh_jax' has no attribute 'nothing'"):
+        _ = fj.nothing

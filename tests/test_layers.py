@@ -1,0 +1,84 @@
+"""The modules form layers: no import cycles, and the core knows no backend, no simulator and no plot."""
+
+from __future__ import annotations
+
+import ast
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "figaroh_jax"
+MODULES = {path.stem: path for path in sorted(PACKAGE.glob("*.py"))}
+# Only these may touch a file format, a simulator, the terminal or the page.
+OUTSIDE = {
+    "yaml": {"taskfile", "export"},
+    "yourdfpy": {"urdf"},
+    "mujoco": {"mjcf", "export"},
+    "pinocchio": set(),
+    "pyarrow": {"tables"},
+    "pydantic": {"config"},
+    "rich": {"terminal"},
+    "jinja2": {"report"},
+    "plotly": {"report"},
+    "jaxopt": {"refit"},
+}
+
+
+class _Used(ast.NodeVisitor):
+    """Modules that a file imports when it runs (`.name`: a sibling); `lazy`: those inside functions too."""
+
+    def __init__(self, lazy: bool) -> None:
+        self.lazy, self.found = lazy, set[str]()
+
+    def visit_If(self, node: ast.If) -> None:
+        if ast.unparse(node.test) != "TYPE_CHECKING":
+            self.generic_visit(node)
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
+        if self.lazy:
+            self.generic_visit(node)
+
+    def visit_Import(self, node: ast.Import) -> None:
+        self.found |= {alias.name.split(".")[0] for alias in node.names}
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
+        if node.level:
+            self.found |= {f".{node.module}"} if node.module else {f".{alias.name}" for alias in node.names}
+        elif node.module:
+            self.found.add(node.module.split(".")[0])
+
+
+def _imports(path: Path, *, lazy: bool) -> set[str]:
+    used = _Used(lazy)
+    used.visit(ast.parse(path.read_text(encoding="utf-8")))
+    return used.found
+
+
+def test_modules_import_each_other_without_cycles():
+    graph = {name: {m[1:] for m in _imports(path, lazy=False) if m[:1] == "."} for name, path in MODULES.items()}
+    tuple(TopologicalSorter(graph).static_order())  # raises CycleError with the cycle
+
+
+@pytest.mark.parametrize("package", OUTSIDE)
+def test_outside_packages_stay_in_their_modules(package: str):
+    users = {name for name, path in MODULES.items() if package in _imports(path, lazy=True)}
+    assert users <= OUTSIDE[package]
+
+
+def test_core_never_imports_a_backend():
+    for path in MODULES.values():
+        assert not {name for name in _imports(path, lazy=True) if name.startswith("figaroh_jax_")}, path
+
+
+def test_backends_never_import_each_other():
+    for folder in (ROOT / "backends").iterdir():
+        for path in folder.glob("*.py"):
+            others = {name for name in _imports(path, lazy=True) if name.startswith("figaroh_jax_")}
+            assert others <= {folder.name}, path
+
+
+def test_files_are_short_enough_to_read():
+    lengths = {path.name: len(path.read_text(encoding="utf-8").splitlines()) for path in MODULES.values()}
+    assert {name: length for name, length in lengths.items() if length > 400} == {}
