@@ -110,7 +110,7 @@ def test_a_vmap_over_models_is_one_model_at_a_time(leaf: str, model: RobotModel)
         return dynamics.inverse_dynamics(shifted(model, leaf, by), *state)  # pyright: ignore[reportArgumentType]
 
     singly = np.stack([torque(jnp.asarray(by)) for by in changes])
-    np.testing.assert_allclose(jax.vmap(torque)(changes), singly, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(jax.vmap(torque)(jnp.asarray(changes)), singly, rtol=0, atol=1e-11)
 
 
 def test_torque_is_linear_in_the_inertial_parameters(model: RobotModel) -> None:
