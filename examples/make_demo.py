@@ -5,9 +5,11 @@ model is, and two causes are hidden: Stribeck friction at the shoulder, and a tr
 Run `python examples/make_demo.py` to write the same files again (`figaroh_jax/demo`), the truth in `truth.yaml`.
 """
 
+# pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import mujoco
@@ -178,7 +180,7 @@ def task(runs: dict[str, int]) -> str:
     return text + "preprocess: {cutoff: 15, rate: 50}\nbaseline: {viscous: true, coulomb: true, rotor: true}\n"
 
 
-def words(numbers) -> str:  # noqa: ANN001
+def words(numbers: Iterable[float]) -> str:
     """Numbers as XML wants them."""
     return " ".join(repr(float(x)) for x in numbers)
 

@@ -40,6 +40,12 @@ def hidden_is_trusted(effect: str) -> bool:
     return effect in {"payload", "link_inertia", "torque_gain"}
 
 
+def _low_passed(x: np.ndarray, cutoff: float) -> np.ndarray:
+    """Zero-phase low pass at `cutoff` Hz of a recording's signal."""
+    numerator, denominator = butter(4, cutoff, fs=250)[:2]  # type: ignore[misc]
+    return filtfilt(numerator, denominator, x, axis=0)
+
+
 def _velocity(case: Case) -> np.ndarray:
     """Velocity of the first recording by central differences."""
     rec = case.recordings[0]
@@ -134,7 +140,7 @@ def test_coupling_acts_on_both_joints_with_its_sign():
 def test_delay_is_a_shift_in_time_and_lag_a_first_order_low_pass():
     for effect, key in (("torque_delay", "delay"), ("torque_lag", "time")):
         hidden, _, clean = _difference(effect)
-        smooth = [filtfilt(*butter(4, 8, fs=250), c.recordings[0]["torque"], axis=0)[200:-200] for c in (hidden, clean)]
+        smooth = [_low_passed(c.recordings[0]["torque"], 8)[200:-200] for c in (hidden, clean)]
         slope = np.gradient(smooth[1], 0.004, axis=0)
         shift = -np.sum((smooth[0] - smooth[1]) * slope) / np.sum(slope**2)
         assert shift == pytest.approx(hidden.truth[0].parameters[key], rel=0.06)
@@ -233,13 +239,12 @@ def _misfit(case: Case, trusted: bool) -> np.ndarray:
     rec, made = case.recordings[0], robots.load(case.robot)
     stream = np.random.default_rng(np.random.SeedSequence(case.seed).spawn(4)[0])
     true = robots.true_robot(made.model, 0.01 if trusted else 0.05, stream)
-    low = butter(4, 15, fs=250)
-    q = filtfilt(*low, rec["position"], axis=0)
+    q = _low_passed(rec["position"], 15)
     v = np.gradient(q, 0.004, axis=0)
     a = np.gradient(v, 0.004, axis=0)
     sign = np.clip(np.gradient(rec["position"], 0.004, axis=0) / 0.005, -1, 1)
     model = robots.torque(true, q, v, a) + made.viscous * v + made.coulomb * sign
-    rest, model = (filtfilt(*low, x, axis=0)[100:-100] for x in (rec["torque"] - model, model))
+    rest, model = (_low_passed(x, 15)[100:-100] for x in (rec["torque"] - model, model))
     return np.sqrt((rest**2).mean(0) / (model**2).mean(0))
 
 

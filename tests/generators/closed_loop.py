@@ -93,8 +93,8 @@ def _run(made: robots.Robot, model: pin.Model, motion: Motion, hidden: list[Hidd
     q, v, a = motion.at(time)
     # the controller knows the nominal robot and its friction, not what is hidden
     forward = robots.torque(made.model, q, v, a) + made.viscous * v + made.coulomb * np.clip(v / 0.02, -1, 1)
-    gains = plant.Gains(made.model, structure.armature, motion.centre)
-    reading, torque = plant.track(compiled, physics, (q, v), forward, gains)
+    inertia = plant.inertia_along(made.model, structure.armature, q)
+    reading, torque = plant.track(compiled, physics, (q, v), forward, inertia)
     fine = -WARM_UP + DT * np.arange(len(torque))
     position = (reading[:-1] + reading[1:]) / 2  # in the middle of the step in which the torque acts
     shifted = np.stack([np.interp(fine[:-1] - late, fine[:-1], column) for column in torque[:-1].T], 1)
@@ -129,7 +129,7 @@ def _physics(
             physics.torques.append(_placed_torque(TORQUES[h.effect], p, j, here))
         elif h.effect == "coupled_transmission":
             sign = p["sign"]
-            pair = (*h.rows, sign, p["inertia"])
+            pair = (h.rows[0], h.rows[1], sign, p["inertia"])
             physics.coupling, physics.sign = (p["damping"], p["friction"]), sign
         elif h.effect == "rotor_inertia":
             armature = armature + p["inertia"] * here

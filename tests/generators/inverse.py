@@ -158,7 +158,8 @@ def _solve(size_at: Callable[[float], float], size: float, lower: float, upper: 
     ends = np.log([lower, upper])
     if miss(ends[0]) > 0 or miss(ends[1]) < 0:
         return np.inf
-    return float(np.exp(brentq(miss, *ends, xtol=2e-3)))
+    root: Any = brentq(miss, *ends, xtol=2e-3)
+    return float(np.exp(root))
 
 
 def _size(robot: robots.Robot, model: pin.Model, motions: list[Motion], time: np.ndarray, hidden: Hidden) -> float:
@@ -184,7 +185,11 @@ def _runs(
             followed = tracked(motion, rng)
             q, tau = scene.run(robot, model, followed, time, hidden, rng.uniform())
             label = chr(ord("A") + number)
-            run = {"time": _averaged(time, time), "position": _averaged(time, q), "torque": _averaged(time, tau)}
+            run: dict[str, Any] = {
+                "time": _averaged(time, time),
+                "position": _averaged(time, q),
+                "torque": _averaged(time, tau),
+            }
             run["name"] = f"holdout_{label}" if held else f"run_{label}{repeat + 1}"
             run |= {"repeat": label if repeats > 1 and not held else None, "role": "holdout" if held else "fit"}
             runs.append(run)

@@ -14,6 +14,7 @@ from . import robots
 Array = np.ndarray
 DT = 2e-4  # s, of the simulation
 CONTROL = 5  # steps between two commands of the controller
+BANDWIDTH = 150.0  # rad/s, of the controller
 REVERSAL = 0.005  # rad/s, half width of the reversal of dry friction
 
 
@@ -89,18 +90,20 @@ def _tendon(model: pin.Model, structure: Structure) -> str:
     return f'<tendon><fixed name="motor" armature="{float(inertia)!r}">{first}{second}</fixed></tendon>'
 
 
-class Gains:
-    """Position and velocity gains that place every joint's error at `frequency` (rad/s), from its mean inertia."""
-
-    def __init__(self, model: pin.Model, armature: Array, centre: Array, frequency: float = 120.0):
-        inertia = np.diag(pin.crba(model, model.createData(), centre)) + armature
-        self.position, self.velocity = inertia * frequency**2, 2 * inertia * frequency
+def inertia_along(model: pin.Model, armature: Array, positions: Array) -> Array:
+    """Joint-space inertia with rotors (commands, nv, nv): what a computed-torque controller multiplies errors with."""
+    data = model.createData()
+    upper = np.array([np.triu(pin.crba(model, data, q)) for q in positions])
+    return upper + np.triu(upper, 1).transpose(0, 2, 1) + np.diag(armature)
 
 
 def track(
-    model: mujoco.MjModel, physics: Physics, desired: tuple[Array, Array], forward: Array, gains: Gains
+    model: mujoco.MjModel, physics: Physics, desired: tuple[Array, Array], forward: Array, inertia: Array
 ) -> tuple[Array, Array]:
-    """Position and drive torque (steps, nv) of a run that follows `desired` (position, velocity), one row a command."""
+    """Position and drive torque (steps, nv) of a run that follows `desired` (position, velocity), one row a command.
+
+    Computed torque: errors in position and velocity are multiplied by `inertia` (commands, nv, nv).
+    """
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = desired[0][0], desired[1][0]
     steps = CONTROL * len(forward)
@@ -113,7 +116,8 @@ def track(
         q, v = data.qpos, data.qvel
         if step % CONTROL == 0:
             k = step // CONTROL
-            drive = forward[k] + gains.position * (desired[0][k] - q) + gains.velocity * (desired[1][k] - v)
+            error, slip = desired[0][k] - q, desired[1][k] - v
+            drive = forward[k] + inertia[k] @ (BANDWIDTH**2 * error + 2 * BANDWIDTH * slip)
         q_log[step], drive_log[step] = q, drive
         level = sum(law(q, v, load) for law in physics.levels)
         # inside a reversal dry friction is a damper, which the integrator takes implicitly: no chatter

@@ -28,7 +28,7 @@ def encoder(position: np.ndarray, rng: np.random.Generator, scale: float, step: 
 def _autoregressive(draw: np.ndarray, time: float) -> np.ndarray:
     """AR(1) of unit variance with the given correlation time, s."""
     phi = np.exp(-1 / (RATE * time))
-    return lfilter([np.sqrt(1 - phi**2)], [1, -phi], draw, axis=0)
+    return np.asarray(lfilter([np.sqrt(1 - phi**2)], [1, -phi], draw, axis=0))
 
 
 def _pink(draw: np.ndarray) -> np.ndarray:

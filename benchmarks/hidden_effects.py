@@ -1,0 +1,132 @@
+"""Hide effects in made recordings and count how the diagnosis does: right, in the set, abstained, wrong.
+
+    python benchmarks/hidden_effects.py --seeds 0 1 --robots tx40 panda      # every effect, with and without repeats
+    python benchmarks/hidden_effects.py --clean 30                           # false names on clean recordings
+    python benchmarks/hidden_effects.py --left-out --size 0.08               # families missing in the catalogue
+    python benchmarks/hidden_effects.py --foreign --size 0.08                # laws that no catalogue holds
+    python benchmarks/hidden_effects.py --closed-loop --robots ur10e         # MuJoCo C in place of inverse dynamics
+
+The recordings come from Pinocchio or MuJoCo C (`tests/generators`), which share no code with the library.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+from generators import CLASSES, CLOSED_LOOP_EFFECTS, EFFECTS, FOREIGN, Case, make_case, make_closed_loop_case  # noqa: E402
+from generators.scoring import Score, judge, table, upper_bound  # noqa: E402
+from generators.sensors import COLOURS  # noqa: E402
+
+LAYOUTS = {"repeats": (2, 3), "single": (1, 6)}
+
+
+def main() -> None:
+    """Run the study that the arguments ask for and print its table."""
+    args = _arguments()
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_compilation_cache_dir", str(ROOT / ".cache" / "jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    scores, seconds = [], []
+    for label, case, forbid in _cases(args):
+        start = time.process_time()
+        answer = _diagnose(case, forbid)
+        seconds.append(time.process_time() - start)
+        scores.append(judge(label, () if forbid or args.foreign else case.truth, answer))
+        print(f"{table(scores[-1:]).splitlines()[0]}  {seconds[-1]:.1f} CPU s", flush=True)
+    print(table(scores).splitlines()[-1])
+    print(f"CPU s a case: first {seconds[0]:.1f}, median {sorted(seconds)[len(seconds) // 2]:.1f}")
+    _rates(scores)
+
+
+def _rates(scores: list[Score]) -> None:
+    wrong = sum(bool(s.false) for s in scores)
+    print(f"cases with a false name: {wrong} of {len(scores)} (95 % bound {upper_bound(wrong, len(scores)):.3f})")
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--effects", nargs="+", help="default: every effect that the catalogue must name")
+    parser.add_argument("--robots", nargs="+", default=["tx40", "panda"])
+    parser.add_argument("--layouts", nargs="+", choices=list(LAYOUTS), default=list(LAYOUTS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--size", type=float, default=0.05)
+    parser.add_argument("--noise", type=float, default=1.0)
+    parser.add_argument("--clean", type=int, default=0, metavar="N", help="N clean cases instead")
+    parser.add_argument("--left-out", action="store_true", help="forbid the hidden effect: `unknown` is right")
+    parser.add_argument("--foreign", action="store_true", help="hide laws that stand in no catalogue")
+    parser.add_argument("--closed-loop", action="store_true", help="MuJoCo C in place of inverse dynamics")
+    return parser.parse_args()
+
+
+def _cases(args: argparse.Namespace) -> Iterator[tuple[str, Case, tuple[str, ...]]]:
+    """Label, case and forbidden effects of the study, one after another."""
+    make = make_closed_loop_case if args.closed_loop else make_case
+    for number in range(args.clean):
+        layout = args.layouts[number % len(args.layouts)]
+        robot, seed = args.robots[number // 2 % len(args.robots)], args.seeds[0] + number
+        more: dict[str, Any] = {} if args.closed_loop else _noise(number)
+        label = f"clean {robot} {layout} seed {seed} {more}"
+        yield label, _made(make, [], robot, layout, seed, **more), ()
+    if args.clean:
+        return
+    known = CLOSED_LOOP_EFFECTS if args.closed_loop else EFFECTS
+    for effect in args.effects or (FOREIGN if args.foreign else known):
+        for robot in args.robots:
+            for layout in args.layouts:
+                for seed in args.seeds:
+                    seed += zlib.crc32(f"{effect} {robot} {layout}".encode()) % 100_000
+                    try:
+                        case = _made(make, [(effect, args.size)], robot, layout, seed, noise=args.noise)
+                    except ValueError as error:
+                        print(error)
+                        continue
+                    label = f"{effect} ({', '.join(case.truth[0].at)}) {robot} {layout} seed {seed}"
+                    yield label, case, _twins(effect) if args.left_out else ()
+
+
+def _made(make: Any, effects: list[Any], robot: str, layout: str, seed: int, **more: Any) -> Case:
+    repeats, trajectories = LAYOUTS[layout]
+    return make(effects, robot=robot, repeats=repeats, trajectories=trajectories, seed=seed, **more)
+
+
+def _noise(number: int) -> dict[str, Any]:
+    """White and coloured noise of three levels, encoders of fine and coarse steps, in turn."""
+    return {
+        "colour": COLOURS[number % len(COLOURS)],
+        "noise": (0.5, 1.0, 2.0)[number % 3],
+        "encoder_step": (1e-5, 1e-4)[number % 2],
+    }
+
+
+def _twins(effect: str) -> tuple[str, ...]:
+    """The effect and what cannot be told from it, as far as the library knows the names."""
+    from figaroh_jax.effects import CATALOGUE
+
+    names = {effect}.union(*(names for names in CLASSES if effect in names))
+    return tuple(sorted(names & set(CATALOGUE)))
+
+
+def _diagnose(case: Case, forbid: tuple[str, ...]) -> Any:
+    from figaroh_jax.diagnosis import diagnose_task
+
+    from figaroh_jax import config
+
+    with tempfile.TemporaryDirectory() as folder:
+        return diagnose_task(config.load_task(case.write(Path(folder), forbid)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,156 @@
+"""Effects hidden by simulators that share no code with the library are named, and clean recordings are left alone."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from generators import Case, available, make_case, make_closed_loop_case
+from generators.scoring import Score, judge, named, table
+
+from figaroh_jax import config
+from figaroh_jax.results import Diagnosis
+
+ROOT = Path(__file__).resolve().parents[1]
+# the arm that needs no file stands in where the real robots' models are not on this machine
+ROBOTS = tuple(name if available(name) else "small" for name in ("tx40", "panda"))
+HIDDEN = (
+    "rotor_inertia",
+    "torque_offset",
+    "coupled_transmission",
+    "asymmetric_viscous_friction",
+    "stribeck_friction",
+    "power_law_friction",
+    "load_dependent_friction",
+    "position_dependent_friction",
+    "torque_ripple",
+    "joint_spring",
+    "gravity_tilt",
+    "payload",
+    "torque_delay",
+)
+LEFT_OUT = (
+    "stribeck_friction",
+    "coupled_transmission",
+    "torque_ripple",
+    "position_dependent_friction",
+    "asymmetric_viscous_friction",
+)
+# what a case is made of beside its effect: (repeats, trajectories)
+WITH_REPEATS, WITHOUT_REPEATS = (2, 3), (1, 6)
+NOISES: tuple[dict[str, Any], ...] = (
+    {"colour": "white"},
+    {"colour": "ar20", "encoder_step": 1e-4},
+    {"colour": "ar100"},
+    {"colour": "ar20", "noise": 2.0},
+    {"colour": "pink", "noise": 0.5},
+)
+
+
+def diagnosis_of(case: Case, forbid: tuple[str, ...] = ()) -> Diagnosis:
+    """The library's answer to the case as a user would ask it: files and a task."""
+    from figaroh_jax.diagnosis import diagnose_task
+
+    with tempfile.TemporaryDirectory() as folder:
+        return diagnose_task(config.load_task(case.write(Path(folder), forbid)))
+
+
+def hidden_effect(effect: str, robot: str, layout: tuple[int, int], seed: int, size: float = 0.05) -> Score:
+    """Hide one effect and judge what is said about it."""
+    repeats, trajectories = layout
+    case = make_case([(effect, size)], robot=robot, repeats=repeats, trajectories=trajectories, seed=seed)
+    truth = case.truth[0]
+    label = f"{effect} ({', '.join(truth.at)}) on {robot}, {repeats} x {trajectories}, seed {seed}"
+    return judge(label, case.truth, diagnosis_of(case))
+
+
+def clean(robot: str, layout: tuple[int, int], seed: int) -> Score:
+    """Judge what is said about recordings in which nothing is hidden; the noise goes by the seed."""
+    repeats, trajectories = layout
+    noise = NOISES[seed % len(NOISES)]
+    case = make_case([], robot=robot, repeats=repeats, trajectories=trajectories, seed=seed, **noise)
+    return judge(f"clean {robot}, {repeats} x {trajectories}, seed {seed}, {noise}", (), diagnosis_of(case))
+
+
+@cache
+def scores_of_hidden_effects() -> tuple[Score, ...]:
+    """Every effect once: robots and layouts take turns."""
+    out = []
+    for k, effect in enumerate(HIDDEN):
+        robot, layout = ROBOTS[k % 2], (WITH_REPEATS, WITHOUT_REPEATS)[(k // 2) % 2]
+        out.append(hidden_effect(effect, robot, layout, seed=100 + k))
+    return tuple(out)
+
+
+def test_most_hidden_effects_are_named_at_their_place():
+    scores = scores_of_hidden_effects()
+    right = sum(s.grade == "right" for s in scores)
+    assert right >= 0.85 * len(scores), f"{right} of {len(scores)} right\n{table(scores)}"
+
+
+def test_no_hidden_effect_gets_a_confident_wrong_name():
+    scores = scores_of_hidden_effects()
+    assert not any(s.grade == "wrong" for s in scores), table(scores)
+
+
+def test_nothing_is_named_in_clean_recordings():
+    scores = [clean(ROBOTS[k % 2], (WITH_REPEATS, WITHOUT_REPEATS)[k % 2], seed=200 + k) for k in range(5)]
+    assert not any(s.told for s in scores), table(scores)
+
+
+@pytest.mark.parametrize("effect", LEFT_OUT)
+def test_an_effect_left_out_of_the_catalogue_is_unknown(effect: str):
+    case = make_case([(effect, 0.08)], robot=ROBOTS[0], seed=300 + LEFT_OUT.index(effect))
+    answer = diagnosis_of(case, forbid=(effect,))
+    assert answer.verdict == "unknown", f"{case.truth[0]}: {answer.verdict} {named(answer)}"
+
+
+@pytest.mark.parametrize("draw", range(2))
+def test_a_case_drawn_at_run_time_gets_no_wrong_name(draw: int):
+    seed = int.from_bytes(os.urandom(4), "little")
+    rng = np.random.default_rng(seed)
+    effect, robot = rng.choice(HIDDEN), rng.choice(ROBOTS)
+    score = hidden_effect(str(effect), str(robot), (WITH_REPEATS, WITHOUT_REPEATS)[draw % 2], seed)
+    assert score.grade != "wrong", f"seed {seed} ({effect} on {robot}):\n{table([score])}"
+
+
+def test_demo_finds_both_causes_at_their_size():
+    from figaroh_jax.diagnosis import diagnose_task
+
+    folder = ROOT / "figaroh_jax" / "demo"
+    truth = yaml.safe_load((folder / "truth.yaml").read_text())["causes"]
+    answer = diagnose_task(config.load_task(folder / "task.yaml"))
+    found = {(cause.name.effect, tuple(cause.name.at)): cause.parameters for cause in answer.causes}
+    assert answer.verdict == "named"
+    assert set(found) == {(cause["effect"], tuple(cause["at"])) for cause in truth}
+    for cause in truth:
+        estimates = found[cause["effect"], tuple(cause["at"])]
+        for name, value in cause["parameters"].items():
+            assert abs(estimates[name].value - value) < 0.25 * abs(value), (name, estimates[name], value)
+
+
+def test_demo_files_are_small():
+    assert sum(file.stat().st_size for file in (ROOT / "figaroh_jax" / "demo").iterdir()) <= 500_000
+
+
+@pytest.mark.slow
+def test_clean_recordings_of_every_noise_get_at_most_one_name():
+    scores = [clean(ROBOTS[k % 2], (WITH_REPEATS, WITHOUT_REPEATS)[(k // 2) % 2], seed=1000 + k) for k in range(30)]
+    assert sum(bool(s.told) for s in scores) <= 1, table(scores)
+
+
+@pytest.mark.slow
+def test_closed_loop_recordings_are_named_or_left_alone():
+    effects = (None, "stribeck_friction", "torque_ripple", "joint_spring", "coupled_transmission")
+    scores = []
+    for seed, effect in enumerate(effects):
+        case = make_closed_loop_case([effect] if effect else [], robot="small", trajectories=2, seed=seed)
+        scores.append(judge(f"closed loop, {effect}", case.truth, diagnosis_of(case)))
+    assert not any(s.grade == "wrong" for s in scores), table(scores)
+    assert sum(s.grade == "right" for s in scores) >= 3, table(scores)
