@@ -140,7 +140,7 @@ def _room(part: Array, axis: int, samples: int) -> Array:
 
 
 @partial(jax.jit, static_argnums=3, donate_argnums=0)
-def _put(whole: Array, part: Array, start: int, axis: int) -> Array:
+def _put(whole: Array, part: Array, start: int | Array, axis: int) -> Array:
     return jax.lax.dynamic_update_slice_in_dim(whole, part, start, axis)
 
 
