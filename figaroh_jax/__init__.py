@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from .effect import Effect as Effect, Motion as Motion, amplitude as amplitude, shape as shape
     from .effects import register as register
     from .errors import InputError as InputError
-    from .export import write_model as write_model
+    from .export import load_model as load_model, write_model as write_model
+    from .extended import ExtendedModel as ExtendedModel, extend as extend, predict as predict
     from .kinematics import (
         forward_kinematics as forward_kinematics,
         frame_jacobian as frame_jacobian,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     )
     from .report import write_report as write_report
     from .results import Cause as Cause, Diagnosis as Diagnosis, Estimate as Estimate, Gain as Gain, Name as Name
+    from .simulation import Simulation as Simulation, simulate as simulate
     from .urdf import load_urdf as load_urdf
 
 __version__ = "0.1.0"
@@ -50,13 +52,15 @@ _MODULES = {
     "effect": ("Effect", "Motion", "amplitude", "shape"),
     "effects": ("register",),
     "errors": ("InputError",),
-    "export": ("write_model",),
+    "export": ("load_model", "write_model"),
+    "extended": ("ExtendedModel", "extend", "predict"),
     "kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
     "model": ("Frame", "Joint", "RobotModel"),
     "regressor": ("joint_torque_regressor", "normal_matrix", "packed_regressor", "triangular_factor"),
     "registry": ("backend",),
     "report": ("write_report",),
     "results": ("Cause", "Diagnosis", "Estimate", "Gain", "Name"),
+    "simulation": ("Simulation", "simulate"),
     "urdf": ("load_urdf",),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
