@@ -80,7 +80,7 @@ def excitation(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Sine and cosine coefficients (rad) of five harmonics of .1 Hz, at most 1 rad from the centre and 2.5 rad/s."""
     order = np.arange(1, 6)[:, None]
     coefficients = rng.standard_normal((2, 5, 4)) / np.sqrt(order)
-    q, v, _ = motion(*coefficients, np.linspace(0, PERIOD, 1001))
+    q, v, _ = motion(coefficients[0], coefficients[1], np.linspace(0, PERIOD, 1001))
     scale = np.minimum(1.0 / np.abs(q - CENTRE).max(0), 2.5 / np.abs(v).max(0))
     return coefficients[0] * scale, coefficients[1] * scale
 
@@ -105,6 +105,7 @@ def simulate(
     inertia = np.array([0.25, 0.30, 0.08, 0.015]) + ROTOR
     stiffness, damping = inertia * 200.0**2, inertia * 400.0
     data.qpos[:], data.qvel[:] = q[0], v[0]
+    drive = forward[0]
     position, torque = np.empty((2, len(time) * CONTROL, 4))
     for step in range(len(position)):
         k, late = divmod(step, CONTROL)
