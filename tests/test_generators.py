@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +15,7 @@ from generators import (
     CLOSED_LOOP_EFFECTS,
     EFFECTS,
     Case,
+    Truth,
     available,
     make_case,
     make_closed_loop_case,
@@ -23,6 +25,7 @@ from generators import (
 )
 from generators.laws import FAMILIES
 from generators.motion import TRACKING
+from generators.scoring import judge, upper_bound
 from scipy.signal import butter, filtfilt
 
 PACKAGE = Path(__file__).parent / "generators"
@@ -53,7 +56,7 @@ def _velocity(case: Case) -> np.ndarray:
 
 
 def test_the_generators_import_nothing_of_the_library():
-    allowed = {"__future__", "collections", "dataclasses", "json", "os", "pathlib", "typing", "sys"}
+    allowed = {"__future__", "collections", "dataclasses", "json", "os", "pathlib", "typing", "sys", "types"}
     allowed |= {"numpy", "scipy", "pinocchio", "mujoco"}
     demo = PACKAGE.parents[1] / "examples" / "make_demo.py"
     for file in (*PACKAGE.glob("*.py"), demo):
@@ -269,3 +272,35 @@ def test_every_closed_loop_effect_changes_the_recording():
         clean = make_closed_loop_case([], trusted=hidden_is_trusted(effect), **options)
         change = np.abs(hidden.recordings[0]["torque"] - clean.recordings[0]["torque"]).max()
         assert change > 0.005 and np.isfinite(change), effect
+
+
+def _answer(verdict: str, *causes: tuple[str, str, tuple[str, ...]]) -> SimpleNamespace:
+    """An answer whose causes are (effect, joint, names of other effects there that cannot be told from it)."""
+
+    def name(effect: str, joint: str) -> SimpleNamespace:
+        return SimpleNamespace(effect=effect, at=(joint,))
+
+    told = [SimpleNamespace(name=name(e, j), ambiguous_with=[name(o, j) for o in others]) for e, j, others in causes]
+    return SimpleNamespace(verdict=verdict, causes=told)
+
+
+@pytest.mark.parametrize(
+    ("answer", "grade", "false"),
+    [
+        (_answer("named", ("torque_offset", "j1", ())), "right", 0),
+        (_answer("named", ("asymmetric_coulomb_friction", "j1", ())), "right", 0),
+        (_answer("named", ("joint_spring", "j1", ("torque_offset",))), "set", 0),
+        (_answer("named", ("joint_spring", "j1", ())), "wrong", 1),
+        (_answer("named", ("torque_offset", "j2", ())), "wrong", 1),
+        (_answer("named+rest", ("torque_offset", "j1", ()), ("torque_gain", "j2", ())), "right", 1),
+        (_answer("unknown", ("torque_gain", "j1", ())), "unknown", 0),
+        (_answer("nothing"), "nothing", 0),
+    ],
+)
+def test_answers_are_judged_by_name_place_and_set(answer: SimpleNamespace, grade: str, false: int):
+    score = judge("case", [Truth("torque_offset", ("j1",), {})], answer)
+    assert (score.grade, len(score.false)) == (grade, false)
+
+
+def test_bound_of_no_failure_in_thirty_is_that_of_the_books():
+    assert upper_bound(0, 30) == pytest.approx(1 - 0.05 ** (1 / 30), abs=1e-9)  # Clopper and Pearson 1934
