@@ -228,7 +228,7 @@ class TorqueRipple(JointEffect):
     separated_by = "sweeps of {at} at two constant speeds: the order stays, the frequency moves"
     sine: Scalar = amplitude("N m")
     cosine: Scalar = amplitude("N m")
-    order: Scalar = shape("1/rad", tuple(3.0 + 0.8 * k for k in range(30)), (2.6, 26.6))
+    order: Scalar = shape("1/rad", tuple(3.0 + 0.8 * k for k in range(30)), (2.9, 26.6))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
         angle = self.order * self.here(motion.position)

@@ -26,9 +26,11 @@ from .model import RobotModel
 from .records import Records, filter_rows
 from .regressor import joint_torque_regressor
 
-__all__ = ["Layout", "Problem", "State", "baseline", "extended_state", "whitened"]
+__all__ = ["Layout", "Problem", "State", "baseline", "extended_state", "friction_width", "whitened"]
 
 FRICTION_PRECISION = 1e-6
+WIDTHS = (0.0, 0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # rad/s or m/s
+WIDTH_GAIN = 10.0
 
 
 class Layout(eqx.Module):
@@ -205,3 +207,64 @@ def _term_columns(term: Effect, motion: Motion) -> Float[Array, "nN nv columns"]
 
 def _rigid(problem: Problem, motion: Motion) -> Float[np.ndarray, "nN nv 10nj"]:
     return np.asarray(joint_torque_regressor(problem.model, motion.position, motion.velocity, motion.acceleration))
+
+
+def friction_width(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> Problem:
+    """The problem with the half width of each joint's dry friction that fits best, from `WIDTHS`.
+
+    A simulator smooths Coulomb friction, a real gear rounds it: taken as a hard sign, the rest would be named Stribeck.
+    A joint keeps a width of zero unless another lowers the squares by more than `WIDTH_GAIN`.
+    """
+    rows = whitened(problem, state, whitening)
+    X, y = rows.X.reshape(-1, rows.X.shape[-1]), rows.y.reshape(-1)
+    G, b = X.T @ X + np.diag(state.prior.precision), X.T @ y + state.prior.precision * state.prior.mean
+    width = np.array(problem.width)
+    for joint in range(problem.model.nv):
+        column = _coulomb_column(problem, state, joint)
+        if column is None:
+            continue
+        tried = [_with_width(problem, state, rows, whitening, joint, w) for w in WIDTHS]
+        costs = [_replaced(G, b, column, z @ rows.X[joint], z @ z, z @ rows.y[joint])[0] for z in tried]
+        best = int(np.argmin(np.array(costs) - WIDTH_GAIN * (np.array(WIDTHS) == 0)))
+        width[joint] = WIDTHS[best]
+        z = tried[best]
+        G, b = _replaced(G, b, column, z @ rows.X[joint], z @ z, z @ rows.y[joint])[1:]
+        rows.X[joint, :, column] = z
+    return replace(problem, width=width)
+
+
+def _coulomb_column(problem: Problem, state: State, joint: int) -> int | None:
+    """Column of the joint's Coulomb friction in the regressor, if the model has one."""
+    column = 10 * len(problem.model.joints)
+    for term in state.terms:
+        amplitudes = sum(p.linear for p in term.parameters().values())
+        for at in np.asarray(term.at):
+            if term.name == "coulomb_friction" and at[0] == joint:
+                return column
+            column += amplitudes
+    return None
+
+
+def _with_width(
+    problem: Problem, state: State, rows: Rows, whitening: Float[np.ndarray, "F nv"], joint: int, width: float
+) -> Float[np.ndarray, " T"]:
+    """Whitened rows of the joint's dry friction with another width."""
+    motion = eqx.tree_at(lambda m: m.width, state.motion, np.full(problem.model.nv, width))
+    column = np.asarray(motion.direction).reshape(problem.records.position.shape)
+    response = jnp.asarray(whitening) * state.response(jnp.asarray(problem.records.omega))[:, None]
+    filtered = np.asarray(_rows(problem.records, jnp.asarray(column), response)) * problem.records.weight
+    return filtered.reshape(-1, problem.model.nv)[:, joint]
+
+
+def _replaced(G: np.ndarray, b: np.ndarray, column: int, cross: np.ndarray, square: float, right: float):
+    """Penalised squares (less a constant) of the fit with one column replaced, and its normal equations."""
+    old = G[column, column]
+    G, b = G.copy(), b.copy()
+    own = cross.copy()
+    own[column] = square
+    precision = FRICTION_PRECISION if old > 0 else 0.0
+    G[column], G[:, column] = own, own
+    G[column, column] += precision
+    b[column] = right
+    theta = np.linalg.solve(G + 1e-12 * np.diag(np.maximum(np.diag(G), 1e-12)), b)
+    return -float(b @ theta), G, b
