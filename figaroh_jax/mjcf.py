@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -155,21 +155,19 @@ def read_mjcf(path: str | Path) -> RobotModel:
     return assemble(str(path), root.get("model"), (links, joints), order, None, gravity.tolist())
 
 
-def _numbers(element: ET.Element | None, attribute: str) -> Float[np.ndarray, " n"]:
+def _numbers(element: Any, attribute: str) -> Float[np.ndarray, " n"]:
     if element is None:
         raise KeyError(attribute)
     return np.array([float(word) for word in element.attrib[attribute].split()])
 
 
-def _read_pose(element: ET.Element) -> Float[np.ndarray, "4 4"]:
+def _read_pose(element: Any) -> Float[np.ndarray, "4 4"]:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = _rotation(_numbers(element, "quat")), _numbers(element, "pos")
     return pose
 
 
-def _read_body(
-    body: ET.Element, name: str, links: list[LinkPart], joints: list[JointPart], follow: dict[str | None, ET.Element]
-) -> None:
+def _read_body(body: Any, name: str, links: list[LinkPart], joints: list[JointPart], follow: dict[str, Any]) -> None:
     for child in body.iterfind("body"):
         link, joint = child.attrib["name"], child.find("joint")
         if joint is None:
@@ -185,7 +183,7 @@ def _read_body(
             joints.append(JointPart(frame, "fixed", name, frame, _read_pose(site), np.zeros(3)))
 
 
-def _read_joint(joint: ET.Element, parent: str, body: ET.Element, follow: ET.Element | None) -> JointPart:
+def _read_joint(joint: Any, parent: str, body: Any, follow: Any) -> JointPart:
     lower, upper = _numbers(joint, "range") if "range" in joint.attrib else (-np.inf, np.inf)
     mimic = None
     if follow is not None:
@@ -198,7 +196,7 @@ def _read_joint(joint: ET.Element, parent: str, body: ET.Element, follow: ET.Ele
     )
 
 
-def _read_inertial(inertial: ET.Element | None) -> Float[np.ndarray, "10"]:
+def _read_inertial(inertial: Any) -> Float[np.ndarray, "10"]:
     xx, yy, zz, xy, xz, yz = _numbers(inertial, "fullinertia")
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     return from_com(np.float64(_numbers(inertial, "mass")[0]), _numbers(inertial, "pos"), inertia)

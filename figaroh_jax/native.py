@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from .effect import Effect, Native
 from .extended import ExtendedModel
-from .inertia import from_pseudo_inertia, is_physical, pseudo_inertia, to_com
+from .inertia import from_com, from_pseudo_inertia, is_physical, pseudo_inertia, to_com
 from .model import RobotModel
 
 __all__ = ["Carried", "Drives", "Tendon", "carried", "changed_leaves", "drives", "physical_inertia", "place_names"]
@@ -168,19 +168,38 @@ def _part(effect: Effect, attribute: str, joint: int) -> float:
 def physical_inertia(parameters: Float[np.ndarray, "10"], form: Format) -> tuple[Float[np.ndarray, "10"], str]:
     """The link's ten parameters as the format can hold them, and what had to be changed (empty: nothing).
 
-    URDF takes any mass above zero with a non-negative inertia about the centre of mass. MuJoCo wants a body that can
-    exist: the nearest positive definite pseudo-inertia in the Frobenius norm is written.
+    URDF takes any mass above zero with a non-negative inertia about the centre of mass; MuJoCo wants a body that can
+    exist. Where it cannot, mass and centre of mass are kept and the second moments about it made positive definite.
     """
     parameters = np.asarray(parameters, float)
     massless = not parameters.any()
     mass, _, inertia = to_com(parameters)
     if form == "urdf" and (massless or (mass > 0 and np.linalg.eigvalsh(inertia)[0] >= 0)):
         return parameters, ""
-    values, vectors = np.linalg.eigh(pseudo_inertia(parameters))
-    floor = max(_SMALLEST, 1e-12 * values[-1])
-    nearest = from_pseudo_inertia(vectors * np.maximum(values, floor) @ vectors.T)
+    mended = _mended(parameters)
     if massless:
-        return nearest, f"has no mass; {_SMALLEST:g} kg is written"
+        return mended, f"has no mass; {_SMALLEST:g} kg is written"
     if form == "mjcf" and is_physical(parameters):
-        return nearest if values[0] < floor else parameters, ""
-    return nearest, f"has an inertia that no body can have; the nearest possible is written ({mass:.4g} kg before)"
+        return mended, ""
+    return mended, f"has an inertia that no body can have; a possible one is written ({mended[0]:.4g} kg)"
+
+
+def _mended(parameters: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
+    mass, com, inertia = to_com(parameters)
+    wanted = pseudo_inertia(parameters)
+    nearest = _positive(wanted)
+    if mass > 0:
+        about_com = np.zeros((4, 4))
+        about_com[:3, :3] = _positive(np.trace(inertia) / 2 * np.eye(3) - inertia)
+        kept = from_pseudo_inertia(about_com) + from_com(mass, com, np.zeros((3, 3)))
+        # a tiny mass can put its centre far away: then the nearest of all pseudo-inertias does less harm
+        if np.linalg.norm(pseudo_inertia(kept) - wanted) <= 3 * np.linalg.norm(nearest - wanted):
+            return kept
+    return parameters if np.array_equal(nearest, wanted) else from_pseudo_inertia(nearest)
+
+
+def _positive(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """The nearest positive definite matrix, the matrix itself where it is one."""
+    values, vectors = np.linalg.eigh(matrix)
+    floor = max(_SMALLEST, 1e-12 * values[-1])
+    return matrix if values[0] >= floor else vectors * np.maximum(values, floor) @ vectors.T

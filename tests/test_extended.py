@@ -321,7 +321,7 @@ def test_wrong_shapes_are_refused(chain: RobotModel):
     with pytest.raises(InputError, match="needs one number or 3"):
         extend(chain, width=np.zeros(2))
     with pytest.raises(InputError, match="5 samples or more"):
-        predict(extend(chain), *(x[:3] for x in record(chain)), 0.002)
+        predict(extend(chain), np.arange(3) * 0.1, np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), 0.1)
     with pytest.raises(InputError, match="number of steps"):
         simulate(extend(chain), lambda t, q, v: q, np.zeros(3), np.zeros(3), DT)
     with pytest.raises(InputError, match="last axis must hold the 3 joints"):
