@@ -10,7 +10,7 @@ from jaxtyping import Float
 from . import noise
 from .evidence import Prior, Rows, fit
 from .noise import Spectrum
-from .problem import Problem, State, solved, whitened
+from .problem import Problem, State, plain_rows, solved, whitened
 from .screening import Group, catalogue, screen
 
 __all__ = ["noise_floor"]
@@ -54,11 +54,6 @@ def _weighted(rows: Rows, prior: Prior, scale: Float[np.ndarray, " nv"]) -> Floa
 def _whitening(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, "F nv"]:
     frequency = np.asarray(problem.records.omega) / (2 * np.pi)
     return noise.whitening(spectrum, frequency, problem.gain, float(problem.records.cutoff))
-
-
-def plain_rows(problem: Problem, state: State) -> Rows:
-    """Rows as they are, N m or N."""
-    return whitened(problem, state, np.ones((len(np.asarray(problem.records.omega)), problem.records.shape[3])))
 
 
 def _from_repeats(problem: Problem, rows: Rows, state: State) -> Spectrum:

@@ -26,7 +26,7 @@ from .model import RobotModel
 from .records import Records, filter_rows
 from .regressor import joint_torque_regressor
 
-__all__ = ["Layout", "Problem", "State", "baseline", "extended_state", "friction_width", "whitened"]
+__all__ = ["Layout", "Problem", "State", "baseline", "extended_state", "friction_width", "plain_rows", "whitened"]
 
 FRICTION_PRECISION = 1e-6
 WIDTHS = (0.0, 0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # rad/s or m/s
@@ -177,6 +177,21 @@ def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"
     if layout.repeats:
         Xi = np.stack([instruments(x.T, layout.partner, p).T for x, p in zip(X, layout.paired, strict=True)])
     return Rows(y, np.ascontiguousarray(X), np.ascontiguousarray(Xi), *_row_layout(layout))
+
+
+def plain_rows(problem: Problem, state: State) -> Rows:
+    """Rows as they are, N m or N."""
+    return whitened(problem, state, np.ones((len(np.asarray(problem.records.omega)), problem.records.shape[3])))
+
+
+def filtered_rows(
+    problem: Problem, torque: Float[Array, "nN nv"], response: Complex[Array, "F nv"]
+) -> Float[np.ndarray, "nv T"]:
+    """Rows of a torque at all samples through the row filter and `response`, masked."""
+    n, samples, _, nv = problem.records.shape
+    columns = jnp.asarray(torque).reshape(n, samples, nv)
+    rows = np.asarray(_rows(problem.records, columns, response)) * problem.records.weight
+    return np.moveaxis(rows.reshape(-1, nv), 0, 1)
 
 
 def _row_layout(layout: Layout) -> tuple[np.ndarray, ...]:

@@ -13,10 +13,10 @@ from jaxtyping import Float
 from .comparison import Hypothesis, Verdicts, judge, shares_of_wins, t_value
 from .design import kind
 from .effect import Effect
+from .estimates import torque_slope
 from .evidence import Linear, Rows, fit
 from .noise import Spectrum
 from .problem import Problem, State, extended_state, solved, whitened
-from .records import filter_rows
 from .refit import Whitened, refit, shapes, with_shape
 from .results import Name
 from .screening import Group, Screen, catalogue, family_p, screen
@@ -121,7 +121,7 @@ def _response_contender(
     for _ in range(6):
         state = extended_state(problem, step.state, effect)
         here = stand(problem, state, whitening)
-        slope = _response_slope(problem, here.state, effect, name, whitening)
+        slope = torque_slope(problem, here.state, effect, name, whitening)
         X = np.concatenate([here.rows.X, slope[..., None]], axis=2)
         change = judge(here.rows, Hypothesis(X, state.prior.extended(1))).theta[-1]
         value = float(np.clip(float(getattr(effect, name)) + change, parameter.lower, parameter.upper))
@@ -132,22 +132,6 @@ def _response_contender(
     state = extended_state(problem, step.state, effect)
     here = stand(problem, state, whitening)
     return Contender(group.name, effect, Hypothesis(here.rows.X, state.prior), here.verdicts)
-
-
-def _response_slope(
-    problem: Problem, state: State, effect: Effect, name: str, whitening: Float[np.ndarray, "F nv"]
-) -> Float[np.ndarray, "nv T"]:
-    """Derivative of the whitened torque of the state in the parameter of its response."""
-    omega = jnp.asarray(problem.records.omega)
-    n, samples, _, nv = problem.records.shape
-    value, slope = jax.jvp(
-        lambda p: with_shape(effect, [name], [p]).torque_response(omega),
-        (jnp.asarray(getattr(effect, name)),),
-        (jnp.ones(()),),
-    )
-    response = (state.response(omega) * slope / value)[:, None] * jnp.asarray(whitening)
-    rows = filter_rows(problem.records, jnp.asarray(state.motion.total).reshape(n, samples, nv), response)
-    return np.moveaxis(np.asarray(rows * problem.records.weight).reshape(-1, nv), 0, 1)
 
 
 def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray]]:
@@ -187,6 +171,39 @@ def find_causes(
         step = stand(problem, extended_state(problem, step.state, accepted.effect), whitening)
         found.append(accepted)
     return step, found, first_p, first_screen or Screen([], [])
+
+
+def catalogue_p(
+    problem: Problem,
+    step: Step,
+    spectrum: Spectrum,
+    whitening: Float[np.ndarray, "F nv"],
+    forbid: Collection[str],
+    generator: np.random.Generator,
+) -> float:
+    """p-value of the whole catalogue where a search stands."""
+    screened = screen(step.rows, step.linear, catalogue(problem, step.state, step.rows, whitening, forbid))
+    return family_p(problem, step.rows, step.linear, screened, spectrum, whitening, generator)
+
+
+def eliminate(
+    problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]
+) -> list[Found]:
+    """The causes without those that no longer predict anything once the others are in (earliest first)."""
+    for one in list(found[:-1]):
+        others = [f for f in found if f is not one]
+        with_it, without = (_stand_with(problem, start, some, whitening) for some in (found, others))
+        gain = 1 - with_it.verdicts.heldout / without.verdicts.heldout
+        if gain < GAIN or t_value(without.verdicts.blocks, with_it.verdicts.blocks) < CONFIDENT:
+            found = others
+    return found
+
+
+def _stand_with(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> Step:
+    step = stand(problem, start, whitening)
+    for one in found:
+        step = stand(problem, extended_state(problem, step.state, one.effect), whitening)
+    return step
 
 
 def _accept(
