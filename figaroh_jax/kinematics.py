@@ -1,16 +1,17 @@
 """Where the joints and frames are and how they move.
 
-The kernel is `motion`: one `lax.scan` over the levels of the tree, all joints of a level side by side and padded to the
-widest level, so that its compile time grows with neither the number of joints nor that of samples. Inside the kernels
-the sample is the last axis; the public functions take any leading batch axes and transpose once at the border. Frames:
-positions, velocities and accelerations are those of the joint frame's origin, expressed in the world.
+The kernel is `motion`. Only rotations multiply along the tree: one `lax.scan` over its levels, all joints of a level
+side by side and padded to the widest, so that compile time grows with neither joints nor samples. Everything else adds
+up along the tree: one product with its matrix of 0 and 1. Inside the kernels the sample is the last axis; the public
+functions take any leading batch axes and transpose once at the border. Frames: positions, velocities and accelerations
+are those of the joint frame's origin, expressed in the world.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +40,10 @@ __all__ = [
     "states",
     "world_axes",
 ]
+
+
+_BLOCK = 32  # samples computed together on a CPU, so that what lies between stays in its cache
+_BLOCK_ACCELERATOR = 65536
 
 
 class Motion(NamedTuple):
@@ -135,13 +140,28 @@ def add_up(which: Shaped[np.ndarray, "k n"], x: Float[Array, "n *rest"]) -> Floa
     return jnp.tensordot(jnp.asarray(which, x.dtype), x, axes=1, precision=jax.lax.Precision.HIGHEST)
 
 
+def _tree(model: RobotModel, q: Float[Array, "nv samples"]) -> tuple[Array, Array]:
+    """Rotation of each joint in the world and, in the world, the way from its parent's origin to its own."""
+    rotation, shift = _local(model, q)
+    levels = _levels(model.joints)
+    parent = None if levels.parent is None else jnp.asarray(levels.parent)
+
+    def level(R: Array, step: tuple[Array | None, Array]) -> tuple[Array, Array]:
+        above = R if step[0] is None else R[step[0]]
+        R = matmul(above, step[1])
+        return R, R
+
+    world = jnp.broadcast_to(jnp.eye(3, dtype=q.dtype)[..., None], (levels.order.shape[1], *rotation.shape[1:]))
+    stacked = jax.lax.scan(level, world, (parent, rotation[levels.order]))[1]
+    R = stacked.reshape(-1, *rotation.shape[1:])[levels.place]
+    parents = np.array([joint.parent for joint in model.joints], int)
+    return R, rotate(jnp.concatenate([world[:1], R])[parents + 1], shift)
+
+
 def placements(model: RobotModel, q: Float[Array, "nv samples"]) -> Float[Array, "nj 4 4 samples"]:
     """Kernel of `forward_kinematics`: poses `world_T_joint`, the samples on the last axis, the dtype that of `q`."""
-
-    def below(above: tuple[Array, Array], rotation: Array, shift: Array) -> tuple[Array, Array]:
-        return matmul(above[0], rotation), above[1] + rotate(above[0], shift)
-
-    R, p = _along_tree(model, below, (jnp.eye(3), jnp.zeros(3)), _local(model, q))
+    R, d = _tree(model, q)
+    p = add_up(ancestors(model.joints).T, d)
     bottom = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0], q.dtype)[:, None], (len(R), 1, 4, q.shape[-1]))
     return jnp.concatenate([jnp.concatenate([R, p[:, :, None]], axis=2), bottom], axis=1)
 
@@ -157,42 +177,18 @@ def motion(
     $$c = c_p + \alpha_p \times d + w_p \times (w_p \times d) + (1 - r)(s \ddot q + 2 w_p \times s \dot q)$$
     starting from rest with c = -gravity. Units: rad or m, and their rates in seconds. The dtype is that of `q`.
     """
-    dtype, zero = q.dtype, jnp.zeros(3)
-    world = Motion(jnp.eye(3), zero, zero, zero, -jnp.asarray(model.gravity, dtype))
-    rates = [_to_joints(model, x)[:, None] for x in (v, a)]
-    constants = jnp.asarray(model.axis, dtype)[..., None], jnp.asarray(revolute(model), dtype)[:, None, None]
-    return _along_tree(model, _below, world, (*_local(model, q), *rates, *constants))
-
-
-def _along_tree(model: RobotModel, below: Callable[..., Any], world: Any, inputs: Sequence[Array]) -> Any:
-    """States of all joints from the root on: each is `below(state of the parent, *inputs of the joint)`."""
-    levels, dtype, samples = _levels(model.joints), inputs[0].dtype, inputs[0].shape[-1]
-    steps = [x[levels.order] for x in inputs]
-
-    def level(state: Any, step: tuple[Array | None, list[Array]]) -> tuple[Any, Any]:
-        parent, inputs = step
-        above = state if parent is None else jax.tree.map(lambda x: x[parent], state)
-        state = below(above, *inputs)
-        return state, state
-
-    width = levels.order.shape[1]
-    first = jax.tree.map(lambda x: jnp.broadcast_to(x.astype(dtype)[..., None], (width, *x.shape, samples)), world)
-    parent = None if levels.parent is None else jnp.asarray(levels.parent)
-    stacked = jax.lax.scan(level, first, (parent, steps))[1]
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[levels.place], stacked)
-
-
-def _below(above: Motion, rotation: Array, shift: Array, v: Array, a: Array, axis: Array, turns: Array) -> Motion:
-    R = matmul(above.R, rotation)
-    s, d = rotate(R, axis), rotate(above.R, shift)
-    sv, sa, coriolis = s * v, s * a, cross(above.w, s * v)
-    return Motion(
-        R=R,
-        p=above.p + d,
-        w=above.w + turns * sv,
-        al=above.al + turns * (sa + coriolis),
-        ac=above.ac + cross(above.al, d) + cross(above.w, cross(above.w, d)) + (1.0 - turns) * (sa + 2.0 * coriolis),
-    )
+    R, d = _tree(model, q)
+    above, s = ancestors(model.joints).T, world_axes(model, R)
+    turns = jnp.asarray(revolute(model), q.dtype)[:, None, None]
+    sv, sa = (s * _to_joints(model, x)[:, None] for x in (v, a))
+    w, p = add_up(above, turns * sv), add_up(above, d)
+    w_p = w - turns * sv
+    coriolis = cross(w_p, sv)
+    al_own = turns * (sa + coriolis)
+    al = add_up(above, al_own)
+    turning = cross(al - al_own, d) + cross(w_p, cross(w_p, d))
+    ac = add_up(above, turning + (1.0 - turns) * (sa + 2.0 * coriolis))
+    return Motion(R, p, w, al, ac - jnp.asarray(model.gravity, q.dtype)[:, None])
 
 
 def world_axes(model: RobotModel, R: Float[Array, "nj 3 3 samples"]) -> Float[Array, "nj 3 samples"]:
@@ -220,9 +216,20 @@ def check_shapes(model: RobotModel, **arrays: Float[ArrayLike, "..."]) -> None:
 
 def in_samples(kernel: Callable[..., Array], *arrays: Float[Array, "*batch nv"]) -> Float[Array, "..."]:
     """Apply a kernel that holds the samples on its last axis to arrays with any leading batch axes."""
-    batch = arrays[0].shape[:-1]
-    answer = kernel(*(x.reshape(-1, x.shape[-1]).T for x in arrays))
-    return jnp.moveaxis(answer, -1, 0).reshape(*batch, *answer.shape[:-1])
+    batch, flat = arrays[0].shape[:-1], [x.reshape(-1, x.shape[-1]) for x in arrays]
+    samples, block = len(flat[0]), _BLOCK if jax.default_backend() == "cpu" else _BLOCK_ACCELERATOR
+
+    def apply(rows: Sequence[Array]) -> Array:
+        return jnp.moveaxis(kernel(*(x.T for x in rows)), -1, 0)
+
+    if samples <= 2 * block:
+        answer = apply(flat)
+    else:
+        blocks = -(-samples // block)
+        padded = [jnp.pad(x, ((0, blocks * block - samples), (0, 0))).reshape(blocks, block, -1) for x in flat]
+        answer = jax.lax.map(apply, padded)
+        answer = answer.reshape(blocks * block, *answer.shape[2:])[:samples]
+    return answer.reshape(*batch, *answer.shape[1:])
 
 
 def forward_kinematics(model: RobotModel, q: Float[ArrayLike, "*batch nv"]) -> Float[Array, "*batch nj 4 4"]:
