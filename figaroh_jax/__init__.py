@@ -31,15 +31,11 @@ if TYPE_CHECKING:
     )
     from .model import Frame as Frame, Joint as Joint, RobotModel as RobotModel
     from .registry import backend as backend
-    from .regressor import (
-        joint_torque_regressor as joint_torque_regressor,
-        normal_matrix as normal_matrix,
-        packed_regressor as packed_regressor,
-        triangular_factor as triangular_factor,
-    )
+    from .regressor import joint_torque_regressor as joint_torque_regressor, packed_regressor as packed_regressor
     from .report import write_report as write_report
     from .results import Cause as Cause, Diagnosis as Diagnosis, Estimate as Estimate, Gain as Gain, Name as Name
     from .simulation import Simulation as Simulation, simulate as simulate
+    from .streaming import normal_matrix as normal_matrix, triangular_factor as triangular_factor
     from .urdf import load_urdf as load_urdf
 
 __version__ = "0.1.0"
@@ -56,11 +52,12 @@ _MODULES = {
     "extended": ("ExtendedModel", "extend", "predict"),
     "kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
     "model": ("Frame", "Joint", "RobotModel"),
-    "regressor": ("joint_torque_regressor", "normal_matrix", "packed_regressor", "triangular_factor"),
+    "regressor": ("joint_torque_regressor", "packed_regressor"),
     "registry": ("backend",),
     "report": ("write_report",),
     "results": ("Cause", "Diagnosis", "Estimate", "Gain", "Name"),
     "simulation": ("Simulation", "simulate"),
+    "streaming": ("normal_matrix", "triangular_factor"),
     "urdf": ("load_urdf",),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}

@@ -9,8 +9,6 @@ the processor's cache.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -19,12 +17,21 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from .chunks import over_samples
 from .errors import InputError
-from .kinematics import Motion, ancestors, motion, revolute, states, world_axes
+from .kinematics import Motion, ancestors, check_shapes, motion, revolute, world_axes
 from .model import RobotModel
 from .spatial import rotate_back
 
-__all__ = ["coordinate_blocks", "joint_torque_regressor", "packed_regressor", "packed_rows", "pairs"]
+__all__ = [
+    "coordinate_blocks",
+    "coordinate_rows",
+    "dense_rows",
+    "joint_torque_regressor",
+    "packed_regressor",
+    "packed_rows",
+    "pairs",
+]
 
 Vector = list[Array]  # the three components of vectors, each (any, samples)
 
@@ -47,9 +54,9 @@ def joint_torque_regressor(
     Raises `InputError` where the shapes do not fit the model.
     """
     with jax.enable_x64(True):
-        q, v, a = states(model, q=q, v=v, a=a)
-        shape = (*q.shape[:-1], model.nv, 10 * len(model.joints))
-        return _over_samples(_dense, 0, model, *(x.reshape(-1, model.nv) for x in (q, v, a))).reshape(shape)
+        check_shapes(model, q=q, v=v, a=a)
+        shape = (*np.shape(q)[:-1], model.nv, 10 * len(model.joints))
+        return over_samples(dense_rows, 0, model, q, v, a).reshape(shape)
 
 
 def packed_regressor(
@@ -64,10 +71,10 @@ def packed_regressor(
     Units and errors as `joint_torque_regressor`.
     """
     with jax.enable_x64(True):
-        q, v, a = states(model, q=q, v=v, a=a)
-        if q.ndim != 2:
-            raise InputError(f"q has shape {q.shape}; a packed regressor takes (samples, joints)")
-        return _over_samples(_packed, -1, model, q, v, a)
+        check_shapes(model, q=q, v=v, a=a)
+        if np.ndim(q) != 2:
+            raise InputError(f"q has shape {np.shape(q)}; a packed regressor takes (samples, joints)")
+        return over_samples(packed_rows, -1, model, q, v, a)
 
 
 def coordinate_blocks(model: RobotModel) -> tuple[Int[np.ndarray, "blocks 2"], Int[np.ndarray, " pairs"]]:
@@ -78,70 +85,25 @@ def coordinate_blocks(model: RobotModel) -> tuple[Int[np.ndarray, "blocks 2"], I
     return blocks, place.reshape(-1)
 
 
-def chunk_size() -> int:
-    """Samples to a chunk: few on a CPU, whose cache then holds the temporaries, many on an accelerator."""
-    return 128 if jax.default_backend() == "cpu" else 65536
-
-
-def _dense(model: RobotModel, q: Array, v: Array, a: Array) -> Float[Array, "samples nv columns"]:
+def coordinate_rows(
+    model: RobotModel, q: Float[Array, "nv samples"], v: Float[Array, "nv samples"], a: Float[Array, "nv samples"]
+) -> Float[Array, "blocks 10 samples"]:
+    """Kernel: the blocks of `coordinate_blocks`, the samples last."""
     rows = packed_rows(model, q, v, a, scale=model.ratio)
     blocks, place = coordinate_blocks(model)
-    target = jnp.zeros((model.nv, len(model.joints), *rows.shape[1:]), rows.dtype)
-    index = tuple(blocks[place].T)
-    dense = target.at[index].set(rows, unique_indices=True) if len(blocks) == len(place) else target.at[index].add(rows)
+    if (place == np.arange(len(blocks))).all():
+        return rows
+    return jnp.zeros((len(blocks), *rows.shape[1:]), rows.dtype).at[place].add(rows)
+
+
+def dense_rows(
+    model: RobotModel, q: Float[Array, "nv samples"], v: Float[Array, "nv samples"], a: Float[Array, "nv samples"]
+) -> Float[Array, "samples nv columns"]:
+    """Kernel of `joint_torque_regressor`: arguments with the samples last, W with the samples first."""
+    rows, (blocks, _) = coordinate_rows(model, q, v, a), coordinate_blocks(model)
+    room = jnp.zeros((model.nv, len(model.joints), *rows.shape[1:]), rows.dtype)
+    dense = room.at[tuple(blocks.T)].set(rows, unique_indices=True)
     return dense.reshape(-1, q.shape[-1]).T.reshape(-1, model.nv, 10 * len(model.joints))
-
-
-def _packed(model: RobotModel, q: Array, v: Array, a: Array) -> Float[Array, "pairs 10 samples"]:
-    return packed_rows(model, q, v, a)
-
-
-def _over_samples(kernel: Callable[..., Array], axis: int, model: RobotModel, *arrays: Array) -> Array:
-    """Kernel over all samples, which stand on `axis` of its answer.
-
-    Under a transformation the whole is one program. Otherwise one program of fixed size serves any number of samples:
-    the last block overlaps the one before, so that nothing is cut off at the end.
-    """
-    samples, chunk = len(arrays[0]), chunk_size()
-    if samples == 0 or any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((model, arrays))):
-        return _in_chunks(kernel, axis, chunk, model, *arrays)
-    block = chunk if samples <= chunk else 8 * chunk
-    model = jax.tree.map(jnp.asarray, model)
-    if samples <= block:
-        short = [jnp.pad(x, ((0, block - samples), (0, 0))) for x in arrays]
-        return jax.lax.slice_in_dim(_block(kernel, axis, chunk, model, *short), 0, samples, axis=axis)
-    whole = None
-    for start in [*range(0, samples - block, block), samples - block]:
-        part = _block(kernel, axis, chunk, model, *(x[start : start + block] for x in arrays))
-        whole = _room(part, axis, samples) if whole is None else whole
-        whole = _put(whole, part, start, axis)
-    return whole
-
-
-def _in_chunks(kernel: Callable[..., Array], axis: int, chunk: int, model: RobotModel, *arrays: Array) -> Array:
-    samples = len(arrays[0])
-    count = -(-samples // chunk)
-    if count <= 1:
-        return kernel(model, *(x.T for x in arrays))
-    padded = (jnp.pad(x, ((0, count * chunk - samples), (0, 0))).reshape(count, chunk, -1) for x in arrays)
-    parts = jax.lax.map(lambda part: kernel(model, *(x.T for x in part)), tuple(padded))
-    whole = jnp.moveaxis(parts, 0, axis - 1 if axis < 0 else axis)
-    whole = jax.lax.collapse(whole, whole.ndim - 2 if axis < 0 else 0, whole.ndim if axis < 0 else 2)
-    return jax.lax.slice_in_dim(whole, 0, samples, axis=axis)
-
-
-_block = jax.jit(_in_chunks, static_argnums=(0, 1, 2))
-
-
-def _room(part: Array, axis: int, samples: int) -> Array:
-    shape = list(part.shape)
-    shape[axis] = samples
-    return jnp.empty(shape, part.dtype)
-
-
-@partial(jax.jit, static_argnums=3, donate_argnums=0)
-def _put(whole: Array, part: Array, start: int | Array, axis: int) -> Array:
-    return jax.lax.dynamic_update_slice_in_dim(whole, part, start, axis)
 
 
 def packed_rows(
@@ -180,7 +142,10 @@ def _pair_vectors(
     turns = revolute(model)[joint]
     if not turns.all():
         slides = jnp.asarray(~turns, s.dtype)[:, None]
-        u, lever = [x * (1.0 - slides) for x in u], [x * (1.0 - slides) + y * slides for x, y in zip(lever, u, strict=True)]
+        u, lever = (
+            [x * (1.0 - slides) for x in u],
+            [x * (1.0 - slides) + y * slides for x, y in zip(lever, u, strict=True)],
+        )
     return *_once((u, lever)), w, al, c
 
 
