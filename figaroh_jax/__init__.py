@@ -11,7 +11,7 @@ import importlib.util
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .config import load_task as load_task
+    from .config import Baseline as Baseline, Preprocess as Preprocess, load_robot as load_robot, load_task as load_task
     from .dataset import Recording as Recording, read_recordings as read_recordings
     from .diagnosis import diagnose as diagnose, diagnose_task as diagnose_task
     from .dynamics import (
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
         inverse_dynamics as inverse_dynamics,
         mass_matrix as mass_matrix,
     )
-    from .effect import Effect as Effect, Motion as Motion, amplitude as amplitude, shape as shape
-    from .effects import register as register
+    from .effect import Effect as Effect, Motion as Motion, amplitude as amplitude, place as place, shape as shape
+    from .effects import CATALOGUE as CATALOGUE, register as register
     from .errors import InputError as InputError
     from .export import load_model as load_model, write_model as write_model
-    from .extended import ExtendedModel as ExtendedModel, extend as extend, predict as predict
+    from .extended import ExtendedModel as ExtendedModel, extend as extend
     from .kinematics import (
         forward_kinematics as forward_kinematics,
         frame_jacobian as frame_jacobian,
@@ -34,29 +34,29 @@ if TYPE_CHECKING:
     from .regressor import joint_torque_regressor as joint_torque_regressor, packed_regressor as packed_regressor
     from .report import write_report as write_report
     from .results import Cause as Cause, Diagnosis as Diagnosis, Estimate as Estimate, Gain as Gain, Name as Name
-    from .simulation import Simulation as Simulation, simulate as simulate
+    from .simulation import simulate as simulate
     from .streaming import normal_matrix as normal_matrix, triangular_factor as triangular_factor
     from .urdf import load_urdf as load_urdf
 
 __version__ = "0.1.0"
 
 _MODULES = {
-    "config": ("load_task",),
+    "config": ("Baseline", "Preprocess", "load_robot", "load_task"),
     "dataset": ("Recording", "read_recordings"),
     "diagnosis": ("diagnose", "diagnose_task"),
     "dynamics": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
-    "effect": ("Effect", "Motion", "amplitude", "shape"),
-    "effects": ("register",),
+    "effect": ("Effect", "Motion", "amplitude", "place", "shape"),
+    "effects": ("CATALOGUE", "register"),
     "errors": ("InputError",),
     "export": ("load_model", "write_model"),
-    "extended": ("ExtendedModel", "extend", "predict"),
+    "extended": ("ExtendedModel", "extend"),
     "kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
     "model": ("Frame", "Joint", "RobotModel"),
-    "regressor": ("joint_torque_regressor", "packed_regressor"),
     "registry": ("backend",),
+    "regressor": ("joint_torque_regressor", "packed_regressor"),
     "report": ("write_report",),
     "results": ("Cause", "Diagnosis", "Estimate", "Gain", "Name"),
-    "simulation": ("Simulation", "simulate"),
+    "simulation": ("simulate",),
     "streaming": ("normal_matrix", "triangular_factor"),
     "urdf": ("load_urdf",),
 }

@@ -52,7 +52,7 @@ def write_run(task: Task, diagnosis: Diagnosis, out: Path) -> None:
         (folder / ANSWER).write_text(to_json(diagnosis), encoding="utf-8")
         write_predictions(folder / "predictions.npz", predictions(task, diagnosis))
         write_report(diagnosis, folder / REPORT, diagnosis.model.robot.name)
-        write_model(diagnosis.model, folder / "model")
+        write_model(diagnosis.model, folder / "model", diagnosis.causes)
 
 
 def predictions(task: Task, diagnosis: Diagnosis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
