@@ -96,7 +96,6 @@ def predict(
         return _predict(extended, jnp.asarray(time, jnp.float64), *motion, jnp.float64(dt))
 
 
-@jax.jit
 def _predict(extended: ExtendedModel, time: Array, q: Array, v: Array, a: Array, dt: Array) -> Array:
     robot = changed_robot(extended)
     load = inverse_dynamics(robot, q, v, a)
@@ -163,8 +162,14 @@ def with_torque(effects: tuple[Effect, ...], motion: Motion, load: Float[Array, 
     motion = dataclasses.replace(motion, load=load, total=load)
     for effect in effects:
         if effect.has("torque"):
-            motion = dataclasses.replace(motion, total=motion.total + effect.joint_torque(motion))
+            motion = dataclasses.replace(motion, total=motion.total + _joint_torque(effect, motion))
     return motion
+
+
+# compiled once for each kind of effect, whatever the joint: a model of other effects then needs no new compilation
+@jax.jit
+def _joint_torque(effect: Effect, motion: Motion) -> Float[Array, "samples nv"]:
+    return effect.joint_torque(motion)
 
 
 def read_position(effects: tuple[Effect, ...], motion: Motion) -> Float[Array, "samples nv"]:
@@ -188,6 +193,7 @@ def read_torque(
     return torque
 
 
+@jax.jit
 def _respond(effect: Effect, signal: Float[Array, "samples nv"], dt: Float[Array, ""] | float) -> Array:
     """Response to a record: exactly to the line between its ends, in the frequency domain to the rest.
 
@@ -206,6 +212,7 @@ def _respond(effect: Effect, signal: Float[Array, "samples nv"], dt: Float[Array
     return answer + gain.real * line + slope.imag * slide
 
 
+@jax.jit
 def _difference(signal: Float[Array, "samples nv"], dt: Float[Array, ""]) -> Float[Array, "samples nv"]:
     """Five-point central derivative of a uniform record; the two samples at each end take their neighbour's."""
     inner = (8 * (signal[3:-1] - signal[1:-3]) - (signal[4:] - signal[:-4])) / (12 * dt)
