@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from .evidence import Prior, Rows
 
-__all__ = ["Hypothesis", "Verdicts", "judge", "t_value"]
+__all__ = ["Hypothesis", "Verdicts", "judge", "overlap", "shares_of_wins", "t_value"]
 
 
 class Hypothesis(NamedTuple):
@@ -28,6 +28,7 @@ class Verdicts(NamedTuple):
     folds: Float[np.ndarray, "folds P"]  # coefficients without each fold
     blocks: Float[np.ndarray, " blocks"]  # sum of squares of each block, predicted without its fold
     without: Float[np.ndarray, " folds"]  # penalised sum of squares of the fit without each fold
+    residual: Float[np.ndarray, "nv T"]  # of the whole fit
 
     @property
     def heldout(self) -> float:
@@ -53,7 +54,7 @@ def judge(rows: Rows, hypothesis: Hypothesis) -> Verdicts:
     residual = y - np.einsum("jtp,tp->jt", X, each[np.maximum(rows.fold, 0)], optimize=True)
     member = rows.block == np.arange(rows.block.max() + 1)[:, None]
     blocks = member.astype(float) @ (residual**2).sum(0)
-    return Verdicts(cost, theta, each, blocks, np.array([cost for _, cost in left]))
+    return Verdicts(cost, theta, each, blocks, np.array([cost for _, cost in left]), y - X @ theta)
 
 
 def t_value(worse: Float[np.ndarray, " blocks"], better: Float[np.ndarray, " blocks"]) -> float:
@@ -61,6 +62,12 @@ def t_value(worse: Float[np.ndarray, " blocks"], better: Float[np.ndarray, " blo
     gain = worse - better
     spread = gain.std(ddof=1) / np.sqrt(len(gain))
     return float(gain.mean() / spread) if spread > 0 else 0.0
+
+
+def overlap(current: Verdicts, one: Verdicts, other: Verdicts) -> float:
+    """Cosine between what two hypotheses change of the current residual: 1, the same misfit; 0, another one."""
+    a, b = (current.residual - v.residual for v in (one, other))
+    return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum() + 1e-300))
 
 
 def shares_of_wins(

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .comparison import Hypothesis, Verdicts, judge, shares_of_wins, t_value
+from .comparison import Hypothesis, Verdicts, judge, overlap, shares_of_wins, t_value
 from .design import kind
 from .effect import Effect
-from .estimates import torque_slope
-from .evidence import Linear, Rows, fit
+from .estimates import amplitude_places, torque_slope
+from .evidence import Linear, Prior, Rows, fit
 from .noise import Spectrum
 from .problem import Problem, State, extended_state, solved, whitened
 from .refit import Whitened, refit, shapes, with_shape
@@ -26,6 +26,7 @@ __all__ = ["Found", "Step", "find_causes", "stand"]
 SHORTLIST, SHARE = 8, 0.35  # candidates compared exactly; share of the best rank that they need
 STARTS = 4
 GAIN, CONFIDENT, UNSURE = 0.004, 1.64, 1.7
+SAME = 0.5  # overlap from which two causes explain the same misfit
 MOST = 12
 
 
@@ -191,19 +192,29 @@ def eliminate(
 ) -> list[Found]:
     """The causes without those that no longer predict anything once the others are in (earliest first)."""
     for one in list(found[:-1]):
+        full = _stand_with(problem, start, found, whitening)
         others = [f for f in found if f is not one]
-        with_it, without = (_stand_with(problem, start, some, whitening) for some in (found, others))
-        gain = 1 - with_it.verdicts.heldout / without.verdicts.heldout
-        if gain < GAIN or t_value(without.verdicts.blocks, with_it.verdicts.blocks) < CONFIDENT:
+        if kind(one.effect) == "columns":
+            place = amplitude_places(full.state, [f.effect for f in found], problem.model)[found.index(one)]
+            X, prior = np.delete(full.rows.X, place, axis=2), full.state.prior
+            fewer = Prior(np.delete(prior.mean, place), np.delete(prior.precision, place))
+            without = judge(full.rows, Hypothesis(X, fewer))
+        else:
+            without = _stand_with(problem, start, others, whitening).verdicts
+        gain = 1 - full.verdicts.heldout / without.heldout
+        if gain < GAIN or t_value(without.blocks, full.verdicts.blocks) < CONFIDENT:
             found = others
     return found
 
 
 def _stand_with(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> Step:
-    step = stand(problem, start, whitening)
+    """All causes in at once (sensor effects see the torque of the baseline and of the causes before them)."""
+    state = start
     for one in found:
-        step = stand(problem, extended_state(problem, step.state, one.effect), whitening)
-    return step
+        if kind(one.effect) != "columns":
+            state = stand(problem, state, whitening).state
+        state = extended_state(problem, state, one.effect)
+    return stand(problem, state, whitening)
 
 
 def _accept(
@@ -221,22 +232,31 @@ def _accept(
     best = next((c for c in contenders if _passes(step, contenders, c)), None)
     if best is None:
         return None
-    t = t_value(step.verdicts.blocks, best.verdicts.blocks)
-    contenders = [best, *(c for c in contenders if c is not best)]
-    members = [c for c in contenders[1:] if t_value(c.verdicts.blocks, best.verdicts.blocks) < UNSURE]
-    drop = step.verdicts.cost - best.verdicts.cost
-    members = [c for c in members if c.verdicts.cost - best.verdicts.cost < max(0.1 * drop, 15)]
-    wins = shares_of_wins(np.stack([c.verdicts.blocks for c in contenders]), generator)
+    rivals = _rivals(step, contenders, best)
+    wins = shares_of_wins(np.stack([c.verdicts.blocks for c in [best, *rivals]]), generator)
     return Found(
         best.name,
         best.effect,
         p,
         (step.verdicts.heldout, best.verdicts.heldout),
         (step.verdicts.cost, best.verdicts.cost),
-        t,
+        t_value(step.verdicts.blocks, best.verdicts.blocks),
         float(wins[0]) * (1 - p),
-        tuple(c.name for c in members),
+        tuple(c.name for c in rivals if _member(step, best, c)),
     )
+
+
+def _rivals(step: Step, contenders: list[Contender], one: Contender) -> list[Contender]:
+    """The others that explain the same misfit; a cause of another misfit is no alternative to this one."""
+    others = [c for c in contenders if c is not one]
+    return [c for c in others if overlap(step.verdicts, one.verdicts, c.verdicts) > SAME]
+
+
+def _member(step: Step, best: Contender, other: Contender) -> bool:
+    """Whether the data cannot tell the other from the best: held-out blocks and penalised squares alike."""
+    drop = step.verdicts.cost - best.verdicts.cost
+    close = other.verdicts.cost - best.verdicts.cost < max(0.1 * drop, 15)
+    return close and t_value(other.verdicts.blocks, best.verdicts.blocks) < UNSURE
 
 
 def _passes(step: Step, contenders: list[Contender], one: Contender) -> bool:
@@ -245,10 +265,11 @@ def _passes(step: Step, contenders: list[Contender], one: Contender) -> bool:
     return gain > GAIN and surely and _recurs(step, contenders, one)
 
 
-def _recurs(step: Step, contenders: list[Contender], best: Contender) -> bool:
-    """Whether the cause is among the best three in at least two thirds of the folds, ranked without the fold."""
-    ranks = []
-    for fold, without in enumerate(step.verdicts.without):
-        drops = sorted(contenders, key=lambda c: c.verdicts.without[fold] - without)
-        ranks.append(drops.index(best))
+def _recurs(step: Step, contenders: list[Contender], one: Contender) -> bool:
+    """Whether the cause is among the best three of its rivals in two thirds of the folds, ranked without the fold."""
+    field = [one, *_rivals(step, contenders, one)]
+    ranks = [
+        sum(c.verdicts.without[fold] < one.verdicts.without[fold] for c in field)
+        for fold in range(len(one.verdicts.without))
+    ]
     return float(np.mean(np.array(ranks) < 3)) >= 2 / 3
