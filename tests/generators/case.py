@@ -32,7 +32,6 @@ class Case:
     trust: float
     seed: int
     induced: dict[str, float] = field(default_factory=dict)  # effect: RMS of its torque over the joint's RMS torque
-    posture: dict[str, float] = field(default_factory=dict)  # joints held still
     baseline: dict[str, bool] = field(default_factory=dict)  # what the task declares beside friction
 
     def write(self, folder: Path | str, forbid: Sequence[str] = (), cutoff: float = 15, rate: float = 50) -> Path:
@@ -50,8 +49,6 @@ class Case:
 
     def _task(self, forbid: Sequence[str], cutoff: float, rate: float) -> dict[str, Any]:
         robot: dict[str, Any] = {"model": "robot.urdf", "joints": list(self.joints), "trust": self.trust}
-        if self.posture:
-            robot["posture"] = self.posture
         task: dict[str, Any] = {"robot": robot, "data": [_entry(rec) for rec in self.recordings]}
         task["preprocess"] = {"cutoff": cutoff, "rate": rate}
         if self.baseline:

@@ -74,7 +74,7 @@ def make_closed_loop_case(
     recordings = noisy(runs, rngs[3], noise, "ar20", 1e-5)
     baseline = {"rotor": True} if any(h.effect == "coupled_transmission" for h in hidden) else {}
     trust = 0.02 if trusted else 0.10
-    return Case(robot, made.urdf, made.joints, recordings, truth, trust, seed, {}, made.posture, baseline)
+    return Case(robot, made.urdf, made.joints, recordings, truth, trust, seed, {}, baseline)
 
 
 def _hide_one(

@@ -85,7 +85,7 @@ def make_case(
     truth = tuple(Truth(h.effect, h.at, h.parameters(h.scale)) for h in hidden)
     induced = {h.effect: _size(made, model, fit, time, h) for h in hidden} if noise == 0 else {}
     trust = 0.02 if trusted else 0.10
-    return Case(robot, made.urdf, made.joints, recordings, truth, trust, seed, induced, made.posture)
+    return Case(robot, made.urdf, made.joints, recordings, truth, trust, seed, induced)
 
 
 def observable(truth: Truth) -> set[tuple[str, tuple[str, ...]]]:

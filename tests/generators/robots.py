@@ -41,19 +41,18 @@ class Robot:
     prismatic: np.ndarray
     viscous: np.ndarray
     coulomb: np.ndarray
-    posture: dict[str, float]
 
 
 # file below the data folder, joints held still, viscous (N m s/rad), Coulomb (N m)
 FILES = {
-    "tx40": ("staubli_tx40/tx40.urdf", {}, (8.05, 5.53, 1.97, 1.11, 1.86, 0.65), (7.14, 8.26, 6.34, 2.48, 3.03, 0.6)),
+    "tx40": ("staubli_tx40/tx40.urdf", (), (8.05, 5.53, 1.97, 1.11, 1.86, 0.65), (7.14, 8.26, 6.34, 2.48, 3.03, 0.6)),
     "panda": (
         "panda_gaz2019/panda.urdf",
-        {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0},
+        ("panda_finger_joint1", "panda_finger_joint2"),
         (3.0, 3.5, 2.5, 2.5, 1.2, 1.0, 0.8),
         (4.0, 5.0, 4.0, 4.0, 1.5, 1.5, 1.0),
     ),
-    "ur10e": ("ur10e_innopolis/ur10e.urdf", {}, (12.0, 12.0, 8.0, 2.5, 2.5, 2.0), (12.0, 14.0, 9.0, 2.5, 2.5, 2.0)),
+    "ur10e": ("ur10e_innopolis/ur10e.urdf", (), (12.0, 12.0, 8.0, 2.5, 2.5, 2.0), (12.0, 14.0, 9.0, 2.5, 2.5, 2.0)),
 }
 INLINE = {"small": (SMALL_ARM, (2.5, 2.0, 8.0), (3.0, 3.5, 6.0))}
 
@@ -73,20 +72,17 @@ def load(name: str) -> Robot:
     """The robot called `name`."""
     if name in INLINE:
         text, viscous, coulomb = INLINE[name]
-        posture: dict[str, float] = {}
+        still: tuple[str, ...] = ()
     else:
-        file, posture, viscous, coulomb = FILES[name]
+        file, still, viscous, coulomb = FILES[name]
         text = (data_folder() / file).read_text()
     full = pin.buildModelFromXML(text)
-    locked = [full.getJointId(joint) for joint in posture]
-    neutral = pin.neutral(full)
-    for joint, value in posture.items():
-        neutral[full.joints[full.getJointId(joint)].idx_q] = value
-    model = pin.buildReducedModel(full, locked, neutral) if locked else full
+    locked = [full.getJointId(joint) for joint in still]
+    model = pin.buildReducedModel(full, locked, pin.neutral(full)) if locked else full
     joints = tuple(model.names)[1:]
     prismatic = np.array(["P" in model.joints[i + 1].shortname()[10:] for i in range(model.nv)])
     links = tuple(_moved_link(model, i + 1) for i in range(model.nv))
-    return Robot(name, text, model, joints, links, prismatic, np.array(viscous), np.array(coulomb), posture)
+    return Robot(name, text, model, joints, links, prismatic, np.array(viscous), np.array(coulomb))
 
 
 def _moved_link(model: pin.Model, joint: int) -> str:
