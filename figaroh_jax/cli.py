@@ -41,7 +41,7 @@ def _run(args: argparse.Namespace) -> int:
     from . import answer, terminal
     from .runs import REPORT, diagnose_file
 
-    with resources.as_file(resources.files(__package__) / "demo") as demo:
+    with resources.as_file(resources.files("figaroh_jax") / "demo") as demo:
         task_file = args.task or demo / "task.yaml"
         out = args.out or Path(f"{args.task.stem if args.task else 'demo'}_diagnosis")
         with terminal.Progress(quiet=args.quiet) as progress:
@@ -103,7 +103,7 @@ def _set_up_jax(cache: bool) -> None:
     jax.config.update("jax_enable_x64", True)
     if not cache:
         jax.config.update("jax_enable_compilation_cache", False)
-    elif jax.config.jax_compilation_cache_dir is None:
+    elif jax.config.values.get("jax_compilation_cache_dir") is None:
         home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
         folder = Path(home).expanduser() / "figaroh_jax" / "jax"
         jax.config.update("jax_compilation_cache_dir", str(folder))

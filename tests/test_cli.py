@@ -1,6 +1,6 @@
-"""The command line: commands, exit statuses, what goes to which stream, and run directories written whole or not at all.
+"""The command line: commands, exit statuses, streams, and run directories that are written whole or not at all.
 
-The diagnosis itself is made up here; `test_demo.py` runs the real one.
+The diagnosis itself is made up here; `make demo` runs the real one.
 """
 
 from __future__ import annotations

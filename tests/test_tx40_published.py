@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from jaxtyping import Float
-from scipy import linalg, signal
+from scipy import signal
 from tx40 import OFFSET, POSITION, TORQUE
 
 import figaroh_jax as fj
@@ -79,7 +79,7 @@ def _motion(motor: Float[np.ndarray, "samples 6"]) -> tuple[np.ndarray, np.ndarr
 
 def _low_pass(x: np.ndarray, padding: int = 12) -> np.ndarray:
     """`scipy.signal.filtfilt` with odd padding, from the initial state `STATE`."""
-    b, a = signal.butter(4, 0.01)
+    b, a = np.array(signal.butter(4, 0.01))
     state = np.array([float.fromhex(bits) for bits in STATE])[:, None]
     before, after = 2 * x[:1] - x[padding:0:-1], 2 * x[-1:] - x[-2 : -padding - 2 : -1]
     y = np.concatenate([before, x, after])
@@ -128,12 +128,12 @@ def _system(model: fj.RobotModel, q: np.ndarray, v: np.ndarray, a: np.ndarray, t
 
 def _base(system: System) -> tuple[np.ndarray, list[str]]:
     """Step 10: the leftmost independent columns, and the combination of parameters that each stands for."""
-    R = linalg.qr(system.W, mode="r")[0][: system.W.shape[1]]
+    R = np.asarray(np.linalg.qr(system.W, mode="r"))
     base = np.abs(np.diag(R)) > 1e-8
     ordered = np.concatenate([np.flatnonzero(base), np.flatnonzero(~base)])
-    R = linalg.qr(system.W[:, ordered], mode="r")[0]
+    R = np.asarray(np.linalg.qr(system.W[:, ordered], mode="r"))
     rank = int(base.sum())
-    beta = np.round(linalg.solve_triangular(R[:rank, :rank], R[:rank, rank:]), 6)
+    beta = np.round(np.linalg.solve(R[:rank, :rank], R[:rank, rank:]), 6)
     others = [system.names[k] for k in ordered[rank:]]
     names = []
     for k, row in zip(ordered, beta, strict=False):
