@@ -24,7 +24,7 @@ from .explain import explain
 from .extended import extend
 from .floor import noise_floor
 from .holdout import held_out, traces
-from .layout import describe_folds, layout
+from .layout import describe_folds, held_rows, layout
 from .model import RobotModel
 from .noise import Spectrum
 from .problem import Problem, State, baseline, extended_state, friction_width, plain_rows, solved
@@ -87,9 +87,10 @@ def _diagnose(
     progress: Callable[[str, float], None],
     generator: np.random.Generator,
 ) -> Diagnosis:
-    fit = [s for s in signals if s.role == "fit"]
-    records = stack(fit)
-    problem = Problem(model, records, layout(fit, records), trust, np.zeros(model.nv))
+    signals = sorted(signals, key=lambda s: s.role == "holdout")
+    records = stack(signals)
+    held = held_rows(signals, records)
+    problem = Problem(model, records, layout(signals, records), trust, np.zeros(model.nv), held)
     names, given = _baseline_effects(model, known)
     start = baseline(problem, names, given)
     progress("estimating the noise", 0.08)
@@ -110,7 +111,7 @@ def _diagnose(
         rest = rest._replace(text=f"{rest.text}; best proxy, not a cause: {proxy}"[:160])
         found, causes, last = [], [], first
     progress("measuring the gain", 0.9)
-    gains = held_out(problem, start, causes, whitening, signals)
+    gains = held_out(problem, start, causes, whitening)
     extended = fitted_model(problem, last.state, causes)
     places = fitted.places if causes else ()
     noise = _noise_rms(problem, spectrum)
@@ -132,10 +133,10 @@ def _diagnose(
         after=_rms(problem, last.state),
         noise=noise,
         holdout=Gain(gains[0], gains[-1]),
-        holdout_scheme=_scheme(signals, fit),
+        holdout_scheme=_scheme(signals),
         experiment=_experiment(word, found, model),
         candidates=explain(first.rows, first.linear, screened, noise),
-        traces=traces(problem, signals, fitted_model(problem, first.state, []), extended, causes, found),
+        traces=traces(problem, signals, first.state, last.state, causes, found),
         baseline=fitted_model(problem, first.state, []),
         model=extended,
         rest=rest.text,
@@ -220,10 +221,10 @@ def _noise_rms(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, " nv"]
     return np.sqrt((gain[:, None] * spectrum.power(frequency)).mean(0))
 
 
-def _scheme(signals: Sequence[Signals], fit: Sequence[Signals]) -> str:
+def _scheme(signals: Sequence[Signals]) -> str:
     if any(s.role == "holdout" and s.torque is not None for s in signals):
         return "recordings kept out of the fit"
-    return describe_folds(fit)
+    return describe_folds(signals)
 
 
 def _experiment(word: str, found: list[Found], model: RobotModel) -> Experiment | None:

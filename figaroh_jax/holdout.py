@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .design import kind, torque_change
 from .effect import Effect
-from .extended import ExtendedModel, predict
-from .problem import Problem, State, extended_state, plain_rows
-from .records import Records, filter_rows, stack
+from .estimates import amplitude_places
+from .problem import Problem, State, extended_state, open_rows, plain_rows
 from .results import Trace
 from .search import Found, stand
 from .signals import Signals
@@ -19,58 +19,45 @@ from .signals import Signals
 __all__ = ["held_out", "traces"]
 
 
-def held_out(
-    problem: Problem,
-    start: State,
-    causes: list[Effect],
-    whitening: Float[np.ndarray, "F nv"],
-    signals: Sequence[Signals],
-) -> list[float]:
+def held_out(problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> list[float]:
     """Relative RMS error on data not fitted: of the baseline, then after each cause (filtered torque, all joints).
 
     sqrt(sum e^2 / sum tau^2) over the holdout recordings with torque; without any, over the folds, each predicted by
     a fit to the others.
     """
-    kept = [s for s in signals if s.role == "holdout" and s.torque is not None]
     out, state = [], start
     for effect in [None, *causes]:
         state = state if effect is None else extended_state(problem, state, effect)
         step = stand(problem, state, whitening)
         state = step.state
-        if kept:
-            out.append(_recorded_error(fitted_so_far(problem, state, causes[: len(out)]), kept))
+        if problem.held.any():
+            error = (problem.torque - predicted(problem, state)) * problem.held
+            out.append(float(np.sqrt((error**2).sum() / ((problem.torque * problem.held) ** 2).sum())))
         else:
-            out.append(_fold_error(problem, step.state, step.verdicts.folds))
+            out.append(_fold_error(problem, state, step.verdicts.folds))
     return out
 
 
-def fitted_so_far(problem: Problem, state: State, causes: list[Effect]) -> ExtendedModel:
-    """The extended model of a state."""
-    from .estimates import fitted_model
-
-    return fitted_model(problem, state, causes)
+def predicted(problem: Problem, state: State) -> Float[np.ndarray, "n M nv"]:
+    """Rows of the torque that the state predicts, as the sensors read it, in all recordings (N m or N)."""
+    return open_rows(problem, state.X @ state.theta, state.response(jnp.asarray(problem.records.omega)))
 
 
 def traces(
     problem: Problem,
     signals: Sequence[Signals],
-    before: ExtendedModel,
-    after: ExtendedModel,
+    first: State,
+    last: State,
     causes: list[Effect],
     found: Sequence[Found],
 ) -> tuple[Trace, ...]:
     """Each recording's rows: measured torque, the model's before and after, the share of each cause."""
+    before, after = predicted(problem, first), predicted(problem, last)
+    places = amplitude_places(last, causes, problem.model)
+    shares = [_share(problem, last, e, at) for e, at in zip(causes, places, strict=True)]
     out = []
-    for one in signals:
-        records = stack([one])
-        rows = one.rows.index
-        share = {}
-        full = _predicted(after, one, records)
-        for effect, cause in zip(causes, found, strict=True):
-            others = tuple(e for e in after.effects if not _same(e, effect))
-            without = ExtendedModel(after.robot, others, after.width)
-            share[str(cause.name)] = full - _predicted(without, one, records)
-        measured = None if one.torque is None else _filtered(records, one.torque)
+    for k, one in enumerate(signals):
+        rows, count = one.rows.index, one.rows.kept
         out.append(
             Trace(
                 name=one.name,
@@ -78,36 +65,24 @@ def traces(
                 time=one.time[rows],
                 position=one.position[rows],
                 velocity=one.velocity[rows],
-                measured=measured,
-                before=_predicted(before, one, records),
-                after=full,
-                shares=share,
+                measured=None if one.torque is None else problem.torque[k, :count],
+                before=before[k, :count],
+                after=after[k, :count],
+                shares={str(f.name): share[k, :count] for f, share in zip(found, shares, strict=True)},
             )
         )
     return tuple(out)
 
 
-def _same(one: Effect, other: Effect) -> bool:
-    return type(one) is type(other) and np.array_equal(np.asarray(one.at), np.asarray(other.at))
-
-
-def _predicted(model: ExtendedModel, one: Signals, records: Records) -> Float[np.ndarray, "M nv"]:
-    return _filtered(records, np.asarray(predict(model, one.time, one.position, one.velocity, one.acceleration, one.dt)))
-
-
-def _filtered(records: Records, torque: Float[np.ndarray, "N nv"]) -> Float[np.ndarray, "M nv"]:
-    return np.asarray(filter_rows(records, jnp.asarray(torque)[None]))[0]
-
-
-def _recorded_error(model: ExtendedModel, kept: Sequence[Signals]) -> float:
-    errors, powers = 0.0, 0.0
-    for one in kept:
-        records = stack([one])
-        weight = np.asarray(one.rows.weight)
-        measured = _filtered(records, one.torque)
-        errors += (((measured - _predicted(model, one, records)) * weight) ** 2).sum()
-        powers += ((measured * weight) ** 2).sum()
-    return float(np.sqrt(errors / powers))
+def _share(problem: Problem, state: State, effect: Effect, place: list[int]) -> Float[np.ndarray, "n M nv"]:
+    """Rows of the torque that one cause brings about, the others being as they are."""
+    omega = jnp.asarray(problem.records.omega)
+    response = state.response(omega)
+    if kind(effect) == "response":
+        return open_rows(problem, state.motion.total, response * (1 - 1 / effect.torque_response(omega)))
+    if kind(effect) == "position":
+        return open_rows(problem, np.asarray(torque_change(effect, state.motion, problem.records)), response)
+    return open_rows(problem, state.X[:, :, place] @ state.theta[place], response)
 
 
 def _fold_error(problem: Problem, state: State, folds: Float[np.ndarray, "folds P"]) -> float:

@@ -45,18 +45,19 @@ class Layout(eqx.Module):
 
 @dataclass(frozen=True)
 class Problem:
-    """Recordings to fit and what is believed of the robot before."""
+    """Recordings and what is believed of the robot before; rows that are not fitted have no weight."""
 
     model: RobotModel
     records: Records
     layout: Layout
     trust: float
     width: Float[np.ndarray, " nv"]  # half width of the friction's reversal, rad/s or m/s
+    held: Float[np.ndarray, "n M nv"]  # 1: a row of a holdout recording with torque
 
     @cached_property
     def torque(self) -> Float[np.ndarray, "n M nv"]:
-        """Rows of the measured torque, not whitened, N m or N."""
-        return np.asarray(_rows(self.records, jnp.asarray(self.records.torque), jnp.ones(self.records.shape[3])))
+        """Rows of the measured torque, not whitened, also those that are not fitted, N m or N."""
+        return open_rows(self, self.records.flat(self.records.torque), jnp.ones(len(np.asarray(self.records.omega))))
 
     @cached_property
     def gain(self) -> Float[np.ndarray, " F"]:
@@ -182,6 +183,15 @@ def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"
 def plain_rows(problem: Problem, state: State) -> Rows:
     """Rows as they are, N m or N."""
     return whitened(problem, state, np.ones((len(np.asarray(problem.records.omega)), problem.records.shape[3])))
+
+
+def open_rows(
+    problem: Problem, torque: Float[Array, "nN nv"], response: Complex[Array, " F"]
+) -> Float[np.ndarray, "n M nv"]:
+    """Rows of a torque at all samples, of all recordings and without a mask."""
+    n, samples, _, nv = problem.records.shape
+    factor = jnp.asarray(response)[:, None] + jnp.zeros((1, nv), complex)
+    return np.asarray(_rows(problem.records, jnp.asarray(torque).reshape(n, samples, nv), factor))
 
 
 def filtered_rows(

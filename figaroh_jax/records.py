@@ -33,7 +33,7 @@ class Records(eqx.Module):
     pivot: Int[Array, "n L"]  # sample about which it is reflected, where it is
     reflected: Float[Array, "n L"]  # 1 where it is
     kept: Int[Array, "n M"]  # place of each row in the extended record
-    weight: Float[Array, "n M nv"]  # 1: a row, 0: trimmed, gated, in a gap or padding
+    weight: Float[Array, "n M nv"]  # 1: a row of the fit, 0: gated, in a gap, padding or of a holdout recording
     low_pass: Float[Array, " F"]  # response of the row filter
     omega: Float[Array, " F"]  # rad/s
     dt: Float[Array, ""] | float  # s, of the samples
@@ -102,7 +102,7 @@ def stack(signals: Sequence[Signals]) -> Records:
         pivot=np.stack([e[1] for e in extended]),
         reflected=np.stack([e[2] for e in extended]),
         kept=_padded([s.rows.index + reach for s in signals], count),
-        weight=_padded([s.rows.weight for s in signals], count, hold=False),
+        weight=_padded([s.rows.weight * (s.role == "fit") for s in signals], count, hold=False),
         low_pass=butterworth_power(omega, first.cutoff, first.dt),
         omega=omega,
         dt=first.dt,
