@@ -56,9 +56,8 @@ def normal_matrix(
         groups = _groups(model, columns)
         start = tuple(jnp.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
         parts = _fold(_add_products, chunk_size(), start, model, rows)
-        whole = jnp.zeros((columns, columns))
-        for group, part in zip(groups, parts, strict=True):
-            whole = whole.at[group.columns[:, :, None], group.columns[:, None, :]].add(part)
+        index = np.concatenate([_flat(group, columns).ravel() for group in groups])
+        whole = _scattered(columns, index, parts)
         new = NormalMatrix(whole[:-1, :-1], whole[:-1, -1], whole[-1, -1])
         return new if total is None else NormalMatrix(*(x + y for x, y in zip(total, new, strict=True)))
 
@@ -83,8 +82,12 @@ def triangular_factor(
         rows = _rows(model, q, v, a, tau, weight, extra)
         columns = 10 * len(model.joints) + sum(np.shape(x)[-1] for x in (extra,) if x is not None) + (tau is not None)
         start = jnp.zeros((columns, columns)) if total is None else jnp.asarray(total, jnp.float64)
-        factor = _fold(_add_rows, 2 * chunk_size(), start, model, rows)
-        return factor * jnp.where(jnp.diagonal(factor) < 0.0, -1.0, 1.0)[:, None]
+        return _upright(_fold(_add_rows, 2 * chunk_size(), start, model, rows))
+
+
+@jax.jit
+def _upright(factor: Float[Array, "columns columns"]) -> Float[Array, "columns columns"]:
+    return factor * jnp.where(jnp.diagonal(factor) < 0.0, -1.0, 1.0)[:, None]
 
 
 class _Rows(NamedTuple):
@@ -167,6 +170,17 @@ def _groups(model: RobotModel, columns: int) -> list[_Group]:
         )
         groups.append(_Group(which, index, np.concatenate([own, shared], axis=1)))
     return groups
+
+
+def _flat(group: _Group, columns: int) -> np.ndarray:
+    """Places of the group's products in the flattened normal matrix."""
+    return columns * group.columns[:, :, None] + group.columns[:, None, :]
+
+
+@partial(jax.jit, static_argnums=0)
+def _scattered(columns: int, index: Array, parts: tuple[Array, ...]) -> Float[Array, "columns columns"]:
+    values = jnp.concatenate([part.reshape(-1) for part in parts])
+    return jnp.zeros(columns * columns).at[index].add(values).reshape(columns, columns)
 
 
 def _add_products(model: RobotModel, totals: tuple[Array, ...], rows: _Rows) -> tuple[Array, ...]:
