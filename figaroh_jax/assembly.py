@@ -67,9 +67,19 @@ def assemble(
         locked = _locked(drives, [j.name for j in parts[1] if j.kind == "fixed"], joints, posture or {})
         build = _Build(dict(parts[0]), children, drives, locked)
         build.grow(root)
-        return build.finish(name, joints, np.asarray(gravity, float))
+        return build.finish(name, joints, _gravity(gravity))
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
+
+
+def _gravity(gravity: Sequence[float]) -> Float[np.ndarray, "3"]:
+    try:
+        vector = np.asarray(gravity, float)
+    except (TypeError, ValueError):
+        vector = np.full(1, np.nan)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise InputError(f"gravity is {gravity}; three finite numbers in m/s^2 are expected, such as (0, 0, -9.81)")
+    return vector
 
 
 def _tree(links: Sequence[LinkPart], joints: Sequence[JointPart]) -> tuple[str, dict[str, list[JointPart]]]:

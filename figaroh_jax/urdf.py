@@ -27,7 +27,11 @@ _KINDS: dict[str, Literal["revolute", "prismatic", "fixed"]] = {
     "fixed": "fixed",
 }
 _UNSUPPORTED = ("floating", "planar")
-_UNREAD = ("material", "transmission", "gazebo")  # of the robot; of a link: visual, collision
+_UNREAD = {  # by the element that holds them
+    ".": ("material", "transmission", "gazebo"),
+    "link": ("visual", "collision"),
+    "joint": ("dynamics", "calibration", "safety_controller"),
+}
 _NUMBERS = {  # element: attributes, how many numbers each holds, which must be there
     "origin": {"xyz": 3, "rpy": 3},
     "axis": {"xyz": 3},
@@ -70,7 +74,7 @@ def _read(path: str | Path) -> Any:
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
     root = read_xml(path, "robot")
-    for part in [*root.iterchildren(*_UNREAD), *root.iterfind("link/visual"), *root.iterfind("link/collision")]:
+    for part in [part for holder, tags in _UNREAD.items() for tag in tags for part in root.findall(f"{holder}/{tag}")]:
         part.getparent().remove(part)
     try:
         for part in root.iterchildren("link", "joint"):
@@ -104,7 +108,8 @@ def _check_joint(part: Any, where: str) -> None:
     if kind in _UNSUPPORTED:
         raise InputError(f"{where}: type '{kind}' is not supported yet; supported: {', '.join(_KINDS)}")
     if kind not in _KINDS:
-        raise InputError(f"{where}: unknown type '{kind}'{nearest(str(kind), _KINDS)}")
+        wrong = "has no type" if kind is None else f"unknown type '{kind}'"
+        raise InputError(f"{where}: {wrong}{nearest(kind or '', _KINDS)}")
     for end in ("parent", "child"):
         element = part.find(end)
         if element is None or not element.get("link"):

@@ -135,6 +135,7 @@ BAD = {
     "two links of a name": (robot(*LINKS3, link("a"), *TWO), "two links are called 'a'"),
     "two joints of a name": (robot(*LINKS3, TWO[0], joint("j0", "a", "b")), "two joints are called 'j0'"),
     "no name": (robots.ARM.replace('name="slide"', ""), "a <joint> in line 1 has no name"),
+    "no type": (robots.ARM.replace('type="prismatic"', ""), "'slide': has no type; known: revolute"),
     "floating": (robots.ARM.replace("prismatic", "floating"), "'slide': type 'floating' is not supported yet"),
     "unknown type": (robots.ARM.replace("prismatic", "prismatc"), "'slide': unknown type 'prismatc'; did you mean 'pr"),
     "limits reversed": (
@@ -178,6 +179,8 @@ OPTIONS = {
     "no joints": ({"joints": []}, "no joint moves"),
     "unknown posture": ({"posture": {"hop": 0.0}}, "posture: there is no joint 'hop'"),
     "posture of a moving joint": ({"joints": ["hip"], "posture": {"hip": 0.0}}, "'hip' is one of the moving joints"),
+    "gravity of two numbers": ({"gravity": (0.0, -9.81)}, r"gravity is \(0.0, -9.81\); three finite numbers"),
+    "gravity NaN": ({"gravity": (0.0, 0.0, float("nan"))}, "three finite numbers"),
     "posture NaN": ({"posture": {"hip": float("nan")}}, "posture: joint 'hip' is at nan"),
 }
 
