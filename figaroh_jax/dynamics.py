@@ -114,8 +114,8 @@ def forward_dynamics(
 ) -> Float[Array, "*batch nv"]:
     """Accelerations (rad/s^2, m/s^2) that the torques `tau` (N m, N) give the rigid body; inverse of inverse_dynamics.
 
-    Cholesky solve with the mass matrix, in float64. The answer is NaN where that matrix is not positive definite: a
-    joint that moves no mass. Raises `InputError` where the shapes do not fit the model.
+    Cholesky solve with the mass matrix, in float64. Where a joint moves no mass that matrix is singular and the answer
+    is NaN or huge: give the link an inertia (or the joint a rotor). Raises `InputError` where the shapes do not fit.
     """
     with jax.enable_x64(True):
         return _forward_dynamics(model, *states(model, q=q, v=v, tau=tau))
