@@ -14,31 +14,31 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Shaped
 
+from .model import Leaf
 from .signals import Signals
 
 __all__ = ["Records", "filter_rows", "stack"]
 
 REACH = 12.0  # impulse response of the row filter that is kept beyond each end, in 1/cutoff
+END = 2.0  # part of a record at each end that is not used, in 1/cutoff
 
 
 class Records(eqx.Module):
     """`n` recordings of at most `N` samples at one period, and of at most `M` rows; short ones are padded."""
 
-    time: Float[Array, "n N"]  # s
-    position: Float[Array, "n N nv"]  # rad or m, low-passed
-    velocity: Float[Array, "n N nv"]
-    acceleration: Float[Array, "n N nv"]
-    torque: Float[Array, "n N nv"]  # N m or N, as measured
-    source: Int[Array, "n L"]  # sample that stands at each place of the extended record
-    pivot: Int[Array, "n L"]  # sample about which it is reflected, where it is
-    reflected: Float[Array, "n L"]  # 1 where it is
-    kept: Int[Array, "n M"]  # place of each row in the extended record
-    weight: Float[Array, "n M nv"]  # 1: a row of the fit, 0: gated, in a gap, padding or of a holdout recording
-    low_pass: Float[Array, " F"]  # response of the row filter
-    omega: Float[Array, " F"]  # rad/s
-    dt: Float[Array, ""] | float  # s, of the samples
-    rate: Float[Array, ""] | float  # Hz, of the rows
-    cutoff: Float[Array, ""] | float  # Hz
+    time: Float[Leaf, "n N"]  # s
+    position: Float[Leaf, "n N nv"]  # rad or m, low-passed
+    velocity: Float[Leaf, "n N nv"]
+    acceleration: Float[Leaf, "n N nv"]
+    torque: Float[Leaf, "n N nv"]  # N m or N, as measured
+    source: Int[Leaf, "n L"]  # sample that stands at each place of the extended record
+    kept: Int[Leaf, "n M"]  # place of each row in the extended record
+    weight: Float[Leaf, "n M nv"]  # 1: a row of the fit; 0: gated, gap, padding, holdout
+    low_pass: Float[Leaf, " F"]  # response of the row filter
+    omega: Float[Leaf, " F"]  # rad/s
+    dt: Float[Leaf, ""] | float  # s, of the samples
+    rate: Float[Leaf, ""] | float  # Hz, of the rows
+    cutoff: Float[Leaf, ""] | float  # Hz
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
@@ -46,7 +46,7 @@ class Records(eqx.Module):
         n, samples, nv = self.position.shape
         return n, samples, self.kept.shape[1], nv
 
-    def flat(self, signal: Shaped[Array, "n N *rest"]) -> Shaped[Array, "nN *rest"]:
+    def flat(self, signal: Shaped[Leaf, "n N *rest"]) -> Shaped[Leaf, "nN *rest"]:
         """The samples of all recordings on one axis."""
         return signal.reshape(-1, *signal.shape[2:])
 
@@ -67,11 +67,8 @@ def filter_rows(
     n, _, *rest = columns.shape
     flat = columns.reshape(n, columns.shape[1], -1)
 
-    def extend(x: Float[Array, "N k"], source: Array, pivot: Array, reflected: Array) -> Float[Array, "L k"]:
-        return x[source] * (1 - 2 * reflected[:, None]) + 2 * x[pivot] * reflected[:, None]
-
-    extended = jax.vmap(extend)(flat, records.source, records.pivot, records.reflected)
-    factor: Shaped[Array, " F k"] = records.low_pass[:, None]
+    extended = jax.vmap(lambda x, source: x[source])(flat, records.source)
+    factor: Shaped[Array, " F k"] = jnp.asarray(records.low_pass)[:, None]
     if response is not None:
         series = response.reshape(*response.shape, *[1] * (1 + len(rest) - response.ndim))
         factor = factor * jnp.broadcast_to(series, (response.shape[0], *rest)).reshape(response.shape[0], -1)
@@ -89,8 +86,8 @@ def stack(signals: Sequence[Signals]) -> Records:
     reach = int(np.ceil(max(REACH / first.cutoff, 0.5) / first.dt))
     samples = max(s.time.size for s in signals)
     count = max(s.rows.kept for s in signals)
-    length = next_fast_len(samples + 2 * reach, real=True)
-    extended = [_extension(s.time.size, reach, length) for s in signals]
+    length = int(next_fast_len(samples + 2 * reach, real=True))  # pyright: ignore
+    extended = [_extension(s.time.size, reach, length, _inset(s)) for s in signals]
     omega = 2 * np.pi * np.fft.rfftfreq(length, first.dt)
     return Records(
         time=_padded([s.time for s in signals], samples),
@@ -98,9 +95,7 @@ def stack(signals: Sequence[Signals]) -> Records:
         velocity=_padded([s.velocity for s in signals], samples, hold=False),
         acceleration=_padded([s.acceleration for s in signals], samples, hold=False),
         torque=_padded([np.zeros_like(s.position) if s.torque is None else s.torque for s in signals], samples),
-        source=np.stack([e[0] for e in extended]),
-        pivot=np.stack([e[1] for e in extended]),
-        reflected=np.stack([e[2] for e in extended]),
+        source=np.stack(extended),
         kept=_padded([s.rows.index + reach for s in signals], count),
         weight=_padded([s.rows.weight * (s.role == "fit") for s in signals], count, hold=False),
         low_pass=butterworth_power(omega, first.cutoff, first.dt),
@@ -117,17 +112,27 @@ def butterworth_power(omega: Float[np.ndarray, " F"], cutoff: float, dt: float) 
     return 1 / (1 + ratio**8)
 
 
-def _extension(
-    samples: int, reach: int, length: int
-) -> tuple[Int[np.ndarray, " L"], Int[np.ndarray, " L"], Float[np.ndarray, " L"]]:
-    """Odd reflection of `reach` samples at both ends; what is left of `length` holds the two outermost values."""
+def _extension(samples: int, reach: int, length: int, inset: int) -> Int[np.ndarray, " L"]:
+    """Samples mirrored about those `inset` from both ends; what is left of `length` holds the outermost values.
+
+    An odd reflection would add twice the noise of the sample that it turns about.
+    """
     place = np.arange(length) - reach
     end = samples - 1
-    past = np.clip(place, -min(reach, end), end + min(reach, end))
-    past = np.where(place > end + (length - samples - reach) // 2 + reach // 2, -min(reach, end), past)
-    before, after = past < 0, past > end
-    source = np.where(before, -past, np.where(after, 2 * end - past, past))
-    return source, np.where(after, end, 0), (before | after).astype(float)
+    first, last = inset, end - inset
+    far = min(reach + inset, last - first)
+    past = np.clip(place, first - far, last + far)
+    past = np.where(place > end + (length - samples - reach) // 2 + reach // 2, first - far, past)
+    return np.where(past < first, 2 * first - past, np.where(past > last, 2 * last - past, past))
+
+
+def _inset(one: Signals) -> int:
+    """Samples at each end that no row may see: derivatives of the low-passed position are wrong there.
+
+    They repeat with the motion, and a whitening filter would carry them far into the record.
+    """
+    kept = one.rows.index
+    return max(0, min(int(np.ceil(END / (one.cutoff * one.dt))), int(kept[0]), one.time.size - 1 - int(kept[-1])))
 
 
 def _padded(arrays: Sequence[np.ndarray], length: int, hold: bool = True) -> np.ndarray:
