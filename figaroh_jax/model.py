@@ -9,7 +9,7 @@ numpy float64 until a computation takes them, so a model loaded without 64-bit J
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -17,7 +17,13 @@ from jaxtyping import Array, Float
 
 from .errors import InputError, nearest
 
-__all__ = ["Frame", "Joint", "RobotModel"]
+__all__ = ["Frame", "Joint", "Leaf", "RobotModel"]
+
+# A leaf is NumPy's until a computation takes it, then JAX's; a type checker cannot know which of the two it meets.
+if TYPE_CHECKING:
+    Leaf = Any
+else:
+    Leaf = Array | np.ndarray
 
 
 class Joint(NamedTuple):
@@ -44,16 +50,16 @@ class RobotModel(eqx.Module):
     A tree joint's position is `ratio * q[coordinate] + offset`; ratio is 1 and offset 0 except for mimic joints.
     """
 
-    placement: Float[Array | np.ndarray, "nj 4 4"]  # pose of each joint in its parent's joint frame, at zero
-    axis: Float[Array | np.ndarray, "nj 3"]  # unit axis in the joint frame
-    inertia: Float[Array | np.ndarray, "nj 10"]  # of the link that the joint moves, at and in the joint frame
-    ratio: Float[Array | np.ndarray, " nj"]
-    offset: Float[Array | np.ndarray, " nj"]
-    gravity: Float[Array | np.ndarray, "3"]  # m/s^2, in the world
-    frame_placement: Float[Array | np.ndarray, "nf 4 4"]  # pose of each frame in its parent's joint frame
-    position_limit: Float[Array | np.ndarray, "nv 2"]  # lower, upper; infinite where the model gives none
-    velocity_limit: Float[Array | np.ndarray, " nv"]
-    effort_limit: Float[Array | np.ndarray, " nv"]
+    placement: Float[Leaf, "nj 4 4"]  # pose of each joint in its parent's joint frame, at zero
+    axis: Float[Leaf, "nj 3"]  # unit axis in the joint frame
+    inertia: Float[Leaf, "nj 10"]  # of the link that the joint moves, at and in the joint frame
+    ratio: Float[Leaf, " nj"]
+    offset: Float[Leaf, " nj"]
+    gravity: Float[Leaf, "3"]  # m/s^2, in the world
+    frame_placement: Float[Leaf, "nf 4 4"]  # pose of each frame in its parent's joint frame
+    position_limit: Float[Leaf, "nv 2"]  # lower, upper; infinite where the model gives none
+    velocity_limit: Float[Leaf, " nv"]
+    effort_limit: Float[Leaf, " nv"]
     joints: tuple[Joint, ...] = eqx.field(static=True)
     frames: tuple[Frame, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True)
