@@ -29,11 +29,12 @@ from jaxtyping import Array, Complex, Float, Int
 
 from .dynamics import inverse_dynamics
 from .errors import InputError
-from .model import RobotModel
+from .model import Leaf, RobotModel
 
 __all__ = ["Effect", "Motion", "Native", "Parameter", "amplitude", "joint_unit", "place", "shape", "smooth_sign"]
 
-Scalar = Float[Array, ""] | Float[np.ndarray, ""] | float
+# a number; with leading axes where one object holds an effect at many places
+Scalar = Float[Leaf, "..."] | float
 
 
 class Parameter(NamedTuple):
@@ -61,14 +62,14 @@ class Motion(eqx.Module):
     """Motion of the robot at `samples` instants, and what the current model makes of it."""
 
     model: RobotModel
-    time: Float[Array, " samples"]  # s
-    position: Float[Array, "samples nv"]  # rad or m
-    velocity: Float[Array, "samples nv"]
-    acceleration: Float[Array, "samples nv"]
-    load: Float[Array, "samples nv"]  # torque of the rigid body, N m or N
-    total: Float[Array, "samples nv"]  # torque of the whole current model, friction included
-    dt: Float[Array, ""] | float  # sampling period, s; 0 for instants that are not a record
-    width: Float[Array, " nv"]  # half width of a reversal of the joints' dry friction, rad/s or m/s
+    time: Float[Leaf, " samples"]  # s
+    position: Float[Leaf, "samples nv"]  # rad or m
+    velocity: Float[Leaf, "samples nv"]
+    acceleration: Float[Leaf, "samples nv"]
+    load: Float[Leaf, "samples nv"]  # torque of the rigid body, N m or N
+    total: Float[Leaf, "samples nv"]  # torque of the whole current model, friction included
+    dt: Float[Leaf, ""] | float  # sampling period, s; 0 for instants that are not a record
+    width: Float[Leaf, " nv"]  # half width of a reversal of the joints' dry friction, rad/s or m/s
 
     @property
     def direction(self) -> Float[Array, "samples nv"]:
@@ -109,12 +110,13 @@ class Effect(eqx.Module):
     `at` holds the indices of the place: one coordinate (`joint`), two (`pair`), a tree link (`link`), none (`robot`).
     """
 
-    at: Int[Array, " places"] | Int[np.ndarray, " places"]
+    at: Int[Leaf, "*many places"]
 
     name: ClassVar[str]
     title: ClassVar[str]  # in plain words, for people
     equation: ClassVar[str]  # as text
     acts_on: ClassVar[Literal["joint", "pair", "link", "robot"]]
+    contains: ClassVar[tuple[str, ...]] = ()  # simpler effects that it can imitate exactly: they are preferred
     separated_by: ClassVar[str] = ""  # the experiment that tells it from what looks alike; {at} stands for the place
 
     def torque(self, motion: Motion) -> Float[Array, "samples *rows"]:

@@ -71,7 +71,7 @@ def joint_fit(
     step = inverse @ (tall.T @ residual.reshape(-1) + pull)
     blocks = rows.block.max() + 1
     member = (rows.block[:, None] == np.arange(blocks)).astype(float)
-    scores = sum(member.T @ (x * r[:, None]) for x, r in zip(J, residual, strict=True))
+    scores = np.sum([member.T @ (x * r[:, None]) for x, r in zip(J, residual, strict=True)], axis=0)
     covariance = inverse @ (scores.T @ scores * blocks / max(blocks - 1, 1) + np.diag(precision)) @ inverse
     values = [float(getattr(e, n)) for e in causes for n in shapes(type(e))]
     places, first = [], rows.X.shape[2]

@@ -93,7 +93,8 @@ def predict(
         motion = states(extended.robot, position=position, velocity=velocity, acceleration=acceleration)
         if motion[0].ndim != 2 or motion[0].shape[0] < 5:
             raise InputError(f"a record of 5 samples or more is needed, got the shape {motion[0].shape}")
-        return _predict(extended, jnp.asarray(time, jnp.float64), *motion, jnp.float64(dt))
+        q, v, a = motion
+        return _predict(extended, jnp.asarray(time, jnp.float64), q, v, a, jnp.float64(dt))
 
 
 def _predict(extended: ExtendedModel, time: Array, q: Array, v: Array, a: Array, dt: Array) -> Array:

@@ -30,7 +30,7 @@ def noise_floor(
     right. Else from the residual of a rich model, white where the data are short.
     """
     rows = plain_rows(problem, state)
-    count = max(1, rows.count // len(rows.y))
+    count = max(1, rows.size // len(rows.y))
     rough = rows.y - rows.X @ _weighted(rows, state.prior, np.sqrt((rows.y**2).mean(1)))
     scale = np.sqrt((rough**2).sum(1) / count)
     if not problem.layout.repeats:
@@ -41,7 +41,7 @@ def noise_floor(
         state = solved(problem, state, fit(whitened(problem, state, response), state.prior).theta)
         spectrum = _from_repeats(problem, rows, state)
         response = _whitening(problem, spectrum)
-    return spectrum, response
+    return spectrum, response  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
 
 
 def _weighted(rows: Rows, prior: Prior, scale: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " P"]:

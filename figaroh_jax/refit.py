@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from .design import effect_rows, kind
 from .effect import Effect, Motion
+from .model import Leaf
 from .records import Records
 
 __all__ = ["Whitened", "bounded_minimum", "profile", "refit"]
@@ -28,9 +29,9 @@ RIDGE = 1e-9
 class Whitened(eqx.Module):
     """Residual and regressor of the current model as whitened rows, `A^-1`, and the whitening response."""
 
-    residual: Float[Array, "nv n M"]
-    X: Float[Array, "nv n M P"]
-    inverse: Float[Array, "P P"]
+    residual: Float[Leaf, "nv n M"]
+    X: Float[Leaf, "nv n M P"]
+    inverse: Float[Leaf, "P P"]
     whitening: Any  # (F, nv), complex where the torque sensor has a response
 
 
@@ -75,7 +76,7 @@ def profile(
 
 @eqx.filter_jit
 def _profiles(
-    effects: Effect, values: Float[Array, "starts p"], motion: Motion, records: Records, whitened: Whitened
+    effects: Effect, values: Float[Leaf, "starts p"], motion: Motion, records: Records, whitened: Whitened
 ) -> tuple[Float[Array, " starts"], Float[Array, "starts p"], Float[Array, "starts k rows n M"]]:
     """Profile, gradient and columns of several starts, each its own effect with its own shape."""
     names = shapes(type(effects))

@@ -52,7 +52,7 @@ class Screen(NamedTuple):
         out = []
         for index, result in enumerate(self.scores):
             point = int(np.argmax(result.Q))
-            penalty = result.rank[point] * np.log(rows.count) + 2 * np.log(len(result.Q))
+            penalty = result.rank[point] * np.log(rows.size) + 2 * np.log(len(result.Q))
             out.append((float(result.Q[point] - penalty), index, point))
         return sorted(out, reverse=True)
 
