@@ -8,9 +8,9 @@ another, until nothing is gained. What is left decides between `named`, `named+r
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -19,17 +19,17 @@ from .dataset import Recording, read_recordings
 from .effect import Effect, place
 from .effects import find
 from .errors import InputError
-from .estimates import amplitude_places, estimates, fitted_model, joint_fit, moved, prismatic, with_amplitudes
+from .estimates import Fitted, estimates, fitted_model, joint_fit, moved, prismatic, with_amplitudes
 from .explain import explain
-from .extended import extend
+from .flexible import flexible_p, friction_width
 from .floor import noise_floor
 from .holdout import held_out, traces
 from .layout import describe_folds, held_rows, layout
 from .model import RobotModel
 from .noise import Spectrum
-from .problem import Problem, State, baseline, extended_state, friction_width, plain_rows, solved
+from .problem import Problem, State, baseline, extended_state, plain_rows, solved
 from .records import stack
-from .rest import Rest, excess, flexible_p, lines, rest_of, verdict
+from .rest import Rest, excess, lines, rest_of, verdict
 from .results import Cause, Diagnosis, Experiment, Gain, Name
 from .search import Found, Step, eliminate, find_causes, stand
 from .signals import Signals, prepare_all
@@ -125,7 +125,7 @@ def _diagnose(
                 gain=Gain(*pair),
                 ambiguous_with=one.ambiguous,
             )
-            for one, effect, at, pair in zip(found, causes, places, zip(gains[:-1], gains[1:]), strict=True)
+            for one, effect, at, pair in zip(found, causes, places, pairwise(gains), strict=True)
         ),
         p_value=p,
         joints=model.joint_names,
@@ -166,7 +166,7 @@ def _baseline_effects(model: RobotModel, known: Baseline | None) -> tuple[list[s
 
 def _polished(
     problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]
-) -> tuple[Step, list[Effect], object]:
+) -> tuple[Step, list[Effect], Fitted]:
     """All causes fitted together: a few Gauss-Newton steps over coefficients and shapes."""
     for turn in range(POLISH + 1):
         state = start
@@ -177,7 +177,7 @@ def _polished(
         fitted = joint_fit(problem, step.state, step.rows, causes, whitening)
         if turn < POLISH:
             causes = [moved(e, fitted, at) for e, at in zip(causes, fitted.places, strict=True)]
-    return step, causes, fitted
+    return step, causes, fitted  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
 
 
 def _grown(state: State, effect: Effect) -> Float[np.ndarray, " P"]:

@@ -240,6 +240,7 @@ class JointSpring(JointEffect):
     """A spring across the joint: a balancer, a cable, a hose."""
 
     name, title = "joint_spring", "spring at the joint"
+    contains = ("torque_offset",)
     equation = "stiffness (q - rest)"
     separated_by = "motion of {at} over a larger range, or with the base turned"
     stiffness: Scalar = amplitude("N m/rad")
@@ -310,6 +311,7 @@ class LinkInertia(LinkEffect):
     """A link whose inertia is not what the model says, further than it is trusted."""
 
     name, title = "link_inertia", "inertia of a link"
+    contains = ("payload",)
     equation = "W_k dpi_k, dpi_k free"
     separated_by = "the same motion with {at} disconnected or weighed"
 

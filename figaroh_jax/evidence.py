@@ -40,7 +40,7 @@ class Rows(NamedTuple):
     fold: Int[np.ndarray, " T"]
 
     @property
-    def count(self) -> int:
+    def size(self) -> int:
         """Number of rows with weight."""
         return int(np.count_nonzero(self.y))
 
@@ -126,6 +126,11 @@ def fit(rows: Rows, prior: Prior) -> Linear:
     moment = Xi.T @ Xi + np.diag(prior.precision)
     residual = rows.y - rows.X @ theta
     return Linear(theta, inverse, residual, moment, prior.precision * (theta - prior.mean))
+
+
+def with_columns(rows: Rows, more: Float[np.ndarray, "nv T k"]) -> Rows:
+    """Rows whose model has more columns, which are their own instruments."""
+    return rows._replace(X=np.concatenate([rows.X, more], axis=2), Xi=np.concatenate([rows.Xi, more], axis=2))
 
 
 def bank(rows: Rows, candidates: list[Columns]) -> Bank:

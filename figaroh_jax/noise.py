@@ -91,7 +91,9 @@ def whitening(
     has emptied is not blown up.
     """
     if not spectrum.covariance.any():
-        return np.broadcast_to(1 / np.sqrt(spectrum.power(frequency[:1])), (len(frequency), spectrum.coefficients.shape[1]))
+        return np.broadcast_to(
+            1 / np.sqrt(spectrum.power(frequency[:1])), (len(frequency), spectrum.coefficients.shape[1])
+        )
     filtered = gain[:, None] * spectrum.power(frequency)
     band = (frequency >= min(1.0, cutoff / 4)) & (frequency <= 0.8 * cutoff)
     floor = FLOOR * np.median(filtered[band], axis=0)

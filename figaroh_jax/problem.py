@@ -19,18 +19,16 @@ from jaxtyping import Array, Complex, Float, Int
 from .design import joint_columns, kind, shifted
 from .dynamics import inverse_dynamics
 from .effect import Effect, Motion
-from .effects import find
+from .effects import Payload, find
 from .evidence import Prior, Rows, instruments
-from .inertia import to_com
+from .inertia import from_pseudo_inertia, to_com
 from .model import RobotModel
 from .records import Records, filter_rows
 from .regressor import joint_torque_regressor
 
-__all__ = ["Layout", "Problem", "State", "baseline", "extended_state", "friction_width", "plain_rows", "whitened"]
+__all__ = ["Layout", "Problem", "State", "baseline", "extended_state", "plain_rows", "whitened"]
 
 FRICTION_PRECISION = 1e-6
-WIDTHS = (0.0, 0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # rad/s or m/s
-WIDTH_GAIN = 10.0
 
 
 class Layout(eqx.Module):
@@ -100,9 +98,7 @@ def baseline(problem: Problem, names: Sequence[str], given: Sequence[Effect] = (
     return state
 
 
-def rigid_prior(
-    model: RobotModel, trust: float
-) -> tuple[Float[np.ndarray, " 10nj"], Float[np.ndarray, " 10nj"]]:
+def rigid_prior(model: RobotModel, trust: float) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
     """Nominal inertial parameters and their precision: one sigma is `trust` times m, m L (three times), J (six times).
 
     L = max(0.05 m, |c|) and J = tr(I)/3 + 0.3 m L^2 give each link its own scale; a massless link gets that of one
@@ -118,6 +114,35 @@ def rigid_prior(
     return nominal.reshape(-1), 1 / (trust * scale.reshape(-1)) ** 2
 
 
+def physical_body(free: Float[np.ndarray, "10"], information: Float[np.ndarray, "10 10"]) -> Float[np.ndarray, "10"]:
+    """The ten parameters nearest to `free` (in the metric `information`) that a body of positive mass can have.
+
+    The pseudo-inertia is L L' with L lower triangular (Wensing, Kim, Slotine 2018), L fitted by least squares.
+    """
+    from scipy.optimize import least_squares  # slow to import
+
+    values, vectors = np.linalg.eigh((information + information.T) / 2)
+    root = np.sqrt(np.maximum(values, 0))[:, None] * vectors.T
+
+    def body(x: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
+        lower = np.zeros((4, 4))
+        lower[np.tril_indices(4)] = x
+        return from_pseudo_inertia(lower @ lower.T)
+
+    mass = max(float(free[0]), 0.05)
+    start = np.linalg.cholesky(mass * np.diag([0.002, 0.002, 0.002, 1.0]))
+    fitted = least_squares(lambda x: root @ (body(x) - free), start[np.tril_indices(4)], x_scale=0.1, max_nfev=200)
+    return body(fitted.x)
+
+
+def body_precision(ten: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
+    """Prior precision of a fitted body about itself: half of its own scale, no arm shorter than 5 cm."""
+    mass, com, _ = (np.asarray(part) for part in to_com(ten))
+    length = max(0.05, float(np.linalg.norm(com)))
+    scale = float(mass) * np.array([1.0, *[length] * 3, *[length**2] * 6])
+    return 1 / (0.5 * np.maximum(scale, 1e-6)) ** 2
+
+
 def batched(effect: Effect) -> Effect:
     """The effect with a leading axis of one place."""
     return jax.tree.map(lambda x: np.asarray(x)[None], effect)
@@ -127,10 +152,11 @@ def with_term(problem: Problem, state: State, term: Effect) -> State:
     """The state with one more effect (leading axis of places) whose torque is linear in its amplitudes."""
     own = np.asarray(_term_columns(term, state.motion))
     count = own.shape[-1]
-    prior = Prior(
-        np.append(state.prior.mean, np.zeros(count)),
-        np.append(state.prior.precision, np.full(count, FRICTION_PRECISION)),
-    )
+    mean, precision = np.zeros(count), np.full(count, FRICTION_PRECISION)
+    if isinstance(term, Payload):
+        mean = np.array([float(getattr(term, name)[0]) for name in term.parameters()])
+        precision = body_precision(mean)
+    prior = Prior(np.append(state.prior.mean, mean), np.append(state.prior.precision, precision))
     X = np.concatenate([state.X, own], axis=2)
     theta = np.append(state.theta, np.zeros(count))
     return replace(state, terms=(*state.terms, term), X=X, prior=prior, theta=theta)
@@ -230,66 +256,5 @@ def _term_columns(term: Effect, motion: Motion) -> Float[Array, "nN nv columns"]
     return jnp.moveaxis(columns, 0, 2).reshape(*columns.shape[1:3], -1)
 
 
-def _rigid(problem: Problem, motion: Motion) -> Float[np.ndarray, "nN nv 10nj"]:
+def _rigid(problem: Problem, motion: Motion) -> Float[np.ndarray, "nN nv P"]:
     return np.asarray(joint_torque_regressor(problem.model, motion.position, motion.velocity, motion.acceleration))
-
-
-def friction_width(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> Problem:
-    """The problem with the half width of each joint's dry friction that fits best, from `WIDTHS`.
-
-    A simulator smooths Coulomb friction, a real gear rounds it: taken as a hard sign, the rest would be named Stribeck.
-    A joint keeps a width of zero unless another lowers the squares by more than `WIDTH_GAIN`.
-    """
-    rows = whitened(problem, state, whitening)
-    X, y = rows.X.reshape(-1, rows.X.shape[-1]), rows.y.reshape(-1)
-    G, b = X.T @ X + np.diag(state.prior.precision), X.T @ y + state.prior.precision * state.prior.mean
-    width = np.array(problem.width)
-    for joint in range(problem.model.nv):
-        column = _coulomb_column(problem, state, joint)
-        if column is None:
-            continue
-        tried = [_with_width(problem, state, rows, whitening, joint, w) for w in WIDTHS]
-        costs = [_replaced(G, b, column, z @ rows.X[joint], z @ z, z @ rows.y[joint])[0] for z in tried]
-        best = int(np.argmin(np.array(costs) - WIDTH_GAIN * (np.array(WIDTHS) == 0)))
-        width[joint] = WIDTHS[best]
-        z = tried[best]
-        G, b = _replaced(G, b, column, z @ rows.X[joint], z @ z, z @ rows.y[joint])[1:]
-        rows.X[joint, :, column] = z
-    return replace(problem, width=width)
-
-
-def _coulomb_column(problem: Problem, state: State, joint: int) -> int | None:
-    """Column of the joint's Coulomb friction in the regressor, if the model has one."""
-    column = 10 * len(problem.model.joints)
-    for term in state.terms:
-        amplitudes = sum(p.linear for p in term.parameters().values())
-        for at in np.asarray(term.at):
-            if term.name == "coulomb_friction" and at[0] == joint:
-                return column
-            column += amplitudes
-    return None
-
-
-def _with_width(
-    problem: Problem, state: State, rows: Rows, whitening: Float[np.ndarray, "F nv"], joint: int, width: float
-) -> Float[np.ndarray, " T"]:
-    """Whitened rows of the joint's dry friction with another width."""
-    motion = eqx.tree_at(lambda m: m.width, state.motion, np.full(problem.model.nv, width))
-    column = np.asarray(motion.direction).reshape(problem.records.position.shape)
-    response = jnp.asarray(whitening) * state.response(jnp.asarray(problem.records.omega))[:, None]
-    filtered = np.asarray(_rows(problem.records, jnp.asarray(column), response)) * problem.records.weight
-    return filtered.reshape(-1, problem.model.nv)[:, joint]
-
-
-def _replaced(G: np.ndarray, b: np.ndarray, column: int, cross: np.ndarray, square: float, right: float):
-    """Penalised squares (less a constant) of the fit with one column replaced, and its normal equations."""
-    old = G[column, column]
-    G, b = G.copy(), b.copy()
-    own = cross.copy()
-    own[column] = square
-    precision = FRICTION_PRECISION if old > 0 else 0.0
-    G[column], G[:, column] = own, own
-    G[column, column] += precision
-    b[column] = right
-    theta = np.linalg.solve(G + 1e-12 * np.diag(np.maximum(np.diag(G), 1e-12)), b)
-    return -float(b @ theta), G, b

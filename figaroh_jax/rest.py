@@ -9,21 +9,19 @@ from jaxtyping import Float
 from scipy.stats import norm
 
 from . import noise
-from .effect import Motion
-from .evidence import Columns, Rows, fit
+from .evidence import Rows
 from .noise import Spectrum
-from .problem import Problem, State, filtered_rows
+from .problem import Problem
 from .results import Name, Verdict
-from .screening import Group, Screen, draw_noise, family_p, screen
+from .screening import draw_noise
 
-__all__ = ["Rest", "excess", "flexible_p", "rest_of", "verdict"]
+__all__ = ["Rest", "excess", "lines", "rest_of", "verdict"]
 
 CERTAIN = 0.01
 LINE = 1e-3
 REPEATED, REPEATED_SHARE = 0.08, 0.05  # excess that repeats: absolute, and as a share of the first excess
 FITTED, FITTED_SHARE = 0.03, 0.03  # excess that a flexible model or the catalogue still scores on
 EXPLAINED = 0.9  # share that causes must remove before they are named beside a rest
-DEGREES = 6
 
 
 class Rest(NamedTuple):
@@ -52,25 +50,6 @@ def excess(
     z = blocks.sum() / np.sqrt((blocks**2).sum() + 1e-300)
     share = rows.paired.mean(1) * level
     return float(products.sum() / share.sum()), float(norm.sf(z)), products.sum(1) / share
-
-
-def flexible_p(
-    problem: Problem,
-    state: State,
-    rows: Rows,
-    spectrum: Spectrum,
-    whitening: Float[np.ndarray, "F nv"],
-    generator: np.random.Generator,
-) -> tuple[float, Name]:
-    """p-value of three smooth families a joint (position; friction over q and v; time), and the strongest of them.
-
-    They test and describe; they are never named as a cause.
-    """
-    groups = _families(problem, state, whitening)
-    linear = fit(rows, state.prior)
-    found = screen(rows, linear, groups)
-    p = family_p(problem, rows, linear, found, spectrum, whitening, generator)
-    return p, found.groups[int(np.argmax([result.z.max() for result in found.scores]))].name
 
 
 def rest_of(
@@ -112,37 +91,3 @@ def lines(problem: Problem, residual: Float[np.ndarray, "nv T"]) -> tuple[float,
     n, _, count, nv = problem.records.shape
     series = np.moveaxis(residual.reshape(nv, n, count), 0, 2)
     return noise.spectral_line(series, float(problem.records.rate), float(problem.records.cutoff))
-
-
-def _families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> list[Group]:
-    motion, groups = state.motion, []
-    for joint in range(problem.model.nv):
-        for title, columns in _smooth(motion, joint).items():
-            rows = [_placed(problem, column, joint, whitening) for column in columns]
-            Z = np.stack(rows)[None, :, None]
-            groups.append(Group(Name(title, (problem.model.joint_names[joint],)), None, Columns((joint,), Z)))
-    return groups
-
-
-def _smooth(motion: Motion, joint: int) -> dict[str, list[Float[np.ndarray, " nN"]]]:
-    q, v = np.asarray(motion.position)[:, joint], np.asarray(motion.velocity)[:, joint]
-    t, s = np.asarray(motion.time), np.asarray(motion.direction)[:, joint]
-    x, u, w = _unit(q), _unit(np.abs(v)), _unit(t)
-    powers = [np.polynomial.chebyshev.chebval(x, np.eye(DEGREES + 1)[k]) for k in range(1, DEGREES + 1)]
-    speeds = [np.polynomial.chebyshev.chebval(u, np.eye(4)[k]) for k in range(4)]
-    return {
-        "position": powers,
-        "friction": [s * f for f in speeds] + [s * p for p in powers[:3]] + [np.abs(s) * p for p in powers[:1]],
-        "time": [np.cos(np.pi * k * (w + 1) / 2) for k in range(1, DEGREES)],
-    }
-
-
-def _unit(x: Float[np.ndarray, " nN"]) -> Float[np.ndarray, " nN"]:
-    low, high = x.min(), x.max()
-    return 2 * (x - low) / max(high - low, 1e-9) - 1
-
-
-def _placed(problem: Problem, column: np.ndarray, joint: int, whitening: np.ndarray) -> Float[np.ndarray, " T"]:
-    torque = np.zeros((len(column), problem.model.nv))
-    torque[:, joint] = column
-    return filtered_rows(problem, torque, whitening)[joint]

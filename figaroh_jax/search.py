@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +13,11 @@ from jaxtyping import Float
 from .comparison import Hypothesis, Verdicts, judge, overlap, shares_of_wins, t_value
 from .design import kind
 from .effect import Effect
+from .effects import Payload
 from .estimates import amplitude_places, torque_slope
 from .evidence import Linear, Prior, Rows, fit
 from .noise import Spectrum
-from .problem import Problem, State, extended_state, solved, whitened
+from .problem import Problem, State, extended_state, physical_body, solved, whitened
 from .refit import Whitened, refit, shapes, with_shape
 from .results import Name
 from .screening import Group, Screen, catalogue, family_p, screen
@@ -27,6 +28,8 @@ SHORTLIST, SHARE = 8, 0.35  # candidates compared exactly; share of the best ran
 STARTS = 4
 GAIN, CONFIDENT, UNSURE = 0.004, 1.64, 1.7
 SAME = 0.5  # overlap from which two causes explain the same misfit
+CLEARLY = 3.0  # t from which data tell effects apart that are the same while the joint moves
+EXACT = ({"torque_offset", "asymmetric_coulomb_friction"}, {"payload", "link_inertia"})
 MOST = 12
 
 
@@ -72,7 +75,9 @@ def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) 
     return Step(solved(problem, state, verdicts.theta), rows, linear, verdicts)
 
 
-def contend(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group, order: np.ndarray) -> Contender:
+def contend(
+    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group, order: np.ndarray
+) -> Contender:
     """The candidate with its exact shape, started from its best grid points."""
     way = kind(group.effect)
     if way == "response":
@@ -93,14 +98,26 @@ def contend(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], 
     if way == "position":
         (name,) = effect.parameters()
         hypothesis = Hypothesis(rows.X, step.state.prior, full[..., 0] * float(getattr(effect, name)))
+    elif isinstance(effect, Payload):
+        free = judge(rows, Hypothesis(np.concatenate([rows.X, full], axis=2), step.state.prior.extended(10)))
+        body = physical_body(free.theta[-10:], _information(rows, step, full))
+        hypothesis = Hypothesis(rows.X, step.state.prior, full @ body)
+        effect = with_shape(effect, list(effect.parameters()), list(body))
     else:
         X = np.concatenate([rows.X, full], axis=2)
         hypothesis = Hypothesis(X, step.state.prior.extended(Z.shape[0]))
     verdicts = judge(rows, hypothesis)
-    if way == "columns":
+    if len(verdicts.theta) > rows.X.shape[2]:
         names = [n for n, p in effect.parameters().items() if p.linear]
         effect = with_shape(effect, names, list(verdicts.theta[-len(names) :]))
     return Contender(group.name, effect, hypothesis, verdicts)
+
+
+def _information(rows: Rows, step: Step, Z: Float[np.ndarray, "nv T k"]) -> Float[np.ndarray, "k k"]:
+    """Z'Z with the current model projected out: the precision of the columns' coefficients."""
+    tall, X = Z.reshape(-1, Z.shape[2]), rows.X.reshape(-1, rows.X.shape[2])
+    cross = X.T @ tall
+    return tall.T @ tall - cross.T @ np.linalg.solve(X.T @ X + np.diag(step.state.prior.precision + 1e-12), cross)
 
 
 def _for_refit(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"]) -> Whitened:
@@ -139,6 +156,8 @@ def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray]]:
     """The best groups, each with its grid points in the order of their scores."""
     ranked = found.best(step.rows)
     chosen = [r for r in ranked[:SHORTLIST] if r[0] > SHARE * ranked[0][0]] or ranked[:1]
+    simpler = {Name(n, found.groups[g].name.at) for _, g, _ in chosen for n in type(found.groups[g].effect).contains}
+    chosen += [r for r in ranked if found.groups[r[1]].name in simpler and r not in chosen]
     return [(found.groups[g], np.argsort(-found.scores[g].Q)) for _, g, _ in chosen]
 
 
@@ -187,9 +206,7 @@ def catalogue_p(
     return family_p(problem, step.rows, step.linear, screened, spectrum, whitening, generator)
 
 
-def eliminate(
-    problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]
-) -> list[Found]:
+def eliminate(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> list[Found]:
     """The causes without those that no longer predict anything once the others are in (earliest first)."""
     for one in list(found[:-1]):
         full = _stand_with(problem, start, found, whitening)
@@ -229,7 +246,8 @@ def _accept(
     """The cause that predicts best where it was not fitted, if it passes the gates; else nothing."""
     contenders = [contend(problem, step, whitening, *entry) for entry in shortlist(step, screened)]
     contenders.sort(key=lambda c: c.verdicts.heldout)
-    best = next((c for c in contenders if _passes(step, contenders, c)), None)
+    passing = [c for c in contenders if _passes(step, contenders, c)]
+    best = next((c for c in passing if not _simpler(step, passing, c)), None)
     if best is None:
         return None
     rivals = _rivals(step, contenders, best)
@@ -242,14 +260,32 @@ def _accept(
         (step.verdicts.cost, best.verdicts.cost),
         t_value(step.verdicts.blocks, best.verdicts.blocks),
         float(wins[0]) * (1 - p),
-        tuple(c.name for c in rivals if _member(step, best, c)),
+        _ambiguous(step, best, rivals, screened),
     )
+
+
+def _simpler(step: Step, contenders: list[Contender], one: Contender) -> bool:
+    """Whether an effect that this one contains does as well."""
+    inside = [c for c in contenders if c.name.effect in type(one.effect).contains and c.name.at == one.name.at]
+    return any(_member(step, one, c) for c in inside)
 
 
 def _rivals(step: Step, contenders: list[Contender], one: Contender) -> list[Contender]:
     """The others that explain the same misfit; a cause of another misfit is no alternative to this one."""
     others = [c for c in contenders if c is not one]
     return [c for c in others if overlap(step.verdicts, one.verdicts, c.verdicts) > SAME]
+
+
+def _ambiguous(step: Step, best: Contender, rivals: list[Contender], screened: Screen) -> tuple[Name, ...]:
+    """What cannot be told from the best: rivals that predict as well, and effects that are the same while moving."""
+    names = [c.name for c in rivals if _member(step, best, c)]
+    clearly_worse = {c.name for c in rivals if t_value(c.verdicts.blocks, best.verdicts.blocks) > CLEARLY}
+    known = {group.name for group in screened.groups}
+    for alike in EXACT:
+        same = [Name(effect, best.name.at) for effect in sorted(alike - {best.name.effect})]
+        if best.name.effect in alike:
+            names += [n for n in same if n in known and n not in names and n not in clearly_worse]
+    return tuple(names)
 
 
 def _member(step: Step, best: Contender, other: Contender) -> bool:
