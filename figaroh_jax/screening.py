@@ -6,7 +6,7 @@ Naming starts here and never ends here: columns that are right to first order fi
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,7 +35,7 @@ class Group(NamedTuple):
     """One effect at one place: `effect` has a leading axis, the grid of its shape."""
 
     name: Name
-    effect: Effect
+    effect: Any  # an `Effect`; None for a family that has no name
     columns: Columns
 
 
