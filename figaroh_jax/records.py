@@ -135,7 +135,7 @@ def _inset(one: Signals) -> int:
     return max(0, min(int(np.ceil(END / (one.cutoff * one.dt))), int(kept[0]), one.time.size - 1 - int(kept[-1])))
 
 
-def _padded(arrays: Sequence[np.ndarray], length: int, hold: bool = True) -> np.ndarray:
+def _padded(arrays: Sequence[Leaf], length: int, hold: bool = True) -> np.ndarray:
     """The arrays stacked; short ones hold their last value, or are zero from their end."""
     out = []
     for array in arrays:
