@@ -23,6 +23,7 @@ from figaroh_jax.kinematics import frame_placement
 from figaroh_jax.mjcf import read_mjcf
 from figaroh_jax.model import RobotModel
 from figaroh_jax.results import Cause, Estimate, Gain, Name
+from figaroh_jax.simulation import simulate
 from figaroh_jax.urdf import load_urdf
 
 LIMIT = '<limit lower="-1.5" upper="2.5" velocity="3" effort="40"/>'
@@ -346,3 +347,26 @@ def test_a_folder_that_is_none_and_mjcf_of_others_are_refused(tmp_path: Path):
     )
     with pytest.raises(InputError, match="not MJCF as figaroh-jax writes it"):
         read_mjcf(tmp_path / "other.xml")
+
+
+def test_mujoco_and_our_simulation_stay_together(model: RobotModel, tmp_path: Path):
+    """Both are first order in the step: half the step, half the distance after .3 s of falling and swinging."""
+    extended = put(model, *DRIVES, *BODIES)
+    simulator, data, place = in_mujoco(extended, tmp_path)
+    start, torque = np.array([0.3, -0.4, 0.1, 0.5]), np.array([5.0, 2.0, -3.0, 1.0])
+
+    def apart(dt: float) -> float:
+        steps = round(0.3 / dt)
+        simulator.opt.timestep = dt
+        mujoco.mj_resetData(simulator, data)
+        data.qpos[place] = start
+        for name, value in zip(model.joint_names, torque, strict=True):
+            data.actuator(name).ctrl = value
+        for _ in range(steps):
+            mujoco.mj_step(simulator, data)
+        ours = simulate(extended, np.tile(torque, (1201, 1)), start, np.zeros(4), dt).position[steps]
+        return float(np.abs(data.qpos[place] - ours).max())
+
+    coarse, fine = apart(5e-4), apart(2.5e-4)
+    assert fine < 2e-3
+    assert coarse / fine == pytest.approx(2.0, rel=0.2)
