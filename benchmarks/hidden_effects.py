@@ -105,7 +105,7 @@ def _made(make: Any, effects: list[Any], robot: str, layout: str, seed: int, **m
 def _noise(number: int) -> dict[str, Any]:
     """White and coloured noise of three levels, encoders of fine and coarse steps, in turn."""
     return {
-        "colour": COLOURS[number % len(COLOURS)],
+        "colour": COLOURS[(number + number // 4) % len(COLOURS)],
         "noise": (0.5, 1.0, 2.0)[number % 3],
         "encoder_step": (1e-5, 1e-4)[number % 2],
     }
