@@ -23,9 +23,11 @@ __all__ = ["BLOCK", "chunk_size", "in_chunks", "over_samples", "traced", "two_ax
 BLOCK = 8  # chunks to a block
 
 
-def chunk_size() -> int:
-    """Samples to a chunk: few on a CPU, many on an accelerator."""
-    return 128 if jax.default_backend() == "cpu" else 65536
+def chunk_size(width: int = 1) -> int:
+    """Samples to a chunk: few on a CPU, fewer where an answer has many numbers a sample (`width`), many elsewhere."""
+    if jax.default_backend() != "cpu":
+        return 65536
+    return 128 if width <= 640 else 32
 
 
 def traced(*trees: Any) -> bool:
@@ -45,19 +47,20 @@ def in_chunks(x: Float[Array, "samples k"], chunk: int) -> Float[Array, "chunks 
     return jnp.swapaxes(padded.reshape(-1, chunk, x.shape[1]), 1, 2)
 
 
-def over_samples(kernel: Callable[..., Array], axis: int, model: Any, *arrays: ArrayLike) -> Array:
+def over_samples(kernel: Callable[..., Array], axis: int, chunk: int, model: Any, *arrays: ArrayLike) -> Array:
     """Answers of `kernel(model, *arrays)`, whose samples stand on `axis` (0 or -1), for arrays (*batch, k)."""
     if traced(model, arrays):
-        return _chunked(kernel, axis, chunk_size(), model, *two_axes(*arrays, on_host=False))
-    return _in_blocks(kernel, axis, jax.tree.map(jnp.asarray, model), *two_axes(*arrays, on_host=True))
+        return _chunked(kernel, axis, chunk, model, *two_axes(*arrays, on_host=False))
+    return _in_blocks(kernel, axis, chunk, jax.tree.map(jnp.asarray, model), *two_axes(*arrays, on_host=True))
 
 
-def _in_blocks(kernel: Callable[..., Array], axis: int, model: Any, *arrays: np.ndarray) -> Array:
-    samples, chunk = len(arrays[0]), chunk_size()
+def _in_blocks(kernel: Callable[..., Array], axis: int, chunk: int, model: Any, *arrays: np.ndarray) -> Array:
+    samples = len(arrays[0])
     block = chunk if samples <= chunk else BLOCK * chunk
     if samples <= block:
         filled = [np.pad(x, ((0, block - samples), (0, 0))) for x in arrays]
-        return jax.lax.slice_in_dim(_program(kernel, axis, chunk, model, *filled), 0, samples, axis=axis)
+        answer = _program(kernel, axis, chunk, model, *filled)
+        return answer if samples == block else jax.lax.slice_in_dim(answer, 0, samples, axis=axis)
     part = _program(kernel, axis, chunk, model, *(x[:block] for x in arrays))
     shape = (samples, *part.shape[1:]) if axis == 0 else (*part.shape[:-1], samples)
     whole = _put(jnp.empty(shape), part, 0, axis)

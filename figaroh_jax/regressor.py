@@ -17,7 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from .chunks import over_samples
+from .chunks import chunk_size, over_samples
 from .errors import InputError
 from .kinematics import Motion, ancestors, check_shapes, motion, revolute, world_axes
 from .model import RobotModel
@@ -56,7 +56,7 @@ def joint_torque_regressor(
     with jax.enable_x64(True):
         check_shapes(model, q=q, v=v, a=a)
         shape = (*np.shape(q)[:-1], model.nv, 10 * len(model.joints))
-        return over_samples(dense_rows, 0, model, q, v, a).reshape(shape)
+        return over_samples(dense_rows, 0, _chunk(model), model, q, v, a).reshape(shape)
 
 
 def packed_regressor(
@@ -74,7 +74,11 @@ def packed_regressor(
         check_shapes(model, q=q, v=v, a=a)
         if np.ndim(q) != 2:
             raise InputError(f"q has shape {np.shape(q)}; a packed regressor takes (samples, joints)")
-        return over_samples(packed_rows, -1, model, q, v, a)
+        return over_samples(packed_rows, -1, _chunk(model), model, q, v, a)
+
+
+def _chunk(model: RobotModel) -> int:
+    return chunk_size(10 * len(pairs(model)))
 
 
 def coordinate_blocks(model: RobotModel) -> tuple[Int[np.ndarray, "blocks 2"], Int[np.ndarray, " pairs"]]:
@@ -101,9 +105,11 @@ def dense_rows(
 ) -> Float[Array, "samples nv columns"]:
     """Kernel of `joint_torque_regressor`: arguments with the samples last, W with the samples first."""
     rows, (blocks, _) = coordinate_rows(model, q, v, a), coordinate_blocks(model)
-    room = jnp.zeros((model.nv, len(model.joints), *rows.shape[1:]), rows.dtype)
-    dense = room.at[tuple(blocks.T)].set(rows, unique_indices=True)
-    return dense.reshape(-1, q.shape[-1]).T.reshape(-1, model.nv, 10 * len(model.joints))
+    source = np.full((model.nv, len(model.joints)), len(rows))  # zeros, where no block is
+    source[tuple(blocks.T)] = np.arange(len(rows))
+    # samples first before the zeros come in: the blocks that are there fit the cache, all of W may not
+    filled = jnp.pad(rows.reshape(-1, q.shape[-1]).T.reshape(-1, *rows.shape[:2]), ((0, 0), (0, 1), (0, 0)))
+    return _once(filled)[:, source.ravel()].reshape(-1, model.nv, 10 * len(model.joints))
 
 
 def packed_rows(
