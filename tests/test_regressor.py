@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -33,12 +34,13 @@ def reference(path: Path, model: RobotModel, *state: np.ndarray) -> np.ndarray:
     tree = [moved[name] for name in list(robot.names)[1:]]
     share = np.zeros((len(tree), model.nv))
     share[np.arange(len(tree)), [model.joints[i].coordinate for i in tree]] = np.asarray(model.ratio)[tree]
+    data: Any = robot.createData()
     answer = np.zeros((len(state[0]), model.nv, len(tree), 10))
     for k, (q, v, a) in enumerate(zip(*state, strict=True)):
         angle = share @ q + np.asarray(model.offset)[tree]
         turns = zip(list(robot.joints)[1:], angle, strict=True)
         configuration = np.concatenate([[np.cos(x), np.sin(x)] if joint.nq == 2 else [x] for joint, x in turns])
-        rows = pin.computeJointTorqueRegressor(robot, robot.createData(), configuration, share @ v, share @ a)
+        rows = pin.computeJointTorqueRegressor(robot, data, configuration, share @ v, share @ a)
         answer[k][:, tree] = (share.T @ rows).reshape(model.nv, -1, 10)
     return answer.reshape(*answer.shape[:2], -1)
 
@@ -223,12 +225,13 @@ def test_golden_numbers_of_the_sample_manipulator() -> None:
     rate = 2.0 * np.pi * f
     state = [(A * rate**k * wave(rate * t)).sum(1) for k, wave in ((0, np.sin), (1, np.cos))]
     state.append(-(A * rate**2 * np.sin(rate * t)).sum(1))
-    data = robot.createData()
+    data: Any = robot.createData()
     tau = np.array([pin.rnea(robot, data, *x) for x in zip(*state, strict=True)])
     deviations = [189.555343, 164.726164, 119.022653, 89.967928, 52.225450, 51.008909]
     np.testing.assert_allclose(tau.std(axis=0), deviations, rtol=0, atol=1e-6)
-    smooth = [filtfilt(*butter(4, 10.0 / 50.0), x, axis=0, padtype="odd", padlen=12) for x in state]
-    W = np.asarray(joint_torque_regressor(model, *smooth)).reshape(-1, 60)
+    b, a = np.array(butter(4, 10.0 / 50.0))
+    smooth = [filtfilt(b, a, x, axis=0, padtype="odd", padlen=12) for x in state]
+    W = np.asarray(joint_torque_regressor(model, smooth[0], smooth[1], smooth[2])).reshape(-1, 60)
     assert np.sum(np.linalg.norm(W, axis=0) > 1e-6) == 51
     assert np.linalg.matrix_rank(W, tol=1e-9 * np.linalg.norm(W, 2)) == 38
     error = tau.ravel() - W @ np.linalg.lstsq(W, tau.ravel(), rcond=1e-10)[0]

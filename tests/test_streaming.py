@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -28,7 +29,7 @@ def tree(tmp_path: Path) -> RobotModel:
     return robots.load(robots.TREE, tmp_path)
 
 
-def data(model: RobotModel, samples: int) -> list[np.ndarray]:
+def data(model: RobotModel, samples: int) -> list[Any]:
     """q, v, a, tau and weights."""
     *state, weight = np.random.default_rng(samples).standard_normal((5, samples, model.nv))
     return [*state, weight**2]
@@ -93,7 +94,8 @@ def test_a_weight_for_each_joint_is_the_same_weight_in_every_sample(tree: RobotM
 
 
 def test_no_samples_give_zero(tree: RobotModel) -> None:
-    assert not assembled(normal_matrix(tree, *(np.zeros((0, tree.nv)),) * 4)).any()
+    none = np.zeros((0, tree.nv))
+    assert not assembled(normal_matrix(tree, none, none, none, none)).any()
 
 
 def test_normal_matrix_under_jit_grad_and_vmap(tree: RobotModel) -> None:
@@ -102,7 +104,7 @@ def test_normal_matrix_under_jit_grad_and_vmap(tree: RobotModel) -> None:
     jitted = jax.jit(normal_matrix)(tree, q, v, a, tau, weight)
     assert_relatively_equal(assembled(jitted), expected)
 
-    def square(scale: jax.Array) -> jax.Array:
+    def square(scale: float | jax.Array) -> jax.Array:
         longer = eqx.tree_at(lambda m: m.placement, tree, tree.placement.at[:, :3, 3].multiply(scale))
         return jnp.sum(normal_matrix(longer, q, v, a, tau, weight).matrix)
 
@@ -110,7 +112,7 @@ def test_normal_matrix_under_jit_grad_and_vmap(tree: RobotModel) -> None:
     h = 1e-5
     difference = (square(1.0 + h) - square(1.0 - h)) / (2 * h)
     np.testing.assert_allclose(jax.grad(square)(1.0), difference, rtol=1e-6, atol=0)
-    two = [np.stack([x, 2.0 * x]) for x in (q, v, a, tau)]
+    two: list[Any] = [np.stack([x, 2.0 * x]) for x in (q, v, a, tau)]
     mapped = jax.vmap(normal_matrix, (None, 0, 0, 0, 0))(tree, *two).matrix[1]
     assert_relatively_equal(np.asarray(mapped), np.asarray(normal_matrix(tree, *(x[1] for x in two)).matrix))
 
@@ -120,7 +122,7 @@ def test_wrong_shapes_are_named(tree: RobotModel) -> None:
     with pytest.raises(InputError, match="weight has shape"):
         normal_matrix(tree, q, q, q, q, weight=np.ones(7))
     with pytest.raises(InputError, match="last axis must hold"):
-        triangular_factor(tree, *(q[:, :2],) * 4)
+        triangular_factor(tree, q[:, :2], q[:, :2], q[:, :2])
 
 
 PEAK = """
