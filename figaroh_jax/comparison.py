@@ -9,7 +9,17 @@ from jaxtyping import Float
 
 from .evidence import Prior, Rows
 
-__all__ = ["Hypothesis", "Verdicts", "judge", "overlap", "shares_of_wins", "t_value"]
+__all__ = [
+    "FoldSums",
+    "Hypothesis",
+    "Verdicts",
+    "fold_sums",
+    "grown_sums",
+    "judge",
+    "overlap",
+    "shares_of_wins",
+    "t_value",
+]
 
 
 class Hypothesis(NamedTuple):
@@ -36,24 +46,53 @@ class Verdicts(NamedTuple):
         return float(self.blocks.sum())
 
 
-def judge(rows: Rows, hypothesis: Hypothesis) -> Verdicts:
-    """Fit to all rows and to all but each fold, and predict the fold that was left out."""
-    X, y = hypothesis.X, rows.y - hypothesis.fixed
-    prior, folds = hypothesis.prior, rows.fold.max() + 1
-    grams, moments, squares = [], [], []
-    for fold in range(folds):
+class FoldSums(NamedTuple):
+    """Normal equations of each fold."""
+
+    gram: Float[np.ndarray, "folds P P"]
+    moment: Float[np.ndarray, "folds P"]
+    square: Float[np.ndarray, " folds"]
+
+
+def fold_sums(rows: Rows, X: Float[np.ndarray, "nv T P"], y: Float[np.ndarray, "nv T"] | None = None) -> FoldSums:
+    """X'X, X'y and y'y over each fold; `y` is the rows' own unless given."""
+    y = rows.y if y is None else y
+    parts = []
+    for fold in range(rows.fold.max() + 1):
         own = rows.fold == fold
         tall, target = X[:, own].reshape(-1, X.shape[-1]), y[:, own].reshape(-1)
-        grams.append(tall.T @ tall)
-        moments.append(tall.T @ target)
-        squares.append(target @ target)
-    G, b, yy = np.sum(grams, axis=0), np.sum(moments, axis=0), float(np.sum(squares))
+        parts.append((tall.T @ tall, tall.T @ target, target @ target))
+    return FoldSums(*(np.array(part) for part in zip(*parts, strict=True)))
+
+
+def grown_sums(rows: Rows, known: FoldSums, X: Float[np.ndarray, "nv T P"]) -> FoldSums:
+    """The sums of columns whose first ones are known."""
+    P, folds = known.gram.shape[1], len(known.gram)
+    gram, moment = np.zeros((folds, X.shape[2], X.shape[2])), np.zeros((folds, X.shape[2]))
+    gram[:, :P, :P], moment[:, :P] = known.gram, known.moment
+    for fold in range(folds):
+        own = rows.fold == fold
+        tall = X[:, own].reshape(-1, X.shape[2])
+        cross = tall.T @ tall[:, P:]
+        gram[fold, :, P:], gram[fold, P:, :P] = cross, cross[:P].T
+        moment[fold, P:] = tall[:, P:].T @ rows.y[:, own].reshape(-1)
+    return FoldSums(gram, moment, known.square)
+
+
+def judge(rows: Rows, hypothesis: Hypothesis, known: FoldSums | None = None) -> Verdicts:
+    """Fit to all rows and to all but each fold, and predict the fold that was left out."""
+    X, y, prior = hypothesis.X, rows.y - hypothesis.fixed, hypothesis.prior
+    sums = known or fold_sums(rows, X, y)
+    G, b, yy = (part.sum(0) for part in sums)
     theta, cost = _solve(G, b, yy, prior)
-    left = [_solve(G - g, b - m, yy - s, prior) for g, m, s in zip(grams, moments, squares, strict=True)]
+    left = [_solve(G - g, b - m, yy - s, prior) for g, m, s in zip(*sums, strict=True)]
     each = np.stack([solution for solution, _ in left])
-    residual = y - np.einsum("jtp,tp->jt", X, each[np.maximum(rows.fold, 0)], optimize=True)
-    member = rows.block == np.arange(rows.block.max() + 1)[:, None]
-    blocks = member.astype(float) @ (residual**2).sum(0)
+    residual = y.copy()
+    for fold, solution in enumerate(each):
+        own = rows.fold == fold
+        residual[:, own] -= X[:, own] @ solution
+    used = rows.block >= 0
+    blocks = np.bincount(rows.block[used], (residual**2).sum(0)[used])
     return Verdicts(cost, theta, each, blocks, np.array([cost for _, cost in left]), y - X @ theta)
 
 

@@ -23,11 +23,11 @@ from .estimates import Fitted, estimates, fitted_model, joint_fit, moved, prisma
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor
-from .holdout import held_out, traces
+from .holdout import held_out, predicted, traces
 from .layout import describe_folds, held_rows, layout
 from .model import RobotModel
 from .noise import Spectrum
-from .problem import Problem, State, baseline, extended_state, plain_rows, solved
+from .problem import Problem, State, baseline, extended_state, solved
 from .records import stack
 from .rest import Rest, excess, lines, rest_of, verdict
 from .results import Cause, Diagnosis, Experiment, Gain, Name
@@ -210,9 +210,9 @@ def _what_is_left(
 
 
 def _rms(problem: Problem, state: State) -> Float[np.ndarray, " nv"]:
-    rows = plain_rows(problem, state)
-    residual = (rows.y - rows.X @ state.theta) * (rows.y != 0)
-    return np.sqrt((residual**2).sum(1) / np.maximum((rows.y != 0).sum(1), 1))
+    weight = np.asarray(problem.records.weight)
+    squares = ((problem.torque - predicted(problem, state)) ** 2 * weight).sum((0, 1))
+    return np.sqrt(squares / np.maximum(weight.sum((0, 1)), 1))
 
 
 def _noise_rms(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, " nv"]:

@@ -117,6 +117,7 @@ class Effect(eqx.Module):
     equation: ClassVar[str]  # as text
     acts_on: ClassVar[Literal["joint", "pair", "link", "robot"]]
     contains: ClassVar[tuple[str, ...]] = ()  # simpler effects that it can imitate exactly: they are preferred
+    follows_torque: ClassVar[bool] = False  # whether its torque depends on the current model's (load or total)
     separated_by: ClassVar[str] = ""  # the experiment that tells it from what looks alike; {at} stands for the place
 
     def torque(self, motion: Motion) -> Float[Array, "samples *rows"]:

@@ -196,6 +196,7 @@ class LoadDependentFriction(JointEffect):
     """Friction of the gears that grows with the torque they transmit."""
 
     name, title = "load_dependent_friction", "friction that grows with the load"
+    follows_torque = True
     equation = "ratio |tau_load| s(v)"
     separated_by = "the same motion of {at} with and without a payload"
     ratio: Scalar = amplitude("")
@@ -337,6 +338,7 @@ class TorqueGain(JointEffect):
     """A wrong torque constant or gear ratio: the reading is off by a factor."""
 
     name, title = "torque_gain", "wrong torque gain"
+    follows_torque = True
     equation = "gain tau_hat"
     separated_by = "the same motion of {at} with and without a payload of known mass"
     gain: Scalar = amplitude("")
@@ -350,6 +352,7 @@ class TorqueDelay(Effect):
     """Torque that is stamped late against the position."""
 
     name, title, acts_on = "torque_delay", "delay of the torque", "robot"
+    follows_torque = True
     equation = "tau_hat(t - delay) - tau_hat(t)"
     separated_by = "faster motion: a lag weakens high frequencies, a delay does not"
     delay: Scalar = shape("s", (0.001, 0.003, 0.006, 0.012, 0.025, -0.001, -0.003, -0.006, -0.012), (-0.03, 0.06))
@@ -363,6 +366,7 @@ class TorqueLag(Effect):
     """Torque seen through a first-order low pass."""
 
     name, title, acts_on = "torque_lag", "lag of the torque", "robot"
+    follows_torque = True
     equation = "(1/(1 + time p) - 1) tau_hat"
     separated_by = "faster motion: a lag weakens high frequencies, a delay does not"
     time: Scalar = shape("s", (0.001, 0.003, 0.006, 0.012, 0.025), (0.0002, 0.06))
@@ -376,6 +380,7 @@ class JointElasticity(JointEffect):
     """A gear that winds up under load: the sensor on the motor reads more than the link has turned."""
 
     name, title = "joint_elasticity", "elasticity of the joint"
+    follows_torque = True
     equation = "q_measured = q + compliance tau_load"
     separated_by = "a chirp of {at} above a third of its resonance, or a sensor on the link side"
     compliance: Scalar = shape("rad/(N m)", (2e-5, 1e-4, 4e-4, 1.5e-3, 5e-3), (0.0, 1e-2))

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from .design import kind, torque_change
 from .effect import Effect
 from .estimates import amplitude_places
-from .problem import Problem, State, extended_state, open_rows, plain_rows
+from .problem import Problem, State, extended_state, open_rows
 from .results import Trace
 from .search import Found, stand
 from .signals import Signals
@@ -25,10 +25,10 @@ def held_out(problem: Problem, start: State, causes: list[Effect], whitening: Fl
     sqrt(sum e^2 / sum tau^2) over the holdout recordings with torque; without any, over the folds, each predicted by
     a fit to the others.
     """
-    out, state = [], start
+    out, step = [], None
     for effect in [None, *causes]:
-        state = state if effect is None else extended_state(problem, state, effect)
-        step = stand(problem, state, whitening)
+        grown = start if step is None or effect is None else extended_state(problem, step.state, effect)
+        step = stand(problem, grown, whitening, step)
         state = step.state
         if problem.held.any():
             error = (problem.torque - predicted(problem, state)) * problem.held
@@ -86,7 +86,10 @@ def _share(problem: Problem, state: State, effect: Effect, place: list[int]) -> 
 
 
 def _fold_error(problem: Problem, state: State, folds: Float[np.ndarray, "folds P"]) -> float:
-    rows = plain_rows(problem, state)
-    theta = folds[np.maximum(rows.fold, 0)]
-    residual = (rows.y - np.einsum("jtp,tp->jt", rows.X, theta, optimize=True)) * (rows.y != 0)
-    return float(np.sqrt((residual**2).sum() / (rows.y**2).sum()))
+    omega, weight = jnp.asarray(problem.records.omega), np.asarray(problem.records.weight)
+    response, fold = state.response(omega), problem.layout.fold.reshape(weight.shape[:2])
+    error = problem.torque * weight
+    power = (error**2).sum()
+    for k, theta in enumerate(folds):
+        error = error - open_rows(problem, state.X @ theta, response) * weight * (fold == k)[..., None]
+    return float(np.sqrt((error**2).sum() / power))

@@ -22,13 +22,14 @@ from .effect import Effect, Motion
 from .effects import Payload, find
 from .evidence import Prior, Rows, instruments
 from .inertia import from_pseudo_inertia, to_com
-from .model import RobotModel
+from .model import Leaf, RobotModel
 from .records import Records, filter_rows
 from .regressor import joint_torque_regressor
 
 __all__ = ["Layout", "Problem", "State", "baseline", "extended_state", "plain_rows", "whitened"]
 
 FRICTION_PRECISION = 1e-6
+COLUMNS = 4  # filtered columns are padded to a multiple of it
 
 
 class Layout(eqx.Module):
@@ -190,20 +191,34 @@ def solved(problem: Problem, state: State, theta: Float[np.ndarray, " P"]) -> St
     return replace(state, theta=theta, motion=motion)
 
 
-def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> Rows:
-    """Whitened rows of the measured torque and of the state's regressor, with their instruments."""
-    records, layout = problem.records, problem.layout
-    n, samples, _, nv = records.shape
-    weight = jnp.asarray(records.weight)
-    y = _rows(records, jnp.asarray(records.torque), jnp.asarray(whitening)) * weight
-    response = jnp.asarray(whitening) * state.response(records.omega)[:, None]
-    X = _rows(records, jnp.asarray(state.X.reshape(n, samples, nv, -1)), response) * weight[..., None]
-    y = np.moveaxis(np.asarray(y).reshape(-1, nv), 0, 1)
-    X = np.moveaxis(np.asarray(X).reshape(-1, nv, X.shape[-1]), 0, 1)
+def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], before: Rows | None = None) -> Rows:
+    """Whitened rows of the measured torque and of the state's regressor, with their instruments.
+
+    `before` are the rows of the state that this one extends by columns alone: only the new columns are filtered.
+    """
+    layout = problem.layout
+    y = filtered_rows(problem, problem.records.flat(problem.records.torque), jnp.asarray(whitening))
+    known = 0 if before is None else before.X.shape[2]
+    response = jnp.asarray(whitening) * state.response(problem.records.omega)[:, None]
+    X = _filtered_columns(problem, state.X[:, :, known:], response)
     Xi = X
     if layout.repeats:
         Xi = np.stack([instruments(x.T, layout.partner, p).T for x, p in zip(X, layout.paired, strict=True)])
+    if before is not None:
+        X, Xi = np.concatenate([before.X, X], axis=2), np.concatenate([before.Xi, Xi], axis=2)
     return Rows(y, np.ascontiguousarray(X), np.ascontiguousarray(Xi), *_row_layout(layout))
+
+
+def _filtered_columns(
+    problem: Problem, X: Float[np.ndarray, "nN nv k"], response: Complex[Array, "F nv"]
+) -> Float[np.ndarray, "nv T k"]:
+    """Masked rows of columns; their number is padded, so that few programs serve all models."""
+    n, samples, _, nv = problem.records.shape
+    count = X.shape[2]
+    padded = np.pad(X, ((0, 0), (0, 0), (0, -count % COLUMNS))).reshape(n, samples, nv, -1)
+    rows = np.asarray(_rows(problem.records, padded, response))[..., :count]
+    rows = rows * np.asarray(problem.records.weight)[..., None]
+    return np.moveaxis(rows.reshape(-1, nv, count), 0, 1)
 
 
 def plain_rows(problem: Problem, state: State) -> Rows:
@@ -212,7 +227,7 @@ def plain_rows(problem: Problem, state: State) -> Rows:
 
 
 def open_rows(
-    problem: Problem, torque: Float[Array, "nN nv"], response: Complex[Array, " F"]
+    problem: Problem, torque: Float[Leaf, "nN nv"], response: Complex[Array, " F"]
 ) -> Float[np.ndarray, "n M nv"]:
     """Rows of a torque at all samples, of all recordings and without a mask."""
     n, samples, _, nv = problem.records.shape
@@ -221,7 +236,7 @@ def open_rows(
 
 
 def filtered_rows(
-    problem: Problem, torque: Float[Array, "nN nv"], response: Complex[Array, "F nv"]
+    problem: Problem, torque: Float[Leaf, "nN nv"], response: Complex[Array, "F nv"]
 ) -> Float[np.ndarray, "nv T"]:
     """Rows of a torque at all samples through the row filter and `response`, masked."""
     n, samples, _, nv = problem.records.shape
@@ -235,7 +250,7 @@ def _row_layout(layout: Layout) -> tuple[np.ndarray, ...]:
 
 
 @eqx.filter_jit
-def measured_motion(model: RobotModel, records: Records, width: Float[Array, " nv"]) -> Motion:
+def measured_motion(model: RobotModel, records: Records, width: Float[Leaf, " nv"]) -> Motion:
     """All samples of all recordings as one motion, with the load of the nominal robot."""
     q, v, a = (records.flat(jnp.asarray(x)) for x in (records.position, records.velocity, records.acceleration))
     load = inverse_dynamics(model, q, v, a)

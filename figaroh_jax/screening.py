@@ -26,8 +26,7 @@ from .results import Name
 
 __all__ = ["Group", "Screen", "catalogue", "family_p", "screen"]
 
-DRAWS = 400
-CHUNK = 50  # draws held at once
+DRAWS, CHUNK = 400, 50  # draws held at once
 ALTERNATIVES = ({"torque_delay", "torque_lag"},)  # once one is in, the other is not tried
 
 
@@ -58,32 +57,46 @@ class Screen(NamedTuple):
 
 
 def catalogue(
-    problem: Problem, state: State, rows: Rows, whitening: Float[np.ndarray, "F nv"], forbid: Collection[str]
+    problem: Problem,
+    state: State,
+    rows: Rows,
+    whitening: Float[np.ndarray, "F nv"],
+    forbid: Collection[str],
+    before: list[Group] | None = None,
 ) -> list[Group]:
-    """Whitened columns of every effect that may be named, at every place and grid point."""
-    taken = {(type(e).name, tuple(at)) for term in state.terms for e, at in _places_of(term)}
-    taken |= {(effect.name, tuple(np.asarray(effect.at))) for effect in state.sensors}
+    """Whitened columns of every effect that may be named, at every place and grid point.
+
+    `before` are the groups of an earlier state with the same sensors: columns that do not follow the torque are kept.
+    """
+    taken = {(type(e).name, at) for term in state.terms for e, at in _places_of(term)}
+    taken |= {(effect.name, tuple(int(i) for i in np.asarray(effect.at))) for effect in state.sensors}
     closed = {name for pair in ALTERNATIVES if any(t[0] in pair for t in taken) for name in pair}
     wanted = {n: e for n, e in CATALOGUE.items() if n not in forbid and n not in closed}
     batches = {name: candidates(effect, problem.model) for name, effect in wanted.items()}
+    old = {group.name: group.columns for group in before or ()}
     free = {n: b for n, b in batches.items() if not isinstance(b, LinkEffect) and b.at.shape[0]}
+    new = {n: b for n, b in free.items() if before is None or b.follows_torque}
     response = jnp.asarray(whitening) * state.response(problem.records.omega)[:, None]
-    computed = _all_rows(free, state.motion, problem.records, response)
+    computed = _all_rows(new, state.motion, problem.records, response)
     groups = []
     for name, batch in batches.items():
         for place in range(batch.at.shape[0]):
             one = jax.tree.map(lambda x, p=place: np.asarray(x)[p], batch)
             at = tuple(int(i) for i in one.at[0])
+            title = Name(name, place_names(problem.model, batch, at))
             if (name, at) in taken:
                 continue
-            if name in free:
+            if isinstance(batch, LinkEffect):
+                columns = _link_columns(rows, at[0], problem.model)
+            elif name in new:
                 own = len(at) and kind(batch) == "columns"
                 Z = np.asarray(computed[name][place])
                 columns = Columns(at if own else tuple(range(problem.model.nv)), Z.reshape(*Z.shape[:3], -1))
             else:
-                columns = _link_columns(rows, at[0], problem.model)
-            groups.append(Group(Name(name, place_names(problem.model, batch, at)), one, columns))
-    return [group for group in groups if np.abs(group.columns.Z).max() > 0]
+                columns = old.get(title)
+            if columns is not None and np.abs(columns.Z).max() > 0:
+                groups.append(Group(title, one, columns))
+    return groups
 
 
 def place_names(model: RobotModel, effect: Effect | type[Effect], at: tuple[int, ...]) -> tuple[str, ...]:
@@ -107,6 +120,7 @@ def family_p(
     spectrum: Spectrum,
     whitening: Float[np.ndarray, "F nv"],
     generator: np.random.Generator,
+    draws: int = DRAWS,
 ) -> float:
     """Chance that noise alone gives some candidate of the whole catalogue a score as large as the largest.
 
@@ -115,16 +129,16 @@ def family_p(
     """
     highest = max(float(result.z.max()) for result in found.scores)
     parts = block_scores(rows, linear, found.stock, found.H)
-    signs = generator.choice([-1.0, 1.0], (DRAWS, len(parts)))
+    signs = generator.choice([-1.0, 1.0], (draws, len(parts)))
     nulls = [_largest(found, signs @ parts)]
     prior = np.sqrt(np.maximum(np.diag(linear.moment) - (rows.Xi**2).sum((0, 1)), 0))
     drawn = []
-    for _ in range(DRAWS // CHUNK):
+    for _ in range(draws // CHUNK):
         noise = draw_noise(problem, spectrum, whitening, CHUNK, generator)
         pulls = prior * generator.standard_normal((CHUNK, len(prior)))
         drawn.append(_largest(found, other_scores(rows, found.stock, found.H, noise) + pulls @ found.H))
     nulls.append(np.concatenate(drawn))
-    return max((1 + np.sum(null >= highest)) / (DRAWS + 1) for null in nulls)
+    return max((1 + np.sum(null >= highest)) / (draws + 1) for null in nulls)
 
 
 def _largest(found: Screen, drawn: Float[np.ndarray, "draws columns"]) -> Float[np.ndarray, " draws"]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .comparison import Hypothesis, Verdicts, judge, overlap, shares_of_wins, t_value
+from .comparison import FoldSums, Hypothesis, Verdicts, fold_sums, grown_sums, judge, overlap, shares_of_wins, t_value
 from .design import kind
 from .effect import Effect
 from .effects import Payload
@@ -20,7 +20,7 @@ from .noise import Spectrum
 from .problem import Problem, State, extended_state, physical_body, solved, whitened
 from .refit import Whitened, refit, shapes, with_shape
 from .results import Name
-from .screening import Group, Screen, catalogue, family_p, screen
+from .screening import DRAWS, Group, Screen, catalogue, family_p, screen
 
 __all__ = ["Found", "Step", "find_causes", "stand"]
 
@@ -31,6 +31,8 @@ SAME = 0.5  # overlap from which two causes explain the same misfit
 CLEARLY = 3.0  # t from which data tell effects apart that are the same while the joint moves
 EXACT = ({"torque_offset", "asymmetric_coulomb_friction"}, {"payload", "link_inertia"})
 MOST = 12
+LATER = 150  # draws of the null once the first step has given the p-value that is reported
+PADDED = 32
 
 
 @dataclass(frozen=True)
@@ -65,14 +67,20 @@ class Step:
     rows: Rows
     linear: Linear
     verdicts: Verdicts
+    folded: FoldSums
 
 
-def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> Step:
-    """Rows, fit and held-out squares of a state; the state comes back with its coefficients."""
-    rows = whitened(problem, state, whitening)
+def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], before: Step | None = None) -> Step:
+    """Rows, fit and held-out squares of a state; the state comes back with its coefficients.
+
+    `before` is where the search stood when this state has grown out of it.
+    """
+    grown = before is not None and len(before.state.sensors) == len(state.sensors)
+    rows = whitened(problem, state, whitening, before.rows if grown else None)
     linear = fit(rows, state.prior)
-    verdicts = judge(rows, Hypothesis(rows.X, state.prior))
-    return Step(solved(problem, state, verdicts.theta), rows, linear, verdicts)
+    folded = fold_sums(rows, rows.X)
+    verdicts = judge(rows, Hypothesis(rows.X, state.prior), folded)
+    return Step(solved(problem, state, verdicts.theta), rows, linear, verdicts, folded)
 
 
 def contend(
@@ -99,14 +107,16 @@ def contend(
         (name,) = effect.parameters()
         hypothesis = Hypothesis(rows.X, step.state.prior, full[..., 0] * float(getattr(effect, name)))
     elif isinstance(effect, Payload):
-        free = judge(rows, Hypothesis(np.concatenate([rows.X, full], axis=2), step.state.prior.extended(10)))
+        both = np.concatenate([rows.X, full], axis=2)
+        free = judge(rows, Hypothesis(both, step.state.prior.extended(10)), grown_sums(rows, step.folded, both))
         body = physical_body(free.theta[-10:], _information(rows, step, full))
         hypothesis = Hypothesis(rows.X, step.state.prior, full @ body)
         effect = with_shape(effect, list(effect.parameters()), list(body))
     else:
         X = np.concatenate([rows.X, full], axis=2)
         hypothesis = Hypothesis(X, step.state.prior.extended(Z.shape[0]))
-    verdicts = judge(rows, hypothesis)
+    known = None if np.ndim(hypothesis.fixed) else grown_sums(rows, step.folded, hypothesis.X)
+    verdicts = judge(rows, hypothesis, known)
     if len(verdicts.theta) > rows.X.shape[2]:
         names = [n for n, p in effect.parameters().items() if p.linear]
         effect = with_shape(effect, names, list(verdicts.theta[-len(names) :]))
@@ -121,13 +131,16 @@ def _information(rows: Rows, step: Step, Z: Float[np.ndarray, "nv T k"]) -> Floa
 
 
 def _for_refit(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"]) -> Whitened:
+    """What a refit needs; columns padded with zeros, so that the programs serve models of several sizes."""
     n, _, count, nv = problem.records.shape
-    rows = step.rows
-    tall = rows.X.reshape(-1, rows.X.shape[-1])
-    A = tall.T @ tall + np.diag(step.state.prior.precision)
+    rows, P = step.rows, step.rows.X.shape[2]
+    A = step.folded.gram.sum(0) + np.diag(step.state.prior.precision)
+    inverse = np.zeros((P + -P % PADDED,) * 2)
+    inverse[:P, :P] = np.linalg.inv(A + 1e-12 * np.diag(np.maximum(np.diag(A), 1e-12)))
+    X = np.pad(rows.X, ((0, 0), (0, 0), (0, -P % PADDED)))
     residual = rows.y - rows.X @ step.verdicts.theta
     response = whitening * np.asarray(step.state.response(jnp.asarray(problem.records.omega)))[:, None]
-    return Whitened(residual.reshape(nv, n, count), rows.X.reshape(nv, n, count, -1), np.linalg.inv(A), response)
+    return Whitened(residual.reshape(nv, n, count), X.reshape(nv, n, count, -1), inverse, response)
 
 
 def _response_contender(
@@ -174,12 +187,13 @@ def find_causes(
     """Accept the best cause until none passes the gates; answers the last step, the causes, the first p and screen."""
     generator = generator or np.random.default_rng(0)
     step, found = stand(problem, state, whitening), []
-    first_p, first_screen = 1.0, None
+    first_p, first_screen, groups = 1.0, None, None
     while len(found) < MOST:
         progress("screening the catalogue", len(found) / MOST)
-        groups = catalogue(problem, step.state, step.rows, whitening, forbid)
+        groups = catalogue(problem, step.state, step.rows, whitening, forbid, groups)
         screened = screen(step.rows, step.linear, groups)
-        p = family_p(problem, step.rows, step.linear, screened, spectrum, whitening, generator)
+        draws = DRAWS if first_screen is None else LATER
+        p = family_p(problem, step.rows, step.linear, screened, spectrum, whitening, generator, draws)
         if first_screen is None:
             first_p, first_screen = p, screened
         if p > alpha:
@@ -188,7 +202,8 @@ def find_causes(
         accepted = _accept(problem, step, screened, whitening, p, generator, found)
         if accepted is None:
             break
-        step = stand(problem, extended_state(problem, step.state, accepted.effect), whitening)
+        step = stand(problem, extended_state(problem, step.state, accepted.effect), whitening, step)
+        groups = groups if kind(accepted.effect) == "columns" else None
         found.append(accepted)
     return step, found, first_p, first_screen or Screen([], [])
 
@@ -208,8 +223,8 @@ def catalogue_p(
 
 def eliminate(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> list[Found]:
     """The causes without those that no longer predict anything once the others are in (earliest first)."""
+    full = _stand_with(problem, start, found, whitening) if len(found) > 1 else None
     for one in list(found[:-1]):
-        full = _stand_with(problem, start, found, whitening)
         others = [f for f in found if f is not one]
         if kind(one.effect) == "columns":
             place = amplitude_places(full.state, [f.effect for f in found], problem.model)[found.index(one)]
@@ -220,7 +235,7 @@ def eliminate(problem: Problem, start: State, found: list[Found], whitening: Flo
             without = _stand_with(problem, start, others, whitening).verdicts
         gain = 1 - full.verdicts.heldout / without.heldout
         if gain < GAIN or t_value(without.blocks, full.verdicts.blocks) < CONFIDENT:
-            found = others
+            found, full = others, _stand_with(problem, start, others, whitening)
     return found
 
 
