@@ -100,11 +100,11 @@ def test_no_hidden_effect_gets_a_confident_wrong_name():
 
 
 def test_nothing_is_named_in_clean_recordings():
-    scores = [clean(ROBOTS[k % 2], (WITH_REPEATS, WITHOUT_REPEATS)[k % 2], seed=200 + k) for k in range(5)]
+    scores = [clean(ROBOTS[k % 2], (WITH_REPEATS, WITHOUT_REPEATS)[k % 2], seed=200 + k) for k in range(3)]
     assert not any(s.told for s in scores), table(scores)
 
 
-@pytest.mark.parametrize("effect", LEFT_OUT)
+@pytest.mark.parametrize("effect", [*LEFT_OUT[:2], *(pytest.param(e, marks=pytest.mark.slow) for e in LEFT_OUT[2:])])
 def test_an_effect_left_out_of_the_catalogue_is_unknown(effect: str):
     case = make_case([(effect, 0.08)], robot=ROBOTS[0], seed=300 + LEFT_OUT.index(effect))
     answer = diagnosis_of(case, forbid=(effect,))
