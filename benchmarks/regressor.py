@@ -12,7 +12,6 @@ import argparse
 import json
 import os
 import platform
-import resource
 import subprocess
 import sys
 import time
@@ -65,10 +64,16 @@ def work() -> None:
         start = time.process_time()
         answer = jax.block_until_ready(methods[request["method"]](model, *state))
         cpu = time.process_time() - start
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        peak = peak_mb()
         norm = squared_norm(request["method"], answer) ** 0.5
         del answer
         print(json.dumps({"cpu": cpu, "norm": norm, "peak_mb": peak}), flush=True)
+
+
+def peak_mb() -> float:
+    """Peak resident memory of this process (ru_maxrss would inherit the peak of the one that started it)."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
 
 
 def squared_norm(method: str, answer: Any) -> float:
@@ -200,6 +205,7 @@ def tell(robot: str, case: dict[str, Any]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a thousand samples, three rounds")
+    parser.add_argument("--samples", type=int, nargs="+", help="sample counts (default 1000 10000 100000)")
     parser.add_argument("--rounds", type=int, help="interleaved rounds (default 9)")
     parser.add_argument("--core", type=int, default=max(os.sched_getaffinity(0)), help="core on which all run")
     parser.add_argument("--figaroh", metavar="PYTHON", help="interpreter of an environment that has figaroh")
@@ -226,7 +232,9 @@ def main() -> None:
     for name, file in ROBOTS.items():
         path = str(DATA / file)
         joints = [j for j in load_urdf(path).joint_names if j not in LOCKED]
-        compile_time[name] = {m: spread([bench.fresh(m, path, joints, 1000)["cpu"] for _ in range(3)]) for m in OURS}
+        compile_time[name] = {
+            m: spread([bench.fresh(m, path, joints, 1000)["cpu"] for _ in range(min(3, rounds))]) for m in OURS
+        }
         told_times = (f"{m} {x['median']:.2f} [{x['min']:.2f}, {x['max']:.2f}]" for m, x in compile_time[name].items())
         print(f"{name:6}", "  ".join(told_times))
     print(f"\n{'robot  samples method         us a sample, CPU':58} peak MB ", *(f"times faster: {p:9}" for p in PEERS))
@@ -236,7 +244,7 @@ def main() -> None:
         model = load_urdf(path, joints=joints)
         sizes = {"nv": model.nv, "links": len(model.joints), "pairs": len(pairs(model))}
         cases[name] = []
-        for samples in (1000,) if options.quick else (1_000, 10_000, 100_000):
+        for samples in options.samples or ([1_000] if options.quick else [1_000, 10_000, 100_000]):
             cases[name].append(bench.case(path, joints, sizes, samples, rounds))
             tell(name, cases[name][-1])
     if options.json:
