@@ -216,7 +216,7 @@ def _filtered_columns(
     n, samples, _, nv = problem.records.shape
     count = X.shape[2]
     padded = np.pad(X, ((0, 0), (0, 0), (0, -count % COLUMNS))).reshape(n, samples, nv, -1)
-    rows = np.asarray(_rows(problem.records, padded, response))[..., :count]
+    rows = np.asarray(_rows(problem.records, jnp.asarray(padded), response))[..., :count]
     rows = rows * np.asarray(problem.records.weight)[..., None]
     return np.moveaxis(rows.reshape(-1, nv, count), 0, 1)
 

@@ -75,8 +75,8 @@ def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], 
 
     `before` is where the search stood when this state has grown out of it.
     """
-    grown = before is not None and len(before.state.sensors) == len(state.sensors)
-    rows = whitened(problem, state, whitening, before.rows if grown else None)
+    shared = before.rows if before is not None and len(before.state.sensors) == len(state.sensors) else None
+    rows = whitened(problem, state, whitening, shared)
     linear = fit(rows, state.prior)
     folded = fold_sums(rows, rows.X)
     verdicts = judge(rows, Hypothesis(rows.X, state.prior), folded)
@@ -205,7 +205,8 @@ def find_causes(
         step = stand(problem, extended_state(problem, step.state, accepted.effect), whitening, step)
         groups = groups if kind(accepted.effect) == "columns" else None
         found.append(accepted)
-    return step, found, first_p, first_screen or Screen([], [])
+    assert first_screen is not None  # the loop has run at least once
+    return step, found, first_p, first_screen
 
 
 def catalogue_p(
@@ -223,7 +224,9 @@ def catalogue_p(
 
 def eliminate(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> list[Found]:
     """The causes without those that no longer predict anything once the others are in (earliest first)."""
-    full = _stand_with(problem, start, found, whitening) if len(found) > 1 else None
+    if len(found) < 2:
+        return found
+    full = _stand_with(problem, start, found, whitening)
     for one in list(found[:-1]):
         others = [f for f in found if f is not one]
         if kind(one.effect) == "columns":
@@ -260,6 +263,7 @@ def _accept(
 ) -> Found | None:
     """The cause that predicts best where it was not fitted, if it passes the gates; else nothing."""
     contenders = [contend(problem, step, whitening, *entry) for entry in shortlist(step, screened)]
+    contenders = [c for c in contenders if _exists(problem, c.effect)]
     contenders.sort(key=lambda c: c.verdicts.heldout)
     passing = [c for c in contenders if _passes(step, contenders, c)]
     best = next((c for c in passing if not _simpler(step, passing, c)), None)
@@ -277,6 +281,18 @@ def _accept(
         float(wins[0]) * (1 - p),
         _ambiguous(step, best, rivals, screened),
     )
+
+
+def _exists(problem: Problem, effect: Effect) -> bool:
+    """Whether such an effect can exist: amplitudes in their bounds, forces no larger than the joint's torque."""
+    strongest = np.sqrt((problem.torque**2).mean((0, 1)))[np.asarray(effect.at)] if effect.acts_on == "joint" else None
+    for name, parameter in effect.parameters().items():
+        value = float(getattr(effect, name))
+        if parameter.linear and value < parameter.lower:
+            return False
+        if strongest is not None and parameter.linear and parameter.unit == "N m" and abs(value) > strongest[0]:
+            return False
+    return True
 
 
 def _simpler(step: Step, contenders: list[Contender], one: Contender) -> bool:
