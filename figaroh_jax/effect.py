@@ -83,9 +83,9 @@ class Motion(eqx.Module):
         return smooth_sign(velocity, acceleration, self.dt, width)
 
 
-def amplitude(unit: str) -> Any:
-    """Declare a parameter in which the torque is linear."""
-    return eqx.field(default=0.0, metadata={"parameter": Parameter(unit, True)})
+def amplitude(unit: str, lower: float = -np.inf) -> Any:
+    """Declare a parameter in which the torque is linear; below `lower` the effect is not one that exists."""
+    return eqx.field(default=0.0, metadata={"parameter": Parameter(unit, True, lower)})
 
 
 def shape(

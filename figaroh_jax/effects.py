@@ -79,7 +79,7 @@ class RotorInertia(JointEffect):
     name, title = "rotor_inertia", "rotor inertia"
     equation = "inertia a"
     separated_by = "fast motion of {at} in several postures of the joints beyond it"
-    inertia: Scalar = amplitude("kg m2")
+    inertia: Scalar = amplitude("kg m2", lower=0.0)
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
         return self.inertia * self.here(motion.acceleration)
@@ -168,7 +168,7 @@ class StribeckFriction(JointEffect):
     name, title = "stribeck_friction", "Stribeck friction"
     equation = "force exp(-(|v|/speed)^2) s(v)"
     separated_by = "slow constant-velocity sweeps of {at} at five or more speeds below 0.3 rad/s"
-    force: Scalar = amplitude("N m")
+    force: Scalar = amplitude("N m", lower=0.0)
     speed: Scalar = shape("rad/s", (0.03, 0.06, 0.1, 0.15, 0.25, 0.4), (0.012, 0.64))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
@@ -199,7 +199,7 @@ class LoadDependentFriction(JointEffect):
     follows_torque = True
     equation = "ratio |tau_load| s(v)"
     separated_by = "the same motion of {at} with and without a payload"
-    ratio: Scalar = amplitude("")
+    ratio: Scalar = amplitude("", lower=0.0)
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
         return self.ratio * jnp.abs(self.here(motion.load)) * self.here(motion.direction)

@@ -75,7 +75,7 @@ class State:
     theta: Float[np.ndarray, " P"]
     motion: Motion  # as measured, with load and total torque of `theta`
 
-    def response(self, omega: Float[Array, " F"]) -> Complex[Array, " F"]:
+    def response(self, omega: Float[Array | np.ndarray, " F"]) -> Complex[Array, " F"]:
         """Response of the torque sensor of all sensor effects together."""
         out = jnp.ones(omega.shape, dtype=complex)
         for effect in self.sensors:

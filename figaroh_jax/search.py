@@ -30,6 +30,7 @@ GAIN, CONFIDENT, UNSURE = 0.004, 1.64, 1.7
 SAME = 0.5  # overlap from which two causes explain the same misfit
 CLEARLY = 3.0  # t from which data tell effects apart that are the same while the joint moves
 EXACT = ({"torque_offset", "asymmetric_coulomb_friction"}, {"payload", "link_inertia"})
+SMALLEST = 0.005  # share of the first cause's drop below which a later one may be what the first left over
 MOST = 12
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
 PADDED = 32
@@ -265,7 +266,8 @@ def _accept(
     contenders = [contend(problem, step, whitening, *entry) for entry in shortlist(step, screened)]
     contenders = [c for c in contenders if _exists(problem, c.effect)]
     contenders.sort(key=lambda c: c.verdicts.heldout)
-    passing = [c for c in contenders if _passes(step, contenders, c)]
+    least = SMALLEST * (before[0].cost[0] - before[0].cost[1]) if before else 0.0
+    passing = [c for c in contenders if _passes(step, contenders, c) and step.verdicts.cost - c.verdicts.cost > least]
     best = next((c for c in passing if not _simpler(step, passing, c)), None)
     if best is None:
         return None
