@@ -142,7 +142,7 @@ def test_demo_finds_both_causes_at_their_size():
     truth = yaml.safe_load((folder / "truth.yaml").read_text())["causes"]
     answer = diagnose_task(config.load_task(folder / "task.yaml"))
     found = {(cause.name.effect, tuple(cause.name.at)): cause.parameters for cause in answer.causes}
-    assert answer.verdict == "named"
+    assert answer.verdict in ("named", "named+rest")
     assert set(found) == {(cause["effect"], tuple(cause["at"])) for cause in truth}
     for cause in truth:
         estimates = found[cause["effect"], tuple(cause["at"])]
