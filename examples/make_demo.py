@@ -36,8 +36,8 @@ CENTRE = np.array([0.0, -0.7, 1.1, 0.3])  # rad, of the motion
 VISCOUS = np.array([1.2, 1.5, 0.9, 0.5])  # N m s/rad
 COULOMB = np.array([1.4, 1.8, 1.1, 0.6])  # N m
 ROTOR = np.array([0.020, 0.025, 0.012, 0.006])  # kg m2, which a URDF cannot hold; the task fits it
-STRIBECK = {"force": 0.9, "speed": 0.13}  # at the shoulder
-COUPLING = {"inertia": 0.004, "damping": 0.20, "friction": 0.45, "sign": 1.0}  # of elbow and wrist
+STRIBECK = {"force": 1.6, "speed": 0.13}  # at the shoulder
+COUPLING = {"inertia": 0.004, "damping": 0.10, "friction": 0.25, "sign": 1.0}  # of elbow and wrist
 
 
 def main(folder: Path) -> None:
