@@ -115,25 +115,33 @@ def rigid_prior(model: RobotModel, trust: float) -> tuple[Float[np.ndarray, " P"
     return nominal.reshape(-1), 1 / (trust * scale.reshape(-1)) ** 2
 
 
-def physical_body(free: Float[np.ndarray, "10"], information: Float[np.ndarray, "10 10"]) -> Float[np.ndarray, "10"]:
+def physical_body(
+    free: Float[np.ndarray, "10"], information: Float[np.ndarray, "10 10"]
+) -> Float[np.ndarray, "10"]:
     """The ten parameters nearest to `free` (in the metric `information`) that a body of positive mass can have.
 
-    The pseudo-inertia is L L' with L lower triangular (Wensing, Kim, Slotine 2018), L fitted by least squares.
+    The pseudo-inertia is L L' with L lower triangular (Wensing, Kim, Slotine 2018), L by Levenberg-Marquardt.
     """
-    from scipy.optimize import least_squares  # slow to import
+    import optimistix  # slow to import
 
     values, vectors = np.linalg.eigh((information + information.T) / 2)
     root = np.sqrt(np.maximum(values, 0))[:, None] * vectors.T
+    start = np.diag(np.sqrt(max(float(free[0]), 0.05) * np.array([0.002, 0.002, 0.002, 1.0])))[np.tril_indices(4)]
+    solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
+    arguments = jnp.asarray(root), jnp.asarray(free)
+    found = optimistix.least_squares(_misfit, solver, jnp.asarray(start), arguments, max_steps=200, throw=False)
+    return np.asarray(_body(found.value))
 
-    def body(x: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
-        lower = np.zeros((4, 4))
-        lower[np.tril_indices(4)] = x
-        return from_pseudo_inertia(lower @ lower.T)
 
-    mass = max(float(free[0]), 0.05)
-    start = np.linalg.cholesky(mass * np.diag([0.002, 0.002, 0.002, 1.0]))
-    fitted = least_squares(lambda x: root @ (body(x) - free), start[np.tril_indices(4)], x_scale=0.1, max_nfev=200)
-    return body(fitted.x)
+def _body(lower: Float[Array, "10"]) -> Float[Array, "10"]:
+    """Ten parameters of the pseudo-inertia L L'."""
+    L = jnp.zeros((4, 4)).at[np.tril_indices(4)].set(lower)
+    return jnp.asarray(from_pseudo_inertia(L @ L.T))
+
+
+def _misfit(lower: Float[Array, "10"], arguments: tuple[Array, Array]) -> Float[Array, "10"]:
+    root, free = arguments
+    return root @ (_body(lower) - free)
 
 
 def body_precision(ten: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:

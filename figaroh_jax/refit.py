@@ -36,16 +36,19 @@ class Whitened(eqx.Module):
 
 
 def bounded_minimum(
-    function: Callable[[Float[np.ndarray, " p"]], tuple[float, Float[np.ndarray, " p"]]],
-    start: Float[np.ndarray, " p"],
-    lower: Float[np.ndarray, " p"],
-    upper: Float[np.ndarray, " p"],
-) -> Float[np.ndarray, " p"]:
+    function: Callable[[Any], tuple[Any, Any]], start: Any, lower: Any, upper: Any, *, native: bool = False
+) -> Any:
     """Minimiser in a box of a smooth function that answers its value and its gradient, by L-BFGS-B.
 
-    The only place that knows the minimiser. SciPy's runs on the host around one compiled function; the one native to
-    JAX (jaxopt) compiles its own loop around every function, several seconds each (`benchmarks/README.md`).
+    The only place that knows the minimisers. SciPy's runs on the host around one compiled function. `native` takes
+    jaxopt's, which works inside `jit` and `vmap` but compiles its own loop around every function (6 CPU s around a
+    trivial one, 13 to 38 s around a refit), and is no longer maintained.
     """
+    if native:
+        from jaxopt import LBFGSB
+
+        solver = LBFGSB(function, value_and_grad=True, maxiter=STEPS, tol=1e-6, implicit_diff=False)
+        return solver.run(start, bounds=(lower, upper)).params
     from scipy.optimize import minimize  # slow to import
 
     options = {"maxiter": STEPS, "ftol": 1e-7, "gtol": 1e-6}

@@ -1,0 +1,62 @@
+"""The real Staubli TX40, blind: rotor, offset and wrist coupling all absent from the baseline."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import pytest
+from tx40 import write_task
+
+from figaroh_jax.results import Cause, Diagnosis
+
+WRIST = ("joint_5", "joint_6")
+
+
+@cache
+def diagnosis_of(data: Path, folder: Path) -> Diagnosis:
+    from figaroh_jax.config import load_task
+    from figaroh_jax.diagnosis import diagnose_task
+
+    return diagnose_task(load_task(write_task(folder, data)))
+
+
+@pytest.fixture(scope="module")
+def answer(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Diagnosis:
+    return diagnosis_of(data_dir, tmp_path_factory.mktemp("tx40"))
+
+
+@pytest.fixture(scope="module")
+def coupling(answer: Diagnosis) -> Cause:
+    return answer.causes[0]
+
+
+def test_the_coupling_of_the_wrist_is_the_first_cause_and_alone_in_its_set(coupling: Cause):
+    assert coupling.name == ("coupled_transmission", WRIST)
+    assert coupling.ambiguous_with == ()
+    assert coupling.confidence > 0.9
+
+
+def test_the_coupling_has_the_sign_and_the_size_of_the_published_one(coupling: Cause):
+    # Published: Iam6 .00964, fvm6 .616, fsm6 1.95; a fit with rotor and offset gives .0113, .609, 1.96.
+    found = coupling.parameters
+    assert found["sign"].value == 1.0
+    for name, published in {"inertia": 0.0113, "damping": 0.609, "friction": 1.96}.items():
+        assert abs(found[name].value - published) < max(0.1 * published, 2 * found[name].std), (name, found[name])
+
+
+def test_the_error_on_quarters_left_out_falls_as_it_must(answer: Diagnosis, coupling: Cause):
+    assert 0.130 < answer.holdout.before < 0.142
+    assert coupling.gain.after <= 0.0725
+    assert answer.holdout.after <= 0.055
+
+
+def test_rotor_inertias_are_found_where_they_can_be_seen_and_nowhere_else(answer: Diagnosis):
+    rotors = {cause.name.at[0] for cause in answer.causes if cause.name.effect == "rotor_inertia"}
+    assert rotors >= {"joint_3", "joint_4", "joint_5", "joint_6"}
+    assert not rotors & {"joint_1", "joint_2"}  # absorbed by the links' inertia
+
+
+def test_the_data_say_that_something_is_missing(answer: Diagnosis):
+    assert answer.p_value < 0.01
+    assert answer.verdict in ("named", "named+rest")
