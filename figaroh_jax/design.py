@@ -10,10 +10,9 @@ from __future__ import annotations
 from typing import Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 from .dynamics import inverse_dynamics
 from .effect import Effect, Motion, columns
@@ -66,22 +65,42 @@ def effect_rows(
 
     Sensor effects have one column, their torque divided by the parameter: exact at that parameter's value.
     """
-    n, samples, _, nv = records.shape
-    way = kind(effect)
-    if way == "columns":
-        torque = columns(effect, motion)
-        torque = torque.reshape(torque.shape[0], n, samples, -1)
-    elif way == "position":
-        torque = torque_change(effect, motion, records).reshape(1, n, samples, nv) / _size(effect)
-    else:
-        torque = motion.total.reshape(1, n, samples, nv)
-    own = effect.acts_on in ("joint", "pair") and way == "columns"
-    response: Complex[Array, "F rows"] = whitening[:, effect.at] if own else whitening
-    weight = records.weight[..., effect.at] if own else records.weight
+    torque, joints = raw_columns(effect, motion, records)
+    flat = torque.reshape(-1, torque.shape[2])
+    rows = placed_rows(flat, jnp.tile(joints, torque.shape[0]), records, response_of(effect, records, whitening))
+    return rows.reshape(*torque.shape[:2], *rows.shape[1:])
+
+
+def raw_columns(
+    effect: Effect, motion: Motion, records: Records
+) -> tuple[Float[Array, "amplitudes rows nN"], Int[Array, " rows"]]:
+    """Torque of a unit of each amplitude at the samples, and the joints of its rows."""
+    way, everywhere = kind(effect), jnp.arange(records.position.shape[2])
     if way == "response":
-        response = response * ((effect.torque_response(records.omega) - 1) / _size(effect))[:, None]
-    rows = jax.vmap(lambda column: filter_rows(records, column, response) * weight)(torque)
-    return jnp.moveaxis(rows, 3, 1)
+        return motion.total.T[None], everywhere
+    if way == "position":
+        return torque_change(effect, motion, records).T[None] / _size(effect), everywhere
+    torque = columns(effect, motion)
+    own = effect.acts_on in ("joint", "pair")
+    torque = jnp.moveaxis(torque.reshape(*torque.shape[:2], -1), 1, 2)
+    return torque, jnp.asarray(effect.at) if own else everywhere
+
+
+def response_of(effect: Effect, records: Records, whitening: Float[Array, "F nv"]) -> Complex[Array, "F nv"]:
+    """Response that the effect's columns pass: the whitening, and what a sensor effect makes of the torque."""
+    if kind(effect) != "response":
+        return whitening
+    return whitening * ((effect.torque_response(records.omega) - 1) / _size(effect))[:, None]
+
+
+def placed_rows(
+    torque: Float[Array, "K nN"], joints: Int[Array, " K"], records: Records, response: Complex[Array, "F nv"]
+) -> Float[Array, "K n M"]:
+    """Rows of torques at one joint each, with that joint's response and weight."""
+    n, samples, _, _ = records.shape
+    signal = jnp.moveaxis(torque.reshape(-1, n, samples), 0, 2)
+    rows = filter_rows(records, signal, jnp.take(response, joints, axis=1)) * jnp.take(records.weight, joints, axis=2)
+    return jnp.moveaxis(rows, 2, 0)
 
 
 def _size(effect: Effect) -> Float[Array, ""]:

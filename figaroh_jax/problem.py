@@ -80,7 +80,7 @@ class State:
         out = jnp.ones(omega.shape, dtype=complex)
         for effect in self.sensors:
             if kind(effect) == "response":
-                out = out * effect.torque_response(omega)
+                out = out * effect.torque_response(jnp.asarray(omega))
         return out
 
 
@@ -115,9 +115,7 @@ def rigid_prior(model: RobotModel, trust: float) -> tuple[Float[np.ndarray, " P"
     return nominal.reshape(-1), 1 / (trust * scale.reshape(-1)) ** 2
 
 
-def physical_body(
-    free: Float[np.ndarray, "10"], information: Float[np.ndarray, "10 10"]
-) -> Float[np.ndarray, "10"]:
+def physical_body(free: Float[np.ndarray, "10"], information: Float[np.ndarray, "10 10"]) -> Float[np.ndarray, "10"]:
     """The ten parameters nearest to `free` (in the metric `information`) that a body of positive mass can have.
 
     The pseudo-inertia is L L' with L lower triangular (Wensing, Kim, Slotine 2018), L by Levenberg-Marquardt.

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .design import candidates, effect_rows, kind
+from .design import candidates, effect_rows, kind, placed_rows, raw_columns
 from .effect import Effect, Motion
 from .effects import CATALOGUE, LinkEffect
 from .evidence import Bank, Columns, Linear, Rows, Score, bank, block_scores, other_scores, projection, scores
@@ -26,7 +26,8 @@ from .results import Name
 
 __all__ = ["Group", "Screen", "catalogue", "family_p", "screen"]
 
-DRAWS, CHUNK = 400, 50  # draws held at once
+DRAWS, CHUNK = 400, 50
+COLUMNS = 128  # filtered at once: bounds the memory  # draws held at once
 ALTERNATIVES = ({"torque_delay", "torque_lag"},)  # once one is in, the other is not tried
 
 
@@ -181,7 +182,24 @@ def _places_of(term: Effect) -> list[tuple[Effect, tuple[int, ...]]]:
 def _all_rows(
     batches: dict[str, Effect], motion: Motion, records: Records, response: Array
 ) -> dict[str, Float[Array, "places grid k rows n M"]]:
-    def rows(effect: Effect) -> Float[Array, "k rows n M"]:
-        return effect_rows(effect, motion, records, response)
+    """Rows of all candidates: their torques side by side through one filter, some columns at a time."""
+    out, torques, joints, shapes = {}, [], [], {}
+    for name, batch in batches.items():
+        if kind(batch) == "response":
+            out[name] = jax.vmap(jax.vmap(lambda e: effect_rows(e, motion, records, response)))(batch)
+            continue
+        raw, at = jax.vmap(jax.vmap(lambda e: raw_columns(e, motion, records)))(batch)
+        shapes[name] = raw.shape[:4]
+        torques.append(raw.reshape(-1, raw.shape[4]))
+        joints.append(jnp.broadcast_to(at[:, :, None], raw.shape[:4]).reshape(-1))
 
-    return {name: jax.vmap(jax.vmap(rows))(batch) for name, batch in batches.items()}
+    def rows(column: tuple[Array, Array]) -> Array:
+        return placed_rows(column[0][None], column[1][None], records, response)[0]
+
+    flat = jax.lax.map(rows, (jnp.concatenate(torques), jnp.concatenate(joints)), batch_size=COLUMNS)
+    first = 0
+    for name, shape in shapes.items():
+        count = int(np.prod(shape))
+        out[name] = flat[first : first + count].reshape(*shape, *flat.shape[1:])
+        first += count
+    return out
