@@ -99,21 +99,32 @@ def estimates(effect: Effect, fitted: Fitted, place: tuple[int, ...], model: Rob
     """What an engineer reads of the effect, with one sigma (first order in the fitted parameters)."""
     names = [n for n, p in effect.parameters().items() if p.linear and kind(effect) == "columns"]
     names += shapes(type(effect))
-    values = jnp.asarray([float(getattr(effect, name)) for name in names])
-
-    def physical(x: Float[Array, " k"]) -> dict[str, Float[Array, ""]]:
-        return {k: jnp.asarray(v) for k, v in with_shape(effect, names, list(x)).physical().items()}
-
-    found, slope = physical(values), jax.jacfwd(physical)(values)
+    found, slope = _physical(effect, names)
     covariance = fitted.covariance[np.ix_(place, place)]
     straight = effect.acts_on == "joint" and prismatic(model)[int(effect.at[0])]
     units = {**{n: p.unit for n, p in effect.parameters().items()}, **effect.units()}
     out = {}
     for name, value in found.items():
-        g = np.asarray(slope[name])
+        g = slope[name]
         std = float(np.sqrt(max(g @ covariance @ g, 0.0)))
         out[name] = Estimate(float(value), std, joint_unit(units[name], straight))
     return out
+
+
+def _physical(effect: Effect, names: list[str]) -> tuple[dict[str, float], dict[str, Float[np.ndarray, " k"]]]:
+    """What is reported of the effect, and its derivatives in the fitted fields `names`."""
+    if not effect.has("physical"):
+        fields = list(effect.parameters())
+        return {n: float(getattr(effect, n)) for n in fields}, {
+            n: np.array([n == k for k in names], float) for n in fields
+        }
+    values = jnp.asarray([float(getattr(effect, name)) for name in names])
+
+    def physical(x: Float[Array, " k"]) -> dict[str, Float[Array, ""]]:
+        return {k: jnp.asarray(v) for k, v in with_shape(effect, names, list(x)).physical().items()}
+
+    slope = jax.jacfwd(physical)(values)
+    return {k: float(v) for k, v in physical(values).items()}, {k: np.asarray(g) for k, g in slope.items()}
 
 
 def prismatic(model: RobotModel) -> tuple[bool, ...]:

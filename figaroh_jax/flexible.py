@@ -120,12 +120,14 @@ def _replaced(G: np.ndarray, b: np.ndarray, column: int, cross: np.ndarray, squa
 
 
 def _families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> list[Group]:
-    motion, groups = state.motion, []
-    for joint in range(problem.model.nv):
-        for title, columns in _smooth(motion, joint).items():
-            rows = [_placed(problem, column, joint, whitening) for column in columns]
-            Z = np.stack(rows)[None, :, None]
-            groups.append(Group(Name(title, (problem.model.joint_names[joint],)), None, Columns((joint,), Z)))
+    nv = problem.model.nv
+    joints = [_smooth(state.motion, joint) for joint in range(nv)]
+    groups = []
+    for title, columns in joints[0].items():
+        every = [np.stack([j[title][k] for j in joints], axis=1) for k in range(len(columns))]
+        rows = np.stack([filtered_rows(problem, one, jnp.asarray(whitening)) for one in every])
+        for joint, name in enumerate(problem.model.joint_names):
+            groups.append(Group(Name(title, (name,)), None, Columns((joint,), rows[None, :, joint][:, :, None])))
     return groups
 
 
@@ -145,9 +147,3 @@ def _smooth(motion: Motion, joint: int) -> dict[str, list[Float[np.ndarray, " nN
 def _unit(x: Float[np.ndarray, " nN"]) -> Float[np.ndarray, " nN"]:
     low, high = x.min(), x.max()
     return 2 * (x - low) / max(high - low, 1e-9) - 1
-
-
-def _placed(problem: Problem, column: np.ndarray, joint: int, whitening: np.ndarray) -> Float[np.ndarray, " T"]:
-    torque = np.zeros((len(column), problem.model.nv))
-    torque[:, joint] = column
-    return filtered_rows(problem, torque, jnp.asarray(whitening))[joint]

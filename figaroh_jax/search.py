@@ -33,7 +33,7 @@ EXACT = ({"torque_offset", "asymmetric_coulomb_friction"}, {"payload", "link_ine
 SMALLEST = 0.005  # share of the first cause's drop below which a later one may be what the first left over
 MOST = 12
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
-PADDED = 32
+PADDED = 64
 
 
 @dataclass(frozen=True)
@@ -291,6 +291,11 @@ def _exists(problem: Problem, effect: Effect) -> bool:
     for name, parameter in effect.parameters().items():
         value = float(getattr(effect, name))
         if parameter.linear and value < parameter.lower:
+            return False
+        if (
+            not (parameter.linear or parameter.choice)
+            and not parameter.lower < value * 0.999 < value * 1.001 < parameter.upper
+        ):
             return False
         if strongest is not None and parameter.linear and parameter.unit == "N m" and abs(value) > strongest[0]:
             return False
