@@ -1,0 +1,131 @@
+"""Spectra, whitening, leverage and lines against simulated noise whose spectrum is known in closed form."""
+
+from __future__ import annotations
+
+import secrets
+
+import numpy as np
+from scipy.signal import lfilter
+
+from figaroh_jax import noise
+
+RATE, COUNT, CUTOFF = 66.0, 2000, 20.0
+POLES, DRIVEN, WHITE = (0.9, 0.6), (0.5, 2.0), (0.7, 1.0)  # of two joints: AR(1), its innovation, white noise
+SERIES = 40
+
+
+def simulated(rng: np.random.Generator) -> np.ndarray:
+    """AR(1) plus white noise: (series, samples, joints)."""
+    out = []
+    for pole, driven, white in zip(POLES, DRIVEN, WHITE, strict=True):
+        slow = lfilter([1.0], [1.0, -pole], driven * rng.standard_normal((SERIES, COUNT + 200)))[:, 200:]
+        out.append(slow + white * rng.standard_normal((SERIES, COUNT)))
+    return np.stack(out, axis=2)
+
+
+def truth(frequency: np.ndarray) -> np.ndarray:
+    turn = np.exp(-2j * np.pi * frequency[:, None] / RATE)
+    return np.array(DRIVEN) ** 2 / abs(1 - np.array(POLES) * turn) ** 2 + np.array(WHITE) ** 2
+
+
+def low_pass(frequency: np.ndarray) -> np.ndarray:
+    return 1 / (1 + (frequency / CUTOFF) ** 8)
+
+
+def filtered(series: np.ndarray, response: np.ndarray) -> np.ndarray:
+    """Rows after a response over the frequencies of `rfft`, with one column a joint or one for all."""
+    shaped = response.reshape(len(response), -1)
+    return np.fft.irfft(np.fft.rfft(series, axis=1) * shaped, series.shape[1], axis=1)
+
+
+def spectrum_of(series: np.ndarray, gain: np.ndarray) -> noise.Spectrum:
+    powers = [noise.periodogram(one, RATE) for one in series]
+    frequency, power = powers[0][0], np.mean([p for _, p in powers], axis=0)
+    return noise.fit_spectrum(frequency, power, gain[1:], np.full(len(frequency), float(len(series))), RATE / 2)
+
+
+def test_periodogram_of_white_noise_is_its_variance() -> None:
+    rows = 3.0 * np.random.default_rng(0).standard_normal((4000, 50))
+    frequency, power = noise.periodogram(rows, RATE)
+    np.testing.assert_allclose(frequency[[0, -1]], [RATE / 4000, RATE / 2], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(power.mean(), 9.0, rtol=0, atol=0.15)
+
+
+def test_spectrum_of_coloured_noise_is_found_behind_the_row_filter() -> None:
+    frequency = np.fft.rfftfreq(COUNT, 1 / RATE)
+    response = low_pass(frequency)
+    rows = filtered(simulated(np.random.default_rng(1)), response)
+    found = spectrum_of(rows, response**2)
+    band = np.linspace(0.7, CUTOFF, 200)
+    np.testing.assert_allclose(found.power(band) / truth(band), 1.0, rtol=0, atol=0.08)
+    # below, the form is a power of the frequency: too stiff for a spectrum that levels off
+    slow = np.linspace(0.1, 0.7, 20)
+    np.testing.assert_allclose(np.log(found.power(slow) / truth(slow)), 0.0, rtol=0, atol=np.log(1.8))
+
+
+def test_whitened_noise_has_a_flat_spectrum_of_power_one_in_the_pass_band() -> None:
+    frequency = np.fft.rfftfreq(COUNT, 1 / RATE)
+    response, rng = low_pass(frequency), np.random.default_rng(2)
+    spectrum = spectrum_of(filtered(simulated(rng), response), response**2)
+    weights = noise.whitening(spectrum, frequency, response**2, CUTOFF)
+    fresh = filtered(filtered(simulated(rng), response), weights)
+    power = np.mean([noise.periodogram(one, RATE)[1] for one in fresh], axis=0)
+    inner = (frequency[1:] > 0.7) & (frequency[1:] < 0.7 * CUTOFF)
+    parts = np.stack([part.mean(0) for part in np.array_split(power[inner], 12)])
+    # the floor takes up to 5 % of the median power
+    np.testing.assert_allclose(parts, 0.97, rtol=0, atol=0.1)
+    assert power[frequency[1:] > 1.4 * CUTOFF].max() < 1.0  # what the filter emptied is not blown up
+
+
+def test_white_spectrum_is_only_a_scale() -> None:
+    frequency = np.linspace(0.0, 33.0, 50)
+    white = noise.white(np.array([4.0, 0.25]), 33.0)
+    np.testing.assert_allclose(white.power(frequency), [[4.0, 0.25]] * 50, rtol=0, atol=1e-12)
+    weights = noise.whitening(white, frequency, low_pass(frequency), CUTOFF)
+    np.testing.assert_allclose(weights, [[0.5, 2.0]] * 50, rtol=0, atol=1e-12)
+
+
+def test_redrawn_spectra_scatter_as_fits_to_new_data_do() -> None:
+    frequency, rng = np.fft.rfftfreq(COUNT, 1 / RATE), np.random.default_rng(3)
+    flat = np.ones(len(frequency))
+    band = np.array([0.5, 2.0, 8.0, 20.0])
+    fits = [spectrum_of(simulated(rng)[:4], flat) for _ in range(40)]
+    scatter = np.std([np.log(one.power(band)) for one in fits], axis=0)
+    drawn = np.std([np.log(fits[0].redrawn(rng).power(band)) for _ in range(400)], axis=0)
+    # a Hann window makes neighbouring bins follow one another: fits scatter by up to sqrt(2) more
+    assert np.all((scatter / drawn > 0.7) & (scatter / drawn < 2.0)), scatter / drawn
+
+
+def test_a_projection_takes_the_share_of_white_noise_that_leverage_says() -> None:
+    rng, count, joints = np.random.default_rng(4), 60, 2
+    time = np.arange(count)[:, None]
+    slow = np.cos(np.pi * (time + 0.5) * np.arange(5) / count)  # low frequencies, at the first joint alone
+    tall = np.zeros((count, joints, 8))
+    tall[:, 0, :5], tall[:, :, 5:] = slow, rng.standard_normal((count, joints, 3))
+    basis = np.linalg.qr(tall.reshape(-1, 8))[0]
+    share = noise.leverage(basis.reshape(count, joints, 8))
+    white = rng.standard_normal((20000, count * joints))
+    left = (white - (white @ basis) @ basis.T).reshape(-1, count, joints)
+    power = (abs(np.fft.rfft(left, axis=1)[:, 1:]) ** 2).mean(0) / count
+    np.testing.assert_allclose(power, 1 - share, rtol=0, atol=6 * np.sqrt(2 / 20000))
+    assert share[0, 0] > 0.8 and share.max() <= 1 + 1e-9
+
+
+def test_a_sine_in_noise_is_found_at_its_frequency_and_joint() -> None:
+    rng, time = np.random.default_rng(5), np.arange(COUNT) / RATE
+    residual = rng.standard_normal((3, COUNT, 2))
+    residual[:, :, 1] += 0.4 * np.sin(2 * np.pi * 7.3 * time + rng.uniform(0, 6, (3, 1)))
+    p, frequency, joint = noise.spectral_line(residual, RATE, CUTOFF)
+    assert p < 1e-6 and joint == 1
+    np.testing.assert_allclose(frequency, 7.3, rtol=0, atol=1.5 * RATE / COUNT)
+
+
+def test_white_noise_rarely_shows_a_line() -> None:
+    rng = np.random.default_rng(secrets.randbits(64))
+    p = np.array([noise.spectral_line(rng.standard_normal((2, 1000, 3)), RATE, CUTOFF)[0] for _ in range(400)])
+    # 400 series at 1e-3: 0.4 are expected, and the median of 41 bins is itself uncertain
+    assert (p < 1e-3).sum() <= 12, np.sort(p)[:15]
+
+
+def test_too_short_a_series_has_no_line() -> None:
+    assert noise.spectral_line(np.ones((1, 60, 1)), RATE, CUTOFF) == (1.0, 0.0, 0)
