@@ -73,7 +73,7 @@ def test_whitened_noise_has_a_flat_spectrum_of_power_one_in_the_pass_band() -> N
     inner = (frequency[1:] > 0.7) & (frequency[1:] < 0.7 * CUTOFF)
     parts = np.stack([part.mean(0) for part in np.array_split(power[inner], 12)])
     # the floor takes up to 5 % of the median power
-    np.testing.assert_allclose(parts, 0.97, rtol=0, atol=0.1)
+    np.testing.assert_allclose(parts, 1.0, rtol=0, atol=0.1)
     assert power[frequency[1:] > 1.4 * CUTOFF].max() < 1.0  # what the filter emptied is not blown up
 
 

@@ -1,0 +1,134 @@
+"""Partners, blocks and folds against the motion itself: rows that repeat have the same position."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic import DT, STEP, made_signals, swing
+
+from figaroh_jax.layout import describe_folds, excitations, held_rows, layout
+from figaroh_jax.records import stack
+from figaroh_jax.signals import Signals
+
+ROW = STEP * DT
+
+
+def other(time: np.ndarray) -> np.ndarray:
+    return swing(time + 100.0)
+
+
+def third(time: np.ndarray) -> np.ndarray:
+    return swing(time + 200.0)
+
+
+def by_recording(flat: np.ndarray, signals: list[Signals]) -> list[np.ndarray]:
+    """The rows of each recording, without padding, out of an axis of all rows."""
+    parts = flat.reshape(*flat.shape[:-1], len(signals), -1)
+    return [parts[..., k, : one.rows.kept] for k, one in enumerate(signals)]
+
+
+def row_positions(signals: list[Signals]) -> np.ndarray:
+    """Position at every row of every recording: (recordings x rows, joints)."""
+    records = stack(signals)
+    sample = records.row_samples()
+    position = np.asarray(records.position)
+    return np.take_along_axis(position, sample[..., None], axis=1).reshape(-1, position.shape[2])
+
+
+@pytest.mark.parametrize("late", [0, 7, -12])
+def test_a_partner_is_the_row_where_the_other_repeat_is_at_the_same_place(late: int) -> None:
+    signals = [
+        made_signals(12.0, begin=1.0, repeat="A"),
+        made_signals(12.0, other),
+        made_signals(11.0, begin=1.0 - late * ROW, repeat="A"),
+    ]
+    found, position = layout(signals, stack(signals)), row_positions(signals)
+    assert found.repeats and found.partner.shape[0] == 1
+    (partner,) = found.partner
+    have = np.flatnonzero(partner >= 0)
+    np.testing.assert_allclose(position[partner[have]], position[have], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(partner[partner[have]], have)
+    alone = by_recording(partner, signals)[1]
+    assert np.all(alone == -1)
+    # the first recording has a partner wherever the second was running
+    expected = min(signals[0].rows.kept, signals[2].rows.kept - late) - max(0, -late)
+    assert (by_recording(partner, signals)[0] >= 0).sum() == expected
+    np.testing.assert_array_equal(found.paired, np.broadcast_to(partner >= 0, found.paired.shape))
+
+
+def test_each_of_three_repeats_has_the_two_others_as_partners() -> None:
+    signals = [made_signals(5.0, repeat="A") for _ in range(3)]
+    found, count = layout(signals, stack(signals)), signals[0].rows.kept
+    number = found.partner.reshape(2, 3, count) // count
+    np.testing.assert_array_equal(
+        np.sort(number, axis=0), [[[1] * count, [0] * count, [0] * count]] + [[[2] * count, [2] * count, [1] * count]]
+    )
+    np.testing.assert_array_equal(found.partner % count, np.broadcast_to(np.tile(np.arange(count), 3), (2, 3 * count)))
+
+
+def test_a_row_whose_partner_is_gated_takes_no_instruments_from_it() -> None:
+    signals = [made_signals(5.0, repeat="A"), made_signals(5.0, repeat="A", gated=slice(20, 30))]
+    found = layout(signals, stack(signals))
+    first, second = by_recording(found.paired, signals)
+    expected = np.ones(signals[0].rows.kept)
+    expected[20:30] = 0.0
+    np.testing.assert_array_equal(first, [expected] * 2)
+    np.testing.assert_array_equal(second, 1.0)
+
+
+def test_without_repeats_nothing_has_a_partner_and_all_rows_count() -> None:
+    signals = [made_signals(5.0), made_signals(5.0, other)]
+    found = layout(signals, stack(signals))
+    assert not found.repeats and found.partner.shape == (0, 2 * signals[0].rows.kept)
+    np.testing.assert_array_equal(found.paired, 1.0)
+
+
+@pytest.mark.parametrize(("seconds", "width"), [(14.0, 1.0), (5.0, 0.3)])
+def test_blocks_are_runs_of_about_one_length_within_a_recording(seconds: float, width: float) -> None:
+    signals = [made_signals(seconds), made_signals(seconds - 1.0, other), made_signals(seconds, role="holdout")]
+    found = layout(signals, stack(signals))
+    own = by_recording(found.block, signals)
+    assert np.all(own[2] == -1)
+    np.testing.assert_array_equal(np.unique(np.concatenate(own[:2])), np.arange(own[1].max() + 1))
+    assert own[0].max() + 1 == own[1].min()
+    for block in own[:2]:
+        assert set(np.diff(block)) == {0, 1}
+        lengths = np.bincount(block - block[0]) * ROW
+        assert lengths.min() > 0.5 * width - 2 * ROW and lengths.max() < 1.5 * width + 2 * ROW
+    assert (found.block >= 0).sum() == signals[0].rows.kept + signals[1].rows.kept
+
+
+def test_three_excitations_are_left_out_one_by_one_with_their_repeats() -> None:
+    motions = [("A", swing), (None, other), ("A", swing), ("C", third)]
+    signals = [made_signals(5.0 + 0.5 * k, motion, repeat=label) for k, (label, motion) in enumerate(motions)]
+    signals.append(made_signals(6.0, role="holdout"))
+    found = layout(signals, stack(signals))
+    for fold, expected in zip(by_recording(found.fold, signals), [0, 1, 0, 2, -1], strict=True):
+        np.testing.assert_array_equal(fold, expected)
+    assert (found.fold >= 0).sum() == sum(one.rows.kept for one in signals[:4])
+    assert excitations(signals[:4]) == [0, 1, 0, 2]
+    assert describe_folds(signals) == "each excitation left out in turn"
+
+
+@pytest.mark.parametrize("labels", [[None], [None, None], ["A", "A"]], ids=["single", "two", "two repeats"])
+def test_fewer_excitations_are_left_out_quarter_by_quarter(labels: list[str | None]) -> None:
+    motions = [swing, other if labels[-1] is None else swing]
+    signals = [made_signals(8.0, m, repeat=label) for m, label in zip(motions, labels, strict=False)]
+    found = layout(signals, stack(signals))
+    quarters = 1 + found.fold.max()
+    assert quarters == (8 if labels == [None, None] else 4)
+    sizes = np.bincount(found.fold)
+    assert sizes.max() - sizes.min() <= 2
+    for fold in by_recording(found.fold, signals):
+        assert set(np.diff(fold)) == {0, 1} and fold[-1] - fold[0] == 3
+    if labels == ["A", "A"]:  # a quarter is left out of both repeats at once
+        np.testing.assert_array_equal(*by_recording(found.fold, signals))
+    assert describe_folds(signals) == "each recording's quarters left out in turn"
+
+
+def test_held_rows_are_those_of_holdout_recordings_with_torque() -> None:
+    signals = [made_signals(5.0), made_signals(4.0, other, role="holdout", gated=slice(0, 5))]
+    held = held_rows(signals, stack(signals))
+    expected = np.zeros_like(held)
+    expected[1, 5 : signals[1].rows.kept] = 1.0
+    np.testing.assert_array_equal(held, expected)
