@@ -1,0 +1,191 @@
+"""Profiles of shapes against finite differences, shapes recovered from noiseless rows, minimisers in a box."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import robots
+from jaxtyping import Array
+from synthetic import made_signals
+
+from figaroh_jax.dynamics import inverse_dynamics
+from figaroh_jax.effect import Effect, Motion
+from figaroh_jax.effects import find
+from figaroh_jax.model import RobotModel
+from figaroh_jax.records import Records, stack
+from figaroh_jax.refit import Whitened, bounded_minimum, profile, refit, with_shape
+
+SECONDS = 12.0
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
+    return robots.load(robots.ARM, tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def records() -> Records:
+    return stack([made_signals(SECONDS)])
+
+
+@pytest.fixture(scope="module")
+def motion(model: RobotModel, records: Records) -> Motion:
+    q, v, a = (records.flat(jnp.asarray(x)) for x in (records.position, records.velocity, records.acceleration))
+    load = inverse_dynamics(model, q, v, a)
+    total = load + 2.0 * v + 3.0 * jnp.tanh(v / 0.05)
+    return Motion(model, records.flat(jnp.asarray(records.time)), q, v, a, load, total, records.dt, np.zeros(2))
+
+
+def whitened(records: Records, residual: np.ndarray | None = None) -> Whitened:
+    """A random residual and a model of three random columns with a prior; rows as they are."""
+    n, _, count, nv = records.shape
+    rng = np.random.default_rng(0)
+    X = rng.standard_normal((nv, n, count, 3))
+    tall = X.reshape(-1, 3)
+    inverse = np.linalg.inv(tall.T @ tall + np.diag([1.0, 10.0, 0.1]))
+    residual = rng.standard_normal((nv, n, count)) if residual is None else residual
+    return Whitened(residual, X, inverse, np.ones((len(np.asarray(records.omega)), nv)))
+
+
+def at_joint(name: str, joint: int = 0, **shape: float) -> Effect:
+    effect = find(name)
+    where = np.array([joint] if effect.acts_on == "joint" else [], dtype=np.int64)
+    return effect(where, **{key: np.float64(value) for key, value in shape.items()})
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "value"),
+    [
+        ("stribeck_friction", "speed", 0.13),
+        ("power_law_friction", "exponent", 1.7),
+        ("torque_ripple", "order", 7.1),
+        ("torque_delay", "delay", 0.004),
+        ("torque_lag", "time", 0.007),
+        ("joint_elasticity", "compliance", 3e-4),
+    ],
+)
+def test_gradient_of_the_profile_is_that_of_finite_differences(
+    motion: Motion, records: Records, name: str, shape: str, value: float
+) -> None:
+    effect, rows = at_joint(name, **{shape: value}), whitened(records)
+
+    @jax.jit
+    def both(x: Array) -> tuple[Array, Array]:
+        def one(x: Array) -> Array:
+            return profile(with_shape(effect, [shape], [x]), motion, records, rows)[0]
+
+        return jax.jvp(one, (x,), (jnp.ones(()),))
+
+    slope = float(both(jnp.asarray(value))[1])
+    step = 2e-3 * value
+    # five points: the error of the step is of fourth order, that of rounding 1e-12
+    offsets, weights = np.array([-2.0, -1.0, 1.0, 2.0]), np.array([1.0, -8.0, 8.0, -1.0]) / 12
+    values = [float(both(jnp.asarray(value + k * step))[0]) for k in offsets]
+    np.testing.assert_allclose(slope, weights @ values / step, rtol=0, atol=1e-6 * abs(slope))
+
+
+def test_profile_is_the_change_of_the_penalised_squares(motion: Motion, records: Records) -> None:
+    effect, rng = at_joint("torque_ripple", 1, order=6.0), np.random.default_rng(1)
+    precision = np.array([1.0, 10.0, 0.1])
+    rows = whitened(records)
+    X, y = np.asarray(rows.X).reshape(-1, 3), rng.standard_normal(np.asarray(rows.residual).size)
+    root = np.diag(np.sqrt(precision))
+    theta = np.linalg.lstsq(np.vstack([X, root]), np.append(y, np.zeros(3)), rcond=None)[0]
+    residual = (y - X @ theta).reshape(np.asarray(rows.residual).shape)
+    value, Z = profile(effect, motion, records, eqx.tree_at(lambda w: w.residual, rows, residual))
+    full = np.zeros((2, 2, residual[0].size))
+    full[:, 1] = np.asarray(Z).reshape(2, -1)
+    stacked = np.hstack([np.vstack([X, root]), np.vstack([full.reshape(2, -1).T, np.zeros((3, 2))])])
+    right = np.append(y, np.zeros(3))
+    after = right - stacked @ np.linalg.lstsq(stacked, right, rcond=None)[0]
+    before = right - np.vstack([X, root]) @ theta
+    np.testing.assert_allclose(value, after @ after - before @ before, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "starts", "truth", "error"),
+    [
+        ("stribeck_friction", "speed", (0.06, 0.1, 0.15, 0.25), 0.122, 2e-3),
+        ("torque_ripple", "order", (6.2, 7.0, 7.8, 8.6), 7.35, 2e-3),
+    ],
+)
+def test_refit_finds_the_shape_that_made_noiseless_rows(
+    motion: Motion, records: Records, name: str, shape: str, starts: tuple[float, ...], truth: float, error: float
+) -> None:
+    made = at_joint(name, **{shape: truth})
+    rows = whitened(records)
+    _, Z = profile(made, motion, records, rows)
+    amplitudes = np.array([3.0, -1.0])[: len(Z)]
+    residual = np.zeros(np.asarray(rows.residual).shape)
+    residual[0] = np.tensordot(amplitudes, np.asarray(Z)[:, 0], 1)
+    X = np.asarray(rows.X).reshape(-1, 3)
+    residual -= (X @ np.asarray(rows.inverse) @ (X.T @ residual.reshape(-1))).reshape(residual.shape)
+    batch = at_joint(name)
+    effects: Any = jax.tree.map(lambda x: np.stack([np.asarray(x)] * len(starts)), batch)
+    effects = with_shape(effects, [shape], [np.array(starts)])
+    found, columns = refit(effects, motion, records, eqx.tree_at(lambda w: w.residual, rows, residual))
+    np.testing.assert_allclose(getattr(found, shape), truth, rtol=0, atol=error)
+    np.testing.assert_allclose(columns, Z, rtol=0, atol=0.02 * np.abs(Z).max())
+
+
+def quadratic(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((3, 3))
+    return root @ root.T + 0.5 * np.eye(3), 3 * rng.standard_normal(3)
+
+
+def box_minimum(A: np.ndarray, b: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Minimiser of x'Ax/2 - b'x in the box: the best feasible one of all sets of active bounds."""
+    best, lowest = lower, np.inf
+    for state in itertools.product((-1, 0, 1), repeat=len(b)):
+        side = np.array(state)
+        x, free = np.where(side < 0, lower, upper), side == 0
+        if free.any():
+            x[free] = np.linalg.solve(A[np.ix_(free, free)], b[free] - A[np.ix_(free, ~free)] @ x[~free])
+        value = x @ A @ x / 2 - b @ x
+        if np.all((x >= lower - 1e-12) & (x <= upper + 1e-12)) and value < lowest:
+            best, lowest = x, value
+    return best
+
+
+LOWER, UPPER = np.array([-0.5, 0.0, -1.0]), np.array([0.5, 1.0, 2.0])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_bounded_minimum_is_the_minimum_of_a_quadratic_in_the_box(seed: int) -> None:
+    A, b = quadratic(seed)
+    asked = []
+
+    def function(x: np.ndarray) -> tuple[float, np.ndarray]:
+        asked.append(np.array(x))
+        return float(x @ A @ x / 2 - b @ x), A @ x - b
+
+    found = bounded_minimum(function, np.array([0.1, 0.2, 0.3]), LOWER, UPPER)
+    np.testing.assert_allclose(found, box_minimum(A, b, LOWER, UPPER), rtol=0, atol=2e-3)
+    assert np.all((np.array(asked) >= LOWER) & (np.array(asked) <= UPPER))
+
+
+@pytest.mark.filterwarnings("ignore:.*JAXopt:DeprecationWarning")
+def test_the_native_minimiser_works_inside_vmap_and_agrees() -> None:
+    made = [quadratic(seed) for seed in range(4)]
+    A, b = (jnp.asarray(np.stack(part)) for part in zip(*made, strict=True))
+
+    @jax.jit
+    @jax.vmap
+    def found(A: Array, b: Array) -> Array:
+        def function(x: Array) -> tuple[Array, Array]:
+            return x @ A @ x / 2 - b @ x, A @ x - b
+
+        start, lower, upper = (jnp.asarray(x) for x in (np.array([0.1, 0.2, 0.3]), LOWER, UPPER))
+        return bounded_minimum(function, start, lower, upper, native=True)
+
+    expected = np.stack([box_minimum(*one, LOWER, UPPER) for one in made])
+    answer = np.asarray(found(A, b))
+    np.testing.assert_allclose(answer, expected, rtol=0, atol=2e-3)
+    assert np.all((answer >= LOWER) & (answer <= UPPER))
