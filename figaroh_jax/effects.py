@@ -380,7 +380,6 @@ class JointElasticity(JointEffect):
     """A gear that winds up under load: the sensor on the motor reads more than the link has turned."""
 
     name, title = "joint_elasticity", "elasticity of the joint"
-    follows_torque = True
     equation = "q_measured = q + compliance tau_load"
     separated_by = "a chirp of {at} above a third of its resonance, or a sensor on the link side"
     compliance: Scalar = shape("rad/(N m)", (2e-5, 1e-4, 4e-4, 1.5e-3, 5e-3), (0.0, 1e-2))

@@ -193,7 +193,9 @@ def solved(problem: Problem, state: State, theta: Float[np.ndarray, " P"]) -> St
     """The state with coefficients `theta`, and with the load and the torque that follow from them."""
     links = 10 * len(problem.model.joints)
     load = state.X[:, :, :links] @ theta[:links]
-    motion = eqx.tree_at(lambda m: (m.load, m.total), state.motion, (load, state.X @ theta))
+    inertia = theta[:links].reshape(-1, 10)
+    new = (load, state.X @ theta, inertia)
+    motion = eqx.tree_at(lambda m: (m.load, m.total, m.model.inertia), state.motion, new)
     return replace(state, theta=theta, motion=motion)
 
 

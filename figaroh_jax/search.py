@@ -25,7 +25,7 @@ from .screening import DRAWS, Group, Screen, catalogue, family_p, screen
 __all__ = ["Found", "Step", "find_causes", "stand"]
 
 SHORTLIST, SHARE = 8, 0.35  # candidates compared exactly; share of the best rank that they need
-STARTS = 4
+STARTS, FEWER = 4, 2  # of a refit; of one whose every step is an inverse dynamics
 GAIN, CONFIDENT, UNSURE = 0.004, 1.64, 1.7
 SAME = 0.5  # overlap from which two causes explain the same misfit
 CLEARLY = 3.0  # t from which data tell effects apart that are the same while the joint moves
@@ -91,10 +91,8 @@ def contend(
     way = kind(group.effect)
     if way == "response":
         return _response_contender(problem, step, whitening, group, int(order[0]))
-    starts = order[:STARTS]
+    starts = np.resize(order, STARTS if way == "columns" else FEWER)
     if shapes(type(group.effect)):
-        if len(starts) < STARTS:
-            starts = np.resize(starts, STARTS)
         effects = jax.tree.map(lambda x: x[starts], group.effect)
         effect, Z = refit(effects, step.state.motion, problem.records, _for_refit(problem, step, whitening))
         Z = Z.reshape(*Z.shape[:2], -1)
