@@ -1,0 +1,169 @@
+"""The model of the data: priors, physical bodies, its torque against Pinocchio, and the width of dry friction."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import figaroh_jax_pinocchio as reference
+import numpy as np
+import pytest
+import robots
+from synthetic import DT, made_signals, swing
+
+from figaroh_jax.effects import find
+from figaroh_jax.evidence import fit
+from figaroh_jax.flexible import WIDTHS, friction_width
+from figaroh_jax.inertia import from_com, pseudo_inertia
+from figaroh_jax.layout import held_rows, layout
+from figaroh_jax.model import RobotModel
+from figaroh_jax.problem import (
+    Problem,
+    baseline,
+    body_precision,
+    extended_state,
+    physical_body,
+    plain_rows,
+    rigid_prior,
+    solved,
+    whitened,
+)
+from figaroh_jax.records import stack
+from figaroh_jax.signals import Signals
+
+TRUST = 0.1
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
+    return robots.load(robots.ARM, tmp_path_factory.mktemp("arm"))
+
+
+def problem_of(model: RobotModel, *signals: Signals) -> Problem:
+    records = stack(signals)
+    return Problem(model, records, layout(signals, records), TRUST, np.zeros(model.nv), held_rows(signals, records))
+
+
+def body(mass: float, com: np.ndarray, moments: np.ndarray) -> np.ndarray:
+    """Ten parameters of a body with principal moments about its centre, turned by an arbitrary rotation."""
+    turn = np.linalg.qr(np.random.default_rng(7).standard_normal((3, 3)))[0]
+    return np.asarray(from_com(np.float64(mass), com, turn @ np.diag(moments) @ turn.T))
+
+
+SOLID = body(1.3, np.array([0.05, -0.1, 0.2]), np.array([0.02, 0.03, 0.04]))
+
+
+def information(seed: int) -> np.ndarray:
+    """A metric of the ten parameters as data give it: some directions much better known than others."""
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.standard_normal((10, 10)))[0]
+    return turn @ np.diag(10.0 ** rng.uniform(2, 5, 10)) @ turn.T
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_body_that_can_exist_is_left_as_it_is(seed: int) -> None:
+    np.testing.assert_allclose(physical_body(SOLID, information(seed)), SOLID, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_body_that_cannot_exist_becomes_the_nearest_that_can(seed: int) -> None:
+    rng, metric = np.random.default_rng(seed), information(seed)
+    free = SOLID + rng.normal(size=10) * [0.2, *[0.1] * 3, *[0.1] * 6]
+    free[4:] *= -1
+    assert np.linalg.eigvalsh(np.asarray(pseudo_inertia(free)))[0] < -0.01
+    found = physical_body(free, metric)
+    assert found[0] > 0
+    assert np.linalg.eigvalsh(np.asarray(pseudo_inertia(found)))[0] >= -1e-9
+    # no body on the straight line to one that exists is nearer: the set is convex
+    distance = (found - free) @ metric @ (found - free)
+    towards = metric @ (found - free)
+    for other in (SOLID, *(body(m, rng.normal(size=3) * 0.1, np.array([0.01, 0.02, 0.02])) for m in (0.2, 1.0, 3.0))):
+        assert (other - found) @ towards >= -1e-3 * distance
+
+
+def test_rigid_prior_is_trust_times_each_links_own_scale(tmp_path: Path) -> None:
+    parts = [robots.link("base"), robots.link("a", 2.0, com="0.3 0 0.4", rpy="0 0 0"), '<link name="b"/>']
+    joints = [robots.joint("turn", "base", "a"), robots.joint("slide", "a", "b", "prismatic")]
+    light = robots.load(robots.robot(*parts, *joints), tmp_path)
+    mean, precision = rigid_prior(light, TRUST)
+    sigma = (1 / np.sqrt(precision) / TRUST).reshape(2, 10)
+    turning = (0.04 + 0.06 + 0.03) / 3 + 0.3 * 2.0 * 0.5**2
+    np.testing.assert_allclose(sigma[0], [2.0, 1.0, 1.0, 1.0, *[turning] * 6], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(mean.reshape(2, 10), light.inertia, rtol=0, atol=0)
+    assert sigma[1, 0] == pytest.approx(2e-3, rel=0, abs=1e-12)  # massless: a thousandth of the heaviest
+
+
+def test_a_fitted_body_is_believed_to_half_of_its_own_scale() -> None:
+    ten = body(2.0, np.array([0.3, 0.0, 0.4]), np.array([0.02, 0.03, 0.04]))
+    np.testing.assert_allclose(1 / np.sqrt(body_precision(ten)), [1, *[0.5] * 3, *[0.25] * 6], rtol=0, atol=1e-9)
+    near = body(2.0, np.zeros(3), np.array([0.02, 0.03, 0.04]))  # no arm shorter than 5 cm
+    np.testing.assert_allclose(1 / np.sqrt(body_precision(near)[1]), 0.05, rtol=0, atol=1e-9)
+
+
+def rigid_torque(model: RobotModel, signals: Signals) -> np.ndarray:
+    return np.asarray(reference.inverse_dynamics(model, signals.position, signals.velocity, signals.acceleration))
+
+
+def test_torque_of_the_baseline_is_pinocchios_plus_the_friction(model: RobotModel) -> None:
+    signals = made_signals(6.0)
+    problem = problem_of(model, signals)
+    state = baseline(problem, ["viscous_friction", "torque_offset"])
+    state = solved(problem, state, np.append(np.asarray(model.inertia).reshape(-1), [2.0, 0.5, -1.0, 3.0]))
+    load = rigid_torque(model, signals)
+    np.testing.assert_allclose(state.motion.load, load, rtol=0, atol=1e-10)
+    expected = load + [2.0, 0.5] * signals.velocity + [-1.0, 3.0]
+    np.testing.assert_allclose(state.motion.total, expected, rtol=0, atol=1e-10)
+
+
+def test_rows_of_a_state_that_has_grown_are_those_computed_from_scratch(model: RobotModel) -> None:
+    problem = problem_of(model, made_signals(6.0, repeat="A"), made_signals(6.0, repeat="A"))
+    weights = 1 / (1 + np.asarray(problem.records.omega)[:, None] * [0.01, 0.02])
+    state = baseline(problem, ["viscous_friction"])
+    grown = extended_state(problem, state, find("joint_spring")(np.array([1])))
+    short = whitened(problem, grown, weights, whitened(problem, state, weights))
+    for one, other in zip(short, whitened(problem, grown, weights), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
+    assert short.X.shape[2] == 20 + 2 + 2
+    np.testing.assert_allclose(short.Xi, short.X, rtol=0, atol=1e-9)  # equal repeats are each other's instruments
+
+
+def test_a_robot_near_its_nominal_values_is_fitted_without_rest(model: RobotModel) -> None:
+    signals = made_signals(12.0)
+    mean, precision = rigid_prior(model, 0.01)
+    rng = np.random.default_rng(0)
+    true = (mean + rng.standard_normal(20) / np.sqrt(precision)).reshape(2, 10)
+    robot = dataclasses.replace(model, inertia=true)
+    torque = rigid_torque(robot, signals) + [4.0, 1.0] * signals.velocity
+    problem = problem_of(model, dataclasses.replace(signals, torque=torque))
+    state = baseline(problem, ["viscous_friction"])
+    sure = 1e4  # rows known to 1e-4 N m: the prior hardly pulls
+    rows = whitened(problem, state, np.full((len(np.asarray(problem.records.omega)), 2), sure))
+    linear = fit(rows, state.prior)
+    assert np.abs(plain_rows(problem, state).y).max() > 10
+    np.testing.assert_allclose(linear.residual / sure, 0.0, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(linear.theta[-2:], [4.0, 1.0], rtol=0, atol=1e-4)
+
+
+def averaged(law: Callable[[np.ndarray], np.ndarray], signals: Signals, joint: int) -> np.ndarray:
+    """Mean of a law of the velocity over each sampling period, the velocity being straight within it."""
+    inside = (np.arange(200) + 0.5) / 200 - 0.5
+    v, a = signals.velocity[:, [joint]], signals.acceleration[:, [joint]]
+    return law(v + a * DT * inside).mean(1)
+
+
+@pytest.mark.parametrize("width", [0.0, 0.02, 0.08])
+def test_the_width_of_simulated_friction_is_found_and_a_hard_sign_keeps_none(model: RobotModel, width: float) -> None:
+    assert width in WIDTHS
+    # slow: the sign's own width, |a| dt / 2, stays far below the friction's
+    signals = made_signals(20.0, lambda time: 0.5 * swing(0.5 * time))
+    hard = averaged(np.sign, signals, 0)
+    smooth = averaged(lambda v: np.clip(v / width, -1, 1), signals, 1) if width else averaged(np.sign, signals, 1)
+    sigma = 0.05
+    noise = sigma * np.random.default_rng(1).standard_normal(signals.position.shape)
+    torque = rigid_torque(model, signals) + np.stack([5.0 * hard, 8.0 * smooth], axis=1) + noise
+    problem = problem_of(model, dataclasses.replace(signals, torque=torque))
+    state = baseline(problem, ["viscous_friction", "coulomb_friction"])
+    weights = np.full((len(np.asarray(problem.records.omega)), 2), 1 / sigma)
+    found = friction_width(problem, state, weights)
+    np.testing.assert_array_equal(found.width, [0.0, width])
