@@ -17,6 +17,7 @@ from numpy.polynomial import legendre
 __all__ = ["Spectrum", "fit_spectrum", "leverage", "periodogram", "spectral_line", "white", "whitening"]
 
 FLOOR = 0.05  # of the median power between 1 Hz and the cutoff: bounds what whitening amplifies
+LEVEL = 16  # independent bins whose mean is as certain as the median of 41 bins of a Hann periodogram
 LOWEST = 0.3  # Hz: below, the spectrum follows a power of the frequency alone
 
 
@@ -121,11 +122,11 @@ def spectral_line(
     shape = float(len(powers))
     ratio = np.where(used[:, None], power / np.maximum(level, 1e-300), 0)
     row, joint = np.unravel_index(np.argmax(ratio), ratio.shape)
-    from scipy.special import gammaincc, gammaincinv  # scipy is slow to import
+    from scipy.special import fdtrc, gammaincinv  # scipy is slow to import
 
-    scale = gammaincinv(shape, 0.5)  # the median of a gamma variable of unit scale
-    # a Hann window spreads a line over three bins and correlates neighbours: fewer independent bins, so this is safe
-    tail = gammaincc(shape, ratio[row, joint] * scale)
+    to_mean = gammaincinv(shape, 0.5) / shape  # median of a gamma variable over its mean
+    # the level is itself uncertain, so the ratio has the tail of an F variable
+    tail = fdtrc(2 * shape, 2 * shape * LEVEL, ratio[row, joint] * to_mean)
     return float(min(1.0, tail * used.sum() * power.shape[1])), float(frequency[row]), int(joint)
 
 

@@ -18,8 +18,8 @@ def simulated(rng: np.random.Generator) -> np.ndarray:
     """AR(1) plus white noise: (series, samples, joints)."""
     out = []
     for pole, driven, white in zip(POLES, DRIVEN, WHITE, strict=True):
-        slow = lfilter([1.0], [1.0, -pole], driven * rng.standard_normal((SERIES, COUNT + 200)))[:, 200:]
-        out.append(slow + white * rng.standard_normal((SERIES, COUNT)))
+        slow = np.asarray(lfilter([1.0], [1.0, -pole], driven * rng.standard_normal((SERIES, COUNT + 200))))
+        out.append(slow[:, 200:] + white * rng.standard_normal((SERIES, COUNT)))
     return np.stack(out, axis=2)
 
 
@@ -122,9 +122,10 @@ def test_a_sine_in_noise_is_found_at_its_frequency_and_joint() -> None:
 
 def test_white_noise_rarely_shows_a_line() -> None:
     rng = np.random.default_rng(secrets.randbits(64))
-    p = np.array([noise.spectral_line(rng.standard_normal((2, 1000, 3)), RATE, CUTOFF)[0] for _ in range(400)])
-    # 400 series at 1e-3: 0.4 are expected, and the median of 41 bins is itself uncertain
-    assert (p < 1e-3).sum() <= 12, np.sort(p)[:15]
+    p = np.array([noise.spectral_line(rng.standard_normal((1, 1500, 6)), RATE, CUTOFF)[0] for _ in range(600)])
+    # 0.6 and 0.06 are expected: more come once in some 1e7 runs
+    assert (p < 1e-3).sum() <= 8, np.sort(p)[:10]
+    assert (p < 1e-4).sum() <= 4, np.sort(p)[:10]
 
 
 def test_too_short_a_series_has_no_line() -> None:
