@@ -21,7 +21,7 @@ from figaroh_jax.model import RobotModel
 from figaroh_jax.records import Records, stack
 from figaroh_jax.refit import Whitened, bounded_minimum, profile, refit, with_shape
 
-SECONDS = 12.0
+SECONDS = 8.0
 
 
 @pytest.fixture(scope="module")
@@ -53,9 +53,9 @@ def whitened(records: Records, residual: np.ndarray | None = None) -> Whitened:
     return Whitened(residual, X, inverse, np.ones((len(np.asarray(records.omega)), nv)))
 
 
-def at_joint(name: str, joint: int = 0, **shape: float) -> Effect:
+def at_joint(name: str, *, joint: float = 0, **shape: float) -> Effect:
     effect = find(name)
-    where = np.array([joint] if effect.acts_on == "joint" else [], dtype=np.int64)
+    where = np.array([int(joint)] if effect.acts_on == "joint" else [], dtype=np.int64)
     return effect(where, **{key: np.float64(value) for key, value in shape.items()})
 
 
@@ -91,7 +91,7 @@ def test_gradient_of_the_profile_is_that_of_finite_differences(
 
 
 def test_profile_is_the_change_of_the_penalised_squares(motion: Motion, records: Records) -> None:
-    effect, rng = at_joint("torque_ripple", 1, order=6.0), np.random.default_rng(1)
+    effect, rng = at_joint("torque_ripple", joint=1, order=6.0), np.random.default_rng(1)
     precision = np.array([1.0, 10.0, 0.1])
     rows = whitened(records)
     X, y = np.asarray(rows.X).reshape(-1, 3), rng.standard_normal(np.asarray(rows.residual).size)
