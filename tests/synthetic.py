@@ -31,7 +31,7 @@ def made_signals(
     name: str = "made",
     repeat: str | None = None,
     role: Literal["fit", "holdout"] = "fit",
-    gated: slice = slice(0, 0),
+    gated: slice | tuple[slice, int] = slice(0, 0),
 ) -> Signals:
     """Signals of an analytic motion from `begin` (s) on, its own clock starting at zero; rows `gated` weigh nothing."""
     time = np.arange(round(seconds / DT)) * DT

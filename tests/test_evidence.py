@@ -108,6 +108,19 @@ def test_score_is_chi_square_when_there_is_only_noise(k: int) -> None:
     assert kstest(Q, chi2(k).cdf).pvalue > 1e-4  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def test_score_with_noisy_instruments_is_chi_square_when_there_is_only_noise() -> None:
+    rng, count, flat, Q = np.random.default_rng(8), 400, Prior(np.zeros(2), np.zeros(2)), []
+    truth = np.tile(rng.normal(size=(count // 2, 2)), (2, 1))
+    alike = 0.9 * np.stack([truth[:, 0], truth[:, 1], truth[:, 0] - truth[:, 1]]) + 0.3 * rng.normal(size=(3, count))
+    X = truth + 0.7 * rng.normal(size=truth.shape)
+    candidate = Columns((0,), alike[None, :, None])
+    for _ in range(600):
+        rows = made_rows(rng.standard_normal((1, count)), X[None], repeats=True)
+        linear, stock = evidence.fit(rows, flat), evidence.bank(rows, [candidate])
+        Q.append(evidence.scores(rows, linear, stock, evidence.projection(rows, linear, stock))[0].Q[0])
+    assert abs(np.mean(Q) - 3) < 4 * np.sqrt(2 * 3 / len(Q))
+
+
 def noisy_repeats(rng: np.random.Generator, count: int = 20000) -> tuple[Rows, Columns]:
     """One column of size 1 that two repeats see each with its own noise, and a candidate that looks like it."""
     truth = np.tile(rng.normal(size=count // 2), 2)
@@ -121,14 +134,17 @@ def plain(rows: Rows) -> Rows:
     return rows._replace(Xi=rows.X, partner=rows.partner[:0])
 
 
-def test_instruments_from_a_repeat_remove_the_bias_of_noisy_columns() -> None:
-    rng, flat = np.random.default_rng(4), Prior(np.zeros(1), np.zeros(1))
-    truth = np.tile(rng.normal(size=20000), 2)
-    seen = truth + 0.5 * rng.normal(size=40000)  # the fit shrinks by 1 / (1 + 0.25)
-    rows = made_rows((2.0 * truth + 0.1 * rng.normal(size=40000))[None], seen[None, :, None], repeats=True)
-    error = 5 * np.sqrt(0.1**2 + (2 * 0.5) ** 2) / np.sqrt(40000)
-    np.testing.assert_allclose(evidence.fit(plain(rows), flat).theta, 2.0 / 1.25, rtol=0, atol=error)
-    np.testing.assert_allclose(evidence.fit(rows, flat).theta, 2.0, rtol=0, atol=1.25 * error)
+@pytest.mark.parametrize("feedback", [0.0, 0.8])
+def test_instruments_from_a_repeat_remove_the_bias_of_noisy_columns(feedback: float) -> None:
+    """Also where a controller answers the noise of the encoder, so that the torque holds a share of it."""
+    rng, flat, count = np.random.default_rng(4), Prior(np.zeros(1), np.zeros(1)), 40000
+    truth, own = np.tile(rng.normal(size=count // 2), 2), 0.5 * rng.normal(size=count)
+    torque = 2.0 * truth + feedback * own + 0.1 * rng.normal(size=count)
+    rows = made_rows(torque[None], (truth + own)[None, :, None], repeats=True)
+    error = 6 * 1.25 / np.sqrt(count)
+    biased = (2.0 + 0.25 * feedback) / 1.25  # truth has power 1, the noise 0.25
+    np.testing.assert_allclose(evidence.fit(plain(rows), flat).theta, biased, rtol=0, atol=error)
+    np.testing.assert_allclose(evidence.fit(rows, flat).theta, 2.0, rtol=0, atol=error)
 
 
 def test_noisy_columns_raise_the_score_of_what_looks_alike_only_without_instruments() -> None:

@@ -74,6 +74,16 @@ def test_a_row_whose_partner_is_gated_takes_no_instruments_from_it() -> None:
     expected[20:30] = 0.0
     np.testing.assert_array_equal(first, [expected] * 2)
     np.testing.assert_array_equal(second, 1.0)
+    np.testing.assert_array_equal(by_recording(found.partner[0], signals)[0] >= 0, expected > 0)
+
+
+def test_a_row_gated_at_one_joint_still_serves_the_other() -> None:
+    signals = [made_signals(5.0, repeat="A"), made_signals(5.0, repeat="A", gated=(slice(20, 30), 1))]
+    found = layout(signals, stack(signals))
+    expected = np.ones((2, signals[0].rows.kept))
+    expected[1, 20:30] = 0.0
+    np.testing.assert_array_equal(by_recording(found.paired, signals)[0], expected)
+    assert np.all(by_recording(found.partner, signals)[0] >= 0)
 
 
 def test_without_repeats_nothing_has_a_partner_and_all_rows_count() -> None:
