@@ -123,7 +123,7 @@ def test_a_sine_in_noise_is_found_at_its_frequency_and_joint() -> None:
 def test_white_noise_rarely_shows_a_line() -> None:
     rng = np.random.default_rng(secrets.randbits(64))
     p = np.array([noise.spectral_line(rng.standard_normal((1, 1500, 6)), RATE, CUTOFF)[0] for _ in range(600)])
-    # 0.6 and 0.06 are expected: more come once in some 1e7 runs
+    # 0.6 and 0.06 are expected; the tail is right within a factor of two
     assert (p < 1e-3).sum() <= 8, np.sort(p)[:10]
     assert (p < 1e-4).sum() <= 4, np.sort(p)[:10]
 
