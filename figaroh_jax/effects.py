@@ -382,7 +382,7 @@ class JointElasticity(JointEffect):
     name, title = "joint_elasticity", "elasticity of the joint"
     equation = "q_measured = q + compliance tau_load"
     separated_by = "a chirp of {at} above a third of its resonance, or a sensor on the link side"
-    compliance: Scalar = shape("rad/(N m)", (2e-5, 1e-4, 4e-4, 1.5e-3, 5e-3), (0.0, 1e-2))
+    compliance: Scalar = shape("rad/(N m)", (2e-5, 1e-4, 4e-4, 1.5e-3, 5e-3), (1e-7, 1e-2))
 
     def position_error(self, motion: Motion) -> Float[Array, " samples"]:
         return self.compliance * self.here(motion.load)

@@ -101,7 +101,8 @@ def refit(
     """
     names = shapes(type(effects))
     start = np.stack([np.asarray(getattr(effects, name)) for name in names], axis=-1)
-    box = np.stack([_box(effects.parameters()[n], x) for n, x in zip(names, start.T, strict=True)], axis=-1)
+    wide = kind(effects) == "position"  # the profile of a shift has one valley, and the grid of its columns is alike
+    box = np.stack([_box(effects.parameters()[n], x, wide) for n, x in zip(names, start.T, strict=True)], axis=-1)
     low, width = box[:, 0], box[:, 1] - box[:, 0]
     scale = 1.0
 
@@ -128,8 +129,10 @@ def shapes(effect: type[Effect]) -> list[str]:
     return [name for name, p in effect.parameters().items() if not p.linear and not p.choice]
 
 
-def _box(parameter: Any, starts: Float[np.ndarray, " starts"]) -> Float[np.ndarray, "starts 2"]:
-    """Neighbouring grid points of each start; the outermost reach to the parameter's bounds."""
+def _box(parameter: Any, starts: Float[np.ndarray, " starts"], wide: bool) -> Float[np.ndarray, "starts 2"]:
+    """Neighbouring grid points of each start; the outermost, or all if `wide`, reach to the parameter's bounds."""
+    if wide:
+        return np.tile([parameter.lower, parameter.upper], (len(starts), 1))
     grid = np.array([parameter.lower, *sorted(parameter.grid), parameter.upper])
     place = np.array([np.argmin(np.abs(grid[1:-1] - x)) + 1 for x in starts])
     low, high = grid[place - 1], grid[place + 1]

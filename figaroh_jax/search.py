@@ -91,7 +91,9 @@ def contend(
     way = kind(group.effect)
     if way == "response":
         return _response_contender(problem, step, whitening, group, int(order[0]))
-    starts = np.resize(order, STARTS if way == "columns" else FEWER)
+    if way == "position":
+        return _position_contender(problem, step, whitening, group)
+    starts = np.resize(order, STARTS)
     if shapes(type(group.effect)):
         effects = jax.tree.map(lambda x: x[starts], group.effect)
         effect, Z = refit(effects, step.state.motion, problem.records, _for_refit(problem, step, whitening))
@@ -102,10 +104,7 @@ def contend(
     rows = step.rows
     full = np.zeros((*rows.y.shape, Z.shape[0]))
     full[list(group.columns.joints)] = np.moveaxis(Z, 0, 2)
-    if way == "position":
-        (name,) = effect.parameters()
-        hypothesis = Hypothesis(rows.X, step.state.prior, full[..., 0] * float(getattr(effect, name)))
-    elif isinstance(effect, Payload):
+    if isinstance(effect, Payload):
         both = np.concatenate([rows.X, full], axis=2)
         free = judge(rows, Hypothesis(both, step.state.prior.extended(10)), grown_sums(rows, step.folded, both))
         body = physical_body(free.theta[-10:], _information(rows, step, full))
@@ -120,6 +119,20 @@ def contend(
         names = [n for n, p in effect.parameters().items() if p.linear]
         effect = with_shape(effect, names, list(verdicts.theta[-len(names) :]))
     return Contender(group.name, effect, hypothesis, verdicts)
+
+
+def _position_contender(
+    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group
+) -> Contender:
+    """A shift of the links' motion: its size by the profile, then the regressor at the true motion.
+
+    The load is that of the motion as measured: taken again at the true motion it holds four derivatives of noise.
+    """
+    starts = np.linspace(1, len(group.columns.Z) - 1, FEWER).astype(int)
+    effects = jax.tree.map(lambda x: x[starts], group.effect)
+    effect, _ = refit(effects, step.state.motion, problem.records, _for_refit(problem, step, whitening))
+    here = stand(problem, extended_state(problem, step.state, effect), whitening)
+    return Contender(group.name, effect, Hypothesis(here.rows.X, here.state.prior), here.verdicts)
 
 
 def _information(rows: Rows, step: Step, Z: Float[np.ndarray, "nv T k"]) -> Float[np.ndarray, "k k"]:
