@@ -97,14 +97,14 @@ def _diagnose(
     spectrum, whitening = noise_floor(problem, start, forbid)
     problem = friction_width(problem, start, whitening)
     start = baseline(problem, names, given)
-    step, found, p, screened = find_causes(
+    step, found, (p, left), screened = find_causes(
         problem, start, spectrum, whitening, forbid, CERTAIN * alpha, progress, generator
     )
     found = eliminate(problem, start, found, whitening)
     progress("fitting all causes together", 0.8)
     first = stand(problem, start, whitening)
     last, causes, fitted = _polished(problem, start, [f.effect for f in found], whitening)
-    rest, before = _what_is_left(problem, first, last, spectrum, whitening, forbid, generator, p, bool(found))
+    rest, before = _what_is_left(problem, first, last, spectrum, whitening, generator, left)
     word = verdict(bool(found), rest, before)
     if word == "unknown" and found:
         proxy = ", ".join(str(f.name) for f in found)
@@ -194,17 +194,12 @@ def _what_is_left(
     last: Step,
     spectrum: Spectrum,
     whitening: Float[np.ndarray, "F nv"],
-    forbid: tuple[str, ...],
     generator: np.random.Generator,
-    p: float,
-    named: bool,
+    left: float,
 ) -> tuple[Rest, float]:
-    from .search import catalogue_p
-
     before = excess(problem, first.rows, first.linear.residual, spectrum, whitening)
     now = excess(problem, last.rows, last.linear.residual, spectrum, whitening)
     flexible = flexible_p(problem, last.state, last.rows, spectrum, whitening, generator)
-    left = catalogue_p(problem, last, spectrum, whitening, forbid, generator) if named else p
     line = lines(problem, last.linear.residual)
     return rest_of(now, max(before[0], 0.0), left, flexible, line, problem.model.joint_names), max(before[0], 0.0)
 

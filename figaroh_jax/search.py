@@ -25,6 +25,7 @@ from .screening import DRAWS, Group, Screen, catalogue, family_p, screen
 __all__ = ["Found", "Step", "find_causes", "stand"]
 
 SHORTLIST, SHARE = 8, 0.35  # candidates compared exactly; share of the best rank that they need
+SHIFTS = 2  # candidates of a position sensor tried at a step: each is a fit of its own
 STARTS, FEWER = 4, 2  # of a refit; of one whose every step is an inverse dynamics
 GAIN, CONFIDENT, UNSURE = 0.004, 1.64, 1.7
 SAME = 0.5  # overlap from which two causes explain the same misfit
@@ -121,9 +122,7 @@ def contend(
     return Contender(group.name, effect, hypothesis, verdicts)
 
 
-def _position_contender(
-    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group
-) -> Contender:
+def _position_contender(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group) -> Contender:
     """A shift of the links' motion: its size by the profile, then the regressor at the true motion.
 
     The load is that of the motion as measured: taken again at the true motion it holds four derivatives of noise.
@@ -180,6 +179,8 @@ def _response_contender(
 def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray]]:
     """The best groups, each with its grid points in the order of their scores."""
     ranked = found.best(step.rows)
+    shifts = [r for r in ranked if kind(found.groups[r[1]].effect) == "position"]
+    ranked = [r for r in ranked if r not in shifts[SHIFTS:]]
     chosen = [r for r in ranked[:SHORTLIST] if r[0] > SHARE * ranked[0][0]] or ranked[:1]
     simpler = {Name(n, found.groups[g].name.at) for _, g, _ in chosen for n in type(found.groups[g].effect).contains}
     chosen += [r for r in ranked if found.groups[r[1]].name in simpler and r not in chosen]
@@ -195,11 +196,15 @@ def find_causes(
     alpha: float,
     progress: Callable[[str, float], None] = lambda phase, share: None,
     generator: np.random.Generator | None = None,
-) -> tuple[Step, list[Found], float, Screen]:
-    """Accept the best cause until none passes the gates; answers the last step, the causes, the first p and screen."""
+) -> tuple[Step, list[Found], tuple[float, float], Screen]:
+    """Accept the best cause until none passes the gates.
+
+    Answers the last step, the causes, the p-values of the whole catalogue at the first and the last step, and the
+    first screen.
+    """
     generator = generator or np.random.default_rng(0)
     step, found = stand(problem, state, whitening), []
-    first_p, first_screen, groups = 1.0, None, None
+    first_p, p, first_screen, groups = 1.0, 1.0, None, None
     while len(found) < MOST:
         progress("screening the catalogue", len(found) / MOST)
         groups = catalogue(problem, step.state, step.rows, whitening, forbid, groups)
@@ -218,20 +223,7 @@ def find_causes(
         groups = groups if kind(accepted.effect) == "columns" else None
         found.append(accepted)
     assert first_screen is not None  # the loop has run at least once
-    return step, found, first_p, first_screen
-
-
-def catalogue_p(
-    problem: Problem,
-    step: Step,
-    spectrum: Spectrum,
-    whitening: Float[np.ndarray, "F nv"],
-    forbid: Collection[str],
-    generator: np.random.Generator,
-) -> float:
-    """p-value of the whole catalogue where a search stands."""
-    screened = screen(step.rows, step.linear, catalogue(problem, step.state, step.rows, whitening, forbid))
-    return family_p(problem, step.rows, step.linear, screened, spectrum, whitening, generator)
+    return step, found, (first_p, p), first_screen
 
 
 def eliminate(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> list[Found]:
