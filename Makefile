@@ -4,6 +4,11 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c '$(ENOUGH)' 2>/dev/null && { echo $$p; break; }; done)
 BIN := .venv/bin
 
+# The matrices are small: more threads only wait for each other.
+export OPENBLAS_NUM_THREADS ?= 1
+export OMP_NUM_THREADS ?= 1
+export XLA_FLAGS ?= --xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1
+
 .PHONY: demo test test-slow lint types bench format clean
 
 demo: .venv/installed ## the main job on the embedded recording
