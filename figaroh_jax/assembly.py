@@ -14,9 +14,15 @@ from jaxtyping import Float
 
 from . import inertia
 from .errors import InputError, nearest
-from .model import Frame, Joint, RobotModel
+from .model import DOF_NAMES, NUMBERS, Frame, Joint, Kind, RobotModel
 
-__all__ = ["JointPart", "LinkPart", "assemble"]
+__all__ = ["ROOT_JOINT", "JointPart", "LinkPart", "Posture", "Root", "assemble", "displacement"]
+
+Posture = Mapping[str, float | Sequence[float]]  # a number for a revolute or prismatic joint, its part of q for others
+Root = Literal["fixed", "free_flyer"]
+
+ROOT_JOINT = "root_joint"  # the free joint between the world and the root link of a free flyer
+_WORLD = ""  # the name of what carries it: no link of a file is called so, and no frame of the model
 
 
 class LinkPart(NamedTuple):
@@ -30,11 +36,11 @@ class JointPart(NamedTuple):
     """A joint of the file; the child link's frame is the joint's."""
 
     name: str
-    kind: Literal["revolute", "prismatic", "fixed"]
+    kind: Kind | Literal["fixed"]
     parent: str  # name of the link that carries it
     child: str  # name of the link that it moves
     placement: Float[np.ndarray, "4 4"]  # in the parent link's frame, at zero
-    axis: Float[np.ndarray, "3"]  # of any length above zero, in the joint frame
+    axis: Float[np.ndarray, "3"]  # of any length above zero, in the joint frame; planar: the normal; else unused
     limit: tuple[float, float, float, float] = (-np.inf, np.inf, np.inf, np.inf)  # lower, upper, velocity, effort
     mimic: tuple[str, float, float] | None = None  # joint that it follows, ratio, offset
 
@@ -52,24 +58,43 @@ def assemble(
     name: str,
     parts: tuple[Sequence[LinkPart], Sequence[JointPart]],
     joints: Sequence[str] | None = None,
-    posture: Mapping[str, float] | None = None,
+    posture: Posture | None = None,
     gravity: Sequence[float] = (0.0, 0.0, -9.81),
+    root: Root = "fixed",
 ) -> RobotModel:
     """Model of the robot `name` whose links and joints are `parts`.
 
     `joints` names the moving joints in column order; every other joint is locked at `posture` (rad or m, 0 where it
-    says nothing). Without `joints`, all joints move but those that `posture` names, in tree order. Raises `InputError`,
-    prefixed by `source`, for parts that are not one tree and for names that do not exist.
+    says nothing; for a spherical, planar or free joint its numbers in q). Without `joints`, all joints move but those
+    that `posture` names, in tree order. The root link is fixed to the world, or moves freely against it
+    (`free_flyer`): then the free joint `root_joint` takes the first columns. Raises `InputError`, prefixed by
+    `source`, for parts that are not one tree and for names that do not exist.
     """
     try:
-        root, children = _tree(*parts)
+        parts, joints = _rooted(root, parts, joints)
+        base, children = _tree(*parts)
         drives = {joint.name: _drive(joint, parts[1]) for joint in parts[1] if joint.kind != "fixed"}
         locked = _locked(drives, [j.name for j in parts[1] if j.kind == "fixed"], joints, posture or {})
         build = _Build(dict(parts[0]), children, drives, locked)
-        build.grow(root)
+        build.grow(base)
         return build.finish(name, joints, _gravity(gravity))
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
+
+
+def _rooted(
+    root: Root, parts: tuple[Sequence[LinkPart], Sequence[JointPart]], joints: Sequence[str] | None
+) -> tuple[tuple[Sequence[LinkPart], Sequence[JointPart]], Sequence[str] | None]:
+    """Parts and moving joints with the free joint of a free flyer."""
+    if root == "fixed":
+        return parts, joints
+    if root != "free_flyer":
+        raise InputError(f"root is '{root}'; known: fixed, free_flyer")
+    base, _ = _tree(*parts)
+    free = JointPart(ROOT_JOINT, "free", _WORLD, base, np.eye(4), np.zeros(3))
+    world = LinkPart(_WORLD, np.zeros(10))
+    order = None if joints is None else [ROOT_JOINT, *(joint for joint in joints if joint != ROOT_JOINT)]
+    return ([world, *parts[0]], [free, *parts[1]]), order
 
 
 def _gravity(gravity: Sequence[float]) -> Float[np.ndarray, "3"]:
@@ -140,29 +165,30 @@ def _drive(joint: JointPart, joints: Sequence[JointPart]) -> _Drive:
             raise InputError(f"joint '{at.name}' mimics '{target}', which does not exist{nearest(target, named)}")
         if target in seen:
             raise InputError(f"joint '{joint.name}' mimics itself by way of {' -> '.join([*seen, target])}")
-        if named[target].kind == "fixed":
-            raise InputError(f"joint '{at.name}' mimics '{target}', which is fixed")
+        for joined in (at, named[target]):
+            if joined.kind not in ("revolute", "prismatic"):
+                raise InputError(f"joint '{at.name}' mimics '{target}', but '{joined.name}' is {joined.kind}")
         ratio, offset, at = ratio * factor, offset + ratio * shift, named[target]
         seen.append(target)
     return _Drive(at.name, ratio, offset)
 
 
 def _locked(
-    drives: Mapping[str, _Drive], fixed: Sequence[str], joints: Sequence[str] | None, posture: Mapping[str, float]
-) -> dict[str, float]:
-    """Position of every independent joint that does not move."""
+    drives: Mapping[str, _Drive], fixed: Sequence[str], joints: Sequence[str] | None, posture: Posture
+) -> dict[str, float | Sequence[float]]:
+    """Position of every independent joint that does not move, where the posture gives one."""
     for name in joints or ():
         _independent(name, drives, fixed, "joints")
     _unique(list(joints or ()), "of the moving joints")
     for name, value in posture.items():
         _independent(name, drives, fixed, "posture")
-        if not np.isfinite(value):
+        if not np.isfinite(value).all():
             raise InputError(f"posture: joint '{name}' is at {value}; a finite position is expected")
         if joints is not None and name in joints:
             raise InputError(f"posture: joint '{name}' is one of the moving joints; only locked joints have a posture")
     leaders = [name for name, drive in drives.items() if drive.leader == name]
     moving = set(leaders) - set(posture) if joints is None else set(joints)
-    return {name: float(posture.get(name, 0.0)) for name in leaders if name not in moving}
+    return {name: posture.get(name, ()) for name in leaders if name not in moving}
 
 
 def _independent(name: str, drives: Mapping[str, _Drive], fixed: Sequence[str], key: str) -> None:
@@ -182,7 +208,7 @@ class _Build:
         inertias: dict[str, np.ndarray],
         children: dict[str, list[JointPart]],
         drives: dict[str, _Drive],
-        locked: dict[str, float],
+        locked: dict[str, float | Sequence[float]],
     ) -> None:
         self.inertias, self.children, self.drives, self.locked = inertias, children, drives, locked
         self.joints: list[JointPart] = []
@@ -210,8 +236,8 @@ class _Build:
         drive = self.drives.get(joint.name)
         if drive is None or drive.leader in self.locked:
             if drive is not None:
-                position = drive.ratio * self.locked[drive.leader] + drive.offset
-                pose = pose @ _displacement(joint, position)
+                at = _numbers(joint, self.locked[drive.leader])
+                pose = pose @ displacement(joint.kind, joint.axis, drive.ratio * at + drive.offset)
             self.joint_frames[joint.name] = (body, pose)
             return body, pose
         self.joints.append(joint)
@@ -226,13 +252,15 @@ class _Build:
         independent = [j.name for j, drive in zip(self.joints, drives, strict=True) if drive.leader == j.name]
         columns = list(order) if order is not None else independent
         if not columns:
-            raise InputError("no joint moves; a robot needs one revolute or prismatic joint")
-        limits = {joint.name: joint.limit for joint in self.joints}
-        limit = np.array([limits[column] for column in columns])
-        frames = self.joint_frames | self.frames
+            raise InputError("no joint moves; a robot needs one joint that is not fixed or locked")
+        named = {joint.name: joint for joint in self.joints}
+        widths = [len(DOF_NAMES[named[column].kind]) for column in columns]
+        first = dict(zip(columns, np.cumsum([0, *widths]), strict=False))
+        limit = np.repeat(np.array([named[column].limit for column in columns], float), widths, axis=0)
+        frames = {name: place for name, place in (self.joint_frames | self.frames).items() if name != _WORLD}
         return RobotModel(
             placement=np.array(self.placements),
-            axis=np.array([joint.axis / np.linalg.norm(joint.axis) for joint in self.joints]),
+            axis=np.concatenate([_axes(joint) for joint in self.joints]),
             inertia=np.array(self.carried),
             ratio=np.array([drive.ratio for drive in drives]),
             offset=np.array([drive.offset for drive in drives]),
@@ -242,7 +270,7 @@ class _Build:
             velocity_limit=limit[:, 2],
             effort_limit=limit[:, 3],
             joints=tuple(
-                Joint(j.name, j.kind, parent, columns.index(drive.leader), j.child, drive.leader != j.name)  # pyright: ignore[reportArgumentType] (none is fixed)
+                Joint(j.name, j.kind, parent, int(first[drive.leader]), j.child, drive.leader != j.name)  # pyright: ignore[reportArgumentType] (none is fixed)
                 for j, parent, drive in zip(self.joints, self.parents, drives, strict=True)
             ),
             frames=tuple(Frame(frame, parent) for frame, (parent, _) in frames.items()),
@@ -250,12 +278,59 @@ class _Build:
         )
 
 
-def _displacement(joint: JointPart, position: float) -> np.ndarray:
-    """Pose of a joint that has moved by `position` in the pose that it had at zero."""
-    pose, axis = np.eye(4), joint.axis / np.linalg.norm(joint.axis)
-    if joint.kind == "prismatic":
-        pose[:3, 3] = position * axis
+def _axes(joint: JointPart) -> Float[np.ndarray, "dofs 3"]:
+    """Unit axis of each degree of freedom, in the joint frame."""
+    if joint.kind == "spherical":
+        return np.eye(3)
+    if joint.kind == "free":
+        return np.concatenate([np.eye(3), np.eye(3)])
+    axis = joint.axis / np.linalg.norm(joint.axis)
+    return _plane(axis).T if joint.kind == "planar" else axis[None]
+
+
+def _plane(normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation whose third column is the normal: the shortest from z, or from -z (half a turn about x before it)."""
+    flip = np.diag([1.0, -1.0, -1.0]) if normal[2] < 0 else np.eye(3)
+    x, y, z = flip @ normal
+    turn = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
+    return flip @ (np.eye(3) + turn + turn @ turn / (1.0 + z))
+
+
+def _numbers(joint: JointPart, given: float | Sequence[float]) -> Float[np.ndarray, " numbers"]:
+    """The joint's part of q as the posture gives it; where it gives nothing (empty), the neutral one."""
+    count = NUMBERS[joint.kind]
+    numbers = np.atleast_1d(np.asarray(given, float))
+    turned = joint.kind in ("spherical", "free")
+    if not numbers.size:
+        return np.append(np.zeros(count - 1), 1.0 if turned else 0.0)
+    if numbers.shape != (count,):
+        raise InputError(f"posture: joint '{joint.name}' is {joint.kind}; {count} numbers are expected, not {given}")
+    if turned and np.linalg.norm(numbers[-4:]) < 1e-9:
+        raise InputError(f"posture: the quaternion of joint '{joint.name}' is zero; x y z w of length one is expected")
+    return numbers
+
+
+def displacement(kind: str, axis: Float[np.ndarray, "3"], position: Float[np.ndarray, " numbers"]) -> np.ndarray:
+    """Pose of a joint that has moved to `position` (its part of q) in the pose that it had at zero."""
+    pose = np.eye(4)
+    if kind == "free":
+        pose[:3, 3] = position[:3]
+    if kind in ("free", "spherical"):
+        pose[:3, :3] = _rotation(position[-4:-1], position[-1])
         return pose
-    k = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
-    pose[:3, :3] += np.sin(position) * k + (1.0 - np.cos(position)) * k @ k
+    axis = axis / np.linalg.norm(axis)
+    if kind == "prismatic":
+        pose[:3, 3] = position[0] * axis
+        return pose
+    if kind == "planar":
+        pose[:3, 3] = _plane(axis)[:, :2] @ position[:2]
+    half = position[-1] / 2
+    pose[:3, :3] = _rotation(np.sin(half) * axis, np.cos(half))
     return pose
+
+
+def _rotation(vector: Float[np.ndarray, "3"], scalar: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation of the quaternion, of any length above zero."""
+    x, y, z = vector
+    k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + (2.0 * scalar * k + 2.0 * k @ k) / (vector @ vector + scalar**2)

@@ -113,7 +113,7 @@ class Robot(_Keys):
     model: Path
     root: Literal["fixed", "free_flyer"] = "fixed"
     joints: tuple[str, ...] | None = None  # moving joints in column order; None: all of them
-    posture: dict[str, Number] = {}  # of the locked joints, rad or m
+    posture: dict[str, Number | tuple[Number, ...]] = {}  # of the locked joints, rad or m; a list where q has several
     gravity: Vector = (0.0, 0.0, -9.81)  # m/s^2
     trust: Positive = 0.10  # relative one sigma of the nominal inertials
 
@@ -326,13 +326,12 @@ def load_task(path: str | Path) -> Task:
 def load_robot(task: Task) -> RobotModel:
     """The robot of a task, joints locked and ordered as it says."""
     robot = task.robot
-    if robot.root != "fixed":
-        raise InputError(f"{task.file}: robot.root: free_flyer robots come later; use fixed")
     if robot.model.suffix.lower() != ".urdf":
         raise InputError(f"{task.file}: robot.model {robot.model}: MJCF models come later; use a .urdf file")
     from .urdf import load_urdf
 
-    return load_urdf(robot.model, joints=robot.joints, posture=dict(robot.posture), gravity=robot.gravity)
+    posture = dict(robot.posture)
+    return load_urdf(robot.model, joints=robot.joints, posture=posture, gravity=robot.gravity, root=robot.root)
 
 
 _EXPECTED = {  # pydantic's kinds of mistakes, in fewer words

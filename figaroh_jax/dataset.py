@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from jaxtyping import Float
 
+from .assembly import ROOT_JOINT
 from .errors import InputError, nearest
 from .model import RobotModel
 from .tables import Table, read_table
@@ -60,6 +61,13 @@ def read_recordings(task: Task, model: RobotModel) -> tuple[Recording, ...]:
 
 
 def _check_names(task: Task, model: RobotModel) -> None:
+    for joint in model.joints:
+        if joint.kind not in ("revolute", "prismatic"):
+            key = f"robot.root is {task.robot.root}" if joint.name == ROOT_JOINT else f"joint '{joint.name}'"
+            raise InputError(
+                f"{task.file}: {key}: recordings of joint torques hold one column a joint, and a {joint.kind} joint "
+                "has several; use root: fixed, and name the revolute and prismatic joints under robot.joints"
+            )
     known = {*model.joint_names, *model.link_names, *(frame.name for frame in model.frames)}
     for joint in task.preprocess.gate:
         if joint not in model.joint_names:

@@ -95,7 +95,17 @@ def ancestors(joints: tuple[Joint, ...]) -> np.ndarray:
 
 def revolute(model: RobotModel) -> Bool[np.ndarray, " nj"]:
     """Which joints turn; the others slide."""
-    return np.array([joint.kind == "revolute" for joint in model.joints], bool)
+    _refuse_general(model)
+    return model.dofs.turns
+
+
+def _refuse_general(model: RobotModel) -> None:
+    for joint in model.joints:
+        if joint.kind not in ("revolute", "prismatic"):
+            raise InputError(
+                f"robot '{model.name}': joint '{joint.name}' is {joint.kind}; kinematics and dynamics take revolute "
+                "and prismatic joints only so far: give the joint a posture, or the root as fixed"
+            )
 
 
 def _local(model: RobotModel, q: Float[Array, "nv samples"]) -> tuple[Array, Array]:
@@ -204,6 +214,7 @@ def states(model: RobotModel, **arrays: Float[ArrayLike, "..."]) -> list[Float[A
 
 def check_shapes(model: RobotModel, **arrays: Float[ArrayLike, "..."]) -> None:
     """Raise `InputError` naming the array (`q=`, `v=`, ...) whose shape does not fit the model or the first array."""
+    _refuse_general(model)
     first = next(iter(arrays))
     for name, array in arrays.items():
         shape, expected = np.shape(array), np.shape(arrays[first])

@@ -6,27 +6,29 @@ Only what moves and weighs is read: links with their inertias, joints with place
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from . import inertia
-from .assembly import JointPart, LinkPart, assemble
+from .assembly import JointPart, LinkPart, Posture, Root, assemble
 from .errors import InputError, nearest
-from .model import RobotModel
-from .xmlfile import read_xml
+from .model import Kind, RobotModel
+from .xmlfile import find_in_packages, read_xml
 
 __all__ = ["load_urdf"]
 
-_KINDS: dict[str, Literal["revolute", "prismatic", "fixed"]] = {
+_KINDS: dict[str, Kind | Literal["fixed"]] = {
     "revolute": "revolute",
     "continuous": "revolute",
     "prismatic": "prismatic",
     "fixed": "fixed",
+    "floating": "free",
+    "planar": "planar",
 }
-_UNSUPPORTED = ("floating", "planar")
+_BOUNDED = ("revolute", "prismatic")
 _UNREAD = {  # by the element that holds them
     ".": ("material", "transmission", "gazebo"),
     "link": ("visual", "collision"),
@@ -48,25 +50,31 @@ _ROUNDED = 1e-6  # kg m^2; the inertias of small parts are often rounded to nons
 def load_urdf(
     path: str | Path,
     joints: Sequence[str] | None = None,
-    posture: Mapping[str, float] | None = None,
+    posture: Posture | None = None,
     gravity: Sequence[float] = (0.0, 0.0, -9.81),
+    root: Root = "fixed",
+    packages: Sequence[str | Path] = (),
 ) -> RobotModel:
-    """Model of the robot in a URDF file, its root link fixed to the world.
+    """Model of the robot in a URDF file, its root link fixed to the world or free (`root="free_flyer"`).
 
     `joints` names the moving joints in the order of the columns of q; every other joint is locked at `posture` (rad,
     m; 0 where it says nothing) and merged into its parent, as fixed joints are. Without `joints`, all joints move in
-    tree order but those that `posture` names. `gravity` in m/s^2 in the root link's frame. A continuous joint is one
-    plain angle; a mimic joint shares the coordinate of the joint it follows. Every link and every joint of the file is
-    a frame of the model. Masses and inertias of links that do not move are left out: they do no work.
+    tree order but those that `posture` names. A free flyer's `root_joint` stands in front of them in either case.
+    `gravity` in m/s^2 in the world, which is the root link's frame where that is fixed. A continuous joint is one
+    plain angle; a `floating` joint is a free one; a `planar` joint moves in the plane normal to its axis; a mimic
+    joint shares the coordinate of the joint it follows. Every link and every joint of the file is a frame of the
+    model. Masses and inertias of links that do not move are left out: they do no work. Meshes are never read;
+    `packages` are the folders of packages by which a path such as `package://my_robot/robot.urdf` is found.
 
     Raises `InputError` naming the file and the joint or link that is wrong.
     """
+    path = find_in_packages(path, packages)
     robot = _read(path)
     try:
         parts = [_link(link) for link in robot.links], [_joint(joint) for joint in robot.joints]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    return assemble(str(path), robot.name, parts, joints, posture, gravity)
+    return assemble(str(path), robot.name, parts, joints, posture, gravity, root)
 
 
 def _read(path: str | Path) -> Any:
@@ -105,8 +113,6 @@ def _check_part(part: Any) -> None:
 
 def _check_joint(part: Any, where: str) -> None:
     kind = part.get("type")
-    if kind in _UNSUPPORTED:
-        raise InputError(f"{where}: type '{kind}' is not supported yet; supported: {', '.join(_KINDS)}")
     if kind not in _KINDS:
         wrong = "has no type" if kind is None else f"unknown type '{kind}'"
         raise InputError(f"{where}: {wrong}{nearest(kind or '', _KINDS)}")
@@ -151,7 +157,7 @@ def _link(link: Any) -> LinkPart:
 
 def _joint(joint: Any) -> JointPart:
     kind = _KINDS[joint.type]
-    if kind != "fixed" and np.linalg.norm(joint.axis) < 1e-9:
+    if kind not in ("fixed", "free") and np.linalg.norm(joint.axis) < 1e-9:
         raise InputError(f"joint '{joint.name}': its axis is zero; a direction is expected")
     origin = np.eye(4) if joint.origin is None else joint.origin
     mimic = joint.mimic and (joint.mimic.joint, joint.mimic.multiplier, joint.mimic.offset)
@@ -170,7 +176,7 @@ def _limit(joint: Any) -> tuple[float, float, float, float]:
             (np.inf, given and given.effort),
         )
     )
-    if joint.type == "continuous":
+    if joint.type not in _BOUNDED:
         lower, upper = -np.inf, np.inf
     if lower > upper:
         raise InputError(f"joint '{joint.name}': its lower limit {lower:g} is above the upper one {upper:g}")

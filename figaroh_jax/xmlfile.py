@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from .errors import InputError
 
-__all__ = ["read_xml"]
+__all__ = ["find_in_packages", "read_xml"]
 
+_PACKAGE = "package:/"  # a Path keeps one slash of the two
 _LARGEST = 20_000_000  # bytes; robot models without their meshes stay far below
 
 
@@ -32,6 +34,23 @@ def read_xml(path: str | Path, root: str) -> Any:
     if element.tag != root:
         raise InputError(f"{path}: the root element is <{element.tag}>; a <{root}> is expected")
     return element
+
+
+def find_in_packages(path: str | Path, packages: Sequence[str | Path]) -> Path:
+    """The file that `package://name/rest` means, or the path itself where it does not begin so.
+
+    A folder of `packages` is the package (its own name is `name`) or holds it. Raises `InputError` where none does.
+    """
+    text = str(path)
+    if not text.startswith(_PACKAGE):
+        return Path(path)
+    name, _, rest = text[len(_PACKAGE) :].lstrip("/").partition("/")
+    for folder in map(Path, packages):
+        for place in (folder, folder / name):
+            if place.name == name and place.is_dir():
+                return place / rest
+    searched = ", ".join(map(str, packages)) or "none was given"
+    raise InputError(f"{text}: package '{name}' is in none of the package folders ({searched}); give them as packages")
 
 
 def _read(path: Path) -> bytes:

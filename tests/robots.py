@@ -65,6 +65,19 @@ TREE = robot(
     joint("toe", "base", "f", axis="1 0 0"),
 )
 
+LIMIT = '<limit lower="-2" upper="2" velocity="3" effort="40"/>'  # Pinocchio reads no sliding joint without one
+
+# joints of several degrees of freedom below, beside and above others
+GENERAL = robot(
+    *LINKS,
+    link("e", 0.3),
+    joint("lift", "base", "a", "prismatic", "0 0 1", more=LIMIT),
+    joint("cart", "a", "b", "planar", "0 0 1"),
+    joint("elbow", "b", "c", axis="1 0 1", more=LIMIT),
+    joint("loose", "c", "d", "floating"),
+    joint("tail", "base", "e", "continuous", "0 1 0"),
+)
+
 INLINE = {"arm": ARM, "tree": TREE}
 
 

@@ -9,6 +9,7 @@ import yaml
 from tasks import task, write
 
 from figaroh_jax.config import Preprocess, Task, load_robot, load_task
+from figaroh_jax.dataset import read_recordings
 from figaroh_jax.errors import InputError
 
 CONTRACT = """
@@ -137,3 +138,13 @@ def test_the_robot_of_a_task_has_its_joints_in_their_order(tmp_path):
     model = load_robot(load_task(write(tmp_path, keys)))
     assert model.joint_names == ("elbow", "shoulder")
     assert tuple(model.gravity) == (0, 0, -1.62)
+
+
+def test_a_free_root_is_loaded_but_refused_where_recordings_hold_joint_torques(tmp_path):
+    keys = task()
+    keys["robot"]["root"] = "free_flyer"
+    read_task = load_task(write(tmp_path, keys))
+    model = load_robot(read_task)
+    assert model.joint_names == ("root_joint", "shoulder", "elbow", "slide") and (model.nq, model.nv) == (10, 9)
+    with pytest.raises(InputError, match="robot.root is free_flyer: recordings of joint torques hold one column"):
+        read_recordings(read_task, model)

@@ -136,7 +136,10 @@ BAD = {
     "two joints of a name": (robot(*LINKS3, TWO[0], joint("j0", "a", "b")), "two joints are called 'j0'"),
     "no name": (robots.ARM.replace('name="slide"', ""), "a <joint> in line 1 has no name"),
     "no type": (robots.ARM.replace('type="prismatic"', ""), "'slide': has no type; known: revolute"),
-    "floating": (robots.ARM.replace("prismatic", "floating"), "'slide': type 'floating' is not supported yet"),
+    "mimic of a ball": (
+        robot(*LINKS3, joint("j0", "base", "a", "floating"), joint("j1", "a", "b", more=FOLLOW.format(0))),
+        "'j1' mimics 'j0', but 'j0' is free",
+    ),
     "unknown type": (robots.ARM.replace("prismatic", "prismatc"), "'slide': unknown type 'prismatc'; did you mean 'pr"),
     "limits reversed": (
         robot(*LINKS3[:2], joint("j0", "base", "a", more='<limit lower="1" upper="-1"/>')),
