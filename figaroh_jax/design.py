@@ -1,25 +1,57 @@
-"""From motion to rows: the regressor of the current model, the columns of every candidate, and exact predictions.
+"""From motion to rows: what a unit of every candidate adds, and exact predictions of what the sensors read.
 
 Three kinds of effect act in three ways. `columns`: torque linear in its amplitudes is added. `position`: the true
 position is the measured one less the sensor's error, so the rigid body moves otherwise. `response`: the torque sensor
 filters the torque of the whole model, all columns alike.
+
+JAX evaluates the equations, many effects in one program; samples, shifts and filters stay on the host in NumPy.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from .dynamics import inverse_dynamics
+from .chunks import chunk_size, over_samples
+from .dynamics import joint_torques
 from .effect import Effect, Motion, columns
-from .model import RobotModel
+from .model import Leaf, RobotModel
 from .records import Records, filter_rows
 
-__all__ = ["candidates", "difference", "effect_rows", "joint_columns", "kind", "shifted", "torque_change"]
+__all__ = [
+    "Units",
+    "candidates",
+    "difference",
+    "flattened",
+    "kind",
+    "rigid_torque",
+    "sensor_response",
+    "shapes",
+    "shifted",
+    "torque_change",
+    "unit_rows",
+    "units",
+    "units_and_slopes",
+    "with_shape",
+]
+
+
+class Units(NamedTuple):
+    """Torque of a unit of each amplitude of several effects of one class, N m or N, at the joints that it touches.
+
+    A sensor effect has one column, its torque divided by its parameter: exact at that parameter's value. That of a
+    torque sensor comes out of the torque of the whole model by `response`.
+    """
+
+    torque: Float[np.ndarray, "effects k rows nN"]
+    joints: Int[np.ndarray, "effects rows"]
+    response: Complex[np.ndarray, "effects F"] | None = None
 
 
 def kind(effect: Effect | type[Effect]) -> Literal["columns", "position", "response"]:
@@ -29,94 +61,123 @@ def kind(effect: Effect | type[Effect]) -> Literal["columns", "position", "respo
     return "response" if effect.has("torque_response") else "columns"
 
 
-def difference(signal: Float[Array, "n N"], dt: Float[Array, ""] | float) -> Float[Array, "n N"]:
+def shapes(effect: type[Effect]) -> list[str]:
+    """Parameters that enter nonlinearly and may take any value between their bounds."""
+    return [name for name, p in effect.parameters().items() if not p.linear and not p.choice]
+
+
+def with_shape(effect: Effect, names: list[str], values: list) -> Effect:
+    """The effect with the named parameters replaced."""
+    return eqx.tree_at(lambda e: [getattr(e, name) for name in names], effect, values)
+
+
+def flattened(batch: Effect) -> Effect:
+    """The effects of a batch with leading axes (places, grid) on one axis."""
+    return jax.tree.map(lambda x: np.reshape(x, (np.shape(x)[0] * np.shape(x)[1], *np.shape(x)[2:])), batch)
+
+
+def difference(signal: Float[np.ndarray, "*n N"], dt: float) -> Float[np.ndarray, "*n N"]:
     """Derivative by five-point central differences; the two ends hold their neighbours' (rows there are trimmed)."""
-    inner = (8 * (signal[:, 3:-1] - signal[:, 1:-3]) - (signal[:, 4:] - signal[:, :-4])) / (12 * dt)
-    return jnp.pad(inner, ((0, 0), (2, 2)), mode="edge")
+    out = np.empty_like(signal)
+    inner = 8 * (signal[..., 3:-1] - signal[..., 1:-3]) - (signal[..., 4:] - signal[..., :-4])
+    out[..., 2:-2] = inner / (12 * dt)
+    out[..., :2], out[..., -2:] = out[..., 2:3], out[..., -3:-2]
+    return out
 
 
-def shifted(effect: Effect, motion: Motion, records: Records) -> Motion:
-    """The true motion of the links where `motion` is what the sensor of `effect` has read."""
-    error = effect.position_error(motion).reshape(records.position.shape[:2])
-    rate = difference(error, records.dt)
-    change = [error, rate, difference(rate, records.dt)]
-    joint = effect.at[0]
-    q, v, a = (
-        signal.at[:, joint].add(-delta.reshape(-1))
-        for signal, delta in zip((motion.position, motion.velocity, motion.acceleration), change, strict=True)
-    )
-    return eqx.tree_at(lambda m: (m.position, m.velocity, m.acceleration), motion, (q, v, a))
+def rigid_torque(
+    model: RobotModel, q: Float[Leaf, "*batch nv"], v: Float[Leaf, "*batch nv"], a: Float[Leaf, "*batch nv"]
+) -> Float[np.ndarray, "*batch nv"]:
+    """`inverse_dynamics` by one program for any number of samples."""
+    torque = over_samples(joint_torques, -1, chunk_size(), model, q, v, a)
+    return np.asarray(torque).T.reshape(np.shape(v))
 
 
-def torque_change(effect: Effect, motion: Motion, records: Records) -> Float[Array, "nN nv"]:
-    """Exact torque of a sensor effect: what the current model says with it less what it says without.
+def shifted(effects: Effect, motion: Motion, records: Records) -> Motion:
+    """The true motion of the links for each of a batch of position sensors that have read `motion`.
 
-    A `position` effect moves the rigid body; a `response` is left to the row filter, which is exact in frequency.
+    Position, velocity and acceleration of the answer have a leading axis of effects.
     """
-    true = shifted(effect, motion, records)
-    moved = inverse_dynamics(motion.model, true.position, true.velocity, true.acceleration)
-    return moved - inverse_dynamics(motion.model, motion.position, motion.velocity, motion.acceleration)
+    errors = np.asarray(_errors(effects, motion)).reshape(-1, *records.position.shape[:2])
+    rates = difference(errors, float(records.dt))
+    change = [errors, rates, difference(rates, float(records.dt))]
+    one, joint = np.arange(len(errors)), np.asarray(effects.at)[:, 0]
+    true = []
+    for signal, delta in zip((motion.position, motion.velocity, motion.acceleration), change, strict=True):
+        moved = np.repeat(np.asarray(signal)[None], len(errors), axis=0)
+        moved[one, :, joint] += delta.reshape(len(errors), -1)
+        true.append(moved)
+    return eqx.tree_at(lambda m: (m.position, m.velocity, m.acceleration), motion, tuple(true))
 
 
-def effect_rows(
-    effect: Effect, motion: Motion, records: Records, whitening: Float[Array, "F nv"]
-) -> Float[Array, "amplitudes rows n M"]:
-    """Whitened rows of a unit of each amplitude of `effect` at its joints (`rows`: its own, or all joints).
+def torque_change(effects: Effect, motion: Motion, records: Records) -> Float[np.ndarray, "effects nN nv"]:
+    """Exact torque of a batch of position sensors: of the links' true motion, less that of the motion as it was read.
 
-    Sensor effects have one column, their torque divided by the parameter: exact at that parameter's value.
+    (A torque sensor's is left to the row filter, which is exact in frequency.)
     """
-    torque, joints = raw_columns(effect, motion, records)
-    flat = torque.reshape(-1, torque.shape[2])
-    rows = placed_rows(flat, jnp.tile(joints, torque.shape[0]), records, response_of(effect, records, whitening))
-    return rows.reshape(*torque.shape[:2], *rows.shape[1:])
+    true = shifted(effects, motion, records)
+    moved = rigid_torque(motion.model, true.position, true.velocity, true.acceleration)
+    return moved - rigid_torque(motion.model, motion.position, motion.velocity, motion.acceleration)
 
 
-def raw_columns(
-    effect: Effect, motion: Motion, records: Records
-) -> tuple[Float[Array, "amplitudes rows nN"], Int[Array, " rows"]]:
-    """Torque of a unit of each amplitude at the samples, and the joints of its rows."""
-    way, everywhere = kind(effect), jnp.arange(records.position.shape[2])
-    if way == "response":
-        return motion.total.T[None], everywhere
-    if way == "position":
-        return torque_change(effect, motion, records).T[None] / _size(effect), everywhere
-    torque = columns(effect, motion)
-    own = effect.acts_on in ("joint", "pair")
-    torque = jnp.moveaxis(torque.reshape(*torque.shape[:2], -1), 1, 2)
-    return torque, jnp.asarray(effect.at) if own else everywhere
+def units(batches: Mapping[str, Effect], motion: Motion, records: Records) -> dict[str, Units]:
+    """What a unit of each amplitude adds, for batches (one leading axis) of effects of any kind."""
+    plain = {name: batch for name, batch in batches.items() if _way(batch) == "torque"}
+    torques = _unit_torques(plain, motion) if plain else {}
+    responses = {name: batch for name, batch in batches.items() if kind(batch) == "response"}
+    factors = sensor_response(responses, np.asarray(records.omega))
+    everywhere, out = np.arange(np.shape(motion.velocity)[1]), {}
+    for name, batch in batches.items():
+        own = batch.acts_on in ("joint", "pair") and _way(batch) == "torque"
+        joints = np.asarray(batch.at) if own else np.tile(everywhere, (len(batch.at), 1))
+        if name in torques:
+            torque = np.asarray(torques[name])
+            out[name] = Units(np.moveaxis(torque.reshape(*torque.shape[:3], -1), 2, 3), joints)
+        elif name in factors:
+            torque = np.broadcast_to(np.asarray(motion.total).T, (len(joints), 1, *np.shape(motion.total)[::-1]))
+            out[name] = Units(torque, joints, (factors[name] - 1) / _size(batch)[:, None])
+        elif _way(batch) == "position":
+            torque = torque_change(batch, motion, records) / _size(batch)[:, None, None]
+            out[name] = Units(np.swapaxes(torque, 1, 2)[:, None], joints)
+        else:
+            out[name] = Units(_changed_torques(batch, motion), joints)
+    return out
 
 
-def response_of(effect: Effect, records: Records, whitening: Float[Array, "F nv"]) -> Complex[Array, "F nv"]:
-    """Response that the effect's columns pass: the whitening, and what a sensor effect makes of the torque."""
-    if kind(effect) != "response":
-        return whitening
-    return whitening * ((effect.torque_response(records.omega) - 1) / _size(effect))[:, None]
-
-
-def placed_rows(
-    torque: Float[Array, "K nN"], joints: Int[Array, " K"], records: Records, response: Complex[Array, "F nv"]
-) -> Float[Array, "K n M"]:
-    """Rows of torques at one joint each, with that joint's response and weight."""
+def unit_rows(given: Units, records: Records, whitening: Complex[np.ndarray, "F nv"]) -> Float[np.ndarray, "e k r n M"]:
+    """Whitened rows of the units (effects, k, rows, n, M), with the weight of each joint's rows."""
     n, samples, _, _ = records.shape
-    signal = jnp.moveaxis(torque.reshape(-1, n, samples), 0, 2)
-    rows = filter_rows(records, signal, jnp.take(response, joints, axis=1)) * jnp.take(records.weight, joints, axis=2)
-    return jnp.moveaxis(rows, 2, 0)
+    response = whitening.T[given.joints][:, None]
+    if given.response is not None:
+        response = response * given.response[:, None, None]
+    rows = filter_rows(records, given.torque.reshape(*given.torque.shape[:3], n, samples), response)
+    return rows * np.moveaxis(np.asarray(records.weight), 2, 0)[given.joints][:, None]
 
 
-def _size(effect: Effect) -> Float[Array, ""]:
-    (name,) = effect.parameters()
-    return getattr(effect, name)
+def units_and_slopes(
+    effects: Effect, values: Float[np.ndarray, "effects p"], motion: Motion
+) -> tuple[Float[np.ndarray, "effects k rows nN"], Float[np.ndarray, "effects p k rows nN"]]:
+    """Unit torques of effects with the shapes `values`, and their derivatives in each shape."""
+    torque, slope = _units_and_slopes(effects, values, motion)
+    return _rows_first(np.asarray(torque)), _rows_first(np.moveaxis(np.asarray(slope), -1, 1))
+
+
+def sensor_response(
+    batches: Mapping[str, Effect], omega: Float[np.ndarray, " F"]
+) -> dict[str, Complex[np.ndarray, "effects F"]]:
+    """`torque_response` of batches of effects."""
+    return {name: np.asarray(x) for name, x in _responses(dict(batches), omega).items()} if batches else {}
 
 
 def candidates(effect: type[Effect], model: RobotModel) -> Effect:
     """The effect at every place where it may act, on its grid: one object with leading axes (places, grid)."""
     places = _places(effect, model)
-    shapes = {name: p for name, p in effect.parameters().items() if not p.linear}
-    mesh = np.meshgrid(*[np.asarray(p.grid) for p in shapes.values()], indexing="ij")
-    points = max(1, int(np.prod([len(p.grid) for p in shapes.values()])))
+    grids = {name: p for name, p in effect.parameters().items() if not p.linear}
+    mesh = np.meshgrid(*[np.asarray(p.grid) for p in grids.values()], indexing="ij")
+    points = max(1, int(np.prod([len(p.grid) for p in grids.values()])))
     at = np.broadcast_to(places[:, None], (len(places), points, places.shape[1]))
     values = {name: np.zeros(at.shape[:2]) for name in effect.parameters()}
-    for name, grid in zip(shapes, mesh, strict=True):
+    for name, grid in zip(grids, mesh, strict=True):
         values[name] = np.broadcast_to(grid.reshape(1, -1), at.shape[:2])
     return effect(at, **values)
 
@@ -136,11 +197,78 @@ def _places(effect: type[Effect], model: RobotModel) -> np.ndarray:
     return np.array(sorted(neighbours), dtype=int).reshape(-1, 2)
 
 
-def joint_columns(effect: Effect, motion: Motion) -> Float[Array, "nN nv amplitudes"]:
-    """`columns` of the effect in the rows of all joints."""
-    torque = jnp.moveaxis(columns(effect, motion), 0, -1)
-    if effect.acts_on in ("link", "robot"):
-        return torque
-    torque = torque.reshape(torque.shape[0], -1, torque.shape[-1])
-    blank = jnp.zeros((*motion.position.shape, torque.shape[-1]))
-    return blank.at[:, effect.at].add(torque)
+def _way(effect: Effect | type[Effect]) -> Literal["torque", "change", "position", "response"]:
+    """Where the torque comes from: an equation of its own, or the rigid body with another model or motion."""
+    way = kind(effect)
+    if way != "columns":
+        return way
+    return "change" if effect.has("change") and not effect.has("torque") else "torque"
+
+
+def _size(effect: Effect) -> Float[np.ndarray, " effects"]:
+    (name,) = effect.parameters()
+    return np.asarray(getattr(effect, name))
+
+
+def _changed_torques(batch: Effect, motion: Motion) -> Float[np.ndarray, "effects k nv nN"]:
+    """Torque of a unit of each amplitude of effects that change the robot, which it is linear in."""
+    q, v, a = motion.position, motion.velocity, motion.acceleration
+    before, models = rigid_torque(motion.model, q, v, a), _changed(batch, motion.model)
+    amplitudes = sum(p.linear for p in batch.parameters().values())
+    out = np.empty((len(batch.at), amplitudes, *before.shape[::-1]))
+    for one, amplitude in np.ndindex(out.shape[:2]):
+        changed = jax.tree.map(lambda x, i=one, k=amplitude: np.asarray(x)[i, k], models)
+        out[one, amplitude] = (rigid_torque(changed, q, v, a) - before).T
+    return out
+
+
+def _rows_first(torque: Float[np.ndarray, "*lead k nN rows"]) -> Float[np.ndarray, "*lead k rows nN"]:
+    return np.moveaxis(torque, -1, -2)
+
+
+def _amplitudes(effect: Effect) -> list[str]:
+    return [name for name, p in effect.parameters().items() if p.linear]
+
+
+@jax.jit
+def _unit_torques(batches: dict[str, Effect], motion: Motion) -> dict[str, Float[Array, "effects k nN *rows"]]:
+    return {name: jax.vmap(lambda e: columns(e, motion))(batch) for name, batch in batches.items()}
+
+
+@jax.jit
+def _units_and_slopes(
+    effects: Effect, values: Array, motion: Motion
+) -> tuple[Float[Array, "effects k nN rows"], Float[Array, "effects k nN rows p"]]:
+    names = shapes(type(effects))
+
+    def one(effect: Effect, x: Float[Array, " p"]) -> tuple[Array, Array]:
+        def unit(x: Float[Array, " p"]) -> tuple[Array, Array]:
+            torque = columns(with_shape(effect, names, list(x)), motion)
+            torque = torque.reshape(*torque.shape[:2], -1)
+            return torque, torque
+
+        slope, torque = jax.jacfwd(unit, has_aux=True)(x)
+        return torque, slope
+
+    return jax.vmap(one)(effects, values)
+
+
+@jax.jit
+def _errors(effects: Effect, motion: Motion) -> Float[Array, "effects nN"]:
+    return jax.vmap(lambda effect: effect.position_error(motion))(effects)
+
+
+@jax.jit
+def _responses(batches: dict[str, Effect], omega: Array) -> dict[str, Complex[Array, "effects F"]]:
+    return {name: jax.vmap(lambda e: e.torque_response(omega))(batch) for name, batch in batches.items()}
+
+
+@jax.jit
+def _changed(effects: Effect, model: RobotModel) -> RobotModel:
+    """The robot with a unit of each amplitude of each effect: leading axes (effects, amplitudes)."""
+    names = _amplitudes(effects)
+
+    def change(effect: Effect, unit: Array) -> RobotModel:
+        return with_shape(effect, names, list(unit)).change(model)
+
+    return jax.vmap(jax.vmap(change, in_axes=(None, 0)), in_axes=(0, None))(effects, jnp.eye(len(names)))

@@ -183,7 +183,8 @@ def smooth_sign(
 
     `width` (rad/s or m/s) is the half width of the reversal where the friction of the joint itself is smooth.
     """
-    return jnp.clip(velocity / (jnp.abs(acceleration) * dt / 2 + width + 1e-9), -1.0, 1.0)
+    # operators and methods that NumPy's arrays have too: on the host it costs no program
+    return (velocity / (abs(acceleration) * dt / 2 + width + 1e-9)).clip(-1.0, 1.0)
 
 
 def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **parameters: float) -> Effect:

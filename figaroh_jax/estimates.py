@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from .design import kind, torque_change
-from .effect import Effect, Motion, joint_unit
+from .design import kind, sensor_response, shapes, torque_change, units_and_slopes, with_shape
+from .effect import Effect, joint_unit
 from .evidence import Rows
 from .extended import ExtendedModel, extend
 from .model import RobotModel
-from .problem import Problem, State, filtered_rows
-from .records import Records
-from .refit import shapes, with_shape
+from .problem import BATCH, Problem, State, filtered_rows
 from .results import Estimate
 
 __all__ = ["Fitted", "estimates", "fitted_model", "joint_fit", "torque_slope", "with_amplitudes"]
 
 KEPT = 1e-12
+STEP = 1e-5  # of central differences, relative: error 1e-10 of a third derivative's size
 
 
 class Fitted(eqx.Module):
@@ -118,13 +116,19 @@ def _physical(effect: Effect, names: list[str]) -> tuple[dict[str, float], dict[
         return {n: float(getattr(effect, n)) for n in fields}, {
             n: np.array([n == k for k in names], float) for n in fields
         }
-    values = jnp.asarray([float(getattr(effect, name)) for name in names])
+    values = np.array([float(getattr(effect, name)) for name in names])
 
-    def physical(x: Float[Array, " k"]) -> dict[str, Float[Array, ""]]:
-        return {k: jnp.asarray(v) for k, v in with_shape(effect, names, list(x)).physical().items()}
+    def physical(x: Float[np.ndarray, " k"]) -> dict[str, float]:
+        return {k: float(v) for k, v in with_shape(effect, names, list(x)).physical().items()}
 
-    slope = jax.jacfwd(physical)(values)
-    return {k: float(v) for k, v in physical(values).items()}, {k: np.asarray(g) for k, g in slope.items()}
+    steps = np.diag(STEP * np.maximum(np.abs(values), STEP))
+    sides = [(physical(values + step), physical(values - step)) for step in steps]
+    found = physical(values)
+    slope = {
+        key: np.array([(high[key] - low[key]) / (2 * h) for (high, low), h in zip(sides, np.diag(steps), strict=True)])
+        for key in found
+    }
+    return found, slope
 
 
 def prismatic(model: RobotModel) -> tuple[bool, ...]:
@@ -155,25 +159,22 @@ def torque_slope(
     problem: Problem, state: State, effect: Effect, name: str, whitening: Float[np.ndarray, "F nv"]
 ) -> Float[np.ndarray, "nv T"]:
     """Derivative of the whitened torque in one shape of the effect, its amplitudes as they are."""
-    omega = jnp.asarray(problem.records.omega)
-    response = state.response(omega)[:, None] * jnp.asarray(whitening)
+    response = state.response(problem.records.omega)[:, None] * whitening
+    names, size = shapes(type(effect)), float(getattr(effect, name))
+    if kind(effect) == "columns":
+        batch = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], BATCH, axis=0), effect)
+        values = np.stack([getattr(batch, n) for n in names], axis=1)
+        slope = units_and_slopes(batch, values, state.motion)[1][0, names.index(name)]
+        amplitudes = [float(getattr(effect, n)) for n, p in effect.parameters().items() if p.linear]
+        torque = np.zeros((slope.shape[-1], problem.model.nv))
+        own = effect.acts_on in ("joint", "pair")
+        torque[:, np.asarray(effect.at) if own else slice(None)] = np.tensordot(amplitudes, slope, 1).T
+        return filtered_rows(problem, torque, response)
+    h = STEP * max(abs(size), STEP)
+    sides = jax.tree.map(lambda *x: np.stack(x), *(with_shape(effect, [name], [size + s * h]) for s in (1, -1)))
     if kind(effect) == "response":
-        value, slope = jax.jvp(
-            lambda p: with_shape(effect, [name], [p]).torque_response(omega),
-            (jnp.asarray(getattr(effect, name)),),
-            (jnp.ones(()),),
-        )
-        return filtered_rows(problem, state.motion.total, response * (slope / value)[:, None])
-    torque = _torque_slope(effect, jnp.asarray(getattr(effect, name)), name, state.motion, problem.records)
-    return filtered_rows(problem, torque, response)
-
-
-@eqx.filter_jit
-def _torque_slope(effect: Effect, value: Array, name: str, motion: Motion, records: Records) -> Float[Array, "nN nv"]:
-    def torque(p: Float[Array, ""]) -> Float[Array, "nN nv"]:
-        changed = with_shape(effect, [name], [p])
-        if kind(effect) == "position":
-            return torque_change(changed, motion, records)
-        return changed.joint_torque(motion)
-
-    return jax.jvp(torque, (value,), (jnp.ones(()),))[1]
+        high, low = sensor_response({effect.name: sides}, problem.records.omega)[effect.name]
+        relative = 2 * (high - low) / (high + low) / (2 * h)
+        return filtered_rows(problem, state.motion.total, response * relative[:, None])
+    high, low = torque_change(sides, state.motion, problem.records)
+    return filtered_rows(problem, (high - low) / (2 * h), response)

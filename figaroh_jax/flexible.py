@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -79,7 +78,7 @@ def _smooth_columns(
     series = [np.stack([j["position"][k] for j in joints], 1) for k in range(DEGREES)]
     series += [np.stack([j["time"][k] for j in joints], 1) for k in range(DEGREES - 1)]
     for one in [*series, acceleration, np.ones_like(acceleration)]:
-        rows = filtered_rows(problem, one, jnp.asarray(whitening))
+        rows = filtered_rows(problem, one, whitening)
         columns += [rows * (np.arange(nv) == joint)[:, None] for joint in range(nv)]
     return np.stack(columns, axis=2)
 
@@ -101,7 +100,7 @@ def _with_width(
 ) -> Float[np.ndarray, "nv T"]:
     """Whitened rows of every joint's dry friction with another width."""
     motion = eqx.tree_at(lambda m: m.width, state.motion, np.full(problem.model.nv, width))
-    response = jnp.asarray(whitening) * state.response(jnp.asarray(problem.records.omega))[:, None]
+    response = whitening * state.response(problem.records.omega)[:, None]
     return filtered_rows(problem, np.asarray(motion.direction), response)
 
 
@@ -125,7 +124,7 @@ def _families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv
     groups = []
     for title, columns in joints[0].items():
         every = [np.stack([j[title][k] for j in joints], axis=1) for k in range(len(columns))]
-        rows = np.stack([filtered_rows(problem, one, jnp.asarray(whitening)) for one in every])
+        rows = np.stack([filtered_rows(problem, one, whitening) for one in every])
         for joint, name in enumerate(problem.model.joint_names):
             groups.append(Group(Name(title, (name,)), None, Columns((joint,), rows[None, :, joint][:, :, None])))
     return groups

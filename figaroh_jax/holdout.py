@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .design import kind, torque_change
+from .design import kind, sensor_response, torque_change
 from .effect import Effect
 from .estimates import amplitude_places
-from .problem import Problem, State, extended_state, open_rows
+from .problem import Problem, State, batched, extended_state, open_rows
 from .results import Trace
 from .search import Found, stand
 from .signals import Signals
@@ -40,7 +39,7 @@ def held_out(problem: Problem, start: State, causes: list[Effect], whitening: Fl
 
 def predicted(problem: Problem, state: State) -> Float[np.ndarray, "n M nv"]:
     """Rows of the torque that the state predicts, as the sensors read it, in all recordings (N m or N)."""
-    return open_rows(problem, state.X @ state.theta, state.response(jnp.asarray(problem.records.omega)))
+    return open_rows(problem, state.X @ state.theta, state.response(problem.records.omega))
 
 
 def traces(
@@ -76,18 +75,18 @@ def traces(
 
 def _share(problem: Problem, state: State, effect: Effect, place: list[int]) -> Float[np.ndarray, "n M nv"]:
     """Rows of the torque that one cause brings about, the others being as they are."""
-    omega = jnp.asarray(problem.records.omega)
-    response = state.response(omega)
+    response = state.response(problem.records.omega)
     if kind(effect) == "response":
-        return open_rows(problem, state.motion.total, response * (1 - 1 / effect.torque_response(omega)))
+        own = sensor_response({effect.name: batched(effect)}, problem.records.omega)[effect.name][0]
+        return open_rows(problem, state.motion.total, response * (1 - 1 / own))
     if kind(effect) == "position":
-        return open_rows(problem, np.asarray(torque_change(effect, state.motion, problem.records)), response)
+        return open_rows(problem, torque_change(batched(effect), state.motion, problem.records)[0], response)
     return open_rows(problem, state.X[:, :, place] @ state.theta[place], response)
 
 
 def _fold_error(problem: Problem, state: State, folds: Float[np.ndarray, "folds P"]) -> float:
-    omega, weight = jnp.asarray(problem.records.omega), np.asarray(problem.records.weight)
-    response, fold = state.response(omega), problem.layout.fold.reshape(weight.shape[:2])
+    weight = problem.records.weight
+    response, fold = state.response(problem.records.omega), problem.layout.fold.reshape(weight.shape[:2])
     error = problem.torque * weight
     power = (error**2).sum()
     for k, theta in enumerate(folds):

@@ -12,24 +12,33 @@ from functools import cached_property
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Complex, Float, Int
 
-from .design import joint_columns, kind, shifted
-from .dynamics import inverse_dynamics
+from .design import (
+    Units,
+    candidates,
+    flattened,
+    kind,
+    rigid_torque,
+    sensor_response,
+    shapes,
+    shifted,
+    units,
+    units_and_slopes,
+)
 from .effect import Effect, Motion
-from .effects import Payload, find
+from .effects import CATALOGUE, LinkEffect, Payload, find
 from .evidence import Prior, Rows, instruments
-from .inertia import from_pseudo_inertia, to_com
+from .inertia import to_com
 from .model import Leaf, RobotModel
 from .records import Records, filter_rows
 from .regressor import joint_torque_regressor
 
-__all__ = ["Layout", "Problem", "State", "baseline", "extended_state", "plain_rows", "whitened"]
+__all__ = ["Layout", "Problem", "State", "baseline", "extended_state", "plain_rows", "unit_torques", "whitened"]
 
 FRICTION_PRECISION = 1e-6
-COLUMNS = 4  # filtered columns are padded to a multiple of it
+BATCH = 4  # effects with a shape in one program
 
 
 class Layout(eqx.Module):
@@ -56,12 +65,43 @@ class Problem:
     @cached_property
     def torque(self) -> Float[np.ndarray, "n M nv"]:
         """Rows of the measured torque, not whitened, also those that are not fitted, N m or N."""
-        return open_rows(self, self.records.flat(self.records.torque), jnp.ones(len(np.asarray(self.records.omega))))
+        return open_rows(self, self.records.flat(self.records.torque), np.ones(len(self.records.omega)))
 
     @cached_property
     def gain(self) -> Float[np.ndarray, " F"]:
         """Power gain of the row filter."""
         return np.asarray(self.records.low_pass) ** 2
+
+    @cached_property
+    def motion(self) -> Motion:
+        """All samples of all recordings as measured, with the load of the nominal robot."""
+        r = self.records
+        q, v, a = (r.flat(x) for x in (r.position, r.velocity, r.acceleration))
+        load = rigid_torque(self.model, q, v, a)
+        return Motion(self.model, r.flat(r.time), q, v, a, load, load, r.dt, self.width)
+
+    @cached_property
+    def families(self) -> dict[str, dict[str, Effect]]:
+        """Candidates of the whole catalogue (leading axes places, grid), by what their torque depends on.
+
+        The equations of a family are one program: `fixed` by the measured motion alone, `shaped` (those that have a
+        shape to search too), `following` the current model's torque, `sensor` through the rigid body or the filter.
+        """
+        out: dict[str, dict[str, Effect]] = {name: {} for name in ("fixed", "shaped", "following", "sensor", "link")}
+        for name, effect in CATALOGUE.items():
+            batch = candidates(effect, self.model)
+            if batch.at.shape[0]:
+                out[_family(effect)][name] = batch
+        return out
+
+    @cached_property
+    def fixed(self) -> dict[str, Units]:
+        """Unit torques of the effects that depend on the measured motion alone."""
+        return self.family("fixed", self.motion)
+
+    def family(self, name: str, motion: Motion) -> dict[str, Units]:
+        """Unit torques of a family, on one axis of places and grid points."""
+        return units({n: flattened(b) for n, b in self.families[name].items()}, motion, self.records)
 
 
 @dataclass(frozen=True)
@@ -75,12 +115,12 @@ class State:
     theta: Float[np.ndarray, " P"]
     motion: Motion  # as measured, with load and total torque of `theta`
 
-    def response(self, omega: Float[Array | np.ndarray, " F"]) -> Complex[Array, " F"]:
+    def response(self, omega: Float[Leaf, " F"]) -> Complex[np.ndarray, " F"] | Float[np.ndarray, " F"]:
         """Response of the torque sensor of all sensor effects together."""
-        out = jnp.ones(omega.shape, dtype=complex)
+        out = np.ones(np.shape(omega))
         for effect in self.sensors:
             if kind(effect) == "response":
-                out = out * effect.torque_response(jnp.asarray(omega))
+                out = out * sensor_response({effect.name: batched(effect)}, np.asarray(omega))[effect.name][0]
         return out
 
 
@@ -91,9 +131,8 @@ def baseline(problem: Problem, names: Sequence[str], given: Sequence[Effect] = (
     for name in names:
         effect = find(name)
         terms.append(effect(joints, **{p: np.zeros(len(joints)) for p in effect.parameters()}))
-    motion = measured_motion(problem.model, problem.records, problem.width)
-    rigid, theta, precision = _rigid(problem, motion), *rigid_prior(problem.model, problem.trust)
-    state = State((), (), rigid, Prior(theta, precision), theta, motion)
+    rigid, theta, precision = _rigid(problem, problem.motion), *rigid_prior(problem.model, problem.trust)
+    state = State((), (), rigid, Prior(theta, precision), theta, problem.motion)
     for term in [*terms, *(batched(effect) for effect in given)]:
         state = with_term(problem, state, term)
     return state
@@ -120,26 +159,34 @@ def physical_body(free: Float[np.ndarray, "10"], information: Float[np.ndarray, 
 
     The pseudo-inertia is L L' with L lower triangular (Wensing, Kim, Slotine 2018), L by Levenberg-Marquardt.
     """
-    import optimistix  # slow to import
+    from scipy.optimize import least_squares  # slow to import
 
     values, vectors = np.linalg.eigh((information + information.T) / 2)
     root = np.sqrt(np.maximum(values, 0))[:, None] * vectors.T
-    start = np.diag(np.sqrt(max(float(free[0]), 0.05) * np.array([0.002, 0.002, 0.002, 1.0])))[np.tril_indices(4)]
-    solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-10)
-    arguments = jnp.asarray(root), jnp.asarray(free)
-    found = optimistix.least_squares(_misfit, solver, jnp.asarray(start), arguments, max_steps=200, throw=False)
-    return np.asarray(_body(found.value))
+    lower = np.tril_indices(4)
+    start = np.diag(np.sqrt(max(float(free[0]), 0.05) * np.array([0.002, 0.002, 0.002, 1.0])))[lower]
+    basis = np.zeros((10, 4, 4))
+    basis[(np.arange(10), *lower)] = 1.0
+
+    def misfit(x: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
+        L = np.tensordot(x, basis, 1)
+        return root @ (_ten(L @ L.T) - free)
+
+    def slope(x: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10 10"]:
+        half = basis @ np.tensordot(x, basis, 1).T
+        return root @ _ten(half + np.swapaxes(half, 1, 2)).T
+
+    options = {"method": "lm", "ftol": 1e-10, "xtol": 1e-10}
+    L = np.tensordot(least_squares(misfit, start, slope, **options).x, basis, 1)  # pyright: ignore[reportArgumentType]
+    return _ten(L @ L.T)
 
 
-def _body(lower: Float[Array, "10"]) -> Float[Array, "10"]:
-    """Ten parameters of the pseudo-inertia L L'."""
-    L = jnp.zeros((4, 4)).at[np.tril_indices(4)].set(lower)
-    return jnp.asarray(from_pseudo_inertia(L @ L.T))
-
-
-def _misfit(lower: Float[Array, "10"], arguments: tuple[Array, Array]) -> Float[Array, "10"]:
-    root, free = arguments
-    return root @ (_body(lower) - free)
+def _ten(P: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 10"]:
+    """Ten parameters of pseudo-inertias [[S, h], [h', m]]: the inertia is tr(S) 1 - S."""
+    trace = np.trace(P[..., :3, :3], axis1=-2, axis2=-1)
+    (xx, yy, zz), (xy, xz, yz) = ((P[..., i, i] for i in range(3)), (P[..., i, j] for i, j in ((0, 1), (0, 2), (1, 2))))
+    h = (P[..., k, 3] for k in range(3))
+    return np.stack([P[..., 3, 3], *h, trace - xx, -xy, trace - yy, -xz, -yz, trace - zz], axis=-1)
 
 
 def body_precision(ten: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
@@ -157,7 +204,7 @@ def batched(effect: Effect) -> Effect:
 
 def with_term(problem: Problem, state: State, term: Effect) -> State:
     """The state with one more effect (leading axis of places) whose torque is linear in its amplitudes."""
-    own = np.asarray(_term_columns(term, state.motion))
+    own = _term_columns(problem, state, term)
     count = own.shape[-1]
     mean, precision = np.zeros(count), np.full(count, FRICTION_PRECISION)
     if isinstance(term, Payload):
@@ -185,7 +232,9 @@ def link_motion(problem: Problem, state: State) -> Motion:
     motion = state.motion
     for effect in state.sensors:
         if kind(effect) == "position":
-            motion = _shifted(effect, motion, problem.records)
+            moved = shifted(batched(effect), motion, problem.records)
+            first = (moved.position[0], moved.velocity[0], moved.acceleration[0])
+            motion = eqx.tree_at(lambda m: (m.position, m.velocity, m.acceleration), moved, first)
     return motion
 
 
@@ -199,15 +248,80 @@ def solved(problem: Problem, state: State, theta: Float[np.ndarray, " P"]) -> St
     return replace(state, theta=theta, motion=motion)
 
 
+def unit_torques(problem: Problem, state: State, term: Effect) -> Units:
+    """What a unit of each amplitude of a term (one leading axis) adds in the state, N m or N."""
+    if isinstance(term, LinkEffect):
+        links = np.asarray(term.at)[:, 0]
+        torque = np.stack([state.X[:, :, 10 * k : 10 * k + 10].transpose(2, 1, 0) for k in links])
+        return Units(torque, np.tile(np.arange(problem.model.nv), (len(links), 1)))
+    family = _family(type(term))
+    if family == "shaped":
+        return _shaped_units(term, state.motion)
+    if family in ("fixed", "following"):
+        place = _places_in(problem.families[family].get(term.name), term)
+        if place is not None:
+            known = problem.fixed if family == "fixed" else problem.family(family, state.motion)
+            return Units(known[term.name].torque[place], known[term.name].joints[place])
+    return units({term.name: term}, state.motion, problem.records)[term.name]
+
+
+def _family(effect: type[Effect]) -> str:
+    if issubclass(effect, LinkEffect):
+        return "link"
+    if kind(effect) != "columns" or (effect.has("change") and not effect.has("torque")):
+        return "sensor"
+    if effect.follows_torque:
+        return "following"
+    return "shaped" if shapes(effect) else "fixed"
+
+
+def _places_in(batch: Effect | None, term: Effect) -> Int[np.ndarray, " places"] | None:
+    """Where the effects of a term stand among the candidates; nothing where one of them is no candidate."""
+    if batch is None:
+        return None
+    flat, same = flattened(batch), []
+    for at, *values in zip(np.asarray(term.at), *(np.asarray(getattr(term, n)) for n in _choices(term)), strict=True):
+        alike = (np.asarray(flat.at) == at).all(1)
+        for name, value in zip(_choices(term), values, strict=True):
+            alike &= np.asarray(getattr(flat, name)) == value
+        same.append(np.flatnonzero(alike))
+    return np.array([place[0] for place in same]) if all(len(place) for place in same) else None
+
+
+def _choices(effect: Effect) -> list[str]:
+    return [name for name, p in effect.parameters().items() if not p.linear]
+
+
+def _shaped_units(term: Effect, motion: Motion) -> Units:
+    """By the program of the refits: filled up to its batch."""
+    count, torques = len(term.at), []
+    for start in range(0, count, BATCH):
+        some = np.resize(np.arange(start, min(start + BATCH, count)), BATCH)
+        part = jax.tree.map(lambda x, i=some: np.asarray(x)[i], term)
+        values = np.stack([getattr(part, name) for name in shapes(type(term))], axis=1)
+        torques.append(units_and_slopes(part, values, motion)[0])
+    everywhere = np.tile(np.arange(np.shape(motion.velocity)[1]), (count, 1))
+    joints = np.asarray(term.at) if term.acts_on in ("joint", "pair") else everywhere
+    return Units(np.concatenate(torques)[:count], joints)
+
+
+def _term_columns(problem: Problem, state: State, term: Effect) -> Float[np.ndarray, "nN nv columns"]:
+    given = unit_torques(problem, state, term)
+    columns = np.zeros((problem.model.nv, *given.torque.shape[:2], given.torque.shape[3]))
+    for one, joints in enumerate(given.joints):
+        np.add.at(columns[:, one], joints, np.swapaxes(given.torque[one], 0, 1))
+    return np.moveaxis(columns.reshape(problem.model.nv, -1, columns.shape[-1]), 2, 0)
+
+
 def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], before: Rows | None = None) -> Rows:
     """Whitened rows of the measured torque and of the state's regressor, with their instruments.
 
     `before` are the rows of the state that this one extends by columns alone: only the new columns are filtered.
     """
     layout = problem.layout
-    y = filtered_rows(problem, problem.records.flat(problem.records.torque), jnp.asarray(whitening))
+    y = filtered_rows(problem, problem.records.flat(problem.records.torque), whitening)
     known = 0 if before is None else before.X.shape[2]
-    response = jnp.asarray(whitening) * state.response(problem.records.omega)[:, None]
+    response = whitening * state.response(problem.records.omega)[:, None]
     X = _filtered_columns(problem, state.X[:, :, known:], response)
     Xi = X
     if layout.repeats:
@@ -218,65 +332,43 @@ def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"
 
 
 def _filtered_columns(
-    problem: Problem, X: Float[np.ndarray, "nN nv k"], response: Complex[Array, "F nv"]
+    problem: Problem, X: Float[np.ndarray, "nN nv k"], response: Complex[np.ndarray, "F nv"]
 ) -> Float[np.ndarray, "nv T k"]:
-    """Masked rows of columns; their number is padded, so that few programs serve all models."""
-    n, samples, _, nv = problem.records.shape
-    count = X.shape[2]
-    padded = np.pad(X, ((0, 0), (0, 0), (0, -count % COLUMNS))).reshape(n, samples, nv, -1)
-    rows = np.asarray(_rows(problem.records, jnp.asarray(padded), response))[..., :count]
-    rows = rows * np.asarray(problem.records.weight)[..., None]
-    return np.moveaxis(rows.reshape(-1, nv, count), 0, 1)
+    """Masked rows of columns, of which a tree leaves many zero."""
+    n, samples, count, nv = problem.records.shape
+    torque = np.ascontiguousarray(np.moveaxis(X, 0, 2)).reshape(-1, n, samples)
+    joints = np.repeat(np.arange(nv), X.shape[2])
+    used = torque.any(axis=(1, 2))
+    rows = np.zeros((len(torque), n, count))
+    rows[used] = filter_rows(problem.records, torque[used], response.T[joints[used]])
+    rows = rows.reshape(nv, -1, n, count) * np.moveaxis(problem.records.weight, 2, 0)[:, None]
+    return np.ascontiguousarray(np.swapaxes(rows.reshape(nv, -1, n * count), 1, 2))
 
 
 def plain_rows(problem: Problem, state: State) -> Rows:
     """Rows as they are, N m or N."""
-    return whitened(problem, state, np.ones((len(np.asarray(problem.records.omega)), problem.records.shape[3])))
+    return whitened(problem, state, np.ones((len(problem.records.omega), problem.records.shape[3])))
 
 
 def open_rows(
-    problem: Problem, torque: Float[Leaf, "nN nv"], response: Complex[Array, " F"]
+    problem: Problem, torque: Float[np.ndarray, "nN nv"], response: Complex[np.ndarray, " F"]
 ) -> Float[np.ndarray, "n M nv"]:
     """Rows of a torque at all samples, of all recordings and without a mask."""
     n, samples, _, nv = problem.records.shape
-    factor = jnp.asarray(response)[:, None] + jnp.zeros((1, nv), complex)
-    return np.asarray(_rows(problem.records, jnp.asarray(torque).reshape(n, samples, nv), factor))
+    return np.moveaxis(filter_rows(problem.records, torque.T.reshape(nv, n, samples), response), 0, 2)
 
 
 def filtered_rows(
-    problem: Problem, torque: Float[Leaf, "nN nv"], response: Complex[Array, "F nv"]
+    problem: Problem, torque: Float[np.ndarray, "nN nv"], response: Complex[np.ndarray, "F nv"]
 ) -> Float[np.ndarray, "nv T"]:
     """Rows of a torque at all samples through the row filter and `response`, masked."""
     n, samples, _, nv = problem.records.shape
-    columns = jnp.asarray(torque).reshape(n, samples, nv)
-    rows = np.asarray(_rows(problem.records, columns, response)) * problem.records.weight
-    return np.moveaxis(rows.reshape(-1, nv), 0, 1)
+    rows = filter_rows(problem.records, torque.T.reshape(nv, n, samples), response.T)
+    return (rows * np.moveaxis(problem.records.weight, 2, 0)).reshape(nv, -1)
 
 
 def _row_layout(layout: Layout) -> tuple[np.ndarray, ...]:
     return layout.paired, layout.partner, layout.block, layout.fold
-
-
-@eqx.filter_jit
-def measured_motion(model: RobotModel, records: Records, width: Float[Leaf, " nv"]) -> Motion:
-    """All samples of all recordings as one motion, with the load of the nominal robot."""
-    q, v, a = (records.flat(jnp.asarray(x)) for x in (records.position, records.velocity, records.acceleration))
-    load = inverse_dynamics(model, q, v, a)
-    return Motion(model, records.flat(jnp.asarray(records.time)), q, v, a, load, load, records.dt, width)
-
-
-@eqx.filter_jit
-def _rows(records: Records, columns: Array, response: Array) -> Array:
-    return filter_rows(records, columns, jnp.broadcast_to(response, (records.omega.shape[0], records.shape[3])))
-
-
-_shifted = eqx.filter_jit(shifted)
-
-
-@eqx.filter_jit
-def _term_columns(term: Effect, motion: Motion) -> Float[Array, "nN nv columns"]:
-    columns = jax.vmap(lambda effect: joint_columns(effect, motion))(term)
-    return jnp.moveaxis(columns, 0, 2).reshape(*columns.shape[1:3], -1)
 
 
 def _rigid(problem: Problem, motion: Motion) -> Float[np.ndarray, "nN nv P"]:

@@ -1,38 +1,37 @@
-"""Exact refit of what enters nonlinearly: the profile likelihood of an effect's shape, minimised by its gradient.
+"""Exact refit of what enters nonlinearly: the profile likelihood of an effect's shape, minimised in its box.
 
 For a shape p the linear unknowns are solved for, so the profile is J(p) = -s'G^-1 s for columns Z(p), s = Z'r and
-G = Z'Z - Z'X A^-1 X'Z; for a sensor effect, whose size is its parameter, J(p) = D'D - 2 D'r - D'X A^-1 X'D.
+G = Z'Z - Z'X A^-1 X'Z, with its gradient from those of the columns; for a position sensor, whose size is its
+parameter, J(p) = D'D - 2 D'r - D'X A^-1 X'D with the exact change D(p) of the torque.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Complex, Float
 
-from .design import effect_rows, kind
+from .design import Units, shapes, torque_change, unit_rows, units_and_slopes, with_shape
 from .effect import Effect, Motion
-from .model import Leaf
 from .records import Records
 
-__all__ = ["Whitened", "bounded_minimum", "profile", "refit"]
+__all__ = ["Whitened", "bounded_minimum", "profile", "refit", "refit_shift", "shift_profile"]
 
 STEPS = 12
 RIDGE = 1e-9
+CLOSE = 1e-4  # of its bracket: how exactly the size of a shift is searched
 
 
-class Whitened(eqx.Module):
+class Whitened(NamedTuple):
     """Residual and regressor of the current model as whitened rows, `A^-1`, and the whitening response."""
 
-    residual: Float[Leaf, "nv n M"]
-    X: Float[Leaf, "nv n M P"]
-    inverse: Float[Leaf, "P P"]
-    whitening: Any  # (F, nv), complex where the torque sensor has a response
+    residual: Float[np.ndarray, "nv n M"]
+    X: Float[np.ndarray, "nv n M P"]
+    inverse: Float[np.ndarray, "P P"]
+    whitening: Complex[np.ndarray, "F nv"] | Float[np.ndarray, "F nv"]
 
 
 def bounded_minimum(
@@ -56,40 +55,26 @@ def bounded_minimum(
 
 
 def profile(
-    effect: Effect, motion: Motion, records: Records, whitened: Whitened
-) -> tuple[Float[Array, ""], Float[Array, "k rows n M"]]:
-    """J(p) of the effect at its shape, the change of the penalised sum of squares that it brings; its columns."""
-    Z = effect_rows(effect, motion, records, whitened.whitening)
-    own = Z.shape[1] != whitened.residual.shape[0]
-    residual = whitened.residual[effect.at] if own else whitened.residual
-    X = whitened.X[effect.at] if own else whitened.X
-    k = Z.shape[0]
+    Z: Float[np.ndarray, "k rows n M"],
+    slope: Float[np.ndarray, "p k rows n M"],
+    joints: list[int],
+    whitened: Whitened,
+) -> tuple[float, Float[np.ndarray, " p"]]:
+    """J of the columns `Z` at the `joints`, the change of the penalised squares that they bring, and its gradient.
+
+    With x = G^-1 s: dJ = x' dG x - 2 ds'x.
+    """
+    residual, X = whitened.residual[joints].reshape(-1), whitened.X[joints].reshape(-1, whitened.X.shape[-1])
+    k = len(Z)
     flat = Z.reshape(k, -1)
-    s = flat @ residual.reshape(-1)
-    C = flat @ X.reshape(flat.shape[1], -1)
-    G = flat @ flat.T - C @ whitened.inverse @ C.T
-    if kind(effect) != "columns":
-        (name,) = effect.parameters()
-        size = getattr(effect, name)
-        return size**2 * G[0, 0] - 2 * size * s[0], Z
-    scale = jnp.sqrt(jnp.diagonal(flat @ flat.T) + 1e-300)
-    unit = G / (scale[:, None] * scale[None, :]) + RIDGE * jnp.eye(k)
-    return -(s / scale) @ jnp.linalg.solve(unit, s / scale), Z
-
-
-@eqx.filter_jit
-def _profiles(
-    effects: Effect, values: Float[Leaf, "starts p"], motion: Motion, records: Records, whitened: Whitened
-) -> tuple[Float[Array, " starts"], Float[Array, "starts p"], Float[Array, "starts k rows n M"]]:
-    """Profile, gradient and columns of several starts, each its own effect with its own shape."""
-    names = shapes(type(effects))
-
-    def one(effect: Effect, x: Float[Array, " p"]) -> tuple[Array, tuple[Array, Array]]:
-        value, Z = profile(with_shape(effect, names, list(x)), motion, records, whitened)
-        return value, (value, Z)
-
-    slope, (value, Z) = jax.vmap(jax.jacfwd(one, argnums=1, has_aux=True))(effects, values)
-    return value, slope, Z
+    s, C, gram = flat @ residual, flat @ X, flat @ flat.T
+    taken = C @ whitened.inverse
+    scale = np.sqrt(np.diagonal(gram) + 1e-300)
+    unit = (gram - taken @ C.T) / np.outer(scale, scale) + RIDGE * np.eye(k)
+    x = np.linalg.solve(unit, s / scale) / scale
+    left = x @ flat - X @ (x @ taken)  # what G x is a product with: the columns less what the model takes up
+    changes = slope.reshape(len(slope), k, -1)
+    return float(-s @ x), 2 * (changes @ (left - residual)) @ x
 
 
 def refit(
@@ -101,38 +86,87 @@ def refit(
     """
     names = shapes(type(effects))
     start = np.stack([np.asarray(getattr(effects, name)) for name in names], axis=-1)
-    wide = kind(effects) == "position"  # the profile of a shift has one valley, and the grid of its columns is alike
-    box = np.stack([_box(effects.parameters()[n], x, wide) for n, x in zip(names, start.T, strict=True)], axis=-1)
+    box = np.stack([_box(effects.parameters()[n], x) for n, x in zip(names, start.T, strict=True)], axis=-1)
     low, width = box[:, 0], box[:, 1] - box[:, 0]
-    scale = 1.0
+    device_effects, device_motion = jax.device_put((effects, motion))
+    scale, known = 1.0, {}
 
     def function(u: Float[np.ndarray, " startsp"]) -> tuple[float, Float[np.ndarray, " startsp"]]:
-        value, slope, _ = _profiles(effects, low + u.reshape(low.shape) * width, motion, records, whitened)
-        return float(value.sum()) / scale, np.asarray(slope * width).reshape(-1) / scale
+        values = low + u.reshape(low.shape) * width
+        known.update(_profiles(device_effects, device_motion, values, records, whitened), at=values)
+        return float(known["value"].sum()) / scale, (known["slope"] * width).reshape(-1) / scale
 
     first = ((start - low) / width).reshape(-1)
     scale = abs(function(first)[0]) + 1e-9
-    found = bounded_minimum(function, first, np.zeros_like(first), np.ones_like(first))
-    values = low + found.reshape(low.shape) * width
-    value, _, Z = _profiles(effects, values, motion, records, whitened)
-    best = int(np.argmin(np.where(np.isfinite(value), value, np.inf)))
+    values = (
+        low + bounded_minimum(function, first, np.zeros_like(first), np.ones_like(first)).reshape(low.shape) * width
+    )
+    if not np.array_equal(known["at"], values):
+        known = _profiles(device_effects, device_motion, values, records, whitened)
+    best = int(np.argmin(np.where(np.isfinite(known["value"]), known["value"], np.inf)))
     one = jax.tree.map(lambda x: np.asarray(x)[best], effects)
-    return with_shape(one, names, list(values[best])), np.asarray(Z[best])
+    return with_shape(one, names, list(values[best])), known["Z"][best]
 
 
-def with_shape(effect: Effect, names: list[str], values: list[Any]) -> Effect:
-    """The effect with the named parameters replaced."""
-    return eqx.tree_at(lambda e: [getattr(e, name) for name in names], effect, values)
+def shift_profile(
+    effect: Effect,
+    sizes: Float[np.ndarray, " sizes"],
+    motion: Motion,
+    records: Records,
+    whitened: Whitened,
+) -> Float[np.ndarray, " sizes"]:
+    """J of a position sensor's effect (without leading axes) for several sizes, its one parameter."""
+    (name,) = effect.parameters()
+    batch = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], len(sizes), axis=0), effect)
+    change = torque_change(with_shape(batch, [name], [sizes]), motion, records)
+    joints = np.tile(np.arange(change.shape[2]), (len(sizes), 1))
+    rows = unit_rows(Units(np.swapaxes(change, 1, 2)[:, None], joints), records, whitened.whitening)
+    D = rows.reshape(len(sizes), -1)
+    C = D @ whitened.X.reshape(D.shape[1], -1)
+    return (D * (D - 2 * whitened.residual.reshape(-1))).sum(1) - ((C @ whitened.inverse) * C).sum(1)
 
 
-def shapes(effect: type[Effect]) -> list[str]:
-    return [name for name, p in effect.parameters().items() if not p.linear and not p.choice]
+def refit_shift(effect: Effect, motion: Motion, records: Records, whitened: Whitened) -> Effect:
+    """The effect of a position sensor with the size that fits best, between the neighbours of the best grid point.
+
+    The profile of a shift has one valley. It is searched without its gradient: that of the inverse dynamics takes
+    longer to compile than all the values that a search in one number needs.
+    """
+    from scipy.optimize import minimize_scalar  # slow to import
+
+    ((name, parameter),) = effect.parameters().items()
+    grid = np.array(sorted(parameter.grid))
+    best = int(np.argmin(shift_profile(effect, grid, motion, records, whitened)))
+    low = grid[best - 1] if best else parameter.lower
+    high = grid[best + 1] if best + 1 < len(grid) else parameter.upper
+
+    def value(size: float) -> float:
+        return float(shift_profile(effect, np.array([size]), motion, records, whitened)[0])
+
+    options = {"xatol": CLOSE * (high - low), "maxiter": 3 * STEPS}
+    found = minimize_scalar(value, bounds=(low, high), method="bounded", options=options)
+    size = np.float64(found.x)  # pyright: ignore[reportAttributeAccessIssue]
+    return with_shape(effect, [name], [size])
 
 
-def _box(parameter: Any, starts: Float[np.ndarray, " starts"], wide: bool) -> Float[np.ndarray, "starts 2"]:
-    """Neighbouring grid points of each start; the outermost, or all if `wide`, reach to the parameter's bounds."""
-    if wide:
-        return np.tile([parameter.lower, parameter.upper], (len(starts), 1))
+def _profiles(
+    effects: Effect, motion: Motion, values: Float[np.ndarray, "starts p"], records: Records, whitened: Whitened
+) -> dict[str, Any]:
+    """Profile, gradient and columns of several starts, each its own effect with its own shape."""
+    torque, slope = units_and_slopes(effects, values, motion)
+    starts, p, k = slope.shape[:3]
+    own = effects.acts_on in ("joint", "pair")
+    joints = np.asarray(effects.at) if own else np.tile(np.arange(len(whitened.residual)), (starts, 1))
+    both = np.concatenate([torque[:, None], slope], axis=1).reshape(starts, (1 + p) * k, *torque.shape[2:])
+    rows = unit_rows(Units(both, joints), records, whitened.whitening)
+    rows = rows.reshape(starts, 1 + p, k, *rows.shape[2:])
+    parts = [profile(one[0], one[1:], list(at), whitened) for one, at in zip(rows, joints, strict=True)]
+    value, gradient = (np.array(x) for x in zip(*parts, strict=True))
+    return {"value": value, "slope": gradient, "Z": rows[:, 0]}
+
+
+def _box(parameter: Any, starts: Float[np.ndarray, " starts"]) -> Float[np.ndarray, "starts 2"]:
+    """Neighbouring grid points of each start; the outermost reach to the parameter's bounds."""
     grid = np.array([parameter.lower, *sorted(parameter.grid), parameter.upper])
     place = np.array([np.argmin(np.abs(grid[1:-1] - x)) + 1 for x in starts])
     low, high = grid[place - 1], grid[place + 1]

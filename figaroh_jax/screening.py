@@ -8,26 +8,22 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from .design import candidates, effect_rows, kind, placed_rows, raw_columns
-from .effect import Effect, Motion
+from .design import flattened, unit_rows, units
+from .effect import Effect
 from .effects import CATALOGUE, LinkEffect
 from .evidence import Bank, Columns, Linear, Rows, Score, bank, block_scores, other_scores, projection, scores
 from .model import RobotModel
 from .noise import Spectrum
 from .problem import Problem, State
-from .records import Records
 from .results import Name
 
 __all__ = ["Group", "Screen", "catalogue", "family_p", "screen"]
 
-DRAWS, CHUNK = 400, 50
-COLUMNS = 128  # filtered at once: bounds the memory  # draws held at once
+DRAWS, CHUNK = 400, 50  # draws, and how many are held at once
 ALTERNATIVES = ({"torque_delay", "torque_lag"},)  # once one is in, the other is not tried
 
 
@@ -72,32 +68,45 @@ def catalogue(
     taken = {(type(e).name, at) for term in state.terms for e, at in _places_of(term)}
     taken |= {(effect.name, tuple(int(i) for i in np.asarray(effect.at))) for effect in state.sensors}
     closed = {name for pair in ALTERNATIVES if any(t[0] in pair for t in taken) for name in pair}
-    wanted = {n: e for n, e in CATALOGUE.items() if n not in forbid and n not in closed}
-    batches = {name: candidates(effect, problem.model) for name, effect in wanted.items()}
+    wanted = [n for n in CATALOGUE if n not in forbid and n not in closed]
+    batches = {n: b for family in problem.families.values() for n, b in family.items()}
     old = {group.name: group.columns for group in before or ()}
-    free = {n: b for n, b in batches.items() if not isinstance(b, LinkEffect) and b.at.shape[0]}
-    new = {n: b for n, b in free.items() if before is None or b.follows_torque}
-    response = jnp.asarray(whitening) * state.response(problem.records.omega)[:, None]
-    computed = _all_rows(new, state.motion, problem.records, response)
+    fresh = _fresh_columns(problem, state, whitening, wanted, everything=before is None)
     groups = []
-    for name, batch in batches.items():
-        for place in range(batch.at.shape[0]):
-            one = jax.tree.map(lambda x, p=place: np.asarray(x)[p], batch)
-            at = tuple(int(i) for i in one.at[0])
-            title = Name(name, place_names(problem.model, batch, at))
-            if (name, at) in taken:
+    for name in (n for n in wanted if n in batches):
+        for place, at in enumerate(np.asarray(batches[name].at)[:, 0].tolist()):
+            title = Name(name, place_names(problem.model, batches[name], tuple(at)))
+            if (name, tuple(at)) in taken:
                 continue
-            if isinstance(batch, LinkEffect):
+            if isinstance(batches[name], LinkEffect):
                 columns = _link_columns(rows, at[0], problem.model)
-            elif name in new:
-                own = len(at) and kind(batch) == "columns"
-                Z = np.asarray(computed[name][place])
-                columns = Columns(at if own else tuple(range(problem.model.nv)), Z.reshape(*Z.shape[:3], -1))
             else:
-                columns = old.get(title)
+                columns = fresh[name][place] if name in fresh else old.get(title)
             if columns is not None and np.abs(columns.Z).max() > 0:
+                one = jax.tree.map(lambda x, p=place: np.asarray(x)[p], batches[name])
                 groups.append(Group(title, one, columns))
     return groups
+
+
+def _fresh_columns(
+    problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], wanted: Collection[str], everything: bool
+) -> dict[str, list[Columns]]:
+    """Whitened columns by place: of all wanted effects, or of those whose columns follow the torque of the state."""
+    given = problem.family("following", state.motion)
+    if everything:
+        given |= problem.fixed | problem.family("shaped", state.motion)
+    sensors = {n: b for n, b in problem.families["sensor"].items() if n in wanted and (everything or b.follows_torque)}
+    given |= units({n: flattened(b) for n, b in sensors.items()}, state.motion, problem.records)
+    response = whitening * state.response(problem.records.omega)[:, None]
+    batches = {n: b for family in problem.families.values() for n, b in family.items()}
+    out = {}
+    for name in (n for n in given if n in wanted):
+        places, grid = batches[name].at.shape[:2]
+        rows = unit_rows(given[name], problem.records, response)
+        rows = rows.reshape(places, grid, *rows.shape[1:3], -1)
+        joints = given[name].joints[::grid].tolist()
+        out[name] = [Columns(tuple(at), Z) for at, Z in zip(joints, rows, strict=True)]
+    return out
 
 
 def place_names(model: RobotModel, effect: Effect | type[Effect], at: tuple[int, ...]) -> tuple[str, ...]:
@@ -176,30 +185,3 @@ def _link_columns(rows: Rows, link: int, model: RobotModel) -> Columns:
 
 def _places_of(term: Effect) -> list[tuple[Effect, tuple[int, ...]]]:
     return [(term, tuple(int(i) for i in at)) for at in np.asarray(term.at)]
-
-
-@eqx.filter_jit
-def _all_rows(
-    batches: dict[str, Effect], motion: Motion, records: Records, response: Array
-) -> dict[str, Float[Array, "places grid k rows n M"]]:
-    """Rows of all candidates: their torques side by side through one filter, some columns at a time."""
-    out, torques, joints, shapes = {}, [], [], {}
-    for name, batch in batches.items():
-        if kind(batch) == "response":
-            out[name] = jax.vmap(jax.vmap(lambda e: effect_rows(e, motion, records, response)))(batch)
-            continue
-        raw, at = jax.vmap(jax.vmap(lambda e: raw_columns(e, motion, records)))(batch)
-        shapes[name] = raw.shape[:4]
-        torques.append(raw.reshape(-1, raw.shape[4]))
-        joints.append(jnp.broadcast_to(at[:, :, None], raw.shape[:4]).reshape(-1))
-
-    def rows(column: tuple[Array, Array]) -> Array:
-        return placed_rows(column[0][None], column[1][None], records, response)[0]
-
-    flat = jax.lax.map(rows, (jnp.concatenate(torques), jnp.concatenate(joints)), batch_size=COLUMNS)
-    first = 0
-    for name, shape in shapes.items():
-        count = int(np.prod(shape))
-        out[name] = flat[first : first + count].reshape(*shape, *flat.shape[1:])
-        first += count
-    return out

@@ -6,19 +6,18 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from .comparison import FoldSums, Hypothesis, Verdicts, fold_sums, grown_sums, judge, overlap, shares_of_wins, t_value
-from .design import kind
+from .design import kind, shapes, with_shape
 from .effect import Effect
 from .effects import Payload
 from .estimates import amplitude_places, torque_slope
 from .evidence import Linear, Prior, Rows, fit
 from .noise import Spectrum
 from .problem import Problem, State, extended_state, physical_body, solved, whitened
-from .refit import Whitened, refit, shapes, with_shape
+from .refit import Whitened, refit, refit_shift
 from .results import Name
 from .screening import DRAWS, Group, Screen, catalogue, family_p, screen
 
@@ -26,7 +25,7 @@ __all__ = ["Found", "Step", "find_causes", "stand"]
 
 SHORTLIST, SHARE = 8, 0.35  # candidates compared exactly; share of the best rank that they need
 SHIFTS = 2  # candidates of a position sensor tried at a step: each is a fit of its own
-STARTS, FEWER = 4, 2  # of a refit; of one whose every step is an inverse dynamics
+STARTS = 4  # of a refit
 GAIN, CONFIDENT, UNSURE = 0.004, 1.64, 1.7
 SAME = 0.5  # overlap from which two causes explain the same misfit
 CLEARLY = 3.0  # t from which data tell effects apart that are the same while the joint moves
@@ -34,7 +33,6 @@ EXACT = ({"torque_offset", "asymmetric_coulomb_friction"}, {"payload", "link_ine
 SMALLEST = 0.005  # share of the first cause's drop below which a later one may be what the first left over
 MOST = 12
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
-PADDED = 64
 
 
 @dataclass(frozen=True)
@@ -86,18 +84,23 @@ def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], 
 
 
 def contend(
-    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group, order: np.ndarray
+    problem: Problem,
+    step: Step,
+    whitening: Float[np.ndarray, "F nv"],
+    ready: Whitened,
+    group: Group,
+    order: np.ndarray,
 ) -> Contender:
     """The candidate with its exact shape, started from its best grid points."""
     way = kind(group.effect)
     if way == "response":
         return _response_contender(problem, step, whitening, group, int(order[0]))
     if way == "position":
-        return _position_contender(problem, step, whitening, group)
+        return _position_contender(problem, step, whitening, ready, group)
     starts = np.resize(order, STARTS)
     if shapes(type(group.effect)):
         effects = jax.tree.map(lambda x: x[starts], group.effect)
-        effect, Z = refit(effects, step.state.motion, problem.records, _for_refit(problem, step, whitening))
+        effect, Z = refit(effects, step.state.motion, problem.records, ready)
         Z = Z.reshape(*Z.shape[:2], -1)
     else:
         effect = jax.tree.map(lambda x: x[starts[0]], group.effect)
@@ -122,14 +125,15 @@ def contend(
     return Contender(group.name, effect, hypothesis, verdicts)
 
 
-def _position_contender(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group) -> Contender:
+def _position_contender(
+    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], ready: Whitened, group: Group
+) -> Contender:
     """A shift of the links' motion: its size by the profile, then the regressor at the true motion.
 
     The load is that of the motion as measured: taken again at the true motion it holds four derivatives of noise.
     """
-    starts = np.linspace(1, len(group.columns.Z) - 1, FEWER).astype(int)
-    effects = jax.tree.map(lambda x: x[starts], group.effect)
-    effect, _ = refit(effects, step.state.motion, problem.records, _for_refit(problem, step, whitening))
+    effect = jax.tree.map(lambda x: x[0], group.effect)
+    effect = refit_shift(effect, step.state.motion, problem.records, ready)
     here = stand(problem, extended_state(problem, step.state, effect), whitening)
     return Contender(group.name, effect, Hypothesis(here.rows.X, here.state.prior), here.verdicts)
 
@@ -142,16 +146,13 @@ def _information(rows: Rows, step: Step, Z: Float[np.ndarray, "nv T k"]) -> Floa
 
 
 def _for_refit(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"]) -> Whitened:
-    """What a refit needs; columns padded with zeros, so that the programs serve models of several sizes."""
+    """What the refits of a step need."""
     n, _, count, nv = problem.records.shape
-    rows, P = step.rows, step.rows.X.shape[2]
     A = step.folded.gram.sum(0) + np.diag(step.state.prior.precision)
-    inverse = np.zeros((P + -P % PADDED,) * 2)
-    inverse[:P, :P] = np.linalg.inv(A + 1e-12 * np.diag(np.maximum(np.diag(A), 1e-12)))
-    X = np.pad(rows.X, ((0, 0), (0, 0), (0, -P % PADDED)))
-    residual = rows.y - rows.X @ step.verdicts.theta
-    response = whitening * np.asarray(step.state.response(jnp.asarray(problem.records.omega)))[:, None]
-    return Whitened(residual.reshape(nv, n, count), X.reshape(nv, n, count, -1), inverse, response)
+    inverse = np.linalg.inv(A + 1e-12 * np.diag(np.maximum(np.diag(A), 1e-12)))
+    residual = step.verdicts.residual.reshape(nv, n, count)
+    response = whitening * step.state.response(problem.records.omega)[:, None]
+    return Whitened(residual, step.rows.X.reshape(nv, n, count, -1), inverse, response)
 
 
 def _response_contender(
@@ -266,7 +267,8 @@ def _accept(
     before: list[Found],
 ) -> Found | None:
     """The cause that predicts best where it was not fitted, if it passes the gates; else nothing."""
-    contenders = [contend(problem, step, whitening, *entry) for entry in shortlist(step, screened)]
+    ready = _for_refit(problem, step, whitening)
+    contenders = [contend(problem, step, whitening, ready, *entry) for entry in shortlist(step, screened)]
     contenders = [c for c in contenders if _exists(problem, c.effect)]
     contenders.sort(key=lambda c: c.verdicts.heldout)
     least = SMALLEST * (before[0].cost[0] - before[0].cost[1]) if before else 0.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
@@ -15,8 +14,8 @@ SECONDS = 12.0
 
 def rows_of(records: Records, signal: np.ndarray, response: np.ndarray | None = None) -> np.ndarray:
     """Filtered rows of the first recording for a signal (samples, series)."""
-    given = None if response is None else jnp.asarray(response)
-    return np.asarray(filter_rows(records, jnp.asarray(signal)[None], given))[0]
+    given = None if response is None else response.T
+    return filter_rows(records, signal.T[:, None], given)[:, 0].T
 
 
 def inner_rows(records: Records, seconds: float = 1.2) -> tuple[np.ndarray, np.ndarray]:
@@ -92,8 +91,8 @@ def test_a_padded_short_recording_gives_the_rows_that_it_gives_alone(delay: floa
     signal = np.random.default_rng(2).standard_normal((alone.shape[1], 2))
     padded = np.full((2, together.shape[1], 2), 1e3)  # what stands behind the end of a recording must not matter
     padded[1, : len(signal)] = signal
-    given = jnp.asarray(np.exp(-1j * np.asarray(together.omega) * delay))
-    found = np.asarray(filter_rows(together, jnp.asarray(padded), given))[1, : short.rows.kept]
+    given = np.exp(-1j * np.asarray(together.omega) * delay)
+    found = np.moveaxis(filter_rows(together, np.moveaxis(padded, 2, 0), given), 0, 2)[1, : short.rows.kept]
     expected = rows_of(alone, signal, np.exp(-1j * np.asarray(alone.omega) * delay))
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
 

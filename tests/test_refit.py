@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,12 +13,13 @@ import robots
 from jaxtyping import Array
 from synthetic import made_signals
 
+from figaroh_jax.design import Units, shapes, torque_change, unit_rows, units_and_slopes, with_shape
 from figaroh_jax.dynamics import inverse_dynamics
 from figaroh_jax.effect import Effect, Motion
 from figaroh_jax.effects import find
 from figaroh_jax.model import RobotModel
 from figaroh_jax.records import Records, stack
-from figaroh_jax.refit import Whitened, bounded_minimum, profile, refit, with_shape
+from figaroh_jax.refit import Whitened, bounded_minimum, profile, refit, refit_shift, shift_profile
 
 SECONDS = 8.0
 
@@ -36,10 +36,10 @@ def records() -> Records:
 
 @pytest.fixture(scope="module")
 def motion(model: RobotModel, records: Records) -> Motion:
-    q, v, a = (records.flat(jnp.asarray(x)) for x in (records.position, records.velocity, records.acceleration))
-    load = inverse_dynamics(model, q, v, a)
-    total = load + 2.0 * v + 3.0 * jnp.tanh(v / 0.05)
-    return Motion(model, records.flat(jnp.asarray(records.time)), q, v, a, load, total, records.dt, np.zeros(2))
+    q, v, a = (records.flat(x) for x in (records.position, records.velocity, records.acceleration))
+    load = np.asarray(inverse_dynamics(model, q, v, a))
+    total = load + 2.0 * v + 3.0 * np.tanh(v / 0.05)
+    return Motion(model, records.flat(records.time), q, v, a, load, total, records.dt, np.zeros(2))
 
 
 def whitened(records: Records, residual: np.ndarray | None = None) -> Whitened:
@@ -59,34 +59,36 @@ def at_joint(name: str, *, joint: float = 0, **shape: float) -> Effect:
     return effect(where, **{key: np.float64(value) for key, value in shape.items()})
 
 
+def batch_of(effect: Effect, count: int) -> Any:
+    return jax.tree.map(lambda x: np.stack([np.asarray(x)] * count), effect)
+
+
+def columns_of(effect: Effect, motion: Motion, records: Records, rows: Whitened) -> tuple[np.ndarray, np.ndarray]:
+    """Whitened columns of one effect with a shape, and their slopes."""
+    batch, names = batch_of(effect, 1), shapes(type(effect))
+    torque, slope = units_and_slopes(batch, np.stack([getattr(batch, n) for n in names], axis=1), motion)
+    both = np.concatenate([torque[:, None], slope], axis=1)[0]
+    parts = unit_rows(Units(both, np.repeat(batch.at, len(both), axis=0)), records, rows.whitening)
+    return parts[0], parts[1:]
+
+
 @pytest.mark.parametrize(
     ("name", "shape", "value"),
-    [
-        ("stribeck_friction", "speed", 0.13),
-        ("power_law_friction", "exponent", 1.7),
-        ("torque_ripple", "order", 7.1),
-        ("torque_delay", "delay", 0.004),
-        ("torque_lag", "time", 0.007),
-        ("joint_elasticity", "compliance", 3e-4),
-    ],
+    [("stribeck_friction", "speed", 0.13), ("power_law_friction", "exponent", 1.7), ("torque_ripple", "order", 7.1)],
 )
 def test_gradient_of_the_profile_is_that_of_finite_differences(
     motion: Motion, records: Records, name: str, shape: str, value: float
 ) -> None:
     effect, rows = at_joint(name, **{shape: value}), whitened(records)
 
-    @jax.jit
-    def both(x: Array) -> tuple[Array, Array]:
-        def one(x: Array) -> Array:
-            return profile(with_shape(effect, [shape], [x]), motion, records, rows)[0]
+    def both(x: float) -> tuple[float, np.ndarray]:
+        return profile(*columns_of(with_shape(effect, [shape], [np.float64(x)]), motion, records, rows), [0], rows)
 
-        return jax.jvp(one, (x,), (jnp.ones(()),))
-
-    slope = float(both(jnp.asarray(value))[1])
+    (slope,) = both(value)[1]
     step = 2e-3 * value
     # five points: the error of the step is of fourth order, that of rounding 1e-12
     offsets, weights = np.array([-2.0, -1.0, 1.0, 2.0]), np.array([1.0, -8.0, 8.0, -1.0]) / 12
-    values = [float(both(jnp.asarray(value + k * step))[0]) for k in offsets]
+    values = [both(value + k * step)[0] for k in offsets]
     np.testing.assert_allclose(slope, weights @ values / step, rtol=0, atol=1e-6 * abs(slope))
 
 
@@ -98,9 +100,10 @@ def test_profile_is_the_change_of_the_penalised_squares(motion: Motion, records:
     root = np.diag(np.sqrt(precision))
     theta = np.linalg.lstsq(np.vstack([X, root]), np.append(y, np.zeros(3)), rcond=None)[0]
     residual = (y - X @ theta).reshape(np.asarray(rows.residual).shape)
-    value, Z = profile(effect, motion, records, eqx.tree_at(lambda w: w.residual, rows, residual))
+    Z, slope = columns_of(effect, motion, records, rows)
+    value, _ = profile(Z, slope, [1], rows._replace(residual=residual))
     full = np.zeros((2, 2, residual[0].size))
-    full[:, 1] = np.asarray(Z).reshape(2, -1)
+    full[:, 1] = Z.reshape(2, -1)
     stacked = np.hstack([np.vstack([X, root]), np.vstack([full.reshape(2, -1).T, np.zeros((3, 2))])])
     right = np.append(y, np.zeros(3))
     after = right - stacked @ np.linalg.lstsq(stacked, right, rcond=None)[0]
@@ -120,18 +123,34 @@ def test_refit_finds_the_shape_that_made_noiseless_rows(
 ) -> None:
     made = at_joint(name, **{shape: truth})
     rows = whitened(records)
-    _, Z = profile(made, motion, records, rows)
+    Z, _ = columns_of(made, motion, records, rows)
     amplitudes = np.array([3.0, -1.0])[: len(Z)]
-    residual = np.zeros(np.asarray(rows.residual).shape)
-    residual[0] = np.tensordot(amplitudes, np.asarray(Z)[:, 0], 1)
-    X = np.asarray(rows.X).reshape(-1, 3)
-    residual -= (X @ np.asarray(rows.inverse) @ (X.T @ residual.reshape(-1))).reshape(residual.shape)
-    batch = at_joint(name)
-    effects: Any = jax.tree.map(lambda x: np.stack([np.asarray(x)] * len(starts)), batch)
-    effects = with_shape(effects, [shape], [np.array(starts)])
-    found, columns = refit(effects, motion, records, eqx.tree_at(lambda w: w.residual, rows, residual))
+    residual = np.zeros(rows.residual.shape)
+    residual[0] = np.tensordot(amplitudes, Z[:, 0], 1)
+    effects = with_shape(batch_of(at_joint(name), len(starts)), [shape], [np.array(starts)])
+    found, columns = refit(effects, motion, records, less_the_model(rows, residual))
     np.testing.assert_allclose(getattr(found, shape), truth, rtol=0, atol=error)
     np.testing.assert_allclose(columns, Z, rtol=0, atol=0.02 * np.abs(Z).max())
+
+
+def less_the_model(rows: Whitened, residual: np.ndarray) -> Whitened:
+    """The rows with what the model leaves of a residual."""
+    X = rows.X.reshape(-1, rows.X.shape[-1])
+    taken = X @ rows.inverse @ (X.T @ residual.reshape(-1))
+    return rows._replace(residual=residual - taken.reshape(residual.shape))
+
+
+@pytest.mark.parametrize("truth", [5e-5, 3e-4, 2.4e-3])
+def test_the_compliance_that_made_noiseless_rows_is_found(motion: Motion, records: Records, truth: float) -> None:
+    made, rows = at_joint("joint_elasticity", joint=1, compliance=truth), whitened(records)
+    change = torque_change(batch_of(made, 1), motion, records)
+    residual = unit_rows(Units(np.swapaxes(change, 1, 2)[:, None], np.array([[0, 1]])), records, rows.whitening)[0, 0]
+    rows = less_the_model(rows, residual)
+    found = refit_shift(made, motion, records, rows)
+    np.testing.assert_allclose(found.compliance, truth, rtol=2e-3, atol=0)  # pyright: ignore
+    sizes = truth * np.array([0.99, 1.0, 1.01])
+    low, best, high = shift_profile(made, sizes, motion, records, rows)
+    assert best < low and best < high
 
 
 def quadratic(seed: int) -> tuple[np.ndarray, np.ndarray]:

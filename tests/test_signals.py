@@ -47,7 +47,8 @@ def test_filter_rows_equals_sosfiltfilt_away_from_the_ends(cutoff, rate):
     rows = row_filter(len(x), 1 / rate, cutoff, step=3, trim=0.5, start=0.0, nv=4)
     butterworth = signal.butter(4, cutoff, fs=rate, output="sos")
     reference = signal.sosfiltfilt(butterworth, x, axis=0, padlen=len(x) - 1)
-    np.testing.assert_allclose(filter_rows(rows, x), reference[rows.index], rtol=0, atol=1e-6)
+    inner = slice(int(12 / cutoff * rate / 3), -int(12 / cutoff * rate / 3))  # ends are mirrored, not reflected
+    np.testing.assert_allclose(filter_rows(rows, x)[inner], reference[rows.index][inner], rtol=0, atol=1e-6)
     np.testing.assert_allclose(low_pass(x, 1 / rate, cutoff)[rows.index], reference[rows.index], rtol=0, atol=1e-6)
 
 
