@@ -29,11 +29,13 @@ if TYPE_CHECKING:
         frame_jacobian as frame_jacobian,
         frame_placement as frame_placement,
     )
+    from .mjcf import load_mjcf as load_mjcf
     from .model import Frame as Frame, Joint as Joint, RobotModel as RobotModel
     from .registry import backend as backend
     from .regressor import joint_torque_regressor as joint_torque_regressor, packed_regressor as packed_regressor
     from .report import write_report as write_report
     from .results import Cause as Cause, Diagnosis as Diagnosis, Estimate as Estimate, Gain as Gain, Name as Name
+    from .robotfile import load_extended as load_extended
     from .simulation import simulate as simulate
     from .streaming import normal_matrix as normal_matrix, triangular_factor as triangular_factor
     from .urdf import load_urdf as load_urdf
@@ -51,11 +53,13 @@ _MODULES = {
     "export": ("load_model", "write_model"),
     "extended": ("ExtendedModel", "extend"),
     "kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
+    "mjcf": ("load_mjcf",),
     "model": ("Frame", "Joint", "RobotModel"),
     "registry": ("backend",),
     "regressor": ("joint_torque_regressor", "packed_regressor"),
     "report": ("write_report",),
     "results": ("Cause", "Diagnosis", "Estimate", "Gain", "Name"),
+    "robotfile": ("load_extended",),
     "simulation": ("simulate",),
     "streaming": ("normal_matrix", "triangular_factor"),
     "urdf": ("load_urdf",),

@@ -1,7 +1,8 @@
 """From the links and joints of a file to a `RobotModel`: one tree, fixed and locked joints merged into their parents.
 
-Readers of file formats describe links and joints in the order of the file (`LinkPart`, `JointPart`); `assemble` checks
-that they form one tree and builds the model. Frames: a link's frame is that of the joint that carries it.
+Readers of file formats describe links, joints and further frames in the order of the file (`LinkPart`, `JointPart`,
+`FramePart`); `assemble` checks that they form one tree and builds the model. Frames: a link's frame is that of the
+joint that carries it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from . import inertia
 from .errors import InputError, nearest
 from .model import DOF_NAMES, NUMBERS, Frame, Joint, Kind, RobotModel
 
-__all__ = ["ROOT_JOINT", "JointPart", "LinkPart", "Posture", "Root", "assemble", "displacement"]
+__all__ = ["ROOT_JOINT", "FramePart", "JointPart", "LinkPart", "Posture", "Root", "assemble", "displacement"]
 
 Posture = Mapping[str, float | Sequence[float]]  # a number for a revolute or prismatic joint, its part of q for others
 Root = Literal["fixed", "free_flyer"]
@@ -43,6 +44,15 @@ class JointPart(NamedTuple):
     axis: Float[np.ndarray, "3"]  # of any length above zero, in the joint frame; planar: the normal; else unused
     limit: tuple[float, float, float, float] = (-np.inf, np.inf, np.inf, np.inf)  # lower, upper, velocity, effort
     mimic: tuple[str, float, float] | None = None  # joint that it follows, ratio, offset
+    neutral: tuple[float, ...] = ()  # its numbers in q where it is locked and the posture says nothing; empty: zero
+
+
+class FramePart(NamedTuple):
+    """A frame of the file beside those of links and joints, or in place of the one of its name."""
+
+    name: str
+    link: str  # name of the link that it is fixed to
+    placement: Float[np.ndarray, "4 4"]  # in the link's frame
 
 
 class _Drive(NamedTuple):
@@ -61,6 +71,7 @@ def assemble(
     posture: Posture | None = None,
     gravity: Sequence[float] = (0.0, 0.0, -9.81),
     root: Root = "fixed",
+    frames: Sequence[FramePart] = (),
 ) -> RobotModel:
     """Model of the robot `name` whose links and joints are `parts`.
 
@@ -77,6 +88,7 @@ def assemble(
         locked = _locked(drives, [j.name for j in parts[1] if j.kind == "fixed"], joints, posture or {})
         build = _Build(dict(parts[0]), children, drives, locked)
         build.grow(base)
+        build.mark(frames)
         return build.finish(name, joints, _gravity(gravity))
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
@@ -247,6 +259,12 @@ class _Build:
         self.joint_frames[joint.name] = (len(self.joints) - 1, np.eye(4))
         return len(self.joints) - 1, np.eye(4)
 
+    def mark(self, frames: Sequence[FramePart]) -> None:
+        links = dict(self.frames)
+        for name, link, placement in frames:
+            body, pose = links[link]
+            self.frames[name] = (body, pose @ placement)
+
     def finish(self, name: str, order: Sequence[str] | None, gravity: np.ndarray) -> RobotModel:
         drives = [self.drives[joint.name] for joint in self.joints]
         independent = [j.name for j, drive in zip(self.joints, drives, strict=True) if drive.leader == j.name]
@@ -301,6 +319,8 @@ def _numbers(joint: JointPart, given: float | Sequence[float]) -> Float[np.ndarr
     count = NUMBERS[joint.kind]
     numbers = np.atleast_1d(np.asarray(given, float))
     turned = joint.kind in ("spherical", "free")
+    if not numbers.size and joint.neutral:
+        return np.array(joint.neutral)
     if not numbers.size:
         return np.append(np.zeros(count - 1), 1.0 if turned else 0.0)
     if numbers.shape != (count,):

@@ -324,14 +324,14 @@ def load_task(path: str | Path) -> Task:
 
 
 def load_robot(task: Task) -> RobotModel:
-    """The robot of a task, joints locked and ordered as it says."""
+    """The robot of a task, joints locked and ordered as it says; gravity is an MJCF's own where the task gives none."""
     robot = task.robot
-    if robot.model.suffix.lower() != ".urdf":
-        raise InputError(f"{task.file}: robot.model {robot.model}: MJCF models come later; use a .urdf file")
-    from .urdf import load_urdf
+    if robot.model.suffix.lower() not in (".urdf", ".xml"):
+        raise InputError(f"{task.file}: robot.model {robot.model}: expected a .urdf or an .xml (MJCF) file")
+    from .robotfile import read_robot
 
-    posture = dict(robot.posture)
-    return load_urdf(robot.model, joints=robot.joints, posture=posture, gravity=robot.gravity, root=robot.root)
+    own = robot.model.suffix.lower() == ".xml" and "gravity" not in robot.model_fields_set  # an MJCF has gravity
+    return read_robot(robot.model, robot.joints, dict(robot.posture), None if own else robot.gravity, robot.root)
 
 
 _EXPECTED = {  # pydantic's kinds of mistakes, in fewer words

@@ -52,7 +52,7 @@ class Parameter(NamedTuple):
 class Native(NamedTuple):
     """Element of a model format that carries a parameter: `value` is added to `attribute` of the joints `at`."""
 
-    element: Literal["joint", "tendon", "actuator"]
+    element: Literal["joint", "tendon", "actuator", "body"]
     attribute: str
     value: float
     sign: float = 1.0  # second coefficient of a tendon over a pair of joints
@@ -118,6 +118,7 @@ class Effect(eqx.Module):
     acts_on: ClassVar[Literal["joint", "pair", "link", "robot"]]
     contains: ClassVar[tuple[str, ...]] = ()  # simpler effects that it can imitate exactly: they are preferred
     follows_torque: ClassVar[bool] = False  # whether its torque depends on the current model's (load or total)
+    searched: ClassVar[bool] = True  # whether a diagnosis looks for it
     separated_by: ClassVar[str] = ""  # the experiment that tells it from what looks alike; {at} stands for the place
 
     def torque(self, motion: Motion) -> Float[Array, "samples *rows"]:

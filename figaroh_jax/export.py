@@ -16,13 +16,15 @@ import equinox as eqx
 import jax
 import numpy as np
 import yaml
+from jaxtyping import Int
 
+from . import compensation as compensation  # an effect of its own, registered when it is imported
 from .effect import Effect, joint_unit, place
 from .effects import find
 from .errors import InputError
 from .extended import ExtendedModel, changed_robot, extend
-from .mjcf import mjcf_text
-from .model import RobotModel
+from .mjcf_text import mjcf_text
+from .model import DOF_NAMES, RobotModel
 from .native import Carried, carried, changed_leaves, drives, place_names
 from .results import Cause, Estimate, Name
 from .taskfile import read_yaml
@@ -85,8 +87,12 @@ def _robot(extended: ExtendedModel, changed: RobotModel) -> dict[str, Any]:
     limits = zip(robot.position_limit, robot.velocity_limit, robot.effort_limit, extended.width, strict=True)
     joints = [
         {"name": name, "position": np.asarray(p), "velocity": float(v), "effort": float(e), "reversal": float(w)}
-        for name, (p, v, e, w) in zip(robot.joint_names, limits, strict=True)
+        for name, (p, v, e, w) in zip(robot.dof_names, limits, strict=True)
     ]
+    owners = [(joint.coordinate, len(DOF_NAMES[joint.kind]), joint.name) for joint in robot.joints if not joint.follows]
+    for first, width, name in owners:
+        for entry in joints[first : first + width] if width > 1 else ():
+            entry["joint"] = name  # the one of several degrees of freedom that it belongs to
     links = [
         {"name": name, "inertia": np.asarray(ten)} for name, ten in zip(robot.link_names, robot.inertia, strict=True)
     ]
@@ -113,12 +119,19 @@ def _describe(
 
 
 def _parameters(robot: RobotModel, effect: Effect, known: Mapping[str, Estimate]) -> dict[str, Any]:
-    kinds = [joint.kind for joint in robot.joints if joint.name in place_names(robot, effect)]
-    units = {name: joint_unit(unit, "prismatic" in kinds) for name, unit in effect.units().items()}
+    slides = effect.acts_on in ("joint", "pair") and _slides(robot, np.ravel(np.asarray(effect.at)))
+    units = {name: joint_unit(unit, slides) for name, unit in effect.units().items()}
     return {
         name: {"value": float(value), "std": float(known[name].std) if name in known else None, "unit": units[name]}
         for name, value in _physical(effect).items()
     }
+
+
+def _slides(robot: RobotModel, columns: Int[np.ndarray, " places"]) -> bool:
+    """Whether one of the coordinates is a length."""
+    of, follows = robot.dofs, np.array([joint.follows for joint in robot.joints])
+    own = np.isin(of.column, columns) & ~follows[of.joint]
+    return not of.turns[own].all()
 
 
 def _physical(effect: Effect) -> Mapping[str, Any]:
@@ -181,7 +194,8 @@ def load_model(directory: str | Path) -> ExtendedModel:
 def _restored(content: Mapping[str, Any], urdf: Path) -> RobotModel:
     """The robot of the URDF as it was before its effects."""
     joints = content["joints"]
-    robot = load_urdf(urdf, joints=[joint["name"] for joint in joints], gravity=content["gravity"])
+    names = list(dict.fromkeys(joint.get("joint", joint["name"]) for joint in joints))
+    robot = load_urdf(urdf, joints=names, gravity=content["gravity"])
     inertia = np.array(robot.inertia)
     for link in content["links"]:
         inertia[robot.link_index(link["name"])] = _array(link["inertia"], (10,))

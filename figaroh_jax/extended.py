@@ -110,17 +110,17 @@ def _predict(extended: ExtendedModel, time: Array, q: Array, v: Array, a: Array,
 
 @jax.jit
 def _inverse_dynamics(extended: ExtendedModel, q: Array, v: Array, a: Array) -> Array:
-    robot, shape = changed_robot(extended), q.shape
-    q, v, a = (x.reshape(-1, shape[-1]) for x in (q, v, a))
+    robot, shape = changed_robot(extended), v.shape
+    q, v, a = (x.reshape(-1, x.shape[-1]) for x in (q, v, a))
     load = inverse_dynamics(robot, q, v, a)
-    motion = Motion(robot, jnp.zeros(q.shape[0]), q, v, a, load, load, 0.0, jnp.asarray(extended.width))
+    motion = Motion(robot, jnp.zeros(len(q)), q, v, a, load, load, 0.0, jnp.asarray(extended.width))
     return with_torque(extended.effects, motion, load).total.reshape(shape)
 
 
 @jax.jit
 def _forward_dynamics(extended: ExtendedModel, q: Array, v: Array, tau: Array) -> Array:
     flat = (x.reshape(-1, x.shape[-1]) for x in (q, v, tau))
-    return jax.vmap(_solve_acceleration, (None, 0, 0, 0))(extended, *flat).reshape(q.shape)
+    return jax.vmap(_solve_acceleration, (None, 0, 0, 0))(extended, *flat).reshape(v.shape)
 
 
 def _solve_acceleration(extended: ExtendedModel, q: Array, v: Array, tau: Array) -> Array:

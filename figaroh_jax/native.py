@@ -1,8 +1,9 @@
 """Which effects a model format carries by itself, and as what: the drives that URDF and MJCF can write.
 
-URDF knows a joint's viscous and dry friction. MJCF also knows armature, springs, tendons between joints and constant
-actuator bias. Both carry what changes the robot; gravity is in MJCF alone. Neither takes a negative armature, damping
-or dry friction, so an effect that would leave one is not carried.
+URDF knows a joint's viscous and dry friction. MJCF also knows armature, springs, tendons between joints, constant
+actuator bias and compensated gravity. Both carry what changes the robot; gravity is in MJCF alone. Neither takes a
+negative armature, damping or dry friction, so an effect that would leave one is not carried. A joint of several
+degrees of freedom has one value of each in a file, so its effects are carried where they are the same about all axes.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from jaxtyping import Float
 from .effect import Effect, Native
 from .extended import ExtendedModel
 from .inertia import from_com, from_pseudo_inertia, is_physical, pseudo_inertia, to_com
-from .model import RobotModel
+from .model import DOF_NAMES, RobotModel
 
 __all__ = ["Carried", "Drives", "Tendon", "carried", "changed_leaves", "drives", "physical_inertia", "place_names"]
 
@@ -24,6 +25,10 @@ Format = Literal["urdf", "mjcf"]
 _JOINT = {
     "urdf": ("damping", "frictionloss"),
     "mjcf": ("armature", "damping", "frictionloss", "stiffness", "springref"),
+}
+_WHOLE: dict[str, dict[str, tuple[str, ...]]] = {  # what a joint of several degrees of freedom has one value of
+    "urdf": {"free": ("damping", "frictionloss"), "planar": ("damping", "frictionloss")},
+    "mjcf": {"spherical": ("armature", "damping", "frictionloss"), "free": ("damping",), "planar": ("damping",)},
 }
 _NOT_NEGATIVE = ("armature", "damping", "frictionloss", "stiffness")
 _SENSORS = {"position_error": "position sensor", "torque_response": "torque sensor"}
@@ -48,6 +53,7 @@ class Drives(NamedTuple):
     frictionloss: Float[np.ndarray, " nv"]
     stiffness: Float[np.ndarray, " nv"]
     springref: Float[np.ndarray, " nv"]  # rad or m
+    gravcomp: Float[np.ndarray, " nj"]  # fraction of each link's weight that is compensated
     bias: Float[np.ndarray, " nv"]  # torque that the drive gives for nothing, N m or N
     tendons: tuple[Tendon, ...]
 
@@ -61,7 +67,7 @@ class Carried(NamedTuple):
 
 def place_names(robot: RobotModel, effect: Effect) -> tuple[str, ...]:
     """Names of the joints or the link where the effect acts."""
-    names = robot.link_names if effect.acts_on == "link" else robot.joint_names
+    names = robot.link_names if effect.acts_on == "link" else robot.dof_names
     return tuple(names[int(index)] for index in np.ravel(np.asarray(effect.at)))
 
 
@@ -79,7 +85,7 @@ def carried(extended: ExtendedModel, form: Format) -> tuple[Carried, ...]:
         after = effect.change(robot)
         answers.append(_alone(effect, changed_leaves(robot, after), form))
         robot = after
-    while (refused := _negative(extended, tuple(answers), form)) is not None:
+    while (refused := _negative(extended, tuple(answers)) or _uneven(extended, tuple(answers), form)) is not None:
         index, why = refused
         answers[index] = Carried(False, why)
     return tuple(answers)
@@ -116,12 +122,15 @@ def _known(element: Native, form: Format) -> bool:
         return element.attribute in _JOINT[form]
     if form == "urdf":
         return False
+    if element.element == "body":
+        return element.attribute == "gravcomp"
     return element.attribute in ("armature", "damping", "frictionloss", "bias")
 
 
 def drives(extended: ExtendedModel, answers: tuple[Carried, ...]) -> Drives:
     """The elements of all effects that are carried, summed at each joint."""
     sums = {name: np.zeros(extended.robot.nv) for name in (*_JOINT["mjcf"], "bias")}
+    sums["gravcomp"] = np.zeros(len(extended.robot.joints))
     tendons = []
     for effect, answer in zip(extended.effects, answers, strict=True):
         if not answer.yes:
@@ -129,7 +138,8 @@ def drives(extended: ExtendedModel, answers: tuple[Carried, ...]) -> Drives:
         at, elements = np.ravel(np.asarray(effect.at)).astype(int), _native(effect)
         of_joints = {e.attribute: e.value for e in elements if e.element != "tendon"}
         # the torques of springs add, not their rests
-        of_joints["springref"] = of_joints.get("springref", 0.0) * of_joints.get("stiffness", 0.0)
+        if "springref" in of_joints:
+            of_joints["springref"] *= of_joints.get("stiffness", 0.0)
         for attribute, value in of_joints.items():
             sums[attribute][at] += value
         tendon = {e.attribute: e for e in elements if e.element == "tendon"}
@@ -142,7 +152,7 @@ def drives(extended: ExtendedModel, answers: tuple[Carried, ...]) -> Drives:
     return Drives(**sums, tendons=tuple(tendons))
 
 
-def _negative(extended: ExtendedModel, answers: tuple[Carried, ...], form: Format) -> tuple[int, str] | None:
+def _negative(extended: ExtendedModel, answers: tuple[Carried, ...]) -> tuple[int, str] | None:
     """An effect that leaves a negative value, with what it leaves; the largest offender where several do."""
     total = drives(extended, answers)
     for index, effect in enumerate(extended.effects):
@@ -154,15 +164,33 @@ def _negative(extended: ExtendedModel, answers: tuple[Carried, ...], form: Forma
         for joint in map(int, np.flatnonzero(sums < 0)):
             pairs = zip(extended.effects, answers, strict=True)
             parts = [_part(effect, attribute, joint) if answer.yes else 0.0 for effect, answer in pairs]
-            name = extended.robot.joint_names[joint]
+            name = extended.robot.dof_names[joint]
             return int(np.argmin(parts)), f"{attribute} of {name} would be {sums[joint]:.4g}, below zero"
+    return None
+
+
+def _uneven(extended: ExtendedModel, answers: tuple[Carried, ...], form: Format) -> tuple[int, str] | None:
+    """An effect at a joint of several degrees of freedom that has no one value for all of them."""
+    total, robot = drives(extended, answers), extended.robot
+    for joint in robot.joints:
+        columns = np.arange(joint.coordinate, joint.coordinate + len(DOF_NAMES[joint.kind]))
+        for attribute in (*_JOINT["mjcf"], "bias") if len(columns) > 1 else ():
+            values = getattr(total, attribute)[columns]
+            if not values.any() or attribute in _WHOLE[form].get(joint.kind, ()) and np.ptp(values) == 0:
+                continue
+            for index, (effect, answer) in enumerate(zip(extended.effects, answers, strict=True)):
+                if answer.yes and any(_part(effect, attribute, int(column)) for column in columns):
+                    return index, f"no element for the {attribute} of one axis of the {joint.kind} joint {joint.name}"
+        for index, (effect, answer) in enumerate(zip(extended.effects, answers, strict=True)):
+            if answer.yes and len(columns) > 1 and effect.acts_on == "pair" and np.isin(effect.at, columns).any():
+                return index, f"no tendon for an axis of the {joint.kind} joint {joint.name}"
     return None
 
 
 def _part(effect: Effect, attribute: str, joint: int) -> float:
     if effect.acts_on not in ("joint", "pair") or joint not in np.ravel(np.asarray(effect.at)):
         return 0.0
-    return sum(e.value for e in _native(effect) if e.element == "joint" and e.attribute == attribute)
+    return sum(e.value for e in _native(effect) if e.element in ("joint", "actuator") and e.attribute == attribute)
 
 
 def physical_inertia(parameters: Float[np.ndarray, "10"], form: Format) -> tuple[Float[np.ndarray, "10"], str]:

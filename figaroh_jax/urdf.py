@@ -18,7 +18,7 @@ from .errors import InputError, nearest
 from .model import Kind, RobotModel
 from .xmlfile import find_in_packages, read_xml
 
-__all__ = ["load_urdf"]
+__all__ = ["load_urdf", "urdf_dynamics"]
 
 _KINDS: dict[str, Kind | Literal["fixed"]] = {
     "revolute": "revolute",
@@ -27,6 +27,7 @@ _KINDS: dict[str, Kind | Literal["fixed"]] = {
     "fixed": "fixed",
     "floating": "free",
     "planar": "planar",
+    "spherical": "spherical",  # not in the standard; MuJoCo's reader takes it too
 }
 _BOUNDED = ("revolute", "prismatic")
 _UNREAD = {  # by the element that holds them
@@ -60,11 +61,14 @@ def load_urdf(
     `joints` names the moving joints in the order of the columns of q; every other joint is locked at `posture` (rad,
     m; 0 where it says nothing) and merged into its parent, as fixed joints are. Without `joints`, all joints move in
     tree order but those that `posture` names. A free flyer's `root_joint` stands in front of them in either case.
-    `gravity` in m/s^2 in the world, which is the root link's frame where that is fixed. A continuous joint is one
-    plain angle; a `floating` joint is a free one; a `planar` joint moves in the plane normal to its axis; a mimic
-    joint shares the coordinate of the joint it follows. Every link and every joint of the file is a frame of the
-    model. Masses and inertias of links that do not move are left out: they do no work. Meshes are never read;
-    `packages` are the folders of packages by which a path such as `package://my_robot/robot.urdf` is found.
+    `gravity` in m/s^2 in the world, which is the root link's frame where that is fixed.
+
+    A continuous joint is one plain angle; a `floating` joint is a free one; a `planar` joint moves in the plane normal
+    to its axis; `spherical`, which is not in the standard, is read too; a mimic joint shares the coordinate of the
+    joint it follows. Every link and every joint of the file is a frame of the model. Masses and inertias of links that
+    do not move are left out: they do no work. Damping and friction of `<dynamics>` are not part of this model:
+    `load_extended`. Meshes are never read; `packages` are the folders of packages by which a path such as
+    `package://my_robot/robot.urdf` is found.
 
     Raises `InputError` naming the file and the joint or link that is wrong.
     """
@@ -75,6 +79,17 @@ def load_urdf(
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return assemble(str(path), robot.name, parts, joints, posture, gravity, root)
+
+
+def urdf_dynamics(path: str | Path) -> dict[str, tuple[float, float]]:
+    """Damping (N m s/rad or N s/m) and dry friction (N m or N) of the joints that the file gives one."""
+    found = {}
+    for joint in read_xml(path, "robot").iterchildren("joint"):
+        for element in joint.iterchildren("dynamics"):
+            for attribute in ("damping", "friction"):
+                _check_numbers(element, attribute, 1, f"{path}: joint '{joint.get('name')}'")
+            found[joint.get("name")] = (float(element.get("damping", 0)), float(element.get("friction", 0)))
+    return found
 
 
 def _read(path: str | Path) -> Any:
@@ -157,7 +172,7 @@ def _link(link: Any) -> LinkPart:
 
 def _joint(joint: Any) -> JointPart:
     kind = _KINDS[joint.type]
-    if kind not in ("fixed", "free") and np.linalg.norm(joint.axis) < 1e-9:
+    if kind in ("revolute", "prismatic", "planar") and np.linalg.norm(joint.axis) < 1e-9:
         raise InputError(f"joint '{joint.name}': its axis is zero; a direction is expected")
     origin = np.eye(4) if joint.origin is None else joint.origin
     mimic = joint.mimic and (joint.mimic.joint, joint.mimic.multiplier, joint.mimic.offset)

@@ -25,16 +25,18 @@ def urdf_text(robot: RobotModel, drives: Drives) -> tuple[str, tuple[str, ...]]:
     one pose, the first half are joints and the second half links, as the reader puts them.
     """
     root = ET.Element("robot", name=robot.name)
-    fixed = _fixed_links(robot)
+    fixed, warnings = _fixed_links(robot)
     base = fixed.pop(0)[1]
     ET.SubElement(root, "link", name=base)
-    links, warnings = {-1: base}, []
+    links = {-1: base}
     for index, joint in enumerate(robot.joints):
         inertia, warning = physical_inertia(np.asarray(robot.inertia[index]), "urdf")
         if warning:
             warnings.append(f"robot.urdf: link {joint.link} {warning}")
         _link(root, joint.link, inertia)
         _moving(root, robot, index, links[joint.parent], drives)
+        if joint.kind == "spherical":
+            warnings.append(f"robot.urdf: joint {joint.name} is 'spherical', which MuJoCo reads but URDF does not have")
         links[index] = joint.link
     for name, link, parent, placement in fixed:
         ET.SubElement(root, "link", name=link)
@@ -43,18 +45,23 @@ def urdf_text(robot: RobotModel, drives: Drives) -> tuple[str, tuple[str, ...]]:
     return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n", tuple(warnings)
 
 
-def _fixed_links(robot: RobotModel) -> list[tuple[str, str, int, Float[np.ndarray, "4 4"]]]:
-    """Joint, link, parent and pose of everything that does not move by itself; the base link comes first."""
-    moving = {joint.name for joint in robot.joints} | set(robot.link_names)
+def _fixed_links(robot: RobotModel) -> tuple[list[tuple[str, str, int, Float[np.ndarray, "4 4"]]], list[str]]:
+    """Joint, link, parent and pose of everything that does not move by itself, the base link first; and warnings."""
+    moving = {name: i for i, joint in enumerate(robot.joints) for name in (joint.name, joint.link)}
     poses = [np.asarray(placement) for placement in robot.frame_placement]
     groups: list[tuple[int, np.ndarray, list[str]]] = [(-1, np.eye(4), [])]
+    warnings = []
     for frame, pose in zip(robot.frames, poses, strict=True):
-        if frame.name in moving:
+        name = frame.name
+        if moving.get(name) == frame.parent and np.array_equal(pose, np.eye(4)):
             continue
+        if name in moving:  # a body whose joint is not at its origin: a link of URDF is where its joint is
+            name = _unused(f"{name}_origin", robot.frames)
+            warnings.append(f"robot.urdf: frame {frame.name} is called {name}: the link of that name is at its joint")
         group = next((g for g in groups if g[0] == frame.parent and np.array_equal(g[1], pose)), None)
         if group is None:
             groups.append(group := (frame.parent, pose, []))
-        group[2].append(frame.name)
+        group[2].append(name)
     names = groups[0][2]
     root = names.pop(len(names) // 2) if names else _unused("base", robot.frames)
     fixed = [("", root, -1, np.eye(4))]
@@ -62,7 +69,7 @@ def _fixed_links(robot: RobotModel) -> list[tuple[str, str, int, Float[np.ndarra
         half = len(names) // 2
         joints = names[:half] + [_unused(f"{name}_fixed", robot.frames) for name in names[2 * half :]]
         fixed += [(joint, link, parent, pose) for joint, link in zip(joints, names[half:], strict=True)]
-    return fixed
+    return fixed, warnings
 
 
 def _unused(name: str, frames: tuple[Frame, ...]) -> str:
@@ -86,14 +93,17 @@ def _link(root: ET.Element, name: str, parameters: Float[np.ndarray, "10"]) -> N
 def _moving(root: ET.Element, robot: RobotModel, index: int, parent: str, drives: Drives) -> None:
     joint = robot.joints[index]
     limit = np.asarray(robot.position_limit[joint.coordinate])
-    free = joint.kind == "revolute" and not np.isfinite(limit).any()
-    kind = "continuous" if free else joint.kind
+    several = joint.kind not in ("revolute", "prismatic")
+    unbounded = several or joint.kind == "revolute" and not np.isfinite(limit).any()
+    kind = {"free": "floating", "revolute": "continuous" if unbounded else "revolute"}.get(joint.kind, joint.kind)
     element = _joint(root, joint.name, kind, (parent, joint.link), np.asarray(robot.placement[index]))
-    ET.SubElement(element, "axis", xyz=_text(robot.axis[index]))
-    bounds = {} if free else {"lower": _bound(limit[0]), "upper": _bound(limit[1])}
+    first = robot.dofs.first[index]
+    if not several or joint.kind == "planar":
+        ET.SubElement(element, "axis", xyz=_text(robot.axis[first + 2 if several else first]))
+    bounds = {} if unbounded else {"lower": _bound(limit[0]), "upper": _bound(limit[1])}
     velocity, effort = robot.velocity_limit[joint.coordinate], robot.effort_limit[joint.coordinate]
     ET.SubElement(element, "limit", bounds | {"velocity": _bound(velocity), "effort": _bound(effort)})
-    leader = robot.joint_names[joint.coordinate]
+    leader = robot.dof_names[joint.coordinate]
     if joint.follows:
         ratio, offset = repr(float(robot.ratio[index])), repr(float(robot.offset[index]))
         ET.SubElement(element, "mimic", joint=leader, multiplier=ratio, offset=offset)

@@ -1,7 +1,8 @@
-"""Tiny robots in URDF, written inline: what a test does not say about a robot is here."""
+"""Tiny robots in URDF and MJCF, written inline: what a test does not say about a robot is here."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +80,113 @@ GENERAL = robot(
 )
 
 INLINE = {"arm": ARM, "tree": TREE}
+
+
+# MJCF: several joints on a body with anchors away from its origin, ball and free joints, welded bodies, turned frames,
+# a reference position, defaults, a name for body and joint alike, and bodies and joints without a name
+CREATURE = """<mujoco model="creature">
+  <compiler angle="degree" eulerseq="XYZ"/>
+  <option gravity="0.3 -0.2 -9.5"/>
+  <default>
+    <joint armature="0.02" damping="0.1"/>
+    <default class="stiff"><joint stiffness="3" damping="0.4"/></default>
+  </default>
+  <worldbody>
+    <geom type="plane" size="5 5 0.1"/>
+    <body name="torso" pos="0 0 1" euler="10 20 30">
+      <freejoint/>
+      <inertial pos="0.05 -0.02 0.1" quat="0.9 0.1 -0.2 0.3" mass="4" diaginertia="0.2 0.15 0.1"/>
+      <site name="imu" pos="0.1 0 0.2" euler="0 90 0"/>
+      <body name="pack" pos="-0.1 0.05 0.2" euler="30 0 20">
+        <geom type="box" size="0.1 0.05 0.08" pos="0.02 0 0.01" mass="0.8"/>
+        <site name="strap" pos="0 0.05 0"/>
+      </body>
+      <body name="thigh" pos="0.1 0.2 -0.1" euler="-10 5 0">
+        <joint name="hip_z" axis="0 0 1" pos="0.01 0.02 0.03" range="-60 60"/>
+        <joint name="hip_x" axis="1 0.1 0" pos="-0.02 0.03 0.05" ref="15" frictionloss="0.3"/>
+        <joint type="slide" axis="0 0.2 1" pos="0.1 0.1 0" damping="2" springref="0.1" stiffness="40"/>
+        <geom type="capsule" fromto="0 0 0 0 0.05 -0.4" size="0.05" density="800"/>
+        <body name="shank" pos="0 0.05 -0.4">
+          <joint name="shank" class="stiff" axis="0 1 0" pos="0 0 0.02" ref="-20" springref="10" armature="0.05"/>
+          <inertial pos="0.01 0 -0.2" mass="0.9" fullinertia="0.02 0.021 0.004 0.001 -0.002 0.0005"/>
+        </body>
+      </body>
+      <body pos="0.1 -0.25 0.3" euler="40 0 -30">
+        <joint name="shoulder" type="ball" pos="0.02 0.01 -0.03" damping="0.3"/>
+        <inertial pos="0.2 0 0" mass="1.1" diaginertia="0.01 0.03 0.03"/>
+        <body name="hand" pos="0.4 0 0">
+          <joint name="wrist" axis="0 1 1" actuatorfrcrange="-7 7"/>
+          <inertial pos="0.05 0.01 0" mass="0.3" diaginertia="0.001 0.002 0.002"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+# MJCF of an arm on a table: a coupled finger, coupled drives, motors with gears, compensated gravity
+GRIPPER = """<mujoco model="gripper">
+  <compiler autolimits="true"/>
+  <worldbody>
+    <body name="table" pos="0.5 0 0.7">
+      <geom type="box" size="0.5 0.5 0.02" mass="20"/>
+      <body name="upper" pos="0 0.1 0.1" quat="0.8 0.6 0 0" gravcomp="1">
+        <joint name="shoulder" axis="0 0 1" range="-90 90" frictionloss="0.4"/>
+        <inertial pos="0 0 0.2" mass="3" diaginertia="0.05 0.05 0.01"/>
+        <body name="fore" pos="0 0 0.4" gravcomp="0.5">
+          <joint name="elbow" axis="0 1 0" damping="0.5 0.2 0.1" armature="0.1"/>
+          <inertial pos="0.02 0 0.15" mass="2" diaginertia="0.02 0.02 0.004"/>
+          <site name="tool" pos="0 0 0.3"/>
+          <body name="left" pos="0 0.03 0.3">
+            <joint name="left" type="slide" axis="0 1 0" range="0 0.04" ref="0.01" armature="0.3" damping="1.5"/>
+            <inertial pos="0 0 0.03" mass="0.1" diaginertia="1e-4 1e-4 1e-5"/>
+          </body>
+          <body name="right" pos="0 -0.03 0.3">
+            <joint name="right" type="slide" axis="0 -1 0" ref="0.02" damping="0.7" stiffness="5" springref="0.03"/>
+            <inertial pos="0 0 0.03" mass="0.1" diaginertia="1e-4 1e-4 1e-5"/>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <equality><joint joint1="right" joint2="left" polycoef="0.005 0.9 0 0 0"/></equality>
+  <tendon>
+    <fixed name="belt" armature="0.03" damping="0.6" frictionloss="0.2">
+      <joint joint="shoulder" coef="2"/><joint joint="elbow" coef="-2"/>
+    </fixed>
+  </tendon>
+  <actuator>
+    <motor joint="shoulder" gear="50" ctrlrange="-2 2" armature="1e-4" damping="2e-4"/>
+    <position joint="elbow" kp="100" kv="10" forcerange="-80 60" gear="2"/>
+    <general joint="left" biastype="affine" biasprm="-0.5 0 0" gear="3"/>
+  </actuator>
+</mujoco>"""
+
+
+def quadruped(legs: int = 4) -> str:
+    """MJCF of a walking robot: a free trunk and three joints a leg."""
+    trunk = '<freejoint name="base"/><inertial pos="0.01 0 0.02" mass="5" fullinertia="0.02 0.06 0.07 0.001 0.002 0"/>'
+    body = ""
+    for leg in range(legs):
+        x, y = 0.2 * (-1) ** (leg // 2), 0.1 * (-1) ** leg
+        body += f'''<body name="hip{leg}" pos="{x} {y} 0"><joint name="abduct{leg}" axis="1 0 0" armature="0.005"/>
+          <inertial pos="0 {y / 5} 0" mass="0.6" diaginertia="4e-4 6e-4 5e-4"/>
+          <body name="thigh{leg}" pos="0 {y / 2} 0"><joint name="swing{leg}" axis="0 1 0" range="-2 2" damping="0.1"/>
+            <inertial pos="0 0 -0.05" mass="0.9" diaginertia="5e-3 5e-3 1e-3"/>
+            <body name="shank{leg}" pos="0 0 -0.2"><joint name="knee{leg}" axis="0 1 0" frictionloss="0.1"/>
+              <inertial pos="0.01 0 -0.1" mass="0.2" diaginertia="2e-3 2e-3 1e-4"/>
+              <site name="foot{leg}" pos="0 0 -0.2"/></body></body></body>'''
+    world = f'<body name="trunk" pos="0 0 0.4">{trunk}{body}</body>'
+    return f'<mujoco model="quadruped"><compiler angle="radian"/><worldbody>{world}</worldbody></mujoco>'
+
+
+MJCF = {"creature": CREATURE, "gripper": GRIPPER, "quadruped": quadruped()}
+
+
+def without_looks(urdf: str) -> str:
+    """The URDF without what names a mesh."""
+    for tag in ("visual", "collision"):
+        urdf = re.sub(rf"<{tag}\b.*?</{tag}>|<{tag}\b[^>]*/>", "", urdf, flags=re.DOTALL)
+    return urdf
 
 
 def load(text: str, folder: Path, **options: object) -> RobotModel:

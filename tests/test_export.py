@@ -20,7 +20,7 @@ from figaroh_jax.export import load_model, model_files, write_model
 from figaroh_jax.extended import ExtendedModel, extend, predict
 from figaroh_jax.inertia import is_physical
 from figaroh_jax.kinematics import frame_placement
-from figaroh_jax.mjcf import read_mjcf
+from figaroh_jax.mjcf import load_mjcf
 from figaroh_jax.model import RobotModel
 from figaroh_jax.results import Cause, Estimate, Gain, Name
 from figaroh_jax.simulation import simulate
@@ -91,7 +91,7 @@ def assert_reloads(model: RobotModel, folder: Path) -> None:
     found = load_urdf(folder / "robot.urdf", joints=model.joint_names)
     assert_same_robot(found, model)
     np.testing.assert_allclose(found.effort_limit, np.minimum(model.effort_limit, 1e9))
-    in_mjcf = read_mjcf(folder / "robot.xml")
+    in_mjcf = load_mjcf(folder / "robot.xml", joints=model.joint_names)
     physical = is_physical(np.asarray(model.inertia))[:, None]  # of the others mass and centre of mass are kept
     np.testing.assert_allclose(in_mjcf.inertia[:, :4], model.inertia[:, :4], rtol=0, atol=1e-10)
     inertia = np.where(physical, in_mjcf.inertia, model.inertia)
@@ -339,14 +339,9 @@ def test_a_damaged_folder_is_refused(damage: Callable, message: str, model: Robo
         load_model(tmp_path)
 
 
-def test_a_folder_that_is_none_and_mjcf_of_others_are_refused(tmp_path: Path):
+def test_a_folder_that_is_none_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="is not a folder"):
         load_model(tmp_path / "nothing")
-    (tmp_path / "other.xml").write_text(
-        '<mujoco><worldbody><body name="b"><geom size="1"/></body></worldbody></mujoco>'
-    )
-    with pytest.raises(InputError, match="not MJCF as figaroh-jax writes it"):
-        read_mjcf(tmp_path / "other.xml")
 
 
 def test_mujoco_and_our_simulation_stay_together(model: RobotModel, tmp_path: Path):

@@ -15,7 +15,7 @@ MODULES = {path.stem: path for path in sorted(PACKAGE.glob("*.py"))}
 OUTSIDE = {
     "yaml": {"taskfile", "export"},
     "yourdfpy": {"urdf"},
-    "mujoco": {"mjcf", "export"},
+    "mujoco": {"mjcf"},
     "pinocchio": set(),
     "pyarrow": {"tables"},
     "pydantic": {"config"},

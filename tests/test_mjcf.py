@@ -1,0 +1,331 @@
+"""Reading MJCF: the tree, its dynamics and what acts at the joints, compared with MuJoCo C on the same file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import mujoco_c
+import numpy as np
+import pytest
+import robots
+import tasks
+import yaml
+
+import figaroh_jax as fj
+from figaroh_jax.config import load_robot, load_task
+from figaroh_jax.dynamics import inverse_dynamics, mass_matrix
+from figaroh_jax.errors import InputError
+from figaroh_jax.export import write_model
+from figaroh_jax.extended import extend
+from figaroh_jax.kinematics import forward_kinematics
+from figaroh_jax.mjcf import compiled_robot, load_mjcf
+from figaroh_jax.model import RobotModel
+from figaroh_jax.robotfile import load_extended, read_robot
+from figaroh_jax.urdf import load_urdf
+
+
+def written(text: str, folder: Path) -> Path:
+    path = folder / "robot.xml"
+    path.write_text(text)
+    return path
+
+
+def stacked(model: RobotModel, samples: int) -> tuple[np.ndarray, ...]:
+    return tuple(np.array(x) for x in zip(*mujoco_c.states(model, samples), strict=True))
+
+
+def sliding(model: RobotModel, samples: int) -> tuple[np.ndarray, ...]:
+    """States away from rest, where MuJoCo's dry friction is soft; neighbours turn against each other, as in a belt."""
+    q, v, a = stacked(model, samples)
+    return q, (0.5 + np.abs(v)) * (-1.0) ** np.arange(model.nv), a
+
+
+@pytest.mark.parametrize("name", ["gripper"])
+def test_rigid_bodies_are_mujocos(name: str, tmp_path: Path) -> None:
+    path = written(robots.MJCF[name], tmp_path)
+    model = load_mjcf(path)
+    theirs = mujoco_c.load(path, model, passive=False)
+    q, v, a = stacked(model, 20)
+    torques = [theirs.torque(*state) for state in zip(q, v, a, strict=True)]
+    np.testing.assert_allclose(inverse_dynamics(model, q, v, a), torques, rtol=0, atol=1e-11)
+    masses = [theirs.mass_matrix(one) for one in q]
+    np.testing.assert_allclose(mass_matrix(model, q), masses, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["gripper"])
+def test_bodies_and_sites_are_where_mujoco_has_them(name: str, tmp_path: Path) -> None:
+    path = written(robots.MJCF[name], tmp_path)
+    model = load_mjcf(path)
+    theirs = mujoco_c.load(path, model, passive=False)
+    q, v, a = stacked(model, 3)
+    names = {frame.name for frame in model.frames}
+    bodies, sites = ({getattr(theirs.mj, kind)(i).name for i in range(count)} - {""}
+                     for kind, count in (("body", theirs.mj.nbody), ("site", theirs.mj.nsite)))  # fmt: skip
+    assert bodies | sites <= names
+    for one, tree in zip(q, np.asarray(forward_kinematics(model, q)), strict=True):
+        theirs.set(one, v[0], a[0])
+        mujoco.mj_forward(theirs.mj, theirs.data)
+        for frame, placement in zip(model.frames, model.frame_placement, strict=True):
+            if frame.name in bodies | sites:
+                found = getattr(theirs.data, "body" if frame.name in bodies else "site")(frame.name)
+                pose = (tree[frame.parent] if frame.parent >= 0 else np.eye(4)) @ placement
+                np.testing.assert_allclose(pose[:3, 3], found.xpos, rtol=0, atol=1e-13, err_msg=frame.name)
+                np.testing.assert_allclose(pose[:3, :3].ravel(), found.xmat, rtol=0, atol=1e-13, err_msg=frame.name)
+
+
+@pytest.mark.parametrize("name", ["gripper"])
+def test_what_acts_at_the_joints_is_mujocos(name: str, tmp_path: Path) -> None:
+    path = written(robots.MJCF[name], tmp_path)
+    extended, notes = load_extended(path)
+    assert notes == ()
+    theirs = mujoco_c.load(path, extended.robot, passive=True)
+    q, v, a = sliding(extended.robot, 20)
+    torques = np.array([theirs.torque(*state) for state in zip(q, v, a, strict=True)])
+    if name == "gripper":
+        torques[:, 2] += 1.5  # the actuator pushes by -0.5 times its gear of 3
+    np.testing.assert_allclose(extended.inverse_dynamics(q, v, a), torques, rtol=0, atol=1e-9)
+
+
+def test_a_body_with_several_joints_is_a_chain_with_massless_links(tmp_path: Path) -> None:
+    model = load_mjcf(written(robots.CREATURE, tmp_path))
+    assert [(j.name, j.kind, j.link) for j in model.joints[:5]] == [
+        ("root_joint", "free", "torso"),
+        ("hip_z", "revolute", "hip_z_link"),
+        ("hip_x", "revolute", "hip_x_link"),
+        ("thigh_joint", "prismatic", "thigh"),
+        ("shank", "revolute", "shank"),
+    ]
+    assert not model.inertia[1:3].any() and model.inertia[3, 0] > 0
+    assert (model.nq, model.nv) == (16, 14)
+    np.testing.assert_allclose(model.position_limit[6], np.radians([-60, 60]))
+    assert model.effort_limit[model.joint_index("wrist")] == 7
+
+
+def test_a_linear_coupling_is_a_mimic_joint_and_motors_bound_the_torque(tmp_path: Path) -> None:
+    model = load_mjcf(written(robots.GRIPPER, tmp_path))
+    assert model.joint_names == ("shoulder", "elbow", "left")
+    assert model.joints[3].follows and model.joints[3].coordinate == 2
+    np.testing.assert_allclose([model.ratio[3], model.offset[3]], [0.9, 0.02 + 0.005 - 0.9 * 0.01])
+    np.testing.assert_allclose(model.effort_limit, [100.0, 160.0, np.inf])
+
+
+def test_locked_joints_stand_where_the_file_has_them_or_the_posture_says(tmp_path: Path) -> None:
+    path = written(robots.CREATURE, tmp_path)
+    mj = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(mj)
+    for posture in (
+        {},
+        {"hip_z": 0.3, "shoulder": [0.1, 0.2, 0.3, 0.9], "root_joint": [1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8]},
+    ):
+        data.qpos[:] = mj.qpos0
+        for name, value in posture.items():
+            at = mj.jnt_qposadr[0] if name == "root_joint" else mj.joint(name).qposadr[0]
+            numbers = np.atleast_1d(np.asarray(value, float))
+            numbers = numbers if len(numbers) == 1 else [*numbers[:-4], *np.roll(numbers[-4:], 1)]
+            data.qpos[at : at + len(numbers)] = numbers
+        mujoco.mj_kinematics(mj, data)
+        model = load_mjcf(path, joints=["wrist"], posture=posture, root="fixed")
+        assert model.joint_names == ("wrist",)
+        frames = {frame.name: k for k, frame in enumerate(model.frames)}
+        for name in ("imu", "strap"):
+            pose = model.frame_placement[frames[name]]
+            np.testing.assert_allclose(pose[:3, 3], data.site(name).xpos, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(model.frame_placement[frames["shank"]][:3, 3], data.body("shank").xpos, atol=1e-13)
+
+
+def test_the_root_is_fixed_or_freed_as_asked(tmp_path: Path) -> None:
+    walker = written(robots.quadruped(), tmp_path)
+    fixed = load_mjcf(walker, root="fixed")
+    assert fixed.nq == fixed.nv == 12
+    for root in (None, "free_flyer"):
+        assert load_mjcf(walker, root=root).joint_names[:2] == ("base", "abduct0")
+    with pytest.raises(InputError, match="joint 'base' is free, but root is fixed"):
+        load_mjcf(walker, joints=["base"], root="fixed")
+    arm = written(robots.GRIPPER, tmp_path)
+    freed = load_mjcf(arm, root="free_flyer")
+    assert freed.joints[0][:5] == ("root_joint", "free", -1, 0, "table") and freed.nq == 10
+    bare = robots.GRIPPER.replace('<body name="table" pos="0.5 0 0.7">', "<body name='table'><joint name='lift'/>")
+    with pytest.raises(InputError, match="needs one body welded to the world to free; the world carries 'table'"):
+        load_mjcf(written(bare, tmp_path), root="free_flyer")
+
+
+def test_meshes_and_materials_are_never_looked_for_where_inertias_are_given(tmp_path: Path) -> None:
+    assets = (
+        '<asset><mesh name="m" file="no.stl"/><material name="k" texture="t"/>'
+        '<texture name="t" type="2d" file="no.png"/></asset>'
+    )
+    looks = '<geom type="mesh" mesh="m" material="k"/><geom type="capsule" mesh="m"/>'
+    text = robots.GRIPPER.replace("<worldbody>", assets + "<worldbody>" + looks)
+    text = text.replace('<site name="tool"', looks + '<site name="tool"')
+    plain = load_mjcf(written(robots.GRIPPER, tmp_path))
+    np.testing.assert_array_equal(load_mjcf(written(text, tmp_path)).inertia, plain.inertia)
+    heavy = text.replace('<inertial pos="0.02 0 0.15" mass="2" diaginertia="0.02 0.02 0.004"/>', "")
+    with pytest.raises(InputError, match="MuJoCo does not compile it: .*no.stl"):
+        load_mjcf(written(heavy, tmp_path))
+
+
+EQUALITY = '<equality><joint joint1="right" joint2="left" polycoef="0.005 0.9 0 0 0"/></equality>'
+FOLLOWS = '<joint joint1="{}" joint2="{}"/>'
+REFUSED = {
+    "loop": (
+        '<connect name="pin" body1="left" body2="table" anchor="0 0 0"/>',
+        "connect 'pin' between bodies 'left' and 'table' closes a kinematic loop",
+    ),
+    "weld": ('<weld body1="right" body2="upper"/>', "the weld 'number 0' between bodies 'right' and 'upper' closes"),
+    "curve": ('<joint joint1="right" joint2="left" polycoef="0 1 2 0 0"/>', "'right' follows 'left' by a curve"),
+    "twice": (FOLLOWS.format("right", "left") + FOLLOWS.format("right", "elbow"), "'right' is coupled by two"),
+    "each other": (FOLLOWS.format("right", "left") + FOLLOWS.format("left", "right"), "mimics itself by way of"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_loops_and_curved_couplings_are_refused_by_name(name: str, tmp_path: Path) -> None:
+    equality, message = REFUSED[name]
+    path = written(robots.GRIPPER.replace(EQUALITY, f"<equality>{equality}</equality>"), tmp_path)
+    with pytest.raises(InputError, match=message) as refusal:
+        load_mjcf(path)
+    assert str(path) in str(refusal.value)
+
+
+def test_a_loop_of_locked_joints_or_one_that_is_not_active_does_not_matter(tmp_path: Path) -> None:
+    loop = '<equality><weld body1="right" body2="fore"/></equality>'
+    assert load_mjcf(written(robots.GRIPPER.replace(EQUALITY, loop), tmp_path), joints=["shoulder", "elbow"]).nv == 2
+    loop = loop.replace("<weld", '<weld active="false"')
+    assert load_mjcf(written(robots.GRIPPER.replace(EQUALITY, loop), tmp_path)).nv == 4
+
+
+def test_a_joint_held_by_an_equality_does_not_move(tmp_path: Path) -> None:
+    held = '<equality><joint joint1="right" polycoef="0.015 0 0 0 0"/></equality>'
+    model = load_mjcf(written(robots.GRIPPER.replace(EQUALITY, held), tmp_path))
+    assert model.joint_names == ("shoulder", "elbow", "left")
+    frame = model.frames.index(next(f for f in model.frames if f.name == "right"))
+    np.testing.assert_allclose(model.frame_placement[frame][:3, 3], [0, -0.03 - 0.015, 0.3], rtol=0, atol=1e-15)
+
+
+def test_files_that_mujoco_does_not_take_are_refused(tmp_path: Path) -> None:
+    for text, message in (
+        (robots.GRIPPER.replace("axis=", "axes="), "MuJoCo does not compile it: .*axes"),
+        (robots.GRIPPER.replace('joint="elbow"', 'joint="elbo"'), "MuJoCo does not compile it: .*elbo"),
+        ("<robot/>", "the root element is <robot>; a <mujoco> is expected"),
+        ("<mujoco/>", "no joint moves"),
+        ("", "the file is empty"),
+    ):
+        with pytest.raises(InputError, match=message):
+            load_mjcf(written(text, tmp_path))
+    with pytest.raises(InputError, match="a robot model is a .urdf or an .xml"):
+        read_robot(tmp_path / "robot.sdf")
+
+
+UNSAID = {
+    "spring of a ball": ('type="ball"', 'type="ball" stiffness="3"', "spring of joint 'shoulder'"),
+    "armature of a free joint": ("<freejoint/>", '<joint type="free" armature="0.1"/>', "free joint 'root_joint'"),
+    "fluid": ("<option ", '<option density="1.2" ', "forces of the fluid"),
+    "curved spring": ('stiffness="40"', 'stiffness="40 5"', "square and cubic stiffness of joint 'thigh_joint'"),
+    "range of a ball": ('type="ball"', 'type="ball" range="0 30" limited="true"', "range of joint 'shoulder'"),
+    "gravcomp of the drives": ('name="wrist"', 'name="wrist" actuatorgravcomp="true"', "gravcomp: at wrist it is part"),
+    "uneven gravcomp": ('name="pack"', 'name="pack" gravcomp="1"', "gravcomp of link 'torso'"),
+}
+
+
+@pytest.mark.parametrize("name", UNSAID)
+def test_what_no_effect_stands_for_is_noted(name: str, tmp_path: Path) -> None:
+    old, new, message = UNSAID[name]
+    text = robots.CREATURE.replace(old, new, 1)
+    if name == "gravcomp of the drives":
+        text = text.replace('name="hand"', 'name="hand" gravcomp="1"')
+    (note,) = load_extended(written(text, tmp_path)).notes
+    assert note.startswith(message) or message in note
+
+
+def test_tendons_are_coupled_drives_or_noted(tmp_path: Path) -> None:
+    for coefficients, noted in (("2 -2", False), ("2 1", True), ("2 0", False)):
+        first, second = coefficients.split()
+        text = robots.GRIPPER.replace('coef="2"', f'coef="{first}"').replace('coef="-2"', f'coef="{second}"')
+        path = written(text, tmp_path)
+        extended, notes = load_extended(path)
+        assert bool(notes) == noted
+        if not noted:
+            theirs = mujoco_c.load(path, extended.robot, passive=True)
+            q, v, a = sliding(extended.robot, 3)
+            torques = [theirs.torque(*s) + [0, 0, 1.5] for s in zip(q, v, a, strict=True)]
+            np.testing.assert_allclose(extended.inverse_dynamics(q, v, a), torques, rtol=0, atol=1e-9)
+    (note,) = load_extended(written(robots.GRIPPER.replace("<fixed ", '<fixed stiffness="3" '), tmp_path)).notes
+    assert note == "spring of tendon 'belt'"
+
+
+def test_urdf_dynamics_are_pinocchios(tmp_path: Path) -> None:
+    import pinocchio as pin
+
+    more = robots.LIMIT + '<dynamics damping="{}" friction="{}"/>'
+    follow = more.format(0.5, 0.2) + '<mimic joint="j0" multiplier="-1.5" offset="0.3"/>'
+    joints = [
+        robots.joint("j0", "base", "a", more=more.format(1.5, 0.7)),
+        robots.joint("j1", "a", "b", "prismatic", more=more.format(0.4, 0)),
+        robots.joint("j2", "b", "c", more=follow),
+    ]
+    text = robots.robot(*robots.LINKS[:4], *joints)
+    path = tmp_path / "robot.urdf"
+    path.write_text(text)
+    extended, notes = load_extended(path)
+    q, v, a = robots.states(extended.robot, 5)
+    theirs = pin.buildModelFromXML(text.replace('<mimic joint="j0" multiplier="-1.5" offset="0.3"/>', ""))
+    share = np.array([[1, 0], [0, 1], [-1.5, 0]])
+    torques = []
+    for position, velocity, acceleration in zip(q @ share.T + [0, 0, 0.3], v @ share.T, a @ share.T, strict=True):
+        rigid = pin.rnea(theirs, theirs.createData(), position, velocity, acceleration)
+        torques.append(share.T @ (rigid + theirs.damping * velocity + theirs.friction * np.sign(velocity)))
+    assert notes == ()
+    np.testing.assert_allclose(extended.inverse_dynamics(q, v, a), torques, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["ur10e", "panda", "talos"])  # the others have inertias that MuJoCo refuses
+def test_real_robots_are_the_same_where_mujoco_reads_the_urdf_itself(name: str, data_dir: Path) -> None:
+    """MuJoCo's own reader of URDF makes the compiled model that is read here: nothing of ours is in between."""
+    urdf = data_dir / robots.REAL[name]
+    spec = mujoco.MjSpec.from_string(robots.without_looks(urdf.read_text()))
+    spec.compiler.fusestatic = False
+    theirs, ours = compiled_robot(name, spec.compile(), gravity=(0.0, 0.0, -9.81)), load_urdf(urdf)
+    back = [ours.joint_names.index(joint) for joint in theirs.joint_names]
+    assert len(back) == ours.nv and {f.name for f in theirs.frames} >= set(ours.link_names)
+    q, v, a = robots.states(ours, 3)
+    found = inverse_dynamics(theirs, q[:, back], v[:, back], a[:, back])
+    np.testing.assert_allclose(found, np.asarray(inverse_dynamics(ours, q, v, a))[:, back], rtol=0, atol=1e-9)
+
+
+def test_a_task_takes_an_mjcf_model(tmp_path: Path) -> None:
+    tasks.write(tmp_path)
+    written(robots.GRIPPER, tmp_path)
+    for gravity, expected in ((None, (0, 0, -9.81)), ([0, 0, -1.62], (0, 0, -1.62))):
+        keys = tasks.task()
+        keys["robot"] = {"model": "robot.xml", "joints": ["elbow", "shoulder"]} | (
+            {"gravity": gravity} if gravity else {}
+        )
+        model = load_robot(load_task(tasks.write(tmp_path, keys)))
+        assert model.joint_names == ("elbow", "shoulder") and tuple(model.gravity) == expected
+
+
+@pytest.mark.slow
+def test_the_demo_has_the_same_verdict_with_an_mjcf_model(tmp_path: Path) -> None:
+    demo = Path(fj.__file__).parent / "demo"
+    keys = yaml.safe_load((demo / "task.yaml").read_text())
+    for entry in keys["data"]:
+        entry["file"] = str(demo / entry["file"])
+    urdf = demo / keys["robot"]["model"]
+    write_model(extend(load_urdf(urdf)), tmp_path)
+    answers = []
+    for model in (urdf, tmp_path / "robot.xml"):
+        keys["robot"]["model"] = str(model)
+        (tmp_path / "task.yaml").write_text(yaml.safe_dump(keys))
+        answers.append(fj.diagnose_task(load_task(tmp_path / "task.yaml")))
+    first, second = answers
+    assert first.verdict == second.verdict and [c.name for c in first.causes] == [c.name for c in second.causes]
+    for ours, theirs in zip(first.causes, second.causes, strict=True):
+        for name, estimate in ours.parameters.items():
+            np.testing.assert_allclose(theirs.parameters[name].value, estimate.value, rtol=1e-6, atol=0)
+
+
+def test_nothing_acts_at_the_joints_of_a_plain_robot(tmp_path: Path) -> None:
+    extended, notes = load_extended(written(robots.quadruped().replace('armature="0.005"', ""), tmp_path), root="fixed")
+    assert notes == () and {effect.name for effect in extended.effects} == {"viscous_friction", "coulomb_friction"}
+    assert extend(extended.robot).effects == ()
