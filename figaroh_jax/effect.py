@@ -118,7 +118,7 @@ class Effect(eqx.Module):
     acts_on: ClassVar[Literal["joint", "pair", "link", "robot"]]
     contains: ClassVar[tuple[str, ...]] = ()  # simpler effects that it can imitate exactly: they are preferred
     follows_torque: ClassVar[bool] = False  # whether its torque depends on the current model's (load or total)
-    searched: ClassVar[bool] = True  # whether a diagnosis looks for it
+    searched: ClassVar[bool] = True  # whether a diagnosis looks for it, that is, whether it is in the catalogue
     separated_by: ClassVar[str] = ""  # the experiment that tells it from what looks alike; {at} stands for the place
 
     def torque(self, motion: Motion) -> Float[Array, "samples *rows"]:

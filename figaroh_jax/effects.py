@@ -17,21 +17,23 @@ from .model import RobotModel
 __all__ = ["CATALOGUE", "find", "register"]
 
 CATALOGUE: dict[str, type[Effect]] = {}
+_OTHERS: dict[str, type[Effect]] = {}  # known by name, but nothing that a diagnosis looks for
 
 
 def register(effect: type[Effect]) -> type[Effect]:
     """Add an effect class to the catalogue under its `name` (usable as a decorator); returns it."""
-    if CATALOGUE.get(effect.name, effect).__qualname__ != effect.__qualname__:
+    if (CATALOGUE | _OTHERS).get(effect.name, effect).__qualname__ != effect.__qualname__:
         raise InputError(f"an effect called '{effect.name}' is registered already")
-    CATALOGUE[effect.name] = effect
+    (CATALOGUE if effect.searched else _OTHERS)[effect.name] = effect
     return effect
 
 
 def find(name: str) -> type[Effect]:
     """The effect called `name`; raises `InputError` with the nearest known name."""
-    if name not in CATALOGUE:
-        raise InputError(f"no effect '{name}' in the catalogue{nearest(name, CATALOGUE)}")
-    return CATALOGUE[name]
+    known = CATALOGUE | _OTHERS
+    if name not in known:
+        raise InputError(f"no effect '{name}' in the catalogue{nearest(name, known)}")
+    return known[name]
 
 
 class JointEffect(Effect):
