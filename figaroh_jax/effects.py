@@ -192,6 +192,10 @@ class PowerLawFriction(JointEffect):
         speed = jnp.sqrt(self.here(motion.velocity) ** 2 + 1e-12)
         return self.strength * speed**self.exponent * self.here(motion.direction)
 
+    def native(self) -> tuple[Native, ...]:
+        attribute = {2.0: "damping2", 3.0: "damping3"}.get(float(self.exponent))
+        return (Native("joint", attribute, float(self.strength)),) if attribute else ()
+
 
 @register
 class LoadDependentFriction(JointEffect):

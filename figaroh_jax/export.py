@@ -96,9 +96,23 @@ def _robot(extended: ExtendedModel, changed: RobotModel) -> dict[str, Any]:
     links = [
         {"name": name, "inertia": np.asarray(ten)} for name, ten in zip(robot.link_names, robot.inertia, strict=True)
     ]
-    geometry = {leaf: np.asarray(getattr(robot, leaf)) for leaf in changed_leaves(robot, changed) if leaf in _GEOMETRY}
+    geometry: dict[str, Any] = {
+        leaf: np.asarray(getattr(robot, leaf)) for leaf in changed_leaves(robot, changed) if leaf in _GEOMETRY
+    }
     gravity = {"gravity": np.asarray(robot.gravity)}
+    if shifted := _shifted(robot):
+        geometry["frames"] = shifted
     return {"format": 1, "robot": robot.name, **gravity, "joints": joints, "links": links, **geometry}
+
+
+def _shifted(robot: RobotModel) -> list[dict[str, Any]]:
+    """Frames called as links but away from their joints, where a URDF has the links."""
+    links = {joint.link: i for i, joint in enumerate(robot.joints)}
+    return [
+        {"name": frame.name, "placement": np.asarray(placement)}
+        for frame, placement in zip(robot.frames, robot.frame_placement, strict=True)
+        if links.get(frame.name) == frame.parent and not np.array_equal(np.asarray(placement), np.eye(4))
+    ]
 
 
 def _describe(
@@ -205,6 +219,10 @@ def _restored(content: Mapping[str, Any], urdf: Path) -> RobotModel:
         "velocity_limit": _array([joint["velocity"] for joint in joints], (robot.nv,)),
         "effort_limit": _array([joint["effort"] for joint in joints], (robot.nv,)),
     }
+    frames = np.array(robot.frame_placement)
+    for frame in content.get("frames", ()):
+        frames[robot.frame_index(frame["name"])] = _array(frame["placement"], (4, 4))
+    values |= {"frame_placement": frames}
     values |= {leaf: _array(content[leaf], np.shape(getattr(robot, leaf))) for leaf in _GEOMETRY if leaf in content}
     return eqx.tree_at(lambda m: [getattr(m, name) for name in values], robot, list(values.values()))
 

@@ -133,6 +133,8 @@ def _joint(robot: RobotModel, index: int, joint: tuple[str, str], dof: int, driv
     for attribute in ("armature", "damping", "frictionloss", "stiffness", "springref"):
         if (value := getattr(drives, attribute)[column]) != 0:
             element[attribute] = repr(float(value))
+    if drives.damping2[column] or drives.damping3[column]:  # MuJoCo's damping is of v, v |v| and v^3
+        element["damping"] = _text([drives.damping[column], drives.damping2[column], drives.damping3[column]])
     return element
 
 

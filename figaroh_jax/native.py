@@ -24,11 +24,15 @@ Format = Literal["urdf", "mjcf"]
 
 _JOINT = {
     "urdf": ("damping", "frictionloss"),
-    "mjcf": ("armature", "damping", "frictionloss", "stiffness", "springref"),
+    "mjcf": ("armature", "damping", "damping2", "damping3", "frictionloss", "stiffness", "springref"),
 }
 _WHOLE: dict[str, dict[str, tuple[str, ...]]] = {  # what a joint of several degrees of freedom has one value of
     "urdf": {"free": ("damping", "frictionloss"), "planar": ("damping", "frictionloss")},
-    "mjcf": {"spherical": ("armature", "damping", "frictionloss"), "free": ("damping",), "planar": ("damping",)},
+    "mjcf": {
+        "spherical": ("armature", "damping", "damping2", "damping3", "frictionloss"),
+        "free": ("damping",),
+        "planar": ("damping",),
+    },
 }
 _NOT_NEGATIVE = ("armature", "damping", "frictionloss", "stiffness")
 _SENSORS = {"position_error": "position sensor", "torque_response": "torque sensor"}
@@ -50,6 +54,8 @@ class Drives(NamedTuple):
 
     armature: Float[np.ndarray, " nv"]
     damping: Float[np.ndarray, " nv"]
+    damping2: Float[np.ndarray, " nv"]  # of v |v|
+    damping3: Float[np.ndarray, " nv"]  # of v^3
     frictionloss: Float[np.ndarray, " nv"]
     stiffness: Float[np.ndarray, " nv"]
     springref: Float[np.ndarray, " nv"]  # rad or m

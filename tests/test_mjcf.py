@@ -16,7 +16,7 @@ import figaroh_jax as fj
 from figaroh_jax.config import load_robot, load_task
 from figaroh_jax.dynamics import inverse_dynamics, mass_matrix
 from figaroh_jax.errors import InputError
-from figaroh_jax.export import write_model
+from figaroh_jax.export import load_model, write_model
 from figaroh_jax.extended import extend
 from figaroh_jax.kinematics import forward_kinematics
 from figaroh_jax.mjcf import compiled_robot, load_mjcf
@@ -252,6 +252,39 @@ def test_tendons_are_coupled_drives_or_noted(tmp_path: Path) -> None:
             np.testing.assert_allclose(extended.inverse_dynamics(q, v, a), torques, rtol=0, atol=1e-9)
     (note,) = load_extended(written(robots.GRIPPER.replace("<fixed ", '<fixed stiffness="3" '), tmp_path)).notes
     assert note == "spring of tendon 'belt'"
+
+
+@pytest.mark.parametrize("name", robots.MJCF)
+def test_what_acts_at_the_joints_comes_back_from_the_written_mjcf_and_folder(name: str, tmp_path: Path) -> None:
+    extended, _ = load_extended(written(robots.MJCF[name], tmp_path))
+    write_model(extended, tmp_path / "model")
+    again, notes = load_extended(tmp_path / "model" / "robot.xml")
+    assert notes == ()
+    for found in (again, load_model(tmp_path / "model")):
+        assert found.robot.joints == extended.robot.joints
+        for leaf in ("placement", "axis", "inertia", "ratio", "offset", "gravity"):
+            pair = (np.asarray(getattr(model.robot, leaf)) for model in (found, extended))
+            np.testing.assert_allclose(*pair, rtol=0, atol=1e-11, err_msg=leaf)
+        for back, effect in zip(found.effects, extended.effects, strict=True):
+            assert (back.name, *back.at) == (effect.name, *effect.at)
+            values = [[float(getattr(e, key)) for key in effect.parameters()] for e in (back, effect)]
+            np.testing.assert_allclose(*values, rtol=1e-12, atol=1e-15)
+
+
+def test_what_differs_between_the_axes_of_a_joint_is_listed_and_not_written(tmp_path: Path) -> None:
+    model = load_mjcf(written(robots.CREATURE, tmp_path))
+    effects = [
+        fj.place(fj.CATALOGUE["viscous_friction"], model, ["shoulder.wx"], damping=0.5),
+        fj.place(fj.CATALOGUE["coulomb_friction"], model, ["root_joint.vz"], force=1.0),
+        fj.place(fj.CATALOGUE["coupled_transmission"], model, ["shoulder.wx", "wrist"], friction=1.0),
+        *(fj.place(fj.CATALOGUE["rotor_inertia"], model, [f"shoulder.w{k}"], inertia=0.1) for k in "xyz"),
+    ]
+    write_model(extend(model, *effects), tmp_path / "model")
+    answer = yaml.safe_load((tmp_path / "model" / "effects.yaml").read_text())
+    assert [effect["mjcf"] for effect in answer["effects"]] == [False, False, False, True, True, True]
+    assert "damping of one axis of the spherical joint shoulder" in answer["effects"][0]["not in mjcf"]
+    assert answer["effects"][1]["parameters"]["force"]["unit"] == "N"
+    assert len(load_model(tmp_path / "model").effects) == 6
 
 
 def test_urdf_dynamics_are_pinocchios(tmp_path: Path) -> None:
