@@ -3,6 +3,7 @@ ENOUGH := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c '$(ENOUGH)' 2>/dev/null && { echo $$p; break; }; done)
 BIN := .venv/bin
+WORKERS ?= 2
 
 # The matrices are small: more threads only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
@@ -15,10 +16,10 @@ demo: .venv/installed ## the main job on the embedded recording
 	$(BIN)/figaroh-jax demo --out runs/demo
 
 test: .venv/developed ## the tests, without the slow ones
-	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile $(ARGS)
 
 test-slow: .venv/developed ## the slow tests: many hidden effects, many clean recordings
-	$(BIN)/python -m pytest -m slow $(ARGS)
+	$(BIN)/python -m pytest -m slow -n $(WORKERS) --dist loadfile $(ARGS)
 
 lint: .venv/developed
 	$(BIN)/ruff check .
