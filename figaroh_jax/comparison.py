@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from .evidence import Prior, Rows
+from .evidence import UNKNOWN, Prior, Rows
 
 __all__ = [
     "FoldSums",
+    "Ground",
     "Hypothesis",
     "Verdicts",
     "fold_sums",
+    "ground",
     "grown_sums",
     "judge",
+    "judge_grown",
     "overlap",
     "shares_of_wins",
     "t_value",
 ]
+
+
+TINY = 1e-12  # of the diagonal: the rounding of columns that nothing excites
 
 
 class Hypothesis(NamedTuple):
@@ -39,11 +46,20 @@ class Verdicts(NamedTuple):
     blocks: Float[np.ndarray, " blocks"]  # sum of squares of each block, predicted without its fold
     without: Float[np.ndarray, " folds"]  # penalised sum of squares of the fit without each fold
     residual: Float[np.ndarray, "nv T"]  # of the whole fit
+    error: Float[np.ndarray, "nv T"]  # of each fold, predicted without it
 
     @property
     def heldout(self) -> float:
         """Sum of squares over all blocks, each predicted without its fold."""
         return float(self.blocks.sum())
+
+
+class Ground(NamedTuple):
+    """A hypothesis that many others extend by a few columns: what they share with it."""
+
+    verdicts: Verdicts
+    inverse: Float[np.ndarray, "folds+1 P P"]  # of the normal matrix without each fold, then of all rows
+    member: Float[np.ndarray, "T folds"]  # 1 where a row belongs to the fold
 
 
 class FoldSums(NamedTuple):
@@ -87,13 +103,61 @@ def judge(rows: Rows, hypothesis: Hypothesis, known: FoldSums | None = None) -> 
     theta, cost = _solve(G, b, yy, prior)
     left = [_solve(G - g, b - m, yy - s, prior) for g, m, s in zip(*sums, strict=True)]
     each = np.stack([solution for solution, _ in left])
-    residual = y.copy()
+    error = y.copy()
     for fold, solution in enumerate(each):
         own = rows.fold == fold
-        residual[:, own] -= X[:, own] @ solution
+        error[:, own] -= X[:, own] @ solution
+    costs = np.array([cost for _, cost in left])
+    return Verdicts(cost, theta, each, _block_squares(rows, error), costs, y - X @ theta, error)
+
+
+def ground(rows: Rows, verdicts: Verdicts, prior: Prior, sums: FoldSums) -> Ground:
+    """What judging hypotheses that extend one (its verdicts, prior and sums) needs once."""
+    gram = sums.gram.sum(0) - np.concatenate([sums.gram, np.zeros_like(sums.gram[:1])])
+    A = gram + np.diag(prior.precision)
+    diagonal = np.maximum(np.diagonal(A, axis1=1, axis2=2), TINY)
+    inverse = np.linalg.inv(A + TINY * diagonal[:, None] * np.eye(A.shape[1]))
+    return Ground(verdicts, inverse, (rows.fold[:, None] == np.arange(len(sums.gram))).astype(float))
+
+
+def judge_grown(rows: Rows, base: Ground, joints: Sequence[int], more: Float[np.ndarray, "k rows T"]) -> Verdicts:
+    """`judge` of the ground hypothesis with columns more, of which nothing is known, in the rows of some joints.
+
+    By block elimination: with C = X'Z and S = Z'Z - C'A^-1 C the new coefficients are t = S^-1 (Z'y - C'theta), the
+    others change by -A^-1 C t and the squares by -t'S t; all for the whole fit and for that without each fold.
+    """
+    was, k, folds = base.verdicts, len(more), base.member.shape[1]
+    X = rows.X[list(joints)]
+    split = more[..., None] * base.member  # (k, rows, T, folds)
+    shared = _without(np.einsum("jtp,kjtf->fpk", X, split, optimize=True))
+    own = _without(np.einsum("ljt,kjtf->flk", more, split, optimize=True))
+    right = _without(np.einsum("jt,kjtf->fk", rows.y[list(joints)], split, optimize=True)[..., None])
+    known = np.concatenate([was.folds, was.theta[None]])[..., None]
+    across = np.matmul(base.inverse, shared)
+    S = own - np.matmul(np.swapaxes(shared, 1, 2), across)
+    diagonal = np.maximum(np.diagonal(own, axis1=1, axis2=2) + UNKNOWN, TINY)
+    S = S + UNKNOWN * np.eye(k) + TINY * diagonal[:, None] * np.eye(k)
+    left = right - np.matmul(np.swapaxes(shared, 1, 2), known)
+    t = np.linalg.solve(S, left)
+    drop = (left * t).sum((1, 2))
+    change = -np.matmul(across, t)
+    theta = np.concatenate([known + change, t], axis=1)[..., 0]
+    moved = rows.X @ change[..., 0].T  # (nv, T, folds + 1)
+    moved[list(joints)] += np.einsum("kjt,fk->jtf", more, t[..., 0], optimize=True)
+    error = was.error - (moved[..., :folds] * base.member).sum(2)
+    squares, costs = _block_squares(rows, error), was.without - drop[:folds]
+    residual = was.residual - moved[..., folds]
+    return Verdicts(was.cost - float(drop[folds]), theta[folds], theta[:folds], squares, costs, residual, error)
+
+
+def _without(parts: Float[np.ndarray, "folds *rest"]) -> Float[np.ndarray, "folds+1 *rest"]:
+    """Sums over all folds but each, then over all."""
+    return np.concatenate([parts.sum(0) - parts, parts.sum(0)[None]])
+
+
+def _block_squares(rows: Rows, error: Float[np.ndarray, "nv T"]) -> Float[np.ndarray, " blocks"]:
     used = rows.block >= 0
-    blocks = np.bincount(rows.block[used], (residual**2).sum(0)[used])
-    return Verdicts(cost, theta, each, blocks, np.array([cost for _, cost in left]), y - X @ theta)
+    return np.bincount(rows.block[used], (error**2).sum(0)[used])
 
 
 def t_value(worse: Float[np.ndarray, " blocks"], better: Float[np.ndarray, " blocks"]) -> float:
@@ -123,7 +187,7 @@ def _solve(
     G: Float[np.ndarray, "P P"], b: Float[np.ndarray, " P"], yy: float, prior: Prior
 ) -> tuple[Float[np.ndarray, " P"], float]:
     A = G + np.diag(prior.precision)
-    A = A + 1e-12 * np.diag(np.maximum(np.diag(A), 1e-12))
+    A = A + TINY * np.diag(np.maximum(np.diag(A), TINY))
     right = b + prior.precision * prior.mean
     theta = np.linalg.solve(A, right)
     return theta, float(yy + prior.precision @ prior.mean**2 - right @ theta)

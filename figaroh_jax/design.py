@@ -110,14 +110,17 @@ def shifted(effects: Effect, motion: Motion, records: Records) -> Motion:
     return eqx.tree_at(lambda m: (m.position, m.velocity, m.acceleration), motion, tuple(true))
 
 
-def torque_change(effects: Effect, motion: Motion, records: Records) -> Float[np.ndarray, "effects nN nv"]:
+def torque_change(
+    effects: Effect, motion: Motion, records: Records, as_read: Float[np.ndarray, "nN nv"] | None = None
+) -> Float[np.ndarray, "effects nN nv"]:
     """Exact torque of a batch of position sensors: of the links' true motion, less that of the motion as it was read.
 
-    (A torque sensor's is left to the row filter, which is exact in frequency.)
+    (A torque sensor's is left to the row filter, which is exact in frequency.) `as_read` is the latter torque.
     """
+    if as_read is None:
+        as_read = rigid_torque(motion.model, motion.position, motion.velocity, motion.acceleration)
     true = shifted(effects, motion, records)
-    moved = rigid_torque(motion.model, true.position, true.velocity, true.acceleration)
-    return moved - rigid_torque(motion.model, motion.position, motion.velocity, motion.acceleration)
+    return rigid_torque(motion.model, true.position, true.velocity, true.acceleration) - as_read
 
 
 def units(batches: Mapping[str, Effect], motion: Motion, records: Records) -> dict[str, Units]:

@@ -41,7 +41,7 @@ def with_amplitudes(state: State, causes: list[Effect], model: RobotModel) -> li
 def amplitude_places(state: State, causes: list[Effect], model: RobotModel) -> list[list[int]]:
     """Columns of each cause's amplitudes in the state; causes with columns are its last terms, in order."""
     counts = [sum(p.linear for p in e.parameters().values()) if kind(e) == "columns" else 0 for e in causes]
-    first = state.X.shape[2] - sum(counts)
+    first = len(state.theta) - sum(counts)
     starts = first + np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int) if counts else []
     return [list(range(s, s + c)) for s, c in zip(starts, counts, strict=True)]
 

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-__all__ = ["Bank", "Columns", "Linear", "Prior", "Rows", "Score", "bank", "fit", "projection", "scores"]
+__all__ = ["Bank", "Columns", "Linear", "Prior", "Rows", "Score", "bank", "fit", "largest", "projection", "scores"]
 
+UNKNOWN = 1e-8  # precision of a coefficient of which nothing is known
 CUT = 1e-7  # eigenvalues of the unit-diagonal variance below it: a direction that the baseline has absorbed
 
 
@@ -25,7 +26,7 @@ class Prior(NamedTuple):
 
     def extended(self, count: int) -> Prior:
         """With `count` more coefficients of which nothing is known."""
-        return Prior(np.append(self.mean, np.zeros(count)), np.append(self.precision, np.full(count, 1e-8)))
+        return Prior(np.append(self.mean, np.zeros(count)), np.append(self.precision, np.full(count, UNKNOWN)))
 
 
 class Rows(NamedTuple):
@@ -67,14 +68,19 @@ class Columns(NamedTuple):
 
 
 class Bank(NamedTuple):
-    """Instruments of many candidates, joint by joint: one product serves all of them.
+    """Instruments of many candidates, joint by joint (one product serves all of them), and their products.
 
     Candidate i owns the columns `span[i]`, grid point by grid point; `joint[j]` are the columns that touch joint j.
     """
 
+    candidates: list[Columns]
     span: list[tuple[int, int, int]]  # first column, grid points, columns a point
+    parts: list[list[Float[np.ndarray, "columns T"]]]  # instruments of each candidate at each of its joints
     joint: list[Int[np.ndarray, " columns"]]
     Zi: list[Float[np.ndarray, "columns T"]]
+    own: list[Float[np.ndarray, "grid k k"]]  # Zi'Zi of each candidate
+    ZX: Float[np.ndarray, "columns P"]  # Zi'X
+    ZXi: Float[np.ndarray, "columns P"]  # Zi'Xi
 
     @property
     def width(self) -> int:
@@ -83,10 +89,7 @@ class Bank(NamedTuple):
 
     def product(self, rows: list[Float[np.ndarray, "T m"]]) -> Float[np.ndarray, "columns m"]:
         """Every column times one matrix of rows a joint, summed over the joints."""
-        out = np.zeros((self.width, rows[0].shape[1]))
-        for columns, Zi, right in zip(self.joint, self.Zi, rows, strict=True):
-            out[columns] += Zi @ right
-        return out
+        return _product(self.width, self.joint, self.Zi, rows)
 
 
 class Score(NamedTuple):
@@ -96,12 +99,6 @@ class Score(NamedTuple):
     rank: Int[np.ndarray, " grid"]
     Q: Float[np.ndarray, " grid"]
     z: Float[np.ndarray, " grid"]  # Q on one scale for all ranks (Wilson-Hilferty)
-
-    def largest(self, scores: Float[np.ndarray, "draws gridk"]) -> Float[np.ndarray, " draws"]:
-        """Largest z over the grid that other scores of the same columns would have."""
-        grid, k = self.root.shape[:2]
-        white = np.matmul(scores.reshape(-1, grid, 1, k), np.swapaxes(self.root, 1, 2))[:, :, 0]
-        return wilson_hilferty((white**2).sum(-1), np.broadcast_to(self.rank, white.shape[:2])).max(1)
 
 
 def instruments(
@@ -115,15 +112,18 @@ def instruments(
     return total / np.maximum(have.sum(0), 1) * paired
 
 
-def fit(rows: Rows, prior: Prior) -> Linear:
-    """Coefficients th = A^-1 (Xi'y + L th0), A = sym(Xi'X) + L, and the residual y - X th."""
-    X, Xi, y = (_tall(rows.X), _tall(rows.Xi), rows.y.reshape(-1))
-    cross = Xi.T @ X
+def fit(rows: Rows, prior: Prior, gram: Float[np.ndarray, "P P"] | None = None) -> Linear:
+    """Coefficients th = A^-1 (Xi'y + L th0), A = sym(Xi'X) + L, and the residual y - X th.
+
+    `gram` is X'X where that is known.
+    """
+    repeats = bool(len(rows.partner))
+    Xi, y = _tall(rows.Xi), (rows.y * rows.paired).reshape(-1)
+    cross = Xi.T @ _tall(rows.X) if repeats or gram is None else gram
     A = (cross + cross.T) / 2 + np.diag(prior.precision)
     inverse = np.linalg.inv(_conditioned(A))
-    y = y * rows.paired.reshape(-1)
     theta = inverse @ (Xi.T @ y + prior.precision * prior.mean)
-    moment = Xi.T @ Xi + np.diag(prior.precision)
+    moment = (Xi.T @ Xi if repeats else cross) + np.diag(prior.precision)
     residual = rows.y - rows.X @ theta
     return Linear(theta, inverse, residual, moment, prior.precision * (theta - prior.mean))
 
@@ -133,42 +133,123 @@ def with_columns(rows: Rows, more: Float[np.ndarray, "nv T k"]) -> Rows:
     return rows._replace(X=np.concatenate([rows.X, more], axis=2), Xi=np.concatenate([rows.Xi, more], axis=2))
 
 
-def bank(rows: Rows, candidates: list[Columns]) -> Bank:
-    """The candidates' instruments, arranged by joint."""
-    span, first = [], 0
-    touching: list[list[np.ndarray]] = [[] for _ in rows.y]
-    stored: list[list[np.ndarray]] = [[] for _ in rows.y]
-    for one in candidates:
-        grid, k = one.Z.shape[:2]
-        span.append((first, grid, k))
-        for place, joint in enumerate(one.joints):
-            stored[joint].append(rows.instrument(one.Z[:, :, place].reshape(grid * k, -1), joint))
-            touching[joint].append(np.arange(first, first + grid * k))
-        first += grid * k
-    empty = np.zeros((0, rows.y.shape[1]))
-    joint = [np.concatenate([*t, np.zeros(0, int)]) for t in touching]
-    return Bank(span, joint, [np.concatenate([*z, empty]) for z in stored])
+def bank(rows: Rows, candidates: list[Columns], before: Bank | None = None) -> Bank:
+    """The candidates' instruments, arranged by joint, and their products with each other and with the model.
+
+    `before` is the bank of rows whose model these rows have only added columns to: of a candidate that was there, the
+    same object, only the products with the new columns are computed.
+    """
+    old = {id(one): place for place, one in enumerate(before.candidates)} if before else {}
+    place = [old.get(id(one)) for one in candidates]
+    parts = [
+        _parts(rows, c) if i is None or not before else before.parts[i] for i, c in zip(place, candidates, strict=True)
+    ]
+    own = [
+        sum(np.matmul(z, np.swapaxes(z, 1, 2)) for z in (x.reshape(*c.Z.shape[:2], -1) for x in part))
+        if i is None or not before
+        else before.own[i]
+        for i, c, part in zip(place, candidates, parts, strict=True)
+    ]
+    sizes = [c.Z.shape[0] * c.Z.shape[1] for c in candidates]
+    firsts = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
+    span = [(int(first), *c.Z.shape[:2]) for first, c in zip(firsts[:-1], candidates, strict=True)]
+    stored: list[list[np.ndarray]] = [[np.zeros((0, rows.y.shape[1]))] for _ in rows.y]
+    touching: list[list[np.ndarray]] = [[np.zeros(0, int)] for _ in rows.y]
+    for one, part, first, size in zip(candidates, parts, firsts, sizes, strict=False):
+        for joint, columns in zip(one.joints, part, strict=True):
+            stored[joint].append(columns)
+            touching[joint].append(np.arange(first, first + size))
+    joint, Zi = [np.concatenate(t) for t in touching], [np.concatenate(z) for z in stored]
+    kept = np.full(firsts[-1], -1)  # column of `before`
+    for i, first, size in zip(place, firsts, sizes, strict=False):
+        if i is not None and before:
+            kept[first : first + size] = before.span[i][0] + np.arange(size)
+    ZX = _grown_product(rows.X, joint, Zi, kept, before.ZX if before else None)
+    ZXi = ZX if not len(rows.partner) else _grown_product(rows.Xi, joint, Zi, kept, before.ZXi if before else None)
+    return Bank(candidates, span, parts, joint, Zi, own, ZX, ZXi)
 
 
-def projection(rows: Rows, linear: Linear, stock: Bank) -> Float[np.ndarray, "P columns"]:
+def _parts(rows: Rows, one: Columns) -> list[Float[np.ndarray, "columns T"]]:
+    count = one.Z.shape[0] * one.Z.shape[1]
+    return [rows.instrument(one.Z[:, :, place].reshape(count, -1), joint) for place, joint in enumerate(one.joints)]
+
+
+def _grown_product(
+    X: Float[np.ndarray, "nv T P"],
+    joint: list[Int[np.ndarray, " columns"]],
+    Zi: list[Float[np.ndarray, "columns T"]],
+    kept: Int[np.ndarray, " width"],
+    known: Float[np.ndarray, "before P0"] | None,
+) -> Float[np.ndarray, "width P"]:
+    """Zi'X, of which the first columns are `known` where `kept` names a row of them."""
+    if known is None:
+        return _product(len(kept), joint, Zi, list(X))
+    P, same = known.shape[1], kept >= 0
+    out = np.zeros((len(kept), X.shape[2]))
+    out[:, P:] = _product(len(kept), joint, Zi, [x[:, P:] for x in X])
+    fresh = [~same[columns] for columns in joint]
+    left = [columns[new] for columns, new in zip(joint, fresh, strict=True)]
+    some = [z[new] for z, new in zip(Zi, fresh, strict=True)]
+    out[:, :P] = _product(len(kept), left, some, [x[:, :P] for x in X])
+    out[same, :P] = known[kept[same]]
+    return out
+
+
+def _product(
+    width: int,
+    joint: list[Int[np.ndarray, " columns"]],
+    Zi: list[Float[np.ndarray, "columns T"]],
+    rows: list[Float[np.ndarray, "T m"]],
+) -> Float[np.ndarray, "columns m"]:
+    out = np.zeros((width, rows[0].shape[1]))
+    for columns, own, right in zip(joint, Zi, rows, strict=True):
+        out[columns] += own @ right
+    return out
+
+
+def projection(linear: Linear, stock: Bank) -> Float[np.ndarray, "P columns"]:
     """H = A^-1 X'Zi: what the current model takes up of each candidate column."""
-    return linear.inverse @ stock.product(list(rows.X)).T
+    return linear.inverse @ stock.ZX.T
 
 
-def scores(rows: Rows, linear: Linear, stock: Bank, H: Float[np.ndarray, "P columns"]) -> list[Score]:
+def scores(linear: Linear, stock: Bank, H: Float[np.ndarray, "P columns"]) -> list[Score]:
     """Score s = Zi'r of every candidate and Q = s'V^-1 s, V its variance with the current model projected out."""
     s = stock.product([r[:, None] for r in linear.residual])[:, 0]
-    XiZi, moved = stock.product(list(rows.Xi)).T, linear.moment @ H
-    raw = _own_products(stock)
-    out = []
-    for (first, grid, k), ZiZi in zip(stock.span, raw, strict=True):
-        own = slice(first, first + grid * k)
-        h, xz, mh = (np.moveaxis(m[:, own].reshape(-1, grid, k), 1, 0) for m in (H, XiZi, moved))
-        mixed = np.matmul(np.swapaxes(xz, 1, 2), h)
-        V = ZiZi - mixed - np.swapaxes(mixed, 1, 2) + np.matmul(np.swapaxes(h, 1, 2), mh)
+    moved, out = (linear.moment @ H).T, list[Score | None]([None] * len(stock.span))
+    for members, columns in _by_width(stock.span):
+        h, xz, mh = H.T[columns], stock.ZXi[columns], moved[columns]
+        ZiZi = np.concatenate([stock.own[i] for i in members])
+        mixed = np.matmul(xz, np.swapaxes(h, 1, 2))
+        V = ZiZi - mixed - np.swapaxes(mixed, 1, 2) + np.matmul(h, np.swapaxes(mh, 1, 2))
         root, rank = _whitener(V, ZiZi)
-        Q = (np.matmul(root, s[own].reshape(grid, k, 1)) ** 2).sum((1, 2))
-        out.append(Score(root, rank, Q, wilson_hilferty(Q, rank)))
+        Q = (np.matmul(root, s[columns][..., None]) ** 2).sum((1, 2))
+        z, ends = wilson_hilferty(Q, rank), np.cumsum([stock.span[i][1] for i in members])
+        for i, end in zip(members, ends, strict=True):
+            own = slice(end - stock.span[i][1], end)
+            out[i] = Score(root[own], rank[own], Q[own], z[own])
+    return [score for score in out if score is not None]
+
+
+def largest(stock: Bank, found: list[Score], drawn: Float[np.ndarray, "draws columns"]) -> Float[np.ndarray, " draws"]:
+    """Largest z of all candidates that other scores of the same columns would have."""
+    highest = np.full(len(drawn), -np.inf)
+    for members, columns in _by_width(stock.span):
+        root = np.concatenate([found[i].root for i in members])
+        rank = np.concatenate([found[i].rank for i in members])
+        white = np.matmul(np.swapaxes(drawn[:, columns], 0, 1), np.swapaxes(root, 1, 2))
+        Q = (white**2).sum(-1)  # (points, draws); z grows with Q, so that the largest Q of a rank will do
+        for one in np.unique(rank):
+            highest = np.maximum(highest, wilson_hilferty(Q[rank == one].max(0), np.full(len(drawn), one)))
+    return highest
+
+
+def _by_width(span: list[tuple[int, int, int]]) -> list[tuple[list[int], Int[np.ndarray, "points k"]]]:
+    """Candidates of as many columns a point, and the columns of all their points."""
+    out = []
+    for k in sorted({width for _, _, width in span}):
+        members = [i for i, (_, _, width) in enumerate(span) if width == k]
+        columns = [np.arange(first, first + grid * k).reshape(grid, k) for first, grid, _ in (span[i] for i in members)]
+        out.append((members, np.concatenate(columns)))
     return out
 
 
@@ -190,21 +271,6 @@ def block_scores(
     model = sum(member.T @ (x * r[:, None]) for x, r in zip(rows.Xi, own, strict=True))
     total = stock.product([member * r[:, None] for r in linear.residual]).T - model @ H
     return np.concatenate([total, linear.pull[:, None] * H])
-
-
-def _own_products(stock: Bank) -> list[Float[np.ndarray, "grid k k"]]:
-    """Zi'Zi of each candidate at each grid point."""
-    out = [np.zeros((grid, k, k)) for _, grid, k in stock.span]
-    starts = np.array([first for first, _, _ in stock.span])
-    for columns, Zi in zip(stock.joint, stock.Zi, strict=True):
-        place = 0
-        while place < len(columns):
-            which = int(np.searchsorted(starts, columns[place], side="right")) - 1
-            _, grid, k = stock.span[which]
-            own = Zi[place : place + grid * k].reshape(grid, k, -1)
-            out[which] += np.matmul(own, np.swapaxes(own, 1, 2))
-            place += grid * k
-    return out
 
 
 def absorbed(rows: Rows, linear: Linear, columns: Columns) -> Float[np.ndarray, "grid"]:

@@ -49,7 +49,7 @@ def friction_width(problem: Problem, state: State, whitening: Float[np.ndarray, 
     position and time stand beside, so that the width does not make up for a cause that is not in yet.
     """
     rows = with_columns(whitened(problem, state, whitening), _smooth_columns(problem, state, whitening))
-    prior = state.prior.extended(rows.X.shape[2] - state.X.shape[2])
+    prior = state.prior.extended(rows.X.shape[2] - len(state.theta))
     X, y = rows.X.reshape(-1, rows.X.shape[-1]), rows.y.reshape(-1)
     G, b = X.T @ X + np.diag(prior.precision), X.T @ y + prior.precision * prior.mean
     width = np.array(problem.width)

@@ -75,9 +75,10 @@ def _from_rich_model(
     response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
     rows = whitened(problem, state, response)
     groups = catalogue(problem, solved(problem, state, fit(rows, state.prior).theta), rows, response, forbid)
-    blocks, prior = [rows.X], state.prior
+    blocks, prior, found = [rows.X], state.prior, None
     for _ in range(RICHNESS):
-        scores = screen(rows, fit(rows, prior), groups).scores
+        found = screen(rows, fit(rows, prior), groups, found)
+        scores = found.scores
         best = int(np.argmax([result.Q.max() for result in scores]))
         blocks.append(_full(rows, groups[best], int(np.argmax(scores[best].Q))))
         X = np.concatenate(blocks, axis=2)

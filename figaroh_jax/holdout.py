@@ -39,7 +39,7 @@ def held_out(problem: Problem, start: State, causes: list[Effect], whitening: Fl
 
 def predicted(problem: Problem, state: State) -> Float[np.ndarray, "n M nv"]:
     """Rows of the torque that the state predicts, as the sensors read it, in all recordings (N m or N)."""
-    return open_rows(problem, state.X @ state.theta, state.response(problem.records.omega))
+    return open_rows(problem, state.torque(state.theta), state.response(problem.records.omega))
 
 
 def traces(
@@ -81,7 +81,9 @@ def _share(problem: Problem, state: State, effect: Effect, place: list[int]) -> 
         return open_rows(problem, state.motion.total, response * (1 - 1 / own))
     if kind(effect) == "position":
         return open_rows(problem, torque_change(batched(effect), state.motion, problem.records)[0], response)
-    return open_rows(problem, state.X[:, :, place] @ state.theta[place], response)
+    return open_rows(
+        problem, state.torque(np.where(np.isin(np.arange(len(state.theta)), place), state.theta, 0.0)), response
+    )
 
 
 def _fold_error(problem: Problem, state: State, folds: Float[np.ndarray, "folds P"]) -> float:
@@ -90,5 +92,5 @@ def _fold_error(problem: Problem, state: State, folds: Float[np.ndarray, "folds 
     error = problem.torque * weight
     power = (error**2).sum()
     for k, theta in enumerate(folds):
-        error = error - open_rows(problem, state.X @ theta, response) * weight * (fold == k)[..., None]
+        error = error - open_rows(problem, state.torque(theta), response) * weight * (fold == k)[..., None]
     return float(np.sqrt((error**2).sum() / power))

@@ -110,10 +110,27 @@ class State:
 
     terms: tuple[Effect, ...]  # each with a leading axis of places
     sensors: tuple[Effect, ...]
-    X: Float[np.ndarray, "nN nv P"]
+    parts: tuple[Float[np.ndarray, "nN nv k"], ...]  # regressor: the rigid body's columns, then those of each term
     prior: Prior
     theta: Float[np.ndarray, " P"]
     motion: Motion  # as measured, with load and total torque of `theta`
+
+    @property
+    def rigid(self) -> Float[np.ndarray, "nN nv columns"]:
+        """Regressor of the rigid body."""
+        return self.parts[0]
+
+    def columns(self, first: int = 0) -> Float[np.ndarray, "nN nv k"]:
+        """Columns of the regressor from one on."""
+        starts = np.cumsum([0, *(part.shape[2] for part in self.parts)])
+        kept = [part[:, :, max(first - start, 0) :] for part, start in zip(self.parts, starts, strict=False)]
+        return np.concatenate([part for part in kept if part.shape[2]] or [self.rigid[:, :, :0]], axis=2)
+
+    def torque(self, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "nN nv"]:
+        """Torque at the samples with the coefficients `theta`, N m or N."""
+        split = np.split(theta, np.cumsum([part.shape[2] for part in self.parts])[:-1])
+        torques = [part.reshape(-1, part.shape[2]) @ own for part, own in zip(self.parts, split, strict=True)]
+        return np.sum(torques, axis=0).reshape(self.rigid.shape[:2])
 
     def response(self, omega: Float[Leaf, " F"]) -> Complex[np.ndarray, " F"] | Float[np.ndarray, " F"]:
         """Response of the torque sensor of all sensor effects together."""
@@ -132,7 +149,7 @@ def baseline(problem: Problem, names: Sequence[str], given: Sequence[Effect] = (
         effect = find(name)
         terms.append(effect(joints, **{p: np.zeros(len(joints)) for p in effect.parameters()}))
     rigid, theta, precision = _rigid(problem, problem.motion), *rigid_prior(problem.model, problem.trust)
-    state = State((), (), rigid, Prior(theta, precision), theta, problem.motion)
+    state = State((), (), (rigid,), Prior(theta, precision), theta, problem.motion)
     for term in [*terms, *(batched(effect) for effect in given)]:
         state = with_term(problem, state, term)
     return state
@@ -211,9 +228,8 @@ def with_term(problem: Problem, state: State, term: Effect) -> State:
         mean = np.array([float(getattr(term, name)[0]) for name in term.parameters()])
         precision = body_precision(mean)
     prior = Prior(np.append(state.prior.mean, mean), np.append(state.prior.precision, precision))
-    X = np.concatenate([state.X, own], axis=2)
     theta = np.append(state.theta, np.zeros(count))
-    return replace(state, terms=(*state.terms, term), X=X, prior=prior, theta=theta)
+    return replace(state, terms=(*state.terms, term), parts=(*state.parts, own), prior=prior, theta=theta)
 
 
 def extended_state(problem: Problem, state: State, effect: Effect) -> State:
@@ -224,7 +240,7 @@ def extended_state(problem: Problem, state: State, effect: Effect) -> State:
     if kind(effect) == "response":
         return grown
     moved = _rigid(problem, link_motion(problem, grown))
-    return replace(grown, X=np.concatenate([moved, state.X[:, :, moved.shape[2] :]], axis=2))
+    return replace(grown, parts=(moved, *state.parts[1:]))
 
 
 def link_motion(problem: Problem, state: State) -> Motion:
@@ -240,10 +256,9 @@ def link_motion(problem: Problem, state: State) -> Motion:
 
 def solved(problem: Problem, state: State, theta: Float[np.ndarray, " P"]) -> State:
     """The state with coefficients `theta`, and with the load and the torque that follow from them."""
-    links = 10 * len(problem.model.joints)
-    load = state.X[:, :, :links] @ theta[:links]
-    inertia = theta[:links].reshape(-1, 10)
-    new = (load, state.X @ theta, inertia)
+    links = state.rigid.shape[2]
+    load = (state.rigid.reshape(-1, links) @ theta[:links]).reshape(state.rigid.shape[:2])
+    new = (load, state.torque(theta), theta[:links].reshape(-1, 10))
     motion = eqx.tree_at(lambda m: (m.load, m.total, m.model.inertia), state.motion, new)
     return replace(state, theta=theta, motion=motion)
 
@@ -252,7 +267,7 @@ def unit_torques(problem: Problem, state: State, term: Effect) -> Units:
     """What a unit of each amplitude of a term (one leading axis) adds in the state, N m or N."""
     if isinstance(term, LinkEffect):
         links = np.asarray(term.at)[:, 0]
-        torque = np.stack([state.X[:, :, 10 * k : 10 * k + 10].transpose(2, 1, 0) for k in links])
+        torque = np.stack([state.rigid[:, :, 10 * k : 10 * k + 10].transpose(2, 1, 0) for k in links])
         return Units(torque, np.tile(np.arange(problem.model.nv), (len(links), 1)))
     family = _family(type(term))
     if family == "shaped":
@@ -310,7 +325,7 @@ def _term_columns(problem: Problem, state: State, term: Effect) -> Float[np.ndar
     columns = np.zeros((problem.model.nv, *given.torque.shape[:2], given.torque.shape[3]))
     for one, joints in enumerate(given.joints):
         np.add.at(columns[:, one], joints, np.swapaxes(given.torque[one], 0, 1))
-    return np.moveaxis(columns.reshape(problem.model.nv, -1, columns.shape[-1]), 2, 0)
+    return np.ascontiguousarray(np.moveaxis(columns.reshape(problem.model.nv, -1, columns.shape[-1]), 2, 0))
 
 
 def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], before: Rows | None = None) -> Rows:
@@ -319,10 +334,11 @@ def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"
     `before` are the rows of the state that this one extends by columns alone: only the new columns are filtered.
     """
     layout = problem.layout
-    y = filtered_rows(problem, problem.records.flat(problem.records.torque), whitening)
+    torque = problem.records.flat(problem.records.torque)
+    y = filtered_rows(problem, torque, whitening) if before is None else before.y
     known = 0 if before is None else before.X.shape[2]
     response = whitening * state.response(problem.records.omega)[:, None]
-    X = _filtered_columns(problem, state.X[:, :, known:], response)
+    X = _filtered_columns(problem, state.columns(known), response)
     Xi = X
     if layout.repeats:
         Xi = np.stack([instruments(x.T, layout.partner, p).T for x, p in zip(X, layout.paired, strict=True)])

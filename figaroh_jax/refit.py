@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Complex, Float
 
-from .design import Units, shapes, torque_change, unit_rows, units_and_slopes, with_shape
+from .design import Units, rigid_torque, shapes, torque_change, unit_rows, units_and_slopes, with_shape
 from .effect import Effect, Motion
 from .records import Records
 
@@ -22,7 +22,7 @@ __all__ = ["Whitened", "bounded_minimum", "profile", "refit", "refit_shift", "sh
 
 STEPS = 12
 RIDGE = 1e-9
-CLOSE = 1e-4  # of its bracket: how exactly the size of a shift is searched
+CLOSE = 1e-3  # of its bracket: how exactly the size of a shift is searched
 
 
 class Whitened(NamedTuple):
@@ -108,45 +108,40 @@ def refit(
     return with_shape(one, names, list(values[best])), known["Z"][best]
 
 
-def shift_profile(
-    effect: Effect,
-    sizes: Float[np.ndarray, " sizes"],
-    motion: Motion,
-    records: Records,
-    whitened: Whitened,
-) -> Float[np.ndarray, " sizes"]:
-    """J of a position sensor's effect (without leading axes) for several sizes, its one parameter."""
-    (name,) = effect.parameters()
-    batch = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], len(sizes), axis=0), effect)
-    change = torque_change(with_shape(batch, [name], [sizes]), motion, records)
-    joints = np.tile(np.arange(change.shape[2]), (len(sizes), 1))
-    rows = unit_rows(Units(np.swapaxes(change, 1, 2)[:, None], joints), records, whitened.whitening)
-    D = rows.reshape(len(sizes), -1)
+def shift_profile(change: Float[np.ndarray, "sizes nv T"], whitened: Whitened) -> Float[np.ndarray, " sizes"]:
+    """J of whitened rows of exact changes of the torque."""
+    D = change.reshape(len(change), -1)
     C = D @ whitened.X.reshape(D.shape[1], -1)
     return (D * (D - 2 * whitened.residual.reshape(-1))).sum(1) - ((C @ whitened.inverse) * C).sum(1)
 
 
-def refit_shift(effect: Effect, motion: Motion, records: Records, whitened: Whitened) -> Effect:
+def refit_shift(
+    effects: Effect, Z: Float[np.ndarray, "grid nv T"], motion: Motion, records: Records, whitened: Whitened
+) -> Effect:
     """The effect of a position sensor with the size that fits best, between the neighbours of the best grid point.
 
-    The profile of a shift has one valley. It is searched without its gradient: that of the inverse dynamics takes
-    longer to compile than all the values that a search in one number needs.
+    `effects` are the grid of its size, `Z` their columns. The profile of a shift has one valley. It is searched
+    without its gradient: that of the inverse dynamics takes longer to compile than all the values that a search in
+    one number needs.
     """
     from scipy.optimize import minimize_scalar  # slow to import
 
-    ((name, parameter),) = effect.parameters().items()
-    grid = np.array(sorted(parameter.grid))
-    best = int(np.argmin(shift_profile(effect, grid, motion, records, whitened)))
-    low = grid[best - 1] if best else parameter.lower
-    high = grid[best + 1] if best + 1 < len(grid) else parameter.upper
+    ((name, parameter),) = effects.parameters().items()
+    sizes, one = np.asarray(getattr(effects, name)), jax.tree.map(lambda x: np.asarray(x)[:1], effects)
+    best = sizes[np.argmin(shift_profile(Z * sizes[:, None, None], whitened))]
+    edges = np.array([parameter.lower, *np.sort(sizes), parameter.upper])
+    low, high = edges[edges < best].max(initial=parameter.lower), edges[edges > best].min(initial=parameter.upper)
+    as_read = rigid_torque(motion.model, motion.position, motion.velocity, motion.acceleration)
+    joints = np.arange(as_read.shape[1])[None]
 
     def value(size: float) -> float:
-        return float(shift_profile(effect, np.array([size]), motion, records, whitened)[0])
+        change = torque_change(with_shape(one, [name], [np.array([size])]), motion, records, as_read)
+        rows = unit_rows(Units(np.swapaxes(change, 1, 2)[:, None], joints), records, whitened.whitening)
+        return float(shift_profile(rows, whitened)[0])
 
-    options = {"xatol": CLOSE * (high - low), "maxiter": 3 * STEPS}
-    found = minimize_scalar(value, bounds=(low, high), method="bounded", options=options)
-    size = np.float64(found.x)  # pyright: ignore[reportAttributeAccessIssue]
-    return with_shape(effect, [name], [size])
+    options = {"xatol": CLOSE * (high - low), "maxiter": 2 * STEPS}
+    found: Any = minimize_scalar(value, bounds=(low, high), method="bounded", options=options)
+    return with_shape(jax.tree.map(lambda x: x[0], one), [name], [np.float64(found.x)])
 
 
 def _profiles(

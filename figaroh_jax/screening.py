@@ -15,7 +15,7 @@ from jaxtyping import Float
 from .design import flattened, unit_rows, units
 from .effect import Effect
 from .effects import CATALOGUE, LinkEffect
-from .evidence import Bank, Columns, Linear, Rows, Score, bank, block_scores, other_scores, projection, scores
+from .evidence import Bank, Columns, Linear, Rows, Score, bank, block_scores, largest, other_scores, projection, scores
 from .model import RobotModel
 from .noise import Spectrum
 from .problem import Problem, State
@@ -78,10 +78,9 @@ def catalogue(
             title = Name(name, place_names(problem.model, batches[name], tuple(at)))
             if (name, tuple(at)) in taken:
                 continue
-            if isinstance(batches[name], LinkEffect):
+            columns = fresh[name][place] if name in fresh else old.get(title)
+            if columns is None and isinstance(batches[name], LinkEffect):
                 columns = _link_columns(rows, at[0], problem.model)
-            else:
-                columns = fresh[name][place] if name in fresh else old.get(title)
             if columns is not None and np.abs(columns.Z).max() > 0:
                 one = jax.tree.map(lambda x, p=place: np.asarray(x)[p], batches[name])
                 groups.append(Group(title, one, columns))
@@ -115,11 +114,14 @@ def place_names(model: RobotModel, effect: Effect | type[Effect], at: tuple[int,
     return tuple(names[i] for i in at)
 
 
-def screen(rows: Rows, linear: Linear, groups: list[Group]) -> Screen:
-    """Scores of all groups with the current model projected out."""
-    stock = bank(rows, [group.columns for group in groups])
-    H = projection(rows, linear, stock)
-    return Screen(groups, scores(rows, linear, stock, H), stock, H)
+def screen(rows: Rows, linear: Linear, groups: list[Group], before: Screen | None = None) -> Screen:
+    """Scores of all groups with the current model projected out.
+
+    `before` is the screen of a model that this one has only added columns to: what is the same is taken from there.
+    """
+    stock = bank(rows, [group.columns for group in groups], before.stock if before else None)
+    H = projection(linear, stock)
+    return Screen(groups, scores(linear, stock, H), stock, H)
 
 
 def family_p(
@@ -140,23 +142,16 @@ def family_p(
     highest = max(float(result.z.max()) for result in found.scores)
     parts = block_scores(rows, linear, found.stock, found.H)
     signs = generator.choice([-1.0, 1.0], (draws, len(parts)))
-    nulls = [_largest(found, signs @ parts)]
+    nulls = [largest(found.stock, found.scores, signs @ parts)]
     prior = np.sqrt(np.maximum(np.diag(linear.moment) - (rows.Xi**2).sum((0, 1)), 0))
     drawn = []
     for _ in range(draws // CHUNK):
         noise = draw_noise(problem, spectrum, whitening, CHUNK, generator)
         pulls = prior * generator.standard_normal((CHUNK, len(prior)))
-        drawn.append(_largest(found, other_scores(rows, found.stock, found.H, noise) + pulls @ found.H))
+        again = other_scores(rows, found.stock, found.H, noise) + pulls @ found.H
+        drawn.append(largest(found.stock, found.scores, again))
     nulls.append(np.concatenate(drawn))
     return max((1 + np.sum(null >= highest)) / (draws + 1) for null in nulls)
-
-
-def _largest(found: Screen, drawn: Float[np.ndarray, "draws columns"]) -> Float[np.ndarray, " draws"]:
-    """Largest z of the whole catalogue in each draw."""
-    highest = np.full(len(drawn), -np.inf)
-    for (first, grid, k), result in zip(found.stock.span, found.scores, strict=True):
-        highest = np.maximum(highest, result.largest(drawn[:, first : first + grid * k]))
-    return highest
 
 
 def draw_noise(
@@ -172,10 +167,14 @@ def draw_noise(
     frequency = np.fft.rfftfreq(count, 1 / float(records.rate))
     known = np.asarray(records.omega) / (2 * np.pi)
     response = [np.interp(frequency, known, np.asarray(records.low_pass) * whitening[:, j]) for j in range(nv)]
-    shape = np.sqrt(spectrum.redrawn(generator).power(frequency)) * np.stack(response, axis=1)
-    white = np.fft.rfft(generator.standard_normal((draws, n, count, nv)), axis=2)
-    rows = np.fft.irfft(white * shape, count, axis=2) * records.weight
-    return np.moveaxis(rows.reshape(draws, -1, nv), 1, 2)
+    shape = np.sqrt(spectrum.redrawn(generator).power(frequency)).T * np.stack(response)
+    # what `rfft` makes of white noise: equal real and imaginary parts, but for the two ends, which are real
+    white = generator.standard_normal((draws, nv, n, len(frequency), 2)).view(complex)[..., 0] * np.sqrt(count / 2)
+    white[..., 0] *= np.sqrt(2)
+    if count % 2 == 0:
+        white[..., -1] *= np.sqrt(2)
+    rows = np.fft.irfft(white * shape[:, None], count, axis=-1)
+    return (rows * np.moveaxis(np.asarray(records.weight), 2, 0)).reshape(draws, nv, -1)
 
 
 def _link_columns(rows: Rows, link: int, model: RobotModel) -> Columns:

@@ -9,7 +9,20 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from .comparison import FoldSums, Hypothesis, Verdicts, fold_sums, grown_sums, judge, overlap, shares_of_wins, t_value
+from .comparison import (
+    FoldSums,
+    Ground,
+    Hypothesis,
+    Verdicts,
+    fold_sums,
+    ground,
+    grown_sums,
+    judge,
+    judge_grown,
+    overlap,
+    shares_of_wins,
+    t_value,
+)
 from .design import kind, shapes, with_shape
 from .effect import Effect
 from .effects import Payload
@@ -41,7 +54,6 @@ class Contender:
 
     name: Name
     effect: Effect
-    hypothesis: Hypothesis
     verdicts: Verdicts
 
 
@@ -77,8 +89,8 @@ def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], 
     """
     shared = before.rows if before is not None and len(before.state.sensors) == len(state.sensors) else None
     rows = whitened(problem, state, whitening, shared)
-    linear = fit(rows, state.prior)
-    folded = fold_sums(rows, rows.X)
+    folded = fold_sums(rows, rows.X) if before is None or shared is None else grown_sums(rows, before.folded, rows.X)
+    linear = fit(rows, state.prior, folded.gram.sum(0))
     verdicts = judge(rows, Hypothesis(rows.X, state.prior), folded)
     return Step(solved(problem, state, verdicts.theta), rows, linear, verdicts, folded)
 
@@ -87,6 +99,7 @@ def contend(
     problem: Problem,
     step: Step,
     whitening: Float[np.ndarray, "F nv"],
+    base: Ground,
     ready: Whitened,
     group: Group,
     order: np.ndarray,
@@ -105,24 +118,25 @@ def contend(
     else:
         effect = jax.tree.map(lambda x: x[starts[0]], group.effect)
         Z = group.columns.Z[starts[0]]
-    rows = step.rows
-    full = np.zeros((*rows.y.shape, Z.shape[0]))
-    full[list(group.columns.joints)] = np.moveaxis(Z, 0, 2)
+    joints = list(group.columns.joints)
     if isinstance(effect, Payload):
-        both = np.concatenate([rows.X, full], axis=2)
-        free = judge(rows, Hypothesis(both, step.state.prior.extended(10)), grown_sums(rows, step.folded, both))
-        body = physical_body(free.theta[-10:], _information(rows, step, full))
-        hypothesis = Hypothesis(rows.X, step.state.prior, full @ body)
-        effect = with_shape(effect, list(effect.parameters()), list(body))
+        effect, verdicts = _body_verdicts(step, base, effect, Z)
     else:
-        X = np.concatenate([rows.X, full], axis=2)
-        hypothesis = Hypothesis(X, step.state.prior.extended(Z.shape[0]))
-    known = None if np.ndim(hypothesis.fixed) else grown_sums(rows, step.folded, hypothesis.X)
-    verdicts = judge(rows, hypothesis, known)
-    if len(verdicts.theta) > rows.X.shape[2]:
+        verdicts = judge_grown(step.rows, base, joints, Z)
         names = [n for n, p in effect.parameters().items() if p.linear]
         effect = with_shape(effect, names, list(verdicts.theta[-len(names) :]))
-    return Contender(group.name, effect, hypothesis, verdicts)
+    return Contender(group.name, effect, verdicts)
+
+
+def _body_verdicts(
+    step: Step, base: Ground, effect: Payload, Z: Float[np.ndarray, "10 nv T"]
+) -> tuple[Payload, Verdicts]:
+    """A payload with the parameters of the nearest body that can exist."""
+    rows, full = step.rows, np.moveaxis(Z, 0, 2)
+    free = judge_grown(rows, base, range(len(rows.y)), Z)
+    body = physical_body(free.theta[-10:], _information(rows, base, full))
+    verdicts = judge(rows, Hypothesis(rows.X, step.state.prior, full @ body))
+    return with_shape(effect, list(effect.parameters()), list(body)), verdicts
 
 
 def _position_contender(
@@ -132,27 +146,25 @@ def _position_contender(
 
     The load is that of the motion as measured: taken again at the true motion it holds four derivatives of noise.
     """
-    effect = jax.tree.map(lambda x: x[0], group.effect)
-    effect = refit_shift(effect, step.state.motion, problem.records, ready)
+    Z = group.columns.Z[:, 0]
+    effect = refit_shift(group.effect, Z, step.state.motion, problem.records, ready)
     here = stand(problem, extended_state(problem, step.state, effect), whitening)
-    return Contender(group.name, effect, Hypothesis(here.rows.X, here.state.prior), here.verdicts)
+    return Contender(group.name, effect, here.verdicts)
 
 
-def _information(rows: Rows, step: Step, Z: Float[np.ndarray, "nv T k"]) -> Float[np.ndarray, "k k"]:
+def _information(rows: Rows, base: Ground, Z: Float[np.ndarray, "nv T k"]) -> Float[np.ndarray, "k k"]:
     """Z'Z with the current model projected out: the precision of the columns' coefficients."""
     tall, X = Z.reshape(-1, Z.shape[2]), rows.X.reshape(-1, rows.X.shape[2])
     cross = X.T @ tall
-    return tall.T @ tall - cross.T @ np.linalg.solve(X.T @ X + np.diag(step.state.prior.precision + 1e-12), cross)
+    return tall.T @ tall - cross.T @ base.inverse[-1] @ cross
 
 
-def _for_refit(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"]) -> Whitened:
+def _for_refit(problem: Problem, step: Step, base: Ground, whitening: Float[np.ndarray, "F nv"]) -> Whitened:
     """What the refits of a step need."""
     n, _, count, nv = problem.records.shape
-    A = step.folded.gram.sum(0) + np.diag(step.state.prior.precision)
-    inverse = np.linalg.inv(A + 1e-12 * np.diag(np.maximum(np.diag(A), 1e-12)))
     residual = step.verdicts.residual.reshape(nv, n, count)
     response = whitening * step.state.response(problem.records.omega)[:, None]
-    return Whitened(residual, step.rows.X.reshape(nv, n, count, -1), inverse, response)
+    return Whitened(residual, step.rows.X.reshape(nv, n, count, -1), base.inverse[-1], response)
 
 
 def _response_contender(
@@ -174,7 +186,7 @@ def _response_contender(
             break
     state = extended_state(problem, step.state, effect)
     here = stand(problem, state, whitening)
-    return Contender(group.name, effect, Hypothesis(here.rows.X, state.prior), here.verdicts)
+    return Contender(group.name, effect, here.verdicts)
 
 
 def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray]]:
@@ -205,11 +217,11 @@ def find_causes(
     """
     generator = generator or np.random.default_rng(0)
     step, found = stand(problem, state, whitening), []
-    first_p, p, first_screen, groups = 1.0, 1.0, None, None
+    first_p, p, first_screen, screened, groups = 1.0, 1.0, None, None, None
     while len(found) < MOST:
         progress("screening the catalogue", len(found) / MOST)
         groups = catalogue(problem, step.state, step.rows, whitening, forbid, groups)
-        screened = screen(step.rows, step.linear, groups)
+        screened = screen(step.rows, step.linear, groups, screened)
         draws = DRAWS if first_screen is None else LATER
         p = family_p(problem, step.rows, step.linear, screened, spectrum, whitening, generator, draws)
         if first_screen is None:
@@ -221,7 +233,7 @@ def find_causes(
         if accepted is None:
             break
         step = stand(problem, extended_state(problem, step.state, accepted.effect), whitening, step)
-        groups = groups if kind(accepted.effect) == "columns" else None
+        groups, screened = (groups, screened) if kind(accepted.effect) == "columns" else (None, None)
         found.append(accepted)
     assert first_screen is not None  # the loop has run at least once
     return step, found, (first_p, p), first_screen
@@ -267,8 +279,9 @@ def _accept(
     before: list[Found],
 ) -> Found | None:
     """The cause that predicts best where it was not fitted, if it passes the gates; else nothing."""
-    ready = _for_refit(problem, step, whitening)
-    contenders = [contend(problem, step, whitening, ready, *entry) for entry in shortlist(step, screened)]
+    base = ground(step.rows, step.verdicts, step.state.prior, step.folded)
+    ready = _for_refit(problem, step, base, whitening)
+    contenders = [contend(problem, step, whitening, base, ready, *entry) for entry in shortlist(step, screened)]
     contenders = [c for c in contenders if _exists(problem, c.effect)]
     contenders.sort(key=lambda c: c.verdicts.heldout)
     least = SMALLEST * (before[0].cost[0] - before[0].cost[1]) if before else 0.0

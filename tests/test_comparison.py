@@ -7,7 +7,17 @@ import pytest
 from scipy.stats import ttest_1samp
 from synthetic import made_rows
 
-from figaroh_jax.comparison import Hypothesis, fold_sums, grown_sums, judge, overlap, shares_of_wins, t_value
+from figaroh_jax.comparison import (
+    Hypothesis,
+    fold_sums,
+    ground,
+    grown_sums,
+    judge,
+    judge_grown,
+    overlap,
+    shares_of_wins,
+    t_value,
+)
 from figaroh_jax.evidence import Prior, Rows
 
 NV, COUNT, WIDTH, BLOCKS, FOLDS = 2, 80, 3, 9, 4
@@ -60,6 +70,18 @@ def test_sums_grown_by_columns_are_the_sums_of_all_columns(rows: Rows) -> None:
     grown, whole = grown_sums(rows, fold_sums(rows, rows.X), both), fold_sums(rows, both)
     for one, other in zip(grown, whole, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("joints", [(1,), (0, 1)])
+def test_a_hypothesis_grown_by_columns_is_judged_as_one_of_all_columns(rows: Rows, joints: tuple[int, ...]) -> None:
+    more = np.random.default_rng(2).normal(size=(2, len(joints), COUNT)) * (rows.block >= 0)
+    full = np.zeros((NV, COUNT, 2))
+    full[list(joints)] = np.moveaxis(more, 0, 2)
+    known = fold_sums(rows, rows.X)
+    base = ground(rows, judge(rows, Hypothesis(rows.X, PRIOR), known), PRIOR, known)
+    whole = judge(rows, Hypothesis(np.concatenate([rows.X, full], axis=2), PRIOR.extended(2)))
+    for one, other in zip(judge_grown(rows, base, joints, more), whole, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)
 
 
 def test_sums_over_the_folds_are_the_normal_equations_of_all_rows(rows: Rows) -> None:

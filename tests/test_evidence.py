@@ -69,7 +69,7 @@ def test_a_column_that_nothing_excites_keeps_its_prior_value() -> None:
 def test_score_is_the_drop_in_penalised_squares_when_the_columns_are_added(k: int, joints: tuple[int, ...]) -> None:
     rows, columns = random_rows(), random_columns(k, joints)
     linear, stock = evidence.fit(rows, PRIOR), evidence.bank(rows, [random_columns(2, (1,), seed=5), columns])
-    found = evidence.scores(rows, linear, stock, evidence.projection(rows, linear, stock))[1]
+    found = evidence.scores(linear, stock, evidence.projection(linear, stock))[1]
     _, before = least_squares(rows.y, rows.X, PRIOR)
     drops = [before - least_squares(rows.y, rows.X, PRIOR, spread(columns, g))[1] for g in range(2)]
     np.testing.assert_allclose(found.Q, drops, rtol=0, atol=1e-9)
@@ -80,7 +80,7 @@ def test_a_candidate_inside_the_model_scores_nothing() -> None:
     rows, flat = random_rows(), Prior(np.zeros(WIDTH), np.zeros(WIDTH))
     inside = Columns((0, 1), (rows.X @ [1.0, 2.0, -1.0, 0.5])[None, None])
     linear, stock = evidence.fit(rows, flat), evidence.bank(rows, [inside])
-    (found,) = evidence.scores(rows, linear, stock, evidence.projection(rows, linear, stock))
+    (found,) = evidence.scores(linear, stock, evidence.projection(linear, stock))
     assert found.rank[0] == 0
     np.testing.assert_allclose(evidence.absorbed(rows, linear, inside), 1.0, rtol=0, atol=1e-9)
 
@@ -103,7 +103,7 @@ def test_score_is_chi_square_when_there_is_only_noise(k: int) -> None:
         theta = prior.mean + rng.standard_normal(WIDTH) / np.sqrt(prior.precision)
         drawn = rows._replace(y=rows.X @ theta + rng.standard_normal(rows.y.shape))
         linear, stock = evidence.fit(drawn, prior), evidence.bank(drawn, [columns])
-        Q.append(evidence.scores(drawn, linear, stock, evidence.projection(drawn, linear, stock))[0].Q[0])
+        Q.append(evidence.scores(linear, stock, evidence.projection(linear, stock))[0].Q[0])
     assert abs(np.mean(Q) - k) < 4 * np.sqrt(2 * k / len(Q))
     assert kstest(Q, chi2(k).cdf).pvalue > 1e-4  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -117,7 +117,7 @@ def test_score_with_noisy_instruments_is_chi_square_when_there_is_only_noise() -
     for _ in range(600):
         rows = made_rows(rng.standard_normal((1, count)), X[None], repeats=True)
         linear, stock = evidence.fit(rows, flat), evidence.bank(rows, [candidate])
-        Q.append(evidence.scores(rows, linear, stock, evidence.projection(rows, linear, stock))[0].Q[0])
+        Q.append(evidence.scores(linear, stock, evidence.projection(linear, stock))[0].Q[0])
     assert abs(np.mean(Q) - 3) < 4 * np.sqrt(2 * 3 / len(Q))
 
 
@@ -154,7 +154,7 @@ def test_noisy_columns_raise_the_score_of_what_looks_alike_only_without_instrume
         rows, candidate = noisy_repeats(rng)
         for name, one in (("plain", plain(rows)), ("instruments", rows)):
             linear, stock = evidence.fit(one, flat), evidence.bank(one, [candidate])
-            Q[name].append(evidence.scores(one, linear, stock, evidence.projection(one, linear, stock))[0].Q[0])
+            Q[name].append(evidence.scores(linear, stock, evidence.projection(linear, stock))[0].Q[0])
     # noise 0.01 of the power: the score of a column with cosine 0.9 grows by 20000 (0.9 0.01)^2 / (1 - 0.9^2)
     assert np.mean(Q["plain"]) == pytest.approx(1 + 20000 * 0.009**2 / 0.19, rel=0, abs=3.0)
     assert abs(np.mean(Q["instruments"]) - 1) < 4 * np.sqrt(2 / 80)
@@ -172,7 +172,7 @@ def test_instruments_are_the_mean_over_the_other_repeats_and_zero_without_one() 
 def test_block_scores_sum_to_the_score(prior: Prior) -> None:
     rows, columns = random_rows(), [random_columns(3), random_columns(1, (1,), seed=7)]
     linear, stock = evidence.fit(rows, prior), evidence.bank(rows, columns)
-    parts = evidence.block_scores(rows, linear, stock, evidence.projection(rows, linear, stock))
+    parts = evidence.block_scores(rows, linear, stock, evidence.projection(linear, stock))
     expected = np.concatenate([own_scores(rows, linear, one) for one in columns])
     assert len(parts) == rows.block.max() + 1 + WIDTH
     np.testing.assert_allclose(parts.sum(0), expected, rtol=0, atol=1e-9)
@@ -181,13 +181,13 @@ def test_block_scores_sum_to_the_score(prior: Prior) -> None:
 def test_scores_of_the_residual_drawn_again_are_the_scores() -> None:
     rows, columns = random_rows(), random_columns(3)
     linear, stock = evidence.fit(rows, PRIOR), evidence.bank(rows, [columns])
-    H = evidence.projection(rows, linear, stock)
+    H = evidence.projection(linear, stock)
     drawn = np.stack([linear.residual, 0 * linear.residual])
     again = evidence.other_scores(rows, stock, H, drawn) + linear.pull @ H * [[1.0], [0.0]]
     np.testing.assert_allclose(again[0], own_scores(rows, linear, columns), rtol=0, atol=1e-9)
     np.testing.assert_array_equal(again[1], 0.0)
-    (found,) = evidence.scores(rows, linear, stock, H)
-    np.testing.assert_allclose(found.largest(again)[0], found.z.max(), rtol=0, atol=1e-9)
+    found = evidence.scores(linear, stock, H)
+    np.testing.assert_allclose(evidence.largest(stock, found, again)[0], found[0].z.max(), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("k", "error"), [(1, 0.2), (2, 0.12), (3, 0.09), (10, 0.04)])

@@ -13,7 +13,16 @@ import robots
 from jaxtyping import Array
 from synthetic import made_signals
 
-from figaroh_jax.design import Units, shapes, torque_change, unit_rows, units_and_slopes, with_shape
+from figaroh_jax.design import (
+    Units,
+    candidates,
+    flattened,
+    shapes,
+    torque_change,
+    unit_rows,
+    units_and_slopes,
+    with_shape,
+)
 from figaroh_jax.dynamics import inverse_dynamics
 from figaroh_jax.effect import Effect, Motion
 from figaroh_jax.effects import find
@@ -143,13 +152,21 @@ def less_the_model(rows: Whitened, residual: np.ndarray) -> Whitened:
 @pytest.mark.parametrize("truth", [5e-5, 3e-4, 2.4e-3])
 def test_the_compliance_that_made_noiseless_rows_is_found(motion: Motion, records: Records, truth: float) -> None:
     made, rows = at_joint("joint_elasticity", joint=1, compliance=truth), whitened(records)
-    change = torque_change(batch_of(made, 1), motion, records)
-    residual = unit_rows(Units(np.swapaxes(change, 1, 2)[:, None], np.array([[0, 1]])), records, rows.whitening)[0, 0]
+    effects = flattened(batch_of(candidates(find("joint_elasticity"), motion.model), 1))
+    effects = jax.tree.map(lambda x: x[1], effects)
+
+    def changes(effects: Effect) -> np.ndarray:
+        change = np.swapaxes(torque_change(effects, motion, records), 1, 2)[:, None]
+        joints = np.tile([0, 1], (len(change), 1))
+        return unit_rows(Units(change, joints), records, rows.whitening).reshape(len(change), 2, -1)
+
+    residual = changes(batch_of(made, 1))[0].reshape(rows.residual.shape)
     rows = less_the_model(rows, residual)
-    found = refit_shift(made, motion, records, rows)
-    np.testing.assert_allclose(found.compliance, truth, rtol=2e-3, atol=0)  # pyright: ignore
-    sizes = truth * np.array([0.99, 1.0, 1.01])
-    low, best, high = shift_profile(made, sizes, motion, records, rows)
+    sizes = np.asarray(effects.compliance)  # pyright: ignore
+    found = refit_shift(effects, changes(effects) / sizes[:, None, None], motion, records, rows)
+    np.testing.assert_allclose(found.compliance, truth, rtol=3e-3, atol=0)  # pyright: ignore
+    tried = with_shape(batch_of(made, 3), ["compliance"], [truth * np.array([0.99, 1.0, 1.01])])
+    low, best, high = shift_profile(changes(tried), rows)
     assert best < low and best < high
 
 
