@@ -140,33 +140,41 @@ def bank(rows: Rows, candidates: list[Columns], before: Bank | None = None) -> B
     same object, only the products with the new columns are computed.
     """
     old = {id(one): place for place, one in enumerate(before.candidates)} if before else {}
-    place = [old.get(id(one)) for one in candidates]
-    parts = [
-        _parts(rows, c) if i is None or not before else before.parts[i] for i, c in zip(place, candidates, strict=True)
-    ]
+    place = [old.get(id(one), -1) for one in candidates]
+    parts = [before.parts[i] if before and i >= 0 else _parts(rows, c) for i, c in zip(place, candidates, strict=True)]
     own = [
-        sum(np.matmul(z, np.swapaxes(z, 1, 2)) for z in (x.reshape(*c.Z.shape[:2], -1) for x in part))
-        if i is None or not before
-        else before.own[i]
+        before.own[i] if before and i >= 0 else _own_product(c, part)
         for i, c, part in zip(place, candidates, parts, strict=True)
     ]
-    sizes = [c.Z.shape[0] * c.Z.shape[1] for c in candidates]
-    firsts = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
-    span = [(int(first), *c.Z.shape[:2]) for first, c in zip(firsts[:-1], candidates, strict=True)]
-    stored: list[list[np.ndarray]] = [[np.zeros((0, rows.y.shape[1]))] for _ in rows.y]
-    touching: list[list[np.ndarray]] = [[np.zeros(0, int)] for _ in rows.y]
-    for one, part, first, size in zip(candidates, parts, firsts, sizes, strict=False):
-        for joint, columns in zip(one.joints, part, strict=True):
-            stored[joint].append(columns)
-            touching[joint].append(np.arange(first, first + size))
-    joint, Zi = [np.concatenate(t) for t in touching], [np.concatenate(z) for z in stored]
-    kept = np.full(firsts[-1], -1)  # column of `before`
-    for i, first, size in zip(place, firsts, sizes, strict=False):
-        if i is not None and before:
+    sizes = np.array([c.Z.shape[0] * c.Z.shape[1] for c in candidates], int)
+    firsts = np.cumsum(sizes) - sizes
+    span = [(int(first), *c.Z.shape[:2]) for first, c in zip(firsts, candidates, strict=True)]
+    joint, Zi = _by_joint(rows, candidates, parts, firsts)
+    kept = np.full(int(sizes.sum()), -1)  # column of `before`
+    for i, first, size in zip(place, firsts, sizes, strict=True):
+        if before and i >= 0:
             kept[first : first + size] = before.span[i][0] + np.arange(size)
     ZX = _grown_product(rows.X, joint, Zi, kept, before.ZX if before else None)
-    ZXi = ZX if not len(rows.partner) else _grown_product(rows.Xi, joint, Zi, kept, before.ZXi if before else None)
+    ZXi = _grown_product(rows.Xi, joint, Zi, kept, before.ZXi if before else None) if len(rows.partner) else ZX
     return Bank(candidates, span, parts, joint, Zi, own, ZX, ZXi)
+
+
+def _by_joint(
+    rows: Rows, candidates: list[Columns], parts: list[list[np.ndarray]], firsts: Int[np.ndarray, " candidates"]
+) -> tuple[list[Int[np.ndarray, " columns"]], list[Float[np.ndarray, "columns T"]]]:
+    """Columns that touch each joint, and their instruments there."""
+    stored: list[list[np.ndarray]] = [[np.zeros((0, rows.y.shape[1]))] for _ in rows.y]
+    touching: list[list[np.ndarray]] = [[np.zeros(0, int)] for _ in rows.y]
+    for one, part, first in zip(candidates, parts, firsts, strict=True):
+        for joint, columns in zip(one.joints, part, strict=True):
+            stored[joint].append(columns)
+            touching[joint].append(np.arange(first, first + len(columns)))
+    return [np.concatenate(t) for t in touching], [np.concatenate(z) for z in stored]
+
+
+def _own_product(one: Columns, part: list[Float[np.ndarray, "columns T"]]) -> Float[np.ndarray, "grid k k"]:
+    shaped = [x.reshape(*one.Z.shape[:2], -1) for x in part]
+    return np.sum([np.matmul(x, np.swapaxes(x, 1, 2)) for x in shaped], axis=0)
 
 
 def _parts(rows: Rows, one: Columns) -> list[Float[np.ndarray, "columns T"]]:
