@@ -13,14 +13,14 @@ from jaxtyping import Float
 
 from .results import Cause, Diagnosis, Estimate, Name
 
-__all__ = ["answer", "to_json", "write_predictions"]
+__all__ = ["answer", "cause", "to_json", "write_predictions"]
 
 
 def answer(diagnosis: Diagnosis) -> dict[str, Any]:
     """The diagnosis as the dictionary of `answer.json`; a number that is not finite becomes None (JSON null)."""
     return {
         "verdict": diagnosis.verdict,
-        "causes": [_cause(cause) for cause in diagnosis.causes],
+        "causes": [cause(found) for found in diagnosis.causes],
         "p_value": _number(diagnosis.p_value),
         "residual": {
             "before": [_number(value) for value in diagnosis.before],
@@ -58,14 +58,15 @@ def write_predictions(
         np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
 
 
-def _cause(cause: Cause) -> dict[str, Any]:
-    gain = cause.gain
+def cause(found: Cause) -> dict[str, Any]:
+    """A cause as it stands in `answer.json`."""
+    gain = found.gain
     return {
-        **_name(cause.name),
-        "parameters": {name: _estimate(estimate) for name, estimate in cause.parameters.items()},
-        "confidence": _number(cause.confidence),
+        **_name(found.name),
+        "parameters": {name: _estimate(estimate) for name, estimate in found.parameters.items()},
+        "confidence": _number(found.confidence),
         "gain": {"holdout_before": _number(gain.before), "holdout_after": _number(gain.after), "unit": gain.unit},
-        "ambiguous_with": [_name(other) for other in cause.ambiguous_with],
+        "ambiguous_with": [_name(other) for other in found.ambiguous_with],
     }
 
 

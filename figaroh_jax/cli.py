@@ -24,6 +24,10 @@ _THREADS = {
     "OMP_NUM_THREADS": "1",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
 }
+_TASKS = {  # commands that take a task file
+    "diagnose": "the main job, on a task file of yours",
+    "calibrate": "fit the kinematics from measured poses or points",
+}
 _DESCRIPTION = "Name what a robot's simulation gets wrong, extend the model with it and measure the gain."
 
 
@@ -46,18 +50,19 @@ def _run(args: argparse.Namespace) -> int:
         os.environ.setdefault(name, value)
     _choose_backend(args.backend)
     _set_up_jax(cache=not args.no_cache)
-    from . import answer, terminal
-    from .runs import REPORT, diagnose_file
+    from . import terminal
+    from .runs import JOBS, REPORT
 
+    job = JOBS["diagnose" if args.command == "demo" else args.command]
     with resources.as_file(resources.files("figaroh_jax") / "demo") as demo:
         task_file = args.task or demo / "task.yaml"
-        out = args.out or Path(f"{args.task.stem if args.task else 'demo'}_diagnosis")
+        out = args.out or Path(f"{args.task.stem if args.task else 'demo'}_{job.noun}")
         with terminal.Progress(quiet=args.quiet) as progress:
-            diagnosis = diagnose_file(task_file, out, progress)
+            found = job.run(task_file, out, progress)
     if args.json:
-        sys.stdout.write(answer.to_json(diagnosis))
+        sys.stdout.write(job.to_json(found))
     else:
-        terminal.show(diagnosis, diagnosis.model.robot.name)
+        job.show(found)
         print(f"Report: {out / REPORT}")
     return 0
 
@@ -83,8 +88,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="figaroh-jax", description=_DESCRIPTION)
     parser.add_argument("--version", action="version", version=_version())
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    diagnose = commands.add_parser("diagnose", parents=[common], help="the main job, on a task file of yours")
-    diagnose.add_argument("task", type=Path, metavar="TASK.yaml")
+    for name, explained in _TASKS.items():
+        commands.add_parser(name, parents=[common], help=explained).add_argument("task", type=Path, metavar="TASK.yaml")
     demo = commands.add_parser("demo", parents=[common], help="the main job on an embedded recording, no file needed")
     demo.set_defaults(task=None)
     return parser
@@ -102,7 +107,7 @@ def _choose_backend(name: str) -> None:
     from .registry import backend
 
     backend(name)  # an unknown one is refused there, with the list of those installed
-    raise InputError(f"--backend {name}: a diagnosis needs gradients, which only the backend 'native' gives")
+    raise InputError(f"--backend {name}: this job needs gradients, which only the backend 'native' gives")
 
 
 def _set_up_jax(cache: bool) -> None:

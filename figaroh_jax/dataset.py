@@ -21,7 +21,7 @@ from .tables import Table, read_table
 if TYPE_CHECKING:
     from .config import Load, RecordingEntry, Task
 
-__all__ = ["Recording", "read_recordings"]
+__all__ = ["Drive", "Recording", "joint_columns", "read_recordings", "read_time", "unit_factors"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ def read_recordings(task: Task, model: RobotModel) -> tuple[Recording, ...]:
     wrong shapes, time that does not increase, names that the model does not know, a fit recording without torque.
     """
     _check_names(task, model)
-    drive = _Drive(task, model)
+    drive = Drive(task, model)
     recordings = tuple(_read(entry, f"data[{k}]", model, drive) for k, entry in enumerate(task.data))
     lacking = next((r for r in recordings if r.role == "fit" and r.torque is None), None)
     if lacking is not None:
@@ -84,7 +84,7 @@ def _check_names(task: Task, model: RobotModel) -> None:
             raise InputError(f"{place}: robot has no frame '{entry.load.frame}'{nearest(entry.load.frame, frames)}")
 
 
-class _Drive:
+class Drive:
     """Motor side to joint side; the identity where the task gives no transmission."""
 
     def __init__(self, task: Task, model: RobotModel):
@@ -111,21 +111,21 @@ class _Drive:
         return motor if self.torque is None else motor @ self.torque.T
 
 
-def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: _Drive) -> Recording:
+def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive) -> Recording:
     table = read_table(entry.file, f"{key}.file")
     units = entry.units
-    angle = _unit_factors(units.position, drive.position is not None, model)
-    position = _array(table, entry.position, model, f"{key}.position") * angle
-    time = _time(table, entry, key, len(position))
+    angle = unit_factors(units.position, drive.position is not None, model)
+    position = joint_columns(table, entry.position, model, f"{key}.position") * angle
+    time = read_time(table, entry, key, len(position))
 
     def optional(name: str):
         source = getattr(entry, name)
-        return None if source is None else _array(table, source, model, f"{key}.{name}", len(position))
+        return None if source is None else joint_columns(table, source, model, f"{key}.{name}", len(position))
 
     velocity, torque, command = optional("velocity"), optional("torque"), optional("command")
     if torque is not None and units.torque == "A" and drive.torque is None:
         raise InputError(f"{entry.file}: {key}.units.torque is A: transmission.torque must say what one ampere gives")
-    rate = _unit_factors(units.velocity or units.position, drive.position is not None, model)
+    rate = unit_factors(units.velocity or units.position, drive.position is not None, model)
     return Recording(
         name=entry.file.stem,
         file=entry.file,
@@ -141,7 +141,7 @@ def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: _Drive) -> 
     )
 
 
-def _unit_factors(unit: str, motor_side: bool, model: RobotModel) -> Float[np.ndarray, " nv"]:
+def unit_factors(unit: str, motor_side: bool, model: RobotModel) -> Float[np.ndarray, " nv"]:
     """What turns each column into rad or m: degrees are of turning joints, millimetres of sliding ones."""
     prismatic = np.zeros(model.nv, dtype=bool)
     for joint in model.joints:
@@ -152,7 +152,7 @@ def _unit_factors(unit: str, motor_side: bool, model: RobotModel) -> Float[np.nd
     return np.where(prismatic, sliding, turning)
 
 
-def _array(table: Table, source, model: RobotModel, key: str, samples: int | None = None):
+def joint_columns(table: Table, source, model: RobotModel, key: str, samples: int | None = None):
     values = table.matrix(source, model.joint_names, key)
     if samples is not None and len(values) != samples:
         raise InputError(f"{table.file}: {key} has {len(values)} samples, but position has {samples}")
@@ -166,7 +166,7 @@ def _array(table: Table, source, model: RobotModel, key: str, samples: int | Non
     return values
 
 
-def _time(table: Table, entry: RecordingEntry, key: str, samples: int) -> Float[np.ndarray, " samples"]:
+def read_time(table: Table, entry: RecordingEntry, key: str, samples: int) -> Float[np.ndarray, " samples"]:
     if samples < 2:
         raise InputError(f"{table.file}: {samples} sample{'s'[samples:]}; a recording is a motion over time")
     if entry.time is None:

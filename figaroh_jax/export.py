@@ -31,7 +31,7 @@ from .taskfile import read_yaml
 from .urdf import load_urdf
 from .urdf_text import urdf_text
 
-__all__ = ["load_model", "model_files", "write_model"]
+__all__ = ["dump_yaml", "load_model", "model_files", "write_model"]
 
 _GEOMETRY = ("placement", "axis", "ratio", "offset", "frame_placement")
 
@@ -44,6 +44,11 @@ class _Dumper(yaml.SafeDumper):
 
 
 _Dumper.add_representer(np.ndarray, lambda dumper, array: dumper.represent_list(array.tolist()))
+
+
+def dump_yaml(content: Mapping[str, Any]) -> str:
+    """The mapping as YAML, in its order, numbers in full and lists of numbers on one line."""
+    return yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None)
 
 
 def write_model(extended: ExtendedModel, directory: str | Path, causes: Sequence[Cause] = ()) -> None:
@@ -77,7 +82,7 @@ def _files(extended: ExtendedModel, robot: RobotModel, causes: Sequence[Cause]) 
     content = _robot(extended, robot) | {"effects": effects}
     warnings = {"warnings": [*urdf_warnings, *mjcf_warnings, *_warnings(extended, in_urdf, in_mjcf)]}
     head = "# The extended model: the robot before its effects, and every effect. Read by figaroh-jax.\n"
-    text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None)
+    text = dump_yaml(content)
     text += yaml.dump(warnings, Dumper=_Dumper, width=120, default_flow_style=False)
     return {"robot.urdf": urdf, "robot.xml": mjcf, "effects.yaml": head + text}
 

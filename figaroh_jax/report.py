@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 from . import wording
 from .results import Candidate, Diagnosis, Trace
 
-__all__ = ["write_report"]
+__all__ = ["page_template", "plotly_source", "write_report"]
 
 _POINTS = 1500  # of a trace at most: more cannot be told apart on a screen
 _PAGE_POINTS = 100_000  # of all traces of a channel together, so that a humanoid's page stays light
@@ -70,7 +70,7 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
     page = resources.files("figaroh_jax") / "page"
     roles = [trace.role for trace in diagnosis.traces]
     gain = diagnosis.holdout
-    return _template((page / "report.html").read_text("utf-8")).render(
+    return page_template((page / "report.html").read_text("utf-8")).render(
         d=diagnosis,
         robot=title,
         badge=_BADGES[diagnosis.verdict],
@@ -84,11 +84,12 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
         css=Markup((page / "report.css").read_text("utf-8")),
         js=Markup((page / "report.js").read_text("utf-8")),
         data=Markup(_data(diagnosis)),
-        plotly=Markup(_plotly()),
+        plotly=Markup(plotly_source()),
     )
 
 
-def _template(text: str) -> Any:
+def page_template(text: str) -> Any:
+    """A page of `figaroh_jax/page` with the filters that put numbers and names into words."""
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(autoescape=True, undefined=StrictUndefined)
@@ -197,7 +198,7 @@ def _packed(values: Float[np.ndarray, " samples"]) -> dict[str, Any]:
     return {"o": middle, "s": scale, "d": base64.b64encode(steps.tobytes()).decode("ascii")}
 
 
-def _plotly() -> str:
+def plotly_source() -> str:
     """Source of plotly.js; empty without the plotly package, and the page then says that it cannot draw."""
     found = importlib.util.find_spec("plotly")
     folders = found.submodule_search_locations if found else None

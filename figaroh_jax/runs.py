@@ -1,4 +1,4 @@
-"""A run directory: `answer.json`, `predictions.npz`, `report.html` and `model/`, written whole or not at all."""
+"""A run directory: `answer.json` or `result.json`, `report.html`, `model/` and more, written whole or not at all."""
 
 from __future__ import annotations
 
@@ -7,19 +7,41 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from .errors import InputError
 
 if TYPE_CHECKING:
+    from .calibrated import Calibration
     from .config import Task
     from .results import Diagnosis
 
-__all__ = ["ANSWER", "REPORT", "check_directory", "diagnose_file", "predictions", "whole_directory", "write_run"]
+__all__ = [
+    "ANSWER",
+    "JOBS",
+    "REPORT",
+    "RESULT",
+    "Job",
+    "calibrate_file",
+    "check_directory",
+    "diagnose_file",
+    "predictions",
+    "whole_directory",
+    "write_run",
+]
 
-ANSWER, REPORT = "answer.json", "report.html"
+ANSWER, RESULT, REPORT = "answer.json", "result.json", "report.html"
+
+
+class Job(NamedTuple):
+    """A command on a task file: what it runs and writes, what `--json` prints, what a reader sees."""
+
+    noun: str  # of the run directory's default name
+    run: Callable[[Path, Path, Callable[[str, float], None]], Any]
+    to_json: Callable[[Any], str]
+    show: Callable[[Any], None]
 
 
 def diagnose_file(
@@ -40,6 +62,24 @@ def diagnose_file(
     progress("writing the report", 1.0)
     write_run(task, diagnosis, out)
     return diagnosis
+
+
+def calibrate_file(
+    task_file: Path, out: Path, progress: Callable[[str, float], None] = lambda phase, fraction: None
+) -> Calibration:
+    """Read a task, calibrate its robot and write the run directory `out`, as `diagnose_file` does."""
+    from .config import load_task
+
+    check_directory(out)
+    task = load_task(task_file)
+    from .calibration import calibrate_task
+    from .calibration_files import write_calibration
+
+    calibration = calibrate_task(task, progress=progress)
+    progress("writing the report", 1.0)
+    with whole_directory(out) as folder:
+        write_calibration(calibration, folder, task.robot.model)
+    return calibration
 
 
 def write_run(task: Task, diagnosis: Diagnosis, out: Path) -> None:
@@ -84,9 +124,9 @@ def check_directory(out: Path) -> None:
     """Raise `InputError` unless `out` can become a run directory: absent, empty, or an earlier run."""
     if out.exists() and not out.is_dir():
         raise InputError(f"--out {out}: a file stands there; name a directory")
-    if out.is_dir() and any(out.iterdir()) and not (out / ANSWER).is_file():
+    if out.is_dir() and any(out.iterdir()) and not ((out / ANSWER).is_file() or (out / RESULT).is_file()):
         raise InputError(
-            f"--out {out}: the directory holds other things than an earlier run (no {ANSWER}); name another"
+            f"--out {out}: the directory holds other things than an earlier run (no {ANSWER} or {RESULT}); name another"
         )
     existing = next(parent for parent in out.absolute().parents if parent.exists())
     if not existing.is_dir():
@@ -117,3 +157,33 @@ def whole_directory(out: Path) -> Iterator[Path]:
             raise
     finally:
         shutil.rmtree(beside, ignore_errors=True)
+
+
+def _diagnosis_json(diagnosis: Diagnosis) -> str:
+    from .answer import to_json
+
+    return to_json(diagnosis)
+
+
+def _show_diagnosis(diagnosis: Diagnosis) -> None:
+    from .terminal import show
+
+    show(diagnosis, diagnosis.model.robot.name)
+
+
+def _calibration_json(calibration: Calibration) -> str:
+    from .calibration_files import to_json
+
+    return to_json(calibration)
+
+
+def _show_calibration(calibration: Calibration) -> None:
+    from .terminal import show_calibration
+
+    show_calibration(calibration)
+
+
+JOBS = {
+    "diagnose": Job("diagnosis", diagnose_file, _diagnosis_json, _show_diagnosis),
+    "calibrate": Job("calibration", calibrate_file, _calibration_json, _show_calibration),
+}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from rich import progress as bars
 from rich.console import Console, Group, RenderableType
@@ -14,7 +15,10 @@ from rich.text import Text
 from . import wording
 from .results import Cause, Diagnosis
 
-__all__ = ["Progress", "show", "summary"]
+if TYPE_CHECKING:
+    from .calibrated import Calibration
+
+__all__ = ["Progress", "calibration_summary", "show", "show_calibration", "summary"]
 
 _STYLE = {"nothing": "green", "named": "bold blue", "named+rest": "bold blue", "unknown": "bold yellow"}
 
@@ -70,6 +74,31 @@ def summary(diagnosis: Diagnosis, robot: str = "the robot") -> RenderableType:
         parts.append(Text(f"Measure next: {diagnosis.experiment.text}"))
     parts += [Text(f"Note: {note}", style="dim") for note in diagnosis.notes]
     return Group(*parts)
+
+
+def show_calibration(calibration: Calibration) -> None:
+    """Print the summary of a calibration on standard output."""
+    Console(file=sys.stdout).print(calibration_summary(calibration))
+
+
+def calibration_summary(calibration: Calibration) -> RenderableType:
+    """The calibration in a few lines: how much better, why this level, outliers and causes, what to know."""
+    head = Text.assemble((calibration.level, "bold blue"), f"  {wording.calibration_sentence(calibration)}\n")
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("held-out RMS error")
+    errors = [error for error in (calibration.position, calibration.orientation) if error is not None]
+    for error in errors:
+        table.add_column(error.unit, justify="right")
+    for name, pair in calibration.table.items():
+        values = [pair[0] * 1e3] * (calibration.position is not None)
+        values += [pair[1] * 57.29577951308232] * (calibration.orientation is not None)
+        table.add_row(wording.level(name), *(wording.number(value, 4) for value in values))
+    parts: list[RenderableType] = [head, table]
+    for number, cause in enumerate(calibration.causes, 1):
+        values = ", ".join(f"{key} {wording.interval(value)}" for key, value in cause.parameters.items())
+        parts.append(Text.assemble(f"\n{number}. ", (wording.phrase(cause.name), "bold"), f"  {cause.note or values}"))
+    parts.append(Text(f"\nHeld out: {calibration.scheme}.", style="dim"))
+    return Group(*parts, *(Text(f"Note: {note}", style="dim") for note in calibration.notes))
 
 
 def _cause(number: int, cause: Cause) -> RenderableType:

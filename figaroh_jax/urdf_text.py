@@ -12,7 +12,7 @@ from .inertia import to_com
 from .model import Frame, RobotModel
 from .native import Drives, physical_inertia
 
-__all__ = ["urdf_text"]
+__all__ = ["roll_pitch_yaw", "urdf_text"]
 
 _NO_LIMIT = 1e9  # rad, m, N m, ...: URDF readers in C++ refuse "inf"
 _MOMENTS = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
@@ -117,13 +117,13 @@ def _joint(
     root: ET.Element, name: str, kind: str, ends: tuple[str, str], placement: Float[np.ndarray, "4 4"]
 ) -> ET.Element:
     joint = ET.SubElement(root, "joint", name=name, type=kind)
-    ET.SubElement(joint, "origin", xyz=_text(placement[:3, 3]), rpy=_text(_roll_pitch_yaw(placement[:3, :3])))
+    ET.SubElement(joint, "origin", xyz=_text(placement[:3, 3]), rpy=_text(roll_pitch_yaw(placement[:3, :3])))
     ET.SubElement(joint, "parent", link=ends[0])
     ET.SubElement(joint, "child", link=ends[1])
     return joint
 
 
-def _roll_pitch_yaw(r: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
+def roll_pitch_yaw(r: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
     """Angles with R = Rz(yaw) Ry(pitch) Rx(roll); exact through the pole, where the yaw is taken as it comes.
 
     The roll is read off after the yaw has been turned back, so that near the pole their errors cancel.

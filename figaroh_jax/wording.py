@@ -5,16 +5,22 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from .results import Cause, Diagnosis, Estimate, Name
 
+if TYPE_CHECKING:
+    from .calibrated import Calibration
+
 __all__ = [
     "aside",
+    "calibration_sentence",
     "effect_equation",
     "effect_meaning",
     "effect_title",
     "error",
     "interval",
+    "level",
     "number",
     "p_value",
     "phrase",
@@ -40,6 +46,27 @@ def sentence(diagnosis: Diagnosis, robot: str) -> str:
         return f"{subject} is wrong in a way that no effect of the catalogue explains.{found}"
     rest = ". A part of what it gets wrong still has no name" if diagnosis.verdict == "named+rest" else ""
     return f"{subject} is missing {_list(diagnosis.causes)}: {fall}{rest}."
+
+
+def calibration_sentence(calibration: Calibration) -> str:
+    """What the calibration gained, in one sentence."""
+    error = calibration.position or calibration.orientation
+    if error is None:
+        return "nothing was measured"
+    before, after = (_with_unit(number(x, 3), error.unit) for x in (error.validated_before, error.validated_after))
+    if calibration.level == "frames":
+        return (
+            f"The robot is already as good as these measurements can tell: {after} on held-out postures with the frames"
+            " of the device alone; no correction of the robot predicts better."
+        )
+    fall = f"On held-out postures the error falls from {before} (frames alone) to {after}"
+    return f"{fall}, with {level(calibration.level)}."
+
+
+def level(name: str) -> str:
+    """A level of calibration in words."""
+    words = {"joint_offset": "joint offsets", "full": "full geometry", "chosen": "as chosen inside the folds"}
+    return words.get(name, name)
 
 
 def aside(name: Name, alternatives: Sequence[Name]) -> str:
@@ -68,8 +95,10 @@ def effect_title(effect: str) -> str:
 def effect_meaning(effect: str) -> str:
     """What the effect is, in one line: the first paragraph of its docstring in the catalogue."""
     entry = _entry(effect)
-    text = inspect.cleandoc((entry.__doc__ if entry else "") or "").split("\n\n")[0].replace("\n", " ")
-    generated = entry is not None and text.startswith(f"{entry.__name__}(")  # the signature that a dataclass writes
+    if not isinstance(entry, type):
+        return ""
+    text = inspect.cleandoc(entry.__doc__ or "").split("\n\n")[0].replace("\n", " ")
+    generated = text.startswith(f"{entry.__name__}(")  # the signature that a dataclass writes
     return "" if generated else text
 
 
@@ -158,7 +187,7 @@ def _superscript(power: int) -> str:
     return "".join("⁰¹²³⁴⁵⁶⁷⁸⁹"[int(digit)] if digit != "-" else "⁻" for digit in str(power))
 
 
-def _entry(effect: str) -> type | None:
-    from .effects import CATALOGUE  # the catalogue brings JAX, which a reader of a finished run may not need
+def _entry(effect: str) -> Any:
+    from . import effects, kinematic_effects  # they bring JAX, which a reader of a finished run may not need
 
-    return CATALOGUE.get(effect)
+    return effects.CATALOGUE.get(effect) or kinematic_effects.CATALOGUE.get(effect)

@@ -1,0 +1,323 @@
+r"""How much of the kinematics to estimate: the level and the effects that predict held-out postures best.
+
+Levels are nested: the frames of the device alone, the joints' offsets with them, then every link's geometry. Each is a
+robust maximum a posteriori fit (`marginal`); each is judged on postures left out (every fifth one), all of its widths
+and weights chosen without them. Effects join one by one, the one that gains most on those postures first, as long as
+the gain is worth it. `nested` repeats the whole choice inside each of five outer folds, so that what it reports on the
+postures of a fold was chosen without them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from . import marginal, posefit
+from .kinematic_effects import Column
+from .marginal import FLAT, Linear, Posterior
+from .posegroups import Measured
+
+__all__ = [
+    "FOLDS",
+    "LEVELS",
+    "Choice",
+    "Effects",
+    "Fold",
+    "choose",
+    "errors",
+    "fit_level",
+    "linearise",
+    "nested",
+    "pooled",
+    "rms",
+    "tolerances",
+]
+
+LEVELS = ("frames", "joint_offset", "full")
+FOLDS = 5
+_EFFECT = 3  # prior groups: 0 offsets, 1 translations, 2 rotations, 3 effects
+_TOLERANCE = (5.0, 1.0, 1.0, 1.0)  # stated widths in mrad or mm
+_EFFECT_WIDTH = 3.0  # of an effect's coefficient, in sizes that move its joint by 1 mrad or 1 mm RMS
+_LEVEL_GAIN = 0.01  # of the held-out error, that a level must take away from the one below it
+_LEAST_GAIN = 0.03  # of the held-out error, that an effect must take away to be taken in
+_MOST = 6  # effects
+
+Array = np.ndarray
+
+
+class Effects(NamedTuple):
+    """Candidate effects, each a block of columns, linear at the nominal robot with its frames."""
+
+    blocks: tuple[tuple[Column, ...], ...]
+    jacobian: Callable[[Float[Array, " unknowns"]], Float[Array, "rows all"]]  # of all blocks side by side, at a fit
+    sizes: Float[Array, " all"]  # of the coefficients that jacobian counts in
+    handicap: Float[Array, " blocks"]  # share of the error by which a more flexible effect must do better
+
+    def slices(self) -> list[slice]:
+        """Columns of each block."""
+        ends = np.cumsum([0, *(len(block) for block in self.blocks)])
+        return [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+
+class Choice(NamedTuple):
+    """A level with the effects (indices of blocks, in the order found) chosen on some rows, and its fit."""
+
+    level: str
+    effects: tuple[int, ...]
+    fits: dict[str, tuple[Linear, Posterior]]  # every level's rows at its fit
+    scores: dict[str, float]  # held-out error of each level, and of each effect that joined
+    gains: tuple[float, ...]  # share of the held-out error that each effect took away
+
+    @property
+    def linear(self) -> Linear:
+        """The rows at the fit of the chosen level."""
+        return self.fits[self.level][0]
+
+
+class Fold(NamedTuple):
+    """An outer fold: what was chosen without its postures, and the errors on them in m and rad."""
+
+    choice: Choice
+    levels: dict[str, tuple[Array, Array]]
+    plain: tuple[Array, Array]  # the chosen level without effects
+    chosen: tuple[Array, Array]
+
+
+def tolerances(measured: Measured) -> tuple[Int[Array, " unknowns"], Float[Array, " groups"]]:
+    """Prior group of every unknown (devices' own have none) and the stated width of each group."""
+    geometry = {"joint_offset": 0, "link_geometry m": 1, "link_geometry rad": 2}
+    names = (c.effect if c.effect == "joint_offset" else f"{c.effect} {c.unit}" for c in measured.columns)
+    groups = [geometry.get(name, _EFFECT) for name in names]
+    return np.array([*groups, *(FLAT for _ in measured.own)], int), np.array(_TOLERANCE)
+
+
+def free_at(level: str, prior: Int[Array, " unknowns"]) -> Bool[Array, " unknowns"]:
+    """Which unknowns the level estimates; effects that stand among the columns always."""
+    highest = {"frames": FLAT, "joint_offset": 0, "full": 2}[level]
+    return (prior <= highest) | (prior == _EFFECT)
+
+
+def linearise(measured: Measured, at: Float[Array, " unknowns"]) -> Linear:
+    """The problem's rows at a point."""
+    residual, jacobian = posefit.linearise(measured.problem, jnp.asarray(at))
+    prior, width = tolerances(measured)
+    return Linear(np.asarray(residual), np.asarray(jacobian), at, measured.channel, measured.posture, prior, width)
+
+
+def fit_level(
+    measured: Measured, used: Bool[Array, " rows"], level: str, start: Float[Array, " unknowns"] | None = None
+) -> tuple[Linear, Posterior]:
+    """Fit of a level to the rows `used`, linearised anew until it stays; the frames alone by plain least squares."""
+    prior, _ = tolerances(measured)
+    at = np.zeros(len(prior)) if start is None else start
+    posterior = None
+    linear = linearise(measured, at)
+    for _ in range(8):
+        posterior = marginal.fit(linear, used, free_at(level, prior), robust=level != "frames", start=posterior)
+        step = np.abs(posterior.unknowns - linear.at).max()
+        linear = linearise(measured, posterior.unknowns)
+        if step < 1e-3:
+            break
+    assert posterior is not None
+    return linear, posterior
+
+
+def errors(measured: Measured, residual: Float[Array, " rows"], postures: Int[Array, " some"]) -> tuple[Array, Array]:
+    """Error of every point (m) and every orientation (rad) measured in the given postures.
+
+    What sits in a socket that no fitted posture shows is compared with the mean of its own.
+    """
+    found = []
+    for channel in (0, 1):
+        rows = (measured.channel == channel) & measured.measured & np.isin(measured.posture, postures)
+        square = np.bincount(measured.item[rows], residual[rows] ** 2)
+        found.append(np.sqrt(square[np.bincount(measured.item[rows]) > 0]) if rows.any() else np.zeros(0))
+    return found[0], found[1]
+
+
+def rms(values: Array) -> float:
+    """Root mean square; NaN of nothing."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
+
+
+def pooled(parts: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
+    """RMS error of all folds together, m and rad."""
+    a, b = (rms(np.concatenate([part[c] for part in parts])) for c in (0, 1))
+    return a, b
+
+
+def choose(measured: Measured, used: Bool[Array, " rows"], effects: Effects | None) -> Choice:
+    """Level and effects that predict best on postures left out of the rows `used`."""
+    fits, scores, best = {}, {}, None
+    start = None
+    for level in LEVELS:
+        linear, posterior = fit_level(measured, used, level, start)
+        start = posterior.unknowns
+        scores[level] = _held_out(measured, linear, used, level, posterior)
+        fits[level] = linear, posterior
+        if best is None or scores[level] < (1.0 - _LEVEL_GAIN) * scores[best]:
+            best = level
+    assert best is not None
+    linear, posterior = fits[best]
+    found, gains = ((), ()) if effects is None else _forward(measured, used, best, linear, posterior, effects, scores)
+    return Choice(best, found, fits, scores, gains)
+
+
+def _inner_folds(measured: Measured, used: Array) -> list[tuple[Array, Array]]:
+    """Rows to fit, and postures left out, of each inner fold."""
+    inside = np.unique(measured.posture[used & (measured.posture >= 0)])
+    folds = [inside[k::FOLDS] for k in range(min(FOLDS, len(inside)))]
+    return [(used & ~np.isin(measured.posture, fold), fold) for fold in folds]
+
+
+def _held_out(measured: Measured, linear: Linear, used: Array, level: str, start: Posterior) -> float:
+    """Error on the inner folds: geometric mean of the channels' RMS."""
+    free, robust = free_at(level, linear.prior), level != "frames"
+    parts: tuple[list[Array], list[Array]] = ([], [])
+    for rows, fold in _inner_folds(measured, used):
+        posterior = marginal.fit(linear, rows, free, robust=robust, start=start, iterations=15)
+        residual = linear.residual + linear.jacobian @ (posterior.unknowns - linear.at)
+        for part, error in zip(parts, errors(measured, residual, fold), strict=True):
+            part.append(error)
+    return _score([np.concatenate(part) for part in parts])
+
+
+def _score(parts: Sequence[Array]) -> float:
+    return float(np.exp(np.mean([np.log(rms(part) + 1e-15) for part in parts if len(part)])))
+
+
+def _forward(
+    measured: Measured,
+    used: Array,
+    level: str,
+    linear: Linear,
+    posterior: Posterior,
+    effects: Effects,
+    scores: dict[str, float],
+) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Effects that join one by one, each the one that gains most on the inner folds."""
+    Z, slices = effects.jacobian(linear.at), effects.slices()
+    free = free_at(level, linear.prior)
+    folds = []
+    for rows, fold in _inner_folds(measured, used):
+        inner = marginal.fit(linear, rows, free, robust=True, start=posterior, iterations=15)
+        folds.append(_Inner.make(measured, linear, inner, rows, fold, free, Z))
+    chosen: list[int] = []
+    gains: list[float] = []
+    current = _score_of(folds)
+    while len(chosen) < _MOST:
+        ranked = _screen(folds, slices, chosen)
+        trials = {k: _score_of(folds, np.r_[slices[k]]) for k in ranked[:12]}
+        best = min(trials, key=lambda k: trials[k] * (1.0 + effects.handicap[k]), default=None)
+        if best is None or trials[best] > (1.0 - _LEAST_GAIN) * current:
+            break
+        for inner in folds:
+            inner.take(np.r_[slices[best]])
+        gains.append(1.0 - trials[best] / current)
+        current = trials[best]
+        chosen.append(best)
+        scores[f"{level} + " + " + ".join(_name(effects.blocks[k]) for k in chosen)] = current
+    return tuple(chosen), tuple(gains)
+
+
+def _name(block: tuple[Column, ...]) -> str:
+    return " ".join([block[0].effect, *block[0].at])
+
+
+class _Inner(NamedTuple):
+    """An inner fold whitened by its own fit: what candidates are regressed on, and what they must predict."""
+
+    residual: list[Array]  # [whitened, to fit; in m and rad, left out]
+    columns: list[Array]  # candidates, projected off what is fitted already: [to fit; left out]
+    shape: tuple[Array, Array, int]  # channel and item of the rows left out; how many items
+
+    @classmethod
+    def make(cls, measured, linear, inner: Posterior, rows, fold, free, Z) -> _Inner:
+        weight = np.where(linear.posture >= 0, inner.weight[linear.posture], 1.0)
+        scale = np.sqrt(weight) / inner.noise[linear.channel]
+        fit, out = np.flatnonzero(rows), np.flatnonzero(measured.measured & np.isin(measured.posture, fold))
+        residual = linear.residual + linear.jacobian @ (inner.unknowns - linear.at)
+        J = linear.jacobian[:, free]
+        G = J[fit] * scale[fit, None]
+        inverse = inner.covariance[np.ix_(free, free)]
+        Z_fit = Z[fit] * scale[fit, None]
+        pull = inverse @ (G.T @ Z_fit)  # how the fitted unknowns give way to a candidate
+        _, item = np.unique(measured.item[out], return_inverse=True)
+        # prior rows belong to the fit: they too see the unknowns give way
+        prior = np.sqrt(inner.precision[free])[:, None]
+        r_fit = np.concatenate([residual[fit] * scale[fit], prior[:, 0] * inner.unknowns[free]])
+        c_fit = np.concatenate([Z_fit - G @ pull, -prior * pull])
+        return cls(
+            [r_fit, residual[out]], [c_fit, Z[out] - J[out] @ pull], (measured.channel[out], item, item.max() + 1)
+        )
+
+    def solve(self, which: Array) -> tuple[Array, Array]:
+        """Coefficients of the candidates `which` and their normal matrix, each with a wide prior."""
+        C = self.columns[0][:, which]
+        normal = C.T @ C + np.eye(len(which)) / _EFFECT_WIDTH**2
+        return -np.linalg.solve(normal, C.T @ self.residual[0]), normal
+
+    def error(self, which: Array) -> list[Array]:
+        residual = self.residual[1] + (self.columns[1][:, which] @ self.solve(which)[0] if len(which) else 0.0)
+        channel, item, count = self.shape
+        parts = []
+        for c in (0, 1):
+            mine = channel == c
+            square = np.bincount(item[mine], residual[mine] ** 2, minlength=count)
+            parts.append(np.sqrt(square[np.bincount(item[mine], minlength=count) > 0]))
+        return parts
+
+    def take(self, which: Array) -> None:
+        """Fit the candidates `which` for good: project them out of all the others."""
+        beta, normal = self.solve(which)
+        C, D = self.columns[0][:, which], self.columns[1][:, which]
+        pull = np.linalg.solve(normal, C.T @ self.columns[0])
+        self.residual[0] = self.residual[0] + C @ beta
+        self.residual[1] = self.residual[1] + D @ beta
+        self.columns[0] = self.columns[0] - C @ pull
+        self.columns[1] = self.columns[1] - D @ pull
+
+
+def _score_of(folds: Sequence[_Inner], which: Array | None = None) -> float:
+    parts = [inner.error(np.zeros(0, int) if which is None else which) for inner in folds]
+    return _score([np.concatenate([part[c] for part in parts]) for c in (0, 1)])
+
+
+def _screen(folds: Sequence[_Inner], slices: Sequence[slice], taken: Sequence[int]) -> list[int]:
+    """Blocks by how much of the fitted rows they explain, for their number of columns; not those taken already."""
+    merit = {}
+    for k, block in enumerate(slices):
+        if k not in taken:
+            which = np.r_[block]
+            drops = [inner.residual[0] @ inner.columns[0][:, which] @ -inner.solve(which)[0] for inner in folds]
+            merit[k] = np.mean(drops) - len(which) * np.log(len(folds[0].residual[0])) / 2
+    return sorted(merit, key=lambda k: -merit[k])
+
+
+def nested(
+    measured: Measured,
+    used: Bool[Array, " rows"],
+    effects: Effects | None,
+    extended: Callable[[Choice, Bool[Array, " rows"]], Float[Array, " rows"]],
+    progress: Callable[[float], None] = lambda share: None,
+) -> list[Fold]:
+    """Five outer folds (every fifth posture): the whole choice without each, and the errors on it.
+
+    `extended(choice, rows)` gives the residual of all rows for a choice with its effects fitted to `rows`.
+    """
+    inside = np.unique(measured.posture[used & (measured.posture >= 0)])
+    folds = []
+    for k in range(min(FOLDS, len(inside))):
+        fold = inside[k::FOLDS]
+        rows = used & ~np.isin(measured.posture, fold)
+        choice = choose(measured, rows, effects)
+        each = {level: errors(measured, fit[0].residual, fold) for level, fit in choice.fits.items()}
+        plain = each[choice.level]
+        chosen = errors(measured, extended(choice, rows), fold) if choice.effects else plain
+        folds.append(Fold(choice, each, plain, chosen))
+        progress((k + 1) / FOLDS)
+    return folds

@@ -1,0 +1,46 @@
+r"""Postures that no model explains: found one after the other by what the others predict for them.
+
+The error of posture i is predicted by a robust fit without it, to first order: $e_i = (I - w_i H_i)^{-1} r_i$ with
+$H_i = J_i \Sigma J_i'$ of whitened rows, whose covariance is $(I - w_i H_i)^{-1}$. Its size is the root of the mean
+square of $e_i$ in that covariance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool
+
+from . import levels
+from .marginal import Linear, Posterior
+from .posegroups import Measured
+
+__all__ = ["find_outliers"]
+
+_FAR = 8.0  # sizes of the noise; what is nearer may be a heavy tail, which the robust fit bears
+_MOST = 0.1  # of the postures
+
+
+def find_outliers(measured: Measured, used: Bool[np.ndarray, " rows"]) -> dict[int, float]:
+    """Postures among the rows `used` that are outliers, and the size of each."""
+    found: dict[int, float] = {}
+    postures = len(np.unique(measured.posture[used]))
+    while len(found) < max(1, int(_MOST * postures)):
+        rows = used & ~np.isin(measured.posture, list(found))
+        linear, posterior = levels.fit_level(measured, rows, "full")
+        sizes = _sizes(linear, posterior, rows)
+        worst = max(sizes, key=lambda k: sizes[k])
+        if sizes[worst] < _FAR:
+            break
+        found[worst] = sizes[worst]
+    return found
+
+
+def _sizes(linear: Linear, posterior: Posterior, used: np.ndarray) -> dict[int, float]:
+    sizes = {}
+    for k in np.unique(linear.posture[used & (linear.posture >= 0)]):
+        rows = np.flatnonzero(used & (linear.posture == k))
+        noise = posterior.noise[linear.channel[rows]]
+        G, r = linear.jacobian[rows] / noise[:, None], linear.residual[rows] / noise
+        left = np.eye(len(rows)) - posterior.weight[k] * G @ posterior.covariance @ G.T
+        sizes[int(k)] = float(np.sqrt(max(r @ np.linalg.solve(left, r), 0.0) / len(rows)))
+    return sizes

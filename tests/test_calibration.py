@@ -1,0 +1,196 @@
+"""Calibration of robots whose truth Pinocchio made, and of real ones: what it predicts, names, refuses and writes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import poses
+import pytest
+import yaml
+
+from figaroh_jax import cli
+from figaroh_jax.calibrated import Calibration
+from figaroh_jax.calibration import calibrate_task
+from figaroh_jax.config import load_task
+
+OFFSET = np.array([0.01, -0.03, 0.05, 0.04, -0.06, 0.02])
+BAD_ROW = 17
+
+
+def write(folder: Path, q: np.ndarray, points: np.ndarray, **measurement: Any) -> Path:
+    """A task of one recording of points."""
+    (folder / "robot.urdf").write_text(poses.urdf())
+    np.savez(folder / "postures.npz", q=q, points=points)
+    known = {"position": "points", "base_frame": "base", "tool_frame": "tool0"}
+    entry = {"file": "postures.npz", "position": "q", "measurement": known | {"unknown": ["base_frame", "tool_frame"]}}
+    entry["measurement"] |= measurement
+    task = folder / "task.yaml"
+    task.write_text(yaml.safe_dump({"robot": {"model": "robot.urdf"}, "data": [entry]}))
+    return task
+
+
+def recorded(folder: Path, rng: np.random.Generator, real: poses.Truth, bad: int | None = None) -> Path:
+    (folder / "robot.urdf").write_text(poses.urdf())
+    q = poses.postures(rng, 40)
+    points = poses.points(poses.tool_poses(folder / "robot.urdf", q, real), real, rng)
+    if bad is not None:
+        points[bad] += [0.0, 0.02, -0.01]
+    return write(folder, q, points)
+
+
+@pytest.fixture(scope="module")
+def wrong(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, poses.Truth]:
+    """A robot with wrong offsets and a soft second joint, one posture measured badly."""
+    folder = tmp_path_factory.mktemp("wrong")
+    rng = np.random.default_rng(11)
+    twists = {"j3": np.array([5e-4, -3e-4, 2e-4, 1e-3, -8e-4, 0.0])}
+    real = poses.truth(rng, offset=OFFSET, twists=twists, compliance=np.array([0.0, 2e-4, 0, 0, 0, 0]))
+    return recorded(folder, rng, real, BAD_ROW), real
+
+
+@pytest.fixture(scope="module")
+def calibrated(wrong: tuple[Path, poses.Truth]) -> Calibration:
+    return calibrate_task(load_task(wrong[0]))
+
+
+def test_offsets_and_compliance_are_found_and_named(calibrated: Calibration):
+    found = {p.name: p for p in calibrated.parameters}
+    for joint in range(1, 5):
+        p = found[f"joint_offset j{joint + 1}"]
+        assert p.status == "identified"
+        assert abs(p.value - OFFSET[joint]) < max(3.0 * p.std, 2e-4), p
+    causes = {str(cause.name): cause for cause in calibrated.causes}
+    assert calibrated.verdict == "named"
+    assert {f"joint_offset (j{k})" for k in (2, 3, 4, 5)} <= set(causes)
+    soft = causes["joint_compliance (j2)"].parameters["compliance"]
+    assert abs(soft.value - 2e-4) < 4.0 * soft.std
+    assert {cause.name.effect for cause in calibrated.causes} == {"outlier", "joint_offset", "joint_compliance"}
+
+
+def test_offsets_of_the_first_and_the_last_joint_are_a_gauge(calibrated: Calibration):
+    status = {p.name: p.status for p in calibrated.parameters}
+    assert status["joint_offset j1"] == status["joint_offset j6"] == "gauge"
+    classes = {names[0]: names[1:] for names in calibrated.classes}
+    assert any(name.startswith("base_frame") for name in classes["joint_offset j1"])
+    assert any(name.startswith("tool_frame") for name in classes["joint_offset j6"])
+    soft = sum(cause.name.effect == "joint_compliance" for cause in calibrated.causes)
+    assert calibrated.rank == (4 * 6 + 6) + 3 + soft  # 4 n + 6 with a 6-D tool; three numbers more for three markers
+
+
+def test_the_badly_measured_posture_is_named_and_left_out(calibrated: Calibration):
+    assert [(o.file, o.row) for o in calibrated.outliers] == [("postures.npz", BAD_ROW)]
+
+
+def test_calibrated_robot_predicts_postures_it_has_not_seen(calibrated: Calibration, wrong: tuple[Path, poses.Truth]):
+    from figaroh_jax.gravity import gravity_moments
+    from figaroh_jax.kinematics import frame_placement
+
+    task, real = wrong
+    q = poses.postures(np.random.default_rng(12), 50)
+    truth = np.array([pose.act(real.markers[0]) for pose in poses.tool_poses(task.parent / "robot.urdf", q, real)])
+    soft = next(p for p in calibrated.parameters if p.name == "joint_compliance j2").value
+    sag = soft * np.asarray(gravity_moments(calibrated.model, q)[0])[:, 1]
+    tool = np.asarray(frame_placement(calibrated.model, q + sag[:, None] * np.eye(6)[1], "tool0"))
+    whole = calibrated.frames["base_frame"] @ tool
+    predicted = whole[:, :3, :3] @ calibrated.frames["tool_frame"][0] + whole[:, :3, 3]
+    error = np.sqrt(np.mean(np.sum((predicted - truth) ** 2, axis=1)))
+    assert error < 1.5e-4  # the noise of one point is 1.7e-4
+    assert calibrated.position is not None and calibrated.orientation is None
+    assert calibrated.position.validated_after < 0.25 < 20.0 < calibrated.position.validated_before
+    assert calibrated.converged
+
+
+def test_run_directory_holds_what_the_contract_asks(wrong: tuple[Path, poses.Truth], tmp_path: Path, capsys: Any):
+    out = tmp_path / "run"
+    assert cli.main(["calibrate", str(wrong[0]), "--out", str(out), "--quiet", "--json"]) == 0
+    result = json.loads((out / "result.json").read_text())
+    assert result == json.loads(capsys.readouterr().out)
+    assert result["level"] == "full" and result["orientation"] is None and result["verdict"] == "named"
+    assert result["outliers"] == [{"file": "postures.npz", "row": BAD_ROW}]
+    assert set(result["position"]) == {"unit", "before", "after", "validated_before", "validated_after"}
+    assert {"name", "value", "std", "unit", "status"} == set(result["parameters"][0])
+    assert "plotly" in (out / "report.html").read_text().lower()
+    robot = pin.buildModelFromUrdf(str(out / "model" / "robot.urdf"))
+    placed = robot.jointPlacements[robot.getJointId("j3")]
+    corrections = yaml.safe_load((out / "model" / "calibration.yaml").read_text())
+    twist = np.array(corrections["placements"]["j3"])
+    nominal = pin.buildModelFromUrdf(str(wrong[0].parent / "robot.urdf")).jointPlacements[3]
+    np.testing.assert_allclose(placed, nominal * pin.SE3(pin.exp3(twist[3:]), twist[:3]), rtol=0, atol=1e-12)
+    assert cli.main(["calibrate", str(wrong[0]), "--out", str(out), "--quiet"]) == 0
+    assert "full geometry" in capsys.readouterr().out
+
+
+def test_a_robot_that_is_already_good_gets_nothing(tmp_path: Path):
+    rng = np.random.default_rng(13)
+    found = calibrate_task(load_task(recorded(tmp_path, rng, poses.truth(rng))))
+    assert (found.level, found.verdict, found.causes, found.outliers) == ("frames", "nothing", (), ())
+    assert found.position is not None
+    assert found.position.validated_after == found.position.validated_before
+
+
+def spoil(key: str, value: Any) -> Any:
+    def change(keys: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+        keys["data"][0]["measurement"][key] = value
+
+    return change
+
+
+def nan_in_a_point(keys: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    arrays["points"][4, 1, 2] = np.nan
+
+
+def wrong_shape(keys: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    arrays["points"] = arrays["points"][..., :2]
+
+
+def too_few(keys: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    arrays["points"], arrays["q"] = arrays["points"][:4], arrays["q"][:4]
+
+
+def short(keys: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    arrays["points"] = arrays["points"][:-1]
+
+
+def no_measurement(keys: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    del keys["data"][0]["measurement"]
+    keys["data"][0]["rate"] = 1.0
+
+
+def no_pose(keys: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    keys["data"][0]["measurement"] |= {"pose": "points"}
+    del keys["data"][0]["measurement"]["position"]
+    arrays["points"] = np.tile(2.0 * np.eye(4), (len(arrays["q"]), 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (spoil("tool_frame", "tool"), "data[0].measurement.tool_frame: robot 'arm6' has no frame 'tool'; did you mean"),
+        (spoil("base_frame", "tool0"), "no joint moves tool_frame 'tool0' against base_frame 'tool0'"),
+        (spoil("tool_frame", None), "data[0].measurement.tool_frame is missing"),
+        (spoil("position", "spoints"), "no array 'spoints' (data[0].measurement.position); did you mean 'points'?"),
+        (nan_in_a_point, "row 4 (from 0): point 1 is"),
+        (wrong_shape, "expected (postures, 3) or (postures, markers, 3)"),
+        (short, "has 39 rows, but position has 40"),
+        (too_few, "4 measured postures give 36 numbers for 15 unknowns"),
+        (no_measurement, "data[0] has no `measurement`"),
+        (no_pose, "row 0 (from 0): the orientation is no rotation matrix"),
+    ],
+)
+def test_wrong_measurements_are_refused_with_what_would_be_right(
+    change: Any, message: str, tmp_path: Path, capsys: Any
+):
+    rng = np.random.default_rng(14)
+    task = write(tmp_path, poses.postures(rng, 40), rng.normal(size=(40, 3, 3)))
+    keys = yaml.safe_load(task.read_text())
+    arrays = dict(np.load(tmp_path / "postures.npz"))
+    change(keys, arrays)
+    np.savez(tmp_path / "postures.npz", **arrays)  # pyright: ignore[reportArgumentType]
+    task.write_text(yaml.safe_dump(keys))
+    assert cli.main(["calibrate", str(task), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

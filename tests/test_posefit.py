@@ -1,0 +1,128 @@
+"""Rows and Jacobians of every device against finite differences; closed-form starts; the solve on synthetic truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pinocchio as pin
+import poses
+import pytest
+
+from figaroh_jax import posefit, starts
+from figaroh_jax.chain import chain_between
+from figaroh_jax.devices import Camera, Device, Distance, Planes, Points, Poses, Sockets
+from figaroh_jax.model import RobotModel
+from figaroh_jax.urdf import load_urdf
+
+N = 4
+BOTH = ("base_frame", "tool_frame")
+
+
+@pytest.fixture(scope="module")
+def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("arm") / "robot.urdf"
+    path.write_text(poses.urdf())
+    return path
+
+
+@pytest.fixture(scope="module")
+def model(urdf: Path) -> RobotModel:
+    return load_urdf(urdf)
+
+
+def turn(rng: np.random.Generator) -> np.ndarray:
+    return pin.SE3(pin.exp3(rng.normal(size=3)), rng.normal(size=3)).homogeneous
+
+
+def devices(rng: np.random.Generator) -> dict[str, tuple[Device, np.ndarray]]:
+    """Every device with something for it to have measured."""
+    base, centre = turn(rng), rng.normal(size=3)
+    near = np.array([turn(rng) for _ in range(N)])
+    board = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]])
+    camera = np.array([[600.0, 0, 320], [0, 610, 240], [0, 0, 1]])
+    axes = np.array([turn(rng)[:3, :3], turn(rng)[:3, :3]])
+    number = np.array([0, 1, 1, 0])
+    pair = (((0, 1),), np.array([0.05]), np.array([2.0]))
+    return {
+        "points": (Points(base, centre, BOTH, rng.normal(size=(2, 3))), rng.normal(size=(N, 2, 3))),
+        "poses": (Poses(base, centre, BOTH, turn(rng)), near),
+        "camera": (Camera(base, centre, BOTH, turn(rng), board, camera), 100.0 * rng.normal(size=(N, 4, 2))),
+        "sockets": (Sockets(rng.normal(size=3), ("tool_frame",), rng.normal(size=(2, 3)), *pair), number),
+        "planes": (Planes(rng.normal(size=3), ("tool_frame",), axes, rng.normal(size=(2, 3))), number),
+        "distance": (Distance(rng.normal(size=3), ("tool_frame",), rng.normal(size=3)), rng.uniform(1.0, 2.0, N)),
+    }
+
+
+def problem(model: RobotModel, device: Device, datum: np.ndarray, q: np.ndarray, rng: np.random.Generator):
+    """A problem of one device: a column of any kind at each joint, and one that acts at two."""
+    chain = chain_between(model, "base", "tool0")
+    fields = rng.normal(size=(8, 6, len(q)))
+    at, column = np.array([0, 1, 2, 3, 4, 5, 1, 4]), np.array([0, 1, 2, 3, 4, 5, 6, 6])
+    measured = np.ones((len(q), len(device.channels())), bool)
+    group = posefit.Group(chain, device, q.T, fields, at, column, datum, measured)
+    return posefit.Problem((group,), posefit.sizes([group], [1e-2] * 7), 7)
+
+
+@pytest.mark.parametrize("name", devices(np.random.default_rng(0)))
+def test_jacobian_of_every_device_is_the_derivative_of_its_rows(name: str, model: RobotModel):
+    rng = np.random.default_rng(5)
+    device, datum = devices(rng)[name]
+    whole = problem(model, device, datum, poses.postures(rng, N), rng)
+    y = jnp.asarray(0.3 * rng.normal(size=len(whole.scale)))
+    residual, jacobian = posefit.linearise(whole, y)
+    np.testing.assert_allclose(residual, posefit.predict(whole, y), rtol=0, atol=1e-14)
+    assert len(posefit.rows_of(whole).group) == len(residual)
+    step = 1e-4
+    for k, e in enumerate(np.eye(len(y))):
+        ahead, behind = (np.asarray(posefit.predict(whole, y + sign * step * e)) for sign in (1, -1))
+        scale = max(1.0, float(np.abs(jacobian[:, k]).max()))
+        np.testing.assert_allclose(jacobian[:, k], (ahead - behind) / (2 * step), rtol=0, atol=3e-8 * scale)
+
+
+def test_closed_form_frames_are_exact_without_noise():
+    rng = np.random.default_rng(6)
+    R, p = np.array([turn(rng)[:3, :3] for _ in range(20)]), rng.normal(size=(20, 3))
+    base, tool, markers = turn(rng), turn(rng), rng.normal(size=(2, 3))
+    seen = (p[:, None] + np.einsum("nij,kj->nki", R, markers)) @ base[:3, :3].T + base[:3, 3]
+    seen[3, 1] = np.nan
+    found = starts.place_points(R, p, seen, BOTH)
+    np.testing.assert_allclose(found[0], base, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found[1], markers, rtol=0, atol=1e-9)
+    local = np.tile(np.eye(4), (20, 1, 1))
+    local[:, :3, :3], local[:, :3, 3] = R, p
+    for unknown in (BOTH, ("base_frame",), ("tool_frame",)):
+        b, t = base if "base_frame" in unknown else np.eye(4), tool if "tool_frame" in unknown else np.eye(4)
+        found = starts.place_poses(R, p, b @ local @ t, unknown)
+        np.testing.assert_allclose(found[0], b, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found[1], t, rtol=0, atol=1e-9)
+    point, number = rng.normal(size=3), np.arange(20) % 2
+    sockets = rng.normal(size=(2, 3))
+    found = starts.place_sockets(R, sockets[number] - R @ point, number, ("tool_frame",))
+    np.testing.assert_allclose(found[0], point, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found[1], sockets, rtol=0, atol=1e-9)
+
+
+def test_solve_finds_offsets_from_far_away_and_says_that_it_converged(model: RobotModel, urdf: Path):
+    rng = np.random.default_rng(7)
+    real = poses.truth(rng, offset=np.array([0.0, 0.05, -0.08, 0.1, -0.04, 0.0]))
+    q = poses.postures(rng, 40)
+    chain = chain_between(model, "base", "tool0")
+    fields = np.zeros((4, 6, len(q)))
+    fields[:, 5] = 1.0
+    joints = np.arange(1, 5)
+    reference = poses.points(poses.tool_poses(urdf, q, real), real, rng, noise=0.0)
+    device = Points(real.base.homogeneous, reference.mean(axis=(0, 1)), BOTH, np.zeros((3, 3)))
+    measured = np.ones((len(q), 9), bool)
+    group = posefit.Group(chain, device, q.T, fields, joints, np.arange(4), reference, measured)
+    whole = posefit.Problem((group,), posefit.sizes([group], [1e-3] * 4), 4)
+    count = len(whole.scale)
+    weights, start = jnp.full(len(q) * 9, 1e4), jnp.zeros(count).at[4:10].set(30.0)
+    found = posefit.solve(whole, weights, jnp.zeros(count), jnp.ones(count), start)
+    assert bool(found.converged)
+    np.testing.assert_allclose(found.unknowns[:4] * 1e-3, real.offset[1:5], rtol=0, atol=1e-9)
+    held = posefit.solve(whole, weights, jnp.ones(count), jnp.ones(count).at[:4].set(0.0), start)
+    np.testing.assert_array_equal(held.unknowns[:4], 0.0)
+    stopped = posefit.solve(whole, weights, jnp.zeros(count), jnp.ones(count), start, max_steps=2)
+    assert not bool(stopped.converged)
