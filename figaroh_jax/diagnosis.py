@@ -8,6 +8,7 @@ another, until nothing is gained. What is left decides between `named`, `named+r
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -45,13 +46,14 @@ POLISH = 2
 
 def diagnose_task(task: Task, progress: Callable[[str, float], None] = lambda phase, share: None) -> Diagnosis:
     """Diagnose what a task file describes; `InputError` before any work where it is wrong."""
-    from .config import load_robot
+    from .config import load_robot, robot_notes
 
     progress("reading", 0.0)
-    model = load_robot(task)
+    model, notes = load_robot(task), robot_notes(task)
     recordings = read_recordings(task, model)
     options = {"trust": task.robot.trust, "forbid": task.diagnose.forbid, "alpha": task.diagnose.alpha}
-    return diagnose(model, recordings, task.preprocess, task.baseline, progress=progress, **options)
+    found = diagnose(model, recordings, task.preprocess, task.baseline, progress=progress, **options)
+    return replace(found, notes=(*notes, *found.notes))
 
 
 def diagnose(

@@ -13,7 +13,7 @@ import tasks
 import yaml
 
 import figaroh_jax as fj
-from figaroh_jax.config import load_robot, load_task
+from figaroh_jax.config import load_robot, load_task, robot_notes
 from figaroh_jax.dynamics import inverse_dynamics, mass_matrix
 from figaroh_jax.errors import InputError
 from figaroh_jax.export import load_model, write_model
@@ -336,6 +336,21 @@ def test_a_task_takes_an_mjcf_model(tmp_path: Path) -> None:
         )
         model = load_robot(load_task(tasks.write(tmp_path, keys)))
         assert model.joint_names == ("elbow", "shoulder") and tuple(model.gravity) == expected
+
+
+def test_what_a_task_leaves_out_of_its_model_file_is_noted(tmp_path: Path) -> None:
+    tasks.write(tmp_path)
+    written(robots.GRIPPER, tmp_path)
+    keys = tasks.task() | {"baseline": {"rotor": True}}
+    keys["robot"] = {"model": "robot.xml", "joints": ["elbow", "shoulder"], "posture": {"left": 0.02}}
+    notes = robot_notes(load_task(tasks.write(tmp_path, keys)))
+    assert [note.split(" of the file")[0] for note in notes] == [
+        "robot.xml: power_law_friction (elbow)",
+        "robot.xml: coupled_transmission (elbow, shoulder)",
+        "robot.xml: gravity_compensation (upper)",
+        "robot.xml: not read: gravcomp of link 'fore', whose welded bodies differ in it",
+    ]
+    assert robot_notes(load_task(tasks.write(tmp_path))) == ()
 
 
 @pytest.mark.slow
