@@ -63,7 +63,7 @@ class Motion(eqx.Module):
 
     model: RobotModel
     time: Float[Leaf, " samples"]  # s
-    position: Float[Leaf, "samples nv"]  # rad or m
+    position: Float[Leaf, "samples nq"]  # rad or m; quaternions where the robot has any
     velocity: Float[Leaf, "samples nv"]
     acceleration: Float[Leaf, "samples nv"]
     load: Float[Leaf, "samples nv"]  # torque of the rigid body, N m or N
@@ -75,6 +75,17 @@ class Motion(eqx.Module):
     def direction(self) -> Float[Array, "samples nv"]:
         """Sign of the velocity, smooth within one sample (`smooth_sign`)."""
         return smooth_sign(self.velocity, self.acceleration, self.dt, self.width)
+
+    @property
+    def angle(self) -> Float[Array, "samples nv"]:
+        """Position of each coordinate, rad or m; zero where no one number tells it (joints of several axes)."""
+        if self.model.nq == len(self.model.joint_names):
+            return jnp.asarray(self.position)
+        column = np.full(self.model.nv, -1)
+        for joint, at in zip(self.model.joints, self.model.dofs.positions, strict=True):
+            if joint.kind in ("revolute", "prismatic"):
+                column[joint.coordinate] = at.start
+        return jnp.where(column < 0, 0.0, jnp.asarray(self.position)[:, column])
 
     def reversal(
         self, velocity: Float[Array, " samples"], acceleration: Float[Array, " samples"], width: Float[Array, ""]
@@ -171,7 +182,7 @@ class Effect(eqx.Module):
         if self.acts_on in ("link", "robot") or not self.has("torque"):
             return torque  # a change of the robot is felt at every joint
         columns = torque.reshape(torque.shape[0], -1)
-        return jnp.zeros_like(motion.position).at[:, self.at].add(columns)
+        return jnp.zeros_like(motion.velocity).at[:, self.at].add(columns)
 
 
 def smooth_sign(

@@ -222,7 +222,7 @@ class PositionDependentFriction(JointEffect):
     sine: Scalar = amplitude("N m")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
-        q = self.here(motion.position)
+        q = self.here(motion.angle)
         return self.here(motion.direction) * (self.cosine * jnp.cos(q) + self.sine * jnp.sin(q))
 
 
@@ -238,7 +238,7 @@ class TorqueRipple(JointEffect):
     order: Scalar = shape("1/rad", tuple(3.0 + 0.8 * k for k in range(30)), (2.9, 26.6))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
-        angle = self.order * self.here(motion.position)
+        angle = self.order * self.here(motion.angle)
         return self.sine * jnp.sin(angle) + self.cosine * jnp.cos(angle)
 
 
@@ -254,7 +254,7 @@ class JointSpring(JointEffect):
     offset: Scalar = amplitude("N m")  # -stiffness rest: linear, where the rest position is not
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
-        return self.stiffness * self.here(motion.position) + self.offset
+        return self.stiffness * self.here(motion.angle) + self.offset
 
     def physical(self) -> dict[str, Scalar]:
         return {"stiffness": self.stiffness, "rest": -self.offset / self.stiffness}

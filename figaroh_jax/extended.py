@@ -25,7 +25,16 @@ from .errors import InputError
 from .kinematics import states
 from .model import RobotModel
 
-__all__ = ["ExtendedModel", "changed_robot", "extend", "predict", "read_position", "read_torque", "with_torque"]
+__all__ = [
+    "ExtendedModel",
+    "changed_robot",
+    "extend",
+    "predict",
+    "read_position",
+    "read_torque",
+    "require_single_axes",
+    "with_torque",
+]
 
 _NEWTON_STEPS = 12  # a load-dependent friction makes the torque piecewise affine in the acceleration: 2 or 3 are used
 
@@ -87,14 +96,24 @@ def predict(
 
     A uniform record of at least five samples, `dt` seconds apart. The rigid body moves as the links do, that is, as
     read less the sensors' errors (differentiated by five-point central differences; their load is that of the motion
-    as read). Friction sits at the motor and follows the motion as read.
+    as read). Friction sits at the motor and follows the motion as read. Raises `InputError` for a robot with joints
+    of several degrees of freedom: no one sensor reads their position.
     """
+    require_single_axes(extended.robot, "a record of sensors")
     with jax.enable_x64(True):
         motion = states(extended.robot, position=position, velocity=velocity, acceleration=acceleration)
         if motion[0].ndim != 2 or motion[0].shape[0] < 5:
             raise InputError(f"a record of 5 samples or more is needed, got the shape {motion[0].shape}")
         q, v, a = motion
         return _predict(extended, jnp.asarray(time, jnp.float64), q, v, a, jnp.float64(dt))
+
+
+def require_single_axes(robot: RobotModel, what: str) -> None:
+    """Raise `InputError` where a joint has several degrees of freedom, which `what` does not take."""
+    for joint in robot.joints:
+        if joint.kind not in ("revolute", "prismatic"):
+            given = f"joint '{joint.name}' of robot '{robot.name}' is {joint.kind}"
+            raise InputError(f"{what} takes revolute and prismatic joints; {given}: lock it, or fix the root")
 
 
 def _predict(extended: ExtendedModel, time: Array, q: Array, v: Array, a: Array, dt: Array) -> Array:

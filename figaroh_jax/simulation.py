@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from .dynamics import inverse_dynamics
 from .effect import Motion
 from .errors import InputError
-from .extended import ExtendedModel, changed_robot, read_position, read_torque, with_torque
+from .extended import ExtendedModel, changed_robot, read_position, read_torque, require_single_axes, with_torque
 from .kinematics import states
 from .model import RobotModel
 
@@ -59,8 +59,10 @@ def simulate(
     $h(q, v^+, (v^+ - v)/dt) + J' f = \tau$, $f_i = F_i \, \mathrm{clip}(J_i v^+ / w_i, -1, 1)$, $q^+ = q + dt\, v^+$,
     where the rows of J are the joints and the motors between joints, w is the width of their reversals (0: they stick)
     and the levels F hold the state at the step's beginning. Dry friction of an effect on the whole robot counts as
-    friction of the joints. Differentiable with respect to model, command and start.
+    friction of the joints. Differentiable with respect to model, command and start. Joints of several degrees of
+    freedom are not simulated.
     """
+    require_single_axes(extended.robot, "a simulation")
     with jax.enable_x64(True):
         q, v = states(extended.robot, position=position, velocity=velocity)
         if q.ndim != 1:

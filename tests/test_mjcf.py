@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import mujoco_c
 import numpy as np
+import pinocchio as pin
 import pytest
 import robots
 import tasks
@@ -17,7 +18,7 @@ from figaroh_jax.config import load_robot, load_task, robot_notes
 from figaroh_jax.dynamics import inverse_dynamics, mass_matrix
 from figaroh_jax.errors import InputError
 from figaroh_jax.export import load_model, write_model
-from figaroh_jax.extended import extend
+from figaroh_jax.extended import extend, predict
 from figaroh_jax.kinematics import forward_kinematics
 from figaroh_jax.mjcf import compiled_robot, load_mjcf
 from figaroh_jax.model import RobotModel
@@ -271,6 +272,15 @@ def test_what_acts_at_the_joints_comes_back_from_the_written_mjcf_and_folder(nam
             np.testing.assert_allclose(*values, rtol=1e-12, atol=1e-15)
 
 
+def test_simulation_and_sensors_refuse_joints_of_several_axes_by_name(tmp_path: Path) -> None:
+    extended = extend(load_mjcf(written(robots.quadruped(), tmp_path)))
+    q, v, a = stacked(extended.robot, 6)
+    with pytest.raises(InputError, match="a simulation takes revolute and prismatic joints; joint 'base' of robot"):
+        fj.simulate(extended, v, q[0], v[0], 0.01)
+    with pytest.raises(InputError, match="a record of sensors takes .* joint 'base' of robot 'quadruped' is free"):
+        predict(extended, np.arange(6) * 0.01, v, v, a, 0.01)
+
+
 def test_what_differs_between_the_axes_of_a_joint_is_listed_and_not_written(tmp_path: Path) -> None:
     model = load_mjcf(written(robots.CREATURE, tmp_path))
     effects = [
@@ -288,8 +298,6 @@ def test_what_differs_between_the_axes_of_a_joint_is_listed_and_not_written(tmp_
 
 
 def test_urdf_dynamics_are_pinocchios(tmp_path: Path) -> None:
-    import pinocchio as pin
-
     more = robots.LIMIT + '<dynamics damping="{}" friction="{}"/>'
     follow = more.format(0.5, 0.2) + '<mimic joint="j0" multiplier="-1.5" offset="0.3"/>'
     joints = [

@@ -1,4 +1,4 @@
-"""Random robots: what is read and written again is, for Pinocchio and MuJoCo C, the robot of the original file."""
+"""What is read and written again is, for Pinocchio and MuJoCo C, the robot of the original file."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import mujoco_c
 import numpy as np
 import pinocchio as pin
+import pytest
 import robots
 from hypothesis import given, settings, strategies as st
 
+import figaroh_jax as fj
 from figaroh_jax.export import load_model, write_model
 from figaroh_jax.extended import extend
 from figaroh_jax.mjcf import load_mjcf
 from figaroh_jax.model import RobotModel
+from figaroh_jax.native import physical_inertia
+from figaroh_jax.robotfile import load_extended
 from figaroh_jax.urdf import load_urdf
 
 KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar", "mimic")
@@ -76,7 +81,7 @@ def random_mjcf(rng: np.random.Generator, bodies: int) -> str:
 
 
 def in_pinocchio(model: RobotModel, urdf: str, states: list[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
-    """Torques of the URDF text by Pinocchio, at states of our model of it and in its columns."""
+    """Torques of the URDF text by Pinocchio, damping and friction too, at states of our model and in its columns."""
     theirs = pin.buildModelFromXML(urdf)
     data, torques = theirs.createData(), []
     for q, v, a in states:
@@ -91,7 +96,9 @@ def in_pinocchio(model: RobotModel, urdf: str, states: list[tuple[np.ndarray, ..
             position[found.idx_q : found.idx_q + found.nq] = numbers
             columns = slice(joint.coordinate, joint.coordinate + found.nv)
             share[found.idx_v : found.idx_v + found.nv, columns] = np.eye(found.nv) * float(model.ratio[i])
-        torques.append(share.T @ pin.rnea(theirs, data, position, share @ v, share @ a))
+        rate = share @ v
+        passive = theirs.damping * rate + theirs.friction * np.sign(rate)
+        torques.append(share.T @ (pin.rnea(theirs, data, position, rate, share @ a) + passive))
     return torques
 
 
@@ -143,3 +150,35 @@ def test_an_mjcf_is_for_mujoco_and_pinocchio_what_it_was(seed: int, bodies: int)
         wanted = [theirs.torque(*state) for state in states]
         written = (folder / "model" / "robot.urdf").read_text()
         np.testing.assert_allclose(in_pinocchio(model, written, states), wanted, rtol=1e-10, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", robots.REAL)
+def test_real_robots_lose_nothing_from_urdf_to_mjcf_to_urdf(name: str, data_dir: Path, tmp_path: Path) -> None:
+    """Random drives at every joint; MuJoCo C reads the file in the middle, Pinocchio the first and the last."""
+    robot = load_urdf(data_dir / robots.REAL[name])
+    inertia = [physical_inertia(np.asarray(ten), "mjcf")[0] for ten in robot.inertia]  # MuJoCo refuses some
+    robot = eqx.tree_at(lambda m: m.inertia, robot, np.array(inertia))
+    rng = np.random.default_rng()
+    damping, force, rotor = rng.uniform(0.1, 1, (3, robot.nv))
+    drives = [
+        fj.place(fj.CATALOGUE[kind], robot, [joint], **{parameter: value})
+        for kind, parameter, values in (
+            ("viscous_friction", "damping", damping),
+            ("coulomb_friction", "force", force),
+            ("rotor_inertia", "inertia", rotor),
+        )
+        for joint, value in zip(robot.joint_names, values, strict=True)
+    ]
+    write_model(extend(robot), tmp_path / "rigid")
+    write_model(extend(robot, *drives), tmp_path / "first")
+    middle, notes = load_extended(tmp_path / "first" / "robot.xml", joints=robot.joint_names)
+    write_model(middle, tmp_path / "second")
+    states = [(q, np.sign(v) * (1 + abs(v)), a) for q, v, a in mujoco_c.states(robot, 5)]
+    rigid = in_pinocchio(robot, (tmp_path / "rigid" / "robot.urdf").read_text(), states)
+    wanted = [t + damping * v + force * np.sign(v) + rotor * a for t, (_, v, a) in zip(rigid, states, strict=True)]
+    theirs = mujoco_c.load(tmp_path / "first" / "robot.xml", robot, passive=True)
+    np.testing.assert_allclose([theirs.torque(*s) for s in states], wanted, rtol=1e-11, atol=1e-9)
+    last = in_pinocchio(robot, (tmp_path / "second" / "robot.urdf").read_text(), states)
+    last = [torque + rotor * a for torque, (_, _, a) in zip(last, states, strict=True)]  # which URDF has no element for
+    np.testing.assert_allclose(last, wanted, rtol=1e-11, atol=1e-9)
+    assert notes == () and [e.name for e in middle.effects if e.name == "rotor_inertia"] == ["rotor_inertia"] * robot.nv
