@@ -98,7 +98,8 @@ def shifted(effects: Effect, motion: Motion, records: Records) -> Motion:
 
     Position, velocity and acceleration of the answer have a leading axis of effects.
     """
-    errors = np.asarray(_errors(effects, motion)).reshape(-1, *records.position.shape[:2])
+    each = [jax.tree.map(lambda x, i=i: np.asarray(x)[i], effects) for i in range(len(effects.at))]
+    errors = np.stack([_error(effect, motion) for effect in each]).reshape(-1, *records.position.shape[:2])
     rates = difference(errors, float(records.dt))
     change = [errors, rates, difference(rates, float(records.dt))]
     one, joint = np.arange(len(errors)), np.asarray(effects.at)[:, 0]
@@ -257,8 +258,8 @@ def _units_and_slopes(
 
 
 @jax.jit
-def _errors(effects: Effect, motion: Motion) -> Float[Array, "effects nN"]:
-    return jax.vmap(lambda effect: effect.position_error(motion))(effects)
+def _error(effect: Effect, motion: Motion) -> Float[Array, " nN"]:
+    return effect.position_error(motion)
 
 
 @jax.jit

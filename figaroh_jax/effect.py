@@ -174,7 +174,9 @@ class Effect(eqx.Module):
 
     def here(self, signal: Float[Array, "samples nv"], place: int = 0) -> Float[Array, " samples"]:
         """Column of `signal` at the joint where the effect acts (`place` 1: the second of a pair)."""
-        return signal[:, self.at[place]]
+        if isinstance(signal, np.ndarray) and isinstance(self.at, np.ndarray):
+            return signal[:, self.at[place]]
+        return jax.lax.dynamic_index_in_dim(signal, self.at[place], 1, keepdims=False)  # traced at once, unlike `[]`
 
     def joint_torque(self, motion: Motion) -> Float[Array, "samples nv"]:
         """`torque` in the columns of all joints, zero elsewhere."""
@@ -233,4 +235,6 @@ def columns(effect: Effect, motion: Motion) -> Float[Array, "amplitudes samples 
         return eqx.tree_at(lambda e: [getattr(e, n) for n in names], effect, list(values)).torque(motion)
 
     # linear and zero at zero, so the torque of a unit is the derivative, with half the work to trace
+    if len(names) == 1:
+        return torque(jnp.ones(1))[None]
     return jax.vmap(torque)(jnp.eye(len(names)))

@@ -211,7 +211,7 @@ def _product(
 ) -> Float[np.ndarray, "columns m"]:
     out = np.zeros((width, rows[0].shape[1]))
     for columns, own, right in zip(joint, Zi, rows, strict=True):
-        out[columns] += own @ right
+        out[columns] += own.astype(right.dtype, copy=False) @ right
     return out
 
 
@@ -264,9 +264,9 @@ def _by_width(span: list[tuple[int, int, int]]) -> list[tuple[list[int], Int[np.
 def other_scores(
     rows: Rows, stock: Bank, H: Float[np.ndarray, "P columns"], residual: Float[np.ndarray, "draws nv T"]
 ) -> Float[np.ndarray, "draws columns"]:
-    """The scores that other residual rows would give: Zi'e - H'Xi'e."""
-    draws = len(residual)
-    model = (residual * rows.paired).reshape(draws, -1) @ _tall(rows.Xi)
+    """The scores that other residual rows would give: Zi'e - H'Xi'e, in the precision of those rows."""
+    draws, kind = len(residual), residual.dtype
+    model = (residual * rows.paired.astype(kind)).reshape(draws, -1) @ _tall(rows.Xi).astype(kind, copy=False)
     return stock.product(list(np.moveaxis(residual, 0, 2))).T - model @ H
 
 

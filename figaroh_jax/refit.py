@@ -22,7 +22,7 @@ __all__ = ["Whitened", "bounded_minimum", "profile", "refit", "refit_shift", "sh
 
 STEPS = 12
 RIDGE = 1e-9
-CLOSE = 1e-3  # of its bracket: how exactly the size of a shift is searched
+CLOSE = 1e-2  # of its bracket: how exactly the size of a shift is searched
 
 
 class Whitened(NamedTuple):

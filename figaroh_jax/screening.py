@@ -161,7 +161,7 @@ def draw_noise(
     draws: int,
     generator: np.random.Generator,
 ) -> Float[np.ndarray, "draws nv T"]:
-    """Whitened rows of noise with the spectrum, its coefficients redrawn from their covariance."""
+    """Whitened rows of noise with the spectrum, its coefficients redrawn from their covariance (single precision)."""
     records = problem.records
     n, _, count, nv = records.shape
     frequency = np.fft.rfftfreq(count, 1 / float(records.rate))
@@ -169,12 +169,11 @@ def draw_noise(
     response = [np.interp(frequency, known, np.asarray(records.low_pass) * whitening[:, j]) for j in range(nv)]
     shape = np.sqrt(spectrum.redrawn(generator).power(frequency)).T * np.stack(response)
     # what `rfft` makes of white noise: equal real and imaginary parts, but for the two ends, which are real
-    white = generator.standard_normal((draws, nv, n, len(frequency), 2)).view(complex)[..., 0] * np.sqrt(count / 2)
-    white[..., 0] *= np.sqrt(2)
-    if count % 2 == 0:
-        white[..., -1] *= np.sqrt(2)
-    rows = np.fft.irfft(white * shape[:, None], count, axis=-1)
-    return (rows * np.moveaxis(np.asarray(records.weight), 2, 0)).reshape(draws, nv, -1)
+    shape *= np.sqrt(count / 2)
+    shape[:, [0, -1] if count % 2 == 0 else [0]] *= np.sqrt(2)
+    white = generator.standard_normal((draws, nv, n, len(frequency), 2), np.float32).view(np.complex64)[..., 0]
+    rows = np.fft.irfft(white * shape[:, None].astype(np.float32), count, axis=-1)
+    return (rows * np.moveaxis(np.asarray(records.weight, np.float32), 2, 0)).reshape(draws, nv, -1)
 
 
 def _link_columns(rows: Rows, link: int, model: RobotModel) -> Columns:
