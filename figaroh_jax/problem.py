@@ -6,9 +6,9 @@ far, with the regressor at every sample. `whitened` gives the rows in which ever
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import equinox as eqx
 import jax
@@ -19,6 +19,7 @@ from .design import (
     Units,
     candidates,
     flattened,
+    in_pieces,
     kind,
     rigid_torque,
     sensor_response,
@@ -128,9 +129,13 @@ class State:
 
     def torque(self, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "nN nv"]:
         """Torque at the samples with the coefficients `theta`, N m or N."""
+        return sum(self.shares(theta), np.zeros(self.rigid.shape[:2]))
+
+    def shares(self, theta: Float[np.ndarray, " P"]) -> Iterator[Float[np.ndarray, "nN nv"]]:
+        """Torque of the rigid body, then of each term."""
         split = np.split(theta, np.cumsum([part.shape[2] for part in self.parts])[:-1])
-        torques = [part.reshape(-1, part.shape[2]) @ own for part, own in zip(self.parts, split, strict=True)]
-        return np.sum(torques, axis=0).reshape(self.rigid.shape[:2])
+        for part, own in zip(self.parts, split, strict=True):
+            yield (part.reshape(-1, part.shape[2]) @ own).reshape(self.rigid.shape[:2])
 
     def response(self, omega: Float[Leaf, " F"]) -> Complex[np.ndarray, " F"] | Float[np.ndarray, " F"]:
         """Response of the torque sensor of all sensor effects together."""
@@ -257,8 +262,8 @@ def link_motion(problem: Problem, state: State) -> Motion:
 def solved(problem: Problem, state: State, theta: Float[np.ndarray, " P"]) -> State:
     """The state with coefficients `theta`, and with the load and the torque that follow from them."""
     links = state.rigid.shape[2]
-    load = (state.rigid.reshape(-1, links) @ theta[:links]).reshape(state.rigid.shape[:2])
-    new = (load, state.torque(theta), theta[:links].reshape(-1, 10))
+    load, *others = state.shares(theta)
+    new = (load, sum(others, load), theta[:links].reshape(-1, 10))
     motion = eqx.tree_at(lambda m: (m.load, m.total, m.model.inertia), state.motion, new)
     return replace(state, theta=theta, motion=motion)
 
@@ -388,4 +393,5 @@ def _row_layout(layout: Layout) -> tuple[np.ndarray, ...]:
 
 
 def _rigid(problem: Problem, motion: Motion) -> Float[np.ndarray, "nN nv P"]:
-    return np.asarray(joint_torque_regressor(problem.model, motion.position, motion.velocity, motion.acceleration))
+    regressor = partial(joint_torque_regressor, problem.model)
+    return in_pieces(regressor, motion.position, motion.velocity, motion.acceleration)
