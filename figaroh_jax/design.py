@@ -89,7 +89,9 @@ def difference(signal: Float[np.ndarray, "*n N"], dt: float) -> Float[np.ndarray
     return out
 
 
-def in_pieces(function: Callable[..., Array], *arrays: Float[Leaf, "*batch nv"]) -> Float[np.ndarray, "*batch rest"]:
+def in_pieces(
+    function: Callable[..., Array | np.ndarray], *arrays: Float[Leaf, "*batch nv"]
+) -> Float[np.ndarray, "*batch rest"]:
     """`function` over samples, a piece of one size at a time: no program depends on their number."""
     flat = [np.reshape(x, (-1, np.shape(x)[-1])) for x in arrays]
     count, out = len(flat[0]), []
