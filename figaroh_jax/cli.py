@@ -26,6 +26,7 @@ _THREADS = {
 }
 _TASKS = {  # commands that take a task file
     "diagnose": "the main job, on a task file of yours",
+    "identify": "fit the dynamics: links, friction, intervals",
     "calibrate": "fit the kinematics from measured poses or points",
 }
 _DESCRIPTION = "Name what a robot's simulation gets wrong, extend the model with it and measure the gain."

@@ -31,7 +31,9 @@ __all__ = [
     "Actuator",
     "Baseline",
     "BaselineEffect",
+    "Bound",
     "Diagnose",
+    "Identify",
     "Load",
     "Measurement",
     "Preprocess",
@@ -281,6 +283,25 @@ class Diagnose(_Keys):
     alpha: Annotated[Number, Field(gt=0, lt=1)] = 0.05
 
 
+class Bound(_Keys):
+    """What CAD says of a link, in its joint frame."""
+
+    mass: tuple[Number, Number] | None = None  # kg, least and greatest
+    com: tuple[Vector, Vector] | None = None  # m, corners of a box around the centre of mass
+
+    def given(self) -> dict[str, Any]:
+        """What is given, as `consistency.bodies` takes it."""
+        return {name: value for name in ("mass", "com") if (value := getattr(self, name)) is not None}
+
+
+class Identify(_Keys):
+    """How `identify` fits."""
+
+    fit: Literal["physical", "log_cholesky", "unconstrained"] = "physical"
+    joints: tuple[str, ...] | None = None  # whose torque is fitted; None: all
+    bounds: dict[str, Bound] = {}  # by link
+
+
 class Task(_Keys):
     """A whole task file."""
 
@@ -291,6 +312,7 @@ class Task(_Keys):
     baseline: Baseline = Baseline()
     actuator: Actuator = Actuator()
     diagnose: Diagnose = Diagnose()
+    identify: Identify = Identify()
     _file: Path = PrivateAttr(default=Path("task"))
 
     @property

@@ -10,6 +10,7 @@ import base64
 import importlib.util
 import json
 import math
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ from jaxtyping import Float, Int
 from . import wording
 from .results import Candidate, Diagnosis, Trace
 
-__all__ = ["page_template", "plotly_source", "write_report"]
+__all__ = ["page_template", "plot_data", "plotly_source", "write_report"]
 
 _POINTS = 1500  # of a trace at most: more cannot be told apart on a screen
 _PAGE_POINTS = 100_000  # of all traces of a channel together, so that a humanoid's page stays light
@@ -83,7 +84,7 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
         candidates=sorted(diagnosis.candidates, key=_rank),
         css=Markup((page / "report.css").read_text("utf-8")),
         js=Markup((page / "report.js").read_text("utf-8")),
-        data=Markup(_data(diagnosis)),
+        data=Markup(plot_data(diagnosis.noise, diagnosis.torque_units, diagnosis.traces)),
         plotly=Markup(plotly_source()),
     )
 
@@ -151,15 +152,15 @@ def _rank(candidate: Candidate) -> float:
     return -candidate.score if math.isfinite(candidate.score) else math.inf
 
 
-def _data(diagnosis: Diagnosis) -> str:
+def plot_data(floor: Float[np.ndarray, " nv"], units: Sequence[str], traces: Sequence[Trace]) -> str:
     """What the plots are drawn from, as JSON that may stand inside a script element."""
-    count = len(diagnosis.joints) * max(len(diagnosis.traces), 1)
+    count = len(units) * max(len(traces), 1)
     points = min(_POINTS, max(200, _PAGE_POINTS // count))
     joints = [
         {"noise": _finite(float(noise)), "unit": unit, "angle": "m" if unit == "N" else "rad"}
-        for noise, unit in zip(diagnosis.noise, diagnosis.torque_units, strict=True)
+        for noise, unit in zip(floor, units, strict=True)
     ]
-    recordings = [_series(trace, points) for trace in diagnosis.traces]
+    recordings = [_series(trace, points) for trace in traces]
     text = json.dumps({"joints": joints, "recordings": recordings}, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")
 

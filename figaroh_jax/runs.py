@@ -16,6 +16,7 @@ from .errors import InputError
 if TYPE_CHECKING:
     from .calibrated import Calibration
     from .config import Task
+    from .result import Identification
     from .results import Diagnosis
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "calibrate_file",
     "check_directory",
     "diagnose_file",
+    "identify_file",
     "predictions",
     "whole_directory",
     "write_run",
@@ -62,6 +64,29 @@ def diagnose_file(
     progress("writing the report", 1.0)
     write_run(task, diagnosis, out)
     return diagnosis
+
+
+def identify_file(
+    task_file: Path, out: Path, progress: Callable[[str, float], None] = lambda phase, fraction: None
+) -> Identification:
+    """Read a task, identify its robot and write the run directory `out`, as `diagnose_file` does."""
+    from .config import load_task
+
+    check_directory(out)
+    task = load_task(task_file)
+    from .export import write_model
+    from .identification import identify_task
+    from .identification_report import write_identification
+    from .parameter_files import write_parameters
+
+    found = identify_task(task, progress=progress)
+    progress("writing the report", 1.0)
+    with whole_directory(out) as folder:
+        (folder / RESULT).write_text(_identification_json(found), encoding="utf-8")
+        write_parameters(found, folder)
+        write_identification(found, folder / REPORT, found.model.robot.name)
+        write_model(found.model, folder / "model")
+    return found
 
 
 def calibrate_file(
@@ -171,6 +196,18 @@ def _show_diagnosis(diagnosis: Diagnosis) -> None:
     show(diagnosis, diagnosis.model.robot.name)
 
 
+def _identification_json(found: Identification) -> str:
+    from .result import to_json
+
+    return to_json(found)
+
+
+def _show_identification(found: Identification) -> None:
+    from .terminal import show_identification
+
+    show_identification(found, found.model.robot.name)
+
+
 def _calibration_json(calibration: Calibration) -> str:
     from .calibration_files import to_json
 
@@ -185,5 +222,6 @@ def _show_calibration(calibration: Calibration) -> None:
 
 JOBS = {
     "diagnose": Job("diagnosis", diagnose_file, _diagnosis_json, _show_diagnosis),
+    "identify": Job("identification", identify_file, _identification_json, _show_identification),
     "calibrate": Job("calibration", calibrate_file, _calibration_json, _show_calibration),
 }

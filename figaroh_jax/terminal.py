@@ -13,12 +13,13 @@ from rich.table import Table
 from rich.text import Text
 
 from . import wording
+from .result import FittedEffect, Identification
 from .results import Cause, Diagnosis
 
 if TYPE_CHECKING:
     from .calibrated import Calibration
 
-__all__ = ["Progress", "calibration_summary", "show", "show_calibration", "summary"]
+__all__ = ["Progress", "calibration_summary", "identification_summary", "show", "show_calibration", "show_identification", "summary"]
 
 _STYLE = {"nothing": "green", "named": "bold blue", "named+rest": "bold blue", "unknown": "bold yellow"}
 
@@ -136,3 +137,45 @@ def _residuals(diagnosis: Diagnosis) -> RenderableType:
 
 def _plain(text: str) -> str:
     return text.replace("[", "(").replace("]", ")")  # the progress bar reads brackets as its own markup
+
+
+def show_identification(found: Identification, robot: str = "the robot") -> None:
+    """Print the summary of an identification on standard output."""
+    Console(file=sys.stdout).print(identification_summary(found, robot))
+
+
+def identification_summary(found: Identification, robot: str = "the robot") -> RenderableType:
+    """The identification in a few lines: rank, error of each joint, friction, what cannot be trusted."""
+    base = [one.status for one in found.base]
+    wrong = [link.name for link in found.links if not link.consistent]
+    head = Text.assemble(
+        ("identified", "bold blue"),
+        f"  {robot}: {found.rank} base parameters (of {found.structural_rank} that a motion could show),"
+        f" {base.count('identified')} of them told by the data; condition {found.condition:.4g}",
+    )
+    links = f"No body can have the parameters of {', '.join(wrong)}." if wrong else "Every link can exist."
+    parts: list[RenderableType] = [head, Text(links, style="yellow" if wrong else "")]
+    parts += [Text(), _qualities(found), Text()]
+    parts += [Text(_effect(effect)) for effect in found.effects]
+    parts += [Text(f"Note: {note}", style="dim") for note in found.notes]
+    return Group(*parts)
+
+
+def _effect(effect: FittedEffect) -> str:
+    values = ", ".join(f"{name} {wording.interval(value)}" for name, value in effect.parameters.items())
+    return f"{wording.phrase(effect.name)}: {values}"
+
+
+def _qualities(found: Identification) -> RenderableType:
+    """RMS residual of every joint on the data fitted, cross-validated, and on each held-out recording."""
+    columns = {"nominal": found.nominal, "fit": found.fit, "cross-validated": found.validated} | found.holdout
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("RMS residual")
+    for title in [*columns, "R2"]:
+        table.add_column(Text(title), justify="right")
+    table.add_column("")
+    last = list(found.holdout.values())[-1] if found.holdout else found.validated
+    for j, (joint, unit) in enumerate(zip(found.joints, found.torque_units, strict=True)):
+        values = [wording.number(float(quality.rms[j]), 3) for quality in columns.values()]
+        table.add_row(Text(joint), *values, f"{last.r2[j]:.4f}", unit)
+    return table

@@ -23,6 +23,8 @@ OUTSIDE = {
     "jinja2": {"report"},
     "plotly": {"report"},
     "jaxopt": {"refit"},
+    "clarabel": {"conic"},
+    "sklearn": {"least_squares"},
 }
 
 

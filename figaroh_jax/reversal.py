@@ -1,0 +1,53 @@
+"""How sharply dry friction turns round: the half width of each joint's reversal, chosen from a grid.
+
+A gear's friction does not jump. All widths stand in one condensed regression as columns, so a choice costs no pass over
+the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .regression import Regression, condense
+
+__all__ = ["WIDTHS", "with_reversal_widths"]
+
+WIDTHS = (0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # rad/s or m/s; zero is the column that is there anyway
+GAIN = 10.0  # by which the weighted squares must fall: a smooth reversal has to earn its place
+
+
+def with_reversal_widths(
+    regression: Regression,
+    used: Bool[np.ndarray, "nv columns"],
+    kept: Sequence[int] | Int[np.ndarray, " kept"],
+    weight: Float[np.ndarray, " nv"],
+) -> Regression:
+    """The regression with the half width that fits best at each joint that has Coulomb friction.
+
+    `kept` are the base columns, `weight` the joints' inverse variances.
+    """
+    names, nv = regression.names, regression.model.nv
+    coulomb = [names.index(f"fc{j + 1}") if f"fc{j + 1}" in names else None for j in range(nv)]
+    if not any(column in kept for column in coulomb if column is not None):
+        return regression
+    factor = condense(regression, used, widths=WIDTHS).factor(weight)
+    chosen, width = list(kept), np.array(regression.width, float)
+    for j, column in enumerate(coulomb):
+        if column not in chosen:
+            continue
+        tried = [column, *(len(names) + j * len(WIDTHS) + k for k in range(len(WIDTHS)))]
+        place = chosen.index(column)
+        costs = [_cost(factor, [*chosen[:place], other, *chosen[place + 1 :]]) for other in tried]
+        best = int(np.argmin(np.array(costs) - GAIN * (np.arange(len(tried)) == 0)))
+        chosen[place] = tried[best]
+        width[j] = 0.0 if best == 0 else WIDTHS[best - 1]
+    return replace(regression, width=width)
+
+
+def _cost(factor: Float[np.ndarray, "n k"], columns: Sequence[int]) -> float:
+    """Squares that the columns leave."""
+    return float(np.asarray(np.linalg.qr(factor[:, [*columns, -1]], mode="r"))[-1, -1] ** 2)

@@ -1,0 +1,87 @@
+"""Recordings of an arm with known parameters, made by Pinocchio: the tests' truth shares no code with the library."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pinocchio as pin
+import tasks
+from scipy import signal
+
+import figaroh_jax as fj
+from figaroh_jax.dataset import Recording
+
+RATE = 200.0  # Hz
+VISCOUS, COULOMB = np.array([1.5, 0.8, 20.0]), np.array([2.0, 1.0, 5.0])
+TORQUE_NOISE = np.array([0.3, 0.15, 0.5])
+TEN = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 9])
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The robot as its file says it, the robot as it is, and the parameters of the latter in the library's order."""
+
+    file: Path
+    nominal: fj.RobotModel
+    model: Any
+    theta: np.ndarray  # ten of each link, viscous and Coulomb friction of each joint
+
+
+def arm(folder: Path, spread: float = 0.1, seed: int = 0) -> Truth:
+    """Links heavier or lighter, longer or shorter than the file says, by `spread`; each of them a body."""
+    file = folder / "robot.urdf"
+    file.write_text(tasks.URDF)
+    model = pin.buildModelFromXML(tasks.URDF)
+    generator = np.random.default_rng(seed)
+    for k in range(1, model.njoints):
+        body = model.inertias[k]
+        mass, lever = (float(body.mass * (1 + spread * generator.normal())), body.lever)
+        turn = body.inertia * (1 + spread * generator.normal())
+        model.inertias[k] = pin.Inertia(mass, lever + spread * 0.05 * generator.normal(size=3), turn)
+    ten = np.concatenate([model.inertias[k].toDynamicParameters() for k in range(1, model.njoints)])
+    return Truth(file, fj.load_urdf(file), model, np.concatenate([ten, VISCOUS, COULOMB]))
+
+
+def recording(
+    truth: Truth,
+    seconds: float = 20.0,
+    seed: int = 0,
+    *,
+    noise: Literal["white", "coloured", "none"] = "white",
+    role: Literal["fit", "holdout"] = "fit",
+    name: str = "run",
+    payload: tuple[float, np.ndarray] | None = None,
+) -> Recording:
+    """A rich motion; `coloured` noise has a correlation time of 0.1 s and the same standard deviation."""
+    generator = np.random.default_rng(seed)
+    t = np.arange(int(seconds * RATE)) / RATE
+    frequency = generator.uniform(0.1, 1.0, (5, 3))
+    phase = generator.uniform(0, 2 * np.pi, (5, 3))
+    amplitude = generator.uniform(0.1, 0.35, (5, 3)) * [1, 1, 0.15]
+    angle = 2 * np.pi * frequency * t[:, None, None] + phase
+    w = 2 * np.pi * frequency
+    q = (amplitude * np.sin(angle)).sum(1) + [0.1, -0.2, 0.25]
+    v, a = (amplitude * w * np.cos(angle)).sum(1), -(amplitude * w**2 * np.sin(angle)).sum(1)
+    model = truth.model
+    if payload is not None:
+        model = model.copy()
+        mass, place = payload
+        model.inertias[3] = model.inertias[3] + pin.Inertia(mass, place, np.zeros((3, 3)))
+    data = model.createData()
+    tau = np.array([pin.rnea(model, data, *s) for s in zip(q, v, a, strict=True)])
+    tau += VISCOUS * v + COULOMB * np.sign(v) + _noise(noise, generator, len(t))
+    joints = tuple(truth.nominal.joint_names)
+    return Recording(name, Path(f"{name}.npz"), joints, t, q, None, tau, None, None, None, role)
+
+
+def _noise(kind: str, generator: np.random.Generator, samples: int) -> np.ndarray:
+    white = generator.normal(size=(samples, 3)) * TORQUE_NOISE
+    if kind == "none":
+        return 0 * white
+    if kind == "white":
+        return white
+    decay = np.exp(-1 / (0.1 * RATE))
+    return np.asarray(signal.lfilter([np.sqrt(1 - decay**2)], [1.0, -decay], white, axis=0))

@@ -1,0 +1,229 @@
+"""Identification from end to end: simulated truth, files in and out, refusals."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import simulated_arm
+import tasks
+from simulated_arm import Truth, recording
+
+import figaroh_jax as fj
+from figaroh_jax import cli, regression as regression_module
+from figaroh_jax.base_parameters import base_parameters
+from figaroh_jax.config import Baseline, Load, Preprocess
+from figaroh_jax.errors import InputError
+from figaroh_jax.identification import identify
+from figaroh_jax.regression import Regression, condense, friction_terms
+from figaroh_jax.result import Identification, to_json
+from figaroh_jax.signals import prepare_all
+
+SETTINGS = Preprocess(cutoff=10)
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
+    return simulated_arm.arm(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def found(truth: Truth) -> Identification:
+    held = recording(truth, 10.0, seed=7, role="holdout", name="other")
+    return identify(truth.nominal, [recording(truth, seed=1), held], SETTINGS)
+
+
+def test_held_out_torque_is_predicted_to_the_noise(found: Identification):
+    passed = np.sqrt(2 * 10.0 / simulated_arm.RATE)  # of white noise, by a low pass at 10 Hz
+    assert (found.holdout["other.npz"].rms < 1.3 * passed * simulated_arm.TORQUE_NOISE).all()
+    assert (found.holdout["other.npz"].r2 > 0.99).all()
+
+
+def test_base_parameters_are_the_truth_within_their_intervals(truth: Truth, found: Identification):
+    base = _base(truth)
+    assert [one.expression for one in found.base] == list(base.expressions)
+    value, std = (np.array([getattr(one, key) for one in found.base]) for key in ("value", "std"))
+    score = (value - base.matrix @ truth.theta) / std
+    assert np.abs(score).max() < 4.5 and np.sqrt(np.mean(score**2)) < 1.6
+
+
+def test_friction_is_named_with_its_truth(found: Identification):
+    values = {(e.name.effect, e.name.at[0]): next(iter(e.parameters.values())) for e in found.effects}
+    for j, joint in enumerate(tasks.JOINTS):
+        for effect, true in (("viscous_friction", simulated_arm.VISCOUS), ("coulomb_friction", simulated_arm.COULOMB)):
+            estimate = values[effect, joint]
+            assert abs(estimate.value - true[j]) < max(5 * estimate.std, 0.06 * true[j])
+    assert values["viscous_friction", "slide"].unit.startswith("N s")
+
+
+def test_every_link_can_exist_and_the_rank_is_the_structural_one(found: Identification):
+    assert all(link.consistent for link in found.links)
+    assert found.rank == found.structural_rank
+    assert {one.status for one in found.base} <= {"identified", "prior only", "on its bound"}
+    assert any(p.status == "prior only" and p.absorbed_in for p in found.parameters)
+
+
+def test_result_holds_what_the_contract_asks(found: Identification):
+    answer = json.loads(to_json(found))
+    assert {"rank", "condition", "base_parameters", "links", "effects", "fit", "holdout"} <= set(answer)
+    assert {"expression", "value", "std", "status"} == set(answer["base_parameters"][0])
+    assert all(len(link["parameters"]) == 10 and link["consistent"] is True for link in answer["links"])
+    assert {"effect", "at", "parameters"} == set(answer["effects"][0])
+    assert {"rms", "relative", "r2"} == set(answer["fit"]) == set(answer["holdout"]["other.npz"])
+
+
+def test_unconstrained_fit_of_the_same_data_is_hardly_better(truth: Truth, found: Identification):
+    free = identify(truth.nominal, [recording(truth, seed=1)], SETTINGS, fit="unconstrained")
+    assert found.fit.total <= 1.01 * free.unconstrained.total
+    assert free.fit.total <= found.fit.total * (1 + 1e-6)
+
+
+def test_log_cholesky_fit_gives_the_same_robot(truth: Truth, found: Identification):
+    other = identify(truth.nominal, [recording(truth, seed=1)], SETTINGS, fit="log_cholesky")
+    assert other.fit.total == pytest.approx(found.fit.total, rel=2e-3)
+    assert all(link.consistent for link in other.links)
+
+
+def test_a_dead_torque_is_refused_and_said(truth: Truth):
+    one = recording(truth, seed=1)
+    assert one.torque is not None
+    torque = one.torque.copy()
+    torque[:, 1] = 0.02 * (np.abs(torque[:, 1]) > np.quantile(np.abs(torque[:, 1]), 0.9))
+    found = identify(truth.nominal, [replace(one, torque=torque)], SETTINGS)
+    assert any("torque of elbow is not fitted" in note for note in found.notes)
+    assert np.isnan(found.fit.rms[1]) and np.isfinite(found.fit.rms[[0, 2]]).all()
+    assert json.loads(to_json(found))["fit"]["rms"][1] is None
+
+
+def test_only_the_joints_asked_for_are_fitted(truth: Truth):
+    found = identify(truth.nominal, [recording(truth, seed=1)], SETTINGS, joints=["shoulder"])
+    assert np.isfinite(found.fit.rms).tolist() == [True, False, False]
+    with pytest.raises(InputError, match="no moving joint 'sholder'.*shoulder"):
+        identify(truth.nominal, [recording(truth, seed=1)], SETTINGS, joints=["sholder"])
+
+
+def test_a_known_payload_is_no_part_of_the_robot(truth: Truth):
+    place = np.array([0.0, 0.05, 0.3])
+    loaded = recording(truth, seed=1, payload=(1.5, place), noise="none")
+    load = Load(frame="rod", mass=1.5, com=tuple(place))
+    bare = recording(truth, seed=1, noise="none")
+    options = {"preprocess": SETTINGS, "trust": 1.0}
+    first = identify(truth.nominal, [replace(loaded, load=load)], **options)
+    second = identify(truth.nominal, [bare], **options)
+    values = [np.array([one.value for one in found.base]) for found in (first, second)]
+    np.testing.assert_allclose(values[0], values[1], rtol=1e-3, atol=5e-3)
+
+
+def test_bounds_of_cad_hold(truth: Truth):
+    found = identify(truth.nominal, [recording(truth, seed=1)], SETTINGS, bounds={"fore": {"mass": (2.5, 2.6)}})
+    assert 2.5 - 1e-6 <= found.links[1].parameters[0] <= 2.6 + 1e-6
+    with pytest.raises(InputError, match="no link 'for'"):
+        identify(truth.nominal, [recording(truth, seed=1)], SETTINGS, bounds={"for": {}})
+
+
+def test_recordings_that_show_nothing_are_refused(truth: Truth):
+    still = recording(truth, seed=1)
+    still = replace(still, position=np.zeros_like(still.position))
+    found = identify(truth.nominal, [still], SETTINGS)
+    assert found.rank < 5 < found.structural_rank  # gravity alone
+    assert json.loads(to_json(found))
+    with pytest.raises(InputError, match="too short|record for longer"):
+        identify(truth.nominal, [recording(truth, 0.9, seed=1)], SETTINGS)
+
+
+def test_pieces_of_a_long_recording_give_the_same_factor(truth: Truth, monkeypatch: pytest.MonkeyPatch):
+    signals = prepare_all((recording(truth, 60.0, seed=3),), SETTINGS)
+    terms = friction_terms(truth.nominal, Baseline())
+    whole = Regression(truth.nominal, terms, np.zeros(3), signals)
+    used = np.ones((3, len(whole.names)), bool)
+    one = condense(whole, used)
+    monkeypatch.setattr(regression_module, "PIECE_BYTES", 8 * 3 * len(whole.names) * 1500)
+    assert len(list(whole.pieces())) > 3
+    cut = condense(whole, used)
+    assert (one.count == cut.count).all()
+    R, S = one.factor(), cut.factor()
+    np.testing.assert_allclose(S.T @ S, R.T @ R, rtol=0, atol=1e-7 * np.abs(R.T @ R).max())
+
+
+@pytest.fixture(scope="module")
+def run(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run directory made by the command."""
+    folder = tmp_path_factory.mktemp("run")
+    for name, one in (("first", recording(truth, seed=1)), ("other", recording(truth, 10.0, seed=7))):
+        np.savez(folder / f"{name}.npz", t=one.time, q=one.position, tau=one.torque)  # pyright: ignore
+    entry = {"time": "t", "position": "q", "torque": "tau"}
+    keys = {
+        "robot": {"model": str(truth.file)},
+        "data": [{"file": "first.npz", **entry}, {"file": "other.npz", "role": "holdout", **entry}],
+        "preprocess": {"cutoff": 10},
+        "identify": {"bounds": {"upper": {"mass": [0.1, 20]}}},
+    }
+    (folder / "task.yaml").write_text(json.dumps(keys))
+    assert cli.main(["identify", str(folder / "task.yaml"), "--out", str(folder / "out"), "--quiet"]) == 0
+    return folder / "out"
+
+
+def test_command_writes_a_whole_run(run: Path, capsys: pytest.CaptureFixture[str]):
+    names = {path.name for path in run.iterdir()}
+    tables = {"parameters.csv", "parameters.yaml", "parameters.npz"}
+    assert names == {"result.json", "report.html", "model"} | tables
+    answer = json.loads((run / "result.json").read_text())
+    with np.load(run / "parameters.npz") as file:
+        assert file["base_values"].tolist() == [b["value"] for b in answer["base_parameters"]]
+    page = (run / "report.html").read_text()
+    assert answer["base_parameters"][0]["expression"] in page and "cross-validated" in page
+
+
+def test_written_model_is_the_one_that_was_fitted(run: Path, truth: Truth):
+    answer = json.loads((run / "result.json").read_text())
+    again = pin.buildModelFromUrdf(str(run / "model" / "robot.urdf"))
+    for k, link in enumerate(answer["links"], 1):
+        np.testing.assert_allclose(again.inertias[k].toDynamicParameters(), link["parameters"], rtol=0, atol=1e-9)
+    loaded = fj.load_model(run / "model")
+    q, v, a = np.random.default_rng(0).normal(size=(3, 20, 3))
+    ours = np.asarray(loaded.robot.inertia)
+    np.testing.assert_allclose(ours, [link["parameters"] for link in answer["links"]], rtol=0, atol=1e-12)
+    torque = np.array([pin.rnea(again, again.createData(), *s) for s in zip(q, v, a, strict=True)])
+    viscous, coulomb = (
+        np.array([next(iter(e["parameters"].values()))["value"] for e in answer["effects"] if e["effect"] == name])
+        for name in ("viscous_friction", "coulomb_friction")
+    )
+    far = np.abs(v) > 0.2  # beyond every reversal
+    expected = torque + viscous * v + coulomb * np.sign(v)
+    np.testing.assert_allclose(np.asarray(loaded.inverse_dynamics(q, v, a))[far], expected[far], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"fit": "magic"}, "identify.fit"),
+        ({"joint": ["shoulder"]}, "unknown key 'joint'.*joints"),
+        ({"bounds": {"upper": {"weight": [0, 1]}}}, "unknown key 'weight'"),
+        ({"bounds": {"uper": {"mass": [0, 1]}}}, "no link 'uper'"),
+        ({"bounds": {"upper": {"mass": [2, 1]}}}, "least, greatest"),
+        ({"joints": ["elbows"]}, "no moving joint 'elbows'"),
+    ],
+)
+def test_wrong_keys_get_one_message_and_no_output(keys: dict, message: str, tmp_path: Path, capsys):
+    import re
+
+    file = tasks.write(tmp_path, tasks.task() | {"identify": keys})
+    assert cli.main(["identify", str(file), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert re.search(message, said) and said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def _base(truth: Truth):
+    """Base parameters from Pinocchio's regressor at random states."""
+    data, rng = truth.model.createData(), np.random.default_rng(3)
+    rows = []
+    for q, v, a in rng.normal(size=(100, 3, 3)):
+        rigid = pin.computeJointTorqueRegressor(truth.model, data, q, v, a)
+        rows.append(np.concatenate([rigid, np.diag(v), np.diag(np.sign(v))], axis=1))
+    links = [f"{name}{k}" for k in (1, 2, 3) for name in "m mx my mz Ixx Ixy Iyy Ixz Iyz Izz".split()]
+    return base_parameters(np.concatenate(rows), [*links, *(f"{n}{k}" for n in ("fv", "fc") for k in (1, 2, 3))])
