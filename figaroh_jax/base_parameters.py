@@ -147,13 +147,14 @@ def _independent(columns: Float[np.ndarray, "n k"], order: Sequence[int], tolera
 
 
 def _condition(columns: Float[np.ndarray, "n k"]) -> float:
-    values = np.asarray(np.linalg.svd(columns, compute_uv=False))
-    return float(values.max() / values.min()) if columns.size else 1.0
+    if not columns.size:
+        return 1.0
+    return float(np.linalg.cond(columns))
 
 
 def _leading(row: Float[np.ndarray, " columns"], names: Sequence[str]) -> list[tuple[float, str]]:
     least = TERM * np.abs(row).max()
-    return [(float(row[k]), names[k]) for k in np.flatnonzero(np.abs(row) > least)]
+    return [(float(x), name) for x, name in zip(row, names, strict=True) if abs(x) > least]
 
 
 def _text(terms: Sequence[tuple[float, str]]) -> str:

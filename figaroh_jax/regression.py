@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -20,14 +19,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .base_parameters import inertial_names
-from .design import joint_columns
-from .effect import Effect, Motion, place, smooth_sign
+from .effect import Effect, Motion, columns, place, smooth_sign
 from .effects import find
 from .errors import InputError
 from .inertia import from_com, transform
 from .model import RobotModel
-from .records import REACH, Records, filter_rows, stack
+from .records import Records, filter_rows, stack
 from .regressor import joint_torque_regressor
+from .rowfilter import reach
 from .signals import Signals
 
 if TYPE_CHECKING:
@@ -167,7 +166,7 @@ class Regression:
                 if fitted and one.role != "fit":
                     continue
                 single = _one(records, place_of)
-                rows = _rows(self.model, self.terms, jnp.asarray(self.width), single, tuple(widths))
+                rows = _rows(self.model, self.terms, self.width, single, tuple(widths))
                 X, y = (np.asarray(x)[: one.rows.kept] for x in rows)
                 weight = np.asarray(one.rows.weight) * (one.torque is not None) * trusted
                 yield Piece(X, y - self._carried(one, X), weight, one.rows.row_times, _folds(one), k)
@@ -181,8 +180,8 @@ class Regression:
 
     def _samples(self, one: Signals) -> int:
         """Working samples of a piece."""
-        reach = int(np.ceil(REACH / one.cutoff / one.dt))
-        return max(int(PIECE_BYTES / 8 / self.model.nv / max(len(self.names), 1)), 8 * reach)
+        beside = reach(one.dt, one.cutoff)
+        return max(int(PIECE_BYTES / 8 / self.model.nv / max(len(self.names), 1)), 8 * beside)
 
 
 def friction_terms(model: RobotModel, known: Baseline) -> tuple[Effect, ...]:
@@ -277,14 +276,14 @@ def _segments(one: Signals, samples: int) -> list[Signals]:
     """A recording cut into equally long pieces that overlap by the reach of the row filter at both sides."""
     if one.time.size <= samples:
         return [one]
-    reach = int(np.ceil(REACH / one.cutoff / one.dt))
+    beside = reach(one.dt, one.cutoff)
     index, out = one.rows.index, []
-    inner = samples - 2 * reach
+    inner = samples - 2 * beside
     for begin in range(int(index[0]), int(index[-1]) + 1, inner):
         mine = np.flatnonzero((index >= begin) & (index < begin + inner))
         if len(mine) == 0:
             continue
-        first = min(max(begin - reach, 0), one.time.size - samples)
+        first = min(max(begin - beside, 0), one.time.size - samples)
         out.append(_cut(one, slice(first, first + samples), mine))
     return out
 
@@ -328,23 +327,42 @@ def _motion(model: RobotModel, time: Any, q: Any, v: Any, a: Any, dt: Any, width
 
 
 @eqx.filter_jit
-def _columns(model: RobotModel, terms: tuple[Effect, ...], motion: Motion) -> Float[Array, "samples nv columns"]:
+def _columns(
+    model: RobotModel, terms: tuple[Effect, ...], motion: Motion, widths: tuple[float, ...] = ()
+) -> Float[Array, "samples nv columns"]:
     blocks = [joint_torque_regressor(model, motion.position, motion.velocity, motion.acceleration)]
     for term in terms:
-        columns = jax.vmap(lambda effect: joint_columns(effect, motion))(term)
+        columns = jax.vmap(lambda effect: _joint_columns(effect, motion))(term)
         blocks.append(jnp.moveaxis(columns, 0, 2).reshape(*columns.shape[1:3], -1))
-    return jnp.concatenate(blocks, axis=2)
+    signs = (smooth_sign(motion.velocity, motion.acceleration, motion.dt, w) for w in widths)
+    return jnp.concatenate([*blocks, *(sign[:, :, None] for sign in signs)], axis=2)
 
 
-@eqx.filter_jit
+def _joint_columns(effect: Effect, motion: Motion) -> Float[Array, "samples nv amplitudes"]:
+    """Torque of a unit of each amplitude in the rows of all joints."""
+    torque = jnp.moveaxis(columns(effect, motion), 0, -1)
+    if effect.acts_on in ("link", "robot"):
+        return torque
+    torque = torque.reshape(torque.shape[0], -1, torque.shape[-1])
+    return jnp.zeros((*motion.velocity.shape, torque.shape[-1])).at[:, effect.at].add(torque)
+
+
 def _rows(
-    model: RobotModel, terms: tuple[Effect, ...], width: Array, records: Records, widths: tuple[float, ...]
-) -> tuple[Array, Array]:
-    position, velocity, acceleration = (
-        records.flat(jnp.asarray(x)) for x in (records.position, records.velocity, records.acceleration)
+    model: RobotModel,
+    terms: tuple[Effect, ...],
+    width: Float[np.ndarray, " nv"],
+    records: Records,
+    widths: tuple[float, ...],
+) -> tuple[Float[np.ndarray, "rows nv columns"], Float[np.ndarray, "rows nv"]]:
+    """Filtered columns and torque of one recording; columns that are zero throughout need no filter."""
+    flat = (
+        records.flat(np.asarray(x)) for x in (records.time, records.position, records.velocity, records.acceleration)
     )
-    motion = _motion(model, records.flat(records.time), position, velocity, acceleration, records.dt, width)
-    X = [_columns(model, terms, motion)]
-    X += [smooth_sign(velocity, acceleration, records.dt, w)[:, :, None] for w in widths]
-    rows = partial(filter_rows, records)
-    return rows(jnp.concatenate(X, axis=2)[None])[0], rows(jnp.asarray(records.torque))[0]
+    motion = _motion(model, *flat, records.dt, jnp.asarray(width))
+    X = np.asarray(_columns(model, terms, motion, widths))
+    seen = np.argwhere(X.any(axis=0))
+    series = np.moveaxis(X[:, seen[:, 0], seen[:, 1]], 0, 1)[:, None]
+    out = np.zeros((records.kept.shape[1], *X.shape[1:]))
+    out[:, seen[:, 0], seen[:, 1]] = filter_rows(records, np.ascontiguousarray(series))[:, 0].T
+    torque = np.moveaxis(np.asarray(records.torque), 2, 0)
+    return out, filter_rows(records, np.ascontiguousarray(torque))[:, 0].T
