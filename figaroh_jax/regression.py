@@ -355,10 +355,10 @@ def _rows(
     widths: tuple[float, ...],
 ) -> tuple[Float[np.ndarray, "rows nv columns"], Float[np.ndarray, "rows nv"]]:
     """Filtered columns and torque of one recording; columns that are zero throughout need no filter."""
-    flat = (
+    time, q, v, a = (
         records.flat(np.asarray(x)) for x in (records.time, records.position, records.velocity, records.acceleration)
     )
-    motion = _motion(model, *flat, records.dt, jnp.asarray(width))
+    motion = _motion(model, time, q, v, a, records.dt, jnp.asarray(width))
     X = np.asarray(_columns(model, terms, motion, widths))
     seen = np.argwhere(X.any(axis=0))
     series = np.moveaxis(X[:, seen[:, 0], seen[:, 1]], 0, 1)[:, None]

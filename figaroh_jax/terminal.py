@@ -19,7 +19,15 @@ from .results import Cause, Diagnosis
 if TYPE_CHECKING:
     from .calibrated import Calibration
 
-__all__ = ["Progress", "calibration_summary", "identification_summary", "show", "show_calibration", "show_identification", "summary"]
+__all__ = [
+    "Progress",
+    "calibration_summary",
+    "identification_summary",
+    "show",
+    "show_calibration",
+    "show_identification",
+    "summary",
+]
 
 _STYLE = {"nothing": "green", "named": "bold blue", "named+rest": "bold blue", "unknown": "bold yellow"}
 

@@ -147,14 +147,14 @@ def test_traceback_is_shown_on_request(made_up: Diagnosis, capsys):
     assert "Traceback" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("argv", [[], ["identify", "task.yaml"], ["diagnose"], ["demo", "--nonsense"]])
+@pytest.mark.parametrize("argv", [[], ["conjure", "task.yaml"], ["diagnose"], ["demo", "--nonsense"]])
 def test_wrong_usage_is_status_2(argv: list[str], capsys):
     assert cli.main(argv) == 2
     assert "usage: figaroh-jax" in capsys.readouterr().err
 
 
 def test_an_unknown_command_lists_the_known_ones(capsys):
-    assert cli.main(["identify", "task.yaml"]) == 2
+    assert cli.main(["conjure", "task.yaml"]) == 2
     message = capsys.readouterr().err
     assert "identify" in message and "diagnose" in message and "demo" in message
 
