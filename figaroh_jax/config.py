@@ -22,7 +22,7 @@ from pydantic import (
 )
 
 from .errors import InputError, nearest
-from .taskfile import merge, read_task, where
+from .taskfile import CONTRACT_EFFECTS, merge, read_task, where
 
 if TYPE_CHECKING:
     from .model import RobotModel
@@ -46,17 +46,6 @@ __all__ = [
     "load_task",
     "robot_notes",
 ]
-
-# The names that the contract fixes, of every level; a task may forbid one that this version does not look for.
-CONTRACT_EFFECTS = """
-link_inertia payload viscous_friction coulomb_friction asymmetric_coulomb_friction asymmetric_viscous_friction
-stribeck_friction power_law_friction load_dependent_friction position_dependent_friction friction_drift presliding
-rotor_inertia coupled_transmission torque_gain torque_offset torque_ripple joint_spring gravity_tilt joint_elasticity
-backlash torque_delay torque_lag torque_saturation contact external_wrench clock_error encoder_offset encoder_scale
-encoder_eccentricity joint_offset link_geometry gear_transmission_error joint_compliance link_compliance base_frame
-tool_frame outlier thermal_growth payload_deflection settling reversal_hysteresis joint_coupling joint_damping
-friction_loss actuator_gain command_delay actuator_saturation voltage_saturation contact_stiffness contact_friction
-""".split()
 
 
 def _not_bool(value: Any) -> Any:
@@ -288,10 +277,6 @@ class Bound(_Keys):
 
     mass: tuple[Number, Number] | None = None  # kg, least and greatest
     com: tuple[Vector, Vector] | None = None  # m, corners of a box around the centre of mass
-
-    def given(self) -> dict[str, Any]:
-        """What is given, as `consistency.bodies` takes it."""
-        return {name: value for name in ("mass", "com") if (value := getattr(self, name)) is not None}
 
 
 class Identify(_Keys):

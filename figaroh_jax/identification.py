@@ -90,7 +90,7 @@ def identify_task(task: Task, progress: Callable[[str, float], None] = lambda ph
         trust=task.robot.trust,
         fit=options.fit,
         joints=options.joints,
-        bounds={name: bound.given() for name, bound in options.bounds.items()},
+        bounds={name: bound.model_dump(exclude_none=True) for name, bound in options.bounds.items()},
         progress=progress,
     )
 

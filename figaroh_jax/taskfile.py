@@ -13,7 +13,18 @@ import yaml
 
 from .errors import InputError, nearest
 
-__all__ = ["merge", "read_task", "read_yaml", "where"]
+__all__ = ["CONTRACT_EFFECTS", "merge", "read_task", "read_yaml", "where"]
+
+# The names that the contract fixes, of every level; a task may forbid one that this version does not look for.
+CONTRACT_EFFECTS = """
+link_inertia payload viscous_friction coulomb_friction asymmetric_coulomb_friction asymmetric_viscous_friction
+stribeck_friction power_law_friction load_dependent_friction position_dependent_friction friction_drift presliding
+rotor_inertia coupled_transmission torque_gain torque_offset torque_ripple joint_spring gravity_tilt joint_elasticity
+backlash torque_delay torque_lag torque_saturation contact external_wrench clock_error encoder_offset encoder_scale
+encoder_eccentricity joint_offset link_geometry gear_transmission_error joint_compliance link_compliance base_frame
+tool_frame outlier thermal_growth payload_deflection settling reversal_hysteresis joint_coupling joint_damping
+friction_loss actuator_gain command_delay actuator_saturation voltage_saturation contact_stiffness contact_friction
+""".split()
 
 LARGEST = 1 << 18  # bytes
 
