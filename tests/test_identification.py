@@ -132,7 +132,7 @@ def test_recordings_that_show_nothing_are_refused(truth: Truth):
     assert found.rank < 5 < found.structural_rank  # gravity alone
     assert json.loads(to_json(found))
     with pytest.raises(InputError, match="too short|record for longer"):
-        identify(truth.nominal, [recording(truth, 0.7, seed=1)], SETTINGS)
+        identify(truth.nominal, [recording(truth, 0.3, seed=1)], SETTINGS)
 
 
 def test_pieces_of_a_long_recording_give_the_same_factor(truth: Truth, monkeypatch: pytest.MonkeyPatch):
