@@ -58,6 +58,10 @@ class Units(NamedTuple):
     response: Complex[np.ndarray, "effects F"] | None = None
 
 
+TURNS = 3  # of Newton's method for the true motion
+RESONANT = 0.5  # bounds the response at the link's resonance
+
+
 def kind(effect: Effect | type[Effect]) -> Literal["columns", "position", "response"]:
     """How the effect acts on the rows."""
     if effect.has("position_error"):
@@ -109,26 +113,79 @@ def rigid_torque(
     return in_pieces(lambda *x: np.asarray(over_samples(joint_torques, -1, chunk, model, *x)).T, q, v, a)
 
 
-def shifted(effects: Effect, motion: Motion, records: Records) -> Motion:
+def shifted(effects: Effect, motion: Motion, records: Records, turns: int = TURNS) -> Motion:
     """The true motion of the links for each of a batch of position sensors that have read `motion`.
+
+    A sensor whose error follows the load feels that of the true motion, so q + error(load(q)) = q_measured is solved:
+    Newton's steps, with the joint's mean inertia and stiffness and therefore one response over frequency each. Without
+    `turns` the load is that of `motion`, right to first order.
 
     Position, velocity and acceleration of the answer have a leading axis of effects.
     """
-    each = [jax.tree.map(lambda x, i=i: np.asarray(x)[i], effects) for i in range(len(effects.at))]
-    errors = np.stack([_error(effect, motion) for effect in each]).reshape(-1, *records.position.shape[:2])
+    shift = _errors(effects, motion)
+    if not turns:
+        return _moved(effects, motion, shift, records)
+    inverse, (n, samples) = _inverse_responses(effects, motion, records), records.position.shape[:2]
+    shift = np.zeros_like(shift)
+    for _ in range(turns):
+        true = _moved(effects, motion, shift, records)
+        loads = rigid_torque(motion.model, true.position, true.velocity, true.acceleration)
+        missing = (_errors(effects, motion, loads) - shift).reshape(-1, n, samples)
+        mirrored = np.fft.rfft(np.concatenate([missing, missing[..., ::-1]], axis=-1))
+        shift = shift + np.fft.irfft(mirrored * inverse[:, None], 2 * samples)[..., :samples].reshape(shift.shape)
+    return _moved(effects, motion, shift, records)
+
+
+def _inverse_responses(effects: Effect, motion: Motion, records: Records) -> Float[np.ndarray, "effects F"]:
+    """1 / (1 + c (K - M w^2)), c the error per load, K and M from the joint's load over position and acceleration.
+
+    Bounded where it would be singular, at the resonance of the link on the joint's spring.
+    """
+    load = rigid_torque(motion.model, motion.position, motion.velocity, motion.acceleration)
+    loads = np.repeat(load[None], len(effects.at), axis=0)
+    unit = (_errors(effects, motion, loads + 1) - _errors(effects, motion, loads)).mean(1)
+    omega = 2 * np.pi * np.fft.rfftfreq(2 * records.position.shape[1], float(records.dt))
+    out = np.empty((len(unit), len(omega)))
+    for one, joint in enumerate(np.asarray(effects.at)[:, 0]):
+        columns = np.stack([np.asarray(x)[:, joint] for x in (motion.position, motion.acceleration)])
+        columns = columns - columns.mean(1, keepdims=True)
+        stiffness, inertia = np.linalg.lstsq(columns.T, load[:, joint], rcond=None)[0]
+        straight = 1 + unit[one] * (stiffness - inertia * omega**2)
+        out[one] = straight / (straight**2 + RESONANT**2)
+    return out
+
+
+def _errors(
+    effects: Effect, motion: Motion, loads: Float[np.ndarray, "effects nN nv"] | None = None
+) -> Float[np.ndarray, "effects nN"]:
+    """What each sensor reads beside the truth, under the motion's load or each under its own."""
+    out = []
+    for one in range(len(effects.at)):
+        here = motion if loads is None else eqx.tree_at(lambda m: m.load, motion, loads[one])
+        out.append(np.asarray(_error(jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects), here)))
+    return np.stack(out)
+
+
+def _moved(effects: Effect, motion: Motion, errors: Float[np.ndarray, "effects nN"], records: Records) -> Motion:
+    """The motion less each error of the joint of each effect."""
+    errors = errors.reshape(-1, *records.position.shape[:2])
     rates = difference(errors, float(records.dt))
     change = [errors, rates, difference(rates, float(records.dt))]
     one, joint = np.arange(len(errors)), np.asarray(effects.at)[:, 0]
     true = []
     for signal, delta in zip((motion.position, motion.velocity, motion.acceleration), change, strict=True):
         moved = np.repeat(np.asarray(signal)[None], len(errors), axis=0)
-        moved[one, :, joint] += delta.reshape(len(errors), -1)
+        moved[one, :, joint] -= delta.reshape(len(errors), -1)
         true.append(moved)
     return eqx.tree_at(lambda m: (m.position, m.velocity, m.acceleration), motion, tuple(true))
 
 
 def torque_change(
-    effects: Effect, motion: Motion, records: Records, as_read: Float[np.ndarray, "nN nv"] | None = None
+    effects: Effect,
+    motion: Motion,
+    records: Records,
+    as_read: Float[np.ndarray, "nN nv"] | None = None,
+    turns: int = TURNS,
 ) -> Float[np.ndarray, "effects nN nv"]:
     """Exact torque of a batch of position sensors: of the links' true motion, less that of the motion as it was read.
 
@@ -136,7 +193,7 @@ def torque_change(
     """
     if as_read is None:
         as_read = rigid_torque(motion.model, motion.position, motion.velocity, motion.acceleration)
-    true = shifted(effects, motion, records)
+    true = shifted(effects, motion, records, turns)
     return rigid_torque(motion.model, true.position, true.velocity, true.acceleration) - as_read
 
 
@@ -157,7 +214,8 @@ def units(batches: Mapping[str, Effect], motion: Motion, records: Records) -> di
             torque = np.broadcast_to(np.asarray(motion.total).T, (len(joints), 1, *np.shape(motion.total)[::-1]))
             out[name] = Units(torque, joints, (factors[name] - 1) / _size(batch)[:, None])
         elif _way(batch) == "position":
-            torque = torque_change(batch, motion, records) / _size(batch)[:, None, None]
+            # finds; `shifted` with its turns decides
+            torque = torque_change(batch, motion, records, turns=0) / _size(batch)[:, None, None]
             out[name] = Units(np.swapaxes(torque, 1, 2)[:, None], joints)
         else:
             out[name] = Units(_changed_torques(batch, motion), joints)

@@ -20,7 +20,7 @@ from .dataset import Recording, read_recordings
 from .effect import Effect, place
 from .effects import find
 from .errors import InputError
-from .estimates import Fitted, estimates, fitted_model, joint_fit, moved, prismatic, with_amplitudes
+from .estimates import Fitted, estimates, fitted_model, has_size, joint_fit, moved, prismatic, with_amplitudes
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor
@@ -30,7 +30,7 @@ from .model import RobotModel
 from .noise import Spectrum
 from .problem import Problem, State, baseline, extended_state, solved
 from .records import stack
-from .rest import Rest, excess, lines, rest_of, verdict
+from .rest import Rest, excess, lines, rest_of, verdict, wrong_law
 from .results import Cause, Diagnosis, Experiment, Gain, Name
 from .search import Found, Step, eliminate, find_causes, stand
 from .signals import Signals, prepare_all
@@ -42,6 +42,7 @@ __all__ = ["diagnose", "diagnose_task"]
 
 CERTAIN = 0.2  # of alpha: what a name needs, for p is not uniform under coloured noise
 POLISH = 2
+SPEED_LAWS = ("stribeck_friction", "power_law_friction")  # of dry friction over the speed
 
 
 def diagnose_task(task: Task, progress: Callable[[str, float], None] = lambda phase, share: None) -> Diagnosis:
@@ -106,8 +107,13 @@ def _diagnose(
     progress("fitting all causes together", 0.8)
     first = stand(problem, start, whitening)
     last, causes, fitted = _polished(problem, start, [f.effect for f in found], whitening)
-    rest, before = _what_is_left(problem, first, last, spectrum, whitening, generator, left)
-    word = verdict(bool(found), rest, before)
+    sized = _sized(found, causes, fitted, forbid)
+    if len(sized) < len(found):
+        last, causes, fitted = _polished(problem, start, [f.effect for f in sized], whitening)
+    found = sized
+    rest, before, flexible = _what_is_left(problem, first, last, spectrum, whitening, generator, left)
+    wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
+    word = verdict(bool(found), rest, before, wrong)
     if word == "unknown" and found:
         proxy = ", ".join(str(f.name) for f in found)
         rest = rest._replace(text=f"{rest.text}; best proxy, not a cause: {proxy}"[:160])
@@ -169,9 +175,13 @@ def _baseline_effects(model: RobotModel, known: Baseline | None) -> tuple[list[s
 def _polished(
     problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]
 ) -> tuple[Step, list[Effect], Fitted]:
-    """All causes fitted together: a few Gauss-Newton steps over coefficients and shapes."""
+    """All causes fitted together: a few Gauss-Newton steps over coefficients and shapes.
+
+    Sensor effects follow the load and the torque, so each turn begins with what the last one made of the baseline.
+    """
+    step = None
     for turn in range(POLISH + 1):
-        state = start
+        state = start if step is None else solved(problem, start, step.state.theta[: len(start.theta)])
         for effect in causes:
             state = solved(problem, extended_state(problem, state, effect), _grown(state, effect))
         step = stand(problem, state, whitening)
@@ -179,7 +189,26 @@ def _polished(
         fitted = joint_fit(problem, step.state, step.rows, causes, whitening)
         if turn < POLISH:
             causes = [moved(e, fitted, at) for e, at in zip(causes, fitted.places, strict=True)]
+    assert step is not None
     return step, causes, fitted  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
+
+
+def _sized(found: list[Found], causes: list[Effect], fitted: Fitted, forbid: Sequence[str]) -> list[Found]:
+    """The causes whose size is surely not zero, and those whose law alone is open, with all that it may be.
+
+    Where the amplitude's interval includes zero because any of several laws would do, the set says so; where nothing
+    else explains the misfit, there is no cause to tell of.
+    """
+    out = []
+    for one, effect, at in zip(found, causes, fitted.places, strict=True):
+        if has_size(effect, fitted, at):
+            out.append(one)
+            continue
+        laws = [n for n in SPEED_LAWS if one.name.effect in SPEED_LAWS and n not in (one.name.effect, *forbid)]
+        more = dict.fromkeys([*one.ambiguous, *one.alike, *(Name(n, one.name.at) for n in laws)])
+        if more and not type(effect).contains:
+            out.append(replace(one, ambiguous=tuple(more)))
+    return out
 
 
 def _grown(state: State, effect: Effect) -> Float[np.ndarray, " P"]:
@@ -198,12 +227,16 @@ def _what_is_left(
     whitening: Float[np.ndarray, "F nv"],
     generator: np.random.Generator,
     left: float,
-) -> tuple[Rest, float]:
+) -> tuple[Rest, float, tuple[float, Name, float]]:
     before = excess(problem, first.rows, first.linear.residual, spectrum, whitening)
     now = excess(problem, last.rows, last.linear.residual, spectrum, whitening)
     flexible = flexible_p(problem, last.state, last.rows, spectrum, whitening, generator)
     line = lines(problem, last.linear.residual)
-    return rest_of(now, max(before[0], 0.0), left, flexible, line, problem.model.joint_names), max(before[0], 0.0)
+    return (
+        rest_of(now, max(before[0], 0.0), left, flexible, line, problem.model.joint_names),
+        max(before[0], 0.0),
+        flexible,
+    )
 
 
 def _rms(problem: Problem, state: State) -> Float[np.ndarray, " nv"]:

@@ -153,6 +153,10 @@ class Effect(eqx.Module):
         """Parameters as they are reported; a function of the fields where those are not what an engineer reads."""
         return {name: getattr(self, name) for name in self.parameters()}
 
+    def shown_by(self, low: Float[np.ndarray, " nv"], high: Float[np.ndarray, " nv"]) -> bool:
+        """Whether motion between the positions `low` and `high` can tell the effect from a smooth torque at all."""
+        return True
+
     def native(self) -> tuple[Native, ...]:
         """Elements of MJCF that carry the effect (URDF takes `damping` and `frictionloss` of a joint)."""
         return ()
@@ -193,12 +197,15 @@ def smooth_sign(
     dt: Float[Array, ""] | float,
     width: Float[Array, "*rows"] | float = 0.0,
 ) -> Float[Array, "samples *rows"]:
-    """Sign of the velocity averaged over one sample: clip(v / (|a| dt / 2 + width), -1, 1).
+    """Sign of the velocity averaged over one sample: clip(v / max(|a| dt / 2, width), -1, 1).
 
-    `width` (rad/s or m/s) is the half width of the reversal where the friction of the joint itself is smooth.
+    `width` (rad/s or m/s) is the half width of the reversal where the friction of the joint itself is smooth; the
+    wider of the two ramps is the reversal's.
     """
     # operators and methods that NumPy's arrays have too: on the host it costs no program
-    return (velocity / (abs(acceleration) * dt / 2 + width + 1e-9)).clip(-1.0, 1.0)
+    ramp = abs(acceleration) * dt / 2
+    wider = (ramp + width + abs(ramp - width)) / 2
+    return (velocity / (wider + 1e-9)).clip(-1.0, 1.0)
 
 
 def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **parameters: float) -> Effect:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from .effect import Effect, Motion, Native, Scalar, amplitude, shape
@@ -15,6 +16,8 @@ from .errors import InputError, nearest
 from .model import RobotModel
 
 __all__ = ["CATALOGUE", "find", "register"]
+
+PERIODS = 1.5  # of a ripple within the joint's motion, so that it is seen to repeat
 
 CATALOGUE: dict[str, type[Effect]] = {}
 _OTHERS: dict[str, type[Effect]] = {}  # known by name, but nothing that a diagnosis looks for
@@ -240,6 +243,10 @@ class TorqueRipple(JointEffect):
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
         angle = self.order * self.here(motion.angle)
         return self.sine * jnp.sin(angle) + self.cosine * jnp.cos(angle)
+
+    def shown_by(self, low: Float[np.ndarray, " nv"], high: Float[np.ndarray, " nv"]) -> bool:
+        # what has not been seen to come back is any smooth function of the position
+        return bool(float(self.order) * (high - low)[int(self.at[0])] > 2 * np.pi * PERIODS)
 
 
 @register

@@ -9,16 +9,18 @@ from jaxtyping import Float
 
 from .design import kind, sensor_response, shapes, torque_change, units_and_slopes, with_shape
 from .effect import Effect, joint_unit
+from .effects import find
 from .evidence import Rows
 from .extended import ExtendedModel, extend
 from .model import RobotModel
 from .problem import BATCH, Problem, State, filtered_rows
 from .results import Estimate
 
-__all__ = ["Fitted", "estimates", "fitted_model", "joint_fit", "torque_slope", "with_amplitudes"]
+__all__ = ["Fitted", "estimates", "fitted_model", "has_size", "joint_fit", "torque_slope", "with_amplitudes"]
 
 KEPT = 1e-12
 STEP = 1e-5  # of central differences, relative: error 1e-10 of a third derivative's size
+SURE = 0.95  # of the region of a cause's amplitudes that must not hold zero
 
 
 class Fitted(eqx.Module):
@@ -107,6 +109,24 @@ def estimates(effect: Effect, fitted: Fitted, place: tuple[int, ...], model: Rob
         std = float(np.sqrt(max(g @ covariance @ g, 0.0)))
         out[name] = Estimate(float(value), std, joint_unit(units[name], straight))
     return out
+
+
+def has_size(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
+    """Whether the effect's size is surely not zero: its amplitudes' 95 % region excludes it.
+
+    Amplitudes that a simpler effect has too do not count: a spring without stiffness is an offset.
+    """
+    from scipy.stats import chi2  # scipy is slow to import
+
+    names = [n for n, p in effect.parameters().items() if p.linear]
+    simpler = {name for inside in type(effect).contains for name in find(inside).parameters()}
+    own = [k for k, name in enumerate(names) if name not in simpler]
+    if not own or kind(effect) != "columns":
+        return True
+    at = np.array(place)[own]
+    value = np.array([float(getattr(effect, names[k])) for k in own])
+    covariance = fitted.covariance[np.ix_(at, at)]
+    return bool(value @ np.linalg.pinv(covariance, hermitian=True) @ value > chi2.ppf(SURE, len(own)))
 
 
 def _physical(effect: Effect, names: list[str]) -> tuple[dict[str, float], dict[str, Float[np.ndarray, " k"]]]:

@@ -15,7 +15,7 @@ from .problem import FRICTION_PRECISION, Problem, State, filtered_rows, whitened
 from .results import Name
 from .screening import Group, family_p, screen
 
-__all__ = ["flexible_p", "friction_width"]
+__all__ = ["families", "flexible_p", "friction_width"]
 
 DEGREES = 6
 WIDTHS = (0.0, 0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # rad/s or m/s
@@ -29,16 +29,19 @@ def flexible_p(
     spectrum: Spectrum,
     whitening: Float[np.ndarray, "F nv"],
     generator: np.random.Generator,
-) -> tuple[float, Name]:
-    """p-value of three smooth families a joint (position; friction over q and v; time), and the strongest of them.
+) -> tuple[float, Name, float]:
+    """p-value of four smooth families a joint (position; friction over q and v; posture; time), the strongest of them,
+    and by how much its score exceeds what chance gives (squares of the whitened rows).
 
     They test and describe; they are never named as a cause.
     """
-    groups = _families(problem, state, whitening)
+    groups = families(problem, state, whitening)
     linear = fit(rows, state.prior)
     found = screen(rows, linear, groups)
     p = family_p(problem, rows, linear, found, spectrum, whitening, generator)
-    return p, found.groups[int(np.argmax([result.z.max() for result in found.scores]))].name
+    best = int(np.argmax([result.z.max() for result in found.scores]))
+    score = found.scores[best]
+    return p, found.groups[best].name, float(score.Q.max() - score.rank.max())
 
 
 def friction_width(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> Problem:
@@ -118,16 +121,29 @@ def _replaced(G: np.ndarray, b: np.ndarray, column: int, cross: np.ndarray, squa
     return -float(b @ theta), G, b
 
 
-def _families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> list[Group]:
+def families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], still: bool = False) -> list[Group]:
+    """Smooth functions in the rows of each joint: of its position; of its velocity and position, odd in the velocity;
+    of all positions (second degree); and, unless `still`, of time."""
     nv = problem.model.nv
     joints = [_smooth(state.motion, joint) for joint in range(nv)]
+    series = {
+        title: [np.stack([j[title][k] for j in joints], 1) for k in range(len(joints[0][title]))] for title in joints[0]
+    }
+    series["posture"] = [np.repeat(column[:, None], nv, axis=1) for column in _posture(state.motion)]
     groups = []
-    for title, columns in joints[0].items():
-        every = [np.stack([j[title][k] for j in joints], axis=1) for k in range(len(columns))]
-        rows = np.stack([filtered_rows(problem, one, whitening) for one in every])
+    for title, columns in series.items():
+        if still and title == "time":
+            continue
+        rows = np.stack([filtered_rows(problem, one, whitening) for one in columns])
         for joint, name in enumerate(problem.model.joint_names):
             groups.append(Group(Name(title, (name,)), None, Columns((joint,), rows[None, :, joint][:, :, None])))
     return groups
+
+
+def _posture(motion: Motion) -> list[Float[np.ndarray, " nN"]]:
+    """First and second degree in all positions: near to any torque that follows the posture alone."""
+    x = [_unit(q) for q in np.asarray(motion.position).T]
+    return [*x, *(x[i] * x[k] for i in range(len(x)) for k in range(i + 1))]
 
 
 def _smooth(motion: Motion, joint: int) -> dict[str, list[Float[np.ndarray, " nN"]]]:

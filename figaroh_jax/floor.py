@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from . import noise
 from .evidence import Prior, Rows, fit
+from .flexible import families
 from .noise import Spectrum
 from .problem import Problem, State, plain_rows, solved, whitened
 from .screening import Group, catalogue, screen
@@ -16,9 +17,9 @@ from .screening import Group, catalogue, screen
 __all__ = ["noise_floor"]
 
 ROUNDS = 2
-RICHNESS = 10  # groups of the catalogue in the rich model
+RICHNESS = 10  # groups of columns in the rich model
 RICH_CUT = 1e-9  # of the unit-diagonal Gram of the rich model
-ENOUGH = 1500  # rows a joint without which a spectrum cannot be told from misfit: then the noise is white
+ENOUGH = 1500  # rows a joint without which misfit takes spectra and smooth families: then the noise is white
 
 
 def noise_floor(
@@ -71,22 +72,31 @@ def _mean_of_partners(rows: Rows, residual: Float[np.ndarray, "nv T"]) -> Float[
 def _from_rich_model(
     problem: Problem, state: State, scale: Float[np.ndarray, " nv"], forbid: Collection[str], count: int
 ) -> Spectrum:
-    """Residual of the baseline with the groups of the catalogue that a forward selection takes first."""
+    """Residual of the baseline with the groups of the catalogue, and smooth families, that a forward selection takes.
+
+    Where the data are long, smooth families stand in for what the catalogue does not hold: what the model misses of a
+    misfit passes for noise.
+    """
     response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
     rows = whitened(problem, state, response)
-    groups = catalogue(problem, solved(problem, state, fit(rows, state.prior).theta), rows, response, forbid)
+    state = solved(problem, state, fit(rows, state.prior).theta)
+    groups = catalogue(problem, state, rows, response, forbid)
+    long = count >= ENOUGH
+    if long:
+        groups += families(problem, state, response, still=True)
     blocks, prior, found = [rows.X], state.prior, None
     for _ in range(RICHNESS):
         found = screen(rows, fit(rows, prior), groups, found)
         scores = found.scores
-        best = int(np.argmax([result.Q.max() for result in scores]))
+        # families have many columns: only z weighs them fairly
+        best = int(np.argmax([(result.z if long else result.Q).max() for result in scores]))
         blocks.append(_full(rows, groups[best], int(np.argmax(scores[best].Q))))
         X = np.concatenate(blocks, axis=2)
         rows, prior = rows._replace(X=X, Xi=X), prior.extended(blocks[-1].shape[2])
     basis = _orthonormal(rows)
     y = rows.y.reshape(-1)
     residual = (y - basis @ (basis.T @ y)).reshape(rows.y.shape) * scale[:, None]
-    if count < ENOUGH:
+    if not long:
         degrees = count - (basis.reshape(len(rows.y), -1, basis.shape[1]) ** 2).sum((1, 2))
         return noise.white((residual**2).sum(1) / np.maximum(degrees, count / 4), float(problem.records.rate) / 2)
     n, _, length, nv = problem.records.shape

@@ -122,7 +122,7 @@ def refit_shift(
 
     `effects` are the grid of its size, `Z` their columns. The profile of a shift has one valley. It is searched
     without its gradient: that of the inverse dynamics takes longer to compile than all the values that a search in
-    one number needs.
+    one number needs. The load is that of the motion as read: right to first order, and near enough to begin with.
     """
     from scipy.optimize import minimize_scalar  # slow to import
 
@@ -135,7 +135,7 @@ def refit_shift(
     joints = np.arange(as_read.shape[1])[None]
 
     def value(size: float) -> float:
-        change = torque_change(with_shape(one, [name], [np.array([size])]), motion, records, as_read)
+        change = torque_change(with_shape(one, [name], [np.array([size])]), motion, records, as_read, turns=0)
         rows = unit_rows(Units(np.swapaxes(change, 1, 2)[:, None], joints), records, whitened.whitening)
         return float(shift_profile(rows, whitened)[0])
 

@@ -14,12 +14,14 @@ from .problem import Problem
 from .results import Name, Verdict
 from .screening import draw_noise
 
-__all__ = ["Rest", "excess", "lines", "rest_of", "verdict"]
+__all__ = ["Rest", "excess", "lines", "rest_of", "verdict", "wrong_law"]
 
 CERTAIN = 0.01
 LINE = 1e-3
 REPEATED, REPEATED_SHARE = 0.08, 0.05  # excess that repeats: absolute, and as a share of the first excess
 FITTED, FITTED_SHARE = 0.03, 0.03  # excess that a flexible model or the catalogue still scores on
+UNREPEATED = 0.01  # the same where no recording repeats another
+OWN_SHARE = 0.03  # of what a cause has removed: a rest at its own place that speaks against its law
 EXPLAINED = 0.9  # share that causes must remove before they are named beside a rest
 
 
@@ -57,14 +59,16 @@ def rest_of(
     now: tuple[float, float, Float[np.ndarray, " nv"]],
     first: float,
     p_catalogue: float,
-    flexible: tuple[float, Name],
+    flexible: tuple[float, Name, float],
     line: tuple[float, float, int],
     joints: tuple[str, ...],
 ) -> Rest:
     """Whether the rest is significant, and a description without a cause's name."""
     size, p_repeat, own = now
     repeats = p_repeat < CERTAIN and size > max(REPEATED, REPEATED_SHARE * first)
-    scored = min(flexible[0], p_catalogue) < CERTAIN and size > max(FITTED, FITTED_SHARE * first)
+    # without repeats the noise was taken from a model that has fitted part of any misfit
+    least = FITTED if p_repeat < 1 else UNREPEATED
+    scored = min(flexible[0], p_catalogue) < CERTAIN and size > max(least, FITTED_SHARE * first)
     vibrates = line[0] < LINE
     worst = int(np.argmax(own))
     text = ""
@@ -77,10 +81,21 @@ def rest_of(
     return Rest(bool(repeats or scored or vibrates), size, text)
 
 
-def verdict(named: bool, rest: Rest, first: float) -> Verdict:
-    """The contract's four words from the causes and the rest."""
+def wrong_law(at: tuple[str, ...], drop: float, flexible: tuple[float, Name, float]) -> bool:
+    """Whether a cause that acts at the joints `at` leaves a rest of its own there, beside the squares it removed.
+
+    The right law leaves noise; one that only resembles it leaves a share of what it stands for.
+    """
+    p, (_, places), score = flexible
+    return p < CERTAIN and (not at or places[0] in at) and score > OWN_SHARE * drop
+
+
+def verdict(named: bool, rest: Rest, first: float, wrong: bool = False) -> Verdict:
+    """The contract's four words from the causes and the rest; `wrong`: the first cause leaves a rest of its own."""
     if not named:
         return "unknown" if rest.significant else "nothing"
+    if wrong:
+        return "unknown"
     if not rest.significant:
         return "named"
     share = 1 - max(rest.excess, 0.0) / first if first > 0.02 else 0.0

@@ -38,12 +38,15 @@ __all__ = ["Found", "Step", "find_causes", "stand"]
 
 SHORTLIST, SHARE = 8, 0.35  # candidates compared exactly; share of the best rank that they need
 SHIFTS = 2  # candidates of a position sensor tried at a step: each is a fit of its own
+TURNS, RESPONSE_TURNS = 3, 6  # of Gauss-Newton on a shift of the position; on a response of the torque
 STARTS = 4  # of a refit
 GAIN, CONFIDENT, UNSURE = 0.004, 1.64, 1.7
 SAME = 0.5  # overlap from which two causes explain the same misfit
+MUCH = 0.5  # share of the best's drop from which another cause explains much of the same
 CLEARLY = 3.0  # t from which data tell effects apart that are the same while the joint moves
 EXACT = ({"torque_offset", "asymmetric_coulomb_friction"}, {"payload", "link_inertia"})
 SMALLEST = 0.005  # share of the first cause's drop below which a later one may be what the first left over
+TRUSTED = 0.05  # of the inertials, relative: up to it a link's own inertia may be the cause
 MOST = 12
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
 
@@ -69,6 +72,7 @@ class Found:
     t: float
     confidence: float
     ambiguous: tuple[Name, ...]
+    alike: tuple[Name, ...] = ()  # what else explains much of the same misfit, though not as well
 
 
 @dataclass(frozen=True)
@@ -107,7 +111,8 @@ def contend(
     """The candidate with its exact shape, started from its best grid points."""
     way = kind(group.effect)
     if way == "response":
-        return _response_contender(problem, step, whitening, group, int(order[0]))
+        first = jax.tree.map(lambda x: x[order[0]], group.effect)
+        return _sensor_contender(problem, step, whitening, group, first, RESPONSE_TURNS)
     if way == "position":
         return _position_contender(problem, step, whitening, ready, group)
     starts = np.resize(order, STARTS)
@@ -142,14 +147,13 @@ def _body_verdicts(
 def _position_contender(
     problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], ready: Whitened, group: Group
 ) -> Contender:
-    """A shift of the links' motion: its size by the profile, then the regressor at the true motion.
+    """A shift of the links' motion: its size by the profile, then with the regressor and the load at the true motion.
 
-    The load is that of the motion as measured: taken again at the true motion it holds four derivatives of noise.
+    The load that the profile knows is that of a fit without the effect.
     """
     Z = group.columns.Z[:, 0]
     effect = refit_shift(group.effect, Z, step.state.motion, problem.records, ready)
-    here = stand(problem, extended_state(problem, step.state, effect), whitening)
-    return Contender(group.name, effect, here.verdicts)
+    return _sensor_contender(problem, step, whitening, group, effect, TURNS)
 
 
 def _information(rows: Rows, base: Ground, Z: Float[np.ndarray, "nv T k"]) -> Float[np.ndarray, "k k"]:
@@ -167,25 +171,25 @@ def _for_refit(problem: Problem, step: Step, base: Ground, whitening: Float[np.n
     return Whitened(residual, step.rows.X.reshape(nv, n, count, -1), base.inverse[-1], response)
 
 
-def _response_contender(
-    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group, start: int
+def _sensor_contender(
+    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group, effect: Effect, turns: int
 ) -> Contender:
-    """Gauss-Newton on the parameter of a response of the torque sensor, all coefficients fitted anew each time."""
-    effect = jax.tree.map(lambda x: x[start], group.effect)
+    """Gauss-Newton on the one parameter of a sensor effect, all coefficients fitted anew each time."""
     ((name, parameter),) = effect.parameters().items()
-    for _ in range(6):
-        state = extended_state(problem, step.state, effect)
-        here = stand(problem, state, whitening)
+    base = step.state
+    for _ in range(turns):
+        here = stand(problem, extended_state(problem, base, effect), whitening)
         slope = torque_slope(problem, here.state, effect, name, whitening)
         X = np.concatenate([here.rows.X, slope[..., None]], axis=2)
-        change = judge(here.rows, Hypothesis(X, state.prior.extended(1))).theta[-1]
-        value = float(np.clip(float(getattr(effect, name)) + change, parameter.lower, parameter.upper))
+        theta = judge(here.rows, Hypothesis(X, here.state.prior.extended(1))).theta
+        value = float(np.clip(float(getattr(effect, name)) + theta[-1], parameter.lower, parameter.upper))
         done = abs(value - float(getattr(effect, name))) < 1e-7
         effect = with_shape(effect, [name], [np.float64(value)])
-        if done:
+        if kind(effect) == "position":
+            base = solved(problem, step.state, theta[:-1])
+        elif done:
             break
-    state = extended_state(problem, step.state, effect)
-    here = stand(problem, state, whitening)
+    here = stand(problem, extended_state(problem, base, effect), whitening)
     return Contender(group.name, effect, here.verdicts)
 
 
@@ -232,11 +236,20 @@ def find_causes(
         accepted = _accept(problem, step, screened, whitening, p, generator, found)
         if accepted is None:
             break
-        step = stand(problem, extended_state(problem, step.state, accepted.effect), whitening, step)
+        step = _with(problem, step, accepted.effect, whitening)
         groups, screened = (groups, screened) if kind(accepted.effect) == "columns" else (None, None)
         found.append(accepted)
     assert first_screen is not None  # the loop has run at least once
     return step, found, (first_p, p), first_screen
+
+
+def _with(problem: Problem, step: Step, effect: Effect, whitening: Float[np.ndarray, "F nv"]) -> Step:
+    """The search with one more cause; a shift of the position follows the load of the fit that it stands in."""
+    grown = stand(problem, extended_state(problem, step.state, effect), whitening, step)
+    if kind(effect) != "position":
+        return grown
+    base = solved(problem, step.state, grown.state.theta)
+    return stand(problem, extended_state(problem, base, effect), whitening)
 
 
 def eliminate(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> list[Found]:
@@ -278,7 +291,11 @@ def _accept(
     generator: np.random.Generator,
     before: list[Found],
 ) -> Found | None:
-    """The cause that predicts best where it was not fitted, if it passes the gates; else nothing."""
+    """The cause that predicts best where it was not fitted, if it passes the gates; else nothing.
+
+    Ten free parameters of a link make up for many a misfit: they are a cause only where the inertials are well known,
+    and where they are not, what explains the same misfit less well is none either.
+    """
     base = ground(step.rows, step.verdicts, step.state.prior, step.folded)
     ready = _for_refit(problem, step, base, whitening)
     contenders = [contend(problem, step, whitening, base, ready, *entry) for entry in shortlist(step, screened)]
@@ -286,10 +303,13 @@ def _accept(
     contenders.sort(key=lambda c: c.verdicts.heldout)
     least = SMALLEST * (before[0].cost[0] - before[0].cost[1]) if before else 0.0
     passing = [c for c in contenders if _passes(step, contenders, c) and step.verdicts.cost - c.verdicts.cost > least]
+    while problem.trust > TRUSTED and passing and passing[0].name.effect == "link_inertia":
+        passing = [c for c in passing[1:] if c not in _rivals(step, passing, passing[0])]
     best = next((c for c in passing if not _simpler(step, passing, c)), None)
     if best is None:
         return None
     rivals = _rivals(step, contenders, best)
+    drop = step.verdicts.cost - best.verdicts.cost
     wins = shares_of_wins(np.stack([c.verdicts.blocks for c in [best, *rivals]]), generator)
     return Found(
         best.name,
@@ -300,12 +320,19 @@ def _accept(
         t_value(step.verdicts.blocks, best.verdicts.blocks),
         float(wins[0]) * (1 - p),
         _ambiguous(step, best, rivals, screened),
+        tuple(c.name for c in rivals if step.verdicts.cost - c.verdicts.cost > MUCH * drop),
     )
 
 
 def _exists(problem: Problem, effect: Effect) -> bool:
-    """Whether such an effect can exist: amplitudes in their bounds, forces no larger than the joint's torque."""
+    """Whether such an effect can exist and be seen: amplitudes in bounds, forces no larger than the joint's torque."""
+    position = np.asarray(problem.records.position)
+    if not effect.shown_by(position.min((0, 1)), position.max((0, 1))):
+        return False
     strongest = np.sqrt((problem.torque**2).mean((0, 1)))[np.asarray(effect.at)] if effect.acts_on == "joint" else None
+    body = vars(effect)["mass"] if isinstance(effect, Payload) else 0.0
+    if float(body) > float(np.asarray(problem.model.inertia)[:, 0].sum()):
+        return False
     for name, parameter in effect.parameters().items():
         value = float(getattr(effect, name))
         if parameter.linear and value < parameter.lower:

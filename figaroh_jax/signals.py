@@ -18,6 +18,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from .bandwidth import motion_band, smoothed
 from .dataset import Recording
 from .errors import InputError
 from .resampling import Grid, band_limited, differentiate, even_grid, sampling_rate, to_recording_times
@@ -116,7 +117,7 @@ def prepare(recording: Recording, preprocess: Preprocess, rates: Rates | None = 
             f"{recording.file}: {seconds:.3g} s are too short: {rows.kept} row(s) at {1 / rates.row:.4g} Hz are left"
             f" after {trim} s are cut at both ends, at least {FEWEST_ROWS} are needed"
         )
-    position = low_pass(columns[0], dt, rates.cutoff)
+    position = _motion(columns[0], dt, rates.cutoff)
     velocity = differentiate(position, dt)
     weight = _weight(recording, preprocess, rows, velocity, grid.gaps, rates.cutoff)
     return Signals(
@@ -135,6 +136,16 @@ def prepare(recording: Recording, preprocess: Preprocess, rates: Rates | None = 
         load=recording.load,
         notes=recording.notes + _gap_notes(recording, grid.gaps, rates.cutoff),
     )
+
+
+def _motion(position: Float[np.ndarray, "samples nv"], dt: float, cutoff: float) -> Float[np.ndarray, "samples nv"]:
+    """The position of each joint without what lies above its cutoff, or above its motion where that is slower."""
+    out = low_pass(position, dt, cutoff)
+    for joint, column in enumerate(position.T):
+        band = motion_band(column, dt, cutoff)
+        if band < cutoff:
+            out[:, joint] = smoothed(column, dt, band)
+    return out
 
 
 def choose_rates(recordings: Sequence[Recording], preprocess: Preprocess) -> Rates:

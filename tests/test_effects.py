@@ -78,7 +78,7 @@ def made(name: str, model: RobotModel, **other: float) -> Effect:
 
 def sign(v: np.ndarray, a: np.ndarray, width: float = 0.02) -> np.ndarray:
     """The sign averaged over one sample, a straight line from -1 to 1 through the reversal."""
-    return np.clip(v / (abs(a) * DT / 2 + width + 1e-9), -1, 1)
+    return np.clip(v / (np.maximum(abs(a) * DT / 2, width) + 1e-9), -1, 1)
 
 
 def rigid_change(motion: Motion, inertia: np.ndarray | float = 0.0, gravity: np.ndarray | float = 0.0) -> np.ndarray:
