@@ -232,6 +232,20 @@ def test_sign_is_the_mean_of_the_sign_over_one_sample():
     )
 
 
+def test_the_sign_of_smooth_friction_has_the_wider_of_its_two_ramps():
+    v = jnp.array([0.004, 0.004])
+    np.testing.assert_allclose(smooth_sign(v, jnp.array([0.1, 4.0]), DT, 0.02)[0], 0.2, rtol=0, atol=1e-6)
+    wide = 4.0 * 0.02 / 2
+    np.testing.assert_allclose(smooth_sign(v, jnp.array([0.1, 4.0]), 0.02, 0.01)[1], 0.004 / wide, rtol=0, atol=1e-6)
+
+
+def test_a_ripple_is_shown_by_a_motion_over_more_than_a_turn_of_it(model: RobotModel):
+    ripple = made("torque_ripple", model)
+    low, high = np.full(model.nv, -0.5), np.full(model.nv, 0.5)
+    assert not ripple.shown_by(low, high * 2 * np.pi / float(ripple.order))
+    assert ripple.shown_by(low * 2 * np.pi * 4 / float(ripple.order), high * 2 * np.pi * 4 / float(ripple.order))
+
+
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_every_effect_says_what_it_is(name: str, model: RobotModel):
     effect = made(name, model)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
+import figaroh_jax_pinocchio as reference
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,7 @@ from figaroh_jax.design import (
     candidates,
     flattened,
     shapes,
+    shifted,
     torque_change,
     unit_rows,
     units_and_slopes,
@@ -156,7 +158,7 @@ def test_the_compliance_that_made_noiseless_rows_is_found(motion: Motion, record
     effects = jax.tree.map(lambda x: x[1], effects)
 
     def changes(effects: Effect) -> np.ndarray:
-        change = np.swapaxes(torque_change(effects, motion, records), 1, 2)[:, None]
+        change = np.swapaxes(torque_change(effects, motion, records, turns=0), 1, 2)[:, None]
         joints = np.tile([0, 1], (len(change), 1))
         return unit_rows(Units(change, joints), records, rows.whitening).reshape(len(change), 2, -1)
 
@@ -168,6 +170,23 @@ def test_the_compliance_that_made_noiseless_rows_is_found(motion: Motion, record
     tried = with_shape(batch_of(made, 3), ["compliance"], [truth * np.array([0.99, 1.0, 1.01])])
     low, best, high = shift_profile(changes(tried), rows)
     assert best < low and best < high
+
+
+def test_the_true_motion_solves_the_equation_of_the_elastic_joint(motion: Motion, records: Records) -> None:
+    compliance = 1e-3
+    effect: Any = jax.tree.map(lambda x: np.asarray(x)[None], at_joint("joint_elasticity", compliance=compliance))
+    inner = slice(200, -200)
+
+    def missing(turns: int) -> float:
+        true = shifted(effect, motion, records, turns)
+        q, v, a = (np.asarray(x)[0] for x in (true.position, true.velocity, true.acceleration))
+        load = reference.inverse_dynamics(motion.model, q, v, a)
+        wound = np.asarray(motion.position) - q
+        np.testing.assert_array_equal(wound[:, 1], 0.0)
+        return float(np.std((wound[:, 0] - compliance * load[:, 0])[inner]) / np.std(wound[inner, 0]))
+
+    left, first = missing(3), missing(0)
+    assert left < 0.02 and left < 0.4 * first, (left, first)
 
 
 def quadratic(seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,64 @@
+"""The band of a motion against motions whose noise is known, and the smoother against its gain in closed form."""
+
+from __future__ import annotations
+
+import secrets
+
+import numpy as np
+import pytest
+
+from figaroh_jax.bandwidth import motion_band, smoothed
+from figaroh_jax.resampling import differentiate
+
+DT, CUTOFF, SECONDS = 1 / 200, 15.0, 10.0
+TIME = np.arange(0, SECONDS, DT)
+INNER = slice(100, -100)  # what is left of a recording when its ends are cut
+NOISE = 2e-5
+
+
+def swung(fastest: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A motion of harmonics up to `fastest` Hz, and its acceleration."""
+    rng = np.random.default_rng(seed)
+    omega = 2 * np.pi * np.linspace(0.1, fastest, 6)
+    amplitude, phase = 0.4 / np.arange(1, 7), rng.uniform(0, 6, 6)
+    waves = amplitude * np.sin(np.outer(TIME, omega) + phase)
+    return waves.sum(1), -(waves * omega**2).sum(1)
+
+
+def acceleration(position: np.ndarray) -> np.ndarray:
+    return differentiate(position[:, None], DT, order=2)[:, 0]
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-4])
+def test_a_slow_motion_is_smoothed_and_its_acceleration_is_much_better_known(step: float) -> None:
+    seed = secrets.randbits(32)
+    position, true = swung(0.6, seed)
+    read = position + NOISE * np.random.default_rng(seed + 1).standard_normal(len(TIME))
+    read = np.round(read / step) * step if step else read
+    band = motion_band(read, DT, CUTOFF)
+    assert 1.0 < band < CUTOFF / 2, seed
+    at_cutoff, at_band = (acceleration(smoothed(read, DT, b)) - true for b in (CUTOFF, band))
+    assert np.std(at_band[INNER]) < 0.1 * np.std(at_cutoff[INNER]), seed
+
+
+def test_a_motion_that_is_faster_than_the_noise_keeps_its_cutoff() -> None:
+    seed = secrets.randbits(32)
+    position, _ = swung(14.0, seed)
+    assert motion_band(position + NOISE * np.random.default_rng(seed).standard_normal(len(TIME)), DT, CUTOFF) == CUTOFF
+    assert motion_band(position, DT, CUTOFF) == CUTOFF
+
+
+def test_a_short_record_keeps_its_cutoff() -> None:
+    assert motion_band(np.random.default_rng(0).standard_normal(150), DT, CUTOFF) == CUTOFF
+
+
+@pytest.mark.parametrize("frequency", [0.5, 3.0, 6.0])
+def test_smoothing_has_the_gain_of_its_penalty_and_no_phase(frequency: float) -> None:
+    band, wave = 4.0, np.sin(2 * np.pi * frequency * TIME + 0.7)
+    sine = np.sin(np.pi * frequency * DT) / np.sin(np.pi * band * DT)
+    np.testing.assert_allclose(smoothed(wave, DT, band)[300:-300], wave[300:-300] / (1 + sine**6), rtol=0, atol=2e-3)
+
+
+def test_smoothing_leaves_a_parabola_alone_up_to_its_ends() -> None:
+    parabola = 0.3 + 0.2 * TIME - 0.05 * TIME**2
+    np.testing.assert_allclose(smoothed(parabola, DT, 3.0), parabola, rtol=0, atol=1e-7)
