@@ -17,8 +17,6 @@ from .model import RobotModel
 
 __all__ = ["CATALOGUE", "find", "register"]
 
-PERIODS = 1.5  # of a ripple within the joint's motion, so that it is seen to repeat
-
 CATALOGUE: dict[str, type[Effect]] = {}
 _OTHERS: dict[str, type[Effect]] = {}  # known by name, but nothing that a diagnosis looks for
 
@@ -245,8 +243,8 @@ class TorqueRipple(JointEffect):
         return self.sine * jnp.sin(angle) + self.cosine * jnp.cos(angle)
 
     def shown_by(self, low: Float[np.ndarray, " nv"], high: Float[np.ndarray, " nv"]) -> bool:
-        # what has not been seen to come back is any smooth function of the position
-        return bool(float(self.order) * (high - low)[int(self.at[0])] > 2 * np.pi * PERIODS)
+        # one and a half periods: what has not come back is any smooth function of the position
+        return bool(float(self.order) * (high - low)[int(self.at[0])] > 3 * np.pi)
 
 
 @register
