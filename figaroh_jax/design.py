@@ -109,8 +109,8 @@ def rigid_torque(
     model: RobotModel, q: Float[Leaf, "*batch nv"], v: Float[Leaf, "*batch nv"], a: Float[Leaf, "*batch nv"]
 ) -> Float[np.ndarray, "*batch nv"]:
     """`inverse_dynamics` by one program for any number of samples."""
-    chunk = chunk_size()
-    return in_pieces(lambda *x: np.asarray(over_samples(joint_torques, -1, chunk, model, *x)).T, q, v, a)
+    chunk, there = chunk_size(), jax.device_put(model)
+    return in_pieces(lambda *x: np.asarray(over_samples(joint_torques, -1, chunk, there, *x)).T, q, v, a)
 
 
 def shifted(effects: Effect, motion: Motion, records: Records, turns: int = TURNS) -> Motion:

@@ -56,11 +56,14 @@ def _angles(
         root = vectors[:, good] / np.sqrt(values[good])
         whiten[own, own.start : own.start + root.shape[1]] = root
     together = whiten.T @ left @ whiten
-    cosine = np.zeros((count, count))
-    for i in range(count):
-        for j in range(i):
-            block = together[spans[i], spans[j]]
-            if (block**2).sum() > cosine[i].max() ** 2 or (block**2).sum() > cosine[j].max() ** 2:
-                cosine[i, j] = cosine[j, i] = np.linalg.norm(block, 2)
+    starts, sizes = [own.start for own in spans], np.array([own.stop - own.start for own in spans])
+    # the Frobenius norm of a block bounds its largest singular value, and is it where the block is a row or a column
+    cosine = np.sqrt(np.add.reduceat(np.add.reduceat(together**2, starts, axis=0), starts, axis=1))
+    cosine[np.diag_indices(count)] = 0.0
+    wide = np.minimum(sizes[:, None], sizes) > 1
+    bound, cosine = cosine, np.where(wide, 0.0, cosine)
+    for i, j in np.argwhere(np.tril(wide, -1)):
+        if bound[i, j] > min(cosine[i].max(), cosine[j].max()):
+            cosine[i, j] = cosine[j, i] = np.linalg.norm(together[spans[i], spans[j]], 2)
     near = cosine.argmax(1)
     return np.degrees(np.arccos(np.clip(cosine.max(1), 0, 1))), [int(k) for k in near]

@@ -114,7 +114,14 @@ class State:
     parts: tuple[Float[np.ndarray, "nN nv k"], ...]  # regressor: the rigid body's columns, then those of each term
     prior: Prior
     theta: Float[np.ndarray, " P"]
-    motion: Motion  # as measured, with load and total torque of `theta`
+    measured: Motion  # as measured, with the nominal robot's load
+
+    @cached_property
+    def motion(self) -> Motion:
+        """The motion as measured, with load, total torque and inertia of `theta`."""
+        load, *others = self.shares(self.theta)
+        new = (load, sum(others, load), self.theta[: self.rigid.shape[2]].reshape(-1, 10))
+        return eqx.tree_at(lambda m: (m.load, m.total, m.model.inertia), self.measured, new)
 
     @property
     def rigid(self) -> Float[np.ndarray, "nN nv columns"]:
@@ -260,12 +267,8 @@ def link_motion(problem: Problem, state: State) -> Motion:
 
 
 def solved(problem: Problem, state: State, theta: Float[np.ndarray, " P"]) -> State:
-    """The state with coefficients `theta`, and with the load and the torque that follow from them."""
-    links = state.rigid.shape[2]
-    load, *others = state.shares(theta)
-    new = (load, sum(others, load), theta[:links].reshape(-1, 10))
-    motion = eqx.tree_at(lambda m: (m.load, m.total, m.model.inertia), state.motion, new)
-    return replace(state, theta=theta, motion=motion)
+    """The state with coefficients `theta`, from which its load and its torque follow."""
+    return replace(state, theta=theta)
 
 
 def unit_torques(problem: Problem, state: State, term: Effect) -> Units:
@@ -393,5 +396,5 @@ def _row_layout(layout: Layout) -> tuple[np.ndarray, ...]:
 
 
 def _rigid(problem: Problem, motion: Motion) -> Float[np.ndarray, "nN nv P"]:
-    regressor = partial(joint_torque_regressor, problem.model)
+    regressor = partial(joint_torque_regressor, jax.device_put(problem.model))
     return in_pieces(regressor, motion.position, motion.velocity, motion.acceleration)
