@@ -44,7 +44,7 @@ __all__ = [
     "Units",
     "load_robot",
     "load_task",
-    "robot_notes",
+    "robot_options",
 ]
 
 
@@ -337,32 +337,14 @@ def load_robot(task: Task) -> RobotModel:
         raise InputError(f"{task.file}: robot.model {task.robot.model}: expected a .urdf or an .xml (MJCF) file")
     from .robotfile import read_robot
 
-    return read_robot(task.robot.model, **_options(task.robot))
+    return read_robot(task.robot.model, **robot_options(task.robot))
 
 
-def _options(robot: Robot) -> dict[str, Any]:
-    own = robot.model.suffix.lower() == ".xml" and "gravity" not in robot.model_fields_set  # an MJCF has gravity
+def robot_options(robot: Robot) -> dict[str, Any]:
+    """Arguments of `read_robot` and `load_extended` beside the file; gravity None is an MJCF's own."""
+    own = robot.model.suffix.lower() == ".xml" and "gravity" not in robot.model_fields_set
     gravity = None if own else robot.gravity
     return {"joints": robot.joints, "posture": dict(robot.posture), "gravity": gravity, "root": robot.root}
-
-
-def robot_notes(task: Task) -> tuple[str, ...]:
-    """What the model file says of the joints and the baseline of the task does not fit, one line for each effect."""
-    from .native import place_names
-    from .robotfile import load_extended
-
-    known, file = task.baseline, task.robot.model
-    switches = {"viscous_friction": known.viscous, "coulomb_friction": known.coulomb}
-    switches |= {"rotor_inertia": known.rotor, "torque_offset": known.offset}
-    fitted = {name for name, on in switches.items() if on} | {entry.effect for entry in known.effects}
-    extended, notes = load_extended(file, **_options(task.robot))
-    places: dict[str, list[str]] = {}
-    for effect in extended.effects:
-        if effect.name not in fitted:
-            places.setdefault(effect.name, []).extend(place_names(extended.robot, effect))
-    lines = [f"{name} ({', '.join(dict.fromkeys(at))}) of the file is not used" for name, at in places.items()]
-    lines = [f"{line}; under `baseline` it is fitted before anything is named" for line in lines]
-    return tuple(f"{file.name}: {line}" for line in (*lines, *(f"not read: {note}" for note in notes)))
 
 
 _EXPECTED = {  # pydantic's kinds of mistakes, in fewer words

@@ -47,7 +47,8 @@ SPEED_LAWS = ("stribeck_friction", "power_law_friction")  # of dry friction over
 
 def diagnose_task(task: Task, progress: Callable[[str, float], None] = lambda phase, share: None) -> Diagnosis:
     """Diagnose what a task file describes; `InputError` before any work where it is wrong."""
-    from .config import load_robot, robot_notes
+    from .config import load_robot
+    from .robotfile import robot_notes
 
     progress("reading", 0.0)
     model, notes = load_robot(task), robot_notes(task)

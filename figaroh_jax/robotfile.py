@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,10 +21,14 @@ from .errors import InputError
 from .extended import ExtendedModel, extend
 from .mjcf import actuator_of, body_name, compile_mjcf, compiled_robot, disabled, engine, joint_names, load_mjcf
 from .model import RobotModel
+from .native import place_names
 from .urdf import load_urdf, urdf_dynamics
 from .xmlfile import find_in_packages
 
-__all__ = ["Loaded", "load_extended", "read_robot"]
+if TYPE_CHECKING:
+    from .config import Task
+
+__all__ = ["Loaded", "load_extended", "read_robot", "robot_notes"]
 
 
 class Loaded(NamedTuple):
@@ -82,6 +86,24 @@ def load_extended(
     notes = [*_joints(mj, found), *_tendons(mj, found), *_biases(mj, found), *_others(mj, robot)]
     compensated, more = _compensation(mj, robot)
     return Loaded(extend(robot, *found.effects(), *compensated), (*notes, *more))
+
+
+def robot_notes(task: Task) -> tuple[str, ...]:
+    """What the model file of a task says of the joints and its baseline does not fit, one line for each effect."""
+    from .config import robot_options
+
+    known, file = task.baseline, task.robot.model
+    switches = {"viscous_friction": known.viscous, "coulomb_friction": known.coulomb}
+    switches |= {"rotor_inertia": known.rotor, "torque_offset": known.offset}
+    fitted = {name for name, on in switches.items() if on} | {entry.effect for entry in known.effects}
+    extended, notes = load_extended(file, **robot_options(task.robot))
+    places: dict[str, list[str]] = {}
+    for effect in extended.effects:
+        if effect.name not in fitted:
+            places.setdefault(effect.name, []).extend(place_names(extended.robot, effect))
+    lines = [f"{name} ({', '.join(dict.fromkeys(at))}) of the file is not used" for name, at in places.items()]
+    lines = [f"{line}; under `baseline` it is fitted before anything is named" for line in lines]
+    return tuple(f"{file.name}: {line}" for line in (*lines, *(f"not read: {note}" for note in notes)))
 
 
 def _is_urdf(path: str | Path) -> bool:
