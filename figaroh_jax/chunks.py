@@ -1,14 +1,14 @@
 """Many samples through a kernel, a chunk at a time, by programs that serve any number of samples.
 
-A kernel takes arrays with the samples last and is compiled once for a chunk: the temporaries of a small chunk stay in
-the processor's cache. Outside of JAX's transformations the samples stay on the host as NumPy arrays and go to the
-device in blocks of fixed size; under a transformation (jit, grad, vmap) the whole is one program.
+A kernel takes parameters and arrays with the samples last, and gives such an array, or several which follow one
+another on the second axis. It is compiled once for a chunk: the temporaries of a small chunk stay in the processor's
+cache. On a CPU, outside of JAX's transformations, samples and answers stay on the host as NumPy arrays and go through
+in blocks of fixed size; under a transformation (jit, grad, vmap) the whole is one program.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -18,9 +18,26 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-__all__ = ["BLOCK", "chunk_size", "in_chunks", "over_samples", "traced", "two_axes"]
+__all__ = [
+    "BLOCK",
+    "CPU_OPTIONS",
+    "aligned",
+    "chunk_size",
+    "host_blocks",
+    "in_chunks",
+    "on_host",
+    "over_samples",
+    "put",
+    "traced",
+    "two_axes",
+]
 
 BLOCK = 8  # chunks to a block
+_ALIGNMENT = 64  # bytes; XLA takes such memory over without a copy
+
+# XLA's older code generator for loops takes half as long to compile our kernels, and the newer one computes gathers
+# inside of sums number by number. Both are in the JAX versions that the package allows.
+CPU_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
 
 
 def chunk_size(width: int = 1) -> int:
@@ -35,55 +52,108 @@ def traced(*trees: Any) -> bool:
     return any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
 
 
-def two_axes(*arrays: ArrayLike, on_host: bool) -> list[Any]:
+def on_host(*trees: Any) -> bool:
+    """Whether the work is done on this machine's CPU, outside of JAX's transformations."""
+    return jax.default_backend() == "cpu" and not traced(*trees)
+
+
+def aligned(shape: Sequence[int], fill: float | None = None) -> np.ndarray:
+    """A new array of float64, empty or zero, in memory that JAX takes over without a copy."""
+    size, spare = int(np.prod(shape)), _ALIGNMENT // 8
+    flat = np.empty(size + spare) if fill is None else np.zeros(size + spare)
+    start = -(flat.ctypes.data // 8) % spare
+    return flat[start : start + size].reshape(shape)
+
+
+def in_chunks(x: Float[Any, "samples k"], chunk: int, chunks: int = 0) -> Float[Any, "chunks k chunk"]:
+    """Samples cut into (at least so many) chunks, last in each; the last sample, sure to be in range, fills them up."""
+    library, missing = np if isinstance(x, np.ndarray) else jnp, max(-len(x) % chunk, chunk * chunks - len(x))
+    padded = library.pad(x, ((0, missing), (0, 0)), mode="edge" if len(x) else "constant") if missing else x
+    return library.swapaxes(padded.reshape(-1, chunk, x.shape[1]), 1, 2)
+
+
+def over_samples(
+    kernel: Callable[..., Any], parameters: Any, *arrays: ArrayLike, last: bool = False, width: int = 1
+) -> Array:
+    """Answers of `kernel(parameters, *arrays)` for float64 arrays (*batch, k): (*batch, ...), or samples `last`.
+
+    `width` is about how many numbers an answer has for a sample. To be called where 64-bit JAX is on.
+    """
+    chunk, batch = chunk_size(width), np.shape(arrays[0])[:-1]
+    if on_host(parameters, arrays):
+        answer = _assembled(kernel, chunk, last, parameters, *two_axes(*arrays, host=True))
+        return answer if last else answer.reshape(*batch, *answer.shape[1:])
+    flat = two_axes(*arrays, host=False)
+    if traced(parameters, arrays):
+        small = len(flat[0]) <= chunk
+        answer = _joined(kernel(parameters, *(x.T for x in flat))) if small else _all(kernel, chunk, parameters, *flat)
+    else:
+        pieces = (tuple(x[k : k + chunk] for x in flat) for k in range(0, max(len(flat[0]), 1), chunk))
+        answer = jnp.concatenate([_device_program(kernel, chunk, parameters, *piece) for piece in pieces], axis=-1)
+    return answer if last else jnp.moveaxis(answer, -1, 0).reshape(*batch, *answer.shape[:-1])
+
+
+def two_axes(*arrays: ArrayLike, host: bool) -> list[Any]:
     """Arrays (*batch, k) as (samples, k) in float64, in NumPy or else in JAX (to be called where 64-bit JAX is on)."""
-    library = np if on_host else jnp
+    library: Any = np if host else jnp
     return [library.reshape(library.asarray(x, float), (-1, np.shape(x)[-1])) for x in arrays]
 
 
-def in_chunks(x: Float[Array, "samples k"], chunk: int) -> Float[Array, "chunks k chunk"]:
-    """Samples cut into chunks, last in each; the last chunk is filled up with zeros."""
-    padded = jnp.pad(x, ((0, -len(x) % chunk), (0, 0)))
-    return jnp.swapaxes(padded.reshape(-1, chunk, x.shape[1]), 1, 2)
+def _joined(pieces: Any) -> Array:
+    return jnp.concatenate(pieces, axis=1) if isinstance(pieces, tuple) else pieces
 
 
-def over_samples(kernel: Callable[..., Array], axis: int, chunk: int, model: Any, *arrays: ArrayLike) -> Array:
-    """Answers of `kernel(model, *arrays)`, whose samples stand on `axis` (0 or -1), for arrays (*batch, k)."""
-    if traced(model, arrays):
-        return _chunked(kernel, axis, chunk, model, *two_axes(*arrays, on_host=False))
-    return _in_blocks(kernel, axis, chunk, jax.tree.map(jnp.asarray, model), *two_axes(*arrays, on_host=True))
+def _chunks(kernel: Callable[..., Any], parameters: Any, *chunks: Array) -> Any:
+    return jax.lax.map(lambda chunk: kernel(parameters, *chunk), chunks)
 
 
-def _in_blocks(kernel: Callable[..., Array], axis: int, chunk: int, model: Any, *arrays: np.ndarray) -> Array:
-    samples = len(arrays[0])
-    block = chunk if samples <= chunk else BLOCK * chunk
-    if samples <= block:
-        filled = [np.pad(x, ((0, block - samples), (0, 0))) for x in arrays]
-        answer = _program(kernel, axis, chunk, model, *filled)
-        return answer if samples == block else jax.lax.slice_in_dim(answer, 0, samples, axis=axis)
-    part = _program(kernel, axis, chunk, model, *(x[:block] for x in arrays))
-    shape = (samples, *part.shape[1:]) if axis == 0 else (*part.shape[:-1], samples)
-    whole = _put(jnp.empty(shape), part, 0, axis)
-    for start in [*range(block, samples - block, block), samples - block]:  # the last block overlaps the one before
-        part = _program(kernel, axis, chunk, model, *(x[start : start + block] for x in arrays))
-        whole = _put(whole, part, start, axis)
-    return whole
+def _all(kernel: Callable[..., Any], chunk: int, parameters: Any, *arrays: Array) -> Array:
+    """Answers with the samples last, a chunk at a time."""
+    chunks = _chunks(lambda *x: _joined(kernel(*x)), parameters, *(in_chunks(x, chunk) for x in arrays))
+    parts = jnp.moveaxis(chunks, 0, -2)
+    return parts.reshape(*parts.shape[:-2], -1)[..., : len(arrays[0])]
 
 
-def _chunked(kernel: Callable[..., Array], axis: int, chunk: int, model: Any, *arrays: Array) -> Array:
-    samples = len(arrays[0])
-    if samples <= chunk:
-        return kernel(model, *(x.T for x in arrays))
-    parts = jax.lax.map(lambda part: kernel(model, *part), tuple(in_chunks(x, chunk) for x in arrays))
-    if axis == 0:
-        return parts.reshape(-1, *parts.shape[2:])[:samples]
-    parts = jnp.moveaxis(parts, 0, -2)
-    return parts.reshape(*parts.shape[:-2], -1)[..., :samples]
+_device_program = jax.jit(_all, static_argnums=(0, 1))
+_host_program = jax.jit(_chunks, static_argnums=0, compiler_options=CPU_OPTIONS)
 
 
-_program = jax.jit(_chunked, static_argnums=(0, 1, 2))
+def host_blocks(
+    kernel: Callable[..., Any], chunk: int, parameters: Any, *arrays: Float[np.ndarray, "samples _"]
+) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
+    """Blocks of samples and the pieces of their answers, each (chunks, ..., chunk); blocks may overlap.
+
+    Fewer samples than a block has are answered with some more behind them.
+    """
+    samples, parameters = len(arrays[0]), jax.device_put(parameters)
+    chunks = 1 if samples <= chunk else BLOCK
+    block = chunk * chunks
+    for start in [*range(0, samples - block, block), max(0, samples - block)]:
+        where = slice(start, min(start + block, samples))
+        pieces = _host_program(kernel, parameters, *(in_chunks(x[where], chunk, chunks) for x in arrays))
+        yield where, tuple(map(np.asarray, pieces if isinstance(pieces, tuple) else (pieces,)))
 
 
-@partial(jax.jit, static_argnums=3, donate_argnums=0)
-def _put(whole: Array, part: Array, start: ArrayLike, axis: int) -> Array:
-    return jax.lax.dynamic_update_slice_in_dim(whole, part, start, axis)
+def _assembled(kernel: Callable[..., Any], chunk: int, last: bool, parameters: Any, *arrays: np.ndarray) -> Array:
+    """Answers put together in NumPy: JAX's own memory comes in small pages, which cost more than the numbers."""
+    samples, whole, view = len(arrays[0]), None, None
+    for where, pieces in host_blocks(kernel, chunk, parameters, *arrays):
+        if whole is None or view is None:
+            shape = [*pieces[0].shape[1:-1]]
+            shape[1:2] = [sum(x.shape[2] for x in pieces)] if len(pieces) > 1 else shape[1:2]
+            whole = aligned((*shape, samples) if last else (samples, *shape))
+            view = whole if last else np.moveaxis(whole, 0, -1)
+        first = 0
+        for piece in pieces:
+            part = view if len(pieces) == 1 else view[:, first : first + piece.shape[2]]
+            put(part[..., where], np.moveaxis(piece, 0, -2))
+            first += piece.shape[2]
+    return jax.device_put(whole, may_alias=True)
+
+
+def put(target: Float[np.ndarray, "*lead samples"], parts: Float[np.ndarray, "*lead chunks chunk"]) -> None:
+    """Write chunks of samples one behind the other; what is beyond the last sample is dropped."""
+    if target.shape[-1] < parts.shape[-2] * parts.shape[-1]:
+        target[...] = parts.reshape(*target.shape[:-1], parts.shape[-2] * parts.shape[-1])[..., : target.shape[-1]]
+    else:
+        target.reshape(parts.shape)[...] = parts

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from .chunks import BLOCK, chunk_size, over_samples
-from .dynamics import joint_torques
+from .chunks import BLOCK
+from .dynamics import inverse_dynamics
 from .effect import Effect, Motion, columns
 from .model import Leaf, RobotModel
 from .records import Records, filter_rows
@@ -108,9 +108,8 @@ def in_pieces(
 def rigid_torque(
     model: RobotModel, q: Float[Leaf, "*batch nv"], v: Float[Leaf, "*batch nv"], a: Float[Leaf, "*batch nv"]
 ) -> Float[np.ndarray, "*batch nv"]:
-    """`inverse_dynamics` by one program for any number of samples."""
-    chunk, there = chunk_size(), jax.device_put(model)
-    return in_pieces(lambda *x: np.asarray(over_samples(joint_torques, -1, chunk, there, *x)).T, q, v, a)
+    """`inverse_dynamics` in NumPy."""
+    return np.asarray(inverse_dynamics(model, q, v, a))
 
 
 def shifted(effects: Effect, motion: Motion, records: Records, turns: int = TURNS) -> Motion:

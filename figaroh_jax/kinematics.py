@@ -1,27 +1,27 @@
 """Where the joints and frames are and how they move.
 
-The kernel is `motion`. Only rotations multiply along the tree: one `lax.scan` over its levels, all joints of a level
-side by side and padded to the widest, so that compile time grows with neither joints nor samples. Everything else adds
-up along the tree: one product with its matrix of 0 and 1. Inside the kernels the sample is the last axis; the public
-functions take any leading batch axes and transpose once at the border. Frames: positions, velocities and accelerations
-are those of the joint frame's origin, expressed in the world.
+Inside the kernels the sample is the last axis and everything is expressed in the world: a pose is its four *columns*,
+origin p and axes r_x, r_y, r_z; a joint's *twist* is the velocity `[linear, angular]` that a unit rate of it gives the
+body point at the world's origin. Only poses multiply along the tree, one `lax.scan` over its levels, all joints of a
+level side by side; twists and what follows from them add up along the tree, one product with its matrix of 0 and 1.
+The public functions take any leading batch axes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Shaped
+from jaxtyping import Array, Float, Int, Shaped
 
+from .chunks import over_samples, traced
 from .errors import InputError
-from .model import Joint, RobotModel
-from .spatial import cross, matmul, rotate
+from .model import Joint, RobotModel, dofs
+from .spatial import cross, matmul, quaternion_rotation, rotate_back, sine_cosine
 
 __all__ = [
     "Motion",
@@ -32,28 +32,29 @@ __all__ = [
     "forward_kinematics",
     "frame_jacobian",
     "frame_placement",
+    "frame_placements",
     "gather",
-    "in_samples",
     "motion",
+    "movers",
     "placements",
-    "revolute",
+    "pose_columns",
     "states",
-    "world_axes",
+    "take",
 ]
 
-
-_BLOCK = 32  # samples computed together on a CPU, so that what lies between stays in its cache
-_BLOCK_ACCELERATOR = 65536
+_UNROLLED = 8  # levels: a short chain compiles to straight code as fast as to a loop, and runs faster
+_ORIGIN = np.array([1.0, 0.0, 0.0, 0.0])[:, None, None]  # picks the origin among the columns of a pose
 
 
 class Motion(NamedTuple):
-    """Motion of every joint frame in the world, the samples on the last axis."""
+    """Motion of every joint frame and its link, in the world, the samples on the last axis."""
 
-    R: Float[Array, "nj 3 3 samples"]  # world_R_joint
-    p: Float[Array, "nj 3 samples"]  # origin, m
-    w: Float[Array, "nj 3 samples"]  # angular velocity, rad/s
-    al: Float[Array, "nj 3 samples"]  # angular acceleration, rad/s^2
-    ac: Float[Array, "nj 3 samples"]  # classical acceleration of the origin minus gravity, m/s^2
+    columns: Float[Array, "nj 4 3 samples"]  # origin p (m) and axes r_x, r_y, r_z
+    linear: Float[Array, "nd 3 samples"]  # twists of the degrees of freedom: velocity at the world's origin, per rate
+    angular: Float[Array, "nd 3 samples"]
+    w: Float[Array, "nj 3 samples"]  # angular velocity of the link, rad/s
+    al: Float[Array, "nj 3 samples"]  # its angular acceleration, rad/s^2
+    acceleration: Float[Array, "nj 4 3 samples"]  # of p, minus gravity (m/s^2), and of the tips of r_x, r_y, r_z
 
 
 class _Levels(NamedTuple):
@@ -93,221 +94,297 @@ def ancestors(joints: tuple[Joint, ...]) -> np.ndarray:
     return above
 
 
-def revolute(model: RobotModel) -> Bool[np.ndarray, " nj"]:
-    """Which joints turn; the others slide."""
-    _refuse_general(model)
-    return model.dofs.turns
+def movers(model: RobotModel) -> Float[np.ndarray, "nd nj"]:
+    """Matrix of 0 and 1: entry (k, i) is 1 where degree of freedom k moves link i."""
+    return ancestors(model.joints)[model.dofs.joint]
 
 
-def _refuse_general(model: RobotModel) -> None:
-    for joint in model.joints:
-        if joint.kind not in ("revolute", "prismatic"):
-            raise InputError(
-                f"robot '{model.name}': joint '{joint.name}' is {joint.kind}; kinematics and dynamics take revolute "
-                "and prismatic joints only so far: give the joint a posture, or the root as fixed"
-            )
-
-
-def _local(model: RobotModel, q: Float[Array, "nv samples"]) -> tuple[Array, Array]:
-    """Rotation (nj 3 3 samples) and displacement (nj 3 samples) of each joint frame in its parent's (Rodrigues)."""
-    dtype, turns = q.dtype, revolute(model)[:, None]
-    placement, axis = jnp.asarray(model.placement, dtype), jnp.asarray(model.axis, dtype)[..., None]
-    position = _to_joints(model, q) + jnp.asarray(model.offset, dtype)[:, None]
-    angle = jnp.where(turns, position, 0.0)[:, None, None]
-    r0, p0 = placement[:, :3, :3, None], placement[:, :3, 3, None]
-    r0k = _times_skew(r0, axis)
-    rotation = r0 + r0k * jnp.sin(angle) + _times_skew(r0k, axis) * (1.0 - jnp.cos(angle))
-    if turns.all():
-        return rotation, jnp.broadcast_to(p0, rotation[:, 0].shape)
-    return rotation, p0 + rotate(r0, axis) * jnp.where(turns, 0.0, position)[:, None]
-
-
-def _times_skew(matrix: Float[Array, "nj 3 3 1"], axis: Float[Array, "nj 3 1"]) -> Float[Array, "nj 3 3 1"]:
-    """Product `matrix @ skew(axis)`: each row crossed with the axis."""
-    return cross(matrix, axis[:, None])
-
-
-def _coordinates(model: RobotModel) -> np.ndarray:
-    return np.array([joint.coordinate for joint in model.joints], int)
-
-
-def _to_joints(model: RobotModel, x: Float[Array, "nv samples"]) -> Float[Array, "nj samples"]:
-    return jnp.asarray(model.ratio, x.dtype)[:, None] * x[_coordinates(model)]
-
-
-def gather(model: RobotModel, x: Float[Array, "nj *rest"]) -> Float[Array, "nv *rest"]:
-    """Sum of a joint quantity over the joints that share each coordinate, each times its ratio (mimic joints)."""
-    coordinates = _coordinates(model)
-    scaled = jnp.asarray(model.ratio, x.dtype).reshape(-1, *[1] * (x.ndim - 1)) * x
-    if len(coordinates) == model.nv:
-        return scaled[np.argsort(coordinates)]
-    return add_up(np.arange(model.nv)[:, None] == coordinates, scaled)
+def take(x: Float[Array, "n *rest"], index: Int[np.ndarray, " m"]) -> Float[Array, "m *rest"]:
+    """The entries of `x` with the given indices, known when tracing: no copy where these are all, in order."""
+    return x if np.array_equal(index, np.arange(len(x))) else x[index]
 
 
 def add_up(which: Shaped[np.ndarray, "k n"], x: Float[Array, "n *rest"]) -> Float[Array, "k *rest"]:
     """Sums of the entries of `x` that each row of the matrix of 0 and 1 picks."""
+    whole = which.shape[0] == which.shape[1] and bool(np.diagonal(which).all())
+    # Each entry's own part apart: XLA then writes `x` to memory in its own shape, instead of computing it again,
+    # number by number, in the flattened shape of the product's operand.
+    others = which - np.eye(len(which)) if whole else which
     # highest precision: an accelerator's default would round the operands
-    return jnp.tensordot(jnp.asarray(which, x.dtype), x, axes=1, precision=jax.lax.Precision.HIGHEST)
+    total = jnp.tensordot(jnp.asarray(others, x.dtype), x, axes=1, precision=jax.lax.Precision.HIGHEST)
+    return total + x if whole else total
 
 
-def _tree(model: RobotModel, q: Float[Array, "nv samples"]) -> tuple[Array, Array]:
-    """Rotation of each joint in the world and, in the world, the way from its parent's origin to its own."""
-    rotation, shift = _local(model, q)
-    levels = _levels(model.joints)
-    parent = None if levels.parent is None else jnp.asarray(levels.parent)
-
-    def level(R: Array, step: tuple[Array | None, Array]) -> tuple[Array, Array]:
-        above = R if step[0] is None else R[step[0]]
-        R = matmul(above, step[1])
-        return R, R
-
-    world = jnp.broadcast_to(jnp.eye(3, dtype=q.dtype)[..., None], (levels.order.shape[1], *rotation.shape[1:]))
-    stacked = jax.lax.scan(level, world, (parent, rotation[levels.order]))[1]
-    R = stacked.reshape(-1, *rotation.shape[1:])[levels.place]
-    parents = np.array([joint.parent for joint in model.joints], int)
-    return R, rotate(jnp.concatenate([world[:1], R])[parents + 1], shift)
+def gather(model: RobotModel, x: Float[Array, "nd *rest"]) -> Float[Array, "nv *rest"]:
+    """Sum of a quantity over the degrees of freedom that share each coordinate, times their ratio (mimic joints)."""
+    column = model.dofs.column
+    scaled = _ratio(model, x.dtype).reshape(-1, *[1] * (x.ndim - 1)) * x
+    if len(column) == model.nv:
+        return take(scaled, np.argsort(column))
+    return add_up(np.arange(model.nv)[:, None] == column, scaled)
 
 
-def placements(model: RobotModel, q: Float[Array, "nv samples"]) -> Float[Array, "nj 4 4 samples"]:
+def _ratio(model: RobotModel, dtype: jnp.dtype) -> Float[Array, " nd"]:
+    return take(jnp.asarray(model.ratio, dtype), model.dofs.joint)
+
+
+def _rates(model: RobotModel, x: Float[Array, "nv samples"]) -> Float[Array, "nd 1 samples"]:
+    return (_ratio(model, x.dtype)[:, None] * take(x, model.dofs.column))[:, None]
+
+
+class _Numbers(NamedTuple):
+    """Which number of q turns each joint about which of its axes (-1: none), and which slides it along which: joint,
+    degree of freedom, place among the joint's ways, column of q. A quaternion's four columns stand by themselves."""
+
+    turn: np.ndarray  # (nj,) column of q
+    hinge: np.ndarray  # (nj,) degree of freedom
+    slides: np.ndarray  # (ways, 4)
+    quaternions: np.ndarray  # (joints, 5): joint, columns of q
+
+
+@lru_cache(maxsize=256)
+def _numbers(joints: tuple[Joint, ...]) -> _Numbers:
+    positions, first = dofs(joints).positions, dofs(joints).first
+    turn, hinge = np.full(len(first), -1), np.array(first, int)
+    slides, quaternions = [], []
+    for i, (joint, at, dof) in enumerate(zip(joints, positions, first, strict=True)):
+        if joint.kind in ("revolute", "planar"):
+            turn[i], hinge[i] = at.stop - 1, dof + (2 if joint.kind == "planar" else 0)
+        ways = {"prismatic": 1, "planar": 2, "free": 3}.get(joint.kind, 0)
+        slides += [(i, dof + k, k, at.start + k) for k in range(ways)]
+        if joint.kind in ("spherical", "free"):
+            quaternions.append((i, *range(at.stop - 4, at.stop)))
+    return _Numbers(turn, hinge, np.array(slides, int).reshape(-1, 4), np.array(quaternions, int).reshape(-1, 5))
+
+
+def _local(model: RobotModel, q: Float[Array, "nq samples"]) -> Float[Array, "nj 4 3 samples"]:
+    """Columns of each joint frame in its parent's: Rodrigues' formula as one product with sine and cosine."""
+    numbers, dtype, joints = _numbers(model.joints), q.dtype, len(model.joints)
+    placement, axis = jnp.asarray(model.placement, dtype), jnp.asarray(model.axis, dtype)
+    ratio, offset = jnp.asarray(model.ratio, dtype)[:, None], jnp.asarray(model.offset, dtype)[:, None]
+    turns = numbers.turn >= 0
+    angle = ratio * take(q, numbers.turn) + offset
+    known = sine_cosine(angle if turns.all() else jnp.where(turns[:, None], angle, 0.0))
+    r0, a = placement[:, :3, :3], take(axis, numbers.hinge)[:, None]
+    across = jnp.cross(r0, a)  # r0 [a]
+    twice = jnp.cross(across, a)
+    weights = jnp.pad(jnp.stack([across, -twice], -1), ((0, 0), (0, 0), (1, 0), (0, 0)))
+    if len(numbers.slides):
+        joint, dof, place, column = numbers.slides.T
+        ways = jnp.zeros((joints, 1 + place.max(), q.shape[1]), dtype)
+        ways = ways.at[joint, place].set(ratio[joint] * q[column] + offset[joint])
+        along = jnp.zeros((joints, 3, 4, ways.shape[1]), dtype)
+        along = along.at[joint, :, 0, place].set(jnp.sum(r0[joint] * axis[dof][:, None], -1))
+        known, weights = jnp.concatenate([known, ways], 1), jnp.concatenate([weights, along], -1)
+    weights = jnp.swapaxes(weights, 1, 2).reshape(joints, 12, -1)
+    still = jnp.concatenate([placement[:, :3, 3:], r0 + twice], 2)
+    product = jnp.einsum("jck,jks->jcs", weights, known, precision=jax.lax.Precision.HIGHEST)
+    columns = product.reshape(joints, 4, 3, -1) + jnp.swapaxes(still, 1, 2)[..., None]
+    return _turned_by_quaternions(numbers.quaternions, columns, q) if len(numbers.quaternions) else columns
+
+
+def _turned_by_quaternions(which: np.ndarray, columns: Array, q: Array) -> Array:
+    joint, rotation = which[:, 0], quaternion_rotation(q[which[:, 1:]])
+    axes = columns[joint, 1:]
+    turned = (
+        sum(rotation[:, i, :, None] * axes[:, None, i] for i in range(1, 3)) + rotation[:, 0, :, None] * axes[:, :1]
+    )
+    return columns.at[joint, 1:].set(turned)
+
+
+def pose_columns(model: RobotModel, q: Float[Array, "nq samples"]) -> Float[Array, "nj 4 3 samples"]:
+    """Origin and axes of every joint frame in the world, the dtype that of `q`."""
+    levels, own = _levels(model.joints), _local(model, q)
+    parent = None if levels.parent is None else jnp.asarray(levels.parent[1:])
+
+    def level(above: Array, step: tuple[Array | None, Array]) -> tuple[Array, Array]:
+        above = above if step[0] is None else above[step[0]]
+        x, y, z = (step[1][:, :, k, None] * above[:, None, k + 1] for k in range(3))
+        here = x + y + z + jnp.asarray(_ORIGIN, q.dtype) * above[:, :1]
+        return here, here
+
+    own = own[:, None] if parent is None else own[levels.order]
+    unroll = max(1, len(own) - 1) if len(own) <= _UNROLLED else 1
+    below = jax.lax.scan(level, own[0], (parent, own[1:]), unroll=unroll)[1]
+    stacked = jnp.concatenate([own[:1], below])
+    return take(stacked.reshape(-1, *own.shape[2:]), levels.place)
+
+
+def placements(model: RobotModel, q: Float[Array, "nq samples"]) -> Float[Array, "nj 4 4 samples"]:
     """Kernel of `forward_kinematics`: poses `world_T_joint`, the samples on the last axis, the dtype that of `q`."""
-    R, d = _tree(model, q)
-    p = add_up(ancestors(model.joints).T, d)
-    bottom = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0], q.dtype)[:, None], (len(R), 1, 4, q.shape[-1]))
-    return jnp.concatenate([jnp.concatenate([R, p[:, :, None]], axis=2), bottom], axis=1)
+    columns = pose_columns(model, q)
+    upper = jnp.swapaxes(jnp.concatenate([columns[:, 1:], columns[:, :1]], axis=1), 1, 2)
+    bottom = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0], q.dtype)[:, None], (len(upper), 1, 4, q.shape[-1]))
+    return jnp.concatenate([upper, bottom], axis=1)
+
+
+def axis_twists(
+    model: RobotModel, columns: Float[Array, "nj 4 3 samples"], point: Float[Array, "3 samples"] | None = None
+) -> tuple[Float[Array, "nd 3 samples"], Float[Array, "nd 3 samples"]]:
+    """Linear and angular velocity that a unit rate of each degree of freedom gives the body at a point of the world.
+
+    The point is the world's origin where it is left out.
+    """
+    joint, turns = model.dofs.joint, model.dofs.turns[:, None, None]
+    axis = jnp.asarray(model.axis, columns.dtype)[..., None]
+    frames = take(columns, joint)
+    s = axis[:, :1] * frames[:, 1] + axis[:, 1:2] * frames[:, 2] + axis[:, 2:] * frames[:, 3]
+    arm = frames[:, 0] if point is None else frames[:, 0] - point
+    if turns.all():
+        return cross(arm, s), s
+    return jnp.where(turns, cross(arm, s), s), jnp.where(turns, s, 0.0)
 
 
 def motion(
-    model: RobotModel, q: Float[Array, "nv samples"], v: Float[Array, "nv samples"], a: Float[Array, "nv samples"]
+    model: RobotModel, q: Float[Array, "nq samples"], v: Float[Array, "nv samples"], a: Float[Array, "nv samples"]
 ) -> Motion:
     r"""Motion of every joint frame in the world, for coordinates with the samples on the last axis.
 
-    From parent to child, with s the joint's axis in the world, d the way from the parent's origin, r = 1 for a revolute
-    and 0 for a prismatic joint (Featherstone 2008, chapter 5, in classical accelerations):
-    $$w = w_p + r s \dot q, \quad \alpha = \alpha_p + r (s \ddot q + w_p \times s \dot q)$$
-    $$c = c_p + \alpha_p \times d + w_p \times (w_p \times d) + (1 - r)(s \ddot q + 2 w_p \times s \dot q)$$
-    starting from rest with c = -gravity. Units: rad or m, and their rates in seconds. The dtype is that of `q`.
+    With $S_k$ the twists, sums over the degrees of freedom that move the link (Featherstone 2008, section 5.3):
+    $$V = \sum S_k \dot q_k, \quad A = \sum S_k \ddot q_k + V_k \times S_k \dot q_k$$
+    where $V_k$ belongs to the link that k carries. Then the accelerations of the frame's origin and of the tips of
+    its axes, seen from its origin: $\alpha \times r + w \times (w \times r)$, and for the origin $A + w \times V$
+    more, starting from rest with -gravity. Units: rad or m, and their rates in seconds. The dtype is that of `q`.
     """
-    R, d = _tree(model, q)
-    above, s = ancestors(model.joints).T, world_axes(model, R)
-    turns = jnp.asarray(revolute(model), q.dtype)[:, None, None]
-    sv, sa = (s * _to_joints(model, x)[:, None] for x in (v, a))
-    w, p = add_up(above, turns * sv), add_up(above, d)
-    w_p = w - turns * sv
-    coriolis = cross(w_p, sv)
-    al_own = turns * (sa + coriolis)
-    al = add_up(above, al_own)
-    turning = cross(al - al_own, d) + cross(w_p, cross(w_p, d))
-    ac = add_up(above, turning + (1.0 - turns) * (sa + 2.0 * coriolis))
-    return Motion(R, p, w, al, ac - jnp.asarray(model.gravity, q.dtype)[:, None])
+    columns = pose_columns(model, q)
+    linear, angular = axis_twists(model, columns)
+    rate, push = _rates(model, v), _rates(model, a)
+    linear_v, angular_v = linear * rate, angular * rate
+    moved, carried = movers(model).T, model.dofs.joint
+    v0, w = add_up(moved, linear_v), add_up(moved, angular_v)
+    v0_k, w_k = take(v0, carried), take(w, carried)
+    al = add_up(moved, angular * push + cross(w_k, angular_v))
+    a0 = add_up(moved, linear * push + cross(w_k, linear_v) + cross(v0_k, angular_v))
+    a0 = a0 + cross(w, v0) - jnp.asarray(model.gravity, q.dtype)[:, None]
+    turning = cross(w[:, None], columns)
+    acceleration = cross(al[:, None], columns) + cross(w[:, None], turning)
+    return Motion(columns, linear, angular, w, al, acceleration + jnp.asarray(_ORIGIN, q.dtype) * a0[:, None])
 
 
-def world_axes(model: RobotModel, R: Float[Array, "nj 3 3 samples"]) -> Float[Array, "nj 3 samples"]:
-    """Unit axis of every joint in the world, from the joints' rotations."""
-    return rotate(R, jnp.asarray(model.axis, R.dtype)[..., None])
-
-
-def states(model: RobotModel, **arrays: Float[ArrayLike, "..."]) -> list[Float[Array, "*batch nv"]]:
+def states(model: RobotModel, **arrays: Float[ArrayLike, "..."]) -> list[Float[Array, "*batch n"]]:
     """The named arrays (`q=`, `v=`, ...) in float64; to be called where 64-bit JAX is on. Raises as `check_shapes`."""
     check_shapes(model, **arrays)
     return [jnp.asarray(array, jnp.float64) for array in arrays.values()]
 
 
 def check_shapes(model: RobotModel, **arrays: Float[ArrayLike, "..."]) -> None:
-    """Raise `InputError` naming the array (`q=`, `v=`, ...) whose shape does not fit the model or the first array."""
-    _refuse_general(model)
+    """Raise `InputError` naming the array (`q=`, `v=`, ...) that does not fit the model or the first array.
+
+    The last axis of `q` holds the model's `nq` numbers, with unit quaternions; that of every other its `nv`.
+    """
     first = next(iter(arrays))
     for name, array in arrays.items():
         shape, expected = np.shape(array), np.shape(arrays[first])
-        if shape[-1:] != (model.nv,):
+        width = model.nq if name == "q" else model.nv
+        if shape[-1:] != (width,):
             joints = ", ".join(model.joint_names)
-            raise InputError(f"{name} has shape {shape}; its last axis must hold the {model.nv} joints {joints}")
-        if shape != expected:
+            what = f"the {width} joints" if model.nq == len(model.joint_names) else f"{width} numbers, for the joints"
+            raise InputError(f"{name} has shape {shape}; its last axis must hold {what} {joints}")
+        if shape[:-1] != expected[:-1]:
             raise InputError(f"{name} has shape {shape}, but {first} has {expected}; give both alike")
+    if model.nq > model.nv and "q" in arrays and not traced(arrays["q"]):
+        _check_quaternions(model, np.asarray(arrays["q"]))
 
 
-def in_samples(kernel: Callable[..., Array], *arrays: Float[Array, "*batch nv"]) -> Float[Array, "..."]:
-    """Apply a kernel that holds the samples on its last axis to arrays with any leading batch axes."""
-    batch, flat = arrays[0].shape[:-1], [x.reshape(-1, x.shape[-1]) for x in arrays]
-    samples, block = len(flat[0]), _BLOCK if jax.default_backend() == "cpu" else _BLOCK_ACCELERATOR
-
-    def apply(rows: Sequence[Array]) -> Array:
-        return jnp.moveaxis(kernel(*(x.T for x in rows)), -1, 0)
-
-    if samples <= 2 * block:
-        answer = apply(flat)
-    else:
-        blocks = -(-samples // block)
-        padded = [jnp.pad(x, ((0, blocks * block - samples), (0, 0))).reshape(blocks, block, -1) for x in flat]
-        answer = jax.lax.map(apply, padded)
-        answer = answer.reshape(blocks * block, *answer.shape[2:])[:samples]
-    return answer.reshape(*batch, *answer.shape[1:])
+def _check_quaternions(model: RobotModel, q: np.ndarray) -> None:
+    for joint, at in zip(model.joints, model.dofs.positions, strict=True):
+        if joint.kind in ("spherical", "free"):
+            off = np.abs(np.linalg.norm(q[..., at.stop - 4 : at.stop], axis=-1) - 1.0)
+            if not (off < 1e-3).all():
+                length = np.ravel(1.0 + off)[np.argmax(np.ravel(~(off < 1e-3)))]
+                raise InputError(
+                    f"q, joint '{joint.name}': a quaternion (columns {at.stop - 4} to {at.stop - 1}, x y z w) is off"
+                    f" unit length by {length - 1.0:.3g}; a unit quaternion is expected"
+                )
 
 
-def forward_kinematics(model: RobotModel, q: Float[ArrayLike, "*batch nv"]) -> Float[Array, "*batch nj 4 4"]:
+def forward_kinematics(model: RobotModel, q: Float[ArrayLike, "*batch nq"]) -> Float[Array, "*batch nj 4 4"]:
     """Poses `world_T_joint` of all tree joints (m; q in rad, m for a prismatic joint), in float64.
 
-    Raises `InputError` where the shape of `q` does not fit the model.
+    Raises `InputError` where `q` does not fit the model.
     """
     with jax.enable_x64(True):
-        return _forward_kinematics(model, *states(model, q=q))
+        check_shapes(model, q=q)
+        return over_samples(placements, model, q)
 
 
-@jax.jit
-def _forward_kinematics(model: RobotModel, q: Array) -> Array:
-    return in_samples(lambda x: placements(model, x), q)
-
-
-def frame_placement(model: RobotModel, q: Float[ArrayLike, "*batch nv"], name: str) -> Float[Array, "*batch 4 4"]:
+def frame_placement(model: RobotModel, q: Float[ArrayLike, "*batch nq"], name: str) -> Float[Array, "*batch 4 4"]:
     """Pose `world_T_frame` of the frame called `name` (a link or a joint of the model), m and rad, in float64.
 
-    Raises `InputError` where there is no such frame or the shape of `q` does not fit the model.
+    Raises `InputError` where there is no such frame or `q` does not fit the model.
     """
     index = model.frame_index(name)
     with jax.enable_x64(True):
-        return _frame_placement(model, *states(model, q=q), index, model.frames[index].parent)
+        check_shapes(model, q=q)
+        return over_samples(_one_frame, (model, index, model.frames[index].parent), q)
 
 
-@jax.jit
-def _frame_placement(model: RobotModel, q: Array, index: Array, parent: Array) -> Array:
-    return in_samples(lambda x: _frame_pose(placements(model, x), model, index, parent), q)
+def frame_placements(model: RobotModel, q: Float[ArrayLike, "*batch nq"]) -> Float[Array, "*batch nf 4 4"]:
+    """Poses `world_T_frame` of all frames, in the order of `model.frames`; units and errors as `frame_placement`."""
+    with jax.enable_x64(True):
+        check_shapes(model, q=q)
+        return over_samples(_all_frames, model, q)
 
 
-def _frame_pose(poses: Float[Array, "nj 4 4 samples"], model: RobotModel, index: Array, parent: Array) -> Array:
-    """Pose (4 4 samples); a parent of -1, the world, stands before the joints."""
+def _one_frame(which: tuple[RobotModel, Any, Any], q: Array) -> Float[Array, "4 4 samples"]:
+    return _frame_pose(placements(which[0], q), *which)
+
+
+def _all_frames(model: RobotModel, q: Array) -> Float[Array, "nf 4 4 samples"]:
+    parents = np.array([frame.parent for frame in model.frames], int)
+    return _frame_pose(placements(model, q), model, slice(None), parents)
+
+
+def _frame_pose(poses: Float[Array, "nj 4 4 samples"], model: RobotModel, index: Any, parent: Any) -> Array:
+    """Poses of frames; a parent of -1, the world, stands before the joints."""
     world = jnp.broadcast_to(jnp.eye(4, dtype=poses.dtype)[..., None], (1, *poses.shape[1:]))
     carrier = jnp.concatenate([world, poses])[parent + 1]
     return matmul(carrier, jnp.asarray(model.frame_placement, poses.dtype)[index][..., None])
 
 
-def frame_jacobian(model: RobotModel, q: Float[ArrayLike, "*batch nv"], name: str) -> Float[Array, "*batch 6 nv"]:
-    """Jacobian of the frame called `name`: its velocity `[linear, angular]` at its origin, in world axes, for each v.
+def frame_jacobian(
+    model: RobotModel,
+    q: Float[ArrayLike, "*batch nq"],
+    name: str,
+    reference: str = "local_world_aligned",
+) -> Float[Array, "*batch 6 nv"]:
+    """Jacobian of the frame called `name`: its velocity `[linear, angular]` for each v, in Pinocchio's references.
 
-    Local-world-aligned in Pinocchio's words; m or 1 per rad or m, in float64. Raises `InputError` where there is no
-    such frame or the shape of `q` does not fit the model.
+    `local_world_aligned`: of its origin, in world axes; `local`: of its origin, in its own axes; `world`: of the point
+    of its body at the world's origin, in world axes. m or 1 per rad or m, in float64. Raises `InputError` where there
+    is no such frame or reference or `q` does not fit the model.
     """
     index = model.frame_index(name)
+    if reference not in _JACOBIANS:
+        raise InputError(f"reference is '{reference}'; known: {', '.join(_JACOBIANS)}")
     with jax.enable_x64(True):
-        return _frame_jacobian(model, *states(model, q=q), index, model.frames[index].parent)
+        check_shapes(model, q=q)
+        return over_samples(_JACOBIANS[reference], (model, index, model.frames[index].parent), q)
 
 
-@jax.jit
-def _frame_jacobian(model: RobotModel, q: Array, index: Array, parent: Array) -> Array:
-    return in_samples(lambda x: _jacobian(model, x, index, parent), q)
+def _aligned(which: tuple[RobotModel, Any, Any], q: Array) -> Float[Array, "6 nv samples"]:
+    columns = pose_columns(which[0], q)
+    pose = _frame_pose(placements(which[0], q), *which)
+    return _jacobian(which, *axis_twists(which[0], columns, pose[:3, 3]))
 
 
-def _jacobian(model: RobotModel, q: Float[Array, "nv samples"], index: Array, parent: Array) -> Array:
-    poses = placements(model, q)
-    origin = _frame_pose(poses, model, index, parent)[:3, 3]
-    linear, angular = axis_twists(model, poses[:, :3, :3], poses[:, :3, 3] - origin)
-    moved = jnp.asarray(np.pad(ancestors(model.joints), ((0, 0), (1, 0))), q.dtype)[:, parent + 1]
+def _at_origin(which: tuple[RobotModel, Any, Any], q: Array) -> Float[Array, "6 nv samples"]:
+    return _jacobian(which, *axis_twists(which[0], pose_columns(which[0], q)))
+
+
+def _in_own_axes(which: tuple[RobotModel, Any, Any], q: Array) -> Float[Array, "6 nv samples"]:
+    columns = pose_columns(which[0], q)
+    pose = _frame_pose(placements(which[0], q), *which)
+    linear, angular = axis_twists(which[0], columns, pose[:3, 3])
+    return _jacobian(which, rotate_back(pose[:3, :3], linear), rotate_back(pose[:3, :3], angular))
+
+
+_JACOBIANS = {"local_world_aligned": _aligned, "local": _in_own_axes, "world": _at_origin}
+
+
+def _jacobian(which: tuple[RobotModel, Any, Any], linear: Array, angular: Array) -> Array:
+    """Twists of the degrees of freedom that move the frame, one column for each coordinate."""
+    model, _, parent = which
+    moved = jnp.asarray(np.pad(movers(model), ((0, 0), (1, 0))), linear.dtype)[:, parent + 1]
     columns = jnp.concatenate([linear, angular], axis=1) * moved[:, None, None]
     return jnp.moveaxis(gather(model, columns), 0, 1)
-
-
-def axis_twists(
-    model: RobotModel, R: Float[Array, "nj 3 3 samples"], p: Float[Array, "nj 3 samples"]
-) -> tuple[Float[Array, "nj 3 samples"], Float[Array, "nj 3 samples"]]:
-    """Linear and angular velocity that a unit rate of each joint gives the point from which `p` is measured."""
-    s = world_axes(model, R)
-    turns = revolute(model)[:, None, None]
-    return jnp.where(turns, cross(p, s), s), jnp.where(turns, s, 0.0)

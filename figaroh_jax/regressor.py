@@ -9,7 +9,7 @@ the processor's cache.
 
 from __future__ import annotations
 
-from typing import Any
+from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +17,11 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from .chunks import chunk_size, over_samples
+from .chunks import aligned, chunk_size, host_blocks, on_host, over_samples, put, two_axes
 from .errors import InputError
-from .kinematics import Motion, ancestors, check_shapes, motion, revolute, world_axes
-from .model import RobotModel
-from .spatial import rotate_back
+from .kinematics import Motion, ancestors, check_shapes, motion, take
+from .model import Joint, RobotModel, dofs
+from .spatial import cross, rotate_back
 
 __all__ = [
     "coordinate_blocks",
@@ -33,158 +33,170 @@ __all__ = [
     "pairs",
 ]
 
-Vector = list[Array]  # the three components of vectors, each (any, samples)
+_ELSEWHERE = np.array([0.0, 1.0, 1.0, 1.0])[:, None, None]  # the columns of a pose but for the origin
+_ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))  # of the inertia, in Pinocchio's order
 
 
 def pairs(model: RobotModel) -> Int[np.ndarray, "pairs 2"]:
-    """Tree joint and link of every block of W that can differ from zero: the joint moves the link. Sorted by joint."""
-    return np.argwhere(ancestors(model.joints) > 0)
+    """Degree of freedom and link of every block of W that can differ from zero: the one moves the other.
+
+    Sorted by degree of freedom (which is the tree joint for robots of revolute and prismatic joints).
+    """
+    return _pairs(model.joints)
+
+
+@lru_cache(maxsize=256)
+def _pairs(joints: tuple[Joint, ...]) -> np.ndarray:
+    found = np.argwhere(ancestors(joints)[dofs(joints).joint] > 0)
+    found.setflags(write=False)
+    return found
 
 
 def joint_torque_regressor(
     model: RobotModel,
-    q: Float[ArrayLike, "*batch nv"],
+    q: Float[ArrayLike, "*batch nq"],
     v: Float[ArrayLike, "*batch nv"],
     a: Float[ArrayLike, "*batch nv"],
 ) -> Float[Array, "*batch nv columns"]:
     """Regressor W with `W @ model.inertia.ravel()` the torques of `inverse_dynamics` (N m; N for a prismatic joint).
 
-    q, v, a in rad, rad/s, rad/s^2 (m for prismatic joints); 10 columns a link, in float64. The rows of joints that
-    share a coordinate add up, each times its ratio. Atkeson, An and Hollerbach (1986), in classical accelerations.
-    Raises `InputError` where the shapes do not fit the model.
+    q, v, a in rad, rad/s, rad/s^2 (m for sliding); 10 columns a link, in float64. The rows of joints that share a
+    coordinate add up, each times its ratio. A free joint's six rows are the force and the torque about its origin, in
+    its own axes. Atkeson, An and Hollerbach (1986), in classical accelerations. Raises `InputError` where the arrays
+    do not fit the model.
     """
     with jax.enable_x64(True):
         check_shapes(model, q=q, v=v, a=a)
-        shape = (*np.shape(q)[:-1], model.nv, 10 * len(model.joints))
-        return over_samples(dense_rows, 0, _chunk(model), model, q, v, a).reshape(shape)
+        width = 10 * len(pairs(model))
+        if on_host(model, q, v, a):
+            shape = (*np.shape(q)[:-1], model.nv, 10 * len(model.joints))
+            return _dense_on_host(model, chunk_size(width), *two_axes(q, v, a, host=True)).reshape(shape)
+        return over_samples(dense_rows, model, q, v, a, width=width)
+
+
+def _dense_on_host(model: RobotModel, chunk: int, *arrays: np.ndarray) -> Array:
+    """W with zeros that are never written: memory that the system gives out is zero already."""
+    whole = aligned((len(arrays[0]), model.nv, len(model.joints), 10), fill=0.0)
+    for where, pieces in host_blocks(coordinate_rows, chunk, model, *arrays):
+        view, first = np.moveaxis(whole[where], 0, -1), 0
+        for piece in pieces:
+            for rows, blocks in _runs(model.joints):
+                put(view[rows][..., first : first + piece.shape[2], :], np.moveaxis(piece[:, blocks], 0, -2))
+            first += piece.shape[2]
+    return jax.device_put(whole.reshape(len(whole), model.nv, 10 * len(model.joints)), may_alias=True)
 
 
 def packed_regressor(
     model: RobotModel,
-    q: Float[ArrayLike, "samples nv"],
+    q: Float[ArrayLike, "samples nq"],
     v: Float[ArrayLike, "samples nv"],
     a: Float[ArrayLike, "samples nv"],
 ) -> Float[Array, "pairs 10 samples"]:
     """Blocks of the regressor that can differ from zero, one for each of `pairs(model)`, the samples last, in float64.
 
-    A row belongs to a joint of the tree, not to a coordinate: mimic joints have rows of their own, without their ratio.
+    A row belongs to a degree of freedom, not to a coordinate: mimic joints have rows of their own, without their ratio.
     Units and errors as `joint_torque_regressor`.
     """
     with jax.enable_x64(True):
         check_shapes(model, q=q, v=v, a=a)
         if np.ndim(q) != 2:
             raise InputError(f"q has shape {np.shape(q)}; a packed regressor takes (samples, joints)")
-        return over_samples(packed_rows, -1, _chunk(model), model, q, v, a)
-
-
-def _chunk(model: RobotModel) -> int:
-    return chunk_size(10 * len(pairs(model)))
+        return over_samples(packed_rows, model, q, v, a, last=True, width=10 * len(pairs(model)))
 
 
 def coordinate_blocks(model: RobotModel) -> tuple[Int[np.ndarray, "blocks 2"], Int[np.ndarray, " pairs"]]:
     """Coordinate and link of each block of W that can differ from zero, and the block to which each pair adds."""
-    moved = pairs(model)
-    coordinate = np.array([joint.coordinate for joint in model.joints], int)
-    blocks, place = np.unique(np.stack([coordinate[moved[:, 0]], moved[:, 1]], 1), axis=0, return_inverse=True)
+    return _coordinate_blocks(model.joints)
+
+
+@lru_cache(maxsize=256)
+def _coordinate_blocks(joints: tuple[Joint, ...]) -> tuple[np.ndarray, np.ndarray]:
+    moved = _pairs(joints)
+    where = np.stack([dofs(joints).column[moved[:, 0]], moved[:, 1]], 1)
+    blocks, place = np.unique(where, axis=0, return_inverse=True)
     return blocks, place.reshape(-1)
 
 
+@lru_cache(maxsize=256)
+def _runs(joints: tuple[Joint, ...]) -> list[tuple[tuple[int, slice], slice]]:
+    """Blocks of W that stand side by side in one row: coordinate and links, and where they are among the blocks."""
+    blocks, _ = _coordinate_blocks(joints)
+    starts = np.flatnonzero((np.diff(blocks, axis=0, prepend=-2) != [0, 1]).any(1))
+    runs = []
+    for start, end in zip(starts, [*starts[1:], len(blocks)], strict=True):
+        row, link = (int(x) for x in blocks[start])
+        runs.append(((row, slice(link, link + end - start)), slice(start, end)))
+    return runs
+
+
 def coordinate_rows(
-    model: RobotModel, q: Float[Array, "nv samples"], v: Float[Array, "nv samples"], a: Float[Array, "nv samples"]
-) -> Float[Array, "blocks 10 samples"]:
-    """Kernel: the blocks of `coordinate_blocks`, the samples last."""
-    rows = packed_rows(model, q, v, a, scale=model.ratio)
+    model: RobotModel, q: Float[Array, "nq samples"], v: Float[Array, "nv samples"], a: Float[Array, "nv samples"]
+) -> tuple[Float[Array, "blocks 4 samples"], Float[Array, "blocks 6 samples"]]:
+    """Kernel: the blocks of `coordinate_blocks` as `packed_rows` gives them, the samples last."""
+    moments, inertias = packed_rows(model, q, v, a, scale=model.ratio)
     blocks, place = coordinate_blocks(model)
-    if (place == np.arange(len(blocks))).all():
-        return rows
-    return jnp.zeros((len(blocks), *rows.shape[1:]), rows.dtype).at[place].add(rows)
+    if len(blocks) == len(place):
+        order = np.argsort(place)
+        return take(moments, order), take(inertias, order)
+    empty = (jnp.zeros((len(blocks), *x.shape[1:]), x.dtype) for x in (moments, inertias))
+    first, second = (x.at[place].add(rows) for x, rows in zip(empty, (moments, inertias), strict=True))
+    return first, second
 
 
 def dense_rows(
-    model: RobotModel, q: Float[Array, "nv samples"], v: Float[Array, "nv samples"], a: Float[Array, "nv samples"]
-) -> Float[Array, "samples nv columns"]:
-    """Kernel of `joint_torque_regressor`: arguments with the samples last, W with the samples first."""
-    rows, (blocks, _) = coordinate_rows(model, q, v, a), coordinate_blocks(model)
+    model: RobotModel, q: Float[Array, "nq samples"], v: Float[Array, "nv samples"], a: Float[Array, "nv samples"]
+) -> Float[Array, "nv columns samples"]:
+    """Kernel of `joint_torque_regressor`: the samples last."""
+    rows, (blocks, _) = jnp.concatenate(coordinate_rows(model, q, v, a), axis=1), coordinate_blocks(model)
     source = np.full((model.nv, len(model.joints)), len(rows))  # zeros, where no block is
     source[tuple(blocks.T)] = np.arange(len(rows))
-    # samples first before the zeros come in: the blocks that are there fit the cache, all of W may not
-    filled = jnp.pad(rows.reshape(-1, q.shape[-1]).T.reshape(-1, *rows.shape[:2]), ((0, 0), (0, 1), (0, 0)))
-    return _once(filled)[:, source.ravel()].reshape(-1, model.nv, 10 * len(model.joints))
+    filled = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
+    return filled[source].reshape(model.nv, 10 * len(model.joints), -1)
 
 
 def packed_rows(
     model: RobotModel,
-    q: Float[Array, "nv samples"],
+    q: Float[Array, "nq samples"],
     v: Float[Array, "nv samples"],
     a: Float[Array, "nv samples"],
     scale: Float[ArrayLike, " nj"] | None = None,
-) -> Float[Array, "pairs 10 samples"]:
-    r"""Kernel of `packed_regressor`: the samples last, the dtype that of `q`; rows times `scale` of their joint.
+) -> tuple[Float[Array, "pairs 4 samples"], Float[Array, "pairs 6 samples"]]:
+    r"""Kernel of `packed_regressor`: columns of mass and first moments, and of the inertia, the samples last.
 
-    With the joint's moment $u = s_j$ and $l = s_j \times (p_i - p_j)$ (prismatic: $u = 0$, $l = s_j$) in the frame of
-    link i, and there $w$, $\alpha$ and $c$ of the link, the columns of the row are
-    $$l \cdot c, \quad l^T ([\alpha] + [w]^2) + c \times u, \quad u^T (L(\alpha) + [w] L(w)), \quad L(w) I = I w$$
+    The dtype is that of `q`; rows times `scale` of their joint. A row is $l \cdot f + u \cdot n$ with the twist (l, u)
+    of the degree of freedom and the force f and the torque n of a unit of each parameter, about the world's origin.
     """
-    joint, link = pairs(model).T
-    u, lever, w, al, c = _pair_vectors(model, joint, link, motion(model, q, v, a), scale)
-    mass = _dot(lever, c)
-    return jnp.stack(_once([mass, *_moment_columns(u, lever, w, al, c), *_inertia_columns(u, w, al)]), axis=1)
+    state = motion(model, q, v, a)
+    linear, angular = state.linear, state.angular
+    if scale is not None:
+        ratio = take(jnp.asarray(scale, q.dtype), model.dofs.joint)[:, None, None]
+        linear, angular = linear * ratio, angular * ratio
+    force, torque, turning = _unit_wrenches(state)
+    dof, link = pairs(model).T
+    moments = [
+        linear[dof][:, None, k] * force[link][:, :, k] + angular[dof][:, None, k] * torque[link][:, :, k]
+        for k in range(3)
+    ]
+    inertias = [angular[dof][:, None, k] * turning[link][:, :, k] for k in range(3)]
+    return moments[0] + moments[1] + moments[2], inertias[0] + inertias[1] + inertias[2]
 
 
-def _pair_vectors(
-    model: RobotModel, joint: np.ndarray, link: np.ndarray, state: Motion, scale: ArrayLike | None
-) -> tuple[Vector, ...]:
-    """Moments u and l of each pair's joint, and w, alpha and c of its link, all in the link's frame."""
-    s = world_axes(model, state.R)
-    s = s if scale is None else s * jnp.asarray(scale, s.dtype)[:, None, None]
-    local = (rotate_back(state.R, x) for x in (state.w, state.al, state.ac))
-    rotation = state.R.reshape(len(s), 9, -1)
-    # barriers: a gather or a rotation fused into each of its uses would be done again for every one of them
-    links, joints = _once((jnp.concatenate([rotation, state.p, *local], 1), jnp.concatenate([s, state.p], 1)))
-    links, joints = _once((links[link], joints[joint]))
-    R, p, w, al, c = (_components(links, k, n) for k, n in ((0, 9), (9, 3), (12, 3), (15, 3), (18, 3)))
-    axis, arm = _components(joints, 0, 3), [x - y for x, y in zip(p, _components(joints, 3, 3), strict=True)]
-    u, lever = _turned_back(R, axis), _turned_back(R, _cross(axis, arm))
-    turns = revolute(model)[joint]
-    if not turns.all():
-        slides = jnp.asarray(~turns, s.dtype)[:, None]
-        u, lever = (
-            [x * (1.0 - slides) for x in u],
-            [x * (1.0 - slides) + y * slides for x, y in zip(lever, u, strict=True)],
-        )
-    return *_once((u, lever)), w, al, c
+def _unit_wrenches(
+    state: Motion,
+) -> tuple[Float[Array, "nj 4 3 samples"], Float[Array, "nj 4 3 samples"], Float[Array, "nj 6 3 samples"]]:
+    r"""Force and torque about the world's origin of a unit of mass and first moments, and torque of a unit of inertia.
 
+    $t_a$ the columns of the pose, $g_a$ their accelerations: force $g_a$, torque $p \times g_a + t_a \times g_p$
+    (once for the mass). An inertia E gives $R (E \alpha + w \times E w)$ with w and $\alpha$ in the link's frame.
+    """
+    columns, force = state.columns, state.acceleration
+    torque = cross(columns, force[:, :1]) + jnp.asarray(_ELSEWHERE, force.dtype) * cross(columns[:, :1], force)
+    axes = columns[:, 1:]
+    turning = cross(state.w[:, None], axes)
+    w, al = (rotate_back(jnp.swapaxes(axes, 1, 2), x) for x in (state.w, state.al))
 
-def _moment_columns(u: Vector, lever: Vector, w: Vector, al: Vector, c: Vector) -> Vector:
-    """Columns of the first moments, `lever' ([al] + [w]^2) + c x u`."""
-    along, square, fall = _dot(lever, w), _dot(w, w), _cross(lever, al)
-    return [fall[k] + along * w[k] - square * lever[k] + _cross(c, u)[k] for k in range(3)]
+    def one(i: int, j: int) -> Array:
+        return axes[:, i] * al[:, j, None] + turning[:, i] * w[:, j, None]
 
-
-def _inertia_columns(u: Vector, w: Vector, al: Vector) -> Vector:
-    """Columns of the inertia, `u' (L(al) + [w] L(w))`, from the symmetric products of u with al and of u x w with w."""
-    turned = _cross(u, w)
-    pairs = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
-    diagonal = [u[i] * al[i] + turned[i] * w[i] for i in range(3)]
-    mixed = {(i, j): u[i] * al[j] + u[j] * al[i] + turned[i] * w[j] + turned[j] * w[i] for i, j in pairs if i != j}
-    return [diagonal[i] if i == j else mixed[i, j] for i, j in pairs]
-
-
-def _once(x: Any) -> Any:
-    return jax.lax.optimization_barrier(x)
-
-
-def _components(x: Float[Array, "n rows samples"], first: int, count: int) -> Vector:
-    return [x[:, k] for k in range(first, first + count)]
-
-
-def _dot(x: Vector, y: Vector) -> Array:
-    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
-
-
-def _cross(x: Vector, y: Vector) -> Vector:
-    return [x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]]
-
-
-def _turned_back(R: Vector, x: Vector) -> Vector:
-    return [R[k] * x[0] + R[3 + k] * x[1] + R[6 + k] * x[2] for k in range(3)]
+    inertia = jnp.stack([one(i, i) if i == j else one(i, j) + one(j, i) for i, j in _ENTRIES], axis=1)
+    return force, torque, inertia

@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from .chunks import BLOCK, chunk_size, in_chunks, traced, two_axes
+from .chunks import BLOCK, CPU_OPTIONS, chunk_size, in_chunks, on_host, traced, two_axes
 from .errors import InputError
 from .kinematics import check_shapes
 from .model import RobotModel
@@ -35,7 +35,7 @@ class NormalMatrix(NamedTuple):
 
 def normal_matrix(
     model: RobotModel,
-    q: Float[ArrayLike, "*batch nv"],
+    q: Float[ArrayLike, "*batch nq"],
     v: Float[ArrayLike, "*batch nv"],
     a: Float[ArrayLike, "*batch nv"],
     tau: Float[ArrayLike, "*batch nv"],
@@ -64,7 +64,7 @@ def normal_matrix(
 
 def triangular_factor(
     model: RobotModel,
-    q: Float[ArrayLike, "*batch nv"],
+    q: Float[ArrayLike, "*batch nq"],
     v: Float[ArrayLike, "*batch nv"],
     a: Float[ArrayLike, "*batch nv"],
     tau: Float[ArrayLike, "*batch nv"] | None = None,
@@ -112,41 +112,46 @@ def _rows(
 ) -> _Rows:
     given = {"q": q, "v": v, "a": a} | ({} if tau is None else {"tau": tau})
     check_shapes(model, **given)
-    shape = np.shape(q)
+    shape = (*np.shape(q)[:-1], model.nv)
     if extra is not None and np.shape(extra)[:-1] != shape:
         raise InputError(f"extra has shape {np.shape(extra)}; expected {(*shape, 'columns')}, a row for each torque")
     if weight is not None and np.shape(weight) not in ((), shape[-1:], shape):
         raise InputError(f"weight has shape {np.shape(weight)}; expected {shape[-1:]} or {shape}")
-    on_host = not traced(model, q, v, a, tau, weight, extra)
-    library: Any = np if on_host else jnp
+    host = not traced(model, q, v, a, tau, weight, extra)
+    library: Any = np if host else jnp
     root = library.broadcast_to(library.sqrt(library.asarray(1.0 if weight is None else weight, float)), shape)
     if extra is not None:
         extra = library.reshape(library.asarray(extra, float), (*shape[:-1], -1))
     given = (q, v, a, root, tau, extra)
-    return _Rows(*(None if x is None else two_axes(x, on_host=on_host)[0] for x in given))
+    return _Rows(*(None if x is None else two_axes(x, host=host)[0] for x in given))
 
 
 def _fold(step: Callable[..., Any], chunk: int, total: Any, model: RobotModel, rows: _Rows) -> Any:
     """All rows, a chunk at a time, by `total = step(model, total, chunk of rows)`; filled-up rows have weight zero."""
     if traced(model, total, rows):
-        return _fold_chunks(step, chunk, total, model, rows)
-    model, samples, block = jax.tree.map(jnp.asarray, model), len(rows.q), BLOCK * chunk
-    block = chunk if samples <= chunk else block
-    for start in range(0, samples, block):
-        piece = jax.tree.map(lambda x: x[start : start + block], rows)  # noqa: B023
-        missing = block - len(piece.q)
-        if missing:
-            piece = jax.tree.map(lambda x: np.pad(x, ((0, missing), (0, 0))), piece)  # noqa: B023
-        total = _program(step, chunk, total, model, piece)
+        return _fold_chunks(step, total, model, _cut(rows, chunk))
+    program = _host_program if on_host() else _device_program
+    model, samples = jax.device_put(model), len(rows.q)
+    chunks = 1 if samples <= chunk else BLOCK
+    for start in range(0, samples, chunk * chunks):
+        piece = jax.tree.map(lambda x: x[start : start + chunk * chunks], rows)  # noqa: B023
+        total = program(step, total, model, _cut(piece, chunk, chunks))
     return total
 
 
-def _fold_chunks(step: Callable[..., Any], chunk: int, total: Any, model: RobotModel, rows: _Rows) -> Any:
-    chunks = jax.tree.map(lambda x: in_chunks(x, chunk), rows)
-    return jax.lax.scan(lambda total, rows: (step(model, total, rows), None), total, chunks)[0]
+def _cut(rows: _Rows, chunk: int, chunks: int = 0) -> _Rows:
+    """Rows in chunks, the samples last in each; what fills the last one up weighs nothing."""
+    cut = jax.tree.map(lambda x: in_chunks(x, chunk, chunks), rows)
+    there = np.arange(cut.root.shape[0] * chunk).reshape(-1, 1, chunk) < len(rows.q)
+    return cut._replace(root=cut.root * there)
 
 
-_program = partial(jax.jit, static_argnums=(0, 1))(_fold_chunks)
+def _fold_chunks(step: Callable[..., Any], total: Any, model: RobotModel, rows: _Rows) -> Any:
+    return jax.lax.scan(lambda total, rows: (step(model, total, rows), None), total, rows)[0]
+
+
+_device_program = jax.jit(_fold_chunks, static_argnums=0)
+_host_program = jax.jit(_fold_chunks, static_argnums=0, compiler_options=CPU_OPTIONS)
 
 
 class _Group(NamedTuple):
@@ -164,7 +169,9 @@ def _groups(model: RobotModel, columns: int) -> list[_Group]:
     for size in sorted({len(m) for m in members}):
         which = np.array([k for k, m in enumerate(members) if len(m) == size], int)
         index = np.stack([members[k] for k in which])
-        own = (10 * blocks[index, 1][..., None] + np.arange(10)).reshape(len(which), -1)
+        # the columns of mass and first moments of all links before those of their inertia, as the kernel gives them
+        first = 10 * blocks[index, 1][..., None]
+        own = np.concatenate([(first + np.arange(*ends)).reshape(len(which), -1) for ends in ((0, 4), (4, 10))], axis=1)
         shared = np.broadcast_to(
             np.arange(10 * len(model.joints), columns), (len(which), columns - 10 * len(model.joints))
         )
@@ -185,13 +192,13 @@ def _scattered(columns: int, index: Array, parts: tuple[Array, ...]) -> Float[Ar
 
 def _add_products(model: RobotModel, totals: tuple[Array, ...], rows: _Rows) -> tuple[Array, ...]:
     samples = rows.q.shape[-1]
-    packed = coordinate_rows(model, rows.q, rows.v, rows.a)
+    pieces = coordinate_rows(model, rows.q, rows.v, rows.a)
     side = _beside(model, rows)
     columns = 10 * len(model.joints) + side.shape[1]
     new = []
     for total, group in zip(totals, _groups(model, columns), strict=True):
-        own = packed[group.blocks].reshape(len(group.coordinates), -1, samples)
-        both = jnp.concatenate([own, side[group.coordinates]], axis=1) * rows.root[group.coordinates, None]
+        own = [x[group.blocks].reshape(len(group.coordinates), -1, samples) for x in pieces]
+        both = jnp.concatenate([*own, side[group.coordinates]], axis=1) * rows.root[group.coordinates, None]
         new.append(total + jnp.einsum("cks,cls->ckl", both, both, precision=jax.lax.Precision.HIGHEST))
     return tuple(new)
 
@@ -199,8 +206,8 @@ def _add_products(model: RobotModel, totals: tuple[Array, ...], rows: _Rows) -> 
 def _add_rows(model: RobotModel, total: Array, rows: _Rows) -> Array:
     """R of [R so far; rows]."""
     dense = dense_rows(model, rows.q, rows.v, rows.a)
-    both = jnp.concatenate([dense, jnp.moveaxis(_beside(model, rows), -1, 0)], axis=2) * rows.root.T[..., None]
-    return jnp.linalg.qr(jnp.concatenate([total, both.reshape(-1, both.shape[-1])]), mode="r")
+    both = jnp.concatenate([dense, _beside(model, rows)], axis=1) * rows.root[:, None]
+    return jnp.linalg.qr(jnp.concatenate([total, jnp.moveaxis(both, 1, 2).reshape(-1, both.shape[1])]), mode="r")
 
 
 def _beside(model: RobotModel, rows: _Rows) -> Float[Array, "nv k samples"]:
