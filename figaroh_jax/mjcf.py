@@ -46,7 +46,8 @@ def load_mjcf(
 
     `joints`, `posture` and `packages` as in `load_urdf`; locked joints stand at the file's own `qpos0` where `posture`
     says nothing. `gravity` (m/s^2) is the file's where it is None. `root` None takes the base as the file has it;
-    `fixed` locks the free joints of the file; `free_flyer` frees a base that the file welds to the world.
+    `fixed` locks the free joints of the file; `free_flyer` frees a base that the file welds to the world. Free joints
+    that are not locked stand in front of `joints` where it does not name them.
 
     Bodies are links, welded bodies are merged into what carries them, and every body, joint and site is a frame. A body
     with several joints is a chain of them with massless links between. Positions are MuJoCo's `qpos` (a `ref` is in
@@ -134,12 +135,16 @@ def compiled_robot(
     """Model of a compiled `mujoco.MjModel`; `source` names it in messages. See `load_mjcf`."""
     try:
         links, parts, frames = _parts(mj, root)
-        fixed = {part.name: part for part in parts if part.kind == "free"} if root == "fixed" else {}
-        if joints is not None and (named := [name for name in joints if name in fixed]):
+        free = [part.name for part in parts if part.kind == "free"]
+        if root == "fixed" and (named := [name for name in joints or () if name in free]):
             raise InputError(f"joints: joint '{named[0]}' is free, but root is fixed")
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
-    posture = dict(posture or {}) if joints is not None else {name: () for name in fixed} | dict(posture or {})
+    posture = dict(posture or {})
+    if root == "fixed" and joints is None:
+        posture = {name: () for name in free} | posture
+    elif root != "fixed" and joints is not None:
+        joints = [*(name for name in free if name not in joints and name not in posture), *joints]
     own = [0.0, 0.0, 0.0] if disabled(mj, "GRAVITY") else mj.opt.gravity.tolist()
     name = mj.names[: mj.names.index(b"\0")].decode() or Path(source).stem
     model = assemble(

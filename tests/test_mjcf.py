@@ -142,6 +142,9 @@ def test_the_root_is_fixed_or_freed_as_asked(tmp_path: Path) -> None:
     assert fixed.nq == fixed.nv == 12
     for root in (None, "free_flyer"):
         assert load_mjcf(walker, root=root).joint_names[:2] == ("base", "abduct0")
+        assert load_mjcf(walker, joints=["knee1", "swing1"], root=root).joint_names == ("base", "knee1", "swing1")
+    locked = load_mjcf(walker, joints=["knee1"], posture={"base": [0.0] * 6 + [1.0]})
+    assert locked.joint_names == load_mjcf(walker, joints=["knee1"], root="fixed").joint_names == ("knee1",)
     with pytest.raises(InputError, match="joint 'base' is free, but root is fixed"):
         load_mjcf(walker, joints=["base"], root="fixed")
     arm = written(robots.GRIPPER, tmp_path)
