@@ -21,6 +21,7 @@ from .candidates import Block, blocks_of, effects_on, geometry_columns
 from .chain import chain_between
 from .errors import InputError
 from .gravity import without_far_masses
+from .kinematic_effects import HISTORY
 from .model import RobotModel
 from .outliers import find_outliers
 from .posegroups import Measured, assemble, postures_of
@@ -29,7 +30,7 @@ from .poserecords import PoseRecording, read_pose_recordings
 if TYPE_CHECKING:
     from .config import Task
 
-__all__ = ["as_holdout", "calibrate", "calibrate_task"]
+__all__ = ["Run", "as_holdout", "calibrate", "calibrate_task"]
 
 _RECURS = 4  # of five outer folds must choose an effect
 _NESTED_GAIN = 0.05  # of the error on the outer folds, that the effects must take away
@@ -54,13 +55,29 @@ def calibrate(
 ) -> Calibration:
     """The calibrated robot; raises `InputError` where there are too few postures or a frame does not move."""
     with jax.enable_x64(True):
-        return _Run(model, recordings, forbid, progress).finish()
+        return Run(model, recordings, forbid, progress).finish()
 
 
-class _Run:
-    """One calibration, step by step."""
+class Run:
+    """One calibration, step by step; `finish` does them all, and what it found on the way stays readable."""
 
-    def __init__(self, model, recordings, forbid, progress) -> None:
+    outliers: tuple[Outlier, ...]
+    used: Bool[np.ndarray, " rows"]
+    blocks: tuple[Block, ...]
+    effects: levels.Effects | None
+    choice: levels.Choice
+    folds: list[levels.Fold]
+    named: list[int]
+    history: bool  # whether an error that depends on the posture before was found and has no name
+    fit: tuple[Measured, marginal.Linear, marginal.Posterior, posefit.Solution]
+
+    def __init__(
+        self,
+        model: RobotModel,
+        recordings: Sequence[PoseRecording],
+        forbid: Sequence[str],
+        progress: Callable[[str, float], None],
+    ) -> None:
         self.model, self.recordings, self.forbid, self.progress = model, tuple(recordings), tuple(forbid), progress
         progress("reading the postures", 0.02)
         weighing, notes = without_far_masses(model)
@@ -73,105 +90,91 @@ class _Run:
         self.notes = [*notes, *(note for r in self.recordings for note in r.notes), *_few(self.recordings)]
 
     def finish(self) -> Calibration:
+        """Outliers, level, effects, validation, and the final fit."""
         measured = self.measured
         everything = measured.measured & ~measured.holdout[measured.posture]
-        self.progress("looking for outliers", 0.05)
-        sizes = find_outliers(measured, everything)
-        outliers = tuple(
+        self.progress("choosing among levels", 0.05)
+        self.blocks = blocks_of(self.weighing, self.chain, self.postures, self.forbid)
+        model, recordings, postures = self.weighing, self.recordings, self.postures
+        self.effects = effects_on(model, recordings, postures, measured, self.blocks) if self.blocks else None
+        choice = levels.choose(measured, everything, self.effects)
+        wide = self._wide(choice)  # with its effects: what they explain is no outlier
+        sizes = find_outliers(wide, everything, levels.free_at(choice.level, wide.prior))
+        self.outliers = tuple(
             Outlier(str(self.recordings[measured.recording[k]].file.name), int(measured.row[k]), size)
             for k, size in sizes.items()
         )
-        used = everything & ~np.isin(measured.posture, list(sizes))
-        self.progress("choosing among levels", 0.15)
-        blocks = blocks_of(self.weighing, self.chain, self.postures, self.forbid)
-        effects = effects_on(self.weighing, self.recordings, self.postures, measured, blocks) if blocks else None
-        choice = levels.choose(measured, used, effects)
-        folds = levels.nested(
-            measured, used, effects, self._extended(effects), lambda s: self.progress("validating", 0.3 + 0.5 * s)
-        )
-        choice, folds = _never_worse(choice, folds)
-        named = _recurring(choice, folds, blocks)
+        self.used = everything & ~np.isin(measured.posture, list(sizes))
+        if sizes:
+            choice = levels.choose(measured, self.used, self.effects)
+        validating = lambda share: self.progress("validating", 0.3 + 0.5 * share)  # noqa: E731
+        folds = levels.nested(measured, self.used, self.effects, self._extended, validating)
+        self.choice, self.folds = _never_worse(choice, folds)
+        recurring = _recurring(self.choice, self.folds, self.blocks)
+        self.named = [k for k in recurring if self.blocks[k].effect is not HISTORY]
+        self.history = len(self.named) < len(recurring)
+        if self.history:
+            self.notes.append("the error of a posture depends on the one before it in a way that no effect explains")
         self.progress("fitting", 0.85)
-        final, linear, posterior, solution = self._fit(choice.level, [blocks[k] for k in named], used)
-        return self._result(choice, folds, named, blocks, used, outliers, (final, linear, posterior, solution))
+        self.fit = self._fit(self.choice.level, [self.blocks[k] for k in self.named])
+        return self._result()
 
-    def _extended(self, effects: levels.Effects | None):
-        """Residual of all rows for a choice with its effects, to first order about its level's fit."""
+    def _extended(self, choice: levels.Choice, rows: Bool[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
+        """Residual of all rows for a choice with its effects fitted to `rows`, to first order about its level's fit."""
+        wide = self._wide(choice)
+        found = marginal.fit(wide, rows, levels.free_at(choice.level, wide.prior), robust=True)
+        return wide.residual + wide.jacobian @ (found.unknowns - wide.at)
 
-        def residual(choice: levels.Choice, rows: Bool[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
-            assert effects is not None
-            linear = choice.linear
-            slices = effects.slices()
-            Z = effects.jacobian(linear.at)[:, np.concatenate([np.r_[slices[k]] for k in choice.effects])]
-            extra = Z.shape[1]
-            wide = linear._replace(
-                jacobian=np.hstack([linear.jacobian, Z]),
-                at=np.r_[linear.at, np.zeros(extra)],
-                prior=np.r_[linear.prior, np.full(extra, len(linear.tolerance) - 1)],
-            )
-            found = marginal.fit(wide, rows, levels.free_at(choice.level, wide.prior), robust=True)
-            return wide.residual + wide.jacobian @ (found.unknowns - wide.at)
+    def _wide(self, choice: levels.Choice) -> marginal.Linear:
+        """The rows at the fit of the choice's level, with the columns of its effects behind the others."""
+        linear = choice.linear
+        if self.effects is None or not choice.effects:
+            return linear
+        slices = self.effects.slices()
+        Z = self.effects.jacobian(linear.at)[:, np.concatenate([np.r_[slices[k]] for k in choice.effects])]
+        return linear._replace(
+            jacobian=np.hstack([linear.jacobian, Z]),
+            at=np.r_[linear.at, np.zeros(Z.shape[1])],
+            prior=np.r_[linear.prior, np.full(Z.shape[1], len(linear.tolerance) - 1)],
+        )
 
-        return residual
-
-    def _fit(self, level: str, blocks: Sequence[Block], used: Bool[np.ndarray, " rows"]):
+    def _fit(self, level: str, blocks: Sequence[Block]):
         """The level with its effects, exactly; then Levenberg-Marquardt from several starts at those weights."""
         measured = self.measured
         if blocks:
             columns = [*measured.columns, *(c for b in blocks for c in b.columns)]
             sizes = [1e-3] * len(measured.columns) + [s for b in blocks for s in b.sizes]
             measured = assemble(self.weighing, self.recordings, self.postures, columns, sizes)
-        linear, posterior = levels.fit_level(measured, used, level)
+        linear, posterior = levels.fit_level(measured, self.used, level)
         free = levels.free_at(level, linear.prior)
-        solution = _polish(measured, linear, posterior, used, free)
+        solution = _polish(measured, linear, posterior, self.used, free)
         return measured, levels.linearise(measured, np.asarray(solution.unknowns)), posterior, solution
 
-    def _result(self, choice, folds, named, blocks, used, outliers, fit) -> Calibration:
-        final, linear, posterior, solution = fit
-        frames = choice.fits["frames"][0].residual
-        gauge, order = corrections.gauge_of(final, linear, used, levels.free_at(choice.level, linear.prior))
+    def _result(self) -> Calibration:
+        final, linear, posterior, solution = self.fit
+        level, free = self.choice.level, levels.free_at(self.choice.level, linear.prior)
+        frames = self.choice.fits["frames"][0].residual
+        gauge, order = corrections.gauge_of(final, linear, self.used, free)
         parameters = corrections.parameters_of(final, linear, posterior, gauge, order)
-        holdout = np.flatnonzero(final.holdout)
-        kept = np.unique(final.posture[used & (final.posture >= 0)])
-        fitted = levels.errors(final, frames, kept), levels.errors(final, linear.residual, kept)
-        table = _table(folds, bool(named))
-        if len(holdout):
-            held = (
-                levels.errors(final, corrections.centred(final, frames), holdout),
-                levels.errors(final, corrections.centred(final, linear.residual), holdout),
-            )
-            validated = tuple((levels.rms(a), levels.rms(b)) for a, b in zip(*held, strict=True))
-            scheme = "recordings with role: holdout"
-        else:
-            validated = tuple(zip(table["frames"], table["chosen"], strict=True))
-            scheme = f"{levels.FOLDS} folds, every fifth posture; level and effects chosen inside each"
-        causes = corrections.causes_of(parameters, choice, named, blocks, table, folds, posterior, final)
+        table = _table(self.folds, bool(self.named))
+        position, orientation, scheme = self._errors(final, frames, linear.residual, table)
+        named = [self.blocks[k] for k in self.named]
+        causes = corrections.causes_of(parameters, level, named, self.blocks, table, self.folds)
         twists = corrections.twists_of(self.model, final, linear.at)
-        errors = [
-            Error(
-                unit,
-                scale * levels.rms(fitted[0][c]),
-                scale * levels.rms(fitted[1][c]),
-                *(scale * v for v in validated[c]),
-            )
-            if len(fitted[0][c])
-            else None
-            for c, (unit, scale) in enumerate((("mm", 1e3), ("deg", 180.0 / np.pi)))
-        ]
         names = [c.label for c in final.columns] + [name for name, _ in final.own]
         if not bool(solution.converged):
             self.notes.append("the solver did not converge within its steps: do not trust these values")
         return Calibration(
-            level=choice.level,
+            level=level,
             model=corrections.corrected(self.model, twists),
             twists=twists,
             frames=corrections.frames_of(final, linear.at),
             parameters=parameters,
-            position=errors[0],
-            orientation=errors[1],
-            outliers=outliers,
-            verdict="named" if causes or outliers else "nothing",
-            causes=(*(corrections.outlier_cause(o) for o in outliers), *causes),
+            position=position,
+            orientation=orientation,
+            outliers=self.outliers,
+            verdict="named" if causes or self.outliers else "nothing",
+            causes=(*(corrections.outlier_cause(o) for o in self.outliers), *causes),
             table=table,
             classes=tuple(tuple(names[order[k]] for k in c) for c in gauge.classes),
             rank=gauge.rank,
@@ -183,6 +186,26 @@ class _Run:
             notes=tuple(self.notes),
             points=corrections.shown_of(final, self.recordings, frames, linear.residual),
         )
+
+    def _errors(
+        self, final: Measured, frames: np.ndarray, after: np.ndarray, table: dict[str, tuple[float, float]]
+    ) -> tuple[Error | None, Error | None, str]:
+        """Errors of position (mm) and orientation (deg) on fitted and on held-out postures, and how those were held."""
+        kept, held = np.unique(final.posture[self.used & (final.posture >= 0)]), np.flatnonzero(final.holdout)
+        fitted = [levels.errors(final, residual, kept) for residual in (frames, after)]
+        if len(held):
+            new = [levels.errors(final, corrections.centred(final, x), held) for x in (frames, after)]
+            validated = [(levels.rms(a), levels.rms(b)) for a, b in zip(*new, strict=True)]
+            scheme = "recordings with role: holdout"
+        else:
+            validated = list(zip(table["frames"], table["chosen"], strict=True))
+            scheme = f"{levels.FOLDS} folds, every fifth posture; level and effects chosen inside each"
+        both: list[Error | None] = [None, None]
+        for c, (unit, scale) in enumerate((("mm", 1e3), ("deg", 180.0 / np.pi))):
+            if len(fitted[0][c]):
+                sizes = levels.rms(fitted[0][c]), levels.rms(fitted[1][c]), *validated[c]
+                both[c] = Error(unit, *(scale * size for size in sizes))
+        return both[0], both[1], scheme
 
 
 def _chain(model: RobotModel, recordings: Sequence[PoseRecording]) -> list[int]:
@@ -233,7 +256,7 @@ def _never_worse(choice: levels.Choice, folds: list[levels.Fold]) -> tuple[level
     if choice.level != "frames" and ratio and np.mean(ratio) < 1.0:
         return choice, folds
     plain = [f._replace(plain=f.levels["frames"], chosen=f.levels["frames"]) for f in folds]
-    return choice._replace(level="frames", effects=(), gains=()), plain
+    return choice._replace(level="frames", effects=(), rivals=()), plain
 
 
 def _table(folds: Sequence[levels.Fold], effects: bool) -> dict[str, tuple[float, float]]:

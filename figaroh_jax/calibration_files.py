@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +17,10 @@ from .calibrated import Calibration, Error
 from .corrections import twist_pose
 from .errors import InputError
 
-__all__ = ["corrected_urdf", "result", "to_json", "write_calibration"]
+if TYPE_CHECKING:
+    from .kinematic_diagnosis import PoseDiagnosis
+
+__all__ = ["corrected_urdf", "pose_answer_json", "result", "to_json", "write_calibration"]
 
 _PARITY = 1e-9  # m and entries of the rotation, between the model and the file read back
 
@@ -70,6 +73,24 @@ def result(calibration: Calibration) -> dict[str, Any]:
 def to_json(calibration: Calibration) -> str:
     """The text of `result.json`: strict JSON, with a newline at its end."""
     return json.dumps(result(calibration), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def pose_answer_json(diagnosis: PoseDiagnosis) -> str:
+    """The text of `answer.json` of a diagnosis of poses; residuals are RMS in mm and deg, as far as measured."""
+    from .answer import cause
+
+    experiment = diagnosis.experiment
+    answer = {
+        "verdict": diagnosis.verdict,
+        "causes": [cause(c) for c in diagnosis.causes],
+        "p_value": _number(diagnosis.p_value),
+        "residual": {
+            key: [_number(x) for x in getattr(diagnosis, key) if x is not None] for key in ("before", "after", "noise")
+        },
+        "next_experiment": experiment
+        and {"text": experiment.text, "separates": [list(pair) for pair in experiment.separates]},
+    }
+    return json.dumps(answer, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def corrected_urdf(calibration: Calibration, source: Path) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from . import posefit
-from .kinematic_effects import CATALOGUE, Column, KinematicEffect, Postures, columns_of
+from .kinematic_effects import CATALOGUE, HISTORY, Column, KinematicEffect, Postures, columns_of
 from .levels import Effects
 from .model import RobotModel
 from .posegroups import Measured, assemble
@@ -46,14 +46,17 @@ def blocks_of(
 ) -> tuple[Block, ...]:
     """Every candidate beyond geometry that does something in these postures."""
     found = []
-    for effect in CATALOGUE.values():
+    for effect in (*CATALOGUE.values(), HISTORY):
         if effect.name in GEOMETRY or effect.name in forbid:
             continue
         for at in _places(effect, model, chain):
             for shape in effect.shape[1]:
                 columns = columns_of(effect, model, at, shape)
                 sizes = sizes_of(columns, postures)
-                if np.isfinite(sizes).all():
+                if effect is HISTORY:  # of joints that move
+                    columns = tuple(c for c, size in zip(columns, sizes, strict=True) if np.isfinite(size))
+                    sizes = sizes[np.isfinite(sizes)]
+                if len(columns) and np.isfinite(sizes).all():
                     found.append(Block(effect, columns, tuple(sizes), shape))
     return tuple(found)
 

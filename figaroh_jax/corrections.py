@@ -61,29 +61,33 @@ def parameters_of(final: Measured, linear, posterior, gauge: Gauge, order: list[
     return tuple(sorted(found, key=lambda p: p.name.split()[0] in ("base_frame", "tool_frame", "socket")))
 
 
-def causes_of(parameters, choice, named, blocks, table, folds, posterior, final) -> tuple[Cause, ...]:
-    unit, channel = ("mm", 0) if np.isfinite(table["frames"][0]) else ("deg", 1)
-    scale = 1e3 if channel == 0 else 180.0 / np.pi
-    found = []
+def causes_of(
+    parameters: Sequence[Parameter],
+    level: str,
+    named: Sequence[Block],
+    blocks: Sequence[Block],
+    table: dict[str, tuple[float, float]],
+    folds: Sequence[levels.Fold],
+) -> tuple[Cause, ...]:
+    """Offsets beyond what a good zeroing leaves, the largest first; then the effects `named`."""
+    channel = 0 if np.isfinite(table["frames"][0]) else 1
+    unit, scale = (("mm", 1e3), ("deg", 180.0 / np.pi))[channel]
     fall = Gain(scale * table["frames"][channel], scale * table["joint_offset"][channel], unit)
-    for p in parameters:
-        if p.name.startswith("joint_offset") and p.status == "identified" and choice.level != "frames":
-            if abs(p.value) > 3.0 * np.hypot(p.std, _OFFSET):
-                name = Name("joint_offset", tuple(p.name.split()[1:]))
-                found.append(Cause(name, {"offset": Estimate(p.value, p.std, p.unit)}, 1.0, fall))
-    found.sort(key=lambda cause: -abs(cause.parameters["offset"].value))
-    for k in named:
-        block = blocks[k]
-        own = {c.parameter: c.label for c in block.columns}
-        by_name = {p.name: p for p in parameters}
-        values = {
-            key: Estimate(by_name[label].value, by_name[label].std, by_name[label].unit) for key, label in own.items()
-        }
+    offsets = [p for p in parameters if p.name.startswith("joint_offset") and p.status == "identified"]
+    found = [
+        Cause(Name("joint_offset", tuple(p.name.split()[1:])), {"offset": Estimate(p.value, p.std, p.unit)}, 1.0, fall)
+        for p in sorted(offsets, key=lambda p: -abs(p.value))
+        if level != "frames" and abs(p.value) > 3.0 * np.hypot(p.std, _OFFSET)
+    ]
+    gain = Gain(scale * levels.pooled([f.plain for f in folds])[channel], scale * table["chosen"][channel], unit)
+    by_name = {p.name: p for p in parameters}
+    for block in named:
+        values = {c.parameter: by_name[c.label] for c in block.columns}
+        estimates = {key: Estimate(p.value, p.std, p.unit) for key, p in values.items()}
         if block.effect.shape[0]:
-            values[block.effect.shape[0]] = Estimate(float(block.shape), float("nan"), "1")
+            estimates[block.effect.shape[0]] = Estimate(float(block.shape), float("nan"), "1")
         share = np.mean([any(_same(blocks[j], block) for j in f.choice.effects) for f in folds])
-        gain = Gain(scale * levels.pooled([f.plain for f in folds])[channel], scale * table["chosen"][channel], unit)
-        found.append(Cause(Name(block.effect.name, block.columns[0].at), values, float(share), gain))
+        found.append(Cause(Name(block.effect.name, block.columns[0].at), estimates, float(share), gain))
     return tuple(found)
 
 

@@ -19,7 +19,7 @@ from .chain import joint_axis
 from .errors import InputError, nearest
 from .model import RobotModel, dofs
 
-__all__ = ["CATALOGUE", "Column", "KinematicEffect", "Postures", "columns_of", "find_kinematic"]
+__all__ = ["CATALOGUE", "HISTORY", "Column", "KinematicEffect", "Postures", "columns_of", "find_kinematic"]
 
 Array = np.ndarray
 _ORDERS = tuple(np.arange(2.0, 12.5, 0.5))  # of gear errors, per turn of the joint
@@ -284,6 +284,20 @@ CATALOGUE: dict[str, KinematicEffect] = {
         KinematicEffect("joint_coupling", "coupling of two joints", "S_j k q_i", "pair", _coupling),
     )
 }
+
+
+def _history(model, at, sign):
+    for j in range(len(model.joints)):
+        move = _move(model)
+        law = (lambda p, j, move=move: np.sign(move(p, j))) if sign else move
+        yield model.joints[j].name, "1", [_along(law)(model, j)]
+
+
+# What depends on the posture before in any way, joint by joint: it competes, so that such an error gets no wrong name,
+# but it is no name itself.
+HISTORY = KinematicEffect(
+    "history", "dependence on the posture before", "S_j h_j(q' - q)", "robot", _history, ("sign", (0.0, 1.0))
+)
 
 
 def find_kinematic(name: str) -> KinematicEffect:

@@ -45,6 +45,7 @@ _EFFECT_WIDTH = 3.0  # of an effect's coefficient, in sizes that move its joint 
 _LEVEL_GAIN = 0.01  # of the held-out error, that a level must take away from the one below it
 _LEAST_GAIN = 0.03  # of the held-out error, that an effect must take away to be taken in
 _MOST = 6  # effects
+_RIVAL = 0.9  # of the gain: what gains that much is not told apart
 
 Array = np.ndarray
 
@@ -70,7 +71,7 @@ class Choice(NamedTuple):
     effects: tuple[int, ...]
     fits: dict[str, tuple[Linear, Posterior]]  # every level's rows at its fit
     scores: dict[str, float]  # held-out error of each level, and of each effect that joined
-    gains: tuple[float, ...]  # share of the held-out error that each effect took away
+    rivals: tuple[tuple[int, ...], ...] = ()  # effects that gain nearly as much as each of the chosen ones
 
     @property
     def linear(self) -> Linear:
@@ -163,8 +164,10 @@ def choose(measured: Measured, used: Bool[Array, " rows"], effects: Effects | No
             best = level
     assert best is not None
     linear, posterior = fits[best]
-    found, gains = ((), ()) if effects is None else _forward(measured, used, best, linear, posterior, effects, scores)
-    return Choice(best, found, fits, scores, gains)
+    if effects is None:
+        return Choice(best, (), fits, scores)
+    chosen, rivals = _forward(measured, used, best, linear, posterior, effects, scores)
+    return Choice(best, chosen, fits, scores, rivals)
 
 
 def _inner_folds(measured: Measured, used: Array) -> list[tuple[Array, Array]]:
@@ -198,7 +201,7 @@ def _forward(
     posterior: Posterior,
     effects: Effects,
     scores: dict[str, float],
-) -> tuple[tuple[int, ...], tuple[float, ...]]:
+) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...]]:
     """Effects that join one by one, each the one that gains most on the inner folds."""
     Z, slices = effects.jacobian(linear.at), effects.slices()
     free = free_at(level, linear.prior)
@@ -207,7 +210,7 @@ def _forward(
         inner = marginal.fit(linear, rows, free, robust=True, start=posterior, iterations=15)
         folds.append(_Inner.make(measured, linear, inner, rows, fold, free, Z))
     chosen: list[int] = []
-    gains: list[float] = []
+    rivals: list[tuple[int, ...]] = []
     current = _score_of(folds)
     while len(chosen) < _MOST:
         ranked = _screen(folds, slices, chosen)
@@ -217,11 +220,12 @@ def _forward(
             break
         for inner in folds:
             inner.take(np.r_[slices[best]])
-        gains.append(1.0 - trials[best] / current)
+        close = current - _RIVAL * (current - trials[best])
+        rivals.append(tuple(k for k in trials if k != best and trials[k] < close))
         current = trials[best]
         chosen.append(best)
         scores[f"{level} + " + " + ".join(_name(effects.blocks[k]) for k in chosen)] = current
-    return tuple(chosen), tuple(gains)
+    return tuple(chosen), tuple(rivals)
 
 
 def _name(block: tuple[Column, ...]) -> str:

@@ -10,9 +10,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool
 
-from . import levels
+from . import marginal
 from .marginal import Linear, Posterior
-from .posegroups import Measured
 
 __all__ = ["find_outliers"]
 
@@ -20,14 +19,17 @@ _FAR = 8.0  # sizes of the noise; what is nearer may be a heavy tail, which the 
 _MOST = 0.1  # of the postures
 
 
-def find_outliers(measured: Measured, used: Bool[np.ndarray, " rows"]) -> dict[int, float]:
-    """Postures among the rows `used` that are outliers, and the size of each."""
+def find_outliers(
+    linear: Linear, used: Bool[np.ndarray, " rows"], free: Bool[np.ndarray, " unknowns"]
+) -> dict[int, float]:
+    """Postures among the rows `used` that are outliers to a fit of the `free` unknowns, and the size of each."""
     found: dict[int, float] = {}
-    postures = len(np.unique(measured.posture[used]))
+    postures = len(np.unique(linear.posture[used]))
     while len(found) < max(1, int(_MOST * postures)):
-        rows = used & ~np.isin(measured.posture, list(found))
-        linear, posterior = levels.fit_level(measured, rows, "full")
-        sizes = _sizes(linear, posterior, rows)
+        rows = used & ~np.isin(linear.posture, list(found))
+        posterior = marginal.fit(linear, rows, free, robust=True)
+        residual = linear.residual + linear.jacobian @ (posterior.unknowns - linear.at)
+        sizes = _sizes(linear._replace(residual=residual), posterior, rows)
         worst = max(sizes, key=lambda k: sizes[k])
         if sizes[worst] < _FAR:
             break

@@ -16,6 +16,7 @@ from .errors import InputError
 if TYPE_CHECKING:
     from .calibrated import Calibration
     from .config import Task
+    from .kinematic_diagnosis import PoseDiagnosis
     from .result import Identification
     from .results import Diagnosis
 
@@ -48,8 +49,8 @@ class Job(NamedTuple):
 
 def diagnose_file(
     task_file: Path, out: Path, progress: Callable[[str, float], None] = lambda phase, fraction: None
-) -> Diagnosis:
-    """Read a task, diagnose it and write the run directory `out`.
+) -> Diagnosis | PoseDiagnosis:
+    """Read a task, diagnose it and write the run directory `out`: torques, or postures with a measurement.
 
     An earlier run in `out` is replaced; a directory that holds anything else is refused before any work. Wrong input
     raises `InputError`, and nothing is written.
@@ -58,6 +59,8 @@ def diagnose_file(
 
     check_directory(out)
     task = load_task(task_file)
+    if any(entry.measurement is not None for entry in task.data):
+        return _diagnose_poses(task, out, progress)
     from .diagnosis import diagnose_task
 
     diagnosis = diagnose_task(task, progress=progress)
@@ -86,6 +89,18 @@ def identify_file(
         write_parameters(found, folder)
         write_identification(found, folder / REPORT, found.model.robot.name)
         write_model(found.model, folder / "model")
+    return found
+
+
+def _diagnose_poses(task: Task, out: Path, progress: Callable[[str, float], None]) -> PoseDiagnosis:
+    from .calibration_files import pose_answer_json, write_calibration
+    from .kinematic_diagnosis import diagnose_pose_task
+
+    found = diagnose_pose_task(task, progress)
+    progress("writing the report", 1.0)
+    with whole_directory(out) as folder:
+        write_calibration(found.calibration, folder, task.robot.model)
+        (folder / ANSWER).write_text(pose_answer_json(found), encoding="utf-8")
     return found
 
 
@@ -184,16 +199,26 @@ def whole_directory(out: Path) -> Iterator[Path]:
         shutil.rmtree(beside, ignore_errors=True)
 
 
-def _diagnosis_json(diagnosis: Diagnosis) -> str:
-    from .answer import to_json
+def _diagnosis_json(diagnosis: Diagnosis | PoseDiagnosis) -> str:
+    from .results import Diagnosis
 
-    return to_json(diagnosis)
+    if isinstance(diagnosis, Diagnosis):
+        from .answer import to_json
+
+        return to_json(diagnosis)
+    from .calibration_files import pose_answer_json
+
+    return pose_answer_json(diagnosis)
 
 
-def _show_diagnosis(diagnosis: Diagnosis) -> None:
-    from .terminal import show
+def _show_diagnosis(diagnosis: Diagnosis | PoseDiagnosis) -> None:
+    from .results import Diagnosis
+    from .terminal import show, show_calibration
 
-    show(diagnosis, diagnosis.model.robot.name)
+    if isinstance(diagnosis, Diagnosis):
+        show(diagnosis, diagnosis.model.robot.name)
+    else:
+        show_calibration(diagnosis.calibration, diagnosis.verdict)
 
 
 def _identification_json(found: Identification) -> str:

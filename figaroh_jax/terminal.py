@@ -85,14 +85,15 @@ def summary(diagnosis: Diagnosis, robot: str = "the robot") -> RenderableType:
     return Group(*parts)
 
 
-def show_calibration(calibration: Calibration) -> None:
-    """Print the summary of a calibration on standard output."""
-    Console(file=sys.stdout).print(calibration_summary(calibration))
+def show_calibration(calibration: Calibration, verdict: str = "") -> None:
+    """Print the summary of a calibration, or of a diagnosis of poses with its verdict, on standard output."""
+    Console(file=sys.stdout).print(calibration_summary(calibration, verdict))
 
 
-def calibration_summary(calibration: Calibration) -> RenderableType:
+def calibration_summary(calibration: Calibration, verdict: str = "") -> RenderableType:
     """The calibration in a few lines: how much better, why this level, outliers and causes, what to know."""
-    head = Text.assemble((calibration.level, "bold blue"), f"  {wording.calibration_sentence(calibration)}\n")
+    word = (verdict, _STYLE[verdict]) if verdict else (calibration.level, "bold blue")
+    head = Text.assemble(word, f"  {wording.calibration_sentence(calibration)}\n")
     table = Table(box=None, pad_edge=False, header_style="dim")
     table.add_column("held-out RMS error")
     errors = [error for error in (calibration.position, calibration.orientation) if error is not None]
@@ -106,6 +107,10 @@ def calibration_summary(calibration: Calibration) -> RenderableType:
     for number, cause in enumerate(calibration.causes, 1):
         values = ", ".join(f"{key} {wording.interval(value)}" for key, value in cause.parameters.items())
         parts.append(Text.assemble(f"\n{number}. ", (wording.phrase(cause.name), "bold"), f"  {cause.note or values}"))
+        if cause.ambiguous_with:
+            parts.append(
+                Text(f"   not told apart from {wording.aside(cause.name, cause.ambiguous_with)}", style="yellow")
+            )
     parts.append(Text(f"\nHeld out: {calibration.scheme}.", style="dim"))
     return Group(*parts, *(Text(f"Note: {note}", style="dim") for note in calibration.notes))
 

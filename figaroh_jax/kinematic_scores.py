@@ -1,0 +1,90 @@
+r"""Score tests of blocks of columns against a fit with priors, with the maximum over all blocks inside the bootstrap.
+
+The fit's rows, whitened, and the rows of its prior stand above each other: $e = (r, \Lambda^{1/2} y)$ is what it
+leaves, M the projector off its columns, $\tilde Z = (Z, 0)$ a block. $Q = |B' e|^2$ with B an orthonormal basis of
+$M \tilde Z$, over the mean square of e; Wilson and Hilferty's cube root puts blocks of different size on one scale.
+Under the null e is white: it is drawn again, with its own level, and the largest score of all blocks kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .marginal import FLAT, Linear
+
+__all__ = ["Scores", "score_blocks"]
+
+_CUT = 1e-7  # of a column's length, that must be left beside the fit
+_DRAWS = 400
+
+Array = np.ndarray
+
+
+class Scores(NamedTuple):
+    """Scores of the blocks (-inf: nothing of it is left beside the fit) and the family-wise p-value of the largest."""
+
+    q: Float[Array, " blocks"]
+    z: Float[Array, " blocks"]
+    size: Float[Array, " blocks"]  # columns that are left
+    p_value: float
+    level: float  # mean square of the whitened rows: 1 where the noise is right
+
+
+def score_blocks(
+    linear: Linear,
+    noise: Float[Array, " rows"],
+    used: Bool[Array, " rows"],
+    precision: Float[Array, " unknowns"],
+    blocks: Sequence[Float[Array, "rows columns"]],
+    free: Bool[Array, " unknowns"],
+    seed: int = 0,
+) -> Scores:
+    """Scores of `blocks` beside the fit of the `free` unknowns with the given noise and prior precision."""
+    rows = np.flatnonzero(used)
+    G = linear.jacobian[rows][:, free] / noise[rows, None]
+    root = np.sqrt(np.where(linear.prior[free] == FLAT, 0.0, precision[free]))
+    A = np.vstack([G, np.diag(root)])
+    left = (linear.residual[rows] - linear.jacobian[rows][:, ~free] @ linear.at[~free]) / noise[rows]
+    e = np.concatenate([left, root * linear.at[free]])
+    basis, kept = np.linalg.qr(A)
+    solid = np.abs(np.diag(kept)) > 1e-12 * np.abs(np.diag(kept)).max()
+    basis = basis[:, solid]
+    e = e - basis @ (basis.T @ e)
+    freedom = len(e) - basis.shape[1]
+    bases = [_basis(np.vstack([Z[rows] / noise[rows, None], np.zeros((len(root), Z.shape[1]))]), basis) for Z in blocks]
+    size = np.array([b.shape[1] for b in bases])
+    whole = np.hstack(bases) if size.sum() else np.zeros((len(e), 0))
+    level = float(e @ e / freedom)
+    q = _sums((whole.T @ e)[None] ** 2, size)[0] / max(level, 1e-300)
+    draws = np.random.default_rng(seed).normal(size=(_DRAWS, len(e)))
+    square = np.sum(draws**2, axis=1) - np.sum((draws @ basis) ** 2, axis=1)
+    null = _sums((draws @ whole) ** 2, size) / (square / freedom)[:, None]
+    z, largest = _scale(q, size), _scale(null, size).max(axis=1, initial=-np.inf)
+    top = z.max(initial=-np.inf)
+    return Scores(q, z, size, float((1 + np.sum(largest >= top)) / (_DRAWS + 1)), level)
+
+
+def _basis(Z: Array, basis: Array) -> Array:
+    """Orthonormal basis of what the columns add to `basis`."""
+    length = np.linalg.norm(Z, axis=0)
+    Z = Z[:, length > 0.0] / length[length > 0.0]
+    Z = Z - basis @ (basis.T @ Z)
+    Z = Z - basis @ (basis.T @ Z)
+    u, s, _ = np.linalg.svd(Z, full_matrices=False)
+    return u[:, s**2 > _CUT]
+
+
+def _sums(squares: Array, size: Array) -> Array:
+    ends = np.concatenate([[0], np.cumsum(size)])
+    total = np.concatenate([np.zeros((len(squares), 1)), np.cumsum(squares, axis=1)], axis=1)
+    return total[:, ends[1:]] - total[:, ends[:-1]]
+
+
+def _scale(q: Array, size: Array) -> Array:
+    k = np.maximum(size, 1)
+    z = ((q / k) ** (1.0 / 3.0) - (1.0 - 2.0 / (9.0 * k))) / np.sqrt(2.0 / (9.0 * k))
+    return np.where(size > 0, z, -np.inf)
