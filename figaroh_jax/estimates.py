@@ -116,7 +116,7 @@ def has_size(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
 
     Amplitudes that a simpler effect has too do not count: a spring without stiffness is an offset.
     """
-    from scipy.stats import chi2  # scipy is slow to import
+    from scipy.special import chdtri  # scipy is slow to import
 
     names = [n for n, p in effect.parameters().items() if p.linear]
     simpler = {name for inside in type(effect).contains for name in find(inside).parameters()}
@@ -126,7 +126,7 @@ def has_size(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
     at = np.array(place)[own]
     value = np.array([float(getattr(effect, names[k])) for k in own])
     covariance = fitted.covariance[np.ix_(at, at)]
-    return bool(value @ np.linalg.pinv(covariance, hermitian=True) @ value > chi2.ppf(SURE, len(own)))
+    return bool(value @ np.linalg.pinv(covariance, hermitian=True) @ value > chdtri(len(own), 1 - SURE))
 
 
 def _physical(effect: Effect, names: list[str]) -> tuple[dict[str, float], dict[str, Float[np.ndarray, " k"]]]:

@@ -91,6 +91,10 @@ class Bank(NamedTuple):
         """Every column times one matrix of rows a joint, summed over the joints."""
         return _product(self.width, self.joint, self.Zi, rows)
 
+    def single(self) -> Bank:
+        """With instruments in single precision, for products with rows in that precision."""
+        return self._replace(Zi=[own.astype(np.float32) for own in self.Zi])
+
 
 class Score(NamedTuple):
     """Score of a candidate at each grid point, and what whitens it."""
@@ -211,7 +215,7 @@ def _product(
 ) -> Float[np.ndarray, "columns m"]:
     out = np.zeros((width, rows[0].shape[1]))
     for columns, own, right in zip(joint, Zi, rows, strict=True):
-        out[columns] += own.astype(right.dtype, copy=False) @ right
+        out[columns] += own @ right
     return out
 
 
@@ -264,7 +268,7 @@ def _by_width(span: list[tuple[int, int, int]]) -> list[tuple[list[int], Int[np.
 def other_scores(
     rows: Rows, stock: Bank, H: Float[np.ndarray, "P columns"], residual: Float[np.ndarray, "draws nv T"]
 ) -> Float[np.ndarray, "draws columns"]:
-    """The scores that other residual rows would give: Zi'e - H'Xi'e, in the precision of those rows."""
+    """The scores that other residual rows would give: Zi'e - H'Xi'e, in the precision of the rows and the bank."""
     draws, kind = len(residual), residual.dtype
     model = (residual * rows.paired.astype(kind)).reshape(draws, -1) @ _tall(rows.Xi).astype(kind, copy=False)
     return stock.product(list(np.moveaxis(residual, 0, 2))).T - model @ H

@@ -34,6 +34,8 @@ class Spectrum(NamedTuple):
 
     def redrawn(self, generator: np.random.Generator) -> Spectrum:
         """The spectrum with its coefficients drawn from their covariance."""
+        if not self.covariance.any():
+            return self
         draws = [generator.multivariate_normal(c, s) for c, s in zip(self.coefficients.T, self.covariance, strict=True)]
         return self._replace(coefficients=np.stack(draws, axis=1))
 

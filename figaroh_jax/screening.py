@@ -144,11 +144,11 @@ def family_p(
     signs = generator.choice([-1.0, 1.0], (draws, len(parts)))
     nulls = [largest(found.stock, found.scores, signs @ parts)]
     prior = np.sqrt(np.maximum(np.diag(linear.moment) - (rows.Xi**2).sum((0, 1)), 0))
-    drawn = []
+    drawn, light = [], found.stock.single()
     for _ in range(draws // CHUNK):
         noise = draw_noise(problem, spectrum, whitening, CHUNK, generator)
         pulls = prior * generator.standard_normal((CHUNK, len(prior)))
-        again = other_scores(rows, found.stock, found.H, noise) + pulls @ found.H
+        again = other_scores(rows, light, found.H, noise) + pulls @ found.H
         drawn.append(largest(found.stock, found.scores, again))
     nulls.append(np.concatenate(drawn))
     return max((1 + np.sum(null >= highest)) / (draws + 1) for null in nulls)
