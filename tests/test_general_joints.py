@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco_c
 import numpy as np
 import pinocchio as pin
 import pytest
 import robots
 
 from figaroh_jax.errors import InputError
+from figaroh_jax.export import load_model, write_model
+from figaroh_jax.extended import extend
+from figaroh_jax.kinematics import frame_placements
 from figaroh_jax.model import Joint, dofs
 from figaroh_jax.urdf import load_urdf
 
@@ -126,3 +130,16 @@ def test_a_file_is_found_in_its_package(tmp_path: Path) -> None:
         assert load_urdf(path, packages=packages).joint_names == ("turn", "slide")
     with pytest.raises(InputError, match="package 'tiny_description' is in none of the package folders .none was"):
         load_urdf(path)
+
+
+def test_written_files_move_every_frame_as_the_model(tmp_path: Path) -> None:
+    """Joints of all kinds through URDF, at random positions: the poses come from the kernels, not from the leaves."""
+    for root in ("fixed", "free_flyer"):
+        model = robots.load(robots.GENERAL, tmp_path, root=root)
+        write_model(extend(model), tmp_path / root)
+        found = load_model(tmp_path / root).robot
+        q = mujoco_c.states(model, 3)
+        poses = [np.asarray(frame_placements(m, np.array([state[0] for state in q]))) for m in (model, found)]
+        places = [[frame.name for frame in m.frames] for m in (model, found)]
+        order = [places[1].index(name) for name in places[0]]
+        np.testing.assert_allclose(poses[1][:, order], poses[0], rtol=0, atol=1e-12)

@@ -42,7 +42,7 @@ def sliding(model: RobotModel, samples: int) -> tuple[np.ndarray, ...]:
     return q, (0.5 + np.abs(v)) * (-1.0) ** np.arange(model.nv), a
 
 
-@pytest.mark.parametrize("name", ["gripper"])
+@pytest.mark.parametrize("name", robots.MJCF)
 def test_rigid_bodies_are_mujocos(name: str, tmp_path: Path) -> None:
     path = written(robots.MJCF[name], tmp_path)
     model = load_mjcf(path)
@@ -55,7 +55,7 @@ def test_rigid_bodies_are_mujocos(name: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(mass_matrix(model, q), masses, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["gripper"])
+@pytest.mark.parametrize("name", robots.MJCF)
 def test_bodies_and_sites_are_where_mujoco_has_them(name: str, tmp_path: Path) -> None:
     path = written(robots.MJCF[name], tmp_path)
     model = load_mjcf(path)
@@ -76,7 +76,7 @@ def test_bodies_and_sites_are_where_mujoco_has_them(name: str, tmp_path: Path) -
                 np.testing.assert_allclose(pose[:3, :3].ravel(), found.xmat, rtol=0, atol=1e-13, err_msg=frame.name)
 
 
-@pytest.mark.parametrize("name", ["gripper"])
+@pytest.mark.parametrize("name", ["gripper", "creature"])
 def test_what_acts_at_the_joints_is_mujocos(name: str, tmp_path: Path) -> None:
     path = written(robots.MJCF[name], tmp_path)
     extended, notes = load_extended(path)
