@@ -61,7 +61,8 @@ class _Problem:
     base: BaseParameters
     weight: Float[np.ndarray, " nv"]
     mean: Float[np.ndarray, " columns"]
-    precision: Float[np.ndarray, " columns"]  # at the stated trust, in units of the weighted squares
+    precision: Float[np.ndarray, " columns"]  # at the stated trust
+    inflation: float  # variance of the base parameters, over that of as many rows of white noise
     bounded: Float[np.ndarray, " columns"]  # least value of each column
     links: tuple[Body, ...]
     fit: Fit
@@ -245,7 +246,7 @@ def _problem(
     lower[len(mean) - drives :] = _least(regression.terms)
     links = bodies(model, bounds)
     nominal = project(np.asarray(model.inertia, float), links)
-    return _Problem(data, base, start.weight, mean, precision * max(inflation, 1e-3), lower, links, fit, nominal)
+    return _Problem(data, base, start.weight, mean, precision, max(inflation, 1e-3), lower, links, fit, nominal)
 
 
 def _least(terms: Sequence[Effect]) -> Float[np.ndarray, " drives"]:
@@ -263,7 +264,9 @@ def _least(terms: Sequence[Effect]) -> Float[np.ndarray, " drives"]:
 
 def _fitted(problem: _Problem, folds: Sequence[int] | None, slack: float) -> Float[np.ndarray, " columns"]:
     """All columns fitted to the rows of `folds` (None: all), the nominal believed `slack` times less."""
-    factor = with_prior(problem.data.factor(problem.weight, folds), problem.mean, problem.precision_at(slack))
+    factor = with_prior(
+        problem.data.factor(problem.weight, folds), problem.mean, problem.inflation * problem.precision_at(slack)
+    )
     if problem.fit == "unconstrained":
         length = np.linalg.norm(factor[:, :-1], axis=0)
         return np.linalg.lstsq(factor[:, :-1] / length, factor[:, -1], rcond=None)[0] / length

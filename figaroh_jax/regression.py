@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from .base_parameters import inertial_names
@@ -41,6 +42,7 @@ __all__ = [
     "condense",
     "friction_terms",
     "payload",
+    "state_columns",
     "structural_columns",
 ]
 
@@ -324,6 +326,21 @@ def _one(records: Records, k: int) -> Records:
 def _motion(model: RobotModel, time: Any, q: Any, v: Any, a: Any, dt: Any, width: Any) -> Motion:
     zero = jnp.zeros(jnp.shape(v))
     return Motion(model, jnp.asarray(time), jnp.asarray(q), jnp.asarray(v), jnp.asarray(a), zero, zero, dt, width)
+
+
+@eqx.filter_jit
+def state_columns(
+    model: RobotModel,
+    terms: tuple[Effect, ...],
+    width: Float[Array, " nv"],
+    widths: tuple[float, ...],
+    q: Float[ArrayLike, "samples nq"],
+    v: Float[ArrayLike, "samples nv"],
+    a: Float[ArrayLike, "samples nv"],
+) -> Float[Array, "samples nv columns"]:
+    """Columns at given states, unfiltered; `widths` as in `Regression.pieces`."""
+    motion = _motion(model, jnp.zeros(jnp.shape(v)[0]), q, v, a, 0.0, width)
+    return _columns(model, terms, motion, widths)
 
 
 @eqx.filter_jit

@@ -17,7 +17,6 @@ from figaroh_jax.dataset import Recording
 RATE = 200.0  # Hz
 VISCOUS, COULOMB = np.array([1.5, 0.8, 20.0]), np.array([2.0, 1.0, 5.0])
 TORQUE_NOISE = np.array([0.3, 0.15, 0.5])
-TEN = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 9])
 
 
 @dataclass(frozen=True)
@@ -30,11 +29,11 @@ class Truth:
     theta: np.ndarray  # ten of each link, viscous and Coulomb friction of each joint
 
 
-def arm(folder: Path, spread: float = 0.1, seed: int = 0) -> Truth:
+def arm(folder: Path, spread: float = 0.1, seed: int = 0, text: str = tasks.URDF) -> Truth:
     """Links heavier or lighter, longer or shorter than the file says, by `spread`; each of them a body."""
     file = folder / "robot.urdf"
-    file.write_text(tasks.URDF)
-    model = pin.buildModelFromXML(tasks.URDF)
+    file.write_text(text)
+    model = pin.buildModelFromXML(text)
     generator = np.random.default_rng(seed)
     for k in range(1, model.njoints):
         body = model.inertias[k]
@@ -42,7 +41,8 @@ def arm(folder: Path, spread: float = 0.1, seed: int = 0) -> Truth:
         turn = body.inertia * (1 + spread * generator.normal())
         model.inertias[k] = pin.Inertia(mass, lever + spread * 0.05 * generator.normal(size=3), turn)
     ten = np.concatenate([model.inertias[k].toDynamicParameters() for k in range(1, model.njoints)])
-    return Truth(file, fj.load_urdf(file), model, np.concatenate([ten, VISCOUS, COULOMB]))
+    nv = model.nv
+    return Truth(file, fj.load_urdf(file), model, np.concatenate([ten, VISCOUS[:nv], COULOMB[:nv]]))
 
 
 def recording(
@@ -57,13 +57,13 @@ def recording(
 ) -> Recording:
     """A rich motion; `coloured` noise has a correlation time of 0.1 s and the same standard deviation."""
     generator = np.random.default_rng(seed)
-    t = np.arange(int(seconds * RATE)) / RATE
-    frequency = generator.uniform(0.1, 1.0, (5, 3))
-    phase = generator.uniform(0, 2 * np.pi, (5, 3))
-    amplitude = generator.uniform(0.1, 0.35, (5, 3)) * [1, 1, 0.15]
+    t, nv = np.arange(int(seconds * RATE)) / RATE, truth.model.nv
+    frequency = generator.uniform(0.1, 1.0, (5, nv))
+    phase = generator.uniform(0, 2 * np.pi, (5, nv))
+    amplitude = generator.uniform(0.1, 0.35, (5, nv)) * np.array([1, 1, 0.15])[:nv]
     angle = 2 * np.pi * frequency * t[:, None, None] + phase
     w = 2 * np.pi * frequency
-    q = (amplitude * np.sin(angle)).sum(1) + [0.1, -0.2, 0.25]
+    q = (amplitude * np.sin(angle)).sum(1) + np.array([0.1, -0.2, 0.25])[:nv]
     v, a = (amplitude * w * np.cos(angle)).sum(1), -(amplitude * w**2 * np.sin(angle)).sum(1)
     model = truth.model
     if payload is not None:
@@ -72,13 +72,13 @@ def recording(
         model.inertias[3] = model.inertias[3] + pin.Inertia(mass, place, np.zeros((3, 3)))
     data = model.createData()
     tau = np.array([pin.rnea(model, data, *s) for s in zip(q, v, a, strict=True)])
-    tau += VISCOUS * v + COULOMB * np.sign(v) + _noise(noise, generator, len(t))
+    tau += VISCOUS[:nv] * v + COULOMB[:nv] * np.sign(v) + _noise(noise, generator, tau.shape)
     joints = tuple(truth.nominal.joint_names)
     return Recording(name, Path(f"{name}.npz"), joints, t, q, None, tau, None, None, None, role)
 
 
-def _noise(kind: str, generator: np.random.Generator, samples: int) -> np.ndarray:
-    white = generator.normal(size=(samples, 3)) * TORQUE_NOISE
+def _noise(kind: str, generator: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+    white = generator.normal(size=shape) * TORQUE_NOISE[: shape[1]]
     if kind == "none":
         return 0 * white
     if kind == "white":
