@@ -120,7 +120,8 @@ def identify(
 
     with jax.enable_x64(True):
         progress("preparing signals", 0.05)
-        signals = prepare_all(tuple(recordings), preprocess or Preprocess())
+        # the cutoff alone: a band guessed from the motion costs accuracy where friction makes the motion sharp
+        signals = prepare_all(tuple(recordings), preprocess or Preprocess(), slowed=False)
         terms = friction_terms(model, known or Baseline())
         refused, notes = _refused(model, recordings, joints)
         regression = Regression(model, terms, np.zeros(model.nv), signals, refused)

@@ -80,28 +80,39 @@ class Rates(NamedTuple):
         return self.step / self.working
 
 
-def prepare_all(recordings: Sequence[Recording], preprocess: Preprocess) -> tuple[Signals, ...]:
+def prepare_all(recordings: Sequence[Recording], preprocess: Preprocess, *, slowed: bool = True) -> tuple[Signals, ...]:
     """`prepare` every recording at the same rates, and repeats of one excitation on grids that meet.
 
     Row k of a repeat's first recording is then row k + `align(first, repeat)` of the repeat, to a fiftieth of a row.
+    `slowed` as for `prepare`.
     """
     rates = choose_rates(recordings, preprocess)
     prepared: list[Signals] = []
     leaders: dict[str, Signals] = {}
     for recording in recordings:
-        signals = prepare(recording, preprocess, rates)
+        signals = prepare(recording, preprocess, rates, slowed=slowed)
         leader = leaders.setdefault(recording.repeat, signals) if recording.repeat else signals
         late = _late_rows(leader, signals) if leader is not signals else 0.0
         off = (late - round(late)) * rates.row
-        prepared.append(signals if abs(off) < rates.row / 50 else prepare(recording, preprocess, rates, shift=off))
+        if abs(off) >= rates.row / 50:
+            signals = prepare(recording, preprocess, rates, shift=off, slowed=slowed)
+        prepared.append(signals)
     return tuple(prepared)
 
 
-def prepare(recording: Recording, preprocess: Preprocess, rates: Rates | None = None, *, shift: float = 0.0) -> Signals:
+def prepare(
+    recording: Recording,
+    preprocess: Preprocess,
+    rates: Rates | None = None,
+    *,
+    shift: float = 0.0,
+    slowed: bool = True,
+) -> Signals:
     """Even, low-passed, differentiated signals of one recording and the filter that makes its rows.
 
     `rates` are those of `choose_rates`, by default for this recording alone; `shift` (s, less than a row) moves the
-    grid. Raises `InputError` where the window, the cutoff or the rate do not fit the recording, or it is too short.
+    grid; `slowed` takes a position down to the band of its own motion where that is below the cutoff. Raises
+    `InputError` where the window, the cutoff or the rate do not fit the recording, or it is too short.
     """
     rates = rates or choose_rates((recording,), preprocess)
     time, position, torque = _window(recording, preprocess.window)
@@ -117,7 +128,7 @@ def prepare(recording: Recording, preprocess: Preprocess, rates: Rates | None = 
             f"{recording.file}: {seconds:.3g} s are too short: {rows.kept} row(s) at {1 / rates.row:.4g} Hz are left"
             f" after {trim} s are cut at both ends, at least {FEWEST_ROWS} are needed"
         )
-    position = _motion(columns[0], dt, rates.cutoff)
+    position = (_motion if slowed else low_pass)(columns[0], dt, rates.cutoff)
     velocity = differentiate(position, dt)
     weight = _weight(recording, preprocess, rows, velocity, grid.gaps, rates.cutoff)
     return Signals(

@@ -49,5 +49,5 @@ def test_ur10e_predicts_other_runs(data_dir: Path, tmp_path: Path):
     found = identify_task(fj.load_task(real_tasks.ur10e_task(tmp_path, data_dir)))
     r2 = np.mean([quality.r2 for quality in found.holdout.values()], axis=0)
     reached = np.array([0.988, 0.996, 0.997, 0.981, 0.955, 0.976])
-    assert (np.round(r2, 3) >= reached).all()
+    assert (r2 >= reached - 1e-3).all()
     assert physical(found) and pooled(found.fit) <= 1.01 * pooled(found.unconstrained)
