@@ -81,7 +81,8 @@ def over_samples(
     """
     chunk, batch = chunk_size(width), np.shape(arrays[0])[:-1]
     if on_host(parameters, arrays):
-        answer = _assembled(kernel, chunk, last, parameters, *two_axes(*arrays, host=True))
+        with jax.ensure_compile_time_eval():  # constants in somebody's `jit` are worked out while that is traced
+            answer = _assembled(kernel, chunk, last, parameters, *two_axes(*arrays, host=True))
         return answer if last else answer.reshape(*batch, *answer.shape[1:])
     flat = two_axes(*arrays, host=False)
     if traced(parameters, arrays):

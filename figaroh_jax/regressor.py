@@ -70,7 +70,8 @@ def joint_torque_regressor(
         width = 10 * len(pairs(model))
         if on_host(model, q, v, a):
             shape = (*np.shape(q)[:-1], model.nv, 10 * len(model.joints))
-            return _dense_on_host(model, chunk_size(width), *two_axes(q, v, a, host=True)).reshape(shape)
+            with jax.ensure_compile_time_eval():
+                return _dense_on_host(model, chunk_size(width), *two_axes(q, v, a, host=True)).reshape(shape)
         return over_samples(dense_rows, model, q, v, a, width=width)
 
 

@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 import robots
 
-from figaroh_jax import dynamics, kinematics
+from figaroh_jax import dynamics, kinematics, regressor
 from figaroh_jax.errors import InputError
 from figaroh_jax.model import RobotModel
 from figaroh_jax.urdf import load_urdf
@@ -143,3 +143,19 @@ def test_wrong_shapes_are_refused_by_name(tmp_path: Path) -> None:
         kinematics.check_shapes(model, q=q, v=v[:, :1], a=a)
     with pytest.raises(InputError, match=r"a has shape \(3, 2\), but q has \(4, 2\)"):
         kinematics.check_shapes(model, q=q, v=v, a=a[:3])
+
+
+def test_constants_inside_somebodys_program_are_worked_out(tmp_path: Path):
+    model = robots.load(robots.ARM, tmp_path)
+    q = np.random.default_rng(0).normal(size=(3, model.nv))
+    inside = jax.jit(
+        lambda scale: (
+            scale
+            * (dynamics.inverse_dynamics(model, q, q, q) + regressor.joint_torque_regressor(model, q, q, q)[..., 0])
+        )
+    )
+    expected = (
+        np.asarray(dynamics.inverse_dynamics(model, q, q, q))
+        + np.asarray(regressor.joint_torque_regressor(model, q, q, q))[..., 0]
+    )
+    np.testing.assert_allclose(inside(2.0), 2 * expected, rtol=0, atol=1e-12)
