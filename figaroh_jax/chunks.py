@@ -9,6 +9,7 @@ in blocks of fixed size; under a transformation (jit, grad, vmap) the whole is o
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -116,39 +117,57 @@ def _all(kernel: Callable[..., Any], chunk: int, parameters: Any, *arrays: Array
 
 
 _device_program = jax.jit(_all, static_argnums=(0, 1))
-_host_program = jax.jit(_chunks, static_argnums=0, compiler_options=CPU_OPTIONS)
+
+
+@partial(jax.jit, static_argnums=0)
+def _room(kernel: Callable[..., Any], parameters: Any, *chunks: Array) -> Array:
+    """Zeros of the shape of the answers, a chunk behind the other."""
+    answer = jax.eval_shape(lambda *x: _joined(kernel(parameters, *x)), *(x[0] for x in chunks))
+    return jnp.zeros((len(chunks[0]), *answer.shape), answer.dtype)
+
+
+@partial(jax.jit, static_argnums=0, donate_argnums=1, compiler_options=CPU_OPTIONS)
+def _fill(kernel: Callable[..., Any], room: Array, parameters: Any, *chunks: Array) -> Array:
+    """Answers written over those of the last block, each piece to its place: no new memory, no copy."""
+
+    def fill(k: Array, room: Array) -> Array:
+        pieces, first = kernel(parameters, *(x[k] for x in chunks)), 0
+        for piece in pieces if isinstance(pieces, tuple) else (pieces,):
+            place = (k, 0, first, *[0] * room.ndim)[: room.ndim]
+            room = jax.lax.dynamic_update_slice(room, piece[None], place)
+            first += piece.shape[1]
+        return room
+
+    return jax.lax.fori_loop(0, len(room), fill, room)
 
 
 def host_blocks(
     kernel: Callable[..., Any], chunk: int, parameters: Any, *arrays: Float[np.ndarray, "samples _"]
-) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
-    """Blocks of samples and the pieces of their answers, each (chunks, ..., chunk); blocks may overlap.
+) -> Iterator[tuple[slice, np.ndarray]]:
+    """Blocks of samples and their answers (..., chunks, chunk), which the next block overwrites; blocks may overlap.
 
     Fewer samples than a block has are answered with some more behind them.
     """
-    samples, parameters = len(arrays[0]), jax.device_put(parameters)
+    samples, room = len(arrays[0]), None
     chunks = 1 if samples <= chunk else BLOCK
     block = chunk * chunks
+    if samples > 4 * block:  # putting the leaves there once costs as much as handing them over four times
+        parameters = jax.device_put(parameters)
     for start in [*range(0, samples - block, block), max(0, samples - block)]:
         where = slice(start, min(start + block, samples))
-        pieces = _host_program(kernel, parameters, *(in_chunks(x[where], chunk, chunks) for x in arrays))
-        yield where, tuple(map(np.asarray, pieces if isinstance(pieces, tuple) else (pieces,)))
+        rows = [in_chunks(x[where], chunk, chunks) for x in arrays]
+        room = _fill(kernel, _room(kernel, parameters, *rows) if room is None else room, parameters, *rows)
+        yield where, np.moveaxis(np.asarray(room), 0, -2)
 
 
 def _assembled(kernel: Callable[..., Any], chunk: int, last: bool, parameters: Any, *arrays: np.ndarray) -> Array:
     """Answers put together in NumPy: JAX's own memory comes in small pages, which cost more than the numbers."""
     samples, whole, view = len(arrays[0]), None, None
-    for where, pieces in host_blocks(kernel, chunk, parameters, *arrays):
+    for where, parts in host_blocks(kernel, chunk, parameters, *arrays):
         if whole is None or view is None:
-            shape = [*pieces[0].shape[1:-1]]
-            shape[1:2] = [sum(x.shape[2] for x in pieces)] if len(pieces) > 1 else shape[1:2]
-            whole = aligned((*shape, samples) if last else (samples, *shape))
+            whole = aligned((*parts.shape[:-2], samples) if last else (samples, *parts.shape[:-2]))
             view = whole if last else np.moveaxis(whole, 0, -1)
-        first = 0
-        for piece in pieces:
-            part = view if len(pieces) == 1 else view[:, first : first + piece.shape[2]]
-            put(part[..., where], np.moveaxis(piece, 0, -2))
-            first += piece.shape[2]
+        put(view[..., where], parts)
     return jax.device_put(whole, may_alias=True)
 
 

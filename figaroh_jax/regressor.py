@@ -78,12 +78,10 @@ def joint_torque_regressor(
 def _dense_on_host(model: RobotModel, chunk: int, *arrays: np.ndarray) -> Array:
     """W with zeros that are never written: memory that the system gives out is zero already."""
     whole = aligned((len(arrays[0]), model.nv, len(model.joints), 10), fill=0.0)
-    for where, pieces in host_blocks(coordinate_rows, chunk, model, *arrays):
-        view, first = np.moveaxis(whole[where], 0, -1), 0
-        for piece in pieces:
-            for rows, blocks in _runs(model.joints):
-                put(view[rows][..., first : first + piece.shape[2], :], np.moveaxis(piece[:, blocks], 0, -2))
-            first += piece.shape[2]
+    for where, parts in host_blocks(coordinate_rows, chunk, model, *arrays):
+        view = np.moveaxis(whole[where], 0, -1)
+        for rows, blocks in _runs(model.joints):
+            put(view[rows], parts[blocks])
     return jax.device_put(whole.reshape(len(whole), model.nv, 10 * len(model.joints)), may_alias=True)
 
 
@@ -172,26 +170,23 @@ def packed_rows(
     if scale is not None:
         ratio = take(jnp.asarray(scale, q.dtype), model.dofs.joint)[:, None, None]
         linear, angular = linear * ratio, angular * ratio
-    force, torque, turning = _unit_wrenches(state)
+    wrench, turning = _unit_wrenches(state)
+    twist = jnp.concatenate([linear, angular], axis=1)
     dof, link = pairs(model).T
-    moments = [
-        linear[dof][:, None, k] * force[link][:, :, k] + angular[dof][:, None, k] * torque[link][:, :, k]
-        for k in range(3)
-    ]
-    inertias = [angular[dof][:, None, k] * turning[link][:, :, k] for k in range(3)]
-    return moments[0] + moments[1] + moments[2], inertias[0] + inertias[1] + inertias[2]
+    moments = [twist[dof][:, None, k] * wrench[link][:, :, k] for k in range(6)]
+    inertias = [twist[dof][:, None, k + 3] * turning[link][:, :, k] for k in range(3)]
+    return sum(moments[1:], moments[0]), sum(inertias[1:], inertias[0])
 
 
-def _unit_wrenches(
-    state: Motion,
-) -> tuple[Float[Array, "nj 4 3 samples"], Float[Array, "nj 4 3 samples"], Float[Array, "nj 6 3 samples"]]:
-    r"""Force and torque about the world's origin of a unit of mass and first moments, and torque of a unit of inertia.
+def _unit_wrenches(state: Motion) -> tuple[Float[Array, "nj 4 6 samples"], Float[Array, "nj 6 3 samples"]]:
+    r"""Wrench about the world's origin of a unit of mass and first moments, and torque of a unit of inertia.
 
     $t_a$ the columns of the pose, $g_a$ their accelerations: force $g_a$, torque $p \times g_a + t_a \times g_p$
     (once for the mass). An inertia E gives $R (E \alpha + w \times E w)$ with w and $\alpha$ in the link's frame.
     """
     columns, force = state.columns, state.acceleration
     torque = cross(columns, force[:, :1]) + jnp.asarray(_ELSEWHERE, force.dtype) * cross(columns[:, :1], force)
+    wrench = jnp.concatenate([force, torque], axis=2)  # as one, XLA keeps them, and computes none for every pair anew
     axes = columns[:, 1:]
     turning = cross(state.w[:, None], axes)
     w, al = (rotate_back(jnp.swapaxes(axes, 1, 2), x) for x in (state.w, state.al))
@@ -200,4 +195,4 @@ def _unit_wrenches(
         return axes[:, i] * al[:, j, None] + turning[:, i] * w[:, j, None]
 
     inertia = jnp.stack([one(i, i) if i == j else one(i, j) + one(j, i) for i, j in _ENTRIES], axis=1)
-    return force, torque, inertia
+    return wrench, inertia

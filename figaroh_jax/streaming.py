@@ -131,7 +131,7 @@ def _fold(step: Callable[..., Any], chunk: int, total: Any, model: RobotModel, r
     if traced(model, total, rows):
         return _fold_chunks(step, total, model, _cut(rows, chunk))
     program = _host_program if on_host() else _device_program
-    model, samples = jax.device_put(model), len(rows.q)
+    samples = len(rows.q)
     chunks = 1 if samples <= chunk else BLOCK
     for start in range(0, samples, chunk * chunks):
         piece = jax.tree.map(lambda x: x[start : start + chunk * chunks], rows)  # noqa: B023
