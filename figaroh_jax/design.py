@@ -9,7 +9,7 @@ JAX evaluates the equations, many effects in one program; samples, shifts and fi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from .chunks import BLOCK
 from .dynamics import inverse_dynamics
 from .effect import Effect, Motion, columns
 from .model import Leaf, RobotModel
@@ -29,7 +28,6 @@ __all__ = [
     "candidates",
     "difference",
     "flattened",
-    "in_pieces",
     "kind",
     "rigid_torque",
     "sensor_response",
@@ -41,9 +39,6 @@ __all__ = [
     "units_and_slopes",
     "with_shape",
 ]
-
-
-PIECE = 128 * BLOCK  # samples
 
 
 class Units(NamedTuple):
@@ -91,18 +86,6 @@ def difference(signal: Float[np.ndarray, "*n N"], dt: float) -> Float[np.ndarray
     out[..., 2:-2] = inner / (12 * dt)
     out[..., :2], out[..., -2:] = out[..., 2:3], out[..., -3:-2]
     return out
-
-
-def in_pieces(
-    function: Callable[..., Array | np.ndarray], *arrays: Float[Leaf, "*batch nv"]
-) -> Float[np.ndarray, "*batch rest"]:
-    """`function` over samples, a piece of one size at a time: no program depends on their number."""
-    flat = [np.reshape(x, (-1, np.shape(x)[-1])) for x in arrays]
-    count, out = len(flat[0]), []
-    for start in range(0, count, PIECE):
-        part = [x[start : start + PIECE] for x in flat]
-        out.append(np.asarray(function(*(np.pad(x, ((0, PIECE - len(x)), (0, 0))) for x in part)))[: len(part[0])])
-    return np.concatenate(out).reshape(*np.shape(arrays[0])[:-1], *out[0].shape[1:])
 
 
 def rigid_torque(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import equinox as eqx
 import jax
@@ -19,7 +19,6 @@ from .design import (
     Units,
     candidates,
     flattened,
-    in_pieces,
     kind,
     rigid_torque,
     sensor_response,
@@ -396,5 +395,4 @@ def _row_layout(layout: Layout) -> tuple[np.ndarray, ...]:
 
 
 def _rigid(problem: Problem, motion: Motion) -> Float[np.ndarray, "nN nv P"]:
-    regressor = partial(joint_torque_regressor, jax.device_put(problem.model))
-    return in_pieces(regressor, motion.position, motion.velocity, motion.acceleration)
+    return np.asarray(joint_torque_regressor(problem.model, motion.position, motion.velocity, motion.acceleration))
