@@ -1,0 +1,212 @@
+"""Calibration on real sets, and the solver's speed against SciPy with Pinocchio and finite differences.
+
+    python benchmarks/calibration.py [sets] [speed]
+
+`sets` calibrates the recordings of $FIGAROH_JAX_DATA with everything chosen inside five folds (MUKCa: on tool positions
+that were not fitted) and prints error and names. `speed` solves one problem, UR10e poses with its identifiable
+parameters, with both; CPU seconds, ours cold (with compilation) and warm, in one interleaved run.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from figaroh_jax.poserecords import PoseRecording
+from figaroh_jax.urdf import load_urdf
+
+DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+BOTH = ("base_frame", "tool_frame")
+PANDA = [f"panda_joint{k}" for k in range(1, 8)]
+TOOL_POSITIONS = {"panda_2_clean": (0, 3, 7), "panda_3": (2, 4), "panda_4_clean": (0, 1), "panda_1": (0,)}  # fitted
+
+
+def recording(q: np.ndarray, kind: str, values: np.ndarray, base: str, tool: str, **more) -> PoseRecording:
+    """A recording made in memory."""
+    unknown = more.pop("unknown", BOTH)
+    return PoseRecording("set", Path("set"), np.arange(float(len(q))), q, kind, values, base, tool, unknown, **more)  # pyright: ignore[reportArgumentType]
+
+
+def talos():
+    joints = ["torso_1_joint", "torso_2_joint", *(f"arm_left_{k}_joint" for k in range(1, 8))]
+    table = np.genfromtxt(DATA / "talos_contact" / "talos_left_arm_02_10_contact.csv", delimiter=",", skip_header=1)
+    seen = recording(table[:, 4:13], "position", table[:, 1:4], "base_link", "gripper_left_base_link")
+    return load_urdf(DATA / "talos_contact" / "talos_full_v2.urdf", joints=joints), [seen]
+
+
+def tiago(keep: bool = False):
+    joints = ["torso_lift_joint", *(f"arm_{k}_joint" for k in range(1, 8))]
+    model = load_urdf(DATA / "tiago_mocap" / "tiago_no_hand.urdf", joints=joints)
+    table = np.genfromtxt(DATA / "tiago_mocap" / "qualysis_base_hand_calibration.csv", delimiter=",", skip_header=1)
+    rows = np.arange(len(table)) if keep else np.delete(np.arange(len(table)), 9)
+    root = next(frame.name for frame in model.frames if frame.parent < 0)
+    return model, [recording(table[rows, 12:20], "position", table[rows, :3], root, "arm_7_link")]
+
+
+def irb120():
+    model, z = load_urdf(DATA / "irb120_wu2015" / "irb120.urdf"), np.load(DATA / "irb120_wu2015" / "irb120_wu.npz")
+    root = next(frame.name for frame in model.frames if frame.parent < 0)
+    return model, [recording(np.deg2rad(z["cali_q_deg"]), "position", 1e-3 * z["cali_xyz_mm"], root, "tool0")]
+
+
+def handeye():
+    folder = DATA / "panda_handeye_board"
+    model, z = load_urdf(folder / "panda.urdf", joints=PANDA), np.load(folder / "panda_handeye.npz")
+    root = next(frame.name for frame in model.frames if frame.parent < 0)
+    return model, [recording(z["q"], "pose", z["T_board_cam"], root, "panda_link8")]
+
+
+def mukca(name: str):
+    model = load_urdf(DATA / "mukca_panda" / "panda.urdf", joints=PANDA)
+    root = next(frame.name for frame in model.frames if frame.parent < 0)
+    recordings = []
+    for k, file in enumerate(sorted((DATA / "mukca_panda" / "data" / name).glob("*.npz"))):
+        z = np.load(file)
+        q, socket = np.concatenate([z["hole_0"], z["hole_1"]]), np.repeat([0, 1], [len(z["hole_0"]), len(z["hole_1"])])
+        role = "fit" if k in TOOL_POSITIONS[name] else "holdout"
+        more = {"unknown": ("tool_frame",), "role": role, "distance": 0.05}
+        recordings.append(recording(q, "socket", socket, root, "ball_link", **more))
+    return model, recordings
+
+
+SETS: dict[str, Callable] = {
+    "talos_contact": talos,
+    "tiago_mocap, 34": tiago,
+    "tiago_mocap, all 35": lambda: tiago(keep=True),
+    "irb120_wu2015": irb120,
+    "panda_handeye_board": handeye,
+    **{f"mukca {name}": lambda name=name: mukca(name) for name in TOOL_POSITIONS},
+}
+
+
+def points_of(values: np.ndarray) -> np.ndarray:
+    """Points as the library holds them: (postures, markers, 3)."""
+    return values[:, None] if values.ndim == 2 else values
+
+
+def run_sets() -> None:
+    from dataclasses import replace
+
+    from figaroh_jax.calibration import calibrate
+
+    for name, load in SETS.items():
+        model, recordings = load()
+        recordings = [replace(r, values=points_of(r.values)) if r.kind == "position" else r for r in recordings]
+        start = time.process_time()
+        found = calibrate(model, recordings)
+        error, turn = found.position, found.orientation
+        assert error is not None
+        angle = f"; {turn.validated_before:.3f} -> {turn.validated_after:.3f} deg" if turn else ""
+        print(f"{name}: {error.validated_before:.3f} -> {error.validated_after:.3f} mm{angle}; {found.level}", end="; ")
+        print(", ".join(str(c.name) for c in found.causes) or "no cause", end="; ")
+        print(f"outliers {[o.row for o in found.outliers]}; {time.process_time() - start:.0f} CPU s", flush=True)
+        for note in found.notes:
+            print(f"    {note}")
+
+
+class Peer:
+    """The same problem for SciPy: a Pinocchio loop and finite differences."""
+
+    def __init__(self, path: Path, frame: str, joint: np.ndarray, twists: np.ndarray) -> None:
+        import pinocchio
+
+        pin: Any = pinocchio
+        self.pin, self.robot, self.joint, self.twists = pin, pin.buildModelFromUrdf(str(path)), joint, twists
+        self.nominal = [pin.SE3(placement) for placement in self.robot.jointPlacements]
+        self.tool = self.robot.getFrameId(frame)
+
+    def poses(self, q: np.ndarray, x: np.ndarray, base, marker) -> list:
+        """Poses of the marker in the device's frame, with the columns' coefficients `x`."""
+        total = np.zeros((6, 6))
+        np.add.at(total, self.joint, x[:, None] * self.twists)
+        for k, twist in enumerate(total):
+            E = self.pin.SE3(self.pin.exp3(twist[3:]), twist[:3])
+            self.robot.jointPlacements[k + 1] = self.nominal[k + 1] * E
+        data, found = self.robot.createData(), []
+        for row in q:
+            self.pin.framesForwardKinematics(self.robot, data, row)
+            found.append(base * data.oMf[self.tool] * marker)
+        return found
+
+    def solve(self, q: np.ndarray, seen: list, near: list, picked: np.ndarray) -> float:
+        """Cost of the least squares over both frames and the columns `picked`."""
+        from scipy.optimize import least_squares
+
+        def residual(y: np.ndarray) -> np.ndarray:
+            x = np.zeros(len(self.joint))
+            x[picked] = 1e-3 * y[12:]
+            marks = [m * self.pin.exp6(1e-2 * d) for m, d in zip(near, (y[:6], y[6:12]), strict=True)]
+            found = self.poses(q, x, *marks)
+            return 1e4 * np.concatenate([self.pin.log6(s.actInv(p)).vector for s, p in zip(seen, found, strict=True)])
+
+        return least_squares(residual, np.zeros(12 + len(picked)), method="lm").cost
+
+
+def run_speed() -> None:
+    from figaroh_jax.candidates import geometry_columns
+    from figaroh_jax.posegroups import postures_of
+
+    path = next((DATA / "ur10e_innopolis").glob("*.urdf"))
+    model = load_urdf(path)
+    frame = model.frames[max(k for k, f in enumerate(model.frames) if f.parent == len(model.joints) - 1)].name
+    root = next(f.name for f in model.frames if f.parent < 0)
+    columns = geometry_columns(model, range(6))
+    (zero,) = postures_of(model, [recording(np.zeros((1, 6)), "pose", np.eye(4)[None], root, frame)])
+    twists = np.array([column.pieces[0][1](zero)[:, 0] for column in columns])
+    peer = Peer(path, frame, np.array([column.pieces[0][0] for column in columns]), twists)
+    for N in (50, 500, 4000):
+        _compare(N, model, (root, frame), columns, peer)
+
+
+def _compare(N: int, model, frames: tuple[str, str], columns, peer: Peer) -> None:
+    import jax.numpy as jnp
+
+    from figaroh_jax import posefit
+    from figaroh_jax.gauge import find_gauge
+    from figaroh_jax.posegroups import assemble, postures_of
+
+    rng, exp = np.random.default_rng(N), peer.pin.exp6
+    q, x = rng.uniform(-2.5, 2.5, (N, 6)), 1e-3 * rng.normal(size=len(columns))
+    near = [exp(np.concatenate([0.3 * rng.normal(size=3), rng.normal(size=3)])) for _ in range(2)]
+    seen = [pose * exp(1e-4 * rng.normal(size=6)) for pose in peer.poses(q, x, *near)]
+    records = [recording(q, "pose", np.array([pose.homogeneous for pose in seen]), *frames)]
+    start = time.process_time()
+    measured = assemble(model, records, postures_of(model, records), columns, [1e-3] * len(columns))
+    zero = jnp.zeros(len(measured.problem.scale))
+    jacobian = np.asarray(posefit.linearise(measured.problem, zero)[1])
+    gauge = find_gauge(jacobian, [*range(len(columns), len(zero)), *range(len(columns))])
+    free = np.array([k not in gauge.dependent for k in range(len(zero))], float)
+    weights = jnp.full(len(jacobian), 1e4), jnp.where(free > 0, 0.0, 1.0), jnp.asarray(free)
+
+    def ours() -> float:
+        return float(posefit.solve(measured.problem, *weights, zero).cost)
+
+    cost, cold = ours(), time.process_time() - start
+    picked, warm, theirs, other = np.flatnonzero(free[: len(columns)]), [], [], 0.0
+    for _ in range(3 if N < 4000 else 1):
+        start = time.process_time()
+        ours()
+        between = time.process_time()
+        other = peer.solve(q, seen, near, picked)
+        warm.append(between - start)
+        theirs.append(time.process_time() - between)
+    print(
+        f"N {N}: {gauge.rank} parameters; SciPy + Pinocchio {min(theirs):.2f}-{max(theirs):.2f} s; ours warm"
+        f" {min(warm):.3f}-{max(warm):.3f} s, cold {cold:.1f} s; ratio {np.median(theirs) / np.median(warm):.1f};"
+        f" cost {cost:.2f} and {other:.2f}",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    for part in sys.argv[1:] or ["sets", "speed"]:
+        {"sets": run_sets, "speed": run_speed}[part]()
