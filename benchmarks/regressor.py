@@ -206,6 +206,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a thousand samples, three rounds")
     parser.add_argument("--samples", type=int, nargs="+", help="sample counts (default 1000 10000 100000)")
+    parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS), help="default all")
     parser.add_argument("--rounds", type=int, help="interleaved rounds (default 9)")
     parser.add_argument("--core", type=int, default=max(os.sched_getaffinity(0)), help="core on which all run")
     parser.add_argument("--figaroh", metavar="PYTHON", help="interpreter of an environment that has figaroh")
@@ -229,8 +230,8 @@ def main() -> None:
     print(f"{told}; {rounds} rounds on core {options.core}; float64; medians [min, max] over the rounds\n")
     cases, compile_time = {}, {}
     print("CPU s of the first call (trace, compile, run 1000 samples) in a fresh process without cache")
-    for name, file in ROBOTS.items():
-        path = str(DATA / file)
+    for name in options.robots:
+        path = str(DATA / ROBOTS[name])
         joints = [j for j in load_urdf(path).joint_names if j not in LOCKED]
         compile_time[name] = {
             m: spread([bench.fresh(m, path, joints, 1000)["cpu"] for _ in range(min(3, rounds))]) for m in OURS
@@ -238,8 +239,8 @@ def main() -> None:
         told_times = (f"{m} {x['median']:.2f} [{x['min']:.2f}, {x['max']:.2f}]" for m, x in compile_time[name].items())
         print(f"{name:6}", "  ".join(told_times))
     print(f"\n{'robot  samples method         us a sample, CPU':58} peak MB ", *(f"times faster: {p:9}" for p in PEERS))
-    for name, file in ROBOTS.items():
-        path = str(DATA / file)
+    for name in options.robots:
+        path = str(DATA / ROBOTS[name])
         joints = [j for j in load_urdf(path).joint_names if j not in LOCKED]
         model = load_urdf(path, joints=joints)
         sizes = {"nv": model.nv, "links": len(model.joints), "pairs": len(pairs(model))}
