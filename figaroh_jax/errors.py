@@ -1,4 +1,4 @@
-"""The one error that a user's input can cause; the command line turns it into one message and exit status 2."""
+"""The errors that a user can cause; the command line turns them into one message and exit status 2."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ from collections.abc import Iterable
 
 class InputError(ValueError):
     """Wrong input: the message says what is wrong, in which file, key, row or joint, and what would be right."""
+
+
+class NotSupported(InputError):
+    """A backend was asked for what its library does not give; the message names those that do."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

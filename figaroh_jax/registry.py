@@ -1,71 +1,25 @@
-"""Backends by name: other rigid body libraries behind the core's own signatures.
+"""Backends by name, and the robots that they are built for.
 
-A backend is a *module* with the functions of `Backend`; it announces itself by an entry point of the group
-`figaroh_jax.backends`, `name = "module"`, and is imported only when asked for.
+A backend is a class that satisfies `figaroh_jax.contract.Backend`; a package announces it by an entry point of the
+group `figaroh_jax.backends`, and it is imported only when asked for.
 """
 
 from __future__ import annotations
 
-import importlib
+from collections.abc import Sequence
 from importlib import metadata
-from types import ModuleType
-from typing import Protocol, runtime_checkable
+from pathlib import Path
+from typing import Literal
 
-from jax.typing import ArrayLike
-from jaxtyping import Float
-
+from .contract import Backend
 from .errors import InputError
 from .model import RobotModel
+from .robotfile import read_robot
+from .xmlfile import find_in_packages
 
-__all__ = ["GROUP", "Backend", "backend", "names"]
+__all__ = ["GROUP", "backend", "backend_class", "having", "names"]
 
 GROUP = "figaroh_jax.backends"
-_NATIVE = ("figaroh_jax.kinematics", "figaroh_jax.dynamics", "figaroh_jax.regressor")
-
-
-@runtime_checkable
-class Backend(Protocol):
-    """What a backend's module offers; shapes, units and frames are those of the core's functions of the same names."""
-
-    def forward_kinematics(
-        self, model: RobotModel, q: Float[ArrayLike, "*batch nv"]
-    ) -> Float[ArrayLike, "*batch nj 4 4"]:
-        """Poses of all tree joints in the world."""
-        ...
-
-    def inverse_dynamics(
-        self,
-        model: RobotModel,
-        q: Float[ArrayLike, "*batch nv"],
-        v: Float[ArrayLike, "*batch nv"],
-        a: Float[ArrayLike, "*batch nv"],
-    ) -> Float[ArrayLike, "*batch nv"]:
-        """Torques of the rigid body."""
-        ...
-
-    def mass_matrix(self, model: RobotModel, q: Float[ArrayLike, "*batch nv"]) -> Float[ArrayLike, "*batch nv nv"]:
-        """Mass matrix of the rigid body."""
-        ...
-
-    def forward_dynamics(
-        self,
-        model: RobotModel,
-        q: Float[ArrayLike, "*batch nv"],
-        v: Float[ArrayLike, "*batch nv"],
-        tau: Float[ArrayLike, "*batch nv"],
-    ) -> Float[ArrayLike, "*batch nv"]:
-        """Accelerations of the rigid body."""
-        ...
-
-    def joint_torque_regressor(
-        self,
-        model: RobotModel,
-        q: Float[ArrayLike, "*batch nv"],
-        v: Float[ArrayLike, "*batch nv"],
-        a: Float[ArrayLike, "*batch nv"],
-    ) -> Float[ArrayLike, "*batch nv columns"]:
-        """Matrix that the links' inertial parameters map to the torques."""
-        ...
 
 
 def names() -> tuple[str, ...]:
@@ -73,22 +27,47 @@ def names() -> tuple[str, ...]:
     return ("native", *sorted({entry.name for entry in metadata.entry_points(group=GROUP)}))
 
 
-def backend(name: str) -> Backend:
-    """The backend called `name`, imported now.
+def backend(
+    name: str,
+    model: RobotModel | str | Path | None = None,
+    root: Literal["fixed", "free_flyer"] | None = None,
+    packages: Sequence[str | Path] = (),
+) -> Backend:
+    """The backend called `name` for a robot: a `RobotModel`, a URDF file (`.urdf`) or an MJCF file (`.xml`, `.mjcf`).
 
-    Raises `InputError` where none of that name is installed (the message lists those that are), or where the library
-    that it adapts is missing.
+    `root` says whether the root link is fixed to the world or moves freely; None: as the file has it, which for a URDF
+    is fixed. `packages` are the folders of packages by which a path such as `package://my_robot/robot.urdf` is found;
+    meshes are never needed. Raises `InputError` where no backend of that name is installed (the message lists those
+    that are), where the library that it adapts is missing, or for a wrong model.
     """
+    chosen = backend_class(name)
+    if model is None:
+        raise InputError(f"backend '{name}': for which robot? Give a URDF file, an MJCF file or a RobotModel")
+    if isinstance(model, RobotModel):
+        free = any(joint.kind == "free" and joint.parent < 0 for joint in model.joints)
+        if root is not None and free != (root == "free_flyer"):
+            raise InputError(f"robot '{model.name}' is {'free' if free else 'fixed'}; load it with root='{root}'")
+        return chosen.build(model)
+    return chosen.build(read_robot(model, root=root, packages=packages), find_in_packages(model, packages))
+
+
+def backend_class(name: str) -> type[Backend]:
+    """The class of the backend called `name`, imported now. Raises `InputError` as `backend`."""
     if name == "native":
-        return _native()
+        from .native_backend import NativeBackend
+
+        return NativeBackend
     found = [entry for entry in metadata.entry_points(group=GROUP) if entry.name == name]
     if not found:
         raise InputError(
-            f"no backend '{name}' is installed; installed: {', '.join(names())}. "
-            f"A backend is a package with an entry point '{name}' in the group '{GROUP}'"
+            f"no backend '{name}' is installed; installed: {', '.join(names())}. Those of this library are installed "
+            f"with: pip install 'figaroh-jax[mujoco,mjx,pinocchio]'; another one is a package with an entry point "
+            f"'{name}' in the group '{GROUP}'"
         )
     try:
         return found[0].load()
+    except AttributeError as error:
+        raise InputError(f"backend '{name}': its entry point {found[0].value} names no class ({error})") from None
     except ImportError as error:
         missing = error.name or found[0].value
         raise InputError(
@@ -97,8 +76,14 @@ def backend(name: str) -> Backend:
         ) from None
 
 
-def _native() -> Backend:
-    native = ModuleType("figaroh_jax.native")
-    for module in map(importlib.import_module, _NATIVE):
-        vars(native).update({word: getattr(module, word) for word in module.__all__})
-    return native  # pyright: ignore[reportReturnType]
+def having(function: str) -> tuple[str, ...]:
+    """Names of the installed backends that give a function of the contract."""
+    able = []
+    for name in names():
+        try:
+            capabilities = backend_class(name).capabilities
+        except InputError:
+            continue
+        if function in capabilities.functions:
+            able.append(name)
+    return tuple(able)

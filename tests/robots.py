@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -200,3 +201,74 @@ def states(model: RobotModel, samples: int, seed: int = 0) -> tuple[np.ndarray, 
     """Random positions over more than a turn, velocities and accelerations."""
     q, v, a = np.random.default_rng(seed).uniform(-4.0, 4.0, (3, samples, model.nv))
     return q, v, a
+
+
+# gravity along x, centre of mass on x: a textbook pendulum
+PENDULUM = robot(
+    '<link name="base"/><link name="bob"><inertial><mass value="1.3"/><origin xyz="0.4 0 0"/>'
+    '<inertia ixx="0.01" iyy="0.02" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial></link>',
+    joint("swing", "base", "bob", rpy="0 1.5707963267948966 0", xyz="0 0 0"),
+)
+
+# a plane in an odd direction, and a free joint that does not hang on the world
+PLANE = robot(
+    *LINKS[:4],
+    joint("glide", "base", "a", "planar", "1 2 -2"),
+    joint("turn", "a", "b", axis="0 1 -2"),
+    joint("fly", "b", "c", "floating"),
+)
+
+# free and ball joints, anchors off the bodies' origins, a reference position, a welded body, a floor
+BEAST = """<mujoco model="beast"><compiler angle="radian"/><option gravity="0.3 -0.2 -9.7"/><worldbody>
+<geom type="plane" size="5 5 0.1"/>
+<body name="trunk" pos="0 0 0.5" quat="0.9 0.1 -0.2 0.3"><freejoint name="root"/>
+  <geom type="box" size="0.3 0.1 0.05" mass="4" pos="0.02 0 0.01"/>
+  <body name="upper" pos="0.3 0 0.05" quat="0.8 0.3 0 0.2">
+    <joint name="shoulder" type="ball" pos="0.01 0.02 -0.03" damping="0.1"/>
+    <geom type="capsule" size="0.04" fromto="0 0 0 0.2 0.05 0.1" mass="1.2"/>
+    <body name="hand" pos="0.25 0 0">
+      <joint name="wrist" type="hinge" axis="0 1 1" pos="0 0 0.02" ref="0.3" armature="0.2" range="-2 2"/>
+      <geom type="box" size="0.05 0.03 0.02" mass="0.4" pos="0.03 0 0"/>
+      <site name="tip" pos="0.05 0.01 0.02" quat="0.5 0.5 0.5 0.5"/>
+    </body>
+  </body>
+  <body name="tail" pos="-0.3 0 0"><joint name="slider" type="slide" axis="1 0 1" range="-0.2 0.2"/>
+    <geom type="sphere" size="0.05" mass="0.3"/>
+    <body name="fin" pos="-0.1 0 0"><geom type="box" size="0.05 0.05 0.01" mass="0.1" euler="0.3 0.2 0.1"/></body>
+  </body>
+</body></worldbody></mujoco>"""
+
+
+def _quadruped() -> str:
+    """A trunk on a free joint and four legs of three hinges."""
+    legs = []
+    for leg, (x, y) in {"fl": (0.2, 0.1), "fr": (0.2, -0.1), "hl": (-0.2, 0.1), "hr": (-0.2, -0.1)}.items():
+        thigh = (
+            f'<body name="{leg}_calf" pos="0 0 -0.2"><joint name="{leg}_knee" axis="0 1 0" range="-2.6 -0.5"/>'
+            '<geom type="capsule" size="0.015" fromto="0 0 0 0 0 -0.2" mass="0.2"/></body>'
+        )
+        hip = (
+            f'<body name="{leg}_thigh" pos="0 {0.3 * y} 0"><joint name="{leg}_hip" axis="0 1 0" range="-1 3"/>'
+            f'<geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.2" mass="0.9"/>{thigh}</body>'
+        )
+        legs.append(
+            f'<body name="{leg}_abductor" pos="{x} {y} 0"><joint name="{leg}_abduction" axis="1 0 0" range="-1 1"/>'
+            f'<geom type="sphere" size="0.05" mass="0.7"/>{hip}</body>'
+        )
+    trunk = '<freejoint name="base"/><geom type="box" size="0.2 0.1 0.06" mass="6" pos="0.01 0 0"/>'
+    return (
+        '<mujoco model="quadruped"><compiler angle="radian"/><worldbody><body name="trunk" pos="0 0 0.4">'
+        f"{trunk}{''.join(legs)}</body></worldbody></mujoco>"
+    )
+
+
+GENERAL = {"pendulum": PENDULUM, "plane": PLANE, "beast": BEAST, "quadruped": _quadruped()}
+_FOLDER = Path(tempfile.mkdtemp(prefix="figaroh_jax_robots_"))
+
+
+def write(name: str) -> Path:
+    """File of one of the robots of this module, in a folder of the test run."""
+    text = (INLINE | GENERAL)[name]
+    path = _FOLDER / (f"{name}.xml" if text.startswith("<mujoco") else f"{name}.urdf")
+    path.write_text(text)
+    return path

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import equinox as eqx
-import figaroh_jax_pinocchio as reference
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 import robots
 
 from figaroh_jax.effect import Effect, Motion, amplitude, columns, joint_unit, place, shape, smooth_sign

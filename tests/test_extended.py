@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import equinox as eqx
-import figaroh_jax_pinocchio as reference
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 import robots
 from scipy import signal
 

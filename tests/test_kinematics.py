@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import figaroh_jax_pinocchio as reference
 import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 import pytest
+import reference
 import robots
 
 from figaroh_jax import kinematics

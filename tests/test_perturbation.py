@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import equinox as eqx
-import figaroh_jax_pinocchio as reference
 import jax
 import jax.numpy as jnp
 import numpy as np
+import reference
 import robots
 
 from figaroh_jax.chain import chain_between, chain_pose

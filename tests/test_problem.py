@@ -6,9 +6,9 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
-import figaroh_jax_pinocchio as reference
 import numpy as np
 import pytest
+import reference
 import robots
 from synthetic import DT, made_signals, swing
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-import figaroh_jax_pinocchio as reference
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 import robots
 from jaxtyping import Array
 from synthetic import made_signals

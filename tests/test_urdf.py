@@ -6,10 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import figaroh_jax_pinocchio as reference
 import numpy as np
 import pinocchio as pin
 import pytest
+import reference
 import robots
 from robots import joint, link, robot
 

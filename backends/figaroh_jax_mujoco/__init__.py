@@ -1,0 +1,284 @@
+"""MuJoCo C behind the contract of figaroh_jax: many samples on threads, each with an `MjData` of its own.
+
+Given an MJCF file, the functions compute with the model that MuJoCo compiles from it, given anything else with one
+built from the robot's arrays (`figaroh_jax.mujoco_model`, which also translates the coordinates). Only MuJoCo's
+functions of rigid bodies are called (`mj_kinematics`, `mj_comPos`, `mj_comVel`, `mj_rne`, `mj_crb`), with armature
+zero: contacts, constraints, damping, springs and actuators never enter. Nothing here can be differentiated, and MuJoCo
+C has derivatives by finite differences alone, so `dynamics_derivatives` is not supported.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float
+
+from figaroh_jax.contract import Backend, Capabilities, Reference, as_reference, file_format, host_samples
+from figaroh_jax.derivatives import coriolis_from_bias
+from figaroh_jax.errors import InputError
+from figaroh_jax.model import RobotModel
+from figaroh_jax.mujoco_model import (
+    compiled,
+    drift,
+    frame_poses,
+    joint_poses,
+    link_inertias,
+    positions,
+    rates,
+    spatial_inertias,
+)
+
+__all__ = ["MujocoBackend"]
+
+_CHUNK = 64  # samples of a task: what they need stays in the cache
+
+
+class MujocoBackend(Backend):
+    """A `mujoco.MjModel`: `simulator` is the user's own, with contacts and all, where an MJCF file was given."""
+
+    name: ClassVar[str] = "mujoco"
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        batch="threads", contact=True, lacking=frozenset({"dynamics_derivatives"})
+    )
+
+    def __init__(self, robot: RobotModel, source: Path | None = None) -> None:
+        self._robot, self._source = robot, source
+        self._simulator, self._translation, self._from_file = compiled(robot, source)
+        self._rigid = copy.copy(self._simulator)
+        self._rigid.dof_armature[:] = 0.0
+        bodies = np.eye(self._rigid.nbody)
+        for body in range(1, self._rigid.nbody):
+            bodies[self._rigid.body_parentid[body], body] -= 1.0
+        self._own_wrench = bodies[self._translation.body]  # what a body carries, less what its children carry
+
+    @classmethod
+    def build(cls, robot: RobotModel, source: Path | None = None) -> MujocoBackend:
+        """The backend of a robot; of the model compiled from `source` where that is MJCF."""
+        return cls(robot, source)
+
+    @property
+    def robot(self) -> RobotModel:
+        """The robot."""
+        return self._robot
+
+    @property
+    def simulator(self) -> Any:
+        """The `mujoco.MjModel`."""
+        return self._simulator
+
+    @property
+    def model_format(self) -> str:
+        """Format of the file that the robot was read from."""
+        return file_format(self._source)
+
+    @property
+    def inertias(self) -> Float[np.ndarray, "links 10"]:
+        """Inertial parameters of the links in MuJoCo's model."""
+        return link_inertias(self._translation, self._simulator)
+
+    def mass_matrix(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch nv nv"]:
+        """Composite bodies (`mj_crb`)."""
+        samples = host_samples(self, q=q)
+        return samples.restore(self._masses(samples[0]))
+
+    def coriolis_matrix(
+        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"]
+    ) -> Float[np.ndarray, "*batch nv nv"]:
+        """From differences of MuJoCo's quadratic bias torques: exact, see `coriolis_from_bias`."""
+        samples = host_samples(self, q=q, v=v)
+        q, v = samples
+
+        def bias(around: Any) -> np.ndarray:
+            x = np.asarray(around).reshape(-1, self.nv)
+            return self._torques(np.repeat(q, self.nv, 0), x, np.zeros_like(x)).reshape(around.shape)
+
+        return samples.restore(np.asarray(coriolis_from_bias(self._robot, bias, self._masses(q), v)))
+
+    def gravity_vector(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch nv"]:
+        """`mj_rne` at rest."""
+        samples = host_samples(self, q=q)
+        rest = np.zeros((len(samples[0]), self.nv))
+        return samples.restore(self._torques(samples[0], rest, rest))
+
+    def inverse_dynamics(
+        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
+    ) -> Float[np.ndarray, "*batch nv"]:
+        """`mj_rne`."""
+        samples = host_samples(self, q=q, v=v, a=a)
+        return samples.restore(self._torques(*samples))
+
+    def forward_dynamics(
+        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], tau: Float[ArrayLike, "*batch nv"]
+    ) -> Float[np.ndarray, "*batch nv"]:
+        """Solve with the mass matrix of `mj_crb` for the torques less those of `mj_rne` without acceleration.
+
+        Raises `InputError` where a joint moves no mass.
+        """
+        samples = host_samples(self, q=q, v=v, tau=tau)
+        q, v, tau = samples
+        bias = self._torques(q, v, np.zeros_like(v))
+        try:
+            return samples.restore(np.linalg.solve(self._masses(q), (tau - bias)[..., None])[..., 0])
+        except np.linalg.LinAlgError:
+            raise InputError(
+                f"robot '{self._robot.name}': a joint moves no mass, so no torque tells its acceleration; "
+                "give its link an inertia"
+            ) from None
+
+    def frame_placements(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch frames 4 4"]:
+        """`mj_kinematics`."""
+        samples = host_samples(self, q=q)
+        return samples.restore(frame_poses(self._robot, self._joint_poses(samples[0])))
+
+    def frame_jacobian(
+        self, q: Float[ArrayLike, "*batch nq"], frame: str, reference: Reference = "local_world_aligned"
+    ) -> Float[np.ndarray, "*batch 6 nv"]:
+        """`mj_jac` of the frame's origin, or of the world's."""
+        index, axes, samples = self.frame_id(frame), as_reference(reference), host_samples(self, q=q)
+        poses = frame_poses(self._robot, self._joint_poses(samples[0]))[:, index]
+        points = np.zeros((len(poses), 3)) if axes == "world" else poses[:, :3, 3]
+        parent = self._robot.frames[index].parent
+        body = int(self._translation.body[parent]) if parent >= 0 else 0
+
+        def one(data: Any, out: np.ndarray, point: np.ndarray) -> None:
+            mujoco.mj_jac(self._rigid, data, out[:3], out[3:], point, body)
+
+        jacobian = self._each(one, (6, self._rigid.nv), samples[0], more=(points,)) @ rates(
+            self._translation, samples[0]
+        )
+        if axes == "local":
+            back = np.swapaxes(poses[:, None, :3, :3], -1, -2)
+            jacobian = (back @ jacobian.reshape(-1, 2, 3, self.nv)).reshape(jacobian.shape)
+        return samples.restore(jacobian)
+
+    def joint_torque_regressor(
+        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
+    ) -> Float[np.ndarray, "*batch nv columns"]:
+        """MuJoCo's inverse dynamics (`mj_rnePostConstraint`) with unit parameters in the place of the inertias.
+
+        The wrench of a link is linear in its ten parameters, so ten runs a sample give every link's, exactly; the
+        joints that carry the link take it up along their axes (`cdof`).
+        """
+        samples = host_samples(self, q=q, v=v, a=a)
+        width = 10 * len(self._robot.joints)
+        answer = np.empty((len(samples[0]), self.nv, width))
+
+        def fill(data: Any, rows: slice) -> None:
+            answer[rows] = self._regressor(data, *(x[rows] for x in samples))
+
+        self._spread(fill, len(answer))
+        return samples.restore(answer)
+
+    def _regressor(self, data: Any, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        model, t = self._rigid, self._translation
+        wrenches = np.empty((len(q), 10, model.nbody, 6))
+        axes = np.empty((len(q), model.nv, 6))
+        roots = model.body_rootid[t.body]
+        for sample, _ in enumerate(self._states(data, q, v, a)):
+            rotation, position = data.xmat.reshape(-1, 3, 3), data.xpos
+            inertias = spatial_inertias(t, joint_poses(t, rotation, position), data.subtree_com[roots])
+            data.cinert[:] = 0.0
+            axes[sample] = data.cdof
+            for k in range(10):
+                data.cinert[t.body] = inertias[:, k]
+                mujoco.mj_rnePostConstraint(model, data)
+                wrenches[sample, k] = data.cfrc_int
+        own = self._own_wrench @ wrenches
+        rows = np.einsum("ndc,nklc->ndlk", axes, own, optimize=True) * t.reaches[:, :, None]
+        return np.swapaxes(rates(t, q), -1, -2) @ rows.reshape(len(q), model.nv, -1)
+
+    def _torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        def one(data: Any, out: np.ndarray) -> None:
+            mujoco.mj_rne(self._rigid, data, 1, out)
+
+        forces = self._each(one, (self._rigid.nv,), q, v, a)
+        return (forces[:, None] @ rates(self._translation, q))[:, 0]
+
+    def _masses(self, q: np.ndarray) -> np.ndarray:
+        def one(data: Any, out: np.ndarray) -> None:
+            mujoco.mj_crb(self._rigid, data)
+            _full_mass(self._rigid, data, out)
+
+        share = rates(self._translation, q)
+        return np.swapaxes(share, -1, -2) @ self._each(one, (self._rigid.nv, self._rigid.nv), q) @ share
+
+    def _joint_poses(self, q: np.ndarray) -> np.ndarray:
+        def one(data: Any, out: np.ndarray) -> None:
+            out[:, :3], out[:, 3] = data.xmat.reshape(-1, 3, 3), data.xpos
+
+        bodies = self._each(one, (self._rigid.nbody, 4, 3), q)
+        return joint_poses(self._translation, bodies[:, :, :3], bodies[:, :, 3])
+
+    def _each(
+        self,
+        function: Callable[..., None],
+        shape: tuple[int, ...],
+        *state: np.ndarray,
+        more: tuple[np.ndarray, ...] = (),
+    ) -> np.ndarray:
+        """What `function(data, out, ...)` writes into `out`, of the given shape, for every sample."""
+        answer = np.empty((len(state[0]), *shape))
+
+        def fill(data: Any, rows: slice) -> None:
+            states = self._states(data, *(x[rows] for x in state))
+            for _, out, *others in zip(states, answer[rows], *(x[rows] for x in more), strict=True):
+                function(data, out, *others)
+
+        self._spread(fill, len(answer))
+        return answer
+
+    def _states(
+        self, data: Any, q: np.ndarray, v: np.ndarray | None = None, a: np.ndarray | None = None
+    ) -> Iterator[None]:
+        """Bring `data` to one sample after another: kinematics, and velocities where they are given."""
+        model, t = self._rigid, self._translation
+        numbers, qpos, qvel, qacc = positions(t, q), data.qpos, data.qvel, data.qacc
+        if v is None or a is None:
+            for row in numbers:
+                qpos[:] = row
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_comPos(model, data)
+                yield
+            return
+        share = rates(t, q)
+        velocities = (share @ v[..., None])[..., 0]
+        accelerations = (share @ a[..., None])[..., 0] + drift(t, q, v)
+        for row, velocity, acceleration in zip(numbers, velocities, accelerations, strict=True):
+            qpos[:], qvel[:], qacc[:] = row, velocity, acceleration
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_comVel(model, data)
+            yield
+
+    def _spread(self, fill: Callable[[Any, slice], None], samples: int) -> None:
+        """`fill(data, rows)` for chunks of the samples, on as many threads as there are cores."""
+        chunks = [slice(start, start + _CHUNK) for start in range(0, samples, _CHUNK)]
+        if len(chunks) <= 2:
+            data = mujoco.MjData(self._rigid)
+            for rows in chunks:
+                fill(data, rows)
+            return
+        workers = min(len(os.sched_getaffinity(0)), len(chunks))
+
+        def work(first: int) -> None:
+            data = mujoco.MjData(self._rigid)
+            for rows in chunks[first::workers]:
+                fill(data, rows)
+
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(work, range(workers)))
+
+
+def _full_mass(model: Any, data: Any, out: np.ndarray) -> None:
+    if int(mujoco.__version__.split(".")[0]) < 4:
+        mujoco.mj_fullM(model, out, data.qM)
+    else:
+        mujoco.mj_fullM(model, data, out)
