@@ -11,6 +11,7 @@ import importlib.util
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .calibration import calibrate as calibrate, calibrate_task as calibrate_task
     from .config import Baseline as Baseline, Preprocess as Preprocess, load_robot as load_robot, load_task as load_task
     from .dataset import Recording as Recording, read_recordings as read_recordings
     from .diagnosis import diagnose as diagnose, diagnose_task as diagnose_task
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from .errors import InputError as InputError
     from .export import load_model as load_model, write_model as write_model
     from .extended import ExtendedModel as ExtendedModel, extend as extend
+    from .identification import identify as identify, identify_task as identify_task
+    from .kinematic_diagnosis import diagnose_poses as diagnose_poses
     from .kinematics import (
         forward_kinematics as forward_kinematics,
         frame_jacobian as frame_jacobian,
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
     )
     from .mjcf import load_mjcf as load_mjcf
     from .model import Frame as Frame, Joint as Joint, RobotModel as RobotModel
+    from .perturbation import Perturbation as Perturbation
     from .registry import backend as backend
     from .regressor import joint_torque_regressor as joint_torque_regressor, packed_regressor as packed_regressor
     from .report import write_report as write_report
@@ -43,6 +47,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
+    "calibration": ("calibrate", "calibrate_task"),
     "config": ("Baseline", "Preprocess", "load_robot", "load_task"),
     "dataset": ("Recording", "read_recordings"),
     "diagnosis": ("diagnose", "diagnose_task"),
@@ -52,9 +57,12 @@ _MODULES = {
     "errors": ("InputError",),
     "export": ("load_model", "write_model"),
     "extended": ("ExtendedModel", "extend"),
+    "identification": ("identify", "identify_task"),
+    "kinematic_diagnosis": ("diagnose_poses",),
     "kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
     "mjcf": ("load_mjcf",),
     "model": ("Frame", "Joint", "RobotModel"),
+    "perturbation": ("Perturbation",),
     "registry": ("backend",),
     "regressor": ("joint_torque_regressor", "packed_regressor"),
     "report": ("write_report",),

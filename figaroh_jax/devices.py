@@ -3,7 +3,7 @@ r"""What a measuring device makes of the pose of the tool: residuals in m and ra
 A device is a small immutable object with one method, `residual(pose, unknown, datum)`, for one posture: `pose` is that
 of the tool frame in the base frame, `unknown` the vector of what the device itself leaves open (its own place, the
 place of its markers, of sockets, of planes), zero at the start, and `datum` what it measured. Derivatives are JAX's.
-A device of your own is such a class; `examples/own_device.py` has one.
+A device of your own is such a class.
 """
 
 from __future__ import annotations

@@ -44,7 +44,9 @@ def coloured_covariance(
     total, middle = A.sum(axis=0) / np.outer(size, size), M / np.outer(size, size)
     inverse = np.linalg.pinv(total, hermitian=True)
     middle = (middle * _freed(A / np.outer(size, size), middle, inverse, weight, C, overlap)[:, None, None]).sum(axis=0)
-    return inverse @ middle @ inverse / np.outer(size, size)
+    values, vectors = np.linalg.eigh(inverse @ middle @ inverse)
+    # rounding may leave a variance below zero where hardly anything moved
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T / np.outer(size, size)
 
 
 def _freed(A, M, inverse, weight, C, rows) -> Float[np.ndarray, " nv"]:
