@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from .export import load_model as load_model, write_model as write_model
     from .extended import ExtendedModel as ExtendedModel, extend as extend
     from .identification import identify as identify, identify_task as identify_task
-    from .kinematic_diagnosis import diagnose_poses as diagnose_poses
     from .kinematics import (
         forward_kinematics as forward_kinematics,
         frame_jacobian as frame_jacobian,
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
     )
     from .mjcf import load_mjcf as load_mjcf
     from .model import Frame as Frame, Joint as Joint, RobotModel as RobotModel
-    from .perturbation import Perturbation as Perturbation
     from .registry import backend as backend
     from .regressor import joint_torque_regressor as joint_torque_regressor, packed_regressor as packed_regressor
     from .report import write_report as write_report
@@ -58,11 +56,9 @@ _MODULES = {
     "export": ("load_model", "write_model"),
     "extended": ("ExtendedModel", "extend"),
     "identification": ("identify", "identify_task"),
-    "kinematic_diagnosis": ("diagnose_poses",),
     "kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
     "mjcf": ("load_mjcf",),
     "model": ("Frame", "Joint", "RobotModel"),
-    "perturbation": ("Perturbation",),
     "registry": ("backend",),
     "regressor": ("joint_torque_regressor", "packed_regressor"),
     "report": ("write_report",),
