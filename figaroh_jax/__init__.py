@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from .registry import backend as backend
     from .regressor import joint_torque_regressor as joint_torque_regressor, packed_regressor as packed_regressor
     from .report import write_report as write_report
-    from .results import Cause as Cause, Diagnosis as Diagnosis, Estimate as Estimate, Gain as Gain, Name as Name
+    from .results import Cause as Cause, Diagnosis as Diagnosis
     from .robotfile import load_extended as load_extended
     from .simulation import simulate as simulate
     from .streaming import normal_matrix as normal_matrix, triangular_factor as triangular_factor
@@ -62,7 +62,7 @@ _MODULES = {
     "registry": ("backend",),
     "regressor": ("joint_torque_regressor", "packed_regressor"),
     "report": ("write_report",),
-    "results": ("Cause", "Diagnosis", "Estimate", "Gain", "Name"),
+    "results": ("Cause", "Diagnosis"),
     "robotfile": ("load_extended",),
     "simulation": ("simulate",),
     "streaming": ("normal_matrix", "triangular_factor"),
