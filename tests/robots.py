@@ -262,13 +262,13 @@ def _quadruped() -> str:
     )
 
 
-GENERAL = {"pendulum": PENDULUM, "plane": PLANE, "beast": BEAST, "quadruped": _quadruped()}
+MIXED = {"pendulum": PENDULUM, "plane": PLANE, "beast": BEAST, "quadruped": _quadruped()}
 _FOLDER = Path(tempfile.mkdtemp(prefix="figaroh_jax_robots_"))
 
 
 def write(name: str) -> Path:
     """File of one of the robots of this module, in a folder of the test run."""
-    text = (INLINE | GENERAL)[name]
+    text = (INLINE | MIXED)[name]
     path = _FOLDER / (f"{name}.xml" if text.startswith("<mujoco") else f"{name}.urdf")
     path.write_text(text)
     return path

@@ -34,7 +34,7 @@ CLASSES = {"native": native, "mjx": mjx, "mujoco": mujoco_c, "pinocchio": pinocc
 TOLERANCE = {"native": 1e-10, "mujoco": 1e-9, "mjx": 1e-8}
 SAMPLES = 100
 SEED = int.from_bytes(os.urandom(2), "little")  # the states of a run; a failure shows it
-ROBOTS = [*robots.INLINE, *robots.GENERAL, *robots.REAL, "talos_free"]
+ROBOTS = [*robots.INLINE, *robots.MIXED, *robots.REAL, "talos_free"]
 COMPILED_FAST = {"native": ("arm", "tree", "beast"), "mjx": ("pendulum",)}  # the others compile for minutes
 ARGUMENTS = {
     "mass_matrix": "q",
@@ -54,7 +54,7 @@ ARGUMENTS = {
 @lru_cache
 def source(robot: str) -> tuple[Path, Any]:
     """File of a robot and its root; skips where it is one of the recordings' and these are not here."""
-    if robot in robots.INLINE or robot in robots.GENERAL:
+    if robot in robots.INLINE or robot in robots.MIXED:
         return robots.write(robot), None
     folder = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
     path = folder / robots.REAL[robot.removesuffix("_free")]

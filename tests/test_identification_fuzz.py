@@ -59,7 +59,12 @@ def recording(chosen: dict) -> Recording:
     return Recording("run", Path("run.npz"), ("j0", "j1"), t, q, None, tau)
 
 
-@settings(max_examples=15, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(
+    max_examples=15,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
 @given(models(), CHOICES, st.booleans(), st.sampled_from(["physical", "unconstrained"]))
 def test_any_data_ends_with_numbers_or_one_message(tmp_path: Path, text: str, chosen: dict, drives: bool, fit):
     file = tmp_path / "robot.urdf"
