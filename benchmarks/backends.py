@@ -1,10 +1,10 @@
 """Samples a second of inverse dynamics and regressor by every installed backend, in one interleaved run.
 
-    python benchmarks/backends.py [--robots NAME ...] [--samples N] [--rounds N]
+    python benchmarks/backends.py [--robots NAME ...] [--backends NAME ...] [--samples N] [--rounds N]
 
 Robots are found by FIGAROH_JAX_DATA. MuJoCo C uses all cores, the others what JAX is allowed to. A round asks every
 backend in turn; the median over the rounds is told, with the ratio to Pinocchio's loop within the rounds. The first
-call, with its compilation, is told apart.
+call, with its compilation, is told apart. MJX takes minutes to compile for a CPU: leave it out with `--backends`.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ FUNCTIONS = ("inverse_dynamics", "joint_torque_regressor")
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS))
+    parser.add_argument("--backends", nargs="+", default=list(registry.names()), metavar="NAME")
     parser.add_argument("--samples", type=int, default=2000)
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
@@ -37,12 +38,13 @@ def main() -> None:
     print(f"{'robot':7}{'function':24}{'backend':11}{'first call s':>13}{'samples/s':>12}{'times Pinocchio':>17}")
     for robot in options.robots:
         for function in FUNCTIONS:
-            _table(robot, function, options.samples, options.rounds)
+            _table(robot, function, options)
 
 
-def _table(robot: str, function: str, samples: int, rounds: int) -> None:
+def _table(robot: str, function: str, options: argparse.Namespace) -> None:
+    samples, rounds = options.samples, options.rounds
     model = fj.load_urdf(DATA / ROBOTS[robot])
-    backends = {name: registry.backend(name, model) for name in registry.names()}
+    backends = {name: registry.backend(name, model) for name in options.backends}
     state = [np.random.default_rng(k).uniform(-1.5, 1.5, (samples, model.nv)) for k in range(3)]
     first = {name: _seconds(backend, function, state) for name, backend in backends.items()}
     times = [{name: _seconds(backend, function, state) for name, backend in backends.items()} for _ in range(rounds)]
