@@ -114,7 +114,7 @@ class Peer:
     """The same problem for SciPy: a Pinocchio loop and finite differences."""
 
     def __init__(self, path: Path, frame: str, joint: np.ndarray, twists: np.ndarray) -> None:
-        import pinocchio
+        import pinocchio  # pyright: ignore[reportMissingImports]
 
         pin: Any = pinocchio
         self.pin, self.robot, self.joint, self.twists = pin, pin.buildModelFromUrdf(str(path)), joint, twists

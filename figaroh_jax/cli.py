@@ -105,9 +105,9 @@ def _version() -> str:
 def _choose_backend(name: str) -> None:
     if name == "native":
         return
-    from .registry import backend
+    from .registry import backend_class
 
-    backend(name)  # an unknown one is refused there, with the list of those installed
+    backend_class(name)  # an unknown one is refused there, with the list of those installed
     raise InputError(f"--backend {name}: this job needs gradients, which only the backend 'native' gives")
 
 
