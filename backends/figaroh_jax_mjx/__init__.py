@@ -21,6 +21,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -162,14 +163,22 @@ class MjxBackend(Backend):
         """`one(backend, q, ...)` of every sample."""
         check_samples(self, **arrays)
         with jax.enable_x64(True):
-            return _mapped(one, self, *(jnp.asarray(array, jnp.float64) for array in arrays.values()))
+            states = [jnp.asarray(array, jnp.float64) for array in arrays.values()]
+            traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((self, states)))
+            return (_within if traced else _alone)(one, self, *states)
 
 
-@partial(jax.jit, static_argnums=0)
 def _mapped(one: Callable[..., Any], backend: MjxBackend, *states: Array) -> Any:
     for _ in range(states[0].ndim - 1):
         one = jax.vmap(one, in_axes=(None, *[0] * len(states)))
     return one(backend, *states)
+
+
+# XLA's fusion emitters for CPUs compute a chain of small products again for each of its uses: MJX's unrolled tree then
+# runs hundreds of times slower and compiles twenty times longer. Within a caller's program options cannot be set; there
+# XLA_FLAGS=--xla_cpu_use_fusion_emitters=false helps.
+_alone = jax.jit(_mapped, static_argnums=0, compiler_options={"xla_cpu_use_fusion_emitters": False})
+_within = jax.jit(_mapped, static_argnums=0)
 
 
 def _put(made: Compiled) -> tuple[Any, _Structure]:
