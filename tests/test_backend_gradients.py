@@ -51,7 +51,7 @@ def power(backend: Backend, state: tuple[Any, ...], weight: Any) -> Any:
 
 @eqx.filter_jit
 def slopes(backend: Backend, state: tuple[Any, ...], weight: Any) -> Any:
-    return eqx.filter_grad(lambda both: power(*both, weight))((backend, state))
+    return eqx.filter_grad(lambda both: power(both[0], both[1], weight))((backend, state))
 
 
 @pytest.mark.parametrize("at_zero", [False, True])
