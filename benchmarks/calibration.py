@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from figaroh_jax.poserecords import PoseRecording
-from figaroh_jax.urdf import load_urdf
+from figaroh_jax.calibration.poserecords import PoseRecording
+from figaroh_jax.formats.urdf import load_urdf
 
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 BOTH = ("base_frame", "tool_frame")
@@ -93,7 +93,7 @@ def points_of(values: np.ndarray) -> np.ndarray:
 def run_sets() -> None:
     from dataclasses import replace
 
-    from figaroh_jax.calibration import calibrate
+    from figaroh_jax.calibration.calibration import calibrate
 
     for name, load in SETS.items():
         model, recordings = load()
@@ -149,8 +149,8 @@ class Peer:
 
 
 def run_speed() -> None:
-    from figaroh_jax.candidates import geometry_columns
-    from figaroh_jax.posegroups import postures_of
+    from figaroh_jax.calibration.candidates import geometry_columns
+    from figaroh_jax.calibration.posegroups import postures_of
 
     path = next((DATA / "ur10e_innopolis").glob("*.urdf"))
     model = load_urdf(path)
@@ -167,9 +167,9 @@ def run_speed() -> None:
 def _compare(N: int, model, frames: tuple[str, str], columns, peer: Peer) -> None:
     import jax.numpy as jnp
 
-    from figaroh_jax import posefit
-    from figaroh_jax.gauge import find_gauge
-    from figaroh_jax.posegroups import assemble, postures_of
+    from figaroh_jax.calibration import posefit
+    from figaroh_jax.calibration.gauge import find_gauge
+    from figaroh_jax.calibration.posegroups import assemble, postures_of
 
     rng, exp = np.random.default_rng(N), peer.pin.exp6
     q, x = rng.uniform(-2.5, 2.5, (N, 6)), 1e-3 * rng.normal(size=len(columns))

@@ -120,8 +120,8 @@ def _twins(effect: str) -> tuple[str, ...]:
 
 
 def _diagnose(case: Case, forbid: tuple[str, ...]) -> Any:
-    from figaroh_jax import config
-    from figaroh_jax.diagnosis import diagnose_task
+    from figaroh_jax.diagnosis.diagnosis import diagnose_task
+    from figaroh_jax.formats import config
 
     with tempfile.TemporaryDirectory() as folder:
         return diagnose_task(config.load_task(case.write(Path(folder), forbid)))

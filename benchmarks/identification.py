@@ -27,7 +27,7 @@ PIECE = 20_000  # samples that are made, or read from disk, at once
 
 def joints_of(robot: str) -> list[str]:
     """Moving joints in the model's order."""
-    from figaroh_jax.urdf import load_urdf
+    from figaroh_jax.formats.urdf import load_urdf
 
     return list(load_urdf(DATA / ROBOTS[robot]).joint_names)
 
@@ -36,13 +36,13 @@ def ours(request: dict[str, Any]) -> dict[str, Any]:
     """Fit all samples; the first fit, of one chunk, compiles."""
     import numpy as np
 
-    from figaroh_jax.base_parameters import base_parameters
-    from figaroh_jax.config import Baseline
     from figaroh_jax.dynamics import inverse_dynamics
-    from figaroh_jax.least_squares import solve
-    from figaroh_jax.regression import condense, friction_terms
-    from figaroh_jax.states import States
-    from figaroh_jax.urdf import load_urdf
+    from figaroh_jax.formats.config import Baseline
+    from figaroh_jax.formats.urdf import load_urdf
+    from figaroh_jax.identification.base_parameters import base_parameters
+    from figaroh_jax.identification.least_squares import solve
+    from figaroh_jax.identification.regression import condense, friction_terms
+    from figaroh_jax.identification.states import States
 
     model = load_urdf(request["path"], joints=request["joints"])
     terms = friction_terms(model, Baseline(viscous=True, coulomb=True, rotor=True, offset=True))
@@ -92,7 +92,7 @@ def write_states(folder: str, request: dict[str, Any], samples: int) -> str:
     import numpy as np
 
     from figaroh_jax.dynamics import inverse_dynamics
-    from figaroh_jax.urdf import load_urdf
+    from figaroh_jax.formats.urdf import load_urdf
 
     model, path = load_urdf(request["path"], joints=request["joints"]), str(Path(folder) / "states.npy")
     out = np.lib.format.open_memmap(path, mode="w+", dtype=float, shape=(4, samples, model.nv))

@@ -46,9 +46,9 @@ def work() -> None:
     import jax
     import numpy as np
 
+    from figaroh_jax.formats.urdf import load_urdf
     from figaroh_jax.regressor import joint_torque_regressor, packed_regressor
     from figaroh_jax.streaming import normal_matrix
-    from figaroh_jax.urdf import load_urdf
 
     methods: dict[str, Any] = {
         "dense": joint_torque_regressor,
@@ -217,8 +217,8 @@ def main() -> None:
         return work()
     if not DATA.is_dir():
         raise SystemExit(f"no robots in {DATA} (FIGAROH_JAX_DATA names the folder)")
+    from figaroh_jax.formats.urdf import load_urdf
     from figaroh_jax.regressor import pairs
-    from figaroh_jax.urdf import load_urdf
 
     rounds = options.rounds or (3 if options.quick else 9)
     bench = Bench(options.figaroh or environment(), options.core)

@@ -11,10 +11,8 @@ import importlib.util
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .calibration import calibrate as calibrate, calibrate_task as calibrate_task
-    from .config import Baseline as Baseline, Preprocess as Preprocess, load_robot as load_robot, load_task as load_task
-    from .dataset import Recording as Recording, read_recordings as read_recordings
-    from .diagnosis import diagnose as diagnose, diagnose_task as diagnose_task
+    from .calibration.calibration import calibrate as calibrate, calibrate_task as calibrate_task
+    from .diagnosis.diagnosis import diagnose as diagnose, diagnose_task as diagnose_task
     from .dynamics import (
         forward_dynamics as forward_dynamics,
         inverse_dynamics as inverse_dynamics,
@@ -23,50 +21,57 @@ if TYPE_CHECKING:
     from .effect import Effect as Effect, Motion as Motion, amplitude as amplitude, place as place, shape as shape
     from .effects import CATALOGUE as CATALOGUE, register as register
     from .errors import InputError as InputError
-    from .export import load_model as load_model, write_model as write_model
     from .extended import ExtendedModel as ExtendedModel, extend as extend
-    from .identification import identify as identify, identify_task as identify_task
+    from .formats.config import (
+        Baseline as Baseline,
+        Preprocess as Preprocess,
+        load_robot as load_robot,
+        load_task as load_task,
+    )
+    from .formats.export import load_model as load_model, write_model as write_model
+    from .formats.mjcf import load_mjcf as load_mjcf
+    from .formats.robotfile import load_extended as load_extended
+    from .formats.urdf import load_urdf as load_urdf
+    from .identification.identification import identify as identify, identify_task as identify_task
     from .kinematics import (
         forward_kinematics as forward_kinematics,
         frame_jacobian as frame_jacobian,
         frame_placement as frame_placement,
     )
-    from .mjcf import load_mjcf as load_mjcf
     from .model import Frame as Frame, Joint as Joint, RobotModel as RobotModel
+    from .recordings.dataset import Recording as Recording, read_recordings as read_recordings
     from .registry import backend as backend
     from .regressor import joint_torque_regressor as joint_torque_regressor, packed_regressor as packed_regressor
-    from .report import write_report as write_report
+    from .reporting.report import write_report as write_report
     from .results import Cause as Cause, Diagnosis as Diagnosis
-    from .robotfile import load_extended as load_extended
     from .simulation import simulate as simulate
     from .streaming import normal_matrix as normal_matrix, triangular_factor as triangular_factor
-    from .urdf import load_urdf as load_urdf
 
 __version__ = "0.1.0"
 
 _MODULES = {
-    "calibration": ("calibrate", "calibrate_task"),
-    "config": ("Baseline", "Preprocess", "load_robot", "load_task"),
-    "dataset": ("Recording", "read_recordings"),
-    "diagnosis": ("diagnose", "diagnose_task"),
+    "calibration.calibration": ("calibrate", "calibrate_task"),
+    "formats.config": ("Baseline", "Preprocess", "load_robot", "load_task"),
+    "recordings.dataset": ("Recording", "read_recordings"),
+    "diagnosis.diagnosis": ("diagnose", "diagnose_task"),
     "dynamics": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
     "effect": ("Effect", "Motion", "amplitude", "place", "shape"),
     "effects": ("CATALOGUE", "register"),
     "errors": ("InputError",),
-    "export": ("load_model", "write_model"),
+    "formats.export": ("load_model", "write_model"),
     "extended": ("ExtendedModel", "extend"),
-    "identification": ("identify", "identify_task"),
+    "identification.identification": ("identify", "identify_task"),
     "kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
-    "mjcf": ("load_mjcf",),
+    "formats.mjcf": ("load_mjcf",),
     "model": ("Frame", "Joint", "RobotModel"),
     "registry": ("backend",),
     "regressor": ("joint_torque_regressor", "packed_regressor"),
-    "report": ("write_report",),
+    "reporting.report": ("write_report",),
     "results": ("Cause", "Diagnosis"),
-    "robotfile": ("load_extended",),
+    "formats.robotfile": ("load_extended",),
     "simulation": ("simulate",),
     "streaming": ("normal_matrix", "triangular_factor"),
-    "urdf": ("load_urdf",),
+    "formats.urdf": ("load_urdf",),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]

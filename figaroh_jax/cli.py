@@ -51,7 +51,7 @@ def _run(args: argparse.Namespace) -> int:
         os.environ.setdefault(name, value)
     _choose_backend(args.backend)
     _set_up_jax(cache=not args.no_cache)
-    from . import terminal
+    from .reporting import terminal
     from .runs import JOBS, REPORT
 
     job = JOBS["diagnose" if args.command == "demo" else args.command]

@@ -13,9 +13,9 @@ from typing import Literal
 
 from .contract import Backend
 from .errors import InputError
+from .formats.robotfile import read_robot
+from .formats.xmlfile import find_in_packages
 from .model import RobotModel
-from .robotfile import read_robot
-from .xmlfile import find_in_packages
 
 __all__ = ["GROUP", "backend", "backend_class", "having", "names"]
 

@@ -14,10 +14,10 @@ import numpy as np
 from .errors import InputError
 
 if TYPE_CHECKING:
-    from .calibrated import Calibration
-    from .config import Task
-    from .kinematic_diagnosis import PoseDiagnosis
-    from .result import Identification
+    from .calibration.calibrated import Calibration
+    from .calibration.kinematic_diagnosis import PoseDiagnosis
+    from .formats.config import Task
+    from .identification.result import Identification
     from .results import Diagnosis
 
 __all__ = [
@@ -55,13 +55,13 @@ def diagnose_file(
     An earlier run in `out` is replaced; a directory that holds anything else is refused before any work. Wrong input
     raises `InputError`, and nothing is written.
     """
-    from .config import load_task
+    from .formats.config import load_task
 
     check_directory(out)
     task = load_task(task_file)
     if any(entry.measurement is not None for entry in task.data):
         return _diagnose_poses(task, out, progress)
-    from .diagnosis import diagnose_task
+    from .diagnosis.diagnosis import diagnose_task
 
     diagnosis = diagnose_task(task, progress=progress)
     progress("writing the report", 1.0)
@@ -73,14 +73,14 @@ def identify_file(
     task_file: Path, out: Path, progress: Callable[[str, float], None] = lambda phase, fraction: None
 ) -> Identification:
     """Read a task, identify its robot and write the run directory `out`, as `diagnose_file` does."""
-    from .config import load_task
+    from .formats.config import load_task
 
     check_directory(out)
     task = load_task(task_file)
-    from .export import write_model
-    from .identification import identify_task
-    from .identification_report import write_identification
-    from .parameter_files import write_parameters
+    from .formats.export import write_model
+    from .identification.identification import identify_task
+    from .identification.parameter_files import write_parameters
+    from .reporting.identification_report import write_identification
 
     found = identify_task(task, progress=progress)
     progress("writing the report", 1.0)
@@ -93,8 +93,8 @@ def identify_file(
 
 
 def _diagnose_poses(task: Task, out: Path, progress: Callable[[str, float], None]) -> PoseDiagnosis:
-    from .calibration_files import pose_answer_json, write_calibration
-    from .kinematic_diagnosis import diagnose_pose_task
+    from .calibration.kinematic_diagnosis import diagnose_pose_task
+    from .reporting.calibration_files import pose_answer_json, write_calibration
 
     found = diagnose_pose_task(task, progress)
     progress("writing the report", 1.0)
@@ -108,12 +108,12 @@ def calibrate_file(
     task_file: Path, out: Path, progress: Callable[[str, float], None] = lambda phase, fraction: None
 ) -> Calibration:
     """Read a task, calibrate its robot and write the run directory `out`, as `diagnose_file` does."""
-    from .config import load_task
+    from .formats.config import load_task
 
     check_directory(out)
     task = load_task(task_file)
-    from .calibration import calibrate_task
-    from .calibration_files import write_calibration
+    from .calibration.calibration import calibrate_task
+    from .reporting.calibration_files import write_calibration
 
     calibration = calibrate_task(task, progress=progress)
     progress("writing the report", 1.0)
@@ -124,9 +124,9 @@ def calibrate_file(
 
 def write_run(task: Task, diagnosis: Diagnosis, out: Path) -> None:
     """Write everything that the contract asks of a diagnosis into the directory `out`."""
-    from .answer import to_json, write_predictions
-    from .export import write_model
-    from .report import write_report
+    from .formats.export import write_model
+    from .reporting.answer import to_json, write_predictions
+    from .reporting.report import write_report
 
     with whole_directory(out) as folder:
         (folder / ANSWER).write_text(to_json(diagnosis), encoding="utf-8")
@@ -140,9 +140,9 @@ def predictions(task: Task, diagnosis: Diagnosis) -> dict[str, tuple[np.ndarray,
 
     The recording's motion is prepared as for the fit, but over its whole length, whatever window the fit kept.
     """
-    from .dataset import read_recordings
     from .extended import predict
-    from .signals import choose_rates, prepare, to_recording_times
+    from .recordings.dataset import read_recordings
+    from .recordings.signals import choose_rates, prepare, to_recording_times
 
     if all(entry.role == "fit" for entry in task.data):
         return {}
@@ -203,17 +203,17 @@ def _diagnosis_json(diagnosis: Diagnosis | PoseDiagnosis) -> str:
     from .results import Diagnosis
 
     if isinstance(diagnosis, Diagnosis):
-        from .answer import to_json
+        from .reporting.answer import to_json
 
         return to_json(diagnosis)
-    from .calibration_files import pose_answer_json
+    from .reporting.calibration_files import pose_answer_json
 
     return pose_answer_json(diagnosis)
 
 
 def _show_diagnosis(diagnosis: Diagnosis | PoseDiagnosis) -> None:
+    from .reporting.terminal import show, show_calibration
     from .results import Diagnosis
-    from .terminal import show, show_calibration
 
     if isinstance(diagnosis, Diagnosis):
         show(diagnosis, diagnosis.model.robot.name)
@@ -222,25 +222,25 @@ def _show_diagnosis(diagnosis: Diagnosis | PoseDiagnosis) -> None:
 
 
 def _identification_json(found: Identification) -> str:
-    from .result import to_json
+    from .identification.result import to_json
 
     return to_json(found)
 
 
 def _show_identification(found: Identification) -> None:
-    from .terminal import show_identification
+    from .reporting.terminal import show_identification
 
     show_identification(found, found.model.robot.name)
 
 
 def _calibration_json(calibration: Calibration) -> str:
-    from .calibration_files import to_json
+    from .reporting.calibration_files import to_json
 
     return to_json(calibration)
 
 
 def _show_calibration(calibration: Calibration) -> None:
-    from .terminal import show_calibration
+    from .reporting.terminal import show_calibration
 
     show_calibration(calibration)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.model import RobotModel
-from figaroh_jax.urdf import load_urdf
 
 REAL = {  # robots of the recordings, under the data folder
     "tx40": "staubli_tx40/tx40.urdf",

@@ -12,7 +12,7 @@ import tasks
 from scipy import signal
 
 import figaroh_jax as fj
-from figaroh_jax.dataset import Recording
+from figaroh_jax.recordings.dataset import Recording
 
 RATE = 200.0  # Hz
 VISCOUS, COULOMB = np.array([1.5, 0.8, 20.0]), np.array([2.0, 1.0, 5.0])

@@ -8,9 +8,9 @@ from typing import Literal
 import equinox as eqx
 import numpy as np
 
-from figaroh_jax.evidence import Rows
-from figaroh_jax.rowfilter import row_filter
-from figaroh_jax.signals import Signals
+from figaroh_jax.diagnosis.evidence import Rows
+from figaroh_jax.recordings.rowfilter import row_filter
+from figaroh_jax.recordings.signals import Signals
 
 DT, STEP, CUTOFF = 1 / 264, 4, 20.0  # the rates of a recording with the default cutoff
 

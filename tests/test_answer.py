@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from figaroh_jax import answer, terminal
+from figaroh_jax.reporting import answer, terminal
 from figaroh_jax.results import Estimate, Gain
 
 
@@ -84,7 +84,7 @@ def test_summary_is_short_and_says_the_verdict_first(variant: str):
 
 def test_progress_goes_to_standard_error_and_is_silent_when_asked():
     program = (
-        "from figaroh_jax.terminal import Progress\n"
+        "from figaroh_jax.reporting.terminal import Progress\n"
         "for quiet in (False, True):\n"
         "    with Progress(quiet=quiet) as progress:\n"
         "        for share in (0.0, 0.1, 0.5): progress('reading [red]' if share < 0.5 else 'fitting', share)\n"

@@ -14,8 +14,8 @@ import pytest
 import robots
 
 from figaroh_jax.contract import Backend
+from figaroh_jax.formats.robotfile import read_robot
 from figaroh_jax.native_backend import NativeBackend
-from figaroh_jax.robotfile import read_robot
 
 CASES = [
     pytest.param("native", "arm"),

@@ -7,8 +7,8 @@ import secrets
 import numpy as np
 import pytest
 
-from figaroh_jax.bandwidth import motion_band, smoothed
-from figaroh_jax.resampling import differentiate
+from figaroh_jax.recordings.bandwidth import motion_band, smoothed
+from figaroh_jax.recordings.resampling import differentiate
 
 DT, CUTOFF, SECONDS = 1 / 200, 15.0, 10.0
 TIME = np.arange(0, SECONDS, DT)

@@ -9,10 +9,10 @@ import pytest
 from robots import REAL, TREE, load
 
 import figaroh_jax as fj
-from figaroh_jax.base_parameters import BaseParameters, base_parameters
-from figaroh_jax.config import Baseline, BaselineEffect
 from figaroh_jax.errors import InputError
-from figaroh_jax.regression import column_names, friction_terms, structural_columns
+from figaroh_jax.formats.config import Baseline, BaselineEffect
+from figaroh_jax.identification.base_parameters import BaseParameters, base_parameters
+from figaroh_jax.identification.regression import column_names, friction_terms, structural_columns
 
 DRIVES = Baseline(viscous=True, coulomb=True, rotor=True, offset=True)
 

@@ -13,9 +13,9 @@ import pytest
 import yaml
 
 from figaroh_jax import cli
-from figaroh_jax.calibrated import Calibration
-from figaroh_jax.calibration import calibrate_task
-from figaroh_jax.config import load_task
+from figaroh_jax.calibration.calibrated import Calibration
+from figaroh_jax.calibration.calibration import calibrate_task
+from figaroh_jax.formats.config import load_task
 
 OFFSET = np.array([0.01, -0.03, 0.05, 0.04, -0.06, 0.02])
 BAD_ROW = 17
@@ -86,7 +86,7 @@ def test_the_badly_measured_posture_is_named_and_left_out(calibrated: Calibratio
 
 
 def test_calibrated_robot_predicts_postures_it_has_not_seen(calibrated: Calibration, wrong: tuple[Path, poses.Truth]):
-    from figaroh_jax.gravity import gravity_moments
+    from figaroh_jax.calibration.gravity import gravity_moments
     from figaroh_jax.kinematics import frame_placement
 
     task, real = wrong

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from figaroh_jax.calibrated import Calibration
-from figaroh_jax.calibration import calibrate
+from figaroh_jax.calibration.calibrated import Calibration
+from figaroh_jax.calibration.calibration import calibrate
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -12,9 +12,9 @@ import pytest
 import reference
 import robots
 
-from figaroh_jax.chain import chain_between, chain_pose, column_motion
+from figaroh_jax.calibration.chain import chain_between, chain_pose, column_motion
+from figaroh_jax.calibration.gravity import gravity_moments, without_far_masses
 from figaroh_jax.errors import InputError
-from figaroh_jax.gravity import gravity_moments, without_far_masses
 from figaroh_jax.lie import log_so3
 
 pose_of = jax.jit(chain_pose)

@@ -17,12 +17,14 @@ import jax
 import numpy as np
 import pytest
 
-from figaroh_jax import cli, diagnosis, export
+from figaroh_jax import cli
+from figaroh_jax.diagnosis import diagnosis
 from figaroh_jax.errors import InputError
 from figaroh_jax.extended import extend
+from figaroh_jax.formats import export
+from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.results import Diagnosis
 from figaroh_jax.runs import whole_directory
-from figaroh_jax.urdf import load_urdf
 
 DEMO = Path(str(resources.files("figaroh_jax") / "demo"))
 FILES = {"answer.json", "predictions.npz", "report.html", "model"}

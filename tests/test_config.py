@@ -8,9 +8,9 @@ import pytest
 import yaml
 from tasks import task, write
 
-from figaroh_jax.config import Preprocess, Task, load_robot, load_task
-from figaroh_jax.dataset import read_recordings
 from figaroh_jax.errors import InputError
+from figaroh_jax.formats.config import Preprocess, Task, load_robot, load_task
+from figaroh_jax.recordings.dataset import read_recordings
 
 CONTRACT = """
 robot:

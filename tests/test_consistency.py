@@ -9,11 +9,18 @@ import pytest
 from robots import REAL, TREE, load
 
 import figaroh_jax as fj
-from figaroh_jax.conic import Body
-from figaroh_jax.consistency import bodies, full_parameters, inconsistencies, log_cholesky_fit, physical_fit, project
+from figaroh_jax.diagnosis.problem import rigid_prior
 from figaroh_jax.errors import InputError
+from figaroh_jax.identification.conic import Body
+from figaroh_jax.identification.consistency import (
+    bodies,
+    full_parameters,
+    inconsistencies,
+    log_cholesky_fit,
+    physical_fit,
+    project,
+)
 from figaroh_jax.inertia import from_com, pseudo_inertia
-from figaroh_jax.problem import rigid_prior
 
 
 @pytest.fixture(scope="module")

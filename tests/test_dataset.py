@@ -10,9 +10,9 @@ import pytest
 from pyarrow import csv, parquet
 from tasks import JOINTS, arrays, task, write
 
-from figaroh_jax.config import Preprocess, Task, load_robot, load_task
-from figaroh_jax.dataset import Recording, read_recordings
-from figaroh_jax.signals import prepare
+from figaroh_jax.formats.config import Preprocess, Task, load_robot, load_task
+from figaroh_jax.recordings.dataset import Recording, read_recordings
+from figaroh_jax.recordings.signals import prepare
 
 
 def recordings(folder: Path, *entries: dict, **keys) -> tuple[Recording, ...]:

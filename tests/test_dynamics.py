@@ -13,8 +13,8 @@ import robots
 
 from figaroh_jax import dynamics, kinematics, regressor
 from figaroh_jax.errors import InputError
+from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.model import RobotModel
-from figaroh_jax.urdf import load_urdf
 
 
 class Independent:

@@ -16,8 +16,8 @@ import robots
 from figaroh_jax.effect import Effect, Motion, amplitude, columns, joint_unit, place, shape, smooth_sign
 from figaroh_jax.effects import CATALOGUE, find, register
 from figaroh_jax.errors import InputError
+from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.model import RobotModel
-from figaroh_jax.urdf import load_urdf
 
 # three joints, the last one prismatic
 CHAIN = robots.robot(

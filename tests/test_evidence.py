@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import chi2, kstest, norm
 from synthetic import made_rows
 
-from figaroh_jax import evidence
-from figaroh_jax.evidence import Columns, Linear, Prior, Rows
+from figaroh_jax.diagnosis import evidence
+from figaroh_jax.diagnosis.evidence import Columns, Linear, Prior, Rows
 
 NV, COUNT, WIDTH = 2, 90, 4
 PRIOR = Prior(np.array([0.5, -1.0, 0.0, 2.0]), np.array([3.0, 0.5, 40.0, 1e-3]))

@@ -16,15 +16,15 @@ import yaml
 from figaroh_jax.effect import Effect, Motion, amplitude, place
 from figaroh_jax.effects import CATALOGUE, find, register
 from figaroh_jax.errors import InputError
-from figaroh_jax.export import load_model, model_files, write_model
 from figaroh_jax.extended import ExtendedModel, extend, predict
+from figaroh_jax.formats.export import load_model, model_files, write_model
+from figaroh_jax.formats.mjcf import load_mjcf
+from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.inertia import is_physical
 from figaroh_jax.kinematics import frame_placement
-from figaroh_jax.mjcf import load_mjcf
 from figaroh_jax.model import RobotModel
 from figaroh_jax.results import Cause, Estimate, Gain, Name
 from figaroh_jax.simulation import simulate
-from figaroh_jax.urdf import load_urdf
 
 LIMIT = '<limit lower="-1.5" upper="2.5" velocity="3" effort="40"/>'
 # two branches, a prismatic joint, frames on the base and on moving links; `quarter` stands at the pole of rpy

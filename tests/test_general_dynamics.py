@@ -16,10 +16,10 @@ import robots
 
 from figaroh_jax import dynamics, kinematics
 from figaroh_jax.errors import InputError
+from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.model import Frame, Joint, RobotModel
 from figaroh_jax.regressor import joint_torque_regressor, packed_regressor, pairs
 from figaroh_jax.streaming import normal_matrix, triangular_factor
-from figaroh_jax.urdf import load_urdf
 
 REFERENCES = {"local": pin.LOCAL, "world": pin.WORLD, "local_world_aligned": pin.LOCAL_WORLD_ALIGNED}
 KINDS: dict[str, Callable[[np.ndarray], Any]] = {

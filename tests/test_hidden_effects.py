@@ -14,7 +14,7 @@ import yaml
 from generators import Case, available, make_case, make_closed_loop_case
 from generators.scoring import Score, judge, named, table
 
-from figaroh_jax import config
+from figaroh_jax.formats import config
 from figaroh_jax.results import Diagnosis
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -59,7 +59,7 @@ NOISES: tuple[dict[str, Any], ...] = (
 
 def diagnosis_of(case: Case, forbid: tuple[str, ...] = ()) -> Diagnosis:
     """The library's answer to the case as a user would ask it: files and a task."""
-    from figaroh_jax.diagnosis import diagnose_task
+    from figaroh_jax.diagnosis.diagnosis import diagnose_task
 
     with tempfile.TemporaryDirectory() as folder:
         return diagnose_task(config.load_task(case.write(Path(folder), forbid)))
@@ -152,7 +152,7 @@ def test_a_case_drawn_at_run_time_gets_no_wrong_name(draw: int):
 
 
 def test_demo_finds_both_causes_at_their_size():
-    from figaroh_jax.diagnosis import diagnose_task
+    from figaroh_jax.diagnosis.diagnosis import diagnose_task
 
     folder = ROOT / "figaroh_jax" / "demo"
     truth = yaml.safe_load((folder / "truth.yaml").read_text())["causes"]

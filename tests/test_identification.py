@@ -14,14 +14,15 @@ import tasks
 from simulated_arm import Truth, recording
 
 import figaroh_jax as fj
-from figaroh_jax import cli, regression as regression_module
-from figaroh_jax.base_parameters import base_parameters
-from figaroh_jax.config import Baseline, Load, Preprocess
+from figaroh_jax import cli
 from figaroh_jax.errors import InputError
-from figaroh_jax.identification import identify
-from figaroh_jax.regression import Regression, condense, friction_terms
-from figaroh_jax.result import Identification, to_json
-from figaroh_jax.signals import prepare_all
+from figaroh_jax.formats.config import Baseline, Load, Preprocess
+from figaroh_jax.identification import regression as regression_module
+from figaroh_jax.identification.base_parameters import base_parameters
+from figaroh_jax.identification.identification import identify
+from figaroh_jax.identification.regression import Regression, condense, friction_terms
+from figaroh_jax.identification.result import Identification, to_json
+from figaroh_jax.recordings.signals import prepare_all
 
 SETTINGS = Preprocess(cutoff=10)
 

@@ -10,12 +10,12 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from robots import joint, link, robot
 
 import figaroh_jax as fj
-from figaroh_jax.config import Baseline, Preprocess
-from figaroh_jax.dataset import Recording
 from figaroh_jax.errors import InputError
-from figaroh_jax.identification import identify
-from figaroh_jax.result import to_json
-from figaroh_jax.urdf import load_urdf
+from figaroh_jax.formats.config import Baseline, Preprocess
+from figaroh_jax.formats.urdf import load_urdf
+from figaroh_jax.identification.identification import identify
+from figaroh_jax.identification.result import to_json
+from figaroh_jax.recordings.dataset import Recording
 
 SAMPLES = 900  # one length: one program for all draws of a kind
 AXES = ("1 0 0", "0 1 0", "0 0 1")

@@ -9,8 +9,8 @@ import pytest
 import real_tasks
 
 import figaroh_jax as fj
-from figaroh_jax.identification import identify_task
-from figaroh_jax.result import Identification, Quality
+from figaroh_jax.identification.identification import identify_task
+from figaroh_jax.identification.result import Identification, Quality
 
 
 def pooled(quality: Quality) -> float:

@@ -13,9 +13,9 @@ import pytest
 import test_calibration as tasks
 
 from figaroh_jax import cli
-from figaroh_jax.kinematic_diagnosis import PoseDiagnosis, diagnose_poses
-from figaroh_jax.poserecords import PoseRecording
-from figaroh_jax.urdf import load_urdf
+from figaroh_jax.calibration.kinematic_diagnosis import PoseDiagnosis, diagnose_poses
+from figaroh_jax.calibration.poserecords import PoseRecording
+from figaroh_jax.formats.urdf import load_urdf
 
 EFFECTS = (
     "encoder_scale",

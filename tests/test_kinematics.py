@@ -13,7 +13,7 @@ import robots
 
 from figaroh_jax import kinematics
 from figaroh_jax.errors import InputError
-from figaroh_jax.urdf import load_urdf
+from figaroh_jax.formats.urdf import load_urdf
 
 
 @pytest.mark.parametrize("name", robots.REAL)

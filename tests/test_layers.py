@@ -10,29 +10,29 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "figaroh_jax"
-MODULES = {path.stem: path for path in sorted(PACKAGE.glob("*.py"))}
+MODULES = {".".join(path.relative_to(PACKAGE).with_suffix("").parts): path for path in sorted(PACKAGE.rglob("*.py"))}
 # Only these may touch a file format, a simulator, the terminal or the page.
 OUTSIDE = {
-    "yaml": {"taskfile", "export"},
-    "yourdfpy": {"urdf"},
-    "mujoco": {"mjcf"},
+    "yaml": {"formats.taskfile", "formats.export"},
+    "yourdfpy": {"formats.urdf"},
+    "mujoco": {"formats.mjcf"},
     "pinocchio": set(),
-    "pyarrow": {"tables"},
-    "pydantic": {"config"},
-    "rich": {"terminal"},
-    "jinja2": {"report"},
-    "plotly": {"report"},
-    "jaxopt": {"refit"},
-    "clarabel": {"conic"},
-    "sklearn": {"least_squares"},
+    "pyarrow": {"recordings.tables"},
+    "pydantic": {"formats.config"},
+    "rich": {"reporting.terminal"},
+    "jinja2": {"reporting.report"},
+    "plotly": {"reporting.report"},
+    "jaxopt": {"diagnosis.refit"},
+    "clarabel": {"identification.conic"},
+    "sklearn": {"identification.least_squares"},
 }
 
 
 class _Used(ast.NodeVisitor):
-    """Modules that a file imports when it runs (`.name`: a sibling); `lazy`: those inside functions too."""
+    """What a file imports when it runs (the library's modules as `.folder.name`); `lazy`: inside functions too."""
 
-    def __init__(self, lazy: bool) -> None:
-        self.lazy, self.found = lazy, set[str]()
+    def __init__(self, path: Path, lazy: bool) -> None:
+        self.folder, self.lazy, self.found = path.relative_to(ROOT).parts[1:-1], lazy, set[str]()
 
     def visit_If(self, node: ast.If) -> None:
         if ast.unparse(node.test) != "TYPE_CHECKING":
@@ -47,19 +47,32 @@ class _Used(ast.NodeVisitor):
 
     def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
         if node.level:
-            self.found |= {f".{node.module}"} if node.module else {f".{alias.name}" for alias in node.names}
+            above = self.folder[: len(self.folder) + 1 - node.level]
+            inside = [*above, *(node.module or "").split(".")] if node.module else list(above)
+            named = {".".join([*inside, alias.name]) for alias in node.names} & MODULES.keys()
+            self.found |= {f".{name}" for name in named or {".".join(inside)}}
         elif node.module:
             self.found.add(node.module.split(".")[0])
 
 
 def _imports(path: Path, *, lazy: bool) -> set[str]:
-    used = _Used(lazy)
+    used = _Used(path, lazy)
     used.visit(ast.parse(path.read_text(encoding="utf-8")))
     return used.found
 
 
 def test_modules_import_each_other_without_cycles():
     graph = {name: {m[1:] for m in _imports(path, lazy=False) if m[:1] == "."} for name, path in MODULES.items()}
+    tuple(TopologicalSorter(graph).static_order())  # raises CycleError with the cycle
+
+
+def test_folders_import_each_other_without_cycles():
+    """Modules beside the folders are below them, but for the entry points."""
+    graph: dict[str, set[str]] = {}
+    for name, path in MODULES.items():
+        if "." in name:
+            used = {m[1:].split(".")[0] for m in _imports(path, lazy=True) if m[1:] in MODULES and "." in m[1:]}
+            graph.setdefault(name.split(".")[0], set()).update(used - {name.split(".")[0]})
     tuple(TopologicalSorter(graph).static_order())  # raises CycleError with the cycle
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from synthetic import DT, STEP, made_signals, swing
 
-from figaroh_jax.layout import describe_folds, excitations, held_rows, layout
-from figaroh_jax.records import stack
-from figaroh_jax.signals import Signals
+from figaroh_jax.diagnosis.layout import describe_folds, excitations, held_rows, layout
+from figaroh_jax.diagnosis.records import stack
+from figaroh_jax.recordings.signals import Signals
 
 ROW = STEP * DT
 

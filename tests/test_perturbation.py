@@ -11,10 +11,10 @@ import numpy as np
 import reference
 import robots
 
-from figaroh_jax.chain import chain_between, chain_pose
-from figaroh_jax.kinematic_effects import CATALOGUE, Postures, columns_of
+from figaroh_jax.calibration.chain import chain_between, chain_pose
+from figaroh_jax.calibration.kinematic_effects import CATALOGUE, Postures, columns_of
+from figaroh_jax.calibration.perturbation import Perturbation, apply
 from figaroh_jax.kinematics import forward_kinematics
-from figaroh_jax.perturbation import Perturbation, apply
 
 rng = np.random.default_rng(0)
 

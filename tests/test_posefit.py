@@ -10,11 +10,11 @@ import pinocchio as pin
 import poses
 import pytest
 
-from figaroh_jax import posefit, starts
-from figaroh_jax.chain import chain_between
-from figaroh_jax.devices import Camera, Device, Distance, Planes, Points, Poses, Sockets
+from figaroh_jax.calibration import posefit, starts
+from figaroh_jax.calibration.chain import chain_between
+from figaroh_jax.calibration.devices import Camera, Device, Distance, Planes, Points, Poses, Sockets
+from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.model import RobotModel
-from figaroh_jax.urdf import load_urdf
 
 N = 4
 BOTH = ("base_frame", "tool_frame")

@@ -12,13 +12,10 @@ import reference
 import robots
 from synthetic import DT, made_signals, swing
 
-from figaroh_jax.effects import find
-from figaroh_jax.evidence import fit
-from figaroh_jax.flexible import WIDTHS, friction_width
-from figaroh_jax.inertia import from_com, pseudo_inertia
-from figaroh_jax.layout import held_rows, layout
-from figaroh_jax.model import RobotModel
-from figaroh_jax.problem import (
+from figaroh_jax.diagnosis.evidence import fit
+from figaroh_jax.diagnosis.flexible import WIDTHS, friction_width
+from figaroh_jax.diagnosis.layout import held_rows, layout
+from figaroh_jax.diagnosis.problem import (
     Problem,
     baseline,
     body_precision,
@@ -29,8 +26,11 @@ from figaroh_jax.problem import (
     solved,
     whitened,
 )
-from figaroh_jax.records import stack
-from figaroh_jax.signals import Signals
+from figaroh_jax.diagnosis.records import stack
+from figaroh_jax.effects import find
+from figaroh_jax.inertia import from_com, pseudo_inertia
+from figaroh_jax.model import RobotModel
+from figaroh_jax.recordings.signals import Signals
 
 TRUST = 0.1
 

@@ -14,7 +14,7 @@ import robots
 from jaxtyping import Array
 from synthetic import made_signals
 
-from figaroh_jax.design import (
+from figaroh_jax.diagnosis.design import (
     Units,
     candidates,
     flattened,
@@ -25,12 +25,12 @@ from figaroh_jax.design import (
     units_and_slopes,
     with_shape,
 )
+from figaroh_jax.diagnosis.records import Records, stack
+from figaroh_jax.diagnosis.refit import Whitened, bounded_minimum, profile, refit, refit_shift, shift_profile
 from figaroh_jax.dynamics import inverse_dynamics
 from figaroh_jax.effect import Effect, Motion
 from figaroh_jax.effects import find
 from figaroh_jax.model import RobotModel
-from figaroh_jax.records import Records, stack
-from figaroh_jax.refit import Whitened, bounded_minimum, profile, refit, refit_shift, shift_profile
 
 SECONDS = 8.0
 

@@ -16,9 +16,9 @@ import robots
 from figaroh_jax.chunks import BLOCK, chunk_size
 from figaroh_jax.dynamics import inverse_dynamics
 from figaroh_jax.errors import InputError
+from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.model import Joint, RobotModel
 from figaroh_jax.regressor import joint_torque_regressor, packed_regressor, pairs
-from figaroh_jax.urdf import load_urdf
 
 CHUNK = chunk_size()
 LEAVES = ("placement", "axis", "ratio", "offset", "gravity")

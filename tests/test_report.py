@@ -14,9 +14,9 @@ import fake_diagnosis
 import numpy as np
 import pytest
 
-from figaroh_jax import report
+from figaroh_jax.reporting import report
+from figaroh_jax.reporting.wording import error, interval, phrase, sentence
 from figaroh_jax.results import Diagnosis, Estimate, Gain, Name
-from figaroh_jax.wording import error, interval, phrase, sentence
 
 LAPTOP, PHONE = (1280, 800), (390, 844)
 VARIANTS = {name: getattr(fake_diagnosis, name)() for name in ("named", "partly", "unknown", "nothing")}

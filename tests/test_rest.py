@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from figaroh_jax.diagnosis.estimates import Fitted, has_size
+from figaroh_jax.diagnosis.rest import Rest, verdict, wrong_law
 from figaroh_jax.effects import find
-from figaroh_jax.estimates import Fitted, has_size
-from figaroh_jax.rest import Rest, verdict, wrong_law
 from figaroh_jax.results import Name
 
 NOISE, REST = Rest(False, 0.0, ""), Rest(True, 0.2, "")

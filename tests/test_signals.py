@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from figaroh_jax import signals
-from figaroh_jax.config import Preprocess
-from figaroh_jax.dataset import Recording
 from figaroh_jax.errors import InputError
-from figaroh_jax.resampling import differentiate, to_recording_times
-from figaroh_jax.rowfilter import filter_rows, frequencies, low_pass, row_filter
+from figaroh_jax.formats.config import Preprocess
+from figaroh_jax.recordings import signals
+from figaroh_jax.recordings.dataset import Recording
+from figaroh_jax.recordings.resampling import differentiate, to_recording_times
+from figaroh_jax.recordings.rowfilter import filter_rows, frequencies, low_pass, row_filter
 
 JOINTS = ("a", "b", "c")
 

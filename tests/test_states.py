@@ -9,13 +9,13 @@ import pytest
 from robots import TREE, load, states
 
 import figaroh_jax as fj
-from figaroh_jax import states as states_module
-from figaroh_jax.base_parameters import base_parameters
-from figaroh_jax.config import Baseline
 from figaroh_jax.errors import InputError
-from figaroh_jax.least_squares import solve
-from figaroh_jax.regression import condense, friction_terms
-from figaroh_jax.states import States
+from figaroh_jax.formats.config import Baseline
+from figaroh_jax.identification import states as states_module
+from figaroh_jax.identification.base_parameters import base_parameters
+from figaroh_jax.identification.least_squares import solve
+from figaroh_jax.identification.regression import condense, friction_terms
+from figaroh_jax.identification.states import States
 
 
 @pytest.fixture(scope="module")

@@ -65,7 +65,7 @@ def test_normal_matrix_and_factor_are_those_of_the_dense_rows(samples: int, tree
 
 @pytest.mark.parametrize("name", ["tx40", "panda", "talos"])
 def test_normal_matrix_and_factor_of_real_robots(name: str, data_dir: Path) -> None:
-    from figaroh_jax.urdf import load_urdf
+    from figaroh_jax.formats.urdf import load_urdf
 
     model = load_urdf(data_dir / robots.REAL[name])
     q, v, a, tau, _ = data(model, 300)
@@ -130,7 +130,7 @@ import sys
 from pathlib import Path
 import numpy as np, jax
 from figaroh_jax.streaming import normal_matrix, triangular_factor
-from figaroh_jax.urdf import load_urdf
+from figaroh_jax.formats.urdf import load_urdf
 model, rng = load_urdf(sys.argv[1]), np.random.default_rng(0)
 piece = rng.standard_normal((4, 20_000, model.nv))
 for count in (5, 50):

@@ -15,8 +15,8 @@ WRIST = ("joint_5", "joint_6")
 
 @cache
 def diagnosis_of(data: Path, folder: Path) -> Diagnosis:
-    from figaroh_jax.config import load_task
-    from figaroh_jax.diagnosis import diagnose_task
+    from figaroh_jax.diagnosis.diagnosis import diagnose_task
+    from figaroh_jax.formats.config import load_task
 
     return diagnose_task(load_task(write_task(folder, data)))
 

@@ -14,8 +14,8 @@ import robots
 from robots import joint, link, robot
 
 from figaroh_jax.errors import InputError
+from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.kinematics import frame_placement
-from figaroh_jax.urdf import load_urdf
 
 
 def test_joints_are_numbered_depth_first_in_the_order_of_the_file(tmp_path: Path) -> None:
@@ -37,7 +37,7 @@ def test_every_link_and_every_joint_has_a_frame(tmp_path: Path) -> None:
 
 def test_leaves_are_float64_whatever_the_global_setting(tmp_path: Path) -> None:
     code = (
-        "import sys, numpy as np, jax\nfrom figaroh_jax.urdf import load_urdf\n"
+        "import sys, numpy as np, jax\nfrom figaroh_jax.formats.urdf import load_urdf\n"
         "model = load_urdf(sys.argv[1])\nassert not jax.config.jax_enable_x64\n"
         "assert all(x.dtype == np.float64 for x in jax.tree.leaves(model))\n"
         "assert model.inertia[0, 0] == 2.0 and model.placement[0, 0, 3] == 0.1"

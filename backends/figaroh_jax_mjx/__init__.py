@@ -4,8 +4,8 @@ The backend is a pytree around an `mjx.Model`: its functions can be differentiat
 (`jax.grad` of its float leaves, `equinox.filter_grad` of all), mapped over them and compiled with them as arguments.
 Only MJX's functions of rigid bodies are called (`kinematics`, `com_pos`, `com_vel`, `rne`, `crb`), with armature zero:
 contacts, constraints, damping, springs and actuators never enter. The model, the translation of coordinates and what
-is static about them come from `figaroh_jax.mujoco_model`; robots with one tree share one static model, so a changed
-mass compiles nothing.
+is static about them come from `figaroh_jax.formats.mujoco_model`; robots with one tree share one static model, so a
+changed mass compiles nothing.
 """
 
 from __future__ import annotations
@@ -28,9 +28,7 @@ from jaxtyping import Array, Float
 from figaroh_jax.contract import Backend, Capabilities, Reference, as_reference, check_samples, file_format
 from figaroh_jax.derivatives import TorqueDerivatives, coriolis_from_bias
 from figaroh_jax.errors import InputError
-from figaroh_jax.manifold import integrate
-from figaroh_jax.model import RobotModel
-from figaroh_jax.mujoco_model import (
+from figaroh_jax.formats.mujoco_model import (
     Compiled,
     Translation,
     compiled,
@@ -42,6 +40,8 @@ from figaroh_jax.mujoco_model import (
     rates,
     spatial_inertias,
 )
+from figaroh_jax.manifold import integrate
+from figaroh_jax.model import RobotModel
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used here, is not installed
     from mujoco import mjx

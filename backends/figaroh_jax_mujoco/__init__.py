@@ -1,7 +1,7 @@
 """MuJoCo C behind the contract of figaroh_jax; regressors of large robots on threads, each with its own `MjData`.
 
 Given an MJCF file, the functions compute with the model that MuJoCo compiles from it, given anything else with one
-built from the robot's arrays (`figaroh_jax.mujoco_model`, which also translates the coordinates). Only MuJoCo's
+built from the robot's arrays (`figaroh_jax.formats.mujoco_model`, which also translates the coordinates). Only MuJoCo's
 functions of rigid bodies are called (`mj_kinematics`, `mj_comPos`, `mj_comVel`, `mj_rne`, `mj_crb`), with armature
 zero: contacts, constraints, damping, springs and actuators never enter. Nothing here can be differentiated, and MuJoCo
 C has derivatives by finite differences alone, so `dynamics_derivatives` is not supported.
@@ -24,8 +24,7 @@ from jaxtyping import Float
 from figaroh_jax.contract import Backend, Capabilities, Reference, as_reference, file_format, host_samples
 from figaroh_jax.derivatives import coriolis_from_bias
 from figaroh_jax.errors import InputError
-from figaroh_jax.model import RobotModel
-from figaroh_jax.mujoco_model import (
+from figaroh_jax.formats.mujoco_model import (
     compiled,
     drift,
     frame_poses,
@@ -35,6 +34,7 @@ from figaroh_jax.mujoco_model import (
     rates,
     spatial_inertias,
 )
+from figaroh_jax.model import RobotModel
 
 __all__ = ["MujocoBackend"]
 

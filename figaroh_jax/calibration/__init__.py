@@ -1,0 +1,5 @@
+"""Kinematics from measured poses and points, and what in them is not geometry.
+
+In order: `poserecords`, `devices` (residuals), `chain` and `perturbation` (parameterised kinematics), `starts`,
+`posefit`, `levels` and `candidates` (what may be estimated), `kinematic_diagnosis`, `corrections`, `calibrated`.
+"""

@@ -1,0 +1,83 @@
+"""What a calibration answers: plain immutable records, the same for the report, the terminal and `result.json`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..model import RobotModel
+from ..results import Cause
+
+__all__ = ["Calibration", "Error", "Outlier", "Parameter", "Shown"]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """An estimated number; `status` says whether the data give it, its prior does, or it moves with others."""
+
+    name: str
+    value: float
+    std: float
+    unit: str
+    status: str  # "identified", "prior only" or "gauge"
+
+
+@dataclass(frozen=True)
+class Error:
+    """RMS errors in `unit`: of the frames alone and of the calibrated robot, on fitted and on held-out postures."""
+
+    unit: str
+    before: float
+    after: float
+    validated_before: float
+    validated_after: float
+
+
+class Outlier(NamedTuple):
+    """A posture that no model explains, and its error in sizes of the noise."""
+
+    file: str
+    row: int
+    size: float
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The calibrated robot, what was estimated and how well it predicts."""
+
+    level: str
+    model: RobotModel  # with corrected placements
+    twists: dict[str, Float[np.ndarray, "6"]]  # correction of each joint's placement, in the joint frame, m and rad
+    frames: dict[str, Float[np.ndarray, "*shape"]]  # metrology: poses (4 4) or points, by name
+    parameters: tuple[Parameter, ...]
+    position: Error | None
+    orientation: Error | None
+    outliers: tuple[Outlier, ...]
+    verdict: str
+    causes: tuple[Cause, ...]
+    table: dict[str, tuple[float, float]]  # held-out RMS of each level and of the chosen one, m and rad
+    classes: tuple[tuple[str, ...], ...]  # parameters that the data cannot tell apart
+    rank: int
+    condition: float
+    noise: tuple[float, float]  # m, rad
+    converged: bool
+    steps: int
+    scheme: str  # how the validation was held out
+    notes: tuple[str, ...]
+    points: tuple[Shown, ...]
+    posture: dict[str, float] = field(default_factory=dict)  # of the joints that are locked, rad or m
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """One recording as the report draws it: the points and the errors of frames alone and of the calibrated robot."""
+
+    name: str
+    role: str
+    at: Float[np.ndarray, "points 3"]  # m, in the device's or the base frame
+    before: Float[np.ndarray, "points 3"]
+    after: Float[np.ndarray, "points 3"]
+    row: tuple[int, ...]

@@ -1,0 +1,287 @@
+r"""Calibration: from postures and what a device measured at each to a robot model that predicts new postures.
+
+The level (frames of the device, joint offsets, full geometry) and the effects on top of it are chosen by held-out
+postures; so is what is reported (`levels`). Outlier postures are named and left out first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..errors import InputError
+from ..model import RobotModel
+from . import corrections, levels, marginal, posefit
+from .calibrated import Calibration, Error, Outlier
+from .candidates import Block, blocks_of, effects_on, geometry_columns
+from .chain import chain_between
+from .gravity import without_far_masses
+from .kinematic_effects import HISTORY
+from .outliers import find_outliers
+from .posegroups import Measured, assemble, postures_of
+from .poserecords import PoseRecording, read_pose_recordings
+
+if TYPE_CHECKING:
+    from ..formats.config import Task
+
+__all__ = ["Run", "as_holdout", "calibrate", "calibrate_task"]
+
+_RECURS = 4  # of five outer folds must choose an effect
+_NESTED_GAIN = 0.05  # of the error on the outer folds, that the effects must take away
+
+
+def calibrate_task(task: Task, progress: Callable[[str, float], None] = lambda phase, share: None) -> Calibration:
+    """Calibrate the robot of a task from its recordings with a `measurement`."""
+    from ..formats.config import load_robot
+
+    model = load_robot(task)
+    recordings = read_pose_recordings(task, model)
+    found = calibrate(model, recordings, forbid=task.diagnose.forbid, progress=progress)
+    return replace(found, posture=dict(task.robot.posture))
+
+
+def calibrate(
+    model: RobotModel,
+    recordings: Sequence[PoseRecording],
+    *,
+    forbid: Sequence[str] = (),
+    progress: Callable[[str, float], None] = lambda phase, share: None,
+) -> Calibration:
+    """The calibrated robot; raises `InputError` where there are too few postures or a frame does not move."""
+    with jax.enable_x64(True):
+        return Run(model, recordings, forbid, progress).finish()
+
+
+class Run:
+    """One calibration, step by step; `finish` does them all, and what it found on the way stays readable."""
+
+    outliers: tuple[Outlier, ...]
+    used: Bool[np.ndarray, " rows"]
+    blocks: tuple[Block, ...]
+    effects: levels.Effects | None
+    choice: levels.Choice
+    folds: list[levels.Fold]
+    named: list[int]
+    history: bool  # whether an error that depends on the posture before was found and has no name
+    fit: tuple[Measured, marginal.Linear, marginal.Posterior, posefit.Solution]
+
+    def __init__(
+        self,
+        model: RobotModel,
+        recordings: Sequence[PoseRecording],
+        forbid: Sequence[str],
+        progress: Callable[[str, float], None],
+    ) -> None:
+        self.model, self.recordings, self.forbid, self.progress = model, tuple(recordings), tuple(forbid), progress
+        progress("reading the postures", 0.02)
+        weighing, notes = without_far_masses(model)
+        self.weighing = weighing
+        self.postures = postures_of(weighing, self.recordings)
+        self.chain = _chain(model, self.recordings)
+        geometry = geometry_columns(model, self.chain)
+        self.measured = assemble(weighing, self.recordings, self.postures, geometry, [1e-3] * len(geometry))
+        _enough(self.measured, self.recordings)
+        self.notes = [*notes, *(note for r in self.recordings for note in r.notes), *_few(self.recordings)]
+
+    def finish(self) -> Calibration:
+        """Outliers, level, effects, validation, and the final fit."""
+        measured = self.measured
+        everything = measured.measured & ~measured.holdout[measured.posture]
+        self.progress("choosing among levels", 0.05)
+        self.blocks = blocks_of(self.weighing, self.chain, self.postures, self.forbid)
+        model, recordings, postures = self.weighing, self.recordings, self.postures
+        self.effects = effects_on(model, recordings, postures, measured, self.blocks) if self.blocks else None
+        choice = levels.choose(measured, everything, self.effects)
+        wide = self._wide(choice)  # with its effects: what they explain is no outlier
+        sizes = find_outliers(wide, everything, levels.free_at(choice.level, wide.prior))
+        self.outliers = tuple(
+            Outlier(str(self.recordings[measured.recording[k]].file.name), int(measured.row[k]), size)
+            for k, size in sizes.items()
+        )
+        self.used = everything & ~np.isin(measured.posture, list(sizes))
+        if sizes:
+            choice = levels.choose(measured, self.used, self.effects)
+        validating = lambda share: self.progress("validating", 0.3 + 0.5 * share)  # noqa: E731
+        folds = levels.nested(measured, self.used, self.effects, self._extended, validating)
+        self.choice, self.folds = _never_worse(choice, folds)
+        recurring = _recurring(self.choice, self.folds, self.blocks)
+        self.named = [k for k in recurring if self.blocks[k].effect is not HISTORY]
+        self.history = len(self.named) < len(recurring)
+        if self.history:
+            self.notes.append("the error of a posture depends on the one before it in a way that no effect explains")
+        self.progress("fitting", 0.85)
+        self.fit = self._fit(self.choice.level, [self.blocks[k] for k in self.named])
+        return self._result()
+
+    def _extended(self, choice: levels.Choice, rows: Bool[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
+        """Residual of all rows for a choice with its effects fitted to `rows`, to first order about its level's fit."""
+        wide = self._wide(choice)
+        found = marginal.fit(wide, rows, levels.free_at(choice.level, wide.prior), robust=True)
+        return wide.residual + wide.jacobian @ (found.unknowns - wide.at)
+
+    def _wide(self, choice: levels.Choice) -> marginal.Linear:
+        """The rows at the fit of the choice's level, with the columns of its effects behind the others."""
+        linear = choice.linear
+        if self.effects is None or not choice.effects:
+            return linear
+        slices = self.effects.slices()
+        Z = self.effects.jacobian(linear.at)[:, np.concatenate([np.r_[slices[k]] for k in choice.effects])]
+        return linear._replace(
+            jacobian=np.hstack([linear.jacobian, Z]),
+            at=np.r_[linear.at, np.zeros(Z.shape[1])],
+            prior=np.r_[linear.prior, np.full(Z.shape[1], len(linear.tolerance) - 1)],
+        )
+
+    def _fit(self, level: str, blocks: Sequence[Block]):
+        """The level with its effects, exactly; then Levenberg-Marquardt from several starts at those weights."""
+        measured = self.measured
+        if blocks:
+            columns = [*measured.columns, *(c for b in blocks for c in b.columns)]
+            sizes = [1e-3] * len(measured.columns) + [s for b in blocks for s in b.sizes]
+            measured = assemble(self.weighing, self.recordings, self.postures, columns, sizes)
+        linear, posterior = levels.fit_level(measured, self.used, level)
+        free = levels.free_at(level, linear.prior)
+        solution = _polish(measured, linear, posterior, self.used, free)
+        return measured, levels.linearise(measured, np.asarray(solution.unknowns)), posterior, solution
+
+    def _result(self) -> Calibration:
+        final, linear, posterior, solution = self.fit
+        level, free = self.choice.level, levels.free_at(self.choice.level, linear.prior)
+        frames = self.choice.fits["frames"][0].residual
+        gauge, order = corrections.gauge_of(final, linear, self.used, free)
+        parameters = corrections.parameters_of(final, linear, posterior, gauge, order)
+        table = _table(self.folds, bool(self.named))
+        position, orientation, scheme = self._errors(final, frames, linear.residual, table)
+        named = [self.blocks[k] for k in self.named]
+        causes = corrections.causes_of(parameters, level, named, self.blocks, table, self.folds)
+        twists = corrections.twists_of(self.model, final, linear.at)
+        names = [c.label for c in final.columns] + [name for name, _ in final.own]
+        if not bool(solution.converged):
+            self.notes.append("the solver did not converge within its steps: do not trust these values")
+        return Calibration(
+            level=level,
+            model=corrections.corrected(self.model, twists),
+            twists=twists,
+            frames=corrections.frames_of(final, linear.at),
+            parameters=parameters,
+            position=position,
+            orientation=orientation,
+            outliers=self.outliers,
+            verdict="named" if causes or self.outliers else "nothing",
+            causes=(*(corrections.outlier_cause(o) for o in self.outliers), *causes),
+            table=table,
+            classes=tuple(tuple(names[order[k]] for k in c) for c in gauge.classes),
+            rank=gauge.rank,
+            condition=gauge.condition,
+            noise=(float(posterior.noise[0]), float(posterior.noise[1])),
+            converged=bool(solution.converged),
+            steps=int(solution.steps),
+            scheme=scheme,
+            notes=tuple(self.notes),
+            points=corrections.shown_of(final, self.recordings, frames, linear.residual),
+        )
+
+    def _errors(
+        self, final: Measured, frames: np.ndarray, after: np.ndarray, table: dict[str, tuple[float, float]]
+    ) -> tuple[Error | None, Error | None, str]:
+        """Errors of position (mm) and orientation (deg) on fitted and on held-out postures, and how those were held."""
+        kept, held = np.unique(final.posture[self.used & (final.posture >= 0)]), np.flatnonzero(final.holdout)
+        fitted = [levels.errors(final, residual, kept) for residual in (frames, after)]
+        if len(held):
+            new = [levels.errors(final, corrections.centred(final, x), held) for x in (frames, after)]
+            validated = [(levels.rms(a), levels.rms(b)) for a, b in zip(*new, strict=True)]
+            scheme = "recordings with role: holdout"
+        else:
+            validated = list(zip(table["frames"], table["chosen"], strict=True))
+            scheme = f"{levels.FOLDS} folds, every fifth posture; level and effects chosen inside each"
+        both: list[Error | None] = [None, None]
+        for c, (unit, scale) in enumerate((("mm", 1e3), ("deg", 180.0 / np.pi))):
+            if len(fitted[0][c]):
+                sizes = levels.rms(fitted[0][c]), levels.rms(fitted[1][c]), *validated[c]
+                both[c] = Error(unit, *(scale * size for size in sizes))
+        return both[0], both[1], scheme
+
+
+def _chain(model: RobotModel, recordings: Sequence[PoseRecording]) -> list[int]:
+    """Joints that move any of the measured frames against its base, in tree order."""
+    return sorted({j for r in recordings for j in chain_between(model, r.base_frame, r.tool_frame).joints})
+
+
+def _enough(measured: Measured, recordings: Sequence[PoseRecording]) -> None:
+    used = measured.measured & ~measured.holdout[measured.posture]
+    rows, unknowns = int(used.sum()), len(measured.own)
+    postures = len(np.unique(measured.posture[used & (measured.posture >= 0)]))
+    if rows <= unknowns or postures < levels.FOLDS:
+        names = ", ".join(str(r.file.name) for r in recordings if r.role == "fit")
+        raise InputError(
+            f"{names}: {postures} measured postures give {rows} numbers for {unknowns} unknowns of the frames alone;"
+            f" measure at least {max(levels.FOLDS, unknowns // 2)} postures, better 30 or more"
+        )
+
+
+def _few(recordings: Sequence[PoseRecording]) -> list[str]:
+    fitted = [r for r in recordings if r.role == "fit"]
+    if all(r.kind == "socket" for r in fitted) and len(fitted) == 1:
+        return [
+            "the sockets were at one position of the workspace only: that is too few, the calibrated robot may be right"
+            " there and wrong elsewhere; measure at two positions or more"
+        ]
+    return []
+
+
+def _recurring(choice: levels.Choice, folds: Sequence[levels.Fold], blocks: Sequence[Block]) -> list[int]:
+    """Effects of the choice that most outer folds choose too, if all of them together gain on the outer folds."""
+    plain, chosen = (levels.pooled([getattr(f, which) for f in folds]) for which in ("plain", "chosen"))
+    gains = [1.0 - c / p for p, c in zip(plain, chosen, strict=True) if np.isfinite(p) and p > 0.0]
+    if not gains or np.mean(gains) < _NESTED_GAIN:
+        return []
+    places = [{(blocks[k].effect.name, blocks[k].columns[0].at) for k in f.choice.effects} for f in folds]
+    return [
+        k
+        for k in choice.effects
+        if sum((blocks[k].effect.name, blocks[k].columns[0].at) in p for p in places) >= _RECURS
+    ]
+
+
+def _never_worse(choice: levels.Choice, folds: list[levels.Fold]) -> tuple[levels.Choice, list[levels.Fold]]:
+    """The frames alone where the choice, made inside the outer folds, predicts no better than they do."""
+    frames, chosen = levels.pooled([f.levels["frames"] for f in folds]), levels.pooled([f.plain for f in folds])
+    ratio = [c / f for f, c in zip(frames, chosen, strict=True) if np.isfinite(f) and f > 0.0]
+    if choice.level != "frames" and ratio and np.mean(ratio) < 1.0:
+        return choice, folds
+    plain = [f._replace(plain=f.levels["frames"], chosen=f.levels["frames"]) for f in folds]
+    return choice._replace(level="frames", effects=(), rivals=()), plain
+
+
+def _table(folds: Sequence[levels.Fold], effects: bool) -> dict[str, tuple[float, float]]:
+    """Error on the outer folds of every level, and of what was chosen inside each fold."""
+    table = {level: levels.pooled([f.levels[level] for f in folds]) for level in levels.LEVELS}
+    return table | {"chosen": levels.pooled([f.chosen if effects else f.plain for f in folds])}
+
+
+def _polish(measured, linear, posterior, used, free) -> posefit.Solution:
+    """Levenberg-Marquardt from the fit, from the closed-form start and from turned base frames; the least cost wins."""
+    weight = np.where(linear.posture >= 0, posterior.weight[linear.posture], 1.0)
+    rows = np.where(used, np.sqrt(weight) / posterior.noise[linear.channel], 0.0)
+    precision = np.where(free, posterior.precision, 1.0)
+    starts = [linear.at, np.zeros_like(linear.at)]
+    turned = np.zeros_like(linear.at)
+    for k, (name, _) in enumerate(measured.own):
+        if name.startswith("base_frame r"):
+            turned[len(measured.columns) + k] = 0.7 / np.asarray(measured.problem.scale)[len(measured.columns) + k]
+    starts += [turned, -turned] if turned.any() else []
+    many = [jnp.asarray(np.tile(x, (len(starts), 1))) for x in (rows, precision, free.astype(float))]
+    found = posefit.solve_many(measured.problem, posefit.Weights(*many), jnp.asarray(np.array(starts)))
+    best = int(jnp.argmin(found.cost))
+    return jax.tree.map(lambda x: x[best], found)
+
+
+def as_holdout(recordings: Sequence[PoseRecording], names: Sequence[str]) -> tuple[PoseRecording, ...]:
+    """The recordings with those called `names` held out."""
+    return tuple(replace(r, role="holdout") if r.name in names else r for r in recordings)

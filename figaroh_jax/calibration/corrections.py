@@ -1,0 +1,185 @@
+"""From the fit of a calibration to what people read: parameters with their status, causes, corrected joints, frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from .. import lie
+from ..model import RobotModel
+from ..results import Cause, Estimate, Gain, Name
+from . import levels, marginal
+from .calibrated import Outlier, Parameter, Shown
+from .candidates import Block
+from .gauge import Gauge, find_gauge
+from .kinematic_effects import Postures
+from .posegroups import Measured
+
+__all__ = [
+    "causes_of",
+    "centred",
+    "corrected",
+    "frames_of",
+    "gauge_of",
+    "outlier_cause",
+    "parameters_of",
+    "shown_of",
+    "twist_pose",
+    "twists_of",
+]
+
+_KNOWN = 0.7  # a posterior wider than this share of its prior tells nothing new
+_OFFSET = 1e-3  # rad or m: what a good zeroing leaves; beyond it an offset is a cause
+
+
+def gauge_of(final: Measured, fit: marginal.Linear, used, free) -> tuple[Gauge, list[int]]:
+    """Dependence among the free unknowns: the frames stand first, then offsets, then geometry, then effects.
+
+    It is looked for at the nominal geometry, where a dependence is exact.
+    """
+    linear = levels.linearise(final, np.where(fit.prior == marginal.FLAT, fit.at, 0.0))
+    order = [int(k) for k in np.flatnonzero(free)]
+    effects = {k for k, c in enumerate(final.columns) if c.effect not in ("joint_offset", "link_geometry")}
+    first = sorted(range(len(order)), key=lambda i: (linear.prior[order[i]] != marginal.FLAT, order[i] in effects, i))
+    rows = np.flatnonzero(used)
+    return find_gauge(linear.jacobian[rows][:, order], first), order
+
+
+def parameters_of(final: Measured, linear, posterior, gauge: Gauge, order: list[int]) -> tuple[Parameter, ...]:
+    scale = np.asarray(final.problem.scale)
+    names = [(c.label, c.unit) for c in final.columns] + list(final.own)
+    found = []
+    for place, k in enumerate(order):
+        prior = posterior.precision[k] ** -0.5 if linear.prior[k] != marginal.FLAT else np.inf
+        std = float(np.sqrt(posterior.covariance[k, k]))
+        known = "identified" if std < _KNOWN * prior else "prior only"
+        status = "gauge" if place in gauge.dependent else known
+        found.append(Parameter(*(names[k][0], float(linear.at[k] * scale[k]), std * scale[k], names[k][1]), status))
+    return tuple(sorted(found, key=lambda p: p.name.split()[0] in ("base_frame", "tool_frame", "socket")))
+
+
+def causes_of(
+    parameters: Sequence[Parameter],
+    level: str,
+    named: Sequence[Block],
+    blocks: Sequence[Block],
+    table: dict[str, tuple[float, float]],
+    folds: Sequence[levels.Fold],
+) -> tuple[Cause, ...]:
+    """Offsets beyond what a good zeroing leaves, the largest first; then the effects `named`."""
+    channel = 0 if np.isfinite(table["frames"][0]) else 1
+    unit, scale = (("mm", 1e3), ("deg", 180.0 / np.pi))[channel]
+    fall = Gain(scale * table["frames"][channel], scale * table["joint_offset"][channel], unit)
+    offsets = [p for p in parameters if p.name.startswith("joint_offset") and p.status == "identified"]
+    found = [
+        Cause(Name("joint_offset", tuple(p.name.split()[1:])), {"offset": Estimate(p.value, p.std, p.unit)}, 1.0, fall)
+        for p in sorted(offsets, key=lambda p: -abs(p.value))
+        if level != "frames" and abs(p.value) > 3.0 * np.hypot(p.std, _OFFSET)
+    ]
+    gain = Gain(scale * levels.pooled([f.plain for f in folds])[channel], scale * table["chosen"][channel], unit)
+    by_name = {p.name: p for p in parameters}
+    for block in named:
+        values = {c.parameter: by_name[c.label] for c in block.columns}
+        estimates = {key: Estimate(p.value, p.std, p.unit) for key, p in values.items()}
+        if block.effect.shape[0]:
+            estimates[block.effect.shape[0]] = Estimate(float(block.shape), float("nan"), "1")
+        share = np.mean([any(_same(blocks[j], block) for j in f.choice.effects) for f in folds])
+        found.append(Cause(Name(block.effect.name, block.columns[0].at), estimates, float(share), gain))
+    return tuple(found)
+
+
+def _same(a: Block, b: Block) -> bool:
+    return (a.effect.name, a.columns[0].at) == (b.effect.name, b.columns[0].at)
+
+
+def outlier_cause(outlier: Outlier) -> Cause:
+    size = {"size": Estimate(outlier.size, float("nan"), "1")}
+    note = f"row {outlier.row} of {outlier.file} is {outlier.size:.0f} times the noise off; it was left out"
+    return Cause(Name("outlier", ()), size, 1.0, Gain(float("nan"), float("nan"), "mm"), note=note)
+
+
+def twists_of(model: RobotModel, final: Measured, at: np.ndarray) -> dict[str, np.ndarray]:
+    """Constant twist of each joint: offsets and geometry, not what depends on the posture."""
+    scale = np.asarray(final.problem.scale)
+    twists: dict[str, np.ndarray] = {}
+    q, none = np.zeros((1, model.nv)), np.zeros(0)
+    one = Postures(q, q, none, none, none, none, 1.0)
+    for k, column in enumerate(final.columns):
+        if column.effect in ("joint_offset", "link_geometry"):
+            ((joint, field),) = column.pieces
+            name = model.joints[joint].name
+            twists[name] = twists.get(name, np.zeros(6)) + at[k] * scale[k] * field(one)[:, 0]
+    return twists
+
+
+def corrected(model: RobotModel, twists: dict[str, np.ndarray]) -> RobotModel:
+    placement = np.array(model.placement)
+    for k, joint in enumerate(model.joints):
+        if joint.name in twists:
+            placement[k] = placement[k] @ twist_pose(twists[joint.name])
+    return eqx.tree_at(lambda m: m.placement, model, placement)
+
+
+def twist_pose(twist: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
+    """The pose E of a twist of the chain: its translation, then its rotation."""
+    return np.asarray(lie.pose(lie.exp_so3(jnp.asarray(twist[3:])), jnp.asarray(twist[:3])))
+
+
+def frames_of(final: Measured, at: np.ndarray) -> dict[str, np.ndarray]:
+    values = at * np.asarray(final.problem.scale)
+    start, found = len(final.columns), {}
+    for g, group in enumerate(final.problem.groups):
+        count = len(group.device.unknowns())
+        mark = f" {g + 1}" if len(final.problem.groups) > 1 else ""
+        for name, value in group.device.places(jnp.asarray(values[start : start + count])).items():
+            found[name + mark] = np.asarray(value)
+        start += count
+    return found
+
+
+def centred(measured: Measured, residual: np.ndarray) -> np.ndarray:
+    """Residuals at held-out sockets, from the mean of their own postures: no fitted posture shows where they are."""
+    found = residual.copy()
+    held = np.zeros(len(residual), bool)
+    held[measured.posture >= 0] = measured.holdout[measured.posture[measured.posture >= 0]]
+    for socket in np.unique(measured.socket[held & (measured.socket >= 0)]):
+        rows = np.flatnonzero((measured.socket == socket) & measured.measured)
+        parts = residual[rows].reshape(3, -1)
+        found[rows] = (parts - parts.mean(axis=1, keepdims=True)).reshape(-1)
+    return found
+
+
+def shown_of(final: Measured, recordings, frames, after) -> tuple[Shown, ...]:
+    """Points and errors of every recording, for rows of three positions."""
+    before, after = centred(final, frames), centred(final, after)
+    shown = []
+    for k, recording in enumerate(recordings):
+        rows = (final.channel == 0) & final.measured & (final.posture >= 0)
+        rows &= np.where(final.posture >= 0, final.recording[final.posture], -1) == k
+        items, first, count = np.unique(final.item[rows], return_index=True, return_counts=True)
+        if not len(items) or count.max() != 3:
+            continue
+        place = np.flatnonzero(rows)
+        triple = np.array([place[final.item[place] == item] for item in items])
+        at = recording.values[..., :3, 3] if recording.kind == "pose" else recording.values
+        row = tuple(int(final.row[final.posture[t[0]]]) for t in triple)
+        if recording.kind in ("socket", "plane"):
+            at = recording.position[:, :3] * 0.0
+        where = at.reshape(len(recording.position), -1, 3)
+        points = np.array([where[r, min(i, where.shape[1] - 1)] for r, i in zip(row, _repeat(row), strict=True)])
+        shown.append(Shown(recording.name, recording.role, points, before[triple], after[triple], row))
+    return tuple(shown)
+
+
+def _repeat(rows: Sequence[int]) -> list[int]:
+    """How often each row has stood there before: the number of the marker."""
+    seen: dict[int, int] = {}
+    counts = []
+    for row in rows:
+        counts.append(seen.get(row, 0))
+        seen[row] = counts[-1] + 1
+    return counts

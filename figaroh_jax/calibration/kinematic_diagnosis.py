@@ -1,0 +1,218 @@
+r"""Diagnosis at kinematic level: what is wrong with the robot, the device or the postures, named only where it holds.
+
+Two routes to a name. Geometry (offsets, links) by its score against a stated tolerance, for held-out postures cannot
+show what every fit estimates anyway; effects by what they gain on postures left out of everything that chose them
+(`levels.nested`). Both must beat the largest score that noise alone gives over the whole catalogue.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+
+from ..model import RobotModel
+from ..results import Cause, Estimate, Experiment, Gain, Name
+from . import levels, marginal
+from .calibrated import Calibration
+from .calibration import Run
+from .candidates import GEOMETRY
+from .kinematic_effects import CATALOGUE, HISTORY, KinematicEffect
+from .kinematic_scores import Scores, score_blocks
+from .poserecords import PoseRecording, read_pose_recordings
+
+if TYPE_CHECKING:
+    from ..formats.config import Task
+
+__all__ = ["PoseDiagnosis", "diagnose_pose_task", "diagnose_poses"]
+
+_TOLERANCE = (1.0, 0.5, 1.0, 1.0)  # mrad, mm, mrad: how well a good robot is built and zeroed
+_WIDE = 100.0  # of a block that was named: free
+_MOST = 16
+_NOISY = 1.5  # times the device's stated accuracy: the rest is no noise
+
+
+@dataclass(frozen=True, eq=False)
+class PoseDiagnosis:
+    """Verdict and causes, with the calibration that they stand on."""
+
+    verdict: str
+    causes: tuple[Cause, ...]
+    p_value: float
+    before: tuple[float | None, float | None]  # RMS of the frames alone: mm, deg
+    after: tuple[float | None, float | None]
+    noise: tuple[float | None, float | None]
+    experiment: Experiment | None
+    calibration: Calibration
+
+
+def diagnose_pose_task(task: Task, progress: Callable[[str, float], None] = lambda phase, share: None) -> PoseDiagnosis:
+    """Diagnose the robot of a task from its recordings with a `measurement`."""
+    from ..formats.config import load_robot
+
+    model = load_robot(task)
+    recordings = read_pose_recordings(task, model)
+    found = diagnose_poses(model, recordings, task.diagnose.forbid, task.diagnose.alpha, progress)
+    return replace(found, calibration=replace(found.calibration, posture=dict(task.robot.posture)))
+
+
+def diagnose_poses(
+    model: RobotModel,
+    recordings: Sequence[PoseRecording],
+    forbid: Sequence[str] = (),
+    alpha: float = 0.05,
+    progress: Callable[[str, float], None] = lambda phase, share: None,
+) -> PoseDiagnosis:
+    """Verdict, causes and calibration from postures and what a device measured at each."""
+    with jax.enable_x64(True):
+        run = Run(model, recordings, forbid, progress)
+        calibration = run.finish()
+        progress("testing", 0.92)
+        geometry, p_geometry = _geometry(run, calibration, alpha)
+        p_effects, p_rest = _effect_scores(run)
+        effects = [c for c in calibration.causes if c.name.effect not in (*GEOMETRY, "outlier")]
+        if p_effects > alpha:
+            effects = []
+        geometry = [c for c in geometry if c.name.effect not in forbid]
+        outliers = [c for c in calibration.causes if c.name.effect == "outlier"]
+        causes = tuple([*outliers, *geometry, *_with_rivals(effects, run)])
+        p_value = min(1.0, 2.0 * min(p_geometry, p_effects))
+        rest = run.history or p_rest < alpha / 5 or _beyond_accuracy(recordings, calibration)
+        return _answer(calibration, causes, p_value, rest)
+
+
+def _geometry(run: Run, calibration: Calibration, alpha: float) -> tuple[list[Cause], float]:
+    """Offsets and links beyond their stated tolerance, the most evident first, and the p-value of the first one."""
+    linear, posterior = run.choice.fits["full"]
+    _, _, final, _ = run.fit
+    columns = run.measured.columns
+    names = list(dict.fromkeys((c.effect, c.at) for c in columns))
+    places = [np.array([k for k, c in enumerate(columns) if (c.effect, c.at) == name]) for name in names]
+    width = np.array(_TOLERANCE)[np.maximum(linear.prior, 0)]
+    noise = _row_noise(linear, posterior if calibration.level == "full" else final)
+    named: list[int] = []
+    first = 1.0
+    free = np.ones(len(width), bool)
+    at, covariance = linear.at, np.zeros((len(width),) * 2)
+    while len(named) < _MOST:
+        at, covariance = _posterior_mode(linear, noise, run.used, width)
+        here = linear._replace(residual=linear.residual + linear.jacobian @ (at - linear.at), at=at)
+        blocks = [linear.jacobian[:, p] if k not in named else np.zeros((len(noise), 0)) for k, p in enumerate(places)]
+        scores = score_blocks(here, noise, run.used, width**-2.0, blocks, free, seed=len(named))
+        first = scores.p_value if not named else first
+        if scores.p_value > alpha / 5:
+            break
+        named.append(_simplest(scores))
+        width[places[named[-1]]] = _WIDE
+    scale = np.asarray(run.measured.problem.scale)
+    gain = _gain(calibration)
+    causes = []
+    for k in named:
+        values = {
+            columns[i].parameter: Estimate(
+                float(at[i] * scale[i]), float(np.sqrt(covariance[i, i]) * scale[i]), columns[i].unit
+            )
+            for i in places[k]
+        }
+        causes.append(Cause(Name(*names[k]), values, 1.0 - first, gain))
+    return causes, first
+
+
+def _row_noise(linear: marginal.Linear, posterior: marginal.Posterior) -> np.ndarray:
+    weight = np.where(linear.posture >= 0, posterior.weight[linear.posture], 1.0)
+    return posterior.noise[linear.channel] / np.sqrt(weight)
+
+
+def _posterior_mode(linear: marginal.Linear, noise, used, width) -> tuple[np.ndarray, np.ndarray]:
+    """Unknowns at fixed noise and prior widths, and their covariance."""
+    rows = np.flatnonzero(used)
+    G = linear.jacobian[rows] / noise[rows, None]
+    precision = np.where(linear.prior == marginal.FLAT, 1e-10, width**-2.0)
+    normal = G.T @ G + np.diag(precision)
+    covariance = np.linalg.inv(normal)
+    pull = G.T @ (linear.residual[rows] / noise[rows]) + precision * linear.at
+    return linear.at - covariance @ pull, covariance
+
+
+def _simplest(scores: Scores) -> int:
+    """Block that explains most for its number of columns."""
+    merit = np.where(scores.size > 0, scores.q - scores.size * 5.0, -np.inf)
+    return int(np.argmax(merit))
+
+
+def _effect_scores(run: Run) -> tuple[float, float]:
+    """p-value of the largest score of an effect beside the level alone, and beside the level with its effects."""
+    if run.effects is None:
+        return 1.0, 1.0
+    slices = run.effects.slices()
+    linear, posterior = run.choice.fits[run.choice.level]
+    found = []
+    for fit in ((linear, posterior), (run.fit[1], run.fit[2])):
+        Z = run.effects.jacobian(_without_effects(fit[0], run))
+        blocks = [Z[:, s] for k, s in enumerate(slices) if k not in (run.named if fit[0] is run.fit[1] else ())]
+        free = levels.free_at(run.choice.level, fit[0].prior)
+        scores = score_blocks(fit[0], _row_noise(*fit), run.used, fit[1].precision, blocks, free)
+        found.append(scores.p_value)
+    return found[0], found[1]
+
+
+def _without_effects(linear: marginal.Linear, run: Run) -> np.ndarray:
+    """Unknowns of the columns of geometry and of the devices alone."""
+    columns = len(run.measured.columns)
+    extra = len(linear.at) - columns - len(run.measured.own)
+    return np.concatenate([linear.at[:columns], linear.at[columns + extra :]])
+
+
+def _with_rivals(effects: Sequence[Cause], run: Run) -> list[Cause]:
+    """The causes with what gained nearly as much in their place."""
+    rivals: dict[Name, tuple[Name, ...]] = {}
+    for k, others in zip(run.choice.effects, run.choice.rivals, strict=True):
+        own = Name(run.blocks[k].effect.name, run.blocks[k].columns[0].at)
+        named = (run.blocks[j] for j in others if run.blocks[j].effect is not HISTORY)
+        names = (Name(block.effect.name, block.columns[0].at) for block in named)
+        rivals[own] = tuple(dict.fromkeys(name for name in names if name != own))
+    return [replace(cause, ambiguous_with=rivals.get(cause.name, ())) for cause in effects]
+
+
+def _beyond_accuracy(recordings: Sequence[PoseRecording], calibration: Calibration) -> bool:
+    """Whether the noise that is left is more than the device is said to have."""
+    for c in (0, 1):
+        stated = [r.accuracy[c] for r in recordings if r.accuracy[c] is not None]
+        if stated and calibration.noise[c] > _NOISY * max(s for s in stated if s is not None):
+            return True
+    return False
+
+
+def _gain(calibration: Calibration) -> Gain:
+    error = calibration.position or calibration.orientation
+    assert error is not None
+    return Gain(error.validated_before, error.validated_after, error.unit)
+
+
+def _answer(calibration: Calibration, causes: tuple[Cause, ...], p_value: float, rest: bool) -> PoseDiagnosis:
+    verdict = ("named+rest" if rest else "named") if causes else ("unknown" if rest else "nothing")
+    errors = (calibration.position, calibration.orientation)
+    scale = (1e3, 180.0 / np.pi)
+    experiment = None
+    doubted = next((c for c in causes if c.ambiguous_with), None)
+    entry: KinematicEffect | None = CATALOGUE.get(doubted.name.effect) if doubted else None
+    if doubted is not None and entry is not None and entry.separated_by:
+        text = entry.separated_by.format(at=" and ".join(doubted.name.at) or "all joints")
+        pairs = tuple((doubted.name.effect, other.effect) for other in doubted.ambiguous_with)
+        experiment = Experiment(text, tuple(dict.fromkeys(pairs)))
+    return PoseDiagnosis(
+        verdict=verdict,
+        causes=causes,
+        p_value=p_value,
+        before=(errors[0] and errors[0].before, errors[1] and errors[1].before),
+        after=(errors[0] and errors[0].after, errors[1] and errors[1].after),
+        noise=(
+            errors[0] and scale[0] * calibration.noise[0],
+            errors[1] and scale[1] * calibration.noise[1],
+        ),
+        experiment=experiment,
+        calibration=replace(calibration, verdict=verdict, causes=causes),
+    )

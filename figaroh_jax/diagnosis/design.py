@@ -1,0 +1,334 @@
+"""From motion to rows: what a unit of every candidate adds, and exact predictions of what the sensors read.
+
+Three kinds of effect act in three ways. `columns`: torque linear in its amplitudes is added. `position`: the true
+position is the measured one less the sensor's error, so the rigid body moves otherwise. `response`: the torque sensor
+filters the torque of the whole model, all columns alike.
+
+JAX evaluates the equations, many effects in one program; samples, shifts and filters stay on the host in NumPy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int
+
+from ..dynamics import inverse_dynamics
+from ..effect import Effect, Motion, columns
+from ..model import Leaf, RobotModel
+from .records import Records, filter_rows
+
+__all__ = [
+    "Units",
+    "candidates",
+    "difference",
+    "flattened",
+    "kind",
+    "rigid_torque",
+    "sensor_response",
+    "shapes",
+    "shifted",
+    "torque_change",
+    "unit_rows",
+    "units",
+    "units_and_slopes",
+    "with_shape",
+]
+
+
+class Units(NamedTuple):
+    """Torque of a unit of each amplitude of several effects of one class, N m or N, at the joints that it touches.
+
+    A sensor effect has one column, its torque divided by its parameter: exact at that parameter's value. That of a
+    torque sensor comes out of the torque of the whole model by `response`.
+    """
+
+    torque: Float[np.ndarray, "effects k rows nN"]
+    joints: Int[np.ndarray, "effects rows"]
+    response: Complex[np.ndarray, "effects F"] | None = None
+
+
+TURNS = 3  # of Newton's method for the true motion
+RESONANT = 0.5  # bounds the response at the link's resonance
+
+
+def kind(effect: Effect | type[Effect]) -> Literal["columns", "position", "response"]:
+    """How the effect acts on the rows."""
+    if effect.has("position_error"):
+        return "position"
+    return "response" if effect.has("torque_response") else "columns"
+
+
+def shapes(effect: type[Effect]) -> list[str]:
+    """Parameters that enter nonlinearly and may take any value between their bounds."""
+    return [name for name, p in effect.parameters().items() if not p.linear and not p.choice]
+
+
+def with_shape(effect: Effect, names: list[str], values: list) -> Effect:
+    """The effect with the named parameters replaced."""
+    return eqx.tree_at(lambda e: [getattr(e, name) for name in names], effect, values)
+
+
+def flattened(batch: Effect) -> Effect:
+    """The effects of a batch with leading axes (places, grid) on one axis."""
+    return jax.tree.map(lambda x: np.reshape(x, (np.shape(x)[0] * np.shape(x)[1], *np.shape(x)[2:])), batch)
+
+
+def difference(signal: Float[np.ndarray, "*n N"], dt: float) -> Float[np.ndarray, "*n N"]:
+    """Derivative by five-point central differences; the two ends hold their neighbours' (rows there are trimmed)."""
+    out = np.empty_like(signal)
+    inner = 8 * (signal[..., 3:-1] - signal[..., 1:-3]) - (signal[..., 4:] - signal[..., :-4])
+    out[..., 2:-2] = inner / (12 * dt)
+    out[..., :2], out[..., -2:] = out[..., 2:3], out[..., -3:-2]
+    return out
+
+
+def rigid_torque(
+    model: RobotModel, q: Float[Leaf, "*batch nv"], v: Float[Leaf, "*batch nv"], a: Float[Leaf, "*batch nv"]
+) -> Float[np.ndarray, "*batch nv"]:
+    """`inverse_dynamics` in NumPy."""
+    return np.asarray(inverse_dynamics(model, q, v, a))
+
+
+def shifted(effects: Effect, motion: Motion, records: Records, turns: int = TURNS) -> Motion:
+    """The true motion of the links for each of a batch of position sensors that have read `motion`.
+
+    A sensor whose error follows the load feels that of the true motion, so q + error(load(q)) = q_measured is solved:
+    Newton's steps, with the joint's mean inertia and stiffness and therefore one response over frequency each. Without
+    `turns` the load is that of `motion`, right to first order.
+
+    Position, velocity and acceleration of the answer have a leading axis of effects.
+    """
+    shift = _errors(effects, motion)
+    if not turns:
+        return _moved(effects, motion, shift, records)
+    inverse, (n, samples) = _inverse_responses(effects, motion, records), records.position.shape[:2]
+    shift = np.zeros_like(shift)
+    for _ in range(turns):
+        true = _moved(effects, motion, shift, records)
+        loads = rigid_torque(motion.model, true.position, true.velocity, true.acceleration)
+        missing = (_errors(effects, motion, loads) - shift).reshape(-1, n, samples)
+        mirrored = np.fft.rfft(np.concatenate([missing, missing[..., ::-1]], axis=-1))
+        shift = shift + np.fft.irfft(mirrored * inverse[:, None], 2 * samples)[..., :samples].reshape(shift.shape)
+    return _moved(effects, motion, shift, records)
+
+
+def _inverse_responses(effects: Effect, motion: Motion, records: Records) -> Float[np.ndarray, "effects F"]:
+    """1 / (1 + c (K - M w^2)), c the error per load, K and M from the joint's load over position and acceleration.
+
+    Bounded where it would be singular, at the resonance of the link on the joint's spring.
+    """
+    load = rigid_torque(motion.model, motion.position, motion.velocity, motion.acceleration)
+    loads = np.repeat(load[None], len(effects.at), axis=0)
+    unit = (_errors(effects, motion, loads + 1) - _errors(effects, motion, loads)).mean(1)
+    omega = 2 * np.pi * np.fft.rfftfreq(2 * records.position.shape[1], float(records.dt))
+    out = np.empty((len(unit), len(omega)))
+    for one, joint in enumerate(np.asarray(effects.at)[:, 0]):
+        columns = np.stack([np.asarray(x)[:, joint] for x in (motion.position, motion.acceleration)])
+        columns = columns - columns.mean(1, keepdims=True)
+        stiffness, inertia = np.linalg.lstsq(columns.T, load[:, joint], rcond=None)[0]
+        straight = 1 + unit[one] * (stiffness - inertia * omega**2)
+        out[one] = straight / (straight**2 + RESONANT**2)
+    return out
+
+
+def _errors(
+    effects: Effect, motion: Motion, loads: Float[np.ndarray, "effects nN nv"] | None = None
+) -> Float[np.ndarray, "effects nN"]:
+    """What each sensor reads beside the truth, under the motion's load or each under its own."""
+    out = []
+    for one in range(len(effects.at)):
+        here = motion if loads is None else eqx.tree_at(lambda m: m.load, motion, loads[one])
+        out.append(np.asarray(_error(jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects), here)))
+    return np.stack(out)
+
+
+def _moved(effects: Effect, motion: Motion, errors: Float[np.ndarray, "effects nN"], records: Records) -> Motion:
+    """The motion less each error of the joint of each effect."""
+    errors = errors.reshape(-1, *records.position.shape[:2])
+    rates = difference(errors, float(records.dt))
+    change = [errors, rates, difference(rates, float(records.dt))]
+    one, joint = np.arange(len(errors)), np.asarray(effects.at)[:, 0]
+    true = []
+    for signal, delta in zip((motion.position, motion.velocity, motion.acceleration), change, strict=True):
+        moved = np.repeat(np.asarray(signal)[None], len(errors), axis=0)
+        moved[one, :, joint] -= delta.reshape(len(errors), -1)
+        true.append(moved)
+    return eqx.tree_at(lambda m: (m.position, m.velocity, m.acceleration), motion, tuple(true))
+
+
+def torque_change(
+    effects: Effect,
+    motion: Motion,
+    records: Records,
+    as_read: Float[np.ndarray, "nN nv"] | None = None,
+    turns: int = TURNS,
+) -> Float[np.ndarray, "effects nN nv"]:
+    """Exact torque of a batch of position sensors: of the links' true motion, less that of the motion as it was read.
+
+    (A torque sensor's is left to the row filter, which is exact in frequency.) `as_read` is the latter torque.
+    """
+    if as_read is None:
+        as_read = rigid_torque(motion.model, motion.position, motion.velocity, motion.acceleration)
+    true = shifted(effects, motion, records, turns)
+    return rigid_torque(motion.model, true.position, true.velocity, true.acceleration) - as_read
+
+
+def units(batches: Mapping[str, Effect], motion: Motion, records: Records) -> dict[str, Units]:
+    """What a unit of each amplitude adds, for batches (one leading axis) of effects of any kind."""
+    plain = {name: batch for name, batch in batches.items() if _way(batch) == "torque"}
+    torques = _unit_torques(plain, motion) if plain else {}
+    responses = {name: batch for name, batch in batches.items() if kind(batch) == "response"}
+    factors = sensor_response(responses, np.asarray(records.omega))
+    everywhere, out = np.arange(np.shape(motion.velocity)[1]), {}
+    for name, batch in batches.items():
+        own = batch.acts_on in ("joint", "pair") and _way(batch) == "torque"
+        joints = np.asarray(batch.at) if own else np.tile(everywhere, (len(batch.at), 1))
+        if name in torques:
+            torque = np.asarray(torques[name])
+            out[name] = Units(np.moveaxis(torque.reshape(*torque.shape[:3], -1), 2, 3), joints)
+        elif name in factors:
+            torque = np.broadcast_to(np.asarray(motion.total).T, (len(joints), 1, *np.shape(motion.total)[::-1]))
+            out[name] = Units(torque, joints, (factors[name] - 1) / _size(batch)[:, None])
+        elif _way(batch) == "position":
+            # finds; `shifted` with its turns decides
+            torque = torque_change(batch, motion, records, turns=0) / _size(batch)[:, None, None]
+            out[name] = Units(np.swapaxes(torque, 1, 2)[:, None], joints)
+        else:
+            out[name] = Units(_changed_torques(batch, motion), joints)
+    return out
+
+
+def unit_rows(given: Units, records: Records, whitening: Complex[np.ndarray, "F nv"]) -> Float[np.ndarray, "e k r n M"]:
+    """Whitened rows of the units (effects, k, rows, n, M), with the weight of each joint's rows."""
+    n, samples, _, _ = records.shape
+    response = whitening.T[given.joints][:, None]
+    if given.response is not None:
+        response = response * given.response[:, None, None]
+    rows = filter_rows(records, given.torque.reshape(*given.torque.shape[:3], n, samples), response)
+    return rows * np.moveaxis(np.asarray(records.weight), 2, 0)[given.joints][:, None]
+
+
+def units_and_slopes(
+    effects: Effect, values: Float[np.ndarray, "effects p"], motion: Motion
+) -> tuple[Float[np.ndarray, "effects k rows nN"], Float[np.ndarray, "effects p k rows nN"]]:
+    """Unit torques of effects with the shapes `values`, and their derivatives in each shape."""
+    torque, slope = _units_and_slopes(effects, values, motion)
+    return _rows_first(np.asarray(torque)), _rows_first(np.moveaxis(np.asarray(slope), -1, 1))
+
+
+def sensor_response(
+    batches: Mapping[str, Effect], omega: Float[np.ndarray, " F"]
+) -> dict[str, Complex[np.ndarray, "effects F"]]:
+    """`torque_response` of batches of effects."""
+    return {name: np.asarray(x) for name, x in _responses(dict(batches), omega).items()} if batches else {}
+
+
+def candidates(effect: type[Effect], model: RobotModel) -> Effect:
+    """The effect at every place where it may act, on its grid: one object with leading axes (places, grid)."""
+    places = _places(effect, model)
+    grids = {name: p for name, p in effect.parameters().items() if not p.linear}
+    mesh = np.meshgrid(*[np.asarray(p.grid) for p in grids.values()], indexing="ij")
+    points = max(1, int(np.prod([len(p.grid) for p in grids.values()])))
+    at = np.broadcast_to(places[:, None], (len(places), points, places.shape[1]))
+    values = {name: np.zeros(at.shape[:2]) for name in effect.parameters()}
+    for name, grid in zip(grids, mesh, strict=True):
+        values[name] = np.broadcast_to(grid.reshape(1, -1), at.shape[:2])
+    return effect(at, **values)
+
+
+def _places(effect: type[Effect], model: RobotModel) -> np.ndarray:
+    if effect.acts_on == "joint":
+        return np.arange(model.nv)[:, None]
+    if effect.acts_on == "link":
+        return np.arange(len(model.joints))[:, None]
+    if effect.acts_on == "robot":
+        return np.zeros((1, 0), dtype=int)
+    neighbours = {
+        tuple(sorted((model.joints[joint.parent].coordinate, joint.coordinate)))
+        for joint in model.joints
+        if joint.parent >= 0 and model.joints[joint.parent].coordinate != joint.coordinate
+    }
+    return np.array(sorted(neighbours), dtype=int).reshape(-1, 2)
+
+
+def _way(effect: Effect | type[Effect]) -> Literal["torque", "change", "position", "response"]:
+    """Where the torque comes from: an equation of its own, or the rigid body with another model or motion."""
+    way = kind(effect)
+    if way != "columns":
+        return way
+    return "change" if effect.has("change") and not effect.has("torque") else "torque"
+
+
+def _size(effect: Effect) -> Float[np.ndarray, " effects"]:
+    (name,) = effect.parameters()
+    return np.asarray(getattr(effect, name))
+
+
+def _changed_torques(batch: Effect, motion: Motion) -> Float[np.ndarray, "effects k nv nN"]:
+    """Torque of a unit of each amplitude of effects that change the robot, which it is linear in."""
+    q, v, a = motion.position, motion.velocity, motion.acceleration
+    before, models = rigid_torque(motion.model, q, v, a), _changed(batch, motion.model)
+    amplitudes = sum(p.linear for p in batch.parameters().values())
+    out = np.empty((len(batch.at), amplitudes, *before.shape[::-1]))
+    for one, amplitude in np.ndindex(out.shape[:2]):
+        changed = jax.tree.map(lambda x, i=one, k=amplitude: np.asarray(x)[i, k], models)
+        out[one, amplitude] = (rigid_torque(changed, q, v, a) - before).T
+    return out
+
+
+def _rows_first(torque: Float[np.ndarray, "*lead k nN rows"]) -> Float[np.ndarray, "*lead k rows nN"]:
+    return np.moveaxis(torque, -1, -2)
+
+
+def _amplitudes(effect: Effect) -> list[str]:
+    return [name for name, p in effect.parameters().items() if p.linear]
+
+
+@jax.jit
+def _unit_torques(batches: dict[str, Effect], motion: Motion) -> dict[str, Float[Array, "effects k nN *rows"]]:
+    return {name: jax.vmap(lambda e: columns(e, motion))(batch) for name, batch in batches.items()}
+
+
+@jax.jit
+def _units_and_slopes(
+    effects: Effect, values: Array, motion: Motion
+) -> tuple[Float[Array, "effects k nN rows"], Float[Array, "effects k nN rows p"]]:
+    names = shapes(type(effects))
+
+    def one(effect: Effect, x: Float[Array, " p"]) -> tuple[Array, Array]:
+        def unit(x: Float[Array, " p"]) -> tuple[Array, Array]:
+            torque = columns(with_shape(effect, names, list(x)), motion)
+            torque = torque.reshape(*torque.shape[:2], -1)
+            return torque, torque
+
+        slope, torque = jax.jacfwd(unit, has_aux=True)(x)
+        return torque, slope
+
+    return jax.vmap(one)(effects, values)
+
+
+@jax.jit
+def _error(effect: Effect, motion: Motion) -> Float[Array, " nN"]:
+    return effect.position_error(motion)
+
+
+@jax.jit
+def _responses(batches: dict[str, Effect], omega: Array) -> dict[str, Complex[Array, "effects F"]]:
+    return {name: jax.vmap(lambda e: e.torque_response(omega))(batch) for name, batch in batches.items()}
+
+
+@jax.jit
+def _changed(effects: Effect, model: RobotModel) -> RobotModel:
+    """The robot with a unit of each amplitude of each effect: leading axes (effects, amplitudes)."""
+    names = _amplitudes(effects)
+
+    def change(effect: Effect, unit: Array) -> RobotModel:
+        return with_shape(effect, names, list(unit)).change(model)
+
+    return jax.vmap(jax.vmap(change, in_axes=(None, 0)), in_axes=(0, None))(effects, jnp.eye(len(names)))

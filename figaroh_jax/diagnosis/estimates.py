@@ -1,0 +1,200 @@
+"""Values and intervals of the accepted causes, all fitted together, and the models that carry them."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from ..effect import Effect, joint_unit
+from ..effects import find
+from ..extended import ExtendedModel, extend
+from ..model import RobotModel
+from ..results import Estimate
+from .design import kind, sensor_response, shapes, torque_change, units_and_slopes, with_shape
+from .evidence import Rows
+from .problem import BATCH, Problem, State, filtered_rows
+
+__all__ = ["Fitted", "estimates", "fitted_model", "has_size", "joint_fit", "torque_slope", "with_amplitudes"]
+
+KEPT = 1e-12
+STEP = 1e-5  # of central differences, relative: error 1e-10 of a third derivative's size
+SURE = 0.95  # of the region of a cause's amplitudes that must not hold zero
+
+
+class Fitted(eqx.Module):
+    """Parameters fitted together: coefficients of the state, then the shapes of its causes, and their covariance."""
+
+    value: Float[np.ndarray, " parameters"]
+    covariance: Float[np.ndarray, "parameters parameters"]
+    places: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # of each cause's fields among the parameters
+
+
+def with_amplitudes(state: State, causes: list[Effect], model: RobotModel) -> list[Effect]:
+    """The causes with the amplitudes that the state has found for them."""
+    out = []
+    for effect, place in zip(causes, amplitude_places(state, causes, model), strict=True):
+        names = [name for name, p in effect.parameters().items() if p.linear]
+        out.append(with_shape(effect, names, [state.theta[i] for i in place]) if names else effect)
+    return out
+
+
+def amplitude_places(state: State, causes: list[Effect], model: RobotModel) -> list[list[int]]:
+    """Columns of each cause's amplitudes in the state; causes with columns are its last terms, in order."""
+    counts = [sum(p.linear for p in e.parameters().values()) if kind(e) == "columns" else 0 for e in causes]
+    first = len(state.theta) - sum(counts)
+    starts = first + np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int) if counts else []
+    return [list(range(s, s + c)) for s, c in zip(starts, counts, strict=True)]
+
+
+def joint_fit(
+    problem: Problem, state: State, rows: Rows, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]
+) -> Fitted:
+    """Gauss-Newton step of all coefficients and shapes at once, and a covariance from the scores of the blocks.
+
+    `A^-1 (sum_b g_b g_b' + L) A^-1` with g_b the score of a block and L the prior: right for coloured residuals too.
+    """
+    slopes, own = [], []
+    for effect in with_amplitudes(state, causes, problem.model):
+        names = shapes(type(effect))
+        own.append(len(names))
+        slopes += [torque_slope(problem, state, effect, name, whitening) for name in names]
+    J = np.concatenate([rows.X, *[s[..., None] for s in slopes]], axis=2)
+    precision = np.append(state.prior.precision, np.zeros(len(slopes)))
+    tall = J.reshape(-1, J.shape[2])
+    A = tall.T @ tall + np.diag(precision)
+    A = A + KEPT * np.diag(np.maximum(np.diag(A), KEPT))
+    residual = rows.y - rows.X @ state.theta
+    pull = np.append(state.prior.precision * (state.prior.mean - state.theta), np.zeros(len(slopes)))
+    inverse = np.linalg.inv(A)
+    step = inverse @ (tall.T @ residual.reshape(-1) + pull)
+    blocks = rows.block.max() + 1
+    member = (rows.block[:, None] == np.arange(blocks)).astype(float)
+    scores = np.sum([member.T @ (x * r[:, None]) for x, r in zip(J, residual, strict=True)], axis=0)
+    covariance = inverse @ (scores.T @ scores * blocks / max(blocks - 1, 1) + np.diag(precision)) @ inverse
+    values = [float(getattr(e, n)) for e in causes for n in shapes(type(e))]
+    places, first = [], rows.X.shape[2]
+    for amplitude, count in zip(amplitude_places(state, causes, problem.model), own, strict=True):
+        places.append((*amplitude, *range(first, first + count)))
+        first += count
+    return Fitted(np.append(state.theta, values) + step, covariance, tuple(places))
+
+
+def moved(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> Effect:
+    """The cause with its shapes after the step, kept in their bounds."""
+    names = shapes(type(effect))
+    values = fitted.value[list(place[len(place) - len(names) :])] if names else []
+    kept = []
+    for name, value in zip(names, values, strict=True):
+        parameter = effect.parameters()[name]
+        inside = float(np.clip(value, parameter.lower, parameter.upper))
+        if parameter.hole and parameter.hole[0] < inside < parameter.hole[1]:
+            inside = float(getattr(effect, name))
+        kept.append(np.float64(inside))
+    return with_shape(effect, names, kept) if names else effect
+
+
+def estimates(effect: Effect, fitted: Fitted, place: tuple[int, ...], model: RobotModel) -> dict[str, Estimate]:
+    """What an engineer reads of the effect, with one sigma (first order in the fitted parameters)."""
+    names = [n for n, p in effect.parameters().items() if p.linear and kind(effect) == "columns"]
+    names += shapes(type(effect))
+    found, slope = _physical(effect, names)
+    covariance = fitted.covariance[np.ix_(place, place)]
+    straight = effect.acts_on == "joint" and prismatic(model)[int(effect.at[0])]
+    units = {**{n: p.unit for n, p in effect.parameters().items()}, **effect.units()}
+    out = {}
+    for name, value in found.items():
+        g = slope[name]
+        std = float(np.sqrt(max(g @ covariance @ g, 0.0)))
+        out[name] = Estimate(float(value), std, joint_unit(units[name], straight))
+    return out
+
+
+def has_size(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
+    """Whether the effect's size is surely not zero: its amplitudes' 95 % region excludes it.
+
+    Amplitudes that a simpler effect has too do not count: a spring without stiffness is an offset.
+    """
+    from scipy.special import chdtri  # scipy is slow to import
+
+    names = [n for n, p in effect.parameters().items() if p.linear]
+    simpler = {name for inside in type(effect).contains for name in find(inside).parameters()}
+    own = [k for k, name in enumerate(names) if name not in simpler]
+    if not own or kind(effect) != "columns":
+        return True
+    at = np.array(place)[own]
+    value = np.array([float(getattr(effect, names[k])) for k in own])
+    covariance = fitted.covariance[np.ix_(at, at)]
+    return bool(value @ np.linalg.pinv(covariance, hermitian=True) @ value > chdtri(len(own), 1 - SURE))
+
+
+def _physical(effect: Effect, names: list[str]) -> tuple[dict[str, float], dict[str, Float[np.ndarray, " k"]]]:
+    """What is reported of the effect, and its derivatives in the fitted fields `names`."""
+    if not effect.has("physical"):
+        fields = list(effect.parameters())
+        return {n: float(getattr(effect, n)) for n in fields}, {
+            n: np.array([n == k for k in names], float) for n in fields
+        }
+    values = np.array([float(getattr(effect, name)) for name in names])
+
+    def physical(x: Float[np.ndarray, " k"]) -> dict[str, float]:
+        return {k: float(v) for k, v in with_shape(effect, names, list(x)).physical().items()}
+
+    steps = np.diag(STEP * np.maximum(np.abs(values), STEP))
+    sides = [(physical(values + step), physical(values - step)) for step in steps]
+    found = physical(values)
+    slope = {
+        key: np.array([(high[key] - low[key]) / (2 * h) for (high, low), h in zip(sides, np.diag(steps), strict=True)])
+        for key in found
+    }
+    return found, slope
+
+
+def prismatic(model: RobotModel) -> tuple[bool, ...]:
+    """Whether each coordinate slides."""
+    kinds = {joint.coordinate: joint.kind == "prismatic" for joint in reversed(model.joints)}
+    return tuple(kinds[k] for k in range(model.nv))
+
+
+def fitted_model(problem: Problem, state: State, causes: list[Effect]) -> ExtendedModel:
+    """The robot with its fitted inertia, the friction of the baseline and the causes, as one extended model."""
+    links = len(problem.model.joints)
+    inertia = state.theta[: 10 * links].reshape(links, 10)
+    robot = eqx.tree_at(lambda m: m.inertia, problem.model, inertia)
+    effects, column = [], 10 * links
+    known = {(type(e).name, tuple(np.asarray(e.at))) for e in causes}
+    for term in state.terms:
+        names = [name for name, p in term.parameters().items() if p.linear]
+        for place in range(term.at.shape[0]):
+            one = jax.tree.map(lambda x, k=place: np.asarray(x)[k], term)
+            values = [np.float64(v) for v in state.theta[column : column + len(names)]]
+            column += len(names)
+            if (term.name, tuple(one.at)) not in known:
+                effects.append(with_shape(one, names, values))
+    return extend(robot, *effects, *with_amplitudes(state, causes, problem.model), width=problem.width)
+
+
+def torque_slope(
+    problem: Problem, state: State, effect: Effect, name: str, whitening: Float[np.ndarray, "F nv"]
+) -> Float[np.ndarray, "nv T"]:
+    """Derivative of the whitened torque in one shape of the effect, its amplitudes as they are."""
+    response = state.response(problem.records.omega)[:, None] * whitening
+    names, size = shapes(type(effect)), float(getattr(effect, name))
+    if kind(effect) == "columns":
+        batch = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], BATCH, axis=0), effect)
+        values = np.stack([getattr(batch, n) for n in names], axis=1)
+        slope = units_and_slopes(batch, values, state.motion)[1][0, names.index(name)]
+        amplitudes = [float(getattr(effect, n)) for n, p in effect.parameters().items() if p.linear]
+        torque = np.zeros((slope.shape[-1], problem.model.nv))
+        own = effect.acts_on in ("joint", "pair")
+        torque[:, np.asarray(effect.at) if own else slice(None)] = np.tensordot(amplitudes, slope, 1).T
+        return filtered_rows(problem, torque, response)
+    h = STEP * max(abs(size), STEP)
+    sides = jax.tree.map(lambda *x: np.stack(x), *(with_shape(effect, [name], [size + s * h]) for s in (1, -1)))
+    if kind(effect) == "response":
+        high, low = sensor_response({effect.name: sides}, problem.records.omega)[effect.name]
+        relative = 2 * (high - low) / (high + low) / (2 * h)
+        return filtered_rows(problem, state.motion.total, response * relative[:, None])
+    high, low = torque_change(sides, state.motion, problem.records)
+    return filtered_rows(problem, (high - low) / (2 * h), response)

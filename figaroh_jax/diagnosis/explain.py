@@ -1,0 +1,69 @@
+"""What the data can say of each candidate before any verdict: identifiable, detectable, nameable."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from ..results import Candidate
+from .evidence import Linear, Rows
+from .screening import Screen
+
+__all__ = ["explain"]
+
+VISIBLE = 4.0  # noise sigmas at which an effect is seen
+CUT = 1e-9
+
+
+def explain(rows: Rows, linear: Linear, found: Screen, noise: Float[np.ndarray, " nv"]) -> tuple[Candidate, ...]:
+    """Share outside the current model, smallest torque that would show (N m or N), nearest other effect and angle."""
+    points = [int(np.argmax(result.Q)) for result in found.scores]
+    columns = [_full(rows, g.columns.joints, g.columns.Z[p]) for g, p in zip(found.groups, points, strict=True)]
+    sizes = [c.shape[0] for c in columns]
+    Z = np.concatenate(columns).astype(np.float32 if len(columns) > 400 else np.float64)
+    ZX = Z @ rows.X.reshape(Z.shape[1], -1)
+    raw = Z @ Z.T
+    left = raw - ZX @ linear.inverse @ ZX.T
+    starts = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
+    spans = [slice(a, b) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    angle, near = _angles(left, spans)
+    out = []
+    for i, (group, own) in enumerate(zip(found.groups, spans, strict=True)):
+        share = float(np.clip(np.trace(left[own, own]) / max(np.trace(raw[own, own]), 1e-300), 0, 1))
+        count = np.count_nonzero(rows.y[list(group.columns.joints)])
+        level = float(np.mean(noise[list(group.columns.joints)]))
+        seen = VISIBLE * level / np.sqrt(max(count * share, 1e-12))
+        score = float(found.scores[i].z[points[i]])
+        out.append(Candidate(group.name, share, seen, found.groups[near[i]].name, float(angle[i]), score))
+    return tuple(out)
+
+
+def _full(rows: Rows, joints: tuple[int, ...], Z: Float[np.ndarray, "k rows T"]) -> Float[np.ndarray, "k nvT"]:
+    full = np.zeros((len(Z), *rows.y.shape))
+    full[:, list(joints)] = Z
+    return full.reshape(len(Z), -1)
+
+
+def _angles(
+    left: Float[np.ndarray, "columns columns"], spans: list[slice]
+) -> tuple[Float[np.ndarray, " groups"], list[int]]:
+    """Smallest angle (degrees) of each group to any other, in the rows with the current model projected out."""
+    count = len(spans)
+    whiten = np.zeros_like(left)
+    for own in spans:
+        values, vectors = np.linalg.eigh(left[own, own])
+        good = values > CUT * max(values.max(), 1e-300)
+        root = vectors[:, good] / np.sqrt(values[good])
+        whiten[own, own.start : own.start + root.shape[1]] = root
+    together = whiten.T @ left @ whiten
+    starts, sizes = [own.start for own in spans], np.array([own.stop - own.start for own in spans])
+    # the Frobenius norm of a block bounds its largest singular value, and is it where the block is a row or a column
+    cosine = np.sqrt(np.add.reduceat(np.add.reduceat(together**2, starts, axis=0), starts, axis=1))
+    cosine[np.diag_indices(count)] = 0.0
+    wide = np.minimum(sizes[:, None], sizes) > 1
+    bound, cosine = cosine, np.where(wide, 0.0, cosine)
+    for i, j in np.argwhere(np.tril(wide, -1)):
+        if bound[i, j] > min(cosine[i].max(), cosine[j].max()):
+            cosine[i, j] = cosine[j, i] = np.linalg.norm(together[spans[i], spans[j]], 2)
+    near = cosine.argmax(1)
+    return np.degrees(np.arccos(np.clip(cosine.max(1), 0, 1))), [int(k) for k in near]

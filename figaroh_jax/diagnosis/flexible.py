@@ -1,0 +1,164 @@
+"""Smooth families of torque: they test, describe and stand in for what has no name yet; they are never a cause."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ..effect import Motion
+from ..results import Name
+from .evidence import Columns, Rows, fit, with_columns
+from .noise import Spectrum
+from .problem import FRICTION_PRECISION, Problem, State, filtered_rows, whitened
+from .screening import Group, family_p, screen
+
+__all__ = ["families", "flexible_p", "friction_width"]
+
+DEGREES = 6
+WIDTHS = (0.0, 0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # rad/s or m/s
+WIDTH_GAIN = 10.0
+
+
+def flexible_p(
+    problem: Problem,
+    state: State,
+    rows: Rows,
+    spectrum: Spectrum,
+    whitening: Float[np.ndarray, "F nv"],
+    generator: np.random.Generator,
+) -> tuple[float, Name, float]:
+    """p-value of four smooth families a joint (position; friction over q and v; posture; time), the strongest of them,
+    and by how much its score exceeds what chance gives (squares of the whitened rows).
+
+    They test and describe; they are never named as a cause.
+    """
+    groups = families(problem, state, whitening)
+    linear = fit(rows, state.prior)
+    found = screen(rows, linear, groups)
+    p = family_p(problem, rows, linear, found, spectrum, whitening, generator)
+    best = int(np.argmax([result.z.max() for result in found.scores]))
+    score = found.scores[best]
+    return p, found.groups[best].name, float(score.Q.max() - score.rank.max())
+
+
+def friction_width(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> Problem:
+    """The problem with the half width of each joint's dry friction that fits best, from `WIDTHS`.
+
+    A simulator smooths Coulomb friction, a real gear rounds it: taken as a hard sign, the rest would be named Stribeck.
+    A joint keeps a width of zero unless another lowers the squares by more than `WIDTH_GAIN`. Smooth functions of
+    position and time stand beside, so that the width does not make up for a cause that is not in yet.
+    """
+    rows = with_columns(whitened(problem, state, whitening), _smooth_columns(problem, state, whitening))
+    prior = state.prior.extended(rows.X.shape[2] - len(state.theta))
+    X, y = rows.X.reshape(-1, rows.X.shape[-1]), rows.y.reshape(-1)
+    G, b = X.T @ X + np.diag(prior.precision), X.T @ y + prior.precision * prior.mean
+    width = np.array(problem.width)
+    signs = [_with_width(problem, state, whitening, w) for w in WIDTHS]
+    for joint in range(problem.model.nv):
+        column = _coulomb_column(problem, state, joint)
+        if column is None:
+            continue
+        tried = [rows_of_width[joint] for rows_of_width in signs]
+        costs = [_replaced(G, b, column, z @ rows.X[joint], z @ z, z @ rows.y[joint])[0] for z in tried]
+        best = int(np.argmin(np.array(costs) - WIDTH_GAIN * (np.array(WIDTHS) == 0)))
+        width[joint] = WIDTHS[best]
+        z = tried[best]
+        G, b = _replaced(G, b, column, z @ rows.X[joint], z @ z, z @ rows.y[joint])[1:]
+        rows.X[joint, :, column] = z
+    return replace(problem, width=width)
+
+
+def _smooth_columns(
+    problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]
+) -> Float[np.ndarray, "nv T columns"]:
+    """Position, time, offset and acceleration of each joint as columns of their own."""
+    nv, columns = problem.model.nv, []
+    joints = [_smooth(state.motion, joint) for joint in range(nv)]
+    acceleration = np.asarray(state.motion.acceleration)
+    series = [np.stack([j["position"][k] for j in joints], 1) for k in range(DEGREES)]
+    series += [np.stack([j["time"][k] for j in joints], 1) for k in range(DEGREES - 1)]
+    for one in [*series, acceleration, np.ones_like(acceleration)]:
+        rows = filtered_rows(problem, one, whitening)
+        columns += [rows * (np.arange(nv) == joint)[:, None] for joint in range(nv)]
+    return np.stack(columns, axis=2)
+
+
+def _coulomb_column(problem: Problem, state: State, joint: int) -> int | None:
+    """Column of the joint's Coulomb friction in the regressor, if the model has one."""
+    column = 10 * len(problem.model.joints)
+    for term in state.terms:
+        amplitudes = sum(p.linear for p in term.parameters().values())
+        for at in np.asarray(term.at):
+            if term.name == "coulomb_friction" and at[0] == joint:
+                return column
+            column += amplitudes
+    return None
+
+
+def _with_width(
+    problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], width: float
+) -> Float[np.ndarray, "nv T"]:
+    """Whitened rows of every joint's dry friction with another width."""
+    motion = eqx.tree_at(lambda m: m.width, state.motion, np.full(problem.model.nv, width))
+    response = whitening * state.response(problem.records.omega)[:, None]
+    return filtered_rows(problem, np.asarray(motion.direction), response)
+
+
+def _replaced(G: np.ndarray, b: np.ndarray, column: int, cross: np.ndarray, square: float, right: float):
+    """Penalised squares (less a constant) of the fit with one column replaced, and its normal equations."""
+    old = G[column, column]
+    G, b = G.copy(), b.copy()
+    own = cross.copy()
+    own[column] = square
+    precision = FRICTION_PRECISION if old > 0 else 0.0
+    G[column], G[:, column] = own, own
+    G[column, column] += precision
+    b[column] = right
+    theta = np.linalg.solve(G + 1e-12 * np.diag(np.maximum(np.diag(G), 1e-12)), b)
+    return -float(b @ theta), G, b
+
+
+def families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], still: bool = False) -> list[Group]:
+    """Smooth functions in the rows of each joint: of its position; of its velocity and position, odd in the velocity;
+    of all positions (second degree); and, unless `still`, of time."""
+    nv = problem.model.nv
+    joints = [_smooth(state.motion, joint) for joint in range(nv)]
+    series = {
+        title: [np.stack([j[title][k] for j in joints], 1) for k in range(len(joints[0][title]))] for title in joints[0]
+    }
+    series["posture"] = [np.repeat(column[:, None], nv, axis=1) for column in _posture(state.motion)]
+    groups = []
+    for title, columns in series.items():
+        if still and title == "time":
+            continue
+        rows = np.stack([filtered_rows(problem, one, whitening) for one in columns])
+        for joint, name in enumerate(problem.model.joint_names):
+            groups.append(Group(Name(title, (name,)), None, Columns((joint,), rows[None, :, joint][:, :, None])))
+    return groups
+
+
+def _posture(motion: Motion) -> list[Float[np.ndarray, " nN"]]:
+    """First and second degree in all positions: near to any torque that follows the posture alone."""
+    x = [_unit(q) for q in np.asarray(motion.position).T]
+    return [*x, *(x[i] * x[k] for i in range(len(x)) for k in range(i + 1))]
+
+
+def _smooth(motion: Motion, joint: int) -> dict[str, list[Float[np.ndarray, " nN"]]]:
+    q, v = np.asarray(motion.position)[:, joint], np.asarray(motion.velocity)[:, joint]
+    t, s = np.asarray(motion.time), np.asarray(motion.direction)[:, joint]
+    x, u, w = _unit(q), _unit(np.abs(v)), _unit(t)
+    powers = [np.polynomial.chebyshev.chebval(x, np.eye(DEGREES + 1)[k]) for k in range(1, DEGREES + 1)]
+    speeds = [np.polynomial.chebyshev.chebval(u, np.eye(4)[k]) for k in range(4)]
+    return {
+        "position": powers,
+        "friction": [s * f for f in speeds] + [s * p for p in powers[:3]] + [np.abs(s) * p for p in powers[:1]],
+        "time": [np.cos(np.pi * k * (w + 1) / 2) for k in range(1, DEGREES)],
+    }
+
+
+def _unit(x: Float[np.ndarray, " nN"]) -> Float[np.ndarray, " nN"]:
+    low, high = x.min(), x.max()
+    return 2 * (x - low) / max(high - low, 1e-9) - 1

@@ -1,0 +1,100 @@
+"""Which rows repeat one another, which are judged together, which are left out together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..recordings.signals import Signals, align
+from .problem import Layout
+from .records import Records
+
+__all__ = ["describe_folds", "held_rows", "layout"]
+
+BLOCK, SHORT_BLOCK, SHORT = 1.0, 0.3, 9.99  # s: of a block, of a block in recordings shorter than the third
+QUARTERS = 4
+FEWEST_EXCITATIONS = 3
+
+
+def layout(signals: Sequence[Signals], records: Records) -> Layout:
+    """Partners of every row, blocks of about a second, folds of one excitation (or quarters where they are few).
+
+    Holdout recordings stand behind the others and belong to no block and no fold.
+    """
+    n, _, count, _ = records.shape
+    partner = _partners(signals, records)
+    repeats = bool((partner >= 0).any())
+    weight = np.asarray(records.weight)
+    if repeats:
+        target = np.maximum(partner, 0)
+        flat = weight.reshape(n * count, -1)
+        partner = np.where(flat[target].any(-1), partner, -1)
+        paired = (flat[target] * (partner >= 0)[..., None]).max(0).T
+    else:
+        partner, paired = partner[:0], np.ones((weight.shape[2], n * count))
+    return Layout(partner, paired, _blocks(signals, records), _folds(signals, records), repeats)
+
+
+def held_rows(signals: Sequence[Signals], records: Records) -> Float[np.ndarray, "n M nv"]:
+    """1 for the rows of recordings that are kept out of the fit and have torque."""
+    held = np.zeros_like(np.asarray(records.weight))
+    for k, one in enumerate(signals):
+        if one.role == "holdout" and one.torque is not None:
+            held[k, : one.rows.kept] = one.rows.weight
+    return held
+
+
+def describe_folds(signals: Sequence[Signals]) -> str:
+    """How the folds were made, in words."""
+    labels = excitations([s for s in signals if s.role == "fit"])
+    if max(labels) + 1 >= FEWEST_EXCITATIONS:
+        return "each excitation left out in turn"
+    return "each recording's quarters left out in turn"
+
+
+def excitations(signals: Sequence[Signals]) -> list[int]:
+    """Number of the excitation that each recording carries: repeats share one."""
+    seen: dict[str, int] = {}
+    return [seen.setdefault(s.repeat or f"\0{k}", len(seen)) for k, s in enumerate(signals)]
+
+
+def _partners(signals: Sequence[Signals], records: Records) -> Int[np.ndarray, "partners T"]:
+    """Row of every other repeat of the same excitation, -1 where it has none."""
+    n, _, count, _ = records.shape
+    labels = excitations([s for s in signals if s.role == "fit"])
+    most = max(labels.count(label) for label in labels) - 1
+    partner = np.full((max(most, 1), n, count), -1)
+    for one in range(len(labels)):
+        others = [k for k in range(len(labels)) if k != one and labels[k] == labels[one]]
+        for slot, other in enumerate(others):
+            row = np.arange(count) + align(signals[one], signals[other])
+            inside = (row >= 0) & (row < signals[other].rows.kept) & (np.arange(count) < signals[one].rows.kept)
+            partner[slot, one] = np.where(inside, other * count + row, -1)
+    return partner.reshape(len(partner), -1)
+
+
+def _blocks(signals: Sequence[Signals], records: Records) -> Int[np.ndarray, " T"]:
+    n, _, count, _ = records.shape
+    seconds = np.arange(count) / float(records.rate)
+    block, start = np.full((n, count), -1), 0
+    for k, one in enumerate(s for s in signals if s.role == "fit"):
+        length = one.time[-1] - one.time[0]
+        width = BLOCK if length > SHORT else SHORT_BLOCK
+        number = np.minimum(seconds / width, max(1, round(seconds[one.rows.kept - 1] / width)) - 1).astype(int)
+        block[k, : one.rows.kept] = start + number[: one.rows.kept]
+        start = block[k].max() + 1
+    return block.reshape(-1)
+
+
+def _folds(signals: Sequence[Signals], records: Records) -> Int[np.ndarray, " T"]:
+    n, _, count, _ = records.shape
+    fitted = [s for s in signals if s.role == "fit"]
+    labels = excitations(fitted)
+    fold = np.full((n, count), -1)
+    for k, one in enumerate(fitted):
+        quarter = np.minimum(np.arange(count) * QUARTERS // max(one.rows.kept, 1), QUARTERS - 1)
+        fold[k] = labels[k] if max(labels) + 1 >= FEWEST_EXCITATIONS else labels[k] * QUARTERS + quarter
+        fold[k, one.rows.kept :] = -1
+    return fold.reshape(-1)

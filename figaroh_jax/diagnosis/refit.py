@@ -1,0 +1,171 @@
+"""Exact refit of what enters nonlinearly: the profile likelihood of an effect's shape, minimised in its box.
+
+For a shape p the linear unknowns are solved for, so the profile is J(p) = -s'G^-1 s for columns Z(p), s = Z'r and
+G = Z'Z - Z'X A^-1 X'Z, with its gradient from those of the columns; for a position sensor, whose size is its
+parameter, J(p) = D'D - 2 D'r - D'X A^-1 X'D with the exact change D(p) of the torque.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ..effect import Effect, Motion
+from .design import Units, rigid_torque, shapes, torque_change, unit_rows, units_and_slopes, with_shape
+from .records import Records
+
+__all__ = ["Whitened", "bounded_minimum", "profile", "refit", "refit_shift", "shift_profile"]
+
+STEPS = 12
+RIDGE = 1e-9
+CLOSE = 1e-2  # of its bracket: how exactly the size of a shift is searched
+
+
+class Whitened(NamedTuple):
+    """Residual and regressor of the current model as whitened rows, `A^-1`, and the whitening response."""
+
+    residual: Float[np.ndarray, "nv n M"]
+    X: Float[np.ndarray, "nv n M P"]
+    inverse: Float[np.ndarray, "P P"]
+    whitening: Complex[np.ndarray, "F nv"] | Float[np.ndarray, "F nv"]
+
+
+def bounded_minimum(
+    function: Callable[[Any], tuple[Any, Any]], start: Any, lower: Any, upper: Any, *, native: bool = False
+) -> Any:
+    """Minimiser in a box of a smooth function that answers its value and its gradient, by L-BFGS-B.
+
+    The only place that knows the minimisers. SciPy's runs on the host around one compiled function. `native` takes
+    jaxopt's, which works inside `jit` and `vmap` but compiles its own loop around every function (6 CPU s around a
+    trivial one, 13 to 38 s around a refit), and is no longer maintained.
+    """
+    if native:
+        from jaxopt import LBFGSB
+
+        solver = LBFGSB(function, value_and_grad=True, maxiter=STEPS, tol=1e-6, implicit_diff=False)
+        return solver.run(start, bounds=(lower, upper)).params
+    from scipy.optimize import minimize  # slow to import
+
+    options = {"maxiter": STEPS, "ftol": 1e-7, "gtol": 1e-6}
+    return minimize(function, start, jac=True, bounds=list(zip(lower, upper, strict=True)), options=options).x
+
+
+def profile(
+    Z: Float[np.ndarray, "k rows n M"],
+    slope: Float[np.ndarray, "p k rows n M"],
+    joints: list[int],
+    whitened: Whitened,
+) -> tuple[float, Float[np.ndarray, " p"]]:
+    """J of the columns `Z` at the `joints`, the change of the penalised squares that they bring, and its gradient.
+
+    With x = G^-1 s: dJ = x' dG x - 2 ds'x.
+    """
+    residual, X = whitened.residual[joints].reshape(-1), whitened.X[joints].reshape(-1, whitened.X.shape[-1])
+    k = len(Z)
+    flat = Z.reshape(k, -1)
+    s, C, gram = flat @ residual, flat @ X, flat @ flat.T
+    taken = C @ whitened.inverse
+    scale = np.sqrt(np.diagonal(gram) + 1e-300)
+    unit = (gram - taken @ C.T) / np.outer(scale, scale) + RIDGE * np.eye(k)
+    x = np.linalg.solve(unit, s / scale) / scale
+    left = x @ flat - X @ (x @ taken)  # what G x is a product with: the columns less what the model takes up
+    changes = slope.reshape(len(slope), k, -1)
+    return float(-s @ x), 2 * (changes @ (left - residual)) @ x
+
+
+def refit(
+    effects: Effect, motion: Motion, records: Records, whitened: Whitened
+) -> tuple[Effect, Float[np.ndarray, "k rows n M"]]:
+    """Best shape over the starts (leading axis of `effects`), each between its neighbours on the grid; its columns.
+
+    All starts are one box problem: the sum of their profiles, whose gradient is that of each.
+    """
+    names = shapes(type(effects))
+    start = np.stack([np.asarray(getattr(effects, name)) for name in names], axis=-1)
+    box = np.stack([_box(effects.parameters()[n], x) for n, x in zip(names, start.T, strict=True)], axis=-1)
+    low, width = box[:, 0], box[:, 1] - box[:, 0]
+    device_effects, device_motion = jax.device_put((effects, motion))
+    scale, known = 1.0, {}
+
+    def function(u: Float[np.ndarray, " startsp"]) -> tuple[float, Float[np.ndarray, " startsp"]]:
+        values = low + u.reshape(low.shape) * width
+        known.update(_profiles(device_effects, device_motion, values, records, whitened), at=values)
+        return float(known["value"].sum()) / scale, (known["slope"] * width).reshape(-1) / scale
+
+    first = ((start - low) / width).reshape(-1)
+    scale = abs(function(first)[0]) + 1e-9
+    values = (
+        low + bounded_minimum(function, first, np.zeros_like(first), np.ones_like(first)).reshape(low.shape) * width
+    )
+    if not np.array_equal(known["at"], values):
+        known = _profiles(device_effects, device_motion, values, records, whitened)
+    best = int(np.argmin(np.where(np.isfinite(known["value"]), known["value"], np.inf)))
+    one = jax.tree.map(lambda x: np.asarray(x)[best], effects)
+    return with_shape(one, names, list(values[best])), known["Z"][best]
+
+
+def shift_profile(change: Float[np.ndarray, "sizes nv T"], whitened: Whitened) -> Float[np.ndarray, " sizes"]:
+    """J of whitened rows of exact changes of the torque."""
+    D = change.reshape(len(change), -1)
+    C = D @ whitened.X.reshape(D.shape[1], -1)
+    return (D * (D - 2 * whitened.residual.reshape(-1))).sum(1) - ((C @ whitened.inverse) * C).sum(1)
+
+
+def refit_shift(
+    effects: Effect, Z: Float[np.ndarray, "grid nv T"], motion: Motion, records: Records, whitened: Whitened
+) -> Effect:
+    """The effect of a position sensor with the size that fits best, between the neighbours of the best grid point.
+
+    `effects` are the grid of its size, `Z` their columns. The profile of a shift has one valley. It is searched
+    without its gradient: that of the inverse dynamics takes longer to compile than all the values that a search in
+    one number needs. The load is that of the motion as read: right to first order, and near enough to begin with.
+    """
+    from scipy.optimize import minimize_scalar  # slow to import
+
+    ((name, parameter),) = effects.parameters().items()
+    sizes, one = np.asarray(getattr(effects, name)), jax.tree.map(lambda x: np.asarray(x)[:1], effects)
+    best = sizes[np.argmin(shift_profile(Z * sizes[:, None, None], whitened))]
+    edges = np.array([parameter.lower, *np.sort(sizes), parameter.upper])
+    low, high = edges[edges < best].max(initial=parameter.lower), edges[edges > best].min(initial=parameter.upper)
+    as_read = rigid_torque(motion.model, motion.position, motion.velocity, motion.acceleration)
+    joints = np.arange(as_read.shape[1])[None]
+
+    def value(size: float) -> float:
+        change = torque_change(with_shape(one, [name], [np.array([size])]), motion, records, as_read, turns=0)
+        rows = unit_rows(Units(np.swapaxes(change, 1, 2)[:, None], joints), records, whitened.whitening)
+        return float(shift_profile(rows, whitened)[0])
+
+    options = {"xatol": CLOSE * (high - low), "maxiter": 2 * STEPS}
+    found: Any = minimize_scalar(value, bounds=(low, high), method="bounded", options=options)
+    return with_shape(jax.tree.map(lambda x: x[0], one), [name], [np.float64(found.x)])
+
+
+def _profiles(
+    effects: Effect, motion: Motion, values: Float[np.ndarray, "starts p"], records: Records, whitened: Whitened
+) -> dict[str, Any]:
+    """Profile, gradient and columns of several starts, each its own effect with its own shape."""
+    torque, slope = units_and_slopes(effects, values, motion)
+    starts, p, k = slope.shape[:3]
+    own = effects.acts_on in ("joint", "pair")
+    joints = np.asarray(effects.at) if own else np.tile(np.arange(len(whitened.residual)), (starts, 1))
+    both = np.concatenate([torque[:, None], slope], axis=1).reshape(starts, (1 + p) * k, *torque.shape[2:])
+    rows = unit_rows(Units(both, joints), records, whitened.whitening)
+    rows = rows.reshape(starts, 1 + p, k, *rows.shape[2:])
+    parts = [profile(one[0], one[1:], list(at), whitened) for one, at in zip(rows, joints, strict=True)]
+    value, gradient = (np.array(x) for x in zip(*parts, strict=True))
+    return {"value": value, "slope": gradient, "Z": rows[:, 0]}
+
+
+def _box(parameter: Any, starts: Float[np.ndarray, " starts"]) -> Float[np.ndarray, "starts 2"]:
+    """Neighbouring grid points of each start; the outermost reach to the parameter's bounds."""
+    grid = np.array([parameter.lower, *sorted(parameter.grid), parameter.upper])
+    place = np.array([np.argmin(np.abs(grid[1:-1] - x)) + 1 for x in starts])
+    low, high = grid[place - 1], grid[place + 1]
+    if parameter.hole:
+        low = np.where(starts >= parameter.hole[1], np.maximum(low, parameter.hole[1]), low)
+        high = np.where(starts <= parameter.hole[0], np.minimum(high, parameter.hole[0]), high)
+    return np.stack([low, high], axis=1)

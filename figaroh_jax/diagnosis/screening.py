@@ -1,0 +1,185 @@
+"""Which of all candidates the residual points to: scores of the whole catalogue and one family-wise p-value.
+
+Naming starts here and never ends here: columns that are right to first order find, exact models decide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from ..effect import Effect
+from ..effects import CATALOGUE, LinkEffect
+from ..model import RobotModel
+from ..results import Name
+from .design import flattened, unit_rows, units
+from .evidence import Bank, Columns, Linear, Rows, Score, bank, block_scores, largest, other_scores, projection, scores
+from .noise import Spectrum
+from .problem import Problem, State
+
+__all__ = ["Group", "Screen", "catalogue", "family_p", "screen"]
+
+DRAWS, CHUNK = 400, 50  # draws, and how many are held at once
+ALTERNATIVES = ({"torque_delay", "torque_lag"},)  # once one is in, the other is not tried
+
+
+class Group(NamedTuple):
+    """One effect at one place: `effect` has a leading axis, the grid of its shape."""
+
+    name: Name
+    effect: Any  # an `Effect`; None for a family that has no name
+    columns: Columns
+
+
+class Screen(NamedTuple):
+    """Scores of all groups, and what they were computed from."""
+
+    groups: list[Group]
+    scores: list[Score]
+    stock: Bank
+    H: Float[np.ndarray, "P columns"]
+
+    def best(self, rows: Rows) -> list[tuple[float, int, int]]:
+        """Rank (Q less its penalties), group and grid point, best first."""
+        out = []
+        for index, result in enumerate(self.scores):
+            point = int(np.argmax(result.Q))
+            penalty = result.rank[point] * np.log(rows.size) + 2 * np.log(len(result.Q))
+            out.append((float(result.Q[point] - penalty), index, point))
+        return sorted(out, reverse=True)
+
+
+def catalogue(
+    problem: Problem,
+    state: State,
+    rows: Rows,
+    whitening: Float[np.ndarray, "F nv"],
+    forbid: Collection[str],
+    before: list[Group] | None = None,
+) -> list[Group]:
+    """Whitened columns of every effect that may be named, at every place and grid point.
+
+    `before` are the groups of an earlier state with the same sensors: columns that do not follow the torque are kept.
+    """
+    taken = {(type(e).name, at) for term in state.terms for e, at in _places_of(term)}
+    taken |= {(effect.name, tuple(int(i) for i in np.asarray(effect.at))) for effect in state.sensors}
+    closed = {name for pair in ALTERNATIVES if any(t[0] in pair for t in taken) for name in pair}
+    wanted = [n for n in CATALOGUE if n not in forbid and n not in closed]
+    batches = {n: b for family in problem.families.values() for n, b in family.items()}
+    old = {group.name: group.columns for group in before or ()}
+    fresh = _fresh_columns(problem, state, whitening, wanted, everything=before is None)
+    groups = []
+    for name in (n for n in wanted if n in batches):
+        for place, at in enumerate(np.asarray(batches[name].at)[:, 0].tolist()):
+            title = Name(name, place_names(problem.model, batches[name], tuple(at)))
+            if (name, tuple(at)) in taken:
+                continue
+            columns = fresh[name][place] if name in fresh else old.get(title)
+            if columns is None and isinstance(batches[name], LinkEffect):
+                columns = _link_columns(rows, at[0], problem.model)
+            if columns is not None and np.abs(columns.Z).max() > 0:
+                one = jax.tree.map(lambda x, p=place: np.asarray(x)[p], batches[name])
+                groups.append(Group(title, one, columns))
+    return groups
+
+
+def _fresh_columns(
+    problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], wanted: Collection[str], everything: bool
+) -> dict[str, list[Columns]]:
+    """Whitened columns by place: of all wanted effects, or of those whose columns follow the torque of the state."""
+    given = problem.family("following", state.motion)
+    if everything:
+        given |= problem.fixed | problem.family("shaped", state.motion)
+    sensors = {n: b for n, b in problem.families["sensor"].items() if n in wanted and (everything or b.follows_torque)}
+    given |= units({n: flattened(b) for n, b in sensors.items()}, state.motion, problem.records)
+    response = whitening * state.response(problem.records.omega)[:, None]
+    batches = {n: b for family in problem.families.values() for n, b in family.items()}
+    out = {}
+    for name in (n for n in given if n in wanted):
+        places, grid = batches[name].at.shape[:2]
+        rows = unit_rows(given[name], problem.records, response)
+        rows = rows.reshape(places, grid, *rows.shape[1:3], -1)
+        joints = given[name].joints[::grid].tolist()
+        out[name] = [Columns(tuple(at), Z) for at, Z in zip(joints, rows, strict=True)]
+    return out
+
+
+def place_names(model: RobotModel, effect: Effect | type[Effect], at: tuple[int, ...]) -> tuple[str, ...]:
+    """Names of the joints or of the link at the indices."""
+    names = model.link_names if effect.acts_on == "link" else model.joint_names
+    return tuple(names[i] for i in at)
+
+
+def screen(rows: Rows, linear: Linear, groups: list[Group], before: Screen | None = None) -> Screen:
+    """Scores of all groups with the current model projected out.
+
+    `before` is the screen of a model that this one has only added columns to: what is the same is taken from there.
+    """
+    stock = bank(rows, [group.columns for group in groups], before.stock if before else None)
+    H = projection(linear, stock)
+    return Screen(groups, scores(linear, stock, H), stock, H)
+
+
+def family_p(
+    problem: Problem,
+    rows: Rows,
+    linear: Linear,
+    found: Screen,
+    spectrum: Spectrum,
+    whitening: Float[np.ndarray, "F nv"],
+    generator: np.random.Generator,
+    draws: int = DRAWS,
+) -> float:
+    """Chance that noise alone gives some candidate of the whole catalogue a score as large as the largest.
+
+    The larger of two nulls: noise drawn from the spectrum (its coefficients redrawn each time), and fair signs of
+    whole blocks of the residual, the prior's rows among the blocks.
+    """
+    highest = max(float(result.z.max()) for result in found.scores)
+    parts = block_scores(rows, linear, found.stock, found.H)
+    signs = generator.choice([-1.0, 1.0], (draws, len(parts)))
+    nulls = [largest(found.stock, found.scores, signs @ parts)]
+    prior = np.sqrt(np.maximum(np.diag(linear.moment) - (rows.Xi**2).sum((0, 1)), 0))
+    drawn, light = [], found.stock.single()
+    for _ in range(draws // CHUNK):
+        noise = draw_noise(problem, spectrum, whitening, CHUNK, generator)
+        pulls = prior * generator.standard_normal((CHUNK, len(prior)))
+        again = other_scores(rows, light, found.H, noise) + pulls @ found.H
+        drawn.append(largest(found.stock, found.scores, again))
+    nulls.append(np.concatenate(drawn))
+    return max((1 + np.sum(null >= highest)) / (draws + 1) for null in nulls)
+
+
+def draw_noise(
+    problem: Problem,
+    spectrum: Spectrum,
+    whitening: Float[np.ndarray, "F nv"],
+    draws: int,
+    generator: np.random.Generator,
+) -> Float[np.ndarray, "draws nv T"]:
+    """Whitened rows of noise with the spectrum, its coefficients redrawn from their covariance (single precision)."""
+    records = problem.records
+    n, _, count, nv = records.shape
+    frequency = np.fft.rfftfreq(count, 1 / float(records.rate))
+    known = np.asarray(records.omega) / (2 * np.pi)
+    response = [np.interp(frequency, known, np.asarray(records.low_pass) * whitening[:, j]) for j in range(nv)]
+    shape = np.sqrt(spectrum.redrawn(generator).power(frequency)).T * np.stack(response)
+    # what `rfft` makes of white noise: equal real and imaginary parts, but for the two ends, which are real
+    shape *= np.sqrt(count / 2)
+    shape[:, [0, -1] if count % 2 == 0 else [0]] *= np.sqrt(2)
+    white = generator.standard_normal((draws, nv, n, len(frequency), 2), np.float32).view(np.complex64)[..., 0]
+    rows = np.fft.irfft(white * shape[:, None].astype(np.float32), count, axis=-1)
+    return (rows * np.moveaxis(np.asarray(records.weight, np.float32), 2, 0)).reshape(draws, nv, -1)
+
+
+def _link_columns(rows: Rows, link: int, model: RobotModel) -> Columns:
+    Z = np.swapaxes(rows.X[:, :, 10 * link : 10 * link + 10], 1, 2)
+    return Columns(tuple(range(model.nv)), np.moveaxis(Z, 1, 0)[None])
+
+
+def _places_of(term: Effect) -> list[tuple[Effect, tuple[int, ...]]]:
+    return [(term, tuple(int(i) for i in at)) for at in np.asarray(term.at)]

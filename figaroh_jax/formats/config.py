@@ -1,0 +1,378 @@
+"""The task file: every key of TASK.yaml with its type, its default and what may stand there.
+
+`load_task` reads a file, follows `extends` and checks all of it; the first mistake becomes one `InputError` that names
+file and key. The models can also be built in Python: `Preprocess(cutoff=15)`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+from ..errors import InputError, nearest
+from .taskfile import CONTRACT_EFFECTS, merge, read_task, where
+
+if TYPE_CHECKING:
+    from ..model import RobotModel
+
+__all__ = [
+    "Actuator",
+    "Baseline",
+    "BaselineEffect",
+    "Bound",
+    "Diagnose",
+    "Identify",
+    "Load",
+    "Measurement",
+    "Preprocess",
+    "RecordingEntry",
+    "Robot",
+    "Task",
+    "Transmission",
+    "Units",
+    "load_robot",
+    "load_task",
+    "robot_options",
+]
+
+
+def _not_bool(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError("expected a number")
+    return value
+
+
+def _columns(value: Any) -> Any:
+    names = value if isinstance(value, (list, tuple)) else [value]
+    if not names or not all(isinstance(name, str) and name for name in names):
+        raise ValueError("expected the name of an array, a prefix of column names or a list of columns")
+    return value if isinstance(value, str) else tuple(value)
+
+
+def _effect(name: str) -> str:
+    from ..effects import CATALOGUE
+
+    known = list(dict.fromkeys([*CATALOGUE, *CONTRACT_EFFECTS]))
+    if name not in known:
+        raise ValueError(f"no effect '{name}'{nearest(name, known)}")
+    return name
+
+
+def _label(value: Any) -> Any:
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+Number = Annotated[float, BeforeValidator(_not_bool)]
+Positive = Annotated[Number, Field(gt=0)]
+Columns = Annotated[str | tuple[str, ...], BeforeValidator(_columns)]
+Effect = Annotated[str, BeforeValidator(lambda name: _effect(str(name)))]
+Label = Annotated[str, BeforeValidator(_label)]
+Vector = tuple[Number, Number, Number]
+Matrix = list[list[Number]]
+
+
+class _Keys(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, value: Any) -> Any:
+        known = list(cls.model_fields)
+        if isinstance(value, dict):
+            for key in value:
+                if key not in known:
+                    raise ValueError(f"unknown key '{key}'{nearest(str(key), known)}")
+        elif not isinstance(value, BaseModel):
+            raise ValueError(f"expected keys and values: {', '.join(known)}")
+        return value
+
+
+class Robot(_Keys):
+    """Which model, which of its joints move, and how far its inertials are believed."""
+
+    model: Path
+    root: Literal["fixed", "free_flyer"] = "fixed"
+    joints: tuple[str, ...] | None = None  # moving joints in column order; None: all of them
+    posture: dict[str, Number | tuple[Number, ...]] = {}  # of the locked joints, rad or m; a list where q has several
+    gravity: Vector = (0.0, 0.0, -9.81)  # m/s^2
+    trust: Positive = 0.10  # relative one sigma of the nominal inertials
+
+    @field_validator("joints")
+    @classmethod
+    def _once(cls, joints: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        for joint in joints or ():
+            if joints is not None and joints.count(joint) > 1:
+                raise ValueError(f"joint '{joint}' stands there twice")
+        if joints == ():
+            raise ValueError("expected at least one joint")
+        return joints
+
+
+class Load(_Keys):
+    """A known payload carried during a recording."""
+
+    frame: str
+    mass: Positive  # kg
+    com: Vector = (0.0, 0.0, 0.0)  # m, in the frame
+
+
+class Units(_Keys):
+    """Units of the arrays where they are not rad, m and N m."""
+
+    position: Literal["rad", "deg", "m", "mm"] = "rad"
+    velocity: Literal["rad/s", "deg/s", "m/s", "mm/s"] | None = None  # None: as the position
+    torque: Literal["N m", "Nm", "N", "A"] = "N m"
+    measurement: Literal["m", "mm"] = "m"
+
+
+class Accuracy(_Keys):
+    """One sigma of the measuring device."""
+
+    position: Positive | None = None  # m
+    orientation: Positive | None = None  # rad
+
+
+KINDS = ("pose", "position", "plane", "socket", "camera")
+
+
+class Measurement(_Keys):
+    """What was measured at each posture: exactly one of the kinds pose, position, plane, socket, camera."""
+
+    pose: Columns | None = None
+    position: Columns | None = None
+    plane: Columns | None = None
+    socket: Columns | None = None
+    camera: Columns | None = None
+    base_frame: str | None = None
+    tool_frame: str | None = None
+    unknown: tuple[Literal["base_frame", "tool_frame"], ...] = ()
+    accuracy: Accuracy = Accuracy()
+    distance: Positive | None = None  # m between two sockets
+    mount: Literal["hand", "world"] | None = None  # of the camera
+
+    @property
+    def kind(self) -> str:
+        """The kind that was given."""
+        return next(kind for kind in KINDS if kind in self.model_fields_set)
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Measurement:
+        kinds = [kind for kind in KINDS if kind in self.model_fields_set]
+        if len(kinds) != 1:
+            raise ValueError(f"expected exactly one of {', '.join(KINDS)}; given: {', '.join(kinds) or 'none'}")
+        if self.plane is None and getattr(self, kinds[0]) is None and kinds != ["plane"]:
+            raise ValueError(f"{kinds[0]} must name an array")
+        if (self.distance is not None) and kinds != ["socket"]:
+            raise ValueError("distance belongs to the kind socket")
+        if (self.mount is not None) != (kinds == ["camera"]):
+            raise ValueError("the kind camera, and only it, needs mount: hand or world")
+        return self
+
+
+class RecordingEntry(_Keys):
+    """One recording: a file and the names of its arrays or columns."""
+
+    file: Path
+    position: Columns
+    time: str | None = None  # s
+    rate: Positive | None = None  # Hz
+    velocity: Columns | None = None
+    torque: Columns | None = None
+    command: Columns | None = None
+    load: Load | None = None
+    repeat: Label | None = None
+    role: Literal["fit", "holdout"] = "fit"
+    units: Units = Units()
+    measurement: Measurement | None = None
+
+    @model_validator(mode="after")
+    def _one_clock(self) -> RecordingEntry:
+        if self.time is not None and self.rate is not None:
+            raise ValueError("both time and rate are given, expected one of them")
+        if self.time is None and self.rate is None and self.measurement is None:
+            raise ValueError("neither time (name of the time column) nor rate (Hz) is given")
+        return self
+
+
+class Transmission(_Keys):
+    """Motor side to joint side: motor position = position @ joint position, joint torque = torque @ motor torque."""
+
+    position: Matrix | None = None
+    torque: Matrix | None = None
+    offset: tuple[Number, ...] | None = None  # rad or m, added to the joint position
+
+    @field_validator("position", "torque")
+    @classmethod
+    def _invertible(cls, rows: Matrix | None) -> Matrix | None:
+        if rows is None:
+            return None
+        if not rows or any(len(row) != len(rows) for row in rows):
+            raise ValueError(f"expected a square matrix, rows have lengths {[len(row) for row in rows]}")
+        singular = np.linalg.svd(np.asarray(rows), compute_uv=False)
+        if singular[-1] <= 1e-12 * singular[0]:
+            raise ValueError("the matrix is singular: some joint motion moves no motor")
+        return rows
+
+
+class Preprocess(_Keys):
+    """What happens to every recording before anything is fitted; None leaves the choice to `signals`."""
+
+    window: tuple[Number, Number] | None = None  # s, kept
+    cutoff: Positive | None = None  # Hz
+    rate: Positive | None = None  # Hz of the rows
+    gate: dict[str, Annotated[Number, Field(ge=0)]] = {}  # rad/s: slower samples of the joint are dropped
+
+    @field_validator("window")
+    @classmethod
+    def _ordered(cls, window: tuple[float, float] | None) -> tuple[float, float] | None:
+        if window is not None and not window[0] < window[1]:
+            raise ValueError(f"[{window[0]:g}, {window[1]:g}] ends before it begins")
+        return window
+
+
+class BaselineEffect(_Keys):
+    """An effect that is known to be there."""
+
+    effect: Effect
+    at: tuple[str, ...] = ()
+
+
+class Baseline(_Keys):
+    """What is fitted before anything is named."""
+
+    viscous: bool = True
+    coulomb: bool = True
+    rotor: bool = False
+    offset: bool = False
+    effects: tuple[BaselineEffect, ...] = ()
+
+
+class Actuator(_Keys):
+    """Whether a rollout may trust the servo gains."""
+
+    gains: Literal["known", "free"] = "known"
+
+
+class Diagnose(_Keys):
+    """What is looked for."""
+
+    forbid: tuple[Effect, ...] = ()  # effects left out of the catalogue
+    alpha: Annotated[Number, Field(gt=0, lt=1)] = 0.05
+
+
+class Bound(_Keys):
+    """What CAD says of a link, in its joint frame."""
+
+    mass: tuple[Number, Number] | None = None  # kg, least and greatest
+    com: tuple[Vector, Vector] | None = None  # m, corners of a box around the centre of mass
+
+
+class Identify(_Keys):
+    """How `identify` fits."""
+
+    fit: Literal["physical", "log_cholesky", "unconstrained"] = "physical"
+    joints: tuple[str, ...] | None = None  # whose torque is fitted; None: all
+    bounds: dict[str, Bound] = {}  # by link
+
+
+class Task(_Keys):
+    """A whole task file."""
+
+    robot: Robot
+    data: tuple[RecordingEntry, ...]
+    transmission: Transmission | None = None
+    preprocess: Preprocess = Preprocess()
+    baseline: Baseline = Baseline()
+    actuator: Actuator = Actuator()
+    diagnose: Diagnose = Diagnose()
+    identify: Identify = Identify()
+    _file: Path = PrivateAttr(default=Path("task"))
+
+    @property
+    def file(self) -> Path:
+        """The file that the task was read from."""
+        return self._file
+
+    @field_validator("data")
+    @classmethod
+    def _fit_and_holdout(cls, data: tuple[RecordingEntry, ...]) -> tuple[RecordingEntry, ...]:
+        if not data:
+            raise ValueError("expected at least one recording")
+        if all(entry.role == "holdout" for entry in data):
+            raise ValueError("no recording has role: fit")
+        stems = [entry.file.stem for entry in data if entry.role == "holdout"]
+        for stem in stems:
+            if stems.count(stem) > 1:
+                raise ValueError(f"two holdout recordings are called '{stem}': their predictions would share one name")
+        return data
+
+
+def load_task(path: str | Path) -> Task:
+    """Read and check a task file; raises `InputError` that names file and key of the first mistake."""
+    chain = read_task(Path(path))
+    try:
+        task = Task.model_validate(merge(chain))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise InputError(f"{where(chain, first['loc'])}: {_message(first)}") from None
+    task._file = Path(path)
+    return task
+
+
+def load_robot(task: Task) -> RobotModel:
+    """The robot of a task, joints locked and ordered as it says; gravity is an MJCF's own where the task gives none."""
+    if task.robot.model.suffix.lower() not in (".urdf", ".xml"):
+        raise InputError(f"{task.file}: robot.model {task.robot.model}: expected a .urdf or an .xml (MJCF) file")
+    from .robotfile import read_robot
+
+    return read_robot(task.robot.model, **robot_options(task.robot))
+
+
+def robot_options(robot: Robot) -> dict[str, Any]:
+    """Arguments of `read_robot` and `load_extended` beside the file; gravity None is an MJCF's own."""
+    own = robot.model.suffix.lower() == ".xml" and "gravity" not in robot.model_fields_set
+    gravity = None if own else robot.gravity
+    return {"joints": robot.joints, "posture": dict(robot.posture), "gravity": gravity, "root": robot.root}
+
+
+_EXPECTED = {  # pydantic's kinds of mistakes, in fewer words
+    "greater_than": "more than {gt:g}",
+    "greater_than_equal": "at least {ge:g}",
+    "less_than": "less than {lt:g}",
+    "literal_error": "{expected}",
+    "too_long": "{max_length} values",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "finite_number": "a finite number",
+    "string_type": "text",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "dict_type": "keys and values",
+    "path_type": "the name of a file",
+}
+
+
+def _message(error: Any) -> str:
+    """One mistake in the words of the task file."""
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]).lstrip(".")
+    context, kind = error.get("ctx", {}), error["type"]
+    if kind == "missing":
+        return f"{key} is missing"
+    if kind == "value_error":
+        return f"{key}: {context['error']}" if key else str(context["error"])
+    expected = _EXPECTED[kind].format(**context) if kind in _EXPECTED else error["msg"]
+    return f"{key} is {error['input']!r:.80}, expected {expected}"

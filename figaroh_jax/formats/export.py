@@ -1,0 +1,239 @@
+"""The extended model as a folder that other tools read and that loads back: `robot.urdf`, `robot.xml`, `effects.yaml`.
+
+The two robot files carry what their formats can. `effects.yaml` holds everything: the joints in column order, the ten
+inertial parameters of every link before any effect, every effect with its parameters and where else it is written, and
+a warning for all that a robot file could not say.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+import yaml
+from jaxtyping import Int
+
+from ..effect import Effect, joint_unit, place
+from ..effects import find
+from ..errors import InputError
+from ..extended import ExtendedModel, changed_robot, extend
+from ..model import DOF_NAMES, RobotModel
+from ..results import Cause, Estimate, Name
+from . import compensation as compensation
+from .mjcf_text import mjcf_text
+from .native import Carried, carried, changed_leaves, drives, place_names
+from .taskfile import read_yaml
+from .urdf import load_urdf
+from .urdf_text import urdf_text
+
+__all__ = ["dump_yaml", "load_model", "model_files", "write_model"]
+
+_GEOMETRY = ("placement", "axis", "ratio", "offset", "frame_placement")
+
+
+class _Dumper(yaml.SafeDumper):
+    """Numbers in full, lists of numbers on one line, no aliases."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+_Dumper.add_representer(np.ndarray, lambda dumper, array: dumper.represent_list(array.tolist()))
+
+
+def dump_yaml(content: Mapping[str, Any]) -> str:
+    """The mapping as YAML, in its order, numbers in full and lists of numbers on one line."""
+    return yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None)
+
+
+def write_model(extended: ExtendedModel, directory: str | Path, causes: Sequence[Cause] = ()) -> None:
+    """Write `robot.urdf`, `robot.xml` and `effects.yaml` into `directory`, which is made where it is missing.
+
+    `causes` give the standard deviations of the effects that they name; those of the others are null. What a format
+    cannot carry stands in `effects.yaml`, at the effect and under `warnings`.
+    """
+    directory = Path(directory)
+    texts = model_files(extended, causes)
+    directory.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        (directory / name).write_text(text, encoding="utf-8")
+
+
+def model_files(extended: ExtendedModel, causes: Sequence[Cause] = ()) -> dict[str, str]:
+    """Text of each of the three files by its name (see `write_model`)."""
+    with jax.enable_x64(True):
+        robot = jax.tree.map(np.asarray, changed_robot(extended))
+        return _files(extended, robot, causes)
+
+
+def _files(extended: ExtendedModel, robot: RobotModel, causes: Sequence[Cause]) -> dict[str, str]:
+    in_urdf, in_mjcf = carried(extended, "urdf"), carried(extended, "mjcf")
+    urdf, urdf_warnings = urdf_text(robot, drives(extended, in_urdf))
+    mjcf, mjcf_warnings = mjcf_text(robot, drives(extended, in_mjcf))
+    effects = [
+        _describe(extended.robot, effect, causes, *answers)
+        for effect, *answers in zip(extended.effects, in_urdf, in_mjcf, strict=True)
+    ]
+    content = _robot(extended, robot) | {"effects": effects}
+    warnings = {"warnings": [*urdf_warnings, *mjcf_warnings, *_warnings(extended, in_urdf, in_mjcf)]}
+    head = "# The extended model: the robot before its effects, and every effect. Read by figaroh-jax.\n"
+    text = dump_yaml(content)
+    text += yaml.dump(warnings, Dumper=_Dumper, width=120, default_flow_style=False)
+    return {"robot.urdf": urdf, "robot.xml": mjcf, "effects.yaml": head + text}
+
+
+def _robot(extended: ExtendedModel, changed: RobotModel) -> dict[str, Any]:
+    robot = extended.robot
+    limits = zip(robot.position_limit, robot.velocity_limit, robot.effort_limit, extended.width, strict=True)
+    joints = [
+        {"name": name, "position": np.asarray(p), "velocity": float(v), "effort": float(e), "reversal": float(w)}
+        for name, (p, v, e, w) in zip(robot.dof_names, limits, strict=True)
+    ]
+    owners = [(joint.coordinate, len(DOF_NAMES[joint.kind]), joint.name) for joint in robot.joints if not joint.follows]
+    for first, width, name in owners:
+        for entry in joints[first : first + width] if width > 1 else ():
+            entry["joint"] = name  # the one of several degrees of freedom that it belongs to
+    links = [
+        {"name": name, "inertia": np.asarray(ten)} for name, ten in zip(robot.link_names, robot.inertia, strict=True)
+    ]
+    geometry: dict[str, Any] = {
+        leaf: np.asarray(getattr(robot, leaf)) for leaf in changed_leaves(robot, changed) if leaf in _GEOMETRY
+    }
+    gravity = {"gravity": np.asarray(robot.gravity)}
+    if shifted := _shifted(robot):
+        geometry["frames"] = shifted
+    return {"format": 1, "robot": robot.name, **gravity, "joints": joints, "links": links, **geometry}
+
+
+def _shifted(robot: RobotModel) -> list[dict[str, Any]]:
+    """Frames called as links but away from their joints, where a URDF has the links."""
+    links = {joint.link: i for i, joint in enumerate(robot.joints)}
+    return [
+        {"name": frame.name, "placement": np.asarray(placement)}
+        for frame, placement in zip(robot.frames, robot.frame_placement, strict=True)
+        if links.get(frame.name) == frame.parent and not np.array_equal(np.asarray(placement), np.eye(4))
+    ]
+
+
+def _describe(
+    robot: RobotModel, effect: Effect, causes: Sequence[Cause], in_urdf: Carried, in_mjcf: Carried
+) -> dict[str, Any]:
+    at = place_names(robot, effect)
+    known = next((c.parameters for c in causes if c.name == (effect.name, at)), {})
+    answer = {
+        "effect": effect.name,
+        "at": list(at),
+        "parameters": _parameters(robot, effect, known),
+        "fields": {name: float(getattr(effect, name)) for name in _fields(effect)},
+        "urdf": in_urdf.yes,
+        "mjcf": in_mjcf.yes,
+    }
+    reasons = {f"not in {form}": c.why for form, c in (("urdf", in_urdf), ("mjcf", in_mjcf)) if not c.yes}
+    return answer | reasons
+
+
+def _parameters(robot: RobotModel, effect: Effect, known: Mapping[str, Estimate]) -> dict[str, Any]:
+    slides = effect.acts_on in ("joint", "pair") and _slides(robot, np.ravel(np.asarray(effect.at)))
+    units = {name: joint_unit(unit, slides) for name, unit in effect.units().items()}
+    return {
+        name: {"value": float(value), "std": float(known[name].std) if name in known else None, "unit": units[name]}
+        for name, value in _physical(effect).items()
+    }
+
+
+def _slides(robot: RobotModel, columns: Int[np.ndarray, " places"]) -> bool:
+    """Whether one of the coordinates is a length."""
+    of, follows = robot.dofs, np.array([joint.follows for joint in robot.joints])
+    own = np.isin(of.column, columns) & ~follows[of.joint]
+    return not of.turns[own].all()
+
+
+def _physical(effect: Effect) -> Mapping[str, Any]:
+    try:
+        return effect.physical()
+    except ZeroDivisionError:  # e.g. where a spring of zero stiffness rests
+        return {name: getattr(effect, name) for name in effect.parameters()}
+
+
+def _fields(effect: Effect) -> list[str]:
+    known = list(effect.parameters())
+    others = [field.name for field in dataclasses.fields(effect) if field.name not in ("at", *known)]
+    if others:
+        raise InputError(
+            f"effect '{effect.name}' has a field '{others[0]}' that is no parameter; declare it with "
+            "`amplitude` or `shape`, or the model cannot be written"
+        )
+    return known
+
+
+def _warnings(extended: ExtendedModel, in_urdf: Sequence[Carried], in_mjcf: Sequence[Carried]) -> list[str]:
+    """One line for each effect that a robot file leaves out, and for dry friction, which MuJoCo softens."""
+    lines = []
+    for effect, *answers in zip(extended.effects, in_urdf, in_mjcf, strict=True):
+        name = Name(effect.name, place_names(extended.robot, effect))
+        for file, answer in zip(("robot.urdf", "robot.xml"), answers, strict=True):
+            if not answer.yes:
+                lines.append(f"{file} lacks {name}: {answer.why}")
+    if drives(extended, tuple(in_mjcf)).frictionloss.any():
+        lines.append("robot.xml: frictionloss is a soft constraint in MuJoCo, not a step at the reversal")
+    return lines
+
+
+def load_model(directory: str | Path) -> ExtendedModel:
+    """The extended model that `write_model` wrote, the same to rounding: joints in their order, every effect.
+
+    Effects of your own must have been registered (`effects.register`) before. Raises `InputError` for a folder that
+    holds no such model, and for effects, joints or links that are not known.
+    """
+    directory = Path(directory)
+    if not directory.is_dir():
+        raise InputError(f"{directory} is not a folder; a model folder with effects.yaml and robot.urdf is expected")
+    file = directory / "effects.yaml"
+    content = read_yaml(file)
+    try:
+        robot = _restored(content, directory / "robot.urdf")
+        effects = [
+            place(find(e["effect"]), robot, e["at"], **{k: float(x) for k, x in e["fields"].items()})
+            for e in content["effects"]
+        ]
+        return extend(robot, *effects, width=np.array([float(joint["reversal"]) for joint in content["joints"]]))
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+    except KeyError as error:
+        raise InputError(f"{file}: the key {error} is missing; the file is written by figaroh-jax") from None
+    except (TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{file}: not as figaroh-jax writes it: {error}") from None
+
+
+def _restored(content: Mapping[str, Any], urdf: Path) -> RobotModel:
+    """The robot of the URDF as it was before its effects."""
+    joints = content["joints"]
+    names = list(dict.fromkeys(joint.get("joint", joint["name"]) for joint in joints))
+    robot = load_urdf(urdf, joints=names, gravity=content["gravity"])
+    inertia = np.array(robot.inertia)
+    for link in content["links"]:
+        inertia[robot.link_index(link["name"])] = _array(link["inertia"], (10,))
+    values = {
+        "inertia": inertia,
+        "position_limit": _array([joint["position"] for joint in joints], (robot.nv, 2)),
+        "velocity_limit": _array([joint["velocity"] for joint in joints], (robot.nv,)),
+        "effort_limit": _array([joint["effort"] for joint in joints], (robot.nv,)),
+    }
+    frames = np.array(robot.frame_placement)
+    for frame in content.get("frames", ()):
+        frames[robot.frame_index(frame["name"])] = _array(frame["placement"], (4, 4))
+    values |= {"frame_placement": frames}
+    values |= {leaf: _array(content[leaf], np.shape(getattr(robot, leaf))) for leaf in _GEOMETRY if leaf in content}
+    return eqx.tree_at(lambda m: [getattr(m, name) for name in values], robot, list(values.values()))
+
+
+def _array(numbers: Any, shape: tuple[int, ...]) -> np.ndarray:
+    array = np.asarray(numbers, float)
+    if array.shape != shape:
+        raise InputError(f"numbers of shape {array.shape} where {shape} are expected")
+    return array

@@ -1,0 +1,78 @@
+"""XML of a robot model read from a file that nobody has vouched for: no entities, no network, a limited size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+
+__all__ = ["find_in_packages", "read_xml"]
+
+_PACKAGE = "package:/"  # a Path keeps one slash of the two
+_LARGEST = 20_000_000  # bytes; robot models without their meshes stay far below
+
+
+def read_xml(path: str | Path, root: str) -> Any:
+    """Root element (lxml) of the XML file, without its comments.
+
+    Raises `InputError` for a file that is missing, a directory, empty, too large, not text, not well-formed, that
+    declares a document type or entities (the road to exponential expansion and to foreign files), or whose root
+    element is not called `root`.
+    """
+    from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+
+    data = _read(Path(path))
+    parser = etree.XMLParser(remove_comments=True, remove_pis=True, resolve_entities=False, no_network=True)
+    try:
+        element = etree.fromstring(data, parser)
+    except etree.XMLSyntaxError as error:
+        raise InputError(f"{path}: not well-formed XML: {error.msg}") from None
+    if element.getroottree().docinfo.doctype:
+        raise InputError(_no_doctype(Path(path)))
+    if element.tag != root:
+        raise InputError(f"{path}: the root element is <{element.tag}>; a <{root}> is expected")
+    return element
+
+
+def find_in_packages(path: str | Path, packages: Sequence[str | Path]) -> Path:
+    """The file that `package://name/rest` means, or the path itself where it does not begin so.
+
+    A folder of `packages` is the package (its own name is `name`) or holds it. Raises `InputError` where none does.
+    """
+    text = str(path)
+    if not text.startswith(_PACKAGE):
+        return Path(path)
+    name, _, rest = text[len(_PACKAGE) :].lstrip("/").partition("/")
+    for folder in map(Path, packages):
+        for place in (folder, folder / name):
+            if place.name == name and place.is_dir():
+                return place / rest
+    searched = ", ".join(map(str, packages)) or "none was given"
+    raise InputError(f"{text}: package '{name}' is in none of the package folders ({searched}); give them as packages")
+
+
+def _read(path: Path) -> bytes:
+    if path.is_dir():
+        raise InputError(f"{path}: is a directory; the model file itself is needed")
+    try:
+        size, data = path.stat().st_size, b""
+        if size <= _LARGEST:
+            data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if size > _LARGEST:
+        raise InputError(f"{path}: {size} bytes; a robot model has at most {_LARGEST}")
+    data = data.lstrip()  # some files begin with an empty line, which XML forbids
+    if not data:
+        raise InputError(f"{path}: the file is empty; a robot model is expected")
+    if b"\0" in data:
+        raise InputError(f"{path}: not a text file in UTF-8; a robot model is expected")
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+        raise InputError(_no_doctype(path))
+    return data
+
+
+def _no_doctype(path: Path) -> str:
+    return f"{path}: declares a document type or an entity (<!DOCTYPE, <!ENTITY); these are refused, remove them"

@@ -1,0 +1,307 @@
+"""Fit a robot's dynamics to recordings: base parameters, links that can exist, friction, and what can be trusted.
+
+The recordings become one condensed regression (`regression`). Its rank is decided once; the base parameters' weighted
+fit gives weights and covariance; the nominal inertials complete what no motion shows, believed as far as cross-
+validation bears out; and the links are kept to what bodies can have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..diagnosis.estimates import prismatic
+from ..diagnosis.problem import rigid_prior
+from ..effect import Effect
+from ..errors import InputError, nearest
+from ..model import RobotModel
+from ..recordings.dataset import Recording, read_recordings
+from ..recordings.signals import prepare_all
+from .base_parameters import BaseParameters, base_parameters
+from .conic import Body
+from .consistency import bodies, log_cholesky_fit, physical_fit, project
+from .intervals import coloured_covariance
+from .judgement import (
+    Judged,
+    correlations,
+    described_effects,
+    described_links,
+    extended,
+    posterior_covariance,
+    predicted,
+    prior_sigma,
+    quality,
+)
+from .least_squares import Solution, WeightedByJoint, solve, with_prior
+from .regression import Condensed, Regression, condense, friction_terms, structural_columns
+from .result import Identification, Quality
+from .reversal import with_reversal_widths
+
+if TYPE_CHECKING:
+    from ..formats.config import Baseline, Preprocess, Task
+
+__all__ = ["Fit", "identify", "identify_task"]
+
+Fit = Literal["physical", "log_cholesky", "unconstrained"]
+TRUSTS = (1.0, 3.0, 10.0, 100.0)  # multiples of the stated trust that cross-validation chooses from
+DRIVE_PRECISION = 1e-6
+DEAD = 0.5  # share of samples at one single value: such a torque is not measured
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The condensed data and everything a fit of all columns needs."""
+
+    data: Condensed
+    base: BaseParameters
+    weight: Float[np.ndarray, " nv"]
+    mean: Float[np.ndarray, " columns"]
+    precision: Float[np.ndarray, " columns"]  # at the stated trust
+    inflation: float  # variance of the base parameters, over that of as many rows of white noise
+    bounded: Float[np.ndarray, " columns"]  # least value of each column
+    links: tuple[Body, ...]
+    fit: Fit
+    nominal: Float[np.ndarray, "links 10"]
+
+    def precision_at(self, slack: float) -> Float[np.ndarray, " columns"]:
+        """Precision of the prior where the nominal links are believed `slack` times less than stated."""
+        precision = self.precision.copy()
+        precision[: self.nominal.size] /= slack**2
+        return precision
+
+
+def identify_task(task: Task, progress: Callable[[str, float], None] = lambda phase, share: None) -> Identification:
+    """Identify what a task file describes; `InputError` before any work where it is wrong."""
+    from ..formats.config import load_robot
+
+    progress("reading", 0.0)
+    model = load_robot(task)
+    recordings = read_recordings(task, model)
+    options = task.identify
+    return identify(
+        model,
+        recordings,
+        task.preprocess,
+        task.baseline,
+        trust=task.robot.trust,
+        fit=options.fit,
+        joints=options.joints,
+        bounds={name: bound.model_dump(exclude_none=True) for name, bound in options.bounds.items()},
+        progress=progress,
+    )
+
+
+def identify(
+    model: RobotModel,
+    recordings: Sequence[Recording],
+    preprocess: Preprocess | None = None,
+    known: Baseline | None = None,
+    *,
+    trust: float = 0.10,
+    fit: Fit = "physical",
+    joints: Sequence[str] | None = None,
+    bounds: Mapping[str, Mapping[str, Any]] | None = None,
+    progress: Callable[[str, float], None] = lambda phase, share: None,
+) -> Identification:
+    """Fit the dynamics of `model` to recordings (joint side, SI units).
+
+    `known` says which friction is fitted beside the links, `trust` how far the nominal inertials are believed (relative
+    one sigma; less if cross-validation says so), `joints` whose torque is fitted (default: all that have one), `bounds`
+    what CAD says of links (`consistency.bodies`). `fit` "physical" finds the best robot whose links are bodies,
+    "log_cholesky" the same by Levenberg-Marquardt, "unconstrained" leaves the links free. Raises `InputError` where the
+    input is wrong, the recordings show too little, or the fit that was asked for fails.
+    """
+    from ..formats.config import Baseline, Preprocess
+
+    with jax.enable_x64(True):
+        progress("preparing signals", 0.05)
+        # the cutoff alone: a band guessed from the motion costs accuracy where friction makes the motion sharp
+        signals = prepare_all(tuple(recordings), preprocess or Preprocess(), slowed=False)
+        terms = friction_terms(model, known or Baseline())
+        refused, notes = _refused(model, recordings, joints)
+        regression = Regression(model, terms, np.zeros(model.nv), signals, refused)
+        structure = structural_columns(model, terms)
+        used = np.asarray(np.abs(structure).max(axis=0) > 0)
+        structural = base_parameters(structure.reshape(-1, structure.shape[2]), regression.names)
+        progress("condensing the recordings", 0.15)
+        regression, data, base, start = _condensed(regression, used)
+        progress("covariance of coloured residuals", 0.5)
+        covariance = coloured_covariance(regression, start.parameters, base.independent, start.weight)
+        problem = _problem(regression, data, base, start, covariance, trust, fit, bounds)
+        progress("fitting", 0.6)
+        chosen, validated = _validated(problem)
+        theta = _fitted(problem, None, chosen)
+        progress("judging", 0.85)
+        own = 10 * len(model.joints)
+        posterior = posterior_covariance(problem.base, covariance, problem.precision_at(chosen))
+        judged = Judged(data, base, theta, posterior, covariance, prior_sigma(data, own, model, trust), problem.bounded)
+        ten = theta[:own].reshape(-1, 10)
+        given = _given_links(problem)
+        traces, holdout = predicted(regression, theta, given)
+        return Identification(
+            joints=model.joint_names,
+            rank=base.rank,
+            structural_rank=structural.rank,
+            condition=base.condition,
+            scaled_condition=base.scaled_condition,
+            base=judged.base_parameters(),
+            parameters=judged.parameters(),
+            null_directions=base.null_directions,
+            links=described_links(ten, model.link_names),
+            effects=described_effects(model, terms, theta[own:], np.sqrt(np.maximum(np.diag(posterior)[own:], 0.0))),
+            fit=quality(data, data.squares(theta)),
+            unconstrained=quality(data, data.squares(start.parameters)),
+            nominal=quality(data, data.squares(given)),
+            validated=validated,
+            holdout=holdout,
+            trust=chosen * trust,
+            width=regression.width,
+            method=fit,
+            model=extended(regression, theta),
+            traces=traces,
+            correlations=correlations(base, covariance),
+            notes=(*notes, *(note for one in signals for note in one.notes)),
+            prismatic=prismatic(model),
+        )
+
+
+def _refused(
+    model: RobotModel, recordings: Sequence[Recording], joints: Sequence[str] | None
+) -> tuple[frozenset[str], list[str]]:
+    """Joints whose torque is not fitted: not asked for, or standing at one value most of the time."""
+    for name in joints or ():
+        if name not in model.joint_names:
+            raise InputError(f"identify.joints: no moving joint '{name}'{nearest(name, model.joint_names)}")
+    refused = set() if joints is None else set(model.joint_names) - set(joints)
+    notes = [
+        f"torque of {name} is not fitted: not among identify.joints" for name in model.joint_names if name in refused
+    ]
+    for j, name in enumerate(model.joint_names):
+        for one in recordings:
+            if one.role != "fit" or one.torque is None or name in refused:
+                continue
+            share = np.unique(one.torque[:, j], return_counts=True)[1].max() / len(one.torque)
+            if share > DEAD:
+                refused.add(name)
+                notes.append(
+                    f"torque of {name} is not fitted: it stands at one value for {share:.0%} of {one.file}"
+                    " (dead zone, or not measured)"
+                )
+    if refused >= set(model.joint_names):
+        raise InputError(f"no joint has a torque that can be fitted: {'; '.join(notes)}")
+    return frozenset(refused), notes
+
+
+def _condensed(
+    regression: Regression, used: Bool[np.ndarray, "nv columns"]
+) -> tuple[Regression, Condensed, BaseParameters, Solution]:
+    """The regression with its reversal widths, condensed; its base parameters and their weighted fit."""
+    data = condense(regression, used)
+    base = _base(data)
+    first = solve(data, WeightedByJoint(), kept=base.independent)
+    widened = with_reversal_widths(regression, used, base.independent, first.weight)
+    if (widened.width != regression.width).any():
+        regression, data = widened, condense(widened, used)
+        base = _base(data)
+        first = solve(data, WeightedByJoint(), kept=base.independent)
+    return regression, data, base, first
+
+
+def _base(data: Condensed) -> BaseParameters:
+    factor = data.factor()
+    base = base_parameters(factor[:, :-1], data.names)
+    rows = int(data.rows.sum())
+    if base.rank == 0:
+        raise InputError("the recordings show no parameter at all: nothing moves, or every row was dropped")
+    if rows < 2 * base.rank:
+        raise InputError(
+            f"{rows} rows of torque are left for {base.rank} base parameters; at least twice as many are needed:"
+            " record for longer, or raise preprocess.cutoff"
+        )
+    return base
+
+
+def _problem(
+    regression: Regression,
+    data: Condensed,
+    base: BaseParameters,
+    start: Solution,
+    covariance: Float[np.ndarray, "rank rank"],
+    trust: float,
+    fit: Fit,
+    bounds: Mapping[str, Mapping[str, Any]] | None,
+) -> _Problem:
+    model = regression.model
+    mean, precision = rigid_prior(model, trust)
+    drives = len(data.names) - len(mean)
+    mean, precision = np.append(mean, np.zeros(drives)), np.append(precision, np.full(drives, DRIVE_PRECISION))
+    A = data.factor(start.weight)[:, base.independent]
+    # coloured rows tell less than their number says, so the prior weighs more against them
+    inflation = float(np.trace(covariance @ (A.T @ A))) / base.rank
+    lower = np.full(len(mean), -np.inf)
+    lower[len(mean) - drives :] = _least(regression.terms)
+    links = bodies(model, bounds)
+    nominal = project(np.asarray(model.inertia, float), links)
+    return _Problem(data, base, start.weight, mean, precision, max(inflation, 1e-3), lower, links, fit, nominal)
+
+
+def _least(terms: Sequence[Effect]) -> Float[np.ndarray, " drives"]:
+    """Least physical value of each drive column: friction and rotor inertia take no energy out of nothing."""
+    out: list[float] = []
+    for term in terms:
+        for parameter in (p for p in term.parameters().values() if p.linear):
+            dissipates = term.name in ("viscous_friction", "coulomb_friction", "rotor_inertia")
+            out += [0.0 if dissipates else parameter.lower]
+        if len(term.at) > 1:
+            count = sum(p.linear for p in term.parameters().values())
+            out += out[-count:] * (len(term.at) - 1)
+    return np.array(out)
+
+
+def _fitted(problem: _Problem, folds: Sequence[int] | None, slack: float) -> Float[np.ndarray, " columns"]:
+    """All columns fitted to the rows of `folds` (None: all), the nominal believed `slack` times less."""
+    factor = with_prior(
+        problem.data.factor(problem.weight, folds), problem.mean, problem.inflation * problem.precision_at(slack)
+    )
+    if problem.fit == "unconstrained":
+        length = np.linalg.norm(factor[:, :-1], axis=0)
+        return np.linalg.lstsq(factor[:, :-1] / length, factor[:, -1], rcond=None)[0] / length
+    if problem.fit == "log_cholesky":
+        if any(b.box is not None or b.least_mass > 0 or np.isfinite(b.greatest_mass) for b in problem.links):
+            raise InputError("identify.bounds: the fit 'log_cholesky' knows no bounds; use 'physical'")
+        found = log_cholesky_fit(factor, problem.nominal)
+        if not found.converged:
+            raise InputError(f"identify.fit: log_cholesky has not converged in {found.steps} steps; use 'physical'")
+        return found.parameters
+    return physical_fit(factor, problem.links, problem.bounded)
+
+
+def _given_links(problem: _Problem) -> Float[np.ndarray, " columns"]:
+    """The links as the robot's file has them, with the friction that fits best beside them."""
+    own = problem.nominal.size
+    factor = problem.data.factor(problem.weight)
+    left = factor[:, -1] - factor[:, :own] @ problem.mean[:own]
+    drives = np.linalg.lstsq(factor[:, own:-1], left, rcond=None)[0] if len(problem.mean) > own else np.zeros(0)
+    return np.append(problem.mean[:own], drives)
+
+
+def _validated(problem: _Problem) -> tuple[float, Quality]:
+    """How much less than stated the nominal is to be believed, and the quality on blocks that were left out."""
+    folds = [k for k in range(len(problem.data.factors)) if problem.data.count[k].any()]
+    best: tuple[float, float, np.ndarray] | None = None
+    for slack in TRUSTS:
+        squares = np.zeros(len(problem.weight))
+        for fold in folds:
+            others = [k for k in folds if k != fold]
+            theta = _fitted(problem, others, slack) if others else problem.mean
+            squares += problem.data.squares(theta, [fold])
+        cost = float(squares @ problem.weight)
+        if best is None or cost < best[0] * (1 - 1e-3):
+            best = cost, slack, squares
+    assert best is not None
+    return best[1], quality(problem.data, best[2])

@@ -1,0 +1,229 @@
+"""What an identification is worth: spreads, verdicts on parameters, quality of the fit, predictions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from ..diagnosis.problem import rigid_prior
+from ..effect import Effect, joint_unit
+from ..extended import ExtendedModel, extend
+from ..formats.native import place_names
+from ..model import RobotModel
+from ..results import Estimate, Name, Trace
+from .base_parameters import TEN, BaseParameters
+from .consistency import inconsistencies
+from .regression import Condensed, Piece, Regression
+from .result import BaseParameter, FittedEffect, Link, Parameter, Quality, Status
+
+__all__ = [
+    "Judged",
+    "correlations",
+    "described_effects",
+    "described_links",
+    "extended",
+    "posterior_covariance",
+    "predicted",
+    "prior_sigma",
+    "quality",
+]
+
+NOTABLE = 0.95  # correlation that is reported
+FEW = 20  # correlations at most
+ON_BOUND = 1e-6  # of what was believed before: nearer to a bound than any data could say
+TOUCHED = 1e-9  # of a null direction: a smaller part in it is rounding
+
+
+def quality(data: Condensed, squares: Float[np.ndarray, " nv"]) -> Quality:
+    """Quality from each joint's sum of squared residuals; R2 is about the mean of the joint's torque."""
+    rows = np.where(data.rows > 0, data.rows, np.nan)
+    torque = data.squares(np.zeros(len(data.names)))
+    return _quality(squares, torque, data.torque.sum(axis=0), rows)
+
+
+def _quality(squares: np.ndarray, torque: np.ndarray, total: np.ndarray, rows: np.ndarray) -> Quality:
+    spread = torque - total**2 / rows
+    with np.errstate(divide="ignore", invalid="ignore"):
+        r2 = np.where(spread > 0, 1 - squares / spread, np.nan)
+        return Quality(np.sqrt(squares / rows), np.sqrt(np.where(torque > 0, squares / torque, np.nan)), r2)
+
+
+def posterior_covariance(
+    base: BaseParameters, covariance: Float[np.ndarray, "rank rank"], precision: Float[np.ndarray, " columns"]
+) -> Float[np.ndarray, "columns columns"]:
+    """Covariance of all parameters from that of the base parameters, and the precision of what was believed before."""
+    sigma = 1 / np.sqrt(precision)
+    B = base.matrix * sigma
+    # (I + B' C^-1 B)^-1 = I - B' (C + B B')^-1 B: no inverse of C, which may be nearly singular
+    inside = covariance + B @ B.T
+    size = np.sqrt(np.diag(inside))
+    gain = np.linalg.solve(inside / np.outer(size, size), B / size[:, None])
+    whole = np.eye(len(sigma)) - (B / size[:, None]).T @ gain
+    return whole * np.outer(sigma, sigma)
+
+
+def prior_sigma(data: Condensed, links: int, model: RobotModel, trust: float) -> Float[np.ndarray, " columns"]:
+    """What was believed before: the links' `trust`; for a drive, that it makes all the torque."""
+    factor = data.factor()
+    torque = data.squares(np.zeros(len(data.names)))
+    length = np.linalg.norm(factor[:, :-1], axis=0)
+    felt = np.array([sum(torque[j] for j, own in enumerate(data.columns) if k in own) for k in range(len(length))])
+    sigma = np.sqrt(felt) / np.where(length > 0, length, np.inf)
+    sigma[:links] = 1 / np.sqrt(rigid_prior(model, trust)[1])
+    return np.where(sigma > 0, sigma, 1.0)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Fitted parameters with everything that says how far they can be trusted."""
+
+    data: Condensed
+    base: BaseParameters
+    theta: Float[np.ndarray, " columns"]
+    posterior: Float[np.ndarray, "columns columns"]
+    covariance: Float[np.ndarray, "rank rank"]  # of the base parameters, by the data alone
+    believed: Float[np.ndarray, " columns"]  # one sigma before the data
+    bounded: Float[np.ndarray, " columns"]  # least values
+
+    def base_parameters(self) -> tuple[BaseParameter, ...]:
+        """Every base parameter: `identified` where the data say more than was believed before, else `prior only`."""
+        B = self.base.matrix
+        values = B @ self.theta
+        sigma = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", B, self.posterior, B), 0.0))
+        shown = np.sqrt(np.diag(self.covariance)) < np.sqrt((B**2) @ self.believed**2)
+        return tuple(
+            BaseParameter(text, float(value), float(spread), self._status(int(column), bool(ok)))
+            for text, value, spread, ok, column in zip(
+                self.base.expressions, values, sigma, shown, self.base.independent, strict=True
+            )
+        )
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Every single parameter: identified alone, known only through what was believed, or not at all."""
+        sigma = np.sqrt(np.maximum(np.diag(self.posterior), 0.0))
+        null = self.base.null
+        size = np.abs(null).max(axis=0, initial=0.0)
+        alone = ~(np.abs(null) > TOUCHED * size).any(axis=1)
+        out = []
+        for k, name in enumerate(self.base.names):
+            known = bool(alone[k] and sigma[k] < self.believed[k])
+            status = self._status(k, known)
+            if not known and not _inertial(name):
+                status = "not identifiable"
+            out.append(Parameter(name, float(self.theta[k]), float(sigma[k]), status, self.base.absorbed_in(name)))
+        return tuple(out)
+
+    def _status(self, column: int, shown: bool) -> Status:
+        least = self.bounded[column]
+        if np.isfinite(least) and self.theta[column] - least < ON_BOUND * self.believed[column]:
+            return "on its bound"
+        return "identified" if shown else "prior only"
+
+
+def _inertial(name: str) -> bool:
+    return name.rstrip("0123456789") in TEN
+
+
+def correlations(
+    base: BaseParameters, covariance: Float[np.ndarray, "rank rank"]
+) -> tuple[tuple[str, str, float], ...]:
+    """The pairs of base parameters whose errors go together most, strongest first."""
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    table = np.triu(covariance / np.outer(sigma, sigma), 1)
+    pairs = [(int(i), int(j)) for i, j in np.argwhere(np.abs(table) > NOTABLE)]
+    pairs.sort(key=lambda pair: -abs(table[pair]))
+    return tuple((base.expressions[i], base.expressions[j], float(table[i, j])) for i, j in pairs[:FEW])
+
+
+def described_links(ten: Float[np.ndarray, "links 10"], names: Sequence[str]) -> tuple[Link, ...]:
+    """The links with the verdict whether bodies can have their parameters."""
+    wrong = {one.link: one.reason for one in inconsistencies(ten, names)}
+    return tuple(Link(name, own, name not in wrong, wrong.get(name, "")) for name, own in zip(names, ten, strict=True))
+
+
+def fitted_effects(terms: Sequence[Effect], values: Float[np.ndarray, " drives"]) -> list[Effect]:
+    """The effects, one at each place, with their amplitudes."""
+    out, start = [], 0
+    for term in terms:
+        names = [name for name, parameter in term.parameters().items() if parameter.linear]
+        for k in range(len(term.at)):
+            amplitudes = [np.float64(x) for x in values[start : start + len(names)]]
+            start += len(names)
+            one = jax.tree.map(lambda x: np.asarray(x)[k], term)  # noqa: B023
+            out.append(eqx.tree_at(lambda e: [getattr(e, name) for name in names], one, amplitudes))  # noqa: B023
+    return out
+
+
+def extended(regression: Regression, theta: Float[np.ndarray, " columns"]) -> ExtendedModel:
+    """The robot with the fitted links and effects."""
+    links = 10 * len(regression.model.joints)
+    robot = eqx.tree_at(lambda m: m.inertia, regression.model, theta[:links].reshape(-1, 10))
+    return extend(robot, *fitted_effects(regression.terms, theta[links:]), width=regression.width)
+
+
+def described_effects(
+    model: RobotModel,
+    terms: Sequence[Effect],
+    values: Float[np.ndarray, " drives"],
+    sigma: Float[np.ndarray, " drives"],
+) -> tuple[FittedEffect, ...]:
+    """The effects with names, values, standard deviations and units."""
+    out, start = [], 0
+    for effect in fitted_effects(terms, values):
+        linear = [name for name, parameter in effect.parameters().items() if parameter.linear]
+        spread = dict(zip(linear, sigma[start : start + len(linear)], strict=True))
+        start += len(linear)
+        slides = effect.acts_on == "joint" and bool(prismatic_columns(model)[int(effect.at[0])])
+        units = effect.units()
+        parameters = {
+            name: Estimate(float(value), float(spread.get(name, 0.0)), joint_unit(units[name], slides))
+            for name, value in effect.physical().items()
+        }
+        out.append(FittedEffect(Name(effect.name, place_names(model, effect)), parameters))
+    return tuple(out)
+
+
+def prismatic_columns(model: RobotModel) -> Float[np.ndarray, " nv"]:
+    """1 where a coordinate slides."""
+    out = np.zeros(model.nv)
+    out[model.dofs.column[~model.dofs.turns]] = 1.0
+    return out
+
+
+def predicted(
+    regression: Regression, theta: Float[np.ndarray, " columns"], nominal: Float[np.ndarray, " columns"]
+) -> tuple[tuple[Trace, ...], dict[str, Quality]]:
+    """Each recording with the torques of the nominal and of the fitted robot, and the quality on held-out ones."""
+    parts: dict[int, list[Piece]] = {}
+    for piece in regression.pieces(fitted=False):
+        slim = (piece.X @ nominal, piece.X @ theta)
+        parts.setdefault(piece.recording, []).append(piece._replace(X=np.stack(slim, axis=-1)))
+    traces, holdout = [], {}
+    for k, one in enumerate(regression.signals):
+        X, y, weight = (np.concatenate([getattr(p, name) for p in parts[k]]) for name in ("X", "y", "weight"))
+        rows = one.rows.index
+        measured = None if one.torque is None else y
+        traces.append(
+            Trace(
+                one.name,
+                one.role,
+                one.time[rows],
+                one.position[rows],
+                one.velocity[rows],
+                measured,
+                X[..., 0],
+                X[..., 1],
+            )
+        )
+        if one.role == "holdout" and measured is not None:
+            kept = weight > 0
+            error, torque = np.where(kept, y - X[..., 1], 0.0), np.where(kept, y, 0.0)
+            counts = np.where(kept.any(axis=0), kept.sum(axis=0), np.nan)
+            name = one.file.rsplit("/", 1)[-1]
+            holdout[name] = _quality((error**2).sum(0), (torque**2).sum(0), torque.sum(0), counts)
+    return tuple(traces), holdout

@@ -1,0 +1,385 @@
+"""Recordings as a linear regression: rows of torque and columns of parameters, condensed to small triangular factors.
+
+A piece of a recording becomes rows (filtered torque and regressor, `records.filter_rows`), the rows of each joint go
+into that joint's triangular factor, one for each fold, and the rows are forgotten. Weights of joints, choices of folds,
+rank, fits and their errors then need the factors alone. Long recordings are cut into pieces that overlap by the reach
+of the filter, so memory does not grow with their length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from ..diagnosis.records import Records, filter_rows, stack
+from ..effect import Effect, Motion, columns, place, smooth_sign
+from ..effects import find
+from ..errors import InputError
+from ..inertia import from_com, transform
+from ..model import RobotModel
+from ..recordings.rowfilter import reach
+from ..recordings.signals import Signals
+from ..regressor import joint_torque_regressor
+from .base_parameters import inertial_names
+
+if TYPE_CHECKING:
+    from ..formats.config import Baseline, Load
+
+__all__ = [
+    "Condensed",
+    "Piece",
+    "Regression",
+    "Rows",
+    "column_names",
+    "condense",
+    "friction_terms",
+    "payload",
+    "state_columns",
+    "structural_columns",
+]
+
+SHORT_NAMES = {"viscous_friction": "fv", "coulomb_friction": "fc", "rotor_inertia": "Ia", "torque_offset": "off"}
+PIECE_BYTES = 96e6  # of the columns of one piece at the working rate
+FOLDS = 5
+BLOCK = 0.5  # s: rows of one block of time are left out together; longer where the cutoff is low
+BLOCK_PERIODS = 4.0  # at least so many periods of the cutoff
+
+
+class Piece(NamedTuple):
+    """Rows of a stretch of one recording, in time order; `weight` 0: gated, beside a gap, or padding."""
+
+    X: Float[np.ndarray, "rows nv columns"]
+    y: Float[np.ndarray, "rows nv"]  # N m or N, low-passed
+    weight: Float[np.ndarray, "rows nv"]
+    time: Float[np.ndarray, " rows"]  # s
+    fold: Int[np.ndarray, " rows"]
+    recording: int  # place among the signals
+
+
+@runtime_checkable
+class Rows(Protocol):
+    """Anything that gives rows piece by piece, as often as asked: a `Regression`, or data of one's own."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns."""
+        ...
+
+    def pieces(self, widths: Sequence[float] = (), fitted: bool = True) -> Iterator[Piece]:
+        """Pieces in time order; see `Regression.pieces`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Condensed:
+    """The whole regression: one triangular factor of `[X y]` for each fold and joint, over the joint's own columns."""
+
+    names: tuple[str, ...]
+    columns: tuple[Int[np.ndarray, " own"], ...]  # of each joint
+    factors: tuple[tuple[Float[np.ndarray, "k k"], ...], ...]  # [fold][joint], the last column is y
+    count: Float[np.ndarray, "folds nv"]  # rows
+    torque: Float[np.ndarray, "folds nv"]  # sum of y over the rows
+
+    @property
+    def rows(self) -> Float[np.ndarray, " nv"]:
+        """Rows of each joint."""
+        return self.count.sum(axis=0)
+
+    def factor(
+        self, weight: Float[np.ndarray, " nv"] | None = None, folds: Sequence[int] | None = None
+    ) -> Float[np.ndarray, "n n"]:
+        """Triangular factor of `sqrt(weight) [X y]` of all joints, or of the rows in `folds`."""
+        size = len(self.names) + 1
+        total = np.zeros((size, size))
+        root = np.ones(len(self.columns)) if weight is None else np.sqrt(weight)
+        for fold in range(len(self.factors)) if folds is None else folds:
+            blocks = []
+            for own, factor, w in zip(self.columns, self.factors[fold], root, strict=True):
+                block = np.zeros((len(factor), size))
+                block[:, [*own, size - 1]] = w * factor
+                blocks.append(block)
+            total = np.asarray(np.linalg.qr(np.concatenate([total, *blocks]), mode="r"))
+        return total
+
+    def squares(
+        self, theta: Float[np.ndarray, " columns"], folds: Sequence[int] | None = None
+    ) -> Float[np.ndarray, " nv"]:
+        """Sum of the squared residuals of each joint for parameters `theta`, N^2 m^2 or N^2."""
+        out = np.zeros(len(self.columns))
+        for fold in range(len(self.factors)) if folds is None else folds:
+            for j, (own, factor) in enumerate(zip(self.columns, self.factors[fold], strict=True)):
+                out[j] += np.sum((factor @ np.append(theta[own], -1.0)) ** 2)
+        return out
+
+    def rms(self, theta: Float[np.ndarray, " columns"]) -> Float[np.ndarray, " nv"]:
+        """RMS residual of each joint, N m or N; NaN for a joint without rows."""
+        return np.sqrt(self.squares(theta) / np.where(self.rows > 0, self.rows, np.nan))
+
+    def restricted(self, kept: Sequence[int]) -> Condensed:
+        """The regression on the columns `kept` alone."""
+        place_of = {int(k): i for i, k in enumerate(kept)}
+        inside = [[i for i, k in enumerate(own) if int(k) in place_of] for own in self.columns]
+        columns = tuple(
+            np.array([place_of[int(own[i])] for i in ins], int) for own, ins in zip(self.columns, inside, strict=True)
+        )
+        factors = tuple(
+            tuple(
+                np.asarray(np.linalg.qr(R[:, [*ins, R.shape[1] - 1]], mode="r"))
+                for R, ins in zip(fold, inside, strict=True)
+            )
+            for fold in self.factors
+        )
+        return Condensed(tuple(self.names[k] for k in kept), columns, factors, self.count, self.torque)
+
+
+@dataclass(frozen=True)
+class Regression:
+    """Recordings, the robot and the effects whose columns stand beside its ten for each link."""
+
+    model: RobotModel
+    terms: tuple[Effect, ...]  # each with a leading axis of places
+    width: Float[np.ndarray, " nv"]  # half width of a reversal of dry friction, rad/s or m/s
+    signals: tuple[Signals, ...]
+    refused: frozenset[str] = frozenset()  # joints whose torque is not trusted
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns."""
+        return column_names(self.model, self.terms)
+
+    def pieces(self, widths: Sequence[float] = (), fitted: bool = True) -> Iterator[Piece]:
+        """Rows of the recordings, piece by piece, those of the fit alone if `fitted`; each pass forms them anew.
+
+        `widths` adds a column for each (rad/s or m/s): the direction of the row's own joint with that half width.
+        """
+        parts = [(k, part) for k, one in enumerate(self.signals) for part in _segments(one, self._samples(one))]
+        trusted = np.array([name not in self.refused for name in self.model.joint_names])
+        with jax.enable_x64(True):
+            records = stack([replace(part, role="fit") for _, part in parts])
+            for place_of, (k, one) in enumerate(parts):
+                if fitted and one.role != "fit":
+                    continue
+                single = _one(records, place_of)
+                rows = _rows(self.model, self.terms, self.width, single, tuple(widths))
+                X, y = (np.asarray(x)[: one.rows.kept] for x in rows)
+                weight = np.asarray(one.rows.weight) * (one.torque is not None) * trusted
+                yield Piece(X, y - self._carried(one, X), weight, one.rows.row_times, _folds(one), k)
+
+    def _carried(self, one: Signals, X: Float[np.ndarray, "rows nv columns"]) -> Float[np.ndarray, "rows nv"]:
+        """Torque of the known payload, N m or N."""
+        if one.load is None:
+            return np.zeros(X.shape[:2])
+        link, ten = payload(self.model, one.load)
+        return X[:, :, 10 * link : 10 * link + 10] @ ten
+
+    def _samples(self, one: Signals) -> int:
+        """Working samples of a piece."""
+        beside = reach(one.dt, one.cutoff)
+        return max(int(PIECE_BYTES / 8 / self.model.nv / max(len(self.names), 1)), 8 * beside)
+
+
+def friction_terms(model: RobotModel, known: Baseline) -> tuple[Effect, ...]:
+    """The effects that a task's baseline asks for, those of every joint as one object with a leading axis."""
+    switches = {
+        "viscous_friction": known.viscous,
+        "coulomb_friction": known.coulomb,
+        "rotor_inertia": known.rotor,
+        "torque_offset": known.offset,
+    }
+    joints = np.arange(model.nv)[:, None]
+    terms: list[Effect] = []
+    for name in (name for name, on in switches.items() if on):
+        effect = find(name)
+        terms.append(effect(joints, **{p: np.zeros(model.nv) for p in effect.parameters()}))
+    for entry in known.effects:
+        effect = find(entry.effect)
+        if not any(p.linear for p in effect.parameters().values()):
+            raise InputError(f"baseline.effects: '{entry.effect}' has no parameter in which the torque is linear")
+        terms.append(jax.tree.map(lambda x: np.asarray(x)[None], place(effect, model, entry.at)))
+    return tuple(terms)
+
+
+def column_names(model: RobotModel, terms: Sequence[Effect]) -> tuple[str, ...]:
+    """`m1` to `Izz1` and on for the links in tree order, then `fv1`, `fc1` ... of the joints, then other effects."""
+    names = list(inertial_names(model))
+    for term in terms:
+        amplitudes = [name for name, parameter in term.parameters().items() if parameter.linear]
+        for at in np.asarray(term.at):
+            where = "_".join(str(k + 1) for k in at)
+            short = SHORT_NAMES.get(term.name)
+            names += [f"{short}{where}" if short else f"{term.name}.{name}{where}" for name in amplitudes]
+    return tuple(names)
+
+
+def structural_columns(
+    model: RobotModel, terms: tuple[Effect, ...], samples: int | None = None, seed: int = 0
+) -> Float[np.ndarray, "samples nv columns"]:
+    """Columns at independent random states: what any motion at all could show."""
+    columns = len(column_names(model, terms))
+    samples = samples or max(64, 4 * columns // max(model.nv, 1))
+    generator = np.random.default_rng(seed)
+    q, v, a = (generator.normal(scale=2.0, size=(samples, n)) for n in (model.nq, model.nv, model.nv))
+    for joint, where in zip(model.joints, model.dofs.positions, strict=True):
+        if joint.kind in ("spherical", "free"):
+            quaternion = slice(where.stop - 4, where.stop)
+            q[:, quaternion] /= np.linalg.norm(q[:, quaternion], axis=1, keepdims=True)
+    with jax.enable_x64(True):
+        motion = _motion(model, np.arange(samples) * 1.0, q, v, a, 0.0, jnp.zeros(model.nv))
+        return np.asarray(_columns(model, terms, motion))
+
+
+def condense(
+    regression: Rows,
+    used: Bool[np.ndarray, "nv columns"],
+    weight: Callable[[Piece], Float[np.ndarray, "rows nv"]] = lambda piece: piece.weight,
+    widths: Sequence[float] = (),
+    folds: int = FOLDS,
+) -> Condensed:
+    """Triangular factors of all rows; `used` says which columns of a joint's rows can differ from zero.
+
+    `weight` gives the weight of every row of a piece, an inverse variance; rows of weight zero are left out. With
+    `widths` a joint has a column for each of them behind all others, joint by joint.
+    """
+    columns, count_of = used.shape[1], len(widths)
+    beside = [np.arange(columns + j * count_of, columns + (j + 1) * count_of) for j in range(len(used))]
+    local = tuple(np.append(np.flatnonzero(row), np.arange(columns, columns + count_of)) for row in used)
+    own = tuple(np.append(np.flatnonzero(row), extra) for row, extra in zip(used, beside, strict=True))
+    factors = [[np.zeros((0, len(mine) + 1)) for mine in local] for _ in range(folds)]
+    count, torque = np.zeros((2, folds, len(own)))
+    for piece in regression.pieces(widths):
+        weights = weight(piece)
+        for fold in range(folds):
+            for j, mine in enumerate(local):
+                kept = (piece.fold == fold) & (weights[:, j] > 0)
+                root = np.sqrt(weights[kept, j])[:, None]
+                new = root * np.column_stack([piece.X[kept, j][:, mine], piece.y[kept, j]])
+                factors[fold][j] = np.asarray(np.linalg.qr(np.concatenate([factors[fold][j], new]), mode="r"))
+                count[fold, j] += kept.sum()
+                torque[fold, j] += piece.y[kept, j].sum()
+    names = [*regression.names, *(f"fc{j + 1}@{w:g}" for j in range(len(used)) for w in widths)]
+    return Condensed(tuple(names), own, tuple(tuple(row) for row in factors), count, torque)
+
+
+def _folds(one: Signals) -> Int[np.ndarray, " rows"]:
+    """Fold of each row: blocks of time in turn."""
+    block = max(BLOCK, BLOCK_PERIODS / one.cutoff)
+    return np.floor(one.rows.row_times / block + 1e-9).astype(int) % FOLDS
+
+
+def _segments(one: Signals, samples: int) -> list[Signals]:
+    """A recording cut into equally long pieces that overlap by the reach of the row filter at both sides."""
+    if one.time.size <= samples:
+        return [one]
+    beside = reach(one.dt, one.cutoff)
+    index, out = one.rows.index, []
+    inner = samples - 2 * beside
+    for begin in range(int(index[0]), int(index[-1]) + 1, inner):
+        mine = np.flatnonzero((index >= begin) & (index < begin + inner))
+        if len(mine) == 0:
+            continue
+        first = min(max(begin - beside, 0), one.time.size - samples)
+        out.append(_cut(one, slice(first, first + samples), mine))
+    return out
+
+
+def _cut(one: Signals, where: slice, rows: Int[np.ndarray, " mine"]) -> Signals:
+    signals = {name: getattr(one, name)[where] for name in ("time", "position", "velocity", "acceleration")}
+    kept = replace(
+        one.rows,
+        weight=np.asarray(one.rows.weight)[rows],
+        start=np.asarray(one.time[where.start]),
+        samples=where.stop - where.start,
+        first=int(one.rows.index[rows[0]]) - where.start,
+        kept=len(rows),
+    )
+    return replace(one, torque=None if one.torque is None else one.torque[where], rows=kept, **signals)
+
+
+def payload(model: RobotModel, load: Load) -> tuple[int, Float[np.ndarray, "10"]]:
+    """Link (index) that carries a known payload, and its ten parameters as a point mass in that joint's frame."""
+    names = [frame.name for frame in model.frames]
+    if load.frame in model.link_names:
+        link, place_of = model.link_index(load.frame), np.eye(4)
+    else:
+        frame = model.frames[names.index(load.frame)]
+        link, place_of = frame.parent, np.asarray(model.frame_placement[names.index(load.frame)])
+    if link < 0:
+        raise InputError(f"load.frame '{load.frame}' does not move: no torque shows what it carries")
+    point = from_com(load.mass, np.asarray(load.com, float), np.zeros((3, 3)))
+    return link, np.asarray(transform(point, place_of))
+
+
+def _one(records: Records, k: int) -> Records:
+    many = ["time", "position", "velocity", "acceleration", "torque", "source", "kept", "weight"]
+    values = [np.asarray(getattr(records, name))[k : k + 1] for name in many]
+    return eqx.tree_at(lambda r: [getattr(r, name) for name in many], records, values)
+
+
+def _motion(model: RobotModel, time: Any, q: Any, v: Any, a: Any, dt: Any, width: Any) -> Motion:
+    zero = jnp.zeros(jnp.shape(v))
+    return Motion(model, jnp.asarray(time), jnp.asarray(q), jnp.asarray(v), jnp.asarray(a), zero, zero, dt, width)
+
+
+@eqx.filter_jit
+def state_columns(
+    model: RobotModel,
+    terms: tuple[Effect, ...],
+    width: Float[Array, " nv"],
+    widths: tuple[float, ...],
+    q: Float[ArrayLike, "samples nq"],
+    v: Float[ArrayLike, "samples nv"],
+    a: Float[ArrayLike, "samples nv"],
+) -> Float[Array, "samples nv columns"]:
+    """Columns at given states, unfiltered; `widths` as in `Regression.pieces`."""
+    motion = _motion(model, jnp.zeros(jnp.shape(v)[0]), q, v, a, 0.0, width)
+    return _columns(model, terms, motion, widths)
+
+
+@eqx.filter_jit
+def _columns(
+    model: RobotModel, terms: tuple[Effect, ...], motion: Motion, widths: tuple[float, ...] = ()
+) -> Float[Array, "samples nv columns"]:
+    blocks = [joint_torque_regressor(model, motion.position, motion.velocity, motion.acceleration)]
+    for term in terms:
+        columns = jax.vmap(lambda effect: _joint_columns(effect, motion))(term)
+        blocks.append(jnp.moveaxis(columns, 0, 2).reshape(*columns.shape[1:3], -1))
+    signs = (smooth_sign(motion.velocity, motion.acceleration, motion.dt, w) for w in widths)
+    return jnp.concatenate([*blocks, *(sign[:, :, None] for sign in signs)], axis=2)
+
+
+def _joint_columns(effect: Effect, motion: Motion) -> Float[Array, "samples nv amplitudes"]:
+    """Torque of a unit of each amplitude in the rows of all joints."""
+    torque = jnp.moveaxis(columns(effect, motion), 0, -1)
+    if effect.acts_on in ("link", "robot"):
+        return torque
+    torque = torque.reshape(torque.shape[0], -1, torque.shape[-1])
+    return jnp.zeros((*motion.velocity.shape, torque.shape[-1])).at[:, effect.at].add(torque)
+
+
+def _rows(
+    model: RobotModel,
+    terms: tuple[Effect, ...],
+    width: Float[np.ndarray, " nv"],
+    records: Records,
+    widths: tuple[float, ...],
+) -> tuple[Float[np.ndarray, "rows nv columns"], Float[np.ndarray, "rows nv"]]:
+    """Filtered columns and torque of one recording; columns that are zero throughout need no filter."""
+    time, q, v, a = (
+        records.flat(np.asarray(x)) for x in (records.time, records.position, records.velocity, records.acceleration)
+    )
+    motion = _motion(model, time, q, v, a, records.dt, jnp.asarray(width))
+    X = np.asarray(_columns(model, terms, motion, widths))
+    seen = np.argwhere(X.any(axis=0))
+    series = np.moveaxis(X[:, seen[:, 0], seen[:, 1]], 0, 1)[:, None]
+    out = np.zeros((records.kept.shape[1], *X.shape[1:]))
+    out[:, seen[:, 0], seen[:, 1]] = filter_rows(records, np.ascontiguousarray(series))[:, 0].T
+    torque = np.moveaxis(np.asarray(records.torque), 2, 0)
+    return out, filter_rows(records, np.ascontiguousarray(torque))[:, 0].T

@@ -1,0 +1,164 @@
+"""What an identification answers: plain immutable records, the same for report, terminal and `result.json`."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..results import Estimate, Name, Trace
+
+__all__ = ["BaseParameter", "FittedEffect", "Identification", "Link", "Parameter", "Quality", "Status", "to_json"]
+
+Status = Literal["identified", "prior only", "not identifiable", "on its bound"]
+
+
+class BaseParameter(NamedTuple):
+    """A combination of parameters that the torques show."""
+
+    expression: str
+    value: float
+    std: float
+    status: Status
+
+
+class Parameter(NamedTuple):
+    """One parameter of a link or of a joint's drive, and whether it can be told alone."""
+
+    name: str
+    value: float
+    std: float
+    status: Status
+    absorbed_in: tuple[str, ...]  # base parameters that contain it
+
+
+class Link(NamedTuple):
+    """Ten inertial parameters in Pinocchio's order, at and in the joint frame."""
+
+    name: str
+    parameters: Float[np.ndarray, "10"]
+    consistent: bool
+    reason: str  # why no body can have them; empty if one can
+
+
+class FittedEffect(NamedTuple):
+    """An effect with its values."""
+
+    name: Name
+    parameters: dict[str, Estimate]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Residual of each joint: RMS (N m or N), relative to the torque's RMS, R2 about its mean; NaN without rows."""
+
+    rms: Float[np.ndarray, " nv"]
+    relative: Float[np.ndarray, " nv"]
+    r2: Float[np.ndarray, " nv"]
+
+    @property
+    def total(self) -> float:
+        """RMS of the joints together, each counted alike."""
+        return float(np.sqrt(np.nanmean(self.rms**2))) if np.isfinite(self.rms).any() else math.nan
+
+
+@dataclass(frozen=True)
+class Identification:
+    """The fitted robot, what can be trusted of it, and how well it predicts."""
+
+    joints: tuple[str, ...]
+    rank: int
+    structural_rank: int  # what some motion could show
+    condition: float
+    scaled_condition: float
+    base: tuple[BaseParameter, ...]
+    parameters: tuple[Parameter, ...]
+    null_directions: tuple[str, ...]
+    links: tuple[Link, ...]
+    effects: tuple[FittedEffect, ...]
+    fit: Quality
+    unconstrained: Quality  # of the base parameters alone, weighted by joint
+    nominal: Quality  # of the links as the robot's file has them, with friction fitted beside them
+    validated: Quality  # cross-validated in blocks of time
+    holdout: dict[str, Quality]
+    trust: float  # relative one sigma of the nominal inertials that predicts best
+    width: Float[np.ndarray, " nv"]  # half width of the reversal of dry friction, rad/s or m/s
+    method: str
+    model: Any  # extended.ExtendedModel
+    traces: tuple[Trace, ...] = ()
+    correlations: tuple[tuple[str, str, float], ...] = ()  # of base parameters, the strongest
+    notes: tuple[str, ...] = ()
+    prismatic: tuple[bool, ...] = field(default=())
+
+    @property
+    def torque_units(self) -> tuple[str, ...]:
+        """Unit of torque and residual of each joint: "N m", or "N" at a prismatic one."""
+        return tuple("N" if straight else "N m" for straight in self.prismatic or (False,) * len(self.joints))
+
+
+def result(found: Identification) -> dict[str, Any]:
+    """The identification as the dictionary of `result.json`; a number that is not finite becomes None."""
+    return {
+        "rank": found.rank,
+        "structural_rank": found.structural_rank,
+        "condition": _number(found.condition),
+        "scaled_condition": _number(found.scaled_condition),
+        "method": found.method,
+        "trust": _number(found.trust),
+        "base_parameters": [
+            {"expression": b.expression, "value": _number(b.value), "std": _number(b.std), "status": b.status}
+            for b in found.base
+        ],
+        "parameters": [
+            {"name": p.name, "value": _number(p.value), "std": _number(p.std), "status": p.status}
+            | {"absorbed_in": list(p.absorbed_in)}
+            for p in found.parameters
+        ],
+        "null_directions": list(found.null_directions),
+        "links": [
+            {"name": link.name, "parameters": _numbers(link.parameters), "consistent": link.consistent}
+            | ({"reason": link.reason} if link.reason else {})
+            for link in found.links
+        ],
+        "effects": [
+            {
+                "effect": e.name.effect,
+                "at": list(e.name.at),
+                "parameters": {
+                    name: {"value": _number(x.value), "std": _number(x.std), "unit": x.unit}
+                    for name, x in e.parameters.items()
+                },
+            }
+            for e in found.effects
+        ],
+        "fit": _quality(found.fit),
+        "unconstrained": _quality(found.unconstrained),
+        "nominal": _quality(found.nominal),
+        "cross_validation": _quality(found.validated),
+        "holdout": {file: _quality(quality) for file, quality in found.holdout.items()},
+        "reversal_width": _numbers(found.width),
+        "correlations": [{"between": [a, b], "value": _number(c)} for a, b, c in found.correlations],
+        "notes": list(found.notes),
+    }
+
+
+def to_json(found: Identification) -> str:
+    """The text of `result.json`: strict JSON in UTF-8 characters, with a newline at its end."""
+    return json.dumps(result(found), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _quality(quality: Quality) -> dict[str, list[float | None]]:
+    return {name: _numbers(getattr(quality, name)) for name in ("rms", "relative", "r2")}
+
+
+def _numbers(values: Any) -> list[float | None]:
+    return [_number(value) for value in values]
+
+
+def _number(value: Any) -> float | None:
+    plain = float(value)
+    return plain if math.isfinite(plain) else None

@@ -1,0 +1,188 @@
+"""Recordings: measured motion and torque on the joint side, in SI units, with the columns in the model's order.
+
+Motor-side recordings are converted with the task's matrices: motor position = position @ joint position,
+joint torque = torque @ motor torque; the offset is added to the joint position afterwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import InputError, nearest
+from ..formats.assembly import ROOT_JOINT
+from ..model import RobotModel
+from .tables import Table, read_table
+
+if TYPE_CHECKING:
+    from ..formats.config import Load, RecordingEntry, Task
+
+__all__ = ["Drive", "Recording", "joint_columns", "read_recordings", "read_time", "unit_factors"]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One recording on the joint side: rad and N m, or m and N for prismatic joints."""
+
+    name: str  # stem of the file
+    file: Path
+    joints: tuple[str, ...]  # names of the columns
+    time: Float[np.ndarray, " samples"]  # s, increasing
+    position: Float[np.ndarray, "samples nv"]
+    velocity: Float[np.ndarray, "samples nv"] | None = None
+    torque: Float[np.ndarray, "samples nv"] | None = None
+    command: Float[np.ndarray, "samples nv"] | None = None  # commanded position
+    load: Load | None = None  # known payload carried
+    repeat: str | None = None  # recordings with one label repeat one excitation
+    role: Literal["fit", "holdout"] = "fit"
+    notes: tuple[str, ...] = ()
+
+
+def read_recordings(task: Task, model: RobotModel) -> tuple[Recording, ...]:
+    """Read every recording of a task of torque level, in the task's order.
+
+    Raises `InputError` that names the file, the key, the row or the joint: missing or damaged files and columns, NaN,
+    wrong shapes, time that does not increase, names that the model does not know, a fit recording without torque.
+    """
+    _check_names(task, model)
+    drive = Drive(task, model)
+    recordings = tuple(_read(entry, f"data[{k}]", model, drive) for k, entry in enumerate(task.data))
+    lacking = next((r for r in recordings if r.role == "fit" and r.torque is None), None)
+    if lacking is not None:
+        raise InputError(
+            f"{lacking.file}: a fit recording needs `torque` (only `role: holdout` may lack it);"
+            " poses without torque, and commands without torque, are not diagnosed yet"
+        )
+    return recordings
+
+
+def _check_names(task: Task, model: RobotModel) -> None:
+    for joint in model.joints:
+        if joint.kind not in ("revolute", "prismatic"):
+            key = f"robot.root is {task.robot.root}" if joint.name == ROOT_JOINT else f"joint '{joint.name}'"
+            raise InputError(
+                f"{task.file}: {key}: recordings of joint torques hold one column a joint, and a {joint.kind} joint "
+                "has several; use root: fixed, and name the revolute and prismatic joints under robot.joints"
+            )
+    known = {*model.joint_names, *model.link_names, *(frame.name for frame in model.frames)}
+    for joint in task.preprocess.gate:
+        if joint not in model.joint_names:
+            hint = nearest(joint, model.joint_names)
+            raise InputError(f"{task.file}: preprocess.gate: no moving joint '{joint}'{hint}")
+    for k, effect in enumerate(task.baseline.effects):
+        for name in effect.at:
+            if name not in known:
+                raise InputError(f"{task.file}: baseline.effects[{k}].at: robot has no '{name}'{nearest(name, known)}")
+    for k, entry in enumerate(task.data):
+        frames = [frame.name for frame in model.frames]
+        if entry.load is not None and entry.load.frame not in {*frames, *model.link_names}:
+            place = f"{task.file}: data[{k}].load.frame"
+            raise InputError(f"{place}: robot has no frame '{entry.load.frame}'{nearest(entry.load.frame, frames)}")
+
+
+class Drive:
+    """Motor side to joint side; the identity where the task gives no transmission."""
+
+    def __init__(self, task: Task, model: RobotModel):
+        def read(key: str, shape: tuple[int, ...]) -> np.ndarray | None:
+            value = task.transmission and getattr(task.transmission, key)
+            if value is None:
+                return None
+            found = np.asarray(value)
+            if found.shape != shape:
+                names = ", ".join(model.joint_names)
+                place = f"{task.file}: transmission.{key}"
+                raise InputError(f"{place} has shape {found.shape}, expected {shape} for the joints {names}")
+            return found
+
+        self.position = read("position", (model.nv, model.nv))
+        self.torque = read("torque", (model.nv, model.nv))
+        offset = read("offset", (model.nv,))
+        self.offset = np.zeros(model.nv) if offset is None else offset
+
+    def joint_motion(self, motor: Float[np.ndarray, "samples nv"]) -> Float[np.ndarray, "samples nv"]:
+        return motor if self.position is None else np.linalg.solve(self.position, motor.T).T
+
+    def joint_torque(self, motor: Float[np.ndarray, "samples nv"]) -> Float[np.ndarray, "samples nv"]:
+        return motor if self.torque is None else motor @ self.torque.T
+
+
+def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive) -> Recording:
+    table = read_table(entry.file, f"{key}.file")
+    units = entry.units
+    angle = unit_factors(units.position, drive.position is not None, model)
+    position = joint_columns(table, entry.position, model, f"{key}.position") * angle
+    time = read_time(table, entry, key, len(position))
+
+    def optional(name: str):
+        source = getattr(entry, name)
+        return None if source is None else joint_columns(table, source, model, f"{key}.{name}", len(position))
+
+    velocity, torque, command = optional("velocity"), optional("torque"), optional("command")
+    if torque is not None and units.torque == "A" and drive.torque is None:
+        raise InputError(f"{entry.file}: {key}.units.torque is A: transmission.torque must say what one ampere gives")
+    rate = unit_factors(units.velocity or units.position, drive.position is not None, model)
+    return Recording(
+        name=entry.file.stem,
+        file=entry.file,
+        joints=model.joint_names,
+        time=time,
+        position=drive.joint_motion(position) + drive.offset,
+        velocity=None if velocity is None else drive.joint_motion(velocity * rate),
+        torque=None if torque is None else drive.joint_torque(torque),
+        command=None if command is None else drive.joint_motion(command * angle) + drive.offset,
+        load=entry.load,
+        repeat=entry.repeat,
+        role=entry.role,
+    )
+
+
+def unit_factors(unit: str, motor_side: bool, model: RobotModel) -> Float[np.ndarray, " nv"]:
+    """What turns each column into rad or m: degrees are of turning joints, millimetres of sliding ones."""
+    prismatic = np.zeros(model.nv, dtype=bool)
+    for joint in model.joints:
+        if joint.name == model.joint_names[joint.coordinate]:
+            prismatic[joint.coordinate] = joint.kind == "prismatic" and not motor_side
+    factors = {"deg": (np.pi / 180, 1.0), "mm": (1.0, 1e-3)}
+    turning, sliding = factors.get(unit.split("/")[0], (1.0, 1.0))
+    return np.where(prismatic, sliding, turning)
+
+
+def joint_columns(table: Table, source, model: RobotModel, key: str, samples: int | None = None):
+    values = table.matrix(source, model.joint_names, key)
+    if samples is not None and len(values) != samples:
+        raise InputError(f"{table.file}: {key} has {len(values)} samples, but position has {samples}")
+    wrong = np.argwhere(~np.isfinite(values))
+    if len(wrong):
+        row, column = wrong[0]
+        raise InputError(
+            f"{table.file}: {key} ('{source}') is {values[row, column]} in row {row} (from 0), column {column},"
+            f" joint {model.joint_names[column]}; {len(wrong)} such value{'s' if len(wrong) > 1 else ''} in all"
+        )
+    return values
+
+
+def read_time(table: Table, entry: RecordingEntry, key: str, samples: int) -> Float[np.ndarray, " samples"]:
+    if samples < 2:
+        raise InputError(f"{table.file}: {samples} sample{'s'[samples:]}; a recording is a motion over time")
+    if entry.time is None:
+        return np.arange(samples) / (entry.rate or 1.0)  # postures may have no clock: they are counted
+    time = table.vector(entry.time, f"{key}.time")
+    if len(time) != samples:
+        raise InputError(f"{table.file}: {key}.time has {len(time)} samples, but position has {samples}")
+    wrong = np.flatnonzero(~np.isfinite(time))
+    if len(wrong):
+        raise InputError(f"{table.file}: {key}.time ('{entry.time}') is {time[wrong[0]]} in row {wrong[0]} (from 0)")
+    back = np.flatnonzero(np.diff(time) <= 0)
+    if len(back):
+        row = back[0] + 1
+        what = "repeats" if time[row] == time[row - 1] else "goes back"
+        raise InputError(
+            f"{table.file}: {key}.time {what} in row {row} (from 0): {time[row]:.9g} s after {time[row - 1]:.9g} s;"
+            " the stamps must increase"
+        )
+    return time

@@ -1,0 +1,282 @@
+"""From a recording to even samples of position, velocity, acceleration and torque, and the filter of their rows.
+
+Position and torque are brought to one *working rate*, some 12 to 16 times the cutoff, through one zero-phase
+anti-aliasing kernel. Position is then low-passed and differentiated there. Torque stays as it is: `RowFilter` filters
+it together with every regressor column after the column is formed, and keeps the rows at the output rate.
+
+Velocity and acceleration always come from the position, so that the three belong to one motion. A logged velocity is
+not used: controllers filter it with a delay that nobody states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import InputError
+from .bandwidth import motion_band, smoothed
+from .dataset import Recording
+from .resampling import Grid, band_limited, differentiate, even_grid, sampling_rate, to_recording_times
+from .rowfilter import RowFilter, fast_length, filter_rows, frequencies, low_pass, row_filter
+
+if TYPE_CHECKING:
+    from ..formats.config import Load, Preprocess
+
+__all__ = [
+    "Rates",
+    "RowFilter",
+    "Signals",
+    "align",
+    "choose_rates",
+    "common_rows",
+    "filter_rows",
+    "frequencies",
+    "prepare",
+    "prepare_all",
+    "to_recording_times",
+]
+
+DEFAULT_CUTOFF = 20.0  # Hz
+WORKING = 13.2  # working rate over cutoff; the five-point differences are off by 0.2 % at the cutoff there
+ROWS = 3.3  # output rate over cutoff
+FEWEST_ROWS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """A recording at the even working rate, joint side, SI units; `rows` makes the rows of a regression of it."""
+
+    name: str
+    file: str
+    role: Literal["fit", "holdout"]
+    repeat: str | None
+    time: Float[np.ndarray, " samples"]  # s, on the recording's clock
+    position: Float[np.ndarray, "samples nv"]  # low-passed
+    velocity: Float[np.ndarray, "samples nv"]
+    acceleration: Float[np.ndarray, "samples nv"]
+    torque: Float[np.ndarray, "samples nv"] | None  # not low-passed: `rows` does it
+    dt: float
+    cutoff: float  # Hz
+    rows: RowFilter
+    load: Load | None  # known payload carried
+    notes: tuple[str, ...]
+
+
+class Rates(NamedTuple):
+    """Rates that all recordings of a task share."""
+
+    working: float  # Hz
+    step: int  # working samples a row
+    cutoff: float  # Hz
+
+    @property
+    def row(self) -> float:
+        """Seconds from row to row."""
+        return self.step / self.working
+
+
+def prepare_all(recordings: Sequence[Recording], preprocess: Preprocess, *, slowed: bool = True) -> tuple[Signals, ...]:
+    """`prepare` every recording at the same rates, and repeats of one excitation on grids that meet.
+
+    Row k of a repeat's first recording is then row k + `align(first, repeat)` of the repeat, to a fiftieth of a row.
+    `slowed` as for `prepare`.
+    """
+    rates = choose_rates(recordings, preprocess)
+    prepared: list[Signals] = []
+    leaders: dict[str, Signals] = {}
+    for recording in recordings:
+        signals = prepare(recording, preprocess, rates, slowed=slowed)
+        leader = leaders.setdefault(recording.repeat, signals) if recording.repeat else signals
+        late = _late_rows(leader, signals) if leader is not signals else 0.0
+        off = (late - round(late)) * rates.row
+        if abs(off) >= rates.row / 50:
+            signals = prepare(recording, preprocess, rates, shift=off, slowed=slowed)
+        prepared.append(signals)
+    return tuple(prepared)
+
+
+def prepare(
+    recording: Recording,
+    preprocess: Preprocess,
+    rates: Rates | None = None,
+    *,
+    shift: float = 0.0,
+    slowed: bool = True,
+) -> Signals:
+    """Even, low-passed, differentiated signals of one recording and the filter that makes its rows.
+
+    `rates` are those of `choose_rates`, by default for this recording alone; `shift` (s, less than a row) moves the
+    grid; `slowed` takes a position down to the band of its own motion where that is below the cutoff. Raises
+    `InputError` where the window, the cutoff or the rate do not fit the recording, or it is too short.
+    """
+    rates = rates or choose_rates((recording,), preprocess)
+    time, position, torque = _window(recording, preprocess.window)
+    grid = even_grid(time, position, *([] if torque is None else [torque]))
+    at, columns = _resample(grid, rates, shift)
+    dt = 1 / rates.working
+    seconds = time[-1] - time[0] + 1 / grid.rate
+    trim = 0.5 if seconds > 9.99 else 0.1
+    nv = position.shape[1]
+    rows = row_filter(len(at), dt, rates.cutoff, step=rates.step, trim=trim, start=float(at[0]), nv=nv)
+    if rows.kept < FEWEST_ROWS:
+        raise InputError(
+            f"{recording.file}: {seconds:.3g} s are too short: {rows.kept} row(s) at {1 / rates.row:.4g} Hz are left"
+            f" after {trim} s are cut at both ends, at least {FEWEST_ROWS} are needed"
+        )
+    position = (_motion if slowed else low_pass)(columns[0], dt, rates.cutoff)
+    velocity = differentiate(position, dt)
+    weight = _weight(recording, preprocess, rows, velocity, grid.gaps, rates.cutoff)
+    return Signals(
+        name=recording.name,
+        file=str(recording.file),
+        role=recording.role,
+        repeat=recording.repeat,
+        time=at,
+        position=position,
+        velocity=velocity,
+        acceleration=differentiate(position, dt, order=2),
+        torque=None if torque is None else columns[1],
+        dt=dt,
+        cutoff=rates.cutoff,
+        rows=eqx.tree_at(lambda r: r.weight, rows, weight),
+        load=recording.load,
+        notes=recording.notes + _gap_notes(recording, grid.gaps, rates.cutoff),
+    )
+
+
+def _motion(position: Float[np.ndarray, "samples nv"], dt: float, cutoff: float) -> Float[np.ndarray, "samples nv"]:
+    """The position of each joint without what lies above its cutoff, or above its motion where that is slower."""
+    out = low_pass(position, dt, cutoff)
+    for joint, column in enumerate(position.T):
+        band = motion_band(column, dt, cutoff)
+        if band < cutoff:
+            out[:, joint] = smoothed(column, dt, band)
+    return out
+
+
+def choose_rates(recordings: Sequence[Recording], preprocess: Preprocess) -> Rates:
+    """Working rate, output rate and cutoff for all recordings of a task; the slowest recording decides.
+
+    Default cutoff 20 Hz, at most 0.2 of the recording's rate; default output rate about 3.3 times the cutoff. The
+    working rate is a whole multiple of the output rate; it lies above the recording's own where that is below 12
+    times the cutoff, because differences and friction signs need the finer samples.
+    """
+    raw, file = min((sampling_rate(recording.time), str(recording.file)) for recording in recordings)
+    cutoff = preprocess.cutoff or min(DEFAULT_CUTOFF, 0.2 * raw)
+    if cutoff >= raw / 2:
+        raise InputError(
+            f"{file}: preprocess.cutoff {cutoff:g} Hz is not below half of the recording's rate of {raw:.5g} Hz"
+        )
+    if preprocess.rate is not None:
+        if preprocess.rate > raw * 1.001:
+            raise InputError(f"{file}: preprocess.rate {preprocess.rate:g} Hz is above the recording's {raw:.5g} Hz")
+        step = max(1, round(WORKING * cutoff / preprocess.rate))
+        return Rates(step * preprocess.rate, step, cutoff)
+    if raw < 12 * cutoff:
+        return Rates(WORKING * cutoff, round(WORKING / ROWS), cutoff)
+    working = raw / int(raw / (12 * cutoff))  # a whole divisor needs no interpolation between samples
+    return Rates(working, max(1, round(working / (ROWS * cutoff))), cutoff)
+
+
+def _window(recording: Recording, window: tuple[float, float] | None):
+    """The part of a recording that is kept."""
+    time, position, torque = recording.time, recording.position, recording.torque
+    if window is None:
+        return time, position, torque
+    keep = (time >= window[0]) & (time <= window[1])
+    if keep.sum() < 2:
+        raise InputError(
+            f"{recording.file}: preprocess.window [{window[0]:g}, {window[1]:g}] s keeps nothing of this recording,"
+            f" which lasts from {time[0]:g} to {time[-1]:g} s"
+        )
+    return time[keep], position[keep], None if torque is None else torque[keep]
+
+
+def _resample(grid: Grid, rates: Rates, shift: float):
+    """Times and columns at the working rate; columns whose rate is right already pass unchanged."""
+    begin = shift if shift >= 0 else shift + rates.row
+    count = int(((len(grid.columns[0]) - 1) / grid.rate - begin) * rates.working + 1e-6) + 1
+    at = grid.start + begin + np.arange(max(count, 1)) / rates.working
+    if shift == 0 and abs(grid.rate / rates.working - 1) < 1e-9:
+        return at, grid.columns
+    slower = min(grid.rate, rates.working)
+    passed = min(3 * rates.cutoff, 0.4 * slower)
+    edges = {"start": grid.start, "rate": grid.rate, "passed": passed, "stopped": slower - passed}
+    return at, tuple(band_limited(x, at, **edges) for x in grid.columns)
+
+
+def _weight(recording: Recording, preprocess: Preprocess, rows: RowFilter, velocity, gaps, cutoff: float):
+    """0 for the rows near a gap that the filter cannot bridge, and below a joint's gate; else 1."""
+    weight = np.ones((rows.kept, velocity.shape[1]))
+    reach = 0.5 / cutoff
+    for begin, end in _long(gaps, cutoff):
+        weight[(rows.row_times > begin - reach) & (rows.row_times < end + reach)] = 0.0
+    for joint, least in preprocess.gate.items():
+        column = recording.joints.index(joint)
+        weight[np.abs(velocity[rows.index, column]) < least, column] = 0.0
+    return weight
+
+
+def _long(gaps, cutoff: float) -> list[tuple[float, float]]:
+    """Gaps that hide a quarter of the fastest period that passes."""
+    return [(begin, end) for begin, end in gaps if end - begin > 0.25 / cutoff]
+
+
+def _gap_notes(recording: Recording, gaps, cutoff: float) -> tuple[str, ...]:
+    if not gaps:
+        return ()
+    begin, end = max(gaps, key=lambda gap: gap[1] - gap[0])
+    left_out = len(_long(gaps, cutoff))
+    return (
+        f"{recording.name}: {len(gaps)} gap{'s' * (len(gaps) > 1)} in the time stamps, the longest {end - begin:.3g} s"
+        f" at {begin:.4g} s; rows near {left_out} of them are left out, the others are bridged",
+    )
+
+
+def align(first: Signals, second: Signals) -> int:
+    """Rows by which `second` is late: row k of `first` repeats row k + shift of `second`.
+
+    The shift has the smallest mean square difference of the low-passed positions where they then overlap (at least
+    half of the shorter one); of equally good ones, as in a periodic motion, the smallest.
+    """
+    return round(_late_rows(first, second))
+
+
+def common_rows(first: Signals, second: Signals) -> tuple[slice, slice]:
+    """The rows of `first` and of `second` that belong together: `r1[a] - r2[b]` is the difference of two repeats."""
+    shift = align(first, second)
+    begin, end = max(0, -shift), min(first.rows.kept, second.rows.kept - shift)
+    return slice(begin, end), slice(begin + shift, end + shift)
+
+
+def _late_rows(first: Signals, second: Signals) -> float:
+    """Rows by which `second` is late, between whole rows too."""
+    if abs(first.dt / second.dt - 1) > 1e-3:
+        raise InputError(f"{second.file}: {1 / second.dt:.5g} Hz, but its repeat {first.file} has {1 / first.dt:.5g}")
+    late = second.time[0] - first.time[0] + _lag(first.position, second.position) * first.dt
+    return (first.rows.row_times[0] + late - second.rows.row_times[0]) / (first.rows.step * first.dt)
+
+
+def _lag(x: Float[np.ndarray, "n nv"], y: Float[np.ndarray, "m nv"]) -> float:
+    """Samples l, between whole ones too, that make x[i] nearest to y[i + l] in the mean square over the overlap."""
+    centre, scale = x.mean(axis=0), x.std(axis=0)
+    scale = np.where(scale > 1e-6 * max(scale.max(), 1e-12), scale, np.inf)
+    x, y = (x - centre) / scale, (y - centre) / scale
+    lags = np.arange(1 - len(x), len(y))
+    begin, end = np.maximum(0, -lags), np.minimum(len(x), len(y) - lags)
+    size = fast_length(len(x) + len(y) - 1)
+    product = np.fft.irfft(np.conj(np.fft.rfft(x, size, axis=0)) * np.fft.rfft(y, size, axis=0), size, axis=0)
+    power_x, power_y = (np.concatenate([[0.0], np.cumsum((z**2).sum(axis=1))]) for z in (x, y))
+    power = power_x[end] - power_x[begin] + power_y[end + lags] - power_y[begin + lags]
+    distance = (power - 2 * product.sum(axis=1)[lags]) / (end - begin)
+    distance[end - begin < min(len(x), len(y)) / 2] = np.inf
+    good = np.flatnonzero(distance <= 1.05 * distance.min() + 1e-9)
+    best = good[np.argmin(np.abs(lags[good]))]
+    left, middle, right = distance[best - 1 : best + 2] if 0 < best < len(lags) - 1 else (np.inf,) * 3
+    curvature = left - 2 * middle + right
+    return float(lags[best] + (0.5 * (left - right) / curvature if 0 < curvature < np.inf else 0.0))

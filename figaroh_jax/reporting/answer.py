@@ -1,0 +1,90 @@
+"""The answer for other programs: `answer.json` and `predictions.npz`, as the contract writes them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ..results import Cause, Diagnosis, Estimate, Name
+
+__all__ = ["answer", "cause", "to_json", "write_predictions"]
+
+
+def answer(diagnosis: Diagnosis) -> dict[str, Any]:
+    """The diagnosis as the dictionary of `answer.json`; a number that is not finite becomes None (JSON null)."""
+    return {
+        "verdict": diagnosis.verdict,
+        "causes": [cause(found) for found in diagnosis.causes],
+        "p_value": _number(diagnosis.p_value),
+        "residual": {
+            "before": [_number(value) for value in diagnosis.before],
+            "after": [_number(value) for value in diagnosis.after],
+            "noise": [_number(value) for value in diagnosis.noise],
+        },
+        "next_experiment": _experiment(diagnosis),
+    }
+
+
+def to_json(diagnosis: Diagnosis) -> str:
+    """The text of `answer.json`: strict JSON, in UTF-8 characters, with a newline at its end."""
+    return json.dumps(answer(diagnosis), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def write_predictions(
+    path: Path,
+    predictions: Mapping[str, tuple[Float[np.ndarray, "_"], Float[np.ndarray, "_ nv"]]],
+) -> None:
+    """Write `predictions.npz`: `<name>_time` (s) and `<name>_torque` (N m or N) for each held-out recording.
+
+    `predictions` maps a recording's name (its file stem) to its own time stamps and the extended model's torque there.
+    Raises `ValueError` where the two do not belong together.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    for name, (time, torque) in predictions.items():
+        stamps, values = np.asarray(time, np.float64), np.asarray(torque, np.float64)
+        if stamps.ndim != 1 or values.ndim != 2 or len(stamps) != len(values):
+            raise ValueError(
+                f"predictions of '{name}': time has shape {stamps.shape} and torque {values.shape}; "
+                "expected (samples,) and (samples, joints)"
+            )
+        arrays |= {f"{name}_time": stamps, f"{name}_torque": values}
+    with path.open("wb") as file:  # an open file, for savez would add a suffix to a name without one
+        np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def cause(found: Cause) -> dict[str, Any]:
+    """A cause as it stands in `answer.json`."""
+    gain = found.gain
+    return {
+        **_name(found.name),
+        "parameters": {name: _estimate(estimate) for name, estimate in found.parameters.items()},
+        "confidence": _number(found.confidence),
+        "gain": {"holdout_before": _number(gain.before), "holdout_after": _number(gain.after), "unit": gain.unit},
+        "ambiguous_with": [_name(other) for other in found.ambiguous_with],
+    }
+
+
+def _name(name: Name) -> dict[str, Any]:
+    return {"effect": name.effect, "at": list(name.at)}
+
+
+def _estimate(estimate: Estimate) -> dict[str, Any]:
+    return {"value": _number(estimate.value), "std": _number(estimate.std), "unit": estimate.unit}
+
+
+def _experiment(diagnosis: Diagnosis) -> dict[str, Any] | None:
+    experiment = diagnosis.experiment
+    if experiment is None:
+        return None
+    return {"text": experiment.text, "separates": [list(pair) for pair in experiment.separates]}
+
+
+def _number(value: float | np.floating[Any]) -> float | None:
+    plain = float(value)  # numpy's scalars are not JSON
+    return plain if math.isfinite(plain) else None

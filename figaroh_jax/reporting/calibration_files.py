@@ -1,0 +1,179 @@
+"""A calibration for other programs and readers: `result.json`, `report.html` and `model/`.
+
+`model/robot.urdf` is the robot's own file with the origins of the corrected joints; `model/robot.xml` the same as MJCF;
+`model/calibration.yaml` the corrections, the effects that no URDF can carry, and the metrology frames.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..calibration.calibrated import Calibration, Error
+from ..calibration.corrections import twist_pose
+from ..errors import InputError
+
+if TYPE_CHECKING:
+    from ..calibration.kinematic_diagnosis import PoseDiagnosis
+
+__all__ = ["corrected_urdf", "pose_answer_json", "result", "to_json", "write_calibration"]
+
+_PARITY = 1e-9  # m and entries of the rotation, between the model and the file read back
+
+
+def write_calibration(calibration: Calibration, folder: Path, source: Path) -> None:
+    """Write everything that the contract asks of a calibration; `source` is the robot's own URDF."""
+    from ..formats.export import dump_yaml
+    from .calibration_report import write_calibration_report
+
+    (folder / "result.json").write_text(to_json(calibration), encoding="utf-8")
+    write_calibration_report(calibration, folder / "report.html")
+    model = folder / "model"
+    model.mkdir()
+    (model / "calibration.yaml").write_text(dump_yaml(_corrections(calibration)), encoding="utf-8")
+    if source.suffix.lower() == ".urdf":
+        (model / "robot.urdf").write_text(corrected_urdf(calibration, source), encoding="utf-8")
+        _check_parity(calibration, model / "robot.urdf")
+    _write_mjcf(calibration, model / "robot.xml")
+
+
+def result(calibration: Calibration) -> dict[str, Any]:
+    """The calibration as the dictionary of `result.json`; a number that is not finite becomes None (JSON null)."""
+    from .answer import cause
+
+    return {
+        "level": calibration.level,
+        "parameters": [
+            {"name": p.name, "value": _number(p.value), "std": _number(p.std), "unit": p.unit, "status": p.status}
+            for p in calibration.parameters
+        ],
+        "position": _error(calibration.position),
+        "orientation": _error(calibration.orientation),
+        "outliers": [{"file": o.file, "row": o.row} for o in calibration.outliers],
+        "verdict": calibration.verdict,
+        "causes": [cause(c) for c in calibration.causes],
+        "frames": {name: np.asarray(value).tolist() for name, value in calibration.frames.items()},
+        "levels": {
+            name: {"position": _number(1e3 * a), "orientation": _number(math.degrees(b))}
+            for name, (a, b) in calibration.table.items()
+        },
+        "held_out": calibration.scheme,
+        "rank": calibration.rank,
+        "condition": _number(calibration.condition),
+        "classes": [list(c) for c in calibration.classes],
+        "converged": calibration.converged,
+        "notes": list(calibration.notes),
+    }
+
+
+def to_json(calibration: Calibration) -> str:
+    """The text of `result.json`: strict JSON, with a newline at its end."""
+    return json.dumps(result(calibration), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def pose_answer_json(diagnosis: PoseDiagnosis) -> str:
+    """The text of `answer.json` of a diagnosis of poses; residuals are RMS in mm and deg, as far as measured."""
+    from .answer import cause
+
+    experiment = diagnosis.experiment
+    answer = {
+        "verdict": diagnosis.verdict,
+        "causes": [cause(c) for c in diagnosis.causes],
+        "p_value": _number(diagnosis.p_value),
+        "residual": {
+            key: [_number(x) for x in getattr(diagnosis, key) if x is not None] for key in ("before", "after", "noise")
+        },
+        "next_experiment": experiment
+        and {"text": experiment.text, "separates": [list(pair) for pair in experiment.separates]},
+    }
+    return json.dumps(answer, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def corrected_urdf(calibration: Calibration, source: Path) -> str:
+    """The robot's own URDF with the origin of every corrected joint, all else as it was."""
+    from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+
+    from ..formats.urdf_text import roll_pitch_yaw
+    from ..formats.xmlfile import read_xml
+
+    root = read_xml(source, "robot")
+    for joint in root.iterchildren("joint"):
+        twist = calibration.twists.get(joint.get("name"))
+        if twist is None or not twist.any():
+            continue
+        origin = joint.find("origin")
+        if origin is None:
+            origin = etree.SubElement(joint, "origin")
+        pose = _origin(origin) @ twist_pose(twist)
+        origin.set("xyz", " ".join(repr(float(x)) for x in pose[:3, 3]))
+        origin.set("rpy", " ".join(repr(float(x)) for x in roll_pitch_yaw(pose[:3, :3])))
+    return '<?xml version="1.0"?>\n' + etree.tostring(root, encoding="unicode") + "\n"
+
+
+def _origin(element: Any) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    pose = np.eye(4)
+    pose[:3, 3] = [float(x) for x in element.get("xyz", "0 0 0").split()]
+    pose[:3, :3] = Rotation.from_euler("xyz", [float(x) for x in element.get("rpy", "0 0 0").split()]).as_matrix()
+    return pose
+
+
+def _check_parity(calibration: Calibration, urdf: Path) -> None:
+    """Read the file back and compare it with the model in 100 postures."""
+    from ..formats.urdf import load_urdf
+    from ..kinematics import forward_kinematics
+
+    model = calibration.model
+    again = load_urdf(urdf, joints=model.joint_names, posture=calibration.posture)
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (100, model.nv))
+    off = float(np.abs(np.asarray(forward_kinematics(model, q)) - np.asarray(forward_kinematics(again, q))).max())
+    if not off < _PARITY:
+        raise InputError(
+            f"{urdf.name}: read back, it differs from the calibrated model by {off:.2g} m; please report it"
+        )
+
+
+def _write_mjcf(calibration: Calibration, path: Path) -> None:
+    from ..extended import extend
+    from ..formats.export import model_files
+
+    try:
+        text = model_files(extend(calibration.model))["robot.xml"]
+    except InputError:  # links that MuJoCo could not move
+        return
+    path.write_text(text, encoding="utf-8")
+
+
+def _corrections(calibration: Calibration) -> dict[str, Any]:
+    """Corrections in the way controllers take them: offsets by joint, twists of placements, frames, effects."""
+    effects = [p for p in calibration.parameters if p.name.split()[0] not in _PLAIN]
+    return {
+        "level": calibration.level,
+        "offsets": {
+            p.name.split(" ", 1)[1]: float(p.value) for p in calibration.parameters if p.name.startswith("joint_offset")
+        },
+        "placements": {name: [float(x) for x in twist] for name, twist in calibration.twists.items()},
+        "frames": {name: np.asarray(value).tolist() for name, value in calibration.frames.items()},
+        "effects": [{"name": p.name, "value": float(p.value), "std": float(p.std), "unit": p.unit} for p in effects],
+    }
+
+
+_PLAIN = ("joint_offset", "link_geometry", "base_frame", "tool_frame", "socket", "plane", "anchor")
+
+
+def _error(error: Error | None) -> dict[str, Any] | None:
+    if error is None:
+        return None
+    return {"unit": error.unit} | {
+        key: _number(getattr(error, key)) for key in ("before", "after", "validated_before", "validated_after")
+    }
+
+
+def _number(value: float) -> float | None:
+    plain = float(value)
+    return plain if math.isfinite(plain) else None

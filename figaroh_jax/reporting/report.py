@@ -1,0 +1,225 @@
+"""The report: one HTML page that holds all it needs, to be opened from a disk, on a phone, or printed.
+
+The page is a template of `figaroh_jax/page`; plotly.js, which draws the plots, is taken from the installed plotly
+package as text, because importing that package would cost more than writing the page.
+"""
+
+from __future__ import annotations
+
+import base64
+import importlib.util
+import json
+import math
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..results import Candidate, Diagnosis, Trace
+from . import wording
+
+__all__ = ["page_template", "plot_data", "plotly_source", "write_report"]
+
+_POINTS = 1500  # of a trace at most: more cannot be told apart on a screen
+_PAGE_POINTS = 100_000  # of all traces of a channel together, so that a humanoid's page stays light
+_STEPS = 32767  # of a channel's range on each side of its middle; finer than any plot shows
+
+_BADGES = {
+    "nothing": "nothing missing",
+    "named": "cause named",
+    "named+rest": "cause named, a rest stays",
+    "unknown": "wrong, cause unknown",
+}
+
+
+class _Joint(NamedTuple):
+    """One joint as the page shows it: RMS of the residual, and of the torque each cause adds (N m or N)."""
+
+    name: str
+    unit: str
+    before: float
+    after: float
+    noise: float
+    causes: list[str]
+    shares: list[tuple[str, float]]
+    open: bool
+
+    @property
+    def full(self) -> float:
+        return max(_finite(self.before), _finite(self.after), _finite(self.noise))
+
+    @property
+    def widest(self) -> float:
+        return max([self.full, *(_finite(rms) for _, rms in self.shares)])
+
+    @property
+    def floor(self) -> float:
+        return _share(self.noise, self.full)
+
+
+def write_report(diagnosis: Diagnosis, path: Path, title: str) -> None:
+    """Write the page of a diagnosis to `path`; `title` is the robot's name, as the verdict's sentence says it."""
+    path.write_text(_page(diagnosis, title), encoding="utf-8")
+
+
+def _page(diagnosis: Diagnosis, title: str) -> str:
+    from markupsafe import Markup
+
+    page = resources.files("figaroh_jax") / "page"
+    roles = [trace.role for trace in diagnosis.traces]
+    gain = diagnosis.holdout
+    return page_template((page / "report.html").read_text("utf-8")).render(
+        d=diagnosis,
+        robot=title,
+        badge=_BADGES[diagnosis.verdict],
+        sentence=_glued(wording.sentence(diagnosis, title)),
+        largest=max(_finite(gain.before), _finite(gain.after)),
+        joints=_joints(diagnosis),
+        recordings=diagnosis.traces,
+        shown=roles.index("holdout") if "holdout" in roles else 0,
+        doubted=[cause for cause in diagnosis.causes if cause.ambiguous_with],
+        candidates=sorted(diagnosis.candidates, key=_rank),
+        css=Markup((page / "report.css").read_text("utf-8")),
+        js=Markup((page / "report.js").read_text("utf-8")),
+        data=Markup(plot_data(diagnosis.noise, diagnosis.torque_units, diagnosis.traces)),
+        plotly=Markup(plotly_source()),
+    )
+
+
+def page_template(text: str) -> Any:
+    """A page of `figaroh_jax/page` with the filters that put numbers and names into words."""
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    environment.filters |= {
+        "aside": wording.aside,
+        "equation": wording.effect_equation,
+        "error": lambda value, unit: _glued(wording.error(value, unit)),
+        "fixed": lambda value, decimals=0: f"{value:.{decimals}f}" if math.isfinite(value) else "–",
+        "first_upper": lambda words: words[:1].upper() + words[1:],
+        "interval": lambda estimate: _glued(wording.interval(estimate)),
+        "meaning": wording.effect_meaning,
+        "number": wording.number,
+        "p_value": lambda value: _glued(wording.p_value(value)),
+        "phrase": wording.phrase,
+        "place": wording.place,
+        "share": _share,
+        "spaced": lambda name: name.replace("_", " "),
+        "title_of": wording.effect_title,
+        "visible": lambda value: "never" if value == math.inf else wording.number(value, 2),
+    }
+    return environment.from_string(text)
+
+
+def _joints(diagnosis: Diagnosis) -> list[_Joint]:
+    rows = [np.asarray(row, np.float64) for row in (diagnosis.before, diagnosis.after, diagnosis.noise)]
+    shares = _shares(diagnosis)
+    opened = _opened(diagnosis)
+    joints = []
+    for index, (name, unit) in enumerate(zip(diagnosis.joints, diagnosis.torque_units, strict=True)):
+        before, after, noise = (float(row[index]) for row in rows)
+        causes = [wording.effect_title(cause.name.effect) for cause in diagnosis.causes if name in cause.name.at]
+        felt = [(label, float(rms[index])) for label, rms in shares.items() if rms[index] > 1e-3 * max(before, 1e-12)]
+        joints.append(_Joint(name, unit, before, after, noise, causes, felt, name in opened))
+    return joints
+
+
+def _opened(diagnosis: Diagnosis) -> set[str]:
+    """The joints whose plots stand open at first: where the first causes act, else the one with most to explain."""
+    named = {joint for cause in diagnosis.causes[:3] for joint in cause.name.at}
+    if named & set(diagnosis.joints):
+        return named
+    misfit, noise = np.nan_to_num(diagnosis.before), np.maximum(np.nan_to_num(diagnosis.noise), 1e-12)
+    return {diagnosis.joints[int(np.argmax(misfit / noise))]}
+
+
+def _shares(diagnosis: Diagnosis) -> dict[str, Float[np.ndarray, " nv"]]:
+    """RMS over all recordings of the torque that each cause adds, by the cause in words."""
+    words = {str(cause.name): wording.phrase(cause.name) for cause in diagnosis.causes}
+    samples: dict[str, list[np.ndarray]] = {}
+    for trace in diagnosis.traces:
+        for name, torque in trace.shares.items():
+            samples.setdefault(words.get(name, name), []).append(np.asarray(torque, np.float64))
+    return {
+        name: np.sqrt(np.mean(np.nan_to_num(np.concatenate(parts)) ** 2, axis=0)) for name, parts in samples.items()
+    }
+
+
+def _rank(candidate: Candidate) -> float:
+    return -candidate.score if math.isfinite(candidate.score) else math.inf
+
+
+def plot_data(floor: Float[np.ndarray, " nv"], units: Sequence[str], traces: Sequence[Trace]) -> str:
+    """What the plots are drawn from, as JSON that may stand inside a script element."""
+    count = len(units) * max(len(traces), 1)
+    points = min(_POINTS, max(200, _PAGE_POINTS // count))
+    joints = [
+        {"noise": _finite(float(noise)), "unit": unit, "angle": "m" if unit == "N" else "rad"}
+        for noise, unit in zip(floor, units, strict=True)
+    ]
+    recordings = [_series(trace, points) for trace in traces]
+    text = json.dumps({"joints": joints, "recordings": recordings}, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c")
+
+
+def _series(trace: Trace, points: int) -> list[dict[str, Any]]:
+    """The channels of one recording, joint by joint, thinned to `points` samples."""
+    misfit = trace.after if trace.measured is None else trace.measured - trace.before
+    kept = _thinned(np.asarray(misfit, np.float64), points)
+    wide = {key: getattr(trace, key) for key in ("position", "velocity", "before", "after", "measured")}
+    return [
+        {"time": _packed(np.asarray(trace.time)[rows])}
+        | {key: _packed(np.asarray(value)[rows, joint]) for key, value in wide.items() if value is not None}
+        for joint, rows in enumerate(kept.T)
+    ]
+
+
+def _thinned(signal: Float[np.ndarray, "samples nv"], points: int) -> Int[np.ndarray, "kept nv"]:
+    """Rows to keep of each column: the least and the greatest of every stretch, so that no peak gets lost."""
+    samples, columns = signal.shape
+    if samples <= points:
+        return np.tile(np.arange(samples)[:, None], (1, columns))
+    length = math.ceil(2 * samples / points)
+    stretches = samples // length  # what is left over at the end is shorter than a pixel
+    blocks = np.nan_to_num(signal[: stretches * length]).reshape(stretches, length, columns)
+    extremes = np.stack([blocks.argmin(axis=1), blocks.argmax(axis=1)], axis=1)
+    rows = extremes + length * np.arange(stretches)[:, None, None]
+    return np.sort(rows.reshape(2 * stretches, columns), axis=0)
+
+
+def _packed(values: Float[np.ndarray, " samples"]) -> dict[str, Any]:
+    """A channel as scale, offset and 16-bit steps in base64; the lowest step stands for a value that is missing."""
+    valid = np.isfinite(values)
+    low, high = (float(values[valid].min()), float(values[valid].max())) if valid.any() else (0.0, 0.0)
+    middle, scale = (low + high) / 2, (high - low) / (2 * _STEPS) or 1.0
+    steps = np.where(valid, np.rint((np.where(valid, values, middle) - middle) / scale), -_STEPS - 1).astype("<i2")
+    return {"o": middle, "s": scale, "d": base64.b64encode(steps.tobytes()).decode("ascii")}
+
+
+def plotly_source() -> str:
+    """Source of plotly.js; empty without the plotly package, and the page then says that it cannot draw."""
+    found = importlib.util.find_spec("plotly")
+    folders = found.submodule_search_locations if found else None
+    source = Path(folders[0], "package_data", "plotly.min.js") if folders else None
+    if source is None or not source.is_file():
+        return ""
+    return source.read_text("utf-8").replace("</script", "<\\/script").replace("<!--", "<\\!--")
+
+
+def _glued(text: str) -> str:
+    """The text with numbers and their percent sign, and both sides of ± and =, kept on one line."""
+    for mark in (" %", " ±", "± ", "p = ", "p < "):
+        text = text.replace(mark, mark.replace(" ", "\N{NO-BREAK SPACE}"))
+    return text
+
+
+def _share(value: float, full: float) -> float:
+    """Percentage of `full`, for the length of a bar."""
+    return round(100.0 * _finite(value) / full, 2) if full else 0.0
+
+
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else 0.0

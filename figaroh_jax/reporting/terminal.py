@@ -1,0 +1,194 @@
+"""The terminal: a progress bar on standard error while work goes on, a short summary on standard output at its end."""
+
+from __future__ import annotations
+
+import sys
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from rich import progress as bars
+from rich.console import Console, Group, RenderableType
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from ..identification.result import FittedEffect, Identification
+from ..results import Cause, Diagnosis
+from . import wording
+
+if TYPE_CHECKING:
+    from ..calibration.calibrated import Calibration
+
+__all__ = [
+    "Progress",
+    "calibration_summary",
+    "identification_summary",
+    "show",
+    "show_calibration",
+    "show_identification",
+    "summary",
+]
+
+_STYLE = {"nothing": "green", "named": "bold blue", "named+rest": "bold blue", "unknown": "bold yellow"}
+
+
+class Progress:
+    """Progress on standard error, a context manager that is called with a phase and the share done of the whole.
+
+    A terminal gets one moving bar, which vanishes at the end; a file or a pipe gets one line a phase; `quiet` nothing.
+    """
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        self._console = Console(stderr=True, quiet=quiet)
+        self._live = self._console.is_terminal and not quiet
+        self._phase = ""
+        columns = (bars.TextColumn("{task.description:<28}"), bars.BarColumn(), bars.TimeElapsedColumn())
+        self._progress = bars.Progress(
+            *columns, console=self._console, transient=True, disable=not self._live, refresh_per_second=4
+        )
+        self._task = self._progress.add_task("", total=1.0)
+
+    def __enter__(self) -> Progress:
+        self._progress.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None):
+        self._progress.stop()
+
+    def __call__(self, phase: str, fraction: float) -> None:
+        """Show that the work is in `phase` and that `fraction` (0 to 1) of all of it is done."""
+        done = min(max(fraction, 0.0), 1.0)
+        if self._live:
+            self._progress.update(self._task, completed=done, description=_plain(phase))
+        elif phase != self._phase:
+            self._console.print(Text(f"{done:4.0%}  {phase}"), soft_wrap=True)
+        self._phase = phase
+
+
+def show(diagnosis: Diagnosis, robot: str = "the robot") -> None:
+    """Print the summary on standard output."""
+    Console(file=sys.stdout).print(summary(diagnosis, robot))
+
+
+def summary(diagnosis: Diagnosis, robot: str = "the robot") -> RenderableType:
+    """The diagnosis in a few lines: verdict, causes with parameters, residual per joint, what to measure next."""
+    head = Text.assemble((diagnosis.verdict, _STYLE[diagnosis.verdict]), f"  {wording.sentence(diagnosis, robot)}")
+    parts: list[RenderableType] = [head]
+    parts += [_cause(number, cause) for number, cause in enumerate(diagnosis.causes, 1)]
+    if diagnosis.rest:
+        parts.append(Text(f"\nWithout a name: {diagnosis.rest}"))
+    parts += [Text(), _residuals(diagnosis), Text()]
+    parts.append(Text(f"Held out: {diagnosis.holdout_scheme}. {wording.p_value(diagnosis.p_value)}.", style="dim"))
+    if diagnosis.experiment is not None:
+        parts.append(Text(f"Measure next: {diagnosis.experiment.text}"))
+    parts += [Text(f"Note: {note}", style="dim") for note in diagnosis.notes]
+    return Group(*parts)
+
+
+def show_calibration(calibration: Calibration, verdict: str = "") -> None:
+    """Print the summary of a calibration, or of a diagnosis of poses with its verdict, on standard output."""
+    Console(file=sys.stdout).print(calibration_summary(calibration, verdict))
+
+
+def calibration_summary(calibration: Calibration, verdict: str = "") -> RenderableType:
+    """The calibration in a few lines: how much better, why this level, outliers and causes, what to know."""
+    word = (verdict, _STYLE[verdict]) if verdict else (calibration.level, "bold blue")
+    head = Text.assemble(word, f"  {wording.calibration_sentence(calibration)}\n")
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("held-out RMS error")
+    errors = [error for error in (calibration.position, calibration.orientation) if error is not None]
+    for error in errors:
+        table.add_column(error.unit, justify="right")
+    for name, pair in calibration.table.items():
+        values = [pair[0] * 1e3] * (calibration.position is not None)
+        values += [pair[1] * 57.29577951308232] * (calibration.orientation is not None)
+        table.add_row(wording.level(name), *(wording.number(value, 4) for value in values))
+    parts: list[RenderableType] = [head, table]
+    for number, cause in enumerate(calibration.causes, 1):
+        values = ", ".join(f"{key} {wording.interval(value)}" for key, value in cause.parameters.items())
+        parts.append(Text.assemble(f"\n{number}. ", (wording.phrase(cause.name), "bold"), f"  {cause.note or values}"))
+        if cause.ambiguous_with:
+            parts.append(
+                Text(f"   not told apart from {wording.aside(cause.name, cause.ambiguous_with)}", style="yellow")
+            )
+    parts.append(Text(f"\nHeld out: {calibration.scheme}.", style="dim"))
+    return Group(*parts, *(Text(f"Note: {note}", style="dim") for note in calibration.notes))
+
+
+def _cause(number: int, cause: Cause) -> RenderableType:
+    gain = cause.gain
+    lines = [
+        Text.assemble(
+            f"\n{number}. ",
+            (wording.phrase(cause.name), "bold"),
+            f"  [{cause.name.effect}]  error {wording.error(gain.before, gain.unit)} → ",
+            f"{wording.error(gain.after, gain.unit)}, confidence {cause.confidence:.2f}",
+        )
+    ]
+    lines += [Text(f"{name}  {wording.interval(value)}") for name, value in cause.parameters.items()]
+    if cause.ambiguous_with:
+        lines.append(Text(f"not told apart from {wording.aside(cause.name, cause.ambiguous_with)}", style="yellow"))
+    if cause.note:
+        lines.append(Text(cause.note, style="dim"))
+    return Group(lines[0], *(Padding(line, (0, 0, 0, 3), expand=False) for line in lines[1:]))
+
+
+def _residuals(diagnosis: Diagnosis) -> RenderableType:
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("RMS residual")
+    for title in ("before", "after", "noise"):
+        table.add_column(title, justify="right")
+    table.add_column("")
+    rows = zip(
+        diagnosis.joints, diagnosis.before, diagnosis.after, diagnosis.noise, diagnosis.torque_units, strict=True
+    )
+    for joint, before, after, noise, unit in rows:
+        values = (wording.number(float(value), 3) for value in (before, after, noise))
+        table.add_row(Text(joint), *values, unit)
+    return table
+
+
+def _plain(text: str) -> str:
+    return text.replace("[", "(").replace("]", ")")  # the progress bar reads brackets as its own markup
+
+
+def show_identification(found: Identification, robot: str = "the robot") -> None:
+    """Print the summary of an identification on standard output."""
+    Console(file=sys.stdout).print(identification_summary(found, robot))
+
+
+def identification_summary(found: Identification, robot: str = "the robot") -> RenderableType:
+    """The identification in a few lines: rank, error of each joint, friction, what cannot be trusted."""
+    base = [one.status for one in found.base]
+    wrong = [link.name for link in found.links if not link.consistent]
+    head = Text.assemble(
+        ("identified", "bold blue"),
+        f"  {robot}: {found.rank} base parameters (of {found.structural_rank} that a motion could show),"
+        f" {base.count('identified')} of them told by the data; condition {found.condition:.4g}",
+    )
+    links = f"No body can have the parameters of {', '.join(wrong)}." if wrong else "Every link can exist."
+    parts: list[RenderableType] = [head, Text(links, style="yellow" if wrong else "")]
+    parts += [Text(), _qualities(found), Text()]
+    parts += [Text(_effect(effect)) for effect in found.effects]
+    parts += [Text(f"Note: {note}", style="dim") for note in found.notes]
+    return Group(*parts)
+
+
+def _effect(effect: FittedEffect) -> str:
+    values = ", ".join(f"{name} {wording.interval(value)}" for name, value in effect.parameters.items())
+    return f"{wording.phrase(effect.name)}: {values}"
+
+
+def _qualities(found: Identification) -> RenderableType:
+    """RMS residual of every joint on the data fitted, cross-validated, and on each held-out recording."""
+    columns = {"nominal": found.nominal, "fit": found.fit, "cross-validated": found.validated} | found.holdout
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("RMS residual")
+    for title in [*columns, "R2"]:
+        table.add_column(Text(title), justify="right")
+    table.add_column("")
+    last = list(found.holdout.values())[-1] if found.holdout else found.validated
+    for j, (joint, unit) in enumerate(zip(found.joints, found.torque_units, strict=True)):
+        values = [wording.number(float(quality.rms[j]), 3) for quality in columns.values()]
+        table.add_row(Text(joint), *values, f"{last.r2[j]:.4f}", unit)
+    return table

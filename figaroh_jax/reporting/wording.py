@@ -1,0 +1,194 @@
+"""Plain English for what a diagnosis found: the same sentences on the report's first screen and on the terminal."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from ..results import Cause, Diagnosis, Estimate, Name
+
+if TYPE_CHECKING:
+    from ..calibration.calibrated import Calibration
+
+__all__ = [
+    "aside",
+    "calibration_sentence",
+    "effect_equation",
+    "effect_meaning",
+    "effect_title",
+    "error",
+    "interval",
+    "level",
+    "number",
+    "p_value",
+    "phrase",
+    "place",
+    "sentence",
+    "unit",
+]
+
+_NORMAL_95 = 1.96  # standard deviations on each side of a 95 % interval
+
+
+def sentence(diagnosis: Diagnosis, robot: str) -> str:
+    """The verdict in one sentence, e.g. "The simulation of tx40 is missing rotor inertia at joint_3: ..."."""
+    subject = f"The simulation of {robot}"
+    if diagnosis.verdict == "nothing":
+        return (
+            f"{subject} holds up: nothing is missing that this data could show, and what it gets wrong looks like noise"
+            f" (error on held-out data {error(diagnosis.holdout.before, diagnosis.holdout.unit)})."
+        )
+    fall = _fall(diagnosis)
+    if diagnosis.verdict == "unknown":
+        found = f" Adding {_list(diagnosis.causes)} is not enough: {fall}." if diagnosis.causes else ""
+        return f"{subject} is wrong in a way that no effect of the catalogue explains.{found}"
+    rest = ". A part of what it gets wrong still has no name" if diagnosis.verdict == "named+rest" else ""
+    return f"{subject} is missing {_list(diagnosis.causes)}: {fall}{rest}."
+
+
+def calibration_sentence(calibration: Calibration) -> str:
+    """What the calibration gained, in one sentence."""
+    error = calibration.position or calibration.orientation
+    if error is None:
+        return "nothing was measured"
+    before, after = (_with_unit(number(x, 3), error.unit) for x in (error.validated_before, error.validated_after))
+    if calibration.level == "frames":
+        return (
+            f"The robot is already as good as these measurements can tell: {after} on held-out postures with the frames"
+            " of the device alone; no correction of the robot predicts better."
+        )
+    fall = f"On held-out postures the error falls from {before} (frames alone) to {after}"
+    return f"{fall}, with {level(calibration.level)}."
+
+
+def level(name: str) -> str:
+    """A level of calibration in words."""
+    words = {"joint_offset": "joint offsets", "full": "full geometry", "chosen": "as chosen inside the folds"}
+    return words.get(name, name)
+
+
+def aside(name: Name, alternatives: Sequence[Name]) -> str:
+    """What could not be told from the cause `name`, in words; empty where it stands alone."""
+    if not alternatives:
+        return ""
+    here = [effect_title(other.effect) if other.at == name.at else phrase(other) for other in alternatives]
+    return _join(here, "or")
+
+
+def phrase(name: Name) -> str:
+    """Effect and place in words: "Stribeck friction at joint_3"."""
+    return f"{effect_title(name.effect)} at {place(name.at)}" if name.at else effect_title(name.effect)
+
+
+def place(at: Sequence[str]) -> str:
+    """Where an effect acts: "joint_5 + joint_6", or "the whole robot"."""
+    return " + ".join(at) if at else "the whole robot"
+
+
+def effect_title(effect: str) -> str:
+    """The effect's name in plain words, from the catalogue; its own name with spaces where it is not in there."""
+    return getattr(_entry(effect), "title", "") or effect.replace("_", " ")
+
+
+def effect_meaning(effect: str) -> str:
+    """What the effect is, in one line: the first paragraph of its docstring in the catalogue."""
+    entry = _entry(effect)
+    if not isinstance(entry, type):
+        return ""
+    text = inspect.cleandoc(entry.__doc__ or "").split("\n\n")[0].replace("\n", " ")
+    generated = text.startswith(f"{entry.__name__}(")  # the signature that a dataclass writes
+    return "" if generated else text
+
+
+def effect_equation(effect: str) -> str:
+    """The torque that the effect adds, as text; empty where the catalogue gives none."""
+    return getattr(_entry(effect), "equation", "")
+
+
+def interval(estimate: Estimate) -> str:
+    """Value with its 95 % interval and unit: "0.0113 ± 0.0004 kg m²"; without an interval where there is none."""
+    half = _NORMAL_95 * estimate.std
+    if not (math.isfinite(half) and half > 0.0):
+        return _with_unit(number(estimate.value), estimate.unit)
+    power = math.floor(math.log10(half))
+    decimals = max(0, 1 - power)
+    if decimals > 6 or abs(estimate.value) >= 1e6:  # digits that nobody would count
+        scale = math.floor(math.log10(max(abs(estimate.value), half)))
+        pair = Estimate(estimate.value / 10.0**scale, estimate.std / 10.0**scale, "")
+        return _with_unit(f"({interval(pair)}) × 10{_superscript(scale)}", estimate.unit)
+    return _with_unit(_minus(f"{estimate.value:.{decimals}f} ± {half:.{decimals}f}"), estimate.unit)
+
+
+def error(value: float, of: str) -> str:
+    """An error in words: a relative one in percent, any other with its unit."""
+    if not math.isfinite(value):
+        return "not known"
+    if not of.startswith("relative"):
+        return _with_unit(number(value), of)
+    percent = 100.0 * value
+    return f"{percent:.1f} %" if abs(percent) >= 1.0 else f"{number(percent, 2)} %"
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number with `digits` significant digits, never more than a reader needs."""
+    if not math.isfinite(value):
+        return "–" if math.isnan(value) else _minus(f"{value:.0f}".replace("inf", "∞"))
+    return _minus(f"{value:.{digits}g}")
+
+
+def p_value(value: float) -> str:
+    """A p-value as it deserves to be read: below 0.01 its digits mean nothing."""
+    if not math.isfinite(value):
+        return "p not known"
+    return "p < 0.01" if value < 0.01 else f"p = {value:.2f}"
+
+
+def unit(text: str) -> str:
+    """A unit as it is printed: "kg m²" for "kg m2"."""
+    return text.replace("m2", "m²").replace("s2", "s²").replace("m3", "m³")
+
+
+def _fall(diagnosis: Diagnosis) -> str:
+    gain = diagnosis.holdout
+    before, after = error(gain.before, gain.unit), error(gain.after, gain.unit)
+    return f"its error on held-out data falls from {before} to {after}"
+
+
+def _list(causes: Sequence[Cause]) -> str:
+    shown = [_counted(cause) for cause in causes[: 2 if len(causes) == 2 else 1]]
+    more = len(causes) - len(shown)
+    if more:
+        shown.append(f"{more} more {'effect' if more == 1 else 'effects'}")
+    return _join(shown, "and")
+
+
+def _counted(cause: Cause) -> str:
+    others = len(cause.ambiguous_with)
+    if others == 1:
+        return f"{phrase(cause.name)} (or {aside(cause.name, cause.ambiguous_with)})"
+    return phrase(cause.name) + (f" (or one of {others} effects that this data cannot tell from it)" if others else "")
+
+
+def _join(words: Sequence[str], last: str) -> str:
+    return f" {last} ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
+
+
+def _with_unit(text: str, of: str) -> str:
+    return f"{text} {unit(of)}" if of else text
+
+
+def _minus(text: str) -> str:
+    return text.replace("-", "−")
+
+
+def _superscript(power: int) -> str:
+    return "".join("⁰¹²³⁴⁵⁶⁷⁸⁹"[int(digit)] if digit != "-" else "⁻" for digit in str(power))
+
+
+def _entry(effect: str) -> Any:
+    from .. import effects
+    from ..calibration import kinematic_effects
+
+    return effects.CATALOGUE.get(effect) or kinematic_effects.CATALOGUE.get(effect)
