@@ -23,8 +23,9 @@ def write_calibration_report(calibration: Calibration, path: Path) -> None:
     from markupsafe import Markup
 
     page = resources.files("figaroh_jax") / "page"
-    text = page_template((page / "calibration.html").read_text("utf-8")).render(
+    text = page_template("calibration.html").render(
         c=calibration,
+        robot=calibration.model.name,
         sentence=wording.calibration_sentence(calibration),
         level=wording.level,
         errors=[error for error in (calibration.position, calibration.orientation) if error is not None],

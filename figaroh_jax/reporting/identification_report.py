@@ -19,7 +19,7 @@ def write_identification(found: Identification, path: Path, title: str) -> None:
 
     page = resources.files("figaroh_jax") / "page"
     roles = [trace.role for trace in found.traces]
-    text = page_template((page / "identification.html").read_text("utf-8")).render(
+    text = page_template("identification.html").render(
         d=found,
         robot=title,
         columns={"given links": found.nominal, "fit": found.fit, "cross-validated": found.validated} | found.holdout,

@@ -71,7 +71,7 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
     page = resources.files("figaroh_jax") / "page"
     roles = [trace.role for trace in diagnosis.traces]
     gain = diagnosis.holdout
-    return page_template((page / "report.html").read_text("utf-8")).render(
+    return page_template("report.html").render(
         d=diagnosis,
         robot=title,
         badge=_BADGES[diagnosis.verdict],
@@ -89,11 +89,12 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
     )
 
 
-def page_template(text: str) -> Any:
-    """A page of `figaroh_jax/page` with the filters that put numbers and names into words."""
-    from jinja2 import Environment, StrictUndefined
+def page_template(name: str) -> Any:
+    """The page `name` of `figaroh_jax/page` with the filters that put numbers and names into words."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    pages = PackageLoader("figaroh_jax", "page")
+    environment = Environment(loader=pages, autoescape=True, undefined=StrictUndefined)
     environment.filters |= {
         "aside": wording.aside,
         "equation": wording.effect_equation,
@@ -111,7 +112,7 @@ def page_template(text: str) -> Any:
         "title_of": wording.effect_title,
         "visible": lambda value: "never" if value == math.inf else wording.number(value, 2),
     }
-    return environment.from_string(text)
+    return environment.get_template(name)
 
 
 def _joints(diagnosis: Diagnosis) -> list[_Joint]:
