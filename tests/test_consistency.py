@@ -9,7 +9,7 @@ import pytest
 from robots import REAL, TREE, load
 
 import figaroh_jax as fj
-from figaroh_jax.diagnosis.problem import rigid_prior
+from figaroh_jax.diagnosis.priors import rigid_prior
 from figaroh_jax.errors import InputError
 from figaroh_jax.identification.conic import Body
 from figaroh_jax.identification.consistency import (

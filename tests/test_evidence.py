@@ -8,7 +8,8 @@ from scipy.stats import chi2, kstest, norm
 from synthetic import made_rows
 
 from figaroh_jax.diagnosis import evidence
-from figaroh_jax.diagnosis.evidence import Columns, Linear, Prior, Rows
+from figaroh_jax.diagnosis.bank import Columns, bank
+from figaroh_jax.diagnosis.rows import Linear, Prior, Rows, fit, instruments
 
 NV, COUNT, WIDTH = 2, 90, 4
 PRIOR = Prior(np.array([0.5, -1.0, 0.0, 2.0]), np.array([3.0, 0.5, 40.0, 1e-3]))
@@ -52,7 +53,7 @@ def own_scores(rows: Rows, linear: Linear, columns: Columns) -> np.ndarray:
 
 def test_fit_is_the_least_squares_solution_with_the_prior_as_rows() -> None:
     rows = random_rows()
-    linear = evidence.fit(rows, PRIOR)
+    linear = fit(rows, PRIOR)
     theta, _ = least_squares(rows.y, rows.X, PRIOR)
     np.testing.assert_allclose(linear.theta, theta, rtol=0, atol=1e-10)
     np.testing.assert_allclose(linear.residual, rows.y - rows.X @ theta, rtol=0, atol=1e-9)
@@ -62,13 +63,13 @@ def test_a_column_that_nothing_excites_keeps_its_prior_value() -> None:
     rows = random_rows()
     rows.X[:, :, 2] = 0.0
     prior = PRIOR._replace(mean=np.array([0.0, 0.0, 7.0, 0.0]))
-    np.testing.assert_allclose(evidence.fit(rows, prior).theta[2], 7.0, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(fit(rows, prior).theta[2], 7.0, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("k", "joints"), [(1, (0, 1)), (1, (1,)), (3, (0, 1)), (3, (0,))])
 def test_score_is_the_drop_in_penalised_squares_when_the_columns_are_added(k: int, joints: tuple[int, ...]) -> None:
     rows, columns = random_rows(), random_columns(k, joints)
-    linear, stock = evidence.fit(rows, PRIOR), evidence.bank(rows, [random_columns(2, (1,), seed=5), columns])
+    linear, stock = fit(rows, PRIOR), bank(rows, [random_columns(2, (1,), seed=5), columns])
     found = evidence.scores(linear, stock, evidence.projection(linear, stock))[1]
     _, before = least_squares(rows.y, rows.X, PRIOR)
     drops = [before - least_squares(rows.y, rows.X, PRIOR, spread(columns, g))[1] for g in range(2)]
@@ -79,7 +80,7 @@ def test_score_is_the_drop_in_penalised_squares_when_the_columns_are_added(k: in
 def test_a_candidate_inside_the_model_scores_nothing() -> None:
     rows, flat = random_rows(), Prior(np.zeros(WIDTH), np.zeros(WIDTH))
     inside = Columns((0, 1), (rows.X @ [1.0, 2.0, -1.0, 0.5])[None, None])
-    linear, stock = evidence.fit(rows, flat), evidence.bank(rows, [inside])
+    linear, stock = fit(rows, flat), bank(rows, [inside])
     (found,) = evidence.scores(linear, stock, evidence.projection(linear, stock))
     assert found.rank[0] == 0
     np.testing.assert_allclose(evidence.absorbed(rows, linear, inside), 1.0, rtol=0, atol=1e-9)
@@ -91,7 +92,7 @@ def test_nothing_of_a_column_orthogonal_to_the_model_is_absorbed() -> None:
     free = np.random.default_rng(2).normal(size=len(tall))
     free -= tall @ np.linalg.lstsq(tall, free, rcond=None)[0]
     columns = Columns((0, 1), free.reshape(1, 1, NV, COUNT))
-    np.testing.assert_allclose(evidence.absorbed(rows, evidence.fit(rows, PRIOR), columns), 0.0, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(evidence.absorbed(rows, fit(rows, PRIOR), columns), 0.0, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("k", [1, 3])
@@ -102,7 +103,7 @@ def test_score_is_chi_square_when_there_is_only_noise(k: int) -> None:
     for _ in range(600):
         theta = prior.mean + rng.standard_normal(WIDTH) / np.sqrt(prior.precision)
         drawn = rows._replace(y=rows.X @ theta + rng.standard_normal(rows.y.shape))
-        linear, stock = evidence.fit(drawn, prior), evidence.bank(drawn, [columns])
+        linear, stock = fit(drawn, prior), bank(drawn, [columns])
         Q.append(evidence.scores(linear, stock, evidence.projection(linear, stock))[0].Q[0])
     assert abs(np.mean(Q) - k) < 4 * np.sqrt(2 * k / len(Q))
     assert kstest(Q, chi2(k).cdf).pvalue > 1e-4  # pyright: ignore[reportAttributeAccessIssue]
@@ -116,7 +117,7 @@ def test_score_with_noisy_instruments_is_chi_square_when_there_is_only_noise() -
     candidate = Columns((0,), alike[None, :, None])
     for _ in range(600):
         rows = made_rows(rng.standard_normal((1, count)), X[None], repeats=True)
-        linear, stock = evidence.fit(rows, flat), evidence.bank(rows, [candidate])
+        linear, stock = fit(rows, flat), bank(rows, [candidate])
         Q.append(evidence.scores(linear, stock, evidence.projection(linear, stock))[0].Q[0])
     assert abs(np.mean(Q) - 3) < 4 * np.sqrt(2 * 3 / len(Q))
 
@@ -143,8 +144,8 @@ def test_instruments_from_a_repeat_remove_the_bias_of_noisy_columns(feedback: fl
     rows = made_rows(torque[None], (truth + own)[None, :, None], repeats=True)
     error = 6 * 1.25 / np.sqrt(count)
     biased = (2.0 + 0.25 * feedback) / 1.25  # truth has power 1, the noise 0.25
-    np.testing.assert_allclose(evidence.fit(plain(rows), flat).theta, biased, rtol=0, atol=error)
-    np.testing.assert_allclose(evidence.fit(rows, flat).theta, 2.0, rtol=0, atol=error)
+    np.testing.assert_allclose(fit(plain(rows), flat).theta, biased, rtol=0, atol=error)
+    np.testing.assert_allclose(fit(rows, flat).theta, 2.0, rtol=0, atol=error)
 
 
 def test_noisy_columns_raise_the_score_of_what_looks_alike_only_without_instruments() -> None:
@@ -153,7 +154,7 @@ def test_noisy_columns_raise_the_score_of_what_looks_alike_only_without_instrume
     for _ in range(80):
         rows, candidate = noisy_repeats(rng)
         for name, one in (("plain", plain(rows)), ("instruments", rows)):
-            linear, stock = evidence.fit(one, flat), evidence.bank(one, [candidate])
+            linear, stock = fit(one, flat), bank(one, [candidate])
             Q[name].append(evidence.scores(linear, stock, evidence.projection(linear, stock))[0].Q[0])
     # noise 0.01 of the power: the score of a column with cosine 0.9 grows by 20000 (0.9 0.01)^2 / (1 - 0.9^2)
     assert np.mean(Q["plain"]) == pytest.approx(1 + 20000 * 0.009**2 / 0.19, rel=0, abs=3.0)
@@ -165,13 +166,13 @@ def test_instruments_are_the_mean_over_the_other_repeats_and_zero_without_one() 
     partner = np.array([[2, 3, 4, 5, 0, -1], [4, 5, 0, -1, 2, -1]])
     paired = np.array([1.0, 1, 1, 1, 0, 0])
     expected = np.stack([[(z[2] + z[4]) / 2, (z[3] + z[5]) / 2, (z[4] + z[0]) / 2, z[5], 0, 0] for z in Z])
-    np.testing.assert_allclose(evidence.instruments(Z, partner, paired), expected, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(instruments(Z, partner, paired), expected, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("prior", [PRIOR, Prior(np.zeros(WIDTH), np.zeros(WIDTH))], ids=["prior", "flat"])
 def test_block_scores_sum_to_the_score(prior: Prior) -> None:
     rows, columns = random_rows(), [random_columns(3), random_columns(1, (1,), seed=7)]
-    linear, stock = evidence.fit(rows, prior), evidence.bank(rows, columns)
+    linear, stock = fit(rows, prior), bank(rows, columns)
     parts = evidence.block_scores(rows, linear, stock, evidence.projection(linear, stock))
     expected = np.concatenate([own_scores(rows, linear, one) for one in columns])
     assert len(parts) == rows.block.max() + 1 + WIDTH
@@ -180,7 +181,7 @@ def test_block_scores_sum_to_the_score(prior: Prior) -> None:
 
 def test_scores_of_the_residual_drawn_again_are_the_scores() -> None:
     rows, columns = random_rows(), random_columns(3)
-    linear, stock = evidence.fit(rows, PRIOR), evidence.bank(rows, [columns])
+    linear, stock = fit(rows, PRIOR), bank(rows, [columns])
     H = evidence.projection(linear, stock)
     drawn = np.stack([linear.residual, 0 * linear.residual])
     again = evidence.other_scores(rows, stock, H, drawn) + linear.pull @ H * [[1.0], [0.0]]

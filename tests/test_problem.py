@@ -12,21 +12,13 @@ import reference
 import robots
 from synthetic import DT, made_signals, swing
 
-from figaroh_jax.diagnosis.evidence import fit
 from figaroh_jax.diagnosis.flexible import WIDTHS, friction_width
 from figaroh_jax.diagnosis.layout import held_rows, layout
-from figaroh_jax.diagnosis.problem import (
-    Problem,
-    baseline,
-    body_precision,
-    extended_state,
-    physical_body,
-    plain_rows,
-    rigid_prior,
-    solved,
-    whitened,
-)
+from figaroh_jax.diagnosis.priors import body_precision, physical_body, rigid_prior
+from figaroh_jax.diagnosis.problem import Problem
 from figaroh_jax.diagnosis.records import stack
+from figaroh_jax.diagnosis.rows import fit
+from figaroh_jax.diagnosis.state import baseline, extended_state, plain_rows, solved, whitened
 from figaroh_jax.effects import find
 from figaroh_jax.inertia import from_com, pseudo_inertia
 from figaroh_jax.model import RobotModel

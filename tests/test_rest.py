@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from figaroh_jax.diagnosis.estimates import Fitted, has_size
+from figaroh_jax.diagnosis.estimates import Fitted
+from figaroh_jax.diagnosis.joint import has_size
 from figaroh_jax.diagnosis.rest import Rest, verdict, wrong_law
 from figaroh_jax.effects import find
 from figaroh_jax.results import Name

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
@@ -22,18 +22,22 @@ from ..errors import InputError
 from ..model import RobotModel
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Signals, prepare_all
-from ..results import Cause, Diagnosis, Experiment, Gain, Name
-from .estimates import Fitted, estimates, fitted_model, has_size, joint_fit, moved, prismatic, with_amplitudes
+from ..results import Cause, Diagnosis, Gain, Verdict
+from .estimates import Fitted, estimates, fitted_model, prismatic
+from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
-from .floor import noise_floor
-from .holdout import held_out, predicted, traces
+from .floor import noise_floor, noise_rms
+from .holdout import held_out, residual_rms, traces
+from .joint import Joint, polished, sized
 from .layout import describe_folds, held_rows, layout
 from .noise import Spectrum
-from .problem import Problem, State, baseline, extended_state, solved
+from .problem import Problem
 from .records import stack
-from .rest import Rest, excess, lines, rest_of, verdict, wrong_law
-from .search import Found, Step, eliminate, find_causes, stand
+from .rest import excess, lines, rest_of, verdict, wrong_law
+from .search import Found, Search, eliminate, find_causes
+from .state import State, baseline
+from .step import Step, stand
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess, Task
@@ -41,8 +45,6 @@ if TYPE_CHECKING:
 __all__ = ["diagnose", "diagnose_task"]
 
 CERTAIN = 0.2  # of alpha: what a name needs, for p is not uniform under coloured noise
-POLISH = 2
-SPEED_LAWS = ("stribeck_friction", "power_law_friction")  # of dry friction over the speed
 
 
 def diagnose_task(task: Task, progress: Callable[[str, float], None] = lambda phase, share: None) -> Diagnosis:
@@ -77,21 +79,44 @@ def diagnose(
     """
     with jax.enable_x64(True):
         progress("preparing signals", 0.03)
-        signals = prepare_all(tuple(recordings), preprocess)
-        return _diagnose(model, signals, known, trust, tuple(forbid), alpha, progress, np.random.default_rng(seed))
+        signals = sorted(prepare_all(tuple(recordings), preprocess), key=lambda s: s.role == "holdout")
+        here = _setting(model, signals, known, trust, forbid, progress)
+        generator = np.random.default_rng(seed)
+        search = find_causes(*here, forbid, CERTAIN * alpha, progress, generator)
+        progress("fitting all causes together", 0.8)
+        first = stand(here.problem, here.start, here.whitening)
+        told = _judged(here, first, search, *_fitted_together(here, search.found, forbid), generator)
+        progress("measuring the gain", 0.9)
+        return _answer(here, signals, first, search, told)
 
 
-def _diagnose(
+class _Setting(NamedTuple):
+    """What is known before any cause is looked for: data, baseline, noise and what makes it white."""
+
+    problem: Problem
+    start: State
+    spectrum: Spectrum
+    whitening: Float[np.ndarray, "F nv"]
+
+
+class _Told(NamedTuple):
+    """What the diagnosis stands by."""
+
+    word: Verdict
+    found: list[Found]
+    joint: Joint  # all of them in one fit
+    rest: str
+
+
+def _setting(
     model: RobotModel,
     signals: Sequence[Signals],
     known: Baseline | None,
     trust: float,
-    forbid: tuple[str, ...],
-    alpha: float,
+    forbid: Sequence[str],
     progress: Callable[[str, float], None],
-    generator: np.random.Generator,
-) -> Diagnosis:
-    signals = sorted(signals, key=lambda s: s.role == "holdout")
+) -> _Setting:
+    """The recordings on one clock, the baseline, and the noise; holdout recordings stand behind the others."""
     records = stack(signals)
     held = held_rows(signals, records)
     problem = Problem(model, records, layout(signals, records), trust, np.zeros(model.nv), held)
@@ -100,57 +125,69 @@ def _diagnose(
     progress("estimating the noise", 0.08)
     spectrum, whitening = noise_floor(problem, start, forbid)
     problem = friction_width(problem, start, whitening)
-    start = baseline(problem, names, given)
-    step, found, (p, left), screened = find_causes(
-        problem, start, spectrum, whitening, forbid, CERTAIN * alpha, progress, generator
-    )
-    found = eliminate(problem, start, found, whitening)
-    progress("fitting all causes together", 0.8)
-    first = stand(problem, start, whitening)
-    last, causes, fitted = _polished(problem, start, [f.effect for f in found], whitening)
-    sized = _sized(found, causes, fitted, forbid)
-    if len(sized) < len(found):
-        last, causes, fitted = _polished(problem, start, [f.effect for f in sized], whitening)
-    found = sized
-    rest, before, flexible = _what_is_left(problem, first, last, spectrum, whitening, generator, left)
+    return _Setting(problem, baseline(problem, names, given), spectrum, whitening)
+
+
+def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) -> tuple[list[Found], Joint]:
+    """The causes that the others do not make needless and that surely have a size, all in one fit."""
+    found = eliminate(here.problem, here.start, found, here.whitening)
+    joint = polished(here.problem, here.start, [f.effect for f in found], here.whitening)
+    kept = sized(found, joint, forbid)
+    if len(kept) < len(found):
+        joint = polished(here.problem, here.start, [f.effect for f in kept], here.whitening)
+    return kept, joint
+
+
+def _judged(
+    here: _Setting, first: Step, search: Search, found: list[Found], joint: Joint, generator: np.random.Generator
+) -> _Told:
+    """The verdict by what is left; causes beside which too much is left are none."""
+    problem, _, spectrum, whitening = here
+    before, *_ = excess(problem, first.rows, first.linear.residual, spectrum, whitening)
+    now = excess(problem, joint.step.rows, joint.step.linear.residual, spectrum, whitening)
+    flexible = flexible_p(problem, joint.step.state, joint.step.rows, spectrum, whitening, generator)
+    line = lines(problem, joint.step.linear.residual)
+    rest = rest_of(now, max(before, 0.0), search.p_left, flexible, line, problem.model.joint_names)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
-    word = verdict(bool(found), rest, before, wrong)
-    if word == "unknown" and found:
-        proxy = ", ".join(str(f.name) for f in found)
-        rest = rest._replace(text=f"{rest.text}; best proxy, not a cause: {proxy}"[:160])
-        found, causes, last = [], [], first
-    progress("measuring the gain", 0.9)
-    gains = held_out(problem, start, causes, whitening)
-    extended = fitted_model(problem, last.state, causes)
-    places = fitted.places if causes else ()
-    noise = _noise_rms(problem, spectrum)
+    word = verdict(bool(found), rest, max(before, 0.0), wrong)
+    if word != "unknown" or not found:
+        return _Told(word, found, joint, rest.text)
+    proxy = ", ".join(str(f.name) for f in found)
+    text = f"{rest.text}; best proxy, not a cause: {proxy}"[:160]
+    return _Told(word, [], Joint(first, [], Fitted(np.zeros(0), np.zeros((0, 0)), ())), text)
+
+
+def _answer(here: _Setting, signals: Sequence[Signals], first: Step, search: Search, told: _Told) -> Diagnosis:
+    problem, model, last = here.problem, here.problem.model, told.joint.step
+    gains = held_out(problem, here.start, told.joint.causes, here.whitening)
+    noise = noise_rms(problem, here.spectrum)
     return Diagnosis(
-        verdict=word,
-        causes=tuple(
-            Cause(
-                name=one.name,
-                parameters=estimates(effect, fitted, at, model),
-                confidence=one.confidence,
-                gain=Gain(*pair),
-                ambiguous_with=one.ambiguous,
-            )
-            for one, effect, at, pair in zip(found, causes, places, pairwise(gains), strict=True)
-        ),
-        p_value=p,
+        verdict=told.word,
+        causes=_causes(told, gains, model),
+        p_value=search.p_value,
         joints=model.joint_names,
-        before=_rms(problem, first.state),
-        after=_rms(problem, last.state),
+        before=residual_rms(problem, first.state),
+        after=residual_rms(problem, last.state),
         noise=noise,
         holdout=Gain(gains[0], gains[-1]),
         holdout_scheme=_scheme(signals),
-        experiment=_experiment(word, found, model),
-        candidates=explain(first.rows, first.linear, screened, noise),
-        traces=traces(problem, signals, first.state, last.state, causes, found),
+        experiment=next_experiment(told.word, told.found),
+        candidates=explain(first.rows, first.linear, search.screened, noise),
+        traces=traces(problem, signals, first.state, last.state, told.joint.causes, told.found),
         baseline=fitted_model(problem, first.state, []),
-        model=extended,
-        rest=rest.text,
+        model=fitted_model(problem, last.state, told.joint.causes),
+        rest=told.rest,
         notes=_notes(signals, problem),
         prismatic=prismatic(model),
+    )
+
+
+def _causes(told: _Told, gains: Sequence[float], model: RobotModel) -> tuple[Cause, ...]:
+    fitted = told.joint.fitted
+    each = zip(told.found, told.joint.causes, fitted.places, pairwise(gains), strict=True)
+    return tuple(
+        Cause(one.name, estimates(effect, fitted, at, model), one.confidence, Gain(*gain), one.ambiguous)
+        for one, effect, at, gain in each
     )
 
 
@@ -173,105 +210,10 @@ def _baseline_effects(model: RobotModel, known: Baseline | None) -> tuple[list[s
     return [name for name, on in switches.items() if on], given
 
 
-def _polished(
-    problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]
-) -> tuple[Step, list[Effect], Fitted]:
-    """All causes fitted together: a few Gauss-Newton steps over coefficients and shapes.
-
-    Sensor effects follow the load and the torque, so each turn begins with what the last one made of the baseline.
-    """
-    step = None
-    for turn in range(POLISH + 1):
-        state = start if step is None else solved(problem, start, step.state.theta[: len(start.theta)])
-        for effect in causes:
-            state = solved(problem, extended_state(problem, state, effect), _grown(state, effect))
-        step = stand(problem, state, whitening)
-        causes = with_amplitudes(step.state, causes, problem.model)
-        fitted = joint_fit(problem, step.state, step.rows, causes, whitening)
-        if turn < POLISH:
-            causes = [moved(e, fitted, at) for e, at in zip(causes, fitted.places, strict=True)]
-    assert step is not None
-    return step, causes, fitted  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
-
-
-def _sized(found: list[Found], causes: list[Effect], fitted: Fitted, forbid: Sequence[str]) -> list[Found]:
-    """The causes whose size is surely not zero, and those whose law alone is open, with all that it may be.
-
-    Where the amplitude's interval includes zero because any of several laws would do, the set says so; where nothing
-    else explains the misfit, there is no cause to tell of.
-    """
-    out = []
-    for one, effect, at in zip(found, causes, fitted.places, strict=True):
-        if has_size(effect, fitted, at):
-            out.append(one)
-            continue
-        laws = [n for n in SPEED_LAWS if one.name.effect in SPEED_LAWS and n not in (one.name.effect, *forbid)]
-        more = dict.fromkeys([*one.ambiguous, *one.alike, *(Name(n, one.name.at) for n in laws)])
-        if more and not type(effect).contains:
-            out.append(replace(one, ambiguous=tuple(more)))
-    return out
-
-
-def _grown(state: State, effect: Effect) -> Float[np.ndarray, " P"]:
-    from .design import kind
-
-    if kind(effect) != "columns":
-        return state.theta
-    return np.append(state.theta, [float(getattr(effect, n)) for n, p in effect.parameters().items() if p.linear])
-
-
-def _what_is_left(
-    problem: Problem,
-    first: Step,
-    last: Step,
-    spectrum: Spectrum,
-    whitening: Float[np.ndarray, "F nv"],
-    generator: np.random.Generator,
-    left: float,
-) -> tuple[Rest, float, tuple[float, Name, float]]:
-    before = excess(problem, first.rows, first.linear.residual, spectrum, whitening)
-    now = excess(problem, last.rows, last.linear.residual, spectrum, whitening)
-    flexible = flexible_p(problem, last.state, last.rows, spectrum, whitening, generator)
-    line = lines(problem, last.linear.residual)
-    return (
-        rest_of(now, max(before[0], 0.0), left, flexible, line, problem.model.joint_names),
-        max(before[0], 0.0),
-        flexible,
-    )
-
-
-def _rms(problem: Problem, state: State) -> Float[np.ndarray, " nv"]:
-    weight = np.asarray(problem.records.weight)
-    squares = ((problem.torque - predicted(problem, state)) ** 2 * weight).sum((0, 1))
-    return np.sqrt(squares / np.maximum(weight.sum((0, 1)), 1))
-
-
-def _noise_rms(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, " nv"]:
-    frequency = np.linspace(0.05, float(problem.records.rate) / 2, 400)
-    gain = np.interp(frequency, np.asarray(problem.records.omega) / (2 * np.pi), problem.gain)
-    return np.sqrt((gain[:, None] * spectrum.power(frequency)).mean(0))
-
-
 def _scheme(signals: Sequence[Signals]) -> str:
     if any(s.role == "holdout" and s.torque is not None for s in signals):
         return "recordings kept out of the fit"
     return describe_folds(signals)
-
-
-def _experiment(word: str, found: list[Found], model: RobotModel) -> Experiment | None:
-    unsure = [one for one in found if one.ambiguous]
-    if unsure:
-        one = unsure[0]
-        pairs = tuple((one.name.effect, other.effect) for other in one.ambiguous)
-        return Experiment(_text(one.name), pairs)
-    if word == "unknown":
-        return Experiment("the same motion repeated, then each joint alone at several constant speeds")
-    return None
-
-
-def _text(name: Name) -> str:
-    where = " and ".join(name.at) or "the robot"
-    return find(name.effect).separated_by.format(at=where)
 
 
 def _notes(signals: Sequence[Signals], problem: Problem) -> tuple[str, ...]:

@@ -8,19 +8,17 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effect import Effect, joint_unit
-from ..effects import find
 from ..extended import ExtendedModel, extend
 from ..model import RobotModel
 from ..results import Estimate
 from .design import kind, sensor_response, shapes, torque_change, units_and_slopes, with_shape
-from .evidence import Rows
-from .problem import BATCH, Problem, State, filtered_rows
+from .problem import Problem
+from .records import filtered_rows
+from .state import BATCH, State
 
-__all__ = ["Fitted", "estimates", "fitted_model", "has_size", "joint_fit", "torque_slope", "with_amplitudes"]
+__all__ = ["Fitted", "estimates", "fitted_model", "torque_slope", "with_amplitudes"]
 
-KEPT = 1e-12
 STEP = 1e-5  # of central differences, relative: error 1e-10 of a third derivative's size
-SURE = 0.95  # of the region of a cause's amplitudes that must not hold zero
 
 
 class Fitted(eqx.Module):
@@ -48,53 +46,6 @@ def amplitude_places(state: State, causes: list[Effect], model: RobotModel) -> l
     return [list(range(s, s + c)) for s, c in zip(starts, counts, strict=True)]
 
 
-def joint_fit(
-    problem: Problem, state: State, rows: Rows, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]
-) -> Fitted:
-    """Gauss-Newton step of all coefficients and shapes at once, and a covariance from the scores of the blocks.
-
-    `A^-1 (sum_b g_b g_b' + L) A^-1` with g_b the score of a block and L the prior: right for coloured residuals too.
-    """
-    slopes, own = [], []
-    for effect in with_amplitudes(state, causes, problem.model):
-        names = shapes(type(effect))
-        own.append(len(names))
-        slopes += [torque_slope(problem, state, effect, name, whitening) for name in names]
-    J = np.concatenate([rows.X, *[s[..., None] for s in slopes]], axis=2)
-    precision = np.append(state.prior.precision, np.zeros(len(slopes)))
-    tall = J.reshape(-1, J.shape[2])
-    A = tall.T @ tall + np.diag(precision)
-    A = A + KEPT * np.diag(np.maximum(np.diag(A), KEPT))
-    residual = rows.y - rows.X @ state.theta
-    pull = np.append(state.prior.precision * (state.prior.mean - state.theta), np.zeros(len(slopes)))
-    inverse = np.linalg.inv(A)
-    step = inverse @ (tall.T @ residual.reshape(-1) + pull)
-    blocks = rows.block.max() + 1
-    member = (rows.block[:, None] == np.arange(blocks)).astype(float)
-    scores = np.sum([member.T @ (x * r[:, None]) for x, r in zip(J, residual, strict=True)], axis=0)
-    covariance = inverse @ (scores.T @ scores * blocks / max(blocks - 1, 1) + np.diag(precision)) @ inverse
-    values = [float(getattr(e, n)) for e in causes for n in shapes(type(e))]
-    places, first = [], rows.X.shape[2]
-    for amplitude, count in zip(amplitude_places(state, causes, problem.model), own, strict=True):
-        places.append((*amplitude, *range(first, first + count)))
-        first += count
-    return Fitted(np.append(state.theta, values) + step, covariance, tuple(places))
-
-
-def moved(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> Effect:
-    """The cause with its shapes after the step, kept in their bounds."""
-    names = shapes(type(effect))
-    values = fitted.value[list(place[len(place) - len(names) :])] if names else []
-    kept = []
-    for name, value in zip(names, values, strict=True):
-        parameter = effect.parameters()[name]
-        inside = float(np.clip(value, parameter.lower, parameter.upper))
-        if parameter.hole and parameter.hole[0] < inside < parameter.hole[1]:
-            inside = float(getattr(effect, name))
-        kept.append(np.float64(inside))
-    return with_shape(effect, names, kept) if names else effect
-
-
 def estimates(effect: Effect, fitted: Fitted, place: tuple[int, ...], model: RobotModel) -> dict[str, Estimate]:
     """What an engineer reads of the effect, with one sigma (first order in the fitted parameters)."""
     names = [n for n, p in effect.parameters().items() if p.linear and kind(effect) == "columns"]
@@ -109,24 +60,6 @@ def estimates(effect: Effect, fitted: Fitted, place: tuple[int, ...], model: Rob
         std = float(np.sqrt(max(g @ covariance @ g, 0.0)))
         out[name] = Estimate(float(value), std, joint_unit(units[name], straight))
     return out
-
-
-def has_size(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
-    """Whether the effect's size is surely not zero: its amplitudes' 95 % region excludes it.
-
-    Amplitudes that a simpler effect has too do not count: a spring without stiffness is an offset.
-    """
-    from scipy.special import chdtri  # scipy is slow to import
-
-    names = [n for n, p in effect.parameters().items() if p.linear]
-    simpler = {name for inside in type(effect).contains for name in find(inside).parameters()}
-    own = [k for k, name in enumerate(names) if name not in simpler]
-    if not own or kind(effect) != "columns":
-        return True
-    at = np.array(place)[own]
-    value = np.array([float(getattr(effect, names[k])) for k in own])
-    covariance = fitted.covariance[np.ix_(at, at)]
-    return bool(value @ np.linalg.pinv(covariance, hermitian=True) @ value > chdtri(len(own), 1 - SURE))
 
 
 def _physical(effect: Effect, names: list[str]) -> tuple[dict[str, float], dict[str, Float[np.ndarray, " k"]]]:
@@ -189,12 +122,12 @@ def torque_slope(
         torque = np.zeros((slope.shape[-1], problem.model.nv))
         own = effect.acts_on in ("joint", "pair")
         torque[:, np.asarray(effect.at) if own else slice(None)] = np.tensordot(amplitudes, slope, 1).T
-        return filtered_rows(problem, torque, response)
+        return filtered_rows(problem.records, torque, response)
     h = STEP * max(abs(size), STEP)
     sides = jax.tree.map(lambda *x: np.stack(x), *(with_shape(effect, [name], [size + s * h]) for s in (1, -1)))
     if kind(effect) == "response":
         high, low = sensor_response({effect.name: sides}, problem.records.omega)[effect.name]
         relative = 2 * (high - low) / (high + low) / (2 * h)
-        return filtered_rows(problem, state.motion.total, response * relative[:, None])
+        return filtered_rows(problem.records, state.motion.total, response * relative[:, None])
     high, low = torque_change(sides, state.motion, problem.records)
-    return filtered_rows(problem, (high - low) / (2 * h), response)
+    return filtered_rows(problem.records, (high - low) / (2 * h), response)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..results import Candidate
-from .evidence import Linear, Rows
+from .rows import Linear, Rows
 from .screening import Screen
 
 __all__ = ["explain"]

@@ -10,10 +10,13 @@ from jaxtyping import Float
 
 from ..effect import Motion
 from ..results import Name
-from .evidence import Columns, Rows, fit, with_columns
+from .bank import Columns
 from .noise import Spectrum
-from .problem import FRICTION_PRECISION, Problem, State, filtered_rows, whitened
+from .problem import Problem
+from .records import filtered_rows
+from .rows import Rows, fit, with_columns
 from .screening import Group, family_p, screen
+from .state import FRICTION_PRECISION, State, whitened
 
 __all__ = ["families", "flexible_p", "friction_width"]
 
@@ -81,7 +84,7 @@ def _smooth_columns(
     series = [np.stack([j["position"][k] for j in joints], 1) for k in range(DEGREES)]
     series += [np.stack([j["time"][k] for j in joints], 1) for k in range(DEGREES - 1)]
     for one in [*series, acceleration, np.ones_like(acceleration)]:
-        rows = filtered_rows(problem, one, whitening)
+        rows = filtered_rows(problem.records, one, whitening)
         columns += [rows * (np.arange(nv) == joint)[:, None] for joint in range(nv)]
     return np.stack(columns, axis=2)
 
@@ -104,7 +107,7 @@ def _with_width(
     """Whitened rows of every joint's dry friction with another width."""
     motion = eqx.tree_at(lambda m: m.width, state.motion, np.full(problem.model.nv, width))
     response = whitening * state.response(problem.records.omega)[:, None]
-    return filtered_rows(problem, np.asarray(motion.direction), response)
+    return filtered_rows(problem.records, np.asarray(motion.direction), response)
 
 
 def _replaced(G: np.ndarray, b: np.ndarray, column: int, cross: np.ndarray, square: float, right: float):
@@ -134,7 +137,7 @@ def families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"
     for title, columns in series.items():
         if still and title == "time":
             continue
-        rows = np.stack([filtered_rows(problem, one, whitening) for one in columns])
+        rows = np.stack([filtered_rows(problem.records, one, whitening) for one in columns])
         for joint, name in enumerate(problem.model.joint_names):
             groups.append(Group(Name(title, (name,)), None, Columns((joint,), rows[None, :, joint][:, :, None])))
     return groups

@@ -8,13 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from . import noise
-from .evidence import Prior, Rows, fit
 from .flexible import families
 from .noise import Spectrum
-from .problem import Problem, State, plain_rows, solved, whitened
+from .problem import Problem
+from .rows import Prior, Rows, fit
 from .screening import Group, catalogue, screen
+from .state import State, plain_rows, solved, whitened
 
-__all__ = ["noise_floor"]
+__all__ = ["noise_floor", "noise_rms"]
 
 ROUNDS = 2
 RICHNESS = 10  # groups of columns in the rich model
@@ -43,6 +44,13 @@ def noise_floor(
         spectrum = _from_repeats(problem, rows, state)
         response = _whitening(problem, spectrum)
     return spectrum, response  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
+
+
+def noise_rms(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, " nv"]:
+    """RMS of noise with the spectrum in the rows of each joint, N m or N."""
+    frequency = np.linspace(0.05, float(problem.records.rate) / 2, 400)
+    gain = np.interp(frequency, np.asarray(problem.records.omega) / (2 * np.pi), problem.gain)
+    return np.sqrt((gain[:, None] * spectrum.power(frequency)).mean(0))
 
 
 def _weighted(rows: Rows, prior: Prior, scale: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " P"]:

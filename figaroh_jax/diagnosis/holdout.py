@@ -12,10 +12,13 @@ from ..recordings.signals import Signals
 from ..results import Trace
 from .design import kind, sensor_response, torque_change
 from .estimates import amplitude_places
-from .problem import Problem, State, batched, extended_state, open_rows
-from .search import Found, stand
+from .problem import Problem
+from .records import open_rows
+from .search import Found
+from .state import State, batched, extended_state
+from .step import stand
 
-__all__ = ["held_out", "traces"]
+__all__ = ["held_out", "predicted", "residual_rms", "traces"]
 
 
 def held_out(problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> list[float]:
@@ -39,7 +42,14 @@ def held_out(problem: Problem, start: State, causes: list[Effect], whitening: Fl
 
 def predicted(problem: Problem, state: State) -> Float[np.ndarray, "n M nv"]:
     """Rows of the torque that the state predicts, as the sensors read it, in all recordings (N m or N)."""
-    return open_rows(problem, state.torque(state.theta), state.response(problem.records.omega))
+    return open_rows(problem.records, state.torque(state.theta), state.response(problem.records.omega))
+
+
+def residual_rms(problem: Problem, state: State) -> Float[np.ndarray, " nv"]:
+    """RMS of what the state leaves of the fitted rows of each joint, N m or N."""
+    weight = np.asarray(problem.records.weight)
+    squares = ((problem.torque - predicted(problem, state)) ** 2 * weight).sum((0, 1))
+    return np.sqrt(squares / np.maximum(weight.sum((0, 1)), 1))
 
 
 def traces(
@@ -78,12 +88,11 @@ def _share(problem: Problem, state: State, effect: Effect, place: list[int]) -> 
     response = state.response(problem.records.omega)
     if kind(effect) == "response":
         own = sensor_response({effect.name: batched(effect)}, problem.records.omega)[effect.name][0]
-        return open_rows(problem, state.motion.total, response * (1 - 1 / own))
+        return open_rows(problem.records, state.motion.total, response * (1 - 1 / own))
     if kind(effect) == "position":
-        return open_rows(problem, torque_change(batched(effect), state.motion, problem.records)[0], response)
-    return open_rows(
-        problem, state.torque(np.where(np.isin(np.arange(len(state.theta)), place), state.theta, 0.0)), response
-    )
+        return open_rows(problem.records, torque_change(batched(effect), state.motion, problem.records)[0], response)
+    own = np.isin(np.arange(len(state.theta)), place)
+    return open_rows(problem.records, state.torque(np.where(own, state.theta, 0.0)), response)
 
 
 def _fold_error(problem: Problem, state: State, folds: Float[np.ndarray, "folds P"]) -> float:
@@ -92,5 +101,5 @@ def _fold_error(problem: Problem, state: State, folds: Float[np.ndarray, "folds 
     error = problem.torque * weight
     power = (error**2).sum()
     for k, theta in enumerate(folds):
-        error = error - open_rows(problem, state.torque(theta), response) * weight * (fold == k)[..., None]
+        error = error - open_rows(problem.records, state.torque(theta), response) * weight * (fold == k)[..., None]
     return float(np.sqrt((error**2).sum() / power))

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Complex, Float, Int, Shaped
 
 from ..model import Leaf
 from ..recordings.rowfilter import extension, fast_length, filtered, gain, reach
 from ..recordings.signals import Signals
 
-__all__ = ["Records", "filter_rows", "stack"]
+__all__ = ["Records", "filter_rows", "filtered_rows", "open_rows", "stack"]
 
 SERIES = 32  # filtered at once: their spectra stay in the processor's cache
 
@@ -74,6 +74,23 @@ def filter_rows(
         for k, (source, kept) in enumerate(zip(records.source, records.kept, strict=True)):
             out[part, k] = filtered(flat[part, k], source, kept, own)
     return out.reshape(*series, *records.kept.shape)
+
+
+def open_rows(
+    records: Records, torque: Float[np.ndarray, "nN nv"], response: Complex[np.ndarray, " F"]
+) -> Float[np.ndarray, "n M nv"]:
+    """Rows of a torque at all samples, of all recordings and without a mask."""
+    n, samples, _, nv = records.shape
+    return np.moveaxis(filter_rows(records, torque.T.reshape(nv, n, samples), response), 0, 2)
+
+
+def filtered_rows(
+    records: Records, torque: Float[np.ndarray, "nN nv"], response: Complex[np.ndarray, "F nv"]
+) -> Float[np.ndarray, "nv T"]:
+    """Rows of a torque at all samples through the row filter and `response`, masked."""
+    n, samples, _, nv = records.shape
+    rows = filter_rows(records, torque.T.reshape(nv, n, samples), response.T)
+    return (rows * np.moveaxis(records.weight, 2, 0)).reshape(nv, -1)
 
 
 def stack(signals: Sequence[Signals]) -> Records:

@@ -9,9 +9,9 @@ from jaxtyping import Float
 
 from ..results import Name, Verdict
 from . import noise
-from .evidence import Rows
 from .noise import Spectrum
 from .problem import Problem
+from .rows import Rows
 from .screening import draw_noise
 
 __all__ = ["Rest", "excess", "lines", "rest_of", "verdict", "wrong_law"]

@@ -16,10 +16,13 @@ from ..effect import Effect
 from ..effects import CATALOGUE, LinkEffect
 from ..model import RobotModel
 from ..results import Name
+from .bank import Bank, Columns, bank
 from .design import flattened, unit_rows, units
-from .evidence import Bank, Columns, Linear, Rows, Score, bank, block_scores, largest, other_scores, projection, scores
+from .evidence import Score, block_scores, largest, other_scores, projection, scores
 from .noise import Spectrum
-from .problem import Problem, State
+from .problem import Problem
+from .rows import Linear, Rows
+from .state import State
 
 __all__ = ["Group", "Screen", "catalogue", "family_p", "screen"]
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..diagnosis.estimates import prismatic
-from ..diagnosis.problem import rigid_prior
+from ..diagnosis.priors import rigid_prior
 from ..effect import Effect
 from ..errors import InputError, nearest
 from ..model import RobotModel

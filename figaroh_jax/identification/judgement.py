@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..diagnosis.problem import rigid_prior
+from ..diagnosis.priors import rigid_prior
 from ..effect import Effect, joint_unit
 from ..extended import ExtendedModel, extend
 from ..formats.native import place_names

@@ -1,0 +1,148 @@
+"""The candidates that a screen points to, each with its exact shape and what the data say of the model with it in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from ..effect import Effect
+from ..effects import Payload
+from ..results import Name
+from .comparison import Ground, Hypothesis, Verdicts, judge, judge_grown
+from .design import kind, shapes, with_shape
+from .estimates import torque_slope
+from .priors import physical_body
+from .problem import Problem
+from .refit import Whitened, refit, refit_shift
+from .rows import Rows
+from .screening import Group, Screen
+from .state import extended_state, solved
+from .step import Step, stand
+
+__all__ = ["Contender", "contend", "for_refit", "shortlist"]
+
+SHORTLIST, SHARE = 8, 0.35  # candidates compared exactly; share of the best rank that they need
+SHIFTS = 2  # candidates of a position sensor tried at a step: each is a fit of its own
+TURNS, RESPONSE_TURNS = 3, 6  # of Gauss-Newton on a shift of the position; on a response of the torque
+STARTS = 4  # of a refit
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A candidate with its exact shape, the model of the data with it in, and what the data say of that."""
+
+    name: Name
+    effect: Effect
+    verdicts: Verdicts
+
+
+def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray]]:
+    """The best groups, each with its grid points in the order of their scores."""
+    ranked = found.best(step.rows)
+    shifts = [r for r in ranked if kind(found.groups[r[1]].effect) == "position"]
+    ranked = [r for r in ranked if r not in shifts[SHIFTS:]]
+    chosen = [r for r in ranked[:SHORTLIST] if r[0] > SHARE * ranked[0][0]] or ranked[:1]
+    simpler = {Name(n, found.groups[g].name.at) for _, g, _ in chosen for n in type(found.groups[g].effect).contains}
+    chosen += [r for r in ranked if found.groups[r[1]].name in simpler and r not in chosen]
+    return [(found.groups[g], np.argsort(-found.scores[g].Q)) for _, g, _ in chosen]
+
+
+def contend(
+    problem: Problem,
+    step: Step,
+    whitening: Float[np.ndarray, "F nv"],
+    base: Ground,
+    ready: Whitened,
+    group: Group,
+    order: np.ndarray,
+) -> Contender:
+    """The candidate with its exact shape, started from its best grid points."""
+    way = kind(group.effect)
+    if way == "response":
+        first = jax.tree.map(lambda x: x[order[0]], group.effect)
+        return _sensor_contender(problem, step, whitening, group, first, RESPONSE_TURNS)
+    if way == "position":
+        return _position_contender(problem, step, whitening, ready, group)
+    effect, Z = _exact_columns(problem, step, ready, group, order)
+    if isinstance(effect, Payload):
+        effect, verdicts = _body_verdicts(step, base, effect, Z)
+    else:
+        verdicts = judge_grown(step.rows, base, group.columns.joints, Z)
+        names = [n for n, p in effect.parameters().items() if p.linear]
+        effect = with_shape(effect, names, list(verdicts.theta[-len(names) :]))
+    return Contender(group.name, effect, verdicts)
+
+
+def _exact_columns(
+    problem: Problem, step: Step, ready: Whitened, group: Group, order: np.ndarray
+) -> tuple[Effect, Float[np.ndarray, "k rows T"]]:
+    """The effect with the shape that fits best, and its whitened columns."""
+    if not shapes(type(group.effect)):
+        return jax.tree.map(lambda x: x[order[0]], group.effect), group.columns.Z[order[0]]
+    starts = np.resize(order, STARTS)
+    effects = jax.tree.map(lambda x: x[starts], group.effect)
+    effect, Z = refit(effects, step.state.motion, problem.records, ready)
+    return effect, Z.reshape(*Z.shape[:2], -1)
+
+
+def _body_verdicts(
+    step: Step, base: Ground, effect: Payload, Z: Float[np.ndarray, "10 nv T"]
+) -> tuple[Payload, Verdicts]:
+    """A payload with the parameters of the nearest body that can exist."""
+    rows, full = step.rows, np.moveaxis(Z, 0, 2)
+    free = judge_grown(rows, base, range(len(rows.y)), Z)
+    body = physical_body(free.theta[-10:], _information(rows, base, full))
+    verdicts = judge(rows, Hypothesis(rows.X, step.state.prior, full @ body))
+    return with_shape(effect, list(effect.parameters()), list(body)), verdicts
+
+
+def _information(rows: Rows, base: Ground, Z: Float[np.ndarray, "nv T k"]) -> Float[np.ndarray, "k k"]:
+    """Z'Z with the current model projected out: the precision of the columns' coefficients."""
+    tall, X = Z.reshape(-1, Z.shape[2]), rows.X.reshape(-1, rows.X.shape[2])
+    cross = X.T @ tall
+    return tall.T @ tall - cross.T @ base.inverse[-1] @ cross
+
+
+def for_refit(problem: Problem, step: Step, base: Ground, whitening: Float[np.ndarray, "F nv"]) -> Whitened:
+    """What the refits of a step need."""
+    n, _, count, nv = problem.records.shape
+    residual = step.verdicts.residual.reshape(nv, n, count)
+    response = whitening * step.state.response(problem.records.omega)[:, None]
+    return Whitened(residual, step.rows.X.reshape(nv, n, count, -1), base.inverse[-1], response)
+
+
+def _position_contender(
+    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], ready: Whitened, group: Group
+) -> Contender:
+    """A shift of the links' motion: its size by the profile, then with the regressor and the load at the true motion.
+
+    The load that the profile knows is that of a fit without the effect.
+    """
+    Z = group.columns.Z[:, 0]
+    effect = refit_shift(group.effect, Z, step.state.motion, problem.records, ready)
+    return _sensor_contender(problem, step, whitening, group, effect, TURNS)
+
+
+def _sensor_contender(
+    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group, effect: Effect, turns: int
+) -> Contender:
+    """Gauss-Newton on the one parameter of a sensor effect, all coefficients fitted anew each time."""
+    ((name, parameter),) = effect.parameters().items()
+    base = step.state
+    for _ in range(turns):
+        here = stand(problem, extended_state(problem, base, effect), whitening)
+        slope = torque_slope(problem, here.state, effect, name, whitening)
+        X = np.concatenate([here.rows.X, slope[..., None]], axis=2)
+        theta = judge(here.rows, Hypothesis(X, here.state.prior.extended(1))).theta
+        value = float(np.clip(float(getattr(effect, name)) + theta[-1], parameter.lower, parameter.upper))
+        done = abs(value - float(getattr(effect, name))) < 1e-7
+        effect = with_shape(effect, [name], [np.float64(value)])
+        if kind(effect) == "position":
+            base = solved(problem, step.state, theta[:-1])
+        elif done:
+            break
+    here = stand(problem, extended_state(problem, base, effect), whitening)
+    return Contender(group.name, effect, here.verdicts)

@@ -1,0 +1,151 @@
+"""All causes fitted together: coefficients and shapes at once, and which of them surely have a size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..effect import Effect
+from ..effects import find
+from ..results import Name
+from .design import kind, shapes, with_shape
+from .estimates import Fitted, amplitude_places, torque_slope, with_amplitudes
+from .problem import Problem
+from .rows import Rows
+from .search import Found
+from .state import State, extended_state, solved
+from .step import Step, stand
+
+__all__ = ["Joint", "has_size", "joint_fit", "moved", "polished", "sized"]
+
+KEPT = 1e-12
+SURE = 0.95  # of the region of a cause's amplitudes that must not hold zero
+POLISH = 2
+SPEED_LAWS = ("stribeck_friction", "power_law_friction")  # of dry friction over the speed
+
+
+class Joint(NamedTuple):
+    """All causes in one fit: where it stands, the causes with their amplitudes, values with covariance."""
+
+    step: Step
+    causes: list[Effect]
+    fitted: Fitted
+
+
+def polished(problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> Joint:
+    """All causes fitted together: a few Gauss-Newton steps over coefficients and shapes.
+
+    Sensor effects follow the load and the torque, so each turn begins with what the last one made of the baseline.
+    """
+    joint = _together(problem, start, causes, whitening)
+    for _ in range(POLISH):
+        causes = [moved(e, joint.fitted, at) for e, at in zip(joint.causes, joint.fitted.places, strict=True)]
+        base = solved(problem, start, joint.step.state.theta[: len(start.theta)])
+        joint = _together(problem, base, causes, whitening)
+    return joint
+
+
+def _together(problem: Problem, base: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> Joint:
+    state = base
+    for effect in causes:
+        state = solved(problem, extended_state(problem, state, effect), _grown(state, effect))
+    step = stand(problem, state, whitening)
+    causes = with_amplitudes(step.state, causes, problem.model)
+    return Joint(step, causes, joint_fit(problem, step.state, step.rows, causes, whitening))
+
+
+def _grown(state: State, effect: Effect) -> Float[np.ndarray, " P"]:
+    if kind(effect) != "columns":
+        return state.theta
+    return np.append(state.theta, [float(getattr(effect, n)) for n, p in effect.parameters().items() if p.linear])
+
+
+def joint_fit(
+    problem: Problem, state: State, rows: Rows, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]
+) -> Fitted:
+    """Gauss-Newton step of all coefficients and shapes at once, and a covariance from the scores of the blocks."""
+    causes = with_amplitudes(state, causes, problem.model)
+    slopes = [torque_slope(problem, state, e, name, whitening) for e in causes for name in shapes(type(e))]
+    J = np.concatenate([rows.X, *[s[..., None] for s in slopes]], axis=2)
+    precision = np.append(state.prior.precision, np.zeros(len(slopes)))
+    tall = J.reshape(-1, J.shape[2])
+    A = tall.T @ tall + np.diag(precision)
+    inverse = np.linalg.inv(A + KEPT * np.diag(np.maximum(np.diag(A), KEPT)))
+    residual = rows.y - rows.X @ state.theta
+    pull = np.append(state.prior.precision * (state.prior.mean - state.theta), np.zeros(len(slopes)))
+    step = inverse @ (tall.T @ residual.reshape(-1) + pull)
+    values = [float(getattr(e, n)) for e in causes for n in shapes(type(e))]
+    covariance = inverse @ (_scatter(rows, J, residual) + np.diag(precision)) @ inverse
+    return Fitted(np.append(state.theta, values) + step, covariance, _places(problem, state, causes))
+
+
+def _scatter(rows: Rows, J: Float[np.ndarray, "nv T P"], residual: Float[np.ndarray, "nv T"]) -> np.ndarray:
+    """sum_b g_b g_b' of the blocks' scores g_b = J_b' r_b: right for coloured residuals too."""
+    blocks = rows.block.max() + 1
+    member = (rows.block[:, None] == np.arange(blocks)).astype(float)
+    scores = np.sum([member.T @ (x * r[:, None]) for x, r in zip(J, residual, strict=True)], axis=0)
+    return scores.T @ scores * blocks / max(blocks - 1, 1)
+
+
+def _places(problem: Problem, state: State, causes: list[Effect]) -> tuple[tuple[int, ...], ...]:
+    """Where each cause's amplitudes and shapes stand among the parameters."""
+    places, first = [], len(state.theta)
+    for effect, amplitude in zip(causes, amplitude_places(state, causes, problem.model), strict=True):
+        count = len(shapes(type(effect)))
+        places.append((*amplitude, *range(first, first + count)))
+        first += count
+    return tuple(places)
+
+
+def moved(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> Effect:
+    """The cause with its shapes after the step, kept in their bounds."""
+    names = shapes(type(effect))
+    values = fitted.value[list(place[len(place) - len(names) :])] if names else []
+    kept = []
+    for name, value in zip(names, values, strict=True):
+        parameter = effect.parameters()[name]
+        inside = float(np.clip(value, parameter.lower, parameter.upper))
+        if parameter.hole and parameter.hole[0] < inside < parameter.hole[1]:
+            inside = float(getattr(effect, name))
+        kept.append(np.float64(inside))
+    return with_shape(effect, names, kept) if names else effect
+
+
+def sized(found: list[Found], joint: Joint, forbid: Sequence[str]) -> list[Found]:
+    """The causes whose size is surely not zero, and those whose law alone is open, with all that it may be.
+
+    Where the amplitude's interval includes zero because any of several laws would do, the set says so; where nothing
+    else explains the misfit, there is no cause to tell of.
+    """
+    out = []
+    for one, effect, at in zip(found, joint.causes, joint.fitted.places, strict=True):
+        if has_size(effect, joint.fitted, at):
+            out.append(one)
+            continue
+        laws = [n for n in SPEED_LAWS if one.name.effect in SPEED_LAWS and n not in (one.name.effect, *forbid)]
+        more = dict.fromkeys([*one.ambiguous, *one.alike, *(Name(n, one.name.at) for n in laws)])
+        if more and not type(effect).contains:
+            out.append(replace(one, ambiguous=tuple(more)))
+    return out
+
+
+def has_size(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
+    """Whether the effect's size is surely not zero: its amplitudes' 95 % region excludes it.
+
+    Amplitudes that a simpler effect has too do not count: a spring without stiffness is an offset.
+    """
+    from scipy.special import chdtri  # scipy is slow to import
+
+    names = [n for n, p in effect.parameters().items() if p.linear]
+    simpler = {name for inside in type(effect).contains for name in find(inside).parameters()}
+    own = [k for k, name in enumerate(names) if name not in simpler]
+    if not own or kind(effect) != "columns":
+        return True
+    at = np.array(place)[own]
+    value = np.array([float(getattr(effect, names[k])) for k in own])
+    covariance = fitted.covariance[np.ix_(at, at)]
+    return bool(value @ np.linalg.pinv(covariance, hermitian=True) @ value > chdtri(len(own), 1 - SURE))

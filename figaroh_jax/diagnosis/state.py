@@ -1,0 +1,249 @@
+"""A model of the recordings: baseline effects and the causes accepted so far, with its regressor at every sample.
+
+`whitened` gives the rows in which everything is decided.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from ..effect import Effect, Motion
+from ..effects import LinkEffect, Payload, find
+from ..model import Leaf
+from ..regressor import joint_torque_regressor
+from .design import Units, flattened, kind, sensor_response, shapes, shifted, units, units_and_slopes
+from .priors import body_precision, rigid_prior
+from .problem import Layout, Problem, family_of
+from .records import filter_rows, filtered_rows
+from .rows import Prior, Rows, instruments
+
+__all__ = [
+    "State",
+    "baseline",
+    "batched",
+    "extended_state",
+    "link_motion",
+    "plain_rows",
+    "solved",
+    "unit_torques",
+    "whitened",
+    "with_term",
+]
+
+FRICTION_PRECISION = 1e-6
+BATCH = 4  # effects with a shape in one program
+
+
+@dataclass(frozen=True)
+class State:
+    """A model of the data: effects with columns in order, sensor effects, regressor at the samples, coefficients."""
+
+    terms: tuple[Effect, ...]  # each with a leading axis of places
+    sensors: tuple[Effect, ...]
+    parts: tuple[Float[np.ndarray, "nN nv k"], ...]  # regressor: the rigid body's columns, then those of each term
+    prior: Prior
+    theta: Float[np.ndarray, " P"]
+    measured: Motion  # as measured, with the nominal robot's load
+
+    @cached_property
+    def motion(self) -> Motion:
+        """The motion as measured, with load, total torque and inertia of `theta`."""
+        load, *others = self.shares(self.theta)
+        new = (load, sum(others, load), self.theta[: self.rigid.shape[2]].reshape(-1, 10))
+        return eqx.tree_at(lambda m: (m.load, m.total, m.model.inertia), self.measured, new)
+
+    @property
+    def rigid(self) -> Float[np.ndarray, "nN nv columns"]:
+        """Regressor of the rigid body."""
+        return self.parts[0]
+
+    def columns(self, first: int = 0) -> Float[np.ndarray, "nN nv k"]:
+        """Columns of the regressor from one on."""
+        starts = np.cumsum([0, *(part.shape[2] for part in self.parts)])
+        kept = [part[:, :, max(first - start, 0) :] for part, start in zip(self.parts, starts, strict=False)]
+        return np.concatenate([part for part in kept if part.shape[2]] or [self.rigid[:, :, :0]], axis=2)
+
+    def torque(self, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "nN nv"]:
+        """Torque at the samples with the coefficients `theta`, N m or N."""
+        return sum(self.shares(theta), np.zeros(self.rigid.shape[:2]))
+
+    def shares(self, theta: Float[np.ndarray, " P"]) -> Iterator[Float[np.ndarray, "nN nv"]]:
+        """Torque of the rigid body, then of each term."""
+        split = np.split(theta, np.cumsum([part.shape[2] for part in self.parts])[:-1])
+        for part, own in zip(self.parts, split, strict=True):
+            yield (part.reshape(-1, part.shape[2]) @ own).reshape(self.rigid.shape[:2])
+
+    def response(self, omega: Float[Leaf, " F"]) -> Complex[np.ndarray, " F"] | Float[np.ndarray, " F"]:
+        """Response of the torque sensor of all sensor effects together."""
+        out = np.ones(np.shape(omega))
+        for effect in self.sensors:
+            if kind(effect) == "response":
+                out = out * sensor_response({effect.name: batched(effect)}, np.asarray(omega))[effect.name][0]
+        return out
+
+
+def baseline(problem: Problem, names: Sequence[str], given: Sequence[Effect] = ()) -> State:
+    """Rigid body with its prior and the named effects at every joint, then the `given` ones."""
+    joints = np.arange(problem.model.nv)[:, None]
+    terms = []
+    for name in names:
+        effect = find(name)
+        terms.append(effect(joints, **{p: np.zeros(len(joints)) for p in effect.parameters()}))
+    rigid, theta, precision = _rigid(problem, problem.motion), *rigid_prior(problem.model, problem.trust)
+    state = State((), (), (rigid,), Prior(theta, precision), theta, problem.motion)
+    for term in [*terms, *(batched(effect) for effect in given)]:
+        state = with_term(problem, state, term)
+    return state
+
+
+def batched(effect: Effect) -> Effect:
+    """The effect with a leading axis of one place."""
+    return jax.tree.map(lambda x: np.asarray(x)[None], effect)
+
+
+def with_term(problem: Problem, state: State, term: Effect) -> State:
+    """The state with one more effect (leading axis of places) whose torque is linear in its amplitudes."""
+    own = _term_columns(problem, state, term)
+    count = own.shape[-1]
+    mean, precision = np.zeros(count), np.full(count, FRICTION_PRECISION)
+    if isinstance(term, Payload):
+        mean = np.array([float(getattr(term, name)[0]) for name in term.parameters()])
+        precision = body_precision(mean)
+    prior = Prior(np.append(state.prior.mean, mean), np.append(state.prior.precision, precision))
+    theta = np.append(state.theta, np.zeros(count))
+    return replace(state, terms=(*state.terms, term), parts=(*state.parts, own), prior=prior, theta=theta)
+
+
+def extended_state(problem: Problem, state: State, effect: Effect) -> State:
+    """The state with one more cause of whatever kind."""
+    if kind(effect) == "columns":
+        return with_term(problem, state, batched(effect))
+    grown = replace(state, sensors=(*state.sensors, effect))
+    if kind(effect) == "response":
+        return grown
+    moved = _rigid(problem, link_motion(problem, grown))
+    return replace(grown, parts=(moved, *state.parts[1:]))
+
+
+def link_motion(problem: Problem, state: State) -> Motion:
+    """True motion of the links: as measured, less the errors of the position sensors."""
+    motion = state.motion
+    for effect in state.sensors:
+        if kind(effect) == "position":
+            moved = shifted(batched(effect), motion, problem.records)
+            first = (moved.position[0], moved.velocity[0], moved.acceleration[0])
+            motion = eqx.tree_at(lambda m: (m.position, m.velocity, m.acceleration), moved, first)
+    return motion
+
+
+def solved(problem: Problem, state: State, theta: Float[np.ndarray, " P"]) -> State:
+    """The state with coefficients `theta`, from which its load and its torque follow."""
+    return replace(state, theta=theta)
+
+
+def unit_torques(problem: Problem, state: State, term: Effect) -> Units:
+    """What a unit of each amplitude of a term (one leading axis) adds in the state, N m or N."""
+    if isinstance(term, LinkEffect):
+        links = np.asarray(term.at)[:, 0]
+        torque = np.stack([state.rigid[:, :, 10 * k : 10 * k + 10].transpose(2, 1, 0) for k in links])
+        return Units(torque, np.tile(np.arange(problem.model.nv), (len(links), 1)))
+    family = family_of(type(term))
+    if family == "shaped":
+        return _shaped_units(term, state.motion)
+    if family in ("fixed", "following"):
+        place = _places_in(problem.families[family].get(term.name), term)
+        if place is not None:
+            known = problem.fixed if family == "fixed" else problem.family(family, state.motion)
+            return Units(known[term.name].torque[place], known[term.name].joints[place])
+    return units({term.name: term}, state.motion, problem.records)[term.name]
+
+
+def _places_in(batch: Effect | None, term: Effect) -> Int[np.ndarray, " places"] | None:
+    """Where the effects of a term stand among the candidates; nothing where one of them is no candidate."""
+    if batch is None:
+        return None
+    flat, same = flattened(batch), []
+    for at, *values in zip(np.asarray(term.at), *(np.asarray(getattr(term, n)) for n in _choices(term)), strict=True):
+        alike = (np.asarray(flat.at) == at).all(1)
+        for name, value in zip(_choices(term), values, strict=True):
+            alike &= np.asarray(getattr(flat, name)) == value
+        same.append(np.flatnonzero(alike))
+    return np.array([place[0] for place in same]) if all(len(place) for place in same) else None
+
+
+def _choices(effect: Effect) -> list[str]:
+    return [name for name, p in effect.parameters().items() if not p.linear]
+
+
+def _shaped_units(term: Effect, motion: Motion) -> Units:
+    """By the program of the refits: filled up to its batch."""
+    count, torques = len(term.at), []
+    for start in range(0, count, BATCH):
+        some = np.resize(np.arange(start, min(start + BATCH, count)), BATCH)
+        part = jax.tree.map(lambda x, i=some: np.asarray(x)[i], term)
+        values = np.stack([getattr(part, name) for name in shapes(type(term))], axis=1)
+        torques.append(units_and_slopes(part, values, motion)[0])
+    everywhere = np.tile(np.arange(np.shape(motion.velocity)[1]), (count, 1))
+    joints = np.asarray(term.at) if term.acts_on in ("joint", "pair") else everywhere
+    return Units(np.concatenate(torques)[:count], joints)
+
+
+def _term_columns(problem: Problem, state: State, term: Effect) -> Float[np.ndarray, "nN nv columns"]:
+    given = unit_torques(problem, state, term)
+    columns = np.zeros((problem.model.nv, *given.torque.shape[:2], given.torque.shape[3]))
+    for one, joints in enumerate(given.joints):
+        np.add.at(columns[:, one], joints, np.swapaxes(given.torque[one], 0, 1))
+    return np.ascontiguousarray(np.moveaxis(columns.reshape(problem.model.nv, -1, columns.shape[-1]), 2, 0))
+
+
+def _rigid(problem: Problem, motion: Motion) -> Float[np.ndarray, "nN nv P"]:
+    return np.asarray(joint_torque_regressor(problem.model, motion.position, motion.velocity, motion.acceleration))
+
+
+def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], before: Rows | None = None) -> Rows:
+    """Whitened rows of the measured torque and of the state's regressor, with their instruments.
+
+    `before` are the rows of the state that this one extends by columns alone: only the new columns are filtered.
+    """
+    layout = problem.layout
+    torque = problem.records.flat(problem.records.torque)
+    y = filtered_rows(problem.records, torque, whitening) if before is None else before.y
+    known = 0 if before is None else before.X.shape[2]
+    response = whitening * state.response(problem.records.omega)[:, None]
+    X = _filtered_columns(problem, state.columns(known), response)
+    Xi = X
+    if layout.repeats:
+        Xi = np.stack([instruments(x.T, layout.partner, p).T for x, p in zip(X, layout.paired, strict=True)])
+    if before is not None:
+        X, Xi = np.concatenate([before.X, X], axis=2), np.concatenate([before.Xi, Xi], axis=2)
+    return Rows(y, np.ascontiguousarray(X), np.ascontiguousarray(Xi), *_row_layout(layout))
+
+
+def plain_rows(problem: Problem, state: State) -> Rows:
+    """Rows as they are, N m or N."""
+    return whitened(problem, state, np.ones((len(problem.records.omega), problem.records.shape[3])))
+
+
+def _filtered_columns(
+    problem: Problem, X: Float[np.ndarray, "nN nv k"], response: Complex[np.ndarray, "F nv"]
+) -> Float[np.ndarray, "nv T k"]:
+    """Masked rows of columns, of which a tree leaves many zero."""
+    n, samples, count, nv = problem.records.shape
+    torque = np.ascontiguousarray(np.moveaxis(X, 0, 2)).reshape(-1, n, samples)
+    joints = np.repeat(np.arange(nv), X.shape[2])
+    used = torque.any(axis=(1, 2))
+    rows = np.zeros((len(torque), n, count))
+    rows[used] = filter_rows(problem.records, torque[used], response.T[joints[used]])
+    rows = rows.reshape(nv, -1, n, count) * np.moveaxis(problem.records.weight, 2, 0)[:, None]
+    return np.ascontiguousarray(np.swapaxes(rows.reshape(nv, -1, n * count), 1, 2))
+
+
+def _row_layout(layout: Layout) -> tuple[np.ndarray, ...]:
+    return layout.paired, layout.partner, layout.block, layout.fold
