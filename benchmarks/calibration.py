@@ -170,6 +170,7 @@ def _compare(N: int, model, frames: tuple[str, str], columns, peer: Peer) -> Non
     from figaroh_jax.calibration import posefit
     from figaroh_jax.calibration.gauge import find_gauge
     from figaroh_jax.calibration.posegroups import assemble, postures_of
+    from figaroh_jax.calibration.posesolver import solve
 
     rng, exp = np.random.default_rng(N), peer.pin.exp6
     q, x = rng.uniform(-2.5, 2.5, (N, 6)), 1e-3 * rng.normal(size=len(columns))
@@ -185,7 +186,7 @@ def _compare(N: int, model, frames: tuple[str, str], columns, peer: Peer) -> Non
     weights = jnp.full(len(jacobian), 1e4), jnp.where(free > 0, 0.0, 1.0), jnp.asarray(free)
 
     def ours() -> float:
-        return float(posefit.solve(measured.problem, *weights, zero).cost)
+        return float(solve(measured.problem, *weights, zero).cost)
 
     cost, cold = ours(), time.process_time() - start
     picked, warm, theirs, other = np.flatnonzero(free[: len(columns)]), [], [], 0.0

@@ -12,7 +12,7 @@ import pytest
 import reference
 import robots
 
-from figaroh_jax.calibration.chain import chain_between, chain_pose, column_motion
+from figaroh_jax.calibration.chain import chain_between, chain_pose, joint_response
 from figaroh_jax.calibration.gravity import gravity_moments, without_far_masses
 from figaroh_jax.errors import InputError
 from figaroh_jax.lie import log_so3
@@ -43,7 +43,8 @@ def test_motion_of_the_tool_is_the_derivative_of_its_pose(tmp_path: Path):
     q, twists = rng.uniform(-2.0, 2.0, (2, 3)), 0.3 * rng.normal(size=(2, 6, 3))
     at, fields = np.array([0, 0, 1, 1]), rng.normal(size=(4, 6, 3))
     here = pose_of(chain, q, twists)
-    motion = column_motion(here, jnp.asarray(at), jnp.asarray(fields))
+    response = joint_response(here, jnp.repeat(jnp.eye(6)[..., None], 3, axis=2))  # rows: the tool's motion itself
+    motion = np.einsum("kris,kis->rks", response[at], fields)
     h = 1e-6
     for k in range(4):
         moved = [pose_of(chain, q, twists + sign * h * np.eye(2)[at[k]][:, None, None] * fields[k]) for sign in (1, -1)]

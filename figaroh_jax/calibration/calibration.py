@@ -11,13 +11,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from ..errors import InputError
 from ..model import RobotModel
-from . import corrections, levels, marginal, posefit
+from . import corrections, levels, marginal
 from .calibrated import Calibration, Error, Outlier
 from .candidates import Block, blocks_of, effects_on, geometry_columns
 from .chain import chain_between
@@ -26,6 +25,7 @@ from .kinematic_effects import HISTORY
 from .outliers import find_outliers
 from .posegroups import Measured, assemble, postures_of
 from .poserecords import PoseRecording, read_pose_recordings
+from .posesolver import Solution, solve
 
 if TYPE_CHECKING:
     from ..formats.config import Task
@@ -69,7 +69,7 @@ class Run:
     folds: list[levels.Fold]
     named: list[int]
     history: bool  # whether an error that depends on the posture before was found and has no name
-    fit: tuple[Measured, marginal.Linear, marginal.Posterior, posefit.Solution]
+    fit: tuple[Measured, marginal.Linear, marginal.Posterior, Solution]
 
     def __init__(
         self,
@@ -148,7 +148,7 @@ class Run:
         linear, posterior = levels.fit_level(measured, self.used, level)
         free = levels.free_at(level, linear.prior)
         solution = _polish(measured, linear, posterior, self.used, free)
-        return measured, levels.linearise(measured, np.asarray(solution.unknowns)), posterior, solution
+        return measured, levels.linearise(measured, solution.unknowns), posterior, solution
 
     def _result(self) -> Calibration:
         final, linear, posterior, solution = self.fit
@@ -162,7 +162,7 @@ class Run:
         causes = corrections.causes_of(parameters, level, named, self.blocks, table, self.folds)
         twists = corrections.twists_of(self.model, final, linear.at)
         names = [c.label for c in final.columns] + [name for name, _ in final.own]
-        if not bool(solution.converged):
+        if not solution.converged:
             self.notes.append("the solver did not converge within its steps: do not trust these values")
         return Calibration(
             level=level,
@@ -180,8 +180,8 @@ class Run:
             rank=gauge.rank,
             condition=gauge.condition,
             noise=(float(posterior.noise[0]), float(posterior.noise[1])),
-            converged=bool(solution.converged),
-            steps=int(solution.steps),
+            converged=solution.converged,
+            steps=solution.steps,
             scheme=scheme,
             notes=tuple(self.notes),
             points=corrections.shown_of(final, self.recordings, frames, linear.residual),
@@ -265,7 +265,7 @@ def _table(folds: Sequence[levels.Fold], effects: bool) -> dict[str, tuple[float
     return table | {"chosen": levels.pooled([f.chosen if effects else f.plain for f in folds])}
 
 
-def _polish(measured, linear, posterior, used, free) -> posefit.Solution:
+def _polish(measured, linear, posterior, used, free) -> Solution:
     """Levenberg-Marquardt from the fit, from the closed-form start and from turned base frames; the least cost wins."""
     weight = np.where(linear.posture >= 0, posterior.weight[linear.posture], 1.0)
     rows = np.where(used, np.sqrt(weight) / posterior.noise[linear.channel], 0.0)
@@ -276,10 +276,8 @@ def _polish(measured, linear, posterior, used, free) -> posefit.Solution:
         if name.startswith("base_frame r"):
             turned[len(measured.columns) + k] = 0.7 / np.asarray(measured.problem.scale)[len(measured.columns) + k]
     starts += [turned, -turned] if turned.any() else []
-    many = [jnp.asarray(np.tile(x, (len(starts), 1))) for x in (rows, precision, free.astype(float))]
-    found = posefit.solve_many(measured.problem, posefit.Weights(*many), jnp.asarray(np.array(starts)))
-    best = int(jnp.argmin(found.cost))
-    return jax.tree.map(lambda x: x[best], found)
+    found = [solve(measured.problem, rows, precision, free, start) for start in starts]
+    return min(found, key=lambda solution: solution.cost)
 
 
 def as_holdout(recordings: Sequence[PoseRecording], names: Sequence[str]) -> tuple[PoseRecording, ...]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -96,7 +95,7 @@ def effects_on(
 
     def jacobian(at: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, "rows all"]:
         whole = np.concatenate([at[:first], np.zeros(len(extra)), at[first:]])
-        return np.asarray(posefit.linearise(wide.problem, jnp.asarray(whole))[1])[:, first:last]
+        return posefit.linearise(wide.problem, whole)[1][:, first:last]
 
     handicap = [0.01 * (len(b.columns) - 1) + 0.005 * np.log(len(b.effect.shape[1])) for b in blocks]
     return Effects(tuple(block.columns for block in blocks), jacobian, sizes, np.array(handicap))

@@ -18,9 +18,9 @@ from jaxtyping import Array, Float, Int
 from .. import lie
 from ..errors import InputError
 from ..model import Leaf, RobotModel, dofs
-from ..spatial import cross, matmul, rotate
+from ..spatial import cross, matmul, rotate, sine_cosine
 
-__all__ = ["Chain", "ChainPose", "chain_between", "chain_pose", "chain_twists", "column_motion", "joint_axis"]
+__all__ = ["Chain", "ChainPose", "chain_between", "chain_pose", "joint_axis", "joint_response"]
 
 
 class Chain(eqx.Module):
@@ -83,28 +83,42 @@ def joint_axis(model: RobotModel, joint: int) -> Float[np.ndarray, "3"]:
     return np.asarray(model.axis)[dofs(model.joints).first[joint]]
 
 
-def chain_pose(chain: Chain, q: Float[Array, "nq samples"], twists: Float[Array, "n 6 samples"]) -> ChainPose:
-    """Pose of the tool frame in the base frame (m), with the twist `[linear, angular]` of every joint (m, rad)."""
+def chain_pose(chain: Chain, q: Float[Array, "nq samples"], twists: Float[Array, "n 6 #samples"]) -> ChainPose:
+    """Pose of the tool frame in the base frame (m), with the twist `[linear, angular]` of every joint (m, rad).
+
+    Twists that no posture changes may come for one sample.
+    """
 
     def step(carry: tuple[Array, Array], joint: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
         R, p = carry
-        placement, axis, turns, position, twist = joint
+        placement, moved, bend, along, across, twice, known = joint
         p = p + rotate(R, placement[:3, 3, None])
         before = matmul(R, placement[:3, :3, None])
-        origin = p + rotate(before, twist[:3])
-        turned = matmul(before, last(lie.left_jacobian)(twist[3:]))
-        R = matmul(before, last(lie.exp_so3)(twist[3:]))
-        slide = jnp.where(turns > 0.0, 0.0, position) * axis[:, None]
-        turn = last(lie.exp_so3)(jnp.where(turns > 0.0, position, 0.0) * axis[:, None])
-        return (matmul(R, turn), origin + rotate(R, slide)), (before, turned, origin)
+        origin = p + rotate(before, moved[:, 3])
+        turned = matmul(before, bend)
+        sine, versine, slide = known
+        turn = jnp.eye(3)[..., None] + sine * across[..., None] + versine * twice[..., None]
+        R = matmul(before, moved[:, :3])
+        return (matmul(R, turn), origin + rotate(R, slide * along[:, None])), (before, turned, origin)
 
     samples = q.shape[1]
     position = chain.ratio[:, None] * q[chain.column] + chain.offset[:, None]
-    first, end = jnp.asarray(chain.first), jnp.asarray(chain.last)
+    turns = jnp.asarray(chain.turns)[:, None] > 0.0
+    both = sine_cosine(jnp.where(turns, position, 0.0))
+    known = jnp.stack([both[:, 0], 1.0 - both[:, 1], jnp.where(turns, 0.0, position)], axis=1)
+    first, end, axis = jnp.asarray(chain.first), jnp.asarray(chain.last), jnp.asarray(chain.axis)
     start = jnp.broadcast_to(first[:3, :3, None], (3, 3, samples)), jnp.broadcast_to(first[:3, 3:], (3, samples))
-    joints = (jnp.asarray(chain.placement), jnp.asarray(chain.axis), jnp.asarray(chain.turns), position, twists)
+    across = jax.vmap(lie.skew)(axis)
+    moved, bend = jax.vmap(last(_moved))(twists)
+    joints = (jnp.asarray(chain.placement), moved, bend, axis, across, across @ across, known)
     (R, p), (before, turned, origin) = jax.lax.scan(step, start, joints)
     return ChainPose(matmul(R, end[:3, :3, None]), p + rotate(R, end[:3, 3, None]), before, turned, origin)
+
+
+def _moved(twist: Float[Array, "6"]) -> tuple[Float[Array, "3 4"], Float[Array, "3 3"]]:
+    """E, rotation and translation side by side, and the left Jacobian of its rotation."""
+    rotation, bend = lie.exp_so3(twist[3:]), lie.left_jacobian(twist[3:])
+    return jnp.concatenate([rotation, twist[:3, None]], axis=1), bend
 
 
 def last(function):
@@ -112,25 +126,13 @@ def last(function):
     return jax.vmap(function, in_axes=-1, out_axes=-1)
 
 
-def chain_twists(
-    coefficients: Float[Array, " columns"],
-    column: Int[Array, " pieces"],
-    at: Int[Array, " pieces"],
-    fields: Float[Array, "pieces 6 samples"],
-    n: int,
-) -> Float[Array, "n 6 samples"]:
-    """Twist of each of the `n` joints: every piece acts at one of them, times the coefficient of its column."""
-    scaled = coefficients[column][:, None, None] * fields
-    return jnp.zeros((n, *fields.shape[1:]), fields.dtype).at[at].add(scaled)
+def joint_response(pose: ChainPose, by_motion: Float[Array, "rows 6 samples"]) -> Float[Array, "n rows 6 samples"]:
+    r"""Derivatives of rows by the twist of every joint, from those by the tool's motion `[linear, angular]`.
 
-
-def column_motion(
-    pose: ChainPose, at: Int[Array, " pieces"], fields: Float[Array, "pieces 6 samples"]
-) -> Float[Array, "6 pieces samples"]:
-    r"""Motion of the tool, `[linear, angular]` in base axes at its origin, for a unit of each piece's coefficient.
-
-    $$\delta p = R_P u_t + (R_P J_l(\xi_r) u_r) \times (p - o), \quad \delta\omega = R_P J_l(\xi_r) u_r$$
+    The motion is in base axes at the tool's origin: with L and W the two halves of a row,
+    $$\delta r = L' R_P u_t + (W + (p - o) \times L)' R_P J_l(\xi_r) u_r$$
     """
-    angular = rotate(pose.turned[at], fields[:, 3:])
-    linear = rotate(pose.before[at], fields[:, :3]) + cross(angular, pose.p - pose.origin[at])
-    return jnp.moveaxis(jnp.concatenate([linear, angular], axis=1), 0, 1)
+    linear, angular = by_motion[:, :3], by_motion[:, 3:]
+    arm = pose.p - pose.origin
+    of_turn = matmul(angular + cross(arm[:, None], linear), pose.turned)
+    return jnp.concatenate([matmul(linear, pose.before), of_turn], axis=2)

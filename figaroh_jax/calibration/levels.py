@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -104,9 +103,9 @@ def free_at(level: str, prior: Int[Array, " unknowns"]) -> Bool[Array, " unknown
 
 def linearise(measured: Measured, at: Float[Array, " unknowns"]) -> Linear:
     """The problem's rows at a point."""
-    residual, jacobian = posefit.linearise(measured.problem, jnp.asarray(at))
+    residual, jacobian = posefit.linearise(measured.problem, at)
     prior, width = tolerances(measured)
-    return Linear(np.asarray(residual), np.asarray(jacobian), at, measured.channel, measured.posture, prior, width)
+    return Linear(residual, jacobian, at, measured.channel, measured.posture, prior, width)
 
 
 def fit_level(

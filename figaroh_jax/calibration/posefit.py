@@ -1,13 +1,19 @@
-r"""Least squares on poses: rows of all devices, their exact Jacobian, and one compiled Levenberg-Marquardt solve.
+r"""Least squares on poses: rows of all devices and their exact Jacobian, a block of postures at a time.
 
-The unknowns stand in one vector of scaled numbers: the coefficients of the twist columns, common to all groups, then
-what each device leaves open. A row is predicted minus measured (m or rad) times its weight; the prior adds a row
-$\sqrt{\lambda_k}\, y_k$ for each unknown. `free` is 0 for unknowns that are held at zero.
+The unknowns stand in one vector y of scaled numbers: the coefficients of the twist columns, common to all groups, then
+what each device leaves open. A row is predicted minus measured (m or rad).
+
+The rows of a group depend on y through few numbers, linear in it: $\ell = T y$ with the steady twist of each joint of
+its chain, the coefficients of the fields that change with the posture, and the device's own unknowns. The compiled
+kernel differentiates by $\ell$: by the tool's motion and the device's unknowns in forward mode, through the chain in
+closed form. Its program depends on the length of the chain and the number of fields, not on which columns are fitted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,23 +23,24 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .. import lie
+from ..chunks import CPU_OPTIONS, chunk_size
 from ..model import Leaf
-from ..spatial import matmul
-from .chain import Chain, ChainPose, chain_pose, chain_twists, column_motion
+from .chain import Chain, chain_pose, joint_response
 from .devices import Device
 
 __all__ = [
     "Group",
+    "Part",
     "Problem",
     "Rows",
-    "Solution",
-    "Weights",
+    "block_rows",
+    "group_of",
     "linearise",
+    "parts_of",
     "predict",
     "rows_of",
     "sizes",
-    "solve",
-    "solve_many",
+    "ties",
 ]
 
 
@@ -43,7 +50,8 @@ class Group(eqx.Module):
     chain: Chain
     device: Device
     position: Float[Leaf, "nv samples"]  # joint positions, rad or m
-    fields: Float[Leaf, "pieces 6 samples"]  # twist of a unit of each piece of a column, at a joint of the chain
+    steady: Float[Leaf, "n 6 columns"]  # twist of each joint of the chain for a unit of each column, in all postures
+    fields: Float[Leaf, "pieces 6 samples"]  # the same where it changes with the posture, one piece after the other
     at: Int[Leaf, " pieces"]  # which joint of the chain
     column: Int[Leaf, " pieces"]  # which column
     datum: Any  # what the device measured, the samples on the first axis
@@ -67,13 +75,26 @@ class Rows(NamedTuple):
     measured: Bool[np.ndarray, " rows"]
 
 
-class Solution(NamedTuple):
-    """Unknowns at the least cost, whether the solver converged, in how many steps, and half the sum of squares."""
-
-    unknowns: Float[Array, " unknowns"]
-    converged: Bool[Array, ""]
-    steps: Int[Array, ""]
-    cost: Float[Array, ""]
+def group_of(
+    chain: Chain,
+    device: Device,
+    position: Float[np.ndarray, "nv samples"],
+    columns: int,
+    pieces: Iterable[tuple[int, int, Float[np.ndarray, "6 samples"]]],
+    datum: Any,
+    measured: Bool[np.ndarray, "samples rows"],
+) -> Group:
+    """A group from the pieces of its columns: column, joint of the chain, and twist of a unit in each posture."""
+    steady, changing = np.zeros((len(chain.joints), 6, columns)), []
+    for column, at, field in pieces:
+        if (field == field[:, :1]).all():
+            steady[at, :, column] += field[:, 0]
+        else:
+            changing.append((field, at, column))
+    fields, at, column = zip(*changing, strict=True) if changing else ((), (), ())
+    stacked = np.array(fields).reshape(len(fields), 6, position.shape[1])
+    where = np.array(at, int), np.array(column, int)
+    return Group(chain, device, position, steady, stacked, *where, datum, measured)
 
 
 def rows_of(problem: Problem) -> Rows:
@@ -84,158 +105,133 @@ def rows_of(problem: Problem) -> Rows:
         channel = np.repeat(group.device.channels(), samples)
         sample = np.tile(np.arange(samples), count)
         parts.append((np.full(len(sample), g), sample, channel, np.asarray(group.measured).T.reshape(-1)))
-        rows = np.zeros(len(_constraint(group.device)), int)
+        rows = np.zeros(ties(group.device), int)
         parts.append((rows + g, rows - 1, rows, rows == 0))
     return Rows(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
-def _constraint(device: Device) -> np.ndarray:
-    with jax.ensure_compile_time_eval():
-        return np.asarray(device.constraint(jnp.zeros(len(device.unknowns()))))
+def ties(device: Device) -> int:
+    """Number of the device's constraint rows."""
+    return jax.eval_shape(device.constraint, np.zeros(len(device.unknowns()))).shape[0]
 
 
-@eqx.filter_jit
-def linearise(problem: Problem, unknowns: Float[Array, " unknowns"]) -> tuple[Array, Array]:
-    """Residual (rows,) in m and rad at the scaled unknowns, and its exact Jacobian (rows, unknowns)."""
-    return _linearise(problem, unknowns)
+class Part(eqx.Module):
+    """A group as the kernel takes it: postures in blocks, the last one filled up with its first posture."""
+
+    chain: Chain
+    device: Device
+    at: Int[Leaf, " pieces"]
+    position: Float[Leaf, "blocks nv block"]
+    fields: Float[Leaf, "blocks pieces 6 block"]
+    datum: Any  # each array (blocks, block, ...)
+    local: Float[Leaf, "local unknowns"]  # T
 
 
-def _linearise(problem: Problem, unknowns: Array) -> tuple[Array, Array]:
-    residuals, jacobians = [], []
-    for group, coefficients, own, where in _split(problem, unknowns):
-        residual, of_pose, of_own, pieces = _group(group, coefficients, own)
-        moved = matmul(of_pose, pieces)  # rows pieces samples
-        motion = jnp.zeros((len(moved), problem.columns, moved.shape[2])).at[:, jnp.asarray(group.column)].add(moved)
-        residuals.append(residual)
-        jacobians.append(_place(motion, of_own, where, len(unknowns)))
-        tied, of_tied = group.device.constraint(own), jax.jacfwd(group.device.constraint)(own)
-        residuals.append(tied)
-        jacobians.append(jnp.zeros((len(tied), len(unknowns))).at[:, where : where + len(own)].set(of_tied))
-    return jnp.concatenate(residuals), jnp.concatenate(jacobians) * problem.scale
-
-
-def _split(problem: Problem, unknowns: Array) -> list[tuple[Group, Array, Array, int]]:
-    """Each group with the coefficients of its columns, its device's unknowns and where those begin."""
-    values = unknowns * problem.scale
-    start = problem.columns
-    coefficients, parts = values[:start], []
+def parts_of(problem: Problem) -> tuple[Part, ...]:
+    """Every group cut into blocks, with its matrix from the scaled unknowns to what its rows depend on."""
+    parts, first = [], problem.columns
     for group in problem.groups:
-        count = len(group.device.unknowns())
-        parts.append((group, coefficients, values[start : start + count], start))
-        start += count
-    return parts
+        n, count, pieces = len(group.chain.joints), len(group.device.unknowns()), len(group.at)
+        local = np.zeros((6 * n + pieces + count, len(problem.scale)))
+        local[: 6 * n, : problem.columns] = np.reshape(group.steady, (6 * n, -1))
+        local[6 * n + np.arange(pieces), group.column] = 1.0
+        local[6 * n + pieces + np.arange(count), first + np.arange(count)] = 1.0
+        first += count
+        size = block_size(np.shape(group.position)[1])
+        cut = partial(_cut, size=size)
+        parts.append(
+            Part(
+                replace(group.chain, joints=()),  # one program for all chains of a length
+                group.device,
+                group.at,
+                np.moveaxis(cut(np.swapaxes(group.position, 0, 1)), 1, -1),
+                np.moveaxis(cut(np.moveaxis(np.asarray(group.fields), -1, 0)), 1, -1),
+                jax.tree.map(cut, group.datum),
+                local * np.asarray(problem.scale),
+            )
+        )
+    return tuple(parts)
 
 
-def _group(group: Group, coefficients: Array, own: Array) -> tuple[Array, Array, Array, Array]:
-    """Residual (rows * samples,), its derivatives by the tool's motion (rows 6 samples) and by the device's unknowns
-    (rows k samples), and the motion of the tool for each piece (6 pieces samples)."""
-    pose = _pose(group, coefficients)
+def block_size(samples: int) -> int:
+    """Postures in a block: as few as keep its arrays in a processor's cache, and not many more than there are."""
+    blocks = max(1, -(-samples // chunk_size()))
+    return 8 * max(1, -(-samples // (8 * blocks)))
 
-    def one(R: Array, p: Array, datum: Array) -> tuple[Array, ...]:
+
+def _cut(x: Any, size: int) -> np.ndarray:
+    """The first axis as blocks; what is missing at the end is filled with the first sample."""
+    x = np.asarray(x)
+    missing = -len(x) % size
+    filled = np.concatenate([x, np.broadcast_to(x[:1], (missing, *x.shape[1:]))]) if missing else x
+    return filled.reshape(len(filled) // size, size, *x.shape[1:])
+
+
+def block_rows(part: Part, local: Array, position: Array, fields: Array, datum: Any) -> tuple[Array, Array]:
+    """Rows of a block (rows, block) at the numbers `local`, and their derivatives by these (local, rows, block)."""
+    n, pieces = len(part.chain.axis), len(part.at)
+    coefficients, own = local[6 * n : 6 * n + pieces], local[6 * n + pieces :]
+    pose = chain_pose(part.chain, position, _twists(part, local[: 6 * n].reshape(n, 6, 1), coefficients, fields))
+
+    def one(R: Array, p: Array, datum: Any) -> tuple[Array, ...]:
         def residual(motion: Array, own: Array) -> Array:
             moved = lie.pose(R + lie.skew(motion[3:]) @ R, p + motion[:3])  # to first order, which is all that is asked
-            return group.device.residual(moved, own, datum)
+            return part.device.residual(moved, own, datum)
 
         zero = jnp.zeros(6)
         return residual(zero, own), *jax.jacfwd(residual, argnums=(0, 1))(zero, own)
 
-    over = jax.vmap(one, in_axes=(-1, -1, 0), out_axes=-1)
-    residual, of_pose, of_own = over(pose.R, pose.p, jax.tree.map(jnp.asarray, group.datum))
-    return residual.reshape(-1), of_pose, of_own, column_motion(pose, jnp.asarray(group.at), jnp.asarray(group.fields))
+    residual, by_motion, by_own = jax.vmap(one, in_axes=(-1, -1, 0), out_axes=-1)(pose.R, pose.p, datum)
+    response = jnp.swapaxes(joint_response(pose, by_motion), 1, 2)  # joint twist row sample
+    columns = [response.reshape(6 * n, *residual.shape), jnp.swapaxes(by_own, 0, 1)]
+    if pieces:
+        columns.insert(1, jnp.sum(response[jnp.asarray(part.at)] * fields[:, :, None], axis=1))
+    return residual, jnp.concatenate(columns)
 
 
-def _pose(group: Group, coefficients: Array) -> ChainPose:
-    column, at, fields = (jnp.asarray(x) for x in (group.column, group.at, group.fields))
-    twists = chain_twists(coefficients, column, at, fields, len(group.chain.joints))
-    return chain_pose(group.chain, jnp.asarray(group.position), twists)
+def _twists(part: Part, steady: Array, coefficients: Array, fields: Array) -> Array:
+    if not len(part.at):
+        return steady
+    place = (jnp.arange(len(steady))[:, None] == jnp.asarray(part.at)).astype(fields.dtype)
+    return steady + jnp.tensordot(place, coefficients[:, None, None] * fields, axes=1)
 
 
-def _place(motion: Array, of_own: Array, where: int, unknowns: int) -> Array:
-    """Jacobian of a group (rows * samples, unknowns): columns first, then the device's own among those of others."""
-    rows, columns, samples = motion.shape
-    before, after = where - columns, unknowns - where - of_own.shape[1]
-    own = jnp.pad(of_own, ((0, 0), (before, after), (0, 0)))
-    whole = jnp.concatenate([motion, own], axis=1)
-    return jnp.moveaxis(whole, 1, 2).reshape(rows * samples, unknowns)
+def _tied(device: Device, own: Float[np.ndarray, " k"]) -> tuple[np.ndarray, np.ndarray]:
+    """Constraint rows of a device and their derivatives by its unknowns."""
+    if not ties(device):
+        return np.zeros(0), np.zeros((0, len(own)))
+    tied = jax.jit(lambda device, own: (device.constraint(own), jax.jacfwd(device.constraint)(own)))(device, own)
+    return np.asarray(tied[0]), np.asarray(tied[1])
 
 
-@eqx.filter_jit
-def predict(problem: Problem, unknowns: Float[Array, " unknowns"]) -> Float[Array, " rows"]:
-    """Residual (rows,) in m and rad at the scaled unknowns."""
-    return _residual(problem, unknowns)
+@partial(jax.jit, compiler_options=CPU_OPTIONS)
+def _whole(part: Part, local: Array) -> tuple[Array, Array]:
+    blocks = (part.position, part.fields, part.datum)
+    return jax.lax.map(lambda block: block_rows(part, local, *block), blocks)
 
 
-def _residual(problem: Problem, unknowns: Array) -> Array:
-    parts = []
-    for group, coefficients, own, _ in _split(problem, unknowns):
-        pose = _pose(group, coefficients)
-
-        def one(R: Array, p: Array, datum: Array, own: Array = own, device: Device = group.device) -> Array:
-            return device.residual(lie.pose(R, p), own, datum)
-
-        over = jax.vmap(one, in_axes=(-1, -1, 0), out_axes=-1)
-        parts += [
-            over(pose.R, pose.p, jax.tree.map(jnp.asarray, group.datum)).reshape(-1),
-            group.device.constraint(own),
-        ]
-    return jnp.concatenate(parts)
-
-
-class Weights(NamedTuple):
-    """Weight of each row, precision of each unknown's prior, and 1 for the unknowns that are free, else 0."""
-
-    row: Float[Array, " rows"]
-    precision: Float[Array, " unknowns"]
-    free: Float[Array, " unknowns"]
+def linearise(
+    problem: Problem, unknowns: Float[Any, " unknowns"]
+) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows unknowns"]]:
+    """Residual in m and rad at the scaled unknowns, and its exact Jacobian."""
+    residuals, jacobians = [], []
+    for group, part in zip(problem.groups, parts_of(problem), strict=True):
+        local, samples = part.local @ np.asarray(unknowns), np.shape(group.position)[1]
+        residual, by_local = (np.asarray(x) for x in _whole(part, local))
+        rows = residual.shape[1]
+        residuals.append(np.swapaxes(residual, 0, 1).reshape(rows, -1)[:, :samples].reshape(-1))
+        each = by_local.transpose(2, 0, 3, 1).reshape(rows, -1, len(local))[:, :samples]
+        jacobians.append(each.reshape(-1, len(local)) @ part.local)
+        count = len(group.device.unknowns())
+        tied, by_own = _tied(group.device, local[len(local) - count :])
+        residuals.append(tied)
+        jacobians.append(by_own @ part.local[len(local) - count :])
+    return np.concatenate(residuals), np.concatenate(jacobians)
 
 
-@jax.custom_jvp
-def _weighted(unknowns: Array, problem: Problem, weights: Weights) -> Array:
-    rows = weights.row * _residual(problem, unknowns * weights.free)
-    return jnp.concatenate([rows, jnp.sqrt(weights.precision) * unknowns])
-
-
-@_weighted.defjvp
-def _weighted_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    unknowns, problem, weights = primals
-    residual, jacobian = _linearise(problem, unknowns * weights.free)
-    whole = jnp.concatenate([weights.row[:, None] * jacobian * weights.free, jnp.diag(jnp.sqrt(weights.precision))])
-    value = jnp.concatenate([weights.row * residual, jnp.sqrt(weights.precision) * unknowns])
-    return value, whole @ tangents[0]
-
-
-def solve(
-    problem: Problem,
-    row_weights: Float[Array, " rows"],
-    precision: Float[Array, " unknowns"],
-    free: Float[Array, " unknowns"],
-    start: Float[Array, " unknowns"],
-    max_steps: int = 200,
-) -> Solution:
-    """Unknowns with the least sum of squared weighted rows and prior rows, by Levenberg-Marquardt from `start`."""
-    weights = Weights(row_weights, precision, free)
-    return jax.tree.map(
-        lambda x: x[0], solve_many(problem, jax.tree.map(lambda x: x[None], weights), start[None], max_steps)
-    )
-
-
-@eqx.filter_jit
-def solve_many(
-    problem: Problem, weights: Weights, start: Float[Array, "lanes unknowns"], max_steps: int = 200
-) -> Solution:
-    """`solve` for several weights, priors, sets of free unknowns or starts at once."""
-    import optimistix as optx
-
-    def lane(weights: Weights, start: Array) -> Solution:
-        solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-        found = optx.least_squares(
-            lambda y, args: _weighted(y, *args), solver, start, (problem, weights), max_steps=max_steps, throw=False
-        )
-        cost = 0.5 * jnp.sum(found.state.f_info.residual**2)
-        converged = found.result == optx.RESULTS.successful
-        return Solution(found.value * weights.free, converged, found.stats["num_steps"], cost)
-
-    return jax.vmap(lane)(weights, start)
+def predict(problem: Problem, unknowns: Float[Any, " unknowns"]) -> Float[np.ndarray, " rows"]:
+    """Residual in m and rad at the scaled unknowns."""
+    return linearise(problem, unknowns)[0]
 
 
 def sizes(groups: Sequence[Group], columns: Sequence[float]) -> Float[np.ndarray, " unknowns"]:

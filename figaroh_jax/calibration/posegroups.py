@@ -9,15 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int
 
 from ..errors import InputError
+from ..kinematics import forward_kinematics
 from ..model import RobotModel
 from . import posefit, starts
-from .chain import Chain, chain_between, chain_pose
+from .chain import chain_between
 from .devices import Device, Planes, Points, Poses, Sockets
 from .gravity import gravity_moments
 from .kinematic_effects import Column, Postures
@@ -135,30 +134,31 @@ def _group(
 ) -> tuple[posefit.Group, np.ndarray | None, int]:
     chain = chain_between(model, recordings[0].base_frame, recordings[0].tool_frame)
     position = np.concatenate([r.position for r in recordings])
-    R, p = _nominal(chain, position)
+    R, p = _nominal(model, recordings[0].base_frame, recordings[0].tool_frame, position)
     kind = recordings[0].kind
     fit = np.concatenate([np.full(len(r.position), r.role == "fit") for r in recordings])
     make = {"position": _points, "pose": _poses, "socket": _sockets, "plane": _planes}[kind]
     device, datum, measured = make(recordings, R, p, fit)
-    pieces = [(k, j, field) for k, column in enumerate(columns) for j, field in column.pieces if j in chain.joints]
-    shape = (len(pieces), 6, len(position))
-    fields = np.array([np.concatenate([f(x) for x in postures], axis=1) for _, _, f in pieces]).reshape(shape)
-    group = posefit.Group(
-        chain=chain,
-        device=device,
-        position=position.T,
-        fields=fields,
-        at=np.array([chain.joints.index(j) for _, j, _ in pieces], int),
-        column=np.array([k for k, _, _ in pieces], int),
-        datum=datum,
-        measured=measured,
+    pieces = (
+        (k, chain.joints.index(j), np.concatenate([field(x) for x in postures], axis=1))
+        for k, column in enumerate(columns)
+        for j, field in column.pieces
+        if j in chain.joints
     )
+    group = posefit.group_of(chain, device, position.T, len(columns), pieces, datum, measured)
     return group, datum if kind == "socket" else None, measured.shape[1]
 
 
-def _nominal(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    pose = jax.jit(chain_pose)(chain, jnp.asarray(q.T), jnp.zeros((len(chain.joints), 6, len(q))))
-    return np.moveaxis(np.asarray(pose.R), -1, 0), np.asarray(pose.p).T
+def _nominal(model: RobotModel, base: str, tool: str, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation and origin of the tool frame in the base frame, without errors."""
+    poses = np.asarray(forward_kinematics(model, q))
+    world = np.concatenate([np.broadcast_to(np.eye(4), (len(q), 1, 4, 4)), poses], axis=1)
+    start, end = (
+        world[:, model.frames[k].parent + 1] @ np.asarray(model.frame_placement)[k]
+        for k in (model.frame_index(base), model.frame_index(tool))
+    )
+    found = np.linalg.solve(start, end)
+    return found[:, :3, :3], found[:, :3, 3]
 
 
 def _points(recordings, R, p, fit) -> tuple[Device, np.ndarray, np.ndarray]:
