@@ -3,7 +3,8 @@
 Random states of a robot with viscous, Coulomb, rotor and offset columns; torque of known parameters and noise. Ours
 streams the states through triangular factors (`States`, `condense`); FIGAROH 1.0.2 builds the tall regressor and
 factors it twice. Each case is a process of its own on one thread; compilation is told apart. `--stream N` reads N
-samples from a file on disk. The environment of FIGAROH is the one that `regressor.py` makes.
+samples from files on disk, through `condense_on_devices`. The environment of FIGAROH is the one that `regressor.py`
+makes.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -40,36 +42,39 @@ def ours(request: dict[str, Any]) -> dict[str, Any]:
     from figaroh_jax.formats.config import Baseline
     from figaroh_jax.formats.urdf import load_urdf
     from figaroh_jax.identification.base_parameters import base_parameters
+    from figaroh_jax.identification.devices import condense_on_devices
     from figaroh_jax.identification.least_squares import solve
     from figaroh_jax.identification.regression import condense, friction_terms
-    from figaroh_jax.identification.states import States
+    from figaroh_jax.identification.states import States, read_pieces
 
     model = load_urdf(request["path"], joints=request["joints"])
     terms = friction_terms(model, Baseline(viscous=True, coulomb=True, rotor=True, offset=True))
     generator = np.random.default_rng(0)
-    if request["file"]:
-        data = np.load(request["file"], mmap_mode="r")
-    else:
+    data = np.empty((4, 0, model.nv))
+    if not request["files"]:
         data = np.empty((4, request["samples"], model.nv))
         data[:3] = generator.standard_normal((3, request["samples"], model.nv))
         for k in range(0, request["samples"], PIECE):
             q, v, a = data[:3, k : k + PIECE]
             data[3, k : k + PIECE] = np.asarray(inverse_dynamics(model, q, v, a)) + v + np.sign(v) + a + 1.0
         data[3] += 0.01 * generator.standard_normal(data[3].shape)
-    count = data.shape[1]
 
     def fit(samples: int) -> tuple[int, float]:
-        rows = States(
-            model, lambda: (tuple(data[:, k : min(k + PIECE, samples)]) for k in range(0, samples, PIECE)), terms
-        )
-        condensed = condense(rows, rows.used, folds=1)
+        if request["files"]:
+            rows = States(model, lambda: islice(read_pieces(request["files"], PIECE), -(-samples // PIECE)), terms)
+            condensed = condense_on_devices(rows, folds=1)
+        else:
+            pieces = range(0, samples, PIECE)
+            rows = States(model, lambda: (tuple(data[:, k : min(k + PIECE, samples)]) for k in pieces), terms)
+            condensed = condense(rows, rows.used, folds=1)
         base = base_parameters(condensed.factor()[:, :-1], rows.names)
         return base.rank, float(solve(condensed, kept=base.independent).rms.max())
 
     before, start = peak_mb(), time.process_time()
-    fit(100)
+    fit(PIECE if request["files"] else 100)
     compiled = time.process_time() - start
     start, wall = time.process_time(), time.perf_counter()
+    count = request["samples"]
     rank, rms = fit(count)
     cpu, seconds = time.process_time() - start, time.perf_counter() - wall
     return {"rank": rank, "rms": rms, "cpu": cpu, "first": compiled, "rate": count / seconds} | {
@@ -87,23 +92,25 @@ def ask(command: list[str], request: dict[str, Any]) -> dict[str, Any]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def write_states(folder: str, request: dict[str, Any], samples: int) -> str:
-    """A file of random states with torques, made piece by piece."""
+def write_states(folder: str, request: dict[str, Any], samples: int) -> list[str]:
+    """Files of random states and torques, made piece by piece."""
     import numpy as np
 
     from figaroh_jax.dynamics import inverse_dynamics
     from figaroh_jax.formats.urdf import load_urdf
 
-    model, path = load_urdf(request["path"], joints=request["joints"]), str(Path(folder) / "states.npy")
-    out = np.lib.format.open_memmap(path, mode="w+", dtype=float, shape=(4, samples, model.nv))
+    model = load_urdf(request["path"], joints=request["joints"])
+    files = [str(Path(folder) / f"{name}.npy") for name in ("q", "v", "a", "tau")]
+    arrays = [np.lib.format.open_memmap(f, mode="w+", dtype=float, shape=(samples, model.nv)) for f in files]
     generator = np.random.default_rng(0)
     for k in range(0, samples, PIECE):
         n = min(PIECE, samples - k)
         q, v, a = generator.standard_normal((3, n, model.nv))
         noise = 0.01 * generator.standard_normal((n, model.nv))
-        out[:, k : k + n] = q, v, a, np.asarray(inverse_dynamics(model, q, v, a)) + v + np.sign(v) + a + 1.0 + noise
-    out.flush()
-    return path
+        tau = np.asarray(inverse_dynamics(model, q, v, a)) + v + np.sign(v) + a + 1.0 + noise
+        for array, values in zip(arrays, (q, v, a, tau), strict=True):
+            array[k : k + n] = values
+    return files
 
 
 def main() -> None:
@@ -119,7 +126,7 @@ def main() -> None:
         return
     for case in options.cases:
         robot, samples = case.split(":")
-        request = {"path": str(DATA / ROBOTS[robot]), "joints": joints_of(robot), "samples": int(samples), "file": ""}
+        request = {"path": str(DATA / ROBOTS[robot]), "joints": joints_of(robot), "samples": int(samples), "files": []}
         mine = ask([sys.executable, __file__, "--work"], request)
         print(f"{case} ours   {_line(mine)}; the first fit, with compilation: {mine.get('first', 0):.1f} s", flush=True)
         if options.no_peer:
@@ -131,10 +138,10 @@ def main() -> None:
         if "cpu" in peer and "cpu" in mine:
             print(f"{case} figaroh / ours: {peer['cpu'] / mine['cpu']:.1f}", flush=True)
     if options.stream:
-        request = {"path": str(DATA / ROBOTS["UR10e"]), "joints": joints_of("UR10e"), "samples": 0}
+        request = {"path": str(DATA / ROBOTS["UR10e"]), "joints": joints_of("UR10e"), "samples": options.stream}
         with tempfile.TemporaryDirectory(dir=ROOT / ".cache") as folder:
-            file = write_states(folder, request, options.stream)
-            found = ask([sys.executable, __file__, "--work"], request | {"file": file})
+            files = write_states(folder, request, options.stream)
+            found = ask([sys.executable, __file__, "--work"], request | {"files": files})
         print(f"UR10e, {options.stream} samples from disk: {_line(found)}, {found['rate']:.0f} samples/s", flush=True)
 
 

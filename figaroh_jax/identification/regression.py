@@ -44,6 +44,7 @@ __all__ = [
     "payload",
     "state_columns",
     "structural_columns",
+    "term_columns",
 ]
 
 SHORT_NAMES = {"viscous_friction": "fv", "coulomb_friction": "fc", "rotor_inertia": "Ia", "torque_offset": "off"}
@@ -348,11 +349,29 @@ def _columns(
     model: RobotModel, terms: tuple[Effect, ...], motion: Motion, widths: tuple[float, ...] = ()
 ) -> Float[Array, "samples nv columns"]:
     blocks = [joint_torque_regressor(model, motion.position, motion.velocity, motion.acceleration)]
+    blocks += _term_columns(terms, motion)
+    signs = (smooth_sign(motion.velocity, motion.acceleration, motion.dt, w) for w in widths)
+    return jnp.concatenate([*blocks, *(sign[:, :, None] for sign in signs)], axis=2)
+
+
+def term_columns(
+    model: RobotModel,
+    terms: tuple[Effect, ...],
+    width: Float[Array, " nv"],
+    q: Float[Array, "samples nq"],
+    v: Float[Array, "samples nv"],
+    a: Float[Array, "samples nv"],
+) -> list[Float[Array, "samples nv columns"]]:
+    """Columns of each effect at given states, unfiltered; to be traced."""
+    return _term_columns(terms, _motion(model, jnp.zeros(jnp.shape(v)[0]), q, v, a, 0.0, width))
+
+
+def _term_columns(terms: tuple[Effect, ...], motion: Motion) -> list[Float[Array, "samples nv columns"]]:
+    blocks = []
     for term in terms:
         columns = jax.vmap(lambda effect: _joint_columns(effect, motion))(term)
         blocks.append(jnp.moveaxis(columns, 0, 2).reshape(*columns.shape[1:3], -1))
-    signs = (smooth_sign(motion.velocity, motion.acceleration, motion.dt, w) for w in widths)
-    return jnp.concatenate([*blocks, *(sign[:, :, None] for sign in signs)], axis=2)
+    return blocks
 
 
 def _joint_columns(effect: Effect, motion: Motion) -> Float[Array, "samples nv amplitudes"]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -22,7 +23,7 @@ from ..model import RobotModel
 from .base_parameters import BaseParameters, base_parameters
 from .regression import Piece, column_names, state_columns, structural_columns
 
-__all__ = ["States"]
+__all__ = ["States", "check_piece", "read_pieces"]
 
 CHUNK_BYTES = 48e6  # of a chunk's columns
 FEWEST = 128  # samples of a chunk, however wide
@@ -57,7 +58,7 @@ class States:
         """Which columns of a joint's rows can differ from zero: what `condense` and `solve` ask for."""
         return np.asarray(np.abs(self.structure).max(axis=0) > 0)
 
-    @property
+    @cached_property
     def structural(self) -> BaseParameters:
         """Base parameters that some motion could show."""
         return base_parameters(self.structure.reshape(-1, len(self.names)), self.names)
@@ -69,7 +70,7 @@ class States:
         width = jnp.broadcast_to(np.asarray(self.width, float), (self.model.nv,))
         count = 0
         for number, part in enumerate(self.source()):
-            _check(self.model, part, number)
+            check_piece(self.model, part, number)
             for start in range(0, len(part[0]), chunk):
                 block = [np.asarray(x[start : start + chunk], float) for x in part]
                 n = len(block[0])
@@ -82,13 +83,44 @@ class States:
                 count += n
 
 
-def _check(model: RobotModel, part: Sequence[Any], number: int) -> None:
+def read_pieces(files: Sequence[str | Path], samples: int = 20_000) -> Iterator[tuple[np.ndarray, ...]]:
+    """Pieces of `samples` rows of the .npy files of q, v, a and tau, read one after another.
+
+    Unlike arrays mapped by `numpy.load(mmap_mode="r")`, what was read does not stay in memory. Raises `InputError`
+    where a file is no .npy file of numbers in rows, or has another number of rows than the first.
+    """
+    arrays = [_mapped(Path(file)) for file in files]
+    for file, array in zip(files, arrays, strict=True):
+        if array.ndim != 2 or len(array) != len(arrays[0]):
+            raise InputError(f"{file} has shape {array.shape}, expected {len(arrays[0])} rows as in {files[0]}")
+    for start in range(0, len(arrays[0]), samples):
+        yield tuple(_rows_of(array, start, samples) for array in arrays)
+
+
+def _mapped(file: Path) -> np.memmap:
+    try:
+        array = np.load(file, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file} cannot be read as an .npy file: {error}") from error
+    if not isinstance(array, np.memmap) or array.dtype.kind not in "fiu" or not array.flags.c_contiguous:
+        raise InputError(f"{file}: expected an .npy file of numbers, rows first (C order)")
+    return array
+
+
+def _rows_of(array: np.memmap, start: int, samples: int) -> np.ndarray:
+    count, width = min(samples, len(array) - start), array.shape[1]
+    offset = array.offset + start * width * array.itemsize
+    return np.fromfile(array.filename or "", array.dtype, count * width, offset=offset).reshape(count, width)
+
+
+def check_piece(model: RobotModel, part: Sequence[Any], number: int, *, values: bool = True) -> None:
+    """Refuse a piece of states with arrays of wrong shapes or, with `values`, a number that is not finite."""
     samples = len(part[0])
     shapes = [(samples, model.nq), *[(samples, model.nv)] * 3]
     for name, x, shape in zip(("q", "v", "a", "tau"), part, shapes, strict=True):
         if np.shape(x) != shape:
             raise InputError(f"piece {number} of the source: {name} has shape {np.shape(x)}, expected {shape}")
-        wrong = ~np.isfinite(np.asarray(x))
+        wrong = ~np.isfinite(np.asarray(x)) if values else np.zeros(0, bool)
         if wrong.any():
             row, column = np.argwhere(wrong)[0]
             raise InputError(f"piece {number} of the source: {name} is not finite in row {row}, column {column}")
