@@ -42,9 +42,10 @@ def ours(request: dict[str, Any]) -> dict[str, Any]:
     from figaroh_jax.formats.config import Baseline
     from figaroh_jax.formats.urdf import load_urdf
     from figaroh_jax.identification.base_parameters import base_parameters
+    from figaroh_jax.identification.columns import friction_terms
     from figaroh_jax.identification.devices import condense_on_devices
     from figaroh_jax.identification.least_squares import solve
-    from figaroh_jax.identification.regression import condense, friction_terms
+    from figaroh_jax.identification.regression import condense
     from figaroh_jax.identification.states import States, read_pieces
 
     model = load_urdf(request["path"], joints=request["joints"])

@@ -12,7 +12,7 @@ import figaroh_jax as fj
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.config import Baseline, BaselineEffect
 from figaroh_jax.identification.base_parameters import BaseParameters, base_parameters
-from figaroh_jax.identification.regression import column_names, friction_terms, structural_columns
+from figaroh_jax.identification.columns import column_names, friction_terms, structural_columns
 
 DRIVES = Baseline(viscous=True, coulomb=True, rotor=True, offset=True)
 

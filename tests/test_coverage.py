@@ -14,8 +14,8 @@ from simulated_arm import recording
 
 from figaroh_jax.formats.config import Baseline, Preprocess
 from figaroh_jax.identification.base_parameters import base_parameters
+from figaroh_jax.identification.columns import column_names, friction_terms, structural_columns
 from figaroh_jax.identification.identification import identify
-from figaroh_jax.identification.regression import column_names, friction_terms, structural_columns
 
 LIMIT = '<limit lower="-3" upper="3" effort="100" velocity="5"/>'
 JOINTS = joint("j1", "base", "a", axis="0 1 0", more=LIMIT), joint("j2", "a", "b", more=LIMIT)

@@ -17,9 +17,10 @@ import figaroh_jax as fj
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.config import Baseline
 from figaroh_jax.identification.base_parameters import base_parameters
+from figaroh_jax.identification.columns import friction_terms
 from figaroh_jax.identification.devices import condense_on_devices, coordinates, fit_states
 from figaroh_jax.identification.least_squares import WeightedByJoint, solve
-from figaroh_jax.identification.regression import Condensed, condense, friction_terms
+from figaroh_jax.identification.regression import Condensed, condense
 from figaroh_jax.identification.states import States, read_pieces
 
 TESTS = Path(__file__).parent

@@ -19,8 +19,9 @@ from figaroh_jax.errors import InputError
 from figaroh_jax.formats.config import Baseline, Load, Preprocess
 from figaroh_jax.identification import regression as regression_module
 from figaroh_jax.identification.base_parameters import base_parameters
+from figaroh_jax.identification.columns import friction_terms
 from figaroh_jax.identification.identification import identify
-from figaroh_jax.identification.regression import Regression, condense, friction_terms
+from figaroh_jax.identification.regression import Regression, condense
 from figaroh_jax.identification.result import Identification, to_json
 from figaroh_jax.recordings.signals import prepare_all
 

@@ -13,8 +13,9 @@ from figaroh_jax.errors import InputError
 from figaroh_jax.formats.config import Baseline
 from figaroh_jax.identification import states as states_module
 from figaroh_jax.identification.base_parameters import base_parameters
+from figaroh_jax.identification.columns import friction_terms
 from figaroh_jax.identification.least_squares import solve
-from figaroh_jax.identification.regression import condense, friction_terms
+from figaroh_jax.identification.regression import condense
 from figaroh_jax.identification.states import States
 
 

@@ -25,7 +25,8 @@ from ..errors import InputError
 from ..model import RobotModel
 from ..regressor import dense_rows
 from .base_parameters import BaseParameters
-from .regression import FOLDS, Condensed, term_columns
+from .columns import term_columns
+from .regression import FOLDS, Condensed
 from .states import States, check_piece
 
 __all__ = ["BatchFit", "Coordinates", "condense_on_devices", "coordinates", "fit_states"]

@@ -23,6 +23,7 @@ from ..model import RobotModel
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import prepare_all
 from .base_parameters import BaseParameters, base_parameters
+from .columns import friction_terms, structural_columns
 from .conic import Body
 from .consistency import bodies, log_cholesky_fit, physical_fit, project
 from .intervals import coloured_covariance
@@ -38,7 +39,7 @@ from .judgement import (
     quality,
 )
 from .least_squares import Solution, WeightedByJoint, solve, with_prior
-from .regression import Condensed, Regression, condense, friction_terms, structural_columns
+from .regression import Condensed, Regression, condense
 from .result import Identification, Quality
 from .reversal import with_reversal_widths
 

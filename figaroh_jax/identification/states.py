@@ -21,7 +21,8 @@ from ..effect import Effect
 from ..errors import InputError
 from ..model import RobotModel
 from .base_parameters import BaseParameters, base_parameters
-from .regression import Piece, column_names, state_columns, structural_columns
+from .columns import column_names, state_columns, structural_columns
+from .regression import Piece
 
 __all__ = ["States", "check_piece", "read_pieces"]
 

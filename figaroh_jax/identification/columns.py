@@ -1,0 +1,147 @@
+"""Columns of parameters at states: ten for each link, then those of the effects at the joints.
+
+The names of the columns, what they are at random states (all that any motion could show), and at given ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from ..effect import Effect, Motion, columns, place, smooth_sign
+from ..effects import find
+from ..errors import InputError
+from ..model import RobotModel
+from ..regressor import joint_torque_regressor
+from .base_parameters import inertial_names
+
+if TYPE_CHECKING:
+    from ..formats.config import Baseline
+
+__all__ = [
+    "column_names",
+    "columns_of",
+    "friction_terms",
+    "motion_at",
+    "state_columns",
+    "structural_columns",
+    "term_columns",
+]
+
+SHORT_NAMES = {"viscous_friction": "fv", "coulomb_friction": "fc", "rotor_inertia": "Ia", "torque_offset": "off"}
+
+
+def friction_terms(model: RobotModel, known: Baseline) -> tuple[Effect, ...]:
+    """The effects that a task's baseline asks for, those of every joint as one object with a leading axis."""
+    switches = {
+        "viscous_friction": known.viscous,
+        "coulomb_friction": known.coulomb,
+        "rotor_inertia": known.rotor,
+        "torque_offset": known.offset,
+    }
+    joints = np.arange(model.nv)[:, None]
+    terms: list[Effect] = []
+    for name in (name for name, on in switches.items() if on):
+        effect = find(name)
+        terms.append(effect(joints, **{p: np.zeros(model.nv) for p in effect.parameters()}))
+    for entry in known.effects:
+        effect = find(entry.effect)
+        if not any(p.linear for p in effect.parameters().values()):
+            raise InputError(f"baseline.effects: '{entry.effect}' has no parameter in which the torque is linear")
+        terms.append(jax.tree.map(lambda x: np.asarray(x)[None], place(effect, model, entry.at)))
+    return tuple(terms)
+
+
+def column_names(model: RobotModel, terms: Sequence[Effect]) -> tuple[str, ...]:
+    """`m1` to `Izz1` and on for the links in tree order, then `fv1`, `fc1` ... of the joints, then other effects."""
+    names = list(inertial_names(model))
+    for term in terms:
+        amplitudes = [name for name, parameter in term.parameters().items() if parameter.linear]
+        for at in np.asarray(term.at):
+            where = "_".join(str(k + 1) for k in at)
+            short = SHORT_NAMES.get(term.name)
+            names += [f"{short}{where}" if short else f"{term.name}.{name}{where}" for name in amplitudes]
+    return tuple(names)
+
+
+def structural_columns(
+    model: RobotModel, terms: tuple[Effect, ...], samples: int | None = None, seed: int = 0
+) -> Float[np.ndarray, "samples nv columns"]:
+    """Columns at independent random states: what any motion at all could show."""
+    columns = len(column_names(model, terms))
+    samples = samples or max(64, 4 * columns // max(model.nv, 1))
+    generator = np.random.default_rng(seed)
+    q, v, a = (generator.normal(scale=2.0, size=(samples, n)) for n in (model.nq, model.nv, model.nv))
+    for joint, where in zip(model.joints, model.dofs.positions, strict=True):
+        if joint.kind in ("spherical", "free"):
+            quaternion = slice(where.stop - 4, where.stop)
+            q[:, quaternion] /= np.linalg.norm(q[:, quaternion], axis=1, keepdims=True)
+    with jax.enable_x64(True):
+        motion = motion_at(model, np.arange(samples) * 1.0, q, v, a, 0.0, jnp.zeros(model.nv))
+        return np.asarray(columns_of(model, terms, motion))
+
+
+def motion_at(model: RobotModel, time: Any, q: Any, v: Any, a: Any, dt: Any, width: Any) -> Motion:
+    zero = jnp.zeros(jnp.shape(v))
+    return Motion(model, jnp.asarray(time), jnp.asarray(q), jnp.asarray(v), jnp.asarray(a), zero, zero, dt, width)
+
+
+@eqx.filter_jit
+def state_columns(
+    model: RobotModel,
+    terms: tuple[Effect, ...],
+    width: Float[Array, " nv"],
+    widths: tuple[float, ...],
+    q: Float[ArrayLike, "samples nq"],
+    v: Float[ArrayLike, "samples nv"],
+    a: Float[ArrayLike, "samples nv"],
+) -> Float[Array, "samples nv columns"]:
+    """Columns at given states, unfiltered; `widths` as in `Regression.pieces`."""
+    motion = motion_at(model, jnp.zeros(jnp.shape(v)[0]), q, v, a, 0.0, width)
+    return columns_of(model, terms, motion, widths)
+
+
+@eqx.filter_jit
+def columns_of(
+    model: RobotModel, terms: tuple[Effect, ...], motion: Motion, widths: tuple[float, ...] = ()
+) -> Float[Array, "samples nv columns"]:
+    blocks = [joint_torque_regressor(model, motion.position, motion.velocity, motion.acceleration)]
+    blocks += _term_columns(terms, motion)
+    signs = (smooth_sign(motion.velocity, motion.acceleration, motion.dt, w) for w in widths)
+    return jnp.concatenate([*blocks, *(sign[:, :, None] for sign in signs)], axis=2)
+
+
+def term_columns(
+    model: RobotModel,
+    terms: tuple[Effect, ...],
+    width: Float[Array, " nv"],
+    q: Float[Array, "samples nq"],
+    v: Float[Array, "samples nv"],
+    a: Float[Array, "samples nv"],
+) -> list[Float[Array, "samples nv columns"]]:
+    """Columns of each effect at given states, unfiltered; to be traced."""
+    return _term_columns(terms, motion_at(model, jnp.zeros(jnp.shape(v)[0]), q, v, a, 0.0, width))
+
+
+def _term_columns(terms: tuple[Effect, ...], motion: Motion) -> list[Float[Array, "samples nv columns"]]:
+    blocks = []
+    for term in terms:
+        columns = jax.vmap(lambda effect: _joint_columns(effect, motion))(term)
+        blocks.append(jnp.moveaxis(columns, 0, 2).reshape(*columns.shape[1:3], -1))
+    return blocks
+
+
+def _joint_columns(effect: Effect, motion: Motion) -> Float[Array, "samples nv amplitudes"]:
+    """Torque of a unit of each amplitude in the rows of all joints."""
+    torque = jnp.moveaxis(columns(effect, motion), 0, -1)
+    if effect.acts_on in ("link", "robot"):
+        return torque
+    torque = torque.reshape(torque.shape[0], -1, torque.shape[-1])
+    return jnp.zeros((*motion.velocity.shape, torque.shape[-1])).at[:, effect.at].add(torque)
