@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,8 +17,9 @@ from .errors import InputError
 if TYPE_CHECKING:
     from .calibration.calibrated import Calibration
     from .calibration.kinematic_diagnosis import PoseDiagnosis
-    from .formats.config import Task
-    from .identification.result import Identification
+    from .extended import ExtendedModel
+    from .formats.config import Load, Task
+    from .identification.result import Identification, Link
     from .results import Diagnosis
 
 __all__ = [
@@ -80,16 +82,30 @@ def identify_file(
     from .formats.export import write_model
     from .identification.identification import identify_task
     from .identification.parameter_files import write_parameters
+    from .reporting.answer import write_predictions
     from .reporting.identification_report import write_identification
 
     found = identify_task(task, progress=progress)
+    wrong = [] if task.identify.infeasible == "write" else [link for link in found.links if not link.consistent]
+    if wrong:
+        found = replace(found, notes=(_not_written(wrong), *found.notes))
     progress("writing the report", 1.0)
     with whole_directory(out) as folder:
         (folder / RESULT).write_text(_identification_json(found), encoding="utf-8")
+        write_predictions(folder / "predictions.npz", predictions(task, found.model, identified=True))
         write_parameters(found, folder)
         write_identification(found, folder / REPORT, found.model.robot.name)
-        write_model(found.model, folder / "model")
+        if not wrong:
+            write_model(found.model, folder / "model")
     return found
+
+
+def _not_written(wrong: Sequence[Link]) -> str:
+    which = "; ".join(f"{link.name}: {link.reason}" for link in wrong)
+    return (
+        f"model/ is not written, for no body can have the parameters of {which}. `identify.fit: physical` gives a robot"
+        " that can exist; `identify.infeasible: write` writes this one all the same"
+    )
 
 
 def _diagnose_poses(task: Task, out: Path, progress: Callable[[str, float], None]) -> PoseDiagnosis:
@@ -130,15 +146,18 @@ def write_run(task: Task, diagnosis: Diagnosis, out: Path) -> None:
 
     with whole_directory(out) as folder:
         (folder / ANSWER).write_text(to_json(diagnosis), encoding="utf-8")
-        write_predictions(folder / "predictions.npz", predictions(task, diagnosis))
+        write_predictions(folder / "predictions.npz", predictions(task, diagnosis.model))
         write_report(diagnosis, folder / REPORT, diagnosis.model.robot.name)
         write_model(diagnosis.model, folder / "model", diagnosis.causes)
 
 
-def predictions(task: Task, diagnosis: Diagnosis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def predictions(
+    task: Task, extended: ExtendedModel, *, identified: bool = False
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Time (s) and the extended model's torque (N m or N) of each holdout recording, on its own time stamps.
 
-    The recording's motion is prepared as for the fit, but over its whole length, whatever window the fit kept.
+    The recording's motion is prepared as for the fit, but over its whole length, whatever window the fit kept. Where
+    the model is an identified one, a known payload is carried in addition.
     """
     from .extended import predict
     from .recordings.dataset import read_recordings
@@ -146,18 +165,31 @@ def predictions(task: Task, diagnosis: Diagnosis) -> dict[str, tuple[np.ndarray,
 
     if all(entry.role == "fit" for entry in task.data):
         return {}
-    recordings = read_recordings(task, diagnosis.model.robot)
+    recordings = read_recordings(task, extended.robot)
     rates = choose_rates(recordings, task.preprocess)
     whole = task.preprocess.model_copy(update={"window": None, "gate": {}})
     found = {}
     for recording in recordings:
         if recording.role == "holdout":
-            motion = prepare(recording, whole, rates)
-            torque = predict(
-                diagnosis.model, motion.time, motion.position, motion.velocity, motion.acceleration, motion.dt
-            )
+            motion = prepare(recording, whole, rates, slowed=not identified)
+            carrying = _carrying(extended, recording.load if identified else None)
+            torque = predict(carrying, motion.time, motion.position, motion.velocity, motion.acceleration, motion.dt)
             found[recording.name] = recording.time, to_recording_times(motion.time, np.asarray(torque), recording.time)
     return found
+
+
+def _carrying(extended: ExtendedModel, load: Load | None) -> ExtendedModel:
+    """The model with a known payload at its link."""
+    if load is None:
+        return extended
+    import equinox as eqx
+
+    from .identification.regression import payload
+
+    link, ten = payload(extended.robot, load)
+    inertia = np.array(extended.robot.inertia, float)
+    inertia[link] += ten
+    return eqx.tree_at(lambda m: m.robot.inertia, extended, inertia)
 
 
 def check_directory(out: Path) -> None:

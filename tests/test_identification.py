@@ -171,13 +171,53 @@ def run(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_command_writes_a_whole_run(run: Path, capsys: pytest.CaptureFixture[str]):
     names = {path.name for path in run.iterdir()}
-    tables = {"parameters.csv", "parameters.yaml", "parameters.npz"}
+    tables = {"parameters.csv", "parameters.yaml", "parameters.npz", "predictions.npz"}
     assert names == {"result.json", "report.html", "model"} | tables
     answer = json.loads((run / "result.json").read_text())
     with np.load(run / "parameters.npz") as file:
         assert file["base_values"].tolist() == [b["value"] for b in answer["base_parameters"]]
     page = (run / "report.html").read_text()
     assert answer["base_parameters"][0]["expression"] in page and "cross-validated" in page
+
+
+def test_predictions_stand_on_the_recordings_own_stamps(run: Path):
+    answer = json.loads((run / "result.json").read_text())
+    with np.load(run.parent / "other.npz") as measured, np.load(run / "predictions.npz") as told:
+        assert set(told.files) == {"other_time", "other_torque"}
+        np.testing.assert_allclose(told["other_time"], measured["t"], rtol=0, atol=0)
+        error = (told["other_torque"] - measured["tau"])[200:-200]
+    # the torque as recorded has all of its noise
+    noise = np.array(simulated_arm.TORQUE_NOISE)
+    assert (np.sqrt(np.mean(error**2, axis=0)) < np.hypot(answer["holdout"]["other.npz"]["rms"], 1.1 * noise)).all()
+
+
+def test_model_with_links_that_cannot_exist_is_written_only_if_told(truth: Truth, tmp_path: Path):
+    one = recording(truth, 10.0, seed=1)
+    np.savez(tmp_path / "run.npz", t=one.time, q=one.position, tau=-one.torque)  # pyright: ignore
+    task = {
+        "robot": {"model": str(truth.file)},
+        "data": [{"file": "run.npz", "time": "t", "position": "q", "torque": "tau"}],
+        "preprocess": {"cutoff": 10},
+    }
+    for told in ("refuse", "write"):
+        keys = {"fit": "unconstrained", "infeasible": told}
+        (tmp_path / "task.yaml").write_text(json.dumps(task | {"identify": keys}))
+        assert cli.main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / told), "--quiet"]) == 0
+        answer = json.loads((tmp_path / told / "result.json").read_text())
+        assert not all(link["consistent"] for link in answer["links"])
+        assert (tmp_path / told / "model").exists() == (told == "write")
+        assert any("model/ is not written" in note for note in answer["notes"]) == (told == "refuse")
+
+
+def test_what_was_dropped_is_said(truth: Truth):
+    one = recording(truth, seed=1)
+    assert one.torque is not None
+    torque = one.torque.copy()
+    torque[2000:2040, 0] += 500.0
+    found = identify(truth.nominal, [replace(one, torque=torque)], Preprocess(cutoff=10, gate={"elbow": 0.05}))
+    assert any("rows a joint at" in note and "elbow" in note for note in found.notes)
+    spike = next(note for note in found.notes if "robust standard deviations" in note and "shoulder" in note)
+    assert float(spike.split()[-2]) == pytest.approx(one.time[2020], abs=0.3)
 
 
 def test_written_model_is_the_one_that_was_fitted(run: Path, truth: Truth):

@@ -18,6 +18,7 @@ from scipy import signal
 from tx40 import OFFSET, POSITION, TORQUE
 
 import figaroh_jax as fj
+from figaroh_jax.identification.base_parameters import essential
 
 TS = 2e-4  # s
 BORDER = 20  # samples cut at both ends after the filter
@@ -53,18 +54,30 @@ class Solution(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def solution(data_dir: Path) -> Solution:
+def system(data_dir: Path) -> System:
+    """Rows with the columns of the base parameters alone, under the names of these."""
     folder = data_dir / "staubli_tx40"
     with np.load(folder / "tx40.npz") as recording:
         q, v, a = _motion(recording["motor_position"])
         tau = (recording["motor_current"] @ TORQUE.T)[BORDER:-BORDER]
     model = fj.load_urdf(folder / "tx40.urdf")
-    return _solve(_system(model, q, v, a, tau))
+    rows = _system(model, q, v, a, tau)
+    W, names = _base(rows)
+    return rows._replace(W=W, names=names)
+
+
+@pytest.fixture(scope="module")
+def solution(system: System) -> Solution:
+    return _solve(system)
 
 
 @pytest.fixture(scope="module")
 def published(data_dir: Path) -> list[list[str]]:
-    with (data_dir / "staubli_tx40" / "ref_TX40_bp_5.csv").open(newline="") as file:
+    return _table(data_dir / "staubli_tx40" / "ref_TX40_bp_5.csv")
+
+
+def _table(path: Path) -> list[list[str]]:
+    with path.open(newline="") as file:
         return list(csv.reader(file))
 
 
@@ -144,13 +157,13 @@ def _base(system: System) -> tuple[np.ndarray, list[str]]:
     return system.W[:, base], names
 
 
-def _solve(system: System) -> Solution:
-    """Step 11: ordinary and weighted least squares with their standard deviations."""
-    W, names = _base(system)
+def _solve(system: System, variance: np.ndarray | None = None) -> Solution:
+    """Step 11: ordinary and weighted least squares with standard deviations; `variance` is the joints', if known."""
+    W, names = system.W, system.names
     tau, joint, excess = system.tau, system.joint, len(system.tau) - W.shape[1]
     ols = np.round(np.linalg.lstsq(W, tau, rcond=None)[0], 6)
     residual = tau - W @ ols
-    variance = np.array([np.mean(residual[joint == j] ** 2) for j in range(6)])
+    variance = np.array([np.mean(residual[joint == j] ** 2) for j in range(6)]) if variance is None else variance
     covariance = np.linalg.inv(W.T @ W) * (residual @ residual) / excess
     weight = 1 / np.sqrt(variance[joint])
     normal = np.linalg.inv((weight[:, None] * W).T @ (weight[:, None] * W))
@@ -192,3 +205,15 @@ def test_condition_and_residuals_are_those_of_the_recipe(solution: Solution):
     assert solution.wls_rmse == pytest.approx(1.118297, abs=1e-6)
     expected = [2.335409, 2.208596, 1.129734, 0.253540, 1.079141, 0.368269]
     np.testing.assert_allclose(solution.variance, expected, rtol=0, atol=1e-6)
+
+
+def test_library_selects_the_published_essential_parameters(system: System, solution: Solution, data_dir: Path):
+    kept = essential(np.column_stack([system.W, system.tau]), ratio=30.0)
+    own = _solve(system._replace(W=system.W[:, kept], names=[system.names[k] for k in kept]), solution.variance)
+    rows = _table(data_dir / "staubli_tx40" / "ref_TX40_ep_5.csv")
+    assert len(kept) == 25 and own.names == [row[0] for row in rows]
+    numbers = np.array([row[1:] for row in rows], float)
+    np.testing.assert_allclose(own.ols, numbers[:, 0], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(own.wls, numbers[:, 2], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(own.ols_std, numbers[:, 1], rtol=0.01, atol=0.005)
+    np.testing.assert_allclose(own.wls_std, numbers[:, 3], rtol=0.01, atol=0.005)

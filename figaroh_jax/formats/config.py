@@ -285,6 +285,7 @@ class Identify(_Keys):
     fit: Literal["physical", "log_cholesky", "unconstrained"] = "physical"
     joints: tuple[str, ...] | None = None  # whose torque is fitted; None: all
     bounds: dict[str, Bound] = {}  # by link
+    infeasible: Literal["refuse", "write"] = "refuse"  # whether `model/` is written with links that cannot exist
 
 
 class Task(_Keys):

@@ -196,7 +196,9 @@ def _uneven(extended: ExtendedModel, answers: tuple[Carried, ...], form: Format)
 def _part(effect: Effect, attribute: str, joint: int) -> float:
     if effect.acts_on not in ("joint", "pair") or joint not in np.ravel(np.asarray(effect.at)):
         return 0.0
-    return sum(e.value for e in _native(effect) if e.element in ("joint", "actuator") and e.attribute == attribute)
+    return float(
+        sum(e.value for e in _native(effect) if e.element in ("joint", "actuator") and e.attribute == attribute)
+    )
 
 
 def physical_inertia(parameters: Float[np.ndarray, "10"], form: Format) -> tuple[Float[np.ndarray, "10"], str]:

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from ..errors import InputError
 from ..model import RobotModel
 
-__all__ = ["TOLERANCE", "BaseParameters", "base_parameters", "inertial_names"]
+__all__ = ["TOLERANCE", "BaseParameters", "base_parameters", "essential", "inertial_names"]
 
 TOLERANCE = 1e-8  # of a column's length: what is left of a dependent column is rounding, some 1e-14 to 1e-11
 SEEN = 1e-12  # of the longest column: a shorter one is zero but for rounding
@@ -125,6 +125,34 @@ def base_parameters(
         condition=_condition(factor[:, kept]),
         scaled_condition=_condition(scaled[:, kept]),
     )
+
+
+def essential(factor: Float[np.ndarray, "n k"], ratio: float = 30.0) -> Int[np.ndarray, " kept"]:
+    """The columns whose parameters matter, of independent columns with the torque as the last of `factor`.
+
+    The parameter with the largest relative standard deviation is set to zero and the others are fitted again, until the
+    largest is at most `ratio` times the smallest (Pham and Gautier, 1991). Raises `InputError` for dependent columns.
+    """
+    length = np.linalg.norm(factor[:, :-1], axis=0)
+    columns = np.arange(len(length))
+    R = np.asarray(np.linalg.qr(factor[:, :-1] / np.where(length > 0, length, 1.0), mode="r"))
+    if len(R) < len(columns) or np.linalg.cond(R) > 1 / TOLERANCE:
+        raise InputError("essential parameters are chosen among independent columns: give the base parameters alone")
+    inverse = np.linalg.inv(R)
+    covariance = inverse @ inverse.T
+    theta = np.linalg.lstsq(factor[:, :-1] / length, factor[:, -1], rcond=None)[0]
+    while len(columns) > 1:
+        relative = np.sqrt(np.diag(covariance)) / np.maximum(np.abs(theta), np.finfo(float).tiny)
+        if relative.max() <= ratio * relative.min():
+            break
+        # what fixing one parameter at zero does to the estimates of the others
+        worst = int(np.argmax(relative))
+        others = np.delete(np.arange(len(columns)), worst)
+        gain = covariance[others, worst] / covariance[worst, worst]
+        theta = theta[others] - gain * theta[worst]
+        covariance = covariance[np.ix_(others, others)] - np.outer(gain, covariance[worst, others])
+        columns = columns[others]
+    return columns
 
 
 def inertial_names(model: RobotModel) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ from ..errors import InputError, nearest
 from ..model import RobotModel
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import prepare_all
-from .base_parameters import BaseParameters, base_parameters
+from .base_parameters import BaseParameters, base_parameters, essential
 from .columns import friction_terms, structural_columns
 from .conic import Body
 from .consistency import bodies, log_cholesky_fit, physical_fit, project
@@ -32,6 +32,7 @@ from .judgement import (
     correlations,
     described_effects,
     described_links,
+    dropped,
     extended,
     posterior_covariance,
     predicted,
@@ -143,7 +144,8 @@ def identify(
         judged = Judged(data, base, theta, posterior, covariance, prior_sigma(data, own, model, trust), problem.bounded)
         ten = theta[:own].reshape(-1, 10)
         given = _given_links(problem)
-        traces, holdout = predicted(regression, theta, given)
+        traces, holdout, outlying = predicted(regression, theta, given)
+        kept = essential(data.factor(start.weight)[:, [*base.independent, -1]])
         return Identification(
             joints=model.joint_names,
             rank=base.rank,
@@ -164,9 +166,10 @@ def identify(
             width=regression.width,
             method=fit,
             model=extended(regression, theta),
+            essential=tuple(base.expressions[k] for k in kept),
             traces=traces,
             correlations=correlations(base, covariance),
-            notes=(*notes, *(note for one in signals for note in one.notes)),
+            notes=(*notes, *dropped(signals, model), *outlying, *(note for one in signals for note in one.notes)),
             prismatic=prismatic(model),
         )
 

@@ -15,6 +15,7 @@ from ..effect import Effect, joint_unit
 from ..extended import ExtendedModel, extend
 from ..formats.native import place_names
 from ..model import RobotModel
+from ..recordings.signals import Signals
 from ..results import Estimate, Name, Trace
 from .base_parameters import TEN, BaseParameters
 from .consistency import inconsistencies
@@ -26,6 +27,7 @@ __all__ = [
     "correlations",
     "described_effects",
     "described_links",
+    "dropped",
     "extended",
     "posterior_covariance",
     "predicted",
@@ -36,6 +38,7 @@ __all__ = [
 NOTABLE = 0.95  # correlation that is reported
 FEW = 20  # correlations at most
 ON_BOUND = 1e-6  # of what was believed before: nearer to a bound than any data could say
+OUTLYING = 8.0  # robust standard deviations of its joint's residual
 TOUCHED = 1e-9  # of a null direction: a smaller part in it is rounding
 
 
@@ -197,13 +200,13 @@ def prismatic_columns(model: RobotModel) -> Float[np.ndarray, " nv"]:
 
 def predicted(
     regression: Regression, theta: Float[np.ndarray, " columns"], nominal: Float[np.ndarray, " columns"]
-) -> tuple[tuple[Trace, ...], dict[str, Quality]]:
-    """Each recording with the torques of the nominal and of the fitted robot, and the quality on held-out ones."""
+) -> tuple[tuple[Trace, ...], dict[str, Quality], tuple[str, ...]]:
+    """Each recording with the torques of the nominal and the fitted robot; the quality of held-out ones; outliers."""
     parts: dict[int, list[Piece]] = {}
     for piece in regression.pieces(fitted=False):
         slim = (piece.X @ nominal, piece.X @ theta)
         parts.setdefault(piece.recording, []).append(piece._replace(X=np.stack(slim, axis=-1)))
-    traces, holdout = [], {}
+    traces, holdout, outlying = [], {}, []
     for k, one in enumerate(regression.signals):
         X, y, weight = (np.concatenate([getattr(p, name) for p in parts[k]]) for name in ("X", "y", "weight"))
         rows = one.rows.index
@@ -220,10 +223,44 @@ def predicted(
                 X[..., 1],
             )
         )
+        kept = weight > 0
+        if measured is not None:
+            outlying += _outlying(one, np.where(kept, y - X[..., 1], np.nan), regression.model.joint_names)
         if one.role == "holdout" and measured is not None:
-            kept = weight > 0
             error, torque = np.where(kept, y - X[..., 1], 0.0), np.where(kept, y, 0.0)
             counts = np.where(kept.any(axis=0), kept.sum(axis=0), np.nan)
             name = one.file.rsplit("/", 1)[-1]
             holdout[name] = _quality((error**2).sum(0), (torque**2).sum(0), torque.sum(0), counts)
-    return tuple(traces), holdout
+    return tuple(traces), holdout, tuple(outlying)
+
+
+def _outlying(one: Signals, error: Float[np.ndarray, "rows nv"], joints: Sequence[str]) -> list[str]:
+    """Rows whose residual lies far beyond those of its joint, in words."""
+    out = []
+    for name, column in zip(joints, error.T, strict=True):
+        own = column[np.isfinite(column)]
+        if not own.size:
+            continue
+        sigma = np.median(np.abs(own - np.median(own))) / 0.6745  # of a normal distribution
+        far = np.abs(np.nan_to_num(column - np.median(own))) > OUTLYING * max(float(sigma), np.finfo(float).tiny)
+        if far.any() and far.mean() < 0.1:
+            worst = float(one.rows.row_times[int(np.nanargmax(np.abs(column)))])
+            out.append(
+                f"{one.name}: {far.sum()} row{'s' * int(far.sum() > 1)} of {name} beyond {OUTLYING:g} robust standard"
+                f" deviations of its residual, the largest at {worst:.4g} s"
+            )
+    return out
+
+
+def dropped(signals: Sequence[Signals], model: RobotModel) -> tuple[str, ...]:
+    """What of each recording became rows, and what was left out, in words."""
+    out = []
+    for one in signals:
+        weight = np.asarray(one.rows.weight)
+        lost = {name: int(n) for name, n in zip(model.joint_names, (weight == 0).sum(axis=0), strict=True) if n}
+        text = f"{one.name}: {one.rows.kept} rows a joint at {1 / (one.dt * one.rows.step):.4g} Hz, low-passed at"
+        text += f" {one.cutoff:.4g} Hz"
+        if lost:
+            text += "; left out by gate, mask or gap: " + ", ".join(f"{name} {n}" for name, n in lost.items())
+        out.append(text)
+    return tuple(out)

@@ -89,6 +89,7 @@ class Identification:
     width: Float[np.ndarray, " nv"]  # half width of the reversal of dry friction, rad/s or m/s
     method: str
     model: Any  # extended.ExtendedModel
+    essential: tuple[str, ...] = ()  # base parameters that matter: the others may be zero (`base_parameters.essential`)
     traces: tuple[Trace, ...] = ()
     correlations: tuple[tuple[str, str, float], ...] = ()  # of base parameters, the strongest
     notes: tuple[str, ...] = ()
@@ -113,6 +114,7 @@ def result(found: Identification) -> dict[str, Any]:
             {"expression": b.expression, "value": _number(b.value), "std": _number(b.std), "status": b.status}
             for b in found.base
         ],
+        "essential": list(found.essential),
         "parameters": [
             {"name": p.name, "value": _number(p.value), "std": _number(p.std), "status": p.status}
             | {"absorbed_in": list(p.absorbed_in)}

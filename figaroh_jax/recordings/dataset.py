@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..errors import InputError, nearest
 from ..formats.assembly import ROOT_JOINT
@@ -40,6 +40,7 @@ class Recording:
     repeat: str | None = None  # recordings with one label repeat one excitation
     role: Literal["fit", "holdout"] = "fit"
     notes: tuple[str, ...] = ()
+    trusted: Bool[np.ndarray, "samples nv"] | None = None  # False: torque that counts for nothing (see `cleaning`)
 
 
 def read_recordings(task: Task, model: RobotModel) -> tuple[Recording, ...]:

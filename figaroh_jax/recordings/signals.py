@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from ..errors import InputError
 from .bandwidth import motion_band, smoothed
+from .cleaning import near, without_untrusted
 from .dataset import Recording
 from .resampling import Grid, band_limited, differentiate, even_grid, sampling_rate, to_recording_times
 from .rowfilter import RowFilter, fast_length, filter_rows, frequencies, low_pass, row_filter
@@ -115,6 +116,7 @@ def prepare(
     `InputError` where the window, the cutoff or the rate do not fit the recording, or it is too short.
     """
     rates = rates or choose_rates((recording,), preprocess)
+    recording, masked = without_untrusted(recording)
     time, position, torque = _window(recording, preprocess.window)
     grid = even_grid(time, position, *([] if torque is None else [torque]))
     at, columns = _resample(grid, rates, shift)
@@ -131,6 +133,7 @@ def prepare(
     position = (_motion if slowed else low_pass)(columns[0], dt, rates.cutoff)
     velocity = differentiate(position, dt)
     weight = _weight(recording, preprocess, rows, velocity, grid.gaps, rates.cutoff)
+    weight *= ~near(rows.row_times, masked, 0.5 / rates.cutoff)
     return Signals(
         name=recording.name,
         file=str(recording.file),
