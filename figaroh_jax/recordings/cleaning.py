@@ -56,7 +56,7 @@ def without_spikes(
     """Torque further than `cut` robust standard deviations from its running median is not trusted any more.
 
     The running median is over `samples` (odd) neighbours; the deviation is 1.48 times the median distance of those that
-    lie off it. `joints` limits it to some of them. Nothing is replaced: the flags are in `trusted`, their number in a note.
+    lie off it. `joints` limits it to some of them. Nothing is replaced: `trusted` holds the flags, a note their number.
     """
     torque = recording.torque
     if torque is None:
