@@ -7,6 +7,7 @@ and `log_*` back. All functions take one element: the caller maps them over samp
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -50,11 +51,12 @@ def exp_so3(w: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.eye(3, dtype=w.dtype) + s * K + c * K @ K
 
 
+@jax.custom_jvp
 def log_so3(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Rotation vector (rad) of a rotation matrix, of the shorter way round; at a half turn either sign.
 
     By way of the unit quaternion, from the largest of its four entries: no quotient is ever small. The angle is
-    2 atan2(|v|, w).
+    2 atan2(|v|, w). Its derivative is that along rotations: `left_jacobian_inverse` times the angular velocity.
     """
     v, w = _quaternion(rotation)
     square = v @ v
@@ -63,6 +65,14 @@ def log_so3(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
     safe = jnp.where(small, w, 1.0)
     series = 2.0 / safe * (1.0 - square / (3.0 * safe**2) + square**2 / (5.0 * safe**4))
     return v * jnp.where(small, series, 2.0 * jnp.arctan2(norm, jnp.where(small, 1.0, w)) / norm)
+
+
+@log_so3.defjvp
+def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    w = log_so3(primals[0])
+    spin = tangents[0] @ primals[0].T
+    rate = 0.5 * jnp.stack([spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]])
+    return w, left_jacobian_inverse(w) @ rate
 
 
 def _quaternion(r: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from .. import lie
 from ..model import RobotModel
 from ..results import Cause, Estimate, Gain, Name
 from . import levels, marginal
 from .calibrated import Outlier, Parameter, Shown
 from .candidates import Block
+from .devices import Device
 from .gauge import Gauge, find_gauge
 from .kinematic_effects import Postures
+from .posefit import DRAFT_OPTIONS
 from .posegroups import Measured
 
 __all__ = [
@@ -126,7 +128,11 @@ def corrected(model: RobotModel, twists: dict[str, np.ndarray]) -> RobotModel:
 
 def twist_pose(twist: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
     """The pose E of a twist of the chain: its translation, then its rotation."""
-    return np.asarray(lie.pose(lie.exp_so3(jnp.asarray(twist[3:])), jnp.asarray(twist[:3])))
+    from scipy.spatial.transform import Rotation
+
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(twist[3:]).as_matrix(), twist[:3]
+    return pose
 
 
 def frames_of(final: Measured, at: np.ndarray) -> dict[str, np.ndarray]:
@@ -135,10 +141,15 @@ def frames_of(final: Measured, at: np.ndarray) -> dict[str, np.ndarray]:
     for g, group in enumerate(final.problem.groups):
         count = len(group.device.unknowns())
         mark = f" {g + 1}" if len(final.problem.groups) > 1 else ""
-        for name, value in group.device.places(jnp.asarray(values[start : start + count])).items():
+        for name, value in _places(group.device, values[start : start + count]).items():
             found[name + mark] = np.asarray(value)
         start += count
     return found
+
+
+@partial(jax.jit, compiler_options=DRAFT_OPTIONS)
+def _places(device: Device, unknown: Array) -> dict[str, Array]:
+    return device.places(unknown)
 
 
 def centred(measured: Measured, residual: np.ndarray) -> np.ndarray:

@@ -29,6 +29,8 @@ from .chain import Chain, chain_pose, joint_response
 from .devices import Device
 
 __all__ = [
+    "DRAFT",
+    "DRAFT_OPTIONS",
     "Group",
     "Part",
     "Problem",
@@ -112,6 +114,8 @@ def rows_of(problem: Problem) -> Rows:
 
 def ties(device: Device) -> int:
     """Number of the device's constraint rows."""
+    if type(device).constraint is Device.constraint:
+        return 0
     return jax.eval_shape(device.constraint, np.zeros(len(device.unknowns()))).shape[0]
 
 
@@ -167,66 +171,87 @@ def _cut(x: Any, size: int) -> np.ndarray:
     return filled.reshape(len(filled) // size, size, *x.shape[1:])
 
 
-def block_rows(part: Part, local: Array, position: Array, fields: Array, datum: Any) -> tuple[Array, Array]:
-    """Rows of a block (rows, block) at the numbers `local`, and their derivatives by these (local, rows, block)."""
-    n, pieces = len(part.chain.axis), len(part.at)
-    coefficients, own = local[6 * n : 6 * n + pieces], local[6 * n + pieces :]
-    pose = chain_pose(part.chain, position, _twists(part, local[: 6 * n].reshape(n, 6, 1), coefficients, fields))
+def block_rows(
+    chain: Chain, device: Device, twists: Array, own: Float[Array, " k"], position: Array, datum: Any
+) -> tuple[Array, Array, Array]:
+    """Rows of a block (rows, block), their derivatives by the twists of the joints (joints * 6, rows, block) and by the
+    device's unknowns (k, rows, block)."""
+    pose = chain_pose(chain, position, twists)
 
     def one(R: Array, p: Array, datum: Any) -> tuple[Array, ...]:
         def residual(motion: Array, own: Array) -> Array:
             moved = lie.pose(R + lie.skew(motion[3:]) @ R, p + motion[:3])  # to first order, which is all that is asked
-            return part.device.residual(moved, own, datum)
+            return device.residual(moved, own, datum)
 
         zero = jnp.zeros(6)
         return residual(zero, own), *jax.jacfwd(residual, argnums=(0, 1))(zero, own)
 
     residual, by_motion, by_own = jax.vmap(one, in_axes=(-1, -1, 0), out_axes=-1)(pose.R, pose.p, datum)
     response = jnp.swapaxes(joint_response(pose, by_motion), 1, 2)  # joint twist row sample
-    columns = [response.reshape(6 * n, *residual.shape), jnp.swapaxes(by_own, 0, 1)]
-    if pieces:
-        columns.insert(1, jnp.sum(response[jnp.asarray(part.at)] * fields[:, :, None], axis=1))
-    return residual, jnp.concatenate(columns)
+    return residual, response.reshape(-1, *residual.shape), jnp.swapaxes(by_own, 0, 1)
 
 
-def _twists(part: Part, steady: Array, coefficients: Array, fields: Array) -> Array:
-    if not len(part.at):
-        return steady
-    place = (jnp.arange(len(steady))[:, None] == jnp.asarray(part.at)).astype(fields.dtype)
-    return steady + jnp.tensordot(place, coefficients[:, None, None] * fields, axes=1)
+def _blocks_rows(chain: Chain, device: Device, own: Array, *blocks: Any) -> tuple[Array, Array, Array]:
+    return jax.lax.map(lambda block: block_rows(chain, device, block[0], own, *block[1:]), blocks)
 
 
-def _tied(device: Device, own: Float[np.ndarray, " k"]) -> tuple[np.ndarray, np.ndarray]:
-    """Constraint rows of a device and their derivatives by its unknowns."""
-    if not ties(device):
-        return np.zeros(0), np.zeros((0, len(own)))
-    tied = jax.jit(lambda device, own: (device.constraint(own), jax.jacfwd(device.constraint)(own)))(device, own)
-    return np.asarray(tied[0]), np.asarray(tied[1])
+DRAFT = 256  # postures; for fewer the compiler takes longer to optimise than that saves later
+DRAFT_OPTIONS = CPU_OPTIONS | {"xla_backend_optimization_level": 0}
+_rows_quick = jax.jit(_blocks_rows, compiler_options=DRAFT_OPTIONS)
+_rows_fast = jax.jit(_blocks_rows, compiler_options=CPU_OPTIONS)
 
 
-@partial(jax.jit, compiler_options=CPU_OPTIONS)
-def _whole(part: Part, local: Array) -> tuple[Array, Array]:
-    blocks = (part.position, part.fields, part.datum)
-    return jax.lax.map(lambda block: block_rows(part, local, *block), blocks)
+@jax.jit
+def _tied(device: Device, own: Array) -> tuple[Array, Array]:
+    return device.constraint(own), jax.jacfwd(device.constraint)(own)
 
 
 def linearise(
     problem: Problem, unknowns: Float[Any, " unknowns"]
 ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows unknowns"]]:
     """Residual in m and rad at the scaled unknowns, and its exact Jacobian."""
+    scale = np.asarray(problem.scale)
+    values, first = np.asarray(unknowns) * scale, problem.columns
     residuals, jacobians = [], []
     for group, part in zip(problem.groups, parts_of(problem), strict=True):
-        local, samples = part.local @ np.asarray(unknowns), np.shape(group.position)[1]
-        residual, by_local = (np.asarray(x) for x in _whole(part, local))
-        rows = residual.shape[1]
-        residuals.append(np.swapaxes(residual, 0, 1).reshape(rows, -1)[:, :samples].reshape(-1))
-        each = by_local.transpose(2, 0, 3, 1).reshape(rows, -1, len(local))[:, :samples]
-        jacobians.append(each.reshape(-1, len(local)) @ part.local)
-        count = len(group.device.unknowns())
-        tied, by_own = _tied(group.device, local[len(local) - count :])
-        residuals.append(tied)
-        jacobians.append(by_own @ part.local[len(local) - count :])
-    return np.concatenate(residuals), np.concatenate(jacobians)
+        own = slice(first, first + len(group.device.unknowns()))
+        residual, response, by_own = _flat_rows(group, part, values[: problem.columns], values[own])
+        columns = np.zeros((len(values), residual.size))  # the Jacobian's columns, each in one piece
+        columns[: problem.columns] = np.reshape(group.steady, (len(response), -1)).T @ response.reshape(
+            -1, residual.size
+        )
+        for column, at, field in zip(group.column, group.at, np.asarray(group.fields), strict=True):
+            columns[column] += np.sum(response[6 * at : 6 * at + 6] * field[:, None], axis=0).reshape(-1)
+        columns[own] = by_own.reshape(-1, residual.size)
+        residuals.append(residual.reshape(-1))
+        jacobians.append(columns.T)
+        if ties(group.device):
+            tied, by_own = _tied(group.device, values[own])
+            residuals.append(np.asarray(tied))
+            jacobians.append(np.zeros((len(tied), len(values))))
+            jacobians[-1][:, own] = by_own
+        first = own.stop
+    return np.concatenate(residuals), np.concatenate(jacobians) * scale
+
+
+def _flat_rows(
+    group: Group, part: Part, coefficients: np.ndarray, own: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows (rows, samples) of a group and their derivatives by joint twists and by the device's unknowns."""
+    samples, block = np.shape(group.position)[1], part.position.shape[2]
+    twists = np.repeat((np.asarray(group.steady) @ coefficients)[..., None], samples, axis=2)
+    np.add.at(twists, np.asarray(group.at), coefficients[np.asarray(group.column)][:, None, None] * group.fields)
+    cut = np.moveaxis(_cut(np.moveaxis(twists, -1, 0), block), 1, -1)
+    rows = _rows_quick if samples <= DRAFT else _rows_fast
+    found = rows(part.chain, part.device, own, cut, part.position, part.datum)
+    residual, response, by_own = (_samples_last(x, samples) for x in found)
+    return residual, response, by_own
+
+
+def _samples_last(blocks: Array, samples: int) -> np.ndarray:
+    """(blocks, ..., block) as (..., samples)."""
+    beside = np.moveaxis(np.asarray(blocks), 0, -2)
+    return beside.reshape(*beside.shape[:-2], -1)[..., :samples]
 
 
 def predict(problem: Problem, unknowns: Float[Any, " unknowns"]) -> Float[np.ndarray, " rows"]:

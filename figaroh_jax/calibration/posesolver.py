@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..chunks import CPU_OPTIONS
-from .posefit import Part, Problem, block_rows, parts_of, ties
+from .posefit import DRAFT, DRAFT_OPTIONS, Part, Problem, block_rows, parts_of, ties
 
 __all__ = ["Solution", "solve"]
 
@@ -67,7 +67,9 @@ def solve(
     """
     parts, free = parts_of(problem), np.asarray(free, float)
     weights = _cut_weights(problem, parts, np.asarray(row_weights, float))
-    found = _minimise(parts, weights, np.asarray(precision, float), free, np.asarray(start, float) * free, max_steps)
+    few = max(np.shape(group.position)[1] for group in problem.groups) <= DRAFT
+    minimise = _minimise_quick if few else _minimise_fast
+    found = minimise(parts, weights, np.asarray(precision, float), free, np.asarray(start, float) * free, max_steps)
     return Solution(np.asarray(found.at), bool(found.converged), int(found.steps), float(found.normal.cost))
 
 
@@ -96,10 +98,7 @@ def _normal(
         local = part.local @ at
 
         def add(sums: Array, block: Any, part: Part = part, local: Array = local) -> tuple[Array, None]:
-            weight, *arrays = block
-            residual, by_local = block_rows(part, local, *arrays)
-            rows = weight * jnp.concatenate([by_local, residual[None]])
-            return sums + _square(rows.reshape(len(rows), -1)), None
+            return sums + _square(_whole_rows(part, local, *block)), None
 
         blocks = (weight, part.position, part.fields, part.datum)
         own = local[len(local) - len(part.device.unknowns()) :]
@@ -113,12 +112,26 @@ def _normal(
     return _Normal(matrix, free * total[1], total[2])
 
 
+def _whole_rows(part: Part, local: Array, weight: Array, position: Array, fields: Array, datum: Any) -> Array:
+    """Weighted derivatives of a block's rows by the numbers `local`, then the rows (local + 1, rows * block)."""
+    joints, pieces = 6 * len(part.chain.axis), len(part.at)
+    twists = local[:joints].reshape(-1, 6, 1)
+    if pieces:
+        place = (jnp.arange(joints // 6)[:, None] == jnp.asarray(part.at)).astype(fields.dtype)
+        twists += jnp.tensordot(place, local[joints : joints + pieces, None, None] * fields, axes=1)
+    residual, response, by_own = block_rows(part.chain, part.device, twists, local[joints + pieces :], position, datum)
+    columns = [response, by_own, residual[None]]
+    if pieces:
+        each = response.reshape(-1, 6, *residual.shape)[jnp.asarray(part.at)]
+        columns.insert(1, jnp.sum(each * fields[:, :, None], axis=1))
+    return (weight * jnp.concatenate(columns)).reshape(-1, residual.size)
+
+
 def _square(rows: Float[Array, "columns samples"]) -> Float[Array, "columns columns"]:
     return jnp.matmul(rows, rows.T, precision=jax.lax.Precision.HIGHEST)
 
 
-@partial(jax.jit, compiler_options=CPU_OPTIONS)
-def _minimise(
+def _search(
     parts: tuple[Part, ...], weights: Any, precision: Array, free: Array, start: Array, max_steps: int
 ) -> _State:
     def try_step(state: _State) -> _State:
@@ -142,6 +155,10 @@ def _minimise(
     nowhere = _Normal(jnp.eye(len(start), dtype=start.dtype), zero, jnp.inf * one)
     first = _State(start, zero, nowhere, _DAMPING * one, 2.0 * one, one, jnp.zeros((), int), jnp.zeros((), bool))
     return jax.lax.while_loop(going, try_step, first)
+
+
+_minimise_quick = jax.jit(_search, compiler_options=DRAFT_OPTIONS)
+_minimise_fast = jax.jit(_search, compiler_options=CPU_OPTIONS)
 
 
 def _damped(normal: _Normal, damping: Array) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
