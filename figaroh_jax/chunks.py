@@ -8,8 +8,8 @@ in blocks of fixed size; under a transformation (jit, grad, vmap) the whole is o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial, wraps
 from typing import Any
 
 import jax
@@ -28,6 +28,7 @@ __all__ = [
     "in_chunks",
     "on_host",
     "over_samples",
+    "program",
     "put",
     "traced",
     "two_axes",
@@ -39,6 +40,18 @@ _ALIGNMENT = 64  # bytes; XLA takes such memory over without a copy
 # XLA's older code generator for loops takes half as long to compile our kernels, and the newer one computes gathers
 # inside of sums number by number. Both are in the JAX versions that the package allows.
 CPU_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+
+
+def program(function: Callable[..., Any], cpu: Mapping[str, Any] = CPU_OPTIONS, **options: Any) -> Callable[..., Any]:
+    """`jax.jit(function, **options)`; on a CPU with the compiler's options `cpu`, unknown to that of other devices."""
+    elsewhere = jax.jit(function, **options)
+    on_cpu = jax.jit(function, compiler_options=dict(cpu), **options)
+
+    @wraps(function)
+    def call(*arguments: Any) -> Any:
+        return (on_cpu if jax.default_backend() == "cpu" else elsewhere)(*arguments)
+
+    return call
 
 
 def chunk_size(width: int = 1) -> int:

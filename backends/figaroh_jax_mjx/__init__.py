@@ -25,6 +25,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from figaroh_jax.chunks import program
 from figaroh_jax.contract import Backend, Capabilities, Reference, as_reference, check_samples, file_format
 from figaroh_jax.derivatives import TorqueDerivatives, coriolis_from_bias
 from figaroh_jax.errors import InputError
@@ -177,7 +178,7 @@ def _mapped(one: Callable[..., Any], backend: MjxBackend, *states: Array) -> Any
 # XLA's fusion emitters for CPUs compute a chain of small products again for each of its uses: MJX's unrolled tree then
 # runs hundreds of times slower and compiles twenty times longer. Within a caller's program options cannot be set; there
 # XLA_FLAGS=--xla_cpu_use_fusion_emitters=false helps.
-_alone = jax.jit(_mapped, static_argnums=0, compiler_options={"xla_cpu_use_fusion_emitters": False})
+_alone = program(_mapped, static_argnums=0)
 _within = jax.jit(_mapped, static_argnums=0)
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..chunks import CPU_OPTIONS
+from ..chunks import program
 from .posefit import DRAFT, DRAFT_OPTIONS, Part, Problem, block_rows, parts_of, ties
 
 __all__ = ["Solution", "solve"]
@@ -157,8 +157,8 @@ def _search(
     return jax.lax.while_loop(going, try_step, first)
 
 
-_minimise_quick = jax.jit(_search, compiler_options=DRAFT_OPTIONS)
-_minimise_fast = jax.jit(_search, compiler_options=CPU_OPTIONS)
+_minimise_quick = program(_search, cpu=DRAFT_OPTIONS)
+_minimise_fast = program(_search)
 
 
 def _damped(normal: _Normal, damping: Array) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
