@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from functools import partial
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..chunks import program
 from ..model import RobotModel
 from ..results import Cause, Estimate, Gain, Name
 from . import levels, marginal
@@ -147,7 +147,7 @@ def frames_of(final: Measured, at: np.ndarray) -> dict[str, np.ndarray]:
     return found
 
 
-@partial(jax.jit, compiler_options=DRAFT_OPTIONS)
+@partial(program, cpu=DRAFT_OPTIONS)
 def _places(device: Device, unknown: Array) -> dict[str, Array]:
     return device.places(unknown)
 
