@@ -15,7 +15,7 @@ from .contract import Backend, Capabilities, Reference, as_reference, file_forma
 from .derivatives import TorqueDerivatives
 from .model import RobotModel
 
-__all__ = ["NativeBackend"]
+__all__ = ["NativeBackend", "as_backend"]
 
 
 @jax.tree_util.register_dataclass
@@ -96,3 +96,8 @@ class NativeBackend(Backend):
     ) -> TorqueDerivatives:
         """See `derivatives.dynamics_derivatives`."""
         return derivatives.dynamics_derivatives(self.robot, q, v, a)
+
+
+def as_backend(model: RobotModel | Backend) -> Backend:
+    """The backend itself, or `native` for a plain robot."""
+    return NativeBackend(model) if isinstance(model, RobotModel) else model

@@ -17,7 +17,7 @@ from .formats.robotfile import read_robot
 from .formats.xmlfile import find_in_packages
 from .model import RobotModel
 
-__all__ = ["GROUP", "backend", "backend_class", "having", "names"]
+__all__ = ["GROUP", "backend", "backend_class", "check_backend", "having", "names"]
 
 GROUP = "figaroh_jax.backends"
 
@@ -74,6 +74,14 @@ def backend_class(name: str) -> type[Backend]:
             f"backend '{name}' needs the package '{missing}', which cannot be imported ({error}); "
             f"install it with: pip install 'figaroh-jax[{name}]'"
         ) from None
+
+
+def check_backend(name: str, *functions: str) -> None:
+    """Raise `InputError` unless the backend called `name` is installed and gives the functions of the contract."""
+    for function in functions:
+        if function not in backend_class(name).capabilities.functions:
+            able = ", ".join(having(function))
+            raise InputError(f"backend '{name}' has no {function}; backends that do: {able}")
 
 
 def having(function: str) -> tuple[str, ...]:

@@ -44,39 +44,50 @@ class Job(NamedTuple):
     """A command on a task file: what it runs and writes, what `--json` prints, what a reader sees."""
 
     noun: str  # of the run directory's default name
-    run: Callable[[Path, Path, Callable[[str, float], None]], Any]
+    run: Callable[[Path, Path, Callable[[str, float], None], str], Any]
     to_json: Callable[[Any], str]
     show: Callable[[Any], None]
 
 
 def diagnose_file(
-    task_file: Path, out: Path, progress: Callable[[str, float], None] = lambda phase, fraction: None
+    task_file: Path,
+    out: Path,
+    progress: Callable[[str, float], None] = lambda phase, fraction: None,
+    backend: str = "native",
 ) -> Diagnosis | PoseDiagnosis:
     """Read a task, diagnose it and write the run directory `out`: torques, or postures with a measurement.
 
-    An earlier run in `out` is replaced; a directory that holds anything else is refused before any work. Wrong input
-    raises `InputError`, and nothing is written.
+    The rigid body's torques are those of the named backend. An earlier run in `out` is replaced; a directory that holds
+    anything else is refused before any work. Wrong input raises `InputError`, and nothing is written.
     """
     from .formats.config import load_task
+    from .registry import check_backend
 
+    check_backend(backend, "joint_torque_regressor")
     check_directory(out)
     task = load_task(task_file)
     if any(entry.measurement is not None for entry in task.data):
+        _native_alone(backend)
         return _diagnose_poses(task, out, progress)
     from .diagnosis.diagnosis import diagnose_task
 
-    diagnosis = diagnose_task(task, progress=progress)
+    diagnosis = diagnose_task(task, progress=progress, backend=backend)
     progress("writing the report", 1.0)
     write_run(task, diagnosis, out)
     return diagnosis
 
 
 def identify_file(
-    task_file: Path, out: Path, progress: Callable[[str, float], None] = lambda phase, fraction: None
+    task_file: Path,
+    out: Path,
+    progress: Callable[[str, float], None] = lambda phase, fraction: None,
+    backend: str = "native",
 ) -> Identification:
     """Read a task, identify its robot and write the run directory `out`, as `diagnose_file` does."""
     from .formats.config import load_task
+    from .registry import check_backend
 
+    check_backend(backend, "joint_torque_regressor")
     check_directory(out)
     task = load_task(task_file)
     from .formats.export import write_model
@@ -85,7 +96,7 @@ def identify_file(
     from .reporting.answer import write_predictions
     from .reporting.identification_report import write_identification
 
-    found = identify_task(task, progress=progress)
+    found = identify_task(task, progress=progress, backend=backend)
     wrong = [] if task.identify.infeasible == "write" else [link for link in found.links if not link.consistent]
     if wrong:
         found = replace(found, notes=(_not_written(wrong), *found.notes))
@@ -121,11 +132,15 @@ def _diagnose_poses(task: Task, out: Path, progress: Callable[[str, float], None
 
 
 def calibrate_file(
-    task_file: Path, out: Path, progress: Callable[[str, float], None] = lambda phase, fraction: None
+    task_file: Path,
+    out: Path,
+    progress: Callable[[str, float], None] = lambda phase, fraction: None,
+    backend: str = "native",
 ) -> Calibration:
     """Read a task, calibrate its robot and write the run directory `out`, as `diagnose_file` does."""
     from .formats.config import load_task
 
+    _native_alone(backend)
     check_directory(out)
     task = load_task(task_file)
     from .calibration.calibration import calibrate_task
@@ -136,6 +151,17 @@ def calibrate_file(
     with whole_directory(out) as folder:
         write_calibration(calibration, folder, task.robot.model)
     return calibration
+
+
+def _native_alone(backend: str) -> None:
+    if backend != "native":
+        from .registry import backend_class
+
+        backend_class(backend)  # one that is not installed is refused there, with the list of those that are
+        raise InputError(
+            f"--backend {backend}: a calibration differentiates by the placements of the links, which the contract of "
+            "backends does not ask for; only 'native' does it"
+        )
 
 
 def write_run(task: Task, diagnosis: Diagnosis, out: Path) -> None:

@@ -16,13 +16,15 @@ import fake_diagnosis
 import jax
 import numpy as np
 import pytest
+from toy_backend import ToyBackend
 
-from figaroh_jax import cli
+from figaroh_jax import cli, registry
 from figaroh_jax.diagnosis import diagnosis
 from figaroh_jax.errors import InputError
 from figaroh_jax.extended import extend
 from figaroh_jax.formats import export
 from figaroh_jax.formats.urdf import load_urdf
+from figaroh_jax.native_backend import NativeBackend
 from figaroh_jax.results import Diagnosis
 from figaroh_jax.runs import whole_directory
 
@@ -35,8 +37,8 @@ def made_up(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Diagnosis:
     """`diagnose_task` answers at once, and the working directory is empty."""
     answer = replace(fake_diagnosis.named(), model=extend(load_urdf(DEMO / "robot.urdf")))
 
-    def diagnose_task(task, *, progress):
-        progress("screening", 0.5)
+    def diagnose_task(task, *, progress, backend):
+        progress(f"screening with {backend}", 0.5)
         return answer
 
     monkeypatch.setattr(diagnosis, "diagnose_task", diagnose_task)
@@ -161,11 +163,28 @@ def test_an_unknown_command_lists_the_known_ones(capsys):
     assert "identify" in message and "diagnose" in message and "demo" in message
 
 
-@pytest.mark.parametrize("name", ["bullet", "pinocchio"])
-def test_a_backend_that_cannot_diagnose_is_refused(made_up: Diagnosis, name: str, capsys):
-    assert _diagnose("--backend", name) == 2
-    message = capsys.readouterr().err
-    assert name in message and "native" in message
+def test_the_backend_that_was_asked_for_is_passed_on(made_up: Diagnosis, capsys):
+    assert _diagnose("--backend", "pinocchio") == 0
+    assert "screening with pinocchio" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["diagnose", "identify", "calibrate"])
+def test_an_unknown_backend_is_refused_with_those_installed(made_up: Diagnosis, command: str, tmp_path: Path, capsys):
+    assert cli.main([command, str(DEMO / "task.yaml"), "--backend", "bullet"]) == 2
+    assert "no backend 'bullet' is installed; installed: native" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_calibration_by_another_backend_is_refused_with_the_reason(made_up: Diagnosis, tmp_path: Path, capsys):
+    assert cli.main(["calibrate", str(DEMO / "task.yaml"), "--backend", "pinocchio"]) == 2
+    assert "differentiates by the placements" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_backend_without_a_regressor_is_refused_with_those_that_have_one(made_up, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(registry, "backend_class", lambda name: ToyBackend if name == "toy" else NativeBackend)
+    assert _diagnose("--backend", "toy") == 2
+    assert "'toy' has no joint_torque_regressor; backends that do: native" in capsys.readouterr().err
 
 
 def test_an_interrupted_block_leaves_nothing(tmp_path: Path):

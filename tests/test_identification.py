@@ -23,6 +23,7 @@ from figaroh_jax.identification.columns import friction_terms
 from figaroh_jax.identification.identification import identify
 from figaroh_jax.identification.regression import Regression, condense
 from figaroh_jax.identification.result import Identification, to_json
+from figaroh_jax.native_backend import NativeBackend
 from figaroh_jax.recordings.signals import prepare_all
 
 SETTINGS = Preprocess(cutoff=10)
@@ -140,7 +141,7 @@ def test_recordings_that_show_nothing_are_refused(truth: Truth):
 def test_pieces_of_a_long_recording_give_the_same_factor(truth: Truth, monkeypatch: pytest.MonkeyPatch):
     signals = prepare_all((recording(truth, 60.0, seed=3),), SETTINGS)
     terms = friction_terms(truth.nominal, Baseline())
-    whole = Regression(truth.nominal, terms, np.zeros(3), signals)
+    whole = Regression(NativeBackend(truth.nominal), terms, np.zeros(3), signals)
     used = np.ones((3, len(whole.names)), bool)
     one = condense(whole, used)
     monkeypatch.setattr(regression_module, "PIECE_BYTES", 8 * 3 * len(whole.names) * 1500)

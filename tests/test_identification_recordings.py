@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +23,38 @@ def physical(found: Identification) -> bool:
     return all(link.consistent for link in found.links)
 
 
+@cache
+def tx40(folder: Path, data: Path, gated: bool = True, backend: str = "native") -> Identification:
+    return identify_task(fj.load_task(real_tasks.tx40_task(folder, data, gated=gated)), backend=backend)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("tx40")
+
+
 @pytest.mark.parametrize(("gated", "limit"), [(True, 1.25), (False, 1.6)])
-def test_tx40_cross_validated_error_beats_figaroh(gated: bool, limit: float, data_dir: Path, tmp_path: Path):
+def test_tx40_cross_validated_error_beats_figaroh(gated: bool, limit: float, data_dir: Path, folder: Path):
     """figaroh's pipeline, corrected: 1.256 to 1.301 N m with the gate, 2.08 without."""
-    found = identify_task(fj.load_task(real_tasks.tx40_task(tmp_path, data_dir, gated=gated)))
+    found = tx40(folder, data_dir, gated)
     assert (found.rank, found.structural_rank) == (61, 61)
     assert pooled(found.validated) <= limit
     assert physical(found) and pooled(found.fit) <= 1.01 * pooled(found.unconstrained)
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "pinocchio", pytest.param("mjx", marks=pytest.mark.slow)])
+def test_every_backend_identifies_the_same_parameters(backend: str, data_dir: Path, folder: Path):
+    want, got = tx40(folder, data_dir), tx40(folder, data_dir, backend=backend)
+    assert [one.expression for one in got.base] == [one.expression for one in want.base]
+    assert [one.status for one in got.base] == [one.status for one in want.base]
+    got_base, want_base = ([(one.value, one.std) for one in found.base] for found in (got, want))
+    np.testing.assert_allclose(got_base, want_base, rtol=1e-6, atol=1e-6)
+    for one, same in zip(want.links, got.links, strict=True):  # to what the conic solver leaves of a link's size
+        size = float(np.linalg.norm(one.parameters))
+        np.testing.assert_allclose(same.parameters, one.parameters, rtol=0, atol=1e-6 * max(1.0, size))
+    for one, same in zip(want.effects, got.effects, strict=True):
+        left, right = ([(e.value, e.std) for e in effect.parameters.values()] for effect in (same, one))
+        np.testing.assert_allclose(left, right, rtol=1e-6, atol=1e-6, err_msg=str(one.name))
 
 
 def test_tiago_arm_predicts_the_last_part_of_its_recording(data_dir: Path, tmp_path: Path):

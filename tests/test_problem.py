@@ -22,6 +22,7 @@ from figaroh_jax.diagnosis.state import baseline, extended_state, plain_rows, so
 from figaroh_jax.effects import find
 from figaroh_jax.inertia import from_com, pseudo_inertia
 from figaroh_jax.model import RobotModel
+from figaroh_jax.native_backend import NativeBackend
 from figaroh_jax.recordings.signals import Signals
 
 TRUST = 0.1
@@ -34,7 +35,8 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
 
 def problem_of(model: RobotModel, *signals: Signals) -> Problem:
     records = stack(signals)
-    return Problem(model, records, layout(signals, records), TRUST, np.zeros(model.nv), held_rows(signals, records))
+    held = held_rows(signals, records)
+    return Problem(NativeBackend(model), records, layout(signals, records), TRUST, np.zeros(model.nv), held)
 
 
 def body(mass: float, com: np.ndarray, moments: np.ndarray) -> np.ndarray:

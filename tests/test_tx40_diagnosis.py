@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tx40 import write_task
 
@@ -14,11 +15,11 @@ WRIST = ("joint_5", "joint_6")
 
 
 @cache
-def diagnosis_of(data: Path, folder: Path) -> Diagnosis:
+def diagnosis_of(data: Path, folder: Path, backend: str = "native") -> Diagnosis:
     from figaroh_jax.diagnosis.diagnosis import diagnose_task
     from figaroh_jax.formats.config import load_task
 
-    return diagnose_task(load_task(write_task(folder, data)))
+    return diagnose_task(load_task(write_task(folder, data)), backend=backend)
 
 
 @pytest.fixture(scope="module")
@@ -60,3 +61,17 @@ def test_rotor_inertias_are_found_where_they_can_be_seen_and_nowhere_else(answer
 def test_the_data_say_that_something_is_missing(answer: Diagnosis):
     assert answer.p_value < 0.01
     assert answer.verdict in ("named", "named+rest")
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "pinocchio", pytest.param("mjx", marks=pytest.mark.slow)])
+def test_every_backend_gives_the_same_verdict_causes_and_parameters(
+    backend: str, answer: Diagnosis, data_dir: Path, tmp_path: Path
+):
+    other = diagnosis_of(data_dir, tmp_path, backend)
+    assert (other.verdict, [cause.name for cause in other.causes]) == (answer.verdict, [c.name for c in answer.causes])
+    for one, same in zip(answer.causes, other.causes, strict=True):
+        assert same.ambiguous_with == one.ambiguous_with
+        want, got = ([(e.value, e.std) for e in cause.parameters.values()] for cause in (one, same))
+        np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-6, err_msg=str(one.name))
+    np.testing.assert_allclose(other.model.robot.inertia, answer.model.robot.inertia, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(other.after, answer.after, rtol=1e-6, atol=0)

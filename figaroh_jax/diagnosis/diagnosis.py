@@ -16,12 +16,15 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from ..contract import Backend
 from ..effect import Effect, place
 from ..effects import find
 from ..errors import InputError
 from ..model import RobotModel
+from ..native_backend import as_backend
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Signals, prepare_all
+from ..registry import backend as make_backend
 from ..results import Cause, Diagnosis, Gain, Verdict
 from .estimates import Fitted, estimates, fitted_model, prismatic
 from .experiment import next_experiment
@@ -47,8 +50,10 @@ __all__ = ["diagnose", "diagnose_task"]
 CERTAIN = 0.2  # of alpha: what a name needs, for p is not uniform under coloured noise
 
 
-def diagnose_task(task: Task, progress: Callable[[str, float], None] = lambda phase, share: None) -> Diagnosis:
-    """Diagnose what a task file describes; `InputError` before any work where it is wrong."""
+def diagnose_task(
+    task: Task, progress: Callable[[str, float], None] = lambda phase, share: None, backend: str = "native"
+) -> Diagnosis:
+    """Diagnose what a task file describes, by the named backend; `InputError` before any work where it is wrong."""
     from ..formats.config import load_robot
     from ..formats.robotfile import robot_notes
 
@@ -56,12 +61,13 @@ def diagnose_task(task: Task, progress: Callable[[str, float], None] = lambda ph
     model, notes = load_robot(task), robot_notes(task)
     recordings = read_recordings(task, model)
     options = {"trust": task.robot.trust, "forbid": task.diagnose.forbid, "alpha": task.diagnose.alpha}
-    found = diagnose(model, recordings, task.preprocess, task.baseline, progress=progress, **options)
+    robot = make_backend(backend, model)
+    found = diagnose(robot, recordings, task.preprocess, task.baseline, progress=progress, **options)
     return replace(found, notes=(*notes, *found.notes))
 
 
 def diagnose(
-    model: RobotModel,
+    model: RobotModel | Backend,
     recordings: Sequence[Recording],
     preprocess: Preprocess,
     known: Baseline | None = None,
@@ -74,13 +80,14 @@ def diagnose(
 ) -> Diagnosis:
     """What the robot's model gets wrong in the recordings (joint side, SI units), named where it can be.
 
-    `trust` is how far the nominal inertials are believed (relative one-sigma), `known` what the baseline contains,
+    `model` is the robot, or a backend of it, which then computes its rigid body's torques and regressor. `trust` is how
+    far the nominal inertials are believed (relative one-sigma), `known` what the baseline contains,
     `forbid` names effects left out of the catalogue, `alpha` is the level of the test for the whole catalogue.
     """
     with jax.enable_x64(True):
         progress("preparing signals", 0.03)
         signals = sorted(prepare_all(tuple(recordings), preprocess), key=lambda s: s.role == "holdout")
-        here = _setting(model, signals, known, trust, forbid, progress)
+        here = _setting(as_backend(model), signals, known, trust, forbid, progress)
         generator = np.random.default_rng(seed)
         search = find_causes(*here, forbid, CERTAIN * alpha, progress, generator)
         progress("fitting all causes together", 0.8)
@@ -109,7 +116,7 @@ class _Told(NamedTuple):
 
 
 def _setting(
-    model: RobotModel,
+    backend: Backend,
     signals: Sequence[Signals],
     known: Baseline | None,
     trust: float,
@@ -119,7 +126,8 @@ def _setting(
     """The recordings on one clock, the baseline, and the noise; holdout recordings stand behind the others."""
     records = stack(signals)
     held = held_rows(signals, records)
-    problem = Problem(model, records, layout(signals, records), trust, np.zeros(model.nv), held)
+    model = backend.robot
+    problem = Problem(backend, records, layout(signals, records), trust, np.zeros(model.nv), held)
     names, given = _baseline_effects(model, known)
     start = baseline(problem, names, given)
     progress("estimating the noise", 0.08)

@@ -20,6 +20,7 @@ __all__ = ["noise_floor", "noise_rms"]
 ROUNDS = 2
 RICHNESS = 10  # groups of columns in the rich model
 RICH_CUT = 1e-9  # of the unit-diagonal Gram of the rich model
+COLUMN_CUT = 1e-8  # of the longest column: below, a column of the rigid body is what rounding leaves of zero
 ENOUGH = 1500  # rows a joint without which misfit takes spectra and smooth families: then the noise is white
 
 
@@ -121,7 +122,8 @@ def _full(rows: Rows, group: Group, point: int) -> Float[np.ndarray, "nv T k"]:
 def _orthonormal(rows: Rows) -> Float[np.ndarray, "nvT columns"]:
     tall = rows.X.reshape(rows.y.size, -1)
     scale = np.sqrt((tall**2).sum(0))
-    tall = tall[:, scale > 0] / scale[scale > 0]
+    seen = scale > COLUMN_CUT * scale.max()
+    tall = tall[:, seen] / scale[seen]
     values, vectors = np.linalg.eigh(tall.T @ tall)
     keep = values > RICH_CUT
     return tall @ (vectors[:, keep] / np.sqrt(values[keep]))

@@ -9,10 +9,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..contract import Backend
 from ..effect import Effect, Motion
 from ..effects import CATALOGUE, LinkEffect
 from ..model import RobotModel
-from .design import Units, candidates, flattened, kind, rigid_torque, shapes, units
+from .design import Units, candidates, flattened, kind, shapes, units
 from .records import Records, open_rows
 
 __all__ = ["Layout", "Problem", "family_of"]
@@ -30,14 +31,22 @@ class Layout(eqx.Module):
 
 @dataclass(frozen=True)
 class Problem:
-    """Recordings and what is believed of the robot before; rows that are not fitted have no weight."""
+    """Recordings and what is believed of the robot before; rows that are not fitted have no weight.
 
-    model: RobotModel
+    The torque of the robot's rigid body, and its regressor, are the backend's; what an effect adds to them is ours.
+    """
+
+    backend: Backend
     records: Records
     layout: Layout
     trust: float
     width: Float[np.ndarray, " nv"]  # half width of the friction's reversal, rad/s or m/s
     held: Float[np.ndarray, "n M nv"]  # 1: a row of a holdout recording with torque
+
+    @property
+    def model(self) -> RobotModel:
+        """The robot."""
+        return self.backend.robot
 
     @cached_property
     def torque(self) -> Float[np.ndarray, "n M nv"]:
@@ -54,7 +63,7 @@ class Problem:
         """All samples of all recordings as measured, with the load of the nominal robot."""
         r = self.records
         q, v, a = (r.flat(x) for x in (r.position, r.velocity, r.acceleration))
-        load = rigid_torque(self.model, q, v, a)
+        load = np.asarray(self.backend.inverse_dynamics(q, v, a))
         return Motion(self.model, r.flat(r.time), q, v, a, load, load, r.dt, self.width)
 
     @cached_property

@@ -17,7 +17,6 @@ from jaxtyping import Complex, Float, Int
 from ..effect import Effect, Motion
 from ..effects import LinkEffect, Payload, find
 from ..model import Leaf
-from ..regressor import joint_torque_regressor
 from .design import Units, flattened, kind, sensor_response, shapes, shifted, units, units_and_slopes
 from .priors import body_precision, rigid_prior
 from .problem import Layout, Problem, family_of
@@ -204,7 +203,8 @@ def _term_columns(problem: Problem, state: State, term: Effect) -> Float[np.ndar
 
 
 def _rigid(problem: Problem, motion: Motion) -> Float[np.ndarray, "nN nv P"]:
-    return np.asarray(joint_torque_regressor(problem.model, motion.position, motion.velocity, motion.acceleration))
+    state = (np.asarray(x) for x in (motion.position, motion.velocity, motion.acceleration))
+    return np.asarray(problem.backend.joint_torque_regressor(*state))
 
 
 def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], before: Rows | None = None) -> Rows:

@@ -1,4 +1,4 @@
-"""Columns of parameters at states: ten for each link, then those of the effects at the joints.
+"""Columns of parameters at states: ten for each link, by a backend, then those of the effects at the joints.
 
 The names of the columns, what they are at random states (all that any motion could show), and at given ones.
 """
@@ -15,11 +15,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from ..contract import Backend
 from ..effect import Effect, Motion, columns, place, smooth_sign
 from ..effects import find
 from ..errors import InputError
 from ..model import RobotModel
-from ..regressor import joint_torque_regressor
+from ..native_backend import NativeBackend
 from .base_parameters import inertial_names
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def structural_columns(
             q[:, quaternion] /= np.linalg.norm(q[:, quaternion], axis=1, keepdims=True)
     with jax.enable_x64(True):
         motion = motion_at(model, np.arange(samples) * 1.0, q, v, a, 0.0, jnp.zeros(model.nv))
-        return np.asarray(columns_of(model, terms, motion))
+        return columns_of(NativeBackend(model), terms, motion)
 
 
 def motion_at(model: RobotModel, time: Any, q: Any, v: Any, a: Any, dt: Any, width: Any) -> Motion:
@@ -93,7 +94,6 @@ def motion_at(model: RobotModel, time: Any, q: Any, v: Any, a: Any, dt: Any, wid
     return Motion(model, jnp.asarray(time), jnp.asarray(q), jnp.asarray(v), jnp.asarray(a), zero, zero, dt, width)
 
 
-@eqx.filter_jit
 def state_columns(
     model: RobotModel,
     terms: tuple[Effect, ...],
@@ -102,20 +102,27 @@ def state_columns(
     q: Float[ArrayLike, "samples nq"],
     v: Float[ArrayLike, "samples nv"],
     a: Float[ArrayLike, "samples nv"],
-) -> Float[Array, "samples nv columns"]:
+) -> Float[np.ndarray, "samples nv columns"]:
     """Columns at given states, unfiltered; `widths` as in `Regression.pieces`."""
     motion = motion_at(model, jnp.zeros(jnp.shape(v)[0]), q, v, a, 0.0, width)
-    return columns_of(model, terms, motion, widths)
+    return columns_of(NativeBackend(model), terms, motion, widths)
+
+
+def columns_of(
+    backend: Backend, terms: tuple[Effect, ...], motion: Motion, widths: tuple[float, ...] = ()
+) -> Float[np.ndarray, "samples nv columns"]:
+    """Columns of the rigid body by its backend, then those of the effects and of the `widths` of dry friction."""
+    state = (np.asarray(x) for x in (motion.position, motion.velocity, motion.acceleration))
+    rigid = np.asarray(backend.joint_torque_regressor(*state))
+    return np.concatenate([rigid, *(np.asarray(x) for x in _beside(terms, motion, widths))], axis=2)
 
 
 @eqx.filter_jit
-def columns_of(
-    model: RobotModel, terms: tuple[Effect, ...], motion: Motion, widths: tuple[float, ...] = ()
-) -> Float[Array, "samples nv columns"]:
-    blocks = [joint_torque_regressor(model, motion.position, motion.velocity, motion.acceleration)]
-    blocks += _term_columns(terms, motion)
+def _beside(
+    terms: tuple[Effect, ...], motion: Motion, widths: tuple[float, ...]
+) -> list[Float[Array, "samples nv columns"]]:
     signs = (smooth_sign(motion.velocity, motion.acceleration, motion.dt, w) for w in widths)
-    return jnp.concatenate([*blocks, *(sign[:, :, None] for sign in signs)], axis=2)
+    return [*_term_columns(terms, motion), *(sign[:, :, None] for sign in signs)]
 
 
 def term_columns(

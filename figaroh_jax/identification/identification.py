@@ -15,13 +15,16 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..contract import Backend
 from ..diagnosis.estimates import prismatic
 from ..diagnosis.priors import rigid_prior
 from ..effect import Effect
 from ..errors import InputError, nearest
 from ..model import RobotModel
+from ..native_backend import as_backend
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import prepare_all
+from ..registry import backend as make_backend
 from .base_parameters import BaseParameters, base_parameters, essential
 from .columns import friction_terms, structural_columns
 from .conic import Body
@@ -77,8 +80,10 @@ class _Problem:
         return precision
 
 
-def identify_task(task: Task, progress: Callable[[str, float], None] = lambda phase, share: None) -> Identification:
-    """Identify what a task file describes; `InputError` before any work where it is wrong."""
+def identify_task(
+    task: Task, progress: Callable[[str, float], None] = lambda phase, share: None, backend: str = "native"
+) -> Identification:
+    """Identify what a task file describes, by the named backend; `InputError` before any work where it is wrong."""
     from ..formats.config import load_robot
 
     progress("reading", 0.0)
@@ -86,7 +91,7 @@ def identify_task(task: Task, progress: Callable[[str, float], None] = lambda ph
     recordings = read_recordings(task, model)
     options = task.identify
     return identify(
-        model,
+        make_backend(backend, model),
         recordings,
         task.preprocess,
         task.baseline,
@@ -99,7 +104,7 @@ def identify_task(task: Task, progress: Callable[[str, float], None] = lambda ph
 
 
 def identify(
-    model: RobotModel,
+    model: RobotModel | Backend,
     recordings: Sequence[Recording],
     preprocess: Preprocess | None = None,
     known: Baseline | None = None,
@@ -110,7 +115,7 @@ def identify(
     bounds: Mapping[str, Mapping[str, Any]] | None = None,
     progress: Callable[[str, float], None] = lambda phase, share: None,
 ) -> Identification:
-    """Fit the dynamics of `model` to recordings (joint side, SI units).
+    """Fit the dynamics of `model`, a robot or a backend of it, to recordings (joint side, SI units).
 
     `known` says which friction is fitted beside the links, `trust` how far the nominal inertials are believed (relative
     one sigma; less if cross-validation says so), `joints` whose torque is fitted (default: all that have one), `bounds`
@@ -120,13 +125,15 @@ def identify(
     """
     from ..formats.config import Baseline, Preprocess
 
+    backend = as_backend(model)
+    model = backend.robot
     with jax.enable_x64(True):
         progress("preparing signals", 0.05)
         # the cutoff alone: a band guessed from the motion costs accuracy where friction makes the motion sharp
         signals = prepare_all(tuple(recordings), preprocess or Preprocess(), slowed=False)
         terms = friction_terms(model, known or Baseline())
         refused, notes = _refused(model, recordings, joints)
-        regression = Regression(model, terms, np.zeros(model.nv), signals, refused)
+        regression = Regression(backend, terms, np.zeros(model.nv), signals, refused)
         structure = structural_columns(model, terms)
         used = np.asarray(np.abs(structure).max(axis=0) > 0)
         structural = base_parameters(structure.reshape(-1, structure.shape[2]), regression.names)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..contract import Backend
 from ..diagnosis.records import Records, filter_rows, stack
 from ..effect import Effect
 from ..errors import InputError
@@ -134,13 +135,18 @@ class Condensed:
 
 @dataclass(frozen=True)
 class Regression:
-    """Recordings, the robot and the effects whose columns stand beside its ten for each link."""
+    """Recordings, the robot (its backend gives ten columns for each link) and the effects with columns beside these."""
 
-    model: RobotModel
+    backend: Backend
     terms: tuple[Effect, ...]  # each with a leading axis of places
     width: Float[np.ndarray, " nv"]  # half width of a reversal of dry friction, rad/s or m/s
     signals: tuple[Signals, ...]
     refused: frozenset[str] = frozenset()  # joints whose torque is not trusted
+
+    @property
+    def model(self) -> RobotModel:
+        """The robot."""
+        return self.backend.robot
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -160,7 +166,7 @@ class Regression:
                 if fitted and one.role != "fit":
                     continue
                 single = _one(records, place_of)
-                rows = _rows(self.model, self.terms, self.width, single, tuple(widths))
+                rows = _rows(self.backend, self.terms, self.width, single, tuple(widths))
                 X, y = (np.asarray(x)[: one.rows.kept] for x in rows)
                 weight = np.asarray(one.rows.weight) * (one.torque is not None) * trusted
                 yield Piece(X, y - self._carried(one, X), weight, one.rows.row_times, _folds(one), k)
@@ -266,7 +272,7 @@ def _one(records: Records, k: int) -> Records:
 
 
 def _rows(
-    model: RobotModel,
+    backend: Backend,
     terms: tuple[Effect, ...],
     width: Float[np.ndarray, " nv"],
     records: Records,
@@ -276,8 +282,8 @@ def _rows(
     time, q, v, a = (
         records.flat(np.asarray(x)) for x in (records.time, records.position, records.velocity, records.acceleration)
     )
-    motion = motion_at(model, time, q, v, a, records.dt, jnp.asarray(width))
-    X = np.asarray(columns_of(model, terms, motion, widths))
+    motion = motion_at(backend.robot, time, q, v, a, records.dt, jnp.asarray(width))
+    X = columns_of(backend, terms, motion, widths)
     seen = np.argwhere(X.any(axis=0))
     series = np.moveaxis(X[:, seen[:, 0], seen[:, 1]], 0, 1)[:, None]
     out = np.zeros((records.kept.shape[1], *X.shape[1:]))

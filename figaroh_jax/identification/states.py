@@ -77,7 +77,7 @@ class States:
                 n = len(block[0])
                 filled = [np.concatenate([x, np.repeat(x[-1:], chunk - n, axis=0)]) if n < chunk else x for x in block]
                 with jax.enable_x64(True):
-                    X = np.asarray(state_columns(self.model, self.terms, width, tuple(widths), *filled[:3]))
+                    X = state_columns(self.model, self.terms, width, tuple(widths), *filled[:3])
                 weight = np.repeat(np.arange(chunk)[:, None] < n, self.model.nv, axis=1).astype(float)
                 index = count + np.arange(chunk)
                 yield Piece(X, filled[3], weight, index.astype(float), index // FEWEST % 5, 0)
