@@ -38,8 +38,8 @@ BLOCK = 8  # chunks to a block
 _ALIGNMENT = 64  # bytes; XLA takes such memory over without a copy
 
 # XLA's older code generator for loops takes half as long to compile our kernels, and the newer one computes gathers
-# inside of sums number by number. Both are in the JAX versions that the package allows.
-CPU_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+# inside of sums number by number. JAX 0.11 has the newer one alone.
+CPU_OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
 
 
 def program(function: Callable[..., Any], cpu: Mapping[str, Any] = CPU_OPTIONS, **options: Any) -> Callable[..., Any]:
