@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -27,6 +28,22 @@ def test_dynamics_load_no_file_format_backend_or_plot():
     code = "import figaroh_jax as fj, sys; fj.RobotModel, fj.inverse_dynamics, fj.joint_torque_regressor, fj.register"
     run = _in_new_process(f"{code}; assert not [name for name in {heavy} if name in sys.modules], sys.modules.keys()")
     assert run.stdout == run.stderr == ""
+
+
+def test_reading_a_urdf_loads_no_mesh_library_and_leaves_yourdfpy_whole(tmp_path: Path):
+    box = "<link name='a'><visual><geometry><box size='1 2 3'/></geometry></visual></link>"
+    joint = "<link name='b'/><joint name='j' type='continuous'><parent link='a'/><child link='b'/></joint>"
+    (tmp_path / "box.urdf").write_text(f"<robot name='r'>{box}{joint}</robot>")
+    code = (
+        "import sys, figaroh_jax as fj\n"
+        "fj.load_urdf('box.urdf')\n"
+        "assert not [name for name in sys.modules if 'trimesh' in name]\n"
+        "import trimesh, yourdfpy\n"
+        "scene = yourdfpy.URDF.load('box.urdf').scene\n"
+        "assert isinstance(scene, trimesh.Scene) and scene.extents.tolist() == [1, 2, 3]\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
 
 
 def test_use_leaves_the_configuration_of_jax_as_it_was():

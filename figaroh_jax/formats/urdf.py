@@ -6,8 +6,13 @@ Only what moves and weighs is read: links with their inertias, joints with place
 from __future__ import annotations
 
 import io
+import sys
 from collections.abc import Sequence
+from functools import lru_cache
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
@@ -105,9 +110,40 @@ def _read(path: str | Path) -> Any:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     root.set("name", root.get("name") or Path(path).stem)
-    from yourdfpy import URDF  # late: it loads trimesh, which takes a second
+    return _yourdfpy().URDF.load(io.BytesIO(etree.tostring(root)), build_scene_graph=False, load_meshes=False).robot
 
-    return URDF.load(io.BytesIO(etree.tostring(root)), build_scene_graph=False, load_meshes=False).robot
+
+class _Later(ModuleType):
+    """Stands for a package that is loaded when something of it is first used; until `ready`, its names are blanks."""
+
+    ready = False
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(import_module(self.__name__), name) if self.ready else object
+
+
+@lru_cache(maxsize=1)
+def _yourdfpy() -> Any:
+    """yourdfpy without trimesh, which with all that it loads takes ten times as long as the rest of reading a robot.
+
+    The reader needs `trimesh.transformations` alone. While yourdfpy is imported, a stand-in takes the place of trimesh
+    (where that is not loaded yet): submodules are found, its own names, which stand in annotations, are blanks. From
+    then on the stand-in passes on to the real one, so that yourdfpy shows scenes as ever.
+    """
+    spec = find_spec("trimesh")
+    if {"trimesh", "yourdfpy"} & set(sys.modules) or spec is None or spec.submodule_search_locations is None:
+        return import_module("yourdfpy")
+    later = _Later("trimesh")
+    later.__path__ = list(spec.submodule_search_locations)
+    sys.modules["trimesh"] = later
+    try:
+        return import_module("yourdfpy")
+    finally:
+        for name in [n for n in sys.modules if n.partition(".")[0] == "trimesh"]:
+            del sys.modules[name]
+        later.ready = True
 
 
 def _check_part(part: Any) -> None:
