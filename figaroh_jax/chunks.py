@@ -9,7 +9,7 @@ in blocks of fixed size; under a transformation (jit, grad, vmap) the whole is o
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial, wraps
+from functools import wraps
 from typing import Any
 
 import jax
@@ -18,6 +18,8 @@ import numpy as np
 from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
+
+from .programs import Program
 
 __all__ = [
     "BLOCK",
@@ -30,6 +32,7 @@ __all__ = [
     "over_samples",
     "program",
     "put",
+    "to_device",
     "traced",
     "two_axes",
 ]
@@ -95,8 +98,7 @@ def over_samples(
     """
     chunk, batch = chunk_size(width), np.shape(arrays[0])[:-1]
     if on_host(parameters, arrays):
-        with jax.ensure_compile_time_eval():  # constants in somebody's `jit` are worked out while that is traced
-            answer = _assembled(kernel, chunk, last, parameters, *two_axes(*arrays, host=True))
+        answer = _assembled(kernel, chunk, last, parameters, *two_axes(*arrays, host=True))
         return answer if last else answer.reshape(*batch, *answer.shape[1:])
     flat = two_axes(*arrays, host=False)
     if traced(parameters, arrays):
@@ -132,15 +134,13 @@ def _all(kernel: Callable[..., Any], chunk: int, parameters: Any, *arrays: Array
 _device_program = jax.jit(_all, static_argnums=(0, 1))
 
 
-@partial(jax.jit, static_argnums=0)
-def _room(kernel: Callable[..., Any], parameters: Any, *chunks: Array) -> Array:
+def _zeros(kernel: Callable[..., Any], parameters: Any, *chunks: Array) -> Array:
     """Zeros of the shape of the answers, a chunk behind the other."""
     answer = jax.eval_shape(lambda *x: _joined(kernel(parameters, *x)), *(x[0] for x in chunks))
     return jnp.zeros((len(chunks[0]), *answer.shape), answer.dtype)
 
 
-@partial(jax.jit, static_argnums=0, donate_argnums=1, compiler_options=CPU_OPTIONS)
-def _fill(kernel: Callable[..., Any], room: Array, parameters: Any, *chunks: Array) -> Array:
+def _filled(kernel: Callable[..., Any], room: Array, parameters: Any, *chunks: Array) -> Array:
     """Answers written over those of the last block, each piece to its place: no new memory, no copy."""
 
     def fill(k: Array, room: Array) -> Array:
@@ -152,6 +152,10 @@ def _fill(kernel: Callable[..., Any], room: Array, parameters: Any, *chunks: Arr
         return room
 
     return jax.lax.fori_loop(0, len(room), fill, room)
+
+
+_room = Program(_zeros, static=1)
+_fill = Program(_filled, static=1, donate=1, options=CPU_OPTIONS)
 
 
 def host_blocks(
@@ -181,7 +185,13 @@ def _assembled(kernel: Callable[..., Any], chunk: int, last: bool, parameters: A
             whole = aligned((*parts.shape[:-2], samples) if last else (samples, *parts.shape[:-2]))
             view = whole if last else np.moveaxis(whole, 0, -1)
         put(view[..., where], parts)
-    return jax.device_put(whole, may_alias=True)
+    return to_device(whole)
+
+
+def to_device(whole: np.ndarray) -> Array:
+    """The array as JAX's, without a copy; inside of somebody's `jit`, too, a constant."""
+    with jax.ensure_compile_time_eval():
+        return jax.device_put(whole, may_alias=True)
 
 
 def put(target: Float[np.ndarray, "*lead samples"], parts: Float[np.ndarray, "*lead chunks chunk"]) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from .chunks import aligned, chunk_size, host_blocks, on_host, over_samples, put, two_axes
+from .chunks import aligned, chunk_size, host_blocks, on_host, over_samples, put, to_device, two_axes
 from .errors import InputError
 from .kinematics import Motion, ancestors, check_shapes, motion, take
 from .model import Joint, RobotModel, dofs
@@ -70,19 +70,18 @@ def joint_torque_regressor(
         width = 10 * len(pairs(model))
         if on_host(model, q, v, a):
             shape = (*np.shape(q)[:-1], model.nv, 10 * len(model.joints))
-            with jax.ensure_compile_time_eval():
-                return _dense_on_host(model, chunk_size(width), *two_axes(q, v, a, host=True)).reshape(shape)
+            return to_device(_dense_on_host(model, chunk_size(width), *two_axes(q, v, a, host=True)).reshape(shape))
         return over_samples(dense_rows, model, q, v, a, width=width)
 
 
-def _dense_on_host(model: RobotModel, chunk: int, *arrays: np.ndarray) -> Array:
+def _dense_on_host(model: RobotModel, chunk: int, *arrays: np.ndarray) -> Float[np.ndarray, "samples nv nj 10"]:
     """W with zeros that are never written: memory that the system gives out is zero already."""
     whole = aligned((len(arrays[0]), model.nv, len(model.joints), 10), fill=0.0)
     for where, parts in host_blocks(coordinate_rows, chunk, model, *arrays):
         view = np.moveaxis(whole[where], 0, -1)
         for rows, blocks in _runs(model.joints):
             put(view[rows], parts[blocks])
-    return jax.device_put(whole.reshape(len(whole), model.nv, 10 * len(model.joints)), may_alias=True)
+    return whole
 
 
 def packed_regressor(

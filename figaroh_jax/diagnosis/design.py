@@ -21,6 +21,7 @@ from jaxtyping import Array, Complex, Float, Int
 from ..dynamics import inverse_dynamics
 from ..effect import Effect, Motion, columns
 from ..model import Leaf, RobotModel
+from ..programs import Program
 from .records import Records, filter_rows
 
 __all__ = [
@@ -273,11 +274,12 @@ def _size(effect: Effect) -> Float[np.ndarray, " effects"]:
 def _changed_torques(batch: Effect, motion: Motion) -> Float[np.ndarray, "effects k nv nN"]:
     """Torque of a unit of each amplitude of effects that change the robot, which it is linear in."""
     q, v, a = motion.position, motion.velocity, motion.acceleration
-    before, models = rigid_torque(motion.model, q, v, a), _changed(batch, motion.model)
+    before, robot = rigid_torque(motion.model, q, v, a), jax.tree.structure(motion.model)
+    models = _changed(batch, motion.model)
     amplitudes = sum(p.linear for p in batch.parameters().values())
     out = np.empty((len(batch.at), amplitudes, *before.shape[::-1]))
     for one, amplitude in np.ndindex(out.shape[:2]):
-        changed = jax.tree.map(lambda x, i=one, k=amplitude: np.asarray(x)[i, k], models)
+        changed = jax.tree.unflatten(robot, [np.asarray(x)[one, amplitude] for x in models])
         out[one, amplitude] = (rigid_torque(changed, q, v, a) - before).T
     return out
 
@@ -290,12 +292,12 @@ def _amplitudes(effect: Effect) -> list[str]:
     return [name for name, p in effect.parameters().items() if p.linear]
 
 
-@jax.jit
+@Program
 def _unit_torques(batches: dict[str, Effect], motion: Motion) -> dict[str, Float[Array, "effects k nN *rows"]]:
     return {name: jax.vmap(lambda e: columns(e, motion))(batch) for name, batch in batches.items()}
 
 
-@jax.jit
+@Program
 def _units_and_slopes(
     effects: Effect, values: Array, motion: Motion
 ) -> tuple[Float[Array, "effects k nN rows"], Float[Array, "effects k nN rows p"]]:
@@ -313,22 +315,24 @@ def _units_and_slopes(
     return jax.vmap(one)(effects, values)
 
 
-@jax.jit
+@Program
 def _error(effect: Effect, motion: Motion) -> Float[Array, " nN"]:
     return effect.position_error(motion)
 
 
-@jax.jit
+@Program
 def _responses(batches: dict[str, Effect], omega: Array) -> dict[str, Complex[Array, "effects F"]]:
     return {name: jax.vmap(lambda e: e.torque_response(omega))(batch) for name, batch in batches.items()}
 
 
-@jax.jit
-def _changed(effects: Effect, model: RobotModel) -> RobotModel:
-    """The robot with a unit of each amplitude of each effect: leading axes (effects, amplitudes)."""
+@Program
+def _changed(effects: Effect, model: RobotModel) -> list[Float[Array, "effects amplitudes *rest"]]:
+    """Leaves of the robot with a unit of each amplitude of each effect."""
     names = _amplitudes(effects)
 
     def change(effect: Effect, unit: Array) -> RobotModel:
         return with_shape(effect, names, list(unit)).change(model)
 
-    return jax.vmap(jax.vmap(change, in_axes=(None, 0)), in_axes=(0, None))(effects, jnp.eye(len(names)))
+    return jax.tree.leaves(
+        jax.vmap(jax.vmap(change, in_axes=(None, 0)), in_axes=(0, None))(effects, jnp.eye(len(names)))
+    )
