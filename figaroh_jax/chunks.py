@@ -179,9 +179,9 @@ def host_blocks(
 
 def _assembled(kernel: Callable[..., Any], chunk: int, last: bool, parameters: Any, *arrays: np.ndarray) -> Array:
     """Answers put together in NumPy: JAX's own memory comes in small pages, which cost more than the numbers."""
-    samples, whole, view = len(arrays[0]), None, None
+    samples, whole, view = len(arrays[0]), np.empty(0), None
     for where, parts in host_blocks(kernel, chunk, parameters, *arrays):
-        if whole is None or view is None:
+        if view is None:
             whole = aligned((*parts.shape[:-2], samples) if last else (samples, *parts.shape[:-2]))
             view = whole if last else np.moveaxis(whole, 0, -1)
         put(view[..., where], parts)

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jaxlib
 import numpy as np
 
 __all__ = ["Program"]
@@ -124,7 +123,7 @@ def _surroundings() -> str:
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     processor = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
-    versions = (jax.__version__, jaxlib.__version__, platform.machine(), platform.processor())
+    versions = (jax.__version__, jax.lib.__version__, platform.machine(), platform.processor())
     return repr((source.hexdigest(), versions, processor, os.environ.get("XLA_FLAGS")))
 
 
