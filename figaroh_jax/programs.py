@@ -14,6 +14,7 @@ import pickle
 import platform
 from collections.abc import Callable, Iterable
 from functools import lru_cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -123,7 +124,7 @@ def _surroundings() -> str:
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     processor = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
-    versions = (jax.__version__, jax.lib.__version__, platform.machine(), platform.processor())
+    versions = (jax.__version__, version("jaxlib"), platform.machine(), platform.processor())
     return repr((source.hexdigest(), versions, processor, os.environ.get("XLA_FLAGS")))
 
 
