@@ -30,8 +30,9 @@ _PLAIN = (tuple, list, dict, type(None))
 class Program:
     """A function of trees of arrays, compiled once for each type of its arguments; to be called outside of any trace.
 
-    The first `static` arguments are functions; the arrays of argument `donate` are given away. Where trees other than
-    tuples, lists and dicts come out, or types of another package go in, the program lives as long as the process.
+    The first `static` arguments are functions; the arrays of argument `donate` are given away; `options` are those of
+    a CPU's compiler. Where trees other than tuples, lists and dicts come out, or types of another package go in, the
+    program lives as long as the process.
     """
 
     def __init__(
@@ -83,7 +84,8 @@ class Program:
         # Another name each time: what comes from JAX's own cache cannot be kept once more (its code is left out).
         flat.__name__ = f"{self.function.__name__}_{os.urandom(8).hex()}"
         types = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
-        compiled = jax.jit(flat, donate_argnums=given, compiler_options=self.options).lower(*types).compile()
+        options = self.options if jax.default_backend() == "cpu" else None
+        compiled = jax.jit(flat, donate_argnums=given, compiler_options=options).lower(*types).compile()
         return compiled, out[-1]
 
     def _file(self, static: tuple[Any, ...], leaves: list[Any], tree: Any) -> Path | None:
