@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from .errors import InputError
 
@@ -58,13 +59,18 @@ def _run(args: argparse.Namespace) -> int:
         task_file = args.task or demo / "task.yaml"
         out = args.out or Path(f"{args.task.stem if args.task else 'demo'}_{job.noun}")
         with terminal.Progress(quiet=args.quiet) as progress:
-            found = job.run(task_file, out, progress, args.backend)
+            found = job.run(task_file, out, progress, args.backend, **_own_options(args))
     if args.json:
         sys.stdout.write(job.to_json(found))
     else:
         job.show(found)
         print(f"Report: {out / REPORT}")
     return 0
+
+
+def _own_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Options that one command alone has."""
+    return {"level": args.level, "priors": args.priors} if args.command == "calibrate" else {}
 
 
 def _explain(error: Exception, with_traceback: bool) -> int:
@@ -94,7 +100,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=_version())
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, explained in _TASKS.items():
-        commands.add_parser(name, parents=[common], help=explained).add_argument("task", type=Path, metavar="TASK.yaml")
+        command = commands.add_parser(name, parents=[common], help=explained)
+        command.add_argument("task", type=Path, metavar="TASK.yaml")
+        if name == "calibrate":
+            command.add_argument("--level", help="frames, joint_offset or full, in place of what predicts best")
+            command.add_argument("--no-priors", dest="priors", action="store_false", help="plain least squares")
     demo = commands.add_parser("demo", parents=[common], help="the main job on an embedded recording, no file needed")
     demo.set_defaults(task=None)
     return parser

@@ -44,7 +44,7 @@ class Job(NamedTuple):
     """A command on a task file: what it runs and writes, what `--json` prints, what a reader sees."""
 
     noun: str  # of the run directory's default name
-    run: Callable[[Path, Path, Callable[[str, float], None], str], Any]
+    run: Callable[..., Any]  # (task file, run directory, progress, backend), and the command's own options by name
     to_json: Callable[[Any], str]
     show: Callable[[Any], None]
 
@@ -136,8 +136,14 @@ def calibrate_file(
     out: Path,
     progress: Callable[[str, float], None] = lambda phase, fraction: None,
     backend: str = "native",
+    *,
+    level: str | None = None,
+    priors: bool = True,
 ) -> Calibration:
-    """Read a task, calibrate its robot and write the run directory `out`, as `diagnose_file` does."""
+    """Read a task, calibrate its robot and write the run directory `out`, as `diagnose_file` does.
+
+    `level` and `priors` are those of `calibration.calibrate`.
+    """
     from .formats.config import load_task
 
     _native_alone(backend)
@@ -146,7 +152,7 @@ def calibrate_file(
     from .calibration.calibration import calibrate_task
     from .reporting.calibration_files import write_calibration
 
-    calibration = calibrate_task(task, progress=progress)
+    calibration = calibrate_task(task, progress=progress, level=level, priors=priors)
     progress("writing the report", 1.0)
     with whole_directory(out) as folder:
         write_calibration(calibration, folder, task.robot.model)

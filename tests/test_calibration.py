@@ -124,6 +124,18 @@ def test_run_directory_holds_what_the_contract_asks(wrong: tuple[Path, poses.Tru
     assert "full geometry" in capsys.readouterr().out
 
 
+def test_the_level_that_is_asked_for_is_the_one_that_is_fitted(
+    wrong: tuple[Path, poses.Truth], tmp_path: Path, capsys: Any
+):
+    task, out = str(wrong[0]), str(tmp_path / "run")
+    assert cli.main(["calibrate", task, "--out", out, "--quiet", "--json", "--level", "joint_offset"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["level"] == "joint_offset"
+    assert {p["name"].split()[0] for p in result["parameters"]} == {"joint_offset", "base_frame", "tool_frame"}
+    assert cli.main(["calibrate", task, "--out", out, "--quiet", "--level", "offset"]) == 2
+    assert "no level 'offset' of calibration; did you mean 'joint_offset'?" in capsys.readouterr().err
+
+
 def test_a_robot_that_is_already_good_gets_nothing(tmp_path: Path):
     rng = np.random.default_rng(13)
     found = calibrate_task(load_task(recorded(tmp_path, rng, poses.truth(rng))))

@@ -14,11 +14,11 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..errors import InputError
+from ..errors import InputError, nearest
 from ..model import RobotModel
 from . import corrections, levels, marginal
 from .calibrated import Calibration, Error, Outlier
-from .candidates import Block, blocks_of, effects_on, geometry_columns
+from .candidates import Block, blocks_of, effects_on, empty_columns, geometry_columns, known_frames
 from .chain import chain_between
 from .gravity import without_far_masses
 from .kinematic_effects import HISTORY
@@ -26,6 +26,7 @@ from .outliers import find_outliers
 from .posegroups import Measured, assemble, postures_of
 from .poserecords import PoseRecording, read_pose_recordings
 from .posesolver import Solution, solve
+from .shapes import refine
 
 if TYPE_CHECKING:
     from ..formats.config import Task
@@ -36,13 +37,19 @@ _RECURS = 4  # of five outer folds must choose an effect
 _NESTED_GAIN = 0.05  # of the error on the outer folds, that the effects must take away
 
 
-def calibrate_task(task: Task, progress: Callable[[str, float], None] = lambda phase, share: None) -> Calibration:
-    """Calibrate the robot of a task from its recordings with a `measurement`."""
+def calibrate_task(
+    task: Task,
+    progress: Callable[[str, float], None] = lambda phase, share: None,
+    *,
+    level: str | None = None,
+    priors: bool = True,
+) -> Calibration:
+    """Calibrate the robot of a task from its recordings with a `measurement`; `level`, `priors`: see `calibrate`."""
     from ..formats.config import load_robot
 
     model = load_robot(task)
     recordings = read_pose_recordings(task, model)
-    found = calibrate(model, recordings, forbid=task.diagnose.forbid, progress=progress)
+    found = calibrate(model, recordings, forbid=task.diagnose.forbid, level=level, priors=priors, progress=progress)
     return replace(found, posture=dict(task.robot.posture))
 
 
@@ -51,11 +58,20 @@ def calibrate(
     recordings: Sequence[PoseRecording],
     *,
     forbid: Sequence[str] = (),
+    level: str | None = None,
+    priors: bool = True,
     progress: Callable[[str, float], None] = lambda phase, share: None,
 ) -> Calibration:
-    """The calibrated robot; raises `InputError` where there are too few postures or a frame does not move."""
+    """The calibrated robot; raises `InputError` where there are too few postures or a frame does not move.
+
+    Level and effects are those that predict best. `level` ("frames", "joint_offset" or "full") asks for one in their
+    place, and for no effects: it is fitted, and the notes say so where it predicts worse than the frames alone. Without
+    `priors` its identifiable parameters are fitted by plain least squares.
+    """
+    if level is not None and level not in levels.LEVELS:
+        raise InputError(f"no level '{level}' of calibration{nearest(level, levels.LEVELS)}")
     with jax.enable_x64(True):
-        return Run(model, recordings, forbid, progress).finish()
+        return Run(model, recordings, forbid, progress, level, priors).finish()
 
 
 class Run:
@@ -68,6 +84,7 @@ class Run:
     choice: levels.Choice
     folds: list[levels.Fold]
     named: list[int]
+    extension: list[Block]  # the named effects as they are fitted
     history: bool  # whether an error that depends on the posture before was found and has no name
     fit: tuple[Measured, marginal.Linear, marginal.Posterior, Solution]
 
@@ -77,8 +94,11 @@ class Run:
         recordings: Sequence[PoseRecording],
         forbid: Sequence[str],
         progress: Callable[[str, float], None],
+        level: str | None = None,
+        priors: bool = True,
     ) -> None:
         self.model, self.recordings, self.forbid, self.progress = model, tuple(recordings), tuple(forbid), progress
+        self.level, self.priors = level, priors
         progress("reading the postures", 0.02)
         weighing, notes = without_far_masses(model)
         self.weighing = weighing
@@ -86,6 +106,10 @@ class Run:
         self.chain = _chain(model, self.recordings)
         geometry = geometry_columns(model, self.chain)
         self.measured = assemble(weighing, self.recordings, self.postures, geometry, [1e-3] * len(geometry))
+        if not priors:
+            geometry = corrections.identifiable(self.measured)
+            self.measured = assemble(weighing, self.recordings, self.postures, geometry, [1e-3] * len(geometry))
+            self.measured = self.measured._replace(plain=True)
         _enough(self.measured, self.recordings)
         self.notes = [*notes, *(note for r in self.recordings for note in r.notes), *_few(self.recordings)]
 
@@ -94,10 +118,11 @@ class Run:
         measured = self.measured
         everything = measured.measured & ~measured.holdout[measured.posture]
         self.progress("choosing among levels", 0.05)
-        self.blocks = blocks_of(self.weighing, self.chain, self.postures, self.forbid)
-        model, recordings, postures = self.weighing, self.recordings, self.postures
-        self.effects = effects_on(model, recordings, postures, measured, self.blocks) if self.blocks else None
-        choice = levels.choose(measured, everything, self.effects)
+        frames = known_frames(self.model, self.chain, self.recordings)
+        self.blocks = blocks_of(self.weighing, self.chain, self.postures, self.forbid, frames)
+        extending = bool(self.blocks) and self.level is None and self.priors
+        self.effects = effects_on(self.postures, measured, self.blocks) if extending else None
+        choice = levels.choose(measured, everything, self.effects, self.level)
         wide = self._wide(choice)  # with its effects: what they explain is no outlier
         sizes = find_outliers(wide, everything, levels.free_at(choice.level, wide.prior))
         self.outliers = tuple(
@@ -106,17 +131,21 @@ class Run:
         )
         self.used = everything & ~np.isin(measured.posture, list(sizes))
         if sizes:
-            choice = levels.choose(measured, self.used, self.effects)
+            choice = levels.choose(measured, self.used, self.effects, self.level)
         validating = lambda share: self.progress("validating", 0.3 + 0.5 * share)  # noqa: E731
-        folds = levels.nested(measured, self.used, self.effects, self._extended, validating)
+        folds = levels.nested(measured, self.used, self.effects, self._extended, self.level, validating)
         self.choice, self.folds = _never_worse(choice, folds)
+        if self.level not in (None, self.choice.level):
+            self.notes.append(f"the level {self.level} that was asked for predicts no better than the frames alone")
+            self.choice, self.folds = choice, folds
         recurring = _recurring(self.choice, self.folds, self.blocks)
         self.named = [k for k in recurring if self.blocks[k].effect is not HISTORY]
         self.history = len(self.named) < len(recurring)
         if self.history:
             self.notes.append("the error of a posture depends on the one before it in a way that no effect explains")
         self.progress("fitting", 0.85)
-        self.fit = self._fit(self.choice.level, [self.blocks[k] for k in self.named])
+        self.extension = self._refined()
+        self.fit = self._fit(self.choice.level, self.extension)
         return self._result()
 
     def _extended(self, choice: levels.Choice, rows: Bool[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
@@ -135,16 +164,26 @@ class Run:
         return linear._replace(
             jacobian=np.hstack([linear.jacobian, Z]),
             at=np.r_[linear.at, np.zeros(Z.shape[1])],
-            prior=np.r_[linear.prior, np.full(Z.shape[1], len(linear.tolerance) - 1)],
+            prior=np.r_[linear.prior, np.full(Z.shape[1], levels.EFFECT)],
         )
+
+    def _refined(self) -> list[Block]:
+        """The named effects, each once, with the best value of their shapes."""
+        if not self.named:
+            return []
+        fit = self.choice.fits[self.choice.level]
+        rows = self.used, levels.free_at(self.choice.level, fit[0].prior)
+        named = [self.blocks[k] for k in self.named]
+        return refine(self.model, self.postures, self.measured, fit, rows, named)
 
     def _fit(self, level: str, blocks: Sequence[Block]):
         """The level with its effects, exactly; then Levenberg-Marquardt from several starts at those weights."""
-        measured = self.measured
-        if blocks:
-            columns = [*measured.columns, *(c for b in blocks for c in b.columns)]
-            sizes = [1e-3] * len(measured.columns) + [s for b in blocks for s in b.sizes]
-            measured = assemble(self.weighing, self.recordings, self.postures, columns, sizes)
+        columns = [*self.measured.columns, *(c for b in blocks for c in b.columns)]
+        columns += empty_columns(self.chain[0], [c for b in blocks for c in b.columns])
+        sizes = np.full(len(columns), 1e-3)
+        sizes[len(self.measured.columns) :][: sum(len(b.sizes) for b in blocks)] = [s for b in blocks for s in b.sizes]
+        measured = assemble(self.weighing, self.recordings, self.postures, columns, list(sizes))
+        measured = measured._replace(plain=not self.priors)
         linear, posterior = levels.fit_level(measured, self.used, level)
         free = levels.free_at(level, linear.prior)
         solution = _polish(measured, linear, posterior, self.used, free)
@@ -158,8 +197,7 @@ class Run:
         parameters = corrections.parameters_of(final, linear, posterior, gauge, order)
         table = _table(self.folds, bool(self.named))
         position, orientation, scheme = self._errors(final, frames, linear.residual, table)
-        named = [self.blocks[k] for k in self.named]
-        causes = corrections.causes_of(parameters, level, named, self.blocks, table, self.folds)
+        causes = corrections.causes_of(parameters, level, self.extension, self.blocks, table, self.folds)
         twists = corrections.twists_of(self.model, final, linear.at)
         names = [c.label for c in final.columns] + [name for name, _ in final.own]
         if not solution.converged:
@@ -241,12 +279,8 @@ def _recurring(choice: levels.Choice, folds: Sequence[levels.Fold], blocks: Sequ
     gains = [1.0 - c / p for p, c in zip(plain, chosen, strict=True) if np.isfinite(p) and p > 0.0]
     if not gains or np.mean(gains) < _NESTED_GAIN:
         return []
-    places = [{(blocks[k].effect.name, blocks[k].columns[0].at) for k in f.choice.effects} for f in folds]
-    return [
-        k
-        for k in choice.effects
-        if sum((blocks[k].effect.name, blocks[k].columns[0].at) in p for p in places) >= _RECURS
-    ]
+    places = [{blocks[k].name for k in f.choice.effects} for f in folds]
+    return [k for k in choice.effects if sum(blocks[k].name in p for p in places) >= _RECURS]
 
 
 def _never_worse(choice: levels.Choice, folds: list[levels.Fold]) -> tuple[levels.Choice, list[levels.Fold]]:

@@ -6,24 +6,43 @@ nothing in these postures (no payload, a vertical axis under gravity) is no cand
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from ..model import RobotModel
+from ..results import Name
 from . import posefit
 from .kinematic_effects import CATALOGUE, HISTORY, Column, KinematicEffect, Postures, columns_of
 from .levels import Effects
-from .posegroups import Measured, assemble
+from .posegroups import Measured
 from .poserecords import PoseRecording
 
-__all__ = ["Block", "GEOMETRY", "blocks_of", "effects_on", "geometry_columns", "sizes_of"]
+__all__ = [
+    "GEOMETRY",
+    "Block",
+    "Moves",
+    "blocks_of",
+    "effects_on",
+    "empty_columns",
+    "geometry_columns",
+    "known_frames",
+    "moved_rows",
+    "moves",
+    "sizes_of",
+    "twist_rows",
+]
 
 GEOMETRY = ("joint_offset", "link_geometry")
 _STEP = 1e-3  # rad or m
 _STILL = 1e-9  # rad or m per unit: the effect does nothing
+_SLOTS = 6, 12  # columns and pieces of effects for which a fit has room
+
+
+Moves = list[tuple[int, Float[np.ndarray, "6 samples"]]]
 
 
 class Block(NamedTuple):
@@ -33,6 +52,12 @@ class Block(NamedTuple):
     columns: tuple[Column, ...]
     sizes: tuple[float, ...]
     shape: float
+    shape_std: float = float("nan")
+
+    @property
+    def name(self) -> Name:
+        """Effect and place."""
+        return Name(self.effect.name, self.columns[0].at)
 
 
 def geometry_columns(model: RobotModel, chain: Sequence[int]) -> tuple[Column, ...]:
@@ -40,15 +65,33 @@ def geometry_columns(model: RobotModel, chain: Sequence[int]) -> tuple[Column, .
     return tuple(c for name in GEOMETRY for j in chain for c in columns_of(CATALOGUE[name], model, (j,)))
 
 
+def empty_columns(joint: int, effects: Sequence[Column]) -> list[Column]:
+    """Columns that do nothing, so that fits with other `effects` have the same shape and share a compiled program."""
+    columns, pieces = -len(effects) % _SLOTS[0], -sum(len(c.pieces) for c in effects) % _SLOTS[1]
+    if not effects:
+        columns, pieces = _SLOTS
+    if not columns:
+        columns, pieces = _SLOTS[0], pieces or _SLOTS[1]
+    still = (joint, lambda postures: np.zeros((6, len(postures.q))))
+    return [Column("", (), "", "", (still,) * (pieces * (k == 0))) for k in range(columns)]
+
+
 def blocks_of(
-    model: RobotModel, chain: Sequence[int], postures: Sequence[Postures], forbid: Sequence[str] = ()
+    model: RobotModel,
+    chain: Sequence[int],
+    postures: Sequence[Postures],
+    forbid: Sequence[str] = (),
+    frames: Mapping[str, tuple[int, int]] = MappingProxyType({}),
 ) -> tuple[Block, ...]:
-    """Every candidate beyond geometry that does something in these postures."""
+    """Every candidate beyond geometry that does something in these postures.
+
+    `frames` are those of base and tool that are said to be known: the joint beside each, and the frame's index.
+    """
     found = []
     for effect in (*CATALOGUE.values(), HISTORY):
         if effect.name in GEOMETRY or effect.name in forbid:
             continue
-        for at in _places(effect, model, chain):
+        for at in _places(effect, chain, frames):
             for shape in effect.shape[1]:
                 columns = columns_of(effect, model, at, shape)
                 sizes = sizes_of(columns, postures)
@@ -70,32 +113,74 @@ def sizes_of(columns: Sequence[Column], postures: Sequence[Postures]) -> Float[n
     return np.array(sizes)
 
 
-def _places(effect: KinematicEffect, model: RobotModel, chain: Sequence[int]) -> list[tuple[int, ...]]:
+def known_frames(
+    model: RobotModel, chain: Sequence[int], recordings: Sequence[PoseRecording]
+) -> dict[str, tuple[int, int]]:
+    """Base and tool frame where all recordings see one, and say that it is known: the joint beside it, its index."""
+    found = {}
+    for name, joint in (("base_frame", chain[0]), ("tool_frame", chain[-1])):
+        frames = {getattr(r, name) for r in recordings}
+        seen = all(name not in r.unknown and r.kind in ("pose", "position") for r in recordings)
+        if seen and len(frames) == 1:
+            found[name] = joint, model.frame_index(frames.pop())
+    return found
+
+
+def _places(
+    effect: KinematicEffect, chain: Sequence[int], frames: Mapping[str, tuple[int, int]]
+) -> list[tuple[int, ...]]:
     if effect.acts_on == "robot":
         return [()]
+    if effect.acts_on == "frame":
+        return [frames[effect.name]] if effect.name in frames else []
     if effect.acts_on == "joint":
         return [(j,) for j in chain]
     pairs = [(a, b) for a, b in zip(chain[:-1], chain[1:], strict=True)]
     return pairs + [(b, a) for a, b in pairs]
 
 
-def effects_on(
-    model: RobotModel,
-    recordings: Sequence[PoseRecording],
-    postures: Sequence[Postures],
-    measured: Measured,
-    blocks: Sequence[Block],
-) -> Effects:
-    """The candidates with their exact columns at any fit of `measured`."""
-    extra = [column for block in blocks for column in block.columns]
+def effects_on(postures: Sequence[Postures], measured: Measured, blocks: Sequence[Block]) -> Effects:
+    """The candidates with their exact columns at any fit of `measured`, which has all twists of every joint."""
     sizes = np.array([size for block in blocks for size in block.sizes])
-    own = np.asarray(measured.problem.scale)[: len(measured.columns)]
-    wide = assemble(model, recordings, postures, [*measured.columns, *extra], [*own, *sizes])
-    first, last = len(measured.columns), len(measured.columns) + len(extra)
+    moved = [moves(column, postures) for block in blocks for column in block.columns]
 
-    def jacobian(at: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, "rows all"]:
-        whole = np.concatenate([at[:first], np.zeros(len(extra)), at[first:]])
-        return posefit.linearise(wide.problem, whole)[1][:, first:last]
+    def jacobian(unknowns: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, "rows all"]:
+        return moved_rows(measured, twist_rows(measured, unknowns), moved) * sizes
 
     handicap = [0.01 * (len(b.columns) - 1) + 0.005 * np.log(len(b.effect.shape[1])) for b in blocks]
     return Effects(tuple(block.columns for block in blocks), jacobian, sizes, np.array(handicap))
+
+
+def moves(column: Column, postures: Sequence[Postures]) -> Moves:
+    """The joints that a column moves, each with the twist of a unit of it in all postures."""
+    return [(joint, np.concatenate([f(p) for p in postures], axis=1)) for joint, f in column.pieces]
+
+
+def twist_rows(measured: Measured, unknowns: Float[np.ndarray, " unknowns"]) -> dict[int, Float[np.ndarray, "rows 6"]]:
+    """Derivative of the rows (m, rad) by a twist of each joint, from those by its offset and its geometry.
+
+    They are an orthonormal basis of the joint's twists, so `measured` must have them all.
+    """
+    jacobian = posefit.linearise(measured.problem, unknowns)[1] / np.asarray(measured.problem.scale)
+    none = np.zeros((1, 0))
+    still = Postures(none, none, none, none, none, np.zeros(1), 1.0)
+    found: dict[int, np.ndarray] = {}
+    for k, column in enumerate(measured.columns):
+        if column.effect in GEOMETRY:
+            ((joint, field),) = column.pieces
+            found[joint] = found.get(joint, 0.0) + np.outer(jacobian[:, k], field(still)[:, 0])
+    return found
+
+
+def moved_rows(
+    measured: Measured, by_twist: Mapping[int, Float[np.ndarray, "rows 6"]], moved: Sequence[Moves]
+) -> Float[np.ndarray, "rows columns"]:
+    """Derivative of the rows by columns that move joints by twists, other ones in each posture."""
+    inside = measured.posture >= 0
+    posture = measured.posture[inside]
+    found = np.zeros((len(inside), len(moved)))
+    for k, pieces in enumerate(moved):
+        for joint, twist in pieces:
+            if joint in by_twist:
+                found[inside, k] += np.einsum("nt,tn->n", by_twist[joint][inside], twist[:, posture])
+    return found

@@ -17,7 +17,7 @@ from .calibrated import Outlier, Parameter, Shown
 from .candidates import Block
 from .devices import Device
 from .gauge import Gauge, find_gauge
-from .kinematic_effects import Postures
+from .kinematic_effects import Column, Postures
 from .posefit import DRAFT_OPTIONS
 from .posegroups import Measured
 
@@ -27,6 +27,7 @@ __all__ = [
     "corrected",
     "frames_of",
     "gauge_of",
+    "identifiable",
     "outlier_cause",
     "parameters_of",
     "shown_of",
@@ -49,6 +50,15 @@ def gauge_of(final: Measured, fit: marginal.Linear, used, free) -> tuple[Gauge, 
     first = sorted(range(len(order)), key=lambda i: (linear.prior[order[i]] != marginal.FLAT, order[i] in effects, i))
     rows = np.flatnonzero(used)
     return find_gauge(linear.jacobian[rows][:, order], first), order
+
+
+def identifiable(measured: Measured) -> list[Column]:
+    """The columns of offsets and geometry that the measured postures tell from the frames and from those before."""
+    linear = levels.linearise(measured, np.zeros(len(measured.columns) + len(measured.own)))
+    rows = measured.measured & ~np.where(linear.posture >= 0, measured.holdout[linear.posture], False)
+    gauge, order = gauge_of(measured, linear, rows, np.ones(len(linear.at), bool))
+    held = {order[k] for k in gauge.dependent}
+    return [column for k, column in enumerate(measured.columns) if k not in held]
 
 
 def parameters_of(final: Measured, linear, posterior, gauge: Gauge, order: list[int]) -> tuple[Parameter, ...]:
@@ -88,14 +98,10 @@ def causes_of(
         values = {c.parameter: by_name[c.label] for c in block.columns}
         estimates = {key: Estimate(p.value, p.std, p.unit) for key, p in values.items()}
         if block.effect.shape[0]:
-            estimates[block.effect.shape[0]] = Estimate(float(block.shape), float("nan"), "1")
-        share = np.mean([any(_same(blocks[j], block) for j in f.choice.effects) for f in folds])
-        found.append(Cause(Name(block.effect.name, block.columns[0].at), estimates, float(share), gain))
+            estimates[block.effect.shape[0]] = Estimate(float(block.shape), block.shape_std, "1")
+        share = np.mean([any(blocks[j].name == block.name for j in f.choice.effects) for f in folds])
+        found.append(Cause(block.name, estimates, float(share), gain))
     return tuple(found)
-
-
-def _same(a: Block, b: Block) -> bool:
-    return (a.effect.name, a.columns[0].at) == (b.effect.name, b.columns[0].at)
 
 
 def outlier_cause(outlier: Outlier) -> Cause:

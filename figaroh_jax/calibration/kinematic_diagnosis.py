@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
@@ -19,9 +19,9 @@ from ..results import Cause, Estimate, Experiment, Gain, Name
 from . import levels, marginal
 from .calibrated import Calibration
 from .calibration import Run
-from .candidates import GEOMETRY
+from .candidates import GEOMETRY, moved_rows, moves, twist_rows
 from .kinematic_effects import CATALOGUE, HISTORY, KinematicEffect
-from .kinematic_scores import Scores, score_blocks
+from .kinematic_scores import Scores, score_blocks, score_jitter
 from .poserecords import PoseRecording, read_pose_recordings
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PoseDiagnosis", "diagnose_pose_task", "diagnose_poses"]
 
-_TOLERANCE = (1.0, 0.5, 1.0, 1.0)  # mrad, mm, mrad: how well a good robot is built and zeroed
+_TOLERANCE = (1.0, 0.5, 1.0, 1.0, 1.0)  # mrad, mm, mrad: how well a good robot is built and zeroed
 _WIDE = 100.0  # of a block that was named: free
 _MOST = 16
 _NOISY = 1.5  # times the device's stated accuracy: the rest is no noise
@@ -80,19 +80,58 @@ def diagnose_poses(
         outliers = [c for c in calibration.causes if c.name.effect == "outlier"]
         causes = tuple([*outliers, *geometry, *_with_rivals(effects, run)])
         p_value = min(1.0, 2.0 * min(p_geometry, p_effects))
-        rest = run.history or p_rest < alpha / 5 or _beyond_accuracy(recordings, calibration)
+        p_play, joint = _play(run)
+        if p_play < alpha / 5:
+            note = f"joint {joint} stands elsewhere from posture to posture than it says: play, or poor repeatability"
+            calibration = replace(calibration, notes=(*calibration.notes, note))
+        rest = run.history or min(p_rest, p_play) < alpha / 5 or _beyond_accuracy(recordings, calibration)
         return _answer(calibration, causes, p_value, rest)
+
+
+class _Geometry(NamedTuple):
+    """Rows about the fit of full geometry, with columns of the named effects (free) and of a base said to be known."""
+
+    linear: marginal.Linear
+    names: list[Name]
+    places: list[np.ndarray]  # columns of each name
+    columns: list[tuple[str, str, float]]  # parameter, unit and size of each column
+    width: np.ndarray  # stated tolerance of each unknown, in its size
+
+
+def _geometry_of(run: Run) -> _Geometry:
+    linear, _ = run.choice.fits["full"]
+    measured = run.measured
+    known = [b for b in run.blocks if b.effect.name == "base_frame"] if run.effects else []
+    extra = [*run.extension, *known]
+    added = [column for block in extra for column in block.columns]
+    sizes = np.array([size for block in extra for size in block.sizes])
+    scale = np.asarray(measured.problem.scale)
+    columns = [(c.parameter, c.unit, float(size)) for c, size in zip(measured.columns, scale, strict=False)]
+    width = np.array(_TOLERANCE)[np.maximum(linear.prior, 0)]
+    names = [Name(c.effect, c.at) for c in measured.columns]
+    places = {name: np.array([k for k, n in enumerate(names) if n == name]) for name in names}
+    if added:
+        Z = moved_rows(measured, twist_rows(measured, linear.at), [moves(c, run.postures) for c in added])
+        effects = sum(len(block.columns) for block in run.extension)
+        group = np.where(np.arange(len(added)) < effects, marginal.FLAT, levels.EFFECT)
+        first = len(linear.at)
+        linear = linear._replace(
+            jacobian=np.hstack([linear.jacobian, Z * sizes]),
+            at=np.concatenate([linear.at, np.zeros(len(added))]),
+            prior=np.concatenate([linear.prior, group]),
+        )
+        width = np.concatenate([width, [_TOLERANCE[1 if c.unit == "m" else 2] for c in added] * (1e-3 / sizes)])
+        columns += [("", "", 1.0)] * (first - len(columns))
+        columns += [(c.parameter, c.unit, float(size)) for c, size in zip(added, sizes, strict=True)]
+        if known:
+            places[known[0].name] = np.arange(first + effects, first + len(added))
+    return _Geometry(linear, list(places), list(places.values()), columns, width)
 
 
 def _geometry(run: Run, calibration: Calibration, alpha: float) -> tuple[list[Cause], float]:
     """Offsets and links beyond their stated tolerance, the most evident first, and the p-value of the first one."""
-    linear, posterior = run.choice.fits["full"]
-    _, _, final, _ = run.fit
-    columns = run.measured.columns
-    names = list(dict.fromkeys((c.effect, c.at) for c in columns))
-    places = [np.array([k for k, c in enumerate(columns) if (c.effect, c.at) == name]) for name in names]
-    width = np.array(_TOLERANCE)[np.maximum(linear.prior, 0)]
-    noise = _row_noise(linear, posterior if calibration.level == "full" else final)
+    linear, names, places, columns, width = _geometry_of(run)
+    noise = _row_noise(linear, run.fit[2])
     named: list[int] = []
     first = 1.0
     free = np.ones(len(width), bool)
@@ -107,18 +146,25 @@ def _geometry(run: Run, calibration: Calibration, alpha: float) -> tuple[list[Ca
             break
         named.append(_simplest(scores))
         width[places[named[-1]]] = _WIDE
-    scale = np.asarray(run.measured.problem.scale)
-    gain = _gain(calibration)
+    gain, twins = _gain(calibration), _twins(run)
     causes = []
     for k in named:
         values = {
-            columns[i].parameter: Estimate(
-                float(at[i] * scale[i]), float(np.sqrt(covariance[i, i]) * scale[i]), columns[i].unit
+            columns[i][0]: Estimate(
+                float(at[i] * columns[i][2]), float(np.sqrt(covariance[i, i]) * columns[i][2]), columns[i][1]
             )
             for i in places[k]
         }
-        causes.append(Cause(Name(*names[k]), values, 1.0 - first, gain))
+        same = tuple(name for twin in twins if names[k] in twin for name in twin if name != names[k])
+        causes.append(Cause(names[k], values, 1.0 - first, gain, ambiguous_with=same))
     return causes, first
+
+
+def _twins(run: Run) -> list[tuple[Name, ...]]:
+    """Names that nothing can tell apart: a base that is said to be known stands where the first joint stands."""
+    place = (run.model.joints[run.chain[0]].name,)
+    known = any(b.effect.name == "base_frame" for b in run.blocks)
+    return [(Name("base_frame", ()), *(Name(effect, place) for effect in GEOMETRY))] if known else []
 
 
 def _row_noise(linear: marginal.Linear, posterior: marginal.Posterior) -> np.ndarray:
@@ -157,6 +203,16 @@ def _effect_scores(run: Run) -> tuple[float, float]:
         scores = score_blocks(fit[0], _row_noise(*fit), run.used, fit[1].precision, blocks, free)
         found.append(scores.p_value)
     return found[0], found[1]
+
+
+def _play(run: Run) -> tuple[float, str]:
+    """p-value of the joint that looks most as if it moved at random from posture to posture, and its name."""
+    final, linear, posterior, _ = run.fit
+    joints = [(c.at[0], k) for k, c in enumerate(final.columns) if c.effect == "joint_offset"]
+    free = levels.free_at(run.choice.level, linear.prior)
+    ways = linear.jacobian[:, [k for _, k in joints]]
+    p_value, worst = score_jitter(linear, _row_noise(linear, posterior), run.used, posterior.precision, ways, free)
+    return p_value, joints[worst][0]
 
 
 def _without_effects(linear: marginal.Linear, run: Run) -> np.ndarray:

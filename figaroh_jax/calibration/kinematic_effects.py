@@ -59,7 +59,7 @@ class KinematicEffect(NamedTuple):
     name: str
     title: str
     equation: str
-    acts_on: Literal["joint", "pair", "robot"]
+    acts_on: Literal["joint", "pair", "robot", "frame"]  # a frame: `at` is its joint and its own index
     build: Callable[[RobotModel, tuple[int, ...], float], Iterator[tuple[str, str, Sequence[tuple[int, Callable]]]]]
     shape: tuple[str, tuple[float, ...]] = ("", (0.0,))  # name and grid of the parameter that is not linear
     separated_by: str = ""
@@ -169,6 +169,43 @@ def _thermal(model, at, share):
 def _payload(model, at, _):
     (j,) = at
     yield "compliance", f"{_angle(model, j)}/({_torque(model, j)})", [_along(lambda p, j: p.payload[:, j])(model, j)]
+
+
+def _base(model, at, _):
+    j, frame = at
+    placed = np.linalg.inv(model.frame_placement[frame]) @ model.placement[j]
+    R, p = placed[:3, :3], placed[:3, 3]
+    for name, unit, twist in _frame_twists():
+        seen = np.r_[R.T @ (twist[:3] + np.cross(twist[3:], p)), R.T @ twist[3:]]
+        yield name, unit, [(j, lambda postures, seen=seen: np.tile(seen[:, None], len(postures.q)))]
+
+
+def _tool(model, at, _):
+    j, frame = at
+    last, axis = np.asarray(model.frame_placement[frame]), joint_axis(model, j)
+    revolute = model.joints[j].kind == "revolute"
+
+    def field(postures: Postures, twist: Array) -> Array:
+        q = model.ratio[j] * _position(model)(postures, j) + model.offset[j]
+        angular, linear, p = last[:3, :3] @ twist[3:], last[:3, :3] @ twist[:3], last[:3, 3]
+        if not revolute:
+            turned = np.tile(angular[:, None], len(q))
+            return np.concatenate([linear[:, None] + np.cross(p + q[:, None] * axis, angular).T, turned])
+        return np.concatenate([_turned(axis, q, linear + np.cross(p, angular)), _turned(axis, q, angular)])
+
+    for name, unit, twist in _frame_twists():
+        yield name, unit, [(j, lambda postures, twist=twist: field(postures, twist))]
+
+
+def _frame_twists() -> Iterator[tuple[str, str, Array]]:
+    for k, name in enumerate(("x", "y", "z", "rx", "ry", "rz")):
+        yield name, "m" if k < 3 else "rad", np.eye(6)[k]
+
+
+def _turned(axis: Array, q: Array, vector: Array) -> Float[np.ndarray, "3 samples"]:
+    """The vector turned by q (rad) about a unit axis (Rodrigues)."""
+    along, across = axis * (axis @ vector), np.cross(axis, vector)
+    return along[:, None] + np.outer(vector - along, np.cos(q)) + np.outer(across, np.sin(q))
 
 
 def _settling(model, at, _):
@@ -282,6 +319,8 @@ CATALOGUE: dict[str, KinematicEffect] = {
             separated_by="postures of {at} near the vertical, on both sides of it",
         ),
         KinematicEffect("joint_coupling", "coupling of two joints", "S_j k q_i", "pair", _coupling),
+        KinematicEffect("base_frame", "place of the base, said to be known", "a fixed twist", "frame", _base),
+        KinematicEffect("tool_frame", "place of the tool frame, said to be known", "a fixed twist", "frame", _tool),
     )
 }
 
@@ -309,7 +348,7 @@ def find_kinematic(name: str) -> KinematicEffect:
 
 def columns_of(effect: KinematicEffect, model: RobotModel, at: Sequence[int], shape: float = 0.0) -> tuple[Column, ...]:
     """The effect's columns at the tree joints `at`."""
-    names = tuple(model.joints[j].name for j in at) if effect.acts_on != "robot" else ()
+    names = tuple(model.joints[j].name for j in at) if effect.acts_on in ("joint", "pair") else ()
     return tuple(
         Column(effect.name, names, parameter, unit, tuple(pieces))
         for parameter, unit, pieces in effect.build(model, tuple(at), shape)

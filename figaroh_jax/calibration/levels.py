@@ -19,8 +19,10 @@ from . import marginal, posefit
 from .kinematic_effects import Column
 from .marginal import FLAT, Linear, Posterior
 from .posegroups import Measured
+from .posesolver import solve
 
 __all__ = [
+    "EFFECT",
     "FOLDS",
     "LEVELS",
     "Choice",
@@ -38,8 +40,10 @@ __all__ = [
 
 LEVELS = ("frames", "joint_offset", "full")
 FOLDS = 5
-_EFFECT = 3  # prior groups: 0 offsets, 1 translations, 2 rotations, 3 effects
-_TOLERANCE = (5.0, 1.0, 1.0, 1.0)  # stated widths in mrad or mm
+EFFECT, _EMPTY = 3, 4  # prior groups: 0 offsets, 1 translations, 2 rotations, 3 effects, 4 empty columns
+_TOLERANCE = (5.0, 1.0, 1.0, 1.0, 1.0)  # stated widths in mrad or mm
+_NO_WIDTH = 1e6  # of a prior that says nothing
+_PATIENCE = 2000  # steps along the valleys of what the data hardly show
 _EFFECT_WIDTH = 3.0  # of an effect's coefficient, in sizes that move its joint by 1 mrad or 1 mm RMS
 _LEVEL_GAIN = 0.01  # of the held-out error, that a level must take away from the one below it
 _LEAST_GAIN = 0.03  # of the held-out error, that an effect must take away to be taken in
@@ -89,16 +93,17 @@ class Fold(NamedTuple):
 
 def tolerances(measured: Measured) -> tuple[Int[Array, " unknowns"], Float[Array, " groups"]]:
     """Prior group of every unknown (devices' own have none) and the stated width of each group."""
-    geometry = {"joint_offset": 0, "link_geometry m": 1, "link_geometry rad": 2}
-    names = (c.effect if c.effect == "joint_offset" else f"{c.effect} {c.unit}" for c in measured.columns)
-    groups = [geometry.get(name, _EFFECT) for name in names]
-    return np.array([*groups, *(FLAT for _ in measured.own)], int), np.array(_TOLERANCE)
+    known = {"joint_offset": 0, "link_geometry m": 1, "link_geometry rad": 2, "": _EMPTY}
+    names = (f"{c.effect} {c.unit}" if c.effect == "link_geometry" else c.effect for c in measured.columns)
+    groups = [known.get(name, EFFECT) for name in names]
+    width = np.full(len(_TOLERANCE), _NO_WIDTH) if measured.plain else np.array(_TOLERANCE)
+    return np.array([*groups, *(FLAT for _ in measured.own)], int), width
 
 
 def free_at(level: str, prior: Int[Array, " unknowns"]) -> Bool[Array, " unknowns"]:
     """Which unknowns the level estimates; effects that stand among the columns always."""
     highest = {"frames": FLAT, "joint_offset": 0, "full": 2}[level]
-    return (prior <= highest) | (prior == _EFFECT)
+    return (prior <= highest) | (prior == EFFECT)
 
 
 def linearise(measured: Measured, at: Float[Array, " unknowns"]) -> Linear:
@@ -114,6 +119,9 @@ def fit_level(
     """Fit of a level to the rows `used`, linearised anew until it stays; the frames alone by plain least squares."""
     prior, _ = tolerances(measured)
     at = np.zeros(len(prior)) if start is None else start
+    if measured.plain and level != "frames":  # without priors undamped steps lead astray
+        linear = linearise(measured, _least_squares(measured, used, level, at))
+        return linear, marginal.fit(linear, used, free_at(level, prior))._replace(unknowns=linear.at)
     posterior = None
     linear = linearise(measured, at)
     for _ in range(8):
@@ -124,6 +132,17 @@ def fit_level(
             break
     assert posterior is not None
     return linear, posterior
+
+
+def _least_squares(measured: Measured, used: Array, level: str, at: Array) -> Array:
+    """Levenberg-Marquardt without priors, each channel in the size of its residual at the start."""
+    linear = linearise(measured, at)
+    free = free_at(level, linear.prior)
+    size = [rms(linear.residual[used & (linear.channel == c)]) for c in (0, 1)]
+    rows = np.where(used, 1.0 / np.array(size)[linear.channel], 0.0)
+    precision = np.where(free & (linear.prior != FLAT), _NO_WIDTH**-2.0, np.where(free, 1e-10, 1.0))
+    start = np.where(free, at, 0.0)
+    return solve(measured.problem, rows, precision, free, start, max_steps=_PATIENCE).unknowns
 
 
 def errors(measured: Measured, residual: Float[Array, " rows"], postures: Int[Array, " some"]) -> tuple[Array, Array]:
@@ -150,17 +169,18 @@ def pooled(parts: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
     return a, b
 
 
-def choose(measured: Measured, used: Bool[Array, " rows"], effects: Effects | None) -> Choice:
-    """Level and effects that predict best on postures left out of the rows `used`."""
-    fits, scores, best = {}, {}, None
+def choose(measured: Measured, used: Bool[Array, " rows"], effects: Effects | None, asked: str | None = None) -> Choice:
+    """Level and effects that predict best on postures left out of the rows `used`; the level `asked` for, if any."""
+    fits, scores, best = {}, {}, asked
     start = None
     for level in LEVELS:
         linear, posterior = fit_level(measured, used, level, start)
         start = posterior.unknowns
-        scores[level] = _held_out(measured, linear, used, level, posterior)
         fits[level] = linear, posterior
-        if best is None or scores[level] < (1.0 - _LEVEL_GAIN) * scores[best]:
-            best = level
+        if asked is None:
+            scores[level] = _held_out(measured, linear, used, level, posterior)
+            if best is None or scores[level] < (1.0 - _LEVEL_GAIN) * scores[best]:
+                best = level
     assert best is not None
     linear, posterior = fits[best]
     if effects is None:
@@ -306,6 +326,7 @@ def nested(
     used: Bool[Array, " rows"],
     effects: Effects | None,
     extended: Callable[[Choice, Bool[Array, " rows"]], Float[Array, " rows"]],
+    asked: str | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[Fold]:
     """Five outer folds (every fifth posture): the whole choice without each, and the errors on it.
@@ -317,7 +338,7 @@ def nested(
     for k in range(min(FOLDS, len(inside))):
         fold = inside[k::FOLDS]
         rows = used & ~np.isin(measured.posture, fold)
-        choice = choose(measured, rows, effects)
+        choice = choose(measured, rows, effects, asked)
         each = {level: errors(measured, fit[0].residual, fold) for level, fit in choice.fits.items()}
         plain = each[choice.level]
         chosen = errors(measured, extended(choice, rows), fold) if choice.effects else plain

@@ -131,8 +131,12 @@ def _inverse(matrix: Array) -> Array:
     from scipy.linalg import cho_factor, cho_solve
 
     root = 1.0 / np.sqrt(np.diag(matrix))
-    factor = cho_factor(matrix * np.outer(root, root))
-    return cho_solve(factor, np.eye(len(matrix))) * np.outer(root, root)
+    unit = matrix * np.outer(root, root)
+    try:
+        found = cho_solve(cho_factor(unit), np.eye(len(matrix)))
+    except np.linalg.LinAlgError:  # without priors what the rows hardly tell apart drowns in rounding
+        found = np.linalg.pinv(unit, rcond=1e-14, hermitian=True)
+    return found * np.outer(root, root)
 
 
 def _spread(y, covariance, precision, free, noise, weight, width) -> Posterior:

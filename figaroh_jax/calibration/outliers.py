@@ -15,7 +15,9 @@ from .marginal import Linear, Posterior
 
 __all__ = ["find_outliers"]
 
-_FAR = 8.0  # sizes of the noise; what is nearer may be a heavy tail, which the robust fit bears
+_FAR = 8.0  # sizes of the noise; what is nearer may be a heavy tail, which the robust fit bears,
+_ALONE = 4.5  # unless it is that many standard deviations off the logarithms of the others' sizes
+_ENOUGH = 20  # postures that show how those spread
 _MOST = 0.1  # of the postures
 
 
@@ -31,10 +33,19 @@ def find_outliers(
         residual = linear.residual + linear.jacobian @ (posterior.unknowns - linear.at)
         sizes = _sizes(linear._replace(residual=residual), posterior, rows)
         worst = max(sizes, key=lambda k: sizes[k])
-        if sizes[worst] < _FAR:
+        if sizes[worst] < _limit(np.log(list(sizes.values()))):
             break
         found[worst] = sizes[worst]
     return found
+
+
+def _limit(logarithms: np.ndarray) -> float:
+    """Size from which a posture is an outlier, from median and median deviation of the logarithms of all sizes."""
+    if len(logarithms) < _ENOUGH:
+        return _FAR
+    middle = np.median(logarithms)
+    spread = 1.4826 * np.median(np.abs(logarithms - middle))
+    return min(_FAR, float(np.exp(middle + _ALONE * spread)))
 
 
 def _sizes(linear: Linear, posterior: Posterior, used: np.ndarray) -> dict[int, float]:
@@ -44,5 +55,5 @@ def _sizes(linear: Linear, posterior: Posterior, used: np.ndarray) -> dict[int, 
         noise = posterior.noise[linear.channel[rows]]
         G, r = linear.jacobian[rows] / noise[:, None], linear.residual[rows] / noise
         left = np.eye(len(rows)) - posterior.weight[k] * G @ posterior.covariance @ G.T
-        sizes[int(k)] = float(np.sqrt(max(r @ np.linalg.solve(left, r), 0.0) / len(rows)))
+        sizes[int(k)] = float(np.sqrt(max(r @ np.linalg.solve(left, r), 1e-24) / len(rows)))
     return sizes

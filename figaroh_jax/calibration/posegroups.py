@@ -38,6 +38,7 @@ class Measured(NamedTuple):
     recording: Int[np.ndarray, " postures"]
     row: Int[np.ndarray, " postures"]  # in the file
     holdout: Bool[np.ndarray, " postures"]
+    plain: bool = False  # to be fitted by plain least squares, without priors and without weights of postures
 
     @property
     def own(self) -> tuple[tuple[str, str], ...]:
