@@ -1,7 +1,7 @@
 """Hide effects in made recordings and count how the diagnosis does: right, in the set, abstained, wrong.
 
     python benchmarks/hidden_effects.py --seeds 0 1 --robots tx40 panda      # every effect, with and without repeats
-    python benchmarks/hidden_effects.py --clean 30                           # false names on clean recordings
+    python benchmarks/hidden_effects.py --clean 48                           # false names, p-values on clean recordings
     python benchmarks/hidden_effects.py --left-out --size 0.08               # families missing in the catalogue
     python benchmarks/hidden_effects.py --foreign --size 0.08                # laws that no catalogue holds
     python benchmarks/hidden_effects.py --closed-loop --robots ur10e         # MuJoCo C in place of inverse dynamics
@@ -23,6 +23,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
+import numpy as np  # noqa: E402
 from generators import CLASSES, CLOSED_LOOP_EFFECTS, EFFECTS, FOREIGN, Case, make_case, make_closed_loop_case  # noqa: E402
 from generators.scoring import Score, judge, table, upper_bound  # noqa: E402
 from generators.sensors import COLOURS  # noqa: E402
@@ -39,16 +40,36 @@ def main() -> None:
     jax.config.update("jax_compilation_cache_dir", str(ROOT / ".cache" / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    scores, seconds = [], []
+    scores, seconds, p_values = [], [], []
     for label, case, forbid in _cases(args):
         start = time.process_time()
         answer = _diagnose(case, forbid)
         seconds.append(time.process_time() - start)
         scores.append(judge(label, () if forbid or args.foreign else case.truth, answer))
-        print(f"{table(scores[-1:]).splitlines()[0]}  {seconds[-1]:.1f} CPU s", flush=True)
+        p_values.append(answer.p_value)
+        print(f"{table(scores[-1:]).splitlines()[0]}  p {p_values[-1]:.4f}  {seconds[-1]:.1f} CPU s", flush=True)
     print(table(scores).splitlines()[-1])
     print(f"CPU s a case: first {seconds[0]:.1f}, median {sorted(seconds)[len(seconds) // 2]:.1f}")
     _rates(scores)
+    if args.clean:
+        _uniformity(dict(zip((score.case for score in scores), p_values, strict=True)))
+
+
+def _uniformity(p: dict[str, float]) -> None:
+    """How often the p-value of clean cases lies below a level (goal: at most 7 % below .05), and how near to uniform.
+
+    A p-value is right if it lies below a level no more often than the level says.
+    """
+    from scipy.stats import kstest
+
+    kinds = {"all": "", "with repeats": " repeats ", "without": " single ", "1/f noise": "pink"}
+    for title, word in kinds.items():
+        own = np.array([value for case, value in p.items() if word in case])
+        if not len(own):
+            continue
+        shares = ", ".join(f"< {level:g}: {np.mean(own < level):.3f}" for level in (0.01, 0.05, 0.1, 0.25, 0.5))
+        too_small = kstest(own, "uniform", alternative="greater").pvalue
+        print(f"p of {len(own)} clean cases, {title}: {shares}; chance of so many small (one-sided KS) {too_small:.3f}")
 
 
 def _rates(scores: list[Score]) -> None:
@@ -64,7 +85,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--size", type=float, default=0.05)
     parser.add_argument("--noise", type=float, default=1.0)
-    parser.add_argument("--clean", type=int, default=0, metavar="N", help="N clean cases instead")
+    parser.add_argument("--clean", type=int, default=0, metavar="N", help="N clean cases instead, with their p-values")
     parser.add_argument("--left-out", action="store_true", help="forbid the hidden effect: `unknown` is right")
     parser.add_argument("--foreign", action="store_true", help="hide laws that stand in no catalogue")
     parser.add_argument("--closed-loop", action="store_true", help="MuJoCo C in place of inverse dynamics")

@@ -90,6 +90,7 @@ def diagnose(
         here = _setting(as_backend(model), signals, known, trust, forbid, progress)
         generator = np.random.default_rng(seed)
         search = find_causes(*here, forbid, CERTAIN * alpha, progress, generator)
+        here = here._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
         first = stand(here.problem, here.start, here.whitening)
         told = _judged(here, first, search, *_fitted_together(here, search.found, forbid), generator)

@@ -15,12 +15,13 @@ from .comparison import Hypothesis, Verdicts, ground, judge, shares_of_wins, t_v
 from .contenders import Contender, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places
+from .flexible import friction_width
 from .gates import CONFIDENT, GAIN, ambiguous, exists, passes, rivals, simpler
 from .noise import Spectrum
 from .problem import Problem
 from .rows import Prior
 from .screening import DRAWS, Screen, catalogue, family_p, screen
-from .state import State
+from .state import State, with_width
 from .step import Step, stand, with_cause, with_causes
 
 __all__ = ["Found", "Search", "eliminate", "find_causes"]
@@ -49,8 +50,10 @@ class Found:
 
 
 class Search(NamedTuple):
-    """How a search ended: its last step, the causes in order, and what the whole catalogue had scored at first."""
+    """How a search ended: the problem and the baseline as it sees them, its last step, the causes in order."""
 
+    problem: Problem
+    start: State
     step: Step
     found: list[Found]
     p_value: float  # of the whole catalogue before anything was found
@@ -68,7 +71,11 @@ def find_causes(
     progress: Callable[[str, float], None] = lambda phase, share: None,
     generator: np.random.Generator | None = None,
 ) -> Search:
-    """Accept the best cause until none passes the gates, or until noise explains what the catalogue still scores."""
+    """Accept the best cause until none passes the gates, or until noise explains what the catalogue still scores.
+
+    A sensor that is late or that winds up rounds the reversals of dry friction, so that their width is fitted anew
+    once such a cause is in: the old one would be made up for by a friction that is not there.
+    """
     generator = generator or np.random.default_rng(0)
     step, found = stand(problem, state, whitening), []
     p_values, screens, screened, groups = [], [], None, None
@@ -87,8 +94,10 @@ def find_causes(
             break
         found.append(_found(step, contenders, best, screened, p_values[-1], generator))
         step = with_cause(problem, step, best.effect, whitening)
-        groups, screened = (groups, screened) if kind(best.effect) == "columns" else (None, None)
-    return Search(step, found, p_values[0], p_values[-1], screens[0])
+        if kind(best.effect) != "columns":
+            problem = friction_width(problem, step.state, whitening)
+            step, groups, screened = stand(problem, with_width(problem, step.state), whitening), None, None
+    return Search(problem, with_width(problem, state), step, found, p_values[0], p_values[-1], screens[0])
 
 
 def _chance(

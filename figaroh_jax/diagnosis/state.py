@@ -131,6 +131,14 @@ def extended_state(problem: Problem, state: State, effect: Effect) -> State:
     return replace(grown, parts=(moved, *state.parts[1:]))
 
 
+def with_width(problem: Problem, state: State) -> State:
+    """The state in a problem whose friction reverses over another width: its columns are evaluated anew."""
+    if state.measured is problem.motion:
+        return state
+    moved = replace(state, measured=problem.motion)
+    return replace(moved, parts=(state.rigid, *(_term_columns(problem, moved, term) for term in state.terms)))
+
+
 def link_motion(problem: Problem, state: State) -> Motion:
     """True motion of the links: as measured, less the errors of the position sensors."""
     motion = state.motion
