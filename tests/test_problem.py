@@ -5,21 +5,29 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import equinox as eqx
 import numpy as np
+import pinocchio as pin
 import pytest
 import reference
 import robots
 from synthetic import DT, made_signals, swing
 
+from figaroh_jax.diagnosis.design import units
 from figaroh_jax.diagnosis.flexible import WIDTHS, friction_width
 from figaroh_jax.diagnosis.layout import held_rows, layout
 from figaroh_jax.diagnosis.priors import body_precision, physical_body, rigid_prior
 from figaroh_jax.diagnosis.problem import Problem
 from figaroh_jax.diagnosis.records import stack
 from figaroh_jax.diagnosis.rows import fit
-from figaroh_jax.diagnosis.state import baseline, extended_state, plain_rows, solved, whitened
+from figaroh_jax.diagnosis.shifts import shifted, torque_change
+from figaroh_jax.diagnosis.state import baseline, batched, extended_state, plain_rows, solved, whitened
+from figaroh_jax.effect import Motion, place
 from figaroh_jax.effects import find
+from figaroh_jax.errors import InputError
+from figaroh_jax.formats.config import Load
 from figaroh_jax.inertia import from_com, pseudo_inertia
 from figaroh_jax.model import RobotModel
 from figaroh_jax.native_backend import NativeBackend
@@ -34,7 +42,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
 
 
 def problem_of(model: RobotModel, *signals: Signals) -> Problem:
-    records = stack(signals)
+    records = stack(signals, model)
     held = held_rows(signals, records)
     return Problem(NativeBackend(model), records, layout(signals, records), TRUST, np.zeros(model.nv), held)
 
@@ -137,6 +145,78 @@ def test_a_robot_near_its_nominal_values_is_fitted_without_rest(model: RobotMode
     assert np.abs(plain_rows(problem, state).y).max() > 10
     np.testing.assert_allclose(linear.residual / sure, 0.0, rtol=0, atol=1e-4)
     np.testing.assert_allclose(linear.theta[-2:], [4.0, 1.0], rtol=0, atol=1e-4)
+
+
+LOAD = Load(frame="tool", mass=1.7, com=(0.05, -0.1, 0.2))
+
+
+@pytest.fixture(scope="module")
+def carrying(tmp_path_factory: pytest.TempPathFactory) -> tuple[Problem, list[Any]]:
+    """Two recordings of an arm with a tool frame, the second with a load there; Pinocchio's robot of each."""
+    weld = robots.joint("weld", "b", "tool", "fixed", xyz="0.2 -0.1 0.3", rpy="0.5 1.0 -0.7")
+    text = robots.ARM.replace("</robot>", f'<link name="tool"/>{weld}</robot>')
+    model = robots.load(text, tmp_path_factory.mktemp("tool"))
+    arms = [reference.build(model) for _ in range(2)]
+    point = pin.Inertia(LOAD.mass, np.array(LOAD.com), np.zeros((3, 3)))
+    frame = pin.SE3(pin.rpy.rpyToMatrix(0.5, 1.0, -0.7), np.array([0.2, -0.1, 0.3]))
+    arms[1].appendBodyToJoint(2, point, frame)
+    bare, loaded = made_signals(4.0), made_signals(4.0, begin=20.0)
+    signals = [
+        dataclasses.replace(one, torque=pinocchio_torque(arm, one.position, one.velocity, one.acceleration), load=load)
+        for one, arm, load in zip((bare, loaded), arms, (None, LOAD), strict=True)
+    ]
+    return problem_of(model, *signals), arms
+
+
+def pinocchio_torque(arm: Any, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    data = arm.createData()
+    return np.array([pin.rnea(arm, data, *x) for x in zip(q, v, a, strict=True)])
+
+
+def torque_of_both(arms: list[Any], motion: Motion) -> np.ndarray:
+    """Torque of the links of two recordings of one length, each with a robot of its own."""
+    parts = [np.split(np.asarray(x), 2) for x in (motion.position, motion.velocity, motion.acceleration)]
+    return np.concatenate([pinocchio_torque(arm, *(x[k] for x in parts)) for k, arm in enumerate(arms)])
+
+
+def test_a_known_load_is_felt_in_its_own_recording_and_leaves_no_rest(carrying: tuple[Problem, list[Any]]) -> None:
+    problem, arms = carrying
+    state = baseline(problem, [])
+    np.testing.assert_allclose(state.motion.load, torque_of_both(arms, problem.motion), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(problem.motion.load, state.motion.load, rtol=0, atol=1e-10)
+    rows = plain_rows(problem, state)
+    assert np.abs(rows.y - rows.X @ state.theta).max() < 1e-9 * np.abs(rows.y).max()
+
+
+def test_a_known_load_moves_and_tilts_with_the_robot(carrying: tuple[Problem, list[Any]]) -> None:
+    problem, arms = carrying
+    motion, records = problem.motion, problem.records
+    elastic = batched(place(find("joint_elasticity"), problem.model, ["turn"], compliance=2e-5))
+    true = shifted(elastic, motion, records)
+    moved = eqx.tree_at(
+        lambda m: (m.position, m.velocity, m.acceleration),
+        motion,
+        (true.position[0], true.velocity[0], true.acceleration[0]),
+    )
+    load = torque_of_both(arms, moved)
+    windup = np.split((motion.position - moved.position)[:, 0], 2)
+    for found, one in zip(windup, np.split(2e-5 * load[:, 0], 2), strict=True):
+        inner = slice(20, -20)  # the ends of a recording hold their neighbours' derivatives
+        np.testing.assert_allclose(found[inner], one[inner], rtol=0, atol=1e-3 * np.abs(one).max())
+    expected = load - torque_of_both(arms, motion)
+    np.testing.assert_allclose(torque_change(elastic, motion, records)[0], expected, rtol=0, atol=1e-9)
+    for arm in arms:
+        arm.gravity.linear += np.array([1.0, 0.0, 0.0])
+    tilted = torque_of_both(arms, motion) - motion.load
+    tilt = batched(place(find("gravity_tilt"), problem.model))
+    found = units({"gravity_tilt": tilt}, motion, records)["gravity_tilt"].torque[0, 0]
+    np.testing.assert_allclose(found.T, tilted, rtol=0, atol=1e-9)
+
+
+def test_a_load_on_what_does_not_move_is_refused(model: RobotModel) -> None:
+    fixed = dataclasses.replace(made_signals(4.0), load=Load(frame="base", mass=1.0))
+    with pytest.raises(InputError, match="load.frame 'base' does not move"):
+        stack([fixed], model)
 
 
 def averaged(law: Callable[[np.ndarray], np.ndarray], signals: Signals, joint: int) -> np.ndarray:

@@ -14,19 +14,10 @@ import robots
 from jaxtyping import Array
 from synthetic import made_signals
 
-from figaroh_jax.diagnosis.design import (
-    Units,
-    candidates,
-    flattened,
-    shapes,
-    shifted,
-    torque_change,
-    unit_rows,
-    units_and_slopes,
-    with_shape,
-)
+from figaroh_jax.diagnosis.design import Units, candidates, flattened, shapes, unit_rows, units_and_slopes, with_shape
 from figaroh_jax.diagnosis.records import Records, stack
 from figaroh_jax.diagnosis.refit import Whitened, bounded_minimum, profile, refit, refit_shift, shift_profile
+from figaroh_jax.diagnosis.shifts import shifted, torque_change
 from figaroh_jax.dynamics import inverse_dynamics
 from figaroh_jax.effect import Effect, Motion
 from figaroh_jax.effects import find

@@ -18,23 +18,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from ..dynamics import inverse_dynamics
 from ..effect import Effect, Motion, columns
-from ..model import Leaf, RobotModel
+from ..model import RobotModel
 from ..programs import Program
 from .records import Records, filter_rows
+from .shifts import links_torque, torque_change
 
 __all__ = [
     "Units",
     "candidates",
-    "difference",
     "flattened",
     "kind",
-    "rigid_torque",
     "sensor_response",
     "shapes",
-    "shifted",
-    "torque_change",
     "unit_rows",
     "units",
     "units_and_slopes",
@@ -52,10 +48,6 @@ class Units(NamedTuple):
     torque: Float[np.ndarray, "effects k rows nN"]
     joints: Int[np.ndarray, "effects rows"]
     response: Complex[np.ndarray, "effects F"] | None = None
-
-
-TURNS = 3  # of Newton's method for the true motion
-RESONANT = 0.5  # bounds the response at the link's resonance
 
 
 def kind(effect: Effect | type[Effect]) -> Literal["columns", "position", "response"]:
@@ -80,106 +72,6 @@ def flattened(batch: Effect) -> Effect:
     return jax.tree.map(lambda x: np.reshape(x, (np.shape(x)[0] * np.shape(x)[1], *np.shape(x)[2:])), batch)
 
 
-def difference(signal: Float[np.ndarray, "*n N"], dt: float) -> Float[np.ndarray, "*n N"]:
-    """Derivative by five-point central differences; the two ends hold their neighbours' (rows there are trimmed)."""
-    out = np.empty_like(signal)
-    inner = 8 * (signal[..., 3:-1] - signal[..., 1:-3]) - (signal[..., 4:] - signal[..., :-4])
-    out[..., 2:-2] = inner / (12 * dt)
-    out[..., :2], out[..., -2:] = out[..., 2:3], out[..., -3:-2]
-    return out
-
-
-def rigid_torque(
-    model: RobotModel, q: Float[Leaf, "*batch nv"], v: Float[Leaf, "*batch nv"], a: Float[Leaf, "*batch nv"]
-) -> Float[np.ndarray, "*batch nv"]:
-    """`inverse_dynamics` in NumPy."""
-    return np.asarray(inverse_dynamics(model, q, v, a))
-
-
-def shifted(effects: Effect, motion: Motion, records: Records, turns: int = TURNS) -> Motion:
-    """The true motion of the links for each of a batch of position sensors that have read `motion`.
-
-    A sensor whose error follows the load feels that of the true motion, so q + error(load(q)) = q_measured is solved:
-    Newton's steps, with the joint's mean inertia and stiffness and therefore one response over frequency each. Without
-    `turns` the load is that of `motion`, right to first order.
-
-    Position, velocity and acceleration of the answer have a leading axis of effects.
-    """
-    shift = _errors(effects, motion)
-    if not turns:
-        return _moved(effects, motion, shift, records)
-    inverse, (n, samples) = _inverse_responses(effects, motion, records), records.position.shape[:2]
-    shift = np.zeros_like(shift)
-    for _ in range(turns):
-        true = _moved(effects, motion, shift, records)
-        loads = rigid_torque(motion.model, true.position, true.velocity, true.acceleration)
-        missing = (_errors(effects, motion, loads) - shift).reshape(-1, n, samples)
-        mirrored = np.fft.rfft(np.concatenate([missing, missing[..., ::-1]], axis=-1))
-        shift = shift + np.fft.irfft(mirrored * inverse[:, None], 2 * samples)[..., :samples].reshape(shift.shape)
-    return _moved(effects, motion, shift, records)
-
-
-def _inverse_responses(effects: Effect, motion: Motion, records: Records) -> Float[np.ndarray, "effects F"]:
-    """1 / (1 + c (K - M w^2)), c the error per load, K and M from the joint's load over position and acceleration.
-
-    Bounded where it would be singular, at the resonance of the link on the joint's spring.
-    """
-    load = rigid_torque(motion.model, motion.position, motion.velocity, motion.acceleration)
-    loads = np.repeat(load[None], len(effects.at), axis=0)
-    unit = (_errors(effects, motion, loads + 1) - _errors(effects, motion, loads)).mean(1)
-    omega = 2 * np.pi * np.fft.rfftfreq(2 * records.position.shape[1], float(records.dt))
-    out = np.empty((len(unit), len(omega)))
-    for one, joint in enumerate(np.asarray(effects.at)[:, 0]):
-        columns = np.stack([np.asarray(x)[:, joint] for x in (motion.position, motion.acceleration)])
-        columns = columns - columns.mean(1, keepdims=True)
-        stiffness, inertia = np.linalg.lstsq(columns.T, load[:, joint], rcond=None)[0]
-        straight = 1 + unit[one] * (stiffness - inertia * omega**2)
-        out[one] = straight / (straight**2 + RESONANT**2)
-    return out
-
-
-def _errors(
-    effects: Effect, motion: Motion, loads: Float[np.ndarray, "effects nN nv"] | None = None
-) -> Float[np.ndarray, "effects nN"]:
-    """What each sensor reads beside the truth, under the motion's load or each under its own."""
-    out = []
-    for one in range(len(effects.at)):
-        here = motion if loads is None else eqx.tree_at(lambda m: m.load, motion, loads[one])
-        out.append(np.asarray(_error(jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects), here)))
-    return np.stack(out)
-
-
-def _moved(effects: Effect, motion: Motion, errors: Float[np.ndarray, "effects nN"], records: Records) -> Motion:
-    """The motion less each error of the joint of each effect."""
-    errors = errors.reshape(-1, *records.position.shape[:2])
-    rates = difference(errors, float(records.dt))
-    change = [errors, rates, difference(rates, float(records.dt))]
-    one, joint = np.arange(len(errors)), np.asarray(effects.at)[:, 0]
-    true = []
-    for signal, delta in zip((motion.position, motion.velocity, motion.acceleration), change, strict=True):
-        moved = np.repeat(np.asarray(signal)[None], len(errors), axis=0)
-        moved[one, :, joint] -= delta.reshape(len(errors), -1)
-        true.append(moved)
-    return eqx.tree_at(lambda m: (m.position, m.velocity, m.acceleration), motion, tuple(true))
-
-
-def torque_change(
-    effects: Effect,
-    motion: Motion,
-    records: Records,
-    as_read: Float[np.ndarray, "nN nv"] | None = None,
-    turns: int = TURNS,
-) -> Float[np.ndarray, "effects nN nv"]:
-    """Exact torque of a batch of position sensors: of the links' true motion, less that of the motion as it was read.
-
-    (A torque sensor's is left to the row filter, which is exact in frequency.) `as_read` is the latter torque.
-    """
-    if as_read is None:
-        as_read = rigid_torque(motion.model, motion.position, motion.velocity, motion.acceleration)
-    true = shifted(effects, motion, records, turns)
-    return rigid_torque(motion.model, true.position, true.velocity, true.acceleration) - as_read
-
-
 def units(batches: Mapping[str, Effect], motion: Motion, records: Records) -> dict[str, Units]:
     """What a unit of each amplitude adds, for batches (one leading axis) of effects of any kind."""
     plain = {name: batch for name, batch in batches.items() if _way(batch) == "torque"}
@@ -201,7 +93,7 @@ def units(batches: Mapping[str, Effect], motion: Motion, records: Records) -> di
             torque = torque_change(batch, motion, records, turns=0) / _size(batch)[:, None, None]
             out[name] = Units(np.swapaxes(torque, 1, 2)[:, None], joints)
         else:
-            out[name] = Units(_changed_torques(batch, motion), joints)
+            out[name] = Units(_changed_torques(batch, motion, records), joints)
     return out
 
 
@@ -271,16 +163,16 @@ def _size(effect: Effect) -> Float[np.ndarray, " effects"]:
     return np.asarray(getattr(effect, name))
 
 
-def _changed_torques(batch: Effect, motion: Motion) -> Float[np.ndarray, "effects k nv nN"]:
+def _changed_torques(batch: Effect, motion: Motion, records: Records) -> Float[np.ndarray, "effects k nv nN"]:
     """Torque of a unit of each amplitude of effects that change the robot, which it is linear in."""
     q, v, a = motion.position, motion.velocity, motion.acceleration
-    before, robot = rigid_torque(motion.model, q, v, a), jax.tree.structure(motion.model)
+    before, robot = links_torque(motion.model, q, v, a, records), jax.tree.structure(motion.model)
     models = _changed(batch, motion.model)
     amplitudes = sum(p.linear for p in batch.parameters().values())
     out = np.empty((len(batch.at), amplitudes, *before.shape[::-1]))
     for one, amplitude in np.ndindex(out.shape[:2]):
         changed = jax.tree.unflatten(robot, [np.asarray(x)[one, amplitude] for x in models])
-        out[one, amplitude] = (rigid_torque(changed, q, v, a) - before).T
+        out[one, amplitude] = (links_torque(changed, q, v, a, records) - before).T
     return out
 
 
@@ -313,11 +205,6 @@ def _units_and_slopes(
         return torque, slope
 
     return jax.vmap(one)(effects, values)
-
-
-@Program
-def _error(effect: Effect, motion: Motion) -> Float[Array, " nN"]:
-    return effect.position_error(motion)
 
 
 @Program

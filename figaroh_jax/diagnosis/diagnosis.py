@@ -125,9 +125,9 @@ def _setting(
     progress: Callable[[str, float], None],
 ) -> _Setting:
     """The recordings on one clock, the baseline, and the noise; holdout recordings stand behind the others."""
-    records = stack(signals)
-    held = held_rows(signals, records)
     model = backend.robot
+    records = stack(signals, model)
+    held = held_rows(signals, records)
     problem = Problem(backend, records, layout(signals, records), trust, np.zeros(model.nv), held)
     names, given = _baseline_effects(model, known)
     start = baseline(problem, names, given)

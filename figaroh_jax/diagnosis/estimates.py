@@ -11,9 +11,10 @@ from ..effect import Effect, joint_unit
 from ..extended import ExtendedModel, extend
 from ..model import RobotModel
 from ..results import Estimate
-from .design import kind, sensor_response, shapes, torque_change, units_and_slopes, with_shape
+from .design import kind, sensor_response, shapes, units_and_slopes, with_shape
 from .problem import Problem
 from .records import filtered_rows
+from .shifts import torque_change
 from .state import BATCH, State
 
 __all__ = ["Fitted", "estimates", "fitted_model", "torque_slope", "with_amplitudes"]

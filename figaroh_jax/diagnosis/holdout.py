@@ -10,11 +10,12 @@ from jaxtyping import Float
 from ..effect import Effect
 from ..recordings.signals import Signals
 from ..results import Trace
-from .design import kind, sensor_response, torque_change
+from .design import kind, sensor_response
 from .estimates import amplitude_places
 from .problem import Problem
 from .records import open_rows
 from .search import Found
+from .shifts import torque_change
 from .state import State, batched, extended_state
 from .step import stand
 
@@ -92,7 +93,7 @@ def _share(problem: Problem, state: State, effect: Effect, place: list[int]) -> 
     if kind(effect) == "position":
         return open_rows(problem.records, torque_change(batched(effect), state.motion, problem.records)[0], response)
     own = np.isin(np.arange(len(state.theta)), place)
-    return open_rows(problem.records, state.torque(np.where(own, state.theta, 0.0)), response)
+    return open_rows(problem.records, state.torque(np.where(own, state.theta, 0.0)) - state.known, response)
 
 
 def _fold_error(problem: Problem, state: State, folds: Float[np.ndarray, "folds P"]) -> float:

@@ -15,6 +15,7 @@ from ..effects import CATALOGUE, LinkEffect
 from ..model import RobotModel
 from .design import Units, candidates, flattened, kind, shapes, units
 from .records import Records, open_rows
+from .shifts import links_torque, rigid_torque
 
 __all__ = ["Layout", "Problem", "family_of"]
 
@@ -60,10 +61,12 @@ class Problem:
 
     @cached_property
     def motion(self) -> Motion:
-        """All samples of all recordings as measured, with the load of the nominal robot."""
+        """All samples of all recordings as measured, with the load of the nominal robot and of what it carries."""
         r = self.records
         q, v, a = (r.flat(x) for x in (r.position, r.velocity, r.acceleration))
         load = np.asarray(self.backend.inverse_dynamics(q, v, a))
+        if r.carried is not None:
+            load = load + links_torque(self.model, q, v, a, r) - rigid_torque(self.model, q, v, a)
         return Motion(self.model, r.flat(r.time), q, v, a, load, load, r.dt, self.width)
 
     @cached_property

@@ -12,7 +12,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float, Int, Shaped
 
-from ..model import Leaf
+from ..model import Leaf, RobotModel
+from ..recordings.dataset import carried_body
 from ..recordings.rowfilter import extension, fast_length, filtered, gain, reach
 from ..recordings.signals import Signals
 
@@ -37,6 +38,7 @@ class Records(eqx.Module):
     dt: Float[Leaf, ""] | float  # s, of the samples
     rate: Float[Leaf, ""] | float  # Hz, of the rows
     cutoff: Float[Leaf, ""] | float  # Hz
+    carried: Float[Leaf, "n links 10"] | None = None  # known bodies on the links, at and in their joint frames
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
@@ -93,8 +95,11 @@ def filtered_rows(
     return (rows * np.moveaxis(records.weight, 2, 0)).reshape(nv, -1)
 
 
-def stack(signals: Sequence[Signals]) -> Records:
-    """The recordings as one; they must share period, row rate and cutoff (`signals.prepare_all` sees to that)."""
+def stack(signals: Sequence[Signals], model: RobotModel | None = None) -> Records:
+    """The recordings as one; they must share period, row rate and cutoff (`signals.prepare_all` sees to that).
+
+    With a `model`, the known loads stand in `carried`; `InputError` where one is fixed to what does not move.
+    """
     first = signals[0]
     pad, samples = reach(first.dt, first.cutoff), max(s.time.size for s in signals)
     count = max(s.rows.kept for s in signals)
@@ -113,7 +118,20 @@ def stack(signals: Sequence[Signals]) -> Records:
         dt=first.dt,
         rate=1 / (first.dt * first.rows.step),
         cutoff=first.cutoff,
+        carried=None if model is None else _carried(model, signals),
     )
+
+
+def _carried(model: RobotModel, signals: Sequence[Signals]) -> Float[np.ndarray, "n links 10"] | None:
+    """Ten parameters that known loads add to each link, recording by recording; None where nothing is carried."""
+    if not any(one.load for one in signals):
+        return None
+    ten = np.zeros((len(signals), len(model.joints), 10))
+    for one, own in zip(signals, ten, strict=True):
+        if one.load:
+            link, body = carried_body(model, one.load)
+            own[link] = body
+    return ten
 
 
 def _extended(one: Signals, pad: int, length: int) -> Int[np.ndarray, " L"]:

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from ..effect import Effect, Motion
-from .design import Units, rigid_torque, shapes, torque_change, unit_rows, units_and_slopes, with_shape
+from .design import Units, shapes, unit_rows, units_and_slopes, with_shape
 from .records import Records
+from .shifts import links_torque, torque_change
 
 __all__ = ["Whitened", "bounded_minimum", "profile", "refit", "refit_shift", "shift_profile"]
 
@@ -131,7 +132,7 @@ def refit_shift(
     best = sizes[np.argmin(shift_profile(Z * sizes[:, None, None], whitened))]
     edges = np.array([parameter.lower, *np.sort(sizes), parameter.upper])
     low, high = edges[edges < best].max(initial=parameter.lower), edges[edges > best].min(initial=parameter.upper)
-    as_read = rigid_torque(motion.model, motion.position, motion.velocity, motion.acceleration)
+    as_read = links_torque(motion.model, motion.position, motion.velocity, motion.acceleration, records)
     joints = np.arange(as_read.shape[1])[None]
 
     def value(size: float) -> float:

@@ -17,11 +17,12 @@ from jaxtyping import Complex, Float, Int
 from ..effect import Effect, Motion
 from ..effects import LinkEffect, Payload, find
 from ..model import Leaf
-from .design import Units, flattened, kind, sensor_response, shapes, shifted, units, units_and_slopes
+from .design import Units, flattened, kind, sensor_response, shapes, units, units_and_slopes
 from .priors import body_precision, rigid_prior
 from .problem import Layout, Problem, family_of
 from .records import filter_rows, filtered_rows
 from .rows import Prior, Rows, instruments
+from .shifts import shifted
 
 __all__ = [
     "State",
@@ -50,6 +51,7 @@ class State:
     prior: Prior
     theta: Float[np.ndarray, " P"]
     measured: Motion  # as measured, with the nominal robot's load
+    carried: Float[np.ndarray, "n links 10"] | None = None  # known bodies on the links of each recording
 
     @cached_property
     def motion(self) -> Motion:
@@ -63,6 +65,15 @@ class State:
         """Regressor of the rigid body."""
         return self.parts[0]
 
+    @cached_property
+    def known(self) -> Float[np.ndarray, "nN nv"]:
+        """Torque of what each recording is known to carry, N m or N."""
+        if self.carried is None:
+            return np.zeros(self.rigid.shape[:2])
+        ten = self.carried.reshape(len(self.carried), -1, 1)
+        each = self.rigid.reshape(len(ten), -1, ten.shape[1]) @ ten
+        return each.reshape(self.rigid.shape[:2])
+
     def columns(self, first: int = 0) -> Float[np.ndarray, "nN nv k"]:
         """Columns of the regressor from one on."""
         starts = np.cumsum([0, *(part.shape[2] for part in self.parts)])
@@ -74,10 +85,10 @@ class State:
         return sum(self.shares(theta), np.zeros(self.rigid.shape[:2]))
 
     def shares(self, theta: Float[np.ndarray, " P"]) -> Iterator[Float[np.ndarray, "nN nv"]]:
-        """Torque of the rigid body, then of each term."""
+        """Torque of the rigid body with what it carries, then of each term."""
         split = np.split(theta, np.cumsum([part.shape[2] for part in self.parts])[:-1])
-        for part, own in zip(self.parts, split, strict=True):
-            yield (part.reshape(-1, part.shape[2]) @ own).reshape(self.rigid.shape[:2])
+        for part, own, known in zip(self.parts, split, (self.known, *(0.0 for _ in self.terms)), strict=True):
+            yield (part.reshape(-1, part.shape[2]) @ own).reshape(self.rigid.shape[:2]) + known
 
     def response(self, omega: Float[Leaf, " F"]) -> Complex[np.ndarray, " F"] | Float[np.ndarray, " F"]:
         """Response of the torque sensor of all sensor effects together."""
@@ -96,7 +107,7 @@ def baseline(problem: Problem, names: Sequence[str], given: Sequence[Effect] = (
         effect = find(name)
         terms.append(effect(joints, **{p: np.zeros(len(joints)) for p in effect.parameters()}))
     rigid, theta, precision = _rigid(problem, problem.motion), *rigid_prior(problem.model, problem.trust)
-    state = State((), (), (rigid,), Prior(theta, precision), theta, problem.motion)
+    state = State((), (), (rigid,), Prior(theta, precision), theta, problem.motion, problem.records.carried)
     for term in [*terms, *(batched(effect) for effect in given)]:
         state = with_term(problem, state, term)
     return state
@@ -221,11 +232,10 @@ def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"
     `before` are the rows of the state that this one extends by columns alone: only the new columns are filtered.
     """
     layout = problem.layout
-    torque = problem.records.flat(problem.records.torque)
-    y = filtered_rows(problem.records, torque, whitening) if before is None else before.y
-    known = 0 if before is None else before.X.shape[2]
     response = whitening * state.response(problem.records.omega)[:, None]
-    X = _filtered_columns(problem, state.columns(known), response)
+    y = _unexplained(problem, state, whitening, response) if before is None else before.y
+    first = 0 if before is None else before.X.shape[2]
+    X = _filtered_columns(problem, state.columns(first), response)
     Xi = X
     if layout.repeats:
         Xi = np.stack([instruments(x.T, layout.partner, p).T for x, p in zip(X, layout.paired, strict=True)])
@@ -237,6 +247,14 @@ def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"
 def plain_rows(problem: Problem, state: State) -> Rows:
     """Rows as they are, N m or N."""
     return whitened(problem, state, np.ones((len(problem.records.omega), problem.records.shape[3])))
+
+
+def _unexplained(
+    problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], response: Complex[np.ndarray, "F nv"]
+) -> Float[np.ndarray, "nv T"]:
+    """Rows of the measured torque, less what the sensors read of a known load."""
+    rows = filtered_rows(problem.records, problem.records.flat(problem.records.torque), whitening)
+    return rows if state.carried is None else rows - filtered_rows(problem.records, state.known, response)
 
 
 def _filtered_columns(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -21,15 +21,11 @@ from jaxtyping import Bool, Float, Int
 from ..contract import Backend
 from ..diagnosis.records import Records, filter_rows, stack
 from ..effect import Effect
-from ..errors import InputError
-from ..inertia import from_com, transform
 from ..model import RobotModel
+from ..recordings.dataset import carried_body
 from ..recordings.rowfilter import reach
 from ..recordings.signals import Signals
 from .columns import column_names, columns_of, motion_at
-
-if TYPE_CHECKING:
-    from ..formats.config import Load
 
 __all__ = [
     "Condensed",
@@ -37,7 +33,6 @@ __all__ = [
     "Regression",
     "Rows",
     "condense",
-    "payload",
 ]
 
 PIECE_BYTES = 96e6  # of the columns of one piece at the working rate
@@ -175,7 +170,7 @@ class Regression:
         """Torque of the known payload, N m or N."""
         if one.load is None:
             return np.zeros(X.shape[:2])
-        link, ten = payload(self.model, one.load)
+        link, ten = carried_body(self.model, one.load)
         return X[:, :, 10 * link : 10 * link + 10] @ ten
 
     def _samples(self, one: Signals) -> int:
@@ -249,20 +244,6 @@ def _cut(one: Signals, where: slice, rows: Int[np.ndarray, " mine"]) -> Signals:
         kept=len(rows),
     )
     return replace(one, torque=None if one.torque is None else one.torque[where], rows=kept, **signals)
-
-
-def payload(model: RobotModel, load: Load) -> tuple[int, Float[np.ndarray, "10"]]:
-    """Link (index) that carries a known payload, and its ten parameters as a point mass in that joint's frame."""
-    names = [frame.name for frame in model.frames]
-    if load.frame in model.link_names:
-        link, place_of = model.link_index(load.frame), np.eye(4)
-    else:
-        frame = model.frames[names.index(load.frame)]
-        link, place_of = frame.parent, np.asarray(model.frame_placement[names.index(load.frame)])
-    if link < 0:
-        raise InputError(f"load.frame '{load.frame}' does not move: no torque shows what it carries")
-    point = from_com(load.mass, np.asarray(load.com, float), np.zeros((3, 3)))
-    return link, np.asarray(transform(point, place_of))
 
 
 def _one(records: Records, k: int) -> Records:

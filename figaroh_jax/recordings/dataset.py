@@ -15,13 +15,14 @@ from jaxtyping import Bool, Float
 
 from ..errors import InputError, nearest
 from ..formats.assembly import ROOT_JOINT
+from ..inertia import from_com, transform
 from ..model import RobotModel
 from .tables import Table, read_table
 
 if TYPE_CHECKING:
     from ..formats.config import Load, RecordingEntry, Task
 
-__all__ = ["Drive", "Recording", "joint_columns", "read_recordings", "read_time", "unit_factors"]
+__all__ = ["Drive", "Recording", "carried_body", "joint_columns", "read_recordings", "read_time", "unit_factors"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +84,20 @@ def _check_names(task: Task, model: RobotModel) -> None:
         if entry.load is not None and entry.load.frame not in {*frames, *model.link_names}:
             place = f"{task.file}: data[{k}].load.frame"
             raise InputError(f"{place}: robot has no frame '{entry.load.frame}'{nearest(entry.load.frame, frames)}")
+
+
+def carried_body(model: RobotModel, load: Load) -> tuple[int, Float[np.ndarray, "10"]]:
+    """Link (index) that carries a known payload, and its ten parameters as a point mass in that joint's frame."""
+    names = [frame.name for frame in model.frames]
+    if load.frame in model.link_names:
+        link, place_of = model.link_index(load.frame), np.eye(4)
+    else:
+        frame = model.frames[names.index(load.frame)]
+        link, place_of = frame.parent, np.asarray(model.frame_placement[names.index(load.frame)])
+    if link < 0:
+        raise InputError(f"load.frame '{load.frame}' does not move: no torque shows what it carries")
+    point = from_com(load.mass, np.asarray(load.com, float), np.zeros((3, 3)))
+    return link, np.asarray(transform(point, place_of))
 
 
 class Drive:

@@ -1,0 +1,194 @@
+"""The true motion behind position sensors that err, and the torque of the links along it.
+
+JAX evaluates inverse dynamics, many samples in one program; the equations of the sensors are solved on the host.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..dynamics import inverse_dynamics
+from ..effect import Effect, Motion
+from ..model import Leaf, RobotModel
+from ..programs import Program
+from .records import Records
+
+__all__ = ["difference", "links_torque", "rigid_torque", "shifted", "torque_change"]
+
+TURNS = 3  # of Newton's method for the true motion
+ENDS, TINY = 6, 1e-6  # samples whose derivatives are held; what makes them zero
+STEP = 1e-4  # of central differences, rad, rad/s or rad/s2 (m for rad)
+
+
+def rigid_torque(
+    model: RobotModel, q: Float[Leaf, "*batch nv"], v: Float[Leaf, "*batch nv"], a: Float[Leaf, "*batch nv"]
+) -> Float[np.ndarray, "*batch nv"]:
+    """`inverse_dynamics` in NumPy."""
+    return np.asarray(inverse_dynamics(model, q, v, a))
+
+
+def links_torque(
+    model: RobotModel,
+    q: Float[Leaf, "*batch nN nv"],
+    v: Float[Leaf, "*batch nN nv"],
+    a: Float[Leaf, "*batch nN nv"],
+    records: Records,
+) -> Float[np.ndarray, "*batch nN nv"]:
+    """`rigid_torque` over the samples of all recordings, each with what it is known to carry."""
+    torque = rigid_torque(model, q, v, a)
+    if records.carried is None:
+        return torque
+    torque = torque.reshape(*torque.shape[:-2], *records.position.shape).copy()
+    bodies = np.unique(records.carried, axis=0)
+    for body in bodies[bodies.any((1, 2))]:
+        loaded = eqx.tree_at(lambda m: m.inertia, model, model.inertia + body)
+        here = (records.carried == body).all((1, 2))
+        torque[..., here, :, :] = rigid_torque(loaded, q, v, a).reshape(torque.shape)[..., here, :, :]
+    return torque.reshape(np.shape(q))
+
+
+def shifted(effects: Effect, motion: Motion, records: Records, turns: int = TURNS) -> Motion:
+    """The true motion of the links for each of a batch of position sensors that have read `motion`.
+
+    A sensor whose error follows the load feels that of the true motion, so q + error(load(q)) = q_measured is solved:
+    Newton's steps, with the joint's inertia and stiffness along the motion. Without `turns` the load is that of
+    `motion`, right to first order.
+
+    Position, velocity and acceleration of the answer have a leading axis of effects.
+    """
+    shift = _errors(effects, motion)
+    if not turns:
+        return _moved(effects, motion, shift, records)
+    compliances, shift = _compliances(effects, motion, records), np.zeros_like(shift)
+    for _ in range(turns):
+        true = _moved(effects, motion, shift, records)
+        loads = links_torque(motion.model, true.position, true.velocity, true.acceleration, records)
+        missing = (_errors(effects, motion, loads) - shift).reshape(-1, *records.position.shape[:2])
+        change = [own.solve(one) for own, one in zip(compliances, missing, strict=True)]
+        shift = shift + np.reshape(change, shift.shape)
+    return _moved(effects, motion, shift, records)
+
+
+class _Compliance(NamedTuple):
+    """1 + c dload/dq of one sensor along its own joint, c (K q + D v + M a) changing with the motion; diagonals.
+
+    Below, on and above the diagonal, by central differences, sample by sample; the ends of a recording say nothing.
+    """
+
+    whole: Float[np.ndarray, "3 n N"]
+    inertial: Float[np.ndarray, "3 n N"]  # c M a alone
+
+    def solve(self, missing: Float[np.ndarray, "n N"]) -> Float[np.ndarray, "n N"]:
+        """The change of position behind a missing error, by damped least squares.
+
+        What the inertia alone would need is damped: nothing at low frequencies, all at the link's resonance, where
+        a motion of any size leaves no error.
+        """
+        from scipy.linalg import solveh_banded  # slow to import
+
+        below, on, above = self.whole
+        right = on * missing
+        right[:, 1:] += above[:, :-1] * missing[:, :-1]
+        right[:, :-1] += below[:, 1:] * missing[:, 1:]
+        square = _square(self.whole) + _square(self.inertial)
+        square[2] += TINY
+        return np.stack([solveh_banded(square[:, k], right[k]) for k in range(len(on))])
+
+
+def _square(diagonals: Float[np.ndarray, "3 n N"]) -> Float[np.ndarray, "3 n N"]:
+    """L'L of tridiagonal L, its upper diagonals as `solveh_banded` takes them."""
+    below, on, above = diagonals
+    square = np.zeros_like(diagonals)
+    square[2] = on**2
+    square[2, :, 1:] += above[:, :-1] ** 2
+    square[2, :, :-1] += below[:, 1:] ** 2
+    square[1, :, 1:] = on[:, :-1] * above[:, :-1] + below[:, 1:] * on[:, 1:]
+    square[0, :, 2:] = above[:, 1:-1] * below[:, 1:-1]
+    return square
+
+
+def _compliances(effects: Effect, motion: Motion, records: Records) -> list[_Compliance]:
+    """What a small change of its joint's motion changes of each sensor's reading."""
+    load = links_torque(motion.model, motion.position, motion.velocity, motion.acceleration, records)
+    loads = np.repeat(load[None], len(effects.at), axis=0)
+    unit = (_errors(effects, motion, loads + 1) - _errors(effects, motion, loads)).mean(1)
+    shape, dt, out = records.position.shape[:2], float(records.dt), []
+    for c, joint in zip(unit, np.asarray(effects.at)[:, 0].tolist(), strict=True):
+        K, D, M = (c * _slope(motion, one, joint, records).reshape(shape) for one in range(3))
+        inertial = np.stack([M, -2 * M, M]) / dt**2
+        whole = inertial + np.stack([-D / (2 * dt), 1 + K, D / (2 * dt)])
+        for part, count in ((inertial, 1), (whole, ENDS)):
+            part[:, :, :count] = part[:, :, -count:] = 0.0
+        out.append(_Compliance(whole, inertial))
+    return out
+
+
+def _slope(motion: Motion, one: int, joint: int, records: Records) -> Float[np.ndarray, " nN"]:
+    """Derivative of a joint's load in its own position, velocity or acceleration (`one`), by central differences."""
+    sides = []
+    for step in (STEP, -STEP):
+        q, v, a = (np.array(x) for x in (motion.position, motion.velocity, motion.acceleration))
+        (q, v, a)[one][:, joint] += step
+        sides.append(links_torque(motion.model, q, v, a, records)[:, joint])
+    return (sides[0] - sides[1]) / (2 * STEP)
+
+
+def _errors(
+    effects: Effect, motion: Motion, loads: Float[np.ndarray, "effects nN nv"] | None = None
+) -> Float[np.ndarray, "effects nN"]:
+    """What each sensor reads beside the truth, under the motion's load or each under its own."""
+    out = []
+    for one in range(len(effects.at)):
+        here = motion if loads is None else eqx.tree_at(lambda m: m.load, motion, loads[one])
+        out.append(np.asarray(_error(jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects), here)))
+    return np.stack(out)
+
+
+def _moved(effects: Effect, motion: Motion, errors: Float[np.ndarray, "effects nN"], records: Records) -> Motion:
+    """The motion less each error of the joint of each effect."""
+    errors = errors.reshape(-1, *records.position.shape[:2])
+    rates = difference(errors, float(records.dt))
+    change = [errors, rates, difference(rates, float(records.dt))]
+    one, joint = np.arange(len(errors)), np.asarray(effects.at)[:, 0]
+    true = []
+    for signal, delta in zip((motion.position, motion.velocity, motion.acceleration), change, strict=True):
+        moved = np.repeat(np.asarray(signal)[None], len(errors), axis=0)
+        moved[one, :, joint] -= delta.reshape(len(errors), -1)
+        true.append(moved)
+    return eqx.tree_at(lambda m: (m.position, m.velocity, m.acceleration), motion, tuple(true))
+
+
+def difference(signal: Float[np.ndarray, "*n N"], dt: float) -> Float[np.ndarray, "*n N"]:
+    """Derivative by five-point central differences; the two ends hold their neighbours' (rows there are trimmed)."""
+    out = np.empty_like(signal)
+    inner = 8 * (signal[..., 3:-1] - signal[..., 1:-3]) - (signal[..., 4:] - signal[..., :-4])
+    out[..., 2:-2] = inner / (12 * dt)
+    out[..., :2], out[..., -2:] = out[..., 2:3], out[..., -3:-2]
+    return out
+
+
+def torque_change(
+    effects: Effect,
+    motion: Motion,
+    records: Records,
+    as_read: Float[np.ndarray, "nN nv"] | None = None,
+    turns: int = TURNS,
+) -> Float[np.ndarray, "effects nN nv"]:
+    """Exact torque of a batch of position sensors: of the links' true motion, less that of the motion as it was read.
+
+    (A torque sensor's is left to the row filter, which is exact in frequency.) `as_read` is the latter torque.
+    """
+    if as_read is None:
+        as_read = links_torque(motion.model, motion.position, motion.velocity, motion.acceleration, records)
+    true = shifted(effects, motion, records, turns)
+    return links_torque(motion.model, true.position, true.velocity, true.acceleration, records) - as_read
+
+
+@Program
+def _error(effect: Effect, motion: Motion) -> Float[Array, " nN"]:
+    return effect.position_error(motion)
