@@ -105,7 +105,7 @@ def identify_file(
         (folder / RESULT).write_text(_identification_json(found), encoding="utf-8")
         write_predictions(folder / "predictions.npz", predictions(task, found.model, identified=True))
         write_parameters(found, folder)
-        write_identification(found, folder / REPORT, found.model.robot.name)
+        write_identification(found, folder / REPORT, found.model.robot.name, model_written=not wrong)
         if not wrong:
             write_model(found.model, folder / "model")
     return found

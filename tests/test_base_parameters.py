@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from robots import REAL, TREE, load
+from robots import REAL, TREE, joint, link, load, robot
 
 import figaroh_jax as fj
 from figaroh_jax.errors import InputError
@@ -50,6 +50,43 @@ def test_panda_with_two_free_fingers_has_the_published_rank(data_dir: Path, tmp_
     model = fj.load_urdf(file)
     _, base = structural(model)
     assert (len(base.names), base.rank) == (126, 85)
+
+
+DH = (  # of the UR10e: d and a in m, alpha (the maker's table)
+    (0.1807, 0.0, np.pi / 2),
+    (0.0, -0.6127, 0.0),
+    (0.0, -0.57155, 0.0),
+    (0.17415, 0.0, np.pi / 2),
+    (0.11985, 0.0, -np.pi / 2),
+    (0.11655, 0.0, 0.0),
+)
+
+
+def dh_arm(folder: Path) -> fj.RobotModel:
+    """The arm from its table of Denavit and Hartenberg: every joint turns about the z of the frame before it."""
+    parts = [link("l0")]
+    before = (0.0, 0.0, 0.0)
+    for k, row in enumerate(DH, 1):
+        d, a, alpha = before
+        parts += [link(f"l{k}"), joint(f"j{k}", f"l{k - 1}", f"l{k}", xyz=f"{a} 0 {d}", rpy=f"{alpha!r} 0 0")]
+        before = row
+    return load(robot(*parts), folder)
+
+
+def test_arm_from_its_dh_table_has_the_published_ranks_and_lever_arms(tmp_path: Path):
+    """Ranks and coefficients of the UR10 as published with figaroh's examples, those of frames beyond joint 6 apart."""
+    model = dh_arm(tmp_path)
+    counts = []
+    for known in (Baseline(viscous=False, coulomb=False), DRIVES):
+        _, base = structural(model, known)
+        counts.append((len(base.names), len(base.names) - len(base.unseen), base.rank))
+    assert counts == [(60, 49, 36), (84, 73, 58)]
+    sizes = np.unique(np.abs(base.matrix[np.abs(base.matrix) > 1e-9]).round(6))
+    for known in (0.6127, 0.57155, 0.11985, 0.17415, 0.375401, 0.326669, 0.014364):
+        assert np.abs(sizes - known).min() < 1e-6
+    row = next(k for k, text in enumerate(base.expressions) if text.startswith("mx2 "))
+    masses = [base.matrix[row, base.names.index(f"m{k}")] for k in range(3, 7)]
+    np.testing.assert_allclose(masses, -0.6127, rtol=0, atol=1e-12)  # kg m of each kilogram beyond the upper arm
 
 
 def test_lever_arms_of_the_urdf_are_the_coefficients(data_dir: Path):

@@ -179,6 +179,9 @@ def test_command_writes_a_whole_run(run: Path, capsys: pytest.CaptureFixture[str
         assert file["base_values"].tolist() == [b["value"] for b in answer["base_parameters"]]
     page = (run / "report.html").read_text()
     assert answer["base_parameters"][0]["expression"] in page and "cross-validated" in page
+    assert "essential" in page and "free links" in page and "<code>predictions.npz</code>" in page
+    told = [e for e in answer["effects"] if e["effect"] == "viscous_friction"]
+    assert all(f'<th scope="row">{e["at"][0]}</th>' in page for e in told) and "rows a joint at" in page
 
 
 def test_predictions_stand_on_the_recordings_own_stamps(run: Path):

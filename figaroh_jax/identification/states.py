@@ -26,8 +26,8 @@ from .regression import Piece
 
 __all__ = ["States", "check_piece", "read_pieces"]
 
-CHUNK_BYTES = 48e6  # of a chunk's columns
-FEWEST = 128  # samples of a chunk, however wide
+CHUNK_BYTES = 8e6  # of a chunk's columns: they stay in the processor's cache
+FEWEST = 256  # samples of a chunk, however wide
 
 
 @dataclass(frozen=True)

@@ -105,6 +105,7 @@ def page_template(name: str) -> Any:
         "meaning": wording.effect_meaning,
         "number": wording.number,
         "p_value": lambda value: _glued(wording.p_value(value)),
+        "percent": lambda value: f"{value:.0f}" if 10 <= value < 1e4 else wording.number(value, 2),
         "phrase": wording.phrase,
         "place": wording.place,
         "share": _share,
