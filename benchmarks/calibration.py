@@ -1,18 +1,24 @@
-"""Calibration on real sets, and the solver's speed against SciPy with Pinocchio and finite differences.
+"""Calibration on real sets, and the solver's speed against FIGAROH and against SciPy with finite differences.
 
-    python benchmarks/calibration.py [sets] [speed]
+    python benchmarks/calibration.py [sets] [speed] [figaroh]
 
 `sets` calibrates the recordings of $FIGAROH_JAX_DATA with everything chosen inside five folds (MUKCa: on tool positions
 that were not fitted) and prints error and names. `speed` solves one problem, UR10e poses with its identifiable
-parameters, with both; CPU seconds, ours cold (with compilation) and warm, in one interleaved run.
+parameters, with both (Pinocchio in a Python loop for SciPy), in interleaved rounds. `figaroh` does the same with
+FIGAROH 1.0.2 on its own sets, in the environment that `regressor.py` makes. CPU seconds; cold is that of a fresh
+process from its first line to the answer, without any cache, which tells peak memory too.
 """
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -91,8 +97,6 @@ def points_of(values: np.ndarray) -> np.ndarray:
 
 
 def run_sets() -> None:
-    from dataclasses import replace
-
     from figaroh_jax.calibration.calibration import calibrate
 
     for name, load in SETS.items():
@@ -152,62 +156,160 @@ def run_speed() -> None:
     from figaroh_jax.calibration.candidates import geometry_columns
     from figaroh_jax.calibration.posegroups import postures_of
 
+    path, model, frames = _ur10e()
+    columns = geometry_columns(model, range(6))
+    (zero,) = postures_of(model, [recording(np.zeros((1, 6)), "pose", np.eye(4)[None], *frames)])
+    twists = np.array([column.pieces[0][1](zero)[:, 0] for column in columns])
+    peer = Peer(path, frames[1], np.array([column.pieces[0][0] for column in columns]), twists)
+    for N in (50, 500, 4000, 10000):
+        _compare(N, model, frames, columns, peer)
+
+
+def _ur10e():
+    """URDF, model, and the frames of base and tool."""
     path = next((DATA / "ur10e_innopolis").glob("*.urdf"))
     model = load_urdf(path)
-    frame = model.frames[max(k for k, f in enumerate(model.frames) if f.parent == len(model.joints) - 1)].name
-    root = next(f.name for f in model.frames if f.parent < 0)
-    columns = geometry_columns(model, range(6))
-    (zero,) = postures_of(model, [recording(np.zeros((1, 6)), "pose", np.eye(4)[None], root, frame)])
-    twists = np.array([column.pieces[0][1](zero)[:, 0] for column in columns])
-    peer = Peer(path, frame, np.array([column.pieces[0][0] for column in columns]), twists)
-    for N in (50, 500, 4000):
-        _compare(N, model, (root, frame), columns, peer)
+    tool = model.frames[max(k for k, f in enumerate(model.frames) if f.parent == len(model.joints) - 1)].name
+    return path, model, (next(f.name for f in model.frames if f.parent < 0), tool)
+
+
+class Ours:
+    """One level fitted by plain least squares: what can be told apart, closed-form start, one solve."""
+
+    def __init__(self, model, records: list[PoseRecording], level: str = "full", weight: float = 1e4) -> None:
+        from figaroh_jax.calibration import posefit
+        from figaroh_jax.calibration.candidates import geometry_columns
+        from figaroh_jax.calibration.chain import chain_between
+        from figaroh_jax.calibration.gauge import find_gauge
+        from figaroh_jax.calibration.posegroups import assemble, postures_of
+
+        chain = chain_between(model, records[0].base_frame, records[0].tool_frame).joints
+        columns = geometry_columns(model, chain)[: len(chain) if level == "joint_offset" else None]
+        measured = assemble(model, records, postures_of(model, records), columns, [1e-3] * len(columns))
+        jacobian, count = posefit.linearise(measured.problem, np.zeros(len(measured.problem.scale)))[1], len(columns)
+        gauge = find_gauge(jacobian, [*range(count, jacobian.shape[1]), *range(count)])
+        self.free = np.array([k not in gauge.dependent for k in range(jacobian.shape[1])], float)
+        self.problem, self.rank, self.columns, self.postures = measured.problem, gauge.rank, count, len(records[0].time)
+        self.weights = np.full(len(jacobian), weight)
+
+    def solve(self):
+        from figaroh_jax.calibration.posesolver import solve
+
+        return solve(self.problem, self.weights, 1.0 - self.free, self.free, np.zeros(len(self.free)))
 
 
 def _compare(N: int, model, frames: tuple[str, str], columns, peer: Peer) -> None:
-    import jax.numpy as jnp
-
-    from figaroh_jax.calibration import posefit
-    from figaroh_jax.calibration.gauge import find_gauge
-    from figaroh_jax.calibration.posegroups import assemble, postures_of
-    from figaroh_jax.calibration.posesolver import solve
-
     rng, exp = np.random.default_rng(N), peer.pin.exp6
     q, x = rng.uniform(-2.5, 2.5, (N, 6)), 1e-3 * rng.normal(size=len(columns))
     near = [exp(np.concatenate([0.3 * rng.normal(size=3), rng.normal(size=3)])) for _ in range(2)]
     seen = [pose * exp(1e-4 * rng.normal(size=6)) for pose in peer.poses(q, x, *near)]
-    records = [recording(q, "pose", np.array([pose.homogeneous for pose in seen]), *frames)]
-    start = time.process_time()
-    measured = assemble(model, records, postures_of(model, records), columns, [1e-3] * len(columns))
-    zero = jnp.zeros(len(measured.problem.scale))
-    jacobian = np.asarray(posefit.linearise(measured.problem, zero)[1])
-    gauge = find_gauge(jacobian, [*range(len(columns), len(zero)), *range(len(columns))])
-    free = np.array([k not in gauge.dependent for k in range(len(zero))], float)
-    weights = jnp.full(len(jacobian), 1e4), jnp.where(free > 0, 0.0, 1.0), jnp.asarray(free)
-
-    def ours() -> float:
-        return float(solve(measured.problem, *weights, zero).cost)
-
-    cost, cold = ours(), time.process_time() - start
-    picked, warm, theirs, other = np.flatnonzero(free[: len(columns)]), [], [], 0.0
-    for _ in range(3 if N < 4000 else 1):
+    poses = np.array([pose.homogeneous for pose in seen])
+    with tempfile.TemporaryDirectory() as folder:
+        np.savez(Path(folder) / "poses.npz", q=q, poses=poses)
+        cold = _fresh("child", str(Path(folder) / "poses.npz"))
+    ours = Ours(model, [recording(q, "pose", poses, *frames)])
+    found, picked = ours.solve(), np.flatnonzero(ours.free[: len(columns)])
+    warm, theirs, cost = [], [], 0.0
+    for _ in range(3 if N <= 500 else 1):
         start = time.process_time()
-        ours()
+        for _ in range(5):
+            ours.solve()
         between = time.process_time()
-        other = peer.solve(q, seen, near, picked)
-        warm.append(between - start)
+        cost = peer.solve(q, seen, near, picked)
+        warm.append((between - start) / 5)
         theirs.append(time.process_time() - between)
     print(
-        f"N {N}: {gauge.rank} parameters; SciPy + Pinocchio {min(theirs):.2f}-{max(theirs):.2f} s; ours warm"
-        f" {min(warm):.3f}-{max(warm):.3f} s, cold {cold:.1f} s; ratio {np.median(theirs) / np.median(warm):.1f};"
-        f" cost {cost:.2f} and {other:.2f}",
+        f"N {N}: {ours.rank} parameters; SciPy + Pinocchio {min(theirs):.2f}-{max(theirs):.2f} s; ours warm"
+        f" {min(warm):.4f}-{max(warm):.4f} s, cold {cold['cpu']:.1f} s, peak {cold['peak_mb']:.0f} MB; ratio"
+        f" {np.median(theirs) / np.median(warm):.0f}; cost {found.cost:.2f} and {cost:.2f}",
         flush=True,
     )
+
+
+def _fresh(*arguments: str) -> dict[str, Any]:
+    """The answer of this file in a new process."""
+    environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+    answer = subprocess.run([sys.executable, __file__, *arguments], check=True, capture_output=True, env=environment)
+    return json.loads(answer.stdout)
+
+
+def solve_child(file: str) -> None:
+    """One solve in this process: CPU seconds since it began, and peak memory."""
+    path, model, frames = _ur10e()
+    with np.load(file) as z:
+        Ours(model, [recording(z["q"], "pose", z["poses"], *frames)]).solve()
+    _tell()
+
+
+def calibrate_child(name: str, level: str) -> None:
+    """One level of a set in this process."""
+    model, records = SETS[name]()
+    Ours(model, [replace(r, values=points_of(r.values)) for r in records], level, 1e3).solve()
+    _tell()
+
+
+def _tell() -> None:
+    peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    print(json.dumps({"cpu": time.process_time(), "peak_mb": int(peak.split()[1]) / 1024}))
+
+
+def run_figaroh() -> None:
+    """FIGAROH and ours, the same level by plain least squares on the same rows."""
+    tiago_set = (
+        "tiago_mocap",
+        "tiago_no_hand.urdf",
+        "qualysis_base_hand_calibration.csv",
+        "universe",
+        "ee_marker",
+        [9],
+    )
+    talos_set = ("talos_contact", "talos_full_v2.urdf", "talos_left_arm_02_10_contact.csv", "base_link")
+    for name, level, peer in (
+        ("tiago_mocap, 34", "joint_offset", tiago_set),
+        ("tiago_mocap, 34", "full", tiago_set),
+        ("talos_contact", "joint_offset", talos_set),
+        ("talos_contact", "full", talos_set),
+    ):
+        cold = _fresh("level", name, level)
+        model, records = SETS[name]()
+        records = [replace(r, values=points_of(r.values), tool_frame=peer[4]) for r in records]
+        ours = Ours(model, records, level, 1e3)
+        found, warm, answers = ours.solve(), [], []
+        for _ in range(1 if (name, level) == ("talos_contact", "full") else 3):
+            start = time.process_time()
+            Ours(model, records, level, 1e3).solve()
+            warm.append(time.process_time() - start)
+            answers.append(_peer_calibration(*peer, "full_params" if level == "full" else level))
+        theirs, first = [answer["cpu"] for answer in answers], answers[0]
+        print(
+            f"{name}, {level}: FIGAROH {first['parameters']} parameters, {first['rms']:.4f} mm, {first['evaluations']}"
+            f" evaluations, {min(theirs):.2f}-{max(theirs):.2f} s, {first['peak_mb']:.0f} MB; ours {ours.rank} parameters,"
+            f" {np.sqrt(2.0 * found.cost / ours.postures):.4f} mm, {found.steps} steps, warm {min(warm):.3f}-{max(warm):.3f}"
+            f" s, cold {cold['cpu']:.1f} s, {cold['peak_mb']:.0f} MB; ratio warm {np.median(theirs) / np.median(warm):.0f},"
+            f" cold {np.median(theirs) / cold['cpu']:.2f}",
+            flush=True,
+        )
+
+
+def _peer_calibration(folder: str, urdf: str, csv: str, base: str, tool: str, left_out: list[int], level: str) -> Any:
+    import regressor  # beside this file
+
+    request = {"urdf": str(DATA / folder / urdf), "csv": str(DATA / folder / csv), "base_frame": base, "level": level}
+    request |= {"tool_frame": tool, "left_out": left_out}
+    peer = Path(__file__).with_name("peer_calibration.py")
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    command = [regressor.environment(), str(peer), json.dumps(request)]
+    return json.loads(subprocess.run(command, check=True, capture_output=True, env=environment).stdout)
 
 
 if __name__ == "__main__":
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    for part in sys.argv[1:] or ["sets", "speed"]:
-        {"sets": run_sets, "speed": run_speed}[part]()
+    if sys.argv[1:2] == ["child"]:
+        solve_child(sys.argv[2])
+    elif sys.argv[1:2] == ["level"]:
+        calibrate_child(*sys.argv[2:])
+    else:
+        for part in sys.argv[1:] or ["sets", "speed", "figaroh"]:
+            {"sets": run_sets, "speed": run_speed, "figaroh": run_figaroh}[part]()

@@ -59,7 +59,7 @@ def solve(
     precision: Float[Any, " unknowns"],
     free: Float[Any, " unknowns"],
     start: Float[Any, " unknowns"],
-    max_steps: int = 200,
+    max_steps: int = 500,
 ) -> Solution:
     """Unknowns with the least sum of squared weighted rows and prior rows, by Levenberg-Marquardt from `start`.
 
