@@ -255,15 +255,10 @@ def _tell() -> None:
 
 def run_figaroh() -> None:
     """FIGAROH and ours, the same level by plain least squares on the same rows."""
-    tiago_set = (
-        "tiago_mocap",
-        "tiago_no_hand.urdf",
-        "qualysis_base_hand_calibration.csv",
-        "universe",
-        "ee_marker",
-        [9],
-    )
-    talos_set = ("talos_contact", "talos_full_v2.urdf", "talos_left_arm_02_10_contact.csv", "base_link")
+    tiago_files = ("tiago_mocap", "tiago_no_hand.urdf", "qualysis_base_hand_calibration.csv")
+    talos_files = ("talos_contact", "talos_full_v2.urdf", "talos_left_arm_02_10_contact.csv")
+    tiago_set = (*tiago_files, "universe", "ee_marker", [9])
+    talos_set = (*talos_files, "base_link", "gripper_left_base_link", [])
     for name, level, peer in (
         ("tiago_mocap, 34", "joint_offset", tiago_set),
         ("tiago_mocap, 34", "full", tiago_set),
@@ -281,11 +276,12 @@ def run_figaroh() -> None:
             warm.append(time.process_time() - start)
             answers.append(_peer_calibration(*peer, "full_params" if level == "full" else level))
         theirs, first = [answer["cpu"] for answer in answers], answers[0]
+        rms = np.sqrt(2.0 * found.cost / ours.postures)
         print(
             f"{name}, {level}: FIGAROH {first['parameters']} parameters, {first['rms']:.4f} mm, {first['evaluations']}"
-            f" evaluations, {min(theirs):.2f}-{max(theirs):.2f} s, {first['peak_mb']:.0f} MB; ours {ours.rank} parameters,"
-            f" {np.sqrt(2.0 * found.cost / ours.postures):.4f} mm, {found.steps} steps, warm {min(warm):.3f}-{max(warm):.3f}"
-            f" s, cold {cold['cpu']:.1f} s, {cold['peak_mb']:.0f} MB; ratio warm {np.median(theirs) / np.median(warm):.0f},"
+            f" evaluations, {min(theirs):.2f}-{max(theirs):.2f} s, {first['peak_mb']:.0f} MB; ours {ours.rank}"
+            f" parameters, {rms:.4f} mm, {found.steps} steps, warm {min(warm):.3f}-{max(warm):.3f} s, cold"
+            f" {cold['cpu']:.1f} s, {cold['peak_mb']:.0f} MB; ratio warm {np.median(theirs) / np.median(warm):.0f},"
             f" cold {np.median(theirs) / cold['cpu']:.2f}",
             flush=True,
         )
