@@ -54,13 +54,14 @@ def recording(
     role: Literal["fit", "holdout"] = "fit",
     name: str = "run",
     payload: tuple[float, np.ndarray] | None = None,
+    moving: tuple[bool, ...] = (True, True, True),
 ) -> Recording:
-    """A rich motion; `coloured` noise has a correlation time of 0.1 s and the same standard deviation."""
+    """A rich motion of the `moving` joints; `coloured` noise has a correlation time of 0.1 s and the same deviation."""
     generator = np.random.default_rng(seed)
     t, nv = np.arange(int(seconds * RATE)) / RATE, truth.model.nv
     frequency = generator.uniform(0.1, 1.0, (5, nv))
     phase = generator.uniform(0, 2 * np.pi, (5, nv))
-    amplitude = generator.uniform(0.1, 0.35, (5, nv)) * np.array([1, 1, 0.15])[:nv]
+    amplitude = generator.uniform(0.1, 0.35, (5, nv)) * np.array([1, 1, 0.15])[:nv] * np.array(moving)[:nv]
     angle = 2 * np.pi * frequency * t[:, None, None] + phase
     w = 2 * np.pi * frequency
     q = (amplitude * np.sin(angle)).sum(1) + np.array([0.1, -0.2, 0.25])[:nv]

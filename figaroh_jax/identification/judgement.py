@@ -111,14 +111,18 @@ class Judged:
         sigma = np.sqrt(np.maximum(np.diag(self.posterior), 0.0))
         null = self.base.null
         size = np.abs(null).max(axis=0, initial=0.0)
-        alone = ~(np.abs(null) > TOUCHED * size).any(axis=1)
+        touched = np.abs(null) > TOUCHED * size
+        alone, terms = ~touched.any(axis=1), touched.sum(axis=0)
         out = []
         for k, name in enumerate(self.base.names):
             known = bool(alone[k] and sigma[k] < self.believed[k])
             status = self._status(k, known)
             if not known and not _inertial(name):
                 status = "not identifiable"
-            out.append(Parameter(name, float(self.theta[k]), float(sigma[k]), status, self.base.absorbed_in(name)))
+            mine = np.flatnonzero(touched[k])
+            why = "" if alone[k] else self.base.null_directions[mine[np.argmin(terms[mine])]]
+            found = name, float(self.theta[k]), float(sigma[k]), status, self.base.absorbed_in(name), why
+            out.append(Parameter(*found))
         return tuple(out)
 
     def _status(self, column: int, shown: bool) -> Status:

@@ -34,6 +34,7 @@ class Parameter(NamedTuple):
     std: float
     status: Status
     absorbed_in: tuple[str, ...]  # base parameters that contain it
+    null_direction: str = ""  # the shortest change that contains it and that no torque shows; empty if told alone
 
 
 class Link(NamedTuple):
@@ -118,6 +119,7 @@ def result(found: Identification) -> dict[str, Any]:
         "parameters": [
             {"name": p.name, "value": _number(p.value), "std": _number(p.std), "status": p.status}
             | {"absorbed_in": list(p.absorbed_in)}
+            | ({"null_direction": p.null_direction} if p.null_direction else {})
             for p in found.parameters
         ],
         "null_directions": list(found.null_directions),

@@ -46,6 +46,7 @@ DEFAULT_CUTOFF = 20.0  # Hz
 WORKING = 13.2  # working rate over cutoff; the five-point differences are off by 0.2 % at the cutoff there
 ROWS = 3.3  # output rate over cutoff
 FEWEST_ROWS = 10
+STILL = 1e-12  # of rad or m: what a joint that stands still moves by rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +132,9 @@ def prepare(
             f" after {trim} s are cut at both ends, at least {FEWEST_ROWS} are needed"
         )
     position = (_motion if slowed else low_pass)(columns[0], dt, rates.cutoff)
-    velocity = differentiate(position, dt)
+    moves = np.ptp(position, axis=0) > STILL * (1 + np.abs(position).max(axis=0))
+    position[:, ~moves] = position[0, ~moves]  # dry friction would see the sign of rounding
+    velocity = differentiate(position, dt) * moves
     weight = _weight(recording, preprocess, rows, velocity, grid.gaps, rates.cutoff)
     weight *= ~near(rows.row_times, masked, 0.5 / rates.cutoff)
     return Signals(
@@ -142,7 +145,7 @@ def prepare(
         time=at,
         position=position,
         velocity=velocity,
-        acceleration=differentiate(position, dt, order=2),
+        acceleration=differentiate(position, dt, order=2) * moves,
         torque=None if torque is None else columns[1],
         dt=dt,
         cutoff=rates.cutoff,
