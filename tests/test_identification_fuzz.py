@@ -62,10 +62,9 @@ def recording(chosen: dict) -> Recording:
 @settings(
     max_examples=15,
     deadline=None,
-    derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
-@given(models(), CHOICES, st.booleans(), st.sampled_from(["physical", "unconstrained"]))
+@given(models(), CHOICES, st.booleans(), st.sampled_from(["physical", "unconstrained", "log_cholesky"]))
 def test_any_data_ends_with_numbers_or_one_message(tmp_path: Path, text: str, chosen: dict, drives: bool, fit):
     file = tmp_path / "robot.urdf"
     file.write_text(text)
