@@ -52,7 +52,8 @@ def judged(truth: Truth, moving: tuple[bool, ...], seed: int) -> list[tuple[str,
         inertial = k < len(believed)
         if not told[k]:
             expected = "prior only" if inertial else "not identifiable"
-            assert parameter.name in parameter.null_direction.replace("-", " ").split() or parameter.status == "identified"
+            contained = parameter.null_direction.replace("-", " ").split()
+            assert parameter.name in contained or parameter.status == "identified"
         elif not inertial or std[k] < 0.3 * believed[k]:
             expected = "identified"
         elif std[k] > 3 * believed[k]:
