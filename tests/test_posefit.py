@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 import poses
@@ -11,7 +13,7 @@ import pytest
 
 from figaroh_jax.calibration import posefit, starts
 from figaroh_jax.calibration.chain import chain_between
-from figaroh_jax.calibration.devices import Camera, Device, Distance, Planes, Points, Poses, Sockets
+from figaroh_jax.calibration.devices import Camera, Device, Distance, Planes, Points, Poses, Sockets, own_device
 from figaroh_jax.calibration.posesolver import solve
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.model import RobotModel
@@ -48,7 +50,22 @@ def devices(rng: np.random.Generator) -> dict[str, tuple[Device, np.ndarray]]:
     return {
         "points": (Points(base, centre, BOTH, rng.normal(size=(2, 3))), rng.normal(size=(N, 2, 3))),
         "poses": (Poses(base, centre, BOTH, turn(rng)), near),
-        "camera": (Camera(base, centre, BOTH, turn(rng), board, camera), 100.0 * rng.normal(size=(N, 4, 2))),
+        "poses on the body": (Poses(base, centre, BOTH, turn(rng), "body"), near),
+        "twists": (Poses(base, centre, BOTH, turn(rng), "twist"), near),
+        "camera": (
+            Camera(base, centre, BOTH, turn(rng), board=board, intrinsics=camera),
+            100.0 * rng.normal(size=(N, 4, 2)),
+        ),
+        "camera of the world": (
+            Camera(base, centre, BOTH, turn(rng), board=board, intrinsics=camera, mount="world"),
+            100.0 * rng.normal(size=(N, 4, 2)),
+        ),
+        "own": (
+            own_device(
+                lambda pose, u, d: jnp.cos(u[0]) * pose[0, 3:] - u[1] * d, {"a": (0.5, "rad", 0.1), "b": (1, "1", 1)}
+            ),
+            rng.normal(size=N),
+        ),
         "sockets": (Sockets(rng.normal(size=3), ("tool_frame",), rng.normal(size=(2, 3)), *pair), number),
         "planes": (Planes(rng.normal(size=3), ("tool_frame",), axes, rng.normal(size=(2, 3))), number),
         "distance": (Distance(rng.normal(size=3), ("tool_frame",), rng.normal(size=3)), rng.uniform(1.0, 2.0, N)),
@@ -75,11 +92,52 @@ def test_jacobian_of_every_device_is_the_derivative_of_its_rows(name: str, model
     residual, jacobian = posefit.linearise(whole, y)
     np.testing.assert_allclose(residual, posefit.predict(whole, y), rtol=0, atol=1e-14)
     assert len(posefit.rows_of(whole).group) == len(residual)
+    assert_derivative(whole, y, jacobian)
+    if isinstance(device, Poses) and not isinstance(device, Camera):
+        for angle in (0.0, np.pi - 1e-3):
+            turned = at_angle(angle, datum, residual[N * 3 :].reshape(3, N).T)
+            whole = eqx.tree_at(lambda p: p.groups[0].datum, whole, turned)
+            residual, jacobian = posefit.linearise(whole, y)
+            size = np.linalg.norm(residual[N * 3 :].reshape(3, N), axis=0)
+            np.testing.assert_allclose(size, angle, rtol=0, atol=1e-12)
+            assert_derivative(whole, y, jacobian)
+            datum = turned
+
+
+def at_angle(angle: float, datum: np.ndarray, away: np.ndarray) -> np.ndarray:
+    """Measured poses that are turned by `angle` from the predicted ones, `away` from the ones measured before."""
+    turned = datum.copy()
+    for k, w in enumerate(away):
+        turned[k, :3, :3] = datum[k, :3, :3] @ pin.exp3(w) @ pin.exp3(-angle * np.array([0.6, -0.48, 0.64]))
+    return turned
+
+
+def assert_derivative(whole: posefit.Problem, y: np.ndarray, jacobian: np.ndarray) -> None:
+    def central(direction: np.ndarray) -> np.ndarray:
+        ahead, behind = (posefit.predict(whole, y + sign * direction) for sign in (1, -1))
+        return ahead - behind
+
     step = 1e-4
-    for k, e in enumerate(np.eye(len(y))):
-        ahead, behind = (posefit.predict(whole, y + sign * step * e) for sign in (1, -1))
+    for k, e in enumerate(np.eye(len(y))):  # extrapolated once (Richardson)
+        differences = (8.0 * central(step / 2 * e) - central(step * e)) / (6.0 * step)
         scale = max(1.0, float(np.abs(jacobian[:, k]).max()))
-        np.testing.assert_allclose(jacobian[:, k], (ahead - behind) / (2 * step), rtol=0, atol=3e-8 * scale)
+        np.testing.assert_allclose(jacobian[:, k], differences, rtol=0, atol=3e-8 * scale)
+
+
+def test_devices_of_two_kinds_share_the_columns_and_nothing_else(model: RobotModel):
+    rng = np.random.default_rng(8)
+    q, both = poses.postures(rng, N), devices(rng)
+    alone = [problem(model, *both[name], q, np.random.default_rng(9)) for name in ("points", "sockets")]
+    groups = tuple(part.groups[0] for part in alone)
+    mixed = posefit.Problem(groups, posefit.sizes(groups, [1e-2] * 7), 7)
+    y, first = 0.3 * rng.normal(size=len(mixed.scale)), len(alone[0].scale)
+    residual, jacobian = posefit.linearise(mixed, y)
+    parts = [posefit.linearise(alone[0], y[:first]), posefit.linearise(alone[1], np.r_[y[:7], y[first:]])]
+    np.testing.assert_array_equal(residual, np.concatenate([part[0] for part in parts]))
+    upper = np.hstack([parts[0][1], np.zeros((len(parts[0][0]), len(y) - first))])
+    lower = np.hstack([parts[1][1][:, :7], np.zeros((len(parts[1][0]), first - 7)), parts[1][1][:, 7:]])
+    np.testing.assert_allclose(jacobian, np.vstack([upper, lower]), rtol=0, atol=1e-15)
+    assert list(np.unique(posefit.rows_of(mixed).group)) == [0, 1]
 
 
 def test_closed_form_frames_are_exact_without_noise():

@@ -178,7 +178,7 @@ def shown_of(final: Measured, recordings, frames, after) -> tuple[Shown, ...]:
         rows = (final.channel == 0) & final.measured & (final.posture >= 0)
         rows &= np.where(final.posture >= 0, final.recording[final.posture], -1) == k
         items, first, count = np.unique(final.item[rows], return_index=True, return_counts=True)
-        if not len(items) or count.max() != 3:
+        if not len(items) or count.max() != 3 or recording.kind == "own":
             continue
         place = np.flatnonzero(rows)
         triple = np.array([place[final.item[place] == item] for item in items])

@@ -3,12 +3,13 @@ r"""What a measuring device makes of the pose of the tool: residuals in m and ra
 A device is a small immutable object with one method, `residual(pose, unknown, datum)`, for one posture: `pose` is that
 of the tool frame in the base frame, `unknown` the vector of what the device itself leaves open (its own place, the
 place of its markers, of sockets, of planes), zero at the start, and `datum` what it measured. Derivatives are JAX's.
-A device of your own is such a class.
+A device of your own is such a class, or a function given to `own_device`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,7 +19,18 @@ from jaxtyping import Array, Float
 from .. import lie
 from ..model import Leaf
 
-__all__ = ["ORIENTATION", "POSITION", "Camera", "Device", "Distance", "Planes", "Points", "Poses", "Sockets"]
+__all__ = [
+    "ORIENTATION",
+    "POSITION",
+    "Camera",
+    "Device",
+    "Distance",
+    "Planes",
+    "Points",
+    "Poses",
+    "Sockets",
+    "own_device",
+]
 
 POSITION, ORIENTATION = 0, 1  # channels of a row: m or rad
 _TWIST = ("x", "y", "z", "rx", "ry", "rz")
@@ -103,15 +115,23 @@ class Points(Placed):
 
 
 class Poses(Placed):
-    """Position and orientation of the tool in the device's frame: the residual is the difference of the positions and
-    the logarithm of the rotation from the measured to the predicted one."""
+    """Position and orientation of the tool in the device's frame.
+
+    The rows are the difference of the positions, on the device's axes or (`axes` "body") on the measured ones, and the
+    logarithm of the rotation from the measured to the predicted orientation; with `axes` "twist", the logarithm of the
+    whole motion from the one pose to the other.
+    """
 
     tool: Float[Leaf, "4 4"]  # pose of the marker in the tool frame, at the start
+    axes: Literal["device", "body", "twist"] = eqx.field(static=True, default="device")
 
     def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, "6"]:
         predicted = self.device_T_base(unknown) @ pose @ self.tool_T_marker(unknown)
+        if self.axes == "twist":
+            return lie.log_se3(lie.inverse_pose(datum) @ predicted)
         turn = lie.log_so3(datum[:3, :3].T @ predicted[:3, :3])
-        return jnp.concatenate([predicted[:3, 3] - datum[:3, 3], turn])
+        away = predicted[:3, 3] - datum[:3, 3]
+        return jnp.concatenate([datum[:3, :3].T @ away if self.axes == "body" else away, turn])
 
     def places(self, unknown: Array) -> dict[str, Array]:
         return {"base_frame": self.device_T_base(unknown), "tool_frame": self.tool_T_marker(unknown)}
@@ -136,8 +156,8 @@ class Camera(Poses):
     Rows are pixels over the focal length, an angle in rad.
     """
 
-    board: Float[Leaf, "corners 3"]  # m, in the board's frame
-    intrinsics: Float[Leaf, "3 3"]
+    board: Float[Leaf, "corners 3"] = eqx.field(kw_only=True)  # m, in the board's frame
+    intrinsics: Float[Leaf, "3 3"] = eqx.field(kw_only=True)
     mount: str = eqx.field(static=True, default="hand")
 
     def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, " rows"]:
@@ -234,6 +254,41 @@ class Distance(_Touch):
 
     def unknowns(self) -> tuple[tuple[str, str, float], ...]:
         return self._tool_unknowns() + _points("anchor", 1)
+
+
+class _Own(Device):
+    """A device given as a function."""
+
+    start: Float[Leaf, " k"]
+    function: Callable[[Array, Array, Any], Array] = eqx.field(static=True)
+    names: tuple[tuple[str, str, float], ...] = eqx.field(static=True)
+    kinds: tuple[int, ...] = eqx.field(static=True)
+
+    def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, " rows"]:
+        return jnp.atleast_1d(self.function(pose, self.start + unknown, datum))
+
+    def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        return self.names
+
+    def channels(self) -> tuple[int, ...]:
+        return self.kinds
+
+
+def own_device(
+    residual: Callable[[Float[Array, "4 4"], Float[Array, " k"], Any], Float[Array, " rows"]],
+    unknowns: Mapping[str, tuple[float, str, float]],
+    channels: Sequence[int] = (POSITION,),
+) -> Device:
+    """A measuring device of your own from a function: the differentiable `residual(pose, unknown, datum)`.
+
+    `pose` is that of the tool frame in the base frame, `datum` what was measured in the posture; given back is
+    predicted minus measured, m (POSITION) or rad (ORIENTATION) as `channels` says row by row. `unknowns` names what
+    the device leaves open, in the order in which the function takes it: its start, its unit, and about how far off
+    that is.
+    Put it into `PoseRecording(kind="own", device=...)`.
+    """
+    names = tuple((name, unit, float(size)) for name, (_, unit, size) in unknowns.items())
+    return _Own(np.array([start for start, _, _ in unknowns.values()], float), residual, names, tuple(channels))
 
 
 def _frame(name: str) -> tuple[tuple[str, str, float], ...]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
@@ -126,7 +127,7 @@ def _shared(recordings: Sequence[PoseRecording]) -> list[list[int]]:
     groups: dict[Any, list[int]] = {}
     for k, r in enumerate(recordings):
         markers = r.values.shape[1] if r.kind == "position" else 0
-        groups.setdefault((r.kind, r.base_frame, r.tool_frame, r.unknown, markers), []).append(k)
+        groups.setdefault((r.kind, r.base_frame, r.tool_frame, r.unknown, markers, id(r.device)), []).append(k)
     return list(groups.values())
 
 
@@ -138,7 +139,7 @@ def _group(
     R, p = _nominal(model, recordings[0].base_frame, recordings[0].tool_frame, position)
     kind = recordings[0].kind
     fit = np.concatenate([np.full(len(r.position), r.role == "fit") for r in recordings])
-    make = {"position": _points, "pose": _poses, "socket": _sockets, "plane": _planes}[kind]
+    make = {"position": _points, "pose": _poses, "socket": _sockets, "plane": _planes, "own": _own}[kind]
     device, datum, measured = make(recordings, R, p, fit)
     pieces = (
         (k, chain.joints.index(j), np.concatenate([field(x) for x in postures], axis=1))
@@ -227,3 +228,17 @@ def _planes(recordings, R, p, fit) -> tuple[Device, np.ndarray, np.ndarray]:
         middle.append(both[1])
     device = Planes(np.zeros(3), recordings[0].unknown, np.array(axes), np.array(middle))
     return device, plane, (values >= 0)[:, None]
+
+
+def _own(recordings, R, p, fit) -> tuple[Device, np.ndarray, np.ndarray]:
+    device, values = recordings[0].device, np.concatenate([r.values for r in recordings])
+    if device is None:
+        raise InputError(f"{recordings[0].file}: a recording of kind 'own' needs its device, see devices.own_device")
+    whole: np.ndarray = np.all(np.isfinite(values).reshape(len(values), -1), axis=1)
+    datum = np.where(whole.reshape(-1, *[1] * (values.ndim - 1)), values, 0.0)
+    rows = jax.eval_shape(device.residual, np.eye(4), np.zeros(len(device.unknowns())), datum[0]).shape
+    if rows != (len(device.channels()),):
+        raise InputError(
+            f"{recordings[0].file}: the device's residual has shape {rows}, but its channels are {device.channels()}"
+        )
+    return device, datum, np.repeat(whole[:, None], len(device.channels()), axis=1)

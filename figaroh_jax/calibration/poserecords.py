@@ -5,6 +5,7 @@
 | `position` | points (postures, markers, 3) in the device's frame, m |
 | `pose` | poses (postures, 4, 4) of the marker in the device's frame; a camera's board too, as the mount asks |
 | `plane`, `socket` | number (postures,) of what the tool point touches |
+| `own` | (postures, ...) whatever `device`, a measuring device of your own, takes; in Python alone |
 
 A row, a marker or an orientation that was not measured is NaN (-1 for a number).
 """
@@ -22,6 +23,7 @@ from ..errors import InputError
 from ..model import RobotModel
 from ..recordings import dataset
 from ..recordings.tables import Table, read_table
+from .devices import Device
 
 if TYPE_CHECKING:
     from ..formats.config import Load, Measurement, RecordingEntry, Task
@@ -39,7 +41,7 @@ class PoseRecording:
     file: Path
     time: Float[np.ndarray, " samples"]  # s; counted where the file has no clock
     position: Float[np.ndarray, "samples nv"]  # rad or m
-    kind: Literal["pose", "position", "plane", "socket"]
+    kind: Literal["pose", "position", "plane", "socket", "own"]
     values: np.ndarray
     base_frame: str
     tool_frame: str
@@ -49,6 +51,7 @@ class PoseRecording:
     load: Load | None = None
     role: Literal["fit", "holdout"] = "fit"
     notes: tuple[str, ...] = ()
+    device: Device | None = None  # of kind "own"
 
 
 def read_pose_recordings(task: Task, model: RobotModel) -> tuple[PoseRecording, ...]:
