@@ -184,7 +184,8 @@ def test_scores_of_the_residual_drawn_again_are_the_scores() -> None:
     linear, stock = fit(rows, PRIOR), bank(rows, [columns])
     H = evidence.projection(linear, stock)
     drawn = np.stack([linear.residual, 0 * linear.residual])
-    again = evidence.other_scores(rows, stock, H, drawn) + linear.pull @ H * [[1.0], [0.0]]
+    prior = np.stack([linear.pull, 0 * linear.pull])
+    again = evidence.other_scores(rows, H, drawn, evidence.pulled(columns, stock.parts[0], drawn), prior)
     np.testing.assert_allclose(again[0], own_scores(rows, linear, columns), rtol=0, atol=1e-9)
     np.testing.assert_array_equal(again[1], 0.0)
     found = evidence.scores(linear, stock, H)

@@ -100,7 +100,7 @@ def test_files_are_short_enough_to_read():
 
 
 def test_options_of_one_kind_of_device_are_set_where_the_device_is_known():
-    """A compiler for another device refuses them: only `chunks.program`, `Program`, or code that has looked, may pass them."""
+    """A compiler for another device refuses them: `chunks.program` and code that looks may pass them."""
     own = {name for name, path in MODULES.items() if "compiler_options=" in path.read_text(encoding="utf-8")}
     assert own <= {"chunks", "programs", "streaming", "identification.devices"}
     for path in (ROOT / "backends").rglob("*.py"):

@@ -46,10 +46,6 @@ class Bank(NamedTuple):
         """Every column times one matrix of rows a joint, summed over the joints."""
         return _product(self.width, self.joint, self.Zi, rows)
 
-    def single(self) -> Bank:
-        """With instruments in single precision, for products with rows in that precision."""
-        return self._replace(Zi=[own.astype(np.float32) for own in self.Zi])
-
 
 def bank(rows: Rows, candidates: list[Columns], before: Bank | None = None) -> Bank:
     """The candidates' instruments, arranged by joint, and their products with each other and with the model.

@@ -13,8 +13,19 @@ from jaxtyping import Float, Int
 from .bank import Bank, Columns
 from .rows import Linear, Rows, tall
 
-__all__ = ["Score", "absorbed", "block_scores", "largest", "other_scores", "projection", "scores", "wilson_hilferty"]
+__all__ = [
+    "Score",
+    "absorbed",
+    "block_scores",
+    "largest",
+    "other_scores",
+    "projection",
+    "pulled",
+    "scores",
+    "wilson_hilferty",
+]
 
+_FEW = 4  # columns of a candidate at a point
 CUT = 1e-7  # eigenvalues of the unit-diagonal variance below it: a direction that the baseline has absorbed
 
 
@@ -52,24 +63,46 @@ def scores(linear: Linear, stock: Bank, H: Float[np.ndarray, "P columns"]) -> li
 
 def largest(stock: Bank, found: list[Score], drawn: Float[np.ndarray, "draws columns"]) -> Float[np.ndarray, " draws"]:
     """Largest z of all candidates that other scores of the same columns would have."""
-    highest = np.full(len(drawn), -np.inf)
+    highest, by_column = np.full(len(drawn), -np.inf), np.ascontiguousarray(drawn.T)
     for members, columns in _by_width(stock.span):
         root = np.concatenate([found[i].root for i in members])
         rank = np.concatenate([found[i].rank for i in members])
-        white = np.matmul(np.swapaxes(drawn[:, columns], 0, 1), np.swapaxes(root, 1, 2))
-        Q = (white**2).sum(-1)  # (points, draws); z grows with Q, so that the largest Q of a rank will do
+        Q = _whitened_squares(by_column[columns.T], root)  # z grows with Q: the largest Q of a rank will do
         for one in np.unique(rank):
             highest = np.maximum(highest, wilson_hilferty(Q[rank == one].max(0), np.full(len(drawn), one)))
     return highest
 
 
-def other_scores(
-    rows: Rows, stock: Bank, H: Float[np.ndarray, "P columns"], residual: Float[np.ndarray, "draws nv T"]
+def _whitened_squares(
+    drawn: Float[np.ndarray, "k points draws"], root: Float[np.ndarray, "points k k"]
+) -> Float[np.ndarray, "points draws"]:
+    """Squares of root times each draw; few columns go term by term, which is faster than many small products."""
+    if len(drawn) > _FEW:
+        return (np.matmul(root.astype(drawn.dtype), np.swapaxes(drawn, 0, 1)) ** 2).sum(1)
+    factors = np.moveaxis(root, 0, 2)[..., None].astype(drawn.dtype)
+    rows = (sum(factor * part for factor, part in zip(row, drawn, strict=True)) for row in factors)
+    return sum(row * row for row in rows)
+
+
+def pulled(
+    one: Columns, parts: list[Float[np.ndarray, "columns T"]], residual: Float[np.ndarray, "draws nv T"]
 ) -> Float[np.ndarray, "draws columns"]:
-    """The scores that other residual rows would give: Zi'e - H'Xi'e, in the precision of the rows and the bank."""
-    draws, kind = len(residual), residual.dtype
-    model = (residual * rows.paired.astype(kind)).reshape(draws, -1) @ tall(rows.Xi).astype(kind, copy=False)
-    return stock.product(list(np.moveaxis(residual, 0, 2))).T - model @ H
+    """Zi'e of a candidate with the instruments `parts` (of its joints) for several residuals, in their precision."""
+    pairs = zip(one.joints, parts, strict=True)
+    return np.sum([residual[:, joint] @ own.astype(residual.dtype).T for joint, own in pairs], axis=0)
+
+
+def other_scores(
+    rows: Rows,
+    H: Float[np.ndarray, "P columns"],
+    residual: Float[np.ndarray, "draws nv T"],
+    pulled: Float[np.ndarray, "draws columns"],
+    prior: Float[np.ndarray, "draws P"],
+) -> Float[np.ndarray, "draws columns"]:
+    """The scores that other residual rows would give: Zi'e - H'(Xi'e - the prior's rows), in their precision."""
+    kind = residual.dtype
+    model = (residual * rows.paired.astype(kind)).reshape(len(residual), -1) @ tall(rows.Xi).astype(kind, copy=False)
+    return pulled + ((prior - model) @ H).astype(kind)
 
 
 def block_scores(

@@ -15,7 +15,7 @@ from .noise import Spectrum
 from .problem import Problem
 from .records import filtered_rows
 from .rows import Rows, fit, with_columns
-from .screening import Group, family_p, screen
+from .screening import Group, Null, family_p, screen
 from .state import FRICTION_PRECISION, State, whitened
 
 __all__ = ["families", "flexible_p", "friction_width"]
@@ -41,7 +41,7 @@ def flexible_p(
     groups = families(problem, state, whitening)
     linear = fit(rows, state.prior)
     found = screen(rows, linear, groups)
-    p = family_p(problem, rows, linear, found, spectrum, whitening, generator)
+    p = family_p(rows, linear, found, Null(problem, spectrum, whitening, generator), generator)
     best = int(np.argmax([result.z.max() for result in found.scores]))
     score = found.scores[best]
     return p, found.groups[best].name, float(score.Q.max() - score.rank.max())

@@ -56,26 +56,27 @@ def bounded_minimum(
 
 
 def profile(
-    Z: Float[np.ndarray, "k rows n M"],
-    slope: Float[np.ndarray, "p k rows n M"],
+    Z: Float[np.ndarray, "*starts k rows n M"],
+    slope: Float[np.ndarray, "*starts p k rows n M"],
     joints: list[int],
     whitened: Whitened,
-) -> tuple[float, Float[np.ndarray, " p"]]:
+) -> tuple[Float[np.ndarray, " *starts"], Float[np.ndarray, "*starts p"]]:
     """J of the columns `Z` at the `joints`, the change of the penalised squares that they bring, and its gradient.
 
     With x = G^-1 s: dJ = x' dG x - 2 ds'x.
     """
-    residual, X = whitened.residual[joints].reshape(-1), whitened.X[joints].reshape(-1, whitened.X.shape[-1])
-    k = len(Z)
-    flat = Z.reshape(k, -1)
-    s, C, gram = flat @ residual, flat @ X, flat @ flat.T
+    residual, X = (x[joints[0]] if len(joints) == 1 else x[joints] for x in (whitened.residual, whitened.X))
+    residual, X = residual.reshape(-1), X.reshape(-1, whitened.X.shape[-1])
+    flat, changes = (x.reshape(*x.shape[:-3], -1) for x in (Z, slope))
+    s, C, gram = flat @ residual, flat @ X, flat @ np.swapaxes(flat, -1, -2)
     taken = C @ whitened.inverse
-    scale = np.sqrt(np.diagonal(gram) + 1e-300)
-    unit = (gram - taken @ C.T) / np.outer(scale, scale) + RIDGE * np.eye(k)
-    x = np.linalg.solve(unit, s / scale) / scale
-    left = x @ flat - X @ (x @ taken)  # what G x is a product with: the columns less what the model takes up
-    changes = slope.reshape(len(slope), k, -1)
-    return float(-s @ x), 2 * (changes @ (left - residual)) @ x
+    scale = np.sqrt(np.diagonal(gram, axis1=-2, axis2=-1) + 1e-300)
+    unit = (gram - taken @ np.swapaxes(C, -1, -2)) / (scale[..., None] * scale[..., None, :])
+    x = np.linalg.solve(unit + RIDGE * np.eye(flat.shape[-2]), (s / scale)[..., None])[..., 0] / scale
+    # what G x is a product with: the columns less what the model takes up
+    left = (x[..., None, :] @ flat)[..., 0, :] - (x[..., None, :] @ taken)[..., 0, :] @ X.T
+    pull = (changes @ (left - residual)[..., None, :, None])[..., 0]
+    return -(s * x).sum(-1), 2 * (pull @ x[..., None])[..., 0]
 
 
 def refit(
@@ -148,7 +149,7 @@ def refit_shift(
 def _profiles(
     effects: Effect, motion: Motion, values: Float[np.ndarray, "starts p"], records: Records, whitened: Whitened
 ) -> dict[str, Any]:
-    """Profile, gradient and columns of several starts, each its own effect with its own shape."""
+    """Profile, gradient and columns of several starts at one place, each its own effect with its own shape."""
     torque, slope = units_and_slopes(effects, values, motion)
     starts, p, k = slope.shape[:3]
     own = effects.acts_on in ("joint", "pair")
@@ -156,8 +157,7 @@ def _profiles(
     both = np.concatenate([torque[:, None], slope], axis=1).reshape(starts, (1 + p) * k, *torque.shape[2:])
     rows = unit_rows(Units(both, joints), records, whitened.whitening)
     rows = rows.reshape(starts, 1 + p, k, *rows.shape[2:])
-    parts = [profile(one[0], one[1:], list(at), whitened) for one, at in zip(rows, joints, strict=True)]
-    value, gradient = (np.array(x) for x in zip(*parts, strict=True))
+    value, gradient = profile(rows[:, 0], rows[:, 1:], joints[0].tolist(), whitened)
     return {"value": value, "slope": gradient, "Z": rows[:, 0]}
 
 

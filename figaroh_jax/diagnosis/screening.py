@@ -6,6 +6,7 @@ Naming starts here and never ends here: columns that are right to first order fi
 from __future__ import annotations
 
 from collections.abc import Collection
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -18,15 +19,16 @@ from ..model import RobotModel
 from ..results import Name
 from .bank import Bank, Columns, bank
 from .design import flattened, unit_rows, units
-from .evidence import Score, block_scores, largest, other_scores, projection, scores
+from .evidence import Score, block_scores, largest, other_scores, projection, pulled, scores
 from .noise import Spectrum
 from .problem import Problem
 from .rows import Linear, Rows
 from .state import State
 
-__all__ = ["Group", "Screen", "catalogue", "family_p", "screen"]
+__all__ = ["Group", "Null", "Screen", "catalogue", "family_p", "screen"]
 
-DRAWS, CHUNK = 400, 50  # draws, and how many are held at once
+DRAWS, CHUNK = 400, 50  # draws, and how many are made at once
+KEPT = 16_000_000  # numbers of noise that are held from step to step
 ALTERNATIVES = ({"torque_delay", "torque_lag"},)  # once one is in, the other is not tried
 
 
@@ -127,34 +129,59 @@ def screen(rows: Rows, linear: Linear, groups: list[Group], before: Screen | Non
     return Screen(groups, scores(linear, stock, H), stock, H)
 
 
+class Null:
+    """Noise with a spectrum, drawn in parts of `CHUNK`, and the scores that it gives.
+
+    A part is the same at every step of a search: its rows are kept where they are few, and so are its products with
+    candidates that are the same objects as at the step before.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        spectrum: Spectrum,
+        whitening: Float[np.ndarray, "F nv"],
+        generator: np.random.Generator,
+    ) -> None:
+        self._draw = partial(draw_noise, problem, spectrum, whitening, CHUNK)
+        self._seed = int(generator.integers(2**62))
+        self._rows: dict[int, np.ndarray] = {}
+        self._products: dict[int, dict[int, tuple[Columns, np.ndarray]]] = {}
+
+    def rows(self, part: int) -> Float[np.ndarray, "draws nv T"]:
+        """Whitened rows of a part, in single precision."""
+        noise = self._rows.get(part)
+        if noise is None:
+            noise = self._draw(np.random.default_rng([self._seed, part]))
+            if noise.size * (part + 1) <= KEPT:
+                self._rows[part] = noise
+        return noise
+
+    def scores(self, part: int, rows: Rows, linear: Linear, found: Screen) -> Float[np.ndarray, "draws columns"]:
+        """Scores of all candidates, with as much drawn for the prior's rows."""
+        noise, before = self.rows(part), self._products.get(part, {})
+        pairs = zip(found.stock.candidates, found.stock.parts, strict=True)
+        known = {id(one): before.get(id(one)) or (one, pulled(one, own, noise)) for one, own in pairs}
+        self._products[part] = known
+        prior = np.sqrt(np.maximum(np.diag(linear.moment) - (rows.Xi**2).sum((0, 1)), 0))
+        pulls = prior * np.random.default_rng([self._seed, part, 1]).standard_normal((CHUNK, len(prior)))
+        return other_scores(rows, found.H, noise, np.concatenate([x for _, x in known.values()], axis=1), pulls)
+
+
 def family_p(
-    problem: Problem,
-    rows: Rows,
-    linear: Linear,
-    found: Screen,
-    spectrum: Spectrum,
-    whitening: Float[np.ndarray, "F nv"],
-    generator: np.random.Generator,
-    draws: int = DRAWS,
+    rows: Rows, linear: Linear, found: Screen, null: Null, generator: np.random.Generator, draws: int = DRAWS
 ) -> float:
     """Chance that noise alone gives some candidate of the whole catalogue a score as large as the largest.
 
-    The larger of two nulls: noise drawn from the spectrum (its coefficients redrawn each time), and fair signs of
+    The larger of two nulls: noise drawn from the spectrum (its coefficients redrawn for each part), and fair signs of
     whole blocks of the residual, the prior's rows among the blocks.
     """
     highest = max(float(result.z.max()) for result in found.scores)
     parts = block_scores(rows, linear, found.stock, found.H)
     signs = generator.choice([-1.0, 1.0], (draws, len(parts)))
-    nulls = [largest(found.stock, found.scores, signs @ parts)]
-    prior = np.sqrt(np.maximum(np.diag(linear.moment) - (rows.Xi**2).sum((0, 1)), 0))
-    drawn, light = [], found.stock.single()
-    for _ in range(draws // CHUNK):
-        noise = draw_noise(problem, spectrum, whitening, CHUNK, generator)
-        pulls = prior * generator.standard_normal((CHUNK, len(prior)))
-        again = other_scores(rows, light, found.H, noise) + pulls @ found.H
-        drawn.append(largest(found.stock, found.scores, again))
-    nulls.append(np.concatenate(drawn))
-    return max((1 + np.sum(null >= highest)) / (draws + 1) for null in nulls)
+    drawn = np.concatenate([null.scores(part, rows, linear, found) for part in range(draws // CHUNK)])
+    nulls = (largest(found.stock, found.scores, x) for x in (signs @ parts, drawn))
+    return max((1 + np.sum(z >= highest)) / (draws + 1) for z in nulls)
 
 
 def draw_noise(

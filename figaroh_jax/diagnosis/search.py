@@ -20,7 +20,7 @@ from .gates import CONFIDENT, GAIN, ambiguous, exists, passes, rivals, simpler
 from .noise import Spectrum
 from .problem import Problem
 from .rows import Prior
-from .screening import DRAWS, Screen, catalogue, family_p, screen
+from .screening import DRAWS, Null, Screen, catalogue, family_p, screen
 from .state import State, with_width
 from .step import Step, stand, with_cause, with_causes
 
@@ -78,12 +78,13 @@ def find_causes(
     """
     generator = generator or np.random.default_rng(0)
     step, found = stand(problem, state, whitening), []
+    null = Null(problem, spectrum, whitening, generator)
     p_values, screens, screened, groups = [], [], None, None
     while len(found) < MOST:
         progress("screening the catalogue", len(found) / MOST)
         groups = catalogue(problem, step.state, step.rows, whitening, forbid, groups)
         screened = screen(step.rows, step.linear, groups, screened)
-        p_values.append(_chance(problem, step, screened, spectrum, whitening, alpha, generator, not found))
+        p_values.append(_chance(step, screened, null, alpha, generator, not found))
         screens = screens or [screened]
         if p_values[-1] > alpha:
             break
@@ -101,11 +102,9 @@ def find_causes(
 
 
 def _chance(
-    problem: Problem,
     step: Step,
     screened: Screen,
-    spectrum: Spectrum,
-    whitening: Float[np.ndarray, "F nv"],
+    null: Null,
     alpha: float,
     generator: np.random.Generator,
     first: bool,
@@ -113,7 +112,7 @@ def _chance(
     """p-value of the whole catalogue, with more draws where few leave it open on which side of `alpha` it lies."""
 
     def drawn(draws: int) -> float:
-        return family_p(problem, step.rows, step.linear, screened, spectrum, whitening, generator, draws)
+        return family_p(step.rows, step.linear, screened, null, generator, draws)
 
     p = drawn(DRAWS if first else LATER)
     return drawn(CLOSER) if alpha < p < NEAR * alpha else p

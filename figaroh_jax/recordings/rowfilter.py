@@ -101,9 +101,23 @@ def filtered(
     response: Shaped[Array | np.ndarray, "*responses freqs"],
 ) -> Float[Array | np.ndarray, "*series rows"]:
     """What stands at the places of the extended record after the `response` (which leads or equals the series)."""
-    library = jnp if traced(signal, source, response) else np
-    spectrum = library.fft.rfft(signal[..., source], axis=-1) * response
-    return library.fft.irfft(spectrum, source.shape[-1], axis=-1)[..., place]
+    if traced(signal, source, response):
+        spectrum = jnp.fft.rfft(signal[..., source], axis=-1) * response
+        return jnp.fft.irfft(spectrum, source.shape[-1], axis=-1)[..., place]
+    return _filtered_on_host(np.asarray(signal), np.asarray(source), np.asarray(place), np.asarray(response))
+
+
+def _filtered_on_host(signal: np.ndarray, source: np.ndarray, place: np.ndarray, response: np.ndarray) -> np.ndarray:
+    """As `filtered`; where only every second, fourth, ... number is asked for, the spectrum is folded before it."""
+    length = len(source)
+    common = int(np.gcd.reduce(place - place[:1], initial=length))
+    step = common & -common
+    first = int(place[0]) % step if len(place) else 0
+    spectrum = np.fft.rfft(signal[..., np.roll(source, -first)], axis=-1) * response
+    for size in (length >> k for k in range(step.bit_length() - 1)):
+        lower = slice(size // 4 + 1)
+        spectrum = 0.5 * (spectrum[..., lower] + spectrum[..., ::-1][..., lower].conj())
+    return np.fft.irfft(spectrum, length // step, axis=-1)[..., place // step]
 
 
 def frequencies(rows: RowFilter) -> Float[np.ndarray, " freqs"]:
