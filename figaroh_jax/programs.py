@@ -53,7 +53,7 @@ class Program:
             args[: self.static],
             tree,
             tuple((x.shape, x.dtype) for x in leaves),
-            jax.config.jax_enable_x64,
+            jax.dtypes.canonicalize_dtype(float),
         )
         if key not in self._ready:
             self._ready[key] = self._prepared(args, leaves, tree)
@@ -99,7 +99,7 @@ class Program:
             *(f"{f.__module__}.{f.__qualname__}" for f in functions),
             str(tree),
             *(f"{x.shape} {x.dtype}" for x in leaves),
-            f"{self.options} {self.donate} {jax.config.jax_enable_x64}",
+            f"{self.options} {self.donate} {jax.dtypes.canonicalize_dtype(float)}",
             _surroundings(),
         ]
         return Path(folder) / "programs" / hashlib.blake2b("\n".join(parts).encode(), digest_size=20).hexdigest()

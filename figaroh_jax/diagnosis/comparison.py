@@ -127,11 +127,12 @@ def judge_grown(rows: Rows, base: Ground, joints: Sequence[int], more: Float[np.
     others change by -A^-1 C t and the squares by -t'S t; all for the whole fit and for that without each fold.
     """
     was, k, folds = base.verdicts, len(more), base.member.shape[1]
-    X = rows.X[list(joints)]
-    split = more[..., None] * base.member  # (k, rows, T, folds)
-    shared = _without(np.einsum("jtp,kjtf->fpk", X, split, optimize=True))
-    own = _without(np.einsum("ljt,kjtf->flk", more, split, optimize=True))
-    right = _without(np.einsum("jt,kjtf->fk", rows.y[list(joints)], split, optimize=True)[..., None])
+    X, y = rows.X[list(joints)].reshape(-1, rows.X.shape[2]), rows.y[list(joints)].reshape(-1)
+    Z = np.moveaxis(more, 0, -1)
+    split = (Z[:, :, None] * base.member[..., None]).reshape(len(y), -1)  # a column for each fold and candidate column
+    products = (side.T @ split for side in (X, Z.reshape(-1, k), y[:, None]))
+    shared, own, right = (_without(np.swapaxes(x.reshape(-1, folds, k), 0, 1)) for x in products)
+    right = np.swapaxes(right, 1, 2)
     known = np.concatenate([was.folds, was.theta[None]])[..., None]
     across = np.matmul(base.inverse, shared)
     S = own - np.matmul(np.swapaxes(shared, 1, 2), across)
@@ -143,7 +144,7 @@ def judge_grown(rows: Rows, base: Ground, joints: Sequence[int], more: Float[np.
     change = -np.matmul(across, t)
     theta = np.concatenate([known + change, t], axis=1)[..., 0]
     moved = rows.X @ change[..., 0].T  # (nv, T, folds + 1)
-    moved[list(joints)] += np.einsum("kjt,fk->jtf", more, t[..., 0], optimize=True)
+    moved[list(joints)] += Z @ t[..., 0].T
     error = was.error - (moved[..., :folds] * base.member).sum(2)
     squares, costs = _block_squares(rows, error), was.without - drop[:folds]
     residual = was.residual - moved[..., folds]

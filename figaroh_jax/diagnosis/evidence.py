@@ -81,7 +81,7 @@ def _whitened_squares(
         return (np.matmul(root.astype(drawn.dtype), np.swapaxes(drawn, 0, 1)) ** 2).sum(1)
     factors = np.moveaxis(root, 0, 2)[..., None].astype(drawn.dtype)
     rows = (sum(factor * part for factor, part in zip(row, drawn, strict=True)) for row in factors)
-    return sum(row * row for row in rows)
+    return sum((row * row for row in rows), np.zeros((), drawn.dtype))
 
 
 def pulled(

@@ -174,7 +174,7 @@ def unit_torques(problem: Problem, state: State, term: Effect) -> Units:
         return Units(torque, np.tile(np.arange(problem.model.nv), (len(links), 1)))
     family = family_of(type(term))
     if family == "shaped":
-        return _shaped_units(term, state.motion)
+        return _shaped_units(term, state.measured)  # its torque does not follow the model's
     if family in ("fixed", "following"):
         place = _places_in(problem.families[family].get(term.name), term)
         if place is not None:
