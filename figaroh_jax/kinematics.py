@@ -33,6 +33,7 @@ __all__ = [
     "frame_jacobian",
     "frame_placement",
     "frame_placements",
+    "frame_pose",
     "gather",
     "motion",
     "movers",
@@ -327,15 +328,15 @@ def frame_placements(model: RobotModel, q: Float[ArrayLike, "*batch nq"]) -> Flo
 
 
 def _one_frame(which: tuple[RobotModel, Any, Any], q: Array) -> Float[Array, "4 4 samples"]:
-    return _frame_pose(placements(which[0], q), *which)
+    return frame_pose(placements(which[0], q), *which)
 
 
 def _all_frames(model: RobotModel, q: Array) -> Float[Array, "nf 4 4 samples"]:
     parents = np.array([frame.parent for frame in model.frames], int)
-    return _frame_pose(placements(model, q), model, slice(None), parents)
+    return frame_pose(placements(model, q), model, slice(None), parents)
 
 
-def _frame_pose(poses: Float[Array, "nj 4 4 samples"], model: RobotModel, index: Any, parent: Any) -> Array:
+def frame_pose(poses: Float[Array, "nj 4 4 samples"], model: RobotModel, index: Any, parent: Any) -> Array:
     """Poses of frames; a parent of -1, the world, stands before the joints."""
     world = jnp.broadcast_to(jnp.eye(4, dtype=poses.dtype)[..., None], (1, *poses.shape[1:]))
     carrier = jnp.concatenate([world, poses])[parent + 1]
@@ -364,7 +365,7 @@ def frame_jacobian(
 
 def _aligned(which: tuple[RobotModel, Any, Any], q: Array) -> Float[Array, "6 nv samples"]:
     columns = pose_columns(which[0], q)
-    pose = _frame_pose(placements(which[0], q), *which)
+    pose = frame_pose(placements(which[0], q), *which)
     return _jacobian(which, *axis_twists(which[0], columns, pose[:3, 3]))
 
 
@@ -374,7 +375,7 @@ def _at_origin(which: tuple[RobotModel, Any, Any], q: Array) -> Float[Array, "6 
 
 def _in_own_axes(which: tuple[RobotModel, Any, Any], q: Array) -> Float[Array, "6 nv samples"]:
     columns = pose_columns(which[0], q)
-    pose = _frame_pose(placements(which[0], q), *which)
+    pose = frame_pose(placements(which[0], q), *which)
     linear, angular = axis_twists(which[0], columns, pose[:3, 3])
     return _jacobian(which, rotate_back(pose[:3, :3], linear), rotate_back(pose[:3, :3], angular))
 

@@ -31,6 +31,7 @@ __all__ = [
     "packed_regressor",
     "packed_rows",
     "pairs",
+    "unit_wrenches",
 ]
 
 _ELSEWHERE = np.array([0.0, 1.0, 1.0, 1.0])[:, None, None]  # the columns of a pose but for the origin
@@ -169,7 +170,7 @@ def packed_rows(
     if scale is not None:
         ratio = take(jnp.asarray(scale, q.dtype), model.dofs.joint)[:, None, None]
         linear, angular = linear * ratio, angular * ratio
-    wrench, turning = _unit_wrenches(state)
+    wrench, turning = unit_wrenches(state)
     twist = jnp.concatenate([linear, angular], axis=1)
     dof, link = pairs(model).T
     moments = [twist[dof][:, None, k] * wrench[link][:, :, k] for k in range(6)]
@@ -177,7 +178,7 @@ def packed_rows(
     return sum(moments[1:], moments[0]), sum(inertias[1:], inertias[0])
 
 
-def _unit_wrenches(state: Motion) -> tuple[Float[Array, "nj 4 6 samples"], Float[Array, "nj 6 3 samples"]]:
+def unit_wrenches(state: Motion) -> tuple[Float[Array, "nj 4 6 samples"], Float[Array, "nj 6 3 samples"]]:
     r"""Wrench about the world's origin of a unit of mass and first moments, and torque of a unit of inertia.
 
     $t_a$ the columns of the pose, $g_a$ their accelerations: force $g_a$, torque $p \times g_a + t_a \times g_p$

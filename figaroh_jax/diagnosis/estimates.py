@@ -87,8 +87,8 @@ def _physical(effect: Effect, names: list[str]) -> tuple[dict[str, float], dict[
 
 def prismatic(model: RobotModel) -> tuple[bool, ...]:
     """Whether each coordinate slides."""
-    kinds = {joint.coordinate: joint.kind == "prismatic" for joint in reversed(model.joints)}
-    return tuple(kinds[k] for k in range(model.nv))
+    turns = dict(zip(model.dofs.column.tolist()[::-1], model.dofs.turns.tolist()[::-1], strict=True))
+    return tuple(not turns[k] for k in range(model.nv))
 
 
 def fitted_model(problem: Problem, state: State, causes: list[Effect]) -> ExtendedModel:

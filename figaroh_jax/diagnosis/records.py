@@ -26,7 +26,7 @@ class Records(eqx.Module):
     """`n` recordings of at most `N` samples at one period, and of at most `M` rows; short ones are padded."""
 
     time: Float[Leaf, "n N"]  # s
-    position: Float[Leaf, "n N nv"]  # rad or m, low-passed
+    position: Float[Leaf, "n N nq"]  # rad or m, low-passed
     velocity: Float[Leaf, "n N nv"]
     acceleration: Float[Leaf, "n N nv"]
     torque: Float[Leaf, "n N nv"]  # N m or N, as measured
@@ -43,7 +43,7 @@ class Records(eqx.Module):
     @property
     def shape(self) -> tuple[int, int, int, int]:
         """Recordings, samples, rows, coordinates."""
-        n, samples, nv = self.position.shape
+        n, samples, nv = self.velocity.shape
         return n, samples, self.kept.shape[1], nv
 
     def flat(self, signal: Shaped[Leaf, "n N *rest"]) -> Shaped[Leaf, "nN *rest"]:

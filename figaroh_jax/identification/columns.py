@@ -19,7 +19,7 @@ from ..contract import Backend
 from ..effect import Effect, Motion, columns, place, smooth_sign
 from ..effects import find
 from ..errors import InputError
-from ..model import RobotModel
+from ..model import Joint, RobotModel
 from ..native_backend import NativeBackend
 from .base_parameters import inertial_names
 
@@ -31,6 +31,7 @@ __all__ = [
     "columns_of",
     "friction_terms",
     "motion_at",
+    "random_states",
     "state_columns",
     "structural_columns",
     "term_columns",
@@ -40,24 +41,34 @@ SHORT_NAMES = {"viscous_friction": "fv", "coulomb_friction": "fc", "rotor_inerti
 
 
 def friction_terms(model: RobotModel, known: Baseline) -> tuple[Effect, ...]:
-    """The effects that a task's baseline asks for, those of every joint as one object with a leading axis."""
+    """The effects that a task's baseline asks for, those of every joint as one object with a leading axis.
+
+    A free joint has no drive, so the six rows of a free flyer's root have no friction.
+    """
     switches = {
         "viscous_friction": known.viscous,
         "coulomb_friction": known.coulomb,
         "rotor_inertia": known.rotor,
         "torque_offset": known.offset,
     }
-    joints = np.arange(model.nv)[:, None]
+    driven = [k for k, joint in enumerate(_joints(model)) if joint.kind != "free"]
+    joints = np.array(driven)[:, None]
     terms: list[Effect] = []
-    for name in (name for name, on in switches.items() if on):
+    for name in (name for name, on in switches.items() if on and driven):
         effect = find(name)
-        terms.append(effect(joints, **{p: np.zeros(model.nv) for p in effect.parameters()}))
+        terms.append(effect(joints, **{p: np.zeros(len(driven)) for p in effect.parameters()}))
     for entry in known.effects:
         effect = find(entry.effect)
         if not any(p.linear for p in effect.parameters().values()):
             raise InputError(f"baseline.effects: '{entry.effect}' has no parameter in which the torque is linear")
         terms.append(jax.tree.map(lambda x: np.asarray(x)[None], place(effect, model, entry.at)))
     return tuple(terms)
+
+
+def _joints(model: RobotModel) -> list[Joint]:
+    """The joint of each coordinate."""
+    own = {int(column): model.joints[j] for j, column in zip(model.dofs.joint, model.dofs.column, strict=True)}
+    return [own[k] for k in range(model.nv)]
 
 
 def column_names(model: RobotModel, terms: Sequence[Effect]) -> tuple[str, ...]:
@@ -76,17 +87,24 @@ def structural_columns(
     model: RobotModel, terms: tuple[Effect, ...], samples: int | None = None, seed: int = 0
 ) -> Float[np.ndarray, "samples nv columns"]:
     """Columns at independent random states: what any motion at all could show."""
-    columns = len(column_names(model, terms))
-    samples = samples or max(64, 4 * columns // max(model.nv, 1))
+    samples = samples or max(64, 4 * len(column_names(model, terms)) // max(model.nv, 1))
+    q, v, a = random_states(model, samples, seed)
+    with jax.enable_x64(True):
+        motion = motion_at(model, np.arange(samples) * 1.0, q, v, a, 0.0, jnp.zeros(model.nv))
+        return columns_of(NativeBackend(model), terms, motion)
+
+
+def random_states(
+    model: RobotModel, samples: int, seed: int = 0
+) -> tuple[Float[np.ndarray, "samples nq"], Float[np.ndarray, "samples nv"], Float[np.ndarray, "samples nv"]]:
+    """Independent random positions (quaternions of length one), velocities and accelerations."""
     generator = np.random.default_rng(seed)
     q, v, a = (generator.normal(scale=2.0, size=(samples, n)) for n in (model.nq, model.nv, model.nv))
     for joint, where in zip(model.joints, model.dofs.positions, strict=True):
         if joint.kind in ("spherical", "free"):
             quaternion = slice(where.stop - 4, where.stop)
             q[:, quaternion] /= np.linalg.norm(q[:, quaternion], axis=1, keepdims=True)
-    with jax.enable_x64(True):
-        motion = motion_at(model, np.arange(samples) * 1.0, q, v, a, 0.0, jnp.zeros(model.nv))
-        return columns_of(NativeBackend(model), terms, motion)
+    return q, v, a
 
 
 def motion_at(model: RobotModel, time: Any, q: Any, v: Any, a: Any, dt: Any, width: Any) -> Motion:

@@ -88,7 +88,7 @@ def identify_task(
 
     progress("reading", 0.0)
     model = load_robot(task)
-    recordings = read_recordings(task, model)
+    recordings = read_recordings(task, model, floating=True)
     options = task.identify
     return identify(
         make_backend(backend, model),
@@ -130,7 +130,7 @@ def identify(
     with jax.enable_x64(True):
         progress("preparing signals", 0.05)
         # the cutoff alone: a band guessed from the motion costs accuracy where friction makes the motion sharp
-        signals = prepare_all(tuple(recordings), preprocess or Preprocess(), slowed=False)
+        signals = prepare_all(tuple(recordings), preprocess or Preprocess(), slowed=False, model=model)
         terms = friction_terms(model, known or Baseline())
         refused, notes = _refused(model, recordings, joints)
         regression = Regression(backend, terms, np.zeros(model.nv), signals, refused)
@@ -154,7 +154,7 @@ def identify(
         traces, holdout, outlying = predicted(regression, theta, given)
         kept = essential(data.factor(start.weight)[:, [*base.independent, -1]])
         return Identification(
-            joints=model.joint_names,
+            joints=model.dof_names,
             rank=base.rank,
             structural_rank=structural.rank,
             condition=base.condition,
@@ -185,16 +185,17 @@ def _refused(
     model: RobotModel, recordings: Sequence[Recording], joints: Sequence[str] | None
 ) -> tuple[frozenset[str], list[str]]:
     """Joints whose torque is not fitted: not asked for, or standing at one value most of the time."""
+    names = model.dof_names
     for name in joints or ():
-        if name not in model.joint_names:
-            raise InputError(f"identify.joints: no moving joint '{name}'{nearest(name, model.joint_names)}")
-    refused = set() if joints is None else set(model.joint_names) - set(joints)
-    notes = [
-        f"torque of {name} is not fitted: not among identify.joints" for name in model.joint_names if name in refused
-    ]
-    for j, name in enumerate(model.joint_names):
+        if name not in {*names, *model.joint_names}:
+            raise InputError(f"identify.joints: no moving joint '{name}'{nearest(name, (*model.joint_names, *names))}")
+    asked = {name for name in names if joints is None or name in joints or name.split(".")[0] in joints}
+    refused = set(names) - asked
+    notes = [f"torque of {name} is not fitted: not among identify.joints" for name in names if name in refused]
+    for j, name in enumerate(names):
         for one in recordings:
-            if one.role != "fit" or one.torque is None or name in refused:
+            # a root without any wrench on it is a measurement too: the robot flies
+            if one.role != "fit" or one.torque is None or name in refused or name not in model.joint_names:
                 continue
             share = np.unique(one.torque[:, j], return_counts=True)[1].max() / len(one.torque)
             if share > DEAD:
@@ -203,7 +204,7 @@ def _refused(
                     f"torque of {name} is not fitted: it stands at one value for {share:.0%} of {one.file}"
                     " (dead zone, or not measured)"
                 )
-    if refused >= set(model.joint_names):
+    if refused >= set(names):
         raise InputError(f"no joint has a torque that can be fitted: {'; '.join(notes)}")
     return frozenset(refused), notes
 

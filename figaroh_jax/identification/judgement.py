@@ -15,6 +15,7 @@ from ..effect import Effect, joint_unit
 from ..extended import ExtendedModel, extend
 from ..formats.native import place_names
 from ..model import RobotModel
+from ..recordings.groupmotion import coordinate_positions
 from ..recordings.signals import Signals
 from ..results import Estimate, Name, Trace
 from .base_parameters import TEN, BaseParameters
@@ -220,7 +221,7 @@ def predicted(
                 one.name,
                 one.role,
                 one.time[rows],
-                one.position[rows],
+                coordinate_positions(regression.model, one.position[rows]),
                 one.velocity[rows],
                 measured,
                 X[..., 0],

@@ -154,7 +154,7 @@ class Regression:
         `widths` adds a column for each (rad/s or m/s): the direction of the row's own joint with that half width.
         """
         parts = [(k, part) for k, one in enumerate(self.signals) for part in _segments(one, self._samples(one))]
-        trusted = np.array([name not in self.refused for name in self.model.joint_names])
+        trusted = np.array([name not in self.refused for name in self.model.dof_names])
         with jax.enable_x64(True):
             records = stack([replace(part, role="fit") for _, part in parts])
             for place_of, (k, one) in enumerate(parts):

@@ -6,6 +6,7 @@ joint torque = torque @ motor torque; the offset is added to the joint position 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -17,6 +18,7 @@ from ..errors import InputError, nearest
 from ..formats.assembly import ROOT_JOINT
 from ..inertia import from_com, transform
 from ..model import RobotModel
+from .groupmotion import position_names
 from .tables import Table, read_table
 
 if TYPE_CHECKING:
@@ -31,9 +33,9 @@ class Recording:
 
     name: str  # stem of the file
     file: Path
-    joints: tuple[str, ...]  # names of the columns
+    joints: tuple[str, ...]  # names of the columns of torque
     time: Float[np.ndarray, " samples"]  # s, increasing
-    position: Float[np.ndarray, "samples nv"]
+    position: Float[np.ndarray, "samples nq"]  # with quaternions x y z w where the robot has any
     velocity: Float[np.ndarray, "samples nv"] | None = None
     torque: Float[np.ndarray, "samples nv"] | None = None
     command: Float[np.ndarray, "samples nv"] | None = None  # commanded position
@@ -44,13 +46,15 @@ class Recording:
     trusted: Bool[np.ndarray, "samples nv"] | None = None  # False: torque that counts for nothing (see `cleaning`)
 
 
-def read_recordings(task: Task, model: RobotModel) -> tuple[Recording, ...]:
+def read_recordings(task: Task, model: RobotModel, *, floating: bool = False) -> tuple[Recording, ...]:
     """Read every recording of a task of torque level, in the task's order.
 
-    Raises `InputError` that names the file, the key, the row or the joint: missing or damaged files and columns, NaN,
-    wrong shapes, time that does not increase, names that the model does not know, a fit recording without torque.
+    With `floating` the root may be a free joint: the position then begins with its origin and quaternion (x y z,
+    x y z w), the torque with the measured wrench on it, force and torque about its origin in its own axes. Raises
+    `InputError` that names the file, the key, the row or the joint: missing or damaged files and columns, NaN, wrong
+    shapes, time that does not increase, names that the model does not know, a fit recording without torque.
     """
-    _check_names(task, model)
+    _check_names(task, model, floating)
     drive = Drive(task, model)
     recordings = tuple(_read(entry, f"data[{k}]", model, drive) for k, entry in enumerate(task.data))
     lacking = next((r for r in recordings if r.role == "fit" and r.torque is None), None)
@@ -62,15 +66,18 @@ def read_recordings(task: Task, model: RobotModel) -> tuple[Recording, ...]:
     return recordings
 
 
-def _check_names(task: Task, model: RobotModel) -> None:
+def _check_names(task: Task, model: RobotModel, floating: bool = False) -> None:
     for joint in model.joints:
-        if joint.kind not in ("revolute", "prismatic"):
+        free = floating and joint.kind == "free" and joint.parent < 0
+        if joint.kind not in ("revolute", "prismatic") and not free:
             key = f"robot.root is {task.robot.root}" if joint.name == ROOT_JOINT else f"joint '{joint.name}'"
             raise InputError(
                 f"{task.file}: {key}: recordings of joint torques hold one column a joint, and a {joint.kind} joint "
                 "has several; use root: fixed, and name the revolute and prismatic joints under robot.joints"
             )
     known = {*model.joint_names, *model.link_names, *(frame.name for frame in model.frames)}
+    if model.nq != model.nv and task.transmission is not None:
+        raise InputError(f"{task.file}: transmission: recordings of a robot with a free root are on the joint side")
     for joint in task.preprocess.gate:
         if joint not in model.joint_names:
             hint = nearest(joint, model.joint_names)
@@ -118,7 +125,7 @@ class Drive:
         self.position = read("position", (model.nv, model.nv))
         self.torque = read("torque", (model.nv, model.nv))
         offset = read("offset", (model.nv,))
-        self.offset = np.zeros(model.nv) if offset is None else offset
+        self.offset = np.zeros(model.nq) if offset is None else offset
 
     def joint_motion(self, motor: Float[np.ndarray, "samples nv"]) -> Float[np.ndarray, "samples nv"]:
         return motor if self.position is None else np.linalg.solve(self.position, motor.T).T
@@ -131,21 +138,22 @@ def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive) -> R
     table = read_table(entry.file, f"{key}.file")
     units = entry.units
     angle = unit_factors(units.position, drive.position is not None, model)
-    position = joint_columns(table, entry.position, model, f"{key}.position") * angle
+    position = _columns(table, entry.position, position_names(model), f"{key}.position") * angle
     time = read_time(table, entry, key, len(position))
 
-    def optional(name: str):
+    def optional(name: str, columns: Sequence[str]):
         source = getattr(entry, name)
-        return None if source is None else joint_columns(table, source, model, f"{key}.{name}", len(position))
+        return None if source is None else _columns(table, source, columns, f"{key}.{name}", len(position))
 
-    velocity, torque, command = optional("velocity"), optional("torque"), optional("command")
+    velocity, torque = optional("velocity", model.dof_names), optional("torque", model.dof_names)
+    command = optional("command", position_names(model))
     if torque is not None and units.torque == "A" and drive.torque is None:
         raise InputError(f"{entry.file}: {key}.units.torque is A: transmission.torque must say what one ampere gives")
-    rate = unit_factors(units.velocity or units.position, drive.position is not None, model)
+    rate = unit_factors(units.velocity or units.position, drive.position is not None, model, of="v")
     return Recording(
         name=entry.file.stem,
         file=entry.file,
-        joints=model.joint_names,
+        joints=model.dof_names,
         time=time,
         position=drive.joint_motion(position) + drive.offset,
         velocity=None if velocity is None else drive.joint_motion(velocity * rate),
@@ -157,19 +165,30 @@ def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive) -> R
     )
 
 
-def unit_factors(unit: str, motor_side: bool, model: RobotModel) -> Float[np.ndarray, " nv"]:
+def unit_factors(
+    unit: str, motor_side: bool, model: RobotModel, of: Literal["q", "v"] = "q"
+) -> Float[np.ndarray, " columns"]:
     """What turns each column into rad or m: degrees are of turning joints, millimetres of sliding ones."""
-    prismatic = np.zeros(model.nv, dtype=bool)
-    for joint in model.joints:
-        if joint.name == model.joint_names[joint.coordinate]:
-            prismatic[joint.coordinate] = joint.kind == "prismatic" and not motor_side
+    turns = np.ones(model.nv, dtype=bool)
+    turns[model.dofs.column[::-1]] = model.dofs.turns[::-1] | motor_side
     factors = {"deg": (np.pi / 180, 1.0), "mm": (1.0, 1e-3)}
     turning, sliding = factors.get(unit.split("/")[0], (1.0, 1.0))
-    return np.where(prismatic, sliding, turning)
+    rates = np.where(turns, turning, sliding)
+    if of == "v" or model.nq == model.nv:
+        return rates
+    out = np.ones(model.nq)
+    for joint, at in zip(model.joints, model.dofs.positions, strict=True):
+        numbers = at.stop - at.start - (4 if joint.kind in ("spherical", "free") else 0)  # quaternions have no unit
+        out[at.start : at.start + numbers] = rates[joint.coordinate : joint.coordinate + numbers]
+    return out
 
 
 def joint_columns(table: Table, source, model: RobotModel, key: str, samples: int | None = None):
-    values = table.matrix(source, model.joint_names, key)
+    return _columns(table, source, model.joint_names, key, samples)
+
+
+def _columns(table: Table, source, names: Sequence[str], key: str, samples: int | None = None):
+    values = table.matrix(source, names, key)
     if samples is not None and len(values) != samples:
         raise InputError(f"{table.file}: {key} has {len(values)} samples, but position has {samples}")
     wrong = np.argwhere(~np.isfinite(values))
@@ -177,7 +196,7 @@ def joint_columns(table: Table, source, model: RobotModel, key: str, samples: in
         row, column = wrong[0]
         raise InputError(
             f"{table.file}: {key} ('{source}') is {values[row, column]} in row {row} (from 0), column {column},"
-            f" joint {model.joint_names[column]}; {len(wrong)} such value{'s' if len(wrong) > 1 else ''} in all"
+            f" joint {names[column]}; {len(wrong)} such value{'s' if len(wrong) > 1 else ''} in all"
         )
     return values
 

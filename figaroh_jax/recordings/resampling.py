@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["Grid", "band_limited", "differentiate", "even_grid", "sampling_rate", "to_recording_times"]
+__all__ = ["Grid", "band_limited", "differentiate", "even_grid", "sampling_rate", "stencil", "to_recording_times"]
 
 EVEN = 0.02  # stamps within this share of a step of a straight line count as even
 GAP_STEPS = 5
@@ -110,14 +110,14 @@ def differentiate(x: Float[np.ndarray, "samples cols"], dt: float, order: int = 
     """
     offsets = np.arange(5)
     result = np.empty_like(x)
-    result[2:-2] = sum(c * x[k : len(x) - 4 + k] for k, c in enumerate(_stencil(offsets - 2, order)))
+    result[2:-2] = sum(c * x[k : len(x) - 4 + k] for k, c in enumerate(stencil(offsets - 2, order)))
     for row in (0, 1):
-        result[row] = _stencil(offsets - row, order) @ x[:5]
-        result[-1 - row] = _stencil(offsets - 4 + row, order) @ x[-5:]
+        result[row] = stencil(offsets - row, order) @ x[:5]
+        result[-1 - row] = stencil(offsets - 4 + row, order) @ x[-5:]
     return result / dt**order
 
 
-def _stencil(offsets: np.ndarray, order: int) -> Float[np.ndarray, "5"]:
+def stencil(offsets: np.ndarray, order: int) -> Float[np.ndarray, "5"]:
     """Weights on five samples that give the derivative of every polynomial up to degree four at offset zero."""
     powers = np.vander(offsets.astype(float), 5, increasing=True).T
     return np.linalg.solve(powers, np.eye(5)[order] * order)

@@ -22,11 +22,13 @@ from ..errors import InputError
 from .bandwidth import motion_band, smoothed
 from .cleaning import near, without_untrusted
 from .dataset import Recording
+from .groupmotion import continued, group_rates, normalised
 from .resampling import Grid, band_limited, differentiate, even_grid, sampling_rate, to_recording_times
 from .rowfilter import RowFilter, fast_length, filter_rows, frequencies, low_pass, row_filter
 
 if TYPE_CHECKING:
     from ..formats.config import Load, Preprocess
+    from ..model import RobotModel
 
 __all__ = [
     "Rates",
@@ -58,7 +60,7 @@ class Signals:
     role: Literal["fit", "holdout"]
     repeat: str | None
     time: Float[np.ndarray, " samples"]  # s, on the recording's clock
-    position: Float[np.ndarray, "samples nv"]  # low-passed
+    position: Float[np.ndarray, "samples nq"]  # low-passed
     velocity: Float[np.ndarray, "samples nv"]
     acceleration: Float[np.ndarray, "samples nv"]
     torque: Float[np.ndarray, "samples nv"] | None  # not low-passed: `rows` does it
@@ -82,22 +84,24 @@ class Rates(NamedTuple):
         return self.step / self.working
 
 
-def prepare_all(recordings: Sequence[Recording], preprocess: Preprocess, *, slowed: bool = True) -> tuple[Signals, ...]:
+def prepare_all(
+    recordings: Sequence[Recording], preprocess: Preprocess, *, slowed: bool = True, model: RobotModel | None = None
+) -> tuple[Signals, ...]:
     """`prepare` every recording at the same rates, and repeats of one excitation on grids that meet.
 
     Row k of a repeat's first recording is then row k + `align(first, repeat)` of the repeat, to a fiftieth of a row.
-    `slowed` as for `prepare`.
+    `slowed` and `model` as for `prepare`.
     """
     rates = choose_rates(recordings, preprocess)
     prepared: list[Signals] = []
     leaders: dict[str, Signals] = {}
     for recording in recordings:
-        signals = prepare(recording, preprocess, rates, slowed=slowed)
+        signals = prepare(recording, preprocess, rates, slowed=slowed, model=model)
         leader = leaders.setdefault(recording.repeat, signals) if recording.repeat else signals
         late = _late_rows(leader, signals) if leader is not signals else 0.0
         off = (late - round(late)) * rates.row
         if abs(off) >= rates.row / 50:
-            signals = prepare(recording, preprocess, rates, shift=off, slowed=slowed)
+            signals = prepare(recording, preprocess, rates, shift=off, slowed=slowed, model=model)
         prepared.append(signals)
     return tuple(prepared)
 
@@ -109,32 +113,41 @@ def prepare(
     *,
     shift: float = 0.0,
     slowed: bool = True,
+    model: RobotModel | None = None,
 ) -> Signals:
     """Even, low-passed, differentiated signals of one recording and the filter that makes its rows.
 
     `rates` are those of `choose_rates`, by default for this recording alone; `shift` (s, less than a row) moves the
-    grid; `slowed` takes a position down to the band of its own motion where that is below the cutoff. Raises
-    `InputError` where the window, the cutoff or the rate do not fit the recording, or it is too short.
+    grid; `slowed` takes a position down to the band of its own motion where that is below the cutoff. A `model` with
+    quaternions in q takes the rates on its group (`groupmotion`). Raises `InputError` where the window, the cutoff or
+    the rate do not fit the recording, or it is too short.
     """
     rates = rates or choose_rates((recording,), preprocess)
     recording, masked = without_untrusted(recording)
     time, position, torque = _window(recording, preprocess.window)
+    grouped = model if model is not None and model.nq != model.nv else None
+    if grouped is not None:
+        position = continued(grouped, position, str(recording.file))
     grid = even_grid(time, position, *([] if torque is None else [torque]))
     at, columns = _resample(grid, rates, shift)
     dt = 1 / rates.working
     seconds = time[-1] - time[0] + 1 / grid.rate
     trim = 0.5 if seconds > 9.99 else 0.1
-    nv = position.shape[1]
+    nv = len(recording.joints)
     rows = row_filter(len(at), dt, rates.cutoff, step=rates.step, trim=trim, start=float(at[0]), nv=nv)
     if rows.kept < FEWEST_ROWS:
         raise InputError(
             f"{recording.file}: {seconds:.3g} s are too short: {rows.kept} row(s) at {1 / rates.row:.4g} Hz are left"
             f" after {trim} s are cut at both ends, at least {FEWEST_ROWS} are needed"
         )
-    position = (_motion if slowed else low_pass)(columns[0], dt, rates.cutoff)
-    moves = np.ptp(position, axis=0) > STILL * (1 + np.abs(position).max(axis=0))
-    position[:, ~moves] = position[0, ~moves]  # dry friction would see the sign of rounding
-    velocity = differentiate(position, dt) * moves
+    if grouped is None:
+        position = (_motion if slowed else low_pass)(columns[0], dt, rates.cutoff)
+        moves = np.ptp(position, axis=0) > STILL * (1 + np.abs(position).max(axis=0))
+        position[:, ~moves] = position[0, ~moves]  # dry friction would see the sign of rounding
+        velocity, acceleration = (differentiate(position, dt, order=order) * moves for order in (1, 2))
+    else:
+        position = normalised(grouped, low_pass(columns[0], dt, rates.cutoff))
+        velocity, acceleration = group_rates(grouped, position, dt)
     weight = _weight(recording, preprocess, rows, velocity, grid.gaps, rates.cutoff)
     weight *= ~near(rows.row_times, masked, 0.5 / rates.cutoff)
     return Signals(
@@ -145,7 +158,7 @@ def prepare(
         time=at,
         position=position,
         velocity=velocity,
-        acceleration=differentiate(position, dt, order=2) * moves,
+        acceleration=acceleration,
         torque=None if torque is None else columns[1],
         dt=dt,
         cutoff=rates.cutoff,
