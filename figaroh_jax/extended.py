@@ -47,14 +47,14 @@ class ExtendedModel(eqx.Module):
     width: Float[Array | np.ndarray, " nv"]  # half width of a reversal of the joints' dry friction, rad/s or m/s
 
     def inverse_dynamics(
-        self, q: Float[ArrayLike, "*batch nv"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
+        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
     ) -> Float[Array, "*batch nv"]:
         """Torques of the drives (N m or N) that give the true motion q, v, a (rad or m, and their rates)."""
         with jax.enable_x64(True):
             return _inverse_dynamics(self, *states(self.robot, q=q, v=v, a=a))
 
     def forward_dynamics(
-        self, q: Float[ArrayLike, "*batch nv"], v: Float[ArrayLike, "*batch nv"], tau: Float[ArrayLike, "*batch nv"]
+        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], tau: Float[ArrayLike, "*batch nv"]
     ) -> Float[Array, "*batch nv"]:
         """Accelerations (rad/s^2 or m/s^2) under the drives' torques `tau`: `inverse_dynamics` solved for `a`.
 

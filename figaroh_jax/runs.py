@@ -197,15 +197,19 @@ def predictions(
 
     if all(entry.role == "fit" for entry in task.data):
         return {}
-    recordings = read_recordings(task, extended.robot)
+    recordings = read_recordings(task, extended.robot, floating=identified)
     rates = choose_rates(recordings, task.preprocess)
     whole = task.preprocess.model_copy(update={"window": None, "gate": {}})
     found = {}
     for recording in recordings:
         if recording.role == "holdout":
-            motion = prepare(recording, whole, rates, slowed=not identified)
+            motion = prepare(recording, whole, rates, slowed=not identified, model=extended.robot)
             carrying = _carrying(extended, recording.load if identified else None)
-            torque = predict(carrying, motion.time, motion.position, motion.velocity, motion.acceleration, motion.dt)
+            state = motion.position, motion.velocity, motion.acceleration
+            if extended.robot.nq == extended.robot.nv:
+                torque = predict(carrying, motion.time, *state, motion.dt)
+            else:
+                torque = carrying.inverse_dynamics(*state)
             found[recording.name] = recording.time, to_recording_times(motion.time, np.asarray(torque), recording.time)
     return found
 

@@ -20,6 +20,7 @@ from figaroh_jax.identification.result import Identification
 from figaroh_jax.identification.states import States
 from figaroh_jax.identification.wrenches import SensorStates, generalized_force, wrench_regressor
 from figaroh_jax.recordings.groupmotion import group_rates
+from figaroh_jax.runs import predictions
 
 # a trunk that flies, an arm of two joints on it; {k} scales what the model is told of the masses
 FLYER = """<mujoco model="flyer"><compiler angle="radian"/><option timestep="1e-3" integrator="Euler"/><worldbody>
@@ -175,6 +176,15 @@ def test_the_held_out_flight_is_predicted_to_its_noise(found: Identification):
     assert (held.relative < 0.02).all(), held.relative
     assert (np.asarray(found.nominal.rms) > 2 * np.asarray(found.fit.rms)).all()
     assert all(link.consistent for link in found.links)
+
+
+def test_predictions_of_the_held_out_flight_hold_the_wrench_on_the_root_too(found: Identification, task: Path):
+    time, torque = predictions(load_task(task), found.model, identified=True)["held"]
+    with np.load(task.parent / "held.npz") as held:
+        inside = slice(1000, -1000)
+        error = torque[inside] - held["tau"][inside]
+        assert (time == held["t"]).all()
+        assert (error.std(axis=0) < 0.1 * held["tau"][inside].std(axis=0)).all()
 
 
 def test_friction_stands_in_the_rows_of_the_joints_alone(found: Identification):

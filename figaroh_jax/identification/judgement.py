@@ -230,7 +230,7 @@ def predicted(
         )
         kept = weight > 0
         if measured is not None:
-            outlying += _outlying(one, np.where(kept, y - X[..., 1], np.nan), regression.model.joint_names)
+            outlying += _outlying(one, np.where(kept, y - X[..., 1], np.nan), regression.model.dof_names)
         if one.role == "holdout" and measured is not None:
             error, torque = np.where(kept, y - X[..., 1], 0.0), np.where(kept, y, 0.0)
             counts = np.where(kept.any(axis=0), kept.sum(axis=0), np.nan)
@@ -262,7 +262,7 @@ def dropped(signals: Sequence[Signals], model: RobotModel) -> tuple[str, ...]:
     out = []
     for one in signals:
         weight = np.asarray(one.rows.weight)
-        lost = {name: int(n) for name, n in zip(model.joint_names, (weight == 0).sum(axis=0), strict=True) if n}
+        lost = {name: int(n) for name, n in zip(model.dof_names, (weight == 0).sum(axis=0), strict=True) if n}
         text = f"{one.name}: {one.rows.kept} rows a joint at {1 / (one.dt * one.rows.step):.4g} Hz, low-passed at"
         text += f" {one.cutoff:.4g} Hz"
         if lost:
