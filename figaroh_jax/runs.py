@@ -220,9 +220,9 @@ def _carrying(extended: ExtendedModel, load: Load | None) -> ExtendedModel:
         return extended
     import equinox as eqx
 
-    from .identification.regression import payload
+    from .recordings.dataset import carried_body
 
-    link, ten = payload(extended.robot, load)
+    link, ten = carried_body(extended.robot, load)
     inertia = np.array(extended.robot.inertia, float)
     inertia[link] += ten
     return eqx.tree_at(lambda m: m.robot.inertia, extended, inertia)
