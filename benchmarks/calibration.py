@@ -46,13 +46,14 @@ def talos():
     return load_urdf(DATA / "talos_contact" / "talos_full_v2.urdf", joints=joints), [seen]
 
 
-def tiago(keep: bool = False):
+def tiago(keep: bool = False, markers: int = 1):
     joints = ["torso_lift_joint", *(f"arm_{k}_joint" for k in range(1, 8))]
     model = load_urdf(DATA / "tiago_mocap" / "tiago_no_hand.urdf", joints=joints)
     table = np.genfromtxt(DATA / "tiago_mocap" / "qualysis_base_hand_calibration.csv", delimiter=",", skip_header=1)
     rows = np.arange(len(table)) if keep else np.delete(np.arange(len(table)), 9)
     root = next(frame.name for frame in model.frames if frame.parent < 0)
-    return model, [recording(table[rows, 12:20], "position", table[rows, :3], root, "arm_7_link")]
+    points = table[rows, : 3 * markers].reshape(len(rows), markers, 3)
+    return model, [recording(table[rows, 12:20], "position", points, root, "arm_7_link")]
 
 
 def irb120():
@@ -85,6 +86,7 @@ SETS: dict[str, Callable] = {
     "talos_contact": talos,
     "tiago_mocap, 34": tiago,
     "tiago_mocap, all 35": lambda: tiago(keep=True),
+    "tiago_mocap, three markers": lambda: tiago(markers=3),
     "irb120_wu2015": irb120,
     "panda_handeye_board": handeye,
     **{f"mukca {name}": lambda name=name: mukca(name) for name in TOOL_POSITIONS},
@@ -98,6 +100,7 @@ def points_of(values: np.ndarray) -> np.ndarray:
 
 def run_sets() -> None:
     from figaroh_jax.calibration.calibration import calibrate
+    from figaroh_jax.reporting import wording
 
     for name, load in SETS.items():
         model, recordings = load()
@@ -110,8 +113,8 @@ def run_sets() -> None:
         print(f"{name}: {error.validated_before:.3f} -> {error.validated_after:.3f} mm{angle}; {found.level}", end="; ")
         print(", ".join(str(c.name) for c in found.causes) or "no cause", end="; ")
         print(f"outliers {[o.row for o in found.outliers]}; {time.process_time() - start:.0f} CPU s", flush=True)
-        for note in found.notes:
-            print(f"    {note}")
+        for note in (*found.notes, wording.distances(found)):
+            print(f"    {note}" * bool(note), end="\n" * bool(note))
 
 
 class Peer:

@@ -2,7 +2,7 @@
 
     python benchmarks/calibration_coverage.py --runs 200 [--robots arm6 panda] [--seed 0] [--chosen]
 
-Links are off by the tolerance of a good robot and joints by 5 mrad, drawn anew in each run. Full geometry is asked for;
+Links are off by 1 mm and 1 mrad, joints by 5 mrad, drawn anew in each run. Full geometry is asked for;
 with `--chosen` the level and the effects are chosen. Prints the coverage of every parameter, by its status, and gauge
 classes. A parameter of a gauge class may say nothing of its own: its interval must be as wide as its prior.
 """

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from ..model import RobotModel
 from ..results import Cause
 
-__all__ = ["Calibration", "Error", "Outlier", "Parameter", "Shown"]
+__all__ = ["Calibration", "Error", "Outlier", "Parameter", "Shown", "SocketDistance"]
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,16 @@ class Outlier(NamedTuple):
     size: float
 
 
+class SocketDistance(NamedTuple):
+    """Distance of the two sockets of a recording, m: stated, and by its postures with the frames alone, calibrated."""
+
+    recording: str
+    role: str
+    stated: float
+    before: float
+    after: float
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """The calibrated robot, what was estimated and how well it predicts."""
@@ -68,6 +78,7 @@ class Calibration:
     scheme: str  # how the validation was held out
     notes: tuple[str, ...]
     points: tuple[Shown, ...]
+    distances: tuple[SocketDistance, ...] = ()
     posture: dict[str, float] = field(default_factory=dict)  # of the joints that are locked, rad or m
 
 

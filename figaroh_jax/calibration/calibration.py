@@ -20,6 +20,7 @@ from . import corrections, levels, marginal
 from .calibrated import Calibration, Error, Outlier
 from .candidates import Block, blocks_of, effects_on, empty_columns, geometry_columns, known_frames
 from .chain import chain_between
+from .distances import socket_distances
 from .gravity import without_far_masses
 from .kinematic_effects import HISTORY
 from .outliers import find_outliers
@@ -116,7 +117,7 @@ class Run:
     def finish(self) -> Calibration:
         """Outliers, level, effects, validation, and the final fit."""
         measured = self.measured
-        everything = measured.measured & ~measured.holdout[measured.posture]
+        everything = measured.fitted
         self.progress("choosing among levels", 0.05)
         frames = known_frames(self.model, self.chain, self.recordings)
         self.blocks = blocks_of(self.weighing, self.chain, self.postures, self.forbid, frames)
@@ -222,6 +223,9 @@ class Run:
             steps=solution.steps,
             scheme=scheme,
             notes=tuple(self.notes),
+            distances=socket_distances(
+                self.recordings, (self.measured, self.choice.fits["frames"][0]), (final, linear)
+            ),
             points=corrections.shown_of(final, self.recordings, frames, linear.residual),
         )
 
@@ -252,7 +256,7 @@ def _chain(model: RobotModel, recordings: Sequence[PoseRecording]) -> list[int]:
 
 
 def _enough(measured: Measured, recordings: Sequence[PoseRecording]) -> None:
-    used = measured.measured & ~measured.holdout[measured.posture]
+    used = measured.fitted
     rows, unknowns = int(used.sum()), len(measured.own)
     postures = len(np.unique(measured.posture[used & (measured.posture >= 0)]))
     if rows <= unknowns or postures < levels.FOLDS:
@@ -274,13 +278,14 @@ def _few(recordings: Sequence[PoseRecording]) -> list[str]:
 
 
 def _recurring(choice: levels.Choice, folds: Sequence[levels.Fold], blocks: Sequence[Block]) -> list[int]:
-    """Effects of the choice that most outer folds choose too, if all of them together gain on the outer folds."""
+    """Effects of the choice that most outer folds choose too, or a rival of theirs, if all gain on the outer folds."""
     plain, chosen = (levels.pooled([getattr(f, which) for f in folds]) for which in ("plain", "chosen"))
     gains = [1.0 - c / p for p, c in zip(plain, chosen, strict=True) if np.isfinite(p) and p > 0.0]
     if not gains or np.mean(gains) < _NESTED_GAIN:
         return []
-    places = [{blocks[k].name for k in f.choice.effects} for f in folds]
-    return [k for k in choice.effects if sum(blocks[k].name in p for p in places) >= _RECURS]
+    # a fold that takes one which it does not tell apart chooses the other too
+    places = [{blocks[k].name for k in (*f.choice.effects, *sum(f.choice.rivals, ()))} for f in folds]
+    return [k for k in choice.effects if sum(blocks[k].name in place for place in places) >= _RECURS]
 
 
 def _never_worse(choice: levels.Choice, folds: list[levels.Fold]) -> tuple[levels.Choice, list[levels.Fold]]:

@@ -55,8 +55,7 @@ def gauge_of(final: Measured, fit: marginal.Linear, used, free) -> tuple[Gauge, 
 def identifiable(measured: Measured) -> list[Column]:
     """The columns of offsets and geometry that the measured postures tell from the frames and from those before."""
     linear = levels.linearise(measured, np.zeros(len(measured.columns) + len(measured.own)))
-    rows = measured.measured & ~np.where(linear.posture >= 0, measured.holdout[linear.posture], False)
-    gauge, order = gauge_of(measured, linear, rows, np.ones(len(linear.at), bool))
+    gauge, order = gauge_of(measured, linear, measured.fitted, np.ones(len(linear.at), bool))
     held = {order[k] for k in gauge.dependent}
     return [column for k, column in enumerate(measured.columns) if k not in held]
 
@@ -64,10 +63,11 @@ def identifiable(measured: Measured) -> list[Column]:
 def parameters_of(final: Measured, linear, posterior, gauge: Gauge, order: list[int]) -> tuple[Parameter, ...]:
     scale = np.asarray(final.problem.scale)
     names = [(c.label, c.unit) for c in final.columns] + list(final.own)
+    covariance = marginal.honest_covariance(posterior, linear.prior)
     found = []
     for place, k in enumerate(order):
         prior = posterior.precision[k] ** -0.5 if linear.prior[k] != marginal.FLAT else np.inf
-        std = float(np.sqrt(posterior.covariance[k, k]))
+        std = float(np.sqrt(covariance[k, k]))
         known = "identified" if std < _KNOWN * prior else "prior only"
         status = "gauge" if place in gauge.dependent else known
         found.append(Parameter(*(names[k][0], float(linear.at[k] * scale[k]), std * scale[k], names[k][1]), status))

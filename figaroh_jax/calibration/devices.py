@@ -200,12 +200,15 @@ class Sockets(_Touch):
     distance: Float[Leaf, " pairs"] = eqx.field(default_factory=lambda: np.zeros(0))  # m
     weight: Float[Leaf, " pairs"] = eqx.field(default_factory=lambda: np.zeros(0))  # root of the postures that carry it
 
+    def centres(self, unknown: Float[Array, " k"]) -> Float[Array, "sockets 3"]:
+        """The sockets in the base frame, m."""
+        return self.sockets + self._fixed(unknown)
+
     def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, "3"]:
-        place = self.sockets + self._fixed(unknown)
-        return pose[:3, :3] @ self.tool_point(unknown) + pose[:3, 3] - place[datum]
+        return pose[:3, :3] @ self.tool_point(unknown) + pose[:3, 3] - self.centres(unknown)[datum]
 
     def constraint(self, unknown: Float[Array, " k"]) -> Float[Array, " pairs"]:
-        place = self.sockets + self._fixed(unknown)
+        place = self.centres(unknown)
         if not self.pairs:
             return jnp.zeros(0)
         a, b = np.array(self.pairs).T

@@ -1,10 +1,10 @@
 r"""How much of the kinematics to estimate: the level and the effects that predict held-out postures best.
 
 Levels are nested: the frames of the device alone, the joints' offsets with them, then every link's geometry. Each is a
-robust maximum a posteriori fit (`marginal`); each is judged on postures left out (every fifth one), all of its widths
-and weights chosen without them. Effects join one by one, the one that gains most on those postures first, as long as
-the gain is worth it. `nested` repeats the whole choice inside each of five outer folds, so that what it reports on the
-postures of a fold was chosen without them.
+robust maximum a posteriori fit (`marginal`); each is judged by what it predicts for every posture without that one.
+Effects join one by one, the one that gains most on postures left out (every fifth one) first, as long as the gain is
+worth it; all widths and weights are chosen without those. `nested` repeats the whole choice inside each of five outer
+folds, so that what it reports on the postures of a fold was chosen without them.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ def choose(measured: Measured, used: Bool[Array, " rows"], effects: Effects | No
         start = posterior.unknowns
         fits[level] = linear, posterior
         if asked is None:
-            scores[level] = _held_out(measured, linear, used, level, posterior)
+            scores[level] = _held_out(measured, linear, used, posterior)
             if best is None or scores[level] < (1.0 - _LEVEL_GAIN) * scores[best]:
                 best = level
     assert best is not None
@@ -196,16 +196,14 @@ def _inner_folds(measured: Measured, used: Array) -> list[tuple[Array, Array]]:
     return [(used & ~np.isin(measured.posture, fold), fold) for fold in folds]
 
 
-def _held_out(measured: Measured, linear: Linear, used: Array, level: str, start: Posterior) -> float:
-    """Error on the inner folds: geometric mean of the channels' RMS."""
-    free, robust = free_at(level, linear.prior), level != "frames"
-    parts: tuple[list[Array], list[Array]] = ([], [])
-    for rows, fold in _inner_folds(measured, used):
-        posterior = marginal.fit(linear, rows, free, robust=robust, start=start, iterations=15)
-        residual = linear.residual + linear.jacobian @ (posterior.unknowns - linear.at)
-        for part, error in zip(parts, errors(measured, residual, fold), strict=True):
-            part.append(error)
-    return _score([np.concatenate(part) for part in parts])
+def _held_out(measured: Measured, linear: Linear, used: Array, posterior: Posterior) -> float:
+    """Typical error of a posture that was left out of the fit: the geometric mean, in which no single one counts much.
+
+    A robust fit bears postures with a heavy tail; the root mean square of a few dozen would choose by them alone.
+    """
+    _, predicted = marginal.left_out(linear, posterior, used)
+    parts = errors(measured, predicted, np.unique(linear.posture[used & (linear.posture >= 0)]))
+    return float(np.exp(np.mean([np.mean(np.log(part + 1e-15)) for part in parts if len(part)])))
 
 
 def _score(parts: Sequence[Array]) -> float:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-__all__ = ["FLAT", "Linear", "Posterior", "fit", "posture_weights"]
+__all__ = ["FLAT", "Linear", "Posterior", "fit", "honest_covariance", "left_out", "posture_weights"]
 
 FLAT = -1  # group of unknowns without a prior
 _FREEDOM = 10.0  # of the Student t: fewer cost clean sets more than they gain on dirty ones
@@ -46,6 +46,7 @@ class Posterior(NamedTuple):
     weight: Float[Array, " postures"]  # 1 unless robust
     width: Float[Array, " groups"]
     freedom: float  # unknowns that the data decide
+    spread: float  # variance of estimates from weighted rows over what `covariance` says, which counts weights as known
 
 
 def fit(
@@ -66,7 +67,7 @@ def fit(
     width = linear.tolerance.copy() if start is None else start.width.copy()
     noise = _first_noise(base, channel) if start is None else start.noise.copy()
     weight = np.ones(postures) if start is None else start.weight.copy()
-    y, covariance, precision = at, np.zeros((len(at),) * 2), np.zeros(len(at))
+    y, covariance, precision, spread = at, np.zeros((len(at),) * 2), np.zeros(len(at)), 1.0
     for _ in range(iterations):
         previous = np.concatenate([width, noise, weight])
         scaled = np.sqrt(_row_weights(weight, posture)) / noise[channel]
@@ -80,10 +81,64 @@ def fit(
         width = _widths(y, covariance, precision, prior, linear.tolerance)
         if robust:
             weight = posture_weights(r / noise[channel], posture, postures)
+            spread = _spread_of(r / noise[channel], weight, posture, float(leverage.sum()))
         now = np.concatenate([width, noise, weight])
         if np.max(np.abs(now - previous) / (np.abs(previous) + 1e-300)) < 1e-3:
             break
-    return _spread(y, covariance, precision, free, noise, weight, width)
+    return _filled(y, covariance, precision, free, noise, weight, width)._replace(spread=spread)
+
+
+def honest_covariance(posterior: Posterior, prior: Int[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
+    r"""Covariance of the estimates that counts in what was estimated with them: weights of postures, widths of priors.
+
+    The information of the rows over `spread`, and priors of variance $\sigma_g^2\, \nu / (\nu - 2)$, that of a Student
+    t with the $\nu = \gamma_g + 2$ numbers that the width of a group was taken from.
+    """
+    free = posterior.precision > 0.0
+    inside = np.ix_(free, free)
+    precision = posterior.precision[free]
+    known = 1.0 - precision * np.diag(posterior.covariance)[free]
+    wider = precision.copy()
+    for group in np.unique(prior[free & (prior != FLAT)]):
+        mine = prior[free] == group
+        gamma = max(float(known[mine].sum()), 0.0)
+        wider[mine] *= max(gamma / (gamma + _PSEUDO), 0.25)
+    found = np.zeros_like(posterior.covariance)
+    information = _inverse(posterior.covariance[inside]) - np.diag(precision)
+    found[inside] = _inverse(information / posterior.spread + np.diag(wider))
+    return found
+
+
+def _spread_of(whitened: Array, weight: Array, posture: Array, leverage: float) -> float:
+    r"""$E[w^2 r^2] E[w] / E[d(w r)/dr]^2$, the sandwich over the inverse information (Huber 1967), rows of postures."""
+    inside = posture >= 0
+    w, square = weight[posture[inside]], whitened[inside] ** 2
+    count = np.bincount(posture[inside])[posture[inside]]
+    slope = np.mean(w - 2.0 * w**2 * square / (_FREEDOM + count))
+    left = max(1.0 - leverage / len(whitened), 1e-3)
+    return float(np.mean(w**2 * square) / left * np.mean(w) / slope**2)
+
+
+def left_out(
+    linear: Linear, posterior: Posterior, used: Bool[Array, " rows"]
+) -> tuple[Float[Array, " rows"], Float[Array, " rows"]]:
+    r"""Residual of all rows at the posterior, and what those `used` would be without their posture in the fit.
+
+    To first order, widths and weights held: $e_i = (I - w_i H_i)^{-1} r_i$, $H_i = J_i \Sigma J_i'$ of whitened rows.
+    """
+    residual = linear.residual + linear.jacobian @ (posterior.unknowns - linear.at)
+    predicted = residual.copy()
+    rows = np.flatnonzero(used & (linear.posture >= 0))
+    rows = rows[np.argsort(linear.posture[rows], kind="stable")]
+    _, first, count = np.unique(linear.posture[rows], return_index=True, return_counts=True)
+    for size in np.unique(count):
+        some = rows[first[count == size][:, None] + np.arange(size)]  # postures, their rows
+        noise = posterior.noise[linear.channel[some]]
+        G = linear.jacobian[some] / noise[..., None]
+        weight = posterior.weight[linear.posture[some[:, 0]]][:, None, None]
+        left = np.eye(size) - weight * (G @ posterior.covariance) @ np.swapaxes(G, 1, 2)
+        predicted[some] = noise * np.linalg.solve(left, (residual[some] / noise)[..., None])[..., 0]
+    return residual, predicted
 
 
 def posture_weights(
@@ -139,10 +194,10 @@ def _inverse(matrix: Array) -> Array:
     return found * np.outer(root, root)
 
 
-def _spread(y, covariance, precision, free, noise, weight, width) -> Posterior:
+def _filled(y, covariance, precision, free, noise, weight, width) -> Posterior:
     n, where = len(free), np.flatnonzero(free)
     unknowns, whole, priors = np.zeros(n), np.zeros((n, n)), np.zeros(n)
     unknowns[where], priors[where] = y, precision
     whole[np.ix_(where, where)] = covariance
     freedom = float(np.sum(1.0 - precision * np.diag(covariance)))
-    return Posterior(unknowns, whole, priors, noise, weight, width, freedom)
+    return Posterior(unknowns, whole, priors, noise, weight, width, freedom, 1.0)

@@ -1,8 +1,7 @@
 r"""Postures that no model explains: found one after the other by what the others predict for them.
 
-The error of posture i is predicted by a robust fit without it, to first order: $e_i = (I - w_i H_i)^{-1} r_i$ with
-$H_i = J_i \Sigma J_i'$ of whitened rows, whose covariance is $(I - w_i H_i)^{-1}$. Its size is the root of the mean
-square of $e_i$ in that covariance.
+The error of posture i is predicted by a robust fit without it, $e_i$ of `marginal.left_out`, whose covariance is
+$(I - w_i H_i)^{-1}$. Its size is the root of the mean square of $e_i$ in that covariance, $\sqrt{r_i' e_i / n}$.
 """
 
 from __future__ import annotations
@@ -30,8 +29,7 @@ def find_outliers(
     while len(found) < max(1, int(_MOST * postures)):
         rows = used & ~np.isin(linear.posture, list(found))
         posterior = marginal.fit(linear, rows, free, robust=True)
-        residual = linear.residual + linear.jacobian @ (posterior.unknowns - linear.at)
-        sizes = _sizes(linear._replace(residual=residual), posterior, rows)
+        sizes = _sizes(linear, posterior, rows)
         worst = max(sizes, key=lambda k: sizes[k])
         if sizes[worst] < _limit(np.log(list(sizes.values()))):
             break
@@ -49,11 +47,9 @@ def _limit(logarithms: np.ndarray) -> float:
 
 
 def _sizes(linear: Linear, posterior: Posterior, used: np.ndarray) -> dict[int, float]:
-    sizes = {}
-    for k in np.unique(linear.posture[used & (linear.posture >= 0)]):
-        rows = np.flatnonzero(used & (linear.posture == k))
-        noise = posterior.noise[linear.channel[rows]]
-        G, r = linear.jacobian[rows] / noise[:, None], linear.residual[rows] / noise
-        left = np.eye(len(rows)) - posterior.weight[k] * G @ posterior.covariance @ G.T
-        sizes[int(k)] = float(np.sqrt(max(r @ np.linalg.solve(left, r), 1e-24) / len(rows)))
-    return sizes
+    residual, predicted = marginal.left_out(linear, posterior, used)
+    rows = np.flatnonzero(used & (linear.posture >= 0))
+    postures, which = np.unique(linear.posture[rows], return_inverse=True)
+    square = residual[rows] * predicted[rows] / posterior.noise[linear.channel[rows]] ** 2
+    mean = np.bincount(which, square) / np.bincount(which)
+    return dict(zip(postures.tolist(), np.sqrt(np.maximum(mean, 1e-24)).tolist(), strict=True))

@@ -42,6 +42,11 @@ class Measured(NamedTuple):
     plain: bool = False  # to be fitted by plain least squares, without priors and without weights of postures
 
     @property
+    def fitted(self) -> Bool[np.ndarray, " rows"]:
+        """Rows that were measured and are not held out; constraints are always fitted."""
+        return self.measured & ~np.where(self.posture >= 0, self.holdout[self.posture], False)
+
+    @property
     def own(self) -> tuple[tuple[str, str], ...]:
         """Name and unit of the devices' unknowns, which stand behind the columns'."""
         return tuple((name, unit) for g in self.problem.groups for name, unit, _ in g.device.unknowns())

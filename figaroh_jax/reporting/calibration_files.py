@@ -53,6 +53,11 @@ def result(calibration: Calibration) -> dict[str, Any]:
         ],
         "position": _error(calibration.position),
         "orientation": _error(calibration.orientation),
+        "distances": [
+            {"recording": d.recording, "role": d.role, "unit": "mm"}
+            | {key: _number(1e3 * value) for key, value in zip(("stated", "before", "after"), d[2:], strict=True)}
+            for d in calibration.distances
+        ],
         "outliers": [{"file": o.file, "row": o.row} for o in calibration.outliers],
         "verdict": calibration.verdict,
         "causes": [cause(c) for c in calibration.causes],

@@ -28,6 +28,7 @@ def write_calibration_report(calibration: Calibration, path: Path) -> None:
         robot=calibration.model.name,
         sentence=wording.calibration_sentence(calibration),
         level=wording.level,
+        distances=wording.distances(calibration),
         errors=[error for error in (calibration.position, calibration.orientation) if error is not None],
         table=[(name, 1e3 * a, np.degrees(b)) for name, (a, b) in calibration.table.items()],
         quality=_quality(calibration),

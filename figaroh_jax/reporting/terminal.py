@@ -111,7 +111,7 @@ def calibration_summary(calibration: Calibration, verdict: str = "") -> Renderab
             parts.append(
                 Text(f"   not told apart from {wording.aside(cause.name, cause.ambiguous_with)}", style="yellow")
             )
-    parts.append(Text(f"\nHeld out: {calibration.scheme}.", style="dim"))
+    parts.append(Text(f"\nHeld out: {calibration.scheme}. {wording.distances(calibration)}".rstrip(), style="dim"))
     return Group(*parts, *(Text(f"Note: {note}", style="dim") for note in calibration.notes))
 
 

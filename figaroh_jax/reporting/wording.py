@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 __all__ = [
     "aside",
     "calibration_sentence",
+    "distances",
     "effect_equation",
     "effect_meaning",
     "effect_title",
@@ -61,6 +62,17 @@ def calibration_sentence(calibration: Calibration) -> str:
         )
     fall = f"On held-out postures the error falls from {before} (frames alone) to {after}"
     return f"{fall}, with {level(calibration.level)}."
+
+
+def distances(calibration: Calibration) -> str:
+    """How far off the distances of sockets are: in recordings held out, or in all where none is; else nothing."""
+    known = [d for d in calibration.distances if d.role == "holdout"] or list(calibration.distances)
+    if not known:
+        return ""
+    which = "held-out " if known[0].role == "holdout" else "fitted "
+    before = sum(abs(d.before - d.stated) for d in known) * 1e3 / len(known)
+    after = sum(abs(d.after - d.stated) for d in known) * 1e3 / len(known)
+    return f"Distance of {which}sockets: off by {number(before, 3)} mm, calibrated {number(after, 3)} mm on average."
 
 
 def level(name: str) -> str:

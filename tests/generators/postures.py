@@ -134,10 +134,10 @@ def perturb(
 ) -> Perturbed:
     """All links off by their tolerance, all joints by `offset` (rad), in the mean square; `noise` in m."""
     n, q = len(arm.joints), _postures(arm, rng, count)
-    twists = rng.normal(size=(n, 6)) * np.array([TOLERANCE["m"]] * 3 + [TOLERANCE["rad"]] * 3)
+    twists = 1e-3 * rng.normal(size=(n, 6))
     for j in range(n):
         axis = _axis(arm, j)
-        twists[j, 3:] += axis * (offset * rng.normal() - axis @ twists[j, 3:])
+        twists[j, 3:] += axis * (5e-3 * rng.normal() - axis @ twists[j, 3:])
     device = pin.SE3(pin.exp3(rng.normal(size=3)), rng.normal(size=3))
     poses = _poses(arm, q, twists, _Error(np.zeros_like(q), np.zeros((count, n, 6))))
     points = _points([device * pose for pose in poses])
