@@ -180,7 +180,7 @@ def _answer(here: _Setting, signals: Sequence[Signals], first: Step, search: Sea
         noise=noise,
         holdout=Gain(gains[0], gains[-1]),
         holdout_scheme=_scheme(signals),
-        experiment=next_experiment(told.word, told.found),
+        experiment=next_experiment(told.word, told.found, problem, here.start, told.joint.causes, here.whitening),
         candidates=explain(first.rows, first.linear, search.screened, noise),
         traces=traces(problem, signals, first.state, last.state, told.joint.causes, told.found),
         baseline=fitted_model(problem, first.state, []),

@@ -30,6 +30,7 @@ __all__ = [
     "batched",
     "extended_state",
     "link_motion",
+    "on_motion",
     "plain_rows",
     "solved",
     "unit_torques",
@@ -140,6 +141,20 @@ def extended_state(problem: Problem, state: State, effect: Effect) -> State:
         return grown
     moved = _rigid(problem, link_motion(problem, grown))
     return replace(grown, parts=(moved, *state.parts[1:]))
+
+
+def on_motion(problem: Problem, state: State) -> State:
+    """The state, its coefficients as they are, along the motion of another problem."""
+    rigid = _rigid(problem, problem.motion)
+    first = State((), state.sensors, (rigid,), state.prior, state.theta[: rigid.shape[2]], problem.motion)
+    here = replace(first, carried=problem.records.carried)
+    if any(kind(effect) == "position" for effect in state.sensors):
+        here = replace(here, parts=(_rigid(problem, link_motion(problem, here)),))
+    for term in state.terms:
+        own = _term_columns(problem, here, term)
+        theta = state.theta[: len(here.theta) + own.shape[2]]
+        here = replace(here, terms=(*here.terms, term), parts=(*here.parts, own), theta=theta)
+    return here
 
 
 def with_width(problem: Problem, state: State) -> State:
