@@ -76,7 +76,7 @@ def right(cases: list[tuple[tuple[bool, ...], int]], folder: Path) -> float:
 
 
 def test_verdicts_are_those_of_the_row_space(tmp_path: Path):
-    assert right([(moving, 100 + k) for k, moving in enumerate(CASES[:4])], tmp_path) >= 0.95
+    assert right([(moving, 100 + k) for k, moving in enumerate(CASES[:3])], tmp_path) >= 0.95
 
 
 @pytest.mark.slow
