@@ -120,6 +120,18 @@ def test_run_directory_holds_what_the_contract_asks(wrong: tuple[Path, poses.Tru
     twist = np.array(corrections["placements"]["j3"])
     nominal = pin.buildModelFromUrdf(str(wrong[0].parent / "robot.urdf")).jointPlacements[3]
     np.testing.assert_allclose(placed, nominal * pin.SE3(pin.exp3(twist[3:]), twist[:3]), rtol=0, atol=1e-12)
+    changes = yaml.safe_load((out / "model" / "master_calibration.yaml").read_text())
+    changes = changes["robot_state_publisher"]["geometric_calibration"]
+    for name, xyz, rpy, *_ in poses._CHAIN:  # added to the origins as they are written
+        p, r = (
+            np.array(text.split(), float) + [changes.get(f"{name}_{key}", 0.0) for key in keys]
+            for text, keys in ((xyz, ("dx", "dy", "dz")), (rpy, ("droll", "dpitch", "dyaw")))
+        )
+        moved = robot.jointPlacements[robot.getJointId(name)]
+        np.testing.assert_allclose(pin.SE3(pin.rpy.rpyToMatrix(*r), p), moved, rtol=0, atol=1e-12)
+    assert {q["axis"] for q in result["quality"]} == {"x", "y", "z"}
+    assert all(q["rmse"] < 0.2 < 1.0 < q["before"] and 0.999 < q["r2"] < 1.0 for q in result["quality"])
+    assert all(abs(pair["value"]) <= 1.0 and pair["one"] != pair["other"] for pair in result["correlations"])
     assert cli.main(["calibrate", str(wrong[0]), "--out", str(out), "--quiet"]) == 0
     assert "full geometry" in capsys.readouterr().out
 

@@ -11,7 +11,16 @@ from jaxtyping import Float
 from ..model import RobotModel
 from ..results import Cause
 
-__all__ = ["Calibration", "Error", "Outlier", "Parameter", "Shown", "SocketDistance"]
+__all__ = [
+    "Calibration",
+    "Error",
+    "Outlier",
+    "Parameter",
+    "Quality",
+    "Shown",
+    "SocketDistance",
+    "quality_of",
+]
 
 
 @dataclass(frozen=True)
@@ -79,6 +88,7 @@ class Calibration:
     notes: tuple[str, ...]
     points: tuple[Shown, ...]
     distances: tuple[SocketDistance, ...] = ()
+    correlations: tuple[tuple[str, str, float], ...] = ()  # of identified parameters, the strongest
     posture: dict[str, float] = field(default_factory=dict)  # of the joints that are locked, rad or m
 
 
@@ -92,3 +102,31 @@ class Shown:
     before: Float[np.ndarray, "points 3"]
     after: Float[np.ndarray, "points 3"]
     row: tuple[int, ...]
+
+
+class Quality(NamedTuple):
+    """Errors of one axis of a recording after the calibration, mm; R2 of its points; `before`: RMSE of the frames."""
+
+    recording: str
+    role: str
+    axis: str
+    before: float
+    mean: float
+    std: float
+    rmse: float
+    max: float
+    r2: float
+
+
+def quality_of(calibration: Calibration) -> list[Quality]:
+    """A row for each recording of points and axis of its device, without the outlier postures."""
+    rows, outliers = [], {(o.file.rpartition(".")[0] or o.file, o.row) for o in calibration.outliers}
+    for shown in calibration.points:
+        kept = np.array([(shown.name, row) not in outliers for row in shown.row])
+        for k, axis in enumerate("xyz"):
+            before, error = 1e3 * shown.before[kept, k], 1e3 * shown.after[kept, k]
+            square, spread = np.mean(error**2), 1e3 * np.std(shown.at[kept, k])
+            r2 = 1.0 - square / spread**2 if spread > 0.0 else np.nan
+            sizes = np.sqrt(np.mean(before**2)), error.mean(), error.std(), np.sqrt(square), np.abs(error).max(), r2
+            rows.append(Quality(shown.name, shown.role, axis, *(float(x) for x in sizes)))
+    return rows

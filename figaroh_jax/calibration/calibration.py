@@ -209,6 +209,7 @@ class Run:
             twists=twists,
             frames=corrections.frames_of(final, linear.at),
             parameters=parameters,
+            correlations=corrections.correlations_of(final, posterior, parameters),
             position=position,
             orientation=orientation,
             outliers=self.outliers,

@@ -25,6 +25,7 @@ __all__ = [
     "causes_of",
     "centred",
     "corrected",
+    "correlations_of",
     "frames_of",
     "gauge_of",
     "identifiable",
@@ -72,6 +73,21 @@ def parameters_of(final: Measured, linear, posterior, gauge: Gauge, order: list[
         status = "gauge" if place in gauge.dependent else known
         found.append(Parameter(*(names[k][0], float(linear.at[k] * scale[k]), std * scale[k], names[k][1]), status))
     return tuple(sorted(found, key=lambda p: p.name.split()[0] in ("base_frame", "tool_frame", "socket")))
+
+
+def correlations_of(
+    final: Measured, posterior: marginal.Posterior, parameters: Sequence[Parameter], most: int = 12
+) -> tuple[tuple[str, str, float], ...]:
+    """Pairs of identified parameters whose errors go together by more than a half, the strongest first."""
+    names = [c.label for c in final.columns] + [name for name, _ in final.own]
+    known = {p.name for p in parameters if p.status == "identified"}
+    kept = np.array([k for k, name in enumerate(names) if name in known], int)
+    covariance = posterior.covariance[np.ix_(kept, kept)]
+    size = np.sqrt(np.diag(covariance))
+    correlation = np.triu(covariance / np.where(np.outer(size, size) > 0.0, np.outer(size, size), 1.0), 1)
+    strongest = np.argsort(-np.abs(correlation), axis=None)[:most]
+    pairs = [(*np.unravel_index(k, correlation.shape), correlation.flat[k]) for k in strongest]
+    return tuple((names[kept[i]], names[kept[j]], float(r)) for i, j, r in pairs if abs(r) > 0.5)
 
 
 def causes_of(

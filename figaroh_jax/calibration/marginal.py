@@ -63,7 +63,7 @@ def fit(
     # from `at`, where the residual is small, no digits are lost; held unknowns go to zero
     base = linear.residual[rows] - linear.jacobian[rows][:, ~free] @ linear.at[~free]
     at, prior = linear.at[free], linear.prior[free]
-    postures = linear.posture.max() + 1
+    postures = int(linear.posture.max()) + 1
     width = linear.tolerance.copy() if start is None else start.width.copy()
     noise = _first_noise(base, channel) if start is None else start.noise.copy()
     weight = np.ones(postures) if start is None else start.weight.copy()

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from ..chunks import program
 from .posefit import DRAFT, DRAFT_OPTIONS, Part, Problem, block_rows, parts_of, ties
@@ -57,7 +57,7 @@ def solve(
     problem: Problem,
     row_weights: Float[Any, " rows"],
     precision: Float[Any, " unknowns"],
-    free: Float[Any, " unknowns"],
+    free: Shaped[Any, " unknowns"],
     start: Float[Any, " unknowns"],
     max_steps: int = 500,
 ) -> Solution:
@@ -132,7 +132,7 @@ def _square(rows: Float[Array, "columns samples"]) -> Float[Array, "columns colu
 
 
 def _search(
-    parts: tuple[Part, ...], weights: Any, precision: Array, free: Array, start: Array, max_steps: int
+    parts: tuple[Part, ...], weights: Any, precision: Array, free: Array, start: Array, max_steps: Int[Array, ""]
 ) -> _State:
     def try_step(state: _State) -> _State:
         at = state.at + state.step

@@ -1,26 +1,28 @@
 """A calibration for other programs and readers: `result.json`, `report.html` and `model/`.
 
 `model/robot.urdf` is the robot's own file with the origins of the corrected joints; `model/robot.xml` the same as MJCF;
-`model/calibration.yaml` the corrections, the effects that no URDF can carry, and the metrology frames.
+`model/calibration.yaml` the corrections, the effects that no URDF can carry, and the metrology frames;
+`model/master_calibration.yaml` what PAL's robot_state_publisher adds to the origins of the nominal URDF.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..calibration.calibrated import Calibration, Error
+from ..calibration.calibrated import Calibration, Error, quality_of
 from ..calibration.corrections import twist_pose
 from ..errors import InputError
 
 if TYPE_CHECKING:
     from ..calibration.kinematic_diagnosis import PoseDiagnosis
 
-__all__ = ["corrected_urdf", "pose_answer_json", "result", "to_json", "write_calibration"]
+__all__ = ["corrected_urdf", "origin_changes", "pose_answer_json", "result", "to_json", "write_calibration"]
 
 _PARITY = 1e-9  # m and entries of the rotation, between the model and the file read back
 
@@ -37,6 +39,7 @@ def write_calibration(calibration: Calibration, folder: Path, source: Path) -> N
     (model / "calibration.yaml").write_text(dump_yaml(_corrections(calibration)), encoding="utf-8")
     if source.suffix.lower() == ".urdf":
         (model / "robot.urdf").write_text(corrected_urdf(calibration, source), encoding="utf-8")
+        (model / "master_calibration.yaml").write_text(dump_yaml(origin_changes(calibration, source)), encoding="utf-8")
         _check_parity(calibration, model / "robot.urdf")
     _write_mjcf(calibration, model / "robot.xml")
 
@@ -70,6 +73,8 @@ def result(calibration: Calibration) -> dict[str, Any]:
         "rank": calibration.rank,
         "condition": _number(calibration.condition),
         "classes": [list(c) for c in calibration.classes],
+        "correlations": [{"one": a, "other": b, "value": _number(r)} for a, b, r in calibration.correlations],
+        "quality": [q._asdict() | {"r2": _number(q.r2)} for q in quality_of(calibration)],
         "converged": calibration.converged,
         "notes": list(calibration.notes),
     }
@@ -106,17 +111,47 @@ def corrected_urdf(calibration: Calibration, source: Path) -> str:
     from ..formats.xmlfile import read_xml
 
     root = read_xml(source, "robot")
-    for joint in root.iterchildren("joint"):
-        twist = calibration.twists.get(joint.get("name"))
-        if twist is None or not twist.any():
-            continue
+    for joint, pose in _corrected_joints(calibration, root):
         origin = joint.find("origin")
         if origin is None:
             origin = etree.SubElement(joint, "origin")
-        pose = _origin(origin) @ twist_pose(twist)
         origin.set("xyz", " ".join(repr(float(x)) for x in pose[:3, 3]))
         origin.set("rpy", " ".join(repr(float(x)) for x in roll_pitch_yaw(pose[:3, :3])))
     return '<?xml version="1.0"?>\n' + etree.tostring(root, encoding="unicode") + "\n"
+
+
+def _corrected_joints(calibration: Calibration, root: Any) -> Iterator[tuple[Any, np.ndarray]]:
+    """Joint elements whose origin changes, with the new pose."""
+    for joint in root.iterchildren("joint"):
+        twist = calibration.twists.get(joint.get("name"))
+        if twist is not None and twist.any():
+            origin = joint.find("origin")
+            yield joint, _origin({} if origin is None else origin) @ twist_pose(twist)
+
+
+def origin_changes(calibration: Calibration, source: Path) -> dict[str, Any]:
+    """What to add to `xyz` (m) and `rpy` (rad) of the joints of the URDF `source`, in the layout of PAL's robots.
+
+    The angles are those whose sum with the ones written in the URDF gives the corrected rotation, the smaller ones of
+    the two triplets that do.
+    """
+    from ..formats.urdf_text import roll_pitch_yaw
+    from ..formats.xmlfile import read_xml
+
+    found = {}
+    for joint, pose in _corrected_joints(calibration, read_xml(source, "robot")):
+        origin = joint.find("origin")
+        written = {} if origin is None else origin
+        xyz, rpy = (np.array([float(x) for x in written.get(key, "0 0 0").split()]) for key in ("xyz", "rpy"))
+        roll, pitch, yaw = roll_pitch_yaw(pose[:3, :3])
+        both = np.array([[roll, pitch, yaw], [roll + np.pi, np.pi - pitch, yaw + np.pi]]) - rpy
+        turns = (both + np.pi) % (2.0 * np.pi) - np.pi
+        change = [*(pose[:3, 3] - xyz), *min(turns, key=np.linalg.norm)]
+        name = joint.get("name").removesuffix("_joint")
+        for key, value in zip(("dx", "dy", "dz", "droll", "dpitch", "dyaw"), change, strict=True):
+            if abs(value) > 1e-12:
+                found[f"{name}_{key}"] = float(value)
+    return {"robot_state_publisher": {"geometric_calibration": found}}
 
 
 def _origin(element: Any) -> np.ndarray:

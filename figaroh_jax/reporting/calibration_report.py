@@ -9,13 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.calibrated import Calibration, Shown
+from ..calibration.calibrated import Calibration, Shown, quality_of
 from . import wording
 from .report import page_template, plotly_source
 
 __all__ = ["write_calibration_report"]
-
-_COLOURS = {"before": "#c2410c", "after": "#0f766e"}
 
 
 def write_calibration_report(calibration: Calibration, path: Path) -> None:
@@ -31,7 +29,12 @@ def write_calibration_report(calibration: Calibration, path: Path) -> None:
         distances=wording.distances(calibration),
         errors=[error for error in (calibration.position, calibration.orientation) if error is not None],
         table=[(name, 1e3 * a, np.degrees(b)) for name, (a, b) in calibration.table.items()],
-        quality=_quality(calibration),
+        quality=quality_of(calibration),
+        stretch=_stretch(_shown(calibration)),
+        parameters={
+            status: [p for p in calibration.parameters if p.status == status]
+            for status in ("identified", "prior only", "gauge")
+        },
         css=Markup((page / "report.css").read_text("utf-8")),
         plotly=Markup(plotly_source()),
         figure=Markup(_figure(calibration)),
@@ -39,32 +42,43 @@ def write_calibration_report(calibration: Calibration, path: Path) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def _quality(calibration: Calibration) -> list[tuple[str, str, list[float]]]:
-    """For each recording and axis: mean, std, RMSE, max of the error after (mm), and R2 of the points."""
-    rows = []
-    for shown in calibration.points:
-        for axis, name in enumerate("xyz"):
-            error = 1e3 * shown.after[:, axis]
-            spread = 1e3 * np.std(shown.at[:, axis])
-            r2 = 1.0 - np.mean(error**2) / spread**2 if spread > 0.0 else float("nan")
-            size = [error.mean(), error.std(), np.sqrt(np.mean(error**2)), np.abs(error).max(), r2]
-            rows.append((shown.name, name, [float(x) for x in size]))
-    return rows
+def _shown(calibration: Calibration) -> list[Shown]:
+    return [part for part in calibration.points if np.ptp(part.at) > 0.0]
+
+
+def _stretch(shown: list[Shown]) -> int:
+    """How much longer than they are arrows are drawn: all but the few longest then stay apart."""
+    if not shown:
+        return 1
+    size = float(np.ptp(np.concatenate([part.at for part in shown]), axis=0).max())
+    long = float(np.quantile(np.concatenate([np.linalg.norm(part.before, axis=1) for part in shown]), 0.9))
+    return max(1, round(0.1 * size / max(long, 1e-12)))
 
 
 def _figure(calibration: Calibration) -> str:
-    """Traces of plotly as JSON that may stand inside a script element: arrows, drawn longer than they are."""
-    shown = [s for s in calibration.points if np.ptp(s.at) > 0.0]
-    if not shown:
-        return "[]"
-    size = max(float(np.ptp(np.concatenate([s.at for s in shown]), axis=0).max()), 1e-6)
-    longest = max(float(np.linalg.norm(s.before, axis=1).max()) for s in shown)
-    stretch = 0.15 * size / max(longest, 1e-12)
-    traces = [_arrows(shown, which, stretch) for which in ("before", "after")]
+    """Traces of plotly as JSON that may stand inside a script element: arrows, and sizes by row."""
+    shown = _shown(calibration)
+    both = ("before", "after")
+    traces = {
+        "space": [_arrows(shown, which, _stretch(shown)) for which in both] if shown else [],
+        "rows": [_sizes(part, which) for part in shown for which in both],
+    }
     return json.dumps(traces, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def _arrows(shown: list[Shown], which: str, stretch: float) -> dict[str, Any]:
+def _sizes(part: Shown, which: str) -> dict[str, Any]:
+    size = 1e3 * np.linalg.norm(getattr(part, which), axis=1)
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "name": which,
+        "x": part.row,
+        "y": size.tolist(),
+        "marker": {"size": 6},
+    }
+
+
+def _arrows(shown: list[Shown], which: str, stretch: int) -> dict[str, Any]:
     ends: dict[str, list[float | None]] = {axis: [] for axis in "xyz"}
     text: list[str] = []
     for part in shown:
@@ -72,11 +86,5 @@ def _arrows(shown: list[Shown], which: str, stretch: float) -> dict[str, Any]:
             for k, axis in enumerate("xyz"):
                 ends[axis] += [float(point[k]), float(point[k] + stretch * error[k]), None]
             text += [f"{part.name}, row {row}: {1e3 * np.linalg.norm(error):.3g} mm"] * 3
-    line = {"color": _COLOURS[which], "width": 5}
-    return {
-        "type": "scatter3d",
-        "mode": "lines",
-        "name": f"{which} (x {stretch:.0f})",
-        "line": line,
-        "text": text,
-    } | ends
+    width = 4 if which == "before" else 8  # the short ones stay visible
+    return {"type": "scatter3d", "mode": "lines", "name": which, "line": {"width": width}, "text": text} | ends
