@@ -157,6 +157,7 @@ def test_frames_and_their_jacobians_are_pinocchios_in_every_reference() -> None:
         kinematics.frame_jacobian(twin.model, q, "f0", "body")
 
 
+@pytest.mark.slow
 def test_talos_with_a_free_root_is_pinocchios(data_dir: Path) -> None:
     """The first six rows of the regressor are the wrench at the base, in its own axes."""
     path = data_dir / robots.REAL["talos"]

@@ -59,6 +59,14 @@ def tree(tmp_path: Path) -> RobotModel:
     return robots.load(robots.TREE, tmp_path)
 
 
+ROBOTS = ["arm", pytest.param("tree", marks=pytest.mark.slow)]  # transformed programs of a tree take long to compile
+
+
+@pytest.fixture
+def robot(request: pytest.FixtureRequest) -> RobotModel:
+    return request.getfixturevalue(request.param)
+
+
 @pytest.mark.parametrize("name", robots.REAL)
 def test_regressor_of_real_robots_is_pinocchios(name: str, data_dir: Path) -> None:
     path = data_dir / robots.REAL[name]
@@ -125,27 +133,29 @@ def test_any_batch_axes(arm: RobotModel) -> None:
     np.testing.assert_array_equal(W[1, 2], joint_torque_regressor(arm, q[1, 2], v[1, 2], a[1, 2]))
 
 
-def test_transformations_agree_with_plain_calls(tree: RobotModel) -> None:
-    state = unit_states(tree, CHUNK + 5)
-    W = joint_torque_regressor(tree, *state)
-    np.testing.assert_allclose(jax.jit(joint_torque_regressor)(tree, *state), W, rtol=0, atol=1e-13)
-    mapped = jax.vmap(joint_torque_regressor, (None, 0, 0, 0))(tree, *state)
+@pytest.mark.parametrize("robot", ROBOTS, indirect=True)
+def test_transformations_agree_with_plain_calls(robot: RobotModel) -> None:
+    state = unit_states(robot, CHUNK + 5)
+    W = joint_torque_regressor(robot, *state)
+    np.testing.assert_allclose(jax.jit(joint_torque_regressor)(robot, *state), W, rtol=0, atol=1e-13)
+    mapped = jax.vmap(joint_torque_regressor, (None, 0, 0, 0))(robot, *state)
     np.testing.assert_allclose(mapped, W, rtol=0, atol=1e-13)
-    packed = jax.jit(packed_regressor)(tree, *state)
-    np.testing.assert_allclose(packed, packed_regressor(tree, *state), rtol=0, atol=1e-13)
+    packed = jax.jit(packed_regressor)(robot, *state)
+    np.testing.assert_allclose(packed, packed_regressor(robot, *state), rtol=0, atol=1e-13)
 
 
-def test_derivatives_in_leaves_and_states_are_central_differences(tree: RobotModel) -> None:
+@pytest.mark.parametrize("robot", ROBOTS, indirect=True)
+def test_derivatives_in_leaves_and_states_are_central_differences(robot: RobotModel) -> None:
     """Forward mode against differences and reverse mode against forward, over more than one chunk."""
     rng = np.random.default_rng(1)
-    point = dict(zip("qva", unit_states(tree, CHUNK + 3), strict=True))
-    point |= {leaf: np.asarray(getattr(tree, leaf)) for leaf in LEAVES}
-    weight = rng.standard_normal((CHUNK + 3, tree.nv, 10 * len(tree.joints)))
+    point = dict(zip("qva", unit_states(robot, CHUNK + 3), strict=True))
+    point |= {leaf: np.asarray(getattr(robot, leaf)) for leaf in LEAVES}
+    weight = rng.standard_normal((CHUNK + 3, robot.nv, 10 * len(robot.joints)))
 
     @jax.jit
     def value(point: dict[str, jax.Array]) -> jax.Array:
-        robot = eqx.tree_at(lambda m: [getattr(m, k) for k in LEAVES], tree, [point[k] for k in LEAVES])
-        return jnp.mean(weight * joint_torque_regressor(robot, *(point[k] for k in "qva")))
+        changed = eqx.tree_at(lambda m: [getattr(m, k) for k in LEAVES], robot, [point[k] for k in LEAVES])
+        return jnp.mean(weight * joint_torque_regressor(changed, *(point[k] for k in "qva")))
 
     forward, backward = jax.jit(lambda x, d: jax.jvp(value, (x,), (d,))[1]), jax.grad(value)(point)
     for name, x in point.items():

@@ -98,7 +98,9 @@ def test_no_samples_give_zero(tree: RobotModel) -> None:
     assert not assembled(normal_matrix(tree, none, none, none, none)).any()
 
 
-def test_normal_matrix_under_jit_grad_and_vmap(tree: RobotModel) -> None:
+@pytest.mark.parametrize("name", ["arm", pytest.param("tree", marks=pytest.mark.slow)])
+def test_normal_matrix_under_jit_grad_and_vmap(name: str, tmp_path: Path) -> None:
+    tree = robots.load(robots.INLINE[name], tmp_path)
     q, v, a, tau, weight = data(tree, 2 * CHUNK + 1)
     expected = assembled(normal_matrix(tree, q, v, a, tau, weight))
     jitted = jax.jit(normal_matrix)(tree, q, v, a, tau, weight)
