@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import wraps
+from math import prod
 from typing import Any
 
 import jax
@@ -31,6 +32,7 @@ __all__ = [
     "on_host",
     "over_samples",
     "program",
+    "sized_program",
     "put",
     "to_device",
     "traced",
@@ -44,15 +46,33 @@ _ALIGNMENT = 64  # bytes; XLA takes such memory over without a copy
 # inside of sums number by number. JAX 0.11 has the newer one alone.
 CPU_OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
 
+DRAFT_OPTIONS = CPU_OPTIONS | {"xla_backend_optimization_level": 0}
+FEW = 512  # samples; for these the compiler takes longer to optimise a long program than that saves later
+
 
 def program(function: Callable[..., Any], cpu: Mapping[str, Any] = CPU_OPTIONS, **options: Any) -> Callable[..., Any]:
-    """`jax.jit(function, **options)`; on a CPU with the compiler's options `cpu`, unknown to that of other devices."""
+    """`jax.jit(function, **options)`; on a CPU with the compiler's options `cpu`, unknown to that of other devices.
+
+    Within a program of the caller's, where options cannot be set, it is compiled with the caller's.
+    """
     elsewhere = jax.jit(function, **options)
     on_cpu = jax.jit(function, compiler_options=dict(cpu), **options)
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
-        return (on_cpu if jax.default_backend() == "cpu" else elsewhere)(*arguments)
+        return (on_cpu if on_host(*arguments) else elsewhere)(*arguments)
+
+    return call
+
+
+def sized_program(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """`program` whose last argument has its samples before its last axis: for few of them compiled in a third of the
+    time, to run slower."""
+    quick, fast = program(function, DRAFT_OPTIONS, **options), program(function, **options)
+
+    @wraps(function)
+    def call(*arguments: Any) -> Any:
+        return (quick if prod(np.shape(arguments[-1])[:-1]) <= FEW else fast)(*arguments)
 
     return call
 

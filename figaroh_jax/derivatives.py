@@ -15,6 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from .chunks import sized_program
 from .dynamics import inverse_dynamics, mass_matrix
 from .manifold import bracket, integrate
 from .model import RobotModel
@@ -52,7 +53,7 @@ def coriolis_matrix(
         return _coriolis_matrix(model, jnp.asarray(q, jnp.float64), jnp.asarray(v, jnp.float64))
 
 
-@jax.jit
+@sized_program
 def _coriolis_matrix(model: RobotModel, q: Array, v: Array) -> Array:
     rest = jnp.zeros_like(v)
     half_slope = 0.5 * _columns(lambda x: inverse_dynamics(model, q, x, rest), v)
@@ -76,7 +77,7 @@ def coriolis_from_bias(
         v, mass = jnp.asarray(v, jnp.float64), jnp.asarray(mass, jnp.float64)
         around, steps = v[..., None, :], jnp.eye(model.nv)
         columns = jnp.swapaxes(0.25 * (bias(around + steps) - bias(around - steps)), -1, -2)
-        return columns + 0.5 * mass @ _brackets(model, v)
+        return columns if _abelian(model) else columns + 0.5 * mass @ _brackets(model, v)
 
 
 def dynamics_derivatives(
@@ -90,7 +91,7 @@ def dynamics_derivatives(
         return _dynamics_derivatives(model, *(jnp.asarray(x, jnp.float64) for x in (q, v, a)))
 
 
-@jax.jit
+@sized_program
 def _dynamics_derivatives(model: RobotModel, q: Array, v: Array, a: Array) -> TorqueDerivatives:
     along_q = _columns(lambda step: inverse_dynamics(model, integrate(model, q, step), v, a), jnp.zeros_like(v))
     along_v = _columns(lambda x: inverse_dynamics(model, q, x, a), v)
@@ -104,8 +105,16 @@ def _columns(function: Callable[[Array], Array], x: Array) -> Array:
     return jnp.moveaxis(columns, 0, -1)
 
 
+def _abelian(model: RobotModel) -> bool:
+    """Whether no joint has several degrees of freedom: all brackets are zero."""
+    return all(joint.kind in ("revolute", "prismatic") for joint in model.joints)
+
+
+@jax.jit
 def _brackets(model: RobotModel, v: Array) -> Array:
     """Matrix of `w -> [v, w]`."""
+    if _abelian(model):
+        return jnp.zeros((*v.shape, v.shape[-1]))
     steps = jnp.eye(v.shape[-1])
     columns = jax.vmap(lambda step: bracket(model, v, jnp.broadcast_to(step, v.shape)))(steps)
     return jnp.moveaxis(columns, 0, -1)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import robots
 
+from figaroh_jax.chunks import DRAFT_OPTIONS, program
 from figaroh_jax.contract import Backend
 from figaroh_jax.formats.robotfile import read_robot
 from figaroh_jax.native_backend import NativeBackend
@@ -43,15 +44,16 @@ def leaf(tree: Any, path: str) -> Any:
     return tree
 
 
-@eqx.filter_jit
-def power(backend: Backend, state: tuple[Any, ...], weight: Any) -> Any:
+def power_of(backend: Backend, state: tuple[Any, ...], weight: Any) -> Any:
     q, v, a, step = state
     return weight @ backend.inverse_dynamics(backend.integrate(q, step), v, a)
 
 
-@eqx.filter_jit
-def slopes(backend: Backend, state: tuple[Any, ...], weight: Any) -> Any:
-    return eqx.filter_grad(lambda both: power(both[0], both[1], weight))((backend, state))
+def slopes_of(backend: Backend, state: tuple[Any, ...], weight: Any) -> Any:
+    return eqx.filter_grad(lambda both: power_of(both[0], both[1], weight))((backend, state))
+
+
+power, slopes = program(power_of, DRAFT_OPTIONS), program(slopes_of, DRAFT_OPTIONS)
 
 
 @pytest.mark.parametrize("at_zero", [False, True])

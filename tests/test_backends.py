@@ -21,6 +21,7 @@ import toy_backend
 from hypothesis import given, settings, strategies as st
 
 from figaroh_jax import registry
+from figaroh_jax.chunks import DRAFT_OPTIONS, program
 from figaroh_jax.contract import FUNCTIONS, Backend
 from figaroh_jax.errors import InputError, NotSupported
 from figaroh_jax.native_backend import NativeBackend
@@ -37,7 +38,7 @@ TOLERANCE = {"native": 1e-10, "mujoco": 1e-9, "mjx": 1e-8}
 SAMPLES = 100
 SEED = int.from_bytes(os.urandom(2), "little")  # the states of a run; a failure shows it
 ROBOTS = [*robots.INLINE, *robots.MIXED, *robots.REAL, "talos_free"]
-COMPILED_FAST = {"native": ("arm", "tree", "beast"), "mjx": ("pendulum",)}  # the others compile for minutes
+LONG_CHAIN = "inverse_dynamics joint_torque_regressor mass_matrix frame_jacobian".split()
 ARGUMENTS = {
     "mass_matrix": "q",
     "coriolis_matrix": "q v",
@@ -90,16 +91,26 @@ def answer(name: str, robot: str, function: str) -> np.ndarray:
     return np.stack(value) if function == "dynamics_derivatives" else np.asarray(value)
 
 
+def quick(name: str, robot: str, function: str) -> bool:
+    """Whether a case belongs to the quick tests: every compiled program costs seconds, on each robot anew."""
+    if name == "native":
+        return robot in ("arm", "beast") or (robot == "tree" and function in LONG_CHAIN)
+    if name == "mjx" and function != "dynamics_derivatives":
+        return robot == "pendulum" or (robot == "beast" and function in LONG_CHAIN)
+    return name == "mujoco"
+
+
 def cases() -> list[Any]:
-    """The table robot x function x backend; what compiles for minutes is slow."""
+    """The table robot x function x backend; what a backend inherits from the contract is tested on one robot."""
     table = []
     for name in TOLERANCE:
         for robot in ROBOTS:
-            slow = name in COMPILED_FAST and robot not in COMPILED_FAST[name]
             for function in ARGUMENTS:
-                if function in CLASSES[name].capabilities.functions:
-                    marks = [pytest.mark.slow] if slow or (name, function) == ("mjx", "dynamics_derivatives") else []
-                    table.append(pytest.param(robot, function, name, marks=marks))
+                inherited = name != "native" and getattr(CLASSES[name], function) is getattr(Backend, function)
+                if function not in CLASSES[name].capabilities.functions or (inherited and robot != "beast"):
+                    continue
+                marks = [] if quick(name, robot, function) else [pytest.mark.slow]
+                table.append(pytest.param(robot, function, name, marks=marks))
     return table
 
 
@@ -232,9 +243,26 @@ def test_an_installed_backend_is_found_by_its_name() -> None:
     assert backend.joint_names[0] == "root_joint"
 
 
-def test_an_unknown_backend_is_refused_with_those_installed() -> None:
-    with pytest.raises(InputError, match="no backend 'bullet' is installed; installed: native.*pip install"):
+def test_an_unknown_backend_is_refused_with_those_installed_and_how_to_install_more() -> None:
+    with pytest.raises(InputError, match="no backend 'bullet' is installed; installed: native.*pip install") as told:
         registry.backend("bullet", source("arm")[0])
+    assert all(name in str(told.value) for name in registry.names())
+    assert "'figaroh-jax[mujoco,mjx,pinocchio]'" in str(told.value)
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_a_robot_of_a_package_needs_no_meshes(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`package://` is found in the folders given; the mesh that the file names exists nowhere."""
+    mesh = '<visual><geometry><mesh filename="package://my_arm/meshes/none.stl"/></geometry></visual></link>'
+    package = tmp_path / "ros" / "my_arm"
+    package.mkdir(parents=True)
+    (package / "arm.urdf").write_text(robots.ARM.replace("</link>", mesh))
+    monkeypatch.setattr(registry, "backend_class", CLASSES.__getitem__)
+    backend = registry.backend(name, "package://my_arm/arm.urdf", packages=[tmp_path / "ros"])
+    assert backend.joint_names == ("turn", "slide")
+    np.testing.assert_allclose(backend.inertias, made("native", "arm").inertias, rtol=0, atol=1e-12)
+    with pytest.raises(InputError, match="my_arm"):
+        registry.backend(name, "package://my_arm/arm.urdf", packages=[tmp_path])
 
 
 def test_a_backend_needs_a_robot() -> None:
@@ -281,6 +309,6 @@ def test_mjx_maps_over_its_leaves() -> None:
             changed = dataclasses.replace(backend, model=backend.simulator.replace(body_mass=mass))
             return changed.inverse_dynamics(q, v, a)
 
-        got = np.asarray(jax.vmap(torque)(masses))
+        got = np.asarray(program(jax.vmap(torque), DRAFT_OPTIONS)(masses))
     each = [float(np.asarray(torque(mass))[0]) for mass in np.asarray(masses)]
     np.testing.assert_allclose(got[:, 0], each, rtol=0, atol=1e-12)

@@ -14,18 +14,16 @@ import contextlib
 import io
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from figaroh_jax.chunks import program
+from figaroh_jax.chunks import sized_program
 from figaroh_jax.contract import Backend, Capabilities, Reference, as_reference, check_samples, file_format
 from figaroh_jax.derivatives import TorqueDerivatives, coriolis_from_bias
 from figaroh_jax.errors import InputError
@@ -108,7 +106,7 @@ class MjxBackend(Backend):
     def inertias(self) -> Float[Array, "links 10"]:
         """Inertial parameters of the links in MJX's model."""
         with jax.enable_x64(True):
-            return link_inertias(self.structure.translation, self.model)
+            return _own_inertias(self)
 
     def mass_matrix(self, q: Float[ArrayLike, "*batch nq"]) -> Float[Array, "*batch nv nv"]:
         """Composite bodies (`mjx.crb`)."""
@@ -146,7 +144,8 @@ class MjxBackend(Backend):
     ) -> Float[Array, "*batch 6 nv"]:
         """`mjx.jac` of the frame's origin, or of the world's."""
         index, axes = self.frame_id(frame), as_reference(reference)
-        return self._each(_jacobian_of(index, axes), q=q)
+        at = (np.int32(index), np.bool_(axes == "local"), np.bool_(axes == "world"))
+        return self._each(_jacobian, *at, q=q)
 
     def joint_torque_regressor(
         self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
@@ -160,26 +159,29 @@ class MjxBackend(Backend):
         """Forward derivatives of `mjx.rne`, and the mass matrix of `mjx.crb`."""
         return self._each(_derivatives, q=q, v=v, a=a)
 
-    def _each(self, one: Callable[..., Any], **arrays: ArrayLike) -> Any:
-        """`one(backend, q, ...)` of every sample."""
+    def _each(self, one: Callable[..., Any], *which: Any, **arrays: ArrayLike) -> Any:
+        """`one((backend, *which), q, ...)` of every sample."""
         check_samples(self, **arrays)
         with jax.enable_x64(True):
             states = [jnp.asarray(array, jnp.float64) for array in arrays.values()]
-            traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((self, states)))
-            return (_within if traced else _alone)(one, self, *states)
+            return _mapped(one, (self, *which) if which else self, *states)
 
 
-def _mapped(one: Callable[..., Any], backend: MjxBackend, *states: Array) -> Any:
+def _over_batch(one: Callable[..., Any], fixed: Any, *states: Array) -> Any:
     for _ in range(states[0].ndim - 1):
         one = jax.vmap(one, in_axes=(None, *[0] * len(states)))
-    return one(backend, *states)
+    return one(fixed, *states)
 
 
 # XLA's fusion emitters for CPUs compute a chain of small products again for each of its uses: MJX's unrolled tree then
 # runs hundreds of times slower and compiles twenty times longer. Within a caller's program options cannot be set; there
 # XLA_FLAGS=--xla_cpu_use_fusion_emitters=false helps.
-_alone = program(_mapped, static_argnums=0)
-_within = jax.jit(_mapped, static_argnums=0)
+_mapped = sized_program(_over_batch, static_argnums=0)
+
+
+@jax.jit
+def _own_inertias(backend: MjxBackend) -> Array:
+    return link_inertias(backend.structure.translation, backend.model)
 
 
 def _put(made: Compiled) -> tuple[Any, _Structure]:
@@ -244,19 +246,16 @@ def _frames(backend: MjxBackend, q: Array) -> Array:
     return frame_poses(backend.robot, joint_poses(backend.structure.translation, data.xmat, data.xpos))
 
 
-@lru_cache(maxsize=256)
-def _jacobian_of(index: int, axes: str) -> Callable[..., Any]:
-    return partial(_jacobian, index=index, axes=axes)
-
-
-def _jacobian(backend: MjxBackend, q: Array, index: int, axes: str) -> Array:
+def _jacobian(which: tuple[MjxBackend, Array, Array, Array], q: Array) -> Array:
+    """Of the frame `index` in one of three references, all by one program."""
+    backend, index, local, world = which
     t, data = backend.structure.translation, _placed(backend, q)
     pose = frame_poses(backend.robot, joint_poses(t, data.xmat, data.xpos))[index]
-    parent = backend.robot.frames[index].parent
-    point = jnp.zeros(3) if axes == "world" else pose[:3, 3]
-    parts = mjx.jac(backend.model, data, point, jnp.asarray(t.body[parent] if parent >= 0 else 0))
+    bodies = [t.body[frame.parent] if frame.parent >= 0 else 0 for frame in backend.robot.frames]
+    point = jnp.where(world, 0.0, pose[:3, 3])
+    parts = mjx.jac(backend.model, data, point, jnp.asarray(bodies)[index])
     share = jnp.asarray(rates(t, q))
-    turn = pose[:3, :3].T if axes == "local" else jnp.eye(3)
+    turn = jnp.where(local, pose[:3, :3].T, jnp.eye(3))
     return jnp.concatenate([turn @ part.T @ share for part in parts])
 
 

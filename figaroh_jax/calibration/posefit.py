@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .. import lie
-from ..chunks import CPU_OPTIONS, chunk_size, program
+from ..chunks import DRAFT_OPTIONS, chunk_size, program
 from ..model import Leaf
 from .chain import Chain, chain_pose, joint_response
 from .devices import Device
@@ -196,7 +196,7 @@ def _blocks_rows(chain: Chain, device: Device, own: Array, *blocks: Any) -> tupl
 
 
 DRAFT = 256  # postures; for fewer the compiler takes longer to optimise than that saves later
-DRAFT_OPTIONS = CPU_OPTIONS | {"xla_backend_optimization_level": 0}
+
 _rows_quick = program(_blocks_rows, cpu=DRAFT_OPTIONS)
 _rows_fast = program(_blocks_rows)
 
