@@ -17,6 +17,7 @@ from synthetic import DT, made_signals, swing
 
 from figaroh_jax.diagnosis.design import units
 from figaroh_jax.diagnosis.flexible import WIDTHS, friction_width
+from figaroh_jax.diagnosis.gates import exists
 from figaroh_jax.diagnosis.layout import held_rows, layout
 from figaroh_jax.diagnosis.priors import body_precision, physical_body, rigid_prior
 from figaroh_jax.diagnosis.problem import Problem
@@ -145,6 +146,20 @@ def test_a_robot_near_its_nominal_values_is_fitted_without_rest(model: RobotMode
     assert np.abs(plain_rows(problem, state).y).max() > 10
     np.testing.assert_allclose(linear.residual / sure, 0.0, rtol=0, atol=1e-4)
     np.testing.assert_allclose(linear.theta[-2:], [4.0, 1.0], rtol=0, atol=1e-4)
+
+
+def test_an_effect_exists_within_its_bounds_only(model: RobotModel) -> None:
+    signals = made_signals(4.0)
+    problem = problem_of(model, dataclasses.replace(signals, torque=rigid_torque(model, signals)))
+
+    def known(effect: str, *at: str, **values: float) -> bool:
+        return exists(problem, place(find(effect), model, at, **values))
+
+    assert known("torque_delay", delay=0.004) and known("torque_delay", delay=-0.004)  # stamped late, stamped early
+    assert not known("torque_delay", delay=0.06) and not known("torque_delay", delay=-0.03)  # lean against their bounds
+    assert known("stribeck_friction", "turn", force=0.1, speed=0.1)
+    assert not known("stribeck_friction", "turn", force=-0.1, speed=0.1)
+    assert not known("torque_offset", "turn", offset=1e3)  # more than the joint ever feels
 
 
 LOAD = Load(frame="tool", mass=1.7, com=(0.05, -0.1, 0.2))

@@ -41,7 +41,8 @@ def _within(parameter: Parameter, value: float) -> bool:
     """Whether a parameter lies in its bounds; one that enters nonlinearly must not lean against them."""
     if parameter.linear:
         return value >= parameter.lower
-    return parameter.choice or parameter.lower < value * 0.999 < value * 1.001 < parameter.upper
+    margin = 1e-3 * abs(value)
+    return parameter.choice or parameter.lower + margin < value < parameter.upper - margin
 
 
 def passes(step: Step, contenders: list[Contender], one: Contender) -> bool:
