@@ -80,8 +80,10 @@ def _whitened_squares(
     if len(drawn) > _FEW:
         return (np.matmul(root.astype(drawn.dtype), np.swapaxes(drawn, 0, 1)) ** 2).sum(1)
     factors = np.moveaxis(root, 0, 2)[..., None].astype(drawn.dtype)
-    rows = (sum(factor * part for factor, part in zip(row, drawn, strict=True)) for row in factors)
-    return sum((row * row for row in rows), np.zeros((), drawn.dtype))
+    squares = np.zeros((len(root), drawn.shape[2]), drawn.dtype)
+    for row in factors:
+        squares += sum(factor * part for factor, part in zip(row, drawn, strict=True)) ** 2
+    return squares
 
 
 def pulled(
