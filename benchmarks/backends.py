@@ -4,7 +4,7 @@
 
 Robots are found by FIGAROH_JAX_DATA. MuJoCo C uses all cores, the others what JAX is allowed to. A round asks every
 backend in turn; the median over the rounds is told, with the ratio to Pinocchio's loop within the rounds. The first
-call, with its compilation, is told apart. MJX takes minutes to compile for a CPU: leave it out with `--backends`.
+call, with its compilation, is told apart.
 """
 
 from __future__ import annotations
