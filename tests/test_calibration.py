@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from pathlib import Path
 from typing import Any
@@ -146,6 +147,19 @@ def test_the_level_that_is_asked_for_is_the_one_that_is_fitted(
     assert {p["name"].split()[0] for p in result["parameters"]} == {"joint_offset", "base_frame", "tool_frame"}
     assert cli.main(["calibrate", task, "--out", out, "--quiet", "--level", "offset"]) == 2
     assert "no level 'offset' of calibration; did you mean 'joint_offset'?" in capsys.readouterr().err
+
+
+def test_the_view_moves_the_nominal_and_the_calibrated_robot(calibrated: Calibration, wrong: tuple[Path, poses.Truth]):
+    from figaroh_jax.reporting.calibration_view import nominal_of, segments, show
+
+    robot = pin.buildModelFromUrdf(str(wrong[0].parent / "robot.urdf"))
+    q, data = poses.postures(np.random.default_rng(3), 1)[0], robot.createData()
+    pin.forwardKinematics(robot, data, q)
+    tips = np.array([data.oMi[k].translation for k in range(1, 7)])
+    np.testing.assert_allclose(segments(nominal_of(calibrated), q)[:, 1], tips, rtol=0, atol=1e-12)
+    assert np.abs(segments(calibrated.model, q)[:, 1] - tips).max() > 1e-3
+    if importlib.util.find_spec("viser") is not None:
+        show(calibrated, port=18080).stop()
 
 
 def test_a_robot_that_is_already_good_gets_nothing(tmp_path: Path):
