@@ -39,7 +39,7 @@ __all__ = [
     "two_axes",
 ]
 
-BLOCK = 8  # chunks to a block
+BLOCK, MOST = 1024, 16  # samples to a block, if these are not more chunks
 _ALIGNMENT = 64  # bytes; XLA takes such memory over without a copy
 
 # XLA's older code generator for loops takes half as long to compile our kernels, and the newer one computes gathers
@@ -81,7 +81,7 @@ def chunk_size(width: int = 1) -> int:
     """Samples to a chunk: few on a CPU, fewer where an answer has many numbers a sample (`width`), many elsewhere."""
     if jax.default_backend() != "cpu":
         return 65536
-    return 128 if width <= 640 else 32
+    return 128 if width <= 64 else 64 if width <= 640 else 32
 
 
 def traced(*trees: Any) -> bool:
@@ -186,7 +186,7 @@ def host_blocks(
     Fewer samples than a block has are answered with some more behind them.
     """
     samples, room = len(arrays[0]), None
-    chunks = 1 if samples <= chunk else BLOCK
+    chunks = 1 if samples <= chunk else min(MOST, max(1, BLOCK // chunk))
     block = chunk * chunks
     if samples > 4 * block:  # putting the leaves there once costs as much as handing them over four times
         parameters = jax.device_put(parameters)

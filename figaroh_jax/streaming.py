@@ -24,6 +24,8 @@ from .regressor import coordinate_blocks, coordinate_rows, dense_rows
 
 __all__ = ["NormalMatrix", "normal_matrix", "triangular_factor"]
 
+SMALL = 160  # columns of a normal matrix
+
 
 class NormalMatrix(NamedTuple):
     """Sums over all rows of the regressor, `[W extra]' weight [W extra tau]` and tau' weight tau."""
@@ -55,7 +57,9 @@ def normal_matrix(
         columns = 10 * len(model.joints) + (0 if extra is None else np.shape(extra)[-1]) + 1
         groups = _groups(model, columns)
         start = tuple(jnp.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
-        parts = _fold(_add_products, chunk_size(), start, model, rows)
+        # a small matrix is added to from the innermost cache; a large one costs more to add to than its rows to make
+        chunk = 32 if on_host() and columns <= SMALL else chunk_size()
+        parts = _fold(_add_products, chunk, start, model, rows)
         index = np.concatenate([_flat(group, columns).ravel() for group in groups])
         whole = _scattered(columns, index, parts)
         new = NormalMatrix(whole[:-1, :-1], whole[:-1, -1], whole[-1, -1])
@@ -132,7 +136,7 @@ def _fold(step: Callable[..., Any], chunk: int, total: Any, model: RobotModel, r
         return _fold_chunks(step, total, model, _cut(rows, chunk))
     program = _host_program if on_host() else _device_program
     samples = len(rows.q)
-    chunks = 1 if samples <= chunk else BLOCK
+    chunks = 1 if samples <= chunk else max(8, BLOCK // chunk)
     for start in range(0, samples, chunk * chunks):
         piece = jax.tree.map(lambda x: x[start : start + chunk * chunks], rows)  # noqa: B023
         total = program(step, total, model, _cut(piece, chunk, chunks))

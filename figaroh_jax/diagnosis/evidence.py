@@ -78,9 +78,9 @@ def _whitened_squares(
 ) -> Float[np.ndarray, "points draws"]:
     """Squares of root times each draw; few columns go term by term, which is faster than many small products."""
     if len(drawn) > _FEW:
-        return (np.matmul(root.astype(drawn.dtype), np.swapaxes(drawn, 0, 1)) ** 2).sum(1)
-    factors = np.moveaxis(root, 0, 2)[..., None].astype(drawn.dtype)
-    squares = np.zeros((len(root), drawn.shape[2]), drawn.dtype)
+        return (np.matmul(root, np.swapaxes(drawn, 0, 1)) ** 2).sum(1)
+    factors = np.moveaxis(root, 0, 2)[..., None]  # in double: what nothing excites has huge ones
+    squares = np.zeros((len(root), drawn.shape[2]))
     for row in factors:
         squares += sum(factor * part for factor, part in zip(row, drawn, strict=True)) ** 2
     return squares
