@@ -39,7 +39,7 @@ def score_blocks(
     noise: Float[Array, " rows"],
     used: Bool[Array, " rows"],
     precision: Float[Array, " unknowns"],
-    blocks: Sequence[Float[Array, "rows columns"]],
+    blocks: Sequence[Float[Array, "rows _"]],
     free: Bool[Array, " unknowns"],
     seed: int = 0,
 ) -> Scores:
