@@ -83,7 +83,7 @@ def test_gradient_of_the_profile_is_that_of_finite_differences(
 ) -> None:
     effect, rows = at_joint(name, **{shape: value}), whitened(records)
 
-    def both(x: float) -> tuple[float, np.ndarray]:
+    def both(x: float) -> tuple[np.ndarray, np.ndarray]:
         return profile(*columns_of(with_shape(effect, [shape], [np.float64(x)]), motion, records, rows), [0], rows)
 
     (slope,) = both(value)[1]

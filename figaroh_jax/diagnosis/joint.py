@@ -24,7 +24,7 @@ __all__ = ["Joint", "has_size", "joint_fit", "moved", "polished", "sized"]
 
 KEPT = 1e-12
 SURE = 0.95  # of the region of a cause's amplitudes that must not hold zero
-POLISH = 2
+POLISH, SETTLED = 10, 0.03  # turns at the most; a turn that moves nothing by more of its standard deviation is the last
 SPEED_LAWS = ("stribeck_friction", "power_law_friction")  # of dry friction over the speed
 
 
@@ -37,7 +37,7 @@ class Joint(NamedTuple):
 
 
 def polished(problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> Joint:
-    """All causes fitted together: a few Gauss-Newton steps over coefficients and shapes.
+    """All causes fitted together: Gauss-Newton steps over coefficients and shapes until they settle.
 
     Sensor effects follow the load and the torque, so each turn begins with what the last one made of the baseline.
     """
@@ -45,7 +45,9 @@ def polished(problem: Problem, start: State, causes: list[Effect], whitening: Fl
     for _ in range(POLISH):
         causes = [moved(e, joint.fitted, at) for e, at in zip(joint.causes, joint.fitted.places, strict=True)]
         base = solved(problem, start, joint.step.state.theta[: len(start.theta)])
-        joint = _together(problem, base, causes, whitening)
+        last, joint = joint.fitted, _together(problem, base, causes, whitening)
+        if np.all(np.abs(joint.fitted.value - last.value) <= SETTLED * np.sqrt(np.diag(joint.fitted.covariance))):
+            break
     return joint
 
 
