@@ -20,7 +20,7 @@ from figaroh_jax.extended import extend, predict
 from figaroh_jax.formats.config import load_robot, load_task
 from figaroh_jax.formats.export import load_model, write_model
 from figaroh_jax.formats.mjcf import compiled_robot, load_mjcf
-from figaroh_jax.formats.robotfile import load_extended, read_robot, robot_notes
+from figaroh_jax.formats.robotfile import load_extended, read_robot, stated_baseline
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.kinematics import forward_kinematics
 from figaroh_jax.model import RobotModel
@@ -350,19 +350,28 @@ def test_a_task_takes_an_mjcf_model(tmp_path: Path) -> None:
         assert model.joint_names == ("elbow", "shoulder") and tuple(model.gravity) == expected
 
 
-def test_what_a_task_leaves_out_of_its_model_file_is_noted(tmp_path: Path) -> None:
+def test_what_a_model_file_says_of_the_joints_is_in_the_baseline_or_noted(tmp_path: Path) -> None:
     tasks.write(tmp_path)
     written(robots.GRIPPER, tmp_path)
     keys = tasks.task() | {"baseline": {"rotor": True}}
     keys["robot"] = {"model": "robot.xml", "joints": ["elbow", "shoulder"], "posture": {"left": 0.02}}
-    notes = robot_notes(load_task(tasks.write(tmp_path, keys)))
-    assert [note.split(" of the file")[0] for note in notes] == [
-        "robot.xml: power_law_friction (elbow)",
-        "robot.xml: coupled_transmission (elbow, shoulder)",
-        "robot.xml: gravity_compensation (upper)",
+    known, notes = stated_baseline(load_task(tasks.write(tmp_path, keys)))
+    assert notes == (
+        "robot.xml: power_law_friction (elbow) of the file is not used: a baseline takes no such shape",
+        "robot.xml: coupled_transmission (elbow, shoulder) of the file is not used: a baseline takes no such shape",
+        "robot.xml: gravity_compensation (upper) of the file is part of the baseline: its size is fitted",
         "robot.xml: not read: gravcomp of link 'fore', whose welded bodies differ in it",
-    ]
-    assert robot_notes(load_task(tasks.write(tmp_path))) == ()
+    )
+    added = [(entry.effect, entry.at) for entry in known.effects]
+    assert added == [("gravity_compensation", ("upper",))]
+    switched = {}
+    for baseline in ({}, {"rotor": False}):
+        read, notes = stated_baseline(load_task(tasks.write(tmp_path, keys | {"baseline": baseline})))
+        switched[len(baseline)] = [entry.at for entry in read.effects if entry.effect == "rotor_inertia"]
+        assert any("rotor_inertia" in note and ("leaves it out" in note) == bool(baseline) for note in notes)
+    assert switched[0] and not switched[1]
+    task = load_task(tasks.write(tmp_path))
+    assert stated_baseline(task) == (task.baseline, ())
 
 
 @pytest.mark.slow

@@ -55,14 +55,14 @@ def diagnose_task(
 ) -> Diagnosis:
     """Diagnose what a task file describes, by the named backend; `InputError` before any work where it is wrong."""
     from ..formats.config import load_robot
-    from ..formats.robotfile import robot_notes
+    from ..formats.robotfile import stated_baseline
 
     progress("reading", 0.0)
-    model, notes = load_robot(task), robot_notes(task)
+    model, (known, notes) = load_robot(task), stated_baseline(task)
     recordings = read_recordings(task, model)
     options = {"trust": task.robot.trust, "forbid": task.diagnose.forbid, "alpha": task.diagnose.alpha}
     robot = make_backend(backend, model)
-    found = diagnose(robot, recordings, task.preprocess, task.baseline, progress=progress, **options)
+    found = diagnose(robot, recordings, task.preprocess, known, progress=progress, **options)
     return replace(found, notes=(*notes, *found.notes))
 
 
@@ -162,7 +162,7 @@ def _judged(
     if word != "unknown" or not found:
         return _Told(word, found, joint, rest.text)
     proxy = ", ".join(str(f.name) for f in found)
-    text = f"{rest.text}; best proxy, not a cause: {proxy}"[:160]
+    text = f"{rest.text}; best proxy, not a cause: {proxy}"
     return _Told(word, [], Joint(first, [], Fitted(np.zeros(0), np.zeros((0, 0)), ())), text)
 
 

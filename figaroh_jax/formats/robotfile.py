@@ -26,9 +26,9 @@ from .urdf import load_urdf, urdf_dynamics
 from .xmlfile import find_in_packages
 
 if TYPE_CHECKING:
-    from .config import Task
+    from .config import Baseline, Task
 
-__all__ = ["Loaded", "load_extended", "read_robot", "robot_notes"]
+__all__ = ["Loaded", "load_extended", "read_robot", "stated_baseline"]
 
 
 class Loaded(NamedTuple):
@@ -88,22 +88,48 @@ def load_extended(
     return Loaded(extend(robot, *found.effects(), *compensated), (*notes, *more))
 
 
-def robot_notes(task: Task) -> tuple[str, ...]:
-    """What the model file of a task says of the joints and its baseline does not fit, one line for each effect."""
-    from .config import robot_options
+def stated_baseline(task: Task) -> tuple[Baseline, tuple[str, ...]]:
+    """The task's baseline with what its model file says of the joints, and a note on each effect of the file.
+
+    A simulation of the file has its armature, springs and couplings, so none of them is missing; their sizes are fitted
+    with the rest of the baseline. What the task switches off itself, and what has a shape or a sign that a baseline
+    cannot be told, is left out.
+    """
+    from .config import BaselineEffect, robot_options
 
     known, file = task.baseline, task.robot.model
-    switches = {"viscous_friction": known.viscous, "coulomb_friction": known.coulomb}
-    switches |= {"rotor_inertia": known.rotor, "torque_offset": known.offset}
-    fitted = {name for name, on in switches.items() if on} | {entry.effect for entry in known.effects}
+    switches = {"viscous_friction": "viscous", "coulomb_friction": "coulomb"}
+    switches |= {"rotor_inertia": "rotor", "torque_offset": "offset"}
+    fitted = {name for name, key in switches.items() if getattr(known, key)} | {entry.effect for entry in known.effects}
+    refused = {name for name, key in switches.items() if key in known.model_fields_set} - fitted
     extended, notes = load_extended(file, **robot_options(task.robot))
-    places: dict[str, list[str]] = {}
+    added: dict[tuple[str, tuple[str, ...]], BaselineEffect] = {}
+    places: dict[tuple[str, bool], list[str]] = {}
     for effect in extended.effects:
         if effect.name not in fitted:
-            places.setdefault(effect.name, []).extend(place_names(extended.robot, effect))
-    lines = [f"{name} ({', '.join(dict.fromkeys(at))}) of the file is not used" for name, at in places.items()]
-    lines = [f"{line}; under `baseline` it is fitted before anything is named" for line in lines]
-    return tuple(f"{file.name}: {line}" for line in (*lines, *(f"not read: {note}" for note in notes)))
+            at = place_names(extended.robot, effect)
+            linear = effect.name not in refused and _fits_linearly(effect)
+            places.setdefault((effect.name, linear), []).extend(at)
+            if linear:
+                added[effect.name, at] = BaselineEffect.model_construct(effect=effect.name, at=at)
+    lines = [
+        f"{name} ({', '.join(dict.fromkeys(at))}) of the file "
+        + ("is part of the baseline: its size is fitted" if linear else f"is not used: {_why(name, refused)}")
+        for (name, linear), at in places.items()
+    ]
+    whole = known.model_copy(update={"effects": (*known.effects, *added.values())})
+    return whole, tuple(f"{file.name}: {line}" for line in (*lines, *(f"not read: {note}" for note in notes)))
+
+
+def _why(name: str, refused: set[str]) -> str:
+    return "the task's baseline leaves it out" if name in refused else "a baseline takes no such shape"
+
+
+def _fits_linearly(effect: Effect) -> bool:
+    """Whether a baseline can fit it: all is linear but for a choice that stands at its default."""
+    return all(
+        p.linear or (p.choice and float(getattr(effect, name)) == p.grid[0]) for name, p in effect.parameters().items()
+    )
 
 
 def _is_urdf(path: str | Path) -> bool:

@@ -8,7 +8,7 @@ validation bears out; and the links are kept to what bodies can have.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import jax
@@ -85,22 +85,24 @@ def identify_task(
 ) -> Identification:
     """Identify what a task file describes, by the named backend; `InputError` before any work where it is wrong."""
     from ..formats.config import load_robot
+    from ..formats.robotfile import stated_baseline
 
     progress("reading", 0.0)
-    model = load_robot(task)
+    model, (known, notes) = load_robot(task), stated_baseline(task)
     recordings = read_recordings(task, model, floating=True)
     options = task.identify
-    return identify(
+    found = identify(
         make_backend(backend, model),
         recordings,
         task.preprocess,
-        task.baseline,
+        known,
         trust=task.robot.trust,
         fit=options.fit,
         joints=options.joints,
         bounds={name: bound.model_dump(exclude_none=True) for name, bound in options.bounds.items()},
         progress=progress,
     )
+    return replace(found, notes=(*notes, *found.notes))
 
 
 def identify(
