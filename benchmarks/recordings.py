@@ -8,6 +8,7 @@ of squares; SCS, a first-order solver that shares nothing with Clarabel, solves 
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import sys
 import tempfile
@@ -59,7 +60,7 @@ def best_robots(problem: Any) -> dict[str, np.ndarray]:
 
 def by_scs(factor: np.ndarray, problem: Any) -> np.ndarray:
     """The same convex problem written anew for CVXPY and SCS."""
-    import cvxpy as cp
+    cp: Any = importlib.import_module("cvxpy")  # not among the project's dependencies: `pip install cvxpy`
 
     from figaroh_jax.inertia import pseudo_inertia
 

@@ -74,17 +74,20 @@ def diagnose_poses(
         geometry, p_geometry = _geometry(run, calibration, alpha)
         p_effects, p_rest = _effect_scores(run)
         effects = [c for c in calibration.causes if c.name.effect not in (*GEOMETRY, "outlier")]
+        p_play, joint = _play(run)
+        plays = p_play < alpha / 5
         if p_effects > alpha:
             effects = []
+        elif plays:  # a law that leaves its own joint erring at random is not the right one
+            effects = [cause for cause in effects if cause.name.at != (joint,)]
         geometry = [c for c in geometry if c.name.effect not in forbid]
         outliers = [c for c in calibration.causes if c.name.effect == "outlier"]
         causes = tuple([*outliers, *geometry, *_with_rivals(effects, run)])
         p_value = min(1.0, 2.0 * min(p_geometry, p_effects))
-        p_play, joint = _play(run)
-        if p_play < alpha / 5:
+        if plays:
             note = f"joint {joint} stands elsewhere from posture to posture than it says: play, or poor repeatability"
             calibration = replace(calibration, notes=(*calibration.notes, note))
-        rest = run.history or min(p_rest, p_play) < alpha / 5 or _beyond_accuracy(recordings, calibration)
+        rest = run.history or plays or p_rest < alpha / 5 or _beyond_accuracy(recordings, calibration)
         return _answer(calibration, causes, p_value, rest)
 
 
