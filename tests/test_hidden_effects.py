@@ -187,7 +187,6 @@ def test_clean_recordings_of_every_noise_get_at_most_one_name():
 
 @needs_robots
 @pytest.mark.slow
-@pytest.mark.xfail(strict=False, reason="p is too small where recordings repeat: 12 % of 74 clean cases are below .05")
 def test_p_values_of_clean_recordings_are_uniform():
     p = np.array([value for _, value in clean_answers()])
     # 1.5 and 7.5 of 30 are expected
