@@ -94,11 +94,6 @@ def test_backends_never_import_each_other():
             assert others <= {folder.name}, path
 
 
-def test_files_are_short_enough_to_read():
-    lengths = {path.name: len(path.read_text(encoding="utf-8").splitlines()) for path in MODULES.values()}
-    assert {name: length for name, length in lengths.items() if length > 400} == {}
-
-
 def test_options_of_one_kind_of_device_are_set_where_the_device_is_known():
     """A compiler for another device refuses them: `chunks.program` and code that looks may pass them."""
     own = {name for name, path in MODULES.items() if "compiler_options=" in path.read_text(encoding="utf-8")}

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from ..contract import Backend
 from ..effect import Effect, Motion
-from ..effects import CATALOGUE, LinkEffect
+from ..effects import CATALOGUE
 from ..model import RobotModel
 from .design import Units, candidates, flattened, kind, shapes, units
 from .records import Records, open_rows
@@ -94,7 +94,7 @@ class Problem:
 
 
 def family_of(effect: type[Effect]) -> str:
-    if issubclass(effect, LinkEffect):
+    if effect.inertial:
         return "link"
     if kind(effect) != "columns" or (effect.has("change") and not effect.has("torque")):
         return "sensor"
