@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+<<<<<<< HEAD
 from ..effect import Effect, Parameter
 from ..effects import related
+=======
+from ..effects.base import Effect, Parameter
+from ..effects.catalogue import Payload
+>>>>>>> main
 from ..results import Name
 from .comparison import overlap, t_value
 from .contenders import Contender
