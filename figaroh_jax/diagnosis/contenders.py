@@ -8,14 +8,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-<<<<<<< HEAD
-from ..effect import Effect
-=======
 from ..effects.base import Effect
-from ..effects.catalogue import Payload
 from ..estimation.priors import physical_body
 from ..estimation.rows import Rows
->>>>>>> main
 from ..results import Name
 from .comparison import Ground, Hypothesis, Verdicts, judge, judge_grown
 from .design import kind, shapes, with_shape

@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-<<<<<<< HEAD
-from ..effect import Effect, Parameter
-from ..effects import related
-=======
 from ..effects.base import Effect, Parameter
-from ..effects.catalogue import Payload
->>>>>>> main
+from ..effects.catalogue import related
 from ..results import Name
 from .comparison import overlap, t_value
 from .contenders import Contender

@@ -9,14 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-<<<<<<< HEAD
-from ..effect import Effect
-from ..effects import CATALOGUE, find
-=======
 from ..effects.base import Effect
-from ..effects.catalogue import find
+from ..effects.catalogue import CATALOGUE, find
 from ..estimation.rows import Rows
->>>>>>> main
 from ..results import Name
 from .design import kind, shapes, with_shape
 from .estimates import Fitted, amplitude_places, torque_slope, with_amplitudes

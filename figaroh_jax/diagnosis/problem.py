@@ -9,18 +9,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-<<<<<<< HEAD
-from ..contract import Backend
-from ..effect import Effect, Motion
-from ..effects import CATALOGUE
-from ..model import RobotModel
-=======
 from ..effects.base import Effect, Motion
-from ..effects.catalogue import CATALOGUE, LinkEffect
+from ..effects.catalogue import CATALOGUE
 from ..recordings.stacked import Records, open_rows
 from ..rigid.model import RobotModel
 from ..simulators.contract import Backend
->>>>>>> main
 from .design import Units, candidates, flattened, kind, shapes, units
 from .shifts import links_torque, rigid_torque
 

@@ -13,16 +13,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-<<<<<<< HEAD
-from ..effect import Effect
-from ..effects import CATALOGUE, related
-from ..model import RobotModel
-=======
 from ..effects.base import Effect
-from ..effects.catalogue import CATALOGUE, LinkEffect
+from ..effects.catalogue import CATALOGUE, related
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Linear, Rows
->>>>>>> main
 from ..results import Name
 from ..rigid.model import RobotModel
 from .bank import Bank, Columns, bank

@@ -14,18 +14,12 @@ import jax
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-<<<<<<< HEAD
-from ..effect import Effect, Motion
-from ..effects import find
-from ..model import Leaf
-=======
 from ..effects.base import Effect, Motion
-from ..effects.catalogue import LinkEffect, Payload, find
+from ..effects.catalogue import find
 from ..estimation.priors import body_precision, rigid_prior
 from ..estimation.rows import Prior, Rows, instruments
 from ..recordings.stacked import filter_rows, filtered_rows
 from ..rigid.model import Leaf
->>>>>>> main
 from .design import Units, flattened, kind, sensor_response, shapes, units, units_and_slopes
 from .problem import Layout, Problem, family_of
 from .shifts import shifted
