@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..effect import Effect, Parameter
-from ..effects import Payload
+from ..effects.base import Effect, Parameter
+from ..effects.catalogue import Payload
 from ..results import Name
 from .comparison import overlap, t_value
 from .contenders import Contender
