@@ -51,6 +51,7 @@ def fit(real: RealSet, scenes: Sequence[Scene]) -> tuple[Baseline, list[Scene]]:
     torque = np.concatenate([_rows(s, s.torque[:, :, None]) for s in fitted])[:, :, 0]
     mean, precision = _prior(real, columns.shape[2])
     sigma = np.sqrt(np.mean(torque**2, 0)) / 10
+    theta = mean
     for _ in range(3):
         theta = _solved(_tall(columns, sigma), _tall(torque[:, :, None], sigma)[:, 0], mean, precision)
         rest = torque - columns @ theta

@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import blackbox
 from .baseline import fit, seen
-from .laws import FAMILIES, TWELVE, Draw, Law, scaled
+from .laws import TWELVE, Draw, Law, scaled
 from .motion import Scene, scene_of
 from .recordings import SETS, RealSet
 
@@ -46,7 +46,7 @@ def _robot(
     place.mkdir(parents=True, exist_ok=True)
     (place / "robot.urdf").write_text(real.urdf)
     for recording in real.recordings:
-        np.savez_compressed(place / f"{recording.name}.npz", **recording.arrays)
+        _save(place / f"{recording.name}.npz", recording.arrays)
     twin = {"name": f"{real.name}/twin", "group": real.name, "task": _task(real), "truth": []}
     twin["model"] = f"{real.name}/robot.urdf"
     baseline, scenes = fit(real, [scene_of(real, r) for r in real.recordings])
@@ -61,7 +61,7 @@ def _robot(
             law, strength = found
             shown = seen(baseline, scenes, law, strength)
             name = f"{real.name}/{effect}-{100 * size:g}"
-            np.savez_compressed(folder / f"{name}.npz", **_added(real, scenes, law, strength))
+            _save(folder / f"{name}.npz", _added(real, scenes, law, strength))
             cases.append(
                 twin
                 | {"name": name, "twin": twin["name"], "size": size, "added": f"{name}.npz"}
@@ -69,6 +69,10 @@ def _robot(
                 | {"left": shown.left, "sigmas": shown.sigmas, "visible": shown.visible}
             )
     return cases
+
+
+def _save(path: Path, arrays: dict[str, Any]) -> None:
+    np.savez_compressed(path, **arrays)
 
 
 def _task(real: RealSet) -> dict[str, Any]:
@@ -119,6 +123,3 @@ _PAIR = {"inertia": "a", "damping": "v"}
 def _forbidden(effect: str) -> list[str]:
     names = {effect}.union(*(names for names in blackbox.EQUIVALENT if effect in names))
     return sorted(names)
-
-
-__all__ = ["FAMILIES", "generate"]

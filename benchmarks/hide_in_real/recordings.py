@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
+import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
 Array = np.ndarray
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))

@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ..blackbox import Case, Grade, Job, commit, grade, read
+from ..blackbox import Case, Job, commit, grade, read
 
-GRADES = ("right", "more", "set", "wrong", "silent", "failed")
-TITLE = {"more": "right + another", "set": "in the set"}
+TITLE = {  # what a grade is called where the truth may be named, and where it is forbidden
+    "named": {"right": "right", "more": "right + another", "set": "in the set", "wrong": "wrong", "silent": "silent"},
+    "forbidden": {"silent": "no new name", "wrong": "a new name"},
+}
 
 
 def score(cases: dict[str, Case], out: Path, modes: Iterable[str]) -> str:
@@ -24,7 +26,7 @@ def score(cases: dict[str, Case], out: Path, modes: Iterable[str]) -> str:
         for shown, title in ((True, "visible"), (False, "absorbed")):
             own = [r for r in rows if r["mode"] == mode and r["visible"] is shown]
             if own:
-                lines += ["", f"{mode}, {title}:", *_table(own)]
+                lines += ["", f"{mode}, {title}:", *_table(own, TITLE[mode] | {"failed": "failed"})]
     return "\n".join([*lines, "", *_detail(rows)])
 
 
@@ -47,21 +49,21 @@ def _rows(name: str, case: Case, out: Path, modes: Iterable[str]) -> list[dict[s
     return found
 
 
-def _table(rows: list[dict[str, Any]]) -> list[str]:
+def _table(rows: list[dict[str, Any]], titles: dict[str, str]) -> list[str]:
     """Markdown: one line for each robot and size, then for each size."""
-    head = ["robot", "size", "cases", *(TITLE.get(g, g) for g in GRADES), "size error, median", "within 15 %"]
+    head = ["robot", "size", "cases", *titles.values(), "size error, median", "within 15 %"]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     groups = list(dict.fromkeys(r["group"] for r in rows))
     for group in [*groups, None]:
         for size in sorted({r["size"] for r in rows}):
             own = [r for r in rows if r["size"] == size and group in (None, r["group"])]
             if own:
-                lines.append(_line(group or "all", size, own))
+                lines.append(_line(group or "all", size, own, titles))
     return lines
 
 
-def _line(group: str, size: float, rows: list[dict[str, Any]]) -> str:
-    counts = [sum(r["grade"] == g for r in rows) for g in GRADES]
+def _line(group: str, size: float, rows: list[dict[str, Any]], titles: dict[str, str]) -> str:
+    counts = [sum(r["grade"] == g for r in rows) for g in titles]
     errors = np.array([e for r in rows for e in r["size_errors"]])
     told = [f"{np.nanmedian(errors):.2f}", f"{np.sum(errors < 0.15)} of {len(errors)}"] if len(errors) else ["", ""]
     return "| " + " | ".join([group, f"{100 * size:g} %", str(len(rows)), *map(str, counts), *told]) + " |"
@@ -78,6 +80,3 @@ def _detail(rows: list[dict[str, Any]]) -> list[str]:
             f"{r['grade']:<7} {r['verdict'] or '-':<10} new: {new or '-'}" + (f"   size off by {size}" if size else "")
         )
     return lines
-
-
-__all__ = ["Grade", "score"]
