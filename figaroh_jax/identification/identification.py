@@ -267,8 +267,7 @@ def _least(terms: Sequence[Effect]) -> Float[np.ndarray, " drives"]:
     out: list[float] = []
     for term in terms:
         for parameter in (p for p in term.parameters().values() if p.linear):
-            dissipates = term.name in ("viscous_friction", "coulomb_friction", "rotor_inertia")
-            out += [0.0 if dissipates else parameter.lower]
+            out.append(parameter.lower)
         if len(term.at) > 1:
             count = sum(p.linear for p in term.parameters().values())
             out += out[-count:] * (len(term.at) - 1)
