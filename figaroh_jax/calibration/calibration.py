@@ -123,7 +123,7 @@ class Run:
         frames = known_frames(self.model, self.chain, self.recordings)
         self.blocks = blocks_of(self.weighing, self.chain, self.postures, self.forbid, frames)
         extending = bool(self.blocks) and self.level is None and self.priors
-        self.effects = effects_on(self.postures, measured, self.blocks) if extending else None
+        self.effects = effects_on(self.model, self.postures, measured, self.blocks) if extending else None
         choice = levels.choose(measured, everything, self.effects, self.level)
         wide = self._wide(choice)  # with its effects: what they explain is no outlier
         sizes = find_outliers(wide, everything, levels.free_at(choice.level, wide.prior))
@@ -161,8 +161,7 @@ class Run:
         linear = choice.linear
         if self.effects is None or not choice.effects:
             return linear
-        slices = self.effects.slices()
-        Z = self.effects.jacobian(linear.at)[:, np.concatenate([np.r_[slices[k]] for k in choice.effects])]
+        Z = self.effects.jacobian(linear.at, choice.effects)
         return linear._replace(
             jacobian=np.hstack([linear.jacobian, Z]),
             at=np.r_[linear.at, np.zeros(Z.shape[1])],
@@ -286,8 +285,8 @@ def _recurring(choice: levels.Choice, folds: Sequence[levels.Fold], blocks: Sequ
     if not gains or np.mean(gains) < _NESTED_GAIN:
         return []
     # a fold that takes one which it does not tell apart chooses the other too
-    places = [{blocks[k].name for k in (*f.choice.effects, *sum(f.choice.rivals, ()))} for f in folds]
-    return [k for k in choice.effects if sum(blocks[k].name in place for place in places) >= _RECURS]
+    places = [[blocks[k] for k in (*f.choice.effects, *sum(f.choice.rivals, ()))] for f in folds]
+    return [k for k in choice.effects if sum(any(map(blocks[k].near, place)) for place in places) >= _RECURS]
 
 
 def _never_worse(choice: levels.Choice, folds: list[levels.Fold]) -> tuple[levels.Choice, list[levels.Fold]]:

@@ -6,17 +6,17 @@ nothing in these postures (no payload, a vertical axis under gravity) is no cand
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from ..effects.kinematic import CATALOGUE, HISTORY, Column, KinematicEffect, Postures, columns_of
+from ..effects.kinematic import CATALOGUE, HISTORY, Column, KinematicEffect, Postures, axis_twist, columns_of
 from ..recordings.poses import PoseRecording
 from ..results import Name
-from ..rigid.model import RobotModel
+from ..rigid.model import RobotModel, dofs
 from . import posefit
 from .levels import Effects
 from .posegroups import Measured
@@ -37,8 +37,12 @@ __all__ = [
 ]
 
 GEOMETRY = ("joint_offset", "link_geometry")
+Array = np.ndarray
 _STEP = 1e-3  # rad or m
 _STILL = 1e-9  # rad or m per unit: the effect does nothing
+_HIGHEST = 400.0  # order of a gear error that is looked for: two periods a turn of a motor behind 200 : 1
+_NARROW = 0.2  # rad: a joint that moves less shows no order
+_RESOLVED = 8  # orders of a joint for each posture, that are looked for at the most
 _SLOTS = 6, 12  # columns and pieces of effects for which a fit has room
 
 
@@ -53,6 +57,12 @@ class Block(NamedTuple):
     sizes: tuple[float, ...]
     shape: float
     shape_std: float = float("nan")
+    reach: float = 0.0  # how far the shape may be from the truth; 0: as far as the next value of the catalogue's grid
+
+    def near(self, other: Block) -> bool:
+        """Whether both are one effect at one place, with shapes that the postures do not tell apart."""
+        reach = 2.0 * max(self.reach, other.reach)
+        return self.name == other.name and (not reach or abs(self.shape - other.shape) <= reach)
 
     @property
     def name(self) -> Name:
@@ -100,7 +110,31 @@ def blocks_of(
                     sizes = sizes[np.isfinite(sizes)]
                 if len(columns) and np.isfinite(sizes).all():
                     found.append(Block(effect, columns, tuple(sizes), shape))
-    return tuple(found)
+    high = () if "gear_transmission_error" in forbid else _high_orders(model, chain, postures)
+    return (*found, *high)
+
+
+def _high_orders(model: RobotModel, chain: Sequence[int], postures: Sequence[Postures]) -> list[Block]:
+    """Gear errors of orders beyond the catalogue's grid, half as far apart as the range of the joint resolves.
+
+    Two waves over a range R are told apart where their orders differ by 2 pi / R.
+    """
+    effect, found = CATALOGUE["gear_transmission_error"], []
+    for j in (j for j in chain if model.joints[j].kind == "revolute"):
+        q = positions_of(model, postures, j)
+        if np.ptp(q) < _NARROW:
+            continue
+        step, lowest = np.pi / np.ptp(q), effect.shape[1][-1]
+        count = min(int((_HIGHEST - lowest) / step), _RESOLVED * len(q))
+        for order in lowest + step * np.arange(1, count + 1):
+            size = tuple(_STEP / np.maximum(np.sqrt(np.mean(wave(order * q) ** 2)), 0.1) for wave in (np.sin, np.cos))
+            found.append(Block(effect, columns_of(effect, model, (j,), float(order)), size, float(order), reach=step))
+    return found
+
+
+def positions_of(model: RobotModel, postures: Sequence[Postures], joint: int) -> Float[np.ndarray, " samples"]:
+    """Position of one joint in all postures."""
+    return np.concatenate([p.q[:, dofs(model.joints).positions[joint].start] for p in postures])
 
 
 def sizes_of(columns: Sequence[Column], postures: Sequence[Postures]) -> Float[np.ndarray, " columns"]:
@@ -139,16 +173,34 @@ def _places(
     return pairs + [(b, a) for a, b in pairs]
 
 
-def effects_on(postures: Sequence[Postures], measured: Measured, blocks: Sequence[Block]) -> Effects:
+def effects_on(model: RobotModel, postures: Sequence[Postures], measured: Measured, blocks: Sequence[Block]) -> Effects:
     """The candidates with their exact columns at any fit of `measured`, which has all twists of every joint."""
-    sizes = np.array([size for block in blocks for size in block.sizes])
-    moved = [moves(column, postures) for block in blocks for column in block.columns]
+    grid = sum(not block.reach for block in blocks)
+    high: dict[int, list[int]] = {}  # joint: its orders beyond the grid
+    for k in range(grid, len(blocks)):
+        high.setdefault(blocks[k].columns[0].pieces[0][0], []).append(k)
+    kept: dict[int, list[Moves]] = {}  # of the grid all are needed again and again, of the many high orders a few
 
-    def jacobian(unknowns: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, "rows all"]:
-        return moved_rows(measured, twist_rows(measured, unknowns), moved) * sizes
+    def jacobian(unknowns: Float[np.ndarray, " unknowns"], which: Sequence[int]) -> Float[np.ndarray, "rows some"]:
+        for k in which:
+            kept.setdefault(k, [moves(column, postures) for column in blocks[k].columns])
+        sizes = np.array([size for k in which for size in blocks[k].sizes])
+        return moved_rows(measured, twist_rows(measured, unknowns), [m for k in which for m in kept[k]]) * sizes
 
-    handicap = [0.01 * (len(b.columns) - 1) + 0.005 * np.log(len(b.effect.shape[1])) for b in blocks]
-    return Effects(tuple(block.columns for block in blocks), jacobian, sizes, np.array(handicap))
+    def waves(unknowns: Float[np.ndarray, " unknowns"]) -> Iterator[tuple[Array, Array, Array]]:
+        by_twist = twist_rows(measured, unknowns) if grid < len(blocks) else {}
+        inside = measured.posture >= 0
+        for joint, which in high.items():
+            rows, phase = np.zeros(len(inside)), np.zeros((len(inside), len(which)))
+            if joint in by_twist:
+                rows[inside] = by_twist[joint][inside] @ axis_twist(model, joint)
+            angle = positions_of(model, postures, joint)[measured.posture[inside]]
+            phase[inside] = np.outer(angle, [blocks[k].shape for k in which])
+            yield np.array(which), rows[:, None] * np.sin(phase), rows[:, None] * np.cos(phase)
+
+    count = np.array([len(b.effect.shape[1]) if not b.reach else len(blocks) - grid for b in blocks])
+    handicap = 0.01 * (np.array([len(b.columns) for b in blocks]) - 1) + 0.005 * np.log(count)
+    return Effects(tuple(block.columns for block in blocks), jacobian, np.array(handicap), grid, waves)
 
 
 def moves(column: Column, postures: Sequence[Postures]) -> Moves:

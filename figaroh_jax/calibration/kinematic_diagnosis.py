@@ -1,13 +1,14 @@
 r"""Diagnosis at kinematic level: what is wrong with the robot, the device or the postures, named only where it holds.
 
-Two routes to a name. Geometry (offsets, links) by its score against a stated tolerance, for held-out postures cannot
-show what every fit estimates anyway; effects by what they gain on postures left out of everything that chose them
-(`levels.nested`). Both must beat the largest score that noise alone gives over the whole catalogue.
+Two routes to a name. Geometry (offsets, links) by its score against a stated tolerance, and by what postures that were
+left out lose without it; effects by what they gain on postures left out of everything that chose them
+(`levels.nested`). Both must beat the largest score that noise alone gives over the whole catalogue. Where the robot
+that was found predicts held-out postures no better than the frames alone, nothing is named.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -23,7 +24,7 @@ from . import levels
 from .calibrated import Calibration
 from .calibration import Run
 from .candidates import GEOMETRY, moved_rows, moves, twist_rows
-from .kinematic_scores import Scores, score_blocks, score_jitter
+from .kinematic_scores import Scores, row_noise, score_blocks, score_jitter, score_waves
 
 if TYPE_CHECKING:
     from ..formats.config import Task
@@ -31,8 +32,9 @@ if TYPE_CHECKING:
 __all__ = ["PoseDiagnosis", "diagnose_pose_task", "diagnose_poses"]
 
 _TOLERANCE = (1.0, 0.5, 1.0, 1.0, 1.0)  # mrad, mm, mrad: how well a good robot is built and zeroed
-_WIDE = 100.0  # of a block that was named: free
+_WIDE, _HELD = 100.0, 1e-6  # of a block that was named: free; of one that is taken away
 _MOST = 16
+_SURE = 1.0  # standard errors by which left-out postures must be worse without a named geometry
 _NOISY = 1.5  # times the device's stated accuracy: the rest is no noise
 
 
@@ -82,6 +84,11 @@ def diagnose_poses(
         elif plays:  # a law that leaves its own joint erring at random is not the right one
             effects = [cause for cause in effects if cause.name.at != (joint,)]
         geometry = [c for c in geometry if c.name.effect not in forbid]
+        found = bool(geometry or effects)
+        if found and not _better(calibration):
+            geometry, effects = [], []
+            note = "held-out postures are predicted no better than by the frames alone: nothing that was found is named"
+            calibration = replace(calibration, notes=(*calibration.notes, note))
         outliers = [c for c in calibration.causes if c.name.effect == "outlier"]
         causes = tuple([*outliers, *geometry, *_with_rivals(effects, run)])
         p_value = min(1.0, 2.0 * min(p_geometry, p_effects))
@@ -90,6 +97,7 @@ def diagnose_poses(
             note = f"the true position of {joint} varies about its reading between postures: {what}"
             calibration = replace(calibration, notes=(*calibration.notes, note))
         rest = run.history or plays or p_rest < alpha / 5 or _beyond_accuracy(recordings, calibration)
+        rest = rest or (found and not (geometry or effects))
         return _answer(calibration, causes, p_value, rest)
 
 
@@ -135,8 +143,9 @@ def _geometry_of(run: Run) -> _Geometry:
 
 def _geometry(run: Run, calibration: Calibration, alpha: float) -> tuple[list[Cause], float]:
     """Offsets and links beyond their stated tolerance, the most evident first, and the p-value of the first one."""
-    linear, names, places, columns, width = _geometry_of(run)
-    noise = _row_noise(linear, run.fit[2])
+    linear, names, places, columns, stated = _geometry_of(run)
+    width = stated.copy()
+    noise = row_noise(linear, run.fit[2])
     named: list[int] = []
     first = 1.0
     free = np.ones(len(width), bool)
@@ -152,6 +161,9 @@ def _geometry(run: Run, calibration: Calibration, alpha: float) -> tuple[list[Ca
         named.append(_simplest(scores))
         width[places[named[-1]]] = _WIDE
     gain, twins = _gain(calibration), _twins(run)
+    same = [[names.index(name) for name in twin if name in names] for twin in twins]
+    beside = {k: [j for j in group if j != k] for group in same for k in group}
+    named = _needed(linear, noise, run.used, stated, places, named, beside)
     causes = []
     for k in named:
         values = {
@@ -165,16 +177,62 @@ def _geometry(run: Run, calibration: Calibration, alpha: float) -> tuple[list[Ca
     return causes, first
 
 
+def _needed(
+    linear: marginal.Linear,
+    noise: np.ndarray,
+    used: np.ndarray,
+    stated: np.ndarray,
+    places: Sequence[np.ndarray],
+    named: Sequence[int],
+    twins: Mapping[int, Sequence[int]],
+) -> list[int]:
+    """Those of the blocks `named` that postures left out are worse without, by more than chance.
+
+    Without: held at the nominal geometry, together with its `twins`, the others within their `stated` width or free.
+    """
+    kept, width = list(named), stated.copy()
+    for k in kept:
+        width[places[k]] = _WIDE
+    while kept:
+        free = _left_out_squares(linear, noise, used, width)
+        worth = []
+        for k in kept:
+            held = width.copy()
+            held[np.concatenate([places[j] for j in (k, *twins.get(k, ()))])] = _HELD
+            loss = _left_out_squares(linear, noise, used, held) - free
+            worth.append(loss.mean() / (loss.std(ddof=1) / np.sqrt(len(loss)) + 1e-300))
+        least = int(np.argmin(worth))
+        if worth[least] > _SURE:
+            break
+        width[places[kept[least]]] = stated[places[kept[least]]]  # as any other place
+        del kept[least]
+    return kept
+
+
+def _left_out_squares(linear: marginal.Linear, noise: np.ndarray, used: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Sum of the whitened squares of each posture, predicted without its fold."""
+    postures = np.unique(linear.posture[used & (linear.posture >= 0)])
+    found = np.zeros(len(postures))
+    for k in range(min(levels.FOLDS, len(postures))):
+        out = np.isin(linear.posture, postures[k :: levels.FOLDS])
+        at, _ = _posterior_mode(linear, noise, used & ~out, width)
+        rows = np.flatnonzero(out & used)
+        square = ((linear.residual[rows] + linear.jacobian[rows] @ (at - linear.at)) / noise[rows]) ** 2
+        found += np.bincount(np.searchsorted(postures, linear.posture[rows]), square, minlength=len(postures))
+    return found
+
+
+def _better(calibration: Calibration) -> bool:
+    """Whether held-out postures are predicted better than by the frames alone, in position and orientation together."""
+    both = [e for e in (calibration.position, calibration.orientation) if e is not None and e.validated_before > 0.0]
+    return bool(np.mean([np.log(e.validated_after / e.validated_before) for e in both]) < 0.0) if both else False
+
+
 def _twins(run: Run) -> list[tuple[Name, ...]]:
     """Names that nothing can tell apart: a base that is said to be known stands where the first joint stands."""
     place = (run.model.joints[run.chain[0]].name,)
     known = any(b.effect.name == "base_frame" for b in run.blocks)
     return [(Name("base_frame", ()), *(Name(effect, place) for effect in GEOMETRY))] if known else []
-
-
-def _row_noise(linear: marginal.Linear, posterior: marginal.Posterior) -> np.ndarray:
-    weight = np.where(linear.posture >= 0, posterior.weight[linear.posture], 1.0)
-    return posterior.noise[linear.channel] / np.sqrt(weight)
 
 
 def _posterior_mode(linear: marginal.Linear, noise, used, width) -> tuple[np.ndarray, np.ndarray]:
@@ -198,15 +256,19 @@ def _effect_scores(run: Run) -> tuple[float, float]:
     """p-value of the largest score of an effect beside the level alone, and beside the level with its effects."""
     if run.effects is None:
         return 1.0, 1.0
-    slices = run.effects.slices()
+    grid = range(run.effects.grid)
+    slices = run.effects.slices(grid)
     linear, posterior = run.choice.fits[run.choice.level]
     found = []
     for fit in ((linear, posterior), (run.fit[1], run.fit[2])):
-        Z = run.effects.jacobian(_without_effects(fit[0], run))
-        blocks = [Z[:, s] for k, s in enumerate(slices) if k not in (run.named if fit[0] is run.fit[1] else ())]
+        at = _without_effects(fit[0], run)
+        Z = run.effects.jacobian(at, grid)
+        blocks = [Z[:, s] for k, s in slices.items() if k not in (run.named if fit[0] is run.fit[1] else ())]
         free = levels.free_at(run.choice.level, fit[0].prior)
-        scores = score_blocks(fit[0], _row_noise(*fit), run.used, fit[1].precision, blocks, free)
-        found.append(scores.p_value)
+        beside = fit[0], row_noise(*fit), run.used, fit[1].precision
+        p_grid = score_blocks(*beside, blocks, free).p_value
+        p_high = score_waves(*beside, run.effects.waves(at), free)
+        found.append(min(p_grid, p_high) if p_high == 1.0 else min(1.0, 2.0 * min(p_grid, p_high)))
     return found[0], found[1]
 
 
@@ -216,7 +278,7 @@ def _play(run: Run) -> tuple[float, str]:
     joints = [(c.at[0], k) for k, c in enumerate(final.columns) if c.effect == "joint_offset"]
     free = levels.free_at(run.choice.level, linear.prior)
     ways = linear.jacobian[:, [k for _, k in joints]]
-    p_value, worst = score_jitter(linear, _row_noise(linear, posterior), run.used, posterior.precision, ways, free)
+    p_value, worst = score_jitter(linear, row_noise(linear, posterior), run.used, posterior.precision, ways, free)
     return p_value, joints[worst][0]
 
 

@@ -3,23 +3,27 @@ r"""Score tests of blocks of columns against a fit with priors, with the maximum
 The fit's rows, whitened, and the rows of its prior stand above each other: $e = (r, \Lambda^{1/2} y)$ is what it
 leaves, M the projector off its columns, $\tilde Z = (Z, 0)$ a block. $Q = |B' e|^2$ with B an orthonormal basis of
 $M \tilde Z$, over the mean square of e; Wilson and Hilferty's cube root puts blocks of different size on one scale.
-Under the null e is white: it is drawn again, with its own level, and the largest score of all blocks kept.
+Two nulls, the larger p counts: e is white, drawn again with its own level; and e of whole postures with their signs
+flipped, which holds where the error of a posture moves all its rows together (play, a slack joint). The largest score
+of all blocks is kept in each draw.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from ..estimation.marginal import FLAT, Linear
+from ..estimation.marginal import FLAT, Linear, Posterior
 
-__all__ = ["Scores", "score_blocks", "score_jitter"]
+__all__ = ["Scores", "row_noise", "score_blocks", "score_jitter", "score_waves", "waves_shown"]
 
 _CUT = 1e-7  # of a column's length, that must be left beside the fit
 _DRAWS = 400
+_WAVE_DRAWS = 200
+_SHOWN = 1e-2  # chance that noise alone gives the largest wave of a joint, for it to be looked at
 
 Array = np.ndarray
 
@@ -52,11 +56,104 @@ def score_blocks(
     level = float(e @ e / freedom)
     q = _sums((whole.T @ e)[None] ** 2, size)[0] / max(level, 1e-300)
     draws = np.random.default_rng(seed).normal(size=(_DRAWS, len(e)))
-    square = np.sum(draws**2, axis=1) - np.sum((draws @ basis) ** 2, axis=1)
-    null = _sums((draws @ whole) ** 2, size) / (square / freedom)[:, None]
-    z, largest = _scale(q, size), _scale(null, size).max(axis=1, initial=-np.inf)
+    z = _scale(q, size)
     top = z.max(initial=-np.inf)
-    return Scores(q, z, size, float((1 + np.sum(largest >= top)) / (_DRAWS + 1)), level)
+    p_value = 0.0
+    for null in (draws, _flipped(e, linear.posture[rows], draws)):
+        square = np.sum(null**2, axis=1) - np.sum((null @ basis) ** 2, axis=1)
+        scores = _sums((null @ whole) ** 2, size) / (square / freedom)[:, None]
+        largest = _scale(scores, size).max(axis=1, initial=-np.inf)
+        p_value = max(p_value, float((1 + np.sum(largest >= top)) / (_DRAWS + 1)))
+    return Scores(q, z, size, p_value, level)
+
+
+def row_noise(linear: Linear, posterior: Posterior) -> Float[Array, " rows"]:
+    """One sigma of every row, m or rad, wider where its posture has less weight."""
+    weight = np.where(linear.posture >= 0, posterior.weight[linear.posture], 1.0)
+    return posterior.noise[linear.channel] / np.sqrt(weight)
+
+
+Waves = Iterable[tuple[Int[Array, " orders"], Float[Array, "rows orders"], Float[Array, "rows orders"]]]
+
+
+def score_waves(
+    linear: Linear,
+    noise: Float[Array, " rows"],
+    used: Bool[Array, " rows"],
+    precision: Float[Array, " unknowns"],
+    waves: Waves,
+    free: Bool[Array, " unknowns"],
+    seed: int = 0,
+) -> float:
+    r"""Family-wise p-value of the largest wave (sine and cosine of an order of a joint) beside the fit.
+
+    A periodogram of what the fit leaves: with Q what a wave takes of the sum of squares S, white noise of f degrees of
+    freedom exceeds it with probability $(1 - Q/S)^{f/2}$ in one wave, m times that in m of them; and postures with
+    flipped signs are drawn as in `score_blocks`. The larger of both counts.
+    """
+    rows = np.flatnonzero(used)
+    e, basis, freedom = _left(linear, noise, rows, precision, free)
+    draws = np.random.default_rng(seed).normal(size=(_WAVE_DRAWS, len(e)))
+    null = _flipped(e, linear.posture[rows], draws)
+    total = np.sum(null**2, axis=1) - np.sum((null @ basis) ** 2, axis=1)
+    count, found, largest, scale = 0, 0.0, np.zeros(_WAVE_DRAWS), noise[rows, None]
+    for which, sine, cosine in waves:
+        first, second = _orthonormal(sine[rows] / scale, cosine[rows] / scale, basis)
+        count += len(which)
+        found = max(found, float(_taken(e[None], first, second).max(initial=0.0)))
+        largest = np.maximum(largest, _taken(null, first, second).max(axis=1, initial=0.0))
+    if not count:
+        return 1.0
+    share = min(found / float(e @ e), 1.0)
+    white = min(1.0, count * (1.0 - share) ** (0.5 * (freedom - 2)))
+    return max(white, float((1 + np.sum(largest / total >= share)) / (_WAVE_DRAWS + 1)))
+
+
+def waves_shown(
+    linear: Linear,
+    noise: Float[Array, " rows"],
+    used: Bool[Array, " rows"],
+    precision: Float[Array, " unknowns"],
+    waves: Waves,
+    free: Bool[Array, " unknowns"],
+    beside: Float[Array, "rows _"],
+) -> list[int]:
+    """The blocks of the largest wave of each joint beside the fit and the columns `beside`, where noise is unlikely."""
+    rows = np.flatnonzero(used)
+    e, basis, freedom = _left(linear, noise, rows, precision, free)
+    if beside.shape[1]:
+        basis = np.hstack([basis, _basis(_above(beside[rows] / noise[rows, None], len(e)), basis)])
+        e = e - basis @ (basis.T @ e)
+    found, scale = [], noise[rows, None]
+    for which, sine, cosine in waves:
+        taken = _taken(e[None], *_orthonormal(sine[rows] / scale, cosine[rows] / scale, basis))[0]
+        best = int(np.argmax(taken))
+        if len(which) * (1.0 - min(taken[best] / (e @ e), 1.0)) ** (0.5 * (freedom - 2)) < _SHOWN:
+            found.append(int(which[best]))
+    return found
+
+
+def _orthonormal(sine: Array, cosine: Array, basis: Array) -> tuple[Array, Array]:
+    """Two orthonormal vectors for each order (rows and prior rows, orders), off the basis; zeros where none is left."""
+    inside = basis[: len(sine)]
+
+    def off(Z: Array) -> Array:
+        whole = _above(Z, len(basis))
+        return whole - basis @ (inside.T @ Z)
+
+    def unit(Z: Array, before: Array) -> Array:
+        length = np.linalg.norm(Z, axis=0)
+        return np.where(length > 1e-3 * before, Z / np.where(length > 0.0, length, 1.0), 0.0)
+
+    sizes = [np.linalg.norm(Z, axis=0) for Z in (sine, cosine)]
+    first = unit(off(sine), sizes[0])
+    second = off(cosine)
+    return first, unit(second - first * np.sum(first * second, axis=0), sizes[1])
+
+
+def _taken(e: Array, first: Array, second: Array) -> Array:
+    """(draws, orders) what each pair of vectors takes of the squares of each draw."""
+    return (e @ first) ** 2 + (e @ second) ** 2
 
 
 def score_jitter(
@@ -93,6 +190,20 @@ def score_jitter(
     return float((1 + np.sum(largest >= found.max())) / (_DRAWS + 1)), int(np.argmax(found))
 
 
+def _flipped(e: Array, posture: Array, draws: Array) -> Array:
+    """(draws, rows) e with the signs of the `draws`, one for all rows of a posture; rows of the prior drawn anew.
+
+    A single row of the prior can hold all the evidence of an offset, which no sign takes away.
+    """
+    sign = np.where(draws < 0.0, -1.0, 1.0)
+    inside = np.flatnonzero(posture >= 0)
+    _, first, member = np.unique(posture[inside], return_index=True, return_inverse=True)
+    sign[:, inside] = sign[:, inside[first]][:, member]
+    found = sign * e
+    found[:, len(posture) :] = draws[:, len(posture) :]
+    return found
+
+
 def _left(linear: Linear, noise: Array, rows: Array, precision: Array, free: Array) -> tuple[Array, Array, int]:
     """What the fit leaves of its rows and prior rows, whitened; an orthonormal basis of its columns; its freedom."""
     G = linear.jacobian[rows][:, free] / noise[rows, None]
@@ -101,7 +212,7 @@ def _left(linear: Linear, noise: Array, rows: Array, precision: Array, free: Arr
     left = (linear.residual[rows] - linear.jacobian[rows][:, ~free] @ linear.at[~free]) / noise[rows]
     e = np.concatenate([left, root * linear.at[free]])
     basis, kept = np.linalg.qr(A)
-    solid = np.abs(np.diag(kept)) > 1e-12 * np.abs(np.diag(kept)).max()
+    solid = np.abs(np.diag(kept)) > 1e-12 * np.abs(np.diag(kept)).max(initial=0.0)  # nothing is free: no column
     basis = basis[:, solid]
     return e - basis @ (basis.T @ e), basis, len(e) - basis.shape[1]
 

@@ -9,7 +9,7 @@ folds, so that what it reports on the postures of a fold was chosen without them
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from ..effects.kinematic import Column
 from ..estimation import marginal
 from ..estimation.marginal import FLAT, Linear, Posterior
 from . import posefit
+from .kinematic_scores import row_noise, waves_shown
 from .posegroups import Measured
 from .posesolver import solve
 
@@ -54,18 +55,22 @@ _RIVAL = 0.9  # of the gain: what gains that much is not told apart
 Array = np.ndarray
 
 
+Wave = tuple[Int[Array, " orders"], Float[Array, "rows orders"], Float[Array, "rows orders"]]  # blocks, sines, cosines
+
+
 class Effects(NamedTuple):
     """Candidate effects, each a block of columns, linear at the nominal robot with its frames."""
 
     blocks: tuple[tuple[Column, ...], ...]
-    jacobian: Callable[[Float[Array, " unknowns"]], Float[Array, "rows all"]]  # of all blocks side by side, at a fit
-    sizes: Float[Array, " all"]  # of the coefficients that jacobian counts in
+    jacobian: Callable[[Float[Array, " unknowns"], Sequence[int]], Float[Array, "rows some"]]  # of blocks, side by side
     handicap: Float[Array, " blocks"]  # share of the error by which a more flexible effect must do better
+    grid: int  # so many blocks come before the gear errors of high order, of which `waves` tells which to look at
+    waves: Callable[[Float[Array, " unknowns"]], Iterator[Wave]]  # joint by joint, at a fit
 
-    def slices(self) -> list[slice]:
-        """Columns of each block."""
-        ends = np.cumsum([0, *(len(block) for block in self.blocks)])
-        return [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    def slices(self, which: Sequence[int]) -> dict[int, slice]:
+        """Columns of each of the blocks `which` when they stand side by side."""
+        ends = np.cumsum([0, *(len(self.blocks[k]) for k in which)])
+        return {k: slice(a, b) for k, a, b in zip(which, ends[:-1], ends[1:], strict=True)}
 
 
 class Choice(NamedTuple):
@@ -220,15 +225,40 @@ def _forward(
     effects: Effects,
     scores: dict[str, float],
 ) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...]]:
-    """Effects that join one by one, each the one that gains most on the inner folds."""
-    Z, slices = effects.jacobian(linear.at), effects.slices()
+    """Effects that join one by one, each the one that gains most on the inner folds.
+
+    Gear errors of high order take part where the rows to fit show one, at first or beside what joined without them.
+    """
     free = free_at(level, linear.prior)
-    folds = []
-    for rows, fold in _inner_folds(measured, used):
-        inner = marginal.fit(linear, rows, free, robust=True, start=posterior, iterations=15)
-        folds.append(_Inner.make(measured, linear, inner, rows, fold, free, Z))
-    chosen: list[int] = []
-    rivals: list[tuple[int, ...]] = []
+    inner = [
+        (marginal.fit(linear, rows, free, robust=True, start=posterior, iterations=15), rows, fold)
+        for rows, fold in _inner_folds(measured, used)
+    ]
+    noise = row_noise(linear, posterior)
+
+    def joined(which: Sequence[int]) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...], dict[str, float]]:
+        Z = effects.jacobian(linear.at, which)
+        folds = [_Inner.make(measured, linear, *one, free, Z) for one in inner]
+        return _joined(folds, effects, which, level)
+
+    def shown(beside: Sequence[int]) -> list[int]:
+        columns = effects.jacobian(linear.at, beside)
+        return waves_shown(linear, noise, used, posterior.precision, effects.waves(linear.at), free, columns)
+
+    which = [*range(effects.grid), *shown(())]
+    chosen, rivals, found = joined(which)
+    more = sorted(set(shown(chosen)) - set(which)) if chosen else []
+    if more:
+        chosen, rivals, found = joined([*which, *more])
+    scores.update(found)
+    return chosen, rivals
+
+
+def _joined(
+    folds: Sequence[_Inner], effects: Effects, which: Sequence[int], level: str
+) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...], dict[str, float]]:
+    """Of the blocks `which`, those that join, what gains nearly as much as each, and the errors on the inner folds."""
+    slices, chosen, rivals, scores = effects.slices(which), [], [], {}
     current = _score_of(folds)
     while len(chosen) < _MOST:
         ranked = _screen(folds, slices, chosen)
@@ -243,7 +273,7 @@ def _forward(
         current = trials[best]
         chosen.append(best)
         scores[f"{level} + " + " + ".join(_name(effects.blocks[k]) for k in chosen)] = current
-    return tuple(chosen), tuple(rivals)
+    return tuple(chosen), tuple(rivals), scores
 
 
 def _name(block: tuple[Column, ...]) -> str:
@@ -309,10 +339,10 @@ def _score_of(folds: Sequence[_Inner], which: Array | None = None) -> float:
     return _score([np.concatenate([part[c] for part in parts]) for c in (0, 1)])
 
 
-def _screen(folds: Sequence[_Inner], slices: Sequence[slice], taken: Sequence[int]) -> list[int]:
+def _screen(folds: Sequence[_Inner], slices: Mapping[int, slice], taken: Sequence[int]) -> list[int]:
     """Blocks by how much of the fitted rows they explain, for their number of columns; not those taken already."""
     merit = {}
-    for k, block in enumerate(slices):
+    for k, block in slices.items():
         if k not in taken:
             which = np.r_[block]
             drops = [inner.residual[0] @ inner.columns[0][:, which] @ -inner.solve(which)[0] for inner in folds]

@@ -251,7 +251,8 @@ def _flat_rows(
 def _samples_last(blocks: Array, samples: int) -> np.ndarray:
     """(blocks, ..., block) as (..., samples)."""
     beside = np.moveaxis(np.asarray(blocks), 0, -2)
-    return beside.reshape(*beside.shape[:-2], -1)[..., :samples]
+    blocks, block = beside.shape[-2:]
+    return beside.reshape(*beside.shape[:-2], blocks * block)[..., :samples]
 
 
 def predict(problem: Problem, unknowns: Float[Any, " unknowns"]) -> Float[np.ndarray, " rows"]:

@@ -69,6 +69,8 @@ def _sharpest(model: RobotModel, postures: Sequence[Postures], block: Block, tak
     grid = np.array(block.effect.shape[1])
     place = int(np.argmin(np.abs(grid - block.shape)))
     low, high = grid[max(place - 1, 0)], grid[min(place + 1, len(grid) - 1)]
+    if block.reach:
+        low, high = block.shape - block.reach, block.shape + block.reach
     at = tuple(model.joint_index(name) for name in block.columns[0].at)
 
     def moved(shape: float) -> Block:
