@@ -217,7 +217,7 @@ class Presliding(Bristle):
     equation = "force (z - s(v)), z' = v/distance (1 - z s(v))"
     separated_by = "reversals of {at} at several accelerations: presliding is late in position, a delay in time"
     force: Scalar = amplitude("N m", lower=0.0)
-    distance: Scalar = shape("rad", (0.003, 0.01, 0.03, 0.1), (5e-4, 0.4))
+    distance: Scalar = shape("rad", (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1), (2e-5, 0.4))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
         return self.force * (self.bent(motion) - self.here(motion.direction))
@@ -240,7 +240,7 @@ class LuGreFriction(Bristle):
     separated_by = "slow reversals of {at}, and constant speeds below 0.3 rad/s"
     searched = False  # presliding and Stribeck friction together, which a diagnosis finds one after the other
     force: Scalar = amplitude("N m", lower=0.0)
-    distance: Scalar = shape("rad", (0.003, 0.01, 0.03, 0.1), (5e-4, 0.4))
+    distance: Scalar = shape("rad", (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1), (2e-5, 0.4))
     rise: Scalar = shape("", (0.1, 0.5), (0.0, 3.0))
     speed: Scalar = shape("rad/s", (0.05, 0.2), (0.012, 0.64))
 
