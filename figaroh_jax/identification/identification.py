@@ -201,7 +201,7 @@ def _refused(
             if share > DEAD:
                 refused.add(name)
                 notes.append(
-                    f"torque of {name} is not fitted: it stands at one value for {share:.0%} of {one.file}"
+                    f"torque of {name} is not fitted: it is constant in {share:.0%} of {one.file}"
                     " (dead zone, or not measured)"
                 )
     if refused >= set(names):
