@@ -43,8 +43,8 @@ def arm(name: str, folder: Path) -> postures.Arm:
     return postures.load_arm(path, "base", "tool0")
 
 
-def diagnose(robot: postures.Arm, case: postures.Hidden, forbid: tuple[str, ...] = ()) -> Any:
-    """The library's answer to a case."""
+def diagnose(robot: postures.Arm, case: postures.Hidden, forbid: tuple[str, ...] = (), held: int = 0) -> Any:
+    """The library's answer to a case, the last `held` of its recordings held out."""
     from figaroh_jax.calibration.kinematic_diagnosis import diagnose_poses
     from figaroh_jax.formats.config import Load
     from figaroh_jax.formats.urdf import load_urdf
@@ -54,7 +54,8 @@ def diagnose(robot: postures.Arm, case: postures.Hidden, forbid: tuple[str, ...]
     for k, r in enumerate(case.recordings):
         given = postures.arguments(robot, r, case)
         load = Load(**given.pop("load")) if given["load"] else given.pop("load")
-        more = given | {"unknown": case.unknown, "load": load}
+        role = "holdout" if k >= len(case.recordings) - held else "fit"
+        more = given | {"unknown": case.unknown, "load": load, "role": role}
         recordings.append(PoseRecording(name=f"run{k}", file=Path(f"run{k}"), time=r.time, position=r.q, **more))
     return diagnose_poses(load_urdf(robot.path, joints=list(robot.joints)), recordings, forbid)
 

@@ -11,6 +11,7 @@ import pytest
 
 from figaroh_jax.calibration.calibrated import Calibration
 from figaroh_jax.calibration.calibration import Run, calibrate
+from figaroh_jax.calibration.kinematic_diagnosis import diagnose_poses
 
 DISTANCES = {"mukca panda_2_clean": 0.19, "mukca panda_3": 0.04, "mukca panda_4_clean": 0.04}  # mm, not fitted
 ROOT = Path(__file__).resolve().parents[1]
@@ -73,6 +74,33 @@ def test_real_sets_predict_at_least_as_well_as_stated(name: str, frames: float, 
     if name == "talos_contact":
         assert abs(found.position.before - 5.159) < 1e-3  # an external fact
         assert "joint_compliance" in {effect for effect, *_ in names(found)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "talos_contact",
+        "tiago_mocap, 34",
+        "tiago_mocap, all 35",
+        "tiago_mocap, three markers",
+        "irb120_wu2015",
+        "panda_handeye_board",
+        *DISTANCES,
+        "mukca panda_1",
+    ],
+)
+def test_what_is_named_predicts_held_out_postures_better_than_the_frames_alone(name: str, data_dir: Path):
+    sets = bench(data_dir)
+    model, recordings = sets.SETS[name]()
+    points = [replace(r, values=sets.points_of(r.values)) if r.kind == "position" else r for r in recordings]
+    found = diagnose_poses(model, points)
+    position = found.calibration.position
+    assert position is not None
+    if any(cause.name.effect != "outlier" for cause in found.causes):
+        assert position.validated_after < position.validated_before
+    for cause in found.causes:
+        assert cause.name.effect == "outlier" or cause.gain.after < cause.gain.before, cause
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import poses
 import pytest
 import test_calibration as tasks
@@ -70,6 +71,40 @@ def test_the_order_of_a_gear_is_found_between_the_values_of_the_grid(folder: Pat
     order = found.causes[0].parameters["order"]
     assert order.std < 0.05
     assert abs(order.value - case.order) < 5.0 * order.std
+
+
+def test_the_order_of_a_harmonic_drive_is_found_in_the_postures(folder: Path):
+    bench = study()
+    arm = bench.arm("arm6", folder)
+    case = postures.hide(arm, "gear_transmission_error", 6.0, np.random.default_rng(46), orders=(40.0, 320.0))
+    found = bench.diagnose(arm, case)
+    assert bench.grade(case, found) == "right", (case.right, found.causes)
+    order = found.causes[0].parameters["order"]
+    assert abs(order.value - case.order) < 5.0 * order.std < 1.0
+
+
+def test_frames_may_all_be_known(folder: Path):
+    """Nothing of the device is unknown then: its unknowns are an empty set."""
+    arm = study().arm("arm6", folder)
+    rng = np.random.default_rng(47)
+    real = poses.truth(rng, offset=np.array([0.0, 0.0, 0.03, 0.0, 0.0, 0.0]), base=pin.SE3.Identity())
+    q = poses.postures(rng, 40)
+    seen = postures.as_seen(poses.tool_poses(arm.path, q, real), rng)
+    right = frozenset({("joint_offset", ("j3",))})
+    case = postures.Hidden("joint_offset", right, (), (postures.Recording(np.arange(40.0), q, seen, False),))
+    found = study().diagnose(arm, case)
+    assert study().grade(case, found) == "right", found.causes
+    assert abs(found.causes[0].parameters["offset"].value - 0.03) < 2e-3
+    assert found.after[0] < 0.02 * found.before[0]
+
+
+def test_a_robot_that_is_slack_gets_no_joint_offsets(folder: Path):
+    """What is named predicts postures that were held out better than the frames alone; here offsets do not."""
+    arm = study().arm("arm6", folder)
+    case = postures.slack(arm, np.random.default_rng(7), 30, 12e-3, 10)
+    found = study().diagnose(arm, case, held=1)
+    assert not {cause.name.effect for cause in found.causes} & {"joint_offset", "link_geometry"}, found.causes
+    assert found.verdict != "nothing"
 
 
 def test_settling_that_is_not_in_the_catalogue_is_not_called_an_encoder_scale(folder: Path):

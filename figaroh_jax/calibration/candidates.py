@@ -18,6 +18,7 @@ from ..recordings.poses import PoseRecording
 from ..results import Name
 from ..rigid.model import RobotModel, dofs
 from . import posefit
+from .kinematic_scores import Waves
 from .levels import Effects
 from .posegroups import Measured
 
@@ -182,21 +183,19 @@ def effects_on(model: RobotModel, postures: Sequence[Postures], measured: Measur
     kept: dict[int, list[Moves]] = {}  # of the grid all are needed again and again, of the many high orders a few
 
     def jacobian(unknowns: Float[np.ndarray, " unknowns"], which: Sequence[int]) -> Float[np.ndarray, "rows some"]:
+        if not len(which):
+            return np.zeros((len(measured.posture), 0))
         for k in which:
             kept.setdefault(k, [moves(column, postures) for column in blocks[k].columns])
         sizes = np.array([size for k in which for size in blocks[k].sizes])
         return moved_rows(measured, twist_rows(measured, unknowns), [m for k in which for m in kept[k]]) * sizes
 
-    def waves(unknowns: Float[np.ndarray, " unknowns"]) -> Iterator[tuple[Array, Array, Array]]:
-        by_twist = twist_rows(measured, unknowns) if grid < len(blocks) else {}
-        inside = measured.posture >= 0
+    def waves(unknowns: Float[np.ndarray, " unknowns"]) -> Iterator[Waves]:
+        by_twist = twist_rows(measured, unknowns) if high else {}
         for joint, which in high.items():
-            rows, phase = np.zeros(len(inside)), np.zeros((len(inside), len(which)))
-            if joint in by_twist:
-                rows[inside] = by_twist[joint][inside] @ axis_twist(model, joint)
-            angle = positions_of(model, postures, joint)[measured.posture[inside]]
-            phase[inside] = np.outer(angle, [blocks[k].shape for k in which])
-            yield np.array(which), rows[:, None] * np.sin(phase), rows[:, None] * np.cos(phase)
+            rows = by_twist[joint] @ axis_twist(model, joint) if joint in by_twist else np.zeros(len(measured.posture))
+            angle, order = positions_of(model, postures, joint), np.array([blocks[k].shape for k in which])
+            yield Waves(np.array(which), np.where(measured.posture >= 0, rows, 0.0), angle, order)
 
     count = np.array([len(b.effect.shape[1]) if not b.reach else len(blocks) - grid for b in blocks])
     handicap = 0.01 * (np.array([len(b.columns) for b in blocks]) - 1) + 0.005 * np.log(count)

@@ -8,7 +8,7 @@ that was found predicts held-out postures no better than the frames alone, nothi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -146,8 +146,7 @@ def _geometry_of(run: Run) -> _Geometry:
 
 def _geometry(run: Run, calibration: Calibration, alpha: float) -> tuple[list[Cause], float]:
     """Offsets and links beyond their stated tolerance, the most evident first, and the p-value of the first one."""
-    linear, names, places, columns, stated = _geometry_of(run)
-    width = stated.copy()
+    linear, names, places, columns, width = _geometry_of(run)
     noise = row_noise(linear, run.fit[2])
     named: list[int] = []
     first = 1.0
@@ -164,9 +163,7 @@ def _geometry(run: Run, calibration: Calibration, alpha: float) -> tuple[list[Ca
         named.append(_simplest(scores))
         width[places[named[-1]]] = _WIDE
     gain, twins = _gain(calibration), _twins(run)
-    same = [[names.index(name) for name in twin if name in names] for twin in twins]
-    beside = {k: [j for j in group if j != k] for group in same for k in group}
-    named = _needed(linear, noise, run.used, stated, places, named, beside)
+    named = _needed(linear, noise, run.used, places, named)
     causes = []
     for k in named:
         values = {
@@ -184,16 +181,14 @@ def _needed(
     linear: marginal.Linear,
     noise: np.ndarray,
     used: np.ndarray,
-    stated: np.ndarray,
     places: Sequence[np.ndarray],
     named: Sequence[int],
-    twins: Mapping[int, Sequence[int]],
 ) -> list[int]:
     """Those of the blocks `named` that postures left out are worse without, by more than chance.
 
-    Without: held at the nominal geometry, together with its `twins`, the others within their `stated` width or free.
+    All other geometry is held at the nominal one: what a joint's offset does, the next link can do as well.
     """
-    kept, width = list(named), stated.copy()
+    kept, width = list(named), np.full(len(linear.at), _HELD)
     for k in kept:
         width[places[k]] = _WIDE
     while kept:
@@ -201,14 +196,13 @@ def _needed(
         worth = []
         for k in kept:
             held = width.copy()
-            held[np.concatenate([places[j] for j in (k, *twins.get(k, ()))])] = _HELD
+            held[places[k]] = _HELD
             loss = _left_out_squares(linear, noise, used, held) - free
             worth.append(loss.mean() / (loss.std(ddof=1) / np.sqrt(len(loss)) + 1e-300))
         least = int(np.argmin(worth))
         if worth[least] > _SURE:
             break
-        width[places[kept[least]]] = stated[places[kept[least]]]  # as any other place
-        del kept[least]
+        width[places[kept.pop(least)]] = _HELD
     return kept
 
 

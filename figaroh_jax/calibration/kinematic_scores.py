@@ -73,7 +73,18 @@ def row_noise(linear: Linear, posterior: Posterior) -> Float[Array, " rows"]:
     return posterior.noise[linear.channel] / np.sqrt(weight)
 
 
-Waves = Iterable[tuple[Int[Array, " orders"], Float[Array, "rows orders"], Float[Array, "rows orders"]]]
+class Waves(NamedTuple):
+    """Gear errors of one joint: how its motion moves the rows, its angle in each posture, the orders in question."""
+
+    blocks: Int[Array, " orders"]
+    motion: Float[Array, " rows"]  # m or rad for 1 rad
+    angle: Float[Array, " postures"]  # rad
+    order: Float[Array, " orders"]
+
+    def columns(self, posture: Int[Array, " rows"]) -> tuple[Float[Array, "rows orders"], Float[Array, "rows orders"]]:
+        """Sines and cosines of all orders in the rows of the given postures."""
+        phase = np.outer(np.where(posture >= 0, self.angle[posture], 0.0), self.order)
+        return self.motion[:, None] * np.sin(phase), self.motion[:, None] * np.cos(phase)
 
 
 def score_waves(
@@ -81,7 +92,7 @@ def score_waves(
     noise: Float[Array, " rows"],
     used: Bool[Array, " rows"],
     precision: Float[Array, " unknowns"],
-    waves: Waves,
+    waves: Iterable[Waves],
     free: Bool[Array, " unknowns"],
     seed: int = 0,
 ) -> float:
@@ -97,9 +108,10 @@ def score_waves(
     null = _flipped(e, linear.posture[rows], draws)
     total = np.sum(null**2, axis=1) - np.sum((null @ basis) ** 2, axis=1)
     count, found, largest, scale = 0, 0.0, np.zeros(_WAVE_DRAWS), noise[rows, None]
-    for which, sine, cosine in waves:
+    for one in waves:
+        sine, cosine = one.columns(linear.posture)
         first, second = _orthonormal(sine[rows] / scale, cosine[rows] / scale, basis)
-        count += len(which)
+        count += len(one.blocks)
         found = max(found, float(_taken(e[None], first, second).max(initial=0.0)))
         largest = np.maximum(largest, _taken(null, first, second).max(axis=1, initial=0.0))
     if not count:
@@ -114,7 +126,7 @@ def waves_shown(
     noise: Float[Array, " rows"],
     used: Bool[Array, " rows"],
     precision: Float[Array, " unknowns"],
-    waves: Waves,
+    waves: Iterable[Waves],
     free: Bool[Array, " unknowns"],
     beside: Float[Array, "rows _"],
 ) -> list[int]:
@@ -124,13 +136,26 @@ def waves_shown(
     if beside.shape[1]:
         basis = np.hstack([basis, _basis(_above(beside[rows] / noise[rows, None], len(e)), basis)])
         e = e - basis @ (basis.T @ e)
-    found, scale = [], noise[rows, None]
-    for which, sine, cosine in waves:
-        taken = _taken(e[None], *_orthonormal(sine[rows] / scale, cosine[rows] / scale, basis))[0]
+    found, inside = [], rows[linear.posture[rows] >= 0]
+    left, member = e[: len(rows)][linear.posture[rows] >= 0], linear.posture[inside]
+    for one in waves:
+        motion = one.motion[inside] / noise[inside]
+        pull, square = (np.bincount(member, x, minlength=len(one.angle)) for x in (motion * left, motion**2))
+        phase = np.outer(one.angle, one.order)
+        taken = _by_posture(np.sin(phase), np.cos(phase), pull, square)
         best = int(np.argmax(taken))
-        if len(which) * (1.0 - min(taken[best] / (e @ e), 1.0)) ** (0.5 * (freedom - 2)) < _SHOWN:
-            found.append(int(which[best]))
+        if len(one.order) * (1.0 - min(taken[best] / (e @ e), 1.0)) ** (0.5 * (freedom - 2)) < _SHOWN:
+            found.append(int(one.blocks[best]))
     return found
+
+
+def _by_posture(sine: Array, cosine: Array, pull: Array, square: Array) -> Array:
+    """What each order takes of the sum of squares, from the postures' own sums; waves are nearly off the fit."""
+    s, c = pull @ sine, pull @ cosine
+    ss, sc, cc = square @ sine**2, square @ (sine * cosine), square @ cosine**2
+    determinant = ss * cc - sc**2
+    solid = determinant > 1e-3 * ss * cc
+    return np.where(solid, (cc * s**2 - 2 * sc * s * c + ss * c**2) / np.where(solid, determinant, 1.0), 0.0)
 
 
 def _orthonormal(sine: Array, cosine: Array, basis: Array) -> tuple[Array, Array]:

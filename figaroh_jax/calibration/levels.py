@@ -19,7 +19,7 @@ from ..effects.kinematic import Column
 from ..estimation import marginal
 from ..estimation.marginal import FLAT, Linear, Posterior
 from . import posefit
-from .kinematic_scores import row_noise, waves_shown
+from .kinematic_scores import Waves, row_noise, waves_shown
 from .posegroups import Measured
 from .posesolver import solve
 
@@ -55,9 +55,6 @@ _RIVAL = 0.9  # of the gain: what gains that much is not told apart
 Array = np.ndarray
 
 
-Wave = tuple[Int[Array, " orders"], Float[Array, "rows orders"], Float[Array, "rows orders"]]  # blocks, sines, cosines
-
-
 class Effects(NamedTuple):
     """Candidate effects, each a block of columns, linear at the nominal robot with its frames."""
 
@@ -65,7 +62,7 @@ class Effects(NamedTuple):
     jacobian: Callable[[Float[Array, " unknowns"], Sequence[int]], Float[Array, "rows some"]]  # of blocks, side by side
     handicap: Float[Array, " blocks"]  # share of the error by which a more flexible effect must do better
     grid: int  # so many blocks come before the gear errors of high order, of which `waves` tells which to look at
-    waves: Callable[[Float[Array, " unknowns"]], Iterator[Wave]]  # joint by joint, at a fit
+    waves: Callable[[Float[Array, " unknowns"]], Iterator[Waves]]  # joint by joint, at a fit
 
     def slices(self, which: Sequence[int]) -> dict[int, slice]:
         """Columns of each of the blocks `which` when they stand side by side."""

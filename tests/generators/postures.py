@@ -88,8 +88,18 @@ def load_arm(path: Path, base: str, tool: str, joints: tuple[str, ...] = ()) -> 
     return Arm(path, robot, tuple(robot.names)[1:], base, tool)
 
 
-def hide(arm: Arm, effect: str | None, size: float, rng: np.random.Generator, count: int = 80) -> Hidden:
-    """A case with `effect` of `size` sigmas at a place drawn at random; None hides nothing."""
+def hide(
+    arm: Arm,
+    effect: str | None,
+    size: float,
+    rng: np.random.Generator,
+    count: int = 80,
+    orders: tuple[float, float] = (2.5, 11.0),
+) -> Hidden:
+    """A case with `effect` of `size` sigmas at a place drawn at random; None hides nothing.
+
+    `orders` is the range of a gear error's order.
+    """
     n = len(arm.joints)
     loaded = np.arange(count) >= (count // 2 if effect == "payload_deflection" else count)
     q = _postures(arm, rng, count)
@@ -104,9 +114,9 @@ def hide(arm: Arm, effect: str | None, size: float, rng: np.random.Generator, co
         frames[effect] = frames[effect] * _twist_pose(_drawn(rng, 6, size))
         if effect == "base_frame":
             frames["tool_frame"] = pin.SE3(pin.exp3(0.2 * rng.normal(size=3)), 0.1 * rng.normal(size=3))
-    right, error = _placed(arm, effect, size, rng, q, loaded)
+    right, error = _placed(arm, effect, size, rng, q, loaded, orders)
     poses = [frames["base_frame"] * pose * frames["tool_frame"] for pose in _poses(arm, q, built, error)]
-    seen = _pose_matrices(poses, rng) if posed else _points(poses) + NOISE * rng.normal(size=(count, 3, 3))
+    seen = as_seen(poses, rng) if posed else _points(poses) + NOISE * rng.normal(size=(count, 3, 3))
     rows: tuple[int, ...] = ()
     if effect == "outlier":
         rows = tuple(sorted(int(k) for k in rng.choice(count, 2, replace=False)))
@@ -127,6 +137,25 @@ class Perturbed(NamedTuple):
     points: np.ndarray
     twists: np.ndarray  # (joints, 6)
     device: pin.SE3
+
+
+def slack(arm: Arm, rng: np.random.Generator, count: int, width: float, held: int) -> Hidden:
+    """A robot whose geometry is that of a good one, all its joints slack (rad): they lie where gravity and the last
+    motion left them. The last `held` postures are a recording of their own."""
+    n, q = len(arm.joints), _postures(arm, rng, count)
+    built = np.concatenate(
+        [TOLERANCE["m"] * rng.normal(size=(n, 3)), TOLERANCE["rad"] * rng.normal(size=(n, 3))], axis=1
+    )
+    torque, _ = _gravity(arm, q, np.zeros(count, bool))
+    play = width / 2 * rng.uniform(0.2, 1.0, n)
+    before = np.vstack([q[:1], q[:-1]])
+    shift = play * (np.sign(torque + 0.3 * rng.normal(size=q.shape)) + np.sign(q - before))
+    device = pin.SE3(pin.exp3(rng.normal(size=3)), rng.normal(size=3))
+    poses = _poses(arm, q, BUILT * built, _Error(shift, np.zeros((count, n, 6))))
+    seen = _points([device * pose for pose in poses]) + NOISE * rng.normal(size=(count, 3, 3))
+    parts = (slice(0, count - held), slice(count - held, count))
+    recordings = tuple(Recording(INTERVAL * np.arange(count)[p], q[p], seen[p], False) for p in parts)
+    return Hidden("slack", frozenset(), ("base_frame", "tool_frame"), recordings)
 
 
 def perturb(
@@ -163,7 +192,13 @@ def _twist_pose(twist: np.ndarray) -> pin.SE3:
 
 
 def _placed(
-    arm: Arm, effect: str | None, size: float, rng: np.random.Generator, q: np.ndarray, loaded: np.ndarray
+    arm: Arm,
+    effect: str | None,
+    size: float,
+    rng: np.random.Generator,
+    q: np.ndarray,
+    loaded: np.ndarray,
+    orders: tuple[float, float],
 ) -> tuple[frozenset[Name], _Error]:
     """The names that are right, and the error of all postures at its size."""
     n = len(arm.joints)
@@ -189,7 +224,7 @@ def _placed(
         twist[3:] -= axis * (axis @ twist[3:])
         none.twist[:, j] = twist
         return frozenset({(effect, (arm.joints[j],))}), none
-    at, unit = _law(arm, effect, rng, q, loaded)
+    at, unit = _law(arm, effect, rng, q, loaded, orders)
     sign = 1.0 if effect in ("backlash", "settling", "link_compliance", "joint_compliance") else rng.choice([-1.0, 1.0])
     small = 1e-4 / np.sqrt(np.mean(np.sum(unit.shift**2, axis=1) + np.sum(unit.twist**2, axis=(1, 2))))
     built = np.zeros((n, 6))
@@ -203,7 +238,12 @@ def _scaled(error: _Error, factor: float) -> _Error:
 
 
 def _law(
-    arm: Arm, effect: str, rng: np.random.Generator, q: np.ndarray, loaded: np.ndarray
+    arm: Arm,
+    effect: str,
+    rng: np.random.Generator,
+    q: np.ndarray,
+    loaded: np.ndarray,
+    orders: tuple[float, float],
 ) -> tuple[tuple[str, ...], _Error]:
     """Where the effect acts and one unit of it."""
     n = len(arm.joints)
@@ -238,7 +278,7 @@ def _law(
         twist[:, j, :3] = np.outer(warm, way)
         return at, _Error(shift, twist)
     without, _ = _gravity(arm, q, np.zeros(len(q), bool))
-    order = float(rng.uniform(2.5, 11.0))
+    order = float(rng.uniform(*orders))
     shift[:, j] = {
         "encoder_scale": lambda: x,
         "encoder_eccentricity": lambda: np.sin(x + rng.uniform(-np.pi, np.pi)),
@@ -299,7 +339,8 @@ def _points(poses: list[pin.SE3]) -> np.ndarray:
     return np.array([[pose.act(marker) for marker in MARKERS] for pose in poses])
 
 
-def _pose_matrices(poses: list[pin.SE3], rng: np.random.Generator) -> np.ndarray:
+def as_seen(poses: list[pin.SE3], rng: np.random.Generator) -> np.ndarray:
+    """Poses (postures, 4, 4) with the noise of the device."""
     noisy = (p * pin.SE3(pin.exp3(TURN * rng.normal(size=3)), np.zeros(3)) for p in poses)
     found = np.array([pose.homogeneous for pose in noisy])
     found[:, :3, 3] += NOISE * rng.normal(size=(len(poses), 3))
