@@ -19,6 +19,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from ..compiled.precision import in_float64
 from ..errors import InputError
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.kinematics import states
@@ -46,13 +47,14 @@ class ExtendedModel(eqx.Module):
     effects: tuple[Effect, ...]
     width: Float[Array | np.ndarray, " nv"]  # half width of a reversal of the joints' dry friction, rad/s or m/s
 
+    @in_float64
     def inverse_dynamics(
         self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
     ) -> Float[Array, "*batch nv"]:
         """Torques of the drives (N m or N) that give the true motion q, v, a (rad or m, and their rates)."""
-        with jax.enable_x64(True):
-            return _inverse_dynamics(self, *states(self.robot, q=q, v=v, a=a))
+        return _inverse_dynamics(self, *states(self.robot, q=q, v=v, a=a))
 
+    @in_float64
     def forward_dynamics(
         self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], tau: Float[ArrayLike, "*batch nv"]
     ) -> Float[Array, "*batch nv"]:
@@ -61,8 +63,7 @@ class ExtendedModel(eqx.Module):
         Newton's method with the exact Jacobian; the derivatives are those of the solution (implicit function theorem).
         At v = 0 dry friction is taken as zero: a joint that sticks is the business of `simulate`.
         """
-        with jax.enable_x64(True):
-            return _forward_dynamics(self, *states(self.robot, q=q, v=v, tau=tau))
+        return _forward_dynamics(self, *states(self.robot, q=q, v=v, tau=tau))
 
 
 def extend(
@@ -84,6 +85,7 @@ def extend(
     return ExtendedModel(robot, (*present, *effects), space.broadcast_to(space.asarray(width), (robot.nv,)))
 
 
+@in_float64
 def predict(
     extended: ExtendedModel,
     time: Float[ArrayLike, " samples"],
@@ -100,12 +102,11 @@ def predict(
     of several degrees of freedom: no one sensor reads their position.
     """
     require_single_axes(extended.robot, "a record of sensors")
-    with jax.enable_x64(True):
-        motion = states(extended.robot, position=position, velocity=velocity, acceleration=acceleration)
-        if motion[0].ndim != 2 or motion[0].shape[0] < 5:
-            raise InputError(f"a record of 5 samples or more is needed, got the shape {motion[0].shape}")
-        q, v, a = motion
-        return _predict(extended, jnp.asarray(time, jnp.float64), q, v, a, jnp.float64(dt))
+    motion = states(extended.robot, position=position, velocity=velocity, acceleration=acceleration)
+    if motion[0].ndim != 2 or motion[0].shape[0] < 5:
+        raise InputError(f"a record of 5 samples or more is needed, got the shape {motion[0].shape}")
+    q, v, a = motion
+    return _predict(extended, jnp.asarray(time, jnp.float64), q, v, a, jnp.float64(dt))
 
 
 def require_single_axes(robot: RobotModel, what: str) -> None:
