@@ -114,8 +114,8 @@ def identify_file(
 def _not_written(wrong: Sequence[Link]) -> str:
     which = "; ".join(f"{link.name}: {link.reason}" for link in wrong)
     return (
-        f"model/ is not written, for no body can have the parameters of {which}. `identify.fit: physical` gives a robot"
-        " that can exist; `identify.infeasible: write` writes this one all the same"
+        f"model/ is not written: the parameters of {which} are not physically consistent. `identify.fit: physical`"
+        " gives consistent links; `identify.infeasible: write` writes these all the same"
     )
 
 

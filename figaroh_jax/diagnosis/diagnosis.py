@@ -161,7 +161,7 @@ def _judged(
     if word != "unknown" or not found:
         return _Told(word, found, joint, rest.text)
     proxy = ", ".join(str(f.name) for f in found)
-    text = f"{rest.text}; best proxy, not a cause: {proxy}"
+    text = f"{rest.text}; closest effect, not named as a cause: {proxy}"
     return _Told(word, [], Joint(first, [], Fitted(np.zeros(0), np.zeros((0, 0)), ())), text)
 
 

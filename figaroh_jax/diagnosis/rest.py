@@ -73,11 +73,11 @@ def rest_of(
     worst = int(np.argmax(own))
     text = ""
     if repeats or scored:
-        text = f"most of it at {joints[worst]} ({own[worst]:.2g} times the noise power)"
+        text = f"mostly at {joints[worst]} ({own[worst]:.2g} times the noise power)"
         if flexible[0] < CERTAIN:
             text += f"; strongest dependence: {flexible[1].effect} at {flexible[1].at[0]}"
     if vibrates:
-        text += f"{'; ' if text else ''}a line at {line[1]:.3g} Hz in time at {joints[line[2]]}"
+        text += f"{'; ' if text else ''}a spectral line at {line[1]:.3g} Hz at {joints[line[2]]}"
     return Rest(bool(repeats or scored or vibrates), size, text)
 
 

@@ -28,7 +28,6 @@ __all__ = ["Found", "Search", "eliminate", "find_causes"]
 
 MUCH = 0.5  # share of the best's drop from which another cause explains much of the same
 SMALLEST = 0.005  # share of the first cause's drop below which a later one may be what the first left over
-TRUSTED = 0.05  # of the inertials, relative: up to it a link's own inertia may be the cause
 MOST = 12
 NEAR, CLOSER = 4, 800  # times the level: p-values below which few draws cannot tell from it; draws that can
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
@@ -131,12 +130,12 @@ def _contenders(
 def _best(problem: Problem, step: Step, contenders: list[Contender], before: list[Found]) -> Contender | None:
     """The cause that predicts best where it was not fitted, if it passes the gates; else nothing.
 
-    Ten free parameters of a link make up for many a misfit: they are a cause only where the inertials are well known,
-    and where they are not, what explains the same misfit less well is none either.
+    Some effects make up for many a misfit where the inertials are not well known (`Effect.needs_trust`): there they are
+    no cause, and what explains the same misfit less well is none either.
     """
     least = SMALLEST * (before[0].cost[0] - before[0].cost[1]) if before else 0.0
     passing = [c for c in contenders if passes(step, contenders, c) and step.verdicts.cost - c.verdicts.cost > least]
-    while problem.trust > TRUSTED and passing and passing[0].name.effect == "link_inertia":
+    while passing and problem.trust > passing[0].effect.needs_trust:
         passing = [c for c in passing[1:] if c not in rivals(step, passing, passing[0])]
     return next((c for c in passing if not simpler(step, passing, c)), None)
 
