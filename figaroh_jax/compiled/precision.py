@@ -22,7 +22,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
-from .batching import traced
+from .batching import DRAFT_OPTIONS, program, traced
 
 __all__ = ["Float32Boundary", "in_float64"]
 
@@ -111,7 +111,9 @@ _scoped.multiple_results = True
 
 @lru_cache(maxsize=256)
 def _program(jaxpr: ClosedJaxpr) -> Callable[..., Any]:
-    return jax.jit(jaxpr_as_fun(jaxpr))
+    return program(
+        jaxpr_as_fun(jaxpr), DRAFT_OPTIONS
+    )  # run once or twice: whoever runs it often has a `jit` of his own
 
 
 @_scoped.def_impl
