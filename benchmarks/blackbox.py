@@ -11,7 +11,8 @@ Form of an entry of `cases.json`, keys that are not needed left out:
     added                   file of what is added to the recordings' arrays: "<stem of the file>/<array>"
     model                   text file of the robot beside it, copied as "robot.urdf"
     twin                    name of the case without the effect
-    truth                   list of {effect, at, also, parameters, scale}; empty: nothing is hidden
+    truth                   list of {effect, at, also, parameters, scale}; empty: nothing is hidden; `also` are further
+                            names of the place, `accept` lists all (effect, at) that are right in place of both
     forbid                  names forbidden in a second run, in which the truth is left out of the catalogue
     visible                 whether the data show it at all
 """
@@ -71,7 +72,7 @@ def jobs_of(cases: dict[str, Case], modes: Iterable[str]) -> list[Job]:
     for name, case in cases.items():
         twin = case.get("twin")
         for forbid in [()] * ("named" in modes) + [tuple(case.get("forbid", ()))] * ("forbidden" in modes):
-            if not forbid and "named" not in modes:
+            if not forbid and "named" not in modes:  # nothing to forbid
                 continue
             found.setdefault(Job(name, forbid), 1 if twin else 0)
             if twin:
@@ -186,6 +187,8 @@ def same_effect(a: str, b: str, more: Sequence[set[str]] = ()) -> bool:
 
 def accepts(truth: dict[str, Any], name: Name) -> bool:
     """Whether a name is right for a hidden effect, at its place."""
+    if "accept" in truth:
+        return any(name == (effect, tuple(at)) for effect, at in truth["accept"])
     places = [tuple(truth["at"]), *((link,) for link in truth.get("also", ()))]
     names = {truth["effect"], *truth.get("names", ())}
     return name[1] in places and any(same_effect(name[0], n) for n in names)
@@ -265,6 +268,8 @@ def vector(values: dict[str, float], truth: dict[str, Any]) -> np.ndarray:
 
 def size_error(truth: dict[str, Any], cause: dict[str, Any], old: dict[str, Any] | None) -> float:
     """Relative error of a cause's size, what the twin has of it subtracted."""
+    if not truth["parameters"]:
+        return float("nan")
     real, found, before = (vector(v, truth) for v in (truth["parameters"], _values(cause), _values(old)))
     if len(found) != len(real):
         return float("nan")
