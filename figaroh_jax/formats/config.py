@@ -34,6 +34,7 @@ __all__ = [
     "Bound",
     "Diagnose",
     "Identify",
+    "Limits",
     "Load",
     "Measurement",
     "Preprocess",
@@ -42,6 +43,7 @@ __all__ = [
     "Task",
     "Transmission",
     "Units",
+    "load_limits",
     "load_task",
     "robot_options",
 ]
@@ -318,6 +320,33 @@ class Task(_Keys):
             if stems.count(stem) > 1:
                 raise ValueError(f"two holdout recordings are called '{stem}': their predictions would share one name")
         return data
+
+
+class Limits(_Keys):
+    """Bounds on the figures of a run, for `figaroh-jax verify`; what is not given is not asked for."""
+
+    verdict: tuple[Literal["nothing", "named", "named+rest", "unknown"], ...] | None = None  # allowed
+    holdout_relative: Positive | dict[str, Positive] | None = None  # at most, of all joints or by joint
+    gain: Number | None = None  # share by which all causes together lower the held-out error, at least
+    p_value: Annotated[Number, Field(ge=0, le=1)] | None = None  # at least
+    forbidden_causes: tuple[Effect, ...] | None = None
+    rank: Annotated[int, Field(ge=0)] | None = None  # at least
+    condition: Positive | None = None  # at most
+    relative_std: Positive | None = None  # of identified base parameters, at most
+    consistent: bool | None = None  # every link physically consistent
+    position_mm: Positive | None = None  # validated, at most
+    orientation_deg: Positive | None = None
+    fk_parity: Positive | None = None  # m, at most
+
+
+def load_limits(path: str | Path) -> Limits:
+    """Read a file of limits; raises `InputError` that names file and key of the first mistake."""
+    chain = read_task(Path(path))
+    try:
+        return Limits.model_validate(merge(chain))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise InputError(f"{where(chain, first['loc'])}: {_message(first)}") from None
 
 
 def load_task(path: str | Path) -> Task:
