@@ -33,7 +33,7 @@ _TASKS = {  # commands that take a task file
     "identify": "fit the dynamics: links, friction, intervals",
     "calibrate": "fit the kinematics from measured poses or points",
 }
-_OTHERS = ("verify", "compare", "list")  # commands on finished runs: no numbers are computed
+_OTHERS = ("verify", "compare", "list", "new")  # commands before and after a run
 _DESCRIPTION = "Name what a robot's simulation gets wrong, extend the model with it and measure the gain."
 
 
@@ -189,10 +189,17 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_tools(commands: Any) -> None:
-    """Commands on finished runs."""
+    """Commands before and after a run."""
     tool = argparse.ArgumentParser(add_help=False)
     tool.add_argument("--json", action="store_true", help="print JSON in place of the table")
     tool.add_argument("--traceback", action="store_true", help="show where an error was raised")
+    new = commands.add_parser("new", parents=[tool], help="draft a task file from a model and recordings")
+    new.add_argument("model", type=Path, metavar="MODEL")
+    new.add_argument("recordings", type=Path, nargs="+", metavar="RECORDING")
+    new.add_argument("--out", type=Path, metavar="TASK.yaml", help="default: the draft is printed")
+    new.add_argument("--joints", help="comma-separated joints of the columns, in their order")
+    new.add_argument("--rate", type=float, metavar="HZ", help="rate of recordings that have no time column")
+    new.add_argument("--constants", help="comma-separated N m a unit of the torque columns, in the joints' order")
     verify = commands.add_parser("verify", parents=[tool], help="pass or fail of a finished run; exit status 1 on fail")
     verify.add_argument("run", type=Path, metavar="DIR")
     verify.add_argument(

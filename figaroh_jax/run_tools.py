@@ -1,4 +1,4 @@
-"""Commands on finished runs: `verify`, `compare`, `list`, and what `rerun` runs again.
+"""Commands before and after a run: `new`, `verify`, `compare`, `list`, and what `rerun` runs again.
 
 Each function takes the parsed arguments, prints and gives the exit status.
 """
@@ -12,7 +12,37 @@ from pathlib import Path
 from .errors import InputError
 from .reporting.provenance import read_provenance
 
-__all__ = ["command_of", "compare", "list", "verify"]
+__all__ = ["command_of", "compare", "list", "new", "verify"]
+
+
+def new(args: argparse.Namespace) -> int:
+    """Draft a task file, on standard output or where `--out` says."""
+    from .recordings.draft import draft_task
+
+    if args.out is not None and args.out.exists():
+        raise InputError(f"--out {args.out}: exists already; a draft replaces no file")
+    joints = None if args.joints is None else [name.strip() for name in args.joints.split(",")]
+    if args.rate is not None and not 0 < args.rate < float("inf"):
+        raise InputError(f"--rate {args.rate}: expected a positive number of Hz")
+    draft = draft_task(
+        args.model, args.recordings, joints=joints, rate=args.rate, constants=_numbers(args.constants, "--constants")
+    )
+    if args.json:
+        print(json.dumps(draft._asdict(), indent=2, ensure_ascii=False))
+    elif args.out is None:
+        print(draft.text, end="")
+    if args.out is not None:
+        _write(args.out, draft.text, "--out")
+        if not args.json:
+            print("\n".join([*(f"assumed: {line}" for line in draft.assumed), f"Task: {args.out}"]))
+    return 0
+
+
+def _numbers(text: str | None, option: str) -> tuple[float, ...] | None:
+    try:
+        return None if text is None else tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"{option} {text}: expected numbers with commas between them") from None
 
 
 def verify(args: argparse.Namespace) -> int:

@@ -62,6 +62,13 @@ def _columns(value: Any) -> Any:
     return value if isinstance(value, str) else tuple(value)
 
 
+def _diagonal(value: Any) -> Any:
+    plain = isinstance(value, (list, tuple)) and all(isinstance(x, (int, float)) for x in value) and len(value) > 0
+    if not plain:
+        return value
+    return [[x if i == j else 0.0 for j in range(len(value))] for i, x in enumerate(value)]
+
+
 def _effect(name: str) -> str:
     from ..effects.catalogue import CATALOGUE
 
@@ -211,8 +218,8 @@ class RecordingEntry(_Keys):
 class Transmission(_Keys):
     """Motor side to joint side: motor position = position @ joint position, joint torque = torque @ motor torque."""
 
-    position: Matrix | None = None
-    torque: Matrix | None = None
+    position: Annotated[Matrix, BeforeValidator(_diagonal)] | None = None  # a plain list is a diagonal
+    torque: Annotated[Matrix, BeforeValidator(_diagonal)] | None = None
     offset: tuple[Number, ...] | None = None  # rad or m, added to the joint position
 
     @field_validator("position", "torque")
