@@ -212,19 +212,19 @@ def held_out(found: Fit, data: Windows, folds: np.ndarray) -> np.ndarray:
     """Squares of each block and window as predicted without the fold it is in, (blocks, windows).
 
     `folds` (blocks, windows) numbers them. The estimate without a fold is theta - (H - H_k)^-1 g_k; the residual is
-    taken to first order there. Entries at their bounds stay.
+    taken to first order there. The states at the starts stay, and so do entries at their bounds.
     """
-    whole = System(found.sums, data, found.start)
-    cost, gradient, matrix = found.sums.cost.sum(-1), found.sums.gradient, found.sums.matrix
-    fixed, answer = found.free < 0, np.zeros(folds.shape)
+    cost, count = found.sums.cost.sum(-1), len(found.free)
+    gradient, matrix = found.sums.gradient[..., :count], found.sums.matrix[..., :count, :count]
+    whole, answer = matrix.sum((0, 1)), np.zeros(folds.shape)
+    keep = (found.free >= 0) & (np.diag(whole) > 0)
     for fold in np.unique(folds):
         mine = folds == fold
-        left = Sums(*(np.where(mine.reshape(*mine.shape, *[1] * (x.ndim - 2)), 0.0, x) for x in found.sums))
-        without = System(left, data, found.start)
-        without.gp, without.gs = without.gp - whole.gp, without.gs - whole.gs  # zero at a free optimum
-        change, starts = without.solve(fixed, 1e-9)
-        step = np.concatenate([np.broadcast_to(change, (starts.shape[1], len(change))), starts.T], 1)
-        first = np.einsum("bwp,wp->bw", gradient, step)
-        second = np.einsum("wp,bwpr,wr->bw", step, matrix, step)
+        left = (whole - matrix[mine].sum(0))[np.ix_(keep, keep)]
+        size = np.sqrt(np.maximum(np.diag(left), 1e-300))
+        change = np.zeros(count)
+        right = -gradient[mine].sum(0)[keep] / size
+        change[keep] = np.linalg.lstsq(left / np.outer(size, size), right, rcond=1e-12)[0] / size
+        first, second = gradient @ change, np.einsum("p,bwpr,r->bw", change, matrix, change)
         answer = np.where(mine, cost - 2 * first + second, answer)
     return answer
