@@ -2,8 +2,9 @@
 
 Effects act in the order of the tuple. First every `change` makes the robot what it really is; its rigid body torque is
 the load. Then each torque form adds to the total that stands before it (so a `torque_gain` scales what was added
-before). Position sensors read more than the truth by the sum of the `position_error` forms; torque sensors filter the
-total by the product of the `torque_response` forms. Sensors matter to `predict` and to simulated readings alone.
+before). Position sensors read more than the truth by the sum of the `position_error` forms; torque sensors add the
+`torque_error` forms and filter the total by the `torque_response` forms, in the order of the tuple. Sensors matter to
+`predict` and to simulated readings alone.
 """
 
 from __future__ import annotations
@@ -124,7 +125,7 @@ def _predict(extended: ExtendedModel, time: Array, q: Array, v: Array, a: Array,
     if any(effect.has("position_error") for effect in extended.effects):
         rate = _difference(error, dt)
         load = inverse_dynamics(robot, q - error, v - rate, a - _difference(rate, dt))
-    return read_torque(extended.effects, with_torque(extended.effects, motion, load).total, dt)
+    return read_torque(extended.effects, with_torque(extended.effects, motion, load))
 
 
 @jax.jit
@@ -201,16 +202,22 @@ def read_position(effects: tuple[Effect, ...], motion: Motion) -> Float[Array, "
     return position
 
 
-def read_torque(
-    effects: tuple[Effect, ...], torque: Float[Array, "samples nv"], dt: Float[Array, ""] | float
-) -> Float[Array, "samples nv"]:
-    """What the torque sensors make of a uniform record of the true torque, N m or N."""
+def read_torque(effects: tuple[Effect, ...], motion: Motion) -> Float[Array, "samples nv"]:
+    """What the torque sensors make of a uniform record of the drives' torques, the `total` of `motion`; N m or N."""
+    torque = motion.total
     for effect in effects:
+        if effect.has("torque_error"):
+            torque = torque + _joint_torque_error(effect, dataclasses.replace(motion, total=torque))
         if effect.has("torque_response"):
-            answer = _respond(effect, torque, dt)
+            answer = _respond(effect, torque, motion.dt)
             seen = effect.at if effect.acts_on in ("joint", "pair") else jnp.arange(torque.shape[1])
             torque = torque.at[:, seen].set(answer[:, seen])
     return torque
+
+
+@jax.jit
+def _joint_torque_error(effect: Effect, motion: Motion) -> Float[Array, "samples nv"]:
+    return effect.in_joints(effect.torque_error(motion), motion)
 
 
 @jax.jit

@@ -220,11 +220,12 @@ def read_time(table: Table, entry: RecordingEntry, key: str, samples: int) -> Fl
     if len(wrong):
         raise InputError(f"{table.file}: {key}.time ('{entry.time}') is {time[wrong[0]]} in row {wrong[0]} (from 0)")
     back = np.flatnonzero(np.diff(time) <= 0)
+    unit = entry.units.time
     if len(back):
         row = back[0] + 1
         what = "repeats" if time[row] == time[row - 1] else "goes back"
         raise InputError(
-            f"{table.file}: {key}.time {what} in row {row} (from 0): {time[row]:.9g} s after {time[row - 1]:.9g} s;"
-            " the stamps must increase"
+            f"{table.file}: {key}.time {what} in row {row} (from 0): {time[row]:.9g} {unit} after"
+            f" {time[row - 1]:.9g} {unit}; the stamps must increase"
         )
-    return time
+    return time * {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[unit]
