@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +32,7 @@ __all__ = [
     "Job",
     "calibrate_file",
     "diagnose_file",
+    "export_loop",
     "identify_file",
     "predictions",
     "write_run",
@@ -95,6 +98,28 @@ def _diagnose_rollouts(task: Task, out: Path, progress: Callable[[str, float], N
     return found.diagnosis
 
 
+def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
+    """The loop of a run's `model` directory in the words of a simulator, as JSON; with `out`, written there too.
+
+    For MuJoCo `out` also gets `robot.xml`, with everything that MuJoCo has words for. Raises `InputError` for another
+    directory, and for a simulator that is not known.
+    """
+    from .rollouts.export import for_simulator, with_drives
+
+    try:
+        content = json.loads((model / LOOP).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise InputError(f"{model}: no readable {LOOP}; name the `model` directory of a rollout's run") from None
+    text = json.dumps(for_simulator(content, simulator), indent=2, ensure_ascii=False) + "\n"
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / f"{simulator}.json").write_text(text, encoding="utf-8")
+        if simulator == "mujoco":
+            mjcf = (model / "robot.xml").read_text(encoding="utf-8")
+            (out / "robot.xml").write_text(with_drives(mjcf, content), encoding="utf-8")
+    return text
+
+
 def _write_loop(folder: Path, loop: Loop) -> None:
     """`loop.json`, every number of the loop, and the drives in `robot.xml`."""
     from .rollouts.export import described, described_text, with_drives
@@ -150,6 +175,9 @@ def _identify_rollouts(task: Task, out: Path, progress: Callable[[str, float], N
     progress("writing the report", 1.0)
     with whole_directory(out, task_inputs(task.file)) as folder:
         (folder / RESULT).write_text(found.to_json(), encoding="utf-8")
+        lines = html.escape("\n".join(found.lines()))
+        page = f"<!doctype html><meta charset='utf-8'><title>{RESULT}</title><pre>{lines}</pre>\n"
+        (folder / REPORT).write_text(page, encoding="utf-8")
         write_predictions(folder / "predictions.npz", found.predictions, "position")
         write_model(found.model, folder / "model")
         _write_loop(folder / "model", found.loop)

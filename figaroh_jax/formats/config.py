@@ -286,6 +286,15 @@ class Actuator(BaseModel):
 
     gains: Literal["known", "free"] = "known"
 
+    @model_validator(mode="before")
+    @classmethod
+    def _joints_have_drives(cls, value: Any) -> Any:
+        for key, drive in value.items() if isinstance(value, dict) else ():
+            if key != "gains" and not isinstance(drive, dict | JointDrive):
+                hint = nearest(str(key), ["gains"])
+                raise ValueError(f"unknown key '{key}'{hint}; beside it stand joints, as in joint_1: {{kp: 20, kd: 1}}")
+        return value
+
     @property
     def drives(self) -> dict[str, JointDrive]:
         """The stated drives by joint."""

@@ -166,6 +166,6 @@ def for_simulator(content: dict[str, Any], name: str) -> dict[str, Any]:
                 if number in words:
                     values.append({"at": place, "number": number, "word": words[number], "value": value})
                 elif value != 0 and number not in (*_NEUTRAL, "time_constant", "constant"):
-                    unit = UNITS.get({"force": "force_limit"}.get(number, number), "")
+                    unit = UNITS["force_limit" if number == "force" else number]
                     unsaid.append({"at": place, "number": number, "value": value, "unit": unit})
     return {"simulator": name, "meaning": meaning, "values": values, "unsaid": unsaid}

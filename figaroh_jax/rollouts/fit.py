@@ -8,7 +8,7 @@ estimate without the fold.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -124,15 +124,14 @@ class _Lanes:
                     done[k] = damping[k] > 1e8
         return [Fit(self.theta[k], self.free[k], self.start[k], cost[k], now[k], bool(done[k])) for k in everyone]
 
-    def step(self, sums: Sums, lane: int, damping: float) -> _Step:
+    def step(self, sums: Sums, lane: int, damping: Any) -> _Step:
         """The damped step within the bounds; entries that would leave them stay where they are."""
         system = System(sums, self.data, self.start[lane])
         free = self.free[lane]
         at, (low, high) = np.maximum(free, 0), self.bounds[np.maximum(free, 0)].T
         fixed = free < 0
-        change = np.zeros(len(free))
-        for _ in range(3):
-            change, starts = system.solve(fixed, damping)
+        change, starts = system.solve(fixed, damping)
+        for _ in range(2):
             wanted = self.theta[lane][at] + change
             out = ~fixed & (
                 ((wanted < low) & (self.theta[lane][at] <= low)) | ((wanted > high) & (self.theta[lane][at] >= high))
@@ -140,6 +139,7 @@ class _Lanes:
             if not out.any():
                 break
             fixed = fixed | out
+            change, starts = system.solve(fixed, damping)
         theta = self.theta[lane].copy()
         mine = free >= 0
         theta[at[mine]] = np.clip(theta[at[mine]] + change[mine], low[mine], high[mine])

@@ -13,7 +13,7 @@ from scipy import stats
 from ..results import Name, Verdict
 from .causes import BASELINE, CONTAINS, Candidate, Catalogue, catalogue, elastic_loop
 from .data import Run, Stretch, noise_of, windows
-from .fit import Fit, fit, held_out, standard_errors
+from .fit import Fit, System, fit, held_out, standard_errors
 from .loop import Loop
 from .parameters import Entry, Table, values
 from .sensitivity import Windows, predicted
@@ -25,7 +25,9 @@ _CLEAR = 3.0  # t of a name beside which more than noise is left
 _SHORT = 6  # candidates that are fitted where a linear screening can order them
 _GROUP = 25  # rows whose mean shows a slow misfit
 _MOST = 6  # causes
-_EARLY = 4  # iterations of a race among all starts
+_EARLY, _LATE = 4, 12  # iterations of a race among all starts, and of its leaders
+_LIMITS = ("actuator_saturation", "voltage_saturation")
+_SHAPED = ("stribeck_friction",)  # without an amplitude their shape shows nothing
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ def setting(
     count = loop.robot.nv
     return Setting(
         loop, tuple(fitted), data, tuple(noise), Catalogue(known.table, keep), tuple(free),
-        _folds(data, stretches), 8 if count == 1 else 1, len(free) + 5, stretches, block,
+        _folds(data, stretches), 8 if count == 1 else 1, len(free) + (5 if count == 1 else 8), stretches, block,
     )  # fmt: skip
 
 
@@ -265,7 +267,10 @@ def _raced(
         leads.setdefault(owner[k], int(k))
     order = list(leads.values())[: max(here.lanes, _SHORT)]
     states = np.stack([early[k].theta for k in order]), np.stack([early[k].start for k in order])
-    last = fit(*now.structure, states[0], [free[k] for k in order], states[1], width=here.width, lanes=here.lanes)
+    last = fit(
+        *now.structure, states[0], [free[k] for k in order], states[1],
+        width=here.width, lanes=here.lanes, iterations=_LATE,
+    )  # fmt: skip
     return list(zip(order, last, strict=True))
 
 
@@ -276,17 +281,46 @@ def _tried_one(here: Setting, structure: Structure, c: Candidate, best: Fit, fre
 
 
 def _screened(here: Setting, now: _State, left: Sequence[Candidate]) -> list[Candidate]:
-    """The candidates that one linear step from their starts makes the best."""
-    scores = {}
-    for c in left:
-        for start in c.starts:
-            theta = _start_values(now.fit.theta, c, start)
-            one = fit(
-                *now.structure, theta[None], [_free(now.free, c.entries)], now.fit.start[None],
-                width=here.width, lanes=here.lanes, iterations=2,
-            )[0]  # fmt: skip
-            scores[id(c)] = min(scores.get(id(c), np.inf), one.cost)
-    return sorted(left, key=lambda c: scores[id(c)])[:_SHORT]
+    """The candidates that one linear step from the present model promises most, several to one linearisation.
+
+    A limit of a drive changes the model before it can be differentiated: each is linearised at one start of its own.
+    """
+    scores: dict[int, float] = {}
+    room = here.width - len(now.free)
+    limits = [k for k, c in enumerate(left) if c.effect in _LIMITS]
+    packs, filled = [], 0
+    for k in [k for k in range(len(left)) if k not in limits]:
+        if not packs or filled + len(left[k].entries) > room:
+            packs.append([])
+            filled = 0
+        packs[-1].append(k)
+        filled += len(left[k].entries)
+    for pack in packs:
+        for variant in range(max([1, *(len(left[k].starts) for k in pack if left[k].effect in _SHAPED)])):
+            theta = now.fit.theta.copy()
+            for k in pack:
+                if left[k].effect in _SHAPED:
+                    theta[left[k].entries[1]] = left[k].starts[variant][1]
+            _score(here, now, theta, [(k, left[k]) for k in pack], scores)
+    for k in limits:
+        theta = _start_values(now.fit.theta, left[k], left[k].starts[len(left[k].starts) // 2])
+        _score(here, now, theta, [(k, left[k])], scores)
+    return [left[k] for k in sorted(scores, key=lambda k: scores[k])[:_SHORT]]
+
+
+def _score(
+    here: Setting, now: _State, theta: np.ndarray, pack: Sequence[tuple[int, Candidate]], scores: dict[int, float]
+) -> None:
+    """Cost after a linear step of each candidate of the pack beside what is free already."""
+    columns = _free(now.free, [entry for _, c in pack for entry in c.entries])
+    start = now.fit.start[None]
+    one = fit(*now.structure, theta[None], [columns], start, width=here.width, lanes=here.lanes, iterations=0)[0]
+    for k, c in pack:
+        mine = set(now.free) | set(c.entries)
+        fixed = np.array([entry < 0 or entry not in mine for entry in one.free])
+        system = System(one.sums, now.structure.data, one.start)
+        cost = one.cost - system.decrease(*system.solve(fixed, 1e-6))
+        scores[k] = min(scores.get(k, np.inf), cost)
 
 
 def _elastic(here: Setting, now: _State, forbid: Sequence[str]) -> list[_Tried]:
