@@ -179,9 +179,7 @@ def _set_up_jax(cache: bool) -> None:
     jax.config.update("jax_enable_x64", True)
     if not cache:
         jax.config.update("jax_enable_compilation_cache", False)
-    elif jax.config.values.get("jax_compilation_cache_dir") is None:
-        home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-        folder = Path(home).expanduser() / "figaroh_jax" / "jax"
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    else:
+        from .compiled.executable_cache import keep_programs
+
+        keep_programs()
