@@ -81,7 +81,8 @@ def load_urdf(
     path = find_in_packages(path, packages)
     robot = _read(path)
     try:
-        parts = [_link(link) for link in robot.links], [_joint(joint) for joint in robot.joints]
+        with np.errstate(over="ignore", invalid="ignore"):  # `assemble` checks what comes of it
+            parts = [_link(link) for link in robot.links], [_joint(joint) for joint in robot.joints]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return assemble(str(path), robot.name, parts, joints, posture, gravity, root)
