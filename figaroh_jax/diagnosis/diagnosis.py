@@ -18,8 +18,10 @@ from jaxtyping import Float
 
 from ..effects.base import Effect, place
 from ..effects.catalogue import find
+from ..effects.plausibility import implausible
 from ..errors import InputError
 from ..estimation.noise import Spectrum
+from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Signals, prepare_all
 from ..recordings.stacked import stack
@@ -59,10 +61,11 @@ def diagnose_task(
     progress("reading", 0.0)
     model, (known, notes) = load_robot(task), stated_baseline(task)
     recordings = read_recordings(task, model)
+    notes = (*notes, *check_recordings(task, model, recordings))
     options = {"trust": task.robot.trust, "forbid": task.diagnose.forbid, "alpha": task.diagnose.alpha}
     robot = make_backend(backend, model)
     found = diagnose(robot, recordings, task.preprocess, known, progress=progress, **options)
-    return replace(found, notes=(*notes, *found.notes))
+    return replace(found, notes=(*notes, *implausible(model, found.model, task.robot.trust), *found.notes))
 
 
 def diagnose(

@@ -39,7 +39,7 @@ def exists(problem: Problem, effect: Effect) -> bool:
 def _within(parameter: Parameter, value: float) -> bool:
     """Whether a parameter lies in its bounds; one that enters nonlinearly must not lean against them."""
     if parameter.linear:
-        return value >= parameter.lower
+        return parameter.lower <= value <= parameter.upper
     margin = 1e-3 * abs(value)
     return parameter.choice or parameter.lower + margin < value < parameter.upper - margin
 
