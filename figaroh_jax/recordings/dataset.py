@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,7 +24,25 @@ from .tables import Table, read_table
 if TYPE_CHECKING:
     from ..formats.config import Load, RecordingEntry, Task
 
-__all__ = ["Drive", "Recording", "carried_body", "joint_columns", "read_recordings", "read_time", "unit_factors"]
+__all__ = [
+    "Drive",
+    "Memory",
+    "Recording",
+    "carried_body",
+    "joint_columns",
+    "read_recordings",
+    "read_time",
+    "unit_factors",
+]
+
+
+class Memory(NamedTuple):
+    """Where a recording comes from that was never a file; messages name it so."""
+
+    name: str
+
+    def __str__(self) -> str:
+        return f"recording '{self.name}'"
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +50,7 @@ class Recording:
     """One recording on the joint side: rad and N m, or m and N for prismatic joints."""
 
     name: str  # stem of the file
-    file: Path
+    file: Path | Memory
     joints: tuple[str, ...]  # names of the columns of torque
     time: Float[np.ndarray, " samples"]  # s, increasing
     position: Float[np.ndarray, "samples nq"]  # with quaternions x y z w where the robot has any
