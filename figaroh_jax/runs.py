@@ -115,8 +115,7 @@ def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
         out.mkdir(parents=True, exist_ok=True)
         (out / f"{simulator}.json").write_text(text, encoding="utf-8")
         if simulator == "mujoco":
-            mjcf = (model / "robot.xml").read_text(encoding="utf-8")
-            (out / "robot.xml").write_text(with_drives(mjcf, content), encoding="utf-8")
+            (out / "robot.xml").write_text(with_drives(model / "robot.xml", content), encoding="utf-8")
     return text
 
 
@@ -126,7 +125,7 @@ def _write_loop(folder: Path, loop: Loop) -> None:
 
     (folder / LOOP).write_text(described_text(loop), encoding="utf-8")
     mjcf = folder / "robot.xml"
-    mjcf.write_text(with_drives(mjcf.read_text(encoding="utf-8"), described(loop)), encoding="utf-8")
+    mjcf.write_text(with_drives(mjcf, described(loop)), encoding="utf-8")
 
 
 def identify_file(

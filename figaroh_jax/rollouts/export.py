@@ -6,12 +6,14 @@ What a simulator has no word for is listed with its size, never left out silentl
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
+from lxml import etree
 
 from ..errors import InputError, nearest
+from ..formats.xmlfile import read_xml
 from .loop import Loop
 from .parameters import UNITS
 
@@ -58,20 +60,20 @@ def described_text(loop: Loop) -> str:
     return json.dumps(described(loop), indent=2) + "\n"
 
 
-def with_drives(mjcf: str, content: dict[str, Any]) -> str:
-    """An MJCF text with the loop's time step, integrator and drives as `general` actuators."""
-    root = ElementTree.fromstring(mjcf)
+def with_drives(file: Path, content: dict[str, Any]) -> str:
+    """The text of an MJCF file with the loop's time step, integrator and drives as `general` actuators."""
+    root = read_xml(file, "mujoco")
     option = root.find("option")
-    option = ElementTree.SubElement(root, "option") if option is None else option
+    option = etree.SubElement(root, "option") if option is None else option
     names = {"euler": "Euler", "implicitfast": "implicitfast", "rk4": "RK4"}
     option.set("timestep", f"{content['dt']:.9g}")
     option.set("integrator", names[content["integrator"]])
     for old in root.findall("actuator"):
         root.remove(old)
-    actuators = ElementTree.SubElement(root, "actuator")
+    actuators = etree.SubElement(root, "actuator")
     for name, drive in content["drives"].items():
         prm = f"{drive['constant']:.9g} {drive['length']:.9g} {-drive['kd']:.9g}"
-        new = ElementTree.SubElement(
+        new = etree.SubElement(
             actuators, "general", name=name, joint=drive["joint"], gear=f"{drive['gear']:.9g}", biastype="affine",
             gainprm=f"{drive['kp']:.9g}", biasprm=prm,
         )  # fmt: skip
@@ -84,8 +86,8 @@ def with_drives(mjcf: str, content: dict[str, Any]) -> str:
         if drive["delay"] > 0:
             new.set("delay", f"{drive['delay']:.9g}")
             new.set("nsample", str(int(np.ceil(drive["delay"] / content["dt"])) + 2))
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode") + "\n"
+    etree.indent(root)
+    return etree.tostring(root, encoding="unicode") + "\n"
 
 
 # (our number: theirs), and what a number means there

@@ -376,7 +376,7 @@ def _best(
     nearest.clear()
     if not tried:
         return None, 1.0
-    p = float(stats.norm.sf(4 * now.excess))
+    p = float(max(stats.norm.sf(4 * now.excess), 1e-12))
     sure = _SURE if now.excess >= 1.0 else 2.5
     passing = [k for k in range(len(tried)) if gains[k] > _WORTH and ts[k] > sure and _sized(here, tried[k])]
     for k in np.argsort(gains)[::-1][:3]:
