@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["Candidate", "Cause", "Diagnosis", "Estimate", "Experiment", "Gain", "Name", "Trace", "Verdict"]
+__all__ = ["Candidate", "Cause", "Diagnosis", "Estimate", "Experiment", "Gain", "Name", "Nearest", "Trace", "Verdict"]
 
 Verdict = Literal["nothing", "named", "named+rest", "unknown"]
 
@@ -51,6 +51,15 @@ class Cause:
     gain: Gain
     ambiguous_with: tuple[Name, ...] = ()
     note: str = ""  # e.g. what MJCF and URDF cannot express
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """A cause that was found and is not named: the share of its joints' held-out error that it takes, and why not."""
+
+    name: Name
+    share: float
+    why_not: str
 
 
 @dataclass(frozen=True)
@@ -108,6 +117,7 @@ class Diagnosis:
     model: Any  # extended.ExtendedModel with the causes put in
     rest: str = ""  # description of a misfit that has no name: joint, power, strongest dependence
     notes: tuple[str, ...] = ()  # what was dropped or assumed while reading the data
+    nearest: tuple[Nearest, ...] = ()  # causes that came near, and why they are not named
     prismatic: tuple[bool, ...] = ()  # per joint; empty: every joint is revolute
 
     @property

@@ -25,8 +25,8 @@ from ..native_backend import as_backend
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Signals, prepare_all
 from ..registry import backend as make_backend
-from ..results import Cause, Diagnosis, Gain, Verdict
-from .estimates import Fitted, estimates, fitted_model, prismatic
+from ..results import Cause, Diagnosis, Gain, Nearest, Verdict
+from .estimates import estimates, fitted_model, prismatic
 from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
@@ -34,20 +34,21 @@ from .floor import noise_floor, noise_rms
 from .holdout import held_out, residual_rms, traces
 from .joint import Joint, polished, sized
 from .layout import describe_folds, held_rows, layout
+from .naming import reason_against, standings
 from .noise import Spectrum
 from .problem import Problem
 from .records import stack
 from .rest import excess, lines, rest_of, verdict, wrong_law
 from .search import Found, Search, eliminate, find_causes
-from .state import State, baseline
+from .state import State, baseline, with_width
 from .step import Step, stand
+from .thresholds import CERTAIN, WEIGHT_ROUNDS
+from .weights import weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess, Task
 
 __all__ = ["diagnose", "diagnose_task"]
-
-CERTAIN = 0.2  # of alpha: what a name needs, for p is not uniform under coloured noise
 
 
 def diagnose_task(
@@ -89,13 +90,13 @@ def diagnose(
         signals = sorted(prepare_all(tuple(recordings), preprocess), key=lambda s: s.role == "holdout")
         here = _setting(as_backend(model), signals, known, trust, forbid, progress)
         generator = np.random.default_rng(seed)
-        search = find_causes(*here, forbid, CERTAIN * alpha, progress, generator)
+        search = find_causes(*here[:4], forbid, CERTAIN * alpha, progress, generator)
         here = here._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
         first = stand(here.problem, here.start, here.whitening)
-        told = _judged(here, first, search, *_fitted_together(here, search.found, forbid), generator)
+        judged = _judged(here, first, search, *_fitted_together(here, search.found, forbid), generator)
         progress("measuring the gain", 0.9)
-        return _answer(here, signals, first, search, told)
+        return _answer(here, signals, first, search, judged)
 
 
 class _Setting(NamedTuple):
@@ -105,15 +106,17 @@ class _Setting(NamedTuple):
     start: State
     spectrum: Spectrum
     whitening: Float[np.ndarray, "F nv"]
+    white: bool  # whether the rows are weighted by their joint's residual, not by the noise's spectrum
 
 
-class _Told(NamedTuple):
+class _Judged(NamedTuple):
     """What the diagnosis stands by."""
 
     word: Verdict
     found: list[Found]
     joint: Joint  # all of them in one fit
     rest: str
+    nearest: tuple[Nearest, ...]  # what was found and is not named, with the reason
 
 
 def _setting(
@@ -126,7 +129,7 @@ def _setting(
 ) -> _Setting:
     """The recordings on one clock, the baseline, and the noise; holdout recordings stand behind the others."""
     model = backend.robot
-    records = stack(signals, model)
+    records = without_reversals(stack(signals, model))
     held = held_rows(signals, records)
     problem = Problem(backend, records, layout(signals, records), trust, np.zeros(model.nv), held)
     names, given = _baseline_effects(model, known)
@@ -134,7 +137,15 @@ def _setting(
     progress("estimating the noise", 0.08)
     spectrum, whitening = noise_floor(problem, start, forbid)
     problem = friction_width(problem, start, whitening)
-    return _Setting(problem, baseline(problem, names, given), spectrum, whitening)
+    start = with_width(problem, start)
+    for _ in range(WEIGHT_ROUNDS):
+        weighted = weighted_by_speed(problem, start, whitening)
+        if weighted is problem:
+            break
+        problem = weighted
+        spectrum, whitening = noise_floor(problem, start, forbid)
+    whitening, white = white_where_better(problem, start, whitening)
+    return _Setting(problem, start, spectrum, whitening, white)
 
 
 def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) -> tuple[list[Found], Joint]:
@@ -149,30 +160,36 @@ def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) 
 
 def _judged(
     here: _Setting, first: Step, search: Search, found: list[Found], joint: Joint, generator: np.random.Generator
-) -> _Told:
-    """The verdict by what is left; causes beside which too much is left are none."""
-    problem, _, spectrum, whitening = here
+) -> _Judged:
+    """The verdict by what is left beside all causes; of these, the ones that stand beside it are named.
+
+    What is not named is no part of the answer's model: the others are fitted anew without it.
+    """
+    problem, _, spectrum, whitening, _ = here
     before, *_ = excess(problem, first.rows, first.linear.residual, spectrum, whitening)
     now = excess(problem, joint.step.rows, joint.step.linear.residual, spectrum, whitening)
     flexible = flexible_p(problem, joint.step.state, joint.step.rows, spectrum, whitening, generator)
     line = lines(problem, joint.step.linear.residual)
     rest = rest_of(now, max(before, 0.0), search.p_left, flexible, line, problem.model.joint_names)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
-    word = verdict(bool(found), rest, max(before, 0.0), wrong)
-    if word != "unknown" or not found:
-        return _Told(word, found, joint, rest.text)
-    proxy = ", ".join(str(f.name) for f in found)
-    text = f"{rest.text}; best proxy, not a cause: {proxy}"
-    return _Told(word, [], Joint(first, [], Fitted(np.zeros(0), np.zeros((0, 0)), ())), text)
+    beside = rest.significant or wrong
+    each = standings(problem, here.start, found, joint, whitening)
+    against = [reason_against(one, beside, 0.0) for one in each]
+    named = [f for f, reason in zip(found, against, strict=True) if not reason]
+    nearest = tuple(Nearest(s.name, s.gain, reason) for s, reason in zip(each, against, strict=True) if reason)
+    if len(named) < len(found):
+        joint = polished(problem, here.start, [f.effect for f in named], whitening)
+    word = verdict(bool(named), beside or bool(nearest))
+    return _Judged(word, named, joint, rest.text, nearest)
 
 
-def _answer(here: _Setting, signals: Sequence[Signals], first: Step, search: Search, told: _Told) -> Diagnosis:
-    problem, model, last = here.problem, here.problem.model, told.joint.step
-    gains = held_out(problem, here.start, told.joint.causes, here.whitening)
+def _answer(here: _Setting, signals: Sequence[Signals], first: Step, search: Search, judged: _Judged) -> Diagnosis:
+    problem, model, last = here.problem, here.problem.model, judged.joint.step
+    gains = held_out(problem, here.start, judged.joint.causes, here.whitening)
     noise = noise_rms(problem, here.spectrum)
     return Diagnosis(
-        verdict=told.word,
-        causes=_causes(told, gains, model),
+        verdict=judged.word,
+        causes=_causes(judged, gains, model),
         p_value=search.p_value,
         joints=model.joint_names,
         before=residual_rms(problem, first.state),
@@ -180,20 +197,21 @@ def _answer(here: _Setting, signals: Sequence[Signals], first: Step, search: Sea
         noise=noise,
         holdout=Gain(gains[0], gains[-1]),
         holdout_scheme=_scheme(signals),
-        experiment=next_experiment(told.word, told.found, problem, here.start, told.joint.causes, here.whitening),
+        experiment=next_experiment(judged.word, judged.found, problem, here.start, judged.joint.causes, here.whitening),
         candidates=explain(first.rows, first.linear, search.screened, noise),
-        traces=traces(problem, signals, first.state, last.state, told.joint.causes, told.found),
+        traces=traces(problem, signals, first.state, last.state, judged.joint.causes, judged.found),
         baseline=fitted_model(problem, first.state, []),
-        model=fitted_model(problem, last.state, told.joint.causes),
-        rest=told.rest,
+        model=fitted_model(problem, last.state, judged.joint.causes),
+        rest=judged.rest,
+        nearest=judged.nearest,
         notes=_notes(signals, problem),
         prismatic=prismatic(model),
     )
 
 
-def _causes(told: _Told, gains: Sequence[float], model: RobotModel) -> tuple[Cause, ...]:
-    fitted = told.joint.fitted
-    each = zip(told.found, told.joint.causes, fitted.places, pairwise(gains), strict=True)
+def _causes(judged: _Judged, gains: Sequence[float], model: RobotModel) -> tuple[Cause, ...]:
+    fitted = judged.joint.fitted
+    each = zip(judged.found, judged.joint.causes, fitted.places, pairwise(gains), strict=True)
     return tuple(
         Cause(one.name, estimates(effect, fitted, at, model), one.confidence, Gain(*gain), one.ambiguous)
         for one, effect, at, gain in each

@@ -19,7 +19,7 @@ from .shifts import torque_change
 from .state import State, batched, extended_state
 from .step import stand
 
-__all__ = ["held_out", "predicted", "residual_rms", "traces"]
+__all__ = ["fold_error", "held_out", "predicted", "residual_rms", "traces"]
 
 
 def held_out(problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> list[float]:
@@ -37,7 +37,7 @@ def held_out(problem: Problem, start: State, causes: list[Effect], whitening: Fl
             error = (problem.torque - predicted(problem, state)) * problem.held
             out.append(float(np.sqrt((error**2).sum() / ((problem.torque * problem.held) ** 2).sum())))
         else:
-            out.append(_fold_error(problem, state, step.verdicts.folds))
+            out.append(fold_error(problem, state, step.verdicts.folds))
     return out
 
 
@@ -48,7 +48,7 @@ def predicted(problem: Problem, state: State) -> Float[np.ndarray, "n M nv"]:
 
 def residual_rms(problem: Problem, state: State) -> Float[np.ndarray, " nv"]:
     """RMS of what the state leaves of the fitted rows of each joint, N m or N."""
-    weight = np.asarray(problem.records.weight)
+    weight = np.asarray(problem.records.judged)
     squares = ((problem.torque - predicted(problem, state)) ** 2 * weight).sum((0, 1))
     return np.sqrt(squares / np.maximum(weight.sum((0, 1)), 1))
 
@@ -96,8 +96,9 @@ def _share(problem: Problem, state: State, effect: Effect, place: list[int]) -> 
     return open_rows(problem.records, state.torque(np.where(own, state.theta, 0.0)) - state.known, response)
 
 
-def _fold_error(problem: Problem, state: State, folds: Float[np.ndarray, "folds P"]) -> float:
-    weight = problem.records.weight
+def fold_error(problem: Problem, state: State, folds: Float[np.ndarray, "folds P"]) -> float:
+    """Relative RMS error (N m over N m, all joints) of each fold, predicted with the coefficients without it."""
+    weight = np.asarray(problem.records.judged)
     response, fold = state.response(problem.records.omega), problem.layout.fold.reshape(weight.shape[:2])
     error = problem.torque * weight
     power = (error**2).sum()

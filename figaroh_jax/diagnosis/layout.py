@@ -14,19 +14,19 @@ from .records import Records
 __all__ = ["describe_folds", "held_rows", "layout"]
 
 BLOCK, SHORT_BLOCK, SHORT = 1.0, 0.3, 9.99  # s: of a block, of a block in recordings shorter than the third
-QUARTERS = 4
+FOLDS, SLICE = 5, 2.0  # where the excitations are few: folds, and seconds that one takes in turn
 FEWEST_EXCITATIONS = 3
 
 
 def layout(signals: Sequence[Signals], records: Records) -> Layout:
-    """Partners of every row, blocks of about a second, folds of one excitation (or quarters where they are few).
+    """Partners of every row, blocks of about a second, folds of one excitation (or slices in turn where they are few).
 
     Holdout recordings stand behind the others and belong to no block and no fold.
     """
     n, _, count, _ = records.shape
     partner = _partners(signals, records)
     repeats = bool((partner >= 0).any())
-    weight = np.asarray(records.weight)
+    weight = records.fitted
     if repeats:
         target = np.maximum(partner, 0)
         flat = weight.reshape(n * count, -1)
@@ -51,7 +51,7 @@ def describe_folds(signals: Sequence[Signals]) -> str:
     labels = excitations([s for s in signals if s.role == "fit"])
     if max(labels) + 1 >= FEWEST_EXCITATIONS:
         return "each excitation left out in turn"
-    return "each recording's quarters left out in turn"
+    return f"slices of {SLICE:g} s left out in turn, every {FOLDS}th of them at a time"
 
 
 def excitations(signals: Sequence[Signals]) -> list[int]:
@@ -93,8 +93,10 @@ def _folds(signals: Sequence[Signals], records: Records) -> Int[np.ndarray, " T"
     fitted = [s for s in signals if s.role == "fit"]
     labels = excitations(fitted)
     fold = np.full((n, count), -1)
+    first: dict[int, int] = {}
     for k, one in enumerate(fitted):
-        quarter = np.minimum(np.arange(count) * QUARTERS // max(one.rows.kept, 1), QUARTERS - 1)
-        fold[k] = labels[k] if max(labels) + 1 >= FEWEST_EXCITATIONS else labels[k] * QUARTERS + quarter
+        late = align(fitted[first.setdefault(labels[k], k)], one) if one.repeat else 0
+        slices = np.maximum(np.arange(count) - late, 0) / float(records.rate) // SLICE  # repeats share their slices
+        fold[k] = labels[k] if max(labels) + 1 >= FEWEST_EXCITATIONS else slices % FOLDS
         fold[k, one.rows.kept :] = -1
-    return fold.reshape(-1)
+    return np.unique(fold, return_inverse=True)[1].reshape(-1) - int((fold < 0).any())

@@ -13,16 +13,9 @@ from .noise import Spectrum
 from .problem import Problem
 from .rows import Rows
 from .screening import draw_noise
+from .thresholds import FITTED, FITTED_SHARE, LINE_P, OWN_SHARE, REPEATED, REPEATED_SHARE, REST_P, UNREPEATED
 
 __all__ = ["Rest", "excess", "lines", "rest_of", "verdict", "wrong_law"]
-
-CERTAIN = 0.01
-LINE = 1e-3
-REPEATED, REPEATED_SHARE = 0.08, 0.05  # excess that repeats: absolute, and as a share of the first excess
-FITTED, FITTED_SHARE = 0.03, 0.03  # excess that a flexible model or the catalogue still scores on
-UNREPEATED = 0.01  # the same where no recording repeats another
-OWN_SHARE = 0.03  # of what a cause has removed: a rest at its own place that speaks against its law
-EXPLAINED = 0.9  # share that causes must remove before they are named beside a rest
 
 
 class Rest(NamedTuple):
@@ -65,16 +58,16 @@ def rest_of(
 ) -> Rest:
     """Whether the rest is significant, and a description without a cause's name."""
     size, p_repeat, own = now
-    repeats = p_repeat < CERTAIN and size > max(REPEATED, REPEATED_SHARE * first)
+    repeats = p_repeat < REST_P and size > max(REPEATED, REPEATED_SHARE * first)
     # without repeats the noise was taken from a model that has fitted part of any misfit
     least = FITTED if p_repeat < 1 else UNREPEATED
-    scored = min(flexible[0], p_catalogue) < CERTAIN and size > max(least, FITTED_SHARE * first)
-    vibrates = line[0] < LINE
+    scored = min(flexible[0], p_catalogue) < REST_P and size > max(least, FITTED_SHARE * first)
+    vibrates = line[0] < LINE_P
     worst = int(np.argmax(own))
     text = ""
     if repeats or scored:
         text = f"most of it at {joints[worst]} ({own[worst]:.2g} times the noise power)"
-        if flexible[0] < CERTAIN:
+        if flexible[0] < REST_P:
             text += f"; strongest dependence: {flexible[1].effect} at {flexible[1].at[0]}"
     if vibrates:
         text += f"{'; ' if text else ''}a line at {line[1]:.3g} Hz in time at {joints[line[2]]}"
@@ -87,19 +80,14 @@ def wrong_law(at: tuple[str, ...], drop: float, flexible: tuple[float, Name, flo
     The right law leaves noise; one that only resembles it leaves a share of what it stands for.
     """
     p, (_, places), score = flexible
-    return p < CERTAIN and (not at or places[0] in at) and score > OWN_SHARE * drop
+    return p < REST_P and (not at or places[0] in at) and score > OWN_SHARE * drop
 
 
-def verdict(named: bool, rest: Rest, first: float, wrong: bool = False) -> Verdict:
-    """The contract's four words from the causes and the rest; `wrong`: the first cause leaves a rest of its own."""
-    if not named:
-        return "unknown" if rest.significant else "nothing"
-    if wrong:
-        return "unknown"
-    if not rest.significant:
-        return "named"
-    share = 1 - max(rest.excess, 0.0) / first if first > 0.02 else 0.0
-    return "named+rest" if share > EXPLAINED else "unknown"
+def verdict(named: bool, rest: bool) -> Verdict:
+    """The contract's four words: whether a cause is named, and whether something is left that is not noise."""
+    if named:
+        return "named+rest" if rest else "named"
+    return "unknown" if rest else "nothing"
 
 
 def lines(problem: Problem, residual: Float[np.ndarray, "nv T"]) -> tuple[float, float, int]:

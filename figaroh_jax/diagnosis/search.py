@@ -16,20 +16,17 @@ from .contenders import Contender, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places
 from .flexible import friction_width
-from .gates import CONFIDENT, GAIN, ambiguous, exists, passes, rivals, simpler
+from .gates import ambiguous, exists, passes, physical_sign, rivals, simpler
 from .noise import Spectrum
 from .problem import Problem
 from .rows import Prior
 from .screening import DRAWS, Null, Screen, catalogue, family_p, screen
 from .state import State, with_width
 from .step import Step, stand, with_cause, with_causes
+from .thresholds import CONFIDENT, GAIN, MOST_CAUSES, MUCH, SMALLEST, TRUSTED
 
-__all__ = ["Found", "Search", "eliminate", "find_causes"]
+__all__ = ["Found", "Search", "eliminate", "find_causes", "judged_without"]
 
-MUCH = 0.5  # share of the best's drop from which another cause explains much of the same
-SMALLEST = 0.005  # share of the first cause's drop below which a later one may be what the first left over
-TRUSTED = 0.05  # of the inertials, relative: up to it a link's own inertia may be the cause
-MOST = 12
 NEAR, CLOSER = 4, 800  # times the level: p-values below which few draws cannot tell from it; draws that can
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
 
@@ -46,7 +43,13 @@ class Found:
     t: float
     confidence: float
     ambiguous: tuple[Name, ...]
+    joints: tuple[int, ...] = ()  # by whose rows it is judged
     alike: tuple[Name, ...] = ()  # what else explains much of the same misfit, though not as well
+
+    @property
+    def nuisance(self) -> bool:
+        """Whether physics forbids its sign: it stands in the fit and is no cause."""
+        return not physical_sign(self.effect)
 
 
 class Search(NamedTuple):
@@ -80,15 +83,15 @@ def find_causes(
     step, found = stand(problem, state, whitening), []
     null = Null(problem, spectrum, whitening, generator)
     p_values, screens, screened, groups = [], [], None, None
-    while len(found) < MOST:
-        progress("screening the catalogue", len(found) / MOST)
+    while len(found) < MOST_CAUSES:
+        progress("screening the catalogue", len(found) / MOST_CAUSES)
         groups = catalogue(problem, step.state, step.rows, whitening, forbid, groups)
         screened = screen(step.rows, step.linear, groups, screened)
         p_values.append(_chance(step, screened, null, alpha, generator, not found))
         screens = screens or [screened]
         if p_values[-1] > alpha:
             break
-        progress("comparing causes on held-out data", len(found) / MOST)
+        progress("comparing causes on held-out data", len(found) / MOST_CAUSES)
         contenders = _contenders(problem, step, screened, whitening)
         best = _best(problem, step, contenders, found)
         if best is None:
@@ -157,6 +160,7 @@ def _found(
         t=t_value(step.verdicts.blocks, best.verdicts.blocks),
         confidence=float(wins[0]) * (1 - p),
         ambiguous=ambiguous(step, best, alike, screened),
+        joints=best.joints,
         alike=tuple(c.name for c in alike if step.verdicts.cost - c.verdicts.cost > MUCH * drop),
     )
 
@@ -167,15 +171,15 @@ def eliminate(problem: Problem, start: State, found: list[Found], whitening: Flo
         return found
     full = with_causes(problem, start, [f.effect for f in found], whitening)
     for one in list(found[:-1]):
-        without = _without(problem, start, full, found, one, whitening)
-        gain = 1 - full.verdicts.heldout / without.heldout
-        if gain < GAIN or t_value(without.blocks, full.verdicts.blocks) < CONFIDENT:
+        without = judged_without(problem, start, full, found, one, whitening)
+        worse, better = (v.own(full.rows, one.joints) for v in (without, full.verdicts))
+        if 1 - better.sum() / worse.sum() < GAIN or t_value(worse, better) < CONFIDENT:
             found = [f for f in found if f is not one]
             full = with_causes(problem, start, [f.effect for f in found], whitening)
     return found
 
 
-def _without(
+def judged_without(
     problem: Problem, start: State, full: Step, found: list[Found], one: Found, whitening: Float[np.ndarray, "F nv"]
 ) -> Verdicts:
     """What the data say of all causes but one."""
