@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 import figaroh_jax as fj
-from figaroh_jax import registry
+from figaroh_jax.simulators import registry
 
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 ROBOTS = {"UR10e": "ur10e_innopolis/ur10e.urdf", "TALOS": "talos_contact/talos_full_v2.urdf"}

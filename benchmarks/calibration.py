@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from figaroh_jax.calibration.poserecords import PoseRecording
 from figaroh_jax.formats.urdf import load_urdf
+from figaroh_jax.recordings.poses import PoseRecording
 
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 BOTH = ("base_frame", "tool_frame")
@@ -182,9 +182,9 @@ class Ours:
     def __init__(self, model, records: list[PoseRecording], level: str = "full", weight: float = 1e4) -> None:
         from figaroh_jax.calibration import posefit
         from figaroh_jax.calibration.candidates import geometry_columns
-        from figaroh_jax.calibration.chain import chain_between
         from figaroh_jax.calibration.gauge import find_gauge
         from figaroh_jax.calibration.posegroups import assemble, postures_of
+        from figaroh_jax.rigid.chain import chain_between
 
         chain = chain_between(model, records[0].base_frame, records[0].tool_frame).joints
         columns = geometry_columns(model, chain)[: len(chain) if level == "joint_offset" else None]

@@ -28,7 +28,7 @@ from hidden_kinematics import arm  # noqa: E402
 def calibrated(robot: postures.Arm, model: Any, made: postures.Perturbed, level: str | None) -> Any:
     """The library's calibration of a made robot."""
     from figaroh_jax.calibration.calibration import calibrate
-    from figaroh_jax.calibration.poserecords import PoseRecording
+    from figaroh_jax.recordings.poses import PoseRecording
 
     both, clock = ("base_frame", "tool_frame"), np.arange(float(len(made.q)))
     seen = PoseRecording("made", Path("made"), clock, made.q, "position", made.points, robot.base, robot.tool, both)
@@ -40,7 +40,7 @@ def misses(model: Any, robot: postures.Arm, made: postures.Perturbed, found: Any
     import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
     from figaroh_jax.calibration.candidates import geometry_columns
-    from figaroh_jax.calibration.kinematic_effects import Postures
+    from figaroh_jax.effects.kinematic import Postures
 
     none = np.zeros((1, 0))
     still = Postures(none, none, none, none, none, np.zeros(1), 1.0)

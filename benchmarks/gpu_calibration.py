@@ -24,10 +24,10 @@ import jax
 import numpy as np
 
 from figaroh_jax.calibration import posefit, starts
-from figaroh_jax.calibration.chain import Chain
-from figaroh_jax.calibration.devices import Poses
 from figaroh_jax.calibration.gauge import find_gauge
 from figaroh_jax.calibration.posesolver import solve
+from figaroh_jax.recordings.devices import Poses
+from figaroh_jax.rigid.chain import Chain
 
 A = (0.0, -0.6127, -0.57155, 0.0, 0.0, 0.0)  # m
 D = (0.1807, 0.0, 0.0, 0.17415, 0.11985, 0.11655)

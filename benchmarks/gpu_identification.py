@@ -21,14 +21,14 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from figaroh_jax.dynamics import inverse_dynamics
-from figaroh_jax.effects import find
-from figaroh_jax.identification.base_parameters import base_parameters
-from figaroh_jax.identification.devices import condense_on_devices
-from figaroh_jax.identification.least_squares import WeightedByJoint, solve
-from figaroh_jax.identification.regression import condense
-from figaroh_jax.identification.states import States
-from figaroh_jax.model import Joint, RobotModel
+from figaroh_jax.effects.catalogue import find
+from figaroh_jax.estimation.accelerators import condense_on_devices
+from figaroh_jax.estimation.base_parameters import base_parameters
+from figaroh_jax.estimation.least_squares import WeightedByJoint, solve
+from figaroh_jax.estimation.regression import condense
+from figaroh_jax.estimation.states import States
+from figaroh_jax.rigid.dynamics import inverse_dynamics
+from figaroh_jax.rigid.model import Joint, RobotModel
 
 CHECKED = 4000  # samples
 NOISE = 0.05  # N m

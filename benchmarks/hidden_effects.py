@@ -134,7 +134,7 @@ def _noise(number: int) -> dict[str, Any]:
 
 def _twins(effect: str) -> tuple[str, ...]:
     """The effect and what cannot be told from it, as far as the library knows the names."""
-    from figaroh_jax.effects import CATALOGUE
+    from figaroh_jax.effects.catalogue import CATALOGUE
 
     names = {effect}.union(*(names for names in CLASSES if effect in names))
     return tuple(sorted(names & set(CATALOGUE)))

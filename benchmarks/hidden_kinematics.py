@@ -46,9 +46,9 @@ def arm(name: str, folder: Path) -> postures.Arm:
 def diagnose(robot: postures.Arm, case: postures.Hidden, forbid: tuple[str, ...] = ()) -> Any:
     """The library's answer to a case."""
     from figaroh_jax.calibration.kinematic_diagnosis import diagnose_poses
-    from figaroh_jax.calibration.poserecords import PoseRecording
     from figaroh_jax.formats.config import Load
     from figaroh_jax.formats.urdf import load_urdf
+    from figaroh_jax.recordings.poses import PoseRecording
 
     recordings = []
     for k, r in enumerate(case.recordings):

@@ -38,15 +38,15 @@ def ours(request: dict[str, Any]) -> dict[str, Any]:
     """Fit all samples; the first fit, of one chunk, compiles."""
     import numpy as np
 
-    from figaroh_jax.dynamics import inverse_dynamics
+    from figaroh_jax.estimation.accelerators import condense_on_devices
+    from figaroh_jax.estimation.base_parameters import base_parameters
+    from figaroh_jax.estimation.columns import friction_terms
+    from figaroh_jax.estimation.least_squares import solve
+    from figaroh_jax.estimation.regression import condense
+    from figaroh_jax.estimation.states import States, read_pieces
     from figaroh_jax.formats.config import Baseline
     from figaroh_jax.formats.urdf import load_urdf
-    from figaroh_jax.identification.base_parameters import base_parameters
-    from figaroh_jax.identification.columns import friction_terms
-    from figaroh_jax.identification.devices import condense_on_devices
-    from figaroh_jax.identification.least_squares import solve
-    from figaroh_jax.identification.regression import condense
-    from figaroh_jax.identification.states import States, read_pieces
+    from figaroh_jax.rigid.dynamics import inverse_dynamics
 
     model = load_urdf(request["path"], joints=request["joints"])
     terms = friction_terms(model, Baseline(viscous=True, coulomb=True, rotor=True, offset=True))
@@ -97,8 +97,8 @@ def write_states(folder: str, request: dict[str, Any], samples: int) -> list[str
     """Files of random states and torques, made piece by piece."""
     import numpy as np
 
-    from figaroh_jax.dynamics import inverse_dynamics
     from figaroh_jax.formats.urdf import load_urdf
+    from figaroh_jax.rigid.dynamics import inverse_dynamics
 
     model = load_urdf(request["path"], joints=request["joints"])
     files = [str(Path(folder) / f"{name}.npy") for name in ("q", "v", "a", "tau")]

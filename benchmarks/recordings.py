@@ -45,8 +45,8 @@ def identified(name: str, folder: Path) -> tuple[Any, Any]:
 
 def best_robots(problem: Any) -> dict[str, np.ndarray]:
     """Parameters of the best robot of bodies: by our solver, by SCS, and with friction of any sign."""
-    from figaroh_jax.identification.consistency import physical_fit
-    from figaroh_jax.identification.least_squares import with_prior
+    from figaroh_jax.estimation.consistency import physical_fit
+    from figaroh_jax.estimation.least_squares import with_prior
 
     factor = with_prior(
         problem.data.factor(problem.weight), problem.mean, VANISHING * problem.inflation * problem.precision
@@ -62,7 +62,7 @@ def by_scs(factor: np.ndarray, problem: Any) -> np.ndarray:
     """The same convex problem written anew for CVXPY and SCS."""
     cp: Any = importlib.import_module("cvxpy")  # not among the project's dependencies: `pip install cvxpy`
 
-    from figaroh_jax.inertia import pseudo_inertia
+    from figaroh_jax.rigid.inertia import pseudo_inertia
 
     scale = np.ones(factor.shape[1] - 1)
     for body in problem.links:
@@ -113,7 +113,7 @@ def main() -> None:
 
 def problem_start(problem: Any) -> np.ndarray:
     """The weighted fit of the base parameters alone."""
-    from figaroh_jax.identification.least_squares import solve
+    from figaroh_jax.estimation.least_squares import solve
 
     return solve(problem.data, weight=problem.weight, kept=problem.base.independent).parameters
 

@@ -47,8 +47,8 @@ def work() -> None:
     import numpy as np
 
     from figaroh_jax.formats.urdf import load_urdf
-    from figaroh_jax.regressor import joint_torque_regressor, packed_regressor
-    from figaroh_jax.streaming import normal_matrix
+    from figaroh_jax.rigid.normal_equations import normal_matrix
+    from figaroh_jax.rigid.regressor import joint_torque_regressor, packed_regressor
 
     methods: dict[str, Any] = {
         "dense": joint_torque_regressor,
@@ -218,7 +218,7 @@ def main() -> None:
     if not DATA.is_dir():
         raise SystemExit(f"no robots in {DATA} (FIGAROH_JAX_DATA names the folder)")
     from figaroh_jax.formats.urdf import load_urdf
-    from figaroh_jax.regressor import pairs
+    from figaroh_jax.rigid.regressor import pairs
 
     rounds = options.rounds or (3 if options.quick else 9)
     bench = Bench(options.figaroh or environment(), options.core)

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import figaroh_jax as fj
-from figaroh_jax.calibration.devices import own_device
-from figaroh_jax.calibration.poserecords import PoseRecording
+from figaroh_jax.recordings.devices import own_device
+from figaroh_jax.recordings.poses import PoseRecording
 
 
 # the device: predicted minus measured, m

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import figaroh_jax as fj
-from figaroh_jax.effect import Scalar
-from figaroh_jax.extended import predict
+from figaroh_jax.effects.base import Scalar
+from figaroh_jax.effects.extended import predict
 
 
 # the effect: its words, its parameters, its torque

@@ -1,7 +1,7 @@
 """Names what a robot's simulation gets wrong, extends the model with it and measures the gain.
 
 The names below are loaded when they are first used, so that `import figaroh_jax` costs next to nothing; submodules are
-reached as attributes too (`figaroh_jax.spatial`). Importing changes no setting of JAX.
+reached as attributes too (`figaroh_jax.rigid.spatial`). Importing changes no setting of JAX.
 """
 
 from __future__ import annotations
@@ -13,64 +13,59 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .calibration.calibration import calibrate as calibrate, calibrate_task as calibrate_task
     from .diagnosis.diagnosis import diagnose as diagnose, diagnose_task as diagnose_task
-    from .dynamics import (
+    from .effects.base import Effect as Effect, Motion as Motion, amplitude as amplitude, place as place, shape as shape
+    from .effects.catalogue import CATALOGUE as CATALOGUE, register as register
+    from .effects.extended import ExtendedModel as ExtendedModel, extend as extend
+    from .effects.simulation import simulate as simulate
+    from .errors import InputError as InputError
+    from .formats.config import Baseline as Baseline, Preprocess as Preprocess, load_task as load_task
+    from .formats.export import load_model as load_model, write_model as write_model
+    from .formats.mjcf import load_mjcf as load_mjcf
+    from .formats.robotfile import load_extended as load_extended, load_robot as load_robot
+    from .formats.urdf import load_urdf as load_urdf
+    from .identification.identification import identify as identify, identify_task as identify_task
+    from .recordings.dataset import Recording as Recording, read_recordings as read_recordings
+    from .reporting.report import write_report as write_report
+    from .results import Cause as Cause, Diagnosis as Diagnosis
+    from .rigid.dynamics import (
         forward_dynamics as forward_dynamics,
         inverse_dynamics as inverse_dynamics,
         mass_matrix as mass_matrix,
     )
-    from .effect import Effect as Effect, Motion as Motion, amplitude as amplitude, place as place, shape as shape
-    from .effects import CATALOGUE as CATALOGUE, register as register
-    from .errors import InputError as InputError
-    from .extended import ExtendedModel as ExtendedModel, extend as extend
-    from .formats.config import (
-        Baseline as Baseline,
-        Preprocess as Preprocess,
-        load_robot as load_robot,
-        load_task as load_task,
-    )
-    from .formats.export import load_model as load_model, write_model as write_model
-    from .formats.mjcf import load_mjcf as load_mjcf
-    from .formats.robotfile import load_extended as load_extended
-    from .formats.urdf import load_urdf as load_urdf
-    from .identification.identification import identify as identify, identify_task as identify_task
-    from .kinematics import (
+    from .rigid.kinematics import (
         forward_kinematics as forward_kinematics,
         frame_jacobian as frame_jacobian,
         frame_placement as frame_placement,
     )
-    from .model import Frame as Frame, Joint as Joint, RobotModel as RobotModel
-    from .recordings.dataset import Recording as Recording, read_recordings as read_recordings
-    from .registry import backend as backend
-    from .regressor import joint_torque_regressor as joint_torque_regressor, packed_regressor as packed_regressor
-    from .reporting.report import write_report as write_report
-    from .results import Cause as Cause, Diagnosis as Diagnosis
-    from .simulation import simulate as simulate
-    from .streaming import normal_matrix as normal_matrix, triangular_factor as triangular_factor
+    from .rigid.model import Frame as Frame, Joint as Joint, RobotModel as RobotModel
+    from .rigid.normal_equations import normal_matrix as normal_matrix, triangular_factor as triangular_factor
+    from .rigid.regressor import joint_torque_regressor as joint_torque_regressor, packed_regressor as packed_regressor
+    from .simulators.registry import backend as backend
 
 __version__ = "0.1.0"
 
 _MODULES = {
     "calibration.calibration": ("calibrate", "calibrate_task"),
-    "formats.config": ("Baseline", "Preprocess", "load_robot", "load_task"),
+    "formats.config": ("Baseline", "Preprocess", "load_task"),
     "recordings.dataset": ("Recording", "read_recordings"),
     "diagnosis.diagnosis": ("diagnose", "diagnose_task"),
-    "dynamics": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
-    "effect": ("Effect", "Motion", "amplitude", "place", "shape"),
-    "effects": ("CATALOGUE", "register"),
+    "rigid.dynamics": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
+    "effects.base": ("Effect", "Motion", "amplitude", "place", "shape"),
+    "effects.catalogue": ("CATALOGUE", "register"),
     "errors": ("InputError",),
     "formats.export": ("load_model", "write_model"),
-    "extended": ("ExtendedModel", "extend"),
+    "effects.extended": ("ExtendedModel", "extend"),
     "identification.identification": ("identify", "identify_task"),
-    "kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
+    "rigid.kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
     "formats.mjcf": ("load_mjcf",),
-    "model": ("Frame", "Joint", "RobotModel"),
-    "registry": ("backend",),
-    "regressor": ("joint_torque_regressor", "packed_regressor"),
+    "rigid.model": ("Frame", "Joint", "RobotModel"),
+    "simulators.registry": ("backend",),
+    "rigid.regressor": ("joint_torque_regressor", "packed_regressor"),
     "reporting.report": ("write_report",),
     "results": ("Cause", "Diagnosis"),
-    "formats.robotfile": ("load_extended",),
-    "simulation": ("simulate",),
-    "streaming": ("normal_matrix", "triangular_factor"),
+    "formats.robotfile": ("load_extended", "load_robot"),
+    "effects.simulation": ("simulate",),
+    "rigid.normal_equations": ("normal_matrix", "triangular_factor"),
     "formats.urdf": ("load_urdf",),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}

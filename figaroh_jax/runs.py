@@ -17,7 +17,7 @@ from .errors import InputError
 if TYPE_CHECKING:
     from .calibration.calibrated import Calibration
     from .calibration.kinematic_diagnosis import PoseDiagnosis
-    from .extended import ExtendedModel
+    from .effects.extended import ExtendedModel
     from .formats.config import Load, Task
     from .identification.result import Identification, Link
     from .results import Diagnosis
@@ -61,7 +61,7 @@ def diagnose_file(
     anything else is refused before any work. Wrong input raises `InputError`, and nothing is written.
     """
     from .formats.config import load_task
-    from .registry import check_backend
+    from .simulators.registry import check_backend
 
     check_backend(backend, "joint_torque_regressor")
     check_directory(out)
@@ -85,7 +85,7 @@ def identify_file(
 ) -> Identification:
     """Read a task, identify its robot and write the run directory `out`, as `diagnose_file` does."""
     from .formats.config import load_task
-    from .registry import check_backend
+    from .simulators.registry import check_backend
 
     check_backend(backend, "joint_torque_regressor")
     check_directory(out)
@@ -161,7 +161,7 @@ def calibrate_file(
 
 def _native_alone(backend: str) -> None:
     if backend != "native":
-        from .registry import backend_class
+        from .simulators.registry import backend_class
 
         backend_class(backend)  # one that is not installed is refused there, with the list of those that are
         raise InputError(
@@ -191,7 +191,7 @@ def predictions(
     The recording's motion is prepared as for the fit, but over its whole length, whatever window the fit kept. Where
     the model is an identified one, a known payload is carried in addition.
     """
-    from .extended import predict
+    from .effects.extended import predict
     from .recordings.dataset import read_recordings
     from .recordings.signals import choose_rates, prepare, to_recording_times
 

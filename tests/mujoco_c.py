@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from figaroh_jax.formats.mjcf import joint_names
-from figaroh_jax.model import Joint, RobotModel
+from figaroh_jax.rigid.model import Joint, RobotModel
 
 _WIDTH, _NUMBERS = (6, 3, 1, 1), (7, 4, 1, 1)  # of free, ball, slide, hinge
 

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 from figaroh_jax_pinocchio import PinocchioBackend
 
-from figaroh_jax.model import RobotModel
+from figaroh_jax.rigid.model import RobotModel
 
 __all__ = ["build", "forward_dynamics", "forward_kinematics", "inverse_dynamics", "mass_matrix", "regressor"]
 

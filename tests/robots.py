@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from figaroh_jax.formats.urdf import load_urdf
-from figaroh_jax.model import RobotModel
+from figaroh_jax.rigid.model import RobotModel
 
 REAL = {  # robots of the recordings, under the data folder
     "tx40": "staubli_tx40/tx40.urdf",

@@ -8,7 +8,7 @@ from typing import Literal
 import equinox as eqx
 import numpy as np
 
-from figaroh_jax.diagnosis.rows import Rows
+from figaroh_jax.estimation.rows import Rows
 from figaroh_jax.recordings.rowfilter import row_filter
 from figaroh_jax.recordings.signals import Signals
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import robots
 
-from figaroh_jax.chunks import DRAFT_OPTIONS, program
-from figaroh_jax.contract import Backend
+from figaroh_jax.compiled.batching import DRAFT_OPTIONS, program
 from figaroh_jax.formats.robotfile import read_robot
-from figaroh_jax.native_backend import NativeBackend
+from figaroh_jax.simulators.contract import Backend
+from figaroh_jax.simulators.native import NativeBackend
 
 CASES = [
     pytest.param("native", "arm"),

@@ -15,11 +15,11 @@ import pinocchio as pin
 import pytest
 import robots
 
-from figaroh_jax import regressor
-from figaroh_jax.contract import Backend
 from figaroh_jax.errors import NotSupported
 from figaroh_jax.formats.robotfile import read_robot
-from figaroh_jax.native_backend import NativeBackend
+from figaroh_jax.rigid import regressor
+from figaroh_jax.simulators.contract import Backend
+from figaroh_jax.simulators.native import NativeBackend
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 CLASSES: dict[str, type[Backend]] = {

@@ -20,11 +20,11 @@ import robots
 import toy_backend
 from hypothesis import given, settings, strategies as st
 
-from figaroh_jax import registry
-from figaroh_jax.chunks import DRAFT_OPTIONS, program
-from figaroh_jax.contract import FUNCTIONS, Backend
+from figaroh_jax.compiled.batching import DRAFT_OPTIONS, program
 from figaroh_jax.errors import InputError, NotSupported
-from figaroh_jax.native_backend import NativeBackend
+from figaroh_jax.simulators import registry
+from figaroh_jax.simulators.contract import FUNCTIONS, Backend
+from figaroh_jax.simulators.native import NativeBackend
 
 # One line a backend: the type checker compares the signatures with the contract.
 native: type[Backend] = NativeBackend

@@ -10,9 +10,9 @@ from robots import REAL, TREE, joint, link, load, robot
 
 import figaroh_jax as fj
 from figaroh_jax.errors import InputError
+from figaroh_jax.estimation.base_parameters import BaseParameters, base_parameters
+from figaroh_jax.estimation.columns import column_names, friction_terms, structural_columns
 from figaroh_jax.formats.config import Baseline, BaselineEffect
-from figaroh_jax.identification.base_parameters import BaseParameters, base_parameters
-from figaroh_jax.identification.columns import column_names, friction_terms, structural_columns
 
 DRIVES = Baseline(viscous=True, coulomb=True, rotor=True, offset=True)
 

@@ -11,13 +11,13 @@ import numpy as np
 import poses
 import pytest
 
-from figaroh_jax import lie
 from figaroh_jax.calibration import posefit
-from figaroh_jax.calibration.chain import chain_between
-from figaroh_jax.calibration.devices import Points
 from figaroh_jax.calibration.posesolver import solve
-from figaroh_jax.chunks import program
+from figaroh_jax.compiled.batching import program
 from figaroh_jax.formats.urdf import load_urdf
+from figaroh_jax.recordings.devices import Points
+from figaroh_jax.rigid import lie
+from figaroh_jax.rigid.chain import chain_between
 
 BOTH = ("base_frame", "tool_frame")
 JOINTS, COLUMNS = 6, 7

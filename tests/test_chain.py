@@ -12,10 +12,10 @@ import pytest
 import reference
 import robots
 
-from figaroh_jax.calibration.chain import chain_between, chain_pose, joint_response
 from figaroh_jax.calibration.gravity import gravity_moments, without_far_masses
 from figaroh_jax.errors import InputError
-from figaroh_jax.lie import log_so3
+from figaroh_jax.rigid.chain import chain_between, chain_pose, joint_response
+from figaroh_jax.rigid.lie import log_so3
 
 pose_of = jax.jit(chain_pose)
 

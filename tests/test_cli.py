@@ -18,15 +18,16 @@ import numpy as np
 import pytest
 from toy_backend import ToyBackend
 
-from figaroh_jax import cli, registry
+from figaroh_jax import cli
 from figaroh_jax.diagnosis import diagnosis
+from figaroh_jax.effects.extended import extend
 from figaroh_jax.errors import InputError
-from figaroh_jax.extended import extend
 from figaroh_jax.formats import export
 from figaroh_jax.formats.urdf import load_urdf
-from figaroh_jax.native_backend import NativeBackend
 from figaroh_jax.results import Diagnosis
 from figaroh_jax.runs import whole_directory
+from figaroh_jax.simulators import registry
+from figaroh_jax.simulators.native import NativeBackend
 
 DEMO = Path(str(resources.files("figaroh_jax") / "demo"))
 FILES = {"answer.json", "predictions.npz", "report.html", "model"}

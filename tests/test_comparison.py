@@ -18,7 +18,7 @@ from figaroh_jax.diagnosis.comparison import (
     shares_of_wins,
     t_value,
 )
-from figaroh_jax.diagnosis.rows import Prior, Rows
+from figaroh_jax.estimation.rows import Prior, Rows
 
 NV, COUNT, WIDTH, BLOCKS, FOLDS = 2, 80, 3, 9, 4
 PRIOR = Prior(np.array([0.3, -2.0, 0.0]), np.array([5.0, 0.2, 1e-3]))

@@ -9,7 +9,8 @@ import yaml
 from tasks import task, write
 
 from figaroh_jax.errors import InputError
-from figaroh_jax.formats.config import Preprocess, Task, load_robot, load_task
+from figaroh_jax.formats.config import Preprocess, Task, load_task
+from figaroh_jax.formats.robotfile import load_robot
 from figaroh_jax.recordings.dataset import read_recordings
 
 CONTRACT = """

@@ -9,10 +9,9 @@ import pytest
 from robots import REAL, TREE, load
 
 import figaroh_jax as fj
-from figaroh_jax.diagnosis.priors import rigid_prior
 from figaroh_jax.errors import InputError
-from figaroh_jax.identification.conic import Body
-from figaroh_jax.identification.consistency import (
+from figaroh_jax.estimation.conic import Body
+from figaroh_jax.estimation.consistency import (
     bodies,
     full_parameters,
     inconsistencies,
@@ -20,7 +19,8 @@ from figaroh_jax.identification.consistency import (
     physical_fit,
     project,
 )
-from figaroh_jax.inertia import from_com, pseudo_inertia
+from figaroh_jax.estimation.priors import rigid_prior
+from figaroh_jax.rigid.inertia import from_com, pseudo_inertia
 
 
 @pytest.fixture(scope="module")

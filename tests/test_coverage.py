@@ -12,9 +12,9 @@ import tasks
 from robots import joint, link, robot
 from simulated_arm import recording
 
+from figaroh_jax.estimation.base_parameters import base_parameters
+from figaroh_jax.estimation.columns import column_names, friction_terms, structural_columns
 from figaroh_jax.formats.config import Baseline, Preprocess
-from figaroh_jax.identification.base_parameters import base_parameters
-from figaroh_jax.identification.columns import column_names, friction_terms, structural_columns
 from figaroh_jax.identification.identification import identify
 
 LIMIT = '<limit lower="-3" upper="3" effort="100" velocity="5"/>'

@@ -10,7 +10,8 @@ import pytest
 from pyarrow import csv, parquet
 from tasks import JOINTS, arrays, task, write
 
-from figaroh_jax.formats.config import Preprocess, Task, load_robot, load_task
+from figaroh_jax.formats.config import Preprocess, Task, load_task
+from figaroh_jax.formats.robotfile import load_robot
 from figaroh_jax.recordings.dataset import Recording, read_recordings
 from figaroh_jax.recordings.signals import prepare
 

@@ -15,13 +15,13 @@ from robots import ARM, TREE, load, states
 
 import figaroh_jax as fj
 from figaroh_jax.errors import InputError
+from figaroh_jax.estimation.accelerators import condense_on_devices, coordinates, fit_states
+from figaroh_jax.estimation.base_parameters import base_parameters
+from figaroh_jax.estimation.columns import friction_terms
+from figaroh_jax.estimation.least_squares import WeightedByJoint, solve
+from figaroh_jax.estimation.regression import Condensed, condense
+from figaroh_jax.estimation.states import States, read_pieces
 from figaroh_jax.formats.config import Baseline
-from figaroh_jax.identification.base_parameters import base_parameters
-from figaroh_jax.identification.columns import friction_terms
-from figaroh_jax.identification.devices import condense_on_devices, coordinates, fit_states
-from figaroh_jax.identification.least_squares import WeightedByJoint, solve
-from figaroh_jax.identification.regression import Condensed, condense
-from figaroh_jax.identification.states import States, read_pieces
 
 TESTS = Path(__file__).parent
 
@@ -131,8 +131,8 @@ PEAK = """
 import sys
 from pathlib import Path
 import numpy as np
-from figaroh_jax.identification.devices import condense_on_devices
-from figaroh_jax.identification.states import States, read_pieces
+from figaroh_jax.estimation.accelerators import condense_on_devices
+from figaroh_jax.estimation.states import States, read_pieces
 from figaroh_jax.formats.urdf import load_urdf
 folder = Path(sys.argv[1])
 model = load_urdf(folder / "robot.urdf")

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from figaroh_jax.calibration.kinematic_effects import CATALOGUE as KINEMATIC
-from figaroh_jax.effects import CATALOGUE
+from figaroh_jax.effects.catalogue import CATALOGUE
+from figaroh_jax.effects.kinematic import CATALOGUE as KINEMATIC
 
-OWN = {name: effect for name, effect in CATALOGUE.items() if effect.__module__ == "figaroh_jax.effects"}
+OWN = {name: effect for name, effect in CATALOGUE.items() if effect.__module__ == "figaroh_jax.effects.catalogue"}
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "effects.md").read_text("utf-8")
 
 

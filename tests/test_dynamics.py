@@ -11,10 +11,10 @@ import pytest
 import reference
 import robots
 
-from figaroh_jax import dynamics, kinematics, regressor
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.urdf import load_urdf
-from figaroh_jax.model import RobotModel
+from figaroh_jax.rigid import dynamics, kinematics, regressor
+from figaroh_jax.rigid.model import RobotModel
 
 
 class Independent:

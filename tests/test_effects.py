@@ -13,11 +13,11 @@ import pytest
 import reference
 import robots
 
-from figaroh_jax.effect import Effect, Motion, amplitude, columns, joint_unit, place, shape, smooth_sign
-from figaroh_jax.effects import CATALOGUE, find, register
+from figaroh_jax.effects.base import Effect, Motion, amplitude, columns, joint_unit, place, shape, smooth_sign
+from figaroh_jax.effects.catalogue import CATALOGUE, find, register
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.urdf import load_urdf
-from figaroh_jax.model import RobotModel
+from figaroh_jax.rigid.model import RobotModel
 
 # three joints, the last one prismatic
 CHAIN = robots.robot(

@@ -9,7 +9,7 @@ from synthetic import made_rows
 
 from figaroh_jax.diagnosis import evidence
 from figaroh_jax.diagnosis.bank import Columns, bank
-from figaroh_jax.diagnosis.rows import Linear, Prior, Rows, fit, instruments
+from figaroh_jax.estimation.rows import Linear, Prior, Rows, fit, instruments
 
 NV, COUNT, WIDTH = 2, 90, 4
 PRIOR = Prior(np.array([0.5, -1.0, 0.0, 2.0]), np.array([3.0, 0.5, 40.0, 1e-3]))

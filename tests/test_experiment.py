@@ -10,13 +10,13 @@ from synthetic import DT, made_signals
 from figaroh_jax.diagnosis.experiment import SPEEDS, _everywhere, _predicted, _swept, next_experiment
 from figaroh_jax.diagnosis.layout import held_rows, layout
 from figaroh_jax.diagnosis.problem import Problem
-from figaroh_jax.diagnosis.records import stack
 from figaroh_jax.diagnosis.search import Found
 from figaroh_jax.diagnosis.state import State, baseline, extended_state, solved, whitened
-from figaroh_jax.effect import Effect, place
-from figaroh_jax.effects import find
-from figaroh_jax.native_backend import NativeBackend
+from figaroh_jax.effects.base import Effect, place
+from figaroh_jax.effects.catalogue import find
+from figaroh_jax.recordings.stacked import stack
 from figaroh_jax.results import Name
+from figaroh_jax.simulators.native import NativeBackend
 
 NOISE = np.array([0.2, 0.1])  # N m, N
 FRICTION, OTHER = Name("power_law_friction", ("turn",)), Name("asymmetric_viscous_friction", ("turn",))

@@ -13,18 +13,18 @@ import pytest
 import robots
 import yaml
 
-from figaroh_jax.effect import Effect, Motion, amplitude, place
-from figaroh_jax.effects import CATALOGUE, find, register
+from figaroh_jax.effects.base import Effect, Motion, amplitude, place
+from figaroh_jax.effects.catalogue import CATALOGUE, find, register
+from figaroh_jax.effects.extended import ExtendedModel, extend, predict
+from figaroh_jax.effects.simulation import simulate
 from figaroh_jax.errors import InputError
-from figaroh_jax.extended import ExtendedModel, extend, predict
 from figaroh_jax.formats.export import load_model, model_files, write_model
 from figaroh_jax.formats.mjcf import load_mjcf
 from figaroh_jax.formats.urdf import load_urdf
-from figaroh_jax.inertia import is_physical
-from figaroh_jax.kinematics import frame_placement
-from figaroh_jax.model import RobotModel
 from figaroh_jax.results import Cause, Estimate, Gain, Name
-from figaroh_jax.simulation import simulate
+from figaroh_jax.rigid.inertia import is_physical
+from figaroh_jax.rigid.kinematics import frame_placement
+from figaroh_jax.rigid.model import RobotModel
 
 LIMIT = '<limit lower="-1.5" upper="2.5" velocity="3" effort="40"/>'
 # two branches, a prismatic joint, frames on the base and on moving links; `quarter` stands at the pole of rpy

@@ -13,12 +13,12 @@ import reference
 import robots
 from scipy import signal
 
-from figaroh_jax.effect import place
-from figaroh_jax.effects import find
+from figaroh_jax.effects.base import place
+from figaroh_jax.effects.catalogue import find
+from figaroh_jax.effects.extended import ExtendedModel, extend, predict
+from figaroh_jax.effects.simulation import Simulation, simulate
 from figaroh_jax.errors import InputError
-from figaroh_jax.extended import ExtendedModel, extend, predict
-from figaroh_jax.model import RobotModel
-from figaroh_jax.simulation import Simulation, simulate
+from figaroh_jax.rigid.model import RobotModel
 
 CHAIN = robots.robot(
     *robots.LINKS[:4],

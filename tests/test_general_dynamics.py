@@ -14,12 +14,12 @@ import pinocchio as pin
 import pytest
 import robots
 
-from figaroh_jax import dynamics, kinematics
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.urdf import load_urdf
-from figaroh_jax.model import Frame, Joint, RobotModel
-from figaroh_jax.regressor import joint_torque_regressor, packed_regressor, pairs
-from figaroh_jax.streaming import normal_matrix, triangular_factor
+from figaroh_jax.rigid import dynamics, kinematics
+from figaroh_jax.rigid.model import Frame, Joint, RobotModel
+from figaroh_jax.rigid.normal_equations import normal_matrix, triangular_factor
+from figaroh_jax.rigid.regressor import joint_torque_regressor, packed_regressor, pairs
 
 REFERENCES = {"local": pin.LOCAL, "world": pin.WORLD, "local_world_aligned": pin.LOCAL_WORLD_ALIGNED}
 KINDS: dict[str, Callable[[np.ndarray], Any]] = {

@@ -10,12 +10,12 @@ import pinocchio as pin
 import pytest
 import robots
 
+from figaroh_jax.effects.extended import extend
 from figaroh_jax.errors import InputError
-from figaroh_jax.extended import extend
 from figaroh_jax.formats.export import load_model, write_model
 from figaroh_jax.formats.urdf import load_urdf
-from figaroh_jax.kinematics import frame_placements
-from figaroh_jax.model import Joint, dofs
+from figaroh_jax.rigid.kinematics import frame_placements
+from figaroh_jax.rigid.model import Joint, dofs
 
 
 def test_columns_of_a_tree_with_joints_of_several_degrees_of_freedom(tmp_path: Path) -> None:

@@ -16,15 +16,15 @@ from simulated_arm import Truth, recording
 import figaroh_jax as fj
 from figaroh_jax import cli
 from figaroh_jax.errors import InputError
+from figaroh_jax.estimation import regression as regression_module
+from figaroh_jax.estimation.base_parameters import base_parameters
+from figaroh_jax.estimation.columns import friction_terms
+from figaroh_jax.estimation.regression import Regression, condense
 from figaroh_jax.formats.config import Baseline, Load, Preprocess
-from figaroh_jax.identification import regression as regression_module
-from figaroh_jax.identification.base_parameters import base_parameters
-from figaroh_jax.identification.columns import friction_terms
 from figaroh_jax.identification.identification import identify
-from figaroh_jax.identification.regression import Regression, condense
 from figaroh_jax.identification.result import Identification, to_json
-from figaroh_jax.native_backend import NativeBackend
 from figaroh_jax.recordings.signals import prepare_all
+from figaroh_jax.simulators.native import NativeBackend
 
 SETTINGS = Preprocess(cutoff=10)
 

@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from figaroh_jax import inertia
+from figaroh_jax.rigid import inertia
 
 
 def body(seed: int) -> tuple[pin.Inertia, np.ndarray]:

@@ -14,7 +14,7 @@ import test_calibration as tasks
 from generators import postures
 
 from figaroh_jax import cli
-from figaroh_jax.calibration.kinematic_effects import CATALOGUE
+from figaroh_jax.effects.kinematic import CATALOGUE
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZES = (1.5, 3.0, 10.0)

@@ -11,9 +11,9 @@ import pytest
 import reference
 import robots
 
-from figaroh_jax import kinematics
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.urdf import load_urdf
+from figaroh_jax.rigid import kinematics
 
 
 @pytest.mark.parametrize("name", robots.REAL)

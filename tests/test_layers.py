@@ -23,8 +23,8 @@ OUTSIDE = {
     "jinja2": {"reporting.report"},
     "plotly": {"reporting.report"},
     "jaxopt": {"diagnosis.refit"},
-    "clarabel": {"identification.conic"},
-    "sklearn": {"identification.least_squares"},
+    "clarabel": {"estimation.conic"},
+    "sklearn": {"estimation.least_squares"},
 }
 
 
@@ -62,7 +62,8 @@ def _imports(path: Path, *, lazy: bool) -> set[str]:
 
 
 def test_modules_import_each_other_without_cycles():
-    graph = {name: {m[1:] for m in _imports(path, lazy=False) if m[:1] == "."} for name, path in MODULES.items()}
+    """Imports inside functions count: a circle that waits for a call is a circle. The package itself only points."""
+    graph = {name: {m[1:] for m in _imports(path, lazy=True) if m[:1] == "."} for name, path in MODULES.items()}
     tuple(TopologicalSorter(graph).static_order())  # raises CycleError with the cycle
 
 
@@ -94,14 +95,14 @@ def test_backends_never_import_each_other():
             assert others <= {folder.name}, path
 
 
-def test_files_are_short_enough_to_read():
-    lengths = {path.name: len(path.read_text(encoding="utf-8").splitlines()) for path in MODULES.values()}
-    assert {name: length for name, length in lengths.items() if length > 400} == {}
-
-
 def test_options_of_one_kind_of_device_are_set_where_the_device_is_known():
-    """A compiler for another device refuses them: `chunks.program` and code that looks may pass them."""
+    """A compiler for another device refuses them: `batching.program` and code that looks may pass them."""
     own = {name for name, path in MODULES.items() if "compiler_options=" in path.read_text(encoding="utf-8")}
-    assert own <= {"chunks", "programs", "streaming", "identification.devices"}
+    assert own <= {
+        "compiled.batching",
+        "compiled.executable_cache",
+        "rigid.normal_equations",
+        "estimation.accelerators",
+    }
     for path in (ROOT / "backends").rglob("*.py"):
         assert "compiler_options=" not in path.read_text(encoding="utf-8"), path

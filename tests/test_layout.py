@@ -7,8 +7,8 @@ import pytest
 from synthetic import DT, STEP, made_signals, swing
 
 from figaroh_jax.diagnosis.layout import describe_folds, excitations, held_rows, layout
-from figaroh_jax.diagnosis.records import stack
 from figaroh_jax.recordings.signals import Signals
+from figaroh_jax.recordings.stacked import stack
 
 ROW = STEP * DT
 

@@ -10,8 +10,8 @@ import pytest
 from scipy import optimize
 
 from figaroh_jax.errors import InputError
-from figaroh_jax.identification.conic import Constraints
-from figaroh_jax.identification.least_squares import (
+from figaroh_jax.estimation.conic import Constraints
+from figaroh_jax.estimation.least_squares import (
     Constrained,
     ElasticNet,
     InstrumentalVariables,
@@ -24,7 +24,7 @@ from figaroh_jax.identification.least_squares import (
     solve,
     with_prior,
 )
-from figaroh_jax.identification.regression import Condensed, Piece, condense
+from figaroh_jax.estimation.regression import Condensed, Piece, condense
 
 NV, K, ROWS = 2, 5, 400
 SIGMA = np.array([0.1, 1.0])  # of each joint's noise

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
-from figaroh_jax import lie
+from figaroh_jax.rigid import lie
 
 exp_so3, log_so3 = jax.jit(lie.exp_so3), jax.jit(lie.log_so3)
 exp_se3, log_se3 = jax.jit(lie.exp_se3), jax.jit(lie.log_se3)

@@ -11,8 +11,8 @@ from hypothesis import given, settings, strategies as st
 
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.robotfile import read_robot
-from figaroh_jax.manifold import difference, integrate, neutral, random_configuration
-from figaroh_jax.model import RobotModel
+from figaroh_jax.rigid.manifold import difference, integrate, neutral, random_configuration
+from figaroh_jax.rigid.model import RobotModel
 
 MODELS = {name: read_robot(robots.write(name)) for name in ("tree", "plane", "beast")}
 cases = given(

@@ -14,16 +14,16 @@ import tasks
 import yaml
 
 import figaroh_jax as fj
-from figaroh_jax.dynamics import inverse_dynamics, mass_matrix
+from figaroh_jax.effects.extended import extend, predict
 from figaroh_jax.errors import InputError
-from figaroh_jax.extended import extend, predict
-from figaroh_jax.formats.config import load_robot, load_task
+from figaroh_jax.formats.config import load_task
 from figaroh_jax.formats.export import load_model, write_model
 from figaroh_jax.formats.mjcf import compiled_robot, load_mjcf
-from figaroh_jax.formats.robotfile import load_extended, read_robot, stated_baseline
+from figaroh_jax.formats.robotfile import load_extended, load_robot, read_robot, stated_baseline
 from figaroh_jax.formats.urdf import load_urdf
-from figaroh_jax.kinematics import forward_kinematics
-from figaroh_jax.model import RobotModel
+from figaroh_jax.rigid.dynamics import inverse_dynamics, mass_matrix
+from figaroh_jax.rigid.kinematics import forward_kinematics
+from figaroh_jax.rigid.model import RobotModel
 
 
 def written(text: str, folder: Path) -> Path:

@@ -7,7 +7,7 @@ import secrets
 import numpy as np
 from scipy.signal import lfilter
 
-from figaroh_jax.diagnosis import noise
+from figaroh_jax.estimation import noise
 
 RATE, COUNT, CUTOFF = 66.0, 2000, 20.0
 POLES, DRIVEN, WHITE = (0.9, 0.6), (0.5, 2.0), (0.7, 1.0)  # of two joints: AR(1), its innovation, white noise

@@ -13,10 +13,10 @@ import poses
 import pytest
 
 from figaroh_jax.calibration.calibration import calibrate
-from figaroh_jax.calibration.devices import own_device
-from figaroh_jax.calibration.poserecords import PoseRecording
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.urdf import load_urdf
+from figaroh_jax.recordings.devices import own_device
+from figaroh_jax.recordings.poses import PoseRecording
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "examples" / "own_device.py"

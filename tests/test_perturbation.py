@@ -11,10 +11,10 @@ import numpy as np
 import reference
 import robots
 
-from figaroh_jax.calibration.chain import chain_between, chain_pose
-from figaroh_jax.calibration.kinematic_effects import CATALOGUE, Postures, columns_of
-from figaroh_jax.calibration.perturbation import Perturbation, apply
-from figaroh_jax.kinematics import forward_kinematics
+from figaroh_jax.effects.kinematic import CATALOGUE, Postures, columns_of
+from figaroh_jax.estimation.perturbation import Perturbation, apply
+from figaroh_jax.rigid.chain import chain_between, chain_pose
+from figaroh_jax.rigid.kinematics import forward_kinematics
 
 rng = np.random.default_rng(0)
 

@@ -12,11 +12,11 @@ import poses
 import pytest
 
 from figaroh_jax.calibration import posefit, starts
-from figaroh_jax.calibration.chain import chain_between
-from figaroh_jax.calibration.devices import Camera, Device, Distance, Planes, Points, Poses, Sockets, own_device
 from figaroh_jax.calibration.posesolver import solve
 from figaroh_jax.formats.urdf import load_urdf
-from figaroh_jax.model import RobotModel
+from figaroh_jax.recordings.devices import Camera, Device, Distance, Planes, Points, Poses, Sockets, own_device
+from figaroh_jax.rigid.chain import chain_between
+from figaroh_jax.rigid.model import RobotModel
 
 N = 4
 BOTH = ("base_frame", "tool_frame")

@@ -19,20 +19,20 @@ from figaroh_jax.diagnosis.design import units
 from figaroh_jax.diagnosis.flexible import WIDTHS, friction_width
 from figaroh_jax.diagnosis.gates import exists
 from figaroh_jax.diagnosis.layout import held_rows, layout
-from figaroh_jax.diagnosis.priors import body_precision, physical_body, rigid_prior
 from figaroh_jax.diagnosis.problem import Problem
-from figaroh_jax.diagnosis.records import stack
-from figaroh_jax.diagnosis.rows import fit
 from figaroh_jax.diagnosis.shifts import shifted, torque_change
 from figaroh_jax.diagnosis.state import baseline, batched, extended_state, plain_rows, solved, whitened
-from figaroh_jax.effect import Motion, place
-from figaroh_jax.effects import find
+from figaroh_jax.effects.base import Motion, place
+from figaroh_jax.effects.catalogue import find
 from figaroh_jax.errors import InputError
+from figaroh_jax.estimation.priors import body_precision, physical_body, rigid_prior
+from figaroh_jax.estimation.rows import fit
 from figaroh_jax.formats.config import Load
-from figaroh_jax.inertia import from_com, pseudo_inertia
-from figaroh_jax.model import RobotModel
-from figaroh_jax.native_backend import NativeBackend
 from figaroh_jax.recordings.signals import Signals
+from figaroh_jax.recordings.stacked import stack
+from figaroh_jax.rigid.inertia import from_com, pseudo_inertia
+from figaroh_jax.rigid.model import RobotModel
+from figaroh_jax.simulators.native import NativeBackend
 
 TRUST = 0.1
 

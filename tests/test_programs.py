@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from figaroh_jax.programs import Program
+from figaroh_jax.compiled.executable_cache import Program
 
 ARM = """<robot name='arm'><link name='base'/>
 <link name='upper'><inertial><origin xyz='.1 0 .2'/><mass value='2'/>

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import butter, sosfiltfilt
 from synthetic import CUTOFF, DT, STEP, made_signals
 
-from figaroh_jax.diagnosis.records import Records, filter_rows, stack
+from figaroh_jax.recordings.stacked import Records, filter_rows, stack
 
 SECONDS = 12.0
 

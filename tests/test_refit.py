@@ -15,13 +15,13 @@ from jaxtyping import Array
 from synthetic import made_signals
 
 from figaroh_jax.diagnosis.design import Units, candidates, flattened, shapes, unit_rows, units_and_slopes, with_shape
-from figaroh_jax.diagnosis.records import Records, stack
 from figaroh_jax.diagnosis.refit import Whitened, bounded_minimum, profile, refit, refit_shift, shift_profile
 from figaroh_jax.diagnosis.shifts import shifted, torque_change
-from figaroh_jax.dynamics import inverse_dynamics
-from figaroh_jax.effect import Effect, Motion
-from figaroh_jax.effects import find
-from figaroh_jax.model import RobotModel
+from figaroh_jax.effects.base import Effect, Motion
+from figaroh_jax.effects.catalogue import find
+from figaroh_jax.recordings.stacked import Records, stack
+from figaroh_jax.rigid.dynamics import inverse_dynamics
+from figaroh_jax.rigid.model import RobotModel
 
 SECONDS = 8.0
 

@@ -13,14 +13,14 @@ from robots import ARM, PENDULUM, load
 
 import figaroh_jax as fj
 from figaroh_jax.errors import InputError
+from figaroh_jax.estimation.columns import friction_terms
+from figaroh_jax.estimation.least_squares import WeightedByJoint, solve
+from figaroh_jax.estimation.regression import condense
+from figaroh_jax.estimation.states import States
 from figaroh_jax.formats.config import Baseline, Load
 from figaroh_jax.identification.acceleration_free import WindowRows, energy_columns, momentum_columns
-from figaroh_jax.identification.columns import friction_terms
 from figaroh_jax.identification.instruments import solve_by_simulation
-from figaroh_jax.identification.least_squares import WeightedByJoint, solve
 from figaroh_jax.identification.payloads import PayloadStates, drive_gains
-from figaroh_jax.identification.regression import condense
-from figaroh_jax.identification.states import States
 
 DRIVES = np.array([0.8, 0.5, 1.1, 0.7, 0.2, 0.3, 0.15, -0.4])  # viscous, Coulomb, rotor, offset of two joints
 

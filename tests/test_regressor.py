@@ -13,12 +13,12 @@ import pinocchio as pin
 import pytest
 import robots
 
-from figaroh_jax.chunks import BLOCK, chunk_size
-from figaroh_jax.dynamics import inverse_dynamics
+from figaroh_jax.compiled.batching import BLOCK, chunk_size
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.urdf import load_urdf
-from figaroh_jax.model import Joint, RobotModel
-from figaroh_jax.regressor import joint_torque_regressor, packed_regressor, pairs
+from figaroh_jax.rigid.dynamics import inverse_dynamics
+from figaroh_jax.rigid.model import Joint, RobotModel
+from figaroh_jax.rigid.regressor import joint_torque_regressor, packed_regressor, pairs
 
 CHUNK = chunk_size(200)
 LEAVES = ("placement", "axis", "ratio", "offset", "gravity")

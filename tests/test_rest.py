@@ -8,7 +8,7 @@ import pytest
 from figaroh_jax.diagnosis.estimates import Fitted
 from figaroh_jax.diagnosis.joint import has_size
 from figaroh_jax.diagnosis.rest import Rest, verdict, wrong_law
-from figaroh_jax.effects import find
+from figaroh_jax.effects.catalogue import find
 from figaroh_jax.results import Name
 
 NOISE, REST = Rest(False, 0.0, ""), Rest(True, 0.2, "")

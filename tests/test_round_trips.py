@@ -15,13 +15,13 @@ import robots
 from hypothesis import given, settings, strategies as st
 
 import figaroh_jax as fj
-from figaroh_jax.extended import extend
+from figaroh_jax.effects.extended import extend
 from figaroh_jax.formats.export import load_model, write_model
 from figaroh_jax.formats.mjcf import load_mjcf
 from figaroh_jax.formats.native import physical_inertia
 from figaroh_jax.formats.robotfile import load_extended
 from figaroh_jax.formats.urdf import load_urdf
-from figaroh_jax.model import RobotModel
+from figaroh_jax.rigid.model import RobotModel
 
 KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar", "mimic")
 SEEDS = st.integers(0, 2**32 - 1)

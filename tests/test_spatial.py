@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from figaroh_jax import spatial
+from figaroh_jax.rigid import spatial
 
 rng = np.random.default_rng(0)
 A, B = rng.normal(size=(2, 7, 3, 3))

@@ -10,13 +10,13 @@ from robots import TREE, load, states
 
 import figaroh_jax as fj
 from figaroh_jax.errors import InputError
+from figaroh_jax.estimation import states as states_module
+from figaroh_jax.estimation.base_parameters import base_parameters
+from figaroh_jax.estimation.columns import friction_terms
+from figaroh_jax.estimation.least_squares import solve
+from figaroh_jax.estimation.regression import condense
+from figaroh_jax.estimation.states import States
 from figaroh_jax.formats.config import Baseline
-from figaroh_jax.identification import states as states_module
-from figaroh_jax.identification.base_parameters import base_parameters
-from figaroh_jax.identification.columns import friction_terms
-from figaroh_jax.identification.least_squares import solve
-from figaroh_jax.identification.regression import condense
-from figaroh_jax.identification.states import States
 
 
 @pytest.fixture(scope="module")

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 import robots
 
-from figaroh_jax.chunks import BLOCK, chunk_size
+from figaroh_jax.compiled.batching import BLOCK, chunk_size
 from figaroh_jax.errors import InputError
-from figaroh_jax.model import RobotModel
-from figaroh_jax.regressor import joint_torque_regressor
-from figaroh_jax.streaming import NormalMatrix, normal_matrix, triangular_factor
+from figaroh_jax.rigid.model import RobotModel
+from figaroh_jax.rigid.normal_equations import NormalMatrix, normal_matrix, triangular_factor
+from figaroh_jax.rigid.regressor import joint_torque_regressor
 
 CHUNK = chunk_size()
 
@@ -131,7 +131,7 @@ PEAK = """
 import sys
 from pathlib import Path
 import numpy as np, jax
-from figaroh_jax.streaming import normal_matrix, triangular_factor
+from figaroh_jax.rigid.normal_equations import normal_matrix, triangular_factor
 from figaroh_jax.formats.urdf import load_urdf
 model, rng = load_urdf(sys.argv[1]), np.random.default_rng(0)
 piece = rng.standard_normal((4, 20_000, model.nv))

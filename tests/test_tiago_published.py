@@ -15,10 +15,10 @@ import pytest
 from scipy import signal
 
 import figaroh_jax as fj
+from figaroh_jax.estimation.base_parameters import base_parameters
+from figaroh_jax.estimation.columns import friction_terms, state_columns
+from figaroh_jax.estimation.consistency import bodies, inconsistencies, physical_fit
 from figaroh_jax.formats.config import Baseline
-from figaroh_jax.identification.base_parameters import base_parameters
-from figaroh_jax.identification.columns import friction_terms, state_columns
-from figaroh_jax.identification.consistency import bodies, inconsistencies, physical_fit
 
 GAIN = np.array([1.0, 13.6, 13.6, -8.7, -8.7, -20.5968, -20.5968, -20.5968])
 JOINTS = ["torso_lift_joint", *(f"arm_{k}_joint" for k in range(1, 8))]

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import robots
 
-from figaroh_jax import dynamics, kinematics
-from figaroh_jax.model import RobotModel
+from figaroh_jax.rigid import dynamics, kinematics
+from figaroh_jax.rigid.model import RobotModel
 
 LEAVES = ("placement", "axis", "inertia", "ratio", "offset", "gravity", "frame_placement")
 FUNCTIONS: dict[str, Callable[..., jax.Array]] = {

@@ -18,7 +18,7 @@ from scipy import signal
 from tx40 import OFFSET, POSITION, TORQUE
 
 import figaroh_jax as fj
-from figaroh_jax.identification.base_parameters import essential
+from figaroh_jax.estimation.base_parameters import essential
 
 TS = 2e-4  # s
 BORDER = 20  # samples cut at both ends after the filter

@@ -15,7 +15,7 @@ from robots import joint, link, robot
 
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.urdf import load_urdf
-from figaroh_jax.kinematics import frame_placement
+from figaroh_jax.rigid.kinematics import frame_placement
 
 
 def test_joints_are_numbered_depth_first_in_the_order_of_the_file(tmp_path: Path) -> None:

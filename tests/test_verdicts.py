@@ -11,7 +11,7 @@ import pytest
 import simulated_arm
 from simulated_arm import Truth, recording
 
-from figaroh_jax.diagnosis.priors import rigid_prior
+from figaroh_jax.estimation.priors import rigid_prior
 from figaroh_jax.formats.config import Preprocess
 from figaroh_jax.identification.identification import identify
 from figaroh_jax.recordings.dataset import Recording

@@ -12,12 +12,12 @@ import pytest
 
 import figaroh_jax as fj
 from figaroh_jax.errors import InputError
+from figaroh_jax.estimation.columns import friction_terms, random_states
+from figaroh_jax.estimation.least_squares import WeightedByJoint, solve
+from figaroh_jax.estimation.regression import condense
+from figaroh_jax.estimation.states import States
 from figaroh_jax.formats.config import Baseline, load_task
-from figaroh_jax.identification.columns import friction_terms, random_states
-from figaroh_jax.identification.least_squares import WeightedByJoint, solve
-from figaroh_jax.identification.regression import condense
 from figaroh_jax.identification.result import Identification
-from figaroh_jax.identification.states import States
 from figaroh_jax.identification.wrenches import SensorStates, generalized_force, wrench_regressor
 from figaroh_jax.recordings.groupmotion import group_rates
 from figaroh_jax.runs import predictions

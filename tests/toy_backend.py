@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from figaroh_jax.contract import FUNCTIONS, Backend, Capabilities, host_samples
 from figaroh_jax.errors import InputError
-from figaroh_jax.model import RobotModel
+from figaroh_jax.rigid.model import RobotModel
+from figaroh_jax.simulators.contract import FUNCTIONS, Backend, Capabilities, host_samples
 
 GIVEN = {"inverse_dynamics", "mass_matrix", "integrate", "difference", "random_configuration"}
 

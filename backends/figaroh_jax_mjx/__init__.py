@@ -23,9 +23,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from figaroh_jax.chunks import sized_program
-from figaroh_jax.contract import Backend, Capabilities, Reference, as_reference, check_samples, file_format
-from figaroh_jax.derivatives import TorqueDerivatives, coriolis_from_bias
+from figaroh_jax.compiled.batching import sized_program
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.mujoco_model import (
     Compiled,
@@ -39,8 +37,10 @@ from figaroh_jax.formats.mujoco_model import (
     rates,
     spatial_inertias,
 )
-from figaroh_jax.manifold import integrate
-from figaroh_jax.model import RobotModel
+from figaroh_jax.rigid.derivatives import TorqueDerivatives, coriolis_from_bias
+from figaroh_jax.rigid.manifold import integrate
+from figaroh_jax.rigid.model import RobotModel
+from figaroh_jax.simulators.contract import Backend, Capabilities, Reference, as_reference, check_samples, file_format
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used here, is not installed
     from mujoco import mjx

@@ -21,8 +21,6 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from figaroh_jax.contract import Backend, Capabilities, Reference, as_reference, file_format, host_samples
-from figaroh_jax.derivatives import coriolis_from_bias
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.mujoco_model import (
     compiled,
@@ -34,7 +32,9 @@ from figaroh_jax.formats.mujoco_model import (
     rates,
     spatial_inertias,
 )
-from figaroh_jax.model import RobotModel
+from figaroh_jax.rigid.derivatives import coriolis_from_bias
+from figaroh_jax.rigid.model import RobotModel
+from figaroh_jax.simulators.contract import Backend, Capabilities, Reference, as_reference, file_format, host_samples
 
 __all__ = ["MujocoBackend"]
 

@@ -17,10 +17,10 @@ import pinocchio as pin
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from figaroh_jax.contract import Backend, Capabilities, Reference, as_reference, file_format, host_samples
-from figaroh_jax.derivatives import TorqueDerivatives
-from figaroh_jax.inertia import to_com, transform
-from figaroh_jax.model import RobotModel
+from figaroh_jax.rigid.derivatives import TorqueDerivatives
+from figaroh_jax.rigid.inertia import to_com, transform
+from figaroh_jax.rigid.model import RobotModel
+from figaroh_jax.simulators.contract import Backend, Capabilities, Reference, as_reference, file_format, host_samples
 
 __all__ = ["PinocchioBackend"]
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..model import RobotModel
 from ..results import Cause
+from ..rigid.model import RobotModel
 
 __all__ = [
     "Calibration",

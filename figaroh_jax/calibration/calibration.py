@@ -14,18 +14,19 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..effects.kinematic import HISTORY
 from ..errors import InputError, nearest
-from ..model import RobotModel
-from . import corrections, levels, marginal
+from ..estimation import marginal
+from ..recordings.poses import PoseRecording, read_pose_recordings
+from ..rigid.chain import chain_between
+from ..rigid.model import RobotModel
+from . import corrections, levels
 from .calibrated import Calibration, Error, Outlier
 from .candidates import Block, blocks_of, effects_on, empty_columns, geometry_columns, known_frames
-from .chain import chain_between
 from .distances import socket_distances
 from .gravity import without_far_masses
-from .kinematic_effects import HISTORY
 from .outliers import find_outliers
 from .posegroups import Measured, assemble, postures_of
-from .poserecords import PoseRecording, read_pose_recordings
 from .posesolver import Solution, solve
 from .shapes import refine
 
@@ -46,7 +47,7 @@ def calibrate_task(
     priors: bool = True,
 ) -> Calibration:
     """Calibrate the robot of a task from its recordings with a `measurement`; `level`, `priors`: see `calibrate`."""
-    from ..formats.config import load_robot
+    from ..formats.robotfile import load_robot
 
     model = load_robot(task)
     recordings = read_pose_recordings(task, model)

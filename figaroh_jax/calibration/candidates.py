@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..model import RobotModel
+from ..effects.kinematic import CATALOGUE, HISTORY, Column, KinematicEffect, Postures, columns_of
+from ..recordings.poses import PoseRecording
 from ..results import Name
+from ..rigid.model import RobotModel
 from . import posefit
-from .kinematic_effects import CATALOGUE, HISTORY, Column, KinematicEffect, Postures, columns_of
 from .levels import Effects
 from .posegroups import Measured
-from .poserecords import PoseRecording
 
 __all__ = [
     "GEOMETRY",

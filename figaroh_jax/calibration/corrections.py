@@ -9,15 +9,16 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..chunks import program
-from ..model import RobotModel
+from ..compiled.batching import program
+from ..effects.kinematic import Column, Postures
+from ..estimation import marginal
+from ..recordings.devices import Device
 from ..results import Cause, Estimate, Gain, Name
-from . import levels, marginal
+from ..rigid.model import RobotModel
+from . import levels
 from .calibrated import Outlier, Parameter, Shown
 from .candidates import Block
-from .devices import Device
 from .gauge import Gauge, find_gauge
-from .kinematic_effects import Column, Postures
 from .posefit import DRAFT_OPTIONS
 from .posegroups import Measured
 

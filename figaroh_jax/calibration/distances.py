@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
+from ..estimation.marginal import Linear
+from ..recordings.devices import Sockets
+from ..recordings.poses import PoseRecording
 from .calibrated import SocketDistance
-from .devices import Sockets
-from .marginal import Linear
 from .posegroups import Measured
-from .poserecords import PoseRecording
 
 __all__ = ["socket_distances"]
 

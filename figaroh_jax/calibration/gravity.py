@@ -6,9 +6,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..kinematics import ancestors, forward_kinematics
-from ..model import RobotModel
-from .chain import joint_axis
+from ..rigid.chain import joint_axis
+from ..rigid.kinematics import ancestors, forward_kinematics
+from ..rigid.model import RobotModel
 
 __all__ = ["gravity_moments", "without_far_masses"]
 

@@ -14,15 +14,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import jax
 import numpy as np
 
-from ..model import RobotModel
+from ..effects.kinematic import CATALOGUE, HISTORY, KinematicEffect
+from ..estimation import marginal
+from ..recordings.poses import PoseRecording, read_pose_recordings
 from ..results import Cause, Estimate, Experiment, Gain, Name
-from . import levels, marginal
+from ..rigid.model import RobotModel
+from . import levels
 from .calibrated import Calibration
 from .calibration import Run
 from .candidates import GEOMETRY, moved_rows, moves, twist_rows
-from .kinematic_effects import CATALOGUE, HISTORY, KinematicEffect
 from .kinematic_scores import Scores, score_blocks, score_jitter
-from .poserecords import PoseRecording, read_pose_recordings
 
 if TYPE_CHECKING:
     from ..formats.config import Task
@@ -51,7 +52,7 @@ class PoseDiagnosis:
 
 def diagnose_pose_task(task: Task, progress: Callable[[str, float], None] = lambda phase, share: None) -> PoseDiagnosis:
     """Diagnose the robot of a task from its recordings with a `measurement`."""
-    from ..formats.config import load_robot
+    from ..formats.robotfile import load_robot
 
     model = load_robot(task)
     recordings = read_pose_recordings(task, model)

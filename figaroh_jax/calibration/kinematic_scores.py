@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .marginal import FLAT, Linear
+from ..estimation.marginal import FLAT, Linear
 
 __all__ = ["Scores", "score_blocks", "score_jitter"]
 

@@ -15,9 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from . import marginal, posefit
-from .kinematic_effects import Column
-from .marginal import FLAT, Linear, Posterior
+from ..effects.kinematic import Column
+from ..estimation import marginal
+from ..estimation.marginal import FLAT, Linear, Posterior
+from . import posefit
 from .posegroups import Measured
 from .posesolver import solve
 

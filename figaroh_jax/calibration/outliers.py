@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool
 
-from . import marginal
-from .marginal import Linear, Posterior
+from ..estimation import marginal
+from ..estimation.marginal import Linear, Posterior
 
 __all__ = ["find_outliers"]
 

@@ -22,11 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .. import lie
-from ..chunks import DRAFT_OPTIONS, chunk_size, program
-from ..model import Leaf
-from .chain import Chain, chain_pose, joint_response
-from .devices import Device
+from ..compiled.batching import DRAFT_OPTIONS, chunk_size, program
+from ..recordings.devices import Device
+from ..rigid import lie
+from ..rigid.chain import Chain, chain_pose, joint_response
+from ..rigid.model import Leaf
 
 __all__ = [
     "DRAFT",

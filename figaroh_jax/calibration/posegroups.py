@@ -13,15 +13,15 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
+from ..effects.kinematic import Column, Postures
 from ..errors import InputError
-from ..kinematics import forward_kinematics
-from ..model import RobotModel
+from ..recordings.devices import Device, Planes, Points, Poses, Sockets
+from ..recordings.poses import PoseRecording
+from ..rigid.chain import chain_between
+from ..rigid.kinematics import forward_kinematics
+from ..rigid.model import RobotModel
 from . import posefit, starts
-from .chain import chain_between
-from .devices import Device, Planes, Points, Poses, Sockets
 from .gravity import gravity_moments
-from .kinematic_effects import Column, Postures
-from .poserecords import PoseRecording
 
 __all__ = ["Measured", "assemble", "postures_of"]
 

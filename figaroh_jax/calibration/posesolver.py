@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from ..chunks import program
+from ..compiled.batching import program
 from .posefit import DRAFT, DRAFT_OPTIONS, Part, Problem, block_rows, parts_of, ties
 
 __all__ = ["Solution", "solve"]

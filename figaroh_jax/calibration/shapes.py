@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from ..model import RobotModel
+from ..effects.kinematic import Postures, columns_of
+from ..estimation.marginal import FLAT, Linear, Posterior
+from ..rigid.model import RobotModel
 from .candidates import Block, moved_rows, moves, sizes_of, twist_rows
-from .kinematic_effects import Postures, columns_of
-from .marginal import FLAT, Linear, Posterior
 from .posegroups import Measured
 
 __all__ = ["refine"]

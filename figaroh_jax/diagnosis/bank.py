@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from .rows import Rows
+from ..estimation.rows import Rows
 
 __all__ = ["Bank", "Columns", "bank"]
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .rows import UNKNOWN, Prior, Rows
+from ..estimation.rows import UNKNOWN, Prior, Rows
 
 __all__ = [
     "FoldSums",

@@ -9,16 +9,16 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..effect import Effect
-from ..effects import Payload
+from ..effects.base import Effect
+from ..effects.catalogue import Payload
+from ..estimation.priors import physical_body
+from ..estimation.rows import Rows
 from ..results import Name
 from .comparison import Ground, Hypothesis, Verdicts, judge, judge_grown
 from .design import kind, shapes, with_shape
 from .estimates import torque_slope
-from .priors import physical_body
 from .problem import Problem
 from .refit import Whitened, refit, refit_shift
-from .rows import Rows
 from .screening import Group, Screen
 from .state import extended_state, solved
 from .step import Step, stand

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from ..effect import Effect, Motion, columns
-from ..model import RobotModel
-from ..programs import Program
-from .records import Records, filter_rows
+from ..compiled.executable_cache import Program
+from ..effects.base import Effect, Motion, columns
+from ..recordings.stacked import Records, filter_rows
+from ..rigid.model import RobotModel
 from .shifts import links_torque, torque_change
 
 __all__ = [

@@ -16,17 +16,19 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..contract import Backend
-from ..effect import Effect, place
-from ..effects import find
+from ..effects.base import Effect, place
+from ..effects.catalogue import find
 from ..errors import InputError
-from ..model import RobotModel
-from ..native_backend import as_backend
+from ..estimation.noise import Spectrum
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Signals, prepare_all
-from ..registry import backend as make_backend
+from ..recordings.stacked import stack
 from ..results import Cause, Diagnosis, Gain, Nearest, Verdict
-from .estimates import estimates, fitted_model, prismatic
+from ..rigid.model import RobotModel, prismatic
+from ..simulators.contract import Backend
+from ..simulators.native import as_backend
+from ..simulators.registry import backend as make_backend
+from .estimates import estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
@@ -35,9 +37,7 @@ from .holdout import held_out, residual_rms, traces
 from .joint import Joint, polished, sized
 from .layout import describe_folds, held_rows, layout
 from .naming import reason_against, standings
-from .noise import Spectrum
 from .problem import Problem
-from .records import stack
 from .rest import excess, lines, rest_of, verdict, wrong_law
 from .search import Found, Search, eliminate, find_causes
 from .state import State, baseline, with_width
@@ -55,8 +55,7 @@ def diagnose_task(
     task: Task, progress: Callable[[str, float], None] = lambda phase, share: None, backend: str = "native"
 ) -> Diagnosis:
     """Diagnose what a task file describes, by the named backend; `InputError` before any work where it is wrong."""
-    from ..formats.config import load_robot
-    from ..formats.robotfile import stated_baseline
+    from ..formats.robotfile import load_robot, stated_baseline
 
     progress("reading", 0.0)
     model, (known, notes) = load_robot(task), stated_baseline(task)

@@ -7,13 +7,13 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..effect import Effect, joint_unit
-from ..extended import ExtendedModel, extend
-from ..model import RobotModel
+from ..effects.base import Effect, joint_unit
+from ..effects.extended import ExtendedModel, extend
+from ..recordings.stacked import filtered_rows
 from ..results import Estimate
+from ..rigid.model import RobotModel, prismatic
 from .design import kind, sensor_response, shapes, units_and_slopes, with_shape
 from .problem import Problem
-from .records import filtered_rows
 from .shifts import torque_change
 from .state import BATCH, State
 
@@ -83,12 +83,6 @@ def _physical(effect: Effect, names: list[str]) -> tuple[dict[str, float], dict[
         for key in found
     }
     return found, slope
-
-
-def prismatic(model: RobotModel) -> tuple[bool, ...]:
-    """Whether each coordinate slides."""
-    turns = dict(zip(model.dofs.column.tolist()[::-1], model.dofs.turns.tolist()[::-1], strict=True))
-    return tuple(not turns[k] for k in range(model.nv))
 
 
 def fitted_model(problem: Problem, state: State, causes: list[Effect]) -> ExtendedModel:

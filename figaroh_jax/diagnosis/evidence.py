@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..estimation.rows import Linear, Rows, tall
 from .bank import Bank, Columns
-from .rows import Linear, Rows, tall
 
 __all__ = [
     "Score",

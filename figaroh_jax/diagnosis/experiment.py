@@ -17,10 +17,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..effect import Effect
-from ..effects import find
-from ..inertia import from_com
+from ..effects.base import Effect
+from ..effects.catalogue import find
 from ..results import Experiment, Name
+from ..rigid.inertia import from_com
 from .design import candidates, kind, shapes, unit_rows, with_shape
 from .problem import Layout, Problem
 from .screening import place_names

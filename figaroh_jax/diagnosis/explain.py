@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from ..estimation.rows import Linear, Rows
 from ..results import Candidate
-from .rows import Linear, Rows
 from .screening import Screen
 
 __all__ = ["explain"]

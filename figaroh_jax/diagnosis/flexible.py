@@ -8,13 +8,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..effect import Motion
+from ..effects.base import Motion
+from ..estimation.noise import Spectrum
+from ..estimation.rows import Rows, fit, with_columns
+from ..recordings.stacked import filtered_rows
 from ..results import Name
 from .bank import Columns
-from .noise import Spectrum
 from .problem import Problem
-from .records import filtered_rows
-from .rows import Rows, fit, with_columns
 from .screening import Group, Null, family_p, screen
 from .state import FRICTION_PRECISION, State, whitened
 

@@ -7,11 +7,11 @@ from collections.abc import Collection
 import numpy as np
 from jaxtyping import Float
 
-from . import noise
+from ..estimation import noise
+from ..estimation.noise import Spectrum
+from ..estimation.rows import Prior, Rows, fit
 from .flexible import families
-from .noise import Spectrum
 from .problem import Problem
-from .rows import Prior, Rows, fit
 from .screening import Group, catalogue, screen
 from .state import State, plain_rows, solved, whitened
 from .thresholds import LOWEST_FREQUENCY, LOWEST_RESOLVED

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..effect import Effect, Parameter
-from ..effects import Payload
+from ..effects.base import Effect, Parameter
+from ..effects.catalogue import Payload
 from ..results import Name
 from .comparison import overlap, t_value
 from .contenders import Contender
@@ -40,7 +40,7 @@ def exists(problem: Problem, effect: Effect) -> bool:
 
 
 def physical_sign(effect: Effect) -> bool:
-    """Whether no parameter has a sign that physics forbids: no rotor of negative inertia, no torque ahead of its time."""
+    """Whether no parameter has a sign that physics forbids: a rotor of negative inertia, a torque before its time."""
     least = {name: 0.0 if name in POSITIVE.get(effect.name, ()) else p.lower for name, p in effect.parameters().items()}
     return all(float(getattr(effect, name)) >= low for name, low in least.items())
 

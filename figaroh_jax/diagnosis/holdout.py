@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..effect import Effect
+from ..effects.base import Effect
 from ..recordings.signals import Signals
+from ..recordings.stacked import open_rows
 from ..results import Trace
 from .design import kind, sensor_response
 from .estimates import amplitude_places
 from .problem import Problem
-from .records import open_rows
 from .search import Found
 from .shifts import torque_change
 from .state import State, batched, extended_state

@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..effect import Effect
-from ..effects import find
+from ..effects.base import Effect
+from ..effects.catalogue import find
+from ..estimation.rows import Rows
 from ..results import Name
 from .design import kind, shapes, with_shape
 from .estimates import Fitted, amplitude_places, torque_slope, with_amplitudes
 from .problem import Problem
-from .rows import Rows
 from .search import Found
 from .state import State, extended_state, solved
 from .step import Step, stand

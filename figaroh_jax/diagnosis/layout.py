@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..recordings.signals import Signals, align
+from ..recordings.stacked import Records
 from .problem import Layout
-from .records import Records
 
 __all__ = ["describe_folds", "held_rows", "layout"]
 

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..effect import Effect
+from ..effects.base import Effect
+from ..recordings.stacked import filter_rows, filtered_rows, open_rows
 from ..results import Name
 from .comparison import Hypothesis, Verdicts, ground, judge, judge_grown, t_value
 from .design import kind, sensor_response, shapes
@@ -22,7 +23,6 @@ from .flexible import smooth_functions
 from .gates import physical_sign
 from .joint import Joint
 from .problem import Problem
-from .records import filter_rows, filtered_rows, open_rows
 from .search import Found, judged_without
 from .shifts import torque_change
 from .state import State, batched

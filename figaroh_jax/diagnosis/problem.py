@@ -9,12 +9,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..contract import Backend
-from ..effect import Effect, Motion
-from ..effects import CATALOGUE, LinkEffect
-from ..model import RobotModel
+from ..effects.base import Effect, Motion
+from ..effects.catalogue import CATALOGUE, LinkEffect
+from ..recordings.stacked import Records, open_rows
+from ..rigid.model import RobotModel
+from ..simulators.contract import Backend
 from .design import Units, candidates, flattened, kind, shapes, units
-from .records import Records, open_rows
 from .shifts import links_torque, rigid_torque
 
 __all__ = ["Layout", "Problem", "family_of"]

@@ -14,9 +14,9 @@ import jax
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ..effect import Effect, Motion
+from ..effects.base import Effect, Motion
+from ..recordings.stacked import Records
 from .design import Units, shapes, unit_rows, units_and_slopes, with_shape
-from .records import Records
 from .shifts import links_torque, torque_change
 
 __all__ = ["Whitened", "bounded_minimum", "profile", "refit", "refit_shift", "shift_profile"]

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..estimation import noise
+from ..estimation.noise import Spectrum
+from ..estimation.rows import Rows
 from ..results import Name, Verdict
-from . import noise
-from .noise import Spectrum
 from .problem import Problem
-from .rows import Rows
 from .screening import draw_noise
 from .thresholds import FITTED, FITTED_SHARE, LINE_P, OWN_SHARE, REPEATED, REPEATED_SHARE, REST_P, UNREPEATED
 

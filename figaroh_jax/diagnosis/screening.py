@@ -13,16 +13,16 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..effect import Effect
-from ..effects import CATALOGUE, LinkEffect
-from ..model import RobotModel
+from ..effects.base import Effect
+from ..effects.catalogue import CATALOGUE, LinkEffect
+from ..estimation.noise import Spectrum
+from ..estimation.rows import Linear, Rows
 from ..results import Name
+from ..rigid.model import RobotModel
 from .bank import Bank, Columns, bank
 from .design import flattened, unit_rows, units
 from .evidence import Score, block_scores, largest, other_scores, projection, pulled, scores
-from .noise import Spectrum
 from .problem import Problem
-from .rows import Linear, Rows
 from .state import State
 
 __all__ = ["Group", "Null", "Screen", "catalogue", "family_p", "screen"]

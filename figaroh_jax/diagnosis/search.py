@@ -9,7 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..effect import Effect
+from ..effects.base import Effect
+from ..estimation.noise import Spectrum
+from ..estimation.rows import Prior
 from ..results import Name
 from .comparison import Hypothesis, Verdicts, ground, judge, shares_of_wins, t_value
 from .contenders import Contender, contend, for_refit, shortlist
@@ -17,9 +19,7 @@ from .design import kind
 from .estimates import amplitude_places
 from .flexible import friction_width
 from .gates import ambiguous, exists, passes, physical_sign, rivals, simpler
-from .noise import Spectrum
 from .problem import Problem
-from .rows import Prior
 from .screening import DRAWS, Null, Screen, catalogue, family_p, screen
 from .state import State, with_width
 from .step import Step, stand, with_cause, with_causes

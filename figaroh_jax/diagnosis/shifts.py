@@ -12,11 +12,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..dynamics import inverse_dynamics
-from ..effect import Effect, Motion
-from ..model import Leaf, RobotModel
-from ..programs import Program
-from .records import Records
+from ..compiled.executable_cache import Program
+from ..effects.base import Effect, Motion
+from ..recordings.stacked import Records
+from ..rigid.dynamics import inverse_dynamics
+from ..rigid.model import Leaf, RobotModel
 
 __all__ = ["difference", "links_torque", "rigid_torque", "shifted", "torque_change"]
 

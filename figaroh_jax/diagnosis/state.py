@@ -14,14 +14,14 @@ import jax
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from ..effect import Effect, Motion
-from ..effects import LinkEffect, Payload, find
-from ..model import Leaf
+from ..effects.base import Effect, Motion
+from ..effects.catalogue import LinkEffect, Payload, find
+from ..estimation.priors import body_precision, rigid_prior
+from ..estimation.rows import Prior, Rows, instruments
+from ..recordings.stacked import filter_rows, filtered_rows
+from ..rigid.model import Leaf
 from .design import Units, flattened, kind, sensor_response, shapes, units, units_and_slopes
-from .priors import body_precision, rigid_prior
 from .problem import Layout, Problem, family_of
-from .records import filter_rows, filtered_rows
-from .rows import Prior, Rows, instruments
 from .shifts import shifted
 
 __all__ = [

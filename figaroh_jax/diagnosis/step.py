@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from ..effect import Effect
+from ..effects.base import Effect
+from ..estimation.rows import Linear, Rows, fit
 from .comparison import FoldSums, Hypothesis, Verdicts, fold_sums, grown_sums, judge
 from .design import kind
 from .problem import Problem
-from .rows import Linear, Rows, fit
 from .state import State, extended_state, solved, whitened
 
 __all__ = ["Step", "stand", "with_cause", "with_causes"]

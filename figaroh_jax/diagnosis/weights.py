@@ -11,11 +11,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..estimation.rows import Rows
+from ..recordings.stacked import Records, filter_rows
 from .flexible import smooth_functions
 from .holdout import fold_error, residual_rms
 from .problem import Problem
-from .records import Records, filter_rows
-from .rows import Rows
 from .state import State, whitened
 from .step import stand
 from .thresholds import FAST, LEAST_FACTOR, REVERSAL, REVERSALS_AT_MOST, ROWS_OF_A_BIN, SPEED_EDGES, WHITE_GAIN

@@ -13,9 +13,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .. import inertia
 from ..errors import InputError, nearest
-from ..model import DOF_NAMES, NUMBERS, Frame, Joint, Kind, RobotModel
+from ..rigid import inertia
+from ..rigid.model import DOF_NAMES, NUMBERS, Frame, Joint, Kind, RobotModel
 
 __all__ = ["ROOT_JOINT", "FramePart", "JointPart", "LinkPart", "Posture", "Root", "assemble", "displacement"]
 

@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..dynamics import inverse_dynamics
-from ..effect import Effect, Motion, Native, Scalar, amplitude
-from ..effects import register
+from ..effects.base import Effect, Motion, Native, Scalar, amplitude
+from ..effects.catalogue import register
+from ..rigid.dynamics import inverse_dynamics
 
 __all__ = ["GravityCompensation"]
 

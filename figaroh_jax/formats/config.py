@@ -25,7 +25,7 @@ from ..errors import InputError, nearest
 from .taskfile import CONTRACT_EFFECTS, merge, read_task, where
 
 if TYPE_CHECKING:
-    from ..model import RobotModel
+    pass
 
 __all__ = [
     "Actuator",
@@ -42,7 +42,6 @@ __all__ = [
     "Task",
     "Transmission",
     "Units",
-    "load_robot",
     "load_task",
     "robot_options",
 ]
@@ -62,7 +61,7 @@ def _columns(value: Any) -> Any:
 
 
 def _effect(name: str) -> str:
-    from ..effects import CATALOGUE
+    from ..effects.catalogue import CATALOGUE
 
     known = list(dict.fromkeys([*CATALOGUE, *CONTRACT_EFFECTS]))
     if name not in known:
@@ -330,15 +329,6 @@ def load_task(path: str | Path) -> Task:
         raise InputError(f"{where(chain, first['loc'])}: {_message(first)}") from None
     task._file = Path(path)
     return task
-
-
-def load_robot(task: Task) -> RobotModel:
-    """The robot of a task, joints locked and ordered as it says; gravity is an MJCF's own where the task gives none."""
-    if task.robot.model.suffix.lower() not in (".urdf", ".xml"):
-        raise InputError(f"{task.file}: robot.model {task.robot.model}: expected a .urdf or an .xml (MJCF) file")
-    from .robotfile import read_robot
-
-    return read_robot(task.robot.model, **robot_options(task.robot))
 
 
 def robot_options(robot: Robot) -> dict[str, Any]:

@@ -18,13 +18,12 @@ import numpy as np
 import yaml
 from jaxtyping import Int
 
-from ..effect import Effect, joint_unit, place
-from ..effects import find
+from ..effects.base import Effect, joint_unit, place
+from ..effects.catalogue import find
+from ..effects.extended import ExtendedModel, changed_robot, extend
 from ..errors import InputError
-from ..extended import ExtendedModel, changed_robot, extend
-from ..model import DOF_NAMES, RobotModel
 from ..results import Cause, Estimate, Name
-from . import compensation as compensation
+from ..rigid.model import DOF_NAMES, RobotModel
 from .mjcf_text import mjcf_text
 from .native import Carried, carried, changed_leaves, drives, place_names
 from .taskfile import read_yaml

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .. import inertia
 from ..errors import InputError
-from ..model import Kind, RobotModel
+from ..rigid import inertia
+from ..rigid.model import Kind, RobotModel
 from .assembly import ROOT_JOINT, FramePart, JointPart, LinkPart, Posture, Root, assemble, displacement
 from .xmlfile import find_in_packages, read_xml
 

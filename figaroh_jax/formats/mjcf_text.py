@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..inertia import to_com, transform
-from ..model import RobotModel
+from ..rigid.inertia import to_com, transform
+from ..rigid.model import RobotModel
 from .native import Drives, physical_inertia
 
 __all__ = ["mjcf_text"]

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..inertia import from_com, to_com, transform
-from ..model import RobotModel
+from ..rigid.inertia import from_com, to_com, transform
+from ..rigid.model import RobotModel
 from .mjcf import compile_mjcf, engine, joint_names
 
 __all__ = [

@@ -13,10 +13,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..effect import Effect, Native
-from ..extended import ExtendedModel
-from ..inertia import from_com, from_pseudo_inertia, is_physical, pseudo_inertia, to_com
-from ..model import DOF_NAMES, RobotModel
+from ..effects.base import Effect, Native
+from ..effects.extended import ExtendedModel
+from ..rigid.inertia import from_com, from_pseudo_inertia, is_physical, pseudo_inertia, to_com
+from ..rigid.model import DOF_NAMES, RobotModel
 
 __all__ = ["Carried", "Drives", "Tendon", "carried", "changed_leaves", "drives", "physical_inertia", "place_names"]
 

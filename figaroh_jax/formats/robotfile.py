@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..effect import Effect, place
-from ..effects import find
+from ..effects.base import Effect, place
+from ..effects.catalogue import find
+from ..effects.extended import ExtendedModel, extend
 from ..errors import InputError
-from ..extended import ExtendedModel, extend
-from ..model import RobotModel
+from ..rigid.model import RobotModel
 from .assembly import Posture, Root
 from .compensation import GravityCompensation
 from .mjcf import actuator_of, body_name, compile_mjcf, compiled_robot, disabled, engine, joint_names, load_mjcf
@@ -28,7 +28,7 @@ from .xmlfile import find_in_packages
 if TYPE_CHECKING:
     from .config import Baseline, Task
 
-__all__ = ["Loaded", "load_extended", "read_robot", "stated_baseline"]
+__all__ = ["Loaded", "load_extended", "load_robot", "read_robot", "stated_baseline"]
 
 
 class Loaded(NamedTuple):
@@ -86,6 +86,15 @@ def load_extended(
     notes = [*_joints(mj, found), *_tendons(mj, found), *_biases(mj, found), *_others(mj, robot)]
     compensated, more = _compensation(mj, robot)
     return Loaded(extend(robot, *found.effects(), *compensated), (*notes, *more))
+
+
+def load_robot(task: Task) -> RobotModel:
+    """The robot of a task, joints locked and ordered as it says; gravity is an MJCF's own where the task gives none."""
+    if task.robot.model.suffix.lower() not in (".urdf", ".xml"):
+        raise InputError(f"{task.file}: robot.model {task.robot.model}: expected a .urdf or an .xml (MJCF) file")
+    from .config import robot_options
+
+    return read_robot(task.robot.model, **robot_options(task.robot))
 
 
 def stated_baseline(task: Task) -> tuple[Baseline, tuple[str, ...]]:

@@ -17,9 +17,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .. import inertia
 from ..errors import InputError, nearest
-from ..model import Kind, RobotModel
+from ..rigid import inertia
+from ..rigid.model import Kind, RobotModel
 from .assembly import JointPart, LinkPart, Posture, Root, assemble
 from .xmlfile import find_in_packages, read_xml
 

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..inertia import to_com
-from ..model import Frame, RobotModel
+from ..rigid.inertia import to_com
+from ..rigid.model import Frame, RobotModel
 from .native import Drives, physical_inertia
 
 __all__ = ["roll_pitch_yaw", "urdf_text"]

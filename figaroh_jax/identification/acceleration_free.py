@@ -19,13 +19,13 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from ..effect import Effect
+from ..effects.base import Effect
 from ..errors import InputError
-from ..kinematics import placements
-from ..model import RobotModel
-from ..regressor import dense_rows
-from .columns import column_names, random_states, term_columns
-from .regression import Piece
+from ..estimation.columns import column_names, random_states, term_columns
+from ..estimation.regression import Piece
+from ..rigid.kinematics import placements
+from ..rigid.model import RobotModel
+from ..rigid.regressor import dense_rows
 
 __all__ = ["WindowRows", "energy_columns", "momentum_columns"]
 

@@ -15,21 +15,22 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..contract import Backend
-from ..diagnosis.estimates import prismatic
-from ..diagnosis.priors import rigid_prior
-from ..effect import Effect
+from ..effects.base import Effect
 from ..errors import InputError, nearest
-from ..model import RobotModel
-from ..native_backend import as_backend
+from ..estimation.base_parameters import BaseParameters, base_parameters, essential
+from ..estimation.columns import friction_terms, structural_columns
+from ..estimation.conic import Body
+from ..estimation.consistency import bodies, log_cholesky_fit, physical_fit, project
+from ..estimation.intervals import coloured_covariance
+from ..estimation.least_squares import Solution, WeightedByJoint, solve, with_prior
+from ..estimation.priors import rigid_prior
+from ..estimation.regression import Condensed, Regression, condense
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import prepare_all
-from ..registry import backend as make_backend
-from .base_parameters import BaseParameters, base_parameters, essential
-from .columns import friction_terms, structural_columns
-from .conic import Body
-from .consistency import bodies, log_cholesky_fit, physical_fit, project
-from .intervals import coloured_covariance
+from ..rigid.model import RobotModel, prismatic
+from ..simulators.contract import Backend
+from ..simulators.native import as_backend
+from ..simulators.registry import backend as make_backend
 from .judgement import (
     Judged,
     correlations,
@@ -42,8 +43,6 @@ from .judgement import (
     prior_sigma,
     quality,
 )
-from .least_squares import Solution, WeightedByJoint, solve, with_prior
-from .regression import Condensed, Regression, condense
 from .result import Identification, Quality
 from .reversal import with_reversal_widths
 
@@ -84,8 +83,7 @@ def identify_task(
     task: Task, progress: Callable[[str, float], None] = lambda phase, share: None, backend: str = "native"
 ) -> Identification:
     """Identify what a task file describes, by the named backend; `InputError` before any work where it is wrong."""
-    from ..formats.config import load_robot
-    from ..formats.robotfile import stated_baseline
+    from ..formats.robotfile import load_robot, stated_baseline
 
     progress("reading", 0.0)
     model, (known, notes) = load_robot(task), stated_baseline(task)

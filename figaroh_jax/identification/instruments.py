@@ -15,14 +15,14 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..effects.extended import ExtendedModel, extend
+from ..effects.simulation import simulate
 from ..errors import InputError
-from ..extended import ExtendedModel, extend
-from ..simulation import simulate
-from .base_parameters import BaseParameters
+from ..estimation.base_parameters import BaseParameters
+from ..estimation.least_squares import InstrumentalVariables, Solution, WeightedByJoint, joint_weights, solve
+from ..estimation.regression import condense
+from ..estimation.states import States
 from .judgement import fitted_effects
-from .least_squares import InstrumentalVariables, Solution, WeightedByJoint, joint_weights, solve
-from .regression import condense
-from .states import States
 
 __all__ = ["simulated_instruments", "solve_by_simulation"]
 

@@ -10,17 +10,17 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..diagnosis.priors import rigid_prior
-from ..effect import Effect, joint_unit
-from ..extended import ExtendedModel, extend
+from ..effects.base import Effect, joint_unit
+from ..effects.extended import ExtendedModel, extend
+from ..estimation.base_parameters import TEN, BaseParameters
+from ..estimation.consistency import inconsistencies
+from ..estimation.priors import rigid_prior
+from ..estimation.regression import Condensed, Piece, Regression
 from ..formats.native import place_names
-from ..model import RobotModel
 from ..recordings.groupmotion import coordinate_positions
 from ..recordings.signals import Signals
 from ..results import Estimate, Name, Trace
-from .base_parameters import TEN, BaseParameters
-from .consistency import inconsistencies
-from .regression import Condensed, Piece, Regression
+from ..rigid.model import RobotModel
 from .result import BaseParameter, FittedEffect, Link, Parameter, Quality, Status
 
 __all__ = [

@@ -15,14 +15,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..effect import Effect
+from ..effects.base import Effect
 from ..errors import InputError
-from ..inertia import transform
-from ..model import RobotModel
+from ..estimation.base_parameters import TEN, BaseParameters, base_parameters
+from ..estimation.regression import Piece
+from ..estimation.states import States
 from ..recordings.dataset import carried_body
-from .base_parameters import TEN, BaseParameters, base_parameters
-from .regression import Piece
-from .states import States
+from ..rigid.inertia import transform
+from ..rigid.model import RobotModel
 
 if TYPE_CHECKING:
     from ..formats.config import Load

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .regression import Regression, condense
+from ..estimation.regression import Regression, condense
 
 __all__ = ["WIDTHS", "with_reversal_widths"]
 

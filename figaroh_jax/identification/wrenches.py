@@ -18,17 +18,17 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from ..chunks import over_samples
-from ..effect import Effect
+from ..compiled.batching import over_samples
+from ..effects.base import Effect
 from ..errors import InputError
-from ..inertia import transform
-from ..kinematics import ancestors, check_shapes, frame_jacobian, frame_pose, motion, placements
-from ..model import RobotModel
-from ..regressor import unit_wrenches
-from ..spatial import cross, rotate_back
-from .base_parameters import TEN, BaseParameters, base_parameters
-from .columns import column_names, random_states, state_columns
-from .regression import Piece
+from ..estimation.base_parameters import TEN, BaseParameters, base_parameters
+from ..estimation.columns import column_names, random_states, state_columns
+from ..estimation.regression import Piece
+from ..rigid.inertia import transform
+from ..rigid.kinematics import ancestors, check_shapes, frame_jacobian, frame_pose, motion, placements
+from ..rigid.model import RobotModel
+from ..rigid.regressor import unit_wrenches
+from ..rigid.spatial import cross, rotate_back
 
 __all__ = ["SensorStates", "generalized_force", "wrench_regressor"]
 

@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float
 
 from ..errors import InputError, nearest
 from ..formats.assembly import ROOT_JOINT
-from ..inertia import from_com, transform
-from ..model import RobotModel
+from ..rigid.inertia import from_com, transform
+from ..rigid.model import RobotModel
 from .groupmotion import position_names
 from .tables import Table, read_table
 

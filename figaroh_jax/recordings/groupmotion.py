@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
-from ..manifold import difference
-from ..model import RobotModel
+from ..rigid.manifold import difference
+from ..rigid.model import RobotModel
 from .resampling import stencil
 
 __all__ = ["continued", "coordinate_positions", "group_rates", "normalised", "position_names"]

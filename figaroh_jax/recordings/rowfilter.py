@@ -15,7 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Int, Shaped
 
-from ..chunks import traced
+from ..compiled.batching import traced
 
 __all__ = [
     "RowFilter",

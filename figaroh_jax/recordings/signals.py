@@ -28,7 +28,7 @@ from .rowfilter import RowFilter, fast_length, filter_rows, frequencies, low_pas
 
 if TYPE_CHECKING:
     from ..formats.config import Load, Preprocess
-    from ..model import RobotModel
+    from ..rigid.model import RobotModel
 
 __all__ = [
     "Rates",

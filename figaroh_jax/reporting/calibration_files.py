@@ -166,7 +166,7 @@ def _origin(element: Any) -> np.ndarray:
 def _check_parity(calibration: Calibration, urdf: Path) -> None:
     """Read the file back and compare it with the model in 100 postures."""
     from ..formats.urdf import load_urdf
-    from ..kinematics import forward_kinematics
+    from ..rigid.kinematics import forward_kinematics
 
     model = calibration.model
     again = load_urdf(urdf, joints=model.joint_names, posture=calibration.posture)
@@ -179,7 +179,7 @@ def _check_parity(calibration: Calibration, urdf: Path) -> None:
 
 
 def _write_mjcf(calibration: Calibration, path: Path) -> None:
-    from ..extended import extend
+    from ..effects.extended import extend
     from ..formats.export import model_files
 
     try:

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from ..calibration.calibrated import Calibration
 from ..calibration.corrections import twist_pose
 from ..errors import InputError
-from ..kinematics import forward_kinematics
-from ..model import RobotModel
+from ..rigid.kinematics import forward_kinematics
+from ..rigid.model import RobotModel
 
 if TYPE_CHECKING:
     import viser  # pyright: ignore[reportMissingImports]

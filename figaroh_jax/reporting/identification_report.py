@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..identification.result import FittedEffect, Identification, Link, Quality
-from ..inertia import pseudo_inertia, to_com
+from ..rigid.inertia import pseudo_inertia, to_com
 from . import wording
 from .report import page_template, plot_data, plotly_source
 

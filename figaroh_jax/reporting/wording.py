@@ -200,7 +200,6 @@ def _superscript(power: int) -> str:
 
 
 def _entry(effect: str) -> Any:
-    from .. import effects
-    from ..calibration import kinematic_effects
+    from ..effects import catalogue as effects, kinematic as kinematic_effects
 
     return effects.CATALOGUE.get(effect) or kinematic_effects.CATALOGUE.get(effect)

@@ -1,0 +1,247 @@
+"""What an effect is: one immutable object with its equation, its parameters and every form in which it acts.
+
+An effect has whatever forms it has. Identification, diagnosis, export and simulation read the same object:
+
+| form | method | read by |
+|---|---|---|
+| torque that it adds at the joints | `torque` | torque-level diagnosis, inverse and forward dynamics |
+| change of the robot itself | `change` | as above; URDF and MJCF through the changed model |
+| what a position sensor reads beside the truth | `position_error` | torque-level diagnosis, simulated sensors |
+| what a torque sensor makes of a frequency | `torque_response` | torque-level diagnosis, simulated sensors |
+| twist on a link, step of a simulation | `twist`, `step` | pose calibration, servo rollouts |
+| native elements of MJCF and URDF | `native` | export |
+
+Fields declared with `amplitude` enter linearly; fields declared with `shape` do not, and are searched between their
+bounds from their grid. Torques are those of the drive: what has to be added to the rigid body's to give the measured.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int
+
+from ..errors import InputError
+from ..rigid.dynamics import inverse_dynamics
+from ..rigid.model import Leaf, RobotModel
+
+__all__ = ["Effect", "Motion", "Native", "Parameter", "amplitude", "joint_unit", "place", "shape", "smooth_sign"]
+
+# a number; with leading axes where one object holds an effect at many places
+Scalar = Float[Leaf, "..."] | float
+
+
+class Parameter(NamedTuple):
+    """Unit of a parameter, and for one that enters nonlinearly its bounds and the points where a search starts."""
+
+    unit: str
+    linear: bool
+    lower: float = -np.inf
+    upper: float = np.inf
+    grid: tuple[float, ...] = ()
+    choice: bool = False  # one of the grid's values, never anything between (a sign)
+    hole: tuple[float, float] | None = None  # values that are another effect
+
+
+class Native(NamedTuple):
+    """Element of a model format that carries a parameter: `value` is added to `attribute` of the joints `at`."""
+
+    element: Literal["joint", "tendon", "actuator", "body"]
+    attribute: str
+    value: float
+    sign: float = 1.0  # second coefficient of a tendon over a pair of joints
+
+
+class Motion(eqx.Module):
+    """Motion of the robot at `samples` instants, and what the current model makes of it."""
+
+    model: RobotModel
+    time: Float[Leaf, " samples"]  # s
+    position: Float[Leaf, "samples nq"]  # rad or m; quaternions where the robot has any
+    velocity: Float[Leaf, "samples nv"]
+    acceleration: Float[Leaf, "samples nv"]
+    load: Float[Leaf, "samples nv"]  # torque of the rigid body, N m or N
+    total: Float[Leaf, "samples nv"]  # torque of the whole current model, friction included
+    dt: Float[Leaf, ""] | float  # sampling period, s; 0 for instants that are not a record
+    width: Float[Leaf, " nv"]  # half width of a reversal of the joints' dry friction, rad/s or m/s
+
+    @property
+    def direction(self) -> Float[Array, "samples nv"]:
+        """Sign of the velocity, smooth within one sample (`smooth_sign`)."""
+        return smooth_sign(self.velocity, self.acceleration, self.dt, self.width)
+
+    @property
+    def angle(self) -> Float[Array, "samples nv"]:
+        """Position of each coordinate, rad or m; zero where no one number tells it (joints of several axes)."""
+        if self.model.nq == len(self.model.joint_names):
+            return jnp.asarray(self.position)
+        column = np.full(self.model.nv, -1)
+        for joint, at in zip(self.model.joints, self.model.dofs.positions, strict=True):
+            if joint.kind in ("revolute", "prismatic"):
+                column[joint.coordinate] = at.start
+        return jnp.where(column < 0, 0.0, jnp.asarray(self.position)[:, column])
+
+    def reversal(
+        self, velocity: Float[Array, " samples"], acceleration: Float[Array, " samples"], width: Float[Array, ""]
+    ) -> Float[Array, " samples"]:
+        """Smooth sign of another velocity, e.g. that of a motor between two joints."""
+        return smooth_sign(velocity, acceleration, self.dt, width)
+
+
+def amplitude(unit: str, lower: float = -np.inf) -> Any:
+    """Declare a parameter in which the torque is linear; below `lower` the effect is not one that exists."""
+    return eqx.field(default=0.0, metadata={"parameter": Parameter(unit, True, lower)})
+
+
+def shape(
+    unit: str,
+    grid: Sequence[float],
+    bounds: tuple[float, float] | None = None,
+    choice: bool = False,
+    hole: tuple[float, float] | None = None,
+) -> Any:
+    """Declare a parameter in which the torque is not linear; `choice` takes the grid's values alone.
+
+    It is searched within `bounds` but not in the `hole`, where the effect is another one.
+    """
+    lower, upper = bounds or (min(grid), max(grid))
+    parameter = Parameter(unit, False, lower, upper, tuple(grid), choice, hole)
+    return eqx.field(default=grid[0], metadata={"parameter": parameter})
+
+
+class Effect(eqx.Module):
+    """A physical effect at a place; subclass it, declare its parameters and write at least one form.
+
+    `at` holds the indices of the place: one coordinate (`joint`), two (`pair`), a tree link (`link`), none (`robot`).
+    """
+
+    at: Int[Leaf, "*many places"]
+
+    name: ClassVar[str]
+    title: ClassVar[str]  # in plain words, for people
+    equation: ClassVar[str]  # as text
+    acts_on: ClassVar[Literal["joint", "pair", "link", "robot"]]
+    contains: ClassVar[tuple[str, ...]] = ()  # simpler effects that it can imitate exactly: they are preferred
+    follows_torque: ClassVar[bool] = False  # whether its torque depends on the current model's (load or total)
+    searched: ClassVar[bool] = True  # whether a diagnosis looks for it, that is, whether it is in the catalogue
+    separated_by: ClassVar[str] = ""  # the experiment that tells it from what looks alike; {at} stands for the place
+
+    def torque(self, motion: Motion) -> Float[Array, "samples *rows"]:
+        """Torque added, N m or N: `(samples,)` at a joint, `(samples, 2)` at a pair, else `(samples, nv)`."""
+        q, v, a = motion.position, motion.velocity, motion.acceleration
+        return inverse_dynamics(self.change(motion.model), q, v, a) - inverse_dynamics(motion.model, q, v, a)
+
+    def change(self, model: RobotModel) -> RobotModel:
+        """The robot with the effect in it, for effects that change its inertia, gravity or geometry."""
+        return model
+
+    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
+        """What the position sensor of joint `at` reads minus the truth, rad or m."""
+        raise NotImplementedError(f"{self.name} has no form at the position sensor")
+
+    def torque_response(self, omega: Float[Array, " freqs"]) -> Complex[Array, " freqs"]:
+        """Factor of the torque sensor at the angular frequencies `omega` (rad/s)."""
+        raise NotImplementedError(f"{self.name} has no form at the torque sensor")
+
+    def physical(self) -> dict[str, Scalar]:
+        """Parameters as they are reported; a function of the fields where those are not what an engineer reads."""
+        return {name: getattr(self, name) for name in self.parameters()}
+
+    def shown_by(self, low: Float[np.ndarray, " nv"], high: Float[np.ndarray, " nv"]) -> bool:
+        """Whether motion between the positions `low` and `high` can tell the effect from a smooth torque at all."""
+        return True
+
+    def native(self) -> tuple[Native, ...]:
+        """Elements of MJCF that carry the effect (URDF takes `damping` and `frictionloss` of a joint)."""
+        return ()
+
+    @classmethod
+    def parameters(cls) -> dict[str, Parameter]:
+        """Declared parameters by field name, in order."""
+        return {f.name: f.metadata["parameter"] for f in dataclasses.fields(cls) if "parameter" in f.metadata}
+
+    @classmethod
+    def units(cls) -> dict[str, str]:
+        """Units of `physical()`, for a revolute joint."""
+        return {name: parameter.unit for name, parameter in cls.parameters().items()}
+
+    @classmethod
+    def has(cls, form: str) -> bool:
+        """Whether the effect has the form, the name of one of the methods above."""
+        return getattr(cls, form) is not getattr(Effect, form)
+
+    def here(self, signal: Float[Array, "samples nv"], place: int = 0) -> Float[Array, " samples"]:
+        """Column of `signal` at the joint where the effect acts (`place` 1: the second of a pair)."""
+        if isinstance(signal, np.ndarray) and isinstance(self.at, np.ndarray):
+            return signal[:, self.at[place]]
+        return jax.lax.dynamic_index_in_dim(signal, self.at[place], 1, keepdims=False)  # traced at once, unlike `[]`
+
+    def joint_torque(self, motion: Motion) -> Float[Array, "samples nv"]:
+        """`torque` in the columns of all joints, zero elsewhere."""
+        torque = self.torque(motion)
+        if self.acts_on in ("link", "robot") or not self.has("torque"):
+            return torque  # a change of the robot is felt at every joint
+        columns = torque.reshape(torque.shape[0], -1)
+        return jnp.zeros_like(motion.velocity).at[:, self.at].add(columns)
+
+
+def smooth_sign(
+    velocity: Float[Array, "samples *rows"],
+    acceleration: Float[Array, "samples *rows"],
+    dt: Float[Array, ""] | float,
+    width: Float[Array, "*rows"] | float = 0.0,
+) -> Float[Array, "samples *rows"]:
+    """Sign of the velocity averaged over one sample: clip(v / max(|a| dt / 2, width), -1, 1).
+
+    `width` (rad/s or m/s) is the half width of the reversal where the friction of the joint itself is smooth; the
+    wider of the two ramps is the reversal's.
+    """
+    # operators and methods that NumPy's arrays have too: on the host it costs no program
+    ramp = abs(acceleration) * dt / 2
+    wider = (ramp + width + abs(ramp - width)) / 2
+    return (velocity / (wider + 1e-9)).clip(-1.0, 1.0)
+
+
+def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **parameters: float) -> Effect:
+    """The effect at the joints, pair or link named in `at`, with parameters by name (the others at their default)."""
+    wanted = {"joint": 1, "pair": 2, "link": 1, "robot": 0}[effect.acts_on]
+    if len(at) != wanted:
+        raise InputError(f"effect '{effect.name}' acts on a {effect.acts_on}: `at` takes {wanted} names, got {len(at)}")
+    index = model.link_index if effect.acts_on == "link" else model.joint_index
+    unknown = set(parameters) - set(effect.parameters())
+    if unknown:
+        known = ", ".join(effect.parameters())
+        raise InputError(f"effect '{effect.name}' has no parameter '{sorted(unknown)[0]}'; known: {known}")
+    indices = np.asarray([index(name) for name in at], dtype=np.int64)
+    return effect(indices, **{name: np.float64(value) for name, value in parameters.items()})
+
+
+def joint_unit(unit: str, prismatic: bool) -> str:
+    """The unit at a prismatic joint: N for N m, m for rad."""
+    return unit.replace("N m", "N").replace("rad", "m") if prismatic else unit
+
+
+def zeros_like(effect: Effect) -> Effect:
+    """The effect with every amplitude zero and its shape kept."""
+    names = [name for name, parameter in effect.parameters().items() if parameter.linear]
+    blank = [jnp.zeros_like(jnp.asarray(getattr(effect, name))) for name in names]
+    return eqx.tree_at(lambda e: [getattr(e, name) for name in names], effect, blank) if names else effect
+
+
+def columns(effect: Effect, motion: Motion) -> Float[Array, "amplitudes samples *rows"]:
+    """Torque of a unit of each amplitude: the exact columns of the regressor, for the given shape."""
+    names = [name for name, parameter in effect.parameters().items() if parameter.linear]
+
+    def torque(values: Float[Array, " amplitudes"]) -> Float[Array, "samples *rows"]:
+        return eqx.tree_at(lambda e: [getattr(e, n) for n in names], effect, list(values)).torque(motion)
+
+    # linear and zero at zero, so the torque of a unit is the derivative, with half the work to trace
+    if len(names) == 1:
+        return torque(jnp.ones(1))[None]
+    return jax.vmap(torque)(jnp.eye(len(names)))

@@ -1,0 +1,1 @@
+"""What the jobs share: priors, noise, regressions, solvers and their intervals."""

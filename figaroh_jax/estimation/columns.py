@@ -1,0 +1,172 @@
+"""Columns of parameters at states: ten for each link, by a backend, then those of the effects at the joints.
+
+The names of the columns, what they are at random states (all that any motion could show), and at given ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from ..effects.base import Effect, Motion, columns, place, smooth_sign
+from ..effects.catalogue import find
+from ..errors import InputError
+from ..rigid.model import Joint, RobotModel
+from ..simulators.contract import Backend
+from ..simulators.native import NativeBackend
+from .base_parameters import inertial_names
+
+if TYPE_CHECKING:
+    from ..formats.config import Baseline
+
+__all__ = [
+    "column_names",
+    "columns_of",
+    "friction_terms",
+    "motion_at",
+    "random_states",
+    "state_columns",
+    "structural_columns",
+    "term_columns",
+]
+
+SHORT_NAMES = {"viscous_friction": "fv", "coulomb_friction": "fc", "rotor_inertia": "Ia", "torque_offset": "off"}
+
+
+def friction_terms(model: RobotModel, known: Baseline) -> tuple[Effect, ...]:
+    """The effects that a task's baseline asks for, those of every joint as one object with a leading axis.
+
+    A free joint has no drive, so the six rows of a free flyer's root have no friction.
+    """
+    switches = {
+        "viscous_friction": known.viscous,
+        "coulomb_friction": known.coulomb,
+        "rotor_inertia": known.rotor,
+        "torque_offset": known.offset,
+    }
+    driven = [k for k, joint in enumerate(_joints(model)) if joint.kind != "free"]
+    joints = np.array(driven)[:, None]
+    terms: list[Effect] = []
+    for name in (name for name, on in switches.items() if on and driven):
+        effect = find(name)
+        terms.append(effect(joints, **{p: np.zeros(len(driven)) for p in effect.parameters()}))
+    for entry in known.effects:
+        effect = find(entry.effect)
+        if not any(p.linear for p in effect.parameters().values()):
+            raise InputError(f"baseline.effects: '{entry.effect}' has no parameter in which the torque is linear")
+        terms.append(jax.tree.map(lambda x: np.asarray(x)[None], place(effect, model, entry.at)))
+    return tuple(terms)
+
+
+def _joints(model: RobotModel) -> list[Joint]:
+    """The joint of each coordinate."""
+    own = {int(column): model.joints[j] for j, column in zip(model.dofs.joint, model.dofs.column, strict=True)}
+    return [own[k] for k in range(model.nv)]
+
+
+def column_names(model: RobotModel, terms: Sequence[Effect]) -> tuple[str, ...]:
+    """`m1` to `Izz1` and on for the links in tree order, then `fv1`, `fc1` ... of the joints, then other effects."""
+    names = list(inertial_names(model))
+    for term in terms:
+        amplitudes = [name for name, parameter in term.parameters().items() if parameter.linear]
+        for at in np.asarray(term.at):
+            where = "_".join(str(k + 1) for k in at)
+            short = SHORT_NAMES.get(term.name)
+            names += [f"{short}{where}" if short else f"{term.name}.{name}{where}" for name in amplitudes]
+    return tuple(names)
+
+
+def structural_columns(
+    model: RobotModel, terms: tuple[Effect, ...], samples: int | None = None, seed: int = 0
+) -> Float[np.ndarray, "samples nv columns"]:
+    """Columns at independent random states: what any motion at all could show."""
+    samples = samples or max(64, 4 * len(column_names(model, terms)) // max(model.nv, 1))
+    q, v, a = random_states(model, samples, seed)
+    with jax.enable_x64(True):
+        motion = motion_at(model, np.arange(samples) * 1.0, q, v, a, 0.0, jnp.zeros(model.nv))
+        return columns_of(NativeBackend(model), terms, motion)
+
+
+def random_states(
+    model: RobotModel, samples: int, seed: int = 0
+) -> tuple[Float[np.ndarray, "samples nq"], Float[np.ndarray, "samples nv"], Float[np.ndarray, "samples nv"]]:
+    """Independent random positions (quaternions of length one), velocities and accelerations."""
+    generator = np.random.default_rng(seed)
+    q, v, a = (generator.normal(scale=2.0, size=(samples, n)) for n in (model.nq, model.nv, model.nv))
+    for joint, where in zip(model.joints, model.dofs.positions, strict=True):
+        if joint.kind in ("spherical", "free"):
+            quaternion = slice(where.stop - 4, where.stop)
+            q[:, quaternion] /= np.linalg.norm(q[:, quaternion], axis=1, keepdims=True)
+    return q, v, a
+
+
+def motion_at(model: RobotModel, time: Any, q: Any, v: Any, a: Any, dt: Any, width: Any) -> Motion:
+    zero = jnp.zeros(jnp.shape(v))
+    return Motion(model, jnp.asarray(time), jnp.asarray(q), jnp.asarray(v), jnp.asarray(a), zero, zero, dt, width)
+
+
+def state_columns(
+    model: RobotModel,
+    terms: tuple[Effect, ...],
+    width: Float[Array, " nv"],
+    widths: tuple[float, ...],
+    q: Float[ArrayLike, "samples nq"],
+    v: Float[ArrayLike, "samples nv"],
+    a: Float[ArrayLike, "samples nv"],
+) -> Float[np.ndarray, "samples nv columns"]:
+    """Columns at given states, unfiltered; `widths` as in `Regression.pieces`."""
+    motion = motion_at(model, jnp.zeros(jnp.shape(v)[0]), q, v, a, 0.0, width)
+    return columns_of(NativeBackend(model), terms, motion, widths)
+
+
+def columns_of(
+    backend: Backend, terms: tuple[Effect, ...], motion: Motion, widths: tuple[float, ...] = ()
+) -> Float[np.ndarray, "samples nv columns"]:
+    """Columns of the rigid body by its backend, then those of the effects and of the `widths` of dry friction."""
+    state = (np.asarray(x) for x in (motion.position, motion.velocity, motion.acceleration))
+    rigid = np.asarray(backend.joint_torque_regressor(*state))
+    return np.concatenate([rigid, *(np.asarray(x) for x in _beside(terms, motion, widths))], axis=2)
+
+
+@eqx.filter_jit
+def _beside(
+    terms: tuple[Effect, ...], motion: Motion, widths: tuple[float, ...]
+) -> list[Float[Array, "samples nv columns"]]:
+    signs = (smooth_sign(motion.velocity, motion.acceleration, motion.dt, w) for w in widths)
+    return [*_term_columns(terms, motion), *(sign[:, :, None] for sign in signs)]
+
+
+def term_columns(
+    model: RobotModel,
+    terms: tuple[Effect, ...],
+    width: Float[Array, " nv"],
+    q: Float[Array, "samples nq"],
+    v: Float[Array, "samples nv"],
+    a: Float[Array, "samples nv"],
+) -> list[Float[Array, "samples nv columns"]]:
+    """Columns of each effect at given states, unfiltered; to be traced."""
+    return _term_columns(terms, motion_at(model, jnp.zeros(jnp.shape(v)[0]), q, v, a, 0.0, width))
+
+
+def _term_columns(terms: tuple[Effect, ...], motion: Motion) -> list[Float[Array, "samples nv columns"]]:
+    blocks = []
+    for term in terms:
+        columns = jax.vmap(lambda effect: _joint_columns(effect, motion))(term)
+        blocks.append(jnp.moveaxis(columns, 0, 2).reshape(*columns.shape[1:3], -1))
+    return blocks
+
+
+def _joint_columns(effect: Effect, motion: Motion) -> Float[Array, "samples nv amplitudes"]:
+    """Torque of a unit of each amplitude in the rows of all joints."""
+    torque = jnp.moveaxis(columns(effect, motion), 0, -1)
+    if effect.acts_on in ("link", "robot"):
+        return torque
+    torque = torque.reshape(torque.shape[0], -1, torque.shape[-1])
+    return jnp.zeros((*motion.velocity.shape, torque.shape[-1])).at[:, effect.at].add(torque)

@@ -1,0 +1,70 @@
+"""What is believed of inertial parameters before the data: how far, and which bodies can exist."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from ..rigid.inertia import to_com
+from ..rigid.model import RobotModel
+
+__all__ = ["body_precision", "physical_body", "rigid_prior"]
+
+
+def rigid_prior(model: RobotModel, trust: float) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
+    """Nominal inertial parameters and their precision: one sigma is `trust` times m, m L (three times), J (six times).
+
+    L = max(0.05 m, |c|) and J = tr(I)/3 + 0.3 m L^2 give each link its own scale; a massless link gets that of one
+    thousandth of the heaviest.
+    """
+    nominal = np.asarray(model.inertia)
+    mass, com, inertia = (np.asarray(part) for part in to_com(nominal))
+    floor = 1e-3 * max(float(mass.max(initial=0.0)), 1e-3)
+    mass = np.maximum(mass, floor)
+    length = np.maximum(0.05, np.linalg.norm(com, axis=1))
+    turning = np.trace(inertia, axis1=1, axis2=2) / 3 + 0.3 * mass * length**2
+    scale = np.column_stack([mass, *[mass * length] * 3, *[turning] * 6])
+    return nominal.reshape(-1), 1 / (trust * scale.reshape(-1)) ** 2
+
+
+def physical_body(free: Float[np.ndarray, "10"], information: Float[np.ndarray, "10 10"]) -> Float[np.ndarray, "10"]:
+    """The ten parameters nearest to `free` (in the metric `information`) that a body of positive mass can have.
+
+    The pseudo-inertia is L L' with L lower triangular (Wensing, Kim, Slotine 2018), L by Levenberg-Marquardt.
+    """
+    from scipy.optimize import least_squares  # slow to import
+
+    values, vectors = np.linalg.eigh((information + information.T) / 2)
+    root = np.sqrt(np.maximum(values, 0))[:, None] * vectors.T
+    lower = np.tril_indices(4)
+    start = np.diag(np.sqrt(max(float(free[0]), 0.05) * np.array([0.002, 0.002, 0.002, 1.0])))[lower]
+    basis = np.zeros((10, 4, 4))
+    basis[(np.arange(10), *lower)] = 1.0
+
+    def misfit(x: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
+        L = np.tensordot(x, basis, 1)
+        return root @ (_ten(L @ L.T) - free)
+
+    def slope(x: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10 10"]:
+        half = basis @ np.tensordot(x, basis, 1).T
+        return root @ _ten(half + np.swapaxes(half, 1, 2)).T
+
+    options = {"method": "lm", "ftol": 1e-10, "xtol": 1e-10}
+    L = np.tensordot(least_squares(misfit, start, slope, **options).x, basis, 1)  # pyright: ignore[reportArgumentType]
+    return _ten(L @ L.T)
+
+
+def body_precision(ten: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
+    """Prior precision of a fitted body about itself: half of its own scale, no arm shorter than 5 cm."""
+    mass, com, _ = (np.asarray(part) for part in to_com(ten))
+    length = max(0.05, float(np.linalg.norm(com)))
+    scale = float(mass) * np.array([1.0, *[length] * 3, *[length**2] * 6])
+    return 1 / (0.5 * np.maximum(scale, 1e-6)) ** 2
+
+
+def _ten(P: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 10"]:
+    """Ten parameters of pseudo-inertias [[S, h], [h', m]]: the inertia is tr(S) 1 - S."""
+    trace = np.trace(P[..., :3, :3], axis1=-2, axis2=-1)
+    (xx, yy, zz), (xy, xz, yz) = ((P[..., i, i] for i in range(3)), (P[..., i, j] for i, j in ((0, 1), (0, 2), (1, 2))))
+    h = (P[..., k, 3] for k in range(3))
+    return np.stack([P[..., 3, 3], *h, trace - xx, -xy, trace - yy, -xz, -yz, trace - zz], axis=-1)

@@ -1,0 +1,303 @@
+r"""What a measuring device makes of the pose of the tool: residuals in m and rad, and the frames it leaves unknown.
+
+A device is a small immutable object with one method, `residual(pose, unknown, datum)`, for one posture: `pose` is that
+of the tool frame in the base frame, `unknown` the vector of what the device itself leaves open (its own place, the
+place of its markers, of sockets, of planes), zero at the start, and `datum` what it measured. Derivatives are JAX's.
+A device of your own is such a class, or a function given to `own_device`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..rigid import lie
+from ..rigid.model import Leaf
+
+__all__ = [
+    "ORIENTATION",
+    "POSITION",
+    "Camera",
+    "Device",
+    "Distance",
+    "Planes",
+    "Points",
+    "Poses",
+    "Sockets",
+    "own_device",
+]
+
+POSITION, ORIENTATION = 0, 1  # channels of a row: m or rad
+_TWIST = ("x", "y", "z", "rx", "ry", "rz")
+_FRAME_SCALE = (1e-2,) * 3 + (1e-2,) * 3  # m and rad: sizes at which the solver's steps are of order one
+
+
+class Device(eqx.Module):
+    """A measuring device; subclass it and write `residual`, and `unknowns` where it leaves something open."""
+
+    def residual(self, pose: Float[Array, "4 4"], unknown: Float[Array, " k"], datum: Leaf) -> Float[Array, " rows"]:
+        """Predicted minus measured, m or rad, for one posture."""
+        raise NotImplementedError
+
+    def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        """Name, unit and typical size of every entry of `unknown`."""
+        return ()
+
+    def places(self, unknown: Float[Array, " k"]) -> dict[str, Float[Array, "*shape"]]:
+        """Poses (4 4) and points (3) of the device's own frames for the report, by name."""
+        return {}
+
+    def channels(self) -> tuple[int, ...]:
+        """Which of `residual`'s rows are positions (POSITION) and which angles (ORIENTATION)."""
+        return (POSITION, POSITION, POSITION)
+
+    def constraint(self, unknown: Float[Array, " k"]) -> Float[Array, " rows"]:
+        """Rows in m that the unknowns alone must bring to zero, such as a known distance of two sockets."""
+        return jnp.zeros(0)
+
+
+class Placed(Device):
+    """A device that stands at an unknown or a known place and looks at a tool frame, perhaps unknown too.
+
+    The unknown place is a twist about `centre`, the middle of what was measured: turning a far device about its own
+    origin would move every point and stall the solver.
+    """
+
+    base: Float[Leaf, "4 4"]  # pose of the base frame in the device's frame, at the start
+    centre: Float[Leaf, "3"]  # in the device's frame, m
+    estimated: tuple[str, ...] = eqx.field(static=True)  # of "base_frame", "tool_frame"
+
+    def device_T_base(self, unknown: Float[Array, " k"]) -> Float[Array, "4 4"]:
+        """Pose of the base frame in the device's frame."""
+        if "base_frame" not in self.estimated:
+            return jnp.asarray(self.base)
+        about = lie.pose(jnp.eye(3), jnp.asarray(self.centre))
+        return about @ lie.exp_se3(unknown[:6]) @ lie.inverse_pose(about) @ self.base
+
+    def _tool(self, unknown: Float[Array, " k"]) -> Float[Array, " tool"]:
+        return unknown[6:] if "base_frame" in self.estimated else unknown
+
+    def _base_unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        return _frame("base_frame") if "base_frame" in self.estimated else ()
+
+
+class Points(Placed):
+    """One or more points on the tool, measured in the device's frame: a tracker, motion capture, a touch probe."""
+
+    markers: Float[Leaf, "markers 3"]  # in the tool frame, m, at the start
+
+    def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, " rows"]:
+        device_T_tool = self.device_T_base(unknown) @ pose
+        points = self.points(unknown) @ device_T_tool[:3, :3].T + device_T_tool[:3, 3]
+        return (points - datum).reshape(-1)
+
+    def places(self, unknown: Array) -> dict[str, Array]:
+        return {"base_frame": self.device_T_base(unknown), "tool_frame": self.points(unknown)}
+
+    def points(self, unknown: Float[Array, " k"]) -> Float[Array, "markers 3"]:
+        """The markers in the tool frame, m."""
+        if "tool_frame" not in self.estimated:
+            return jnp.asarray(self.markers)
+        return self.markers + self._tool(unknown).reshape(-1, 3)
+
+    def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        return self._base_unknowns() + (
+            _points("tool_frame", len(self.markers)) if "tool_frame" in self.estimated else ()
+        )
+
+    def channels(self) -> tuple[int, ...]:
+        return (POSITION,) * (3 * len(self.markers))
+
+
+class Poses(Placed):
+    """Position and orientation of the tool in the device's frame.
+
+    The rows are the difference of the positions, on the device's axes or (`axes` "body") on the measured ones, and the
+    logarithm of the rotation from the measured to the predicted orientation; with `axes` "twist", the logarithm of the
+    whole motion from the one pose to the other.
+    """
+
+    tool: Float[Leaf, "4 4"]  # pose of the marker in the tool frame, at the start
+    axes: Literal["device", "body", "twist"] = eqx.field(static=True, default="device")
+
+    def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, "6"]:
+        predicted = self.device_T_base(unknown) @ pose @ self.tool_T_marker(unknown)
+        if self.axes == "twist":
+            return lie.log_se3(lie.inverse_pose(datum) @ predicted)
+        turn = lie.log_so3(datum[:3, :3].T @ predicted[:3, :3])
+        away = predicted[:3, 3] - datum[:3, 3]
+        return jnp.concatenate([datum[:3, :3].T @ away if self.axes == "body" else away, turn])
+
+    def places(self, unknown: Array) -> dict[str, Array]:
+        return {"base_frame": self.device_T_base(unknown), "tool_frame": self.tool_T_marker(unknown)}
+
+    def tool_T_marker(self, unknown: Float[Array, " k"]) -> Float[Array, "4 4"]:
+        """Pose of the marker in the tool frame."""
+        return (
+            self.tool @ lie.exp_se3(self._tool(unknown)) if "tool_frame" in self.estimated else jnp.asarray(self.tool)
+        )
+
+    def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        return self._base_unknowns() + (_frame("tool_frame") if "tool_frame" in self.estimated else ())
+
+    def channels(self) -> tuple[int, ...]:
+        return (POSITION,) * 3 + (ORIENTATION,) * 3
+
+
+class Camera(Poses):
+    """Corners of a board in the image of a camera: `datum` is (corners, 2), in pixels; the tool carries the camera
+    (the device's frame is the board's) or, with `mount` "world", the board (the device's frame is the camera's).
+
+    Rows are pixels over the focal length, an angle in rad.
+    """
+
+    board: Float[Leaf, "corners 3"] = eqx.field(kw_only=True)  # m, in the board's frame
+    intrinsics: Float[Leaf, "3 3"] = eqx.field(kw_only=True)
+    mount: str = eqx.field(static=True, default="hand")
+
+    def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, " rows"]:
+        seen = self.device_T_base(unknown) @ pose @ self.tool_T_marker(unknown)
+        camera_T_board = lie.inverse_pose(seen) if self.mount == "hand" else seen
+        points = self.board @ camera_T_board[:3, :3].T + camera_T_board[:3, 3]
+        focal = jnp.array([self.intrinsics[0, 0], self.intrinsics[1, 1]])
+        measured = (datum - self.intrinsics[:2, 2]) / focal
+        return (points[:, :2] / points[:, 2:] - measured).reshape(-1)
+
+    def channels(self) -> tuple[int, ...]:
+        return (ORIENTATION,) * (2 * len(self.board))
+
+
+class _Touch(Device):
+    """A point of the tool, perhaps unknown, that touches something fixed to the base."""
+
+    point: Float[Leaf, "3"]  # in the tool frame, m, at the start
+    estimated: tuple[str, ...] = eqx.field(static=True)
+
+    def tool_point(self, unknown: Float[Array, " k"]) -> Float[Array, "3"]:
+        """The point in the tool frame, m."""
+        return self.point + unknown[:3] if "tool_frame" in self.estimated else jnp.asarray(self.point)
+
+    def places(self, unknown: Array) -> dict[str, Array]:
+        return {"tool_frame": self.tool_point(unknown)}
+
+    def _fixed(self, unknown: Float[Array, " k"]) -> Float[Array, "things 3"]:
+        return unknown[3 if "tool_frame" in self.estimated else 0 :].reshape(-1, 3)
+
+    def _tool_unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        return _points("tool_frame", 1) if "tool_frame" in self.estimated else ()
+
+
+class Sockets(_Touch):
+    """The tool point sits in one of several sockets at unknown places; `datum` is the number of the socket."""
+
+    sockets: Float[Leaf, "sockets 3"]  # in the base frame, m, at the start
+    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())  # sockets of known distance
+    distance: Float[Leaf, " pairs"] = eqx.field(default_factory=lambda: np.zeros(0))  # m
+    weight: Float[Leaf, " pairs"] = eqx.field(default_factory=lambda: np.zeros(0))  # root of the postures that carry it
+
+    def centres(self, unknown: Float[Array, " k"]) -> Float[Array, "sockets 3"]:
+        """The sockets in the base frame, m."""
+        return self.sockets + self._fixed(unknown)
+
+    def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, "3"]:
+        return pose[:3, :3] @ self.tool_point(unknown) + pose[:3, 3] - self.centres(unknown)[datum]
+
+    def constraint(self, unknown: Float[Array, " k"]) -> Float[Array, " pairs"]:
+        place = self.centres(unknown)
+        if not self.pairs:
+            return jnp.zeros(0)
+        a, b = np.array(self.pairs).T
+        return self.weight * (jnp.linalg.norm(place[a] - place[b], axis=1) - self.distance)
+
+    def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        return self._tool_unknowns() + _points("socket", len(self.sockets))
+
+
+class Planes(_Touch):
+    """The tool point touches one of several fixed, unknown planes; `datum` is the number of the plane.
+
+    A plane is the axes at its start (the third one its normal), a point on it, and three unknowns: two tilts, a shift.
+    """
+
+    axes: Float[Leaf, "planes 3 3"]
+    origin: Float[Leaf, "planes 3"]  # m
+
+    def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, "1"]:
+        tilt_x, tilt_y, shift = self._fixed(unknown)[datum]
+        x, y, normal = self.axes[datum]
+        tilted = normal + tilt_x * x + tilt_y * y
+        point = pose[:3, :3] @ self.tool_point(unknown) + pose[:3, 3]
+        return jnp.atleast_1d((tilted @ (point - self.origin[datum])) / jnp.linalg.norm(tilted) - shift)
+
+    def channels(self) -> tuple[int, ...]:
+        return (POSITION,)
+
+    def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        each = (("tilt x", "rad"), ("tilt y", "rad"), ("shift", "m"))
+        planes = ((f"plane {k} {name}", unit, 1e-2) for k in range(len(self.axes)) for name, unit in each)
+        return self._tool_unknowns() + tuple(planes)
+
+
+class Distance(_Touch):
+    """Only the distance from a fixed, unknown point is measured: a wire encoder, a ball bar; `datum` in m."""
+
+    anchor: Float[Leaf, "3"]  # in the base frame, m, at the start
+
+    def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, "1"]:
+        point = pose[:3, :3] @ self.tool_point(unknown) + pose[:3, 3]
+        return jnp.atleast_1d(jnp.linalg.norm(point - self.anchor - self._fixed(unknown)[0]) - datum)
+
+    def channels(self) -> tuple[int, ...]:
+        return (POSITION,)
+
+    def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        return self._tool_unknowns() + _points("anchor", 1)
+
+
+class _Own(Device):
+    """A device given as a function."""
+
+    start: Float[Leaf, " k"]
+    function: Callable[[Array, Array, Any], Array] = eqx.field(static=True)
+    names: tuple[tuple[str, str, float], ...] = eqx.field(static=True)
+    kinds: tuple[int, ...] = eqx.field(static=True)
+
+    def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, " rows"]:
+        return jnp.atleast_1d(self.function(pose, self.start + unknown, datum))
+
+    def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        return self.names
+
+    def channels(self) -> tuple[int, ...]:
+        return self.kinds
+
+
+def own_device(
+    residual: Callable[[Float[Array, "4 4"], Float[Array, " k"], Any], Float[Array, " rows"]],
+    unknowns: Mapping[str, tuple[float, str, float]],
+    channels: Sequence[int] = (POSITION,),
+) -> Device:
+    """A measuring device of your own from a function: the differentiable `residual(pose, unknown, datum)`.
+
+    `pose` is that of the tool frame in the base frame, `datum` what was measured in the posture; given back is
+    predicted minus measured, m (POSITION) or rad (ORIENTATION) as `channels` says row by row. `unknowns` names what
+    the device leaves open, in the order in which the function takes it: its start, its unit, and about how far off
+    that is.
+    Put it into `PoseRecording(kind="own", device=...)`.
+    """
+    names = tuple((name, unit, float(size)) for name, (_, unit, size) in unknowns.items())
+    return _Own(np.array([start for start, _, _ in unknowns.values()], float), residual, names, tuple(channels))
+
+
+def _frame(name: str) -> tuple[tuple[str, str, float], ...]:
+    return tuple((f"{name} {axis}", "m" if k < 3 else "rad", _FRAME_SCALE[k]) for k, axis in enumerate(_TWIST))
+
+
+def _points(name: str, count: int) -> tuple[tuple[str, str, float], ...]:
+    numbers: Sequence[str] = [f" {k + 1}" if count > 1 else "" for k in range(count)]
+    return tuple((f"{name}{number} {axis}", "m", 1e-2) for number in numbers for axis in "xyz")

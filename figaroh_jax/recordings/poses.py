@@ -1,0 +1,230 @@
+"""Recordings of postures with a measurement at each: read, checked and brought to m, rad and one shape per kind.
+
+| kind | `values` |
+|---|---|
+| `position` | points (postures, markers, 3) in the device's frame, m |
+| `pose` | poses (postures, 4, 4) of the marker in the device's frame; a camera's board too, as the mount asks |
+| `plane`, `socket` | number (postures,) of what the tool point touches |
+| `own` | (postures, ...) whatever `device`, a measuring device of your own, takes; in Python alone |
+
+A row, a marker or an orientation that was not measured is NaN (-1 for a number).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import InputError
+from ..rigid.model import RobotModel
+from . import dataset
+from .devices import Device
+from .tables import Table, read_table
+
+if TYPE_CHECKING:
+    from ..formats.config import Load, Measurement, RecordingEntry, Task
+
+__all__ = ["PoseRecording", "read_pose_recordings"]
+
+_LOOSE = 1e-2  # how far a rotation or a quaternion may be off by rounding
+
+
+@dataclass(frozen=True, eq=False)
+class PoseRecording:
+    """Postures in the order in which they were measured, and what the device saw at each."""
+
+    name: str
+    file: Path
+    time: Float[np.ndarray, " samples"]  # s; counted where the file has no clock
+    position: Float[np.ndarray, "samples nv"]  # rad or m
+    kind: Literal["pose", "position", "plane", "socket", "own"]
+    values: np.ndarray
+    base_frame: str
+    tool_frame: str
+    unknown: tuple[str, ...] = ()
+    accuracy: tuple[float | None, float | None] = (None, None)  # m, rad
+    distance: float | None = None  # m, between two sockets
+    load: Load | None = None
+    role: Literal["fit", "holdout"] = "fit"
+    notes: tuple[str, ...] = ()
+    device: Device | None = None  # of kind "own"
+
+
+def read_pose_recordings(task: Task, model: RobotModel) -> tuple[PoseRecording, ...]:
+    """Read every recording of a task whose recordings hold a `measurement`, in the task's order.
+
+    Raises `InputError` that names file, key, row or column: a recording without measurement, arrays of the wrong shape,
+    numbers that are neither NaN nor finite, matrices that are no poses, frames that the model does not have.
+    """
+    drive = dataset.Drive(task, model)
+    return tuple(_read(task, entry, f"data[{k}]", model, drive) for k, entry in enumerate(task.data))
+
+
+def _read(task: Task, entry: RecordingEntry, key: str, model: RobotModel, drive: dataset.Drive) -> PoseRecording:
+    if entry.measurement is None:
+        raise InputError(
+            f"{task.file}: {key} has no `measurement`: calibration needs what was measured at each posture"
+        )
+    table = read_table(entry.file, f"{key}.file")
+    factors = dataset.unit_factors(entry.units.position, drive.position is not None, model)
+    position = drive.joint_motion(dataset.joint_columns(table, entry.position, model, f"{key}.position") * factors)
+    position = position + drive.offset
+    measurement = entry.measurement
+    base, tool, unknown, notes = _frames(task, measurement, f"{key}.measurement", model)
+    scale = 1e-3 if entry.units.measurement == "mm" else 1.0
+    kind, values = _values(table, measurement, f"{key}.measurement", len(position), scale)
+    accuracy = measurement.accuracy
+    return PoseRecording(
+        name=entry.file.stem,
+        file=entry.file,
+        time=_time(table, entry, key, len(position)),
+        position=position,
+        kind=kind,
+        values=values,
+        base_frame=base,
+        tool_frame=tool,
+        unknown=unknown,
+        accuracy=(accuracy.position, accuracy.orientation),
+        distance=measurement.distance,
+        load=entry.load,
+        role=entry.role,
+        notes=notes,
+    )
+
+
+def _frames(task: Task, measurement: Measurement, key: str, model: RobotModel):
+    """Base frame, tool frame, what is unknown, and notes."""
+    if measurement.tool_frame is None:
+        raise InputError(f"{task.file}: {key}.tool_frame is missing: which frame of the model is measured?")
+    base = measurement.base_frame or next((f.name for f in model.frames if f.parent < 0), model.frames[0].name)
+    for name, frame in (("base_frame", base), ("tool_frame", measurement.tool_frame)):
+        try:
+            model.frame_index(frame)
+        except InputError as error:
+            raise InputError(f"{task.file}: {key}.{name}: {error}") from None
+    unknown, notes = tuple(dict.fromkeys(measurement.unknown)), ()
+    if measurement.kind in ("plane", "socket") and "base_frame" in unknown:
+        unknown = tuple(name for name in unknown if name != "base_frame")
+        notes = (f"{key}: touching a {measurement.kind} at an unknown place shows no base frame; it is left as it is",)
+    return base, measurement.tool_frame, unknown, notes
+
+
+def _time(table: Table, entry: RecordingEntry, key: str, samples: int) -> Float[np.ndarray, " samples"]:
+    if entry.time is None:
+        return np.arange(samples, dtype=float) / (entry.rate or 1.0)
+    return dataset.read_time(table, entry, key, samples)
+
+
+def _values(table: Table, measurement: Measurement, key: str, samples: int, scale: float):
+    kind = measurement.kind
+    source = getattr(measurement, kind)
+    where = f"{key}.{kind}"
+    if kind in ("plane", "socket"):
+        return kind, _numbers(table, source, where, samples)
+    values = _array(table, source, where)
+    if len(values) != samples:
+        raise InputError(f"{table.file}: {where} has {len(values)} rows, but position has {samples}")
+    if kind == "position":
+        return kind, _points(values, table, where) * scale
+    poses = _poses(values, table, where)
+    poses[:, :3, 3] *= scale
+    if kind == "camera" and measurement.mount == "hand":  # the board stands still: the camera's pose seen from it
+        poses = np.linalg.inv(np.where(np.isfinite(poses), poses, np.nan))
+    return "pose", poses
+
+
+def _array(table: Table, source: str | tuple[str, ...], key: str) -> np.ndarray:
+    """An array, a list of columns or the columns that begin with a prefix, in their order in the file."""
+    if isinstance(source, str) and source in table.names:
+        return table.read(source)
+    names = list(source) if not isinstance(source, str) else [n for n in table.names if n.startswith(source)]
+    if not names:
+        return table.vector(str(source), key)  # raises with the nearest name
+    return np.stack([table.vector(name, key) for name in names], axis=1)
+
+
+def _points(values: np.ndarray, table: Table, key: str) -> np.ndarray:
+    if values.ndim == 2 and values.shape[1] % 3 == 0 and values.shape[1]:
+        values = values.reshape(len(values), -1, 3)
+    if values.ndim != 3 or values.shape[2] != 3:
+        raise InputError(
+            f"{table.file}: {key} has shape {values.shape}, expected (postures, 3) or (postures, markers, 3)"
+        )
+    _whole_or_missing(values.reshape(len(values), -1, 3), table, key, "point")
+    if not np.isfinite(values).all(axis=2).any(axis=0).all():
+        marker = int(np.argmin(np.isfinite(values).all(axis=2).any(axis=0)))
+        raise InputError(f"{table.file}: {key}: marker {marker} (from 0) was not measured in any posture")
+    return values
+
+
+def _whole_or_missing(values: np.ndarray, table: Table, key: str, what: str) -> None:
+    """Refuse infinite numbers, and NaN in a part of a point or a rotation."""
+    missing = np.isnan(values)
+    wrong = np.isinf(values).any(axis=2) | (missing.any(axis=2) & ~missing.all(axis=2))
+    if wrong.any():
+        row, part = np.argwhere(wrong)[0]
+        raise InputError(
+            f"{table.file}: {key}, row {row} (from 0): {what} {part} is {values[row, part].tolist()};"
+            f" a {what} that was not measured is NaN as a whole"
+        )
+
+
+def _poses(values: np.ndarray, table: Table, key: str) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    if values.ndim == 2 and values.shape[1] == 16:
+        values = values.reshape(-1, 4, 4)
+    if values.ndim == 2 and values.shape[1] == 7:
+        rotation, point = values[:, None, 3:], values[:, None, :3]
+    elif values.shape[1:] == (4, 4):
+        rotation, point = values[:, :3, :3].reshape(-1, 1, 9), values[:, None, :3, 3]
+    else:
+        raise InputError(
+            f"{table.file}: {key} has shape {values.shape},"
+            " expected (postures, 4, 4) or (postures, 7) as x y z qx qy qz qw"
+        )
+    _whole_or_missing(point, table, key, "position")
+    _whole_or_missing(rotation, table, key, "orientation")
+    poses = np.full((len(values), 4, 4), np.nan)
+    poses[:, 3], poses[:, :3, 3] = (0.0, 0.0, 0.0, 1.0), point[:, 0]
+    seen = np.isfinite(rotation[:, 0]).all(axis=1)
+    given = rotation[seen, 0]
+    if given.shape[1] == 4:
+        off = np.abs(np.linalg.norm(given, axis=1) - 1.0)
+        turned = Rotation.from_quat(
+            given / np.maximum(np.linalg.norm(given, axis=1), 1e-9)[:, None] if len(given) else given
+        )
+        matrices = turned.as_matrix() if len(given) else np.zeros((0, 3, 3))
+    else:
+        given = given.reshape(-1, 3, 3)
+        u, _, vt = np.linalg.svd(given)
+        matrices = u @ vt
+        off = np.maximum(np.abs(matrices - given).max(axis=(1, 2), initial=0.0), np.linalg.det(matrices) < 0.0)
+    if np.any(off > _LOOSE):
+        row = np.flatnonzero(seen)[np.argmax(off > _LOOSE)]
+        what = "quaternion x y z w of length 1" if given.ndim == 2 else "rotation matrix"
+        raise InputError(f"{table.file}: {key}, row {row} (from 0): the orientation is no {what}")
+    poses[seen, :3, :3] = matrices
+    return poses
+
+
+def _numbers(table: Table, source: str | tuple[str, ...] | None, key: str, samples: int) -> np.ndarray:
+    if source is None:
+        return np.zeros(samples, int)
+    if not isinstance(source, str):
+        if len(source) != 1:
+            raise InputError(f"{table.file}: {key} names {len(source)} columns, expected one of numbers")
+        source = source[0]
+    values = table.vector(source, key)
+    if len(values) != samples:
+        raise InputError(f"{table.file}: {key} has {len(values)} rows, but position has {samples}")
+    missing = np.isnan(values)
+    wrong = ~missing & (np.isinf(values) | (np.where(missing, 0.0, values) % 1 != 0))
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise InputError(f"{table.file}: {key}, row {row} (from 0): {values[row]} is no whole number")
+    return np.where(missing, -1, values).astype(int)

@@ -1,0 +1,1 @@
+"""The robot and its mechanics: `spatial`, `lie`, `inertia`, `model` -> `kinematics` -> `dynamics`, `regressor`."""

@@ -1,0 +1,221 @@
+"""The regressor condensed while it is formed: memory that does not grow with the number of samples.
+
+All rows of a recording go into the normal matrix of `[W extra tau]`, or into its triangular factor where the condition
+number may not be squared. Both add up over pieces of the data: the answer for earlier pieces goes in as `total`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from ..compiled.batching import BLOCK, CPU_OPTIONS, chunk_size, in_chunks, on_host, traced, two_axes
+from ..errors import InputError
+from .kinematics import check_shapes
+from .model import RobotModel
+from .regressor import coordinate_blocks, coordinate_rows, dense_rows
+
+__all__ = ["NormalMatrix", "normal_matrix", "triangular_factor"]
+
+SMALL = 160  # columns of a normal matrix
+
+
+class NormalMatrix(NamedTuple):
+    """Sums over all rows of the regressor, `[W extra]' weight [W extra tau]` and tau' weight tau."""
+
+    matrix: Float[Array, "columns columns"]
+    moment: Float[Array, " columns"]
+    square: Float[Array, ""]
+
+
+def normal_matrix(
+    model: RobotModel,
+    q: Float[ArrayLike, "*batch nq"],
+    v: Float[ArrayLike, "*batch nv"],
+    a: Float[ArrayLike, "*batch nv"],
+    tau: Float[ArrayLike, "*batch nv"],
+    weight: Float[ArrayLike, "..."] | None = None,
+    extra: Float[ArrayLike, "*batch nv k"] | None = None,
+    total: NormalMatrix | None = None,
+) -> NormalMatrix:
+    """Normal matrix G = W' weight W, b = W' weight tau and tau' weight tau, in float64.
+
+    `weight` is an inverse variance (`(nv,)` or `(*batch, nv)`, not negative, 1 where left out); `extra` are columns
+    that follow those of `joint_torque_regressor`, for friction and the like; `total` is the answer for earlier pieces
+    of the data. Each coordinate's rows enter with the columns of the links that it moves alone, in batches of equally
+    many. Raises `InputError` where the shapes do not fit.
+    """
+    with jax.enable_x64(True):
+        rows = _rows(model, q, v, a, tau, weight, extra)
+        columns = 10 * len(model.joints) + (0 if extra is None else np.shape(extra)[-1]) + 1
+        groups = _groups(model, columns)
+        start = tuple(jnp.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
+        # a small matrix is added to from the innermost cache; a large one costs more to add to than its rows to make
+        chunk = 32 if on_host() and columns <= SMALL else chunk_size()
+        parts = _fold(_add_products, chunk, start, model, rows)
+        index = np.concatenate([_flat(group, columns).ravel() for group in groups])
+        whole = _scattered(columns, index, parts)
+        new = NormalMatrix(whole[:-1, :-1], whole[:-1, -1], whole[-1, -1])
+        return new if total is None else NormalMatrix(*(x + y for x, y in zip(total, new, strict=True)))
+
+
+def triangular_factor(
+    model: RobotModel,
+    q: Float[ArrayLike, "*batch nq"],
+    v: Float[ArrayLike, "*batch nv"],
+    a: Float[ArrayLike, "*batch nv"],
+    tau: Float[ArrayLike, "*batch nv"] | None = None,
+    weight: Float[ArrayLike, "..."] | None = None,
+    extra: Float[ArrayLike, "*batch nv k"] | None = None,
+    total: Float[Array, "columns columns"] | None = None,
+) -> Float[Array, "columns columns"]:
+    """Upper triangular R, diagonal not negative, with R'R = A' weight A for A = [W extra tau], in float64.
+
+    Rank, conditioning and least squares follow from R as from A, without the squared condition number of
+    `normal_matrix`, whose arguments these are. One small QR factorisation a chunk, on top of the R so far (TSQR;
+    Demmel, Grigori, Hoemmen and Langou, 2012). Without `tau` its column is left out.
+    """
+    with jax.enable_x64(True):
+        rows = _rows(model, q, v, a, tau, weight, extra)
+        columns = 10 * len(model.joints) + sum(np.shape(x)[-1] for x in (extra,) if x is not None) + (tau is not None)
+        start = jnp.zeros((columns, columns)) if total is None else jnp.asarray(total, jnp.float64)
+        return _upright(_fold(_add_rows, 2 * chunk_size(), start, model, rows))
+
+
+@jax.jit
+def _upright(factor: Float[Array, "columns columns"]) -> Float[Array, "columns columns"]:
+    return factor * jnp.where(jnp.diagonal(factor) < 0.0, -1.0, 1.0)[:, None]
+
+
+class _Rows(NamedTuple):
+    """What the rows are made of, as (samples, nv) or, for `extra`, (samples, nv * k); `root` is sqrt(weight)."""
+
+    q: Any
+    v: Any
+    a: Any
+    root: Any
+    tau: Any | None
+    extra: Any | None
+
+
+def _rows(
+    model: RobotModel,
+    q: ArrayLike,
+    v: ArrayLike,
+    a: ArrayLike,
+    tau: ArrayLike | None,
+    weight: ArrayLike | None,
+    extra: ArrayLike | None,
+) -> _Rows:
+    given = {"q": q, "v": v, "a": a} | ({} if tau is None else {"tau": tau})
+    check_shapes(model, **given)
+    shape = (*np.shape(q)[:-1], model.nv)
+    if extra is not None and np.shape(extra)[:-1] != shape:
+        raise InputError(f"extra has shape {np.shape(extra)}; expected {(*shape, 'columns')}, a row for each torque")
+    if weight is not None and np.shape(weight) not in ((), shape[-1:], shape):
+        raise InputError(f"weight has shape {np.shape(weight)}; expected {shape[-1:]} or {shape}")
+    host = not traced(model, q, v, a, tau, weight, extra)
+    library: Any = np if host else jnp
+    root = library.broadcast_to(library.sqrt(library.asarray(1.0 if weight is None else weight, float)), shape)
+    if extra is not None:
+        extra = library.reshape(library.asarray(extra, float), (*shape[:-1], -1))
+    given = (q, v, a, root, tau, extra)
+    return _Rows(*(None if x is None else two_axes(x, host=host)[0] for x in given))
+
+
+def _fold(step: Callable[..., Any], chunk: int, total: Any, model: RobotModel, rows: _Rows) -> Any:
+    """All rows, a chunk at a time, by `total = step(model, total, chunk of rows)`; filled-up rows have weight zero."""
+    if traced(model, total, rows):
+        return _fold_chunks(step, total, model, _cut(rows, chunk))
+    program = _host_program if on_host() else _device_program
+    samples = len(rows.q)
+    chunks = 1 if samples <= chunk else max(8, BLOCK // chunk)
+    for start in range(0, samples, chunk * chunks):
+        piece = jax.tree.map(lambda x: x[start : start + chunk * chunks], rows)  # noqa: B023
+        total = program(step, total, model, _cut(piece, chunk, chunks))
+    return total
+
+
+def _cut(rows: _Rows, chunk: int, chunks: int = 0) -> _Rows:
+    """Rows in chunks, the samples last in each; what fills the last one up weighs nothing."""
+    cut = jax.tree.map(lambda x: in_chunks(x, chunk, chunks), rows)
+    there = np.arange(cut.root.shape[0] * chunk).reshape(-1, 1, chunk) < len(rows.q)
+    return cut._replace(root=cut.root * there)
+
+
+def _fold_chunks(step: Callable[..., Any], total: Any, model: RobotModel, rows: _Rows) -> Any:
+    return jax.lax.scan(lambda total, rows: (step(model, total, rows), None), total, rows)[0]
+
+
+_device_program = jax.jit(_fold_chunks, static_argnums=0)
+_host_program = jax.jit(_fold_chunks, static_argnums=0, compiler_options=CPU_OPTIONS)
+
+
+class _Group(NamedTuple):
+    """Coordinates that move equally many links: their blocks (n, links), their columns of [W extra tau] (n, ...)."""
+
+    coordinates: np.ndarray
+    blocks: np.ndarray
+    columns: np.ndarray
+
+
+def _groups(model: RobotModel, columns: int) -> list[_Group]:
+    blocks, _ = coordinate_blocks(model)
+    members = [np.flatnonzero(blocks[:, 0] == coordinate) for coordinate in range(model.nv)]
+    groups = []
+    for size in sorted({len(m) for m in members}):
+        which = np.array([k for k, m in enumerate(members) if len(m) == size], int)
+        index = np.stack([members[k] for k in which])
+        # the columns of mass and first moments of all links before those of their inertia, as the kernel gives them
+        first = 10 * blocks[index, 1][..., None]
+        own = np.concatenate([(first + np.arange(*ends)).reshape(len(which), -1) for ends in ((0, 4), (4, 10))], axis=1)
+        shared = np.broadcast_to(
+            np.arange(10 * len(model.joints), columns), (len(which), columns - 10 * len(model.joints))
+        )
+        groups.append(_Group(which, index, np.concatenate([own, shared], axis=1)))
+    return groups
+
+
+def _flat(group: _Group, columns: int) -> np.ndarray:
+    """Places of the group's products in the flattened normal matrix."""
+    return columns * group.columns[:, :, None] + group.columns[:, None, :]
+
+
+@partial(jax.jit, static_argnums=0)
+def _scattered(columns: int, index: Array, parts: tuple[Array, ...]) -> Float[Array, "columns columns"]:
+    values = jnp.concatenate([part.reshape(-1) for part in parts])
+    return jnp.zeros(columns * columns).at[index].add(values).reshape(columns, columns)
+
+
+def _add_products(model: RobotModel, totals: tuple[Array, ...], rows: _Rows) -> tuple[Array, ...]:
+    samples = rows.q.shape[-1]
+    pieces = coordinate_rows(model, rows.q, rows.v, rows.a)
+    side = _beside(model, rows)
+    columns = 10 * len(model.joints) + side.shape[1]
+    new = []
+    for total, group in zip(totals, _groups(model, columns), strict=True):
+        own = [x[group.blocks].reshape(len(group.coordinates), -1, samples) for x in pieces]
+        both = jnp.concatenate([*own, side[group.coordinates]], axis=1) * rows.root[group.coordinates, None]
+        new.append(total + jnp.einsum("cks,cls->ckl", both, both, precision=jax.lax.Precision.HIGHEST))
+    return tuple(new)
+
+
+def _add_rows(model: RobotModel, total: Array, rows: _Rows) -> Array:
+    """R of [R so far; rows]."""
+    dense = dense_rows(model, rows.q, rows.v, rows.a)
+    both = jnp.concatenate([dense, _beside(model, rows)], axis=1) * rows.root[:, None]
+    return jnp.linalg.qr(jnp.concatenate([total, jnp.moveaxis(both, 1, 2).reshape(-1, both.shape[1])]), mode="r")
+
+
+def _beside(model: RobotModel, rows: _Rows) -> Float[Array, "nv k samples"]:
+    """Columns of [extra tau]."""
+    samples = rows.q.shape[-1]
+    parts = [x.reshape(model.nv, -1, samples) for x in (rows.extra, rows.tau) if x is not None]
+    return jnp.concatenate([jnp.zeros((model.nv, 0, samples), rows.q.dtype), *parts], axis=1)

@@ -1,0 +1,1 @@
+"""Simulators behind one `contract`: this library's own (`native`), others by name (`registry`)."""
