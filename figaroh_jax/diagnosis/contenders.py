@@ -40,8 +40,8 @@ class Contender:
     joints: tuple[int, ...]  # by whose rows it is judged
 
 
-def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray]]:
-    """The best groups of the robot and of each place, each with its grid points in the order of their scores.
+def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray, float]]:
+    """The best groups of the robot and of each place, each with its grid points by their scores, and the best score.
 
     One joint with a large misfit would fill a list of the best alone, and nothing else would be tried.
     """
@@ -52,7 +52,7 @@ def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray]]:
     chosen += [r for r in _best_of_places(step, found, ranked) if r not in chosen]
     simpler = {Name(n, found.groups[g].name.at) for _, g, _ in chosen for n in type(found.groups[g].effect).contains}
     chosen += [r for r in ranked if found.groups[r[1]].name in simpler and r not in chosen]
-    return [(found.groups[g], np.argsort(-found.scores[g].Q)) for _, g, _ in chosen]
+    return [(found.groups[g], np.argsort(-found.scores[g].Q), float(found.scores[g].Q[p])) for _, g, p in chosen]
 
 
 def _best_of_places(step: Step, found: Screen, ranked: list[tuple[float, int, int]]) -> list[tuple[float, int, int]]:

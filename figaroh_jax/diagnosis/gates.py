@@ -14,7 +14,7 @@ from .screening import Screen
 from .step import Step
 from .thresholds import CLEARLY, CONFIDENT, GAIN, SAME, UNSURE
 
-__all__ = ["ambiguous", "exists", "passes", "physical_sign", "rivals", "simpler"]
+__all__ = ["ambiguous", "exists", "gains", "passes", "physical_sign", "rivals", "simpler"]
 
 POSITIVE = {"torque_delay": ("delay",), "joint_spring": ("stiffness",)}  # beside parameters that are bounded by zero
 EXACT = ({"torque_offset", "asymmetric_coulomb_friction"}, {"payload", "link_inertia"})
@@ -53,12 +53,16 @@ def _within(parameter: Parameter, value: float) -> bool:
     return parameter.choice or parameter.lower + margin < value < parameter.upper - margin
 
 
-def passes(step: Step, contenders: list[Contender], one: Contender) -> bool:
-    """Whether the cause predicts what it was not fitted to: by enough, surely, and in most of the folds."""
+def gains(step: Step, one: Contender) -> bool:
+    """Whether the cause predicts what it was not fitted to, at its joints and on the whole: by enough, and surely."""
     before, after = (v.own(step.rows, one.joints) for v in (step.verdicts, one.verdicts))
     gain, surely = 1 - after.sum() / before.sum(), t_value(before, after) > CONFIDENT
-    better = one.verdicts.heldout < step.verdicts.heldout
-    return bool(gain > GAIN and surely and better and _recurs(step, contenders, one))
+    return bool(gain > GAIN and surely and one.verdicts.heldout < step.verdicts.heldout)
+
+
+def passes(step: Step, contenders: list[Contender], one: Contender) -> bool:
+    """Whether the cause predicts what it was not fitted to, and in most of the folds."""
+    return gains(step, one) and _recurs(step, contenders, one)
 
 
 def _recurs(step: Step, contenders: list[Contender], one: Contender) -> bool:

@@ -28,7 +28,8 @@ class Layout(eqx.Module):
     partner: Int[np.ndarray, "partners T"]
     paired: Float[np.ndarray, "nv T"]
     block: Int[np.ndarray, " T"]
-    fold: Int[np.ndarray, " T"]
+    fold: Int[np.ndarray, " T"]  # by which causes are chosen: excitations, or slices in turn where they are few
+    part: Int[np.ndarray, " T"]  # by which the gain is told: excitations, or quarters that follow one another
     repeats: bool = eqx.field(static=True)
 
 

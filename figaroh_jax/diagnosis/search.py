@@ -13,17 +13,17 @@ from ..effects.base import Effect
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Prior
 from ..results import Name
-from .comparison import Hypothesis, Verdicts, ground, judge, shares_of_wins, t_value
-from .contenders import Contender, contend, for_refit, shortlist
+from .comparison import Hypothesis, Verdicts, ground, judge, overlap, shares_of_wins, t_value
+from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places
 from .flexible import friction_width
-from .gates import ambiguous, exists, passes, physical_sign, rivals, simpler
+from .gates import ambiguous, exists, gains, passes, physical_sign, rivals, simpler
 from .problem import Problem
 from .screening import DRAWS, Null, Screen, catalogue, family_p, screen
 from .state import State, with_width
 from .step import Step, stand, with_cause, with_causes
-from .thresholds import CONFIDENT, GAIN, MOST_CAUSES, MUCH, SMALLEST, TRUSTED
+from .thresholds import AGAIN, CONFIDENT, GAIN, MOST_CAUSES, MUCH, OTHER, SMALLEST, TRUSTED
 
 __all__ = ["Found", "Search", "eliminate", "find_causes", "judged_without"]
 
@@ -83,6 +83,7 @@ def find_causes(
     step, found = stand(problem, state, whitening), []
     null = Null(problem, spectrum, whitening, generator)
     p_values, screens, screened, groups = [], [], None, None
+    failed: dict[Name, float] = {}  # share of its joints' squares that a candidate scored when it last failed
     while len(found) < MOST_CAUSES:
         progress("screening the catalogue", len(found) / MOST_CAUSES)
         groups = catalogue(problem, step.state, step.rows, whitening, forbid, groups)
@@ -92,13 +93,15 @@ def find_causes(
         if p_values[-1] > alpha:
             break
         progress("comparing causes on held-out data", len(found) / MOST_CAUSES)
-        contenders = _contenders(problem, step, screened, whitening)
-        best = _best(problem, step, contenders, found)
-        if best is None:
+        contenders = _contenders(problem, step, screened, whitening, failed)
+        chosen = _chosen(problem, step, contenders, found)
+        if not chosen:
             break
-        found.append(_found(step, contenders, best, screened, p_values[-1], generator))
-        step = with_cause(problem, step, best.effect, whitening)
-        if kind(best.effect) != "columns":
+        before = step
+        for best in chosen[: MOST_CAUSES - len(found)]:
+            found.append(_found(before, contenders, best, screened, p_values[-1], generator))
+            step = with_cause(problem, step, best.effect, whitening)
+        if any(kind(best.effect) != "columns" for best in chosen):
             problem = friction_width(problem, step.state, whitening)
             step, groups, screened = stand(problem, with_width(problem, step.state), whitening), None, None
     return Search(problem, with_width(problem, state), step, found, p_values[0], p_values[-1], screens[0])
@@ -122,13 +125,51 @@ def _chance(
 
 
 def _contenders(
-    problem: Problem, step: Step, screened: Screen, whitening: Float[np.ndarray, "F nv"]
+    problem: Problem, step: Step, screened: Screen, whitening: Float[np.ndarray, "F nv"], failed: dict[Name, float]
 ) -> list[Contender]:
-    """The shortlist with exact shapes, without what cannot exist, the best on held-out data first."""
+    """The shortlist with exact shapes, without what cannot exist, the best on held-out data first.
+
+    A candidate that has failed is tried again where it scores more of what its joints leave than it did then.
+    """
     base = ground(step.rows, step.verdicts, step.state.prior, step.folded)
-    ready = for_refit(problem, step, base, whitening)
-    all_of_them = [contend(problem, step, whitening, base, ready, *entry) for entry in shortlist(step, screened)]
-    return sorted((c for c in all_of_them if exists(problem, c.effect)), key=lambda c: c.verdicts.heldout)
+    ready, squares, out = for_refit(problem, step, base, whitening), (step.verdicts.error**2).sum(1), []
+    for group, order, score in shortlist(step, screened):
+        share = score / squares[list(acting(group.effect, len(squares), group.columns.joints))].sum()
+        if share <= AGAIN * failed.get(group.name, 0.0):
+            continue
+        one = contend(problem, step, whitening, base, ready, group, order)
+        if exists(problem, one.effect):
+            out.append(one)
+        else:
+            failed[group.name] = share
+        if not gains(step, one):
+            failed[group.name] = share
+    return sorted(out, key=lambda c: c.verdicts.heldout)
+
+
+def _chosen(problem: Problem, step: Step, contenders: list[Contender], before: list[Found]) -> list[Contender]:
+    """The best cause, and the best of other joints that explain another misfit."""
+    first = _best(problem, step, contenders, before)
+    if first is None:
+        return []
+    chosen = [first]
+    while first.effect.acts_on in ("joint", "pair") and kind(first.effect) == "columns":
+        free = [c for c in contenders if all(_apart(step, c, one) for one in chosen)]
+        other = _best(problem, step, free, before)
+        if other is None:
+            break
+        chosen.append(other)
+    return chosen
+
+
+def _apart(step: Step, one: Contender, other: Contender) -> bool:
+    """Whether a cause acts at other joints than another one and changes another part of the residual."""
+    local = one.effect.acts_on in ("joint", "pair") and kind(one.effect) == "columns"
+    return (
+        local
+        and not set(one.joints) & set(other.joints)
+        and overlap(step.verdicts, one.verdicts, other.verdicts) < OTHER
+    )
 
 
 def _best(problem: Problem, step: Step, contenders: list[Contender], before: list[Found]) -> Contender | None:

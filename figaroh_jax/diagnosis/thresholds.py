@@ -37,6 +37,8 @@ MUCH = 0.5  # share of the best's drop from which another cause explains much of
 SMALLEST = 0.0005  # share of the first cause's drop below which a later one may be what the first left over
 TRUSTED = 0.05  # of the inertials, relative: up to it a link's own inertia may be the cause
 MOST_CAUSES = 16
+AGAIN = 1.2  # times its share of its joints' squares when it failed: from here a candidate is tried again
+OTHER = 0.2  # overlap up to which causes at other joints are taken in at once
 CERTAIN = 0.2  # of alpha: what a name needs, for p is not uniform under coloured noise
 
 # Naming beside a rest (`naming`)
@@ -53,5 +55,9 @@ LINE_P = 1e-3  # p-value of a line in the spectrum
 REPEATED, REPEATED_SHARE = 0.08, 0.05  # excess that repeats: absolute, and as a share of the first excess
 FITTED, FITTED_SHARE = 0.03, 0.03  # excess that a flexible model or the catalogue still scores on
 UNREPEATED = 0.01  # the same where no recording repeats another
+T_REST = 2.3  # t of the blocks: that smooth functions predict the rest on data they were not fitted to
+LEAST_BEYOND = 0.05  # times the noise power: below, nothing is said of what a joint's rest goes with
+LEAST_SHARE = 0.05  # of the power beyond the noise: a dependence that is told
+NO_REST = 0.15  # excess over the noise up to which a cause need only be there to be named
 OWN_SHARE = 0.03  # of what a cause has removed: a rest at its own place that speaks against its law
 STANDSTILL = 0.08  # of a joint's top speed: rows at and around rest

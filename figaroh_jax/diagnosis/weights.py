@@ -20,7 +20,7 @@ from .state import State, whitened
 from .step import stand
 from .thresholds import FAST, LEAST_FACTOR, REVERSAL, REVERSALS_AT_MOST, ROWS_OF_A_BIN, SPEED_EDGES, WHITE_GAIN
 
-__all__ = ["speed_factors", "weighted_by_speed", "white_where_better", "without_reversals"]
+__all__ = ["relative_speed", "speed_factors", "weighted_by_speed", "white_where_better", "without_reversals"]
 
 RIDGE = 1e-6  # of the mean diagonal of a joint's normal equations
 
@@ -42,7 +42,7 @@ def _near_reversal(velocity: Float[np.ndarray, "N nv"], rows: np.ndarray, reach:
 
 def weighted_by_speed(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> Problem:
     """The problem with each row of the fit multiplied by 1/sqrt(factor) of its joint's speed."""
-    speed = _relative_speed(problem)
+    speed = relative_speed(problem)
     factors = speed_factors(problem, state, whitening)
     if (factors == 1).all():
         return problem
@@ -59,7 +59,7 @@ def speed_factors(problem: Problem, state: State, whitening: Float[np.ndarray, "
     """
     rows = whitened(problem, state, whitening)
     weight, speed = (
-        np.moveaxis(x, 2, 0).reshape(len(rows.y), -1) for x in (problem.records.weight, _relative_speed(problem))
+        np.moveaxis(x, 2, 0).reshape(len(rows.y), -1) for x in (problem.records.weight, relative_speed(problem))
     )
     functions, out = smooth_functions(state.motion), []
     for joint in range(len(rows.y)):
@@ -79,16 +79,19 @@ def white_where_better(
     noise alone follow what the model does worst; judged by the error in N m on the folds.
     """
     step = stand(problem, state, coloured)
-    error, residual = fold_error(problem, step.state, step.verdicts.folds), residual_rms(problem, step.state)
+    error, residual = (
+        fold_error(problem, step.state, step.verdicts.folds, problem.layout.fold),
+        residual_rms(problem, step.state),
+    )
     white = np.broadcast_to(1 / np.maximum(residual, 1e-12 * residual.max()), coloured.shape)
     other = stand(problem, state, white)
-    if fold_error(problem, other.state, other.verdicts.folds) > (1 - WHITE_GAIN) * error:
+    if fold_error(problem, other.state, other.verdicts.folds, problem.layout.fold) > (1 - WHITE_GAIN) * error:
         return coloured, False
     residual = residual_rms(problem, other.state)
     return np.broadcast_to(1 / np.maximum(residual, 1e-12 * residual.max()), coloured.shape), True
 
 
-def _relative_speed(problem: Problem) -> Float[np.ndarray, "n M nv"]:
+def relative_speed(problem: Problem) -> Float[np.ndarray, "n M nv"]:
     records = problem.records
     speed = np.take_along_axis(np.abs(np.asarray(records.velocity)), records.row_samples()[..., None], axis=1)
     return speed / np.maximum((speed * records.fitted).max((0, 1)), 1e-12)
