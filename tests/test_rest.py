@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -51,14 +53,7 @@ def test_verdicts_follow_causes_and_rest() -> None:
     assert verdict(True, True) == "named+rest"
 
 
-def standing(**changes: float) -> Standing:
-    return Standing(
-        **(
-            {"name": Name("torque_ripple", ("elbow",)), "whole": False, "physical": True, "gain": 0.4}
-            | {"t": 4.0, "share": 0.1}
-            | changes
-        )
-    )  # type: ignore[arg-type]
+RIGHT = Standing(Name("torque_ripple", ("elbow",)), whole=False, physical=True, gain=0.4, t=4.0, share=0.1)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +71,7 @@ def standing(**changes: float) -> Standing:
     ],
 )
 def test_beside_a_rest_a_cause_is_named_by_what_it_alone_explains(changes: dict[str, float], word: str) -> None:
-    reason = reason_against(standing(**changes), True, 0.01)
+    reason = reason_against(replace(RIGHT, **changes), True, 0.01)
     assert word in reason and bool(word) == bool(reason)
 
 
@@ -90,7 +85,7 @@ def test_beside_a_rest_a_cause_is_named_by_what_it_alone_explains(changes: dict[
     ],
 )
 def test_without_a_rest_a_cause_need_only_be_there(changes: dict[str, float], word: str) -> None:
-    reason = reason_against(standing(**changes), False, 0.01)
+    reason = reason_against(replace(RIGHT, **changes), False, 0.01)
     assert word in reason and bool(word) == bool(reason)
 
 

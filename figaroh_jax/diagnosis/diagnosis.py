@@ -203,11 +203,9 @@ def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> tuple[l
     worse: list[Name] = []
     while named:
         squares, _ = held_squares(here.problem, here.start, joint.causes, here.whitening)
-        own = [
-            1 - b[list(f.joints)].sum() / a[list(f.joints)].sum()
-            for f, (a, b) in zip(named, pairwise(squares), strict=True)
-        ]
-        whole = [a.sum() - b.sum() for a, b in pairwise(squares)]
+        falls, places = [a - b for a, b in pairwise(squares)], [list(f.joints) for f in named]
+        whole = [fall.sum() for fall in falls]
+        own = [f[at].sum() / a[at].sum() for at, f, a in zip(places, falls, squares, strict=False)]
         if min(own) > 0 and sum(whole) >= 0:
             break
         least = int(np.argmin(own if min(own) <= 0 else whole))

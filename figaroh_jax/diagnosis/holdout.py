@@ -119,11 +119,8 @@ def fold_error(
 def _left_out(
     problem: Problem, state: State, folds: Float[np.ndarray, "folds P"], fold: Int[np.ndarray, " T"]
 ) -> Float[np.ndarray, "n M nv"]:
-    response, fold, error = (
-        state.response(problem.records.omega),
-        fold.reshape(problem.torque.shape[:2]),
-        problem.torque,
-    )
+    response, error = state.response(problem.records.omega), problem.torque
+    fold = fold.reshape(error.shape[:2])
     for k, theta in enumerate(folds):
         error = error - open_rows(problem.records, state.torque(theta), response) * (fold == k)[..., None]
     return error

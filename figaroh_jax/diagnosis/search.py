@@ -165,11 +165,8 @@ def _chosen(problem: Problem, step: Step, contenders: list[Contender], before: l
 def _apart(step: Step, one: Contender, other: Contender) -> bool:
     """Whether a cause acts at other joints than another one and changes another part of the residual."""
     local = one.effect.acts_on in ("joint", "pair") and kind(one.effect) == "columns"
-    return (
-        local
-        and not set(one.joints) & set(other.joints)
-        and overlap(step.verdicts, one.verdicts, other.verdicts) < OTHER
-    )
+    elsewhere = local and not set(one.joints) & set(other.joints)
+    return elsewhere and abs(overlap(step.verdicts, one.verdicts, other.verdicts)) < OTHER
 
 
 def _best(problem: Problem, step: Step, contenders: list[Contender], before: list[Found]) -> Contender | None:
