@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from .errors import InputError
+from .reporting.run_directory import check_directory, task_inputs, whole_directory
 
 if TYPE_CHECKING:
     from .calibration.calibrated import Calibration
@@ -29,11 +27,9 @@ __all__ = [
     "RESULT",
     "Job",
     "calibrate_file",
-    "check_directory",
     "diagnose_file",
     "identify_file",
     "predictions",
-    "whole_directory",
     "write_run",
 ]
 
@@ -60,12 +56,10 @@ def diagnose_file(
     The rigid body's torques are those of the named backend. An earlier run in `out` is replaced; a directory that holds
     anything else is refused before any work. Wrong input raises `InputError`, and nothing is written.
     """
-    from .formats.config import load_task
     from .simulators.registry import check_backend
 
     check_backend(backend, "joint_torque_regressor")
-    check_directory(out)
-    task = load_task(task_file)
+    task = _task_for(task_file, out)
     if any(entry.measurement is not None for entry in task.data):
         _native_alone(backend)
         return _diagnose_poses(task, out, progress)
@@ -84,12 +78,10 @@ def identify_file(
     backend: str = "native",
 ) -> Identification:
     """Read a task, identify its robot and write the run directory `out`, as `diagnose_file` does."""
-    from .formats.config import load_task
     from .simulators.registry import check_backend
 
     check_backend(backend, "joint_torque_regressor")
-    check_directory(out)
-    task = load_task(task_file)
+    task = _task_for(task_file, out)
     from .formats.export import write_model
     from .identification.identification import identify_task
     from .identification.parameter_files import write_parameters
@@ -101,7 +93,7 @@ def identify_file(
     if wrong:
         found = replace(found, notes=(_not_written(wrong), *found.notes))
     progress("writing the report", 1.0)
-    with whole_directory(out) as folder:
+    with whole_directory(out, task_inputs(task.file)) as folder:
         (folder / RESULT).write_text(_identification_json(found), encoding="utf-8")
         write_predictions(folder / "predictions.npz", predictions(task, found.model, identified=True))
         write_parameters(found, folder)
@@ -111,11 +103,21 @@ def identify_file(
     return found
 
 
+def _task_for(task_file: Path, out: Path) -> Task:
+    """The task of a run that is to be written to `out`: it can become a run directory and holds no file of the task."""
+    from .formats.config import load_task
+
+    check_directory(out)
+    task = load_task(task_file)
+    check_directory(out, task_inputs(task_file))
+    return task
+
+
 def _not_written(wrong: Sequence[Link]) -> str:
     which = "; ".join(f"{link.name}: {link.reason}" for link in wrong)
     return (
-        f"model/ is not written, for no body can have the parameters of {which}. `identify.fit: physical` gives a robot"
-        " that can exist; `identify.infeasible: write` writes this one all the same"
+        f"model/ is not written: the parameters of {which} are not physically consistent. `identify.fit: physical`"
+        " gives consistent links; `identify.infeasible: write` writes these all the same"
     )
 
 
@@ -125,7 +127,7 @@ def _diagnose_poses(task: Task, out: Path, progress: Callable[[str, float], None
 
     found = diagnose_pose_task(task, progress)
     progress("writing the report", 1.0)
-    with whole_directory(out) as folder:
+    with whole_directory(out, task_inputs(task.file)) as folder:
         write_calibration(found.calibration, folder, task.robot.model)
         (folder / ANSWER).write_text(pose_answer_json(found), encoding="utf-8")
     return found
@@ -144,17 +146,14 @@ def calibrate_file(
 
     `level` and `priors` are those of `calibration.calibrate`.
     """
-    from .formats.config import load_task
-
     _native_alone(backend)
-    check_directory(out)
-    task = load_task(task_file)
+    task = _task_for(task_file, out)
     from .calibration.calibration import calibrate_task
     from .reporting.calibration_files import write_calibration
 
     calibration = calibrate_task(task, progress=progress, level=level, priors=priors)
     progress("writing the report", 1.0)
-    with whole_directory(out) as folder:
+    with whole_directory(out, task_inputs(task.file)) as folder:
         write_calibration(calibration, folder, task.robot.model)
     return calibration
 
@@ -176,7 +175,7 @@ def write_run(task: Task, diagnosis: Diagnosis, out: Path) -> None:
     from .reporting.answer import to_json, write_predictions
     from .reporting.report import write_report
 
-    with whole_directory(out) as folder:
+    with whole_directory(out, task_inputs(task.file)) as folder:
         (folder / ANSWER).write_text(to_json(diagnosis), encoding="utf-8")
         write_predictions(folder / "predictions.npz", predictions(task, diagnosis.model))
         write_report(diagnosis, folder / REPORT, diagnosis.model.robot.name)
@@ -226,45 +225,6 @@ def _carrying(extended: ExtendedModel, load: Load | None) -> ExtendedModel:
     inertia = np.array(extended.robot.inertia, float)
     inertia[link] += ten
     return eqx.tree_at(lambda m: m.robot.inertia, extended, inertia)
-
-
-def check_directory(out: Path) -> None:
-    """Raise `InputError` unless `out` can become a run directory: absent, empty, or an earlier run."""
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out {out}: a file stands there; name a directory")
-    if out.is_dir() and any(out.iterdir()) and not ((out / ANSWER).is_file() or (out / RESULT).is_file()):
-        raise InputError(
-            f"--out {out}: the directory holds other things than an earlier run (no {ANSWER} or {RESULT}); name another"
-        )
-    existing = next(parent for parent in out.absolute().parents if parent.exists())
-    if not existing.is_dir():
-        raise InputError(f"--out {out}: {existing} is a file, no directory can stand below it")
-
-
-@contextmanager
-def whole_directory(out: Path) -> Iterator[Path]:
-    """A new directory beside `out` that takes its place, and that of an earlier run, once the block has succeeded."""
-    out = out.absolute()
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        beside = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    except OSError as error:
-        raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
-    try:
-        new = beside / "new"
-        new.mkdir()
-        yield new
-        earlier = beside / "earlier"
-        if out.exists():
-            out.rename(earlier)
-        try:
-            new.rename(out)
-        except OSError:
-            if earlier.exists():
-                earlier.rename(out)
-            raise
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
 
 
 def _diagnosis_json(diagnosis: Diagnosis | PoseDiagnosis) -> str:

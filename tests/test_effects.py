@@ -14,7 +14,7 @@ import reference
 import robots
 
 from figaroh_jax.effects.base import Effect, Motion, amplitude, columns, joint_unit, place, shape, smooth_sign
-from figaroh_jax.effects.catalogue import CATALOGUE, find, register
+from figaroh_jax.effects.catalogue import CATALOGUE, find, register, related
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.rigid.model import RobotModel
@@ -300,6 +300,48 @@ def test_a_registered_effect_is_found_and_a_taken_name_refused(model: RobotModel
             register(Other)
     finally:
         CATALOGUE.pop("magnet", None)
+
+
+def test_relations_hold_both_ways_whichever_class_states_them():
+    assert related("torque_lag", "excludes") == ("torque_delay",)  # stated by the delay
+    assert related("torque_delay", "excludes") == ("torque_lag",)
+    assert related("torque_offset", "indistinguishable_from") == ("asymmetric_coulomb_friction",)
+    assert related("payload", "indistinguishable_from") == ("link_inertia",)
+    assert related("torque_ripple", "excludes") == ()
+    for effect in CATALOGUE.values():
+        for relation in ("contains", "indistinguishable_from", "excludes"):
+            assert all(find(name) for name in getattr(effect, relation))
+
+
+def test_an_effect_of_ones_own_states_its_relations_and_its_sign():
+    class Seal(Effect):
+        """Dry friction of a seal that wears in."""
+
+        name, title, equation, acts_on = "seal", "a seal", "force s(v) exp(-|v|)", "joint"
+        dissipative = speed_law = True
+        excludes = ("stribeck_friction",)
+        indistinguishable_from = ("power_law_friction", "of another package")
+        force: jax.Array | np.ndarray | float = amplitude("N m")
+
+    try:
+        register(Seal)
+        assert related("stribeck_friction", "excludes") == ("seal",)
+        assert related("seal", "indistinguishable_from") == ("power_law_friction",)
+        assert Seal.parameters()["force"].lower == 0.0
+    finally:
+        CATALOGUE.pop("seal", None)
+    assert related("stribeck_friction", "excludes") == ()
+
+
+@pytest.mark.parametrize(
+    "name", ["viscous_friction", "coulomb_friction", "stribeck_friction", "load_dependent_friction"]
+)
+def test_what_physics_forbids_lies_outside_the_bounds(name: str):
+    assert all(p.lower == 0.0 for p in find(name).parameters().values() if p.linear)
+    bounds = {"torque_delay": "delay", "torque_lag": "time", "joint_elasticity": "compliance"}
+    assert all(find(effect).parameters()[p].lower >= 0.0 for effect, p in bounds.items())
+    assert find("rotor_inertia").parameters()["inertia"].lower == 0.0
+    assert find("joint_spring").parameters()["stiffness"].lower == 0.0
 
 
 def test_a_recorded_robot_takes_effects_at_its_names(data_dir: Path):

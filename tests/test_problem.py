@@ -155,8 +155,8 @@ def test_an_effect_exists_within_its_bounds_only(model: RobotModel) -> None:
     def known(effect: str, *at: str, **values: float) -> bool:
         return exists(problem, place(find(effect), model, at, **values))
 
-    assert known("torque_delay", delay=0.004) and known("torque_delay", delay=-0.004)  # stamped late, stamped early
-    assert not known("torque_delay", delay=0.06) and not known("torque_delay", delay=-0.03)  # lean against their bounds
+    assert known("torque_delay", delay=0.004)
+    assert not known("torque_delay", delay=0.06) and not known("torque_delay", delay=-0.004)  # at its bound; acausal
     assert known("stribeck_friction", "turn", force=0.1, speed=0.1)
     assert not known("stribeck_friction", "turn", force=-0.1, speed=0.1)
     assert not known("torque_offset", "turn", offset=1e3)  # more than the joint ever feels

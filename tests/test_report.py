@@ -47,7 +47,7 @@ def test_sentence_says_which_alternative_remains():
 
 
 def test_sentence_names_nothing_where_nothing_or_no_name_was_found():
-    assert "nothing is missing" in sentence(VARIANTS["nothing"], "tx40")
+    assert "no missing effect is detectable" in sentence(VARIANTS["nothing"], "tx40")
     assert "no effect of the catalogue explains" in sentence(VARIANTS["unknown"], "tx40")
     assert "still has no name" in sentence(VARIANTS["partly"], "tx40")
 
@@ -71,7 +71,7 @@ def test_interval_shows_the_digits_that_count(estimate: Estimate, text: str):
 def test_relative_errors_are_percentages_and_others_keep_their_unit():
     assert error(0.00213, "relative RMS") == "0.21 %"
     assert error(1.5, "N m") == "1.5 N m"
-    assert error(float("nan"), "relative RMS") == "not known"
+    assert error(float("nan"), "relative RMS") == "unknown"
 
 
 def test_effect_outside_the_catalogue_still_reads_as_words():

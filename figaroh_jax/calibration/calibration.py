@@ -138,7 +138,7 @@ class Run:
         folds = levels.nested(measured, self.used, self.effects, self._extended, self.level, validating)
         self.choice, self.folds = _never_worse(choice, folds)
         if self.level not in (None, self.choice.level):
-            self.notes.append(f"the level {self.level} that was asked for predicts no better than the frames alone")
+            self.notes.append(f"the requested level {self.level} predicts no better than the frames alone")
             self.choice, self.folds = choice, folds
         recurring = _recurring(self.choice, self.folds, self.blocks)
         self.named = [k for k in recurring if self.blocks[k].effect is not HISTORY]
@@ -243,7 +243,7 @@ class Run:
             scheme = "recordings with role: holdout"
         else:
             validated = list(zip(table["frames"], table["chosen"], strict=True))
-            scheme = f"{levels.FOLDS} folds, every fifth posture; level and effects chosen inside each"
+            scheme = f"{levels.FOLDS} folds, every fifth posture; level and effects selected within each"
         both: list[Error | None] = [None, None]
         for c, (unit, scale) in enumerate((("mm", 1e3), ("deg", 180.0 / np.pi))):
             if len(fitted[0][c]):

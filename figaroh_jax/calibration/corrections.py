@@ -123,7 +123,7 @@ def causes_of(
 
 def outlier_cause(outlier: Outlier) -> Cause:
     size = {"size": Estimate(outlier.size, float("nan"), "1")}
-    note = f"row {outlier.row} of {outlier.file} is {outlier.size:.0f} times the noise off; it was left out"
+    note = f"row {outlier.row} of {outlier.file} deviates by {outlier.size:.0f} times the noise; it was left out"
     return Cause(Name("outlier", ()), size, 1.0, Gain(float("nan"), float("nan"), "mm"), note=note)
 
 

@@ -23,7 +23,7 @@ def without_far_masses(model: RobotModel) -> tuple[RobotModel, tuple[str, ...]]:
     distance = np.linalg.norm(inertia[:, 1:4], axis=1) / np.where(mass > 0.0, mass, np.inf)
     notes = tuple(
         f"link {model.link_names[k]}: its centre of mass is {distance[k]:.3g} m from its joint, beyond"
-        f" {_FAR:g} times the robot's reach; its weight is left out of what gravity does"
+        f" {_FAR:g} times the robot's reach; its weight is left out of the gravity load"
         for k in np.flatnonzero(distance > _FAR * reach)
     )
     inertia[distance > _FAR * reach] = 0.0

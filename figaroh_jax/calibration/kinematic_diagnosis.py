@@ -86,7 +86,8 @@ def diagnose_poses(
         causes = tuple([*outliers, *geometry, *_with_rivals(effects, run)])
         p_value = min(1.0, 2.0 * min(p_geometry, p_effects))
         if plays:
-            note = f"joint {joint} stands elsewhere from posture to posture than it says: play, or poor repeatability"
+            what = "backlash, or poor repeatability"
+            note = f"the true position of {joint} varies about its reading between postures: {what}"
             calibration = replace(calibration, notes=(*calibration.notes, note))
         rest = run.history or plays or p_rest < alpha / 5 or _beyond_accuracy(recordings, calibration)
         return _answer(calibration, causes, p_value, rest)

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect
-from ..effects.catalogue import Payload
 from ..estimation.priors import physical_body
 from ..estimation.rows import Rows
 from ..results import Name
@@ -91,7 +90,7 @@ def contend(
     if way == "position":
         return _position_contender(problem, step, whitening, ready, group)
     effect, Z = _exact_columns(problem, step, ready, group, order)
-    if isinstance(effect, Payload):
+    if effect.body:
         effect, verdicts = _body_verdicts(step, base, effect, Z)
     else:
         verdicts = judge_grown(step.rows, base, group.columns.joints, Z)
@@ -113,9 +112,9 @@ def _exact_columns(
 
 
 def _body_verdicts(
-    step: Step, base: Ground, effect: Payload, Z: Float[np.ndarray, "10 nv T"]
-) -> tuple[Payload, Verdicts]:
-    """A payload with the parameters of the nearest body that can exist."""
+    step: Step, base: Ground, effect: Effect, Z: Float[np.ndarray, "10 nv T"]
+) -> tuple[Effect, Verdicts]:
+    """An effect that is a body, with the parameters of the nearest body that can exist."""
     rows, full = step.rows, np.moveaxis(Z, 0, 2)
     free = judge_grown(rows, base, range(len(rows.y)), Z)
     body = physical_body(free.theta[-10:], _information(rows, base, full))

@@ -188,7 +188,7 @@ def _judged(
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
     rest = left.there or (bool(nearest) and float(relative.max()) > tolerance)
-    text = left.text or (f"most of it at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else "")
+    text = left.text or (f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else "")
     parts = parts_of(problem, joint.step, whitening, line, names)
     nearest = tuple(sorted(nearest, key=lambda one: -one.share))
     return _Judged(verdict(bool(named), rest), named, joint, Rest(relative, parts, nearest, text))

@@ -63,9 +63,9 @@ def next_experiment(
     best = max(tried, key=lambda text: tried[text])
     if tried[best] - now < ENOUGH**2:
         wording = find(one.name.effect).separated_by.format(at=" and ".join(one.name.at) or "the robot")
-        return Experiment(f"{wording} (of the motions tried on the model, none tells them apart)", pairs)
+        return Experiment(f"{wording} (none of the motions simulated on the model distinguishes them)", pairs)
     worth = (tried[best] - now) / max(again - now, TINY)
-    return Experiment(f"{best}: worth {worth:.2g} more recordings of the present motion", pairs)
+    return Experiment(f"{best}: as informative as {worth:.2g} more recordings of the current motion", pairs)
 
 
 class _Idea(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..effects.base import Effect, Parameter
-from ..effects.catalogue import Payload
+from ..effects.catalogue import related
 from ..results import Name
 from .comparison import overlap, t_value
 from .contenders import Contender
@@ -17,7 +17,6 @@ from .thresholds import CLEARLY, CONFIDENT, GAIN, SAME, UNSURE
 __all__ = ["ambiguous", "exists", "gains", "passes", "physical_sign", "rivals", "simpler"]
 
 POSITIVE = {"torque_delay": ("delay",), "joint_spring": ("stiffness",)}  # beside parameters that are bounded by zero
-EXACT = ({"torque_offset", "asymmetric_coulomb_friction"}, {"payload", "link_inertia"})
 
 
 def exists(problem: Problem, effect: Effect) -> bool:
@@ -29,7 +28,7 @@ def exists(problem: Problem, effect: Effect) -> bool:
     if not effect.shown_by(position.min((0, 1)), position.max((0, 1))):
         return False
     values = {name: float(getattr(effect, name)) for name in effect.parameters()}
-    if isinstance(effect, Payload) and values["mass"] > float(np.asarray(problem.model.inertia)[:, 0].sum()):
+    if effect.body and values["mass"] > float(np.asarray(problem.model.inertia)[:, 0].sum()):
         return False
     if not all(_within(effect.parameters()[name], value) for name, value in values.items()):
         return False
@@ -96,8 +95,5 @@ def ambiguous(step: Step, best: Contender, rivals: list[Contender], screened: Sc
     names = [c.name for c in rivals if _member(step, best, c)]
     clearly_worse = {c.name for c in rivals if t_value(c.verdicts.blocks, best.verdicts.blocks) > CLEARLY}
     known = {group.name for group in screened.groups}
-    for alike in EXACT:
-        same = [Name(effect, best.name.at) for effect in sorted(alike - {best.name.effect})]
-        if best.name.effect in alike:
-            names += [n for n in same if n in known and n not in names and n not in clearly_worse]
-    return tuple(names)
+    same = [Name(effect, best.name.at) for effect in related(best.name.effect, "indistinguishable_from")]
+    return (*names, *(n for n in same if n in known and n not in names and n not in clearly_worse))

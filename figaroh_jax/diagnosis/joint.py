@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect
-from ..effects.catalogue import find
+from ..effects.catalogue import CATALOGUE, find
 from ..estimation.rows import Rows
 from ..results import Name
 from .design import kind, shapes, with_shape
@@ -25,7 +25,6 @@ __all__ = ["Joint", "has_size", "joint_fit", "moved", "polished", "sized"]
 KEPT = 1e-12
 SURE = 0.95  # of the region of a cause's amplitudes that must not hold zero
 POLISH, SETTLED = 10, 0.03  # turns at the most; a turn that moves nothing by more of its standard deviation is the last
-SPEED_LAWS = ("stribeck_friction", "power_law_friction")  # of dry friction over the speed
 
 
 class Joint(NamedTuple):
@@ -128,7 +127,7 @@ def sized(found: list[Found], joint: Joint, forbid: Sequence[str]) -> list[Found
         if has_size(effect, joint.fitted, at):
             out.append(one)
             continue
-        laws = [n for n in SPEED_LAWS if one.name.effect in SPEED_LAWS and n not in (one.name.effect, *forbid)]
+        laws = [n for n, e in CATALOGUE.items() if effect.speed_law and e.speed_law and n not in (effect.name, *forbid)]
         more = dict.fromkeys([*one.ambiguous, *one.alike, *(Name(n, one.name.at) for n in laws)])
         if more and not type(effect).contains:
             out.append(replace(one, ambiguous=tuple(more)))

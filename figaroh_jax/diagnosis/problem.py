@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..effects.base import Effect, Motion
-from ..effects.catalogue import CATALOGUE, LinkEffect
+from ..effects.catalogue import CATALOGUE
 from ..recordings.stacked import Records, open_rows
 from ..rigid.model import RobotModel
 from ..simulators.contract import Backend
@@ -103,7 +103,7 @@ class Problem:
 
 
 def family_of(effect: type[Effect]) -> str:
-    if issubclass(effect, LinkEffect):
+    if effect.inertial:
         return "link"
     if kind(effect) != "columns" or (effect.has("change") and not effect.has("torque")):
         return "sensor"

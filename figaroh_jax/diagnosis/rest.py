@@ -111,11 +111,11 @@ def significance(
     worst, text = int(np.argmax(own)), ""
     there = bool((repeats or (scored and (repeated or predicted))) and not tolerable)
     if there:
-        text = f"most of it at {joints[worst]} ({own[worst]:.2g} times the noise power)"
+        text = f"mostly at {joints[worst]} ({own[worst]:.2g} times the noise power)"
         if flexible[0] < REST_P:
             text += f"; strongest dependence: {flexible[1].effect} at {flexible[1].at[0]}"
     if vibrates:
-        text += f"{'; ' if text else ''}a line at {line[1]:.3g} Hz in time at {joints[line[2]]}"
+        text += f"{'; ' if text else ''}a spectral line at {line[1]:.3g} Hz at {joints[line[2]]}"
     return Significance(there or vibrates, text)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect
-from ..effects.catalogue import CATALOGUE, LinkEffect
+from ..effects.catalogue import CATALOGUE, related
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Linear, Rows
 from ..results import Name
@@ -29,7 +29,6 @@ __all__ = ["Group", "Null", "Screen", "catalogue", "family_p", "screen"]
 
 DRAWS, CHUNK = 400, 50  # draws, and how many are made at once
 KEPT = 16_000_000  # numbers of noise that are held from step to step
-ALTERNATIVES = ({"torque_delay", "torque_lag"},)  # once one is in, the other is not tried
 
 
 class Group(NamedTuple):
@@ -72,7 +71,7 @@ def catalogue(
     """
     taken = {(type(e).name, at) for term in state.terms for e, at in _places_of(term)}
     taken |= {(effect.name, tuple(int(i) for i in np.asarray(effect.at))) for effect in state.sensors}
-    closed = {name for pair in ALTERNATIVES if any(t[0] in pair for t in taken) for name in pair}
+    closed = {n for t, _ in taken for n in related(t, "excludes")}
     wanted = [n for n in CATALOGUE if n not in forbid and n not in closed]
     batches = {n: b for family in problem.families.values() for n, b in family.items()}
     old = {group.name: group.columns for group in before or ()}
@@ -84,7 +83,7 @@ def catalogue(
             if (name, tuple(at)) in taken:
                 continue
             columns = fresh[name][place] if name in fresh else old.get(title)
-            if columns is None and isinstance(batches[name], LinkEffect):
+            if columns is None and batches[name].inertial:
                 columns = _link_columns(rows, at[0], problem.model)
             if columns is not None and np.abs(columns.Z).max() > 0:
                 one = jax.tree.map(lambda x, p=place: np.asarray(x)[p], batches[name])

@@ -23,7 +23,7 @@ from .problem import Problem
 from .screening import DRAWS, Null, Screen, catalogue, family_p, screen
 from .state import State, with_width
 from .step import Step, stand, with_cause, with_causes
-from .thresholds import AGAIN, CONFIDENT, GAIN, MOST_CAUSES, MUCH, OTHER, SMALLEST, TRUSTED
+from .thresholds import AGAIN, CONFIDENT, GAIN, MOST_CAUSES, MUCH, OTHER, SMALLEST
 
 __all__ = ["Found", "Search", "eliminate", "find_causes", "judged_without"]
 
@@ -172,12 +172,12 @@ def _apart(step: Step, one: Contender, other: Contender) -> bool:
 def _best(problem: Problem, step: Step, contenders: list[Contender], before: list[Found]) -> Contender | None:
     """The cause that predicts best where it was not fitted, if it passes the gates; else nothing.
 
-    Ten free parameters of a link make up for many a misfit: they are a cause only where the inertials are well known,
-    and where they are not, what explains the same misfit less well is none either.
+    Some effects make up for many a misfit where the inertials are not well known (`Effect.needs_trust`): there they are
+    no cause, and what explains the same misfit less well is none either.
     """
     least = SMALLEST * (before[0].cost[0] - before[0].cost[1]) if before else 0.0
     passing = [c for c in contenders if passes(step, contenders, c) and step.verdicts.cost - c.verdicts.cost > least]
-    while problem.trust > TRUSTED and passing and passing[0].name.effect == "link_inertia":
+    while passing and problem.trust > passing[0].effect.needs_trust:
         passing = [c for c in passing[1:] if c not in rivals(step, passing, passing[0])]
     return next((c for c in passing if not simpler(step, passing, c)), None)
 

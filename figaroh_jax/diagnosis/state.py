@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from ..effects.base import Effect, Motion
-from ..effects.catalogue import LinkEffect, Payload, find
+from ..effects.catalogue import find
 from ..estimation.priors import body_precision, rigid_prior
 from ..estimation.rows import Prior, Rows, instruments
 from ..recordings.stacked import filter_rows, filtered_rows
@@ -124,7 +124,7 @@ def with_term(problem: Problem, state: State, term: Effect) -> State:
     own = _term_columns(problem, state, term)
     count = own.shape[-1]
     mean, precision = np.zeros(count), np.full(count, FRICTION_PRECISION)
-    if isinstance(term, Payload):
+    if term.body:
         mean = np.array([float(getattr(term, name)[0]) for name in term.parameters()])
         precision = body_precision(mean)
     prior = Prior(np.append(state.prior.mean, mean), np.append(state.prior.precision, precision))
@@ -183,7 +183,7 @@ def solved(problem: Problem, state: State, theta: Float[np.ndarray, " P"]) -> St
 
 def unit_torques(problem: Problem, state: State, term: Effect) -> Units:
     """What a unit of each amplitude of a term (one leading axis) adds in the state, N m or N."""
-    if isinstance(term, LinkEffect):
+    if term.inertial:
         links = np.asarray(term.at)[:, 0]
         torque = np.stack([state.rigid[:, :, 10 * k : 10 * k + 10].transpose(2, 1, 0) for k in links])
         return Units(torque, np.tile(np.arange(problem.model.nv), (len(links), 1)))

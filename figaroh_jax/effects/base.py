@@ -127,9 +127,18 @@ class Effect(eqx.Module):
     title: ClassVar[str]  # in plain words, for people
     equation: ClassVar[str]  # as text
     acts_on: ClassVar[Literal["joint", "pair", "link", "robot"]]
-    contains: ClassVar[tuple[str, ...]] = ()  # simpler effects that it can imitate exactly: they are preferred
     follows_torque: ClassVar[bool] = False  # whether its torque depends on the current model's (load or total)
+    inertial: ClassVar[bool] = False  # whether its amplitudes are ten parameters of its link: the regressor's columns
+    body: ClassVar[bool] = False  # whether these are a body's that exists: mass > 0, pseudo-inertia >= 0
     searched: ClassVar[bool] = True  # whether a diagnosis looks for it, that is, whether it is in the catalogue
+    # relations to other effects, by name; the last two hold both ways, whichever class states them (`related`)
+    contains: ClassVar[tuple[str, ...]] = ()  # simpler effects that it can imitate exactly: they are preferred
+    indistinguishable_from: ClassVar[tuple[str, ...]] = ()  # the same torque in a moving joint
+    excludes: ClassVar[tuple[str, ...]] = ()  # not looked for any more once this one has been accepted
+    # what physics asks of it; for a single parameter see the bounds of `amplitude` and `shape`
+    dissipative: ClassVar[bool] = False  # whether amplitudes below zero would feed energy to the robot
+    speed_law: ClassVar[bool] = False  # whether it is a law of dry friction over the speed, one of several alike
+    needs_trust: ClassVar[float] = np.inf  # trust in the inertials (relative) above which it is no cause
     separated_by: ClassVar[str] = ""  # the experiment that tells it from what looks alike; {at} stands for the place
 
     def torque(self, motion: Motion) -> Float[Array, "samples *rows"]:
@@ -163,8 +172,11 @@ class Effect(eqx.Module):
 
     @classmethod
     def parameters(cls) -> dict[str, Parameter]:
-        """Declared parameters by field name, in order."""
-        return {f.name: f.metadata["parameter"] for f in dataclasses.fields(cls) if "parameter" in f.metadata}
+        """Declared parameters by field name, in order; amplitudes of a dissipative effect are not below zero."""
+        own = {f.name: f.metadata["parameter"] for f in dataclasses.fields(cls) if "parameter" in f.metadata}
+        if not cls.dissipative:
+            return own
+        return {n: p._replace(lower=max(p.lower, 0.0)) if p.linear else p for n, p in own.items()}
 
     @classmethod
     def units(cls) -> dict[str, str]:

@@ -15,7 +15,7 @@ from ..errors import InputError, nearest
 from ..rigid.model import RobotModel
 from .base import Effect, Motion, Native, Scalar, amplitude, shape
 
-__all__ = ["CATALOGUE", "find", "register"]
+__all__ = ["CATALOGUE", "find", "register", "related"]
 
 CATALOGUE: dict[str, type[Effect]] = {}
 _OTHERS: dict[str, type[Effect]] = {}  # known by name, but nothing that a diagnosis looks for
@@ -37,6 +37,17 @@ def find(name: str) -> type[Effect]:
     return known[name]
 
 
+def related(name: str, relation: str) -> tuple[str, ...]:
+    """Effects that stand in a `relation` to one: `indistinguishable_from` or `excludes`, whichever of them states it.
+
+    A tuple of names, sorted, without the name itself; names that are not registered are left out.
+    """
+    known = CATALOGUE | _OTHERS
+    own = getattr(known[name], relation) if name in known else ()
+    back = (other for other, effect in known.items() if name in getattr(effect, relation))
+    return tuple(sorted({*own, *back} & set(known) - {name}))
+
+
 class JointEffect(Effect):
     """An effect at one joint."""
 
@@ -48,6 +59,7 @@ class ViscousFriction(JointEffect):
     """Friction in proportion to the speed."""
 
     name, title = "viscous_friction", "viscous friction"
+    dissipative = True
     equation = "damping v"
     separated_by = "constant-speed sweeps of {at} at five or more speeds up to its maximum"
     damping: Scalar = amplitude("N m s/rad")
@@ -64,6 +76,7 @@ class CoulombFriction(JointEffect):
     """Dry friction: a constant level against the motion."""
 
     name, title = "coulomb_friction", "Coulomb friction"
+    dissipative = True
     equation = "force s(v)"
     separated_by = "reversals of {at} at several accelerations"
     force: Scalar = amplitude("N m")
@@ -143,6 +156,7 @@ class AsymmetricCoulombFriction(JointEffect):
     """Dry friction of another level in each direction; the part that differs."""
 
     name, title = "asymmetric_coulomb_friction", "Coulomb friction that differs by direction"
+    indistinguishable_from = ("torque_offset",)
     equation = "difference |s(v)|"
     separated_by = "a dwell of {at} with the brake on, beside motion in both directions"
     difference: Scalar = amplitude("N m")
@@ -169,9 +183,10 @@ class StribeckFriction(JointEffect):
     """Friction that falls from its breakaway level as the speed rises (Armstrong-Helouvry 1991)."""
 
     name, title = "stribeck_friction", "Stribeck friction"
+    dissipative = speed_law = True
     equation = "force exp(-(|v|/speed)^2) s(v)"
     separated_by = "slow constant-velocity sweeps of {at} at five or more speeds below 0.3 rad/s"
-    force: Scalar = amplitude("N m", lower=0.0)
+    force: Scalar = amplitude("N m")
     speed: Scalar = shape("rad/s", (0.03, 0.06, 0.1, 0.15, 0.25, 0.4), (0.012, 0.64))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
@@ -184,6 +199,7 @@ class PowerLawFriction(JointEffect):
     """Friction that grows with a power of the speed (lubricant, temperature)."""
 
     name, title = "power_law_friction", "friction with a power of the speed"
+    speed_law = True
     equation = "strength |v|^exponent s(v)"
     separated_by = "constant-speed sweeps of {at} from 0.05 rad/s to its maximum speed"
     strength: Scalar = amplitude("N m (s/rad)^exponent")
@@ -203,10 +219,10 @@ class LoadDependentFriction(JointEffect):
     """Friction of the gears that grows with the torque they transmit."""
 
     name, title = "load_dependent_friction", "friction that grows with the load"
-    follows_torque = True
+    follows_torque = dissipative = True
     equation = "ratio |tau_load| s(v)"
     separated_by = "the same motion of {at} with and without a payload"
-    ratio: Scalar = amplitude("", lower=0.0)
+    ratio: Scalar = amplitude("")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
         return self.ratio * jnp.abs(self.here(motion.load)) * self.here(motion.direction)
@@ -255,7 +271,7 @@ class JointSpring(JointEffect):
     contains = ("torque_offset",)
     equation = "stiffness (q - rest)"
     separated_by = "motion of {at} over a larger range, or with the base turned"
-    stiffness: Scalar = amplitude("N m/rad")
+    stiffness: Scalar = amplitude("N m/rad", lower=0.0)
     offset: Scalar = amplitude("N m")  # -stiffness rest: linear, where the rest position is not
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
@@ -299,6 +315,7 @@ class LinkEffect(Effect):
     """A change of the ten inertial parameters of one link, at and in its joint frame."""
 
     acts_on = "link"
+    inertial = True
     mass: Scalar = amplitude("kg")
     mx: Scalar = amplitude("kg m")
     my: Scalar = amplitude("kg m")
@@ -324,6 +341,8 @@ class LinkInertia(LinkEffect):
 
     name, title = "link_inertia", "inertia of a link"
     contains = ("payload",)
+    indistinguishable_from = ("payload",)
+    needs_trust = 0.05  # ten free parameters of a link make up for many a misfit
     equation = "W_k dpi_k, dpi_k free"
     separated_by = "the same motion with {at} disconnected or weighed"
 
@@ -333,6 +352,7 @@ class Payload(LinkEffect):
     """A body fixed to a link: ten parameters that a physical body can have."""
 
     name, title = "payload", "a payload"
+    body = True
     equation = "W_k dpi_k, dpi_k a physical body: pseudo-inertia >= 0, mass > 0"
     separated_by = "the same motion with and without what is fixed to {at}"
 
@@ -364,9 +384,10 @@ class TorqueDelay(Effect):
 
     name, title, acts_on = "torque_delay", "delay of the torque", "robot"
     follows_torque = True
+    excludes = ("torque_lag",)
     equation = "tau_hat(t - delay) - tau_hat(t)"
     separated_by = "faster motion: a lag weakens high frequencies, a delay does not"
-    delay: Scalar = shape("s", (0.001, 0.003, 0.006, 0.012, 0.025, -0.001, -0.003, -0.006, -0.012), (-0.03, 0.06))
+    delay: Scalar = shape("s", (0.001, 0.003, 0.006, 0.012, 0.025), (0.0, 0.06))
 
     def torque_response(self, omega: Float[Array, " freqs"]) -> Complex[Array, " freqs"]:
         return jnp.exp(-1j * omega * self.delay)

@@ -217,7 +217,13 @@ def physical_inertia(parameters: Float[np.ndarray, "10"], form: Format) -> tuple
         return mended, f"has no mass; {_SMALLEST:g} kg is written"
     if form == "mjcf" and is_physical(parameters):
         return mended, ""
-    return mended, "has an inertia that no body can have; a possible one is written, and torques differ from the fit's"
+    return (
+        mended,
+        (
+            "has an inertia that is not physically consistent; the nearest consistent one is written,"
+            " and torques differ from the fit's"
+        ),
+    )
 
 
 def _mended(parameters: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:

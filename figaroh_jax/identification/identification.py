@@ -201,7 +201,7 @@ def _refused(
             if share > DEAD:
                 refused.add(name)
                 notes.append(
-                    f"torque of {name} is not fitted: it stands at one value for {share:.0%} of {one.file}"
+                    f"torque of {name} is not fitted: it is constant in {share:.0%} of {one.file}"
                     " (dead zone, or not measured)"
                 )
     if refused >= set(names):
@@ -267,8 +267,7 @@ def _least(terms: Sequence[Effect]) -> Float[np.ndarray, " drives"]:
     out: list[float] = []
     for term in terms:
         for parameter in (p for p in term.parameters().values() if p.linear):
-            dissipates = term.name in ("viscous_friction", "coulomb_friction", "rotor_inertia")
-            out += [0.0 if dissipates else parameter.lower]
+            out.append(parameter.lower)
         if len(term.at) > 1:
             count = sum(p.linear for p in term.parameters().values())
             out += out[-count:] * (len(term.at) - 1)

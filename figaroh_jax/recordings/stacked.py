@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float, Int, Shaped
+from jaxtyping import Float, Inexact, Int, Shaped
 
 from ..rigid.model import Leaf, RobotModel
 from .dataset import carried_body
@@ -85,7 +85,7 @@ def filter_rows(
 
 
 def open_rows(
-    records: Records, torque: Float[np.ndarray, "nN nv"], response: Complex[np.ndarray, " F"]
+    records: Records, torque: Float[np.ndarray, "nN nv"], response: Inexact[np.ndarray, " F"]
 ) -> Float[np.ndarray, "n M nv"]:
     """Rows of a torque at all samples, of all recordings and without a mask."""
     n, samples, _, nv = records.shape
@@ -93,7 +93,7 @@ def open_rows(
 
 
 def filtered_rows(
-    records: Records, torque: Float[np.ndarray, "nN nv"], response: Complex[np.ndarray, "F nv"]
+    records: Records, torque: Float[np.ndarray, "nN nv"], response: Inexact[np.ndarray, "F nv"]
 ) -> Float[np.ndarray, "nv T"]:
     """Rows of a torque at all samples through the row filter and `response`, masked."""
     n, samples, _, nv = records.shape

@@ -102,7 +102,7 @@ def _described(found: Identification, k: int, link: Link) -> dict[str, Any]:
     return {
         "name": link.name,
         "mass": wording.number(float(mass), 3),
-        "told": "the data" if mass_of.status == "identified" else "belief" if mass_of.status == "prior only" else "",
+        "told": "data" if mass_of.status == "identified" else "prior" if mass_of.status == "prior only" else "",
         "com": " ".join(wording.number(round(1e3 * float(x), 1), 4) for x in com),
         "moments": " ".join(wording.number(float(x), 2) for x in moments),
         "exists": ("border" if border else "yes") if link.consistent else "no",

@@ -112,7 +112,7 @@ def calibration_summary(calibration: Calibration, verdict: str = "") -> Renderab
         parts.append(Text.assemble(f"\n{number}. ", (wording.phrase(cause.name), "bold"), f"  {cause.note or values}"))
         if cause.ambiguous_with:
             parts.append(
-                Text(f"   not told apart from {wording.aside(cause.name, cause.ambiguous_with)}", style="yellow")
+                Text(f"   not distinguishable from {wording.aside(cause.name, cause.ambiguous_with)}", style="yellow")
             )
     parts.append(Text(f"\nHeld out: {calibration.scheme}. {wording.distances(calibration)}".rstrip(), style="dim"))
     return Group(*parts, *(Text(f"Note: {note}", style="dim") for note in calibration.notes))
@@ -130,7 +130,9 @@ def _cause(number: int, cause: Cause) -> RenderableType:
     ]
     lines += [Text(f"{name}  {wording.interval(value)}") for name, value in cause.parameters.items()]
     if cause.ambiguous_with:
-        lines.append(Text(f"not told apart from {wording.aside(cause.name, cause.ambiguous_with)}", style="yellow"))
+        lines.append(
+            Text(f"not distinguishable from {wording.aside(cause.name, cause.ambiguous_with)}", style="yellow")
+        )
     if cause.note:
         lines.append(Text(cause.note, style="dim"))
     return Group(lines[0], *(Padding(line, (0, 0, 0, 3), expand=False) for line in lines[1:]))
@@ -161,15 +163,16 @@ def show_identification(found: Identification, robot: str = "the robot") -> None
 
 
 def identification_summary(found: Identification, robot: str = "the robot") -> RenderableType:
-    """The identification in a few lines: rank, error of each joint, friction, what cannot be trusted."""
+    """The identification in a few lines: rank, error of each joint, friction, notes."""
     base = [one.status for one in found.base]
     wrong = [link.name for link in found.links if not link.consistent]
     head = Text.assemble(
         ("identified", "bold blue"),
-        f"  {robot}: {found.rank} base parameters (of {found.structural_rank} that a motion could show),"
-        f" {base.count('identified')} of them told by the data; condition {found.condition:.4g}",
+        f"  {robot}: {found.rank} of {found.structural_rank} structurally identifiable base parameters are excited;"
+        f" {base.count('identified')} are identified; condition number {found.condition:.4g}",
     )
-    links = f"No body can have the parameters of {', '.join(wrong)}." if wrong else "Every link can exist."
+    inconsistent = f"Not physically consistent: {', '.join(wrong)}."
+    links = inconsistent if wrong else "All link inertias are physically consistent."
     parts: list[RenderableType] = [head, Text(links, style="yellow" if wrong else "")]
     parts += [Text(), _qualities(found), Text()]
     parts += [Text(_effect(effect)) for effect in found.effects]

@@ -41,14 +41,14 @@ def sentence(diagnosis: Diagnosis, robot: str) -> str:
     subject = f"The simulation of {robot}"
     if diagnosis.verdict == "nothing":
         return (
-            f"{subject} holds up: nothing is missing that this data could show, and what it gets wrong looks like noise"
-            f" (error on held-out data {error(diagnosis.holdout.before, diagnosis.holdout.unit)})."
+            f"{subject} agrees with the data: no missing effect is detectable, and the residual is consistent with"
+            f" noise (error on held-out data {error(diagnosis.holdout.before, diagnosis.holdout.unit)})."
         )
     fall = _fall(diagnosis)
     if diagnosis.verdict == "unknown":
         found = f" Adding {_list(diagnosis.causes)} is not enough: {fall}." if diagnosis.causes else ""
-        return f"{subject} is wrong in a way that no effect of the catalogue explains.{found}"
-    rest = ". A part of what it gets wrong still has no name" if diagnosis.verdict == "named+rest" else ""
+        return f"{subject} has an error that no effect in the catalogue explains.{found}"
+    rest = ". Part of the residual remains unexplained" if diagnosis.verdict == "named+rest" else ""
     return f"{subject} is missing {_list(diagnosis.causes)}: {fall}{rest}."
 
 
@@ -57,7 +57,7 @@ def rest(diagnosis: Diagnosis) -> list[str]:
     left, out = diagnosis.rest, []
     if len(left.relative) and max(left.relative) > 0:
         worst = max(range(len(left.relative)), key=lambda k: left.relative[k])
-        size = f"Without a name: {error(float(left.relative[worst]), 'relative RMS')} of the torque of"
+        size = f"Unexplained residual: {error(float(left.relative[worst]), 'relative RMS')} of the torque of"
         out.append(f"{size} {diagnosis.joints[worst]}{f'; {left.text}' if left.text else ''}.")
     for joint in dict.fromkeys(part.at for part in left.parts):
         own = [part for part in left.parts if part.at == joint]
@@ -86,10 +86,10 @@ def calibration_sentence(calibration: Calibration) -> str:
     before, after = (_with_unit(number(x, 3), error.unit) for x in (error.validated_before, error.validated_after))
     if calibration.level == "frames":
         return (
-            f"The robot is already as good as these measurements can tell: {after} on held-out postures with the frames"
-            " of the device alone; no correction of the robot predicts better."
+            f"The nominal kinematics are as accurate as these measurements can show: {after} on held-out postures with"
+            " only the base and tool frames fitted; no correction of the robot predicts better."
         )
-    fall = f"On held-out postures the error falls from {before} (frames alone) to {after}"
+    fall = f"On held-out postures the error falls from {before} (base and tool frames only) to {after}"
     return f"{fall}, with {level(calibration.level)}."
 
 
@@ -101,12 +101,15 @@ def distances(calibration: Calibration) -> str:
     which = "held-out " if known[0].role == "holdout" else "fitted "
     before = sum(abs(d.before - d.stated) for d in known) * 1e3 / len(known)
     after = sum(abs(d.after - d.stated) for d in known) * 1e3 / len(known)
-    return f"Distance of {which}sockets: off by {number(before, 3)} mm, calibrated {number(after, 3)} mm on average."
+    return (
+        f"Mean error of the {which}socket distances: {number(before, 3)} mm before,"
+        f" {number(after, 3)} mm after calibration."
+    )
 
 
 def level(name: str) -> str:
     """A level of calibration in words."""
-    words = {"joint_offset": "joint offsets", "full": "full geometry", "chosen": "as chosen inside the folds"}
+    words = {"joint_offset": "joint offsets", "full": "full geometry", "chosen": "as selected within each fold"}
     return words.get(name, name)
 
 
@@ -165,7 +168,7 @@ def interval(estimate: Estimate) -> str:
 def error(value: float, of: str) -> str:
     """An error in words: a relative one in percent, any other with its unit."""
     if not math.isfinite(value):
-        return "not known"
+        return "unknown"
     if not of.startswith("relative"):
         return _with_unit(number(value), of)
     percent = 100.0 * value
@@ -182,7 +185,7 @@ def number(value: float, digits: int = 4) -> str:
 def p_value(value: float) -> str:
     """A p-value as it deserves to be read: below 0.01 its digits mean nothing."""
     if not math.isfinite(value):
-        return "p not known"
+        return "p unknown"
     return "p < 0.01" if value < 0.01 else f"p = {value:.2f}"
 
 
@@ -209,7 +212,9 @@ def _counted(cause: Cause) -> str:
     others = len(cause.ambiguous_with)
     if others == 1:
         return f"{phrase(cause.name)} (or {aside(cause.name, cause.ambiguous_with)})"
-    return phrase(cause.name) + (f" (or one of {others} effects that this data cannot tell from it)" if others else "")
+    return phrase(cause.name) + (
+        f" (or one of {others} effects that this data cannot distinguish from it)" if others else ""
+    )
 
 
 def _join(words: Sequence[str], last: str) -> str:

@@ -1,0 +1,82 @@
+"""Grades of all cases, as tables and as `results.json`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..blackbox import Case, Job, commit, grade, read
+
+TITLE = {  # what a grade is called where the truth may be named, and where it is forbidden
+    "named": {"right": "right", "more": "right + another", "set": "in the set", "wrong": "wrong", "silent": "silent"},
+    "forbidden": {"silent": "no new name", "wrong": "a new name"},
+}
+
+
+def score(cases: dict[str, Case], out: Path, modes: Iterable[str]) -> str:
+    """The tables; `results.json` in `out` holds every case."""
+    rows = [row for name, case in cases.items() if case["truth"] for row in _rows(name, case, out, modes)]
+    (out / "results.json").write_text(json.dumps({"commit": commit(), "cases": rows}, indent=1))
+    lines = []
+    for mode in modes:
+        for shown, title in ((True, "visible"), (False, "absorbed")):
+            own = [r for r in rows if r["mode"] == mode and r["visible"] is shown]
+            if own:
+                lines += ["", f"{mode}, {title}:", *_table(own, TITLE[mode] | {"failed": "failed"})]
+    return "\n".join([*lines, "", *_detail(rows)])
+
+
+def _rows(name: str, case: Case, out: Path, modes: Iterable[str]) -> list[dict[str, Any]]:
+    found = []
+    for mode in modes:
+        forbid = tuple(case["forbid"]) if mode == "forbidden" else ()
+        job = Job(name, forbid)
+        if not (out / job.folder / "run.json").is_file():
+            continue
+        answer, twin = read(out / job.folder), read(out / Job(case["twin"], forbid).folder)
+        graded = grade(case if mode == "named" else case | {"truth": []}, answer, twin)
+        ran = json.loads((out / job.folder / "run.json").read_text())
+        found.append(
+            {"case": name, "group": case["group"], "size": case["size"], "mode": mode, "visible": case["visible"]}
+            | {"left": case["left"], "sigmas": case["sigmas"], "effect": case["truth"][0]["effect"]}
+            | {"grade": graded.grade, "new": graded.new, "false": graded.false, "size_errors": graded.sizes}
+            | {"inside": graded.inside, "verdict": answer["verdict"] if answer else None, "cpu_s": ran["cpu_s"]}
+        )
+    return found
+
+
+def _table(rows: list[dict[str, Any]], titles: dict[str, str]) -> list[str]:
+    """Markdown: one line for each robot and size, then for each size."""
+    head = ["robot", "size", "cases", *titles.values(), "size error, median", "within 15 %"]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    groups = list(dict.fromkeys(r["group"] for r in rows))
+    for group in [*groups, None]:
+        for size in sorted({r["size"] for r in rows}):
+            own = [r for r in rows if r["size"] == size and group in (None, r["group"])]
+            if own:
+                lines.append(_line(group or "all", size, own, titles))
+    return lines
+
+
+def _line(group: str, size: float, rows: list[dict[str, Any]], titles: dict[str, str]) -> str:
+    counts = [sum(r["grade"] == g for r in rows) for g in titles]
+    errors = np.array([e for r in rows for e in r["size_errors"]])
+    told = [f"{np.nanmedian(errors):.2f}", f"{np.sum(errors < 0.15)} of {len(errors)}"] if len(errors) else ["", ""]
+    return "| " + " | ".join([group, f"{100 * size:g} %", str(len(rows)), *map(str, counts), *told]) + " |"
+
+
+def _detail(rows: list[dict[str, Any]]) -> list[str]:
+    lines = []
+    for r in rows:
+        new = "; ".join(f"{effect} ({', '.join(at)})" for effect, at in r["new"])
+        size = ", ".join(f"{e:.2f}" for e in r["size_errors"])
+        shown = f"left {r['left']:.2f} D {r['sigmas']:.1f}"
+        lines.append(
+            f"{r['case']:<48} {r['mode']:<9} {'visible ' if r['visible'] else 'absorbed'} {shown:<18} "
+            f"{r['grade']:<7} {r['verdict'] or '-':<10} new: {new or '-'}" + (f"   size off by {size}" if size else "")
+        )
+    return lines
