@@ -16,8 +16,6 @@ from .thresholds import CLEARLY, CONFIDENT, GAIN, SAME, UNSURE
 
 __all__ = ["ambiguous", "exists", "gains", "passes", "physical_sign", "rivals", "simpler"]
 
-POSITIVE = {"torque_delay": ("delay",), "joint_spring": ("stiffness",)}  # beside parameters that are bounded by zero
-
 
 def exists(problem: Problem, effect: Effect) -> bool:
     """Whether the data can show such an effect: shapes inside their bounds, forces no larger than the joint's torque.
@@ -40,8 +38,7 @@ def exists(problem: Problem, effect: Effect) -> bool:
 
 def physical_sign(effect: Effect) -> bool:
     """Whether no parameter has a sign that physics forbids: a rotor of negative inertia, a torque before its time."""
-    least = {name: 0.0 if name in POSITIVE.get(effect.name, ()) else p.lower for name, p in effect.parameters().items()}
-    return all(float(getattr(effect, name)) >= low for name, low in least.items())
+    return all(float(getattr(effect, name)) >= p.lower for name, p in effect.parameters().items())
 
 
 def _within(parameter: Parameter, value: float) -> bool:
