@@ -33,7 +33,7 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .holdout import held_out, held_squares, residual_rms, traces
+from .holdout import fold_error, held_out, held_squares, residual_rms, traces
 from .joint import Joint, polished, sized
 from .layout import describe_folds, held_rows, layout
 from .naming import reason_against, standings
@@ -41,7 +41,7 @@ from .problem import Problem
 from .rest import Significance, excess, lines, parts_of, predictable, relative_rest, significance, verdict, wrong_law
 from .search import Found, Search, eliminate, find_causes
 from .state import State, baseline, with_width
-from .step import Step, stand
+from .step import stand
 from .thresholds import CERTAIN, NO_REST, WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_reversals
 
@@ -95,12 +95,11 @@ def diagnose(
         search = find_causes(*here[:4], forbid, CERTAIN * alpha, progress, generator)
         here = here._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
-        first = stand(here.problem, here.start, here.whitening)
         found, joint = _fitted_together(here, search.found, forbid)
         names = [s.name for s in signals]
         judged = _judged(here, search, found, joint, names, tolerance, generator)
         progress("measuring the gain", 0.9)
-        return _answer(here, signals, first, search, judged)
+        return _answer(here, signals, search, judged)
 
 
 class _Setting(NamedTuple):
@@ -120,6 +119,7 @@ class _Judged(NamedTuple):
     found: list[Found]
     joint: Joint  # all of them in one fit
     rest: Rest
+    here: _Setting  # with the weights of the answer's fit
 
 
 def _setting(
@@ -180,9 +180,9 @@ def _judged(
     strict = left.there or beyond > NO_REST
     against = {f.name: reason_against(one, strict, tolerance) for f, one in zip(found, each, strict=True)}
     named = [f for f in found if not against[f.name]]
-    if len(named) < len(found):
-        joint = polished(problem, here.start, [f.effect for f in named], whitening)
+    here, joint = _as_predicts_best(here, named)
     named, joint, worse = _without_losses(here, named, joint)
+    problem, whitening = here.problem, here.whitening
     against |= dict.fromkeys(worse, "the error on the data held out does not fall with it")
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
@@ -191,7 +191,24 @@ def _judged(
     text = left.text or (f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else "")
     parts = parts_of(problem, joint.step, whitening, line, names)
     nearest = tuple(sorted(nearest, key=lambda one: -one.share))
-    return _Judged(verdict(bool(named), rest), named, joint, Rest(relative, parts, nearest, text))
+    return _Judged(verdict(bool(named), rest), named, joint, Rest(relative, parts, nearest, text), here)
+
+
+def _as_predicts_best(here: _Setting, named: list[Found]) -> tuple[_Setting, Joint]:
+    """The named causes in one fit, its rows weighted by their speed or all alike, by the error in N m on the folds.
+
+    Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows.
+    """
+    best = None
+    for weight in (np.asarray(here.problem.records.weight), np.asarray(here.problem.records.judged)):
+        one = here._replace(problem=here.problem.weighted(weight))
+        joint = polished(one.problem, one.start, [f.effect for f in named], one.whitening)
+        error = fold_error(one.problem, joint.step.state, joint.step.verdicts.folds, one.problem.layout.fold)
+        best = (error, one, joint) if best is None or error < best[0] else best
+        if (weight == np.asarray(here.problem.records.judged)).all():
+            break
+    assert best is not None
+    return best[1:]
 
 
 def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> tuple[list[Found], Joint, list[Name]]:
@@ -238,8 +255,10 @@ def _left(
     return left._replace(there=left.there or (wrong and not tolerable)), now[0], line
 
 
-def _answer(here: _Setting, signals: Sequence[Signals], first: Step, search: Search, judged: _Judged) -> Diagnosis:
+def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:
+    here, seen = judged.here, stand(searched.problem, searched.start, searched.whitening)
     problem, model, last = here.problem, here.problem.model, judged.joint.step
+    first = stand(problem, here.start, here.whitening)
     order, gains = _by_gain(here, judged)
     found, joint = [judged.found[k] for k in order], judged.joint
     causes = [joint.causes[k] for k in order]
@@ -265,7 +284,7 @@ def _answer(here: _Setting, signals: Sequence[Signals], first: Step, search: Sea
         holdout=Gain(gains[0], gains[-1]),
         holdout_scheme=_scheme(signals),
         experiment=next_experiment(judged.word, found, problem, here.start, causes, here.whitening),
-        candidates=explain(first.rows, first.linear, search.screened, noise),
+        candidates=explain(seen.rows, seen.linear, search.screened, noise),
         traces=traces(problem, signals, first.state, last.state, joint.causes, judged.found),
         baseline=fitted_model(problem, first.state, []),
         model=fitted_model(problem, last.state, joint.causes),
