@@ -35,7 +35,7 @@ from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
 from .holdout import fold_error, held_out, held_squares, residual_rms, traces
 from .joint import Joint, polished, sized
-from .layout import describe_folds, held_rows, layout
+from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import reason_against, standings
 from .problem import Problem
 from .rest import Significance, excess, lines, parts_of, predictable, relative_rest, significance, verdict, wrong_law
@@ -89,7 +89,8 @@ def diagnose(
     """
     with jax.enable_x64(True):
         progress("preparing signals", 0.03)
-        signals = sorted(prepare_all(tuple(recordings), preprocess), key=lambda s: s.role == "holdout")
+        signals = checked_repeats(prepare_all(tuple(recordings), preprocess))
+        signals.sort(key=lambda s: s.role == "holdout")
         here = _setting(as_backend(model), signals, known, trust, forbid, progress)
         generator = np.random.default_rng(seed)
         search = find_causes(*here[:4], forbid, CERTAIN * alpha, progress, generator)

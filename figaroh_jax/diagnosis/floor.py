@@ -98,6 +98,8 @@ def _from_rich_model(
     for _ in range(RICHNESS):
         found = screen(rows, fit(rows, prior), groups, found)
         scores = found.scores
+        if not scores:
+            break
         # families have many columns: only z weighs them fairly
         best = int(np.argmax([(result.z if long else result.Q).max() for result in scores]))
         blocks.append(_full(rows, groups[best], int(np.argmax(scores[best].Q))))

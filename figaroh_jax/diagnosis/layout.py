@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..recordings.signals import Signals, align
+from ..recordings.signals import Signals, align, common_rows
 from ..recordings.stacked import Records
 from .problem import Layout
+from .thresholds import SAME_MOTION
 
-__all__ = ["describe_folds", "held_rows", "layout"]
+__all__ = ["checked_repeats", "describe_folds", "held_rows", "layout"]
 
 BLOCK, SHORT_BLOCK, SHORT = 1.0, 0.3, 9.99  # s: of a block, of a block in recordings shorter than the third
 FOLDS, SLICE = 5, 2.0  # where the excitations are few: folds, and seconds that one takes in turn
@@ -38,6 +40,39 @@ def layout(signals: Sequence[Signals], records: Records) -> Layout:
         partner, paired = partner[:0], np.ones((weight.shape[2], n * count))
     fold, part = _folds(signals, records, SLICED), _folds(signals, records, QUARTERED)
     return Layout(partner, paired, _blocks(signals, records), fold, part, repeats)
+
+
+def checked_repeats(signals: Sequence[Signals]) -> list[Signals]:
+    """The recordings, each repeat with a note of how near it is; one that moves otherwise loses its label.
+
+    What two recordings of other motions differ by is no noise: without the label they are two excitations.
+    """
+    out, leaders = [], {}
+    for one in signals:
+        leader = leaders.setdefault(one.repeat, one) if one.repeat and one.role == "fit" else one
+        if leader is one:
+            out.append(one)
+            continue
+        apart, note = _compared(leader, one)
+        if apart > SAME_MOTION:
+            text = f"{one.name} does not repeat {leader.name}: {note}; taken as another excitation"
+            out.append(replace(one, repeat=None, notes=(*one.notes, text)))
+        else:
+            out.append(replace(one, notes=(*one.notes, f"{one.name} repeats {leader.name}: {note}")))
+    return out
+
+
+def _compared(first: Signals, second: Signals) -> tuple[float, str]:
+    """Difference of two repeats' positions over the joint's own range (standard deviations), and all of it in words."""
+    own, other = common_rows(first, second)
+    q, p = first.position[first.rows.index[own]], second.position[second.rows.index[other]]
+    apart, motion = (q - p).std(axis=0), q.std(axis=0)
+    late = 1e3 * float(np.mean(second.rows.row_times[other] - first.rows.row_times[own]))
+    text = f"its clock is {late:+.4g} ms off, positions within {apart.max():.2g} rad (or m)"
+    if first.torque is not None and second.torque is not None:
+        torque = first.torque[first.rows.index[own]] - second.torque[second.rows.index[other]]
+        text += f", torques within {torque.std(axis=0).max():.2g} N m (or N)"
+    return float((apart / np.maximum(motion, 1e-3 * max(float(motion.max()), 1e-12))).max()), text
 
 
 def held_rows(signals: Sequence[Signals], records: Records) -> Float[np.ndarray, "n M nv"]:

@@ -175,6 +175,8 @@ def family_p(
     The larger of two nulls: noise drawn from the spectrum (its coefficients redrawn for each part), and fair signs of
     whole blocks of the residual, the prior's rows among the blocks.
     """
+    if not found.scores:
+        return 1.0  # every candidate is forbidden, or stands in the model already
     highest = max(float(result.z.max()) for result in found.scores)
     parts = block_scores(rows, linear, found.stock, found.H)
     signs = generator.choice([-1.0, 1.0], (draws, len(parts)))
