@@ -33,7 +33,7 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .holdout import fold_error, held_out, held_squares, residual_rms, traces
+from .holdout import held_out, held_squares, part_error, residual_rms, traces
 from .joint import Joint, polished, sized
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import reason_against, standings
@@ -196,7 +196,7 @@ def _judged(
 
 
 def _as_predicts_best(here: _Setting, named: list[Found]) -> tuple[_Setting, Joint]:
-    """The named causes in one fit, its rows weighted by their speed or all alike, by the error in N m on the folds.
+    """The named causes in one fit, its rows weighted by their speed or all alike, by the error in N m on parts left out.
 
     Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows.
     """
@@ -204,7 +204,7 @@ def _as_predicts_best(here: _Setting, named: list[Found]) -> tuple[_Setting, Joi
     for weight in (np.asarray(here.problem.records.weight), np.asarray(here.problem.records.judged)):
         one = here._replace(problem=here.problem.weighted(weight))
         joint = polished(one.problem, one.start, [f.effect for f in named], one.whitening)
-        error = fold_error(one.problem, joint.step.state, joint.step.verdicts.folds, one.problem.layout.fold)
+        error = part_error(one.problem, joint.step)
         best = (error, one, joint) if best is None or error < best[0] else best
         if (weight == np.asarray(here.problem.records.judged)).all():
             break

@@ -18,9 +18,9 @@ from .problem import Problem
 from .search import Found
 from .shifts import torque_change
 from .state import State, batched, extended_state
-from .step import stand
+from .step import Step, stand
 
-__all__ = ["fold_error", "held_out", "held_squares", "predicted", "residual_rms", "traces"]
+__all__ = ["fold_error", "held_out", "held_squares", "part_error", "predicted", "residual_rms", "traces"]
 
 
 def held_out(problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> list[float]:
@@ -114,6 +114,13 @@ def fold_error(
     judged = np.asarray(problem.records.judged)
     error = _left_out(problem, state, folds, fold) * judged
     return float(np.sqrt((error**2).sum() / ((problem.torque * judged) ** 2).sum()))
+
+
+def part_error(problem: Problem, step: Step) -> float:
+    """As `fold_error`, of the parts by which the gain is told where no recording is kept out."""
+    part = problem.layout.part
+    folds = judge(step.rows._replace(fold=part), Hypothesis(step.rows.X, step.state.prior)).folds
+    return fold_error(problem, step.state, folds, part)
 
 
 def _left_out(
