@@ -42,7 +42,7 @@ from .rest import Significance, excess, lines, parts_of, predictable, relative_r
 from .search import Found, Search, eliminate, find_causes
 from .state import State, baseline, with_width
 from .step import stand
-from .thresholds import CERTAIN, NO_REST, WEIGHT_ROUNDS
+from .thresholds import CERTAIN, FEW_CAUSES, NO_REST, WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ def _judged(
     problem, whitening = here.problem, here.whitening
     left, beyond, line = _left(here, search, found, joint, tolerance, generator)
     each = standings(problem, here.start, found, joint, whitening)
-    strict = left.there or beyond > NO_REST
+    strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
     against = {f.name: reason_against(one, strict, tolerance) for f, one in zip(found, each, strict=True)}
     named = [f for f in found if not against[f.name]]
     here, joint = _as_predicts_best(here, named)
@@ -196,7 +196,7 @@ def _judged(
 
 
 def _as_predicts_best(here: _Setting, named: list[Found]) -> tuple[_Setting, Joint]:
-    """The named causes in one fit, its rows weighted by their speed or all alike, by the error in N m on parts left out.
+    """The named causes in one fit, its rows weighted by speed or all alike, by the error in N m on parts left out.
 
     Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows.
     """

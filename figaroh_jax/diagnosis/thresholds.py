@@ -58,6 +58,7 @@ UNREPEATED = 0.01  # the same where no recording repeats another
 T_REST = 2.3  # t of the blocks: that smooth functions predict the rest on data they were not fitted to
 LEAST_BEYOND = 0.05  # times the noise power: below, nothing is said of what a joint's rest goes with
 LEAST_SHARE = 0.05  # of the power beyond the noise: a dependence that is told
+FEW_CAUSES = 3  # found together: beyond, the model is wrong in more ways than one, and a stand-in more likely
 NO_REST = 0.15  # excess over the noise up to which a cause need only be there to be named
 OWN_SHARE = 0.03  # of what a cause has removed: a rest at its own place that speaks against its law
 STANDSTILL = 0.08  # of a joint's top speed: rows at and around rest
