@@ -107,7 +107,7 @@ def _exact_columns(
         return jax.tree.map(lambda x: x[order[0]], group.effect), group.columns.Z[order[0]]
     starts = np.resize(order, STARTS)
     effects = jax.tree.map(lambda x: x[starts], group.effect)
-    effect, Z = refit(effects, step.state.motion, problem.records, ready)
+    effect, Z = refit(effects, step.state.motion, problem.records, ready, group.effect)
     return effect, Z.reshape(*Z.shape[:2], -1)
 
 

@@ -20,6 +20,7 @@ from ..effects.base import Effect, place
 from ..effects.catalogue import find
 from ..errors import InputError
 from ..estimation.noise import Spectrum
+from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Signals, prepare_all
 from ..recordings.stacked import stack
@@ -60,6 +61,7 @@ def diagnose_task(
     progress("reading", 0.0)
     model, (known, notes) = load_robot(task), stated_baseline(task)
     recordings = read_recordings(task, model)
+    notes = (*notes, *check_recordings(task, model, recordings))
     options = {"trust": task.robot.trust, "forbid": task.diagnose.forbid, "alpha": task.diagnose.alpha}
     options["tolerance"] = task.diagnose.tolerance.torque
     robot = make_backend(backend, model)

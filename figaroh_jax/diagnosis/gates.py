@@ -42,9 +42,10 @@ def physical_sign(effect: Effect) -> bool:
 
 
 def _within(parameter: Parameter, value: float) -> bool:
-    """Whether a parameter that enters nonlinearly lies in its bounds, and not against them."""
+    """Whether a parameter lies in its bounds, whatever its sign; one that enters nonlinearly not against them."""
     if parameter.linear:
-        return True
+        # zero is a bound of the sign, any other one of the size
+        return (parameter.lower == 0 or parameter.lower <= value) and value <= parameter.upper
     margin = 1e-3 * abs(value)
     return parameter.choice or parameter.lower + margin < value < parameter.upper - margin
 

@@ -86,8 +86,9 @@ class Problem:
         shape to search too), `following` the current model's torque, `sensor` through the rigid body or the filter.
         """
         out: dict[str, dict[str, Effect]] = {name: {} for name in ("fixed", "shaped", "following", "sensor", "link")}
+        measured = eqx.tree_at(lambda m: m.total, self.motion, self.records.flat(self.records.torque))
         for name, effect in CATALOGUE.items():
-            batch = candidates(effect, self.model)
+            batch = candidates(effect, self.model, measured)
             if batch.at.shape[0]:
                 out[family_of(effect)][name] = batch
         return out
@@ -105,7 +106,7 @@ class Problem:
 def family_of(effect: type[Effect]) -> str:
     if effect.inertial:
         return "link"
-    if kind(effect) != "columns" or (effect.has("change") and not effect.has("torque")):
+    if kind(effect) != "columns" or not (effect.has("torque") or effect.has("torque_error")):
         return "sensor"
     if effect.follows_torque:
         return "following"

@@ -128,8 +128,9 @@ class Load(_Keys):
 
 
 class Units(_Keys):
-    """Units of the arrays where they are not rad, m and N m."""
+    """Units of the arrays where they are not s, rad, m and N m."""
 
+    time: Literal["s", "ms", "us", "ns"] = "s"
     position: Literal["rad", "deg", "m", "mm"] = "rad"
     velocity: Literal["rad/s", "deg/s", "m/s", "mm/s"] | None = None  # None: as the position
     torque: Literal["N m", "Nm", "N", "A"] = "N m"

@@ -25,6 +25,7 @@ from ..estimation.intervals import coloured_covariance
 from ..estimation.least_squares import Solution, WeightedByJoint, solve, with_prior
 from ..estimation.priors import rigid_prior
 from ..estimation.regression import Condensed, Regression, condense
+from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import prepare_all
 from ..rigid.model import RobotModel, prismatic
@@ -88,6 +89,7 @@ def identify_task(
     progress("reading", 0.0)
     model, (known, notes) = load_robot(task), stated_baseline(task)
     recordings = read_recordings(task, model, floating=True)
+    notes = (*notes, *check_recordings(task, model, recordings))
     options = task.identify
     found = identify(
         make_backend(backend, model),

@@ -64,7 +64,7 @@ class Records(eqx.Module):
 def filter_rows(
     records: Records,
     torque: Float[np.ndarray, "*series n N"],
-    response: Shaped[np.ndarray, "*series F"] | None = None,
+    response: Shaped[np.ndarray, "... F"] | None = None,
 ) -> Float[np.ndarray, "*series n M"]:
     """Rows of torques or columns: low-passed without phase, times `response`, at the rows' samples.
 
