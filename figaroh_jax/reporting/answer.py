@@ -29,6 +29,7 @@ def answer(diagnosis: Diagnosis) -> dict[str, Any]:
         },
         "rest": rest(diagnosis.rest),
         "next_experiment": _experiment(diagnosis),
+        "notes": list(diagnosis.notes),
     }
 
 
