@@ -10,6 +10,7 @@ runs that were fitted and on runs that were not, each simulated from its first m
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import os
 import time
@@ -80,19 +81,20 @@ def pendulum_runs() -> list[Run]:
     return found
 
 
-def dfki_double_pendulum(window: float) -> None:
+def dfki_double_pendulum(window: float, every: int) -> None:
     """Short windows, their first states fitted too; seven runs are fitted, three are not."""
     drives = {name: {"kind": "torque"} for name in ("Joint1", "Joint2")}
     loop, _ = load_loop(DATA / "dfki_double_pendulum" / "double_pendulum_C1.urdf", drives, law="hard", dt=0.002)
     zero = np.zeros(2)
-    loop = eqx.tree_at(lambda m: (m.joints.friction, m.joints.damping, m.limited), loop, (zero, zero + 0.001, False))
+    loop = eqx.tree_at(lambda m: (m.joints.friction, m.joints.damping), loop, (zero, zero + 0.001))
+    loop = dataclasses.replace(loop, limited=False)
     runs, rows = pendulum_runs(), round(window / 0.002)
     train = [k for k in range(len(runs)) if k % 3 != 2]
     test = [k for k in range(len(runs)) if k % 3 == 2]
     noise = [np.full(2, 2e-3)]
     data = {}
     for name, group in (("train", train), ("test", test)):
-        cut = [Stretch(k, f, rows) for k in group for f in range(0, len(runs[k].time) - rows, rows)]
+        cut = [Stretch(k, f, rows) for k in group for f in range(0, len(runs[k].time) - rows, every * rows)]
         data[name] = windows(loop, runs, cut, noise, window)
     table = (
         *(Entry("payload", (i,)) for i in range(2)),
@@ -145,8 +147,9 @@ if __name__ == "__main__":
     parser.add_argument("data", choices=["servo_miuzei", "dfki_double_pendulum"])
     parser.add_argument("--window", type=float, default=0.3, help="s, of the double pendulum")
     parser.add_argument("--law", choices=["hard", "soft"], default="hard")
+    parser.add_argument("--every", type=int, default=1, help="takes one window of so many")
     args = parser.parse_args()
     if args.data == "servo_miuzei":
         servo_miuzei(args.law)
     else:
-        dfki_double_pendulum(args.window)
+        dfki_double_pendulum(args.window, args.every)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import equinox as eqx
 import jax
+import mujoco
 import numpy as np
 import pytest
 from generators import servo_arm
@@ -14,6 +16,7 @@ from figaroh_jax.cli import main
 from figaroh_jax.errors import InputError
 from figaroh_jax.rollouts.causes import elastic_loop
 from figaroh_jax.rollouts.data import Run, Stretch, noise_of, regular, windows
+from figaroh_jax.rollouts.export import described, for_simulator, with_drives
 from figaroh_jax.rollouts.parameters import Entry, put
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.sensitivity import linear_sums, predicted
@@ -79,6 +82,27 @@ def test_a_joint_of_two_bodies_is_mujocos(tmp_path: Path):
     truth = servo_arm.record("joint_elasticity", 1)
     read = np.asarray(rollout(loop, u[:1500, None], np.zeros(2)).reading)
     assert np.sqrt(np.mean((read - truth["q"][:1500]) ** 2)) < 2.1e-4  # the noise is .2 mrad
+
+
+def test_exported_drives_move_mujoco_as_the_loop_moves(tmp_path: Path):
+    """Gains, force limit and delay in MuJoCo's own words; what Gazebo cannot say is listed with its size."""
+    (tmp_path / "arm.xml").write_text(servo_arm.model_text())
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    loop = eqx.tree_at(
+        lambda m: (m.drives.delay, m.drives.force_range), loop, (np.array([8e-3]), np.array([[-9.0, 9.0]]))
+    )
+    (tmp_path / "out.xml").write_text(with_drives(tmp_path / "arm.xml", described(loop)))
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    data, truth, u = mujoco.MjData(model), [], servo_arm.command()[1][:1500]
+    for value in u:
+        truth.append(data.qpos.copy())
+        data.ctrl[0] = value
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(rollout(loop, u[:, None], np.zeros(1)).position, truth, rtol=0, atol=1e-12)
+    unsaid = {one["number"]: one["value"] for one in for_simulator(described(loop), "gazebo")["unsaid"]}
+    assert unsaid == {"armature": 0.05, "delay": 8e-3}
+    with pytest.raises(InputError, match="did you mean 'mujoco'"):
+        for_simulator(described(loop), "mujco")
 
 
 def test_noise_is_found_under_a_motion_and_a_jump_of_the_clock_is_told():

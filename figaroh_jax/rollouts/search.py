@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -202,7 +202,7 @@ def search(
 
 def begun(here: Setting) -> Fit:
     """The baseline's fit."""
-    begins = _begins(here, values(here.loop, here.known.table))
+    begins: Any = _begins(here, values(here.loop, here.known.table))
     structure = Structure(here.loop, here.known.table, here.data)
     fits = fit(*structure, begins, [here.baseline] * len(begins), width=here.width, lanes=here.lanes)
     return min(fits, key=lambda f: f.cost)
@@ -262,7 +262,7 @@ def _raced(
     start = np.repeat(now.fit.start[None], len(thetas), 0)
     lanes = here.lanes * 3 if here.lanes > 1 else 1
     early = fit(*now.structure, thetas, free, start, width=here.width, lanes=lanes, iterations=_EARLY)
-    leads: dict[tuple, int] = {}
+    leads: dict[Any, int] = {}
     for k in np.argsort([f.cost for f in early]):
         leads.setdefault(owner[k], int(k))
     order = list(leads.values())[: max(here.lanes, _SHORT)]
@@ -416,6 +416,11 @@ def _sized(here: Setting, one: _Tried) -> bool:
     column = int(np.flatnonzero(found.free == one.candidate.entries[0])[0])
     error = standard_errors(found, one.state.structure.data)[column]
     value = found.theta[one.candidate.entries[0]]
+    if one.candidate.effect == "backlash":  # without a width it is an elasticity
+        width = one.candidate.entries[2]
+        spread = standard_errors(found, one.state.structure.data)[int(np.flatnonzero(found.free == width)[0])]
+        if not found.theta[width] > 3 * spread:
+            return False
     neutral = 1.0 if one.candidate.effect == "actuator_gain" else 0.0
     if one.candidate.effect in (*BASELINE, "actuator_saturation", "voltage_saturation", "joint_elasticity", "backlash"):
         return bool(np.isfinite(error) and error < 0.5 * abs(value) + 1e-12)

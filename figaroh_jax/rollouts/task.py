@@ -212,7 +212,14 @@ def _cause(one: Named, found: Search, here: Setting) -> Cause:
     at = one.candidate.at
     sure = 1.0 / (1 + len(one.alike)) * (0.98 if found.verdict == "named" else 0.8)
     gain = Gain(one.before, one.after, "rad")
-    return Cause(Name(one.candidate.effect, at), parameters, sure, gain, one.alike)
+    note = _NOTES.get(one.candidate.effect, "")
+    return Cause(Name(one.candidate.effect, at), parameters, sure, gain, one.alike, note)
+
+
+_NOTES = {
+    "command_delay": "positions that are stamped late by as much look the same",
+    "joint_damping": "a wrong velocity gain of the drive looks the same",
+}
 
 
 def _experiment(found: Search) -> Experiment | None:
