@@ -99,8 +99,13 @@ def _run(args: argparse.Namespace) -> int:
         args = _again(args)
     _set_up_jax(cache=not args.no_cache)
     from .reporting import terminal
-    from .runs import JOBS, REPORT
+    from .runs import JOBS, REPORT, export_loop
 
+    if args.command == "export":
+        text = export_loop(args.task, args.simulator, args.out)
+        with _standard_output():
+            sys.stdout.write(text)
+        return 0
     job = JOBS["diagnose" if args.command == "demo" else args.command]
     with resources.as_file(resources.files("figaroh_jax") / "demo") as demo:
         task_file = args.task or demo / "task.yaml"
@@ -152,10 +157,16 @@ def _explain(error: Exception, with_traceback: bool) -> int:
         traceback.print_exception(error)
     kind = "error" if wrong_input else f"internal error: {type(error).__name__}"
     hint = "" if wrong_input or with_traceback else " (--traceback shows where; please report it)"
-    text = " ".join(str(error).split()) or "no more is known"
+    text = _one_line(str(error))
     with suppress(OSError):
         print(f"figaroh-jax: {kind}: {text}{hint}", file=sys.stderr)
     return 2 if wrong_input else 70
+
+
+def _one_line(text: str) -> str:
+    """The text on one line, nothing in it that a terminal would act on."""
+    line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
+    return line if len(line) <= 4000 else f"{line[:3000]} ... {line[-900:]}"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -183,6 +194,9 @@ def _parser() -> argparse.ArgumentParser:
     again = commands.add_parser("rerun", parents=[common], help="run the command that made a run directory once more")
     again.add_argument("run", type=Path, metavar="DIR")
     _add_tools(commands)
+    export = commands.add_parser("export", parents=[common], help="a rollout's model in the words of a simulator")
+    export.add_argument("task", type=Path, metavar="MODEL_DIR", help="`model` of a run directory")
+    export.add_argument("--for", dest="simulator", required=True, metavar="NAME", help="mujoco, newton, isaaclab, ...")
     demo = commands.add_parser("demo", parents=[common], help="the main job on an embedded recording, no file needed")
     demo.set_defaults(task=None)
     return parser
@@ -225,9 +239,7 @@ def _set_up_jax(cache: bool) -> None:
     jax.config.update("jax_enable_x64", True)
     if not cache:
         jax.config.update("jax_enable_compilation_cache", False)
-    elif jax.config.values.get("jax_compilation_cache_dir") is None:
-        home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-        folder = Path(home).expanduser() / "figaroh_jax" / "jax"
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    else:
+        from .compiled.executable_cache import keep_programs
+
+        keep_programs()

@@ -83,7 +83,7 @@ def figures(run: dict[str, Any]) -> dict[str, Any]:
         "rank": result.get("rank") if "base_parameters" in result else None,
         "condition": _finite(result.get("condition")) if "base_parameters" in result else None,
         "relative_std": _relative_std(result),
-        "consistent": all(link["consistent"] for link in result["links"]) if "links" in result else None,
+        "consistent": all(link.get("consistent", True) for link in result["links"]) if result.get("links") else None,
         "position_mm": _finite((result.get("position") or {}).get("validated_after")),
         "orientation_deg": _finite((result.get("orientation") or {}).get("validated_after")),
         "fk_parity": _finite(result.get("fk_parity")),
