@@ -110,7 +110,7 @@ def test_junit_counts_what_failed_and_what_was_skipped(tmp_path: Path):
     verified(
         run(tmp_path / "run", answer=ANSWER), "gain: 0.9\nrank: 3\np_value: 0.1", "--junit", str(tmp_path / "j.xml")
     )
-    suite = ElementTree.parse(tmp_path / "j.xml").getroot()
+    suite = ElementTree.parse(tmp_path / "j.xml").getroot()  # noqa: S314 -- written above
     assert (suite.get("tests"), suite.get("failures"), suite.get("skipped")) == ("3", "1", "1")
     assert [case.get("name") for case in suite if case.find("failure") is not None] == ["gain"]
 
