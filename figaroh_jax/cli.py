@@ -1,16 +1,19 @@
 """The command `figaroh-jax`: a thin layer that reads arguments, sets JAX up and turns errors into messages.
 
 Exit status: 0 the job ran, 2 the input is wrong (one message on standard error), 70 a fault of the program itself,
-130 interrupted.
+130 interrupted, 143 asked to end (SIGTERM).
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -40,11 +43,47 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as asked:  # --help, or wrong usage, which argparse has explained
         return asked.code if isinstance(asked.code, int) else 2
     try:
-        return _run(args)
+        with _ended_by_signals():
+            return _run(args)
     except KeyboardInterrupt:
         return 130
+    except _Ended as ended:
+        return 128 + ended.signal
     except Exception as error:
         return _explain(error, args.traceback)
+
+
+class _Ended(BaseException):
+    """The system asks the process to end; what is half-written is cleaned up on the way out."""
+
+    def __init__(self, signal: int) -> None:
+        self.signal = signal
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """SIGTERM and SIGHUP are raised as `_Ended`, in the main thread, where nobody handles them otherwise."""
+    taken = {}
+
+    def end(number: int, frame: Any) -> None:
+        raise _Ended(number)
+
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+                taken[number] = signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, before in taken.items():
+            signal.signal(number, before)
+
+
+def _drop_standard_output() -> None:
+    """What Python would still write at exit goes nowhere."""
+    with suppress(OSError, ValueError, AttributeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -52,20 +91,41 @@ def _run(args: argparse.Namespace) -> int:
         os.environ.setdefault(name, value)
     _set_up_jax(cache=not args.no_cache)
     from .reporting import terminal
-    from .runs import JOBS, REPORT
+    from .runs import JOBS, REPORT, export_loop
 
+    if args.command == "export":
+        text = export_loop(args.task, args.simulator, args.out)
+        with _standard_output():
+            sys.stdout.write(text)
+        return 0
     job = JOBS["diagnose" if args.command == "demo" else args.command]
     with resources.as_file(resources.files("figaroh_jax") / "demo") as demo:
         task_file = args.task or demo / "task.yaml"
         out = args.out or Path(f"{args.task.stem if args.task else 'demo'}_{job.noun}")
         with terminal.Progress(quiet=args.quiet) as progress:
             found = job.run(task_file, out, progress, args.backend, **_own_options(args))
-    if args.json:
-        sys.stdout.write(job.to_json(found))
-    else:
-        job.show(found)
-        print(f"Report: {out / REPORT}")
+    with _standard_output():
+        if args.json:
+            sys.stdout.write(job.to_json(found))
+        else:
+            job.show(found)
+            print(f"Report: {out / REPORT}")
     return 0
+
+
+@contextmanager
+def _standard_output() -> Iterator[None]:
+    """Standard output that may end early (`| head`) or refuse; by then the run is written."""
+    with suppress(AttributeError):
+        sys.stdout.reconfigure(errors="backslashreplace")  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        yield
+        sys.stdout.flush()
+    except (BrokenPipeError, SystemExit):  # rich turns the one into the other
+        _drop_standard_output()
+    except OSError as error:
+        _drop_standard_output()
+        raise InputError(f"the summary cannot be written to standard output: {error.strerror or error}") from None
 
 
 def _own_options(args: argparse.Namespace) -> dict[str, Any]:
@@ -74,13 +134,21 @@ def _own_options(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _explain(error: Exception, with_traceback: bool) -> int:
-    wrong_input = isinstance(error, InputError)
+    wrong_input = isinstance(error, (InputError, OSError))
     if with_traceback:
         traceback.print_exception(error)
     kind = "error" if wrong_input else f"internal error: {type(error).__name__}"
     hint = "" if wrong_input or with_traceback else " (--traceback shows where; please report it)"
-    print(f"figaroh-jax: {kind}: {error}{hint}", file=sys.stderr)
+    text = _one_line(str(error))
+    with suppress(OSError):
+        print(f"figaroh-jax: {kind}: {text}{hint}", file=sys.stderr)
     return 2 if wrong_input else 70
+
+
+def _one_line(text: str) -> str:
+    """The text on one line, nothing in it that a terminal would act on."""
+    line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
+    return line if len(line) <= 4000 else f"{line[:3000]} ... {line[-900:]}"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -105,6 +173,9 @@ def _parser() -> argparse.ArgumentParser:
         if name == "calibrate":
             command.add_argument("--level", help="frames, joint_offset or full, in place of what predicts best")
             command.add_argument("--no-priors", dest="priors", action="store_false", help="plain least squares")
+    export = commands.add_parser("export", parents=[common], help="a rollout's model in the words of a simulator")
+    export.add_argument("task", type=Path, metavar="MODEL_DIR", help="`model` of a run directory")
+    export.add_argument("--for", dest="simulator", required=True, metavar="NAME", help="mujoco, newton, isaaclab, ...")
     demo = commands.add_parser("demo", parents=[common], help="the main job on an embedded recording, no file needed")
     demo.set_defaults(task=None)
     return parser
@@ -122,9 +193,7 @@ def _set_up_jax(cache: bool) -> None:
     jax.config.update("jax_enable_x64", True)
     if not cache:
         jax.config.update("jax_enable_compilation_cache", False)
-    elif jax.config.values.get("jax_compilation_cache_dir") is None:
-        home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-        folder = Path(home).expanduser() / "figaroh_jax" / "jax"
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    else:
+        from .compiled.executable_cache import keep_programs
+
+        keep_programs()

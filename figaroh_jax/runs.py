@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import html
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from .errors import InputError
+from .reporting.run_directory import check_directory, task_inputs, whole_directory
 
 if TYPE_CHECKING:
     from .calibration.calibrated import Calibration
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from .formats.config import Load, Task
     from .identification.result import Identification, Link
     from .results import Diagnosis
+    from .rollouts.identification import RolloutIdentification
+    from .rollouts.loop import Loop
 
 __all__ = [
     "ANSWER",
@@ -29,15 +31,14 @@ __all__ = [
     "RESULT",
     "Job",
     "calibrate_file",
-    "check_directory",
     "diagnose_file",
+    "export_loop",
     "identify_file",
     "predictions",
-    "whole_directory",
     "write_run",
 ]
 
-ANSWER, RESULT, REPORT = "answer.json", "result.json", "report.html"
+ANSWER, RESULT, REPORT, LOOP = "answer.json", "result.json", "report.html", "loop.json"
 
 
 class Job(NamedTuple):
@@ -60,15 +61,18 @@ def diagnose_file(
     The rigid body's torques are those of the named backend. An earlier run in `out` is replaced; a directory that holds
     anything else is refused before any work. Wrong input raises `InputError`, and nothing is written.
     """
-    from .formats.config import load_task
     from .simulators.registry import check_backend
 
     check_backend(backend, "joint_torque_regressor")
-    check_directory(out)
-    task = load_task(task_file)
+    task = _task_for(task_file, out)
     if any(entry.measurement is not None for entry in task.data):
         _native_alone(backend)
         return _diagnose_poses(task, out, progress)
+    from .rollouts.task import is_rollout_task
+
+    if is_rollout_task(task):
+        _native_alone(backend)
+        return _diagnose_rollouts(task, out, progress)
     from .diagnosis.diagnosis import diagnose_task
 
     diagnosis = diagnose_task(task, progress=progress, backend=backend)
@@ -77,19 +81,69 @@ def diagnose_file(
     return diagnosis
 
 
+def _diagnose_rollouts(task: Task, out: Path, progress: Callable[[str, float], None]) -> Diagnosis:
+    from .formats.export import write_model
+    from .reporting.answer import to_json, write_predictions
+    from .reporting.report import write_report
+    from .rollouts.task import diagnose_rollout_task
+
+    found = diagnose_rollout_task(task, progress)
+    progress("writing the report", 1.0)
+    with whole_directory(out, task_inputs(task.file)) as folder:
+        (folder / ANSWER).write_text(to_json(found.diagnosis), encoding="utf-8")
+        write_predictions(folder / "predictions.npz", found.predictions, "position")
+        write_report(found.diagnosis, folder / REPORT, found.diagnosis.model.robot.name)
+        write_model(found.diagnosis.model, folder / "model", found.diagnosis.causes)
+        _write_loop(folder / "model", found.loop)
+    return found.diagnosis
+
+
+def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
+    """The loop of a run's `model` directory in the words of a simulator, as JSON; with `out`, written there too.
+
+    For MuJoCo `out` also gets `robot.xml`, with everything that MuJoCo has words for. Raises `InputError` for another
+    directory, and for a simulator that is not known.
+    """
+    from .rollouts.export import for_simulator, with_drives
+
+    try:
+        content = json.loads((model / LOOP).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise InputError(f"{model}: no readable {LOOP}; name the `model` directory of a rollout's run") from None
+    text = json.dumps(for_simulator(content, simulator), indent=2, ensure_ascii=False) + "\n"
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / f"{simulator}.json").write_text(text, encoding="utf-8")
+        if simulator == "mujoco":
+            (out / "robot.xml").write_text(with_drives(model / "robot.xml", content), encoding="utf-8")
+    return text
+
+
+def _write_loop(folder: Path, loop: Loop) -> None:
+    """`loop.json`, every number of the loop, and the drives in `robot.xml`."""
+    from .rollouts.export import described, described_text, with_drives
+
+    (folder / LOOP).write_text(described_text(loop), encoding="utf-8")
+    mjcf = folder / "robot.xml"
+    mjcf.write_text(with_drives(mjcf, described(loop)), encoding="utf-8")
+
+
 def identify_file(
     task_file: Path,
     out: Path,
     progress: Callable[[str, float], None] = lambda phase, fraction: None,
     backend: str = "native",
-) -> Identification:
+) -> Identification | RolloutIdentification:
     """Read a task, identify its robot and write the run directory `out`, as `diagnose_file` does."""
-    from .formats.config import load_task
     from .simulators.registry import check_backend
 
     check_backend(backend, "joint_torque_regressor")
-    check_directory(out)
-    task = load_task(task_file)
+    task = _task_for(task_file, out)
+    from .rollouts.task import is_rollout_task
+
+    if is_rollout_task(task):
+        _native_alone(backend)
+        return _identify_rollouts(task, out, progress)
     from .formats.export import write_model
     from .identification.identification import identify_task
     from .identification.parameter_files import write_parameters
@@ -101,7 +155,7 @@ def identify_file(
     if wrong:
         found = replace(found, notes=(_not_written(wrong), *found.notes))
     progress("writing the report", 1.0)
-    with whole_directory(out) as folder:
+    with whole_directory(out, task_inputs(task.file)) as folder:
         (folder / RESULT).write_text(_identification_json(found), encoding="utf-8")
         write_predictions(folder / "predictions.npz", predictions(task, found.model, identified=True))
         write_parameters(found, folder)
@@ -109,6 +163,34 @@ def identify_file(
         if not wrong:
             write_model(found.model, folder / "model")
     return found
+
+
+def _identify_rollouts(task: Task, out: Path, progress: Callable[[str, float], None]) -> RolloutIdentification:
+    from .formats.export import write_model
+    from .reporting.answer import write_predictions
+    from .rollouts.identification import identify_rollout_task
+
+    found = identify_rollout_task(task, progress)
+    progress("writing the report", 1.0)
+    with whole_directory(out, task_inputs(task.file)) as folder:
+        (folder / RESULT).write_text(found.to_json(), encoding="utf-8")
+        lines = html.escape("\n".join(found.lines()))
+        page = f"<!doctype html><meta charset='utf-8'><title>{RESULT}</title><pre>{lines}</pre>\n"
+        (folder / REPORT).write_text(page, encoding="utf-8")
+        write_predictions(folder / "predictions.npz", found.predictions, "position")
+        write_model(found.model, folder / "model")
+        _write_loop(folder / "model", found.loop)
+    return found
+
+
+def _task_for(task_file: Path, out: Path) -> Task:
+    """The task of a run that is to be written to `out`: it can become a run directory and holds no file of the task."""
+    from .formats.config import load_task
+
+    check_directory(out)
+    task = load_task(task_file)
+    check_directory(out, task_inputs(task_file))
+    return task
 
 
 def _not_written(wrong: Sequence[Link]) -> str:
@@ -125,7 +207,7 @@ def _diagnose_poses(task: Task, out: Path, progress: Callable[[str, float], None
 
     found = diagnose_pose_task(task, progress)
     progress("writing the report", 1.0)
-    with whole_directory(out) as folder:
+    with whole_directory(out, task_inputs(task.file)) as folder:
         write_calibration(found.calibration, folder, task.robot.model)
         (folder / ANSWER).write_text(pose_answer_json(found), encoding="utf-8")
     return found
@@ -144,17 +226,14 @@ def calibrate_file(
 
     `level` and `priors` are those of `calibration.calibrate`.
     """
-    from .formats.config import load_task
-
     _native_alone(backend)
-    check_directory(out)
-    task = load_task(task_file)
+    task = _task_for(task_file, out)
     from .calibration.calibration import calibrate_task
     from .reporting.calibration_files import write_calibration
 
     calibration = calibrate_task(task, progress=progress, level=level, priors=priors)
     progress("writing the report", 1.0)
-    with whole_directory(out) as folder:
+    with whole_directory(out, task_inputs(task.file)) as folder:
         write_calibration(calibration, folder, task.robot.model)
     return calibration
 
@@ -176,7 +255,7 @@ def write_run(task: Task, diagnosis: Diagnosis, out: Path) -> None:
     from .reporting.answer import to_json, write_predictions
     from .reporting.report import write_report
 
-    with whole_directory(out) as folder:
+    with whole_directory(out, task_inputs(task.file)) as folder:
         (folder / ANSWER).write_text(to_json(diagnosis), encoding="utf-8")
         write_predictions(folder / "predictions.npz", predictions(task, diagnosis.model))
         write_report(diagnosis, folder / REPORT, diagnosis.model.robot.name)
@@ -228,45 +307,6 @@ def _carrying(extended: ExtendedModel, load: Load | None) -> ExtendedModel:
     return eqx.tree_at(lambda m: m.robot.inertia, extended, inertia)
 
 
-def check_directory(out: Path) -> None:
-    """Raise `InputError` unless `out` can become a run directory: absent, empty, or an earlier run."""
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out {out}: a file stands there; name a directory")
-    if out.is_dir() and any(out.iterdir()) and not ((out / ANSWER).is_file() or (out / RESULT).is_file()):
-        raise InputError(
-            f"--out {out}: the directory holds other things than an earlier run (no {ANSWER} or {RESULT}); name another"
-        )
-    existing = next(parent for parent in out.absolute().parents if parent.exists())
-    if not existing.is_dir():
-        raise InputError(f"--out {out}: {existing} is a file, no directory can stand below it")
-
-
-@contextmanager
-def whole_directory(out: Path) -> Iterator[Path]:
-    """A new directory beside `out` that takes its place, and that of an earlier run, once the block has succeeded."""
-    out = out.absolute()
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        beside = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    except OSError as error:
-        raise InputError(f"--out {out}: cannot be written ({error.strerror})") from error
-    try:
-        new = beside / "new"
-        new.mkdir()
-        yield new
-        earlier = beside / "earlier"
-        if out.exists():
-            out.rename(earlier)
-        try:
-            new.rename(out)
-        except OSError:
-            if earlier.exists():
-                earlier.rename(out)
-            raise
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
-
-
 def _diagnosis_json(diagnosis: Diagnosis | PoseDiagnosis) -> str:
     from .results import Diagnosis
 
@@ -289,13 +329,22 @@ def _show_diagnosis(diagnosis: Diagnosis | PoseDiagnosis) -> None:
         show_calibration(diagnosis.calibration, diagnosis.verdict)
 
 
-def _identification_json(found: Identification) -> str:
+def _identification_json(found: Identification | RolloutIdentification) -> str:
+    from .rollouts.identification import RolloutIdentification
+
+    if isinstance(found, RolloutIdentification):
+        return found.to_json()
     from .identification.result import to_json
 
     return to_json(found)
 
 
-def _show_identification(found: Identification) -> None:
+def _show_identification(found: Identification | RolloutIdentification) -> None:
+    from .rollouts.identification import RolloutIdentification
+
+    if isinstance(found, RolloutIdentification):
+        print("\n".join(found.lines()))
+        return
     from .reporting.terminal import show_identification
 
     show_identification(found, found.model.robot.name)

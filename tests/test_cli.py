@@ -24,13 +24,13 @@ from figaroh_jax.effects.extended import extend
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats import export
 from figaroh_jax.formats.urdf import load_urdf
+from figaroh_jax.reporting.run_directory import MARKER, whole_directory
 from figaroh_jax.results import Diagnosis
-from figaroh_jax.runs import whole_directory
 from figaroh_jax.simulators import registry
 from figaroh_jax.simulators.native import NativeBackend
 
 DEMO = Path(str(resources.files("figaroh_jax") / "demo"))
-FILES = {"answer.json", "predictions.npz", "report.html", "model"}
+FILES = {MARKER, "answer.json", "predictions.npz", "report.html", "model"}
 
 
 @pytest.fixture
@@ -102,12 +102,10 @@ def test_json_prints_the_answer_and_nothing_else(made_up: Diagnosis, capsys: pyt
 
 
 def test_an_earlier_run_is_replaced_as_a_whole(made_up: Diagnosis, tmp_path: Path):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "answer.json").write_text("{}")
-    (out / "stale.txt").write_text("from an earlier version")
+    with whole_directory(tmp_path / "out") as folder:
+        (folder / "stale.txt").write_text("from an earlier version")
     assert _diagnose("--out", "out") == 0
-    assert {path.name for path in out.iterdir()} == FILES
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
 
 
 def test_a_directory_with_other_things_is_refused_and_left_alone(made_up: Diagnosis, tmp_path: Path, capsys):
@@ -197,7 +195,7 @@ def test_an_interrupted_block_leaves_nothing(tmp_path: Path):
 
 def test_a_directory_that_cannot_be_made_is_wrong_input(tmp_path: Path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be written"), whole_directory(tmp_path / "file" / "out"):
+    with pytest.raises(InputError, match="is a file"), whole_directory(tmp_path / "file" / "out"):
         pass
 
 

@@ -9,7 +9,7 @@ import pytest
 from figaroh_jax.effects.catalogue import CATALOGUE
 from figaroh_jax.effects.kinematic import CATALOGUE as KINEMATIC
 
-OWN = {name: effect for name, effect in CATALOGUE.items() if effect.__module__ == "figaroh_jax.effects.catalogue"}
+OWN = {name: effect for name, effect in CATALOGUE.items() if effect.__module__.startswith("figaroh_jax.effects.")}
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "effects.md").read_text("utf-8")
 
 

@@ -50,6 +50,16 @@ PARAMETERS = {  # of each effect, none of them a default
     "torque_delay": {"delay": 0.005},
     "torque_lag": {"time": 0.008},
     "joint_elasticity": {"compliance": 2e-4},
+    "friction_drift": {"force": 1.1, "damping": 0.4, "time": 3.0},
+    "presliding": {"force": 2.0, "distance": 0.02},
+    "torque_saturation": {"share": 1.0, "limit": 1.7},
+    "contact": {"stiffness": 300.0, "height": 0.4, "x": 0.1, "y": -0.2, "z": 0.3},
+    "external_wrench": {"force_x": 7.0, "force_y": -5.0, "force_z": 4.0, "x": 0.1, "y": -0.2, "z": 0.3},
+    "clock_error": {"rate": 2e-3},
+    "encoder_offset": {"offset": 0.03},
+    "encoder_scale": {"scale": -0.01},
+    "encoder_eccentricity": {"sine": 0.004, "cosine": -0.003},
+    "backlash": {"width": 2e-3},
 }
 AT = {"joint": ["bend"], "pair": ["turn", "bend"], "link": ["b"], "robot": []}
 
@@ -90,6 +100,33 @@ def rigid_change(motion: Motion, inertia: np.ndarray | float = 0.0, gravity: np.
     return reference.inverse_dynamics(changed, *state) - reference.inverse_dynamics(model, *state)
 
 
+def added(effect: Effect, motion: Motion) -> jax.Array:
+    """Torque that the effect adds to the drives', or to their reading."""
+    return effect.torque_error(motion) if effect.has("torque_error") else effect.torque(motion)
+
+
+def bristle(v: np.ndarray, distance: float) -> np.ndarray:
+    """z' = (v / distance)(1 - z s(v)), each sample's velocity held over it, sliding at the first; by steps of Euler."""
+    z, out, parts = np.sign(v[0]), [], 4000
+    for k, speed in enumerate(v):
+        for _ in range(parts if k else 0):
+            z += DT / parts * speed / distance * (1 - z * np.sign(speed))
+        out.append(z)
+    return np.array(out)
+
+
+def pressed(motion: Motion, p: dict[str, float], force: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """-J'f of a force at a point of link `b`, the Jacobian by differences of Pinocchio's poses."""
+    offset, q = np.array([p["x"], p["y"], p["z"], 1.0]), np.asarray(motion.position)
+
+    def point(q: np.ndarray) -> np.ndarray:
+        return (reference.forward_kinematics(motion.model, q)[:, 1] @ offset)[:, :3]
+
+    steps = 1e-6 * np.eye(3)
+    jacobian = np.stack([(point(q + step) - point(q - step)) / 2e-6 for step in steps], axis=1)
+    return -np.einsum("sjc,sc->sj", jacobian, force(point(q)))
+
+
 def expected(name: str, motion: Motion, p: dict[str, float]) -> np.ndarray:
     """Added torque by the equations of the design, section 2.1, at joint `bend` (pair: `turn`, `bend`; link: `b`)."""
     qs, vs, accelerations, load, total = (
@@ -108,6 +145,16 @@ def expected(name: str, motion: Motion, p: dict[str, float]) -> np.ndarray:
         inertia = np.zeros((3, 10))
         inertia[1] = [p.get(key, 0.0) for key in order]
         return rigid_change(motion, inertia=inertia)
+    if name == "external_wrench":
+        constant = np.array([p["force_x"], p["force_y"], p["force_z"]])
+        return pressed(motion, p, lambda at: np.tile(constant, (len(at), 1)))
+    if name == "contact":
+        up = np.array([0.0, 0.0, p["stiffness"]])
+        return pressed(motion, p, lambda at: np.maximum(p["height"] - at[:, 2:], 0) * up)
+    if name == "clock_error":
+        rate = np.zeros_like(total)
+        rate[2:-2] = (8 * (total[3:-1] - total[1:-3]) - (total[4:] - total[:-4])) / (12 * DT)
+        return p["rate"] * np.arange(len(total))[:, None] * DT * rate
     if name == "gravity_tilt":
         return rigid_change(motion, gravity=np.array([p["x"], p["y"], 0.0]))
     equations: dict[str, Callable[[], np.ndarray]] = {
@@ -124,11 +171,15 @@ def expected(name: str, motion: Motion, p: dict[str, float]) -> np.ndarray:
         "torque_ripple": lambda: p["sine"] * np.sin(p["order"] * q) + p["cosine"] * np.cos(p["order"] * q),
         "joint_spring": lambda: p["stiffness"] * (q + p["offset"] / p["stiffness"]),
         "torque_gain": lambda: p["gain"] * total[:, 1],
+        "friction_drift": lambda: (p["force"] * s + p["damping"] * v) * np.exp(-np.arange(len(v)) * DT / p["time"]),
+        "presliding": lambda: p["force"] * (bristle(v, p["distance"]) - s),
+        "torque_saturation": lambda: np.clip(total[:, 1], -p["limit"], p["limit"]) - total[:, 1],
     }
     return equations[name]()
 
 
-TORQUES = [name for name, effect in CATALOGUE.items() if effect.has("torque") or effect.has("change")]
+TORQUES = [n for n, e in CATALOGUE.items() if e.has("torque") or e.has("change") or e.has("torque_error")]
+READ = [name for name in TORQUES if CATALOGUE[name].has("torque_error")]
 SENSORS = [name for name in PARAMETERS if name not in TORQUES]
 
 
@@ -141,9 +192,14 @@ def test_every_effect_of_the_catalogue_is_tested_here():
 def test_torque_equals_the_equation(name: str, model: RobotModel):
     motion, effect = moving(model), made(name, model)
     # |v| is rounded off below 1e-6 in the power law, so that its slope stays finite at rest
-    tolerance = 1e-9 if name == "power_law_friction" else 1e-12
+    tolerance = {"power_law_friction": 1e-9, "presliding": 1e-3, "contact": 1e-6, "external_wrench": 1e-7}.get(
+        name, 1e-12
+    )
     torque = expected(name, motion, PARAMETERS[name])
-    np.testing.assert_allclose(effect.torque(motion), torque, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(added(effect, motion), torque, rtol=0, atol=tolerance)
+    if name in READ:
+        np.testing.assert_array_equal(effect.joint_torque(motion), 0.0)
+        return
     joints = np.zeros((60, 3))
     columns = {"joint": [1], "pair": [0, 1]}.get(effect.acts_on, [0, 1, 2])
     joints[:, columns] = torque.reshape(60, -1)
@@ -158,20 +214,20 @@ def test_columns_are_the_torque_of_a_unit_of_each_amplitude(name: str, model: Ro
     assert found.shape[0] == len(linear)
     for key, column in zip(linear, found, strict=True):
         alone = dict.fromkeys(linear, 0.0) | {key: 1.0}
-        np.testing.assert_allclose(column, made(name, model, **alone).torque(motion), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(column, added(made(name, model, **alone), motion), rtol=0, atol=1e-9)
     amplitudes = np.array([PARAMETERS[name].get(key, 0.0) for key in linear])
-    np.testing.assert_allclose(np.tensordot(amplitudes, found, 1), effect.torque(motion), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(np.tensordot(amplitudes, found, 1), added(effect, motion), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", TORQUES)
 def test_gradient_equals_finite_differences_in_every_parameter(name: str, model: RobotModel):
     motion, effect = moving(model), made(name, model)
     continuous = [key for key, parameter in effect.parameters().items() if not parameter.choice]
-    weight = jnp.cos(jnp.arange(effect.torque(motion).size) + 0.5)
+    weight = jnp.cos(jnp.arange(added(effect, motion).size) + 0.5)
 
     def work(values: jax.Array) -> jax.Array:
         changed = eqx.tree_at(lambda e: [getattr(e, key) for key in continuous], effect, list(values))
-        return weight @ changed.torque(motion).ravel()
+        return weight @ added(changed, motion).ravel()
 
     work = jax.jit(work)
     at = np.array([float(getattr(effect, key)) for key in continuous])
@@ -196,7 +252,7 @@ def test_gradients_stay_finite_at_rest(model: RobotModel):
     still = eqx.tree_at(lambda m: (m.velocity, m.acceleration), motion, (jnp.zeros((60, 3)), jnp.zeros((60, 3))))
     for name in TORQUES:
         effect = made(name, model)
-        slope = jax.grad(lambda e: e.torque(still).sum(), allow_int=True)(effect)
+        slope = jax.grad(lambda e: added(e, still).sum(), allow_int=True)(effect)
         values = [float(getattr(slope, key)) for key in effect.parameters()]
         assert np.isfinite(values).all(), name
 
@@ -205,6 +261,68 @@ def test_elasticity_winds_up_with_the_load(model: RobotModel):
     motion = moving(model)
     error = made("joint_elasticity", model).position_error(motion)
     np.testing.assert_allclose(error, 2e-4 * np.asarray(motion.load)[:, 1], rtol=0, atol=1e-15)
+
+
+def test_encoders_and_play_read_their_errors(model: RobotModel):
+    motion = moving(model)
+    q, load = np.asarray(motion.position)[:, 1], np.asarray(motion.load)[:, 1]
+    errors = {
+        "encoder_offset": np.full(60, 0.03),
+        "encoder_scale": -0.01 * q,
+        "encoder_eccentricity": 0.004 * np.sin(q) - 0.003 * np.cos(q),
+    }
+    for name, error in errors.items():
+        np.testing.assert_allclose(made(name, model).position_error(motion), error, rtol=0, atol=1e-15)
+    side = np.asarray(made("backlash", model).position_error(motion)) / 1e-3
+    rate = np.zeros(60)
+    rate[2:-2] = (8 * (load[3:-1] - load[1:-3]) - (load[4:] - load[:-4])) / (12 * DT)
+    crossed = abs(load) > abs(rate) * 0.005  # on one side of the play for the whole 10 ms that it takes to cross it
+    np.testing.assert_allclose(side[crossed], np.sign(load)[crossed], rtol=0, atol=1e-9)
+    assert np.all(abs(side) <= 1) and 5 < crossed.sum() < 60
+
+
+def test_states_and_clocks_begin_anew_with_each_recording(model: RobotModel):
+    """Two recordings one after another in a record give what each of them gives alone."""
+    motion, half = moving(model), slice(0, 30)
+    twice = eqx.tree_at(lambda m: m.time, motion, jnp.tile(motion.time[half], 2))
+    alone = [
+        jax.tree.map(lambda x, i=i: x[i] if np.ndim(x) and len(x) == 60 else x, motion) for i in (half, slice(30, 60))
+    ]
+    alone = [eqx.tree_at(lambda m: m.time, one, motion.time[half]) for one in alone]
+    for name in ("presliding", "clock_error", "friction_drift"):
+        effect = made(name, model)
+        parts = [added(effect, one) for one in alone]
+        np.testing.assert_allclose(added(effect, twice), jnp.concatenate(parts), rtol=0, atol=1e-12)
+
+
+def test_a_bristle_takes_the_steps_of_a_simulation_as_it_follows_a_record(model: RobotModel):
+    effect = made("presliding", model)
+    motion = moving(model)
+    z = np.asarray(effect.torque(motion)) / 2.0 + np.asarray(motion.direction)[:, 1]
+    here = eqx.tree_at(lambda e: e.memory, effect, jnp.asarray(z[0]), is_leaf=lambda x: x is None)
+    for k in range(1, 20):
+        here = here.step(motion.velocity[k], DT)
+        np.testing.assert_allclose(here.memory, z[k], rtol=0, atol=1e-12)
+
+
+def test_what_the_ladder_of_load_friction_adds(model: RobotModel):
+    motion = moving(model)
+    v, a, load = (np.asarray(x)[:, 1] for x in (motion.velocity, motion.acceleration, motion.load))
+    s = sign(v, a)
+    both = place(find("directional_load_friction"), model, ["bend"], driving=0.2, driven=0.2)
+    np.testing.assert_allclose(both.torque(motion), 0.2 * abs(load) * s, rtol=0, atol=1e-12)
+    one = place(find("directional_load_friction"), model, ["bend"], driving=0.2, driven=0.05)
+    clear = abs(s) == 1
+    share = np.where(load * v > 0, 0.2, 0.05)
+    np.testing.assert_allclose(
+        np.asarray(one.torque(motion))[clear], (share * abs(load) * s)[clear], rtol=0, atol=1e-12
+    )
+    slow = place(find("load_dependent_stribeck_friction"), model, ["bend"], ratio=0.3, speed=0.2)
+    np.testing.assert_allclose(slow.torque(motion), 0.3 * abs(load) * np.exp(-((v / 0.2) ** 2)) * s, rtol=0, atol=1e-12)
+    lugre = place(find("lugre_friction"), model, ["bend"], force=2.0, distance=1e-5, rise=0.5, speed=0.2)
+    sliding = abs(v) > 0.1  # a bristle of no length slides at once: Stribeck's curve
+    level = 2.0 * (1 + 0.5 * np.exp(-((v / 0.2) ** 2))) * np.sign(v) - 2.0 * s
+    np.testing.assert_allclose(np.asarray(lugre.torque(motion))[sliding][1:], level[sliding][1:], rtol=0, atol=1e-6)
 
 
 def test_delay_and_lag_respond_as_their_transfer_functions(model: RobotModel):

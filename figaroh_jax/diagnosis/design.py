@@ -1,7 +1,8 @@
 """From motion to rows: what a unit of every candidate adds, and exact predictions of what the sensors read.
 
-Three kinds of effect act in three ways. `columns`: torque linear in its amplitudes is added. `position`: the true
-position is the measured one less the sensor's error, so the rigid body moves otherwise. `response`: the torque sensor
+Three kinds of effect act in three ways. `columns`: torque linear in its amplitudes is added or read; that of a position
+sensor whose error is linear in them too, which is small, to first order. `position`: the true position is the measured
+one less an error that is not linear in its parameter, so the rigid body moves otherwise. `response`: the torque sensor
 filters the torque of the whole model, all columns alike.
 
 JAX evaluates the equations, many effects in one program; samples, shifts and filters stay on the host in NumPy.
@@ -22,13 +23,14 @@ from ..compiled.executable_cache import Program
 from ..effects.base import Effect, Motion, columns
 from ..recordings.stacked import Records, filter_rows
 from ..rigid.model import RobotModel
-from .shifts import links_torque, torque_change
+from .shifts import links_torque, shift_torques, torque_change
 
 __all__ = [
     "Units",
     "candidates",
     "flattened",
     "kind",
+    "local",
     "sensor_response",
     "shapes",
     "unit_rows",
@@ -52,7 +54,7 @@ class Units(NamedTuple):
 
 def kind(effect: Effect | type[Effect]) -> Literal["columns", "position", "response"]:
     """How the effect acts on the rows."""
-    if effect.has("position_error"):
+    if effect.has("position_error") and shapes(effect if isinstance(effect, type) else type(effect)):
         return "position"
     return "response" if effect.has("torque_response") else "columns"
 
@@ -80,9 +82,10 @@ def units(batches: Mapping[str, Effect], motion: Motion, records: Records) -> di
     factors = sensor_response(responses, np.asarray(records.omega))
     everywhere, out = np.arange(np.shape(motion.velocity)[1]), {}
     for name, batch in batches.items():
-        own = batch.acts_on in ("joint", "pair") and _way(batch) == "torque"
-        joints = np.asarray(batch.at) if own else np.tile(everywhere, (len(batch.at), 1))
-        if name in torques:
+        joints = np.asarray(batch.at) if local(batch) else np.tile(everywhere, (len(batch.at), 1))
+        if _way(batch) == "shift":
+            out[name] = Units(shift_torques(batch, motion, records), joints)
+        elif name in torques:
             torque = np.asarray(torques[name])
             out[name] = Units(np.moveaxis(torque.reshape(*torque.shape[:3], -1), 2, 3), joints)
         elif name in factors:
@@ -122,16 +125,23 @@ def sensor_response(
     return {name: np.asarray(x) for name, x in _responses(dict(batches), omega).items()} if batches else {}
 
 
-def candidates(effect: type[Effect], model: RobotModel) -> Effect:
-    """The effect at every place where it may act, on its grid: one object with leading axes (places, grid)."""
+def candidates(effect: type[Effect], model: RobotModel, motion: Motion | None = None) -> Effect:
+    """The effect at every place where it may act, on its grid: one object with leading axes (places, grid).
+
+    With the recordings' `motion` the grid may follow it (`Effect.starts`), as long at every place.
+    """
     places = _places(effect, model)
-    grids = {name: p for name, p in effect.parameters().items() if not p.linear}
-    mesh = np.meshgrid(*[np.asarray(p.grid) for p in grids.values()], indexing="ij")
-    points = max(1, int(np.prod([len(p.grid) for p in grids.values()])))
+    places = places[[effect.may_act(model, int(at[0])) if len(at) else True for at in places]]
+    own = {name: p.grid for name, p in effect.parameters().items() if not p.linear}
+    grids = [own | (effect.starts(motion, int(at[0])) if motion is not None and len(at) else {}) for at in places]
+    longest = {name: max((len(grid[name]) for grid in grids), default=1) for name in own}
+    grids = [{n: np.resize(np.asarray(g), longest[n]) for n, g in grid.items()} for grid in grids]
+    meshes = [[axis.reshape(-1) for axis in np.meshgrid(*grid.values(), indexing="ij")] for grid in grids]
+    points = int(np.prod([*longest.values(), 1]))
     at = np.broadcast_to(places[:, None], (len(places), points, places.shape[1]))
     values = {name: np.zeros(at.shape[:2]) for name in effect.parameters()}
-    for name, grid in zip(grids, mesh, strict=True):
-        values[name] = np.broadcast_to(grid.reshape(1, -1), at.shape[:2])
+    for k, name in enumerate(own):
+        values[name] = np.stack([mesh[k] for mesh in meshes]) if meshes else values[name]
     return effect(at, **values)
 
 
@@ -150,11 +160,20 @@ def _places(effect: type[Effect], model: RobotModel) -> np.ndarray:
     return np.array(sorted(neighbours), dtype=int).reshape(-1, 2)
 
 
-def _way(effect: Effect | type[Effect]) -> Literal["torque", "change", "position", "response"]:
+def local(effect: Effect) -> bool:
+    """Whether its torque stands in the rows of its own joints alone."""
+    return effect.acts_on in ("joint", "pair") and _way(effect) == "torque"
+
+
+def _way(effect: Effect | type[Effect]) -> Literal["torque", "change", "shift", "position", "response"]:
     """Where the torque comes from: an equation of its own, or the rigid body with another model or motion."""
     way = kind(effect)
     if way != "columns":
         return way
+    if effect.has("position_error"):
+        return "shift"
+    if effect.has("torque_error"):
+        return "torque"
     return "change" if effect.has("change") and not effect.has("torque") else "torque"
 
 

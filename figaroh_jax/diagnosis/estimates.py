@@ -7,12 +7,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..effects.base import Effect, joint_unit
+from ..effects.base import Effect, Motion, joint_unit
 from ..effects.extended import ExtendedModel, extend
 from ..recordings.stacked import filtered_rows
 from ..results import Estimate
 from ..rigid.model import RobotModel, prismatic
-from .design import kind, sensor_response, shapes, units_and_slopes, with_shape
+from .design import kind, local, sensor_response, shapes, units_and_slopes, with_shape
 from .problem import Problem
 from .shifts import torque_change
 from .state import BATCH, State
@@ -103,6 +103,18 @@ def fitted_model(problem: Problem, state: State, causes: list[Effect]) -> Extend
     return extend(robot, *effects, *with_amplitudes(state, causes, problem.model), width=problem.width)
 
 
+def _without(state: State, effect: Effect) -> Motion:
+    """The motion with the total torque that the effect follows: that of the model without it."""
+    motion = state.motion
+    if effect.follows_torque:
+        shares = list(state.shares(state.theta))[1:]
+        own = [
+            s for s, t in zip(shares, state.terms, strict=True) if t.name == effect.name and (t.at == effect.at).all()
+        ]
+        motion = eqx.tree_at(lambda m: m.total, motion, motion.total - sum(own, np.zeros_like(motion.total)))
+    return motion
+
+
 def torque_slope(
     problem: Problem, state: State, effect: Effect, name: str, whitening: Float[np.ndarray, "F nv"]
 ) -> Float[np.ndarray, "nv T"]:
@@ -112,11 +124,10 @@ def torque_slope(
     if kind(effect) == "columns":
         batch = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], BATCH, axis=0), effect)
         values = np.stack([getattr(batch, n) for n in names], axis=1)
-        slope = units_and_slopes(batch, values, state.motion)[1][0, names.index(name)]
+        slope = units_and_slopes(batch, values, _without(state, effect))[1][0, names.index(name)]
         amplitudes = [float(getattr(effect, n)) for n, p in effect.parameters().items() if p.linear]
         torque = np.zeros((slope.shape[-1], problem.model.nv))
-        own = effect.acts_on in ("joint", "pair")
-        torque[:, np.asarray(effect.at) if own else slice(None)] = np.tensordot(amplitudes, slope, 1).T
+        torque[:, np.asarray(effect.at) if local(effect) else slice(None)] = np.tensordot(amplitudes, slope, 1).T
         return filtered_rows(problem.records, torque, response)
     h = STEP * max(abs(size), STEP)
     sides = jax.tree.map(lambda *x: np.stack(x), *(with_shape(effect, [name], [size + s * h]) for s in (1, -1)))

@@ -7,7 +7,7 @@ parameter, J(p) = D'D - 2 D'r - D'X A^-1 X'D with the exact change D(p) of the t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +16,7 @@ from jaxtyping import Complex, Float
 
 from ..effects.base import Effect, Motion
 from ..recordings.stacked import Records
-from .design import Units, shapes, unit_rows, units_and_slopes, with_shape
+from .design import Units, local, shapes, unit_rows, units_and_slopes, with_shape
 from .shifts import links_torque, torque_change
 
 __all__ = ["Whitened", "bounded_minimum", "profile", "refit", "refit_shift", "shift_profile"]
@@ -80,15 +80,17 @@ def profile(
 
 
 def refit(
-    effects: Effect, motion: Motion, records: Records, whitened: Whitened
+    effects: Effect, motion: Motion, records: Records, whitened: Whitened, grid: Effect | None = None
 ) -> tuple[Effect, Float[np.ndarray, "k rows n M"]]:
     """Best shape over the starts (leading axis of `effects`), each between its neighbours on the grid; its columns.
 
+    The `grid` is that of the place where it is not the parameters' own.
     All starts are one box problem: the sum of their profiles, whose gradient is that of each.
     """
     names = shapes(type(effects))
     start = np.stack([np.asarray(getattr(effects, name)) for name in names], axis=-1)
-    box = np.stack([_box(effects.parameters()[n], x) for n, x in zip(names, start.T, strict=True)], axis=-1)
+    points = {n: p.grid if grid is None else np.unique(getattr(grid, n)) for n, p in effects.parameters().items()}
+    box = np.stack([_box(effects.parameters()[n], x, points[n]) for n, x in zip(names, start.T, strict=True)], axis=-1)
     low, width = box[:, 0], box[:, 1] - box[:, 0]
     device_effects, device_motion = jax.device_put((effects, motion))
     scale, known = 1.0, {}
@@ -152,8 +154,7 @@ def _profiles(
     """Profile, gradient and columns of several starts at one place, each its own effect with its own shape."""
     torque, slope = units_and_slopes(effects, values, motion)
     starts, p, k = slope.shape[:3]
-    own = effects.acts_on in ("joint", "pair")
-    joints = np.asarray(effects.at) if own else np.tile(np.arange(len(whitened.residual)), (starts, 1))
+    joints = np.asarray(effects.at) if local(effects) else np.tile(np.arange(len(whitened.residual)), (starts, 1))
     both = np.concatenate([torque[:, None], slope], axis=1).reshape(starts, (1 + p) * k, *torque.shape[2:])
     rows = unit_rows(Units(both, joints), records, whitened.whitening)
     rows = rows.reshape(starts, 1 + p, k, *rows.shape[2:])
@@ -161,9 +162,11 @@ def _profiles(
     return {"value": value, "slope": gradient, "Z": rows[:, 0]}
 
 
-def _box(parameter: Any, starts: Float[np.ndarray, " starts"]) -> Float[np.ndarray, "starts 2"]:
+def _box(
+    parameter: Any, starts: Float[np.ndarray, " starts"], points: Sequence[float] | Float[np.ndarray, " points"]
+) -> Float[np.ndarray, "starts 2"]:
     """Neighbouring grid points of each start; the outermost reach to the parameter's bounds."""
-    grid = np.array([parameter.lower, *sorted(parameter.grid), parameter.upper])
+    grid = np.array([parameter.lower, *sorted(points), parameter.upper])
     place = np.array([np.argmin(np.abs(grid[1:-1] - x)) + 1 for x in starts])
     low, high = grid[place - 1], grid[place + 1]
     if parameter.hole:

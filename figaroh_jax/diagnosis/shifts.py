@@ -5,10 +5,11 @@ JAX evaluates inverse dynamics, many samples in one program; the equations of th
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -18,10 +19,12 @@ from ..recordings.stacked import Records
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.model import Leaf, RobotModel
 
-__all__ = ["difference", "links_torque", "rigid_torque", "shifted", "torque_change"]
+__all__ = ["difference", "links_torque", "rigid_torque", "shift_torques", "shifted", "torque_change"]
 
 TURNS = 3  # of Newton's method for the true motion
 ENDS, TINY = 6, 1e-6  # samples whose derivatives are held; what makes them zero
+EVERY = 4  # samples between which derivatives of the torque are straight
+ROUNDING = 1e-9  # of the largest derivative of the torque
 STEP = 1e-4  # of central differences, rad, rad/s or rad/s2 (m for rad)
 
 
@@ -187,6 +190,76 @@ def torque_change(
         as_read = links_torque(motion.model, motion.position, motion.velocity, motion.acceleration, records)
     true = shifted(effects, motion, records, turns)
     return links_torque(motion.model, true.position, true.velocity, true.acceleration, records) - as_read
+
+
+def shift_torques(effects: Effect, motion: Motion, records: Records) -> Float[np.ndarray, "effects k nv nN"]:
+    """Torque of a unit of each amplitude of position sensors whose errors are linear in them, to first order.
+
+    With errors e of joint j it is -(K_j e + D_j e' + M_j e''), the derivatives of inverse dynamics in the position, the
+    velocity and the acceleration of the joint: the same for all sensors.
+    """
+    names = [name for name, p in effects.parameters().items() if p.linear]
+    errors = np.asarray(_unit_errors(effects, motion))
+    errors = errors.reshape(len(effects.at), len(names), *records.position.shape[:2])
+    rates = difference(errors, float(records.dt))
+    pushes = difference(rates, float(records.dt))
+    loads = _load_slopes(motion, records)
+    out = np.empty((*errors.shape[:2], loads.shape[2], loads.shape[3]))
+    for one, joint in enumerate(np.asarray(effects.at)[:, 0].tolist()):
+        parts = (x[one].reshape(len(names), 1, -1) for x in (errors, rates, pushes))
+        out[one] = -sum(slope[joint] * part for slope, part in zip(loads, parts, strict=True))
+    # a joint whose position shows in no torque has columns of rounding alone
+    out[np.abs(out).max((2, 3)) < ROUNDING * np.abs(loads).max()] = 0.0
+    return out
+
+
+_SLOPES: list[tuple[Any, np.ndarray, np.ndarray]] = []  # the last ones: all sensors of a motion share them
+
+
+def _load_slopes(motion: Motion, records: Records) -> Float[np.ndarray, "3 nv nv nN"]:
+    """Derivatives of the links' torque by position, velocity and acceleration of each joint (second axis).
+
+    By central differences at every few samples (the motion is low-passed far below their rate), straight between.
+    """
+    inertia = np.asarray(motion.model.inertia)
+    if not any(position is motion.position and np.array_equal(known, inertia) for position, known, _ in _SLOPES):
+        n, samples, _, nv = records.shape
+        at = np.append(np.arange(0, samples - 1, EVERY), samples - 1)
+        few = [np.asarray(x).reshape(n, samples, nv)[:, at].reshape(-1, nv) for x in _state(motion)]
+        slopes = np.stack([_one_slopes(motion.model, few, one) for one in range(3)])  # (3, nv, n few, nv)
+        slopes = np.moveaxis(slopes.reshape(3, nv, n, len(at), nv), 4, 2)
+        low = np.minimum(np.arange(samples) // EVERY, len(at) - 2)
+        share = (np.arange(samples) - at[low]) / (at[low + 1] - at[low])
+        full = slopes[..., low] * (1 - share) + slopes[..., low + 1] * share
+        _SLOPES[:] = [(motion.position, inertia, full.reshape(3, nv, nv, -1))]
+    return _SLOPES[0][2]
+
+
+def _state(motion: Motion) -> tuple[Any, Any, Any]:
+    return motion.position, motion.velocity, motion.acceleration
+
+
+def _one_slopes(model: RobotModel, state: list[np.ndarray], one: int) -> Float[np.ndarray, "nv few nv"]:
+    """Derivative of the torque in the position, velocity or acceleration (`one`) of each joint."""
+    out = []
+    for joint in range(state[0].shape[1]):
+        sides = []
+        for step in (STEP, -STEP):
+            moved = [x.copy() if k == one else x for k, x in enumerate(state)]
+            moved[one][:, joint] += step
+            sides.append(rigid_torque(model, *moved))
+        out.append((sides[0] - sides[1]) / (2 * STEP))
+    return np.stack(out)
+
+
+@Program
+def _unit_errors(effects: Effect, motion: Motion) -> Float[Array, "effects k nN"]:
+    names = [name for name, p in effects.parameters().items() if p.linear]
+
+    def one(effect: Effect, unit: Array) -> Array:
+        return eqx.tree_at(lambda e: [getattr(e, n) for n in names], effect, list(unit)).position_error(motion)
+
+    return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(effects, jnp.eye(len(names)))
 
 
 @Program

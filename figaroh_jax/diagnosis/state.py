@@ -20,7 +20,7 @@ from ..estimation.priors import body_precision, rigid_prior
 from ..estimation.rows import Prior, Rows, instruments
 from ..recordings.stacked import filter_rows, filtered_rows
 from ..rigid.model import Leaf
-from .design import Units, flattened, kind, sensor_response, shapes, units, units_and_slopes
+from .design import Units, flattened, kind, local, sensor_response, shapes, units, units_and_slopes
 from .problem import Layout, Problem, family_of
 from .shifts import shifted
 
@@ -224,7 +224,7 @@ def _shaped_units(term: Effect, motion: Motion) -> Units:
         values = np.stack([getattr(part, name) for name in shapes(type(term))], axis=1)
         torques.append(units_and_slopes(part, values, motion)[0])
     everywhere = np.tile(np.arange(np.shape(motion.velocity)[1]), (count, 1))
-    joints = np.asarray(term.at) if term.acts_on in ("joint", "pair") else everywhere
+    joints = np.asarray(term.at) if local(term) else everywhere
     return Units(np.concatenate(torques)[:count], joints)
 
 

@@ -7,8 +7,11 @@ An effect has whatever forms it has. Identification, diagnosis, export and simul
 | torque that it adds at the joints | `torque` | torque-level diagnosis, inverse and forward dynamics |
 | change of the robot itself | `change` | as above; URDF and MJCF through the changed model |
 | what a position sensor reads beside the truth | `position_error` | torque-level diagnosis, simulated sensors |
+| what a torque sensor reads beside the truth | `torque_error` | torque-level diagnosis, simulated sensors |
 | what a torque sensor makes of a frequency | `torque_response` | torque-level diagnosis, simulated sensors |
-| twist on a link, step of a simulation | `twist`, `step` | pose calibration, servo rollouts |
+| what a drive makes of the torque that it is to give | `delivered` | simulation |
+| a state of its own from instant to instant | `step` | simulation; `torque` follows it along a record |
+| twist on a link | `twist` | pose calibration |
 | native elements of MJCF and URDF | `native` | export |
 
 Fields declared with `amplitude` enter linearly; fields declared with `shape` do not, and are searched between their
@@ -18,20 +21,34 @@ bounds from their grid. Torques are those of the drive: what has to be added to 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ..errors import InputError
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.model import Leaf, RobotModel
 
-__all__ = ["Effect", "Motion", "Native", "Parameter", "amplitude", "joint_unit", "place", "shape", "smooth_sign"]
+__all__ = [
+    "Effect",
+    "JointEffect",
+    "Motion",
+    "Native",
+    "Parameter",
+    "Place",
+    "amplitude",
+    "fixed",
+    "joint_unit",
+    "movable",
+    "place",
+    "shape",
+    "smooth_sign",
+]
 
 # a number; with leading axes where one object holds an effect at many places
 Scalar = Float[Leaf, "..."] | float
@@ -87,6 +104,26 @@ class Motion(eqx.Module):
                 column[joint.coordinate] = at.start
         return jnp.where(column < 0, 0.0, jnp.asarray(self.position)[:, column])
 
+    @property
+    def begins(self) -> Bool[Array, " samples"]:
+        """Whether a sample is the first of a recording; every one where the instants are no record."""
+        t = jnp.asarray(self.time)
+        return jnp.abs(jnp.diff(t, prepend=t[:1] - 2 * jnp.asarray(self.dt)) - self.dt) >= jnp.asarray(self.dt) / 2
+
+    @property
+    def elapsed(self) -> Float[Array, " samples"]:
+        """Time since the earliest sample of a record, s; the time itself where the instants are no record."""
+        t = jnp.asarray(self.time)
+        return t - jnp.where(jnp.asarray(self.dt) > 0, t.min(), 0.0)
+
+    def rate(self, signal: Float[Array, "samples *rows"]) -> Float[Array, "samples *rows"]:
+        """Time derivative of a signal, by five-point central differences; zero at the two ends of each recording."""
+        x, t, dt = jnp.asarray(signal), jnp.asarray(self.time), jnp.asarray(self.dt)
+        slope = 8 * (jnp.roll(x, -1, 0) - jnp.roll(x, 1, 0)) - (jnp.roll(x, -2, 0) - jnp.roll(x, 2, 0))
+        inside = jnp.abs(jnp.roll(t, -2) - jnp.roll(t, 2) - 4 * dt) < dt / 2
+        inside = inside.reshape(-1, *(1 for _ in x.shape[1:]))
+        return jnp.where(inside, slope / jnp.where(dt > 0, 12 * dt, 1.0), 0.0)
+
     def reversal(
         self, velocity: Float[Array, " samples"], acceleration: Float[Array, " samples"], width: Float[Array, ""]
     ) -> Float[Array, " samples"]:
@@ -94,9 +131,9 @@ class Motion(eqx.Module):
         return smooth_sign(velocity, acceleration, self.dt, width)
 
 
-def amplitude(unit: str, lower: float = -np.inf) -> Any:
-    """Declare a parameter in which the torque is linear; below `lower` the effect is not one that exists."""
-    return eqx.field(default=0.0, metadata={"parameter": Parameter(unit, True, lower)})
+def amplitude(unit: str, lower: float = -np.inf, upper: float = np.inf) -> Any:
+    """Declare a parameter in which the torque is linear; outside of its bounds the effect is not one that exists."""
+    return eqx.field(default=0.0, metadata={"parameter": Parameter(unit, True, lower, upper)})
 
 
 def shape(
@@ -115,13 +152,44 @@ def shape(
     return eqx.field(default=grid[0], metadata={"parameter": parameter})
 
 
+class Place(eqx.Module):
+    """Where an effect of a model acts, known when tracing: no leaf, so that `jax.grad` takes the model as it is.
+
+    It reads like the array of indices it stands for. An `Effect` whose `at` is an array instead can be mapped over
+    places by `jax.vmap` (`movable`).
+    """
+
+    index: tuple[int, ...] = eqx.field(static=True)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.index, np.int64 if dtype is None else dtype)
+
+    def __jax_array__(self) -> Array:
+        return jnp.asarray(np.asarray(self))
+
+    def __getitem__(self, k: Any) -> Any:
+        return self.index[k]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.index)
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """As that of an array."""
+        return (len(self.index),)
+
+
 class Effect(eqx.Module):
     """A physical effect at a place; subclass it, declare its parameters and write at least one form.
 
-    `at` holds the indices of the place: one coordinate (`joint`), two (`pair`), a tree link (`link`), none (`robot`).
+    `at` holds the indices of the place: one coordinate (`joint`), two (`pair`), a tree link (`link`), none (`robot`);
+    in a model they are static (`Place`).
     """
 
-    at: Int[Leaf, "*many places"]
+    at: Int[Leaf, "*many places"] | Place
 
     name: ClassVar[str]
     title: ClassVar[str]  # in plain words, for people
@@ -154,6 +222,18 @@ class Effect(eqx.Module):
         """What the position sensor of joint `at` reads minus the truth, rad or m."""
         raise NotImplementedError(f"{self.name} has no form at the position sensor")
 
+    def torque_error(self, motion: Motion) -> Float[Array, "samples *rows"]:
+        """What the torque sensors read beside the torque of the drives, N m or N; columns as in `torque`."""
+        raise NotImplementedError(f"{self.name} has no form at the torque sensor of a record")
+
+    def delivered(self, torque: Float[Array, " nv"]) -> Float[Array, " nv"]:
+        """What the drives give of the torques that they are to give, N m or N."""
+        return torque
+
+    def step(self, velocity: Float[Array, " nv"], dt: Float[Array, ""]) -> Effect:
+        """The effect with its state after `dt` seconds at a velocity, for effects that have a state (`memory`)."""
+        return self
+
     def torque_response(self, omega: Float[Array, " freqs"]) -> Complex[Array, " freqs"]:
         """Factor of the torque sensor at the angular frequencies `omega` (rad/s)."""
         raise NotImplementedError(f"{self.name} has no form at the torque sensor")
@@ -161,6 +241,16 @@ class Effect(eqx.Module):
     def physical(self) -> dict[str, Scalar]:
         """Parameters as they are reported; a function of the fields where those are not what an engineer reads."""
         return {name: getattr(self, name) for name in self.parameters()}
+
+    @classmethod
+    def may_act(cls, model: RobotModel, place: int) -> bool:
+        """Whether a diagnosis looks for it at a place: the index of a joint, a link or the first joint of a pair."""
+        return True
+
+    @classmethod
+    def starts(cls, motion: Motion, place: int) -> dict[str, tuple[float, ...]]:
+        """Grids of shapes that depend on the recordings: their motion, its `total` the torque as measured."""
+        return {}
 
     def shown_by(self, low: Float[np.ndarray, " nv"], high: Float[np.ndarray, " nv"]) -> bool:
         """Whether motion between the positions `low` and `high` can tell the effect from a smooth torque at all."""
@@ -188,19 +278,33 @@ class Effect(eqx.Module):
         """Whether the effect has the form, the name of one of the methods above."""
         return getattr(cls, form) is not getattr(Effect, form)
 
+    @property
+    def places(self) -> Int[Leaf, "*many places"]:
+        """`at` as an array."""
+        return np.asarray(self.at) if isinstance(self.at, Place) else self.at
+
     def here(self, signal: Float[Array, "samples nv"], place: int = 0) -> Float[Array, " samples"]:
         """Column of `signal` at the joint where the effect acts (`place` 1: the second of a pair)."""
-        if isinstance(signal, np.ndarray) and isinstance(self.at, np.ndarray):
+        if isinstance(self.at, Place) or (isinstance(signal, np.ndarray) and isinstance(self.at, np.ndarray)):
             return signal[:, self.at[place]]
         return jax.lax.dynamic_index_in_dim(signal, self.at[place], 1, keepdims=False)  # traced at once, unlike `[]`
 
     def joint_torque(self, motion: Motion) -> Float[Array, "samples nv"]:
         """`torque` in the columns of all joints, zero elsewhere."""
         torque = self.torque(motion)
-        if self.acts_on in ("link", "robot") or not self.has("torque"):
-            return torque  # a change of the robot is felt at every joint
-        columns = torque.reshape(torque.shape[0], -1)
-        return jnp.zeros_like(motion.velocity).at[:, self.at].add(columns)
+        return self.in_joints(torque, motion) if self.has("torque") else torque  # a change is felt at every joint
+
+    def in_joints(self, torque: Float[Array, "samples *rows"], motion: Motion) -> Float[Array, "samples nv"]:
+        """A torque or an error of a torque at the effect's own joints in the columns of all."""
+        if self.acts_on in ("link", "robot"):
+            return torque
+        return jnp.zeros_like(motion.velocity).at[:, self.places].add(torque.reshape(torque.shape[0], -1))
+
+
+class JointEffect(Effect):
+    """An effect at one joint."""
+
+    acts_on = "joint"
 
 
 def smooth_sign(
@@ -234,6 +338,18 @@ def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **par
     return effect(indices, **{name: np.float64(value) for name, value in parameters.items()})
 
 
+def fixed(effect: Effect) -> Effect:
+    """The effect with its place static, where it stands at one known place."""
+    if isinstance(effect.at, (Place, jax.core.Tracer)) or np.ndim(effect.at) != 1:
+        return effect
+    return eqx.tree_at(lambda e: e.at, effect, Place(tuple(np.asarray(effect.at).tolist())))
+
+
+def movable(effect: Effect) -> Effect:
+    """The effect with its place an array: programs then serve every place, and `jax.vmap` maps over places."""
+    return eqx.tree_at(lambda e: e.at, effect, effect.places) if isinstance(effect.at, Place) else effect
+
+
 def joint_unit(unit: str, prismatic: bool) -> str:
     """The unit at a prismatic joint: N for N m, m for rad."""
     return unit.replace("N m", "N").replace("rad", "m") if prismatic else unit
@@ -247,11 +363,12 @@ def zeros_like(effect: Effect) -> Effect:
 
 
 def columns(effect: Effect, motion: Motion) -> Float[Array, "amplitudes samples *rows"]:
-    """Torque of a unit of each amplitude: the exact columns of the regressor, for the given shape."""
+    """Torque (read or added) of a unit of each amplitude: the exact columns of the regressor, for the given shape."""
     names = [name for name, parameter in effect.parameters().items() if parameter.linear]
 
     def torque(values: Float[Array, " amplitudes"]) -> Float[Array, "samples *rows"]:
-        return eqx.tree_at(lambda e: [getattr(e, n) for n in names], effect, list(values)).torque(motion)
+        one = eqx.tree_at(lambda e: [getattr(e, n) for n in names], effect, list(values))
+        return one.torque_error(motion) if one.has("torque_error") else one.torque(motion)
 
     # linear and zero at zero, so the torque of a unit is the derivative, with half the work to trace
     if len(names) == 1:

@@ -17,12 +17,13 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from ..compiled.precision import in_float64
 from ..errors import InputError
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.kinematics import states
 from ..rigid.model import RobotModel
-from .base import Motion
-from .extended import ExtendedModel, changed_robot, read_position, read_torque, require_single_axes, with_torque
+from .base import Effect, Motion
+from .extended import ExtendedModel, changed_robot, opened, read_position, read_torque, require_single_axes, with_torque
 
 __all__ = ["Command", "Simulation", "simulate"]
 
@@ -44,6 +45,7 @@ class Simulation(eqx.Module):
     torque_read: Float[Array, "steps nv"]  # with the response of the torque sensors
 
 
+@in_float64
 def simulate(
     extended: ExtendedModel,
     command: Float[ArrayLike, "steps nv"] | Command,
@@ -63,18 +65,17 @@ def simulate(
     freedom are not simulated.
     """
     require_single_axes(extended.robot, "a simulation")
-    with jax.enable_x64(True):
-        q, v = states(extended.robot, position=position, velocity=velocity)
-        if q.ndim != 1:
-            raise InputError(f"position has shape {q.shape}; a simulation starts from one state, map it over several")
-        if callable(command):
-            if steps is None:
-                raise InputError("a command that is a function needs the number of steps")
-            return _simulate(extended, command, jnp.zeros((steps, q.size)), q, v, jnp.float64(dt))
-        torque = states(extended.robot, command=command)[0]
-        if torque.ndim != 2 or (steps is not None and torque.shape[0] < steps):
-            raise InputError(f"command has shape {torque.shape}; one row of torques for each step is needed")
-        return _simulate(extended, None, torque[:steps], q, v, jnp.float64(dt))
+    q, v = states(extended.robot, position=position, velocity=velocity)
+    if q.ndim != 1:
+        raise InputError(f"position has shape {q.shape}; a simulation starts from one state, map it over several")
+    if callable(command):
+        if steps is None:
+            raise InputError("a command that is a function needs the number of steps")
+        return _simulate(opened(extended), command, jnp.zeros((steps, q.size)), q, v, jnp.float64(dt))
+    torque = states(extended.robot, command=command)[0]
+    if torque.ndim != 2 or (steps is not None and torque.shape[0] < steps):
+        raise InputError(f"command has shape {torque.shape}; one row of torques for each step is needed")
+    return _simulate(opened(extended), None, torque[:steps], q, v, jnp.float64(dt))
 
 
 @eqx.filter_jit
@@ -87,23 +88,32 @@ def _simulate(
     def advance(
         state: tuple[Array, Array, Array], step: tuple[Array, Array]
     ) -> tuple[tuple[Array, Array, Array], tuple[Array, ...]]:
-        q, v, a = state
+        q, v, a, memory = state
         tau = step[1] if command is None else jnp.asarray(command(step[0], q, v), jnp.float64)
-        after = _step(extended, robot, step[0], q, v, a, tau, dt)
+        for effect in extended.effects:
+            tau = effect.delivered(tau)
+        here = dataclasses.replace(extended, effects=_remembering(extended.effects, memory))
+        after = _step(here, robot, step[0], q, v, a, tau, dt)
+        memory = [e.step(after, dt).memory for e in here.effects if e.has("step")]
         a = (after - v) / dt
-        return (q + dt * after, after, a), (q, v, a, tau)
+        return (q + dt * after, after, a, memory), (q, v, a, tau)
 
-    _, (qs, vs, accelerations, taus) = jax.lax.scan(advance, (q, v, jnp.zeros_like(v)), (time, record))
-    seen = _position_read(extended, robot, time, qs, vs, accelerations, dt), read_torque(extended.effects, taus, dt)
+    start = (q, v, jnp.zeros_like(v), [jnp.sign(v[e.at[0]]) for e in extended.effects if e.has("step")])
+    _, (qs, vs, accelerations, taus) = jax.lax.scan(advance, start, (time, record))
+    load = jnp.zeros_like(qs) if not _reads(extended) else inverse_dynamics(robot, qs, vs, accelerations)
+    motion = Motion(robot, time, qs, vs, accelerations, load, taus, dt, jnp.asarray(extended.width))
+    seen = read_position(extended.effects, motion), read_torque(extended.effects, motion)
     return Simulation(time, qs, vs, accelerations, taus, *seen)
 
 
-def _position_read(extended: ExtendedModel, robot: RobotModel, time: Array, *record: Array) -> Array:
-    q, v, a, dt = record
-    if not any(effect.has("position_error") for effect in extended.effects):
-        return q
-    load = inverse_dynamics(robot, q, v, a)
-    return read_position(extended.effects, Motion(robot, time, q, v, a, load, load, dt, jnp.asarray(extended.width)))
+def _reads(extended: ExtendedModel) -> bool:
+    return any(effect.has("position_error") or effect.has("torque_error") for effect in extended.effects)
+
+
+def _remembering(effects: tuple[Effect, ...], memory: list[Array]) -> tuple[Effect, ...]:
+    """The effects with the states of those that have one."""
+    states = iter(memory)
+    return tuple(dataclasses.replace(e, memory=next(states)) if e.has("step") else e for e in effects)  # pyright: ignore
 
 
 def _step(
@@ -185,7 +195,7 @@ def _apart(extended: ExtendedModel, motion: _Reversal) -> tuple[_Friction, Float
             size = jnp.max(jnp.abs(jump))
             rows.append((jump / jnp.where(size > 0, size, 1.0))[None])
             levels.append(size[None])
-            widths.append(width[effect.at].mean()[None])
+            widths.append(width[effect.places].mean()[None])
     return _Friction(jnp.concatenate(rows), jnp.concatenate(levels), jnp.concatenate(widths), drive), smooth
 
 

@@ -34,6 +34,16 @@ EFFECTS = (
     "torque_gain",
     "torque_delay",
     "joint_elasticity",
+    "presliding",
+    "friction_drift",
+    "torque_saturation",
+    "contact",
+    "external_wrench",
+    "clock_error",
+    "encoder_offset",
+    "encoder_scale",
+    "encoder_eccentricity",
+    "backlash",
 )
 FOREIGN = outside.FOREIGN
 

@@ -1,0 +1,101 @@
+"""What acts on the robot from outside: the direction of gravity, a force at a link, a floor."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..rigid.kinematics import axis_twists, forward_kinematics, gather, movers, pose_columns
+from ..rigid.model import RobotModel
+from .base import Effect, Motion, Scalar, amplitude, shape
+from .registry import register
+
+__all__ = ["Contact", "ExternalWrench", "GravityTilt", "PointEffect"]
+
+
+@register
+class GravityTilt(Effect):
+    """A base that is not level: gravity in the base frame has a horizontal part."""
+
+    name, title, acts_on = "gravity_tilt", "tilt of the base", "robot"
+    equation = "tau(gravity + (x, y, 0)) - tau(gravity)"
+    separated_by = "a full turn of the first joint with the arm stretched, or a level on the base"
+    x: Scalar = amplitude("m/s2")
+    y: Scalar = amplitude("m/s2")
+
+    def change(self, model: RobotModel) -> RobotModel:
+        tilted = model.gravity + jnp.stack([jnp.asarray(self.x), jnp.asarray(self.y), jnp.zeros(())])
+        return eqx.tree_at(lambda m: m.gravity, model, tilted)
+
+    def physical(self) -> dict[str, Scalar]:
+        return {"about_x": -self.y / 9.81, "about_y": self.x / 9.81}
+
+    @classmethod
+    def units(cls) -> dict[str, str]:
+        return {"about_x": "rad", "about_y": "rad"}
+
+
+class PointEffect(Effect):
+    """A force on a point of a link, fixed in the link's joint frame (m)."""
+
+    acts_on = "link"
+
+    @classmethod
+    def may_act(cls, model: RobotModel, place: int) -> bool:
+        return all(joint.parent != place for joint in model.joints)  # a link at the end of the tree
+
+    def point(self, motion: Motion, offset: Array) -> tuple[Float[Array, "3 samples"], Float[Array, "nv 3 samples"]]:
+        """The point `offset` of the link in the world, and the Jacobian of its position."""
+        model, link = motion.model, self.at[0]
+        poses = pose_columns(model, jnp.asarray(motion.position).T)
+        own = poses[link]
+        at = own[0] + jnp.tensordot(offset, own[1:], 1)
+        linear = axis_twists(model, poses, at)[0] * jnp.asarray(movers(model))[:, link, None, None]
+        return at, gather(model, linear)
+
+
+@register
+class ExternalWrench(PointEffect):
+    """A constant force on the last link: a cable, a hose, somebody who pulls."""
+
+    name, title = "external_wrench", "a constant force from outside"
+    equation = "-J(q)' (force_x, force_y, force_z) at the point (x, y, z) of the link"
+    separated_by = "the same motion with {at} free, or with the base turned"
+    force_x: Scalar = amplitude("N")
+    force_y: Scalar = amplitude("N")
+    force_z: Scalar = amplitude("N")
+    x: Scalar = shape("m", (0.0,), (-0.6, 0.6))
+    y: Scalar = shape("m", (0.0,), (-0.6, 0.6))
+    z: Scalar = shape("m", (0.0,), (-0.6, 0.6))
+
+    def torque(self, motion: Motion) -> Float[Array, "samples nv"]:
+        force = jnp.stack([jnp.asarray(f) for f in (self.force_x, self.force_y, self.force_z)])
+        jacobian = self.point(motion, jnp.stack([jnp.asarray(c) for c in (self.x, self.y, self.z)]))[1]
+        return -jnp.einsum("jcs,c->sj", jacobian, force)
+
+
+@register
+class Contact(PointEffect):
+    """A floor or a table that the last link presses on: a spring below a height, without friction."""
+
+    name, title = "contact", "contact with a horizontal plane"
+    equation = "-J_z(q)' stiffness max(0, height - z(q)) at the point (x, y, z) of the link"
+    separated_by = "the same motion of {at} farther away from the plane"
+    stiffness: Scalar = amplitude("N/m", lower=0.0)
+    height: Scalar = shape("m", (0.0, 0.2, 0.5, 1.0), (-10.0, 10.0))
+    x: Scalar = shape("m", (0.0,), (-0.6, 0.6))
+    y: Scalar = shape("m", (0.0,), (-0.6, 0.6))
+    z: Scalar = shape("m", (0.0,), (-0.6, 0.6))
+
+    def torque(self, motion: Motion) -> Float[Array, "samples nv"]:
+        at, jacobian = self.point(motion, jnp.stack([jnp.asarray(c) for c in (self.x, self.y, self.z)]))
+        depth = jnp.maximum(self.height - at[2], 0.0)
+        return -self.stiffness * (jacobian[:, 2] * depth).T
+
+    @classmethod
+    def starts(cls, motion: Motion, place: int) -> dict[str, tuple[float, ...]]:
+        some = np.asarray(motion.position)[:: max(1, len(motion.position) // 400)]
+        height = np.asarray(forward_kinematics(motion.model, some))[:, place, 2, 3]
+        return {"height": tuple(np.unique(np.quantile(height, (0.05, 0.1, 0.2, 0.3, 0.45))).tolist())}

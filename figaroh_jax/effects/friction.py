@@ -1,0 +1,287 @@
+"""Friction: of the speed, of the load, of the position, of time, and of a bristle that bends before it slides.
+
+q, v: position and velocity of the joint; s(v): the smooth sign of its velocity; tau_load: torque of the rigid body.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .base import JointEffect, Motion, Native, Scalar, amplitude, shape
+from .registry import register
+
+__all__ = [
+    "AsymmetricCoulombFriction",
+    "AsymmetricViscousFriction",
+    "Bristle",
+    "CoulombFriction",
+    "DirectionalLoadFriction",
+    "FrictionDrift",
+    "LoadDependentFriction",
+    "LoadDependentStribeckFriction",
+    "LuGreFriction",
+    "PositionDependentFriction",
+    "PowerLawFriction",
+    "Presliding",
+    "StribeckFriction",
+    "ViscousFriction",
+]
+
+
+@register
+class ViscousFriction(JointEffect):
+    """Friction in proportion to the speed."""
+
+    name, title = "viscous_friction", "viscous friction"
+    dissipative = True
+    equation = "damping v"
+    separated_by = "constant-speed sweeps of {at} at five or more speeds up to its maximum"
+    damping: Scalar = amplitude("N m s/rad")
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.damping * self.here(motion.velocity)
+
+    def native(self) -> tuple[Native, ...]:
+        return (Native("joint", "damping", float(self.damping)),)
+
+
+@register
+class CoulombFriction(JointEffect):
+    """Dry friction: a constant level against the motion."""
+
+    name, title = "coulomb_friction", "Coulomb friction"
+    dissipative = True
+    equation = "force s(v)"
+    separated_by = "reversals of {at} at several accelerations"
+    force: Scalar = amplitude("N m")
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.force * self.here(motion.direction)
+
+    def native(self) -> tuple[Native, ...]:
+        return (Native("joint", "frictionloss", float(self.force)),)
+
+
+@register
+class AsymmetricCoulombFriction(JointEffect):
+    """Dry friction of another level in each direction; the part that differs."""
+
+    name, title = "asymmetric_coulomb_friction", "Coulomb friction that differs by direction"
+    indistinguishable_from = ("torque_offset",)
+    equation = "difference |s(v)|"
+    separated_by = "a dwell of {at} with the brake on, beside motion in both directions"
+    difference: Scalar = amplitude("N m")
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.difference * jnp.abs(self.here(motion.direction))
+
+
+@register
+class AsymmetricViscousFriction(JointEffect):
+    """Viscous friction of another slope in each direction; the part that differs."""
+
+    name, title = "asymmetric_viscous_friction", "viscous friction that differs by direction"
+    equation = "difference |v|"
+    separated_by = "sweeps of {at} in both directions over its whole range of speed"
+    difference: Scalar = amplitude("N m s/rad")
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.difference * jnp.abs(self.here(motion.velocity))
+
+
+@register
+class StribeckFriction(JointEffect):
+    """Friction that falls from its breakaway level as the speed rises (Armstrong-Helouvry 1991)."""
+
+    name, title = "stribeck_friction", "Stribeck friction"
+    dissipative = speed_law = True
+    equation = "force exp(-(|v|/speed)^2) s(v)"
+    separated_by = "slow constant-velocity sweeps of {at} at five or more speeds below 0.3 rad/s"
+    force: Scalar = amplitude("N m")
+    speed: Scalar = shape("rad/s", (0.03, 0.06, 0.1, 0.15, 0.25, 0.4), (0.012, 0.64))
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        weight = jnp.exp(-((self.here(motion.velocity) / self.speed) ** 2))
+        return self.force * weight * self.here(motion.direction)
+
+
+@register
+class PowerLawFriction(JointEffect):
+    """Friction that grows with a power of the speed (lubricant, temperature)."""
+
+    name, title = "power_law_friction", "friction with a power of the speed"
+    speed_law = True
+    equation = "strength |v|^exponent s(v)"
+    separated_by = "constant-speed sweeps of {at} from 0.05 rad/s to its maximum speed"
+    strength: Scalar = amplitude("N m (s/rad)^exponent")
+    exponent: Scalar = shape("", (0.4, 0.6, 1.5, 2.0, 2.5, 3.0), (0.24, 4.0), hole=(0.85, 1.15))
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        speed = jnp.sqrt(self.here(motion.velocity) ** 2 + 1e-12)
+        return self.strength * speed**self.exponent * self.here(motion.direction)
+
+    def native(self) -> tuple[Native, ...]:
+        attribute = {2.0: "damping2", 3.0: "damping3"}.get(float(self.exponent))
+        return (Native("joint", attribute, float(self.strength)),) if attribute else ()
+
+
+@register
+class LoadDependentFriction(JointEffect):
+    """Friction of the gears that grows with the torque they transmit."""
+
+    name, title = "load_dependent_friction", "friction that grows with the load"
+    follows_torque = dissipative = True
+    equation = "ratio |tau_load| s(v)"
+    separated_by = "the same motion of {at} with and without a payload"
+    ratio: Scalar = amplitude("")
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.ratio * jnp.abs(self.here(motion.load)) * self.here(motion.direction)
+
+
+@register
+class PositionDependentFriction(JointEffect):
+    """Dry friction that changes over a turn (a bent shaft, a seal, a worn gear)."""
+
+    name, title = "position_dependent_friction", "friction that changes with the position"
+    equation = "s(v) (cosine cos q + sine sin q)"
+    separated_by = "the same motion of {at} in other postures of the other joints"
+    cosine: Scalar = amplitude("N m")
+    sine: Scalar = amplitude("N m")
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        q = self.here(motion.angle)
+        return self.here(motion.direction) * (self.cosine * jnp.cos(q) + self.sine * jnp.sin(q))
+
+
+@register
+class FrictionDrift(JointEffect):
+    """Friction above its later level that falls off as the joint warms up."""
+
+    name, title = "friction_drift", "friction that drifts with the warmth"
+    equation = "(force s(v) + damping v) exp(-t/time)"
+    separated_by = "the same motion of {at} at the start and again after the robot has warmed up"
+    force: Scalar = amplitude("N m")
+    damping: Scalar = amplitude("N m s/rad")
+    time: Scalar = shape("s", (3.0, 8.0, 20.0, 60.0), (1.0, 600.0))
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        level = self.force * self.here(motion.direction) + self.damping * self.here(motion.velocity)
+        return level * jnp.exp(-motion.elapsed / self.time)
+
+
+class Bristle(JointEffect):
+    """Dry friction with a state: a bristle that bends before it slides, in units of its sliding deflection."""
+
+    memory: Float[Array, ""] | None = eqx.field(default=None, kw_only=True)  # the state, where it is known (`step`)
+
+    def level(self, velocity: Float[Array, "*samples"]) -> Float[Array, "*samples"]:
+        """Deflection at which the bristle slides at a speed."""
+        return jnp.ones_like(velocity)
+
+    def bent(self, motion: Motion) -> Float[Array, " samples"]:
+        """The state z along a record; sliding where the instants are none."""
+        v = self.here(motion.velocity)
+        if self.memory is not None:
+            return self.memory * jnp.ones_like(v)
+        end, stays = self._turn(v, motion.dt)
+        stays = jnp.where(motion.begins, 0.0, stays)
+
+        def follow(z: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+            z = now[0] + (z - now[0]) * now[1]
+            return z, z
+
+        return jax.lax.scan(follow, jnp.zeros_like(end[0]), (end, stays), unroll=8)[1]
+
+    def step(self, velocity: Float[Array, " nv"], dt: Float[Array, ""]) -> Bristle:
+        end, stays = self._turn(velocity[self.at[0]], dt)
+        return dataclasses.replace(self, memory=end + (self.memory - end) * stays)
+
+    def _turn(self, v: Float[Array, "*samples"], dt: Any) -> tuple[Array, Array]:
+        """Where z goes, and the share of its way that is left after `dt` at a constant velocity: exact."""
+        level = self.level(v)
+        return jnp.sign(v) * level, jnp.exp(-jnp.abs(v) * dt / (self.distance * level))
+
+
+@register
+class Presliding(Bristle):
+    """Dry friction that builds up over a small distance after each reversal (Dahl 1968, exponent 1)."""
+
+    name, title = "presliding", "presliding: friction that lags behind the reversal"
+    equation = "force (z - s(v)), z' = v/distance (1 - z s(v))"
+    separated_by = "reversals of {at} at several accelerations: presliding is late in position, a delay in time"
+    force: Scalar = amplitude("N m", lower=0.0)
+    distance: Scalar = shape("rad", (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1), (2e-5, 0.4))
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.force * (self.bent(motion) - self.here(motion.direction))
+
+    def physical(self) -> dict[str, Scalar]:
+        force, distance = self.force, self.distance
+        return {"force": force, "distance": distance, "stiffness": force / distance}
+
+    @classmethod
+    def units(cls) -> dict[str, str]:
+        return {"force": "N m", "distance": "rad", "stiffness": "N m/rad"}
+
+
+@register
+class LuGreFriction(Bristle):
+    """Dry friction of a bristle whose level falls with the speed (Canudas de Wit et al. 1995), without its damping."""
+
+    name, title = "lugre_friction", "friction of a bristle (LuGre)"
+    equation = "force (z - s(v)), z' = v/distance (1 - z s(v)/g), g = 1 + rise exp(-(v/speed)^2)"
+    separated_by = "slow reversals of {at}, and constant speeds below 0.3 rad/s"
+    searched = False  # presliding and Stribeck friction together, which a diagnosis finds one after the other
+    force: Scalar = amplitude("N m", lower=0.0)
+    distance: Scalar = shape("rad", (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1), (2e-5, 0.4))
+    rise: Scalar = shape("", (0.1, 0.5), (0.0, 3.0))
+    speed: Scalar = shape("rad/s", (0.05, 0.2), (0.012, 0.64))
+
+    def level(self, velocity: Float[Array, "*samples"]) -> Float[Array, "*samples"]:
+        return 1 + self.rise * jnp.exp(-((velocity / self.speed) ** 2))
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.force * (self.bent(motion) - self.here(motion.direction))
+
+
+@register
+class DirectionalLoadFriction(JointEffect):
+    """Friction in proportion to the load, of another share where the drive lifts it and where it is driven by it."""
+
+    name, title = "directional_load_friction", "friction that grows with the load, by the direction of the power"
+    follows_torque = dissipative = True
+    contains = ("load_dependent_friction",)
+    equation = "|tau_load| s(v) (driving where tau_load v > 0, driven elsewhere)"
+    separated_by = "slow motion of {at} against and with gravity, with and without a payload"
+    searched = False  # the second rung of a ladder whose first one is `load_dependent_friction`
+    driving: Scalar = amplitude("")
+    driven: Scalar = amplitude("")
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        load, way = self.here(motion.load), self.here(motion.direction)
+        lifts = (1 + jnp.sign(load) * way) / 2
+        return jnp.abs(load) * way * (self.driving * lifts + self.driven * (1 - lifts))
+
+
+@register
+class LoadDependentStribeckFriction(JointEffect):
+    """Friction in proportion to the load that falls as the speed rises."""
+
+    name, title = "load_dependent_stribeck_friction", "Stribeck friction that grows with the load"
+    follows_torque = dissipative = True
+    equation = "ratio |tau_load| exp(-(|v|/speed)^2) s(v)"
+    separated_by = "slow sweeps of {at} below 0.3 rad/s with and without a payload"
+    searched = False  # a rung of the same ladder
+    ratio: Scalar = amplitude("")
+    speed: Scalar = shape("rad/s", (0.03, 0.06, 0.1, 0.15, 0.25, 0.4), (0.012, 0.64))
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        weight = jnp.exp(-((self.here(motion.velocity) / self.speed) ** 2))
+        return self.ratio * jnp.abs(self.here(motion.load)) * weight * self.here(motion.direction)

@@ -1,0 +1,66 @@
+"""Bodies: a link that is not as the model says, and a body that is fixed to one."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..rigid.model import RobotModel
+from .base import Effect, Scalar, amplitude
+from .registry import register
+
+__all__ = ["LinkEffect", "LinkInertia", "Payload"]
+
+
+class LinkEffect(Effect):
+    """A change of the ten inertial parameters of one link, at and in its joint frame."""
+
+    acts_on = "link"
+    inertial = True
+    mass: Scalar = amplitude("kg")
+    mx: Scalar = amplitude("kg m")
+    my: Scalar = amplitude("kg m")
+    mz: Scalar = amplitude("kg m")
+    ixx: Scalar = amplitude("kg m2")
+    ixy: Scalar = amplitude("kg m2")
+    iyy: Scalar = amplitude("kg m2")
+    ixz: Scalar = amplitude("kg m2")
+    iyz: Scalar = amplitude("kg m2")
+    izz: Scalar = amplitude("kg m2")
+
+    def ten(self) -> Float[Array, "10"]:
+        """The change in Pinocchio's order."""
+        return jnp.stack([jnp.asarray(getattr(self, name)) for name in self.parameters()])
+
+    def change(self, model: RobotModel) -> RobotModel:
+        return eqx.tree_at(lambda m: m.inertia, model, jnp.asarray(model.inertia).at[self.at[0]].add(self.ten()))
+
+
+@register
+class LinkInertia(LinkEffect):
+    """A link whose inertia is not what the model says, further than it is trusted."""
+
+    name, title = "link_inertia", "inertia of a link"
+    contains = ("payload",)
+    indistinguishable_from = ("payload",)
+    needs_trust = 0.05  # ten free parameters of a link make up for many a misfit
+    equation = "W_k dpi_k, dpi_k free"
+    separated_by = "the same motion with {at} disconnected or weighed"
+
+
+@register
+class Payload(LinkEffect):
+    """A body fixed to a link: ten parameters that a physical body can have."""
+
+    name, title = "payload", "a payload"
+    body = True
+    equation = "W_k dpi_k, dpi_k a physical body: pseudo-inertia >= 0, mass > 0"
+    separated_by = "the same motion with and without what is fixed to {at}"
+
+    def physical(self) -> dict[str, Scalar]:
+        return {"mass": self.mass} | {f"com_{k}": getattr(self, f"m{k}") / self.mass for k in "xyz"}
+
+    @classmethod
+    def units(cls) -> dict[str, str]:
+        return {"mass": "kg"} | {f"com_{k}": "m" for k in "xyz"}

@@ -1,0 +1,38 @@
+"""Effects by their names: `register` adds one, `find` gives it back, `related` tells how it stands to others."""
+
+from __future__ import annotations
+
+from ..errors import InputError, nearest
+from .base import Effect
+
+__all__ = ["CATALOGUE", "find", "register", "related"]
+
+CATALOGUE: dict[str, type[Effect]] = {}
+_OTHERS: dict[str, type[Effect]] = {}  # known by name, but nothing that a diagnosis looks for
+
+
+def register(effect: type[Effect]) -> type[Effect]:
+    """Add an effect class to the catalogue under its `name` (usable as a decorator); returns it."""
+    if (CATALOGUE | _OTHERS).get(effect.name, effect).__qualname__ != effect.__qualname__:
+        raise InputError(f"an effect called '{effect.name}' is registered already")
+    (CATALOGUE if effect.searched else _OTHERS)[effect.name] = effect
+    return effect
+
+
+def find(name: str) -> type[Effect]:
+    """The effect called `name`; raises `InputError` with the nearest known name."""
+    known = CATALOGUE | _OTHERS
+    if name not in known:
+        raise InputError(f"no effect '{name}' in the catalogue{nearest(name, known)}")
+    return known[name]
+
+
+def related(name: str, relation: str) -> tuple[str, ...]:
+    """Effects that stand in a `relation` to one: `indistinguishable_from` or `excludes`, whichever of them states it.
+
+    A tuple of names, sorted, without the name itself; names that are not registered are left out.
+    """
+    known = CATALOGUE | _OTHERS
+    own = getattr(known[name], relation) if name in known else ()
+    back = (other for other, effect in known.items() if name in getattr(effect, relation))
+    return tuple(sorted({*own, *back} & set(known) - {name}))

@@ -1,0 +1,171 @@
+"""Sensors: what encoders and torque sensors read beside the truth, and clocks that disagree.
+
+q: position of the joint; tau_hat: torque of the whole model; p: d/dt.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from .base import Effect, JointEffect, Motion, Native, Scalar, amplitude, shape
+from .registry import register
+
+__all__ = [
+    "ClockError",
+    "EncoderEccentricity",
+    "EncoderOffset",
+    "EncoderScale",
+    "TorqueDelay",
+    "TorqueGain",
+    "TorqueLag",
+    "TorqueOffset",
+    "TorqueSaturation",
+]
+
+
+@register
+class TorqueOffset(JointEffect):
+    """Constant torque: an offset of the sensor, the drive or a preload."""
+
+    name, title = "torque_offset", "torque offset"
+    equation = "offset"
+    separated_by = "a dwell of {at} with the brake on or the motor unloaded"
+    offset: Scalar = amplitude("N m")
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.offset * jnp.ones_like(motion.time)
+
+    def native(self) -> tuple[Native, ...]:
+        return (Native("actuator", "bias", float(self.offset)),)
+
+
+@register
+class TorqueGain(JointEffect):
+    """A wrong torque constant or gear ratio: the reading is off by a factor."""
+
+    name, title = "torque_gain", "wrong torque gain"
+    follows_torque = True
+    equation = "gain tau_hat"
+    separated_by = "the same motion of {at} with and without a payload of known mass"
+    gain: Scalar = amplitude("")
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.gain * self.here(motion.total)
+
+
+@register
+class TorqueDelay(Effect):
+    """Torque that is stamped late against the position."""
+
+    name, title, acts_on = "torque_delay", "delay of the torque", "robot"
+    follows_torque = True
+    excludes = ("torque_lag",)
+    equation = "tau_hat(t - delay) - tau_hat(t)"
+    separated_by = "faster motion: a lag weakens high frequencies, a delay does not"
+    delay: Scalar = shape("s", (0.001, 0.003, 0.006, 0.012, 0.025), (0.0, 0.06))
+
+    def torque_response(self, omega: Float[Array, " freqs"]) -> Complex[Array, " freqs"]:
+        return jnp.exp(-1j * omega * self.delay)
+
+
+@register
+class TorqueLag(Effect):
+    """Torque seen through a first-order low pass."""
+
+    name, title, acts_on = "torque_lag", "lag of the torque", "robot"
+    follows_torque = True
+    equation = "(1/(1 + time p) - 1) tau_hat"
+    separated_by = "faster motion: a lag weakens high frequencies, a delay does not"
+    time: Scalar = shape("s", (0.001, 0.003, 0.006, 0.012, 0.025), (0.0002, 0.06))
+
+    def torque_response(self, omega: Float[Array, " freqs"]) -> Complex[Array, " freqs"]:
+        return 1 / (1 + 1j * omega * self.time)
+
+
+@register
+class TorqueSaturation(JointEffect):
+    """A drive or a sensor that gives no more than its limit."""
+
+    name, title = "torque_saturation", "saturation of the torque"
+    follows_torque = True
+    equation = "clip(tau_hat, -limit, limit) - tau_hat"
+    separated_by = "motion of {at} at two larger accelerations: the largest torque stays"
+    share: Scalar = amplitude("", lower=0.5, upper=2.0)  # of what lies above the limit; 1 where nothing passes
+    limit: Scalar = shape("N m", (1.0, 3.0, 10.0, 30.0, 100.0, 300.0), (0.0, 1e5))
+
+    def torque_error(self, motion: Motion) -> Float[Array, " samples"]:
+        total = self.here(motion.total)
+        return self.share * (jnp.clip(total, -self.limit, self.limit) - total)
+
+    def delivered(self, torque: Float[Array, " nv"]) -> Float[Array, " nv"]:
+        own = torque[self.at[0]]
+        return torque.at[self.at[0]].add(self.share * (jnp.clip(own, -self.limit, self.limit) - own))
+
+    def physical(self) -> dict[str, Scalar]:
+        return {"limit": self.limit}
+
+    @classmethod
+    def units(cls) -> dict[str, str]:
+        return {"limit": "N m"}
+
+    @classmethod
+    def starts(cls, motion: Motion, place: int) -> dict[str, tuple[float, ...]]:
+        size = np.abs(np.asarray(motion.total)[:, place])
+        return {"limit": tuple(np.unique(np.quantile(size, (0.7, 0.8, 0.88, 0.94, 0.97, 0.99))).tolist())}
+
+
+@register
+class ClockError(Effect):
+    """A clock of the torque that runs faster or slower than that of the position."""
+
+    name, title, acts_on = "clock_error", "clocks of position and torque that drift apart", "robot"
+    follows_torque = True
+    equation = "rate t p tau_hat"
+    separated_by = "a longer recording: the lag at its end against the lag at its start"
+    rate: Scalar = amplitude("s/s", lower=-0.02, upper=0.02)
+
+    def torque_error(self, motion: Motion) -> Float[Array, "samples nv"]:
+        return self.rate * motion.elapsed[:, None] * motion.rate(motion.total)
+
+
+@register
+class EncoderOffset(JointEffect):
+    """A zero of the encoder that is not the model's."""
+
+    name, title = "encoder_offset", "zero offset of the encoder"
+    equation = "q_measured = q + offset"
+    separated_by = "kinematic calibration, or a reference mark of {at}: torque hardly tells it from inertia"
+    offset: Scalar = amplitude("rad", lower=-0.2, upper=0.2)
+
+    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.offset * jnp.ones_like(motion.time)
+
+
+@register
+class EncoderScale(JointEffect):
+    """An encoder that counts too much or too little a turn, or a gear ratio that is not the model's."""
+
+    name, title = "encoder_scale", "scale of the encoder"
+    equation = "q_measured = q + scale q"
+    separated_by = "motion of {at} over more than half a turn, or kinematic calibration"
+    scale: Scalar = amplitude("", lower=-0.2, upper=0.2)
+
+    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.scale * self.here(motion.angle)
+
+
+@register
+class EncoderEccentricity(JointEffect):
+    """An encoder's disc that is not centred: an error that comes back with every turn."""
+
+    name, title = "encoder_eccentricity", "eccentricity of the encoder"
+    equation = "q_measured = q + sine sin q + cosine cos q"
+    separated_by = "a whole turn of {at}, or kinematic calibration with two payloads"
+    sine: Scalar = amplitude("rad", lower=-0.05, upper=0.05)
+    cosine: Scalar = amplitude("rad", lower=-0.05, upper=0.05)
+
+    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
+        q = self.here(motion.angle)
+        return self.sine * jnp.sin(q) + self.cosine * jnp.cos(q)

@@ -1,0 +1,147 @@
+"""Gears and motors: rotors, couplings, ripple, springs, elasticity and play.
+
+q, v, a: position, velocity and acceleration of the joint; s(v): the smooth sign of its velocity; tau_load: torque of
+the rigid body.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .base import Effect, JointEffect, Motion, Native, Scalar, amplitude, shape
+from .registry import register
+
+__all__ = [
+    "Backlash",
+    "CoupledTransmission",
+    "JointElasticity",
+    "JointSpring",
+    "RotorInertia",
+    "TorqueRipple",
+]
+
+
+_CROSSING = 0.01  # s that the motor takes to cross the play of its gear
+
+
+@register
+class RotorInertia(JointEffect):
+    """Inertia of the motor and gears, seen through the gear ratio (armature)."""
+
+    name, title = "rotor_inertia", "rotor inertia"
+    equation = "inertia a"
+    separated_by = "fast motion of {at} in several postures of the joints beyond it"
+    inertia: Scalar = amplitude("kg m2", lower=0.0)
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.inertia * self.here(motion.acceleration)
+
+    def native(self) -> tuple[Native, ...]:
+        return (Native("joint", "armature", float(self.inertia)),)
+
+
+@register
+class CoupledTransmission(Effect):
+    """A motor that turns the sum or the difference of two joints: its rotor and its friction act on both."""
+
+    name, title, acts_on = "coupled_transmission", "coupling of the transmission", "pair"
+    equation = "row i: inertia a_j + damping v_j + friction s(v_i + sign v_j); row j: i and j swapped, friction by sign"
+    separated_by = "{at} alone, together and against each other"
+    inertia: Scalar = amplitude("kg m2")
+    damping: Scalar = amplitude("N m s/rad")
+    friction: Scalar = amplitude("N m")
+    sign: Scalar = shape("", (1.0, -1.0), choice=True)
+
+    def torque(self, motion: Motion) -> Float[Array, "samples 2"]:
+        v, a = (jnp.take(x, self.places, axis=1, mode="clip") for x in (motion.velocity, motion.acceleration))
+        relative = jnp.stack([jnp.ones(()), jnp.asarray(self.sign)])  # of the motor to each joint
+        reversal = motion.reversal(v @ relative, a @ relative, jnp.take(motion.width, self.places, mode="clip").mean())
+        linear = self.sign * (self.inertia * a[:, ::-1] + self.damping * v[:, ::-1])
+        return linear + self.friction * reversal[:, None] * relative
+
+    def native(self) -> tuple[Native, ...]:
+        sign = float(self.sign)
+        inertia, damping, friction = float(self.inertia), float(self.damping), float(self.friction)
+        return (
+            Native("tendon", "armature", inertia, sign),
+            Native("tendon", "damping", damping, sign),
+            Native("tendon", "frictionloss", friction, sign),
+            Native("joint", "armature", -inertia),
+            Native("joint", "damping", -damping),
+        )
+
+
+@register
+class TorqueRipple(JointEffect):
+    """Torque that repeats with the position: cogging, teeth, bearings."""
+
+    name, title = "torque_ripple", "torque ripple"
+    equation = "sine sin(order q) + cosine cos(order q)"
+    separated_by = "sweeps of {at} at two constant speeds: the order stays, the frequency moves"
+    sine: Scalar = amplitude("N m")
+    cosine: Scalar = amplitude("N m")
+    order: Scalar = shape("1/rad", tuple(3.0 + 0.8 * k for k in range(30)), (2.9, 26.6))
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        angle = self.order * self.here(motion.angle)
+        return self.sine * jnp.sin(angle) + self.cosine * jnp.cos(angle)
+
+    def shown_by(self, low: Float[np.ndarray, " nv"], high: Float[np.ndarray, " nv"]) -> bool:
+        # one and a half periods: what has not come back is any smooth function of the position
+        return bool(float(self.order) * (high - low)[int(self.at[0])] > 3 * np.pi)
+
+
+@register
+class JointSpring(JointEffect):
+    """A spring across the joint: a balancer, a cable, a hose."""
+
+    name, title = "joint_spring", "spring at the joint"
+    contains = ("torque_offset",)
+    equation = "stiffness (q - rest)"
+    separated_by = "motion of {at} over a larger range, or with the base turned"
+    stiffness: Scalar = amplitude("N m/rad", lower=0.0)
+    offset: Scalar = amplitude("N m")  # -stiffness rest: linear, where the rest position is not
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.stiffness * self.here(motion.angle) + self.offset
+
+    def physical(self) -> dict[str, Scalar]:
+        return {"stiffness": self.stiffness, "rest": -self.offset / self.stiffness}
+
+    @classmethod
+    def units(cls) -> dict[str, str]:
+        return {"stiffness": "N m/rad", "rest": "rad"}
+
+    def native(self) -> tuple[Native, ...]:
+        rest = -float(self.offset) / float(self.stiffness)
+        return (Native("joint", "stiffness", float(self.stiffness)), Native("joint", "springref", rest))
+
+
+@register
+class JointElasticity(JointEffect):
+    """A gear that winds up under load: the sensor on the motor reads more than the link has turned."""
+
+    name, title = "joint_elasticity", "elasticity of the joint"
+    equation = "q_measured = q + compliance tau_load"
+    separated_by = "a chirp of {at} above a third of its resonance, or a sensor on the link side"
+    compliance: Scalar = shape("rad/(N m)", (2e-5, 1e-4, 4e-4, 1.5e-3, 5e-3), (1e-7, 1e-2))
+
+    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.compliance * self.here(motion.load)
+
+
+@register
+class Backlash(JointEffect):
+    """Play in the gear: the motor stands ahead of the link by half of it, on the side to which it pushes."""
+
+    name, title = "backlash", "backlash"
+    equation = "q_measured = q + width/2 sign(tau_load)"
+    separated_by = "slow reversals of the load of {at}, with a second encoder on the link"
+    width: Scalar = amplitude("rad", lower=0.0, upper=0.05)
+
+    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
+        load = self.here(jnp.asarray(motion.load))
+        ramp = jnp.abs(motion.rate(load)) * jnp.maximum(motion.dt, _CROSSING) / 2
+        return self.width / 2 * jnp.clip(load / (ramp + 1e-12), -1.0, 1.0)

@@ -1,0 +1,184 @@
+"""What a rollout can get wrong: every effect with the numbers of the loop that it frees and where its search starts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from ..rigid.model import Frame, Joint, RobotModel
+from .loop import Loop
+from .parameters import Entry, Table
+
+__all__ = ["BASELINE", "Candidate", "Catalogue", "catalogue", "elastic_loop"]
+
+_JOINT_ENTRIES = (
+    "armature", "damping", "friction", "stribeck_force", "stribeck_speed", "load_ratio", "stiffness",
+    "offset", "reading",
+)  # fmt: skip
+_DRIVE_ENTRIES = ("scale", "delay", "dead_band", "voltage", "force_limit")
+BASELINE = {"rotor_inertia": "armature", "joint_damping": "damping", "friction_loss": "friction"}
+
+
+class Candidate(NamedTuple):
+    """An effect at a place: the entries of the table that it frees, and values from which its fit starts."""
+
+    effect: str
+    at: tuple[str, ...]
+    entries: tuple[int, ...]
+    starts: tuple[tuple[float, ...], ...]  # of its entries; NaN: where the present model stands
+    reported: tuple[str, ...]  # names of the entries in the answer
+    elastic: bool = False  # another structure: two bodies at the joint
+
+
+class Catalogue(NamedTuple):
+    """Every number that may be freed, and the candidates."""
+
+    table: Table
+    candidates: tuple[Candidate, ...]
+
+    def entry(self, name: str, place: int) -> int:
+        """Where the number of a coordinate, drive or link stands in the table."""
+        return next(k for k, e in enumerate(self.table) if e.name == name and place in e.at)
+
+
+CONTAINS = {  # what an effect can imitate exactly: the simpler one is preferred
+    "joint_spring": ("torque_offset",),
+    "backlash": ("joint_elasticity",),
+}
+_HERE = float("nan")
+
+
+def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbid: Sequence[str] = ()) -> Catalogue:
+    """The candidates of a loop; `forces` (nu,) are the largest that its drives gave in the recordings."""
+    table, candidates = [], []
+    robot = loop.robot
+    names = robot.dof_names
+    levers = np.asarray(loop.joints.friction)
+    for j, name in enumerate(names):
+        for number in _JOINT_ENTRIES:
+            table.append(Entry(number, (j,)))
+        torque = _largest(loop, forces, j)
+        candidates += [(*one, name) for one in _of_joint(j, max(float(levers[j]), 0.02 * torque), torque)]
+    for k in range(len(loop.drives.names)):
+        table += [Entry(number, (k,)) for number in _DRIVE_ENTRIES]
+        name = names[int(np.argmax(np.abs(np.asarray(loop.drives.transmission)[k])))]
+        candidates += [(*one, name) for one in _of_drive(k, float(forces[k]), gains_known)]
+    for i, joint in enumerate(robot.joints):
+        table.append(Entry("payload", (i,)))
+        candidates.append(("payload", (("payload", i),), ((0.0,),), ("mass",), joint.link))
+    index = {(e.name, e.at[0]): k for k, e in enumerate(table)}
+    built = [
+        Candidate(effect, (name,), tuple(index[e] for e in entries), starts, reported)
+        for effect, entries, starts, reported, name in candidates
+        if effect not in forbid
+    ]
+    return Catalogue(tuple(table), tuple(built))
+
+
+def _largest(loop: Loop, forces: np.ndarray, joint: int) -> float:
+    way = np.abs(np.asarray(loop.drives.transmission))[:, joint]
+    return float(max((way * forces).max(initial=0.0), 1e-6))
+
+
+def _of_joint(j: int, friction: float, torque: float) -> list[tuple]:
+    h = _HERE
+    return [
+        ("joint_damping", (("damping", j),), ((h,),), ("damping",)),
+        ("friction_loss", (("friction", j),), ((h,), (friction,)), ("force",)),
+        ("rotor_inertia", (("armature", j),), ((h,),), ("inertia",)),
+        (
+            "stribeck_friction",
+            (("stribeck_force", j), ("stribeck_speed", j)),
+            tuple((0.07 * friction, speed) for speed in (0.1, 0.25, 0.6)),
+            ("force", "speed"),
+        ),
+        ("load_dependent_friction", (("load_ratio", j),), ((0.05,),), ("ratio",)),
+        ("joint_spring", (("stiffness", j), ("offset", j)), ((0.002 * torque, 0.0),), ("stiffness", "offset")),
+        ("torque_offset", (("offset", j),), ((0.0,),), ("offset",)),
+        ("encoder_offset", (("reading", j),), ((0.0,),), ("offset",)),
+    ]
+
+
+def _of_drive(k: int, force: float, gains_known: bool) -> list[tuple]:
+    limits = tuple((share * force,) for share in (0.9, 0.6, 0.3))
+    gain = [] if gains_known else [("actuator_gain", (("scale", k),), ((_HERE,),), ("gain",))]
+    return [
+        *gain,
+        ("command_delay", (("delay", k),), ((0.002,), (0.012,), (0.04,)), ("delay",)),
+        ("actuator_saturation", (("force_limit", k),), limits, ("limit",)),
+        ("voltage_saturation", (("voltage", k),), limits, ("limit",)),
+        ("dead_band", (("dead_band", k),), ((0.002,), (0.02,)), ("band",)),
+    ]
+
+
+def elastic_loop(loop: Loop, coordinate: int, stiffness: float, damping: float, *, link_side: bool = False) -> Loop:
+    """The loop with a spring between motor and link of one joint: the new last coordinate is the spring's twist.
+
+    The motor carries the armature, the friction and the damping of the joint and turns first; its encoder is read,
+    or the link's with `link_side`.
+    """
+    robot = loop.robot
+    n, i = robot.nv, next(i for i, joint in enumerate(robot.joints) if joint.coordinate == coordinate)
+    joints = list(robot.joints)
+    mine = joints[i]
+    motor = Joint(mine.name, mine.kind, mine.parent, mine.coordinate, f"{mine.link}_motor")
+    moved = [joint._replace(parent=joint.parent + 1) if joint.parent >= i else joint for joint in joints]
+    spring = Joint(f"{mine.name}_spring", mine.kind, i, n, mine.link)
+    tree = (*moved[:i], motor, spring, *moved[i + 1 :])
+
+    def inserted(values, new):  # noqa: ANN001
+        values = np.asarray(values)
+        return np.concatenate([values[: i + 1], np.asarray(new)[None], values[i + 1 :]])
+
+    ten, placement = np.asarray(robot.inertia), np.asarray(robot.placement)
+    inertia = np.concatenate([ten[:i], _BODY[None], ten[i:]])
+    free = np.array([-np.inf, np.inf])
+    new = RobotModel(
+        placement=inserted(placement, np.eye(4)),
+        axis=inserted(robot.axis, np.asarray(robot.axis)[i]),
+        inertia=inertia,
+        ratio=inserted(robot.ratio, 1.0),
+        offset=inserted(robot.offset, 0.0),
+        gravity=robot.gravity,
+        frame_placement=robot.frame_placement,
+        position_limit=np.concatenate([np.asarray(robot.position_limit), free[None]]),
+        velocity_limit=np.append(np.asarray(robot.velocity_limit), np.inf),
+        effort_limit=np.append(np.asarray(robot.effort_limit), np.inf),
+        joints=tree,
+        frames=tuple(Frame(f.name, f.parent + 1 if f.parent >= i else f.parent) for f in robot.frames),
+        name=robot.name,
+    )
+    own = {}
+    for name in loop.joints.__dataclass_fields__:
+        values = np.asarray(getattr(loop.joints, name))
+        fill = {"stribeck_speed": 0.1, "ripple_order": 1.0, "stiffness": stiffness, "damping": damping}.get(name, 0.0)
+        last = values[-1:] if values.ndim > 1 or name.startswith("friction_") else np.array([fill])
+        if name in ("limit", "torque_range"):
+            last = free[None]
+        own[name] = np.concatenate([values, last])
+    drives = eqx.tree_at(
+        lambda d: d.transmission,
+        loop.drives,
+        np.concatenate([np.asarray(loop.drives.transmission), np.zeros((len(loop.drives.names), 1))], 1),
+    )
+    summed = tuple(
+        n if link_side and k == coordinate else more for k, more in zip(loop.measured, loop.summed, strict=True)
+    )
+    return Loop(
+        robot=new,
+        drives=drives,
+        joints=type(loop.joints)(**own),
+        start=np.append(np.asarray(loop.start), 0.0),
+        dt=loop.dt,
+        integrator=loop.integrator,
+        law=loop.law,
+        limited=loop.limited,
+        measured=loop.measured,
+        summed=summed,
+    )
+
+
+_BODY = np.zeros(10)  # the motor's own inertia is the joint's armature

@@ -1,0 +1,127 @@
+"""Recordings of command and position, cut into windows on the grid of the loop's steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import InputError
+from .loop import Loop
+from .sensitivity import Windows
+
+__all__ = ["Run", "Stretch", "noise_of", "regular", "windows"]
+
+_LEAD = 0.2  # s of command kept before a window: no delay is longer
+
+
+class Run(NamedTuple):
+    """One recording with a regular clock."""
+
+    name: str
+    time: np.ndarray  # (rows,) s
+    command: np.ndarray  # (rows, nu)
+    position: np.ndarray  # (rows, ny)
+    velocity: np.ndarray | None
+    holdout: bool = False
+    trusted: np.ndarray | None = None  # (rows,) False: rows that count for nothing
+
+
+class Stretch(NamedTuple):
+    """What one window covers."""
+
+    run: int
+    first: int
+    rows: int
+
+
+def regular(name: str, time: np.ndarray) -> float:
+    """The period of a regular clock (s); raises `InputError` at the first stamp that jumps."""
+    steps = np.diff(time)
+    period = float(np.median(steps))
+    wrong = np.flatnonzero(np.abs(steps - period) > 0.5 * period)
+    if len(wrong):
+        row = int(wrong[0]) + 1
+        raise InputError(
+            f"{name}: the time stamp jumps in row {row} (from 0): {steps[row - 1]:.6g} s after the row before, "
+            f"where the period is {period:.6g} s; cut the recording there, a rollout needs a regular clock"
+        )
+    return float((time[-1] - time[0]) / (len(time) - 1))
+
+
+def noise_of(values: np.ndarray) -> np.ndarray:
+    """Standard deviation of white noise on smooth records, by fourth differences; at least 0.3 of a counter's step."""
+    fourth = np.diff(values, 4, axis=0)
+    spread = np.median(np.abs(fourth), axis=0) / 0.67449 / np.sqrt(70.0)
+    full = np.sqrt(np.mean(fourth**2, axis=0) / 70.0)
+    white = np.where(full < 1.5 * np.maximum(spread, 1e-300), full, spread)
+    return np.maximum(white, np.maximum(0.3 * _step(values), 1e-9))
+
+
+def _step(values: np.ndarray) -> np.ndarray:
+    """Least step of each column where it repeats values (a counter's resolution), else 0."""
+    found = np.zeros(values.shape[1])
+    for k, column in enumerate(values.T):
+        levels = np.unique(np.round(column, 9))
+        if 1 < len(levels) < 0.5 * len(column):
+            found[k] = np.min(np.diff(levels))
+    return found
+
+
+def windows(
+    loop: Loop, runs: Sequence[Run], stretches: Sequence[Stretch], noise: Sequence[np.ndarray], block: float
+) -> Windows:
+    """Windows of equal length in rows of one period; shorter ones are padded and count for nothing there.
+
+    `noise` holds the standard deviations of positions, and of velocities where they count.
+    """
+    period = regular(runs[0].name, runs[0].time)
+    substeps = max(1, round(period / float(loop.dt)))
+    rows_of_block = max(1, round(block / period))
+    most = max(s.rows for s in stretches)
+    rows = -(-most // rows_of_block) * rows_of_block
+    lead = int(np.ceil(_LEAD / period))
+    command, reading, weight, start, precision = [], [], [], [], []
+    for stretch in stretches:
+        run = runs[stretch.run]
+        at = np.clip(np.arange(stretch.first - lead, stretch.first + rows), 0, len(run.time) - 1)
+        command.append(run.command[at])
+        inside = np.arange(rows) < stretch.rows
+        here = at[lead:]
+        counted = inside if run.trusted is None else inside & run.trusted[here]
+        parts = [run.position] + ([run.velocity] if len(noise) > 1 and run.velocity is not None else [])
+        reading.append(np.concatenate([p[here] for p in parts], 1))
+        weight.append(np.concatenate([counted[:, None] / s for s in noise], 1))
+        state, certainty = _state(loop, run, stretch.first, noise, period)
+        start.append(state)
+        precision.append(certainty)
+    return Windows(
+        command=np.stack(command, -1),
+        reading=np.stack(reading, -1),
+        weight=np.stack(weight, -1),
+        start=np.stack(start, -1),
+        precision=np.stack(precision, -1),
+        substeps=substeps,
+        lead=lead,
+        block=rows_of_block,
+    )
+
+
+def _state(loop: Loop, run: Run, row: int, noise: Sequence[np.ndarray], period: float) -> tuple[np.ndarray, np.ndarray]:
+    """Position and velocity at a row by a line through five rows, and how precise they are."""
+    n = loop.robot.nv
+    first = min(max(row - 2, 0), max(len(run.time) - 5, 0))
+    near = slice(first, first + 5)
+    t = (np.arange(first, first + len(run.position[near])) - row) * period
+    line = np.polyfit(t, run.position[near], min(2, len(t) - 1))
+    q, v = line[-1], line[-2]
+    q = np.where(np.ptp(run.position[near], axis=0) == 0, run.position[row], q)
+    sigma = np.maximum(noise[0], 1e-9)
+    state, certainty = np.zeros(2 * n), np.repeat([50.0, 2.0], n)  # a spring's twist is not read
+    places = np.array(loop.measured)
+    reading = np.asarray(loop.joints.reading, float)[places]
+    state[places], certainty[places] = q - reading, 1 / np.maximum(5 * sigma, 0.05)
+    state[n + places] = v
+    certainty[n + places] = 1 / np.maximum(5 * sigma / period, 0.02)
+    return state, certainty

@@ -1,0 +1,230 @@
+"""Fit of a loop's numbers to recordings: Levenberg-Marquardt on the exact sums, several lanes side by side.
+
+The states at the windows' starts are unknowns too, with a prior at what was measured there. What a fit leaves is kept
+by blocks of time, so that held-out errors follow without another fit: the normal matrix less a fold's share gives the
+estimate without the fold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from .loop import Loop
+from .parameters import BOUNDS, Table
+from .sensitivity import Sums, Windows, linear_sums
+
+__all__ = ["Fit", "fit", "held_out", "standard_errors", "start_of"]
+
+_ITERATIONS = 40
+_CLOSE = 0.02  # predicted decrease of the sum of whitened squares at which a fit ends
+
+
+class Fit(NamedTuple):
+    """One lane's optimum."""
+
+    theta: np.ndarray  # (entries,)
+    free: np.ndarray  # (columns,) which entries were fitted, -1: none
+    start: np.ndarray  # (2 nv, windows)
+    cost: float  # sum of whitened squares, the prior of the starts included
+    sums: Sums  # numpy, without the axis of lanes
+    converged: bool
+
+    @property
+    def squares(self) -> float:
+        """Sum of whitened squared residuals."""
+        return float(self.sums.cost.sum())
+
+
+def start_of(data: Windows, lanes: int = 1) -> np.ndarray:
+    """The measured states at the windows' starts, for each lane."""
+    return np.repeat(np.asarray(data.start)[None], lanes, 0)
+
+
+def fit(
+    loop: Loop,
+    table: Table,
+    data: Windows,
+    theta: np.ndarray,
+    free: Sequence[Sequence[int]],
+    start: np.ndarray | None = None,
+    *,
+    width: int,
+    lanes: int,
+    iterations: int = _ITERATIONS,
+) -> list[Fit]:
+    """Fit each row of `theta` in the entries `free` names for it, from there and from the states `start`.
+
+    `width` pads the number of free entries and `lanes` the number of rows that one program takes, so that one
+    compilation serves all fits.
+    """
+    start = start_of(data, len(theta)) if start is None else start
+    lots = range(0, len(theta), lanes)
+    found = []
+    for lot in lots:
+        rows = slice(lot, lot + lanes)
+        found += _Lanes(loop, table, data, theta[rows], free[rows], start[rows], width, lanes).run(iterations)
+    return found
+
+
+class _Lanes:
+    """Levenberg-Marquardt of a few lanes that share one compiled program."""
+
+    def __init__(self, loop, table, data, theta, free, start, width, lanes):  # noqa: ANN001
+        self.loop, self.table, self.data, self.lanes = loop, table, data, lanes
+        self.theta, self.start = np.array(theta, float), np.array(start, float)
+        self.free = np.full((len(theta), width), -1)
+        for k, one in enumerate(free):
+            self.free[k, : len(one)] = one
+        self.bounds = np.array([BOUNDS[entry.name] for entry in table])
+
+    def sums(self, which: np.ndarray, theta: np.ndarray, start: np.ndarray) -> list[Sums]:
+        padded = np.resize(which, self.lanes)
+        index = np.maximum(self.free[padded], 0)
+        at = np.resize(np.arange(len(which)), self.lanes)
+        with jax.enable_x64(True):
+            found = linear_sums(self.loop, self.table, theta[at], index, self.data, start[at])
+            cost, gradient, matrix = (np.asarray(x) for x in found)
+        return [Sums(cost[k], gradient[k], matrix[k]) for k in range(len(which))]
+
+    def cost(self, sums: Sums, start: np.ndarray) -> float:
+        prior = (start - np.asarray(self.data.start)) * np.asarray(self.data.precision)
+        total = float(sums.cost.sum() + (prior**2).sum())
+        return total if np.isfinite(total) else np.inf
+
+    def run(self, iterations: int) -> list[Fit]:
+        count = len(self.theta)
+        everyone = np.arange(count)
+        now = self.sums(everyone, self.theta, self.start)
+        cost = [self.cost(s, x) for s, x in zip(now, self.start, strict=True)]
+        damping, done = np.full(count, 1e-3), np.zeros(count, bool)
+        for _ in range(iterations):
+            active = everyone[~done]
+            if not len(active):
+                break
+            steps = [self.step(now[k], k, damping[k]) for k in active]
+            for k, step in zip(active, steps, strict=True):
+                done[k] |= step.gain < _CLOSE and damping[k] <= 1.0
+            tried = [(k, step) for k, step in zip(active, steps, strict=True) if not done[k]]
+            if not tried:
+                continue
+            which = np.array([k for k, _ in tried])
+            trial = self.sums(which, np.stack([s.theta for _, s in tried]), np.stack([s.start for _, s in tried]))
+            for (k, step), sums in zip(tried, trial, strict=True):
+                new = self.cost(sums, step.start)
+                if new < cost[k]:
+                    self.theta[k], self.start[k], now[k], damping[k] = step.theta, step.start, sums, damping[k] / 5
+                    done[k] = cost[k] - new < 1e-7 * cost[k]
+                    cost[k] = new
+                else:
+                    damping[k] = max(damping[k] * 6, 1e-6)
+                    done[k] = damping[k] > 1e8
+        return [Fit(self.theta[k], self.free[k], self.start[k], cost[k], now[k], bool(done[k])) for k in everyone]
+
+    def step(self, sums: Sums, lane: int, damping: Any) -> _Step:
+        """The damped step within the bounds; entries that would leave them stay where they are."""
+        system = System(sums, self.data, self.start[lane])
+        free = self.free[lane]
+        at, (low, high) = np.maximum(free, 0), self.bounds[np.maximum(free, 0)].T
+        fixed = free < 0
+        change, starts = system.solve(fixed, damping)
+        for _ in range(2):
+            wanted = self.theta[lane][at] + change
+            out = ~fixed & (
+                ((wanted < low) & (self.theta[lane][at] <= low)) | ((wanted > high) & (self.theta[lane][at] >= high))
+            )
+            if not out.any():
+                break
+            fixed = fixed | out
+            change, starts = system.solve(fixed, damping)
+        theta = self.theta[lane].copy()
+        mine = free >= 0
+        theta[at[mine]] = np.clip(theta[at[mine]] + change[mine], low[mine], high[mine])
+        return _Step(theta, self.start[lane] + starts, system.decrease(change, starts))
+
+
+class _Step(NamedTuple):
+    theta: np.ndarray
+    start: np.ndarray
+    gain: float  # predicted decrease
+
+
+class System:
+    """Normal equations of the parameters and the windows' starts."""
+
+    def __init__(self, sums: Sums, data: Windows, start: np.ndarray):
+        gradient, matrix = sums.gradient.sum(0), sums.matrix.sum(0)
+        states = start.shape[0]
+        m = gradient.shape[1] - states
+        precision = np.asarray(data.precision).T ** 2  # (windows, 2 nv)
+        self.m = m
+        self.hpp, self.gp = matrix[:, :m, :m].sum(0), gradient[:, :m].sum(0)
+        self.hps = matrix[:, :m, m:]
+        self.hss = matrix[:, m:, m:] + np.einsum("wi,ij->wij", precision, np.eye(states))
+        self.gs = gradient[:, m:] - precision * (start - np.asarray(data.start)).T
+
+    def solve(self, fixed: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
+        scale = np.einsum("wii->wi", self.hss)
+        hss = (
+            self.hss + damping * np.einsum("wi,ij->wij", scale, np.eye(scale.shape[1])) + 1e-12 * np.eye(scale.shape[1])
+        )
+        inner = np.linalg.solve(hss, np.concatenate([np.swapaxes(self.hps, 1, 2), self.gs[..., None]], 2))
+        schur = self.hpp - np.einsum("wpi,wiq->pq", self.hps, inner[..., :-1])
+        right = self.gp - np.einsum("wpi,wi->p", self.hps, inner[..., -1])
+        diagonal = np.diag(self.hpp).copy()
+        schur = schur + damping * np.diag(diagonal)
+        keep = ~fixed & (diagonal > 0)
+        change = np.zeros(self.m)
+        if keep.any():
+            size = np.sqrt(diagonal[keep])
+            scaled = schur[np.ix_(keep, keep)] / np.outer(size, size) + 1e-13 * np.eye(keep.sum())
+            change[keep] = np.linalg.lstsq(scaled, right[keep] / size, rcond=1e-12)[0] / size
+        starts = inner[..., -1] - np.einsum("wip,p->wi", inner[..., :-1], change)
+        return change, starts.T
+
+    def decrease(self, change: np.ndarray, starts: np.ndarray) -> float:
+        s = starts.T
+        gain = 2 * (self.gp @ change + (self.gs * s).sum())
+        spent = change @ self.hpp @ change + 2 * np.einsum("p,wpi,wi->", change, self.hps, s)
+        return float(gain - spent - np.einsum("wi,wij,wj->", s, self.hss, s))
+
+    def covariance(self, fixed: np.ndarray) -> np.ndarray:
+        """Of the parameters, the starts being unknown; infinite variance where nothing tells one."""
+        inner = np.linalg.solve(self.hss + 1e-12 * np.eye(self.hss.shape[1]), np.swapaxes(self.hps, 1, 2))
+        schur = self.hpp - np.einsum("wpi,wiq->pq", self.hps, inner)
+        keep = ~fixed & (np.diag(schur) > 0)
+        answer = np.diag(np.full(self.m, np.inf))
+        answer[np.ix_(keep, keep)] = np.linalg.pinv(schur[np.ix_(keep, keep)], rcond=1e-14, hermitian=True)
+        return answer
+
+
+def standard_errors(found: Fit, data: Windows, level: float = 1.0) -> np.ndarray:
+    """One standard deviation of each free entry, (columns,), the noise's variance times `level`."""
+    with np.errstate(invalid="ignore"):
+        spread = np.diag(System(found.sums, data, found.start).covariance(found.free < 0))
+        return np.sqrt(np.maximum(spread, 0.0) * level)
+
+
+def held_out(found: Fit, data: Windows, folds: np.ndarray) -> np.ndarray:
+    """Squares of each block and window as predicted without the fold it is in, (blocks, windows).
+
+    `folds` (blocks, windows) numbers them. The estimate without a fold is theta - (H - H_k)^-1 g_k; the residual is
+    taken to first order there. The states at the starts stay, and so do entries at their bounds.
+    """
+    cost, count = found.sums.cost.sum(-1), len(found.free)
+    gradient, matrix = found.sums.gradient[..., :count], found.sums.matrix[..., :count, :count]
+    whole, answer = matrix.sum((0, 1)), np.zeros(folds.shape)
+    keep = (found.free >= 0) & (np.diag(whole) > 0)
+    for fold in np.unique(folds):
+        mine = folds == fold
+        left = (whole - matrix[mine].sum(0))[np.ix_(keep, keep)]
+        size = np.sqrt(np.maximum(np.diag(left), 1e-300))
+        change = np.zeros(count)
+        right = -gradient[mine].sum(0)[keep] / size
+        change[keep] = np.linalg.lstsq(left / np.outer(size, size), right, rcond=1e-12)[0] / size
+        first, second = gradient @ change, np.einsum("p,bwpr,r->bw", change, matrix, change)
+        answer = np.where(mine, cost - 2 * first + second, answer)
+    return answer

@@ -1,0 +1,393 @@
+"""The loop that turns a command into a motion: drives, joints with friction and limits, and one step of an integrator.
+
+`Loop` holds every number as an array, with a neutral value where the robot has no such thing (no Stribeck force, no
+delay, an infinite limit), so that one compiled program serves all structures and every number can be differentiated.
+Samples stand on the last axis: `q` is (nq, samples), `v` (nv, samples), `act` (nu, samples), `u` (nu, samples).
+
+A step follows MuJoCo 4.0 (`mj_step`): smooth torques at the beginning of the step, then dry friction and joint limits
+as its soft constraints, solved exactly (`friction`), then the integrator. Equal to MuJoCo C within rounding. With
+`law="hard"` friction is the torque that stops the joint within one step, limited to its level, as in BAM.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..rigid.dynamics import joint_masses, joint_torques
+from ..rigid.manifold import integrate
+from ..rigid.model import RobotModel
+from ..rigid.spatial import cross, quaternion_rotation, rotate, rotate_back
+from .friction import Rows, Solution, corrected, solve_rows, solved
+
+__all__ = ["Activation", "Drives", "Integrator", "Joints", "Loop", "State", "Step", "advance", "integrated", "observe"]
+
+Activation = Literal["none", "integrator", "filter", "filterexact"]
+Integrator = Literal["euler", "implicitfast", "rk4"]
+_TINY = 1e-15  # MuJoCo's mjMINVAL
+_HARD = 1e-9  # softness that a hard friction keeps, as a share of the joint's mobility
+
+
+class Drives(eqx.Module):
+    """Actuators: force = clip(gain(l, l') control + bias(l, l')), l = transmission q; torque = transmission' force.
+
+    `gain` and `bias` are MuJoCo's three numbers (constant, of the length, of the rate). `voltage` limits the force
+    before the part that follows the rate (back-EMF) is added, `force_range` limits the sum. `scale` multiplies the
+    control and the part of the bias that follows the length: what a wrong stiffness of a servo does.
+    """
+
+    transmission: Any  # (nu, nv), gear included
+    gain: Any  # (nu, 3)
+    bias: Any  # (nu, 3)
+    scale: Any  # (nu,) 1: as the file says
+    command_range: Any  # (nu, 2)
+    force_range: Any  # (nu, 2), N m or N at the actuator
+    voltage: Any  # (nu,) N m or N
+    dead_band: Any  # (nu,) error of the command without a force, rad or m
+    delay: Any  # (nu,) s
+    time_constant: Any  # (nu,) s, of a filter
+    activation_range: Any  # (nu, 2)
+    names: tuple[str, ...] = eqx.field(static=True)
+    activation: tuple[Activation, ...] = eqx.field(static=True)
+    early: tuple[bool, ...] = eqx.field(static=True)  # the force takes the activation of the end of the step
+
+
+class Joints(eqx.Module):
+    """What acts at each coordinate beside the rigid body, the drives and gravity; arrays (nv,) unless said."""
+
+    armature: Any  # kg m2
+    damping: Any  # N m s/rad
+    friction: Any  # N m, level of dry friction
+    stribeck_force: Any  # N m, more at rest
+    stribeck_speed: Any  # rad/s
+    load_ratio: Any  # N m of friction per N m between motor and load
+    stiffness: Any  # N m/rad
+    rest: Any  # rad, of the spring
+    play: Any  # rad, of the spring: no torque within
+    offset: Any  # N m, constant
+    ripple_sine: Any  # N m
+    ripple_cosine: Any
+    ripple_order: Any  # 1/rad
+    friction_rate: Any  # 1/s, b of the soft law
+    friction_share: Any  # (1 - d) / d of the soft law
+    torque_range: Any  # (nv, 2), N m, of what the drives give together
+    limit: Any  # (nv, 2), rad
+    limit_margin: Any  # rad
+    limit_solref: Any  # (nv, 2)
+    limit_solimp: Any  # (nv, 5)
+    reading: Any  # rad, what the encoder reads beside the position
+
+
+class Loop(eqx.Module):
+    """A robot, its drives and what acts at its joints, in steps of `dt` seconds."""
+
+    robot: RobotModel
+    drives: Drives
+    joints: Joints
+    start: Any  # (nq,) the configuration at which the softness of the constraints is set (MuJoCo's qpos0)
+    dt: Any  # s
+    integrator: Integrator = eqx.field(static=True)
+    law: Literal["soft", "hard"] = eqx.field(static=True)
+    limited: bool = eqx.field(static=True)  # whether any joint limit acts
+    measured: tuple[int, ...] = eqx.field(static=True)  # coordinates that the encoders read
+    summed: tuple[int, ...] = eqx.field(static=True)  # a second coordinate added to each (-1: none)
+
+    @property
+    def columns(self) -> np.ndarray:
+        """Column of q of each coordinate, -1 where no one number tells it."""
+        found = np.full(self.robot.nv, -1)
+        for joint, at in zip(self.robot.joints, self.robot.dofs.positions, strict=True):
+            if joint.kind in ("revolute", "prismatic") and not joint.follows:
+                found[joint.coordinate] = at.start
+        return found
+
+
+class State(NamedTuple):
+    """Where the robot is; the samples on the last axis."""
+
+    q: Array
+    v: Array
+    act: Array
+
+
+class Step(NamedTuple):
+    """What solving a step found, accelerations and acting constraints: enough to differentiate it without a search."""
+
+    solution: Solution  # of the constraints (rk4: stacked over four stages)
+    a: Array  # (nv, samples) of the integrator
+
+
+def mobility(loop: Loop) -> Array:
+    """Diagonal of the inverse inertia at the start (MuJoCo's dof_invweight0), (nv, 1); mean over ball and free axes."""
+    matrix = joint_masses(loop.robot, jnp.asarray(loop.start, jnp.float64)[:, None])[..., 0]
+    matrix = matrix + jnp.diag(jnp.asarray(loop.joints.armature))
+    diagonal = jnp.diagonal(jnp.linalg.inv(matrix)) if loop.robot.nv > 1 else 1.0 / matrix[0]
+    for joint in loop.robot.joints:
+        at = slice(joint.coordinate, joint.coordinate + 3)
+        parts = {"free": (at, slice(at.stop, at.stop + 3)), "spherical": (at,)}.get(joint.kind, ())
+        for part in parts:
+            diagonal = diagonal.at[part].set(diagonal[part].mean())
+    return diagonal[:, None]
+
+
+def _angles(loop: Loop, q: Array) -> Array:
+    columns = loop.columns
+    if np.array_equal(columns, np.arange(len(q))):
+        return q
+    return jnp.where((columns < 0)[:, None], 0.0, q[columns])
+
+
+def _control(loop: Loop, act: Array, u: Array) -> tuple[Array, Array]:
+    """What the gains multiply, and the rate of the activation."""
+    drives = loop.drives
+    low, high = (jnp.asarray(drives.command_range)[:, k, None] for k in (0, 1))
+    u = jnp.clip(u, low, high)
+    rate = jnp.zeros_like(u)
+    if all(kind == "none" for kind in drives.activation):
+        return u, rate
+    time = jnp.maximum(jnp.asarray(drives.time_constant)[:, None], _TINY)
+    kinds = np.array(drives.activation)[:, None]
+    rate = jnp.where(kinds == "integrator", u, jnp.where(kinds == "none", 0.0, (u - act) / time))
+    early = np.array(drives.early)[:, None]
+    state = jnp.where(early, _next_activation(loop, act, rate), act)
+    return jnp.where(kinds == "none", u, state), rate
+
+
+def _next_activation(loop: Loop, act: Array, rate: Array) -> Array:
+    drives = loop.drives
+    if all(kind == "none" for kind in drives.activation):
+        return act
+    time = jnp.maximum(jnp.asarray(drives.time_constant)[:, None], _TINY)
+    exact = np.array(drives.activation)[:, None] == "filterexact"
+    step = jnp.where(exact, time * (1 - jnp.exp(-loop.dt / time)), loop.dt)
+    low, high = (jnp.asarray(drives.activation_range)[:, k, None] for k in (0, 1))
+    return jnp.clip(act + step * rate, low, high)
+
+
+class _Drive(NamedTuple):
+    torque: Array  # (nv, samples) of all drives
+    slope: Array  # (nu, samples) of each force by its rate, where it is not limited
+
+
+def _drive(loop: Loop, angle: Array, v: Array, control: Array) -> _Drive:
+    drives = loop.drives
+    way = jnp.asarray(drives.transmission)
+    length, rate = way @ angle, way @ v
+    gain, bias = (jnp.asarray(x)[..., None] for x in (drives.gain, drives.bias))
+    scale = jnp.asarray(drives.scale)[:, None]
+    force = bias[:, 0] + scale * ((gain[:, 0] + gain[:, 1] * length) * control + bias[:, 1] * length)
+    idle = jnp.abs(gain[:, 0]) * scale * jnp.asarray(drives.dead_band)[:, None]
+    force = force - jnp.clip(force, -idle, idle)
+    volt = jnp.asarray(drives.voltage)[:, None]
+    slope = bias[:, 2] + gain[:, 2] * control
+    force = jnp.clip(force, -volt, volt) + slope * rate
+    low, high = (jnp.asarray(drives.force_range)[:, k, None] for k in (0, 1))
+    free = (force > low) & (force < high)
+    torque = way.T @ jnp.clip(force, low, high)
+    least, most = (jnp.asarray(loop.joints.torque_range)[:, k, None] for k in (0, 1))
+    return _Drive(jnp.clip(torque, least, most), jnp.where(free, slope, 0.0))
+
+
+def _passive(loop: Loop, angle: Array, v: Array) -> Array:
+    j = {name: jnp.asarray(getattr(loop.joints, name))[:, None] for name in _PASSIVE}
+    stretch = angle - j["rest"]
+    stretch = stretch - jnp.clip(stretch, -j["play"] / 2, j["play"] / 2)
+    turn = j["ripple_order"] * angle
+    ripple = j["ripple_sine"] * jnp.sin(turn) + j["ripple_cosine"] * jnp.cos(turn)
+    return -(j["damping"] * v + j["stiffness"] * stretch + j["offset"] + ripple)
+
+
+_PASSIVE = ("damping", "stiffness", "rest", "play", "offset", "ripple_order", "ripple_sine", "ripple_cosine")
+
+
+class _Smooth(NamedTuple):
+    """Everything at the beginning of a step but the constraints."""
+
+    torque: Array  # (nv, samples) of drives and passive elements
+    bias: Array  # gravity and velocity torques of the rigid body
+    damping: Array  # (nv, nv, samples) minus the torque's derivative by v, as implicitfast takes it
+    activation: Array  # at the end of the step
+    rows: Rows
+    shift: Array  # what turns accelerations of free joints into those of MuJoCo's axes
+    rate: Array  # of the activation
+
+
+def _smooth(loop: Loop, state: State, u: Array, weight: Array) -> _Smooth:
+    q, v, act = state
+    angle = _angles(loop, q)
+    control, rate = _control(loop, act, u)
+    drive = _drive(loop, angle, v, control)
+    bias = joint_torques(loop.robot, q, v, jnp.zeros_like(v))
+    damping = jnp.eye(loop.robot.nv)[..., None] * jnp.asarray(loop.joints.damping)[:, None, None]
+    if loop.integrator == "implicitfast":
+        way = jnp.asarray(loop.drives.transmission)
+        damping = damping - jnp.einsum("ai,as,aj->ijs", way, drive.slope, way)
+    torque = drive.torque + _passive(loop, angle, v)
+    rows = _rows(loop, angle, v, drive.torque, bias, weight)
+    return _Smooth(torque, bias, damping, _next_activation(loop, act, rate), rows, _shift(loop, v), rate)
+
+
+def _rows(loop: Loop, angle: Array, v: Array, motor: Array, bias: Array, weight: Array) -> Rows:
+    """Dry friction and limits of each coordinate as soft constraints of its acceleration."""
+    j = loop.joints
+    peak, speed, ratio = (jnp.asarray(x)[:, None] for x in (j.stribeck_force, j.stribeck_speed, j.load_ratio))
+    level = jnp.asarray(j.friction)[:, None] + peak * jnp.exp(-((v / speed) ** 2)) + ratio * jnp.abs(motor - bias)
+    level = jnp.maximum(level, 0.0)
+    if loop.law == "hard":
+        pull, soft = -v / loop.dt, _HARD * weight * jnp.ones_like(v)
+    else:
+        pull = -jnp.asarray(j.friction_rate)[:, None] * v
+        soft = jnp.asarray(j.friction_share)[:, None] * weight * jnp.ones_like(v)
+    if not loop.limited:
+        far, one = jnp.full_like(v, -jnp.inf), jnp.ones_like(v)
+        return Rows(level, pull, soft, far, one, far, one)
+    below, above = (jnp.asarray(j.limit)[:, k, None] for k in (0, 1))
+    low = _limit(loop, angle - below, v, weight)
+    high = _limit(loop, above - angle, -v, weight)
+    return Rows(level, pull, soft, *low, *high)
+
+
+def _limit(loop: Loop, distance: Array, rate: Array, weight: Array) -> tuple[Array, Array]:
+    """Pull (acceleration asked for) and softness of one side's limits; -inf pull where the limit is far."""
+    j = loop.joints
+    margin = jnp.asarray(j.limit_margin)[:, None]
+    time, ratio = (jnp.asarray(j.limit_solref)[:, k, None] for k in (0, 1))
+    lowest, highest, width, middle, power = (jnp.asarray(j.limit_solimp)[:, k, None] for k in range(5))
+    near = distance < margin
+    depth = jnp.where(near, distance - margin, 0.0)
+    x = jnp.clip(jnp.abs(depth) / width, 0.0, 1.0)
+    inner = jnp.where(x <= middle, x, 0.0)
+    outer = jnp.where(x > middle, 1 - x, 0.0)
+    curve = jnp.where(x <= middle, inner**power / middle ** (power - 1), 1 - outer**power / (1 - middle) ** (power - 1))
+    impedance = lowest + jnp.where(power == 1, x, curve) * (highest - lowest)
+    direct = time <= 0
+    safe = jnp.maximum(time, 2 * loop.dt)
+    stiff = jnp.where(direct, -time / highest**2, 1.0 / (highest * safe * jnp.where(direct, 1.0, ratio)) ** 2)
+    damp = jnp.where(direct, -ratio / highest, 2.0 / (highest * safe))
+    pull = -damp * rate - stiff * impedance * depth
+    return jnp.where(near, pull, -jnp.inf), (1 - impedance) / impedance * weight
+
+
+def _shift(loop: Loop, v: Array) -> Array:
+    """w x v at free joints: our linear rates are in the turning axes, MuJoCo's in the world's."""
+    shift = jnp.zeros_like(v)
+    for joint in loop.robot.joints:
+        if joint.kind == "free":
+            k = joint.coordinate
+            shift = shift.at[k : k + 3].set(cross(v[k + 3 : k + 6], v[k : k + 3]))
+    return shift
+
+
+def _masses(loop: Loop, q: Array) -> Array:
+    armature = jnp.asarray(loop.joints.armature)[:, None, None]
+    return joint_masses(loop.robot, q) + jnp.eye(loop.robot.nv)[..., None] * armature
+
+
+def _accelerate(loop: Loop, state: State, u: Array, weight: Array, warm: Array) -> tuple[_Smooth, Array, Solution]:
+    smooth = _smooth(loop, state, u, weight)
+    masses = _masses(loop, state.q)
+    return smooth, masses, solve_rows(masses, smooth.torque - smooth.bias, smooth.rows, warm)
+
+
+def advance(loop: Loop, state: State, u: Array, weight: Array, warm: Array) -> tuple[State, Step]:
+    """One step: the state after it, and what `integrated` needs to compute it again and differentiate it.
+
+    `weight` is `mobility(loop)`, `warm` the acceleration of the step before (any guess will do).
+    """
+    if loop.integrator == "rk4":
+        return _runge_kutta(loop, state, u, weight, warm, None)
+    smooth, masses, solution = _accelerate(loop, state, u, weight, warm)
+    force = jnp.einsum("ijs,js->is", masses, solution.a + smooth.shift)
+    a = solved(masses + loop.dt * smooth.damping, force)
+    return _moved(loop, state, a, smooth.activation), Step(solution, a)
+
+
+def integrated(loop: Loop, state: State, u: Array, weight: Array, step: Step) -> State:
+    """The state after a step that `advance` has solved, differentiable in everything (forward and reverse mode).
+
+    The constraints that act are those of the solution; one Newton step from it, exact already, carries the derivatives.
+    """
+    if loop.integrator == "rk4":
+        return _runge_kutta(loop, state, u, weight, step.a, step)[0]
+    smooth = _smooth(loop, state, u, weight)
+    found, whole = jax.lax.stop_gradient((step.solution, step.a))
+    masses = jax.lax.stop_gradient(_masses(loop, state.q))
+    implicit = masses + loop.dt * jax.lax.stop_gradient(smooth.damping)
+    first, second = _inertial(loop, state, smooth.bias, found.a, whole - smooth.shift)
+    a = corrected(masses, smooth.rows, found, first + smooth.bias - smooth.torque)
+    gap = second + loop.dt * jnp.einsum("ijs,js->is", smooth.damping, whole) - first
+    gap = gap - jnp.einsum("ijs,js->is", masses, a - found.a)
+    return _moved(loop, state, whole - solved(implicit, gap), smooth.activation)
+
+
+def _inertial(loop: Loop, state: State, bias: Array, *accelerations: Array) -> list[Array]:
+    """M a of the rigid body with armature for each of the accelerations, by one inverse dynamics of all of them."""
+    count = len(accelerations)
+    a = jnp.concatenate(accelerations, 1)
+    q, v = (jnp.concatenate([x] * count, 1) for x in (state.q, state.v))
+    torque = joint_torques(loop.robot, q, v, a) + jnp.asarray(loop.joints.armature)[:, None] * a
+    return [part - bias for part in jnp.split(torque, count, axis=1)]
+
+
+def _moved(loop: Loop, state: State, a: Array, activation: Array) -> State:
+    """Semi-implicit: the new velocity carries the position; `a` is in MuJoCo's axes at free joints."""
+    v = state.v + loop.dt * a
+    if loop.robot.nq == loop.robot.nv:
+        return State(state.q + loop.dt * v, v, activation)
+    q = state.q
+    for joint, at in zip(loop.robot.joints, loop.robot.dofs.positions, strict=True):
+        k = joint.coordinate
+        if joint.kind != "free":
+            continue
+        turn = quaternion_rotation(q[at.start + 3 : at.stop])
+        world = rotate(turn, v[k : k + 3])
+        spin = jnp.zeros_like(v).at[k + 3 : k + 6].set(loop.dt * v[k + 3 : k + 6])
+        after = integrate(loop.robot, q.T, spin.T).T
+        back = rotate_back(quaternion_rotation(after[at.start + 3 : at.stop]), world)
+        q = q.at[at].set(jnp.concatenate([q[at.start : at.start + 3] + loop.dt * world, after[at.start + 3 : at.stop]]))
+        v = v.at[k : k + 3].set(back)
+    still = v
+    for joint in loop.robot.joints:
+        if joint.kind == "free":
+            still = still.at[joint.coordinate : joint.coordinate + 6].set(0.0)
+    return State(integrate(loop.robot, q.T, loop.dt * still.T).T, v, activation)
+
+
+def _runge_kutta(
+    loop: Loop, state: State, u: Array, weight: Array, warm: Array, step: Step | None
+) -> tuple[State, Step]:
+    """The classical scheme of fourth order, the constraints solved at each stage."""
+    shares, solutions, rates, now = (0.0, 0.5, 0.5, 1.0), [], [], state
+    for k, share in enumerate(shares):
+        if k:
+            now = State(*(x + share * loop.dt * r for x, r in zip(state, rates[-1], strict=True)))
+        if step is None:
+            smooth, _, solution = _accelerate(loop, now, u, weight, warm)
+            a = warm = solution.a
+        else:
+            smooth = _smooth(loop, now, u, weight)
+            solution = jax.lax.stop_gradient(jax.tree.map(lambda x, k=k: x[k], step.solution))
+            masses = jax.lax.stop_gradient(_masses(loop, now.q))
+            (first,) = _inertial(loop, now, smooth.bias, solution.a)
+            a = corrected(masses, smooth.rows, solution, first + smooth.bias - smooth.torque)
+        solutions.append(solution)
+        rates.append(State(now.v, a, smooth.rate))
+    weights = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
+    mean = jax.tree.map(lambda *parts: sum(w * r for w, r in zip(weights, parts, strict=True)), *rates)
+    after = State(state.q + loop.dt * mean.q, state.v + loop.dt * mean.v, _next_activation(loop, state.act, mean.act))
+    return after, Step(jax.tree.map(lambda *x: jnp.stack(x), *solutions), solutions[-1].a)
+
+
+def observe(loop: Loop, state: State) -> Array:
+    """What the encoders read, (measured, samples), rad or m."""
+    angle = _angles(loop, state.q)
+    read = angle[np.array(loop.measured)]
+    if any(k >= 0 for k in loop.summed):
+        more = np.array(loop.summed)
+        read = read + jnp.where((more >= 0)[:, None], angle[more], 0.0)
+    return read + jnp.asarray(loop.joints.reading)[np.array(loop.measured), None]

@@ -1,0 +1,107 @@
+"""Numbers of a loop by name: what a fit may change, as one vector.
+
+A `Table` lists (name, place) entries; `put` writes a vector of their values into a loop. A place is a coordinate, a
+drive or a link, or several of them that share one number.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .loop import Loop
+
+__all__ = ["BOUNDS", "UNITS", "Entry", "Table", "put", "values"]
+
+_OF_DRIVES = ("scale", "delay", "dead_band", "voltage", "time_constant")
+
+
+class Entry(NamedTuple):
+    """One number: `name` is a field of `Joints` or `Drives`, or kp, kd, force_limit, payload."""
+
+    name: str
+    at: tuple[int, ...]  # coordinates, drives (names of `Drives`, kp, kd, force_limit) or links (payload)
+
+
+Table = tuple[Entry, ...]
+
+UNITS = {
+    "armature": "kg m2", "damping": "N m s/rad", "friction": "N m", "stribeck_force": "N m", "stribeck_speed": "rad/s",
+    "load_ratio": "", "stiffness": "N m/rad", "rest": "rad", "play": "rad", "offset": "N m", "ripple_sine": "N m",
+    "ripple_cosine": "N m", "ripple_order": "1/rad", "reading": "rad", "scale": "", "delay": "s", "dead_band": "rad",
+    "voltage": "N m", "force_limit": "N m", "time_constant": "s", "payload": "kg", "kp": "N m/rad", "kd": "N m s/rad",
+    "gravity_x": "m/s2", "gravity_y": "m/s2",
+}  # fmt: skip
+
+_ANY = (-np.inf, np.inf)
+BOUNDS = {  # what such a number can be
+    "armature": (1e-6, 1e3), "damping": (0.0, 1e4), "friction": (0.0, 1e4), "stribeck_force": (0.0, 1e4),
+    "stribeck_speed": (0.005, 3.0), "load_ratio": (0.0, 0.95), "stiffness": (0.0, 1e7), "play": (0.0, 0.5),
+    "ripple_order": (0.5, 40.0), "scale": (0.02, 50.0), "delay": (0.0, 0.15), "dead_band": (0.0, 0.5),
+    "voltage": (1e-4, 1e6), "force_limit": (1e-4, 1e6), "time_constant": (1e-4, 2.0), "payload": (-50.0, 50.0),
+    "kp": (1e-6, 1e6), "kd": (0.0, 1e5), "reading": (-0.5, 0.5), "offset": _ANY, "rest": _ANY, "ripple_sine": _ANY,
+    "ripple_cosine": _ANY, "gravity_x": (-9.0, 9.0), "gravity_y": (-9.0, 9.0),
+}  # fmt: skip
+
+
+def values(loop: Loop, table: Table) -> np.ndarray:
+    """The numbers of the table in a loop (a payload is 0: it is what is added)."""
+    return np.array([float(_get(loop, entry.name)[entry.at[0]]) for entry in table])
+
+
+def _get(loop: Loop, name: str) -> Any:
+    drives = loop.drives
+    special = {
+        "kp": lambda: np.asarray(drives.gain)[:, 0],
+        "kd": lambda: -np.asarray(drives.bias)[:, 2],
+        "force_limit": lambda: np.asarray(drives.force_range)[:, 1],
+        "payload": lambda: np.zeros(len(loop.robot.joints)),
+        "gravity_x": lambda: np.asarray(loop.robot.gravity)[:1],
+        "gravity_y": lambda: np.asarray(loop.robot.gravity)[1:2],
+    }
+    if name in special:
+        return special[name]()
+    return np.asarray(getattr(drives if name in _OF_DRIVES else loop.joints, name))
+
+
+def put(loop: Loop, table: Table, theta: Array | np.ndarray) -> Loop:
+    """The loop with the table's numbers; differentiable in `theta`."""
+    for name in dict.fromkeys(entry.name for entry in table):
+        pairs = [(place, k) for k, entry in enumerate(table) if entry.name == name for place in entry.at]
+        at, which = (np.array(x) for x in zip(*pairs, strict=True))
+        loop = _put(loop, name, at, theta[which])
+    return loop
+
+
+def _put(loop: Loop, name: str, at: np.ndarray, new: Array | np.ndarray) -> Loop:
+    if name == "payload":
+        own = jnp.asarray(loop.robot.inertia)
+        return eqx.tree_at(lambda m: m.robot.inertia, loop, own.at[at].add(new[:, None] * _point(loop, at)))
+    if name in ("gravity_x", "gravity_y"):
+        k = 0 if name == "gravity_x" else 1
+        return eqx.tree_at(lambda m: m.robot.gravity, loop, jnp.asarray(loop.robot.gravity).at[k].set(new[0]))
+    if name == "force_limit":
+        limits = jnp.asarray(loop.drives.force_range).at[at].set(jnp.stack([-new, new], 1))
+        return eqx.tree_at(lambda m: m.drives.force_range, loop, limits)
+    if name == "kp":
+        gain, bias = (jnp.asarray(x) for x in (loop.drives.gain, loop.drives.bias))
+        both = gain.at[at, 0].set(new), bias.at[at, 1].set(-new)
+        return eqx.tree_at(lambda m: (m.drives.gain, m.drives.bias), loop, both)
+    if name == "kd":
+        return eqx.tree_at(lambda m: m.drives.bias, loop, jnp.asarray(loop.drives.bias).at[at, 2].set(-new))
+    group = "drives" if name in _OF_DRIVES else "joints"
+    old = jnp.asarray(getattr(getattr(loop, group), name))
+    return eqx.tree_at(lambda m: getattr(getattr(m, group), name), loop, old.at[at].set(new))
+
+
+def _point(loop: Loop, at: np.ndarray) -> Array:
+    """Ten parameters of a unit mass at the centre of mass of each link."""
+    own = jnp.asarray(loop.robot.inertia)[at]
+    c = own[:, 1:4] / jnp.maximum(own[:, :1], 1e-9)
+    x, y, z = c.T
+    inertia = jnp.stack([y * y + z * z, -x * y, x * x + z * z, -x * z, -y * z, x * x + y * y], 1)
+    return jnp.concatenate([jnp.ones((len(c), 1)), c, inertia], 1)

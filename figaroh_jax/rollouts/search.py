@@ -1,0 +1,444 @@
+"""Which causes a recording of commands and positions shows: greedy, exact fits, held-out gates, honest verdicts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from scipy import stats
+
+from ..results import Name, Verdict
+from .causes import BASELINE, CONTAINS, Candidate, Catalogue, catalogue, elastic_loop
+from .data import Run, Stretch, noise_of, windows
+from .fit import Fit, System, fit, held_out, standard_errors
+from .loop import Loop
+from .parameters import Entry, Table, values
+from .sensitivity import Windows, predicted
+
+__all__ = ["Named", "Search", "Setting", "begun", "largest_forces", "residuals", "search", "setting"]
+
+_WORTH, _SURE, _ALIKE = 0.004, 1.64, 1.7  # held-out gain and t of a name; t below which two causes are alike
+_CLEAR = 3.0  # t of a name beside which more than noise is left
+_SHORT = 6  # candidates that are fitted where a linear screening can order them
+_GROUP = 25  # rows whose mean shows a slow misfit
+_MOST = 6  # causes
+_EARLY, _LATE = 4, 12  # iterations of a race among all starts, and of its leaders
+_LIMITS = ("actuator_saturation", "voltage_saturation")
+_SHAPED = ("stribeck_friction",)  # without an amplitude their shape shows nothing
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Everything that stays the same during a search."""
+
+    loop: Loop
+    runs: tuple[Run, ...]
+    data: Windows
+    noise: tuple[np.ndarray, ...]
+    known: Catalogue
+    baseline: tuple[int, ...]  # entries that every fit frees
+    folds: np.ndarray  # (blocks, windows)
+    lanes: int
+    width: int
+    stretches: tuple[Stretch, ...]
+    block: float
+
+
+class Structure(NamedTuple):
+    """The loop with the table of its numbers: plain, or with a spring in one joint."""
+
+    loop: Loop
+    table: Table
+    data: Windows
+
+
+class Named(NamedTuple):
+    """A cause that was found."""
+
+    candidate: Candidate
+    t: float
+    gain: float
+    alike: tuple[Name, ...]
+    before: float = float("nan")  # held-out RMS, rad or m
+    after: float = float("nan")
+
+
+@dataclass
+class Search:
+    """What was found."""
+
+    verdict: Verdict
+    named: list[Named]
+    structure: Structure
+    first: Fit  # baseline
+    last: Fit
+    p_value: float
+    proxy: list[Named] = field(default_factory=list)  # best, not named
+    nearest: list[tuple[Name, float, str]] = field(default_factory=list)
+    table: list[tuple[str, float]] = field(default_factory=list)  # chi2/N after each step
+    held: list[float] = field(default_factory=list)  # held-out RMS of the baseline and after each cause, rad or m
+
+
+def setting(
+    loop: Loop,
+    runs: Sequence[Run],
+    *,
+    baseline: Sequence[str] = ("rotor_inertia", "joint_damping", "friction_loss"),
+    more: Sequence[tuple[str, str]] = (),
+    gains_known: bool = True,
+    forbid: Sequence[str] = (),
+    block: float = 0.3,
+    stretches: Sequence[Stretch] = (),
+    rates: bool = True,
+) -> Setting:
+    """Data, catalogue and baseline; `more` are (effect, joint) that it has beside `baseline` at every joint."""
+    fitted = [r for r in runs if not r.holdout]
+    noise = [np.sqrt(np.mean([noise_of(r.position) ** 2 for r in fitted], axis=0))]
+    if rates and all(r.velocity is not None for r in fitted):
+        noise.append(np.sqrt(np.mean([noise_of(r.velocity) ** 2 for r in fitted if r.velocity is not None], axis=0)))
+    stretches = tuple(stretches) or tuple(Stretch(k, 0, len(r.time)) for k, r in enumerate(fitted))
+    data = windows(loop, fitted, stretches, noise, block)
+    known = catalogue(loop, largest_forces(loop, fitted), gains_known=gains_known, forbid=forbid)
+    names = loop.robot.dof_names
+    wanted = [(effect, name) for effect in baseline for name in names] + list(more)
+    all_of = catalogue(loop, largest_forces(loop, fitted), gains_known=False).candidates
+    free = [k for c in all_of if (c.effect, c.at[0]) in wanted for k in c.entries]
+    keep = tuple(c for c in known.candidates if not set(c.entries) <= set(free))
+    count = loop.robot.nv
+    return Setting(
+        loop, tuple(fitted), data, tuple(noise), Catalogue(known.table, keep), tuple(free),
+        _folds(data, stretches), 8 if count == 1 else 1, len(free) + (5 if count == 1 else 8), stretches, block,
+    )  # fmt: skip
+
+
+def _folds(data: Windows, stretches: Sequence[Stretch]) -> np.ndarray:
+    """Recordings where there are three or more, else four quarters of the time."""
+    blocks, count = data.reading.shape[0] // data.block, len(stretches)
+    runs = [s.run for s in stretches]
+    if len(set(runs)) >= 3:
+        return np.broadcast_to(np.array(runs), (blocks, count)).copy()
+    return np.broadcast_to((np.arange(blocks) * 4 // blocks)[:, None], (blocks, count)).copy()
+
+
+def largest_forces(loop: Loop, runs: Sequence[Run]) -> np.ndarray:
+    """The largest force of each drive, its law taken at what was recorded."""
+    drives, found = loop.drives, np.zeros(len(loop.drives.names))
+    for run in runs:
+        position = np.zeros((len(run.time), loop.robot.nv))
+        position[:, list(loop.measured)] = run.position
+        length = position @ np.asarray(drives.transmission).T
+        force = np.asarray(drives.bias)[:, 0] + np.asarray(drives.gain)[:, 0] * run.command
+        force = np.abs(force + np.asarray(drives.bias)[:, 1] * length)
+        found = np.maximum(found, np.quantile(force, 0.999, axis=0))
+    return np.minimum(found, np.asarray(drives.force_range)[:, 1])
+
+
+def residuals(structure: Structure, found: Fit) -> np.ndarray:
+    """Whitened residuals, (rows, ny, windows)."""
+    with jax.enable_x64(True):
+        read = predicted(structure.loop, structure.table, found.theta[None], structure.data, found.start[None])[0]
+    return (np.asarray(structure.data.reading) - np.asarray(read)) * np.asarray(structure.data.weight)
+
+
+def excess(error: np.ndarray, weight: np.ndarray) -> float:
+    """How many sigmas the residual is above white noise: its power, and that of its means over 25 rows."""
+    count = (weight > 0).sum()
+    power = ((error**2).sum() / count - 1) / np.sqrt(6 / count)
+    rows = len(error) // _GROUP * _GROUP
+    means = error[:rows].reshape(-1, _GROUP, *error.shape[1:]).sum(1) / np.sqrt(_GROUP)
+    full = (weight[:rows] > 0).reshape(-1, _GROUP, *error.shape[1:]).all(1)
+    slow = ((means[full] ** 2).mean() - 1.0) / np.sqrt(4 / max(full.sum(), 1)) if full.any() else 0.0
+    return float(max(power / 4, slow / 5))
+
+
+def _free(fitted: Sequence[int], extra: Sequence[int]) -> list[int]:
+    return list(dict.fromkeys([*fitted, *extra]))
+
+
+def _start_values(theta: np.ndarray, candidate: Candidate, values: Sequence[float]) -> np.ndarray:
+    new = theta.copy()
+    for entry, value in zip(candidate.entries, values, strict=True):
+        if not np.isnan(value):
+            new[entry] = value
+    return new
+
+
+class _State(NamedTuple):
+    """The model that stands, and the causes in it."""
+
+    structure: Structure
+    fit: Fit
+    free: tuple[int, ...]
+    excess: float
+
+
+def search(
+    here: Setting, progress: Callable[[str, float], None] = lambda phase, share: None, *, forbid: Sequence[str] = ()
+) -> Search:
+    """Baseline, then one cause after another while held-out data gain; what is left decides the verdict."""
+    structure = Structure(here.loop, here.known.table, here.data)
+    progress("fitting the baseline", 0.1)
+    first = begun(here)
+    weight = np.asarray(here.data.weight)
+    now = _State(structure, first, here.baseline, excess(residuals(structure, first), weight))
+    begin, found, p_value, steps, nearest = now, [], 1.0, [("baseline", _level(first, weight))], []
+    while len(found) < _MOST:
+        progress(f"looking for cause {len(found) + 1}", min(0.2 + 0.15 * len(found), 0.9))
+        tried = _tried(here, now, [n.candidate for n in found], forbid)
+        best, p = _best(here, now, tried, nearest)
+        p_value = p if not found else p_value
+        if best is None:
+            break
+        found.append(best[0])
+        now = best[1]
+        steps.append((str(Name(best[0].candidate.effect, best[0].candidate.at)), _level(now.fit, weight)))
+        if now.excess < 1.0:
+            break
+    return _judged(here, begin, now, found, p_value, steps, nearest)
+
+
+def begun(here: Setting) -> Fit:
+    """The baseline's fit."""
+    begins: Any = _begins(here, values(here.loop, here.known.table))
+    structure = Structure(here.loop, here.known.table, here.data)
+    fits = fit(*structure, begins, [here.baseline] * len(begins), width=here.width, lanes=here.lanes)
+    return min(fits, key=lambda f: f.cost)
+
+
+def _begins(here: Setting, theta: np.ndarray) -> np.ndarray:
+    """Where the baseline's fit starts: at the model; where the gains are free, also stiffer and heavier."""
+    gains = [k for k in here.baseline if here.known.table[k].name == "scale"]
+    if not gains:
+        return theta[None]
+    rotors = [k for k in here.baseline if here.known.table[k].name == "armature"]
+    begins = []
+    for stiff, heavy in ((1.0, 1.0), (4.0, 1.0), (1.0, 8.0), (4.0, 8.0)):
+        begins.append(theta.copy())
+        begins[-1][gains] *= stiff
+        begins[-1][rotors] = np.maximum(begins[-1][rotors], 1e-3) * heavy
+    return np.array(begins)
+
+
+def _level(found: Fit, weight: np.ndarray) -> float:
+    return found.squares / max((weight > 0).sum(), 1)
+
+
+class _Tried(NamedTuple):
+    candidate: Candidate
+    state: _State
+    sse: np.ndarray  # held out, by blocks and windows
+
+
+def _tried(here: Setting, now: _State, named: Sequence[Candidate], forbid: Sequence[str]) -> list[_Tried]:
+    """Every candidate that may still come, fitted from the present optimum from each of its starts."""
+    used = {(c.effect, c.at) for c in named}
+    left = [c for c in here.known.candidates if (c.effect, c.at) not in used and not set(c.entries) <= set(now.free)]
+    if here.loop.robot.nv > 1:
+        left = _screened(here, now, left)
+    thetas, free, owner = [], [], []
+    for c in left:
+        for start in c.starts:
+            thetas.append(_start_values(now.fit.theta, c, start))
+            free.append(_free(now.free, c.entries))
+            owner.append(c)
+    found = []
+    for k, best in _raced(here, now, np.array(thetas), free, [(c.effect, c.at) for c in owner]):
+        found.append(_tried_one(here, now.structure, owner[k], best, free[k]))
+    rigid = len(now.structure.table) == len(here.known.table)
+    if here.loop.robot.nv == 1 and rigid and all(one.state.excess >= 1.0 for one in found):
+        found += _elastic(here, now, forbid)
+    return found
+
+
+def _raced(
+    here: Setting, now: _State, thetas: np.ndarray, free: Sequence[Sequence[int]], owner: Sequence[tuple]
+) -> list[tuple[int, Fit]]:
+    """The fits that lead after a few steps, finished: one of each candidate, with its place among the starts."""
+    if not len(thetas):
+        return []
+    start = np.repeat(now.fit.start[None], len(thetas), 0)
+    lanes = here.lanes * 3 if here.lanes > 1 else 1
+    early = fit(*now.structure, thetas, free, start, width=here.width, lanes=lanes, iterations=_EARLY)
+    leads: dict[Any, int] = {}
+    for k in np.argsort([f.cost for f in early]):
+        leads.setdefault(owner[k], int(k))
+    order = list(leads.values())[: max(here.lanes, _SHORT)]
+    states = np.stack([early[k].theta for k in order]), np.stack([early[k].start for k in order])
+    last = fit(
+        *now.structure, states[0], [free[k] for k in order], states[1],
+        width=here.width, lanes=here.lanes, iterations=_LATE,
+    )  # fmt: skip
+    return list(zip(order, last, strict=True))
+
+
+def _tried_one(here: Setting, structure: Structure, c: Candidate, best: Fit, free: Sequence[int]) -> _Tried:
+    weight = np.asarray(structure.data.weight)
+    state = _State(structure, best, tuple(free), excess(residuals(structure, best), weight))
+    return _Tried(c, state, held_out(best, structure.data, here.folds))
+
+
+def _screened(here: Setting, now: _State, left: Sequence[Candidate]) -> list[Candidate]:
+    """The candidates that one linear step from the present model promises most, several to one linearisation.
+
+    A limit of a drive changes the model before it can be differentiated: each is linearised at one start of its own.
+    """
+    scores: dict[int, float] = {}
+    room = here.width - len(now.free)
+    limits = [k for k, c in enumerate(left) if c.effect in _LIMITS]
+    packs, filled = [], 0
+    for k in [k for k in range(len(left)) if k not in limits]:
+        if not packs or filled + len(left[k].entries) > room:
+            packs.append([])
+            filled = 0
+        packs[-1].append(k)
+        filled += len(left[k].entries)
+    for pack in packs:
+        for variant in range(max([1, *(len(left[k].starts) for k in pack if left[k].effect in _SHAPED)])):
+            theta = now.fit.theta.copy()
+            for k in pack:
+                if left[k].effect in _SHAPED:
+                    theta[left[k].entries[1]] = left[k].starts[variant][1]
+            _score(here, now, theta, [(k, left[k]) for k in pack], scores)
+    for k in limits:
+        theta = _start_values(now.fit.theta, left[k], left[k].starts[len(left[k].starts) // 2])
+        _score(here, now, theta, [(k, left[k])], scores)
+    return [left[k] for k in sorted(scores, key=lambda k: scores[k])[:_SHORT]]
+
+
+def _score(
+    here: Setting, now: _State, theta: np.ndarray, pack: Sequence[tuple[int, Candidate]], scores: dict[int, float]
+) -> None:
+    """Cost after a linear step of each candidate of the pack beside what is free already."""
+    columns = _free(now.free, [entry for _, c in pack for entry in c.entries])
+    start = now.fit.start[None]
+    one = fit(*now.structure, theta[None], [columns], start, width=here.width, lanes=here.lanes, iterations=0)[0]
+    for k, c in pack:
+        mine = set(now.free) | set(c.entries)
+        fixed = np.array([entry < 0 or entry not in mine for entry in one.free])
+        system = System(one.sums, now.structure.data, one.start)
+        cost = one.cost - system.decrease(*system.solve(fixed, 1e-6))
+        scores[k] = min(scores.get(k, np.inf), cost)
+
+
+def _elastic(here: Setting, now: _State, forbid: Sequence[str]) -> list[_Tried]:
+    """A spring, and a spring with play, between motor and link."""
+    wanted = [name for name in ("joint_elasticity", "backlash") if name not in forbid]
+    if not wanted:
+        return []
+    n = here.loop.robot.nv
+    torque = float(largest_forces(here.loop, here.runs).max())
+    loop = elastic_loop(here.loop, 0, 10.0 * torque, 0.01 * torque)
+    extra = tuple(Entry(name, (n,)) for name in ("stiffness", "damping", "play"))
+    table = (*here.known.table, *extra)
+    data = windows(loop, here.runs, here.stretches, here.noise, here.block)
+    structure = Structure(loop, table, data)
+    base = np.concatenate([now.fit.theta, [0.0, 0.0, 0.0]])
+    k = len(here.known.table)
+    made, thetas, free, owner = {}, [], [], []
+    for name in wanted:
+        entries = (k, k + 1) if name == "joint_elasticity" else (k, k + 1, k + 2)
+        reported = ("stiffness", "damping") if name == "joint_elasticity" else ("stiffness", "damping", "width")
+        made[name] = Candidate(name, (here.loop.robot.dof_names[0],), entries, (), reported, True)
+        for share in (0.005, 0.05, 0.3):
+            stiffness = torque / share
+            theta = base.copy()
+            theta[k : k + 3] = stiffness, 0.002 * stiffness, 0.0 if name == "joint_elasticity" else 0.1 * share
+            thetas.append(theta)
+            free.append(_free(now.free, entries))
+            owner.append(name)
+    start = np.zeros((len(thetas), 2 * (n + 1), now.fit.start.shape[1]))
+    start[:, :n], start[:, n + 1 : 2 * n + 1] = now.fit.start[:n], now.fit.start[n:]
+    fits = fit(*structure, np.array(thetas), free, start, width=here.width, lanes=6)
+    found = []
+    for name in wanted:
+        best = min((f for f, o in zip(fits, owner, strict=True) if o == name), key=lambda f: f.cost)
+        found.append(_tried_one(here, structure, made[name], best, _free(now.free, made[name].entries)))
+    return found
+
+
+def _t(worse: np.ndarray, better: np.ndarray) -> float:
+    """t of the blocks' gain in held-out squares."""
+    gain = (worse - better).ravel()
+    gain = gain[(worse.ravel() != 0) | (better.ravel() != 0)]
+    return float(gain.mean() / (gain.std(ddof=1) / np.sqrt(len(gain)) + 1e-300)) if len(gain) > 2 else 0.0
+
+
+def _best(
+    here: Setting, now: _State, tried: Sequence[_Tried], nearest: list[tuple[Name, float, str]]
+) -> tuple[tuple[Named, _State] | None, float]:
+    """The cause to name next with the state it makes, and p of what is left before it being noise."""
+    before = held_out(now.fit, now.structure.data, here.folds)
+    gains = [(before.sum() - one.sse.sum()) / before.sum() for one in tried]
+    ts = [_t(before, one.sse) for one in tried]
+    nearest.clear()
+    if not tried:
+        return None, 1.0
+    p = float(max(stats.norm.sf(4 * now.excess), 1e-12))
+    sure = _SURE if now.excess >= 1.0 else 2.5
+    passing = [k for k in range(len(tried)) if gains[k] > _WORTH and ts[k] > sure and _sized(here, tried[k])]
+    for k in np.argsort(gains)[::-1][:3]:
+        why = "no better than another" if k in passing else "gains too little on data that it was not fitted to"
+        nearest.append((Name(tried[k].candidate.effect, tried[k].candidate.at), float(max(gains[k], 0.0)), why))
+    if not passing:
+        return None, p
+    k = min(passing, key=lambda k: tried[k].sse.sum())
+    for simple in passing:  # what it contains is preferred unless clearly worse
+        if tried[simple].candidate.effect in CONTAINS.get(tried[k].candidate.effect, ()):
+            if _t(tried[simple].sse, tried[k].sse) < _ALIKE or tried[simple].sse.sum() <= 1.002 * tried[k].sse.sum():
+                k = simple
+    best = tried[k]
+    alike = []
+    for other in passing:
+        contained = (
+            tried[other].candidate.effect in CONTAINS
+            and best.candidate.effect in CONTAINS[tried[other].candidate.effect]
+        )
+        noise = tried[other].state.excess < 1.0 or best.state.excess >= 1.0
+        near = tried[other].sse.sum() - best.sse.sum() < 0.1 * (before.sum() - best.sse.sum())
+        if other != k and not contained and noise and near and _t(tried[other].sse, best.sse) < _ALIKE:
+            alike.append(Name(tried[other].candidate.effect, tried[other].candidate.at))
+    named = Named(best.candidate, ts[k], float(gains[k]), tuple(alike), _rms(here, before), _rms(here, best.sse))
+    return (named, best.state), p
+
+
+def _rms(here: Setting, squares: np.ndarray) -> float:
+    """Whitened squares as an RMS of position: rad, or m."""
+    count = (np.asarray(here.data.weight) > 0).sum()
+    return float(np.sqrt(max(squares.sum(), 0.0) / count * np.mean(here.noise[0] ** 2)))
+
+
+def _sized(here: Setting, one: _Tried) -> bool:
+    """Whether its first number is clear of no effect, and on no bound of the search."""
+    found = one.state.fit
+    column = int(np.flatnonzero(found.free == one.candidate.entries[0])[0])
+    error = standard_errors(found, one.state.structure.data)[column]
+    value = found.theta[one.candidate.entries[0]]
+    if one.candidate.effect == "backlash":  # without a width it is an elasticity
+        width = one.candidate.entries[2]
+        spread = standard_errors(found, one.state.structure.data)[int(np.flatnonzero(found.free == width)[0])]
+        if not found.theta[width] > 3 * spread:
+            return False
+    neutral = 1.0 if one.candidate.effect == "actuator_gain" else 0.0
+    if one.candidate.effect in (*BASELINE, "actuator_saturation", "voltage_saturation", "joint_elasticity", "backlash"):
+        return bool(np.isfinite(error) and error < 0.5 * abs(value) + 1e-12)
+    return bool(np.isfinite(error) and abs(value - neutral) > 3 * error)
+
+
+def _judged(
+    here: Setting, begin: _State, now: _State, found: list[Named], p_value: float, steps: list, nearest: list
+) -> Search:
+    """`named` where the rest is noise; `named+rest` where the names hold without each of three recordings or more."""
+    held = [_rms(here, held_out(begin.fit, begin.structure.data, here.folds)), *(n.after for n in found)]
+    result = Search("nothing", found, now.structure, begin.fit, now.fit, p_value, [], list(nearest), steps, held)
+    if now.excess < 1.0:
+        result.verdict = "named" if found else "nothing"
+        return result
+    several = len(np.unique(here.folds)) == len({s.run for s in here.stretches}) >= 3
+    if found and several and all(n.t > _CLEAR for n in found[:1]):
+        result.verdict = "named+rest"
+        return result
+    result.verdict, result.proxy, result.named = "unknown", found, []
+    return result

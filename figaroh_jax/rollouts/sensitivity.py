@@ -1,0 +1,229 @@
+"""What a loop predicts of recordings, and its exact derivatives by parameters and by the state at each start.
+
+Forward mode in three passes over each stretch of time: a plain rollout; all steps of it linearised at once, batched
+over time and windows; a cheap scan of x' = A x + B. Residuals are whitened; sums over each stretch and window are kept,
+for held-out data and for tests by blocks. Several parameter vectors (lanes) are taken side by side, each with its own
+set of free parameters, by one compiled program.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..compiled.batching import program
+from .loop import Loop, State, advance, integrated, mobility, observe
+from .parameters import Table, put
+from .simulation import delayed
+
+__all__ = ["Sums", "Windows", "linear_sums", "predicted", "state_size"]
+
+
+class Windows(eqx.Module):
+    """Stretches of recordings, side by side, on a grid of `substeps` loop steps a row.
+
+    Row k of `reading` is what was measured at the instant at which row `lead + k` of `command` was written.
+    """
+
+    command: Any  # (lead + rows, nu, windows), rad; `lead` rows of history
+    reading: Any  # (rows, ny, windows): positions of the encoders, then their rates where these were recorded
+    weight: Any  # (rows, ny, windows): 1 / standard deviation, 0 where nothing counts
+    start: Any  # (2 nv, windows): position and velocity at the first row, as measured
+    precision: Any  # (2 nv, windows): 1 / standard deviation of that state
+    substeps: int = eqx.field(static=True)
+    lead: int = eqx.field(static=True)
+    block: int = eqx.field(static=True)  # rows that one sum covers; divides the rows
+
+
+class Sums(NamedTuple):
+    """Sums of whitened residuals over each block of rows and window, a leading axis of lanes.
+
+    Columns are the free parameters, then the state at the window's start.
+    """
+
+    cost: Array  # (lanes, blocks, windows, ny) squares
+    gradient: Array  # (lanes, blocks, windows, columns) J' e, e what was read minus what is predicted
+    matrix: Array  # (lanes, blocks, windows, columns, columns) J' J
+
+
+def state_size(loop: Loop) -> int:
+    """Numbers of the state that is carried: positions, velocities and activations."""
+    active = any(kind != "none" for kind in loop.drives.activation)
+    return 2 * loop.robot.nv + (len(loop.drives.names) if active else 0)
+
+
+def _begin(loop: Loop, data: Windows, start: Array) -> State:
+    n = loop.robot.nv
+    q, v = start[:n], start[n:]
+    kinds = np.array(loop.drives.activation)[:, None]
+    first = jnp.asarray(data.command)[data.lead]
+    length = jnp.asarray(loop.drives.transmission) @ q
+    return State(q, v, jnp.where(kinds == "integrator", length, jnp.where(kinds == "none", 0.0, first)))
+
+
+def _seen(loop: Loop, data: Windows, block: Array) -> Array:
+    """Command that the drives see at each step of a block of rows, (steps, nu, windows)."""
+    rows = data.block + data.lead
+    part = jax.lax.dynamic_slice_in_dim(jnp.asarray(data.command), block * data.block, rows)
+    fine = jnp.repeat(part, data.substeps, axis=0)
+    return delayed(fine, jnp.asarray(loop.drives.delay), loop.dt)[data.lead * data.substeps :]
+
+
+def _read(loop: Loop, state: State, rates: bool) -> Array:
+    read = observe(loop, state)
+    if not rates:
+        return read
+    turned = eqx.tree_at(lambda m: m.joints.reading, loop, jnp.zeros(loop.robot.nv))
+    return jnp.concatenate([read, observe(turned, State(state.v, state.v, state.act))])
+
+
+def _rollout(loop: Loop, data: Windows, state: State, warm: Array, weight: Array, block: Array) -> Any:
+    def one(carry: tuple[State, Array], control: Array) -> Any:
+        after, step = advance(loop, carry[0], control, weight, carry[1])
+        return (after, step.a), (carry[0], step)
+
+    return jax.lax.scan(one, (state, warm), _seen(loop, data, block))
+
+
+def _predicted(loop: Loop, table: Table, theta: Array, data: Windows, start: Array) -> Array:
+    """Readings (lanes, rows, ny, windows) of the parameters (lanes, entries) and starts (lanes, 2 nv, windows)."""
+    rates = data.reading.shape[1] > len(loop.measured)
+
+    def lane(theta: Array, start: Array) -> Array:
+        here = put(loop, table, theta)
+        weight = mobility(here)
+
+        def chunk(carry: tuple[State, Array], block: Array) -> Any:
+            carry, (states, _) = _rollout(here, data, *carry, weight, block)
+            rows = jax.tree.map(lambda x: x[:: data.substeps], states)
+            return carry, jax.vmap(lambda q, v, act: _read(here, State(q, v, act), rates))(*rows)
+
+        state = _begin(here, data, start)
+        read = jax.lax.scan(chunk, (state, jnp.zeros_like(state.v)), jnp.arange(len(data.reading) // data.block))[1]
+        return read.reshape(-1, *read.shape[2:])
+
+    return jax.vmap(lane)(theta, start)
+
+
+def _linear_sums(loop: Loop, table: Table, theta: Array, free: Array, data: Windows, start: Array) -> Sums:
+    """Sums of squares, gradients and normal matrices of each lane.
+
+    `theta` (lanes, entries) are all numbers of the table, `free` (lanes, columns) which of them each lane
+    differentiates, `start` (lanes, 2 nv, windows) the states at the windows' starts.
+    """
+    return Sums(*jax.vmap(lambda t, f, s: _lane(loop, table, t, f, data, s))(theta, free, start))
+
+
+predicted = program(_predicted, static_argnums=1)
+linear_sums = program(_linear_sums, static_argnums=1)
+
+
+def _lane(loop: Loop, table: Table, theta: Array, free: Array, data: Windows, start: Array) -> tuple[Array, ...]:
+    size, n, windows = state_size(loop), loop.robot.nv, start.shape[1]
+    rates = data.reading.shape[1] > len(loop.measured)
+    here = put(loop, table, theta)
+    weight = mobility(here)
+    state = _begin(here, data, start)
+    spread = jnp.concatenate([jnp.zeros((size, len(free))), jnp.eye(size)[:, : 2 * n]], 1)
+    spread = jnp.broadcast_to(spread[..., None], (*spread.shape, windows))
+    if size > 2 * n:  # activations start with the command; an integrator's with the position
+        kinds = np.array(loop.drives.activation) == "integrator"
+        begin = jnp.where(kinds[:, None], jnp.asarray(loop.drives.transmission), 0.0)
+        spread = spread.at[2 * n :, len(free) : len(free) + n].set(begin[..., None])
+    look = _looking(loop, size, rates)
+    direct = _direct(loop, table, look.shape[0])[:, free]
+
+    def chunk(carry: tuple[State, Array, Array], block: Array) -> Any:
+        state, warm, spread = carry
+        (state, warm), (states, steps) = _rollout(here, data, state, warm, weight, block)
+        a, b = _linearised(loop, table, theta, free, data, states, steps, block)
+        spread, rows = _spread(a, b, spread, data.substeps)
+        first = data.block * block
+        truth, precise = (jax.lax.dynamic_slice_in_dim(x, first, data.block) for x in (data.reading, data.weight))
+        at_rows = jax.tree.map(lambda x: x[:: data.substeps], states)
+        read = jax.vmap(lambda q, v, act: _read(here, State(q, v, act), rates))(*at_rows)
+        slope = jnp.einsum("yx,txpw->typw", look, rows)
+        slope = slope.at[:, :, : len(free)].add(direct[None, :, :, None]) * precise[:, :, None]
+        error = (truth - read) * precise
+        cost, gradient = jnp.sum(error**2, 0).T, jnp.einsum("typw,tyw->wp", slope, error)
+        return (state, warm, spread), (cost, gradient, jnp.einsum("typw,tyrw->wpr", slope, slope))
+
+    blocks = jnp.arange(data.reading.shape[0] // data.block)
+    return jax.lax.scan(chunk, (state, jnp.zeros_like(state.v), spread), blocks)[1]
+
+
+def _looking(loop: Loop, size: int, rates: bool) -> np.ndarray:
+    """Rows of what is read by the state, (ny, size)."""
+    n, count = loop.robot.nv, len(loop.measured)
+    look = np.zeros((count * (2 if rates else 1), size))
+    for k, (first, more) in enumerate(zip(loop.measured, loop.summed, strict=True)):
+        for coordinate in (first, more):
+            if coordinate >= 0:
+                look[k, coordinate] = 1.0
+                if rates:
+                    look[count + k, n + coordinate] = 1.0
+    return look
+
+
+def _direct(loop: Loop, table: Table, outputs: int) -> Array:
+    """How the readings follow the parameters beside the state: what the encoders read more."""
+    direct = np.zeros((outputs, len(table)))
+    for k, entry in enumerate(table):
+        if entry.name == "reading":
+            for place in entry.at:
+                direct[loop.measured.index(place), k] = 1.0
+    return jnp.asarray(direct)
+
+
+def _linearised(
+    loop: Loop, table: Table, theta: Array, free: Array, data: Windows, states: State, steps: Any, block: Array
+) -> tuple[Array, Array]:
+    """A (steps, size, size, windows) and B (steps, size, columns, windows) of every step of a block at once."""
+    count, windows, size = states.q.shape[0], states.q.shape[2], state_size(loop)
+    active = size > 2 * loop.robot.nv
+
+    def flat(x: Array) -> Array:
+        return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], count * windows)
+
+    if loop.integrator == "rk4":  # its stages stand behind the steps
+        steps = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0) if x.ndim == 4 else x, steps)
+        fixed = jax.tree.map(lambda x: jax.vmap(flat)(x) if x.ndim == 4 else flat(x), steps)
+    else:
+        fixed = jax.tree.map(flat, steps)
+    here = State(*(flat(x) for x in states))
+
+    def move(q: Array, v: Array, act: Array, theta: Array) -> Array:
+        at = put(loop, table, theta)
+        after = integrated(at, State(q, v, act), flat(_seen(at, data, block)), mobility(at), fixed)
+        return jnp.concatenate([after.q, after.v, after.act] if active else [after.q, after.v])
+
+    _, pushed = jax.linearize(move, *here, theta)
+
+    def one(state: Array, k: Array) -> Array:
+        parts = jnp.split(state, [loop.robot.nv, 2 * loop.robot.nv])
+        moved = [jnp.broadcast_to(p[:, None], x.shape) for p, x in zip(parts, here, strict=False) if p.size]
+        own = jnp.where(k < 0, 0.0, jax.nn.one_hot(k, len(theta), dtype=theta.dtype))
+        return pushed(*moved, *([] if active else [jnp.zeros_like(here.act)]), own)
+
+    tangents = jnp.concatenate([jnp.eye(size), jnp.zeros((len(free), size))])
+    entries = jnp.concatenate([jnp.full(size, -1), free])
+    both = jax.vmap(one)(tangents, entries)  # (size + columns, size, steps windows)
+    both = jnp.moveaxis(both.reshape(*both.shape[:2], count, windows), (0, 1, 2), (2, 1, 0))
+    return both[:, :, :size], both[:, :, size:]
+
+
+def _spread(a: Array, b: Array, spread: Array, substeps: int) -> tuple[Array, Array]:
+    """The sensitivities after the block, and at each of its rows: (rows, size, columns, windows)."""
+    columns = b.shape[2]
+
+    def one(spread: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        after = jnp.einsum("xyw,ypw->xpw", step[0], spread)
+        return after.at[:, :columns].add(step[1]), spread
+
+    last, rows = jax.lax.scan(one, spread, (a, b))
+    return last, rows[::substeps]
