@@ -137,11 +137,15 @@ class Backlash(JointEffect):
     """Play in the gear: the motor stands ahead of the link by half of it, on the side to which it pushes."""
 
     name, title = "backlash", "backlash"
+    correction = 2.0  # a calibration reports half of the play
     equation = "q_measured = q + width/2 sign(tau_load)"
     separated_by = "slow reversals of the load of {at}, with a second encoder on the link"
+    separated_by_postures = "postures of {at} near the vertical, on both sides of it"
     width: Scalar = amplitude("rad", lower=0.0, upper=0.05)
 
     def position_error(self, motion: Motion) -> Float[Array, " samples"]:
-        load = self.here(jnp.asarray(motion.load))
+        load = self.here(motion.load)
+        if isinstance(motion.dt, float) and motion.dt == 0.0:  # instants that are no record: the play has been crossed
+            return self.width / 2 * (np if isinstance(load, np.ndarray) else jnp).sign(load)
         ramp = jnp.abs(motion.rate(load)) * jnp.maximum(motion.dt, _CROSSING) / 2
         return self.width / 2 * jnp.clip(load / (ramp + 1e-12), -1.0, 1.0)
