@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -73,7 +74,7 @@ def test_an_effect_of_ones_own_that_errs_in_position_is_one_of_postures(tmp_path
         register(Wear)
         (column,) = columns_of(CATALOGUE["wear"], model, (1,))
         ((joint, field),) = column.pieces
-        assert (joint, column.parameter, column.unit) == (1, "depth", "rad")
+        assert (joint, column.parameter, column.unit) == (1, "depth", "m")  # the joint slides
         # the joint stands behind its reading by the error
         turn = axis_twist(model, 1)[:, None] * -np.exp(-(q[:, 1] ** 2))
         np.testing.assert_allclose(field(postures), turn, rtol=0, atol=1e-15)

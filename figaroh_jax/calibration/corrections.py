@@ -131,8 +131,8 @@ def twists_of(model: RobotModel, final: Measured, at: np.ndarray) -> dict[str, n
     """Constant twist of each joint: offsets and geometry, not what depends on the posture."""
     scale = np.asarray(final.problem.scale)
     twists: dict[str, np.ndarray] = {}
-    q, none = np.zeros((1, model.nv)), np.zeros(0)
-    one = Postures(q, q, none, none, none, none, 1.0)
+    q, none = np.zeros((1, model.nv)), np.zeros((1, 0))
+    one = Postures(q, q, none, none, none, np.zeros(1), 1.0)
     for k, column in enumerate(final.columns):
         if column.effect in ("joint_offset", "link_geometry"):
             ((joint, field),) = column.pieces

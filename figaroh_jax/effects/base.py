@@ -91,7 +91,7 @@ class Motion(eqx.Module):
         return smooth_sign(self.velocity, self.acceleration, self.dt, self.width)
 
     @property
-    def angle(self) -> Float[Array, "samples nv"]:
+    def angle(self) -> Float[Leaf, "samples nv"]:
         """Position of each coordinate, rad or m; zero where no one number tells it (joints of several axes)."""
         if self.model.nq == len(self.model.joint_names):
             return jnp.asarray(self.position)
@@ -187,12 +187,12 @@ class Effect(eqx.Module):
         """The robot with the effect in it, for effects that change its inertia, gravity or geometry."""
         return model
 
-    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
+    def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
         """What the position sensor of the (last) joint `at` reads minus the truth, rad or m; of the robot: of each."""
         raise NotImplementedError(f"{self.name} has no form at the position sensor")
 
     @staticmethod
-    def twist(model: RobotModel, at: tuple[int, ...], shape: float) -> Iterator[tuple[str, str, Sequence[Any]]]:
+    def twist(model: RobotModel, at: tuple[int, ...], shape: float, /) -> Iterator[tuple[str, str, Sequence[Any]]]:
         """Small twists of joint frames that postures show: name, unit and (tree joint, field of the postures) of each.
 
         See `kinematic.Column`; `shape` is the value of the parameter that is not linear.
@@ -255,7 +255,7 @@ class Effect(eqx.Module):
         """Whether the effect has the form, the name of one of the methods above."""
         return getattr(cls, form) is not getattr(Effect, form)
 
-    def here(self, signal: Float[Array, "samples nv"], place: int = 0) -> Float[Array, " samples"]:
+    def here(self, signal: Float[Leaf, "samples nv"], place: int = 0) -> Float[Leaf, " samples"]:
         """Column of `signal` at the joint where the effect acts (`place` 1: the second of a pair)."""
         if isinstance(signal, np.ndarray) and isinstance(self.at, np.ndarray):
             return signal[:, self.at[place]]

@@ -13,7 +13,7 @@ before the joint moves; a coefficient times its field is what the joint's twist 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -187,7 +187,7 @@ class PostureMotion(Motion):
         return cls(model, time, postures.q, rest, rest, load, load, 0.0, width, postures.before, -postures.payload)
 
     @property
-    def angle(self) -> Float[np.ndarray, "samples nj"]:
+    def angle(self) -> Float[Leaf, "samples nj"]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Position of each tree joint, rad or m."""
         return np.asarray(self.position)[:, self._starts]
 
@@ -209,7 +209,7 @@ class JointOffset(JointEffect):
     levels, correction = ("pose",), -1.0
     offset: Scalar = amplitude("rad")
 
-    def position_error(self, motion: Motion) -> Float[np.ndarray, " samples"]:
+    def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
         return self.offset * np.ones(len(motion.time))
 
 
@@ -234,7 +234,7 @@ class GearTransmissionError(JointEffect):
     cosine: Scalar = amplitude("rad")
     order: Scalar = shape("", _ORDERS)
 
-    def position_error(self, motion: Motion) -> Float[np.ndarray, " samples"]:
+    def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
         angle = self.order * self.here(motion.angle)
         return self.sine * np.sin(angle) + self.cosine * np.cos(angle)
 
@@ -248,7 +248,7 @@ class JointCompliance(JointEffect):
     separated_by = "the same postures with two payloads, on both sides of the vertical"
     compliance: Scalar = amplitude("rad/(N m)")
 
-    def position_error(self, motion: Motion) -> Float[np.ndarray, " samples"]:
+    def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
         return self.compliance * self.here(motion.load)
 
 
@@ -284,7 +284,7 @@ class PayloadDeflection(JointEffect):
     separated_by = "the same postures with and without the payload"
     compliance: Scalar = amplitude("rad/(N m)")
 
-    def position_error(self, motion: Motion) -> Float[np.ndarray, " samples"]:
+    def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
         return self.compliance * self.here(motion.payload)
 
 
@@ -298,7 +298,7 @@ class Settling(Effect):
     separated_by = "the same postures in another order, and with a longer wait"
     amount: Scalar = amplitude("")
 
-    def position_error(self, motion: Motion) -> Float[np.ndarray, "samples nj"]:
+    def position_error(self, motion: Any) -> Float[Leaf, "samples nj"]:
         return self.amount * motion.way
 
 
@@ -312,7 +312,7 @@ class ReversalHysteresis(JointEffect):
     separated_by = "each posture approached with {at} from both sides"
     width: Scalar = amplitude("rad")
 
-    def position_error(self, motion: Motion) -> Float[np.ndarray, " samples"]:
+    def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
         return -self.width * np.sign(self.here(motion.way))
 
 
@@ -325,7 +325,7 @@ class JointCoupling(Effect):
     levels, correction = ("pose",), -1.0
     ratio: Scalar = amplitude("")
 
-    def position_error(self, motion: Motion) -> Float[np.ndarray, " samples"]:
+    def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
         return self.ratio * self.here(motion.angle)
 
 

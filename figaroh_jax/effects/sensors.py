@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from ..rigid.model import Leaf
 from .base import Effect, JointEffect, Motion, Native, Scalar, amplitude, shape
 from .registry import register
 
@@ -140,7 +141,7 @@ class EncoderOffset(JointEffect):
     separated_by = "kinematic calibration, or a reference mark of {at}: torque hardly tells it from inertia"
     offset: Scalar = amplitude("rad", lower=-0.2, upper=0.2)
 
-    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
+    def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
         return self.offset * jnp.ones_like(motion.time)
 
 
@@ -155,7 +156,7 @@ class EncoderScale(JointEffect):
     separated_by_postures = "postures over more than half a turn of {at}"
     scale: Scalar = amplitude("", lower=-0.2, upper=0.2)
 
-    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
+    def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
         return self.scale * self.here(motion.angle)
 
 
@@ -171,7 +172,7 @@ class EncoderEccentricity(JointEffect):
     sine: Scalar = amplitude("rad", lower=-0.05, upper=0.05)
     cosine: Scalar = amplitude("rad", lower=-0.05, upper=0.05)
 
-    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
+    def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
         q = self.here(motion.angle)
         space = np if isinstance(q, np.ndarray) else jnp
         return self.sine * space.sin(q) + self.cosine * space.cos(q)
