@@ -18,6 +18,7 @@ from ..effects.kinematic import HISTORY
 from ..errors import InputError, nearest
 from ..estimation import marginal
 from ..recordings.poses import PoseRecording, read_pose_recordings
+from ..recordings.posture_checks import check_pose_recordings
 from ..rigid.chain import chain_between
 from ..rigid.model import RobotModel
 from . import corrections, levels
@@ -51,8 +52,9 @@ def calibrate_task(
 
     model = load_robot(task)
     recordings = read_pose_recordings(task, model)
+    notes = check_pose_recordings(task, model, recordings)
     found = calibrate(model, recordings, forbid=task.diagnose.forbid, level=level, priors=priors, progress=progress)
-    return replace(found, posture=dict(task.robot.posture))
+    return replace(found, posture=dict(task.robot.posture), notes=(*notes, *found.notes))
 
 
 def calibrate(

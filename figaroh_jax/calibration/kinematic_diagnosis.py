@@ -17,6 +17,7 @@ import numpy as np
 from ..effects.kinematic import CATALOGUE, HISTORY
 from ..estimation import marginal
 from ..recordings.poses import PoseRecording, read_pose_recordings
+from ..recordings.posture_checks import check_pose_recordings
 from ..results import Cause, Estimate, Experiment, Gain, Name
 from ..rigid.model import RobotModel
 from . import levels
@@ -56,8 +57,10 @@ def diagnose_pose_task(task: Task, progress: Callable[[str, float], None] = lamb
 
     model = load_robot(task)
     recordings = read_pose_recordings(task, model)
+    notes = check_pose_recordings(task, model, recordings)
     found = diagnose_poses(model, recordings, task.diagnose.forbid, task.diagnose.alpha, progress)
-    return replace(found, calibration=replace(found.calibration, posture=dict(task.robot.posture)))
+    notes = (*notes, *found.calibration.notes)
+    return replace(found, calibration=replace(found.calibration, posture=dict(task.robot.posture), notes=notes))
 
 
 def diagnose_poses(

@@ -40,8 +40,11 @@ __all__ = [
     "Motion",
     "Native",
     "Parameter",
+    "Place",
     "amplitude",
+    "fixed",
     "joint_unit",
+    "movable",
     "place",
     "shape",
     "smooth_sign",
@@ -149,13 +152,44 @@ def shape(
     return eqx.field(default=grid[0], metadata={"parameter": parameter})
 
 
+class Place(eqx.Module):
+    """Where an effect of a model acts, known when tracing: no leaf, so that `jax.grad` takes the model as it is.
+
+    It reads like the array of indices it stands for. An `Effect` whose `at` is an array instead can be mapped over
+    places by `jax.vmap` (`movable`).
+    """
+
+    index: tuple[int, ...] = eqx.field(static=True)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.index, np.int64 if dtype is None else dtype)
+
+    def __jax_array__(self) -> Array:
+        return jnp.asarray(np.asarray(self))
+
+    def __getitem__(self, k: Any) -> Any:
+        return self.index[k]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.index)
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """As that of an array."""
+        return (len(self.index),)
+
+
 class Effect(eqx.Module):
     """A physical effect at a place; subclass it, declare its parameters and write at least one form.
 
-    `at` holds the indices of the place: one coordinate (`joint`), two (`pair`), a tree link (`link`), none (`robot`).
+    `at` holds the indices of the place: one coordinate (`joint`), two (`pair`), a tree link (`link`), none (`robot`);
+    in a model they are static (`Place`).
     """
 
-    at: Int[Leaf, "*many places"]
+    at: Int[Leaf, "*many places"] | Place
 
     name: ClassVar[str]
     title: ClassVar[str]  # in plain words, for people
@@ -255,9 +289,14 @@ class Effect(eqx.Module):
         """Whether the effect has the form, the name of one of the methods above."""
         return getattr(cls, form) is not getattr(Effect, form)
 
+    @property
+    def places(self) -> Int[Leaf, "*many places"]:
+        """`at` as an array."""
+        return np.asarray(self.at) if isinstance(self.at, Place) else self.at
+
     def here(self, signal: Float[Leaf, "samples nv"], place: int = 0) -> Float[Leaf, " samples"]:
         """Column of `signal` at the joint where the effect acts (`place` 1: the second of a pair)."""
-        if isinstance(signal, np.ndarray) and isinstance(self.at, np.ndarray):
+        if isinstance(self.at, Place) or (isinstance(signal, np.ndarray) and isinstance(self.at, np.ndarray)):
             return signal[:, self.at[place]]
         return jax.lax.dynamic_index_in_dim(signal, self.at[place], 1, keepdims=False)  # traced at once, unlike `[]`
 
@@ -270,7 +309,7 @@ class Effect(eqx.Module):
         """A torque or an error of a torque at the effect's own joints in the columns of all."""
         if self.acts_on in ("link", "robot"):
             return torque
-        return jnp.zeros_like(motion.velocity).at[:, self.at].add(torque.reshape(torque.shape[0], -1))
+        return jnp.zeros_like(motion.velocity).at[:, self.places].add(torque.reshape(torque.shape[0], -1))
 
 
 class JointEffect(Effect):
@@ -308,6 +347,18 @@ def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **par
         raise InputError(f"effect '{effect.name}' has no parameter '{sorted(unknown)[0]}'; known: {known}")
     indices = np.asarray([index(name) for name in at], dtype=np.int64)
     return effect(indices, **{name: np.float64(value) for name, value in parameters.items()})
+
+
+def fixed(effect: Effect) -> Effect:
+    """The effect with its place static, where it stands at one known place."""
+    if isinstance(effect.at, (Place, jax.core.Tracer)) or np.ndim(effect.at) != 1:
+        return effect
+    return eqx.tree_at(lambda e: e.at, effect, Place(tuple(np.asarray(effect.at).tolist())))
+
+
+def movable(effect: Effect) -> Effect:
+    """The effect with its place an array: programs then serve every place, and `jax.vmap` maps over places."""
+    return eqx.tree_at(lambda e: e.at, effect, effect.places) if isinstance(effect.at, Place) else effect
 
 
 def joint_unit(unit: str, prismatic: bool) -> str:

@@ -56,9 +56,9 @@ class CoupledTransmission(Effect):
     sign: Scalar = shape("", (1.0, -1.0), choice=True)
 
     def torque(self, motion: Motion) -> Float[Array, "samples 2"]:
-        v, a = (jnp.take(x, self.at, axis=1, mode="clip") for x in (motion.velocity, motion.acceleration))
+        v, a = (jnp.take(x, self.places, axis=1, mode="clip") for x in (motion.velocity, motion.acceleration))
         relative = jnp.stack([jnp.ones(()), jnp.asarray(self.sign)])  # of the motor to each joint
-        reversal = motion.reversal(v @ relative, a @ relative, jnp.take(motion.width, self.at, mode="clip").mean())
+        reversal = motion.reversal(v @ relative, a @ relative, jnp.take(motion.width, self.places, mode="clip").mean())
         linear = self.sign * (self.inertia * a[:, ::-1] + self.damping * v[:, ::-1])
         return linear + self.friction * reversal[:, None] * relative
 

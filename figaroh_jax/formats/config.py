@@ -128,8 +128,9 @@ class Load(_Keys):
 
 
 class Units(_Keys):
-    """Units of the arrays where they are not rad, m and N m."""
+    """Units of the arrays where they are not s, rad, m and N m."""
 
+    time: Literal["s", "ms", "us", "ns"] = "s"
     position: Literal["rad", "deg", "m", "mm"] = "rad"
     velocity: Literal["rad/s", "deg/s", "m/s", "mm/s"] | None = None  # None: as the position
     torque: Literal["N m", "Nm", "N", "A"] = "N m"
@@ -264,11 +265,21 @@ class Actuator(_Keys):
     gains: Literal["known", "free"] = "known"
 
 
+class Tolerance(_Keys):
+    """What is good enough: a misfit below it is `nothing`."""
+
+    torque: Annotated[Number, Field(ge=0, lt=1)] = 0.01  # share of each joint's RMS torque
+    offset: Annotated[Number, Field(ge=0)] = 0.001  # rad
+    geometry: Annotated[Number, Field(ge=0)] = 0.0005  # m
+    position: Annotated[Number, Field(ge=0)] = 0.001  # rad, of rollouts
+
+
 class Diagnose(_Keys):
     """What is looked for."""
 
     forbid: tuple[Effect, ...] = ()  # effects left out of the catalogue
     alpha: Annotated[Number, Field(gt=0, lt=1)] = 0.05
+    tolerance: Tolerance = Tolerance()
 
 
 class Bound(_Keys):

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..effects.base import Effect
+from ..effects.plausibility import implausible
 from ..errors import InputError, nearest
 from ..estimation.base_parameters import BaseParameters, base_parameters, essential
 from ..estimation.columns import friction_terms, structural_columns
@@ -25,6 +26,7 @@ from ..estimation.intervals import coloured_covariance
 from ..estimation.least_squares import Solution, WeightedByJoint, solve, with_prior
 from ..estimation.priors import rigid_prior
 from ..estimation.regression import Condensed, Regression, condense
+from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import prepare_all
 from ..rigid.model import RobotModel, prismatic
@@ -88,6 +90,7 @@ def identify_task(
     progress("reading", 0.0)
     model, (known, notes) = load_robot(task), stated_baseline(task)
     recordings = read_recordings(task, model, floating=True)
+    notes = (*notes, *check_recordings(task, model, recordings))
     options = task.identify
     found = identify(
         make_backend(backend, model),
@@ -100,7 +103,7 @@ def identify_task(
         bounds={name: bound.model_dump(exclude_none=True) for name, bound in options.bounds.items()},
         progress=progress,
     )
-    return replace(found, notes=(*notes, *found.notes))
+    return replace(found, notes=(*notes, *implausible(model, found.model, task.robot.trust), *found.notes))
 
 
 def identify(

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,7 +24,25 @@ from .tables import Table, read_table
 if TYPE_CHECKING:
     from ..formats.config import Load, RecordingEntry, Task
 
-__all__ = ["Drive", "Recording", "carried_body", "joint_columns", "read_recordings", "read_time", "unit_factors"]
+__all__ = [
+    "Drive",
+    "Memory",
+    "Recording",
+    "carried_body",
+    "joint_columns",
+    "read_recordings",
+    "read_time",
+    "unit_factors",
+]
+
+
+class Memory(NamedTuple):
+    """Where a recording comes from that was never a file; messages name it so."""
+
+    name: str
+
+    def __str__(self) -> str:
+        return f"recording '{self.name}'"
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +50,7 @@ class Recording:
     """One recording on the joint side: rad and N m, or m and N for prismatic joints."""
 
     name: str  # stem of the file
-    file: Path
+    file: Path | Memory
     joints: tuple[str, ...]  # names of the columns of torque
     time: Float[np.ndarray, " samples"]  # s, increasing
     position: Float[np.ndarray, "samples nq"]  # with quaternions x y z w where the robot has any
@@ -213,11 +231,12 @@ def read_time(table: Table, entry: RecordingEntry, key: str, samples: int) -> Fl
     if len(wrong):
         raise InputError(f"{table.file}: {key}.time ('{entry.time}') is {time[wrong[0]]} in row {wrong[0]} (from 0)")
     back = np.flatnonzero(np.diff(time) <= 0)
+    unit = entry.units.time
     if len(back):
         row = back[0] + 1
         what = "repeats" if time[row] == time[row - 1] else "goes back"
         raise InputError(
-            f"{table.file}: {key}.time {what} in row {row} (from 0): {time[row]:.9g} s after {time[row - 1]:.9g} s;"
-            " the stamps must increase"
+            f"{table.file}: {key}.time {what} in row {row} (from 0): {time[row]:.9g} {unit} after"
+            f" {time[row - 1]:.9g} {unit}; the stamps must increase"
         )
-    return time
+    return time * {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[unit]

@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..compiled.batching import BLOCK, CPU_OPTIONS, chunk_size, in_chunks, on_host, traced, two_axes
+from ..compiled.precision import in_float64
 from ..errors import InputError
 from .kinematics import check_shapes
 from .model import RobotModel
@@ -35,6 +36,7 @@ class NormalMatrix(NamedTuple):
     square: Float[Array, ""]
 
 
+@in_float64
 def normal_matrix(
     model: RobotModel,
     q: Float[ArrayLike, "*batch nq"],
@@ -52,20 +54,20 @@ def normal_matrix(
     of the data. Each coordinate's rows enter with the columns of the links that it moves alone, in batches of equally
     many. Raises `InputError` where the shapes do not fit.
     """
-    with jax.enable_x64(True):
-        rows = _rows(model, q, v, a, tau, weight, extra)
-        columns = 10 * len(model.joints) + (0 if extra is None else np.shape(extra)[-1]) + 1
-        groups = _groups(model, columns)
-        start = tuple(jnp.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
-        # a small matrix is added to from the innermost cache; a large one costs more to add to than its rows to make
-        chunk = 32 if on_host() and columns <= SMALL else chunk_size()
-        parts = _fold(_add_products, chunk, start, model, rows)
-        index = np.concatenate([_flat(group, columns).ravel() for group in groups])
-        whole = _scattered(columns, index, parts)
-        new = NormalMatrix(whole[:-1, :-1], whole[:-1, -1], whole[-1, -1])
-        return new if total is None else NormalMatrix(*(x + y for x, y in zip(total, new, strict=True)))
+    rows = _rows(model, q, v, a, tau, weight, extra)
+    columns = 10 * len(model.joints) + (0 if extra is None else np.shape(extra)[-1]) + 1
+    groups = _groups(model, columns)
+    start = tuple(jnp.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
+    # a small matrix is added to from the innermost cache; a large one costs more to add to than its rows to make
+    chunk = 32 if on_host() and columns <= SMALL else chunk_size()
+    parts = _fold(_add_products, chunk, start, model, rows)
+    index = np.concatenate([_flat(group, columns).ravel() for group in groups])
+    whole = _scattered(columns, index, parts)
+    new = NormalMatrix(whole[:-1, :-1], whole[:-1, -1], whole[-1, -1])
+    return new if total is None else NormalMatrix(*(x + y for x, y in zip(total, new, strict=True)))
 
 
+@in_float64
 def triangular_factor(
     model: RobotModel,
     q: Float[ArrayLike, "*batch nq"],
@@ -82,11 +84,10 @@ def triangular_factor(
     `normal_matrix`, whose arguments these are. One small QR factorisation a chunk, on top of the R so far (TSQR;
     Demmel, Grigori, Hoemmen and Langou, 2012). Without `tau` its column is left out.
     """
-    with jax.enable_x64(True):
-        rows = _rows(model, q, v, a, tau, weight, extra)
-        columns = 10 * len(model.joints) + sum(np.shape(x)[-1] for x in (extra,) if x is not None) + (tau is not None)
-        start = jnp.zeros((columns, columns)) if total is None else jnp.asarray(total, jnp.float64)
-        return _upright(_fold(_add_rows, 2 * chunk_size(), start, model, rows))
+    rows = _rows(model, q, v, a, tau, weight, extra)
+    columns = 10 * len(model.joints) + sum(np.shape(x)[-1] for x in (extra,) if x is not None) + (tau is not None)
+    start = jnp.zeros((columns, columns)) if total is None else jnp.asarray(total, jnp.float64)
+    return _upright(_fold(_add_rows, 2 * chunk_size(), start, model, rows))
 
 
 @jax.jit

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from ..compiled.batching import aligned, chunk_size, host_blocks, on_host, over_samples, put, to_device, two_axes
+from ..compiled.precision import in_float64
 from ..errors import InputError
 from .kinematics import Motion, ancestors, check_shapes, motion, take
 from .model import Joint, RobotModel, dofs
@@ -53,6 +53,7 @@ def _pairs(joints: tuple[Joint, ...]) -> np.ndarray:
     return found
 
 
+@in_float64
 def joint_torque_regressor(
     model: RobotModel,
     q: Float[ArrayLike, "*batch nq"],
@@ -66,13 +67,12 @@ def joint_torque_regressor(
     its own axes. Atkeson, An and Hollerbach (1986), in classical accelerations. Raises `InputError` where the arrays
     do not fit the model.
     """
-    with jax.enable_x64(True):
-        check_shapes(model, q=q, v=v, a=a)
-        width = 10 * len(pairs(model))
-        if on_host(model, q, v, a):
-            shape = (*np.shape(q)[:-1], model.nv, 10 * len(model.joints))
-            return to_device(_dense_on_host(model, chunk_size(width), *two_axes(q, v, a, host=True)).reshape(shape))
-        return over_samples(dense_rows, model, q, v, a, width=width)
+    check_shapes(model, q=q, v=v, a=a)
+    width = 10 * len(pairs(model))
+    if on_host(model, q, v, a):
+        shape = (*np.shape(q)[:-1], model.nv, 10 * len(model.joints))
+        return to_device(_dense_on_host(model, chunk_size(width), *two_axes(q, v, a, host=True)).reshape(shape))
+    return over_samples(dense_rows, model, q, v, a, width=width)
 
 
 def _dense_on_host(model: RobotModel, chunk: int, *arrays: np.ndarray) -> Float[np.ndarray, "samples nv nj 10"]:
@@ -85,6 +85,7 @@ def _dense_on_host(model: RobotModel, chunk: int, *arrays: np.ndarray) -> Float[
     return whole
 
 
+@in_float64
 def packed_regressor(
     model: RobotModel,
     q: Float[ArrayLike, "samples nq"],
@@ -96,11 +97,10 @@ def packed_regressor(
     A row belongs to a degree of freedom, not to a coordinate: mimic joints have rows of their own, without their ratio.
     Units and errors as `joint_torque_regressor`.
     """
-    with jax.enable_x64(True):
-        check_shapes(model, q=q, v=v, a=a)
-        if np.ndim(q) != 2:
-            raise InputError(f"q has shape {np.shape(q)}; a packed regressor takes (samples, joints)")
-        return over_samples(packed_rows, model, q, v, a, last=True, width=10 * len(pairs(model)))
+    check_shapes(model, q=q, v=v, a=a)
+    if np.ndim(q) != 2:
+        raise InputError(f"q has shape {np.shape(q)}; a packed regressor takes (samples, joints)")
+    return over_samples(packed_rows, model, q, v, a, last=True, width=10 * len(pairs(model)))
 
 
 def coordinate_blocks(model: RobotModel) -> tuple[Int[np.ndarray, "blocks 2"], Int[np.ndarray, " pairs"]]:

@@ -1,0 +1,159 @@
+"""The check of recordings of postures before a calibration: joints against limits, measurements against the model.
+
+The measured points are laid over the model's by the rotation, shift, scale and tool point that fit best. What is left,
+as a share of the points' spread, is a few per cent for a robot out of calibration and tens of per cent for columns in
+the wrong order or unit; the scale shows millimetres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..rigid.model import RobotModel, prismatic
+from .checks import DEGREE, Finding, position_findings, report_findings
+from .likeness import frame_poses
+from .poses import PoseRecording
+
+if TYPE_CHECKING:
+    from ..formats.config import RecordingEntry, Task
+
+__all__ = ["check_pose_recording", "check_pose_recordings"]
+
+OFF = 0.12  # share of the points' spread that no calibration leaves
+FEWEST = 8
+
+
+def check_pose_recordings(task: Task, model: RobotModel, recordings: Sequence[PoseRecording]) -> tuple[str, ...]:
+    """Warnings about recordings of postures, also sent to the log `figaroh_jax`; `InputError` where they are wrong."""
+    entries = {entry.file: entry for entry in task.data}
+    found = [(r.file.name, f) for r in recordings for f in check_pose_recording(r, model, entries.get(r.file))]
+    return report_findings(found)
+
+
+def check_pose_recording(
+    recording: PoseRecording, model: RobotModel, entry: RecordingEntry | None = None
+) -> list[Finding]:
+    """Everything that looks wrong about one recording of postures, the gravest first."""
+    if model.nq != model.nv:
+        return []
+    unit = entry.units.position if entry is not None else "rad"
+    found = position_findings(recording.position, model, unit)
+    if any(finding.wrong for finding in found):
+        return [finding for finding in found if finding.wrong]
+    if len(recording.position) > 2 and not np.ptp(recording.position, axis=0).any():
+        return [Finding(True, "every posture is the same: a calibration needs different ones")]
+    if recording.kind in ("position", "pose"):
+        measured_unit = entry.units.measurement if entry is not None else "m"
+        found += _against_model(recording, model, unit, measured_unit)
+    return found
+
+
+class _Overlay(NamedTuple):
+    """Measured points laid over the model's."""
+
+    left: float  # RMS that remains, share of the points' spread
+    scale: float  # measured over the model's
+
+
+def _against_model(recording: PoseRecording, model: RobotModel, unit: str, measured: str) -> Iterator[Finding]:
+    points = recording.values[:, :3, 3] if recording.kind == "pose" else recording.values[:, 0]
+    seen = np.asarray(np.isfinite(points).all(axis=1))
+    if seen.sum() < FEWEST or np.ptp(points[seen], axis=0).max() == 0:
+        return
+    q, points = recording.position[seen], points[seen]
+
+    def overlay(position: np.ndarray) -> _Overlay:
+        turned, origin = frame_poses(model, position, recording.tool_frame)
+        base_turned, base = frame_poses(model, position, recording.base_frame)
+        origin = np.einsum("nji,nj->ni", base_turned, origin - base)
+        return _overlaid(points, np.einsum("nji,njk->nik", base_turned, turned), origin)
+
+    own = overlay(q)
+    if own.left > OFF:
+        yield _odd(own, [(text, overlay(other)) for text, other in _readings(q, model, unit)])
+    elif not 0.5 < own.scale < 2.0:
+        thousand = 500 < own.scale < 2000
+        advice = "they look like mm: add units: {measurement: mm}" if thousand else "which unit are they in?"
+        if 500 < 1 / own.scale < 2000 and measured == "mm":
+            advice = "they look like m: leave units: {measurement: mm} out"
+        yield Finding(True, f"the measured points spread {own.scale:.4g} times as far as the model's; {advice}")
+    if recording.kind == "pose" and own.left <= OFF:
+        yield from _orientations(recording, model, seen)
+
+
+def _odd(own: _Overlay, others: Sequence[tuple[str, _Overlay]]) -> Finding:
+    text, best = min(others, key=lambda item: item[1].left)
+    advice = "columns in another order, another robot, or another frame?"
+    if best.left < 0.3 * own.left and best.left < OFF:
+        advice = text
+    return Finding(
+        False,
+        f"the measured points do not follow the model's postures ({own.left:.0%} of their spread is left after the best"
+        f" placement of device and tool); {advice}",
+    )
+
+
+def _overlaid(points: np.ndarray, turned: np.ndarray, origin: np.ndarray) -> _Overlay:
+    """The best rotation, shift, scale (Umeyama 1991) and tool point, in turns."""
+    tool = np.zeros(3)
+    middle = points - points.mean(axis=0)
+    scale, rotation, mine = 1.0, np.eye(3), origin
+    for _ in range(30):
+        mine = origin + turned @ tool
+        centred = mine - mine.mean(axis=0)
+        u, s, vt = np.linalg.svd(middle.T @ centred)
+        sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+        rotation, scale = (u * sign) @ vt, float((s * sign).sum() / max((centred**2).sum(), 1e-300))
+        wanted = middle @ rotation / max(scale, 1e-12) - (origin - origin.mean(axis=0))
+        design = (turned - turned.mean(axis=0)).reshape(-1, 3)
+        tool = np.linalg.lstsq(design, wanted.ravel(), rcond=1e-6)[0]
+    rest = middle - scale * (mine - mine.mean(axis=0)) @ rotation.T
+    return _Overlay(float(np.sqrt((rest**2).sum() / (middle**2).sum())), scale)
+
+
+def _readings(q: np.ndarray, model: RobotModel, unit: str) -> Iterator[tuple[str, np.ndarray]]:
+    """The same columns in another unit, a pair swapped, a sign turned."""
+    turns, names = ~np.array(prismatic(model)), model.dof_names
+    if unit == "rad":
+        yield "they would in degrees: add units: {position: deg}", q * np.where(turns, DEGREE, 1e-3)
+    else:
+        yield f"they would in rad: leave units: {{position: {unit}}} out", q * np.where(turns, 1 / DEGREE, 1e3)
+    for i in range(len(names)):
+        sign = np.ones(len(names))
+        sign[i] = -1.0
+        yield f"they would with the opposite sign of {names[i]}", q * sign
+        for j in range(i + 1, len(names)):
+            order = list(range(len(names)))
+            order[i], order[j] = j, i
+            yield f"they would with the columns of {names[i]} and {names[j]} swapped", q[:, order]
+
+
+def _orientations(recording: PoseRecording, model: RobotModel, seen: np.ndarray) -> Iterator[Finding]:
+    """Angles between measured orientations against the model's: another order of the quaternion's numbers."""
+    from scipy.spatial.transform import Rotation
+
+    measured = recording.values[seen][:, :3, :3]
+    whole = np.isfinite(measured).all(axis=(1, 2))
+    if whole.sum() < FEWEST:
+        return
+    turned, _ = frame_poses(model, recording.position[seen][whole], recording.tool_frame)
+    base, _ = frame_poses(model, recording.position[seen][whole], recording.base_frame)
+    own = _angles(base.swapaxes(1, 2) @ turned)
+    if np.median(np.abs(_angles(measured[whole]) - own)) < 0.15:
+        return
+    numbers = Rotation.from_matrix(measured[whole]).as_quat()
+    first = Rotation.from_quat(np.roll(numbers, -1, axis=1)).as_matrix()  # w x y z read as x y z w
+    advice = "another order of columns, or another frame?"
+    if np.median(np.abs(_angles(first) - own)) < 0.15:
+        advice = "they look like w x y z; the columns are to be named in the order x y z qx qy qz qw"
+    yield Finding(False, f"the measured orientations do not turn as the model's do; {advice}")
+
+
+def _angles(turned: Float[np.ndarray, "rows 3 3"]) -> Float[np.ndarray, " _"]:
+    """Angle from each orientation to the next, rad."""
+    relative = turned[:-1].swapaxes(1, 2) @ turned[1:]
+    return np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1.0, 1.0))

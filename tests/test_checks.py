@@ -1,0 +1,140 @@
+"""The check of recordings: wrong ones get the right advice, right ones pass, and what it computes is Pinocchio's."""
+
+from __future__ import annotations
+
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from generators import make_case
+from spoiled import KINDS, Base, said
+
+from figaroh_jax.errors import InputError
+from figaroh_jax.formats.config import load_task
+from figaroh_jax.formats.robotfile import load_robot
+from figaroh_jax.formats.urdf import load_urdf
+from figaroh_jax.recordings.checks import check_recordings
+from figaroh_jax.recordings.dataset import read_recordings
+from figaroh_jax.recordings.likeness import Sampled, frame_poses, rigid_torque, stretch_of_time
+
+# its slide takes mm
+NOT_HERE = {"mm on a revolute arm"}
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Base:
+    case = make_case(robot="small", repeats=1, trajectories=1, seed=4)
+    urdf = tmp_path_factory.mktemp("robot") / "robot.urdf"
+    urdf.write_text(case.urdf)
+    run = case.recordings[0]
+    arrays = {"t": run["time"], "q": run["position"], "tau": run["torque"]}
+    entry = {"time": "t", "position": "q", "torque": "tau"}
+    return Base("run", {"model": str(urdf), "joints": list(case.joints)}, arrays, entry, pair=(0, 1))
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS.keys() - NOT_HERE))
+def test_wrong_recordings_get_the_right_advice(base: Base, kind: str, tmp_path: Path):
+    spoil, advice = KINDS[kind]
+    what, text = said(base, spoil, tmp_path)
+    assert what != "silent" and re.search(advice, text), text
+    assert "run.npz" in text
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_right_recordings_pass_in_silence(seed: int, tmp_path: Path):
+    case = make_case(robot="small", repeats=1, trajectories=1, seed=seed)
+    (tmp_path / "robot.urdf").write_text(case.urdf)
+    run = case.recordings[0]
+    arrays = {"t": run["time"], "q": run["position"], "tau": run["torque"]}
+    robot: dict[str, Any] = {"model": str(tmp_path / "robot.urdf"), "joints": list(case.joints)}
+    entry = {"time": "t", "position": "q", "torque": "tau"}
+    assert said(Base("run", robot, arrays, entry), None, tmp_path) == ("silent", "")
+
+
+def test_millimetres_on_an_arm_without_slides_are_refused(tmp_path: Path):
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(_URDF)
+    t = np.arange(400) / 100
+    arrays = {"t": t, "q": np.sin(t)[:, None], "tau": np.cos(3 * t)[:, None]}
+    entry = {"time": "t", "position": "q", "torque": "tau", "units": {"position": "mm"}}
+    what, text = said(Base("run", {"model": str(urdf)}, arrays, entry), None, tmp_path)
+    assert what == "refused" and "every joint of the robot turns" in text
+
+
+_URDF = """<robot name="arm"><link name="base"/><link name="rod"><inertial><origin xyz="0.3 0 0"/><mass value="1"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="j" type="revolute"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/>
+<limit lower="-3" upper="3" effort="50" velocity="5"/></joint></robot>"""
+
+
+def test_stamps_in_nanoseconds_are_read_with_their_unit(base: Base, tmp_path: Path):
+    arrays = dict(base.arrays) | {"t": np.round(1.7e18 + base.arrays["t"] * 1e9).astype(np.int64)}
+    entry = {**base.entry, "units": {"time": "ns"}}
+    assert said(Base("run", base.robot, arrays, entry), None, tmp_path) == ("silent", "")
+
+
+def test_a_warning_is_logged_and_returned_and_names_all_its_files(base: Base, tmp_path: Path, caplog):
+    spoil, _ = KINDS["sign of one torque"]
+    arrays = {key: np.array(value) for key, value in base.arrays.items()}
+    spoil(base, arrays, dict(base.entry))
+    data = ""
+    for name in ("one", "two"):
+        np.savez(tmp_path / f"{name}.npz", **arrays)  # pyright: ignore[reportArgumentType]
+        data += f"  - {{file: {name}.npz, time: t, position: q, torque: tau}}\n"
+    (tmp_path / "task.yaml").write_text(f"robot: {{model: {base.robot['model']}}}\ndata:\n{data}")
+    task = load_task(tmp_path / "task.yaml")
+    model = load_robot(task)
+    with caplog.at_level(logging.WARNING, "figaroh_jax"):
+        warnings = check_recordings(task, model, read_recordings(task, model))
+    assert len(warnings) == 1 and warnings[0].startswith("check: one.npz, two.npz: ")
+    assert [record.getMessage() for record in caplog.records] == list(warnings)
+
+
+def test_recordings_that_all_stand_still_are_refused_together(base: Base, tmp_path: Path):
+    still = {"t": base.arrays["t"], "q": 0 * base.arrays["q"] + 0.1, "tau": base.arrays["tau"]}
+    np.savez(tmp_path / "still.npz", **still)
+    np.savez(tmp_path / "moves.npz", **base.arrays)  # pyright: ignore[reportArgumentType]
+    entry = "{file: %s.npz, time: t, position: q, torque: tau}"
+    head = f"robot: {{model: {base.robot['model']}}}\ndata:\n"
+    for names, refused in ((("still",), True), (("still", "moves"), False)):
+        (tmp_path / "task.yaml").write_text(head + "".join(f"  - {entry % name}\n" for name in names))
+        task = load_task(tmp_path / "task.yaml")
+        model = load_robot(task)
+        recordings = read_recordings(task, model)
+        if refused:
+            with pytest.raises(InputError, match="no joint moves"):
+                check_recordings(task, model, recordings)
+        else:
+            check_recordings(task, model, recordings)
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+def test_the_clock_is_told_from_the_torque(factor: float, base: Base):
+    model = load_urdf(base.robot["model"])
+    from figaroh_jax.recordings.likeness import sampled
+
+    arrays = base.arrays
+    read = sampled(factor * arrays["t"], arrays["q"], arrays["tau"])
+    assert read is not None
+    stretch, error = stretch_of_time(model, read)
+    assert stretch == pytest.approx(factor, rel=0.15) and error < 0.15
+
+
+def test_torque_and_frames_without_jax_are_those_of_pinocchio(base: Base):
+    path = base.robot["model"]
+    model, other = load_urdf(path), pin.buildModelFromUrdf(path)
+    rng = np.random.default_rng(0)
+    q, v, a = rng.normal(size=(3, 20, model.nv))
+    data = other.createData()
+    expected = np.array([pin.rnea(other, data, *row).copy() for row in zip(q, v, a, strict=True)])
+    np.testing.assert_allclose(rigid_torque(model, Sampled(q, v, a, None, 1.0)), expected, rtol=0, atol=1e-11)
+    turned, origin = frame_poses(model, q, "ram")
+    for k, row in enumerate(q):
+        pin.framesForwardKinematics(other, data, row)
+        pose = data.oMf[other.getFrameId("ram")]
+        np.testing.assert_allclose(origin[k], pose.translation, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(turned[k], pose.rotation, rtol=0, atol=1e-12)
