@@ -330,7 +330,7 @@ def test_wrong_shapes_are_refused(chain: RobotModel):
 
 def test_a_bristle_gives_way_until_it_holds(rod: RobotModel):
     """At rest a torque below the level bends the bristle by -distance log(1 - share): Dahl's curve, with gravity."""
-    model = put(rod, "viscous_friction", "hinge", damping=30.0)
+    model = put(rod, "viscous_friction", "hinge", damping=12.0)
     model = put(model, "coulomb_friction", "hinge", force=2.0)
     model = put(model, "presliding", "hinge", force=2.0, distance=0.02)
     run = simulate(model, np.full((3000, 1), 1.2), np.zeros(1), np.zeros(1), DT)
