@@ -18,13 +18,25 @@ if TYPE_CHECKING:
     from .effects.extended import ExtendedModel as ExtendedModel, extend as extend
     from .effects.simulation import simulate as simulate
     from .errors import InputError as InputError
+    from .fitting.blockwise import BlockLevenbergMarquardt as BlockLevenbergMarquardt
+    from .fitting.data import (
+        PoseData as PoseData,
+        TorqueData as TorqueData,
+        pose_data as pose_data,
+        residual as residual,
+        torque_data as torque_data,
+    )
+    from .fitting.fit import Fit as Fit, fit as fit
+    from .fitting.linear import fit_linear as fit_linear, linear_basis as linear_basis, linear_limits as linear_limits
     from .formats.config import Baseline as Baseline, Preprocess as Preprocess, load_task as load_task
     from .formats.export import load_model as load_model, write_model as write_model
     from .formats.mjcf import load_mjcf as load_mjcf
     from .formats.robotfile import load_extended as load_extended, load_robot as load_robot
     from .formats.urdf import load_urdf as load_urdf
     from .identification.identification import identify as identify, identify_task as identify_task
+    from .recordings.arrays import postures as postures, recording as recording
     from .recordings.dataset import Recording as Recording, read_recordings as read_recordings
+    from .recordings.devices import Device as Device, own_device as own_device
     from .reporting.report import write_report as write_report
     from .results import Cause as Cause, Diagnosis as Diagnosis
     from .rigid.dynamics import (
@@ -44,9 +56,17 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
+DEMO = f"{__path__[0]}/demo/robot.urdf"  # a small arm, for examples
+
 _MODULES = {
     "calibration.calibration": ("calibrate", "calibrate_task"),
     "formats.config": ("Baseline", "Preprocess", "load_task"),
+    "fitting.data": ("PoseData", "TorqueData", "pose_data", "residual", "torque_data"),
+    "fitting.blockwise": ("BlockLevenbergMarquardt",),
+    "fitting.fit": ("Fit", "fit"),
+    "fitting.linear": ("fit_linear", "linear_basis", "linear_limits"),
+    "recordings.arrays": ("postures", "recording"),
+    "recordings.devices": ("Device", "own_device"),
     "recordings.dataset": ("Recording", "read_recordings"),
     "diagnosis.diagnosis": ("diagnose", "diagnose_task"),
     "rigid.dynamics": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),

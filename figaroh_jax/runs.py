@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import html
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,6 +22,8 @@ if TYPE_CHECKING:
     from .formats.config import Load, Task
     from .identification.result import Identification, Link
     from .results import Diagnosis
+    from .rollouts.identification import RolloutIdentification
+    from .rollouts.loop import Loop
 
 __all__ = [
     "ANSWER",
@@ -28,12 +33,13 @@ __all__ = [
     "Job",
     "calibrate_file",
     "diagnose_file",
+    "export_loop",
     "identify_file",
     "predictions",
     "write_run",
 ]
 
-ANSWER, RESULT, REPORT = "answer.json", "result.json", "report.html"
+ANSWER, RESULT, REPORT, LOOP = "answer.json", "result.json", "report.html", "loop.json"
 
 
 class Job(NamedTuple):
@@ -63,12 +69,64 @@ def diagnose_file(
     if any(entry.measurement is not None for entry in task.data):
         _native_alone(backend)
         return _diagnose_poses(task, out, progress)
+    from .rollouts.task import is_rollout_task
+
+    if is_rollout_task(task):
+        _native_alone(backend)
+        return _diagnose_rollouts(task, out, progress)
     from .diagnosis.diagnosis import diagnose_task
 
     diagnosis = diagnose_task(task, progress=progress, backend=backend)
     progress("writing the report", 1.0)
-    write_run(task, diagnosis, out)
+    write_run(task, diagnosis, out, backend)
     return diagnosis
+
+
+def _diagnose_rollouts(task: Task, out: Path, progress: Callable[[str, float], None]) -> Diagnosis:
+    from .formats.export import write_model
+    from .reporting.answer import to_json, write_predictions
+    from .reporting.report import write_report
+    from .rollouts.task import diagnose_rollout_task
+
+    found = diagnose_rollout_task(task, progress)
+    progress("writing the report", 1.0)
+    with _run_folder(task, out, "diagnose") as folder:
+        (folder / ANSWER).write_text(to_json(found.diagnosis), encoding="utf-8")
+        write_predictions(folder / "predictions.npz", found.predictions, "position")
+        write_report(found.diagnosis, folder / REPORT, found.diagnosis.model.robot.name)
+        write_model(found.diagnosis.model, folder / "model", found.diagnosis.causes)
+        _write_loop(folder / "model", found.loop)
+    return found.diagnosis
+
+
+def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
+    """The loop of a run's `model` directory in the words of a simulator, as JSON; with `out`, written there too.
+
+    For MuJoCo `out` also gets `robot.xml`, with everything that MuJoCo has words for. Raises `InputError` for another
+    directory, and for a simulator that is not known.
+    """
+    from .rollouts.export import for_simulator, with_drives
+
+    try:
+        content = json.loads((model / LOOP).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise InputError(f"{model}: no readable {LOOP}; name the `model` directory of a rollout's run") from None
+    text = json.dumps(for_simulator(content, simulator), indent=2, ensure_ascii=False) + "\n"
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / f"{simulator}.json").write_text(text, encoding="utf-8")
+        if simulator == "mujoco":
+            (out / "robot.xml").write_text(with_drives(model / "robot.xml", content), encoding="utf-8")
+    return text
+
+
+def _write_loop(folder: Path, loop: Loop) -> None:
+    """`loop.json`, every number of the loop, and the drives in `robot.xml`."""
+    from .rollouts.export import described, described_text, with_drives
+
+    (folder / LOOP).write_text(described_text(loop), encoding="utf-8")
+    mjcf = folder / "robot.xml"
+    mjcf.write_text(with_drives(mjcf, described(loop)), encoding="utf-8")
 
 
 def identify_file(
@@ -76,12 +134,17 @@ def identify_file(
     out: Path,
     progress: Callable[[str, float], None] = lambda phase, fraction: None,
     backend: str = "native",
-) -> Identification:
+) -> Identification | RolloutIdentification:
     """Read a task, identify its robot and write the run directory `out`, as `diagnose_file` does."""
     from .simulators.registry import check_backend
 
     check_backend(backend, "joint_torque_regressor")
     task = _task_for(task_file, out)
+    from .rollouts.task import is_rollout_task
+
+    if is_rollout_task(task):
+        _native_alone(backend)
+        return _identify_rollouts(task, out, progress)
     from .formats.export import write_model
     from .identification.identification import identify_task
     from .identification.parameter_files import write_parameters
@@ -93,13 +156,45 @@ def identify_file(
     if wrong:
         found = replace(found, notes=(_not_written(wrong), *found.notes))
     progress("writing the report", 1.0)
-    with whole_directory(out, task_inputs(task.file)) as folder:
+    with _run_folder(task, out, "identify", backend) as folder:
         (folder / RESULT).write_text(_identification_json(found), encoding="utf-8")
         write_predictions(folder / "predictions.npz", predictions(task, found.model, identified=True))
         write_parameters(found, folder)
         write_identification(found, folder / REPORT, found.model.robot.name, model_written=not wrong)
         if not wrong:
             write_model(found.model, folder / "model")
+    return found
+
+
+@contextmanager
+def _run_folder(
+    task: Task, out: Path, command: str, backend: str = "native", options: Sequence[str] = ()
+) -> Iterator[Path]:
+    """`whole_directory` with the file that says what made the run."""
+    from .reporting.provenance import PROVENANCE, provenance
+
+    inputs = task_inputs(task.file)
+    with whole_directory(out, inputs) as folder:
+        text = provenance(command, task.file, inputs, backend, options)
+        (folder / PROVENANCE).write_text(text, encoding="utf-8")
+        yield folder
+
+
+def _identify_rollouts(task: Task, out: Path, progress: Callable[[str, float], None]) -> RolloutIdentification:
+    from .formats.export import write_model
+    from .reporting.answer import write_predictions
+    from .rollouts.identification import identify_rollout_task
+
+    found = identify_rollout_task(task, progress)
+    progress("writing the report", 1.0)
+    with _run_folder(task, out, "identify") as folder:
+        (folder / RESULT).write_text(found.to_json(), encoding="utf-8")
+        lines = html.escape("\n".join(found.lines()))
+        page = f"<!doctype html><meta charset='utf-8'><title>{RESULT}</title><pre>{lines}</pre>\n"
+        (folder / REPORT).write_text(page, encoding="utf-8")
+        write_predictions(folder / "predictions.npz", found.predictions, "position")
+        write_model(found.model, folder / "model")
+        _write_loop(folder / "model", found.loop)
     return found
 
 
@@ -127,7 +222,7 @@ def _diagnose_poses(task: Task, out: Path, progress: Callable[[str, float], None
 
     found = diagnose_pose_task(task, progress)
     progress("writing the report", 1.0)
-    with whole_directory(out, task_inputs(task.file)) as folder:
+    with _run_folder(task, out, "diagnose") as folder:
         write_calibration(found.calibration, folder, task.robot.model)
         (folder / ANSWER).write_text(pose_answer_json(found), encoding="utf-8")
     return found
@@ -152,8 +247,9 @@ def calibrate_file(
     from .reporting.calibration_files import write_calibration
 
     calibration = calibrate_task(task, progress=progress, level=level, priors=priors)
+    own = [*(["--level", level] if level else []), *([] if priors else ["--no-priors"])]
     progress("writing the report", 1.0)
-    with whole_directory(out, task_inputs(task.file)) as folder:
+    with _run_folder(task, out, "calibrate", options=own) as folder:
         write_calibration(calibration, folder, task.robot.model)
     return calibration
 
@@ -169,13 +265,13 @@ def _native_alone(backend: str) -> None:
         )
 
 
-def write_run(task: Task, diagnosis: Diagnosis, out: Path) -> None:
+def write_run(task: Task, diagnosis: Diagnosis, out: Path, backend: str = "native") -> None:
     """Write everything that the contract asks of a diagnosis into the directory `out`."""
     from .formats.export import write_model
     from .reporting.answer import to_json, write_predictions
     from .reporting.report import write_report
 
-    with whole_directory(out, task_inputs(task.file)) as folder:
+    with _run_folder(task, out, "diagnose", backend) as folder:
         (folder / ANSWER).write_text(to_json(diagnosis), encoding="utf-8")
         write_predictions(folder / "predictions.npz", predictions(task, diagnosis.model))
         write_report(diagnosis, folder / REPORT, diagnosis.model.robot.name)
@@ -249,13 +345,22 @@ def _show_diagnosis(diagnosis: Diagnosis | PoseDiagnosis) -> None:
         show_calibration(diagnosis.calibration, diagnosis.verdict)
 
 
-def _identification_json(found: Identification) -> str:
+def _identification_json(found: Identification | RolloutIdentification) -> str:
+    from .rollouts.identification import RolloutIdentification
+
+    if isinstance(found, RolloutIdentification):
+        return found.to_json()
     from .identification.result import to_json
 
     return to_json(found)
 
 
-def _show_identification(found: Identification) -> None:
+def _show_identification(found: Identification | RolloutIdentification) -> None:
+    from .rollouts.identification import RolloutIdentification
+
+    if isinstance(found, RolloutIdentification):
+        print("\n".join(found.lines()))
+        return
     from .reporting.terminal import show_identification
 
     show_identification(found, found.model.robot.name)

@@ -115,7 +115,7 @@ def test_settling_that_is_not_in_the_catalogue_is_not_called_an_encoder_scale(fo
 def test_random_play_of_a_joint_is_unknown_with_a_word_on_where(folder: Path):
     _, found, _ = answered(folder, "arm6", "random_play", 3.0, 45)
     assert (found.verdict, found.causes) == ("unknown", ())
-    assert any("from posture to posture" in note for note in found.calibration.notes)
+    assert any("between postures" in note for note in found.calibration.notes)
 
 
 def test_a_robot_built_within_its_tolerance_gets_nothing(folder: Path):

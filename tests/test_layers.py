@@ -22,7 +22,7 @@ OUTSIDE = {
     "rich": {"reporting.terminal"},
     "jinja2": {"reporting.report"},
     "plotly": {"reporting.report"},
-    "jaxopt": {"diagnosis.refit"},
+    "jaxopt": {"diagnosis.refit", "fitting.fit"},
     "clarabel": {"estimation.conic"},
     "sklearn": {"estimation.least_squares"},
 }

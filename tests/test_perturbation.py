@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,7 +12,9 @@ import numpy as np
 import reference
 import robots
 
-from figaroh_jax.effects.kinematic import CATALOGUE, Postures, columns_of
+from figaroh_jax.effects.base import JointEffect, Scalar, amplitude
+from figaroh_jax.effects.catalogue import CATALOGUE as TORQUES, register
+from figaroh_jax.effects.kinematic import CATALOGUE, Postures, axis_twist, columns_of
 from figaroh_jax.estimation.perturbation import Perturbation, apply
 from figaroh_jax.rigid.chain import chain_between, chain_pose
 from figaroh_jax.rigid.kinematics import forward_kinematics
@@ -52,6 +55,32 @@ def test_each_posture_of_the_perturbed_robot_is_pinocchios(tmp_path: Path):
             shift = shift + np.asarray(part)[:, 0] * np.sin(order * x) + np.asarray(part)[:, 1] * np.cos(order * x)
         expected = reference.forward_kinematics(wrong, x + shift)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+
+
+def test_an_effect_of_ones_own_that_errs_in_position_is_one_of_postures(tmp_path: Path):
+    class Wear(JointEffect):
+        """A gear that has worn where it is used most."""
+
+        name, title, equation = "wear", "wear of the gear", "q_measured = q + depth exp(-q^2)"
+        depth: Scalar = amplitude("rad")
+
+        def position_error(self, motion: Any) -> Any:
+            return self.depth * np.exp(-(self.here(motion.angle) ** 2))
+
+    model, q = robots.load(robots.ARM, tmp_path), rng.uniform(-1.0, 1.0, (5, 2))
+    none = np.zeros((5, 2))
+    postures = Postures(q, q, none, np.zeros((5, 2, 3)), none, np.arange(5.0), 4.0)
+    try:
+        register(Wear)
+        (column,) = columns_of(CATALOGUE["wear"], model, (1,))
+        ((joint, field),) = column.pieces
+        assert (joint, column.parameter, column.unit) == (1, "depth", "m")  # the joint slides
+        # the joint stands behind its reading by the error
+        turn = axis_twist(model, 1)[:, None] * -np.exp(-(q[:, 1] ** 2))
+        np.testing.assert_allclose(field(postures), turn, rtol=0, atol=1e-15)
+    finally:
+        for names in (TORQUES, CATALOGUE):
+            names.pop("wear", None)
 
 
 def test_derivative_by_an_offset_is_the_column_of_the_calibration(tmp_path: Path):

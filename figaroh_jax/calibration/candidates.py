@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..effects.kinematic import CATALOGUE, HISTORY, Column, KinematicEffect, Postures, axis_twist, columns_of
+from ..effects.base import Effect
+from ..effects.kinematic import CATALOGUE, HISTORY, Column, Postures, axis_twist, columns_of, shape_of
 from ..recordings.poses import PoseRecording
 from ..results import Name
 from ..rigid.model import RobotModel, dofs
@@ -53,7 +54,7 @@ Moves = list[tuple[int, Float[np.ndarray, "6 samples"]]]
 class Block(NamedTuple):
     """An effect at a place with one value of its shape parameter."""
 
-    effect: KinematicEffect
+    effect: type[Effect]
     columns: tuple[Column, ...]
     sizes: tuple[float, ...]
     shape: float
@@ -103,7 +104,7 @@ def blocks_of(
         if effect.name in GEOMETRY or effect.name in forbid:
             continue
         for at in _places(effect, chain, frames):
-            for shape in effect.shape[1]:
+            for shape in shape_of(effect)[1]:
                 columns = columns_of(effect, model, at, shape)
                 sizes = sizes_of(columns, postures)
                 if effect is HISTORY:  # of joints that move
@@ -125,7 +126,7 @@ def _high_orders(model: RobotModel, chain: Sequence[int], postures: Sequence[Pos
         q = positions_of(model, postures, j)
         if np.ptp(q) < _NARROW:
             continue
-        step, lowest = np.pi / np.ptp(q), effect.shape[1][-1]
+        step, lowest = np.pi / np.ptp(q), shape_of(effect)[1][-1]
         count = min(int((_HIGHEST - lowest) / step), _RESOLVED * len(q))
         for order in lowest + step * np.arange(1, count + 1):
             size = tuple(_STEP / np.maximum(np.sqrt(np.mean(wave(order * q) ** 2)), 0.1) for wave in (np.sin, np.cos))
@@ -161,9 +162,7 @@ def known_frames(
     return found
 
 
-def _places(
-    effect: KinematicEffect, chain: Sequence[int], frames: Mapping[str, tuple[int, int]]
-) -> list[tuple[int, ...]]:
+def _places(effect: type[Effect], chain: Sequence[int], frames: Mapping[str, tuple[int, int]]) -> list[tuple[int, ...]]:
     if effect.acts_on == "robot":
         return [()]
     if effect.acts_on == "frame":
@@ -197,7 +196,7 @@ def effects_on(model: RobotModel, postures: Sequence[Postures], measured: Measur
             angle, order = positions_of(model, postures, joint), np.array([blocks[k].shape for k in which])
             yield Waves(np.array(which), np.where(measured.posture >= 0, rows, 0.0), angle, order)
 
-    count = np.array([len(b.effect.shape[1]) if not b.reach else len(blocks) - grid for b in blocks])
+    count = np.array([len(shape_of(b.effect)[1]) if not b.reach else len(blocks) - grid for b in blocks])
     handicap = 0.01 * (np.array([len(b.columns) for b in blocks]) - 1) + 0.005 * np.log(count)
     return Effects(tuple(block.columns for block in blocks), jacobian, np.array(handicap), grid, waves)
 

@@ -23,7 +23,7 @@ from ..rigid.model import RobotModel
 from . import posefit, starts
 from .gravity import gravity_moments
 
-__all__ = ["Measured", "assemble", "postures_of"]
+__all__ = ["Measured", "assemble", "devices_of", "postures_of"]
 
 
 class Measured(NamedTuple):
@@ -136,16 +136,28 @@ def _shared(recordings: Sequence[PoseRecording]) -> list[list[int]]:
     return list(groups.values())
 
 
+def devices_of(
+    model: RobotModel, recordings: Sequence[PoseRecording]
+) -> list[tuple[list[int], Device, Any, Bool[np.ndarray, "postures rows"]]]:
+    """For each device its recordings (indices), the device as it starts, what it measured, and which rows."""
+    return [(members, *_device(model, [recordings[k] for k in members])) for members in _shared(recordings)]
+
+
+def _device(model: RobotModel, recordings: list[PoseRecording]) -> tuple[Device, np.ndarray, np.ndarray]:
+    position = np.concatenate([r.position for r in recordings])
+    R, p = _nominal(model, recordings[0].base_frame, recordings[0].tool_frame, position)
+    fit = np.concatenate([np.full(len(r.position), r.role == "fit") for r in recordings])
+    make = {"position": _points, "pose": _poses, "socket": _sockets, "plane": _planes, "own": _own}
+    return make[recordings[0].kind](recordings, R, p, fit)
+
+
 def _group(
     model: RobotModel, recordings: list[PoseRecording], postures: list[Postures], columns: Sequence[Column]
 ) -> tuple[posefit.Group, np.ndarray | None, int]:
     chain = chain_between(model, recordings[0].base_frame, recordings[0].tool_frame)
     position = np.concatenate([r.position for r in recordings])
-    R, p = _nominal(model, recordings[0].base_frame, recordings[0].tool_frame, position)
     kind = recordings[0].kind
-    fit = np.concatenate([np.full(len(r.position), r.role == "fit") for r in recordings])
-    make = {"position": _points, "pose": _poses, "socket": _sockets, "plane": _planes, "own": _own}[kind]
-    device, datum, measured = make(recordings, R, p, fit)
+    device, datum, measured = _device(model, recordings)
     pieces = (
         (k, chain.joints.index(j), np.concatenate([field(x) for x in postures], axis=1))
         for k, column in enumerate(columns)

@@ -9,6 +9,7 @@ less to compile.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,7 +21,17 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from ..compiled.batching import program
 from .posefit import DRAFT, DRAFT_OPTIONS, Part, Problem, block_rows, parts_of, ties
 
-__all__ = ["Solution", "solve"]
+__all__ = [
+    "NormalEquations",
+    "Solution",
+    "State",
+    "attempt",
+    "beginning",
+    "cut_weights",
+    "normal_equations",
+    "solve",
+    "stuck",
+]
 
 _DAMPING = 1e-6  # at the start, of the normal matrix's diagonal: a closed-form start is near
 _STEP = 1e-9  # of the scaled unknowns
@@ -37,16 +48,20 @@ class Solution(NamedTuple):
     cost: float
 
 
-class _Normal(NamedTuple):
+class NormalEquations(NamedTuple):
+    """J'J, J'r and half of r'r of weighted rows."""
+
     matrix: Float[Array, "unknowns unknowns"]
     gradient: Float[Array, " unknowns"]
     cost: Float[Array, ""]
 
 
-class _State(NamedTuple):
+class State(NamedTuple):
+    """Where a search stands."""
+
     at: Float[Array, " unknowns"]
     step: Float[Array, " unknowns"]  # to be tried
-    normal: _Normal
+    normal: NormalEquations
     damping: Float[Array, ""]
     growth: Float[Array, ""]
     decrease: Float[Array, ""]  # that the step promises
@@ -67,14 +82,14 @@ def solve(
     Where `free` is 0 an unknown is held at zero. To be called where 64-bit JAX is on.
     """
     parts, free = parts_of(problem), np.asarray(free, float)
-    weights = _cut_weights(problem, parts, np.asarray(row_weights, float))
+    weights = cut_weights(problem, parts, np.asarray(row_weights, float))
     few = max(np.shape(group.position)[1] for group in problem.groups) <= DRAFT
     minimise = _minimise_quick if few else _minimise_fast
     found = minimise(parts, weights, np.asarray(precision, float), free, np.asarray(start, float) * free, max_steps)
     return Solution(np.asarray(found.at), bool(found.converged), int(found.steps), float(found.normal.cost))
 
 
-def _cut_weights(
+def cut_weights(
     problem: Problem, parts: tuple[Part, ...], weights: Float[np.ndarray, " rows"]
 ) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """For each group the weights of its rows (blocks rows block), zero where a block is filled up, and of its ties."""
@@ -90,9 +105,9 @@ def _cut_weights(
     return tuple(found)
 
 
-def _normal(
+def normal_equations(
     parts: tuple[Part, ...], weights: Any, precision: Array, free: Array, at: Float[Array, " unknowns"]
-) -> _Normal:
+) -> NormalEquations:
     """Normal matrix, gradient and cost at `at`; of what is held, a row of the unit matrix."""
     total = jnp.diag(precision), precision * at, 0.5 * jnp.sum(precision * at**2)
     for part, (weight, tied_weight) in zip(parts, weights, strict=True):
@@ -110,7 +125,7 @@ def _normal(
         here = part.local.T @ sums[:-1, :-1] @ part.local, part.local.T @ sums[:-1, -1], 0.5 * sums[-1, -1]
         total = jax.tree.map(jnp.add, total, here)
     matrix = free[:, None] * total[0] * free + jnp.diag(1.0 - free)
-    return _Normal(matrix, free * total[1], total[2])
+    return NormalEquations(matrix, free * total[1], total[2])
 
 
 def _whole_rows(part: Part, local: Array, weight: Array, position: Array, fields: Array, datum: Any) -> Array:
@@ -132,37 +147,50 @@ def _square(rows: Float[Array, "columns samples"]) -> Float[Array, "columns colu
     return jnp.matmul(rows, rows.T, precision=jax.lax.Precision.HIGHEST)
 
 
+def attempt(normal_at: Callable[[Array], NormalEquations], state: State) -> State:
+    """One trial step: taken where the cost falls, and the next one with the damping that follows."""
+    at = state.at + state.step
+    normal = normal_at(at)
+    gained = (state.normal.cost - normal.cost) / state.decrease
+    better = gained > 0.0  # from the infinite cost at the beginning to the first one too
+    at, normal = jax.tree.map(partial(jnp.where, better), (at, normal), (state.at, state.normal))
+    shrink = jnp.clip(1.0 - (2.0 * gained - 1.0) ** 3, 1.0 / 3.0, 1.0)
+    damping = jnp.where(state.steps == 0, state.damping, state.damping * jnp.where(better, shrink, state.growth))
+    step, decrease = _damped(normal, damping)
+    growth = jnp.where(better, 2.0, 2.0 * state.growth)
+    small = jnp.abs(step).max() <= _STEP * (1.0 + jnp.abs(at).max())
+    done = (damping < 1.0) & (small | (decrease <= _DECREASE * normal.cost))
+    return State(at, step, normal, damping, growth, decrease, state.steps + 1, done)
+
+
+def beginning(start: Float[Array, " unknowns"]) -> State:
+    """The state before the first trial, which is the start itself."""
+    zero, one = jnp.zeros_like(start), jnp.ones_like(start[0])
+    nowhere = NormalEquations(jnp.eye(len(start), dtype=start.dtype), zero, jnp.inf * one)
+    return State(start, zero, nowhere, _DAMPING * one, 2.0 * one, one, jnp.zeros((), int), jnp.zeros((), bool))
+
+
+def stuck(state: State) -> Bool[Array, ""]:
+    """Whether no damping helps any more."""
+    return state.damping >= _STUCK
+
+
 def _search(
     parts: tuple[Part, ...], weights: Any, precision: Array, free: Array, start: Array, max_steps: Int[Array, ""]
-) -> _State:
-    def try_step(state: _State) -> _State:
-        at = state.at + state.step
-        normal = _normal(parts, weights, precision, free, at)
-        gained = (state.normal.cost - normal.cost) / state.decrease
-        better = gained > 0.0  # from the infinite cost at the beginning to the first one too
-        at, normal = jax.tree.map(partial(jnp.where, better), (at, normal), (state.at, state.normal))
-        shrink = jnp.clip(1.0 - (2.0 * gained - 1.0) ** 3, 1.0 / 3.0, 1.0)
-        damping = jnp.where(state.steps == 0, state.damping, state.damping * jnp.where(better, shrink, state.growth))
-        step, decrease = _damped(normal, damping)
-        growth = jnp.where(better, 2.0, 2.0 * state.growth)
-        small = jnp.abs(step).max() <= _STEP * (1.0 + jnp.abs(at).max())
-        done = (damping < 1.0) & (small | (decrease <= _DECREASE * normal.cost))
-        return _State(at, step, normal, damping, growth, decrease, state.steps + 1, done)
+) -> State:
+    normal_at = partial(normal_equations, parts, weights, precision, free)
 
-    def going(state: _State) -> Array:
-        return ~state.converged & (state.steps < max_steps) & (state.damping < _STUCK)
+    def going(state: State) -> Array:
+        return ~state.converged & (state.steps < max_steps) & ~stuck(state)
 
-    zero, one = jnp.zeros_like(start), jnp.ones_like(start[0])
-    nowhere = _Normal(jnp.eye(len(start), dtype=start.dtype), zero, jnp.inf * one)
-    first = _State(start, zero, nowhere, _DAMPING * one, 2.0 * one, one, jnp.zeros((), int), jnp.zeros((), bool))
-    return jax.lax.while_loop(going, try_step, first)
+    return jax.lax.while_loop(going, partial(attempt, normal_at), beginning(start))
 
 
 _minimise_quick = program(_search, cpu=DRAFT_OPTIONS)
 _minimise_fast = program(_search)
 
 
-def _damped(normal: _Normal, damping: Array) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
+def _damped(normal: NormalEquations, damping: Array) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
     """Step at a damping, and the decrease of the cost that it promises; by a Cholesky factor of unit diagonal."""
     size = jnp.sqrt(jnp.diagonal(normal.matrix))
     size = jnp.where(size > 0.0, size, 1.0)

@@ -21,7 +21,7 @@ bounds from their grid. Torques are those of the drive: what has to be added to 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
@@ -40,8 +40,11 @@ __all__ = [
     "Motion",
     "Native",
     "Parameter",
+    "Place",
     "amplitude",
+    "fixed",
     "joint_unit",
+    "movable",
     "place",
     "shape",
     "smooth_sign",
@@ -91,7 +94,7 @@ class Motion(eqx.Module):
         return smooth_sign(self.velocity, self.acceleration, self.dt, self.width)
 
     @property
-    def angle(self) -> Float[Array, "samples nv"]:
+    def angle(self) -> Float[Leaf, "samples nv"]:
         """Position of each coordinate, rad or m; zero where no one number tells it (joints of several axes)."""
         if self.model.nq == len(self.model.joint_names):
             return jnp.asarray(self.position)
@@ -149,21 +152,54 @@ def shape(
     return eqx.field(default=grid[0], metadata={"parameter": parameter})
 
 
+class Place(eqx.Module):
+    """Where an effect of a model acts, known when tracing: no leaf, so that `jax.grad` takes the model as it is.
+
+    It reads like the array of indices it stands for. An `Effect` whose `at` is an array instead can be mapped over
+    places by `jax.vmap` (`movable`).
+    """
+
+    index: tuple[int, ...] = eqx.field(static=True)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.index, np.int64 if dtype is None else dtype)
+
+    def __jax_array__(self) -> Array:
+        return jnp.asarray(np.asarray(self))
+
+    def __getitem__(self, k: Any) -> Any:
+        return self.index[k]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.index)
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """As that of an array."""
+        return (len(self.index),)
+
+
 class Effect(eqx.Module):
     """A physical effect at a place; subclass it, declare its parameters and write at least one form.
 
-    `at` holds the indices of the place: one coordinate (`joint`), two (`pair`), a tree link (`link`), none (`robot`).
+    `at` holds the indices of the place: one coordinate (`joint`), two (`pair`), a tree link (`link`), none (`robot`);
+    in a model they are static (`Place`).
     """
 
-    at: Int[Leaf, "*many places"]
+    at: Int[Leaf, "*many places"] | Place
 
     name: ClassVar[str]
     title: ClassVar[str]  # in plain words, for people
     equation: ClassVar[str]  # as text
-    acts_on: ClassVar[Literal["joint", "pair", "link", "robot"]]
+    acts_on: ClassVar[Literal["joint", "pair", "link", "robot", "frame"]]  # frame: of base or tool, in postures
     follows_torque: ClassVar[bool] = False  # whether its torque depends on the current model's (load or total)
     inertial: ClassVar[bool] = False  # whether its amplitudes are ten parameters of its link: the regressor's columns
     body: ClassVar[bool] = False  # whether these are a body's that exists: mass > 0, pseudo-inertia >= 0
+    levels: ClassVar[tuple[str, ...]] = ("torque", "pose")  # of diagnoses that look for it
+    correction: ClassVar[float] = 1.0  # its linear parameters behind one of what a calibration of postures reports
     searched: ClassVar[bool] = True  # whether a diagnosis looks for it, that is, whether it is in the catalogue
     # relations to other effects, by name; the last two hold both ways, whichever class states them (`related`)
     contains: ClassVar[tuple[str, ...]] = ()  # simpler effects that it can imitate exactly: they are preferred
@@ -174,6 +210,7 @@ class Effect(eqx.Module):
     speed_law: ClassVar[bool] = False  # whether it is a law of dry friction over the speed, one of several alike
     needs_trust: ClassVar[float] = np.inf  # trust in the inertials (relative) above which it is no cause
     separated_by: ClassVar[str] = ""  # the experiment that tells it from what looks alike; {at} stands for the place
+    separated_by_postures: ClassVar[str] = ""  # the same of postures, where it is another one
 
     def torque(self, motion: Motion) -> Float[Array, "samples *rows"]:
         """Torque added, N m or N: `(samples,)` at a joint, `(samples, 2)` at a pair, else `(samples, nv)`."""
@@ -184,9 +221,17 @@ class Effect(eqx.Module):
         """The robot with the effect in it, for effects that change its inertia, gravity or geometry."""
         return model
 
-    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
-        """What the position sensor of joint `at` reads minus the truth, rad or m."""
+    def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
+        """What the position sensor of the (last) joint `at` reads minus the truth, rad or m; of the robot: of each."""
         raise NotImplementedError(f"{self.name} has no form at the position sensor")
+
+    @staticmethod
+    def twist(model: RobotModel, at: tuple[int, ...], shape: float, /) -> Iterator[tuple[str, str, Sequence[Any]]]:
+        """Small twists of joint frames that postures show: name, unit and (tree joint, field of the postures) of each.
+
+        See `kinematic.Column`; `shape` is the value of the parameter that is not linear.
+        """
+        raise NotImplementedError("the effect has no form as a twist")
 
     def torque_error(self, motion: Motion) -> Float[Array, "samples *rows"]:
         """What the torque sensors read beside the torque of the drives, N m or N; columns as in `torque`."""
@@ -244,9 +289,14 @@ class Effect(eqx.Module):
         """Whether the effect has the form, the name of one of the methods above."""
         return getattr(cls, form) is not getattr(Effect, form)
 
-    def here(self, signal: Float[Array, "samples nv"], place: int = 0) -> Float[Array, " samples"]:
+    @property
+    def places(self) -> Int[Leaf, "*many places"]:
+        """`at` as an array."""
+        return np.asarray(self.at) if isinstance(self.at, Place) else self.at
+
+    def here(self, signal: Float[Leaf, "samples nv"], place: int = 0) -> Float[Leaf, " samples"]:
         """Column of `signal` at the joint where the effect acts (`place` 1: the second of a pair)."""
-        if isinstance(signal, np.ndarray) and isinstance(self.at, np.ndarray):
+        if isinstance(self.at, Place) or (isinstance(signal, np.ndarray) and isinstance(self.at, np.ndarray)):
             return signal[:, self.at[place]]
         return jax.lax.dynamic_index_in_dim(signal, self.at[place], 1, keepdims=False)  # traced at once, unlike `[]`
 
@@ -259,7 +309,7 @@ class Effect(eqx.Module):
         """A torque or an error of a torque at the effect's own joints in the columns of all."""
         if self.acts_on in ("link", "robot"):
             return torque
-        return jnp.zeros_like(motion.velocity).at[:, self.at].add(torque.reshape(torque.shape[0], -1))
+        return jnp.zeros_like(motion.velocity).at[:, self.places].add(torque.reshape(torque.shape[0], -1))
 
 
 class JointEffect(Effect):
@@ -297,6 +347,18 @@ def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **par
         raise InputError(f"effect '{effect.name}' has no parameter '{sorted(unknown)[0]}'; known: {known}")
     indices = np.asarray([index(name) for name in at], dtype=np.int64)
     return effect(indices, **{name: np.float64(value) for name, value in parameters.items()})
+
+
+def fixed(effect: Effect) -> Effect:
+    """The effect with its place static, where it stands at one known place."""
+    if isinstance(effect.at, (Place, jax.core.Tracer)) or np.ndim(effect.at) != 1:
+        return effect
+    return eqx.tree_at(lambda e: e.at, effect, Place(tuple(np.asarray(effect.at).tolist())))
+
+
+def movable(effect: Effect) -> Effect:
+    """The effect with its place an array: programs then serve every place, and `jax.vmap` maps over places."""
+    return eqx.tree_at(lambda e: e.at, effect, effect.places) if isinstance(effect.at, Place) else effect
 
 
 def joint_unit(unit: str, prismatic: bool) -> str:

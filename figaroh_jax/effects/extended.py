@@ -20,18 +20,21 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from ..compiled.precision import in_float64
 from ..errors import InputError
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.kinematics import states
 from ..rigid.model import RobotModel
-from .base import Effect, Motion
+from .base import Effect, Motion, fixed, movable
 
 __all__ = [
     "ExtendedModel",
     "changed_robot",
     "extend",
+    "opened",
     "predict",
     "read_position",
+    "read_sensors",
     "read_torque",
     "require_single_axes",
     "with_torque",
@@ -47,13 +50,14 @@ class ExtendedModel(eqx.Module):
     effects: tuple[Effect, ...]
     width: Float[Array | np.ndarray, " nv"]  # half width of a reversal of the joints' dry friction, rad/s or m/s
 
+    @in_float64
     def inverse_dynamics(
         self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
     ) -> Float[Array, "*batch nv"]:
         """Torques of the drives (N m or N) that give the true motion q, v, a (rad or m, and their rates)."""
-        with jax.enable_x64(True):
-            return _inverse_dynamics(self, *states(self.robot, q=q, v=v, a=a))
+        return _inverse_dynamics(opened(self), *states(self.robot, q=q, v=v, a=a))
 
+    @in_float64
     def forward_dynamics(
         self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], tau: Float[ArrayLike, "*batch nv"]
     ) -> Float[Array, "*batch nv"]:
@@ -62,8 +66,7 @@ class ExtendedModel(eqx.Module):
         Newton's method with the exact Jacobian; the derivatives are those of the solution (implicit function theorem).
         At v = 0 dry friction is taken as zero: a joint that sticks is the business of `simulate`.
         """
-        with jax.enable_x64(True):
-            return _forward_dynamics(self, *states(self.robot, q=q, v=v, tau=tau))
+        return _forward_dynamics(opened(self), *states(self.robot, q=q, v=v, tau=tau))
 
 
 def extend(
@@ -82,9 +85,11 @@ def extend(
     space: Any = jnp if isinstance(width, jax.Array) else np
     # a Python number would be a constant of the compiled programs, and each new value a new compilation
     effects = jax.tree.map(lambda x: np.float64(x) if isinstance(x, (int, float)) else x, effects)
+    effects = tuple(fixed(effect) for effect in effects)
     return ExtendedModel(robot, (*present, *effects), space.broadcast_to(space.asarray(width), (robot.nv,)))
 
 
+@in_float64
 def predict(
     extended: ExtendedModel,
     time: Float[ArrayLike, " samples"],
@@ -101,12 +106,11 @@ def predict(
     of several degrees of freedom: no one sensor reads their position.
     """
     require_single_axes(extended.robot, "a record of sensors")
-    with jax.enable_x64(True):
-        motion = states(extended.robot, position=position, velocity=velocity, acceleration=acceleration)
-        if motion[0].ndim != 2 or motion[0].shape[0] < 5:
-            raise InputError(f"a record of 5 samples or more is needed, got the shape {motion[0].shape}")
-        q, v, a = motion
-        return _predict(extended, jnp.asarray(time, jnp.float64), q, v, a, jnp.float64(dt))
+    motion = states(extended.robot, position=position, velocity=velocity, acceleration=acceleration)
+    if motion[0].ndim != 2 or motion[0].shape[0] < 5:
+        raise InputError(f"a record of 5 samples or more is needed, got the shape {motion[0].shape}")
+    q, v, a = motion
+    return read_sensors(extended, jnp.asarray(time, jnp.float64), q, v, a, jnp.float64(dt))
 
 
 def require_single_axes(robot: RobotModel, what: str) -> None:
@@ -117,7 +121,8 @@ def require_single_axes(robot: RobotModel, what: str) -> None:
             raise InputError(f"{what} takes revolute and prismatic joints; {given}: lock it, or fix the root")
 
 
-def _predict(extended: ExtendedModel, time: Array, q: Array, v: Array, a: Array, dt: Array) -> Array:
+def read_sensors(extended: ExtendedModel, time: Array, q: Array, v: Array, a: Array, dt: Array) -> Array:
+    """`predict` of float64 arrays, to be traced."""
     robot = changed_robot(extended)
     load = inverse_dynamics(robot, q, v, a)
     motion = Motion(robot, time, q, v, a, load, load, dt, jnp.asarray(extended.width))
@@ -170,6 +175,11 @@ def _newton(excess: Callable[[Array], Array], start: Array) -> Array:
     return jax.lax.while_loop(unfinished, improve, (start, jnp.asarray(jnp.inf), jnp.asarray(0)))[0]
 
 
+def opened(extended: ExtendedModel) -> ExtendedModel:
+    """The model with the places of its effects as arrays: one compiled program for all places."""
+    return eqx.tree_at(lambda m: m.effects, extended, tuple(movable(effect) for effect in extended.effects))
+
+
 def changed_robot(extended: ExtendedModel) -> RobotModel:
     """The robot with every effect in it that changes its inertia, gravity or geometry."""
     robot = extended.robot
@@ -183,7 +193,7 @@ def with_torque(effects: tuple[Effect, ...], motion: Motion, load: Float[Array, 
     motion = dataclasses.replace(motion, load=load, total=load)
     for effect in effects:
         if effect.has("torque"):
-            motion = dataclasses.replace(motion, total=motion.total + _joint_torque(effect, motion))
+            motion = dataclasses.replace(motion, total=motion.total + _joint_torque(movable(effect), motion))
     return motion
 
 
@@ -198,7 +208,8 @@ def read_position(effects: tuple[Effect, ...], motion: Motion) -> Float[Array, "
     position = motion.position
     for effect in effects:
         if effect.has("position_error"):
-            position = position.at[:, effect.at[0]].add(effect.position_error(motion))
+            error = effect.position_error(motion)
+            position = position + error if error.ndim == 2 else position.at[:, effect.at[-1]].add(error)
     return position
 
 
@@ -207,10 +218,10 @@ def read_torque(effects: tuple[Effect, ...], motion: Motion) -> Float[Array, "sa
     torque = motion.total
     for effect in effects:
         if effect.has("torque_error"):
-            torque = torque + _joint_torque_error(effect, dataclasses.replace(motion, total=torque))
+            torque = torque + _joint_torque_error(movable(effect), dataclasses.replace(motion, total=torque))
         if effect.has("torque_response"):
-            answer = _respond(effect, torque, motion.dt)
-            seen = effect.at if effect.acts_on in ("joint", "pair") else jnp.arange(torque.shape[1])
+            answer = _respond(movable(effect), torque, motion.dt)
+            seen = effect.places if effect.acts_on in ("joint", "pair") else jnp.arange(torque.shape[1])
             torque = torque.at[:, seen].set(answer[:, seen])
     return torque
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,12 +17,13 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from ..compiled.precision import in_float64
 from ..errors import InputError
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.kinematics import states
 from ..rigid.model import RobotModel
 from .base import Effect, Motion
-from .extended import ExtendedModel, changed_robot, read_position, read_torque, require_single_axes, with_torque
+from .extended import ExtendedModel, changed_robot, opened, read_position, read_torque, require_single_axes, with_torque
 
 __all__ = ["Command", "Simulation", "simulate"]
 
@@ -44,6 +45,7 @@ class Simulation(eqx.Module):
     torque_read: Float[Array, "steps nv"]  # with the response of the torque sensors
 
 
+@in_float64
 def simulate(
     extended: ExtendedModel,
     command: Float[ArrayLike, "steps nv"] | Command,
@@ -63,18 +65,17 @@ def simulate(
     freedom are not simulated.
     """
     require_single_axes(extended.robot, "a simulation")
-    with jax.enable_x64(True):
-        q, v = states(extended.robot, position=position, velocity=velocity)
-        if q.ndim != 1:
-            raise InputError(f"position has shape {q.shape}; a simulation starts from one state, map it over several")
-        if callable(command):
-            if steps is None:
-                raise InputError("a command that is a function needs the number of steps")
-            return _simulate(extended, command, jnp.zeros((steps, q.size)), q, v, jnp.float64(dt))
-        torque = states(extended.robot, command=command)[0]
-        if torque.ndim != 2 or (steps is not None and torque.shape[0] < steps):
-            raise InputError(f"command has shape {torque.shape}; one row of torques for each step is needed")
-        return _simulate(extended, None, torque[:steps], q, v, jnp.float64(dt))
+    q, v = states(extended.robot, position=position, velocity=velocity)
+    if q.ndim != 1:
+        raise InputError(f"position has shape {q.shape}; a simulation starts from one state, map it over several")
+    if callable(command):
+        if steps is None:
+            raise InputError("a command that is a function needs the number of steps")
+        return _simulate(opened(extended), command, jnp.zeros((steps, q.size)), q, v, jnp.float64(dt))
+    torque = states(extended.robot, command=command)[0]
+    if torque.ndim != 2 or (steps is not None and torque.shape[0] < steps):
+        raise InputError(f"command has shape {torque.shape}; one row of torques for each step is needed")
+    return _simulate(opened(extended), None, torque[:steps], q, v, jnp.float64(dt))
 
 
 @eqx.filter_jit
@@ -85,15 +86,15 @@ def _simulate(
     robot = changed_robot(extended)
 
     def advance(
-        state: tuple[Array, Array, Array], step: tuple[Array, Array]
-    ) -> tuple[tuple[Array, Array, Array], tuple[Array, ...]]:
+        state: tuple[Array, Array, Array, list[Array]], step: tuple[Array, Array]
+    ) -> tuple[tuple[Array, Array, Array, list[Array]], tuple[Array, ...]]:
         q, v, a, memory = state
         tau = step[1] if command is None else jnp.asarray(command(step[0], q, v), jnp.float64)
         for effect in extended.effects:
             tau = effect.delivered(tau)
         here = dataclasses.replace(extended, effects=_remembering(extended.effects, memory))
         after = _step(here, robot, step[0], q, v, a, tau, dt)
-        memory = [e.step(after, dt).memory for e in here.effects if e.has("step")]
+        memory: list[Any] = [getattr(e.step(after, dt), "memory") for e in here.effects if e.has("step")]  # noqa: B009
         a = (after - v) / dt
         return (q + dt * after, after, a, memory), (q, v, a, tau)
 
@@ -194,7 +195,7 @@ def _apart(extended: ExtendedModel, motion: _Reversal) -> tuple[_Friction, Float
             size = jnp.max(jnp.abs(jump))
             rows.append((jump / jnp.where(size > 0, size, 1.0))[None])
             levels.append(size[None])
-            widths.append(width[effect.at].mean()[None])
+            widths.append(width[effect.places].mean()[None])
     return _Friction(jnp.concatenate(rows), jnp.concatenate(levels), jnp.concatenate(widths), drive), smooth
 
 

@@ -34,14 +34,18 @@ __all__ = [
     "Bound",
     "Diagnose",
     "Identify",
+    "JointDrive",
+    "Limits",
     "Load",
     "Measurement",
     "Preprocess",
     "RecordingEntry",
     "Robot",
+    "Rollouts",
     "Task",
     "Transmission",
     "Units",
+    "load_limits",
     "load_task",
     "robot_options",
 ]
@@ -58,6 +62,13 @@ def _columns(value: Any) -> Any:
     if not names or not all(isinstance(name, str) and name for name in names):
         raise ValueError("expected the name of an array, a prefix of column names or a list of columns")
     return value if isinstance(value, str) else tuple(value)
+
+
+def _diagonal(value: Any) -> Any:
+    plain = isinstance(value, (list, tuple)) and all(isinstance(x, (int, float)) for x in value) and len(value) > 0
+    if not plain:
+        return value
+    return [[x if i == j else 0.0 for j in range(len(value))] for i, x in enumerate(value)]
 
 
 def _effect(name: str) -> str:
@@ -209,8 +220,8 @@ class RecordingEntry(_Keys):
 class Transmission(_Keys):
     """Motor side to joint side: motor position = position @ joint position, joint torque = torque @ motor torque."""
 
-    position: Matrix | None = None
-    torque: Matrix | None = None
+    position: Annotated[Matrix, BeforeValidator(_diagonal)] | None = None  # a plain list is a diagonal
+    torque: Annotated[Matrix, BeforeValidator(_diagonal)] | None = None
     offset: tuple[Number, ...] | None = None  # rad or m, added to the joint position
 
     @field_validator("position", "torque")
@@ -259,10 +270,59 @@ class Baseline(_Keys):
     effects: tuple[BaselineEffect, ...] = ()
 
 
-class Actuator(_Keys):
-    """Whether a rollout may trust the servo gains."""
+class JointDrive(_Keys):
+    """The drive of a joint that a URDF does not describe: torque = kp (u - q) - kd v, within the limit."""
+
+    kind: Literal["position", "velocity", "torque"] = "position"
+    kp: Positive | None = None  # N m/rad
+    kd: Annotated[Number, Field(ge=0)] = 0.0  # N m s/rad
+    force: Positive | None = None  # limit, N m
+
+    @model_validator(mode="after")
+    def _gains(self) -> JointDrive:
+        if self.kind == "position" and self.kp is None:
+            raise ValueError("kind position needs kp (N m/rad)")
+        if self.kind == "velocity" and not self.kd:
+            raise ValueError("kind velocity needs kd (N m s/rad)")
+        return self
+
+
+class Actuator(BaseModel):
+    """Whether a rollout may trust the servo gains; every other key is a joint with its drive."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
+    __pydantic_extra__: dict[str, JointDrive]
 
     gains: Literal["known", "free"] = "known"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _joints_have_drives(cls, value: Any) -> Any:
+        for key, drive in value.items() if isinstance(value, dict) else ():
+            if key != "gains" and not isinstance(drive, dict | JointDrive):
+                hint = nearest(str(key), ["gains"])
+                raise ValueError(f"unknown key '{key}'{hint}; beside it stand joints, as in joint_1: {{kp: 20, kd: 1}}")
+        return value
+
+    @property
+    def drives(self) -> dict[str, JointDrive]:
+        """The stated drives by joint."""
+        return dict(self.__pydantic_extra__ or {})
+
+
+class Rollouts(_Keys):
+    """How long a simulation runs before it is set on the measured state again."""
+
+    window: Positive | Literal["auto", "whole"] = "auto"  # s
+
+
+class Tolerance(_Keys):
+    """What is good enough: a misfit below it is `nothing`."""
+
+    torque: Annotated[Number, Field(ge=0, lt=1)] = 0.01  # share of each joint's RMS torque
+    offset: Annotated[Number, Field(ge=0)] = 0.001  # rad
+    geometry: Annotated[Number, Field(ge=0)] = 0.0005  # m
+    position: Annotated[Number, Field(ge=0)] = 0.001  # rad, of rollouts
 
 
 class Diagnose(_Keys):
@@ -270,6 +330,7 @@ class Diagnose(_Keys):
 
     forbid: tuple[Effect, ...] = ()  # effects left out of the catalogue
     alpha: Annotated[Number, Field(gt=0, lt=1)] = 0.05
+    tolerance: Tolerance = Tolerance()
 
 
 class Bound(_Keys):
@@ -297,6 +358,7 @@ class Task(_Keys):
     preprocess: Preprocess = Preprocess()
     baseline: Baseline = Baseline()
     actuator: Actuator = Actuator()
+    rollout: Rollouts = Rollouts()
     diagnose: Diagnose = Diagnose()
     identify: Identify = Identify()
     _file: Path = PrivateAttr(default=Path("task"))
@@ -318,6 +380,33 @@ class Task(_Keys):
             if stems.count(stem) > 1:
                 raise ValueError(f"two holdout recordings are called '{stem}': their predictions would share one name")
         return data
+
+
+class Limits(_Keys):
+    """Bounds on the figures of a run, for `figaroh-jax verify`; what is not given is not asked for."""
+
+    verdict: tuple[Literal["nothing", "named", "named+rest", "unknown"], ...] | None = None  # allowed
+    holdout_relative: Positive | dict[str, Positive] | None = None  # at most, of all joints or by joint
+    gain: Number | None = None  # share by which all causes together lower the held-out error, at least
+    p_value: Annotated[Number, Field(ge=0, le=1)] | None = None  # at least
+    forbidden_causes: tuple[Effect, ...] | None = None
+    rank: Annotated[int, Field(ge=0)] | None = None  # at least
+    condition: Positive | None = None  # at most
+    relative_std: Positive | None = None  # of identified base parameters, at most
+    consistent: bool | None = None  # every link physically consistent
+    position_mm: Positive | None = None  # validated, at most
+    orientation_deg: Positive | None = None
+    fk_parity: Positive | None = None  # m, at most
+
+
+def load_limits(path: str | Path) -> Limits:
+    """Read a file of limits; raises `InputError` that names file and key of the first mistake."""
+    chain = read_task(Path(path))
+    try:
+        return Limits.model_validate(merge(chain))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise InputError(f"{where(chain, first['loc'])}: {_message(first)}") from None
 
 
 def load_task(path: str | Path) -> Task:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,7 +24,25 @@ from .tables import Table, read_table
 if TYPE_CHECKING:
     from ..formats.config import Load, RecordingEntry, Task
 
-__all__ = ["Drive", "Recording", "carried_body", "joint_columns", "read_recordings", "read_time", "unit_factors"]
+__all__ = [
+    "Drive",
+    "Memory",
+    "Recording",
+    "carried_body",
+    "joint_columns",
+    "read_recordings",
+    "read_time",
+    "unit_factors",
+]
+
+
+class Memory(NamedTuple):
+    """Where a recording comes from that was never a file; messages name it so."""
+
+    name: str
+
+    def __str__(self) -> str:
+        return f"recording '{self.name}'"
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +50,7 @@ class Recording:
     """One recording on the joint side: rad and N m, or m and N for prismatic joints."""
 
     name: str  # stem of the file
-    file: Path
+    file: Path | Memory
     joints: tuple[str, ...]  # names of the columns of torque
     time: Float[np.ndarray, " samples"]  # s, increasing
     position: Float[np.ndarray, "samples nq"]  # with quaternions x y z w where the robot has any
@@ -46,8 +64,10 @@ class Recording:
     trusted: Bool[np.ndarray, "samples nv"] | None = None  # False: torque that counts for nothing (see `cleaning`)
 
 
-def read_recordings(task: Task, model: RobotModel, *, floating: bool = False) -> tuple[Recording, ...]:
-    """Read every recording of a task of torque level, in the task's order.
+def read_recordings(
+    task: Task, model: RobotModel, *, floating: bool = False, rollouts: bool = False
+) -> tuple[Recording, ...]:
+    """Read every recording of a task of torque level, or of `rollouts` (a command in place of torque), in its order.
 
     With `floating` the root may be a free joint: the position then begins with its origin and quaternion (x y z,
     x y z w), the torque with the measured wrench on it, force and torque about its origin in its own axes. Raises
@@ -57,11 +77,16 @@ def read_recordings(task: Task, model: RobotModel, *, floating: bool = False) ->
     _check_names(task, model, floating)
     drive = Drive(task, model)
     recordings = tuple(_read(entry, f"data[{k}]", model, drive) for k, entry in enumerate(task.data))
+    if rollouts:
+        lacking = next((r for r in recordings if r.command is None), None)
+        if lacking is not None:
+            raise InputError(f"{lacking.file}: a rollout needs `command`, what the drives were told at each sample")
+        return recordings
     lacking = next((r for r in recordings if r.role == "fit" and r.torque is None), None)
     if lacking is not None:
         raise InputError(
-            f"{lacking.file}: a fit recording needs `torque` (only `role: holdout` may lack it);"
-            " poses without torque, and commands without torque, are not diagnosed yet"
+            f"{lacking.file}: a fit recording needs `torque` (only `role: holdout` may lack it), or all recordings a "
+            "`command` in its place"
         )
     return recordings
 

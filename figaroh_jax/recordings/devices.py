@@ -60,6 +60,32 @@ class Device(eqx.Module):
         """Rows in m that the unknowns alone must bring to zero, such as a known distance of two sockets."""
         return jnp.zeros(0)
 
+    def moved(self, unknown: Float[Array, " k"]) -> Device:
+        """The device with its unknowns put in: those of the new one are counted from there."""
+        return _Moved(self, unknown)
+
+
+class _Moved(Device):
+    """A device with its unknowns put in."""
+
+    device: Device
+    by: Float[Leaf, " k"]
+
+    def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, " rows"]:
+        return self.device.residual(pose, self.by + unknown, datum)
+
+    def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        return self.device.unknowns()
+
+    def places(self, unknown: Array) -> dict[str, Array]:
+        return self.device.places(self.by + unknown)
+
+    def channels(self) -> tuple[int, ...]:
+        return self.device.channels()
+
+    def constraint(self, unknown: Float[Array, " k"]) -> Float[Array, " rows"]:
+        return self.device.constraint(self.by + unknown)
+
 
 class Placed(Device):
     """A device that stands at an unknown or a known place and looks at a tool frame, perhaps unknown too.

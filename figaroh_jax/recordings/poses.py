@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -28,7 +28,7 @@ from .tables import Table, read_table
 if TYPE_CHECKING:
     from ..formats.config import Load, Measurement, RecordingEntry, Task
 
-__all__ = ["PoseRecording", "read_pose_recordings"]
+__all__ = ["PoseRecording", "points", "poses", "read_pose_recordings", "whole_numbers"]
 
 _LOOSE = 1e-2  # how far a rotation or a quaternion may be off by rounding
 
@@ -38,7 +38,7 @@ class PoseRecording:
     """Postures in the order in which they were measured, and what the device saw at each."""
 
     name: str
-    file: Path
+    file: Path | dataset.Memory
     time: Float[np.ndarray, " samples"]  # s; counted where the file has no clock
     position: Float[np.ndarray, "samples nv"]  # rad or m
     kind: Literal["pose", "position", "plane", "socket", "own"]
@@ -129,12 +129,12 @@ def _values(table: Table, measurement: Measurement, key: str, samples: int, scal
     if len(values) != samples:
         raise InputError(f"{table.file}: {where} has {len(values)} rows, but position has {samples}")
     if kind == "position":
-        return kind, _points(values, table, where) * scale
-    poses = _poses(values, table, where)
-    poses[:, :3, 3] *= scale
+        return kind, points(values, table, where) * scale
+    found = poses(values, table, where)
+    found[:, :3, 3] *= scale
     if kind == "camera" and measurement.mount == "hand":  # the board stands still: the camera's pose seen from it
-        poses = np.linalg.inv(np.where(np.isfinite(poses), poses, np.nan))
-    return "pose", poses
+        found = np.linalg.inv(np.where(np.isfinite(found), found, np.nan))
+    return "pose", found
 
 
 def _array(table: Table, source: str | tuple[str, ...], key: str) -> np.ndarray:
@@ -147,7 +147,8 @@ def _array(table: Table, source: str | tuple[str, ...], key: str) -> np.ndarray:
     return np.stack([table.vector(name, key) for name in names], axis=1)
 
 
-def _points(values: np.ndarray, table: Table, key: str) -> np.ndarray:
+def points(values: np.ndarray, table: Any, key: str) -> np.ndarray:
+    """Points (n, markers, 3), checked."""
     if values.ndim == 2 and values.shape[1] % 3 == 0 and values.shape[1]:
         values = values.reshape(len(values), -1, 3)
     if values.ndim != 3 or values.shape[2] != 3:
@@ -161,7 +162,7 @@ def _points(values: np.ndarray, table: Table, key: str) -> np.ndarray:
     return values
 
 
-def _whole_or_missing(values: np.ndarray, table: Table, key: str, what: str) -> None:
+def _whole_or_missing(values: np.ndarray, table: Any, key: str, what: str) -> None:
     """Refuse infinite numbers, and NaN in a part of a point or a rotation."""
     missing = np.isnan(values)
     wrong = np.isinf(values).any(axis=2) | (missing.any(axis=2) & ~missing.all(axis=2))
@@ -173,7 +174,8 @@ def _whole_or_missing(values: np.ndarray, table: Table, key: str, what: str) -> 
         )
 
 
-def _poses(values: np.ndarray, table: Table, key: str) -> np.ndarray:
+def poses(values: np.ndarray, table: Any, key: str) -> np.ndarray:
+    """Poses (n, 4, 4) of matrices or of x y z qx qy qz qw, checked."""
     from scipy.spatial.transform import Rotation
 
     if values.ndim == 2 and values.shape[1] == 16:
@@ -189,8 +191,8 @@ def _poses(values: np.ndarray, table: Table, key: str) -> np.ndarray:
         )
     _whole_or_missing(point, table, key, "position")
     _whole_or_missing(rotation, table, key, "orientation")
-    poses = np.full((len(values), 4, 4), np.nan)
-    poses[:, 3], poses[:, :3, 3] = (0.0, 0.0, 0.0, 1.0), point[:, 0]
+    found = np.full((len(values), 4, 4), np.nan)
+    found[:, 3], found[:, :3, 3] = (0.0, 0.0, 0.0, 1.0), point[:, 0]
     seen = np.isfinite(rotation[:, 0]).all(axis=1)
     given = rotation[seen, 0]
     if given.shape[1] == 4:
@@ -208,8 +210,8 @@ def _poses(values: np.ndarray, table: Table, key: str) -> np.ndarray:
         row = np.flatnonzero(seen)[np.argmax(off > _LOOSE)]
         what = "quaternion x y z w of length 1" if given.ndim == 2 else "rotation matrix"
         raise InputError(f"{table.file}: {key}, row {row} (from 0): the orientation is no {what}")
-    poses[seen, :3, :3] = matrices
-    return poses
+    found[seen, :3, :3] = matrices
+    return found
 
 
 def _numbers(table: Table, source: str | tuple[str, ...] | None, key: str, samples: int) -> np.ndarray:
@@ -222,6 +224,11 @@ def _numbers(table: Table, source: str | tuple[str, ...] | None, key: str, sampl
     values = table.vector(source, key)
     if len(values) != samples:
         raise InputError(f"{table.file}: {key} has {len(values)} rows, but position has {samples}")
+    return whole_numbers(values, table, key)
+
+
+def whole_numbers(values: np.ndarray, table: Any, key: str) -> np.ndarray:
+    """Numbers of what was touched, -1 where nothing was; raises `InputError` where they are no whole numbers."""
     missing = np.isnan(values)
     wrong = ~missing & (np.isinf(values) | (np.where(missing, 0.0, values) % 1 != 0))
     if wrong.any():

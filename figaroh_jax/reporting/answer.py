@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..results import Cause, Diagnosis, Estimate, Name
+from ..results import Cause, Diagnosis, Estimate, Name, Rest
 
-__all__ = ["answer", "cause", "to_json", "write_predictions"]
+__all__ = ["answer", "cause", "holdout", "rest", "to_json", "write_predictions"]
 
 
 def answer(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -27,8 +27,23 @@ def answer(diagnosis: Diagnosis) -> dict[str, Any]:
             "after": [_number(value) for value in diagnosis.after],
             "noise": [_number(value) for value in diagnosis.noise],
         },
+        "rest": rest(diagnosis.rest),
+        "holdout": holdout(diagnosis),
         "next_experiment": _experiment(diagnosis),
+        "notes": list(diagnosis.notes),
     }
+
+
+def holdout(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Error on data not fitted, before and after all causes, and of each joint on the recordings that were held out."""
+    held = [trace for trace in diagnosis.traces if trace.role == "holdout" and trace.measured is not None]
+    gain, joints = diagnosis.holdout, {}
+    for j, name in enumerate(diagnosis.joints if held else ()):
+        measured = np.concatenate([np.asarray(trace.measured)[:, j] for trace in held])
+        after = np.concatenate([np.asarray(trace.after)[:, j] for trace in held])
+        size = float(np.sqrt(np.mean(measured**2)))
+        joints[name] = _number(np.sqrt(np.mean((measured - after) ** 2)) / size) if size > 0 else None
+    return {"before": _number(gain.before), "after": _number(gain.after), "unit": gain.unit, "joints": joints}
 
 
 def to_json(diagnosis: Diagnosis) -> str:
@@ -39,10 +54,12 @@ def to_json(diagnosis: Diagnosis) -> str:
 def write_predictions(
     path: Path,
     predictions: Mapping[str, tuple[Float[np.ndarray, "_"], Float[np.ndarray, "_ nv"]]],
+    quantity: str = "torque",
 ) -> None:
     """Write `predictions.npz`: `<name>_time` (s) and `<name>_torque` (N m or N) for each held-out recording.
 
-    `predictions` maps a recording's name (its file stem) to its own time stamps and the extended model's torque there.
+    `predictions` maps a recording's name (its file stem) to its own time stamps and the extended model's torque there;
+    `quantity` is `position` (rad or m) where it comes from a rollout.
     Raises `ValueError` where the two do not belong together.
     """
     arrays: dict[str, np.ndarray] = {}
@@ -53,7 +70,7 @@ def write_predictions(
                 f"predictions of '{name}': time has shape {stamps.shape} and torque {values.shape}; "
                 "expected (samples,) and (samples, joints)"
             )
-        arrays |= {f"{name}_time": stamps, f"{name}_torque": values}
+        arrays |= {f"{name}_time": stamps, f"{name}_{quantity}": values}
     with path.open("wb") as file:  # an open file, for savez would add a suffix to a name without one
         np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
 
@@ -64,9 +81,24 @@ def cause(found: Cause) -> dict[str, Any]:
     return {
         **_name(found.name),
         "parameters": {name: _estimate(estimate) for name, estimate in found.parameters.items()},
+        "found": found.found,
         "confidence": _number(found.confidence),
         "gain": {"holdout_before": _number(gain.before), "holdout_after": _number(gain.after), "unit": gain.unit},
         "ambiguous_with": [_name(other) for other in found.ambiguous_with],
+    }
+
+
+def rest(left: Rest) -> dict[str, Any]:
+    """What no cause explains, as it stands in `answer.json`."""
+    parts = []
+    for part in left.parts:
+        where = {} if part.band is None else {"band": [_number(edge) for edge in part.band]}
+        where |= {} if part.file is None else {"file": part.file}
+        parts.append({"kind": part.kind, "at": list(part.at), "share": _number(part.share), **where})
+    return {
+        "relative": [_number(value) for value in left.relative],
+        "parts": parts,
+        "nearest": [{**_name(o.name), "share": _number(o.share), "why_not": o.why_not} for o in left.nearest],
     }
 
 

@@ -16,6 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..compiled.batching import sized_program
+from ..compiled.precision import in_float64
 from .dynamics import inverse_dynamics, mass_matrix
 from .manifold import bracket, integrate
 from .model import RobotModel
@@ -31,14 +32,15 @@ class TorqueDerivatives(NamedTuple):
     a: Float[ArrayLike, "*batch nv nv"]  # the mass matrix
 
 
+@in_float64
 def gravity_vector(model: RobotModel, q: Float[ArrayLike, "*batch nq"]) -> Float[Array, "*batch nv"]:
     """Torques (N m, N) that hold the robot still at `q`, in float64."""
-    with jax.enable_x64(True):
-        q = jnp.asarray(q, jnp.float64)
-        rest = jnp.zeros((*q.shape[:-1], model.nv))
-        return inverse_dynamics(model, q, rest, rest)
+    q = jnp.asarray(q, jnp.float64)
+    rest = jnp.zeros((*q.shape[:-1], model.nv))
+    return inverse_dynamics(model, q, rest, rest)
 
 
+@in_float64
 def coriolis_matrix(
     model: RobotModel, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"]
 ) -> Float[Array, "*batch nv nv"]:
@@ -49,8 +51,7 @@ def coriolis_matrix(
     (the connection of the metric M that is free of torsion; Christoffel's symbols where each joint has one degree of
     freedom). The bracket is zero but for joints of several degrees of freedom.
     """
-    with jax.enable_x64(True):
-        return _coriolis_matrix(model, jnp.asarray(q, jnp.float64), jnp.asarray(v, jnp.float64))
+    return _coriolis_matrix(model, jnp.asarray(q, jnp.float64), jnp.asarray(v, jnp.float64))
 
 
 @sized_program
@@ -60,6 +61,7 @@ def _coriolis_matrix(model: RobotModel, q: Array, v: Array) -> Array:
     return half_slope + 0.5 * mass_matrix(model, q) @ _brackets(model, v)
 
 
+@in_float64
 def coriolis_from_bias(
     model: RobotModel,
     bias: Callable[[Array], Array | np.ndarray],
@@ -73,13 +75,13 @@ def coriolis_from_bias(
     The bias is quadratic in the velocities, so the difference of two of its values,
     $\tfrac14 (b(v + e_j) - b(v - e_j))$, is the j-th column without error of approximation.
     """
-    with jax.enable_x64(True):
-        v, mass = jnp.asarray(v, jnp.float64), jnp.asarray(mass, jnp.float64)
-        around, steps = v[..., None, :], jnp.eye(model.nv)
-        columns = jnp.swapaxes(0.25 * (bias(around + steps) - bias(around - steps)), -1, -2)
-        return columns if _abelian(model) else columns + 0.5 * mass @ _brackets(model, v)
+    v, mass = jnp.asarray(v, jnp.float64), jnp.asarray(mass, jnp.float64)
+    around, steps = v[..., None, :], jnp.eye(model.nv)
+    columns = jnp.swapaxes(0.25 * (bias(around + steps) - bias(around - steps)), -1, -2)
+    return columns if _abelian(model) else columns + 0.5 * mass @ _brackets(model, v)
 
 
+@in_float64
 def dynamics_derivatives(
     model: RobotModel,
     q: Float[ArrayLike, "*batch nq"],
@@ -87,8 +89,7 @@ def dynamics_derivatives(
     a: Float[ArrayLike, "*batch nv"],
 ) -> TorqueDerivatives:
     """Derivatives of the torques of `inverse_dynamics` by configuration, velocity and acceleration, in float64."""
-    with jax.enable_x64(True):
-        return _dynamics_derivatives(model, *(jnp.asarray(x, jnp.float64) for x in (q, v, a)))
+    return _dynamics_derivatives(model, *(jnp.asarray(x, jnp.float64) for x in (q, v, a)))
 
 
 @sized_program

@@ -14,9 +14,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..compiled.batching import over_samples
+from ..compiled.precision import in_float64
 from .inertia import pseudo_inertia
 from .kinematics import Motion, add_up, ancestors, axis_twists, check_shapes, gather, motion, movers, pose_columns, take
 from .model import RobotModel
+from .scalar_programs import MASSES, TORQUES, straight
 from .spatial import cross, matmul, rotate
 
 __all__ = [
@@ -29,6 +31,7 @@ __all__ = [
 ]
 
 
+@in_float64
 def inverse_dynamics(
     model: RobotModel,
     q: Float[ArrayLike, "*batch nq"],
@@ -43,9 +46,8 @@ def inverse_dynamics(
     its ratio. A free joint's six are the force and the torque about its origin, in its own axes. Raises `InputError`
     where the arrays do not fit the model.
     """
-    with jax.enable_x64(True):
-        check_shapes(model, q=q, v=v, a=a)
-        return over_samples(joint_torques, model, q, v, a)
+    check_shapes(model, q=q, v=v, a=a)
+    return over_samples(joint_torques, model, q, v, a, straight=_TORQUES)
 
 
 def joint_torques(
@@ -71,6 +73,7 @@ def _pseudo_inertias(model: RobotModel, dtype: jnp.dtype) -> Float[Array, "nj 4 
     return jnp.roll(pseudo_inertia(jnp.asarray(model.inertia, dtype)), 1, axis=(1, 2))[..., None]  # origin first
 
 
+@in_float64
 def mass_matrix(model: RobotModel, q: Float[ArrayLike, "*batch nq"]) -> Float[Array, "*batch nv nv"]:
     r"""Mass matrix of the rigid body (kg m^2; kg m, kg for prismatic joints), symmetric, in float64.
 
@@ -78,9 +81,8 @@ def mass_matrix(model: RobotModel, q: Float[ArrayLike, "*batch nq"]) -> Float[Ar
     the momentum of all that joint k carries, for a unit rate of joint k. Raises `InputError` where the shape of `q`
     does not fit the model.
     """
-    with jax.enable_x64(True):
-        check_shapes(model, q=q)
-        return over_samples(joint_masses, model, q, width=model.nv**2)
+    check_shapes(model, q=q)
+    return over_samples(joint_masses, model, q, width=model.nv**2, straight=_MASSES)
 
 
 def joint_masses(model: RobotModel, q: Float[Array, "nq samples"]) -> Float[Array, "nv nv samples"]:
@@ -102,6 +104,11 @@ def joint_masses(model: RobotModel, q: Float[Array, "nq samples"]) -> Float[Arra
     return gather(model, jnp.swapaxes(gather(model, full), 0, 1))
 
 
+_TORQUES = straight(TORQUES, joint_torques)
+_MASSES = straight(MASSES, joint_masses, lambda model: model.nv**2)
+
+
+@in_float64
 def forward_dynamics(
     model: RobotModel,
     q: Float[ArrayLike, "*batch nq"],
@@ -113,9 +120,8 @@ def forward_dynamics(
     Cholesky solve with the mass matrix, in float64. Where a joint moves no mass that matrix is singular and the answer
     is NaN or huge: give the link an inertia (or the joint a rotor). Raises `InputError` where the shapes do not fit.
     """
-    with jax.enable_x64(True):
-        check_shapes(model, q=q, v=v, tau=tau)
-        return over_samples(joint_accelerations, model, q, v, tau, width=model.nv**2)
+    check_shapes(model, q=q, v=v, tau=tau)
+    return over_samples(joint_accelerations, model, q, v, tau, width=model.nv**2)
 
 
 def joint_accelerations(

@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Shaped
 
 from ..compiled.batching import over_samples, traced
+from ..compiled.precision import in_float64
 from ..errors import InputError
 from .model import Joint, RobotModel, dofs
 from .spatial import cross, matmul, quaternion_rotation, rotate_back, sine_cosine
@@ -299,32 +300,32 @@ def _check_quaternions(model: RobotModel, q: np.ndarray) -> None:
                 )
 
 
+@in_float64
 def forward_kinematics(model: RobotModel, q: Float[ArrayLike, "*batch nq"]) -> Float[Array, "*batch nj 4 4"]:
     """Poses `world_T_joint` of all tree joints (m; q in rad, m for a prismatic joint), in float64.
 
     Raises `InputError` where `q` does not fit the model.
     """
-    with jax.enable_x64(True):
-        check_shapes(model, q=q)
-        return over_samples(placements, model, q)
+    check_shapes(model, q=q)
+    return over_samples(placements, model, q)
 
 
+@in_float64
 def frame_placement(model: RobotModel, q: Float[ArrayLike, "*batch nq"], name: str) -> Float[Array, "*batch 4 4"]:
     """Pose `world_T_frame` of the frame called `name` (a link or a joint of the model), m and rad, in float64.
 
     Raises `InputError` where there is no such frame or `q` does not fit the model.
     """
     index = model.frame_index(name)
-    with jax.enable_x64(True):
-        check_shapes(model, q=q)
-        return over_samples(_one_frame, (model, index, model.frames[index].parent), q)
+    check_shapes(model, q=q)
+    return over_samples(_one_frame, (model, index, model.frames[index].parent), q)
 
 
+@in_float64
 def frame_placements(model: RobotModel, q: Float[ArrayLike, "*batch nq"]) -> Float[Array, "*batch nf 4 4"]:
     """Poses `world_T_frame` of all frames, in the order of `model.frames`; units and errors as `frame_placement`."""
-    with jax.enable_x64(True):
-        check_shapes(model, q=q)
-        return over_samples(_all_frames, model, q)
+    check_shapes(model, q=q)
+    return over_samples(_all_frames, model, q)
 
 
 def _one_frame(which: tuple[RobotModel, Any, Any], q: Array) -> Float[Array, "4 4 samples"]:
@@ -343,6 +344,7 @@ def frame_pose(poses: Float[Array, "nj 4 4 samples"], model: RobotModel, index: 
     return matmul(carrier, jnp.asarray(model.frame_placement, poses.dtype)[index][..., None])
 
 
+@in_float64
 def frame_jacobian(
     model: RobotModel,
     q: Float[ArrayLike, "*batch nq"],
@@ -358,9 +360,8 @@ def frame_jacobian(
     index = model.frame_index(name)
     if reference not in _JACOBIANS:
         raise InputError(f"reference is '{reference}'; known: {', '.join(_JACOBIANS)}")
-    with jax.enable_x64(True):
-        check_shapes(model, q=q)
-        return over_samples(_JACOBIANS[reference], (model, index, model.frames[index].parent), q)
+    check_shapes(model, q=q)
+    return over_samples(_JACOBIANS[reference], (model, index, model.frames[index].parent), q)
 
 
 def _aligned(which: tuple[RobotModel, Any, Any], q: Array) -> Float[Array, "6 nv samples"]:

@@ -17,6 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from ..compiled.precision import in_float64
 from ..errors import InputError
 from .model import DOF_NAMES, Joint, RobotModel
 
@@ -36,6 +37,7 @@ def neutral(model: RobotModel) -> Float[np.ndarray, " nq"]:
     return q
 
 
+@in_float64
 def integrate(
     model: RobotModel, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"]
 ) -> Float[Array, "*batch nq"]:
@@ -45,8 +47,7 @@ def integrate(
     m, v in rad/s and m/s (child axes). Raises `InputError` where the shapes do not fit the model.
     """
     _check(model, q=q, v=v)
-    with jax.enable_x64(True):
-        return _integrate(model, jnp.asarray(q, jnp.float64), jnp.asarray(v, jnp.float64))
+    return _integrate(model, jnp.asarray(q, jnp.float64), jnp.asarray(v, jnp.float64))
 
 
 @jax.jit
@@ -54,6 +55,7 @@ def _integrate(model: RobotModel, q: Array, v: Array) -> Array:
     return jnp.concatenate([_STEP.get(kind, jnp.add)(q[..., at], v[..., dof]) for kind, at, dof in _runs(model)], -1)
 
 
+@in_float64
 def difference(
     model: RobotModel, q0: Float[ArrayLike, "*batch nq"], q1: Float[ArrayLike, "*batch nq"]
 ) -> Float[Array, "*batch nv"]:
@@ -63,8 +65,7 @@ def difference(
     `integrate`. Raises `InputError` where the shapes do not fit the model.
     """
     _check(model, q0=q0, q1=q1)
-    with jax.enable_x64(True):
-        return _difference(model, jnp.asarray(q0, jnp.float64), jnp.asarray(q1, jnp.float64))
+    return _difference(model, jnp.asarray(q0, jnp.float64), jnp.asarray(q1, jnp.float64))
 
 
 @jax.jit

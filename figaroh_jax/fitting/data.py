@@ -1,0 +1,268 @@
+r"""Measured data as pytrees with a pure residual by the model: what `fit`, a user's `jit`, `grad` and `vmap` take.
+
+| data | made by | rows |
+|---|---|---|
+| `TorqueData` | `torque_data` of recordings | torque of the model less the measured one, both low-passed alike |
+| `PoseData` | `pose_data` of postures | predicted less measured of every device, m or rad |
+
+Rows are weighted: the inverse of one sigma where it is known, 0 where nothing was measured. Whatever has a method
+`residual(model)` is data, yours too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, Shaped
+
+from ..calibration.posefit import ties
+from ..calibration.posegroups import devices_of
+from ..compiled.precision import in_float64
+from ..effects.base import Motion
+from ..effects.extended import ExtendedModel, changed_robot, extend, opened, read_position, read_sensors
+from ..errors import InputError
+from ..estimation.regression import BLOCK, BLOCK_PERIODS
+from ..recordings.dataset import Recording
+from ..recordings.devices import Device
+from ..recordings.poses import PoseRecording
+from ..recordings.rowfilter import filtered
+from ..recordings.signals import prepare_all
+from ..recordings.stacked import stack
+from ..rigid.dynamics import inverse_dynamics
+from ..rigid.kinematics import frame_pose, placements
+from ..rigid.model import Leaf, RobotModel
+from ..rigid.spatial import matmul
+
+if TYPE_CHECKING:
+    from ..formats.config import Preprocess
+
+__all__ = ["Data", "PoseData", "TorqueData", "as_data", "pose_data", "residual", "torque_data"]
+
+
+@runtime_checkable
+class Data(Protocol):
+    """Anything measured that a model predicts."""
+
+    def residual(self, model: ExtendedModel) -> Float[Array, " rows"]:
+        """Weighted rows, pure: JAX transforms it by every array of `model` and of the data."""
+        ...
+
+
+class TorqueData(eqx.Module):
+    """`n` recordings of at most `N` samples and `M` rows, joint side, SI units; rows are low-passed torques."""
+
+    time: Float[Leaf, "n N"]  # s
+    position: Float[Leaf, "n N nq"]
+    velocity: Float[Leaf, "n N nv"]
+    acceleration: Float[Leaf, "n N nv"]
+    torque: Float[Leaf, "n M nv"]  # rows of the measured torque, N m or N
+    weight: Float[Leaf, "n M nv"]  # 1 / sigma; 0: not measured, gated, padding
+    dt: Float[Leaf, ""] | float  # s
+    source: Int[Leaf, "n L"] | None = None  # sample at each place of the extended record; None: samples are rows
+    kept: Int[Leaf, "n M"] | None = None  # place of each row
+    response: Shaped[Leaf, " F"] | None = None  # of the row filter
+    carried: Float[Leaf, "n links 10"] | None = None  # known payloads
+    together: int = eqx.field(static=True, default=0)  # rows of a block, half a second or more; 0: a recording is one
+
+    def residual(self, model: ExtendedModel) -> Float[Array, " rows"]:
+        """Torque of the model less the measured one times the weight, recording by recording, row by row."""
+        return (self.weight * (self.predicted(model) - self.torque)).reshape(-1)
+
+    def predicted(self, model: ExtendedModel) -> Float[Array, "n M nv"]:
+        """Rows of the model's torque, as the sensors read it, N m or N."""
+        model = opened(model)
+        axes = (0, 0, 0, 0, None if self.carried is None else 0)
+        motion = self.time, self.position, self.velocity, self.acceleration, self.carried
+        torque = jax.vmap(lambda *one: self._torque(model, *one), in_axes=axes)(*(_traceable(x) for x in motion))
+        return torque if self.source is None else jax.vmap(self._rows)(torque, self.source, self.kept)
+
+    def _torque(self, model: ExtendedModel, time: Any, q: Any, v: Any, a: Any, carried: Any) -> Array:
+        if carried is not None:
+            model = eqx.tree_at(lambda m: m.robot.inertia, model, model.robot.inertia + carried)
+        return read_sensors(model, time, q, v, a, jnp.asarray(self.dt))
+
+    def _rows(self, torque: Array, source: Array, kept: Array) -> Array:
+        return filtered(torque.T, source, kept, jnp.asarray(self.response)).T
+
+
+def _traceable(x: Any) -> Any:
+    return None if x is None else jnp.asarray(x)
+
+
+class PoseData(eqx.Module):
+    """Postures that one device measured; its own place (frames, markers, sockets) is that of the device's arrays."""
+
+    position: Float[Leaf, "postures nq"]  # rad or m
+    datum: Any  # what the device measured, the postures on the first axis
+    weight: Float[Leaf, "postures rows"]  # 1 / sigma; 0: not measured
+    device: Device
+    tied: Float[Leaf, ""] | float = 1.0  # weight of the device's constraints
+    base_frame: str = eqx.field(static=True, default="")
+    tool_frame: str = eqx.field(static=True, default="")
+
+    def residual(self, model: ExtendedModel) -> Float[Array, " rows"]:
+        """Predicted less measured times the weight, posture by posture, then the device's constraints."""
+        unknown = jnp.zeros(len(self.device.unknowns()))
+        poses = tool_poses(model, jnp.asarray(self.position), self.base_frame, self.tool_frame)
+        datum = jax.tree.map(jnp.asarray, self.datum)
+        device: Device = jax.tree.map(jnp.asarray, self.device)
+        rows = jax.vmap(lambda pose, seen: device.residual(pose, unknown, seen))(poses, datum)
+        # what was not measured has no derivative either
+        rows = jnp.where(jnp.asarray(self.weight) > 0, rows, 0.0) * self.weight
+        if not ties(self.device):
+            return rows.reshape(-1)
+        return jnp.concatenate([rows.reshape(-1), self.tied * device.constraint(unknown)])
+
+
+def tool_poses(
+    model: ExtendedModel, q: Float[Array, "postures nq"], base_frame: str, tool_frame: str
+) -> Float[Array, "postures 4 4"]:
+    """Poses of the tool frame in the base frame (m) where the position sensors read `q`; to be traced in float64."""
+    robot = changed_robot(model)
+    poses = placements(robot, true_position(model, robot, q).T)
+    start, end = (
+        frame_pose(poses, robot, k, robot.frames[k].parent)
+        for k in (robot.frame_index(base_frame), robot.frame_index(tool_frame))
+    )
+    back = jnp.swapaxes(start[:3, :3], 0, 1)
+    rotation = matmul(back, end[:3, :3])
+    place = jnp.sum(back * (end[:3, 3] - start[:3, 3])[None], axis=1)
+    top = jnp.moveaxis(jnp.concatenate([rotation, place[:, None]], axis=1), -1, 0)
+    bottom = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]), (len(q), 1, 4))
+    return jnp.concatenate([top, bottom], axis=1)
+
+
+def true_position(model: ExtendedModel, robot: RobotModel, q: Float[Array, "postures nq"]) -> Array:
+    """Where the joints stand while their sensors read `q`, at rest under gravity."""
+    if not any(effect.has("position_error") for effect in model.effects):
+        return q
+    still = jnp.zeros((len(q), robot.nv))
+    load = inverse_dynamics(robot, q, still, still)
+    motion = Motion(robot, jnp.zeros(len(q)), q, still, still, load, load, 0.0, jnp.asarray(model.width))
+    return q - (read_position(model.effects, motion) - q)
+
+
+def torque_data(
+    model: RobotModel | ExtendedModel,
+    recordings: Recording | Sequence[Recording],
+    preprocess: Preprocess | None = None,
+    *,
+    noise: Float[ArrayLike, "..."] = 1.0,
+) -> TorqueData:
+    """The recordings with torque as data of a residual; the work on the host that nothing differentiates.
+
+    They are brought to even samples, position low-passed and differentiated, and rows of torque as `preprocess`
+    says (`Preprocess(cutoff=...)`, Hz). `noise` is one sigma of the rows (N m or N; one, or one for each joint): rows
+    count in its units. Recordings with role "holdout" are left out. Raises `InputError` where they do not fit.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> model = fj.load_urdf(fj.DEMO)
+    >>> t = np.arange(1000)[:, None] / 250.0
+    >>> run = fj.recording(q=np.sin(t + np.arange(4)), tau=np.cos(t + np.arange(4)), rate=250)
+    >>> data = fj.torque_data(model, run, noise=0.1)
+    >>> data.residual(fj.extend(model)).shape[0] == data.torque.size
+    True
+    """
+    from ..formats.config import Preprocess
+
+    robot = model.robot if isinstance(model, ExtendedModel) else model
+    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    fitted = [one for one in given if one.role == "fit"]
+    lacking = next((one for one in fitted if one.torque is None), None)
+    if not fitted or lacking is not None:
+        raise InputError(f"{lacking.file} has no torque" if lacking else "no recording to fit: all have role holdout")
+    signals = prepare_all(tuple(fitted), preprocess or Preprocess(), slowed=False, model=robot)
+    records = stack(signals, robot)
+    flat = np.moveaxis(np.asarray(records.torque), 2, 1)
+    rows = [
+        filtered(x, s, k, np.asarray(records.low_pass))
+        for x, s, k in zip(flat, records.source, records.kept, strict=True)
+    ]
+    return TorqueData(
+        records.time,
+        records.position,
+        records.velocity,
+        records.acceleration,
+        np.swapaxes(np.stack(rows), 1, 2),
+        np.asarray(records.weight) / np.asarray(noise),
+        np.float64(records.dt),
+        records.source,
+        records.kept,
+        np.asarray(records.low_pass),
+        records.carried,
+        max(1, round(float(records.rate) * max(BLOCK, BLOCK_PERIODS / float(records.cutoff)))),
+    )
+
+
+def pose_data(
+    model: RobotModel | ExtendedModel,
+    recordings: PoseRecording | Sequence[PoseRecording],
+    *,
+    sigma: tuple[float, float] | None = None,
+) -> tuple[PoseData, ...]:
+    """Measured postures as data of a residual, one for each device; its frames start in closed form.
+
+    Recordings of one kind with the same frames share a device. `sigma` is one sigma of positions (m) and orientations
+    (rad); by default the recordings' `accuracy`, else 1: rows in m and rad. Held-out recordings have weight zero.
+    """
+    robot = model.robot if isinstance(model, ExtendedModel) else model
+    given = [recordings] if isinstance(recordings, PoseRecording) else list(recordings)
+    found = []
+    for members, device, datum, measured in devices_of(robot, given):
+        scale = sigma or tuple(given[members[0]].accuracy[k] or 1.0 for k in (0, 1))
+        fit = np.concatenate([np.full(len(given[k].position), given[k].role == "fit") for k in members])
+        weight = np.asarray(measured, float) * fit[:, None] / np.asarray(scale)[np.array(device.channels())]
+        position = np.concatenate([given[k].position for k in members])
+        first = given[members[0]]
+        found.append(PoseData(position, datum, weight, device, 1.0 / scale[0], first.base_frame, first.tool_frame))
+    return tuple(found)
+
+
+def as_data(model: ExtendedModel, data: Any) -> tuple[Data, ...]:
+    """Recordings, postures and data of any kind, one or several, as a tuple of data."""
+    if isinstance(data, Recording):
+        return (torque_data(model, data),)
+    if isinstance(data, PoseRecording):
+        return pose_data(model, data)
+    if isinstance(data, Data):
+        return (data,)
+    if not isinstance(data, Sequence) or not len(data):
+        raise InputError(f"data is {type(data).__name__}: recordings, postures, or what has a method `residual(model)`")
+    for kind, make in ((Recording, torque_data), (PoseRecording, pose_data)):
+        if all(isinstance(one, kind) for one in data):
+            made = make(model, data)
+            return made if isinstance(made, tuple) else (made,)
+    return tuple(part for one in data for part in as_data(model, one))
+
+
+def residual(model: RobotModel | ExtendedModel, data: Any) -> Float[Array, " rows"]:
+    """What the model gets wrong in the data: predicted less measured, weighted, in float64; pure.
+
+    `data`: a `TorqueData` (rows N m or N), a `PoseData` of any device (m, rad), your own with a method
+    `residual(model)`, recordings and postures as they are (prepared anew at each call: prepare them once with
+    `torque_data` or `pose_data` where that counts), or a sequence of those. Differentiable by every array of the
+    model (placements, inertials, gravity, parameters of effects) and of the data; rows without weight are zero.
+
+    >>> import jax, numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> t = np.arange(1000)[:, None] / 250.0
+    >>> data = fj.torque_data(robot, fj.recording(q=np.sin(t + np.arange(4)), tau=0 * t + np.zeros(4), rate=250))
+    >>> cost = lambda model: (fj.residual(model, data) ** 2).mean()
+    >>> jax.grad(cost)(robot).gravity.shape
+    (3,)
+    """
+    whole = model if isinstance(model, ExtendedModel) else extend(model)
+    return _residual(whole, as_data(whole, data))
+
+
+@in_float64
+@eqx.filter_jit
+def _residual(model: ExtendedModel, data: tuple[Data, ...]) -> Float[Array, " rows"]:
+    parts = [one.residual(model) for one in data]
+    return parts[0] if len(parts) == 1 else jnp.concatenate(parts)

@@ -1,0 +1,327 @@
+r"""One fit for every job: what is estimated, measured and believed in, out comes a model with its uncertainty.
+
+Least $\tfrac12 |r(\theta)|^2 + \tfrac12 \sum_k (\theta_k / \sigma_k)^2$ over the numbers that `free` names; r are the
+rows of the data (`data`). Optimistix solves it, and differentiates it through the condition of the minimum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax
+import numpy as np
+import optimistix
+from jaxtyping import Array, Float
+
+from ..calibration import posefit
+from ..calibration.posesolver import NormalEquations, cut_weights, normal_equations
+from ..compiled.batching import traced
+from ..compiled.precision import in_float64
+from ..effects.extended import ExtendedModel, extend
+from ..errors import InputError
+from ..estimation.priors import rigid_prior
+from ..rigid.chain import chain_between
+from ..rigid.model import Leaf, RobotModel
+from .blockwise import BlockLevenbergMarquardt, normal_of
+from .data import Data, PoseData, as_data
+from .free import Free, apply, select
+
+__all__ = ["Estimate", "Fit", "fit"]
+
+NULL = 1e-12  # of the largest eigenvalue of the information: below it a direction is not determined
+HIDDEN = 1e-6  # share of a number in such directions above which it is not determined
+
+
+class Estimate(NamedTuple):
+    """A fitted number: its change from the model that was given, one sigma (inf: not determined), its unit."""
+
+    value: float
+    std: float
+    unit: str
+
+
+class Fit(eqx.Module):
+    """What a fit found; a pytree, differentiable through the solution, and a batch of fits under `jax.vmap`."""
+
+    model: ExtendedModel  # with the numbers in it
+    data: tuple[Data, ...]  # with the devices' frames put in
+    values: Float[Array, " numbers"]  # change of each number, SI units
+    covariance: Float[Array, "numbers numbers"]  # for rows of equal variance; without gradient
+    hidden: Float[Array, " numbers"]  # share of each number in directions that nothing determines
+    cost: Float[Array, ""]  # half of the squares of rows and prior
+    rows: Float[Array, " rows"]  # weighted residual of the data
+    rank: Any  # directions that data and prior determine
+    result: optimistix.RESULTS  # `optimistix.RESULTS.successful`, or why not
+    stats: dict[str, Any]
+    free: Free = eqx.field(static=True)
+
+    @property
+    def std(self) -> Float[np.ndarray, " numbers"]:
+        """One sigma of each number; inf where nothing determines it."""
+        size = np.sqrt(np.maximum(np.asarray(jnp.diagonal(self.covariance, axis1=-2, axis2=-1)), 0.0))
+        return np.where(np.asarray(self.hidden) > HIDDEN, np.inf, size)
+
+    @property
+    def parameters(self) -> dict[str, Estimate]:
+        """Each number by its name."""
+        each = zip(self.free.names, np.asarray(self.values), self.std, self.free.units, strict=True)
+        return {name: Estimate(float(value), float(std), unit) for name, value, std, unit in each}
+
+
+class _Closed(eqx.Module):
+    """Rows of postures in closed form, a block at a time."""
+
+    parts: tuple[posefit.Part, ...]
+    weights: Any
+
+
+class _Problem(eqx.Module):
+    """What a solver works on: `y` are the numbers in their sizes."""
+
+    model: ExtendedModel
+    data: tuple[Data, ...]
+    precision: Float[Leaf, " numbers"]  # of the prior on y
+    closed: _Closed | None
+    free: Free = eqx.field(static=True)
+
+    def at(self, y: Float[Array, " numbers"]) -> tuple[ExtendedModel, tuple[Data, ...]]:
+        return apply(self.free, self.model, self.data, y * self.free.sizes)
+
+    def rows(self, y: Float[Array, " numbers"]) -> Float[Array, " rows"]:
+        model, data = self.at(y)
+        return jnp.concatenate([one.residual(model) for one in data])
+
+    def normal(self, y: Float[Array, " numbers"]) -> NormalEquations:
+        if self.closed is None:
+            return normal_of(lambda x: _rows(x, self), y)
+        ones = jnp.ones_like(y)
+        return normal_equations(self.closed.parts, self.closed.weights, jnp.asarray(self.precision), ones, y)
+
+
+def _rows(y: Float[Array, " numbers"], problem: _Problem) -> tuple[Array, Array]:
+    return problem.rows(y), jnp.sqrt(jnp.asarray(problem.precision)) * y
+
+
+def fit(
+    model: RobotModel | ExtendedModel,
+    data: Any,
+    free: Any,
+    *,
+    prior: Mapping[str, Any] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    solver: Any = None,
+    max_steps: int = 256,
+) -> Fit:
+    """The model that fits the data best in what is `free`, with covariance and the solver's verdict; pure.
+
+    `free`: one or several of `inertia`, `friction`, `effects`, `joint_offset`, `link_geometry`, `frames` (what the
+    measuring devices leave open), `tool_frame`, `base`, `gravity`; or a mapping from these to places, `{"joint_offset":
+    ["elbow"], "frames": True}`. `data` as for `residual`. `prior`: one sigma about the given model by the same names
+    (SI units; for `inertia` relative, as `robot.trust`). `bounds`: limits of a number's change, by its name or how
+    that begins: L-BFGS-B of jaxopt then searches. `solver`: any least-squares solver or minimiser of optimistix; by
+    default `optimistix.LevenbergMarquardt`, or for postures alone `BlockLevenbergMarquardt`, which is faster there.
+
+    A solver that fails says so in `result`; `InputError` is wrong input. Differentiable by model and data through the
+    condition of the minimum, and mapped by `jax.vmap`; bounded fits are not differentiable.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> q = np.random.default_rng(0).uniform(-1, 1, (30, 4))
+    >>> hand = robot.link_names[-1]
+    >>> seen = np.asarray(fj.frame_placement(robot, q + [0, 0.02, 0, 0], hand))[:, :3, 3]
+    >>> run = fj.postures(q=q, position=seen, base_frame="base", tool_frame=hand, unknown=[])
+    >>> found = fj.fit(robot, run, {"joint_offset": ["elbow", robot.joint_names[1]]})
+    >>> round(found.parameters["joint_offset " + robot.joint_names[1]].value, 6)
+    0.02
+    """
+    whole = model if isinstance(model, ExtendedModel) else extend(model)
+    parts = as_data(whole, data)
+    chosen = select(whole, parts, free)
+    precision = _precision(chosen, whole, prior or {}) * chosen.sizes**2
+    closed = None if traced(whole, parts) else _closed_form(chosen, whole, parts)
+    problem = _Problem(whole, parts, precision, closed, chosen)
+    if bounds is not None:
+        return _bounded(problem, *_limits(chosen, bounds), max_steps)
+    if solver is None:
+        solver = BlockLevenbergMarquardt() if closed else optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
+    return _solved(problem, solver, max_steps)
+
+
+@in_float64
+def _solved(problem: _Problem, solver: Any, max_steps: int) -> Fit:
+    return _solve(problem, solver, max_steps)
+
+
+@eqx.filter_jit
+def _solve(problem: _Problem, solver: Any, max_steps: int) -> Fit:
+    adjoint = optimistix.ImplicitAdjoint(linear_solver=lineax.AutoLinearSolver(well_posed=False))
+    start = jnp.zeros(len(problem.free.names))
+    found = optimistix.least_squares(
+        _rows, solver, start, args=problem, adjoint=adjoint, max_steps=max_steps, throw=False
+    )
+    return _fit_at(problem, found.value, found.result, found.stats)
+
+
+def _fit_at(problem: _Problem, y: Array, result: Any, stats: dict[str, Any]) -> Fit:
+    model, data = problem.at(y)
+    rows = problem.rows(y)
+    still = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, (problem, y))
+    covariance, hidden, rank = _covariance(*still)
+    scale = jnp.asarray(problem.free.sizes)
+    cost = 0.5 * (jnp.sum(rows**2) + jnp.sum(problem.precision * y**2))
+    return Fit(
+        model,
+        data,
+        y * scale,
+        covariance * scale[:, None] * scale,
+        hidden,
+        cost,
+        rows,
+        rank,
+        result,
+        {key: value for key, value in stats.items() if value is not None},
+        problem.free,
+    )
+
+
+def _covariance(problem: _Problem, y: Array) -> tuple[Array, Array, Array]:
+    """Covariance of y for rows of one variance, share of each number in undetermined directions, and rank."""
+
+    def both(y: Array) -> tuple[Array, Array]:
+        rows = problem.rows(y)
+        return rows, rows
+
+    if problem.closed is None:
+        J, rows = jax.jacfwd(both, has_aux=True)(y)
+        information = jnp.matmul(J.T, J, precision=jax.lax.Precision.HIGHEST) + jnp.diag(jnp.asarray(problem.precision))
+        counted = jnp.sum((rows != 0) | jnp.any(J != 0, axis=1))
+        square = jnp.sum(rows**2)
+    else:
+        normal = problem.normal(y)
+        information = normal.matrix
+        counted = sum(jnp.sum(jnp.asarray(w) > 0) for w in jax.tree.leaves(problem.closed.weights))
+        square = 2.0 * normal.cost - jnp.sum(problem.precision * y**2)
+    size = jnp.sqrt(jnp.maximum(jnp.diagonal(information), 1e-300))
+    values, vectors = jnp.linalg.eigh(information / size[:, None] / size)
+    kept = values > NULL * values[-1]
+    inverse = (vectors * jnp.where(kept, 1.0 / jnp.where(kept, values, 1.0), 0.0)) @ vectors.T / size[:, None] / size
+    rank = jnp.sum(kept)
+    variance = square / jnp.maximum(counted - rank, 1)
+    return variance * inverse, jnp.sum(jnp.where(kept, 0.0, vectors**2), axis=1), rank
+
+
+def _precision(free: Free, model: ExtendedModel, prior: Mapping[str, Any]) -> Float[np.ndarray, " numbers"]:
+    """Inverse variance of each number's prior, zero where there is none."""
+    known = {"effect": "effects"}
+    unused, out = set(prior), []
+    for part in free.parts:
+        kind = known.get(part.kind, part.kind)
+        sigma = prior.get(kind, prior.get("friction") if kind == "effects" else None)
+        unused -= {kind} | ({"friction"} if kind == "effects" else set())
+        if sigma is None:
+            out.append(np.zeros(len(part.index)))
+        elif kind == "inertia" and np.ndim(sigma) == 0:
+            if traced(model.robot.inertia):
+                raise InputError("prior: a relative sigma of `inertia` needs a model that no transformation holds")
+            out.append(rigid_prior(model.robot, float(sigma))[1][np.array(part.index)])
+        else:
+            whole = np.broadcast_to(np.asarray(sigma, float), part.shape).reshape(-1)
+            if not (whole[np.array(part.index)] > 0).all():
+                raise InputError(f"prior: sigma of '{kind}' is {sigma}; expected numbers above zero")
+            out.append(whole[np.array(part.index)] ** -2.0)
+    if unused:
+        raise InputError(f"prior: '{sorted(unused)[0]}' is not free; free are {sorted({p.kind for p in free.parts})}")
+    return np.concatenate(out)
+
+
+def _closed_form(free: Free, model: ExtendedModel, data: tuple[Data, ...]) -> _Closed | None:
+    """Rows and derivatives of postures by the twists of their chains, where nothing else is free."""
+    kinds = {part.kind for part in free.parts}
+    plain = not any(effect.has("position_error") or effect.has("change") for effect in model.effects)
+    if not (plain and kinds <= {"joint_offset", "link_geometry", "frames"}):
+        return None
+    if not all(isinstance(one, PoseData) for one in data):
+        return None
+    columns, order, count = [], [], sum(len(p.index) for p in free.parts if p.kind != "frames")
+    first = np.cumsum([count, *(len(one.device.unknowns()) for one in data if isinstance(one, PoseData))])
+    for part in free.parts:
+        if part.kind == "frames":
+            order += [int(first[part.key[0]]) + i for i in part.index]
+        else:
+            order += range(len(columns), len(columns) + len(part.index))
+            columns += [_unit_twist(model.robot, part.kind, i) for i in part.index]
+    groups = tuple(_group(model.robot, one, columns) for one in data if isinstance(one, PoseData))
+    problem = posefit.Problem(groups, np.ones(int(first[-1])), count)
+    parts = posefit.parts_of(problem)
+    weights = [np.asarray(one.weight, float).T.reshape(-1) for one in data if isinstance(one, PoseData)]
+    tied = [np.full(posefit.ties(g.device), float(one.tied)) for g, one in zip(groups, data, strict=True)]  # pyright: ignore[reportAttributeAccessIssue]
+    cut = cut_weights(problem, parts, np.concatenate([x for pair in zip(weights, tied, strict=True) for x in pair]))
+    local = [eqx.tree_at(lambda p: p.local, part, part.local[:, order] * free.sizes) for part in parts]
+    return _Closed(tuple(local), cut)
+
+
+def _unit_twist(robot: RobotModel, kind: str, index: int) -> tuple[int, Float[np.ndarray, "6"]]:
+    """Joint and twist of a unit of one number."""
+    if kind == "link_geometry":
+        return index // 6, np.eye(6)[index % 6]
+    turns = robot.joints[index].kind == "revolute"
+    axis = np.asarray(robot.axis)[index]
+    return index, np.concatenate([np.zeros(3), axis] if turns else [axis, np.zeros(3)])
+
+
+def _group(robot: RobotModel, one: PoseData, columns: list[tuple[int, np.ndarray]]) -> posefit.Group:
+    chain = chain_between(robot, one.base_frame, one.tool_frame)
+    samples = len(one.position)
+    pieces = (
+        (k, chain.joints.index(joint), np.repeat(twist[:, None], samples, axis=1))
+        for k, (joint, twist) in enumerate(columns)
+        if joint in chain.joints
+    )
+    measured = np.asarray(one.weight) > 0
+    return posefit.group_of(chain, one.device, np.asarray(one.position).T, len(columns), pieces, one.datum, measured)
+
+
+def _limits(free: Free, bounds: Mapping[str, tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper limit of each number in its size."""
+    lower, upper = np.full((2, len(free.names)), np.inf) * [[-1.0], [1.0]]
+    for key, (low, high) in bounds.items():
+        mine = np.array([name == key or name.startswith(f"{key} ") for name in free.names])
+        if not mine.any():
+            raise InputError(f"bounds: nothing free is called '{key}'; free are {', '.join(free.names[:12])}")
+        if not low <= 0.0 <= high:
+            raise InputError(f"bounds: '{key}' {low, high} does not hold 0, the model that is given")
+        lower[mine], upper[mine] = low, high
+    return lower / free.sizes, upper / free.sizes
+
+
+@in_float64
+def _bounded(problem: _Problem, lower: np.ndarray, upper: np.ndarray, max_steps: int) -> Fit:
+    if traced(problem):
+        raise InputError("a fit with bounds runs on the host, not under jit, grad or vmap; see `fit_linear`")
+    from jaxopt import ScipyBoundedMinimize
+
+    start = jnp.zeros(len(problem.free.names))
+    scale = float(_cost(start, problem)) or 1.0
+    search = ScipyBoundedMinimize(
+        method="L-BFGS-B",
+        fun=lambda y: _cost(y, problem) / scale,
+        tol=1e-12,
+        maxiter=max(max_steps, 1000),
+        options={"ftol": 1e-15, "gtol": 1e-9, "maxcor": 30},
+    )
+    found = search.run(start, bounds=(lower, upper))
+    good = optimistix.RESULTS.successful
+    result = good if bool(found.state.success) else optimistix.RESULTS.nonlinear_max_steps_reached
+    return _finished(problem, jnp.asarray(found.params), result, {"num_steps": jnp.asarray(found.state.iter_num)})
+
+
+@eqx.filter_jit
+def _cost(y: Array, problem: _Problem) -> Array:
+    return 0.5 * sum(jnp.sum(x**2) for x in _rows(y, problem))
+
+
+_finished = eqx.filter_jit(_fit_at)

@@ -1,0 +1,255 @@
+"""What of a model is estimated: numbers that change it, zero for the model itself, in one vector with names and units.
+
+| name | numbers | change |
+|---|---|---|
+| `inertia` | ten for each link | added to the link's ten parameters |
+| `friction`, `effects` | parameters of the model's effects (of friction alone) | added to them |
+| `joint_offset` | one for each tree joint, rad or m | of the joint's position |
+| `link_geometry` | twist of each tree joint in its own frame, m and rad | moves the joint on its link |
+| `frames` | what each measuring device leaves open | its base frame, tool frame, markers, sockets |
+| `tool_frame` | twist of each frame of the model, m and rad | moves the frame on its link |
+| `base` | twist at the world's origin, m and rad | moves the whole robot |
+| `gravity` | three, m/s^2 | added to gravity |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..effects.base import Effect
+from ..effects.extended import ExtendedModel
+from ..errors import InputError, nearest
+from ..rigid import lie
+from ..rigid.model import DOF_NAMES, RobotModel
+from .data import Data, PoseData
+
+__all__ = ["KINDS", "Free", "Part", "apply", "select"]
+
+KINDS = ("inertia", "friction", "effects", "joint_offset", "link_geometry", "frames", "tool_frame", "base", "gravity")
+TEN = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
+TEN_UNITS = ("kg", *("kg m",) * 3, *("kg m2",) * 6)
+TWIST = ("x", "y", "z", "rx", "ry", "rz")
+TWIST_UNITS = ("m", "m", "m", "rad", "rad", "rad")
+REACH = 0.2  # m: how far from its joint the mass of a link is taken to be, where a size of its moments is needed
+
+
+class Part(NamedTuple):
+    """Numbers of one array that are estimated; hashable, so that it selects what a program computes."""
+
+    kind: str
+    key: tuple[Any, ...]  # which effect and parameter, or which device
+    index: tuple[int, ...]  # in the flat array
+    shape: tuple[int, ...]  # of the array
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    sizes: tuple[float, ...]  # typical size of each number: what the solver counts in
+
+
+class Free(NamedTuple):
+    """Everything that is estimated, part by part."""
+
+    parts: tuple[Part, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of each number."""
+        return tuple(name for part in self.parts for name in part.names)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each number."""
+        return tuple(unit for part in self.parts for unit in part.units)
+
+    @property
+    def sizes(self) -> Float[np.ndarray, " numbers"]:
+        """Typical size of each number."""
+        return np.array([size for part in self.parts for size in part.sizes], float)
+
+    def cut(self, values: Float[Array, " numbers"]) -> Iterator[tuple[Part, Array]]:
+        """Each part with its numbers in the whole array, zero where nothing is estimated."""
+        first = 0
+        for part in self.parts:
+            last = first + len(part.index)
+            whole = jnp.zeros(int(np.prod(part.shape, dtype=int))).at[np.array(part.index)].set(values[first:last])
+            yield part, whole.reshape(part.shape)
+            first = last
+
+
+def select(model: ExtendedModel, data: Sequence[Data], free: Any) -> Free:
+    """What `free` names: one or several of `KINDS`, or a mapping from them to True or to the places meant.
+
+    Places are names of links (`inertia`), joints (`joint_offset`, `link_geometry`, `friction`, `effects`), effects or
+    frames, or words of the numbers' own names. Raises `InputError` with the nearest name where nothing is meant.
+    """
+    if isinstance(free, Free):
+        return free
+    wanted: dict[str, Any] = dict(free) if isinstance(free, Mapping) else {}
+    if not wanted:
+        wanted = {kind: True for kind in ([free] if isinstance(free, str) else free)}
+    parts: list[Part] = []
+    for kind, places in wanted.items():
+        if kind not in KINDS:
+            raise InputError(f"free: nothing is called '{kind}'{nearest(kind, KINDS)}; known: {', '.join(KINDS)}")
+        given = list(_parts(kind, model, data))
+        chosen = given if places is True else [p for p in (_only(part, places) for part in given) if p.index]
+        if not chosen:
+            what = "the model and the data have none" if places is True else f"none at {places}"
+            known = sorted({name for part in given for name in part.names})
+            raise InputError(f"free: {kind}: {what}{'; known: ' + ', '.join(known[:12]) if known else ''}")
+        parts += chosen
+    double = {p.kind for p in parts if p.kind == "effect" and sum(q[:2] == p[:2] for q in parts) > 1}
+    if double:
+        raise InputError("free: 'effects' holds 'friction' already; give one of them")
+    return Free(tuple(parts))
+
+
+def _only(part: Part, places: Any) -> Part:
+    """The numbers at the places, by the words of their names or by a mask of the array."""
+    if isinstance(places, np.ndarray) and places.dtype == bool:
+        flat = places.reshape(-1)
+        keep = [k for k, i in enumerate(part.index) if flat[i]]
+    else:
+        wanted = [places] if isinstance(places, str) else list(places)
+        words = [set(_words(name)) for name in part.names]
+        keep = [k for k, own in enumerate(words) if any(set(w.split()) <= own for w in wanted)]
+    picked = (tuple(x[k] for k in keep) for x in (part.index, part.names, part.units, part.sizes))
+    index, names, units, sizes = picked
+    return Part(part.kind, part.key, index, part.shape, names, units, sizes)
+
+
+def _words(name: str) -> list[str]:
+    return name.split()
+
+
+def _parts(kind: str, model: ExtendedModel, data: Sequence[Data]) -> Iterator[Part]:
+    robot = model.robot
+    joints = [joint.name for joint in robot.joints]
+    if kind == "inertia":
+        yield _part(kind, robot.link_names, TEN, TEN_UNITS, _inertia_sizes(robot))
+    elif kind == "gravity":
+        yield _part(kind, ("",), ("x", "y", "z"), ("m/s2",) * 3, np.full((1, 3), 0.1))
+    elif kind == "base":
+        yield _part(kind, ("",), TWIST, TWIST_UNITS, np.full((1, 6), 1e-2))
+    elif kind in ("joint_offset", "link_geometry"):
+        _single_axes(robot, kind)
+        slides = [joint.kind == "prismatic" for joint in robot.joints]
+        if kind == "joint_offset":
+            part = _part(kind, joints, ("",), ("",), np.full((len(joints), 1), 1e-2))
+            yield part._replace(units=tuple("m" if s else "rad" for s in slides), shape=(len(joints),))
+        else:
+            yield _part(kind, joints, TWIST, TWIST_UNITS, np.full((len(joints), 6), 1e-2))
+    elif kind == "tool_frame":
+        names = [frame.name for frame in robot.frames]
+        yield _part(kind, names, TWIST, TWIST_UNITS, np.full((len(names), 6), 1e-2))
+    elif kind == "frames":
+        yield from _device_parts(data)
+    else:
+        yield from _effect_parts(model, friction=kind == "friction")
+
+
+def _part(kind: str, places: Sequence[str], words: Sequence[str], units: Sequence[str], sizes: Any) -> Part:
+    names = [" ".join(x for x in (kind, place, word) if x) for place in places for word in words]
+    shape = (len(places), len(words)) if places != ("",) else (len(words),)
+    flat = tuple(np.asarray(sizes, float).reshape(-1).tolist())
+    return Part(kind, (), tuple(range(len(names))), shape, tuple(names), tuple(units) * len(places), flat)
+
+
+def _inertia_sizes(robot: RobotModel) -> np.ndarray:
+    if isinstance(robot.inertia, jax.core.Tracer):
+        mass = np.ones((len(robot.joints), 1))
+    else:
+        ten = np.asarray(robot.inertia)
+        mass = np.maximum(ten[..., :1].reshape(-1, len(robot.joints), 1)[0], 0.1)
+    return 0.1 * mass * np.array([1.0, *(REACH,) * 3, *(REACH**2,) * 6])
+
+
+def _single_axes(robot: RobotModel, kind: str) -> None:
+    wrong = next((joint for joint in robot.joints if len(DOF_NAMES[joint.kind]) != 1), None)
+    if wrong is not None:
+        raise InputError(f"free: {kind}: joint '{wrong.name}' is {wrong.kind}; joints of one axis have one")
+
+
+def _device_parts(data: Sequence[Data]) -> Iterator[Part]:
+    for k, one in enumerate(data):
+        unknowns = one.device.unknowns() if isinstance(one, PoseData) else ()
+        if unknowns:
+            names, units, sizes = zip(*unknowns, strict=True)
+            mark = f" {k + 1}" if len(data) > 1 else ""
+            marked = tuple(f"{name}{mark}" for name in names)
+            yield Part("frames", (k,), tuple(range(len(names))), (len(names),), marked, units, sizes)
+
+
+def _effect_parts(model: ExtendedModel, friction: bool) -> Iterator[Part]:
+    robot = model.robot
+    for k, effect in enumerate(model.effects):
+        if friction and not (effect.dissipative or effect.speed_law or "friction" in effect.name):
+            continue
+        known = robot.link_names if effect.acts_on == "link" else robot.dof_names
+        places = [known[int(i)] for i in effect.at]
+        for name, parameter in effect.parameters().items():
+            if parameter.choice:
+                continue
+            word = " ".join([effect.name, *places, name])
+            yield Part("effect", (k, name), (0,), (), (word,), (parameter.unit,), (_effect_size(effect, name),))
+
+
+def _effect_size(effect: Effect, name: str) -> float:
+    value = getattr(effect, name)
+    known = 0.0 if isinstance(value, jax.core.Tracer) else float(np.max(np.abs(np.asarray(value))))
+    if effect.parameters()[name].linear:
+        return 1.0
+    return 0.1 * known or 0.1
+
+
+def apply(
+    free: Free, model: ExtendedModel, data: tuple[Data, ...], values: Float[Array, " numbers"]
+) -> tuple[ExtendedModel, tuple[Data, ...]]:
+    """The model and the data's devices with the numbers in them; to be traced. The only place that knows how."""
+    twist = None
+    for part, whole in free.cut(values):
+        if part.kind == "effect":
+            where = lambda m, key=part.key: getattr(m.effects[key[0]], key[1])  # noqa: E731
+            model = eqx.tree_at(where, model, jnp.asarray(where(model)) + whole)
+        elif part.kind == "frames":
+            moved = eqx.tree_at(lambda d: d.device, data[part.key[0]], data[part.key[0]].device.moved(whole))
+            data = (*data[: part.key[0]], moved, *data[part.key[0] + 1 :])
+        elif part.kind in ("joint_offset", "link_geometry"):
+            here = whole if part.kind == "link_geometry" else _along(model.robot, whole)
+            twist = here if twist is None else twist + here
+        else:
+            model = eqx.tree_at(lambda m: m.robot, model, _changed(model.robot, part.kind, whole))
+    if twist is not None:
+        placement = jnp.asarray(model.robot.placement) @ jax.vmap(_moved)(twist)
+        model = eqx.tree_at(lambda m: m.robot.placement, model, placement)
+    return model, data
+
+
+def _changed(robot: RobotModel, kind: str, whole: Array) -> RobotModel:
+    if kind in ("inertia", "gravity"):
+        where = (lambda r: r.inertia) if kind == "inertia" else (lambda r: r.gravity)
+        return eqx.tree_at(where, robot, jnp.asarray(where(robot)) + whole)
+    if kind == "tool_frame":
+        frames = jnp.asarray(robot.frame_placement) @ jax.vmap(lie.exp_se3)(whole)
+        return eqx.tree_at(lambda r: r.frame_placement, robot, frames)
+    root = np.array([joint.parent < 0 for joint in robot.joints])[:, None, None]
+    placement = jnp.asarray(robot.placement)
+    return eqx.tree_at(lambda r: r.placement, robot, jnp.where(root, lie.exp_se3(whole) @ placement, placement))
+
+
+def _along(robot: RobotModel, offset: Float[Array, " nj"]) -> Float[Array, "nj 6"]:
+    """Twist of each joint along its own axis."""
+    way = offset[:, None] * jnp.asarray(robot.axis)
+    turns = np.array([joint.kind == "revolute" for joint in robot.joints])[:, None]
+    return jnp.concatenate([jnp.where(turns, 0.0, way), jnp.where(turns, way, 0.0)], axis=1)
+
+
+def _moved(twist: Float[Array, "6"]) -> Float[Array, "4 4"]:
+    """E: the translation, then the rotation."""
+    return lie.pose(lie.exp_so3(twist[3:]), twist[:3])

@@ -1,0 +1,233 @@
+r"""Base parameters, friction and coupled effects by linear least squares as one pure function: batches by `jax.vmap`.
+
+The columns of links and effects are brought to coordinates in which the data's own columns are orthonormal (`Basis`,
+once, on the host, for one robot of the batch), so that their products lose next to nothing. Products are added up by
+blocks of time; a bootstrap resample is a count of each block, and needs neither the columns nor the rows again.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..compiled.batching import traced
+from ..compiled.precision import in_float64
+from ..effects.base import Effect, Motion, columns, movable
+from ..effects.extended import ExtendedModel, extend
+from ..errors import InputError
+from ..estimation.accelerators import coordinates
+from ..estimation.base_parameters import base_parameters
+from ..estimation.columns import column_names
+from ..recordings.rowfilter import filtered
+from ..rigid.model import RobotModel
+from ..rigid.regressor import dense_rows
+from .data import TorqueData
+
+__all__ = ["Basis", "LinearFit", "fit_linear", "linear_basis", "linear_limits"]
+
+TURNS = 10  # of the joints' weights
+ACTIVE_TURNS = 30  # of the bounds that hold
+
+
+class Basis(eqx.Module):
+    """Which parameters are fitted, and the coordinates in which they are: `columns @ into` is orthonormal."""
+
+    into: Float[np.ndarray, "columns rank"]
+    matrix: Float[np.ndarray, "rank columns"]  # base parameters of all parameters
+    kept: tuple[int, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)  # of the kept parameters
+    expressions: tuple[str, ...] = eqx.field(static=True)  # with what is grouped into them
+
+
+class LinearFit(eqx.Module):
+    """Base parameters of one fit; of many under `jax.vmap`."""
+
+    values: Float[Array, " rank"]  # SI units, in the order of `Basis.names`
+    std: Float[Array, " rank"]  # for white residuals, each joint weighed by its own
+    rms: Float[Array, " nv"]  # of the residual, N m or N
+    active: Bool[Array, " rank"]  # stands on its limit
+    converged: Bool[Array, ""]  # whether the active limits were found
+
+
+def linear_basis(model: RobotModel | ExtendedModel, data: TorqueData, tolerance: float | None = None) -> Basis:
+    """The base parameters that the data tells of the robot and of the linear parameters of its effects; on the host.
+
+    One basis serves all robots of one structure and all recordings of about one motion. Raises `InputError` where the
+    data shows no parameter.
+    """
+    whole = model if isinstance(model, ExtendedModel) else extend(model)
+    if traced(whole, data):
+        raise InputError("linear_basis decides ranks on the host: call it outside of jit, grad and vmap")
+    with jax.enable_x64(True):
+        X, _, weight = _rows(whole, data)
+    rows = np.asarray(jnp.moveaxis(X, 2, -1))[np.asarray(weight) > 0]
+    names = column_names(whole.robot, tuple(_batched(effect) for effect in whole.effects))
+    factor = np.linalg.qr(rows, mode="r")
+    base = base_parameters(factor, names, **({} if tolerance is None else {"tolerance": tolerance}))
+    if base.rank == 0:
+        raise InputError("the data shows no parameter: nothing moves, or every row was left out")
+    into = coordinates(factor[:, None], base).into
+    kept = tuple(int(k) for k in base.independent)
+    return Basis(into, base.matrix, kept, tuple(names[k] for k in kept), tuple(base.expressions))
+
+
+def linear_limits(model: ExtendedModel, basis: Basis) -> tuple[Float[np.ndarray, " rank"], Float[np.ndarray, " rank"]]:
+    """Least and greatest value of each kept parameter that physics allows: friction takes energy, rotors have inertia.
+
+    Links have no limits here: a base parameter is a sum of several links'.
+    """
+    lower = [-np.inf] * (10 * len(model.robot.joints))
+    for effect in model.effects:
+        least = {"rotor_inertia": 0.0, "viscous_friction": 0.0, "coulomb_friction": 0.0}.get(effect.name, -np.inf)
+        lower += [max(p.lower, least) for p in effect.parameters().values() if p.linear]
+    low = np.array(lower)[list(basis.kept)]
+    return low, np.full(len(low), np.inf)
+
+
+@in_float64
+def fit_linear(
+    model: RobotModel | ExtendedModel,
+    data: TorqueData,
+    basis: Basis,
+    *,
+    counts: Float[Array, " blocks"] | None = None,
+    lower: Float[Array, " rank"] | None = None,
+    upper: Float[Array, " rank"] | None = None,
+) -> LinearFit:
+    """Base parameters weighed by joint; a function of arrays alone, for `jax.vmap` over data, robots or `counts`.
+
+    The model's effects enter with the parameters in which they are linear, viscous and Coulomb friction or a coupled
+    transmission for instance; what values they have does not matter. `counts` weighs blocks of half a second: drawn
+    with replacement it is a bootstrap. `lower` and `upper` limit parameters (`linear_limits`); which limits hold is
+    found by a primal-dual active set (Hintermueller, Ito and Kunisch, 2002).
+
+    >>> import jax, numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> t = np.arange(2000)[:, None] / 250.0
+    >>> q = 0.5 * np.sin(t * np.array([3.0, 4.0, 5.0, 6.0]) + np.arange(4))
+    >>> data = fj.torque_data(robot, fj.recording(q=q, tau=np.cos(q), rate=250))
+    >>> basis = fj.linear_basis(robot, data)
+    >>> counts = np.random.default_rng(0).multinomial(16, np.full(16, 1 / 16), size=5).astype(float)
+    >>> many = jax.jit(jax.vmap(lambda c: fj.fit_linear(robot, data, basis, counts=c)))(counts)
+    >>> many.values.shape == (5, len(basis.names))
+    True
+    """
+    whole = model if isinstance(model, ExtendedModel) else extend(model)
+    products, rows = _products(whole, data, basis)
+    weight = jnp.ones(len(rows)) if counts is None else jnp.asarray(counts, float)
+    if weight.shape != (len(rows),):
+        raise InputError(f"counts has shape {weight.shape}; the data has {len(rows)} blocks")
+    G, total = jnp.einsum("b,bjkl->jkl", weight, products), jnp.maximum(weight @ rows, 1e-300)
+    kept = jnp.asarray(basis.into)[np.array(basis.kept)]  # kept parameters of the coordinates
+    limits = None if lower is None and upper is None else _limits(lower, upper, len(kept))
+
+    def solved(scale: Array) -> tuple[Array, Array, Array, Array]:
+        A = jnp.einsum("jkl,j->kl", G, scale)
+        H, h = A[:-1, :-1], A[:-1, -1]
+        if limits is None:
+            none = jnp.zeros(len(h), bool)
+            return jnp.linalg.solve(H, h), none, jnp.ones((), bool), H
+        return *_within(H, h, kept, *limits), H
+
+    def squares(z: Array) -> Array:
+        y = jnp.append(z, -1.0)
+        return jnp.maximum(jnp.einsum("k,jkl,l->j", y, G, y), 1e-24 * G[:, -1, -1] + 1e-300)
+
+    def turn(_: Array, scale: Array) -> Array:
+        return total / squares(solved(scale)[0])
+
+    present = jnp.where(G[:, -1, -1] > 0, 1.0, 0.0)
+    scale = jax.lax.fori_loop(0, TURNS, turn, present)
+    z, active, converged, H = solved(scale)
+    variance = jnp.einsum("ck,kl,cl->c", kept, jnp.linalg.inv(H), kept)
+    values = kept @ z
+    if limits is not None:
+        values = jnp.clip(values, *limits)  # on a limit exactly
+    return LinearFit(values, jnp.sqrt(variance), jnp.sqrt(squares(z) / total), active, converged)
+
+
+def _limits(lower: Array | None, upper: Array | None, rank: int) -> tuple[Array, Array]:
+    low = jnp.full(rank, -jnp.inf) if lower is None else jnp.broadcast_to(jnp.asarray(lower, float), (rank,))
+    high = jnp.full(rank, jnp.inf) if upper is None else jnp.broadcast_to(jnp.asarray(upper, float), (rank,))
+    return low, high
+
+
+def _within(H: Array, h: Array, kept: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:
+    """z of least z'Hz/2 - h'z with `kept @ z` between the limits, which of them hold, and whether that was found."""
+    back = jnp.linalg.inv(kept)
+    Q, c = back.T @ H @ back, back.T @ h
+    size = jnp.sqrt(jnp.diagonal(Q))
+    Q, c, low, high = Q / size[:, None] / size, c / size, low * size, high * size
+
+    def at(side: Array) -> tuple[Array, Array]:
+        """Parameters and multipliers where those on a side stand on their limit."""
+        held = side != 0
+        fixed = jnp.where(side < 0, low, jnp.where(side > 0, high, 0.0))
+        fixed = jnp.where(held, fixed, 0.0)
+        matrix = jnp.where(held[:, None] | held, jnp.eye(len(side)), Q)
+        p = jnp.linalg.solve(matrix, jnp.where(held, fixed, c - Q @ fixed))
+        return p, jnp.where(held, c - Q @ p, 0.0)
+
+    def better(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        side, _, count = state
+        p, pull = at(side)
+        new = jnp.where(pull + (p - high) > 0, 1, jnp.where(pull + (p - low) < 0, -1, 0))
+        return new, jnp.all(new == side), count + 1
+
+    def going(state: tuple[Array, Array, Array]) -> Array:
+        return ~state[1] & (state[2] < ACTIVE_TURNS)
+
+    side, done, _ = jax.lax.while_loop(going, better, (jnp.zeros(len(c), int), jnp.zeros((), bool), jnp.zeros((), int)))
+    p, _ = at(side)
+    return back @ (p / size), side != 0, done
+
+
+def _products(model: ExtendedModel, data: TorqueData, basis: Basis) -> tuple[Array, Array]:
+    """Products of [columns, torque] by block and joint, and rows of each block and joint."""
+    X, y, weight = _rows(model, data)  # n M nv columns
+    Z = jnp.einsum("nmjc,ck->njkm", X, jnp.asarray(basis.into), precision=jax.lax.Precision.HIGHEST)
+    both = jnp.concatenate([Z, jnp.moveaxis(y, 1, 2)[:, :, None]], axis=2) * jnp.moveaxis(weight, 1, 2)[:, :, None]
+    counted = (jnp.moveaxis(weight, 1, 2) > 0).astype(both.dtype)
+    together = data.together or both.shape[-1]
+    missing = -both.shape[-1] % together
+    both, counted = (jnp.pad(x, ((0, 0),) * (x.ndim - 1) + ((0, missing),)) for x in (both, counted))
+    both = both.reshape(*both.shape[:3], -1, together)
+    products = jnp.einsum("njkbr,njlbr->nbjkl", both, both, precision=jax.lax.Precision.HIGHEST)
+    rows = counted.reshape(*counted.shape[:2], -1, together).sum(-1)
+    return products.reshape(-1, *products.shape[2:]), jnp.swapaxes(rows, 1, 2).reshape(-1, rows.shape[1])
+
+
+def _rows(model: ExtendedModel, data: TorqueData) -> tuple[Array, Array, Array]:
+    """Low-passed columns (n M nv columns), torque less that of known payloads, and weight (n M nv)."""
+    terms = tuple(movable(effect) for effect in model.effects)
+    n = len(data.position)
+    X = jnp.stack([_columns(model, terms, data, k) for k in range(n)])
+    if data.source is not None and data.kept is not None:
+        rows = [filtered(jnp.moveaxis(X[k], 0, -1), data.source[k], data.kept[k], data.response) for k in range(n)]
+        X = jnp.stack([jnp.moveaxis(jnp.asarray(one), -1, 0) for one in rows])
+    y = jnp.asarray(data.torque)
+    if data.carried is not None:
+        y = y - jnp.einsum("nmjc,nc->nmj", X[..., : 10 * len(model.robot.joints)], data.carried.reshape(n, -1))
+    return X, y, jnp.asarray(data.weight)
+
+
+def _columns(model: ExtendedModel, terms: tuple[Effect, ...], data: TorqueData, k: int) -> Array:
+    """Columns at the samples of one recording (samples nv columns)."""
+    t, q, v, a = (jnp.asarray(x)[k] for x in (data.time, data.position, data.velocity, data.acceleration))
+    robot, zero = model.robot, jnp.zeros(v.shape)
+    blocks = [jnp.moveaxis(dense_rows(robot, q.T, v.T, a.T), -1, 0)]
+    motion = Motion(robot, t, q, v, a, zero, zero, jnp.asarray(data.dt), jnp.asarray(model.width))
+    for term in terms:
+        torque = jnp.moveaxis(columns(term, motion), 0, -1)
+        if term.acts_on not in ("link", "robot"):
+            torque = torque.reshape(len(q), -1, torque.shape[-1])
+            torque = jnp.zeros((*v.shape, torque.shape[-1])).at[:, term.places].add(torque)
+        blocks.append(torque)
+    return jnp.concatenate(blocks, axis=2)
+
+
+def _batched(effect: Effect) -> Effect:
+    return jax.tree.map(lambda x: np.asarray(x)[None], movable(effect))

@@ -1,0 +1,135 @@
+"""One fit: hidden truths come back, solvers agree, derivatives are those of refits, failures are results."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+import pytest
+
+import figaroh_jax as fj
+
+T = np.arange(1500)[:, None] / 250.0
+RATES = 2 * np.pi * np.array([0.5, 0.7, 0.9, 1.1])
+Q, V, A = (0.6 * RATES**k * np.sin(RATES * T + np.arange(4) + k * np.pi / 2) for k in range(3))
+OFFSET = np.array([0.0, 0.02, -0.03, 0.0])
+JOINTS = {"joint_offset": ["shoulder", "elbow"]}
+
+
+@pytest.fixture(scope="module")
+def robot() -> fj.RobotModel:
+    return fj.load_urdf(fj.DEMO)
+
+
+def place(robot: fj.RobotModel, name: str, joint: str, **parameters: float) -> fj.Effect:
+    return fj.place(fj.CATALOGUE[name], robot, [joint], **parameters)
+
+
+@pytest.fixture(scope="module")
+def tracked(robot: fj.RobotModel) -> tuple[fj.PoseData, ...]:
+    """Points that a tracker saw, with noise, while two joints are zeroed wrongly."""
+    rng = np.random.default_rng(0)
+    q, hand = rng.uniform(-1.2, 1.2, (30, 4)), robot.link_names[-1]
+    seen = np.array(fj.frame_placement(robot, q + OFFSET, hand)) @ np.array([0.02, 0.01, 0.05, 1.0])
+    points = seen[:, :3] + 1e-5 * rng.normal(size=(30, 3)) + [0.4, -0.2, 0.1]
+    return fj.pose_data(robot, fj.postures(q=q, position=points, base_frame="base", tool_frame=hand))
+
+
+def test_both_solvers_find_hidden_offsets_and_agree(robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...]):
+    free = {**JOINTS, "frames": True}
+    block = fj.fit(robot, tracked, free)
+    own = fj.fit(robot, tracked, free, solver=optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10))
+    for found in (block, own):
+        assert found.result == optimistix.RESULTS.successful
+        for joint, truth in (("shoulder", 0.02), ("elbow", -0.03)):
+            value, std, unit = found.parameters[f"joint_offset {joint}"]
+            assert abs(value - truth) < 4 * std < 2e-4 and unit == "rad"
+    np.testing.assert_allclose(own.cost, block.cost, rtol=1e-8, atol=0)
+    np.testing.assert_allclose(own.values, block.values, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(own.std, block.std, rtol=1e-5, atol=0)
+    # the fitted model and devices predict what the solver said
+    np.testing.assert_allclose(fj.residual(own.model, own.data), own.rows, rtol=0, atol=1e-12)
+
+
+def test_derivatives_of_a_fit_are_those_of_refits(robot: fj.RobotModel):
+    model = fj.extend(robot, place(robot, "viscous_friction", "elbow"), place(robot, "coulomb_friction", "elbow"))
+    torque = np.asarray(
+        fj.extend(robot, place(robot, "viscous_friction", "elbow", damping=2.0)).inverse_dynamics(Q, V, A)
+    )
+    data = fj.torque_data(model, fj.recording(q=Q, tau=torque, rate=250), fj.Preprocess(cutoff=10, rate=20))
+
+    @jax.jit
+    def damping(scale: jax.Array) -> jax.Array:
+        measured = eqx.tree_at(lambda d: d.torque, data, data.torque * scale)
+        return fj.fit(model, measured, "friction").values[0]
+
+    h = 1e-3
+    np.testing.assert_allclose(damping(1.0), 2.0, rtol=0, atol=5e-2)
+    slope, difference = jax.jit(jax.grad(damping))(1.0), (damping(1 + h) - damping(1 - h)) / (2 * h)
+    np.testing.assert_allclose(slope, difference, rtol=1e-6, atol=0)
+
+
+def test_what_is_not_determined_has_no_size_and_a_failure_is_a_result(
+    robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...]
+):
+    last = robot.joint_names[-1]
+    found = fj.fit(robot, tracked, {"joint_offset": [last, "elbow"], "frames": True})
+    assert np.isinf(found.parameters[f"joint_offset {last}"].std) or int(found.rank) == len(found.values)
+    stopped = fj.fit(robot, tracked, {**JOINTS, "frames": True}, max_steps=1)
+    assert stopped.result == optimistix.RESULTS.nonlinear_max_steps_reached
+
+
+def test_limits_hold_and_a_prior_pulls(robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...]):
+    free = {"joint_offset": ["shoulder", "elbow"], "frames": True}
+    bounded = fj.fit(robot, tracked, free, bounds={"joint_offset elbow": (-0.02, 0.02)})
+    assert bounded.parameters["joint_offset elbow"].value == pytest.approx(-0.02, abs=1e-9)
+    assert bounded.result == optimistix.RESULTS.successful
+    data = tuple(eqx.tree_at(lambda d: d.weight, one, one.weight / 1e-5) for one in tracked)
+    free_fit = fj.fit(robot, data, free)
+    pulled = fj.fit(robot, data, free, prior={"joint_offset": 1e-9})
+    assert (
+        abs(pulled.parameters["joint_offset elbow"].value) < 1e-3 < abs(free_fit.parameters["joint_offset elbow"].value)
+    )
+
+
+@pytest.mark.parametrize(
+    ("free", "message"),
+    [
+        ("joint_offsets", "'joint_offsets' — did you mean|nothing is called 'joint_offsets'"),
+        ({"joint_offset": ["knee"]}, "none at"),
+        ("friction", "the model and the data have none"),
+    ],
+)
+def test_what_is_not_there_cannot_be_free(free, message: str, robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...]):
+    with pytest.raises(fj.InputError, match=message):
+        fj.fit(robot, tracked, free)
+
+
+def test_everything_can_be_free_at_once(robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...]):
+    """The derivative of the rows by each number is that of the model that `free` makes of it."""
+    from figaroh_jax.fitting.free import apply, select
+
+    model = fj.extend(robot, place(robot, "stribeck_friction", "elbow", force=1.0, speed=0.2))
+    kinds = ("inertia", "effects", "joint_offset", "link_geometry", "frames", "tool_frame", "base", "gravity")
+    chosen = select(model, tracked, kinds)
+    counts = {kind: sum(len(p.index) for p in chosen.parts if p.kind == kind) for kind in kinds}
+    assert counts == {
+        "inertia": 40,
+        "effects": 0,
+        "joint_offset": 4,
+        "link_geometry": 24,
+        "frames": 9,
+        "tool_frame": 6 * len(robot.frames),
+        "base": 6,
+        "gravity": 3,
+    }
+    y = 0.01 * np.random.default_rng(1).normal(size=len(chosen.names))
+    moved, devices = apply(chosen, model, tracked, jnp.asarray(y))
+    at = {name: k for k, name in enumerate(chosen.names)}
+    assert float(moved.effects[0].speed) == pytest.approx(0.2 + y[at["stribeck_friction elbow speed"]], abs=1e-15)
+    assert float(moved.robot.inertia[2, 1]) == pytest.approx(
+        float(robot.inertia[2, 1]) + y[at[f"inertia {robot.link_names[2]} mx"]], abs=1e-15
+    )
+    assert np.abs(fj.residual(moved, devices)).max() > 0

@@ -1,0 +1,140 @@
+"""Data in memory and the public residual: against the engine's own rows, and under every transformation."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import figaroh_jax as fj
+from figaroh_jax.recordings.devices import Planes, Sockets
+
+T = np.arange(500)[:, None] / 250.0
+MOTION = 0.6 * np.sin(2 * np.pi * np.array([0.5, 0.7, 0.9, 1.1]) * T + np.arange(4))
+
+
+@pytest.fixture(scope="module")
+def robot() -> fj.RobotModel:
+    return fj.load_urdf(fj.DEMO)
+
+
+def run(**more) -> fj.Recording:
+    return fj.recording(q=MOTION, tau=np.cos(MOTION), rate=250, **more)
+
+
+def test_arrays_in_memory_are_checked_and_converted(robot: fj.RobotModel):
+    found = fj.recording(q=np.degrees(MOTION), tau=MOTION, time=T[:, 0] * 1e9, units={"position": "deg", "time": "ns"})
+    np.testing.assert_allclose(found.position, MOTION, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(found.time, T[:, 0], rtol=0, atol=1e-14)
+    assert found.joints == ("joint 1", "joint 2", "joint 3", "joint 4")
+    assert fj.recording(q=MOTION, rate=1, model=robot).joints == robot.joint_names
+    broken = MOTION.copy()
+    broken[3, 1] = np.nan
+    wrong = [
+        ({"q": broken, "rate": 1}, "q is nan in row 3, column 1"),
+        ({"q": MOTION}, "time or rate"),
+        ({"q": MOTION, "tau": MOTION[:-1], "rate": 1}, "tau has 499 samples"),
+        ({"q": MOTION, "tau": MOTION[:, :3], "rate": 1}, "q has 4 columns, expected 3"),
+        ({"q": MOTION, "time": -T[:, 0]}, "does not increase in row 1"),
+        ({"q": MOTION, "rate": 1, "units": {"position": "turns"}}, "'turns'; known: rad"),
+        ({"q": MOTION, "rate": 1, "units": {"positions": "deg"}}, "no 'positions'"),
+    ]
+    for arguments, message in wrong:
+        with pytest.raises(fj.InputError, match=message):
+            fj.recording(**arguments)
+
+
+def test_residual_is_the_low_passed_torque_of_the_model_less_the_measured(robot: fj.RobotModel):
+    friction = fj.place(fj.CATALOGUE["viscous_friction"], robot, ["elbow"], damping=1.5)
+    model = fj.extend(robot, friction)
+    data = fj.torque_data(model, run(), fj.Preprocess(cutoff=10), noise=np.array([1.0, 2.0, 3.0, 4.0]))
+    rows = np.asarray(fj.residual(model, data)).reshape(-1, 4)
+    torque = np.asarray(model.inverse_dynamics(data.position[0], data.velocity[0], data.acceleration[0]))
+    inside = np.asarray(data.source[0])[np.asarray(data.kept[0])]
+    # a smooth motion far below the cutoff passes the filter as it is
+    expected = (torque[inside] - np.cos(data.position[0])[inside]) / np.array([1.0, 2.0, 3.0, 4.0])
+    np.testing.assert_allclose(rows[4:-4], expected[4:-4], rtol=0, atol=2e-3 * np.abs(expected).max())
+
+
+def test_residual_of_torques_differentiates_by_every_array_of_the_model(robot: fj.RobotModel):
+    model = fj.extend(robot, fj.place(fj.CATALOGUE["stribeck_friction"], robot, ["elbow"], force=1.0, speed=0.2))
+    data = fj.torque_data(model, run())
+
+    def cost(model: fj.ExtendedModel) -> jax.Array:
+        return jnp.mean(fj.residual(model, data) ** 2)
+
+    slope = jax.jit(jax.grad(cost))(model)
+    value = jax.jit(cost)
+    rng = np.random.default_rng(0)
+    for where in (
+        lambda m: m.robot.inertia,
+        lambda m: m.robot.placement,
+        lambda m: m.robot.gravity,
+        lambda m: m.effects[0].force,
+        lambda m: m.effects[0].speed,
+    ):
+        at = np.asarray(where(model), float)
+        way, h = rng.normal(size=at.shape), 1e-5
+        ahead, behind = (value(eqx.tree_at(where, model, at + s * h * way)) for s in (1, -1))
+        np.testing.assert_allclose(np.sum(where(slope) * way), (ahead - behind) / (2 * h), rtol=1e-6, atol=1e-7)
+
+
+def devices(robot: fj.RobotModel) -> dict[str, fj.PoseData]:
+    rng = np.random.default_rng(1)
+    q = rng.uniform(-1, 1, (12, 4))
+    frames = {"q": q, "base_frame": "base", "tool_frame": robot.link_names[-1]}
+    poses = np.asarray(fj.frame_placement(robot, q, robot.link_names[-1]))
+    number = np.arange(12) % 2
+    own = fj.own_device(lambda pose, u, d: pose[:3, 3] @ pose[:3, 3] - u - d, {"zero": (0.1, "m", 0.1)}, (0,))
+    recordings = {
+        "pose": fj.postures(pose=poses, **frames),
+        "position": fj.postures(position=poses[:, :3, 3], **frames),
+        "plane": fj.postures(plane=number, **frames, unknown=["tool_frame"]),
+        "socket": fj.postures(socket=number, distance=0.05, **frames, unknown=["tool_frame"]),
+        "camera": fj.postures(camera=np.linalg.inv(poses), **frames),
+        "device": fj.postures(device=own, measured=poses[:, 0, 3], **frames),
+    }
+    return {kind: fj.pose_data(robot, one)[0] for kind, one in recordings.items()}
+
+
+def test_every_device_has_a_residual_that_differentiates(robot: fj.RobotModel):
+    data = tuple(devices(robot).values())
+    assert isinstance(data[2].device, Planes) and isinstance(data[3].device, Sockets)
+    model = fj.extend(robot)
+    rows = fj.residual(model, data)
+    counts = [12 * 6, 12 * 3, 12, 12 * 3 + 1, 12 * 6, 12]
+    assert len(rows) == sum(counts)
+    for part in (rows[: 12 * 6], rows[12 * 6 : 12 * 9]):  # frames in closed form are exact
+        np.testing.assert_allclose(part, 0.0, rtol=0, atol=1e-9)
+
+    def moved(placement: jax.Array) -> jax.Array:
+        return fj.residual(eqx.tree_at(lambda m: m.robot.placement, model, placement), data)
+
+    at, h = np.asarray(robot.placement), 1e-6
+    way = np.random.default_rng(2).normal(size=at.shape) * (np.arange(4)[:, None] < 3)
+
+    @jax.jit
+    def thrice(x: jax.Array) -> tuple[jax.Array, ...]:
+        forward = jax.jvp(moved, (x,), (way,))[1]
+        return forward, (moved(x + h * way) - moved(x - h * way)) / (2 * h), jax.vjp(moved, x)[1](rows)[0]
+
+    forward, difference, back = thrice(at)
+    np.testing.assert_allclose(forward, difference, rtol=0, atol=2e-7 * np.abs(difference).max())
+    np.testing.assert_allclose(np.sum(back * way), rows @ forward, rtol=1e-9, atol=1e-12)
+
+
+def test_what_was_not_measured_weighs_nothing_and_a_map_over_robots_gives_each_its_rows(robot: fj.RobotModel):
+    q = np.random.default_rng(3).uniform(-1, 1, (10, 4))
+    seen = np.array(fj.frame_placement(robot, q, robot.link_names[-1]))[:, :3, 3]
+    seen[4] = np.nan
+    one = fj.postures(q=q, position=seen, base_frame="base", tool_frame=robot.link_names[-1], accuracy=(1e-3, None))
+    (data,) = fj.pose_data(robot, one)
+    longer = jax.tree.map(lambda x: np.stack([x, x]), robot)
+    placement = np.array(longer.placement)
+    placement[1, 1, 2, 3] += 0.001
+    rows = jax.vmap(lambda r: fj.residual(r, data))(eqx.tree_at(lambda m: m.placement, longer, placement))
+    assert rows.shape == (2, 30)
+    np.testing.assert_array_equal(rows[:, 12:15], 0.0)
+    assert np.abs(rows[0]).max() < 1e-6 < np.abs(rows[1]).max()
