@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .diagnosis.diagnosis import diagnose as diagnose, diagnose_task as diagnose_task
     from .effects.base import Effect as Effect, Motion as Motion, amplitude as amplitude, place as place, shape as shape
     from .effects.catalogue import CATALOGUE as CATALOGUE, register as register
-    from .effects.extended import ExtendedModel as ExtendedModel, extend as extend
+    from .effects.extended import ExtendedModel as ExtendedModel, extend as extend, predict as predict
     from .effects.simulation import simulate as simulate
     from .errors import InputError as InputError
     from .fitting.blockwise import BlockLevenbergMarquardt as BlockLevenbergMarquardt
@@ -64,7 +64,7 @@ _MODULES = {
     "fitting.data": ("PoseData", "TorqueData", "pose_data", "residual", "torque_data"),
     "fitting.blockwise": ("BlockLevenbergMarquardt",),
     "fitting.fit": ("Fit", "fit"),
-    "fitting.linear": ("fit_linear", "linear_basis", "linear_limits"),
+    "fitting.linear": ("LinearFit", "fit_linear", "linear_basis", "linear_limits"),
     "recordings.arrays": ("postures", "recording"),
     "recordings.devices": ("Device", "own_device"),
     "recordings.dataset": ("Recording", "read_recordings"),
@@ -74,7 +74,7 @@ _MODULES = {
     "effects.catalogue": ("CATALOGUE", "register"),
     "errors": ("InputError",),
     "formats.export": ("load_model", "write_model"),
-    "effects.extended": ("ExtendedModel", "extend"),
+    "effects.extended": ("ExtendedModel", "extend", "predict"),
     "identification.identification": ("identify", "identify_task"),
     "rigid.kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
     "formats.mjcf": ("load_mjcf",),
