@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 export XLA_FLAGS ?= --xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1
 
-.PHONY: demo test test-slow lint types bench format clean
+.PHONY: demo test test-slow lint types bench fuzz kills audit format clean
 
 demo: .venv/installed ## the main job on the embedded recording
 	$(BIN)/figaroh-jax demo --out runs/demo
@@ -31,6 +31,15 @@ types: .venv/developed
 bench: .venv/developed ## CPU seconds of import and diagnose; the regressor against Pinocchio and figaroh
 	$(BIN)/python benchmarks/diagnose.py
 	$(BIN)/python benchmarks/regressor.py
+
+fuzz: .venv/developed ## a minute of malformed input; nightly: ARGS="--count 20000 --minutes 600"
+	$(BIN)/python benchmarks/fuzz.py --minutes 1 --workers $(WORKERS) $(ARGS)
+
+kills: .venv/developed ## commands killed at random moments, and every call that writes refused once
+	$(BIN)/python benchmarks/kills.py $(ARGS)
+
+audit: .venv/developed ## known vulnerabilities of what is installed
+	$(BIN)/pip-audit --local --skip-editable $(ARGS)
 
 format: .venv/developed
 	$(BIN)/ruff check --fix .

@@ -134,10 +134,16 @@ def _explain(error: Exception, with_traceback: bool) -> int:
         traceback.print_exception(error)
     kind = "error" if wrong_input else f"internal error: {type(error).__name__}"
     hint = "" if wrong_input or with_traceback else " (--traceback shows where; please report it)"
-    text = " ".join(str(error).split()) or "no more is known"
+    text = _one_line(str(error))
     with suppress(OSError):
         print(f"figaroh-jax: {kind}: {text}{hint}", file=sys.stderr)
     return 2 if wrong_input else 70
+
+
+def _one_line(text: str) -> str:
+    """The text on one line, nothing in it that a terminal would act on."""
+    line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
+    return line if len(line) <= 4000 else f"{line[:3000]} ... {line[-900:]}"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -179,9 +185,7 @@ def _set_up_jax(cache: bool) -> None:
     jax.config.update("jax_enable_x64", True)
     if not cache:
         jax.config.update("jax_enable_compilation_cache", False)
-    elif jax.config.values.get("jax_compilation_cache_dir") is None:
-        home = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-        folder = Path(home).expanduser() / "figaroh_jax" / "jax"
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    else:
+        from .compiled.executable_cache import keep_programs
+
+        keep_programs()

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from itertools import islice
+
+_MOST_KNOWN, _MOST_LISTED, _LONGEST_WORD = 1000, 100, 100  # a file may hold ten thousand names of any length
 
 
 class InputError(ValueError):
@@ -16,8 +19,10 @@ class NotSupported(InputError):
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Text that names the known word nearest to `name`, or lists all of them: `"; did you mean 'joint_3'?"`."""
-    words = [str(word) for word in known]
-    close = difflib.get_close_matches(str(name), words, n=1, cutoff=0.5)
+    words = [str(word) for word in islice(known, _MOST_KNOWN)]
+    short = [word for word in words if len(word) <= _LONGEST_WORD]
+    close = difflib.get_close_matches(str(name)[:_LONGEST_WORD], short, n=1, cutoff=0.5)
     if close:
         return f"; did you mean '{close[0]}'?"
-    return f"; known: {', '.join(words)}" if words else ""
+    listed = ", ".join(word[:_LONGEST_WORD] for word in words[:_MOST_LISTED])
+    return f"; known: {listed}{', ...' * (len(words) > _MOST_LISTED)}" if words else ""

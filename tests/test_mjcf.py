@@ -214,7 +214,7 @@ def test_files_that_mujoco_does_not_take_are_refused(tmp_path: Path) -> None:
         (robots.GRIPPER.replace('joint="elbow"', 'joint="elbo"'), "MuJoCo does not compile it: .*elbo"),
         ("<robot/>", "the root element is <robot>; a <mujoco> is expected"),
         ("<mujoco/>", "no joint moves"),
-        ("", "the file is empty"),
+        ("", "is empty"),
     ):
         with pytest.raises(InputError, match=message):
             load_mjcf(written(text, tmp_path))

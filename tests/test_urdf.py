@@ -199,7 +199,7 @@ def test_files_that_are_no_text_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "binary.urdf").write_bytes(robots.ARM.encode("utf-16"))
     for name, message in (
         ("", "is a directory"),
-        ("absent.urdf", "cannot be read"),
+        ("absent.urdf", "does not exist"),
         ("binary.urdf", "not a text file"),
     ):
         with pytest.raises(InputError, match=message):

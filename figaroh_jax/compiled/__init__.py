@@ -1,1 +1,1 @@
-"""Compiled programs: many samples through one kernel (`batching`), programs kept on disk (`executable_cache`)."""
+"""Compiled programs: samples through one kernel (`batching`), programs kept on disk (`executable_cache`, `store`)."""

@@ -4,6 +4,9 @@ JAX's persistent cache spares the compilation alone, and only after a function h
 five times as long as reading a program. Where that cache is on (the command line turns it on), a `Program` stands in
 it whole, under a name that changes with everything it was made from: this package's source, the versions of JAX, the
 processor, flags, and the types of the arguments. What is no part of this package (an effect of a user) is not kept.
+
+A program from disk is code. It is unpickled only where `store` vouches that this user's own processes wrote it; with
+`keep_programs` the same holds of what JAX itself keeps.
 """
 
 from __future__ import annotations
@@ -16,14 +19,16 @@ from collections.abc import Callable, Iterable
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-__all__ = ["Program"]
+from .store import Store, cache_home
 
-_PACKAGE = Path(__file__).parent
+__all__ = ["Program", "keep_programs"]
+
+_PACKAGE = Path(__file__).parents[1]
 _PLAIN = (tuple, list, dict, type(None))
 
 
@@ -61,12 +66,12 @@ class Program:
         return jax.tree.unflatten(out, compiled(*leaves))
 
     def _prepared(self, args: tuple[Any, ...], leaves: list[Any], tree: Any) -> tuple[Any, Any]:
-        file = self._file(args[: self.static], leaves, tree)
-        known = _read(file, len(leaves)) if file else None
+        entry = self._entry(args[: self.static], leaves, tree)
+        known = _read(entry, len(leaves)) if entry else None
         if known is None:
             known = self._made(args, leaves, tree)
-            if file and all(x is None or x in _PLAIN for x in _types(known[1])):
-                _write(file, leaves, *known)
+            if entry and all(x is None or x in _PLAIN for x in _types(known[1])):
+                _write(entry, leaves, *known)
         return known
 
     def _made(self, args: tuple[Any, ...], leaves: list[Any], tree: Any) -> tuple[Any, Any]:
@@ -88,7 +93,7 @@ class Program:
         compiled = jax.jit(flat, donate_argnums=given, compiler_options=options).lower(*types).compile()
         return compiled, out[-1]
 
-    def _file(self, static: tuple[Any, ...], leaves: list[Any], tree: Any) -> Path | None:
+    def _entry(self, static: tuple[Any, ...], leaves: list[Any], tree: Any) -> _Entry | None:
         """Where the program is kept; None where it is not."""
         folder = jax.config.values.get("jax_compilation_cache_dir")
         on = jax.config.values.get("jax_enable_compilation_cache") and jax.default_backend() == "cpu"
@@ -102,11 +107,12 @@ class Program:
             f"{self.options} {self.donate} {jax.dtypes.canonicalize_dtype(float)}",
             _surroundings(),
         ]
-        return Path(folder) / "programs" / hashlib.blake2b("\n".join(parts).encode(), digest_size=20).hexdigest()
+        name = hashlib.blake2b("\n".join(parts).encode(), digest_size=20).hexdigest()
+        return _Entry(Store(Path(folder) / "programs"), name)
 
 
 def _ours(thing: Any) -> bool:
-    return thing in _PLAIN or thing.__module__.partition(".")[0] == __package__
+    return thing in _PLAIN or thing.__module__.partition(".")[0] == _PACKAGE.name
 
 
 def _types(tree: Any) -> Iterable[Any]:
@@ -130,30 +136,77 @@ def _surroundings() -> str:
     return repr((source.hexdigest(), versions, processor, os.environ.get("XLA_FLAGS")))
 
 
-def _read(file: Path, leaves: int) -> tuple[Any, Any] | None:
+class _Entry(NamedTuple):
+    store: Store
+    name: str
+
+
+def _read(entry: _Entry, leaves: int) -> tuple[Any, Any] | None:
+    data = entry.store.get(entry.name)
     try:
-        return _loaded(file.read_bytes(), leaves)
-    except Exception:  # not there, cut short, or of another version: it is made again
+        return None if data is None else _loaded(data, leaves)
+    except Exception:  # of another version after all: it is made again
         return None
 
 
 def _loaded(data: bytes, leaves: int) -> tuple[Any, Any]:
     from jax.experimental.serialize_executable import deserialize_and_load
 
-    program, out = pickle.loads(data)
+    program, out = pickle.loads(data)  # noqa: S301  the store has checked that this user's process wrote it
     arguments = jax.tree.structure(((0,) * leaves, {}))
     return deserialize_and_load(program, arguments, jax.tree.structure([0] * out.num_leaves)), out
 
 
-def _write(file: Path, leaves: list[Any], compiled: Any, out: Any) -> None:
+def _write(entry: _Entry, leaves: list[Any], compiled: Any, out: Any) -> None:
     from jax.experimental.serialize_executable import serialize
 
-    beside = file.with_name(f"{file.name}.{os.getpid()}")
     try:
         data = pickle.dumps((serialize(compiled)[0], out))
         _loaded(data, len(leaves))[0](*(np.zeros(x.shape, x.dtype) for x in leaves))  # it must run to be worth keeping
-        file.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_bytes(data)
-        beside.replace(file)
-    except Exception:  # a full or read-only disk, a program that cannot be kept: only time is lost
-        beside.unlink(missing_ok=True)
+    except Exception:  # a program that cannot be kept: only time is lost
+        return
+    entry.store.put(entry.name, data)
+
+
+def keep_programs() -> None:
+    """Keep programs between processes, JAX's own included, in the user's cache folder or the one that JAX was told.
+
+    Of what JAX keeps, too, only entries that this user's own processes wrote are read. A folder that cannot be used, or
+    a JAX whose cache has another shape, costs time and nothing else.
+    """
+    told = jax.config.values.get("jax_compilation_cache_dir")
+    home = cache_home()
+    folder = Path(told) if told else home and home / "jax"
+    if folder is None:
+        jax.config.update("jax_enable_compilation_cache", False)
+        return
+    if not told:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    if not _checked_cache(Store(folder / "programs")):
+        jax.config.update("jax_enable_compilation_cache", False)
+
+
+def _checked_cache(store: Store) -> bool:
+    """Put the store in the place of JAX's own cache; False where JAX has no such place (it is no public one)."""
+    try:
+        from jax._src import compilation_cache
+        from jax._src.compilation_cache_interface import CacheInterface
+    except ImportError:
+        return False
+    if not (hasattr(compilation_cache, "_cache") and hasattr(compilation_cache, "_cache_initialized")):
+        return False
+
+    class Checked(CacheInterface):
+        _path = store.folder  # pyright: ignore[reportAssignmentType]  # for a line in JAX's log
+
+        def get(self, key: str) -> bytes | None:
+            return store.get(key)
+
+        def put(self, key: str, value: bytes) -> None:
+            store.put(key, value)
+
+    compilation_cache.reset_cache()
+    compilation_cache._cache, compilation_cache._cache_initialized = Checked(), True
+    return True

@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from ..effects.base import Effect, place
 from ..effects.catalogue import find
+from ..effects.plausibility import implausible
 from ..errors import InputError
 from ..estimation.noise import Spectrum
 from ..recordings.checks import check_recordings
@@ -64,7 +65,7 @@ def diagnose_task(
     options = {"trust": task.robot.trust, "forbid": task.diagnose.forbid, "alpha": task.diagnose.alpha}
     robot = make_backend(backend, model)
     found = diagnose(robot, recordings, task.preprocess, known, progress=progress, **options)
-    return replace(found, notes=(*notes, *found.notes))
+    return replace(found, notes=(*notes, *implausible(model, found.model, task.robot.trust), *found.notes))
 
 
 def diagnose(

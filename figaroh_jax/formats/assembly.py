@@ -17,10 +17,24 @@ from ..errors import InputError, nearest
 from ..rigid import inertia
 from ..rigid.model import DOF_NAMES, NUMBERS, Frame, Joint, Kind, RobotModel
 
-__all__ = ["ROOT_JOINT", "FramePart", "JointPart", "LinkPart", "Posture", "Root", "assemble", "displacement"]
+__all__ = [
+    "LARGEST_NUMBER",
+    "ROOT_JOINT",
+    "FramePart",
+    "JointPart",
+    "LinkPart",
+    "Posture",
+    "Root",
+    "assemble",
+    "displacement",
+    "refuse_many",
+]
 
 Posture = Mapping[str, float | Sequence[float]]  # a number for a revolute or prismatic joint, its part of q for others
 Root = Literal["fixed", "free_flyer"]
+
+MOST_PARTS = 2000  # links or joints of a robot
+LARGEST_NUMBER = 1e9  # m, kg, kg m^2, ...: beyond it no robot is described, and products overflow
 
 ROOT_JOINT = "root_joint"  # the free joint between the world and the root link of a free flyer
 _WORLD = ""  # the name of what carries it: no link of a file is called so, and no frame of the model
@@ -82,16 +96,53 @@ def assemble(
     `source`, for parts that are not one tree and for names that do not exist.
     """
     try:
+        for what, some in zip(("links", "joints"), parts, strict=True):
+            refuse_many("", what, len(some))
         parts, joints = _rooted(root, parts, joints)
         base, children = _tree(*parts)
-        drives = {joint.name: _drive(joint, parts[1]) for joint in parts[1] if joint.kind != "fixed"}
+        drives = _drives(parts[1])
         locked = _locked(drives, [j.name for j in parts[1] if j.kind == "fixed"], joints, posture or {})
         build = _Build(dict(parts[0]), children, drives, locked)
-        build.grow(base)
-        build.mark(frames)
-        return build.finish(name, joints, _gravity(gravity))
+        with np.errstate(over="ignore", invalid="ignore"):  # the model's numbers are checked when it is whole
+            build.grow(base)
+            build.mark(frames)
+            return _sound(build.finish(name, joints, _gravity(gravity)))
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
+
+
+def refuse_many(source: str, what: str, count: int) -> None:
+    """Raise `InputError` for more links or joints than a robot has."""
+    if count > MOST_PARTS:
+        raise InputError(f"{source}{': ' * bool(source)}{count} {what}; a robot has at most {MOST_PARTS}")
+
+
+def _sound(model: RobotModel) -> RobotModel:
+    """The model itself, all of whose numbers are finite and of a size that products bear; else `InputError`."""
+    joints, columns = [joint.name for joint in model.joints], list(model.dof_names)
+    axes = [model.joints[index].name for index in model.dofs.joint]
+    checked = (
+        ("placement", "joint", joints, "the placement"),
+        ("axis", "joint", axes, "the axis"),
+        ("inertia", "link", list(model.link_names), "mass, centre of mass or inertia"),
+        ("ratio", "joint", joints, "the ratio to the joint that it follows"),
+        ("offset", "joint", joints, "the offset to the joint that it follows"),
+        ("frame_placement", "frame", [frame.name for frame in model.frames], "the placement"),
+    )
+    for leaf, kind, names, what in checked:
+        values = np.asarray(getattr(model, leaf)).reshape(len(names), -1)
+        wrong = ~(np.abs(values) <= LARGEST_NUMBER)
+        if wrong.any():
+            row, column = np.argwhere(wrong)[0]
+            raise InputError(
+                f"{kind} '{names[row]}': {what} is {values[row, column]:.3g}, in the file or from its numbers together;"
+                f" finite numbers of at most {LARGEST_NUMBER:g} are expected"
+            )
+    for leaf in ("position_limit", "velocity_limit", "effort_limit"):
+        missing = np.isnan(np.asarray(getattr(model, leaf)).reshape(len(columns), -1)).any(axis=1)
+        if missing.any():
+            raise InputError(f"joint '{columns[int(np.argmax(missing))]}': its {leaf.replace('_', ' ')} is nan")
+    return model
 
 
 def _rooted(
@@ -167,11 +218,23 @@ def _refuse_cycle(carrier: Mapping[str, JointPart], links: Sequence[LinkPart]) -
         sound.update(path)
 
 
-def _drive(joint: JointPart, joints: Sequence[JointPart]) -> _Drive:
-    """Follow the mimic joints from `joint` to the independent one."""
-    named = {j.name: j for j in joints}
-    at, ratio, offset, seen = joint, 1.0, 0.0, [joint.name]
+def _drives(joints: Sequence[JointPart]) -> dict[str, _Drive]:
+    """What moves each joint that is not fixed."""
+    named = {joint.name: joint for joint in joints}
+    found: dict[str, _Drive] = {}
+    for joint in joints:
+        if joint.kind != "fixed":
+            found[joint.name] = _drive(joint, named, found)
+    return found
+
+
+def _drive(joint: JointPart, named: Mapping[str, JointPart], known: Mapping[str, _Drive]) -> _Drive:
+    """Follow the mimic joints from `joint` to the independent one, or to one that is `known`."""
+    at, ratio, offset, seen = joint, 1.0, 0.0, {joint.name: None}
     while at.mimic is not None:
+        if at.name in known:
+            leader, factor, shift = known[at.name]
+            return _Drive(leader, ratio * factor, offset + ratio * shift)
         target, factor, shift = at.mimic
         if target not in named:
             raise InputError(f"joint '{at.name}' mimics '{target}', which does not exist{nearest(target, named)}")
@@ -181,7 +244,7 @@ def _drive(joint: JointPart, joints: Sequence[JointPart]) -> _Drive:
             if joined.kind not in ("revolute", "prismatic"):
                 raise InputError(f"joint '{at.name}' mimics '{target}', but '{joined.name}' is {joined.kind}")
         ratio, offset, at = ratio * factor, offset + ratio * shift, named[target]
-        seen.append(target)
+        seen[target] = None
     return _Drive(at.name, ratio, offset)
 
 

@@ -7,6 +7,7 @@ joints, sites, couplings and limits. Geoms count where a body has its inertia fr
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from jaxtyping import Float
 from ..errors import InputError
 from ..rigid import inertia
 from ..rigid.model import Kind, RobotModel
-from .assembly import ROOT_JOINT, FramePart, JointPart, LinkPart, Posture, Root, assemble, displacement
+from .assembly import ROOT_JOINT, FramePart, JointPart, LinkPart, Posture, Root, assemble, displacement, refuse_many
 from .xmlfile import find_in_packages, read_xml
 
 __all__ = [
@@ -32,6 +33,19 @@ __all__ = [
 
 _KINDS: tuple[Kind, ...] = ("free", "spherical", "prismatic", "revolute")  # in the order of MuJoCo's numbers
 _NUMBERS = (7, 4, 1, 1)
+_LARGEST_COUNT = 10_000
+_COUNTS = {  # attributes that make much of little
+    "replicate": ("count",),
+    "composite": ("count",),
+    "flexcomp": ("count",),
+    "hfield": ("nrow", "ncol"),
+    "texture": ("width", "height"),
+    "numeric": ("size",),
+    "size": (
+        *("nuser_body", "nuser_jnt", "nuser_geom", "nuser_site", "nuser_cam", "nuser_tendon", "nuser_actuator"),
+        *("nuser_sensor", "nkey", "nuserdata"),
+    ),
+}
 
 
 def load_mjcf(
@@ -66,17 +80,54 @@ def load_mjcf(
 def compile_mjcf(path: str | Path) -> Any:
     """The compiled `mujoco.MjModel`, without meshes, textures and sensors that say nothing about the dynamics."""
     mujoco = engine()
-    read_xml(path, "mujoco")
+    _check_counts(Path(path), read_xml(path, "mujoco"))
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         if spec.flexes:
             raise InputError(f"{path}: has a flex, '{spec.flexes[0].name}'; a robot here is a tree of rigid bodies")
         _drop_looks(mujoco, spec)
         return spec.compile()
-    except (ValueError, mujoco.FatalError) as error:
-        if isinstance(error, InputError):
-            raise
+    except InputError:
+        raise
+    except Exception as error:  # MuJoCo's own kinds, and what its Python layer makes of bytes that are no UTF-8
         raise InputError(f"{path}: MuJoCo does not compile it: {' '.join(str(error).split())}") from None
+
+
+def _check_counts(path: Path, root: Any) -> None:
+    """Refuse numbers by which a short file would become a huge model; included files are looked into as well."""
+    waiting, seen, parts = [root], {path.resolve()}, 0
+    while waiting:
+        for element in waiting.pop().iter(*_COUNTS, "body", "include"):
+            parts += _copies(path, element) if element.tag in ("body", "replicate") else 0
+            refuse_many(str(path), "bodies", parts)
+            for attribute in _COUNTS.get(element.tag, ()):
+                _check_count(path, element, attribute)
+            file = path.parent / element.get("file", "") if element.tag == "include" else path
+            if file.resolve() not in seen and file.is_file():
+                seen.add(file.resolve())
+                waiting.append(read_xml(file, None))
+
+
+def _check_count(path: Path, element: Any, attribute: str) -> None:
+    for word in element.get(attribute, "").split():
+        count = 0.0
+        with suppress(ValueError):  # what is no number is MuJoCo's to refuse
+            count = float(word)
+        if count > _LARGEST_COUNT:
+            raise InputError(
+                f"{path}: <{element.tag}> in line {element.sourceline}: {attribute} is {word}; "
+                f"at most {_LARGEST_COUNT} is expected"
+            )
+
+
+def _copies(path: Path, element: Any) -> int:
+    """How often an element is there once those around it are replicated."""
+    total = 1
+    for around in (element, *element.iterancestors("replicate")):
+        if around.tag == "replicate":
+            with suppress(ValueError, OverflowError):
+                total *= max(1, int(float(around.get("count", 1))))
+    return total
 
 
 def engine() -> Any:
@@ -134,7 +185,8 @@ def compiled_robot(
 ) -> RobotModel:
     """Model of a compiled `mujoco.MjModel`; `source` names it in messages. See `load_mjcf`."""
     try:
-        links, parts, frames = _parts(mj, root)
+        with np.errstate(all="ignore"):  # `assemble` checks what comes of it
+            links, parts, frames = _parts(mj, root)
         free = [part.name for part in parts if part.kind == "free"]
         if root == "fixed" and (named := [name for name in joints or () if name in free]):
             raise InputError(f"joints: joint '{named[0]}' is free, but root is fixed")

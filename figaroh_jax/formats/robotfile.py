@@ -18,7 +18,7 @@ from ..effects.catalogue import find
 from ..effects.extended import ExtendedModel, extend
 from ..errors import InputError
 from ..rigid.model import RobotModel
-from .assembly import Posture, Root
+from .assembly import LARGEST_NUMBER, Posture, Root
 from .compensation import GravityCompensation
 from .mjcf import actuator_of, body_name, compile_mjcf, compiled_robot, disabled, engine, joint_names, load_mjcf
 from .native import place_names
@@ -83,9 +83,13 @@ def load_extended(
     mj = compile_mjcf(file)
     robot = compiled_robot(str(file), mj, joints, posture, gravity, root)
     found = _Joints(robot)
-    notes = [*_joints(mj, found), *_tendons(mj, found), *_biases(mj, found), *_others(mj, robot)]
+    with np.errstate(all="ignore"):  # `effects` checks what comes of it
+        notes = [*_joints(mj, found), *_tendons(mj, found), *_biases(mj, found), *_others(mj, robot)]
     compensated, more = _compensation(mj, robot)
-    return Loaded(extend(robot, *found.effects(), *compensated), (*notes, *more))
+    try:
+        return Loaded(extend(robot, *found.effects(), *compensated), (*notes, *more))
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
 
 
 def load_robot(task: Task) -> RobotModel:
@@ -185,9 +189,29 @@ class _Joints:
         for total, value in zip(self.sums.values(), given, strict=True):
             total[k] += value
 
+    def _check(self) -> None:
+        """Raise `InputError` for what no joint has: numbers that are not finite or huge, and drives that push."""
+        names = self.robot.dof_names
+        values = {"armature": self.sums["rotor"], "damping": self.damping, "frictionloss": self.sums["friction"]}
+        values |= {"stiffness": self.sums["stiffness"], "spring's rest": self.sums["offset"]}
+        for what, some in (values | {"constant force": self.sums["bias"]}).items():
+            some = some.reshape(len(names), -1)
+            wrong = ~(np.abs(some) <= LARGEST_NUMBER)
+            if what in ("armature", "frictionloss"):
+                wrong |= some < 0
+            elif what == "damping":
+                wrong[:, 0] |= some[:, 0] < 0
+            if wrong.any():
+                row, column = np.argwhere(wrong)[0]
+                raise InputError(
+                    f"joint '{names[row]}': {what} is {some[row, column]:g}; a finite number"
+                    f"{' of zero or more' * bool(some[row, column] < 0)} up to {LARGEST_NUMBER:g} is expected"
+                )
+
     def effects(self) -> list[Effect]:
         """One effect for each kind and coordinate that anything acts at."""
         found, s = [], self.sums
+        self._check()
         for k, name in enumerate(self.robot.dof_names):
             linear, square, cube = self.damping[k]
             wanted = [

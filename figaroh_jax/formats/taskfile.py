@@ -1,7 +1,8 @@
 """YAML files read with suspicion, and the inheritance between task files (`extends`).
 
-Aliases are refused (a few lines of them can describe gigabytes), so are keys that stand twice, Python tags, and files
-above 256 KiB. Relative paths become absolute against the folder of the file they stand in, before files are merged.
+Aliases are accepted as far as what they expand to stays small (a few lines of them can describe gigabytes). Keys that
+stand twice, Python tags and files above 256 KiB are refused. Relative paths become absolute against the folder of the
+file they stand in, before files are merged.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ from typing import Any
 
 import yaml
 
-from ..errors import InputError, nearest
+from ..errors import InputError
+from .files import read_file
 
 __all__ = ["CONTRACT_EFFECTS", "merge", "read_task", "read_yaml", "where"]
 
@@ -27,43 +29,75 @@ friction_loss actuator_gain command_delay actuator_saturation voltage_saturation
 """.split()
 
 LARGEST = 1 << 18  # bytes
+MOST_NODES = 50_000  # after expansion of the aliases
+DEEPEST = 100
+LONGEST_NUMBER = 500  # characters; what is longer is text (base 60, which YAML has, takes a quadratic time)
+_NUMBERS = tuple(f"tag:yaml.org,2002:{kind}" for kind in ("int", "float", "timestamp"))
 
 
 class _Loader(yaml.SafeLoader):
-    def compose_node(self, parent, index):
-        if self.check_event(yaml.AliasEvent):
-            mark = self.peek_event().start_mark
-            raise InputError(f"line {mark.line + 1}: YAML aliases are not accepted; use `extends` to share keys")
-        return super().compose_node(parent, index)
+    def get_single_node(self):
+        node = super().get_single_node()
+        if node is not None:
+            _expanded(node, {})
+        return node
+
+    def compose_scalar_node(self, anchor):
+        node = super().compose_scalar_node(anchor)
+        if len(node.value) > LONGEST_NUMBER and node.tag in _NUMBERS:
+            node.tag = "tag:yaml.org,2002:str"
+        return node
 
     def construct_mapping(self, node, deep=False):
+        if not isinstance(node, yaml.MappingNode):
+            raise InputError(f"{_line(node)}: the tag {node.tag} stands at something that has no keys")
         seen: set[str] = set()
         for key, _ in node.value:
-            if key.value in seen and isinstance(key, yaml.ScalarNode):
-                raise InputError(f"line {key.start_mark.line + 1}: the key '{key.value}' stands there twice")
-            seen.add(str(key.value))
+            if not isinstance(key, yaml.ScalarNode):
+                raise InputError(f"{_line(key)}: a key is a list or a mapping; a name is expected")
+            if key.value in seen:
+                raise InputError(f"{_line(key)}: the key '{key.value}' stands there twice")
+            seen.add(key.value)
         return super().construct_mapping(node, deep)
+
+
+def _line(node: yaml.Node) -> str:
+    return f"line {node.start_mark.line + 1}"
+
+
+def _expanded(node: yaml.Node, known: dict[int, tuple[int, int] | None]) -> tuple[int, int]:
+    """Number of nodes and depth once every alias is what it stands for; `InputError` where these are too many."""
+    if id(node) in known:
+        found = known[id(node)]
+        if found is None:
+            raise InputError(f"{_line(node)}: an alias (`*`) stands inside of what it stands for")
+        return found
+    known[id(node)] = None
+    children = node.value if isinstance(node, yaml.SequenceNode) else []
+    if isinstance(node, yaml.MappingNode):
+        children = [part for pair in node.value for part in pair]
+    sizes = [_expanded(child, known) for child in children]
+    nodes, depth = 1 + sum(size for size, _ in sizes), 1 + max((deep for _, deep in sizes), default=0)
+    if nodes > MOST_NODES or depth > DEEPEST:
+        what = f"{MOST_NODES} values" if nodes > MOST_NODES else f"{DEEPEST} levels"
+        raise InputError(f"{_line(node)}: with its aliases (`*`) expanded it holds more than {what}")
+    known[id(node)] = nodes, depth
+    return nodes, depth
 
 
 def read_yaml(file: Path, asked_by: str = "") -> dict[str, Any]:
     """The mapping in a YAML file; `asked_by` says which key names the file, for the message of the `InputError`."""
     name = f"{file}{asked_by}"
-    if file.is_dir():
-        raise InputError(f"{name} is a directory, expected a YAML file")
-    if not file.is_file():
-        beside = sorted(path.name for path in file.parent.glob("*.y*ml"))
-        raise InputError(f"{name} does not exist{nearest(file.name, beside)}")
+    data = read_file(file, name, "a YAML file", LARGEST, (".yaml", ".yml"))
     try:
-        if file.stat().st_size > LARGEST:
-            raise InputError(f"{name} is larger than {LARGEST >> 10} KiB, which no task needs")
-        content = yaml.load(file.read_text(encoding="utf-8"), _Loader)
+        content = yaml.load(data.decode("utf-8"), _Loader)  # noqa: S506  a SafeLoader
     except InputError as error:
         raise error if name in str(error) else InputError(f"{name}, {error}") from None
     except yaml.YAMLError as error:
         raise InputError(f"{name}{_explain(error)}") from error
     except RecursionError:
         raise InputError(f"{name} is nested too deeply") from None
-    except (OSError, UnicodeDecodeError, ValueError) as error:
+    except Exception as error:  # what tags at the wrong place make of PyYAML's constructors
         raise InputError(f"{name} cannot be read as YAML: {error}") from error
     if content is None:
         raise InputError(f"{name} is empty")
@@ -86,10 +120,10 @@ def read_task(file: Path) -> list[tuple[Path, dict[str, Any]]]:
     asked_by, seen = "", []
     current: Path | None = file
     while current is not None:
+        keys = read_yaml(current, asked_by)
         if current.resolve() in seen:
             raise InputError(f"{chain[0][0]}: `extends` goes in a circle back to {current}")
         seen.append(current.resolve())
-        keys = read_yaml(current, asked_by)
         parent = keys.pop("extends", None)
         if parent is not None and not isinstance(parent, str):
             raise InputError(f"{current}: extends is {parent!r}, expected the name of one YAML file")

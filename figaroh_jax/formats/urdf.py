@@ -20,7 +20,7 @@ import numpy as np
 from ..errors import InputError, nearest
 from ..rigid import inertia
 from ..rigid.model import Kind, RobotModel
-from .assembly import JointPart, LinkPart, Posture, Root, assemble
+from .assembly import JointPart, LinkPart, Posture, Root, assemble, refuse_many
 from .xmlfile import find_in_packages, read_xml
 
 __all__ = ["load_urdf", "urdf_dynamics"]
@@ -50,6 +50,7 @@ _NUMBERS = {  # element: attributes, how many numbers each holds, which must be 
 }
 _REQUIRED = ("mass", "inertia")  # elements of which no attribute may be left out
 _MAY_BE_INFINITE = ("limit",)
+_ONCE = {"link": ("inertial",), "inertial": ("origin", "mass", "inertia")}  # a second one contradicts the first
 _ROUNDED = 1e-6  # kg m^2; the inertias of small parts are often rounded to nonsense below this
 
 
@@ -80,7 +81,8 @@ def load_urdf(
     path = find_in_packages(path, packages)
     robot = _read(path)
     try:
-        parts = [_link(link) for link in robot.links], [_joint(joint) for joint in robot.joints]
+        with np.errstate(over="ignore", invalid="ignore"):  # `assemble` checks what comes of it
+            parts = [_link(link) for link in robot.links], [_joint(joint) for joint in robot.joints]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return assemble(str(path), robot.name, parts, joints, posture, gravity, root)
@@ -93,6 +95,11 @@ def urdf_dynamics(path: str | Path) -> dict[str, tuple[float, float]]:
         for element in joint.iterchildren("dynamics"):
             for attribute in ("damping", "friction"):
                 _check_numbers(element, attribute, 1, f"{path}: joint '{joint.get('name')}'")
+                if float(element.get(attribute, 0)) < 0:
+                    raise InputError(
+                        f"{path}: joint '{joint.get('name')}': its {attribute} is {element.get(attribute)}; "
+                        "a negative one would drive the joint, zero or more is expected"
+                    )
             found[joint.get("name")] = (float(element.get("damping", 0)), float(element.get("friction", 0)))
     return found
 
@@ -102,6 +109,7 @@ def _read(path: str | Path) -> Any:
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
     root = read_xml(path, "robot")
+    refuse_many(str(path), "links", sum(1 for _ in root.iterchildren("link")))
     for part in [part for holder, tags in _UNREAD.items() for tag in tags for part in root.findall(f"{holder}/{tag}")]:
         part.getparent().remove(part)
     try:
@@ -110,7 +118,11 @@ def _read(path: str | Path) -> Any:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     root.set("name", root.get("name") or Path(path).stem)
-    return _yourdfpy().URDF.load(io.BytesIO(etree.tostring(root)), build_scene_graph=False, load_meshes=False).robot
+    reader = _yourdfpy().URDF
+    try:
+        return reader.load(io.BytesIO(etree.tostring(root)), build_scene_graph=False, load_meshes=False).robot
+    except Exception as error:  # parts that play no role here (materials, ...) may be anything
+        raise InputError(f"{path}: cannot be read as URDF: {type(error).__name__}: {error}") from error
 
 
 class _Later(ModuleType):
@@ -157,6 +169,10 @@ def _check_part(part: Any) -> None:
         for child in _REQUIRED:
             if part.find(f"inertial/{child}") is None:
                 raise InputError(f"{where}: its <inertial> has no <{child}>")
+    for element in part.iter(*_ONCE):
+        for tag in _ONCE[element.tag]:
+            if len(element.findall(tag)) > 1:
+                raise InputError(f"{where}: <{element.tag}> has {len(element.findall(tag))} <{tag}>; one is expected")
     for element in part.iter(*_NUMBERS):
         for attribute, count in _NUMBERS[element.tag].items():
             _check_numbers(element, attribute, count, where)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from .files import read_file
 
 __all__ = ["find_in_packages", "read_xml"]
 
@@ -14,12 +15,12 @@ _PACKAGE = "package:/"  # a Path keeps one slash of the two
 _LARGEST = 20_000_000  # bytes; robot models without their meshes stay far below
 
 
-def read_xml(path: str | Path, root: str) -> Any:
+def read_xml(path: str | Path, root: str | None) -> Any:
     """Root element (lxml) of the XML file, without its comments.
 
     Raises `InputError` for a file that is missing, a directory, empty, too large, not text, not well-formed, that
     declares a document type or entities (the road to exponential expansion and to foreign files), or whose root
-    element is not called `root`.
+    element is not called `root` (None: whatever it is called).
     """
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -31,7 +32,7 @@ def read_xml(path: str | Path, root: str) -> Any:
         raise InputError(f"{path}: not well-formed XML: {error.msg}") from None
     if element.getroottree().docinfo.doctype:
         raise InputError(_no_doctype(Path(path)))
-    if element.tag != root:
+    if root is not None and element.tag != root:
         raise InputError(f"{path}: the root element is <{element.tag}>; a <{root}> is expected")
     return element
 
@@ -54,16 +55,7 @@ def find_in_packages(path: str | Path, packages: Sequence[str | Path]) -> Path:
 
 
 def _read(path: Path) -> bytes:
-    if path.is_dir():
-        raise InputError(f"{path}: is a directory; the model file itself is needed")
-    try:
-        size, data = path.stat().st_size, b""
-        if size <= _LARGEST:
-            data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if size > _LARGEST:
-        raise InputError(f"{path}: {size} bytes; a robot model has at most {_LARGEST}")
+    data = read_file(path, f"{path}", "a robot model", _LARGEST, (".urdf", ".xml", ".mjcf"))
     data = data.lstrip()  # some files begin with an empty line, which XML forbids
     if not data:
         raise InputError(f"{path}: the file is empty; a robot model is expected")

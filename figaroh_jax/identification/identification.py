@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..effects.base import Effect
+from ..effects.plausibility import implausible
 from ..errors import InputError, nearest
 from ..estimation.base_parameters import BaseParameters, base_parameters, essential
 from ..estimation.columns import friction_terms, structural_columns
@@ -102,7 +103,7 @@ def identify_task(
         bounds={name: bound.model_dump(exclude_none=True) for name, bound in options.bounds.items()},
         progress=progress,
     )
-    return replace(found, notes=(*notes, *found.notes))
+    return replace(found, notes=(*notes, *implausible(model, found.model, task.robot.trust), *found.notes))
 
 
 def identify(

@@ -5,21 +5,27 @@ Whatever the format, `Table.matrix` gives the (samples, width) array of a name, 
 
 from __future__ import annotations
 
+import math
 import re
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError, nearest
+from ..formats.files import plain_file
 
 __all__ = ["Table", "read_table"]
 
 FORMATS = (".npz", ".csv", ".parquet")
-LARGEST = 4 << 30  # bytes of one array
+LARGEST_FILE = 2 << 30  # bytes
+LARGEST = 1 << 29  # bytes of one array, or of all columns of a table, once the numbers are float64; of a CSV file
+LARGEST_HEAD = 1 << 20  # bytes of a CSV file's first line
+MOST_COLUMNS = 10_000
 
 
 class Table(NamedTuple):
@@ -83,46 +89,66 @@ def read_table(file: Path, key: str) -> Table:
     suffix = file.suffix.lower()
     if suffix not in FORMATS:
         raise InputError(f"{file} ({key}): recordings are {', '.join(FORMATS)}, not '{file.suffix or file.name}'")
-    if file.is_dir():
-        raise InputError(f"{file} ({key}) is a directory, expected a recording file")
-    if not file.is_file():
-        beside = sorted(path.name for path in file.parent.glob("*") if path.suffix.lower() in FORMATS)
-        raise InputError(f"{file} ({key}) does not exist{nearest(file.name, beside)}")
+    plain_file(file, f"{file} ({key})", "a recording file", LARGEST if suffix == ".csv" else LARGEST_FILE, FORMATS)
     try:
-        if file.stat().st_size == 0:
-            raise InputError(f"{file} ({key}) is empty")
         return {".npz": _npz, ".csv": _csv, ".parquet": _parquet}[suffix](file)
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"{file} ({key}) cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # zipfile, zlib, numpy and Arrow each have their own ways to say "damaged"
+        raise InputError(f"{file} ({key}) is damaged or of another format: {error}") from error
 
 
 def _npz(file: Path) -> Table:
     if not zipfile.is_zipfile(file):
         raise InputError(f"{file} is not an .npz file (a zip of arrays, as numpy.savez writes it)")
     with zipfile.ZipFile(file) as archive:
-        sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in archive.infolist()}
+        entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
 
     def read(name: str) -> np.ndarray:
-        if sizes[name] > LARGEST:
-            raise InputError(f"{file}: array '{name}' of {sizes[name] / 2**30:.1f} GiB is larger than 4 GiB")
         try:
+            with zipfile.ZipFile(file) as archive, archive.open(entries[name]) as stored:
+                _check_size(np.lib.format.read_magic(stored), stored, file, name)
             with np.load(file, allow_pickle=False) as arrays:
                 values = np.asarray(arrays[name])
+        except InputError:
+            raise
         except Exception as error:  # numpy, zipfile and zlib each have their own ways to say "damaged"
             if "allow_pickle" in str(error) or "Object arrays" in str(error):
                 raise InputError(f"{file}: array '{name}' holds Python objects, not numbers: it is refused") from error
             raise InputError(f"{file}: array '{name}' cannot be read: {error}") from error
         return _numbers(values, file, name)
 
-    return Table(file, tuple(sizes), read)
+    return Table(file, tuple(entries), read)
+
+
+def _check_size(version: tuple[int, int], stored: Any, file: Path, name: str) -> None:
+    """Refuse an array by its header, before the memory for its numbers is asked for."""
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = header(stored)
+    size = math.prod(shape) * max(8, dtype.itemsize)
+    if size > LARGEST:
+        raise InputError(
+            f"{file}: array '{name}' of shape {shape} takes {size >> 20} MiB as float64; at most"
+            f" {LARGEST >> 20} MiB are read"
+        )
 
 
 def _csv(file: Path) -> Table:
     import pyarrow as pa
     from pyarrow import csv
 
-    with file.open(encoding="utf-8-sig", errors="replace") as stream:
-        head = stream.readline(1 << 20)
+    with file.open("rb") as stream:
+        first = stream.readline(LARGEST_HEAD)
+    if len(first) == LARGEST_HEAD:
+        raise InputError(
+            f"{file}: its first line is longer than {LARGEST_HEAD >> 20} MiB; names of columns are expected"
+        )
+    try:
+        head = first.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file}: its first line is no text in UTF-8 ({error}); save it as UTF-8") from None
     delimiter = max(",;\t", key=head.count)
     try:
         table = csv.read_csv(file, parse_options=csv.ParseOptions(delimiter=delimiter))
@@ -136,6 +162,12 @@ def _parquet(file: Path) -> Table:
     from pyarrow import parquet
 
     try:
+        with parquet.ParquetFile(file) as opened:
+            _check_columns(file, opened.metadata.num_columns)
+            size = 8 * opened.metadata.num_rows * opened.metadata.num_columns
+            size = max(size, sum(opened.metadata.row_group(k).total_byte_size for k in range(opened.num_row_groups)))
+        if size > LARGEST:
+            raise InputError(f"{file}: its columns take {size >> 20} MiB; at most {LARGEST >> 20} MiB are read")
         return _arrow(file, parquet.read_table(file))
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
         raise InputError(f"{file} is not a Parquet file: {error}") from error
@@ -143,27 +175,40 @@ def _parquet(file: Path) -> Table:
 
 def _arrow(file: Path, table) -> Table:
     names = tuple(table.column_names)
-    twice = next((name for name in names if names.count(name) > 1), None)
+    _check_columns(file, len(names))
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise InputError(f"{file}: the column '{twice}' stands there twice")
 
     def read(name: str) -> np.ndarray:
         column = table.column(name)
-        values = column.to_pylist() if "list" in str(column.type) else column.to_numpy()
         try:
+            values = column.to_pylist() if "list" in str(column.type) else column.to_numpy()
             return _numbers(np.array(values), file, name)
+        except InputError:
+            raise
         except ValueError as error:
-            if isinstance(error, InputError):
-                raise
             raise InputError(f"{file}: the lists in column '{name}' differ in length") from error
+        except Exception as error:  # kinds of columns that have no form in NumPy
+            raise InputError(f"{file}: column '{name}' of type {column.type} cannot be read as numbers") from error
 
     return Table(file, names, read)
+
+
+def _check_columns(file: Path, count: int) -> None:
+    if count > MOST_COLUMNS:
+        raise InputError(f"{file}: {count} columns; a recording has at most {MOST_COLUMNS}")
 
 
 def _numbers(values: np.ndarray, file: Path, name: str) -> Float[np.ndarray, "..."]:
     """As float64, or an `InputError` that shows the first entry that is no number."""
     if values.dtype.kind in "fiu":
-        return values.astype(np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return values.astype(np.float64)
+    if values.dtype.kind == "c":
+        raise InputError(f"{file}: '{name}' holds complex numbers; real ones are expected")
+    if not values.size:
+        raise InputError(f"{file}: '{name}' has shape {values.shape} and holds no number")
     for row, value in enumerate(values.reshape(len(values), -1)[:, 0] if values.ndim else [values]):
         try:
             float(value)

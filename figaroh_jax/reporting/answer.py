@@ -28,6 +28,7 @@ def answer(diagnosis: Diagnosis) -> dict[str, Any]:
             "noise": [_number(value) for value in diagnosis.noise],
         },
         "next_experiment": _experiment(diagnosis),
+        "notes": list(diagnosis.notes),
     }
 
 

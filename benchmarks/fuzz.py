@@ -1,0 +1,560 @@
+"""Malformed input for every reader and the command line: no traceback, no hang, no bomb, nothing executed.
+
+    python benchmarks/fuzz.py --count 20000          # nightly; --workers 2 for two processes
+    python benchmarks/fuzz.py --minutes 1            # what `make fuzz` runs
+    python benchmarks/fuzz.py --replay FOLDER        # what a run has kept of its findings
+
+Each input starts from a right file or from one that reached new lines of the package before (coverage as guide) and is
+changed a few times: bytes, words of a dictionary, keys and values of the tree, numbers, shapes and headers of arrays.
+Only `InputError` (or status 0 or 2 and one line of message) is an answer; anything else, an input of more than ten
+seconds, one that takes more than 2 GB, or one that runs planted code is a finding and kept with its seed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import faulthandler
+import io
+import json
+import os
+import pickle
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+PACKAGE = str(ROOT / "figaroh_jax")
+SECONDS, BYTES = 10, 2 << 30
+
+WORDS = """
+nan inf -inf 1e400 1e200 -1 0 0x1p999 1_0 1:1:1 ~ null true yes !!timestamp !!int !!float !!bool !!set !!binary
+!!python/object/apply:os.mkdir !!str !!map !!seq !!omap &a *a <<: {} [] {[]:1} ? - | > % @ ` \x00 \x1b[31m
+\ud800 é ä ../ / //// . .. ~root file:///etc/passwd package://x/y /dev/zero /dev/stdin /proc/self/mem robot.urdf
+run1.npz task.yaml deg mm ns A rad holdout fit free_flyer fixed joints posture data robot extends preprocess
+window cutoff rate gate units position velocity torque command measurement pose plane socket camera baseline
+effects at effect transmission offset mass inertia origin axis limit mimic joint link parent child name type
+value xyz rpy lower upper effort multiplier body geom site inertial default class include replicate count
+composite freejoint equality tendon actuator
+""".split()
+NUMBERS = [0, -1, 1, 1e-320, 1e200, 1e308, -1e308, 2**31, 2**63, 2**64, 10**40, float("nan"), float("inf"), 0.1]
+
+
+class Source:
+    """Random choices of one input; the seed says them all."""
+
+    def __init__(self, seed: int) -> None:
+        self.random = random.Random(seed)
+        self.array = np.random.default_rng(seed)
+
+    def of(self, some: Any) -> Any:
+        return self.random.choice(list(some))
+
+    def once_in(self, count: int) -> bool:
+        return self.random.randrange(count) == 0
+
+
+def mutated_bytes(data: bytes, source: Source) -> bytes:
+    """A few changes that know nothing of the format."""
+    data = bytearray(data)
+    for _ in range(source.random.choice((1, 1, 2, 4, 8))):
+        at = source.random.randrange(len(data) + 1)
+        kind = source.random.randrange(8)
+        if kind == 0 and data:
+            data[at % len(data)] ^= 1 << source.random.randrange(8)
+        elif kind == 1:
+            data[at:at] = source.of(WORDS).encode("utf-8", "surrogatepass")
+        elif kind == 2:
+            del data[at : at + source.random.randrange(1, 40)]
+        elif kind == 3:
+            data[at:at] = data[at : at + source.random.randrange(1, 60)] * source.random.choice((1, 1, 2, 50))
+        elif kind == 4:
+            data[at : at + 1] = bytes([source.random.randrange(256)])
+        elif kind == 5:
+            del data[at:]
+        elif kind == 6:
+            data[at:at] = str(source.of(NUMBERS)).encode()
+        else:
+            other = source.random.randrange(len(data) + 1)
+            data[at:at] = data[other : other + 30]
+    return bytes(data)
+
+
+def mutated_tree(tree: Any, source: Source) -> Any:
+    """A tree of keys and values with one of its nodes changed, removed, doubled or renamed."""
+    if isinstance(tree, dict) and tree and not source.once_in(6):
+        key = source.of(tree)
+        changed = dict(tree)
+        kind = source.random.randrange(8)
+        if kind == 0:
+            del changed[key]
+        elif kind == 1:
+            changed[source.of(WORDS)] = changed[key]
+        elif kind == 2:
+            changed[source.of((1, None, True, 2.5, "", "a" * 300))] = junk(source)
+        else:
+            changed[key] = mutated_tree(tree[key], source)
+        return changed
+    if isinstance(tree, list) and tree and not source.once_in(6):
+        at = source.random.randrange(len(tree))
+        kind = source.random.randrange(6)
+        if kind == 0:
+            return tree[:at] + tree[at + 1 :]
+        if kind == 1:
+            return tree + [tree[at]] * source.random.choice((1, 2, 500))
+        return [*tree[:at], mutated_tree(tree[at], source), *tree[at + 1 :]]
+    return junk(source)
+
+
+def junk(source: Source) -> Any:
+    """A value that nobody expects."""
+    return source.of(
+        [None, True, [], {}, [[]], [{}], "", "a" * 300, "\0", "x/" * 200, {"a": {"b": {"c": []}}}, [None] * 3]
+        + NUMBERS
+        + [source.of(WORDS), [source.of(NUMBERS)] * source.random.randrange(5), {source.of(WORDS): source.of(NUMBERS)}]
+    )
+
+
+class Bench:
+    """A folder with a right task, its robot in both formats and its recordings in three."""
+
+    def __init__(self, folder: Path) -> None:
+        import tasks
+
+        self.folder, self.accepted, self.most = folder, 0, 0
+        tasks.write(folder)
+        from figaroh_jax.effects.extended import extend
+        from figaroh_jax.formats.export import write_model
+        from figaroh_jax.formats.urdf import load_urdf
+
+        write_model(extend(load_urdf(folder / "robot.urdf")), folder / "model")
+        shutil.copy(folder / "model" / "robot.xml", folder / "robot.xml")
+        self.arrays = {name: np.asarray(x)[:40] for name, x in tasks.arrays().items()}
+        self.columns = {
+            f"{name}{'' if x.ndim == 1 else k + 1}": (x if x.ndim == 1 else x[:, k])
+            for name, x in self.arrays.items()
+            for k in range(1 if x.ndim == 1 else x.shape[1])
+        }
+        self.task = {**tasks.task(), "transmission": {"position": np.eye(3).tolist(), "offset": [0.0] * 3}}
+        self.task["robot"] |= {"root": "fixed", "posture": {}, "joints": ["shoulder", "elbow", "slide"], "trust": 0.1}
+        self.task["baseline"] = {"viscous": True, "effects": [{"effect": "joint_spring", "at": ["elbow"]}]}
+        self.task["diagnose"] = {"forbid": ["payload"], "alpha": 0.05}
+        self.poses = {
+            "robot": {"model": "robot.urdf"},
+            "data": [{"file": "run1.npz", "position": "q", "measurement": {"position": "dq", "tool_frame": "tool0"}}],
+        }
+        self.texts = {name: (folder / name).read_bytes() for name in ("robot.urdf", "robot.xml", "task.yaml")}
+        self.texts["effects.yaml"] = (folder / "model" / "effects.yaml").read_bytes()
+        self.canary = folder / "ran"
+
+    def planted(self) -> bytes:
+        """A pickle that makes the canary when it is read."""
+
+        class Ran:
+            def __reduce__(self, file=str(self.canary)):
+                return os.mkdir, (file,)
+
+        return pickle.dumps(Ran())
+
+
+def yaml_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
+    if source.once_in(2):
+        tree = source.of((bench.task, bench.poses))
+        for _ in range(source.random.choice((1, 1, 2, 3))):
+            tree = mutated_tree(tree, source)
+        text = yaml.dump(tree, allow_unicode=True, sort_keys=False).encode("utf-8", "surrogatepass")
+    else:
+        text = source.of([bench.texts["task.yaml"], *seen[-200:]])
+    return mutated_bytes(text, source) if source.once_in(2) else text.replace(b"ran", str(bench.canary).encode())
+
+
+def text_input(name: str) -> Callable[[Bench, Source, list[bytes]], bytes]:
+    def make(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
+        text = source.of([bench.texts[name], *seen[-200:]])
+        if source.once_in(2):  # a number or a word in quotes becomes another
+            parts = text.split(b'"')
+            for _ in range(source.random.choice((1, 2, 5))):
+                at = source.random.randrange(len(parts))
+                parts[at | 1 if (at | 1) < len(parts) else at] = str(source.of([*NUMBERS, *WORDS])).encode(
+                    "utf-8", "replace"
+                )
+            return b'"'.join(parts)
+        if source.once_in(3):  # an element once more, or somewhere else
+            lines = text.splitlines(keepends=True)
+            lines.insert(source.random.randrange(len(lines)), source.of(lines))
+            return b"".join(lines)
+        return mutated_bytes(text, source)
+
+    return make
+
+
+def odd_array(right: np.ndarray, source: Source) -> np.ndarray:
+    """The array in another type, shape or with other numbers."""
+    kinds: list[Callable[[], Any]] = [
+        lambda: right.astype(source.of(("f2", "f4", "i1", "u8", "c16", "?", "S3", "U4", "U0", "S0", "M8[s]", ">f8"))),
+        lambda: right[: source.random.randrange(4)],
+        lambda: right.T,
+        lambda: right[..., None],
+        lambda: np.array(source.of([*NUMBERS[:6], "", "x", b"", True])),
+        lambda: np.array([], dtype=source.of(("f8", "U1", "S1", "c8"))),
+        lambda: np.array([("a", 1.0)] * 3, dtype=[("name", "U4"), ("x", "f8")]),
+        lambda: np.zeros(source.of(((0, 3), (3, 0), (40, 0), (1, 1, 1), (40, 3, 0)))),
+        lambda: np.where(source.array.random(right.shape) < 0.05, float(source.of(NUMBERS[:9])), right),
+        lambda: np.array([[1, "a"], [None, 2]], dtype=object),
+        lambda: right,
+    ]
+    try:
+        return np.asarray(source.of(kinds)())
+    except (ValueError, TypeError, OverflowError):
+        return right
+
+
+def npz_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
+    arrays = dict(bench.arrays)
+    for _ in range(source.random.choice((0, 1, 2))):
+        arrays[source.of((*arrays, "", "x/y", "../up", "a" * 300))] = odd_array(arrays[source.of(arrays)], source)
+    memory = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with zipfile.ZipFile(memory, "w", source.of((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
+            for name, array in arrays.items():
+                entry = io.BytesIO()
+                np.lib.format.write_array(entry, array, allow_pickle=True)
+                data = entry.getvalue()
+                if source.once_in(8):
+                    size = source.of((10**3, 10**6, 10**10, 10**15, -1))
+                    data = data.replace(b"(40,", f"({size},".encode(), 1)
+                if source.once_in(10):
+                    data = mutated_bytes(data, source)
+                if source.once_in(20):
+                    data = bench.planted()
+                archive.writestr(name + (".npy" if not name or source.random.random() < 0.8 else ""), data)
+    data = memory.getvalue()
+    return mutated_bytes(data, source) if source.once_in(3) else data
+
+
+def csv_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
+    mark = source.of(",;\t |")
+    names = list(bench.columns)
+    rows = np.stack(list(bench.columns.values()), axis=1)[: source.of((0, 1, 3, 40))]
+    lines = [mark.join(names), *(mark.join(map(repr, map(float, row))) for row in rows)]
+    for _ in range(source.random.choice((0, 1, 3))):
+        at = source.random.randrange(len(lines))
+        cells = lines[at].split(mark)
+        cells[source.random.randrange(len(cells))] = str(source.of([*NUMBERS, *WORDS, "", '"', "a" * 5000]))
+        lines[at] = mark.join(cells[: source.of((len(cells), len(cells), 1))])
+    text = source.of(("\n", "\r\n", "\r")).join(lines)
+    data = text.encode(source.of(("utf-8", "utf-8", "utf-8-sig", "utf-16", "latin-1")), "replace")
+    return mutated_bytes(data, source) if source.once_in(3) else data
+
+
+def parquet_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    columns: dict[str, Any] = {name: pa.array(x) for name, x in bench.columns.items()}
+    count = 40
+    for _ in range(source.random.choice((0, 1, 2))):
+        odd: list[Callable[[], Any]] = [
+            lambda: pa.array([None] * count),
+            lambda: pa.array(["x"] * count),
+            lambda: pa.array([[1.0] * source.random.randrange(3) for _ in range(count)]),
+            lambda: pa.array([{"a": 1}] * count),
+            lambda: pa.array([2**62] * count, pa.timestamp("ns")),
+            lambda: pa.array([b""] * count),
+            lambda: pa.array(["a"] * count).dictionary_encode(),
+            lambda: pa.array([1] * count, pa.decimal128(38, 5)),
+        ]
+        columns[source.of((*columns, "", "x" * 300))] = source.of(odd)()
+    memory = io.BytesIO()
+    parquet.write_table(pa.table(columns), memory, compression=source.of(("snappy", "gzip", "none")))
+    data = memory.getvalue()
+    return mutated_bytes(data, source) if source.once_in(2) else data
+
+
+def argv_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
+    words = [source.of(("diagnose", "identify", "calibrate", "demo", "", "x")), source.of(("task.yaml", "", ".", "\1"))]
+    for _ in range(source.random.randrange(5)):
+        option = source.of(
+            ("--out", "--json", "--quiet", "--backend", "--level", "--no-priors", "--no-cache", "--help")
+        )
+        words.append(option)
+        if option in ("--out", "--backend", "--level"):
+            path = source.of(
+                (".", "", "..", "out", "out/../out", "n" * 300, "o/" * 200, "task.yaml", "task.yaml/x", "/")
+            )
+            words.append(source.of((path, path, source.of(WORDS))))
+    return json.dumps(words).encode()
+
+
+def read_task(bench: Bench, file: Path) -> None:
+    """Everything that the commands read before they compute."""
+    from figaroh_jax.formats.config import load_task
+    from figaroh_jax.formats.robotfile import load_robot, stated_baseline
+    from figaroh_jax.recordings.dataset import read_recordings
+    from figaroh_jax.recordings.poses import read_pose_recordings
+    from figaroh_jax.reporting.run_directory import check_directory, task_inputs
+
+    task = load_task(file)
+    check_directory(bench.folder / "out", task_inputs(file))
+    robot = load_robot(task)
+    stated_baseline(task)
+    if any(entry.measurement is not None for entry in task.data):
+        read_pose_recordings(task, robot)
+    else:
+        from figaroh_jax.recordings.signals import choose_rates, prepare
+
+        recordings = read_recordings(task, robot)
+        rates = choose_rates(recordings, task.preprocess)
+        for recording in recordings:
+            prepare(recording, task.preprocess, rates)
+
+
+def read_robot_file(bench: Bench, file: Path) -> None:
+    from figaroh_jax.formats.robotfile import load_extended
+
+    model = load_extended(file, root=None).model.robot
+    for leaf in ("placement", "axis", "inertia", "ratio", "offset", "gravity", "frame_placement"):
+        values = np.asarray(getattr(model, leaf))
+        assert (np.abs(values) <= 1e12).all(), f"{leaf} has {values.ravel()[np.argmax(np.abs(values))]}"
+
+
+def read_recording(bench: Bench, file: Path) -> None:
+    from figaroh_jax.recordings.tables import read_table
+
+    table = read_table(file, "data[0].file")
+    joints = ("shoulder", "elbow", "slide")
+    for read in (lambda: table.vector("t", "time"), lambda: table.matrix("q", joints, "position")):
+        with contextlib.suppress(ValueError):
+            read()
+    for source in ("tau", ["q1", "q2", "q3"]):
+        table.matrix(source, joints, "torque")
+
+
+def read_model(bench: Bench, file: Path) -> None:
+    from figaroh_jax.formats.export import load_model
+
+    shutil.copy(file, bench.folder / "model" / "effects.yaml")
+    load_model(bench.folder / "model")
+
+
+def run_command(bench: Bench, file: Path) -> None:
+    """A command line whose jobs read everything and then stop."""
+    from figaroh_jax import cli, runs
+
+    def job(task_file: Path, out: Path, progress: Any, backend: str, **options: Any) -> None:
+        runs._task_for(task_file, out)
+        read_task(bench, task_file)
+        raise runs.InputError("stop")
+
+    words = json.loads(file.read_bytes())
+    if words[0] == "demo" and len(words) > 1:
+        del words[1]
+    before = {name: entry._replace(run=job) for name, entry in runs.JOBS.items()}
+    original = dict(runs.JOBS)
+    runs.JOBS.update(before)
+    out, error = io.StringIO(), io.StringIO()
+    here = os.getcwd()
+    os.chdir(bench.folder)
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
+            status = cli.main(words)
+    finally:
+        os.chdir(here)
+        runs.JOBS.update(original)
+    assert status in (0, 2), f"status {status}: {error.getvalue()}"
+    assert "Traceback" not in error.getvalue() and "internal error" not in error.getvalue(), error.getvalue()
+
+
+KINDS: dict[str, tuple[str, int, Callable[..., bytes], Callable[[Bench, Path], None]]] = {
+    "task": ("task.yaml", 8, yaml_input, read_task),
+    "urdf": ("fuzzed.urdf", 6, text_input("robot.urdf"), read_robot_file),
+    "mjcf": ("fuzzed.xml", 5, text_input("robot.xml"), read_robot_file),
+    "npz": ("fuzzed.npz", 5, npz_input, read_recording),
+    "csv": ("fuzzed.csv", 5, csv_input, read_recording),
+    "parquet": ("fuzzed.parquet", 3, parquet_input, read_recording),
+    "effects": ("effects.yaml", 2, text_input("effects.yaml"), read_model),
+    "argv": ("argv.json", 2, argv_input, run_command),
+}
+
+
+class Late(BaseException):
+    """An input takes longer than it may."""
+
+
+@contextlib.contextmanager
+def limits() -> Iterator[None]:
+    """Ten seconds of the processor for what is inside, and a minute for what waits."""
+
+    def late(number: int, frame: Any) -> None:
+        raise Late
+
+    signal.signal(signal.SIGPROF, late)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    faulthandler.dump_traceback_later(6 * SECONDS, exit=True)  # a library that does not come back
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        faulthandler.cancel_dump_traceback_later()
+
+
+class Coverage:
+    """Lines of the package that inputs have reached."""
+
+    def __init__(self) -> None:
+        self.lines: set[tuple[str, int]] = set()
+
+    def __call__(self, frame: Any, event: str, argument: Any) -> Any:
+        return self._line if frame.f_code.co_filename.startswith(PACKAGE) else None
+
+    def _line(self, frame: Any, event: str, argument: Any) -> Any:
+        self.lines.add((frame.f_code.co_filename, frame.f_lineno))
+        return self._line
+
+
+def tried(bench: Bench, kind: str, data: bytes, coverage: Coverage | None) -> str | None:
+    """What is wrong with the answer to an input; None for a right one."""
+    from figaroh_jax.errors import InputError
+
+    name, _, _, read = KINDS[kind]
+    file = bench.folder / name
+    file.write_bytes(data)
+    begin = time.process_time()
+    found = None
+    try:
+        with limits(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            sys.settrace(coverage)
+            read(bench, file)
+        bench.accepted += 1
+    except InputError as error:
+        if len(str(error)) > 100_000:
+            found = "a message of more than 100 000 characters"
+    except Late:
+        found = f"more than {SECONDS} s\n{traceback.format_exc(limit=-8)}"
+    except BaseException:
+        found = traceback.format_exc(limit=-8)
+    finally:
+        sys.settrace(None)
+    if time.process_time() - begin > SECONDS:
+        found = found or f"{time.process_time() - begin:.0f} s"
+    if bench.canary.exists():
+        bench.canary.rmdir()
+        found = "planted code ran"
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    if peak > BYTES + bench.most:
+        bench.most = peak
+        found = found or f"{peak >> 20} MiB of memory"
+    return found
+
+
+def work(args: argparse.Namespace) -> int:
+    """One process: inputs until the count or the time is used up; a line of JSON for each finding and at the end."""
+    resource.setrlimit(resource.RLIMIT_AS, (12 << 30, 12 << 30))
+    folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
+    os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
+    bench = Bench(folder)
+    bench.most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    coverage, corpus, done = Coverage(), {kind: list[bytes]() for kind in KINDS}, Counter[str]()
+    kinds = [kind for kind, (_, weight, _, _) in KINDS.items() for _ in range(weight) if kind in args.kinds]
+    end = time.monotonic() + 60 * args.minutes
+    for number in range(args.count):
+        if time.monotonic() > end:
+            break
+        seed = args.seed + args.worker + number * args.workers
+        source = Source(seed)
+        kind = source.of(kinds)
+        data = KINDS[kind][2](bench, source, corpus[kind])
+        (args.keep / f"last-{args.worker}").write_bytes(kind.encode() + b"\n" + data)
+        before = len(coverage.lines)
+        found = tried(bench, kind, data, coverage if number % args.guide == 0 else None)
+        done[kind] += 1
+        if found:
+            (args.keep / f"{kind}-{seed}").write_bytes(kind.encode() + b"\n" + data)
+            print(json.dumps({"seed": seed, "kind": kind, "found": found}), flush=True)
+        elif len(coverage.lines) > before and len(data) < 100_000:
+            corpus[kind].append(data)
+        if not (folder / "robot.urdf").exists() or number % 500 == 0:
+            (folder / "task.yaml").write_bytes(bench.texts["task.yaml"])
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+    print(
+        json.dumps({"done": done, "accepted": bench.accepted, "lines": len(coverage.lines), "peak_MiB": peak}),
+        flush=True,
+    )
+    shutil.rmtree(folder, ignore_errors=True)
+    return 0
+
+
+def replay(folder: Path) -> int:
+    """Try the findings that a run has kept once more."""
+    bench = Bench(Path(tempfile.mkdtemp(prefix="fuzz-")))
+    bench.most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    wrong = 0
+    for file in sorted(folder.iterdir()):
+        kind, _, data = file.read_bytes().partition(b"\n")
+        found = tried(bench, kind.decode(), data, None)
+        wrong += found is not None
+        print(f"{file.name}: {'right' if found is None else found}")
+    return wrong > 0
+
+
+def main() -> int:
+    """Start the workers, collect what they find; status 1 where anything was found."""
+    parser = argparse.ArgumentParser(description="Malformed input for every reader and the command line.")
+    parser.add_argument("--count", type=int, default=10**9, help="inputs in all")
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--seed", type=int, default=int(time.time()) << 20)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=list(KINDS))
+    parser.add_argument("--guide", type=int, default=3, help="of so many inputs one is traced for its coverage")
+    parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()) / "fuzz-findings")
+    parser.add_argument("--replay", type=Path)
+    parser.add_argument("--worker", type=int, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.replay:
+        return replay(args.replay)
+    args.keep.mkdir(parents=True, exist_ok=True)
+    if args.worker is not None:
+        return work(args)
+    passed_on = [f"--{name}={getattr(args, name)}" for name in ("minutes", "seed", "workers", "guide", "keep")]
+    passed_on += [f"--count={-(-args.count // args.workers)}", "--kinds", *args.kinds]
+    command = [sys.executable, __file__, *passed_on]
+    started = [
+        subprocess.Popen([*command, f"--worker={k}"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for k in range(args.workers)
+    ]
+    findings, done = 0, Counter[str]()
+    for k, process in enumerate(started):
+        out, errors = process.communicate()
+        for line in map(json.loads, filter(None, out.splitlines())):
+            findings += "found" in line
+            done.update(line.get("done", {}))
+            print(f"{line['kind']} {line['seed']}: {line['found']}" if "found" in line else line)
+        if process.returncode:
+            findings += 1
+            print(
+                f"worker {k} ended with {process.returncode}; last input: {args.keep / f'last-{k}'}\n{errors[-3000:]}"
+            )
+    print(f"{sum(done.values())} inputs ({dict(done)}), {findings} findings; seed {args.seed}")
+    return findings > 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

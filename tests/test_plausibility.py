@@ -1,0 +1,61 @@
+"""Values of a result that no such robot has are said; right ones are not."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import numpy as np
+import pytest
+from tasks import URDF
+
+from figaroh_jax.effects.base import Effect, place
+from figaroh_jax.effects.catalogue import find
+from figaroh_jax.effects.extended import extend
+from figaroh_jax.effects.plausibility import implausible
+from figaroh_jax.formats.urdf import load_urdf
+from figaroh_jax.rigid.model import RobotModel
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
+    path = tmp_path_factory.mktemp("robot") / "robot.urdf"
+    path.write_text(URDF)
+    return load_urdf(path)
+
+
+def heavier(robot: RobotModel, link: int, factor: float) -> RobotModel:
+    inertia = np.array(robot.inertia)
+    inertia[link] *= factor
+    return eqx.tree_at(lambda r: r.inertia, robot, inertia)
+
+
+def test_a_mass_far_from_what_was_trusted_is_named_with_both_values(robot: RobotModel):
+    (note,) = implausible(robot, extend(heavier(robot, 1, 7.5)), trust=0.1)
+    assert "mass of fore is 15 kg, where 2 kg was trusted to 10 %" in note and "65 sigma" in note
+
+
+@pytest.mark.parametrize(("factor", "trust"), [(1.4, 0.02), (3.0, 1.0), (0.8, 0.1)])
+def test_a_mass_within_what_was_trusted_or_nearly_the_same_is_not(robot: RobotModel, factor: float, trust: float):
+    assert implausible(robot, extend(heavier(robot, 1, factor)), trust) == ()
+
+
+@pytest.mark.parametrize(
+    ("effect", "values", "said"),
+    [
+        ("coulomb_friction", {"friction": 60.0}, "coulomb_friction of elbow: friction 60 N m is above"),
+        ("coulomb_friction", {"friction": 6.0}, None),
+        ("viscous_friction", {"damping": 11.0}, "damping 11 at the speed limit, 55 N m"),
+        ("viscous_friction", {"damping": 2.0}, None),
+        ("torque_offset", {"offset": -70.0}, "70 N m is above the model's effort limit of 50"),
+    ],
+)
+def test_drives_beyond_the_effort_limit_are_named(robot: RobotModel, effect: str, values, said: str | None):
+    kind: type[Effect] = find(effect)
+    names = [name for name, parameter in kind.parameters().items() if parameter.linear]
+    placed = place(kind, robot, ["elbow"], **dict(zip(names, values.values(), strict=False)))
+    notes = implausible(robot, extend(robot, placed), 0.1)
+    assert notes == () if said is None else said.split(": ")[-1].split(" ", 1)[1] in notes[0]
+
+
+def test_a_payload_heavier_than_the_robot_is_named(robot: RobotModel):
+    placed = place(find("payload"), robot, ["rod"], mass=8.0)
+    assert any("more than the whole robot" in note for note in implausible(robot, extend(robot, placed), 0.1))
