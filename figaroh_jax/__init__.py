@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .calibration.calibration import calibrate as calibrate, calibrate_task as calibrate_task
-    from .diagnosis.diagnosis import diagnose as diagnose, diagnose_task as diagnose_task
     from .effects.base import Effect as Effect, Motion as Motion, amplitude as amplitude, place as place, shape as shape
     from .effects.catalogue import CATALOGUE as CATALOGUE, register as register
     from .effects.extended import ExtendedModel as ExtendedModel, extend as extend, predict as predict
@@ -53,6 +52,7 @@ if TYPE_CHECKING:
     from .rigid.normal_equations import normal_matrix as normal_matrix, triangular_factor as triangular_factor
     from .rigid.regressor import joint_torque_regressor as joint_torque_regressor, packed_regressor as packed_regressor
     from .simulators.registry import backend as backend
+    from .tasks import diagnose as diagnose, diagnose_task as diagnose_task
 
 __version__ = "0.1.0"
 
@@ -68,7 +68,7 @@ _MODULES = {
     "recordings.arrays": ("postures", "recording"),
     "recordings.devices": ("Device", "own_device"),
     "recordings.dataset": ("Recording", "read_recordings"),
-    "diagnosis.diagnosis": ("diagnose", "diagnose_task"),
+    "tasks": ("diagnose", "diagnose_task"),
     "rigid.dynamics": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
     "effects.base": ("Effect", "Motion", "amplitude", "place", "shape"),
     "effects.catalogue": ("CATALOGUE", "register"),
