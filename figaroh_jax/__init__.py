@@ -17,6 +17,12 @@ if TYPE_CHECKING:
     from .effects.extended import ExtendedModel as ExtendedModel, extend as extend, predict as predict
     from .effects.simulation import simulate as simulate
     from .errors import InputError as InputError
+    from .estimation import (
+        accelerators as accelerators,
+        least_squares as least_squares,
+        regression as regression,
+        states as states,
+    )
     from .fitting.blockwise import BlockLevenbergMarquardt as BlockLevenbergMarquardt
     from .fitting.data import (
         PoseData as PoseData,
@@ -32,7 +38,14 @@ if TYPE_CHECKING:
     from .formats.mjcf import load_mjcf as load_mjcf
     from .formats.robotfile import load_extended as load_extended, load_robot as load_robot
     from .formats.urdf import load_urdf as load_urdf
+    from .identification import (
+        acceleration_free as acceleration_free,
+        instruments as instruments,
+        payloads as payloads,
+        wrenches as wrenches,
+    )
     from .identification.identification import identify as identify, identify_task as identify_task
+    from .recordings import cleaning as cleaning, devices as devices
     from .recordings.arrays import postures as postures, recording as recording
     from .recordings.dataset import Recording as Recording, read_recordings as read_recordings
     from .recordings.devices import Device as Device, own_device as own_device
@@ -88,6 +101,19 @@ _MODULES = {
     "rigid.normal_equations": ("normal_matrix", "triangular_factor"),
     "formats.urdf": ("load_urdf",),
 }
+# Namespaces of what few need: modules by a short name.
+_SPACES = {
+    "acceleration_free": "identification.acceleration_free",
+    "accelerators": "estimation.accelerators",
+    "cleaning": "recordings.cleaning",
+    "devices": "recordings.devices",
+    "instruments": "identification.instruments",
+    "least_squares": "estimation.least_squares",
+    "payloads": "identification.payloads",
+    "regression": "estimation.regression",
+    "states": "estimation.states",
+    "wrenches": "identification.wrenches",
+}
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 
@@ -97,10 +123,12 @@ def __getattr__(name: str) -> Any:
         value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
         globals()[name] = value
         return value
+    if name in _SPACES:
+        return importlib.import_module(f"{__name__}.{_SPACES[name]}")
     if not name.startswith("_") and importlib.util.find_spec(f"{__name__}.{name}"):
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOME])
+    return sorted([*globals(), *_HOME, *_SPACES])
