@@ -6,6 +6,7 @@ rows of the data (`data`). Optimistix solves it, and differentiates it through t
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -302,7 +303,9 @@ def _limits(free: Free, bounds: Mapping[str, tuple[float, float]]) -> tuple[np.n
 def _bounded(problem: _Problem, lower: np.ndarray, upper: np.ndarray, max_steps: int) -> Fit:
     if traced(problem):
         raise InputError("a fit with bounds runs on the host, not under jit, grad or vmap; see `fit_linear`")
-    from jaxopt import ScipyBoundedMinimize
+    with warnings.catch_warnings():  # that jaxopt is no longer maintained is known, and said where it is required
+        warnings.simplefilter("ignore", DeprecationWarning)
+        from jaxopt import ScipyBoundedMinimize
 
     start = jnp.zeros(len(problem.free.names))
     scale = float(_cost(start, problem)) or 1.0
