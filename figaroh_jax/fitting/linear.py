@@ -145,7 +145,8 @@ def fit_linear(
     variance = jnp.einsum("ck,kl,cl->c", kept, jnp.linalg.inv(H), kept)
     values = kept @ z
     if limits is not None:
-        values = jnp.clip(values, *limits)  # on a limit exactly
+        nearest = jnp.where(values - limits[0] < limits[1] - values, *limits)
+        values = jnp.where(active, nearest, jnp.clip(values, *limits))  # on a limit exactly
     return LinearFit(values, jnp.sqrt(variance), jnp.sqrt(squares(z) / total), active, converged)
 
 
