@@ -8,7 +8,20 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["Candidate", "Cause", "Diagnosis", "Estimate", "Experiment", "Gain", "Name", "Trace", "Verdict"]
+__all__ = [
+    "Candidate",
+    "Cause",
+    "Diagnosis",
+    "Estimate",
+    "Experiment",
+    "Gain",
+    "Name",
+    "Nearest",
+    "Part",
+    "Rest",
+    "Trace",
+    "Verdict",
+]
 
 Verdict = Literal["nothing", "named", "named+rest", "unknown"]
 
@@ -50,7 +63,38 @@ class Cause:
     confidence: float
     gain: Gain
     ambiguous_with: tuple[Name, ...] = ()
+    found: int = 0  # place in the order of discovery, from 1
     note: str = ""  # e.g. what MJCF and URDF cannot express
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """A cause that was found and is not named: the share of its joints' held-out error that it takes, and why not."""
+
+    name: Name
+    share: float
+    why_not: str
+
+
+@dataclass(frozen=True)
+class Part:
+    """What a share of the power beyond the noise goes with, at a joint."""
+
+    kind: Literal["standstill", "position", "velocity", "load", "time", "frequency", "recording"]
+    at: tuple[str, ...]
+    share: float
+    band: tuple[float, float] | None = None  # Hz, of a frequency
+    file: str | None = None  # of a recording
+
+
+@dataclass(frozen=True)
+class Rest:
+    """What no cause explains: how large, what it goes with on held-out data, which causes came near."""
+
+    relative: Float[np.ndarray, " nv"]  # RMS beyond the noise over the RMS torque of each joint
+    parts: tuple[Part, ...] = ()
+    nearest: tuple[Nearest, ...] = ()
+    text: str = ""  # where it is more than noise, in words; empty where it is not
 
 
 @dataclass(frozen=True)
@@ -90,7 +134,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Verdict, causes in the order found, and everything the report needs to show why."""
+    """Verdict, causes by their gain, and everything the report needs to show why."""
 
     verdict: Verdict
     causes: tuple[Cause, ...]
@@ -106,7 +150,7 @@ class Diagnosis:
     traces: tuple[Trace, ...]
     baseline: Any  # extended.ExtendedModel: rigid body with friction, as fitted before anything was named
     model: Any  # extended.ExtendedModel with the causes put in
-    rest: str = ""  # description of a misfit that has no name: joint, power, strongest dependence
+    rest: Rest = field(default_factory=lambda: Rest(np.zeros(0)))
     notes: tuple[str, ...] = ()  # what was dropped or assumed while reading the data
     prismatic: tuple[bool, ...] = ()  # per joint; empty: every joint is revolute
 

@@ -27,9 +27,9 @@ def _strict(text: str) -> dict:
 
 def test_answer_has_the_shape_of_the_contract():
     found = _strict(answer.to_json(fake_diagnosis.named()))
-    assert list(found) == ["verdict", "causes", "p_value", "residual", "next_experiment", "notes"]
+    assert list(found) == ["verdict", "causes", "p_value", "residual", "rest", "next_experiment", "notes"]
     first, second = found["causes"]
-    assert list(first) == ["effect", "at", "parameters", "confidence", "gain", "ambiguous_with"]
+    assert list(first) == ["effect", "at", "parameters", "found", "confidence", "gain", "ambiguous_with"]
     assert (first["effect"], first["at"]) == ("coupled_transmission", ["joint_5", "joint_6"])
     assert first["parameters"]["friction"] == {"value": 1.957, "std": 0.034, "unit": "N m"}
     assert first["gain"] == {"holdout_before": 0.1392, "holdout_after": 0.0718, "unit": "relative RMS"}

@@ -16,7 +16,7 @@ import pytest
 
 from figaroh_jax.reporting import report
 from figaroh_jax.reporting.wording import error, interval, phrase, sentence
-from figaroh_jax.results import Diagnosis, Estimate, Gain, Name
+from figaroh_jax.results import Diagnosis, Estimate, Gain, Name, Nearest, Part, Rest
 
 LAPTOP, PHONE = (1280, 800), (390, 844)
 VARIANTS = {name: getattr(fake_diagnosis, name)() for name in ("named", "partly", "unknown", "nothing")}
@@ -235,6 +235,7 @@ def _hostile() -> Diagnosis:
     cause = replace(
         clean.causes[0], name=Name(HOSTILE, (HOSTILE,)), note=HOSTILE, ambiguous_with=(Name("x", (HOSTILE,)),)
     )
+    name, part = Name(HOSTILE, (HOSTILE,)), Part("recording", (HOSTILE,), 0.3, file=HOSTILE)
     traces = tuple(replace(trace, name=HOSTILE, shares={HOSTILE: trace.before}) for trace in clean.traces)
     return replace(
         clean,
@@ -242,7 +243,7 @@ def _hostile() -> Diagnosis:
         joints=joints,
         causes=(cause,),
         traces=traces,
-        rest=HOSTILE,
+        rest=Rest(np.full(6, 0.1), (part,), (Nearest(name, 0.2, HOSTILE),), HOSTILE),
         notes=(HOSTILE,),
         holdout_scheme=HOSTILE,
         candidates=(replace(clean.candidates[0], name=Name(HOSTILE, (HOSTILE,))),),

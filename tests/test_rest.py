@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from figaroh_jax.diagnosis.estimates import Fitted
 from figaroh_jax.diagnosis.joint import has_size
-from figaroh_jax.diagnosis.rest import Rest, verdict, wrong_law
+from figaroh_jax.diagnosis.naming import Standing, reason_against
+from figaroh_jax.diagnosis.rest import significance, verdict, wrong_law
 from figaroh_jax.effects.catalogue import find
 from figaroh_jax.results import Name
-
-NOISE, REST = Rest(False, 0.0, ""), Rest(True, 0.2, "")
 
 
 def sized(name: str, deviation: list[float], **values: float) -> bool:
@@ -46,9 +47,56 @@ def test_a_law_is_wrong_where_it_leaves_a_rest_at_its_own_place() -> None:
 
 
 def test_verdicts_follow_causes_and_rest() -> None:
-    assert verdict(False, NOISE, 1.0) == "nothing"
-    assert verdict(False, REST, 1.0) == "unknown"
-    assert verdict(True, NOISE, 1.0) == "named"
-    assert verdict(True, NOISE, 1.0, wrong=True) == "unknown"
-    assert verdict(True, REST, 1.0) == "unknown"  # four fifths explained
-    assert verdict(True, REST, 10.0) == "named+rest"
+    assert verdict(False, False) == "nothing"
+    assert verdict(False, True) == "unknown"
+    assert verdict(True, False) == "named"
+    assert verdict(True, True) == "named+rest"
+
+
+RIGHT = Standing(Name("torque_ripple", ("elbow",)), whole=False, physical=True, gain=0.4, t=4.0, share=0.1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({}, ""),
+        ({"gain": 0.2}, "held-out error"),
+        ({"t": 2.0}, "not sure"),
+        ({"share": 0.015}, "needed"),
+        ({"modulation": 0.5}, "vary"),
+        ({"modulation_held_out": 0.25}, "vary"),
+        ({"physical": False}, "physics forbids"),
+        ({"whole": True, "gain": 0.05}, ""),
+        ({"whole": True, "gain": 0.05, "beside_smooth": 0.0}, "smooth functions"),
+    ],
+)
+def test_beside_a_rest_a_cause_is_named_by_what_it_alone_explains(changes: dict[str, float], word: str) -> None:
+    reason = reason_against(replace(RIGHT, **changes), True, 0.01)
+    assert word in reason and bool(word) == bool(reason)
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"gain": 0.02, "t": 1.8}, ""),
+        ({"gain": 0.0}, "no better"),
+        ({"physical": False}, "physics"),
+        ({"share": 0.005}, "tolerance"),
+    ],
+)
+def test_without_a_rest_a_cause_need_only_be_there(changes: dict[str, float], word: str) -> None:
+    reason = reason_against(replace(RIGHT, **changes), False, 0.01)
+    assert word in reason and bool(word) == bool(reason)
+
+
+def test_a_rest_without_repeats_counts_where_smooth_functions_predict_it() -> None:
+    flexible, line = (0.001, Name("position", ("elbow",)), 50.0), (1.0, 0.0, 0)
+    now, joints = (0.2, 1.0, np.array([0.1, 0.3])), ("shoulder", "elbow")
+
+    def there(p_repeat: float = 1.0, predicted: bool = True, tolerable: bool = False) -> bool:
+        return significance((now[0], p_repeat, now[2]), 1.0, 0.5, flexible, line, joints, predicted, tolerable).there
+
+    assert there()
+    assert not there(predicted=False)
+    assert there(p_repeat=1e-4, predicted=False)  # power that repeats is no noise
+    assert not there(p_repeat=1e-4, tolerable=True)

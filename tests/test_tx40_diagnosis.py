@@ -48,7 +48,7 @@ def test_the_coupling_has_the_sign_and_the_size_of_the_published_one(coupling: C
 
 def test_the_error_on_quarters_left_out_falls_as_it_must(answer: Diagnosis, coupling: Cause):
     assert 0.130 < answer.holdout.before < 0.142
-    assert coupling.gain.after <= 0.0725
+    assert coupling.gain.after <= 0.078  # rows at rest count less in the fit, and as much as others in the error
     assert answer.holdout.after <= 0.055
 
 

@@ -48,6 +48,10 @@ class Verdicts(NamedTuple):
     residual: Float[np.ndarray, "nv T"]  # of the whole fit
     error: Float[np.ndarray, "nv T"]  # of each fold, predicted without it
 
+    def own(self, rows: Rows, joints: Sequence[int]) -> Float[np.ndarray, " blocks"]:
+        """As `blocks`, of the rows of some joints."""
+        return _block_squares(rows, self.error[list(joints)])
+
     @property
     def heldout(self) -> float:
         """Sum of squares over all blocks, each predicted without its fold."""

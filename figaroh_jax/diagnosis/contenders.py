@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
@@ -20,11 +21,10 @@ from .refit import Whitened, refit, refit_shift
 from .screening import Group, Screen
 from .state import extended_state, solved
 from .step import Step, stand
+from .thresholds import BEST_OF_A_PLACE, GAIN, SHARE_OF_BEST, SHIFTS, SHORTLIST
 
-__all__ = ["Contender", "contend", "for_refit", "shortlist"]
+__all__ = ["Contender", "acting", "contend", "for_refit", "shortlist"]
 
-SHORTLIST, SHARE = 8, 0.35  # candidates compared exactly; share of the best rank that they need
-SHIFTS = 2  # candidates of a position sensor tried at a step: each is a fit of its own
 TURNS, RESPONSE_TURNS = 3, 6  # of Gauss-Newton on a shift of the position; on a response of the torque
 STARTS = 4  # of a refit
 
@@ -36,17 +36,41 @@ class Contender:
     name: Name
     effect: Effect
     verdicts: Verdicts
+    joints: tuple[int, ...]  # by whose rows it is judged
 
 
-def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray]]:
-    """The best groups, each with its grid points in the order of their scores."""
+def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray, float]]:
+    """The best groups of the robot and of each place, each with its grid points by their scores, and the best score.
+
+    One joint with a large misfit would fill a list of the best alone, and nothing else would be tried.
+    """
     ranked = found.best(step.rows)
     shifts = [r for r in ranked if kind(found.groups[r[1]].effect) == "position"]
     ranked = [r for r in ranked if r not in shifts[SHIFTS:]]
-    chosen = [r for r in ranked[:SHORTLIST] if r[0] > SHARE * ranked[0][0]] or ranked[:1]
+    chosen = [r for r in ranked[:SHORTLIST] if r[0] > SHARE_OF_BEST * ranked[0][0]] or ranked[:1]
+    chosen += [r for r in _best_of_places(step, found, ranked) if r not in chosen]
     simpler = {Name(n, found.groups[g].name.at) for _, g, _ in chosen for n in type(found.groups[g].effect).contains}
     chosen += [r for r in ranked if found.groups[r[1]].name in simpler and r not in chosen]
-    return [(found.groups[g], np.argsort(-found.scores[g].Q)) for _, g, _ in chosen]
+    return [(found.groups[g], np.argsort(-found.scores[g].Q), float(found.scores[g].Q[p])) for _, g, p in chosen]
+
+
+def _best_of_places(step: Step, found: Screen, ranked: list[tuple[float, int, int]]) -> list[tuple[float, int, int]]:
+    """The best of each joint, pair, link and of the robot whose score could pass for a gain there."""
+    squares, places = (step.verdicts.error**2).sum(1), {}
+    for rank, group, point in ranked:
+        one = found.groups[group]
+        least = 0.5 * GAIN * squares[list(acting(one.effect, len(squares), one.columns.joints))].sum()
+        if rank > 0 and found.scores[group].Q[point] > least:
+            places.setdefault(one.name.at, []).append((rank, group, point))
+    best = (own[:BEST_OF_A_PLACE] for own in places.values())
+    return [r for own in best for r in own if r[0] > SHARE_OF_BEST * own[0][0]]
+
+
+def acting(effect: Effect, nv: int, touched: Sequence[int]) -> tuple[int, ...]:
+    """The joints by whose rows an effect is judged: those where it acts, or all that it touches."""
+    if effect.acts_on in ("joint", "pair"):
+        return tuple(int(k) for k in np.asarray(effect.at).reshape(-1, np.shape(effect.at)[-1])[0])
+    return tuple(touched) if len(touched) else tuple(range(nv))
 
 
 def contend(
@@ -72,7 +96,7 @@ def contend(
         verdicts = judge_grown(step.rows, base, group.columns.joints, Z)
         names = [n for n, p in effect.parameters().items() if p.linear]
         effect = with_shape(effect, names, list(verdicts.theta[-len(names) :]))
-    return Contender(group.name, effect, verdicts)
+    return Contender(group.name, effect, verdicts, acting(effect, len(step.rows.y), group.columns.joints))
 
 
 def _exact_columns(
@@ -144,4 +168,4 @@ def _sensor_contender(
         elif done:
             break
     here = stand(problem, extended_state(problem, base, effect), whitening)
-    return Contender(group.name, effect, here.verdicts)
+    return Contender(group.name, effect, here.verdicts, acting(effect, len(step.rows.y), group.columns.joints))

@@ -25,31 +25,32 @@ from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Signals, prepare_all
 from ..recordings.stacked import stack
-from ..results import Cause, Diagnosis, Gain, Verdict
+from ..results import Cause, Diagnosis, Gain, Name, Nearest, Rest, Verdict
 from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
 from ..simulators.native import as_backend
 from ..simulators.registry import backend as make_backend
-from .estimates import Fitted, estimates, fitted_model
+from .estimates import estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .holdout import held_out, residual_rms, traces
+from .holdout import held_out, held_squares, part_error, residual_rms, traces
 from .joint import Joint, polished, sized
-from .layout import describe_folds, held_rows, layout
+from .layout import checked_repeats, describe_folds, held_rows, layout
+from .naming import reason_against, standings
 from .problem import Problem
-from .rest import excess, lines, rest_of, verdict, wrong_law
+from .rest import Significance, excess, lines, parts_of, predictable, relative_rest, significance, verdict, wrong_law
 from .search import Found, Search, eliminate, find_causes
-from .state import State, baseline
-from .step import Step, stand
+from .state import State, baseline, with_width
+from .step import stand
+from .thresholds import CERTAIN, FEW_CAUSES, NO_REST, WEIGHT_ROUNDS
+from .weights import weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess, Task
 
 __all__ = ["diagnose", "diagnose_task"]
-
-CERTAIN = 0.2  # of alpha: what a name needs, for p is not uniform under coloured noise
 
 
 def diagnose_task(
@@ -63,6 +64,7 @@ def diagnose_task(
     recordings = read_recordings(task, model)
     notes = (*notes, *check_recordings(task, model, recordings))
     options = {"trust": task.robot.trust, "forbid": task.diagnose.forbid, "alpha": task.diagnose.alpha}
+    options["tolerance"] = task.diagnose.tolerance.torque
     robot = make_backend(backend, model)
     found = diagnose(robot, recordings, task.preprocess, known, progress=progress, **options)
     return replace(found, notes=(*notes, *implausible(model, found.model, task.robot.trust), *found.notes))
@@ -77,6 +79,7 @@ def diagnose(
     trust: float = 0.10,
     forbid: Sequence[str] = (),
     alpha: float = 0.05,
+    tolerance: float = 0.01,
     progress: Callable[[str, float], None] = lambda phase, share: None,
     seed: int = 0,
 ) -> Diagnosis:
@@ -84,20 +87,23 @@ def diagnose(
 
     `model` is the robot, or a backend of it, which then computes its rigid body's torques and regressor. `trust` is how
     far the nominal inertials are believed (relative one-sigma), `known` what the baseline contains,
-    `forbid` names effects left out of the catalogue, `alpha` is the level of the test for the whole catalogue.
+    `forbid` names effects left out of the catalogue, `alpha` is the level of the test for the whole catalogue, and
+    `tolerance` is the share of each joint's RMS torque below which a misfit is good enough to be `nothing`.
     """
     with jax.enable_x64(True):
         progress("preparing signals", 0.03)
-        signals = sorted(prepare_all(tuple(recordings), preprocess), key=lambda s: s.role == "holdout")
+        signals = checked_repeats(prepare_all(tuple(recordings), preprocess))
+        signals.sort(key=lambda s: s.role == "holdout")
         here = _setting(as_backend(model), signals, known, trust, forbid, progress)
         generator = np.random.default_rng(seed)
-        search = find_causes(*here, forbid, CERTAIN * alpha, progress, generator)
+        search = find_causes(*here[:4], forbid, CERTAIN * alpha, progress, generator)
         here = here._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
-        first = stand(here.problem, here.start, here.whitening)
-        told = _judged(here, first, search, *_fitted_together(here, search.found, forbid), generator)
+        found, joint = _fitted_together(here, search.found, forbid)
+        names = [s.name for s in signals]
+        judged = _judged(here, search, found, joint, names, tolerance, generator)
         progress("measuring the gain", 0.9)
-        return _answer(here, signals, first, search, told)
+        return _answer(here, signals, search, judged)
 
 
 class _Setting(NamedTuple):
@@ -107,15 +113,17 @@ class _Setting(NamedTuple):
     start: State
     spectrum: Spectrum
     whitening: Float[np.ndarray, "F nv"]
+    white: bool  # whether the rows are weighted by their joint's residual, not by the noise's spectrum
 
 
-class _Told(NamedTuple):
+class _Judged(NamedTuple):
     """What the diagnosis stands by."""
 
     word: Verdict
     found: list[Found]
     joint: Joint  # all of them in one fit
-    rest: str
+    rest: Rest
+    here: _Setting  # with the weights of the answer's fit
 
 
 def _setting(
@@ -128,7 +136,7 @@ def _setting(
 ) -> _Setting:
     """The recordings on one clock, the baseline, and the noise; holdout recordings stand behind the others."""
     model = backend.robot
-    records = stack(signals, model)
+    records = without_reversals(stack(signals, model))
     held = held_rows(signals, records)
     problem = Problem(backend, records, layout(signals, records), trust, np.zeros(model.nv), held)
     names, given = _baseline_effects(model, known)
@@ -136,7 +144,15 @@ def _setting(
     progress("estimating the noise", 0.08)
     spectrum, whitening = noise_floor(problem, start, forbid)
     problem = friction_width(problem, start, whitening)
-    return _Setting(problem, baseline(problem, names, given), spectrum, whitening)
+    start = with_width(problem, start)
+    for _ in range(WEIGHT_ROUNDS):
+        weighted = weighted_by_speed(problem, start, whitening)
+        if weighted is problem:
+            break
+        problem = weighted
+        spectrum, whitening = noise_floor(problem, start, forbid)
+    whitening, white = white_where_better(problem, start, whitening)
+    return _Setting(problem, start, spectrum, whitening, white)
 
 
 def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) -> tuple[list[Found], Joint]:
@@ -150,31 +166,120 @@ def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) 
 
 
 def _judged(
-    here: _Setting, first: Step, search: Search, found: list[Found], joint: Joint, generator: np.random.Generator
-) -> _Told:
-    """The verdict by what is left; causes beside which too much is left are none."""
-    problem, _, spectrum, whitening = here
+    here: _Setting,
+    search: Search,
+    found: list[Found],
+    joint: Joint,
+    names: Sequence[str],
+    tolerance: float,
+    generator: np.random.Generator,
+) -> _Judged:
+    """The verdict by what is left beside all causes; of these, the ones that stand beside it are named.
+
+    What is not named is no part of the answer's model: the others are fitted anew without it.
+    """
+    problem, whitening = here.problem, here.whitening
+    left, beyond, line = _left(here, search, found, joint, tolerance, generator)
+    each = standings(problem, here.start, found, joint, whitening)
+    strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
+    against = {f.name: reason_against(one, strict, tolerance) for f, one in zip(found, each, strict=True)}
+    named = [f for f in found if not against[f.name]]
+    here, joint = _as_predicts_best(here, named)
+    named, joint, worse = _without_losses(here, named, joint)
+    problem, whitening = here.problem, here.whitening
+    against |= dict.fromkeys(worse, "the error on the data held out does not fall with it")
+    nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
+    noise = noise_rms(problem, here.spectrum)
+    relative = relative_rest(problem, joint.step.state, noise)
+    rest = left.there or (bool(nearest) and float(relative.max()) > tolerance)
+    text = left.text or (f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else "")
+    parts = parts_of(problem, joint.step, whitening, line, names)
+    nearest = tuple(sorted(nearest, key=lambda one: -one.share))
+    return _Judged(verdict(bool(named), rest), named, joint, Rest(relative, parts, nearest, text), here)
+
+
+def _as_predicts_best(here: _Setting, named: list[Found]) -> tuple[_Setting, Joint]:
+    """The named causes in one fit, its rows weighted by speed or all alike, by the error in N m on parts left out.
+
+    Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows.
+    """
+    best = None
+    for weight in (np.asarray(here.problem.records.weight), np.asarray(here.problem.records.judged)):
+        one = here._replace(problem=here.problem.weighted(weight))
+        joint = polished(one.problem, one.start, [f.effect for f in named], one.whitening)
+        error = part_error(one.problem, joint.step)
+        best = (error, one, joint) if best is None or error < best[0] else best
+        if (weight == np.asarray(here.problem.records.judged)).all():
+            break
+    assert best is not None
+    return best[1:]
+
+
+def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> tuple[list[Found], Joint, list[Name]]:
+    """The causes without those that do not lower the error on the data held out, and the names of these.
+
+    Each must lower the error of the joints where it acts, and all together that of the robot: a joint of large torque
+    hides what happens at the others.
+    """
+    worse: list[Name] = []
+    while named:
+        squares, _ = held_squares(here.problem, here.start, joint.causes, here.whitening)
+        falls, places = [a - b for a, b in pairwise(squares)], [list(f.joints) for f in named]
+        whole = [fall.sum() for fall in falls]
+        own = [f[at].sum() / a[at].sum() for at, f, a in zip(places, falls, squares, strict=False)]
+        if min(own) > 0 and sum(whole) >= 0:
+            break
+        least = int(np.argmin(own if min(own) <= 0 else whole))
+        worse.append(named[least].name)
+        named = [f for k, f in enumerate(named) if k != least]
+        joint = polished(here.problem, here.start, [f.effect for f in named], here.whitening)
+    return named, joint, worse
+
+
+def _left(
+    here: _Setting,
+    search: Search,
+    found: list[Found],
+    joint: Joint,
+    tolerance: float,
+    generator: np.random.Generator,
+) -> tuple[Significance, float, tuple[float, float, int]]:
+    """Whether all causes together leave more than noise, its excess over the noise, and the strongest line in it."""
+    problem, start, spectrum, whitening, _ = here
+    first = stand(problem, start, whitening)
     before, *_ = excess(problem, first.rows, first.linear.residual, spectrum, whitening)
     now = excess(problem, joint.step.rows, joint.step.linear.residual, spectrum, whitening)
     flexible = flexible_p(problem, joint.step.state, joint.step.rows, spectrum, whitening, generator)
     line = lines(problem, joint.step.linear.residual)
-    rest = rest_of(now, max(before, 0.0), search.p_left, flexible, line, problem.model.joint_names)
+    size = float(relative_rest(problem, joint.step.state, noise_rms(problem, spectrum)).max())
+    predicted = predictable(problem, joint.step, whitening)
+    joints, tolerable = problem.model.joint_names, size <= tolerance
+    left = significance(now, max(before, 0.0), search.p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
-    word = verdict(bool(found), rest, max(before, 0.0), wrong)
-    if word != "unknown" or not found:
-        return _Told(word, found, joint, rest.text)
-    proxy = ", ".join(str(f.name) for f in found)
-    text = f"{rest.text}; closest effect, not named as a cause: {proxy}"
-    return _Told(word, [], Joint(first, [], Fitted(np.zeros(0), np.zeros((0, 0)), ())), text)
+    return left._replace(there=left.there or (wrong and not tolerable)), now[0], line
 
 
-def _answer(here: _Setting, signals: Sequence[Signals], first: Step, search: Search, told: _Told) -> Diagnosis:
-    problem, model, last = here.problem, here.problem.model, told.joint.step
-    gains = held_out(problem, here.start, told.joint.causes, here.whitening)
+def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:
+    here, seen = judged.here, stand(searched.problem, searched.start, searched.whitening)
+    problem, model, last = here.problem, here.problem.model, judged.joint.step
+    first = stand(problem, here.start, here.whitening)
+    order, gains = _by_gain(here, judged)
+    found, joint = [judged.found[k] for k in order], judged.joint
+    causes = [joint.causes[k] for k in order]
     noise = noise_rms(problem, here.spectrum)
     return Diagnosis(
-        verdict=told.word,
-        causes=_causes(told, gains, model),
+        verdict=judged.word,
+        causes=tuple(
+            Cause(
+                one.name,
+                estimates(effect, joint.fitted, joint.fitted.places[k], model),
+                one.confidence,
+                Gain(*gain),
+                one.ambiguous,
+                k + 1,
+            )
+            for k, one, effect, gain in zip(order, found, causes, pairwise(gains), strict=True)
+        ),
         p_value=search.p_value,
         joints=model.joint_names,
         before=residual_rms(problem, first.state),
@@ -182,24 +287,26 @@ def _answer(here: _Setting, signals: Sequence[Signals], first: Step, search: Sea
         noise=noise,
         holdout=Gain(gains[0], gains[-1]),
         holdout_scheme=_scheme(signals),
-        experiment=next_experiment(told.word, told.found, problem, here.start, told.joint.causes, here.whitening),
-        candidates=explain(first.rows, first.linear, search.screened, noise),
-        traces=traces(problem, signals, first.state, last.state, told.joint.causes, told.found),
+        experiment=next_experiment(judged.word, found, problem, here.start, causes, here.whitening),
+        candidates=explain(seen.rows, seen.linear, search.screened, noise),
+        traces=traces(problem, signals, first.state, last.state, joint.causes, judged.found),
         baseline=fitted_model(problem, first.state, []),
-        model=fitted_model(problem, last.state, told.joint.causes),
-        rest=told.rest,
-        notes=_notes(signals, problem),
+        model=fitted_model(problem, last.state, joint.causes),
+        rest=judged.rest,
+        notes=_notes(signals, here),
         prismatic=prismatic(model),
     )
 
 
-def _causes(told: _Told, gains: Sequence[float], model: RobotModel) -> tuple[Cause, ...]:
-    fitted = told.joint.fitted
-    each = zip(told.found, told.joint.causes, fitted.places, pairwise(gains), strict=True)
-    return tuple(
-        Cause(one.name, estimates(effect, fitted, at, model), one.confidence, Gain(*gain), one.ambiguous)
-        for one, effect, at, gain in each
-    )
+def _by_gain(here: _Setting, judged: _Judged) -> tuple[list[int], list[float]]:
+    """The causes in the order of what each gains on held-out data as it comes in; the error before and after each."""
+    causes, order = judged.joint.causes, list(range(len(judged.found)))
+    gains = held_out(here.problem, here.start, causes, here.whitening)
+    drops = [before - after for before, after in pairwise(gains)]
+    ranked = sorted(order, key=lambda k: -drops[k])
+    if ranked != order:
+        gains = held_out(here.problem, here.start, [causes[k] for k in ranked], here.whitening)
+    return ranked, gains
 
 
 def _baseline_effects(model: RobotModel, known: Baseline | None) -> tuple[list[str], list[Effect]]:
@@ -227,8 +334,13 @@ def _scheme(signals: Sequence[Signals]) -> str:
     return describe_folds(signals)
 
 
-def _notes(signals: Sequence[Signals], problem: Problem) -> tuple[str, ...]:
+def _notes(signals: Sequence[Signals], here: _Setting) -> tuple[str, ...]:
     notes = [note for s in signals for note in s.notes]
-    if not problem.layout.repeats:
+    if not here.problem.layout.repeats:
         notes.append("no recording repeats another: the noise is what a rich model leaves, less sure than repeats")
+    if here.white:
+        notes.append(
+            "the model errs by more than the noise: rows are weighted by what it leaves of each joint, which predicts"
+            " data that was not fitted better than weights by the spectrum of the noise"
+        )
     return tuple(notes)

@@ -178,7 +178,7 @@ def _imagined(problem: Problem, ideas: Sequence[_Idea]) -> Problem:
         carried=np.stack(ten) if np.any(ten) else None,
     )
     rows = np.zeros(n * count, int)
-    alone = Layout(np.zeros((0, n * count), int), np.ones((weight.shape[2], n * count)), rows, rows, False)
+    alone = Layout(np.zeros((0, n * count), int), np.ones((weight.shape[2], n * count)), rows, rows, rows, False)
     return replace(problem, records=changed, layout=alone, held=np.zeros_like(weight))
 
 
@@ -237,6 +237,7 @@ def _everywhere(problem: Problem, name: Name) -> Effect:
         return one
     grid = np.sort(np.asarray(getattr(one, names[0])))
     grid = np.sort(np.concatenate([grid, (grid[1:] + grid[:-1]) / 2]))
+    grid = grid[np.abs(grid) > TINY]  # between a grid's two signs lies no effect at all
     many = jax.tree.map(lambda x: np.repeat(x[:1], len(grid), axis=0), one)
     return with_shape(many, names, [grid])
 

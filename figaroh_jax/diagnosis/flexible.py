@@ -18,7 +18,7 @@ from .problem import Problem
 from .screening import Group, Null, family_p, screen
 from .state import FRICTION_PRECISION, State, whitened
 
-__all__ = ["families", "flexible_p", "friction_width"]
+__all__ = ["dependences", "families", "flexible_p", "friction_width", "smooth_functions"]
 
 DEGREES = 6
 WIDTHS = (0.0, 0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # rad/s or m/s
@@ -147,6 +147,30 @@ def _posture(motion: Motion) -> list[Float[np.ndarray, " nN"]]:
     """First and second degree in all positions: near to any torque that follows the posture alone."""
     x = [_unit(q) for q in np.asarray(motion.position).T]
     return [*x, *(x[i] * x[k] for i in range(len(x)) for k in range(i + 1))]
+
+
+def smooth_functions(motion: Motion) -> list[Float[np.ndarray, "k nN"]]:
+    """For each joint: smooth functions of its position, speed and load, and of its friction over position and speed."""
+    out, loads = [], np.asarray(motion.load)
+    for joint in range(loads.shape[1]):
+        own = _smooth(motion, joint)
+        speed, load = _unit(np.abs(np.asarray(motion.velocity)[:, joint])), _unit(loads[:, joint])
+        s = np.asarray(motion.direction)[:, joint]
+        more = [speed, 2 * speed**2 - 1, load, 2 * load**2 - 1, s * load, s * (2 * load**2 - 1), np.ones_like(s)]
+        out.append(np.stack([*own["position"], *own["friction"], *more]))
+    return out
+
+
+def dependences(motion: Motion, joint: int) -> dict[str, list[Float[np.ndarray, " nN"]]]:
+    """Smooth functions of what a rest of the joint may go with: position, velocity, load, time."""
+    own, load = _smooth(motion, joint), _unit(np.asarray(motion.load)[:, joint])
+    s, speed = np.asarray(motion.direction)[:, joint], _unit(np.abs(np.asarray(motion.velocity)[:, joint]))
+    return {
+        "position": own["position"],
+        "velocity": [*own["friction"][:4], speed, 2 * speed**2 - 1],
+        "load": [load, 2 * load**2 - 1, s * load, s * (2 * load**2 - 1)],
+        "time": own["time"],
+    }
 
 
 def _smooth(motion: Motion, joint: int) -> dict[str, list[Float[np.ndarray, " nN"]]]:

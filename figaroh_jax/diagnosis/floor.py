@@ -14,6 +14,7 @@ from .flexible import families
 from .problem import Problem
 from .screening import Group, catalogue, screen
 from .state import State, plain_rows, solved, whitened
+from .thresholds import LOWEST_FREQUENCY, LOWEST_RESOLVED
 
 __all__ = ["noise_floor", "noise_rms"]
 
@@ -97,6 +98,8 @@ def _from_rich_model(
     for _ in range(RICHNESS):
         found = screen(rows, fit(rows, prior), groups, found)
         scores = found.scores
+        if not scores:
+            break
         # families have many columns: only z weighs them fairly
         best = int(np.argmax([(result.z if long else result.Q).max() for result in scores]))
         blocks.append(_full(rows, groups[best], int(np.argmax(scores[best].Q))))
@@ -152,7 +155,8 @@ def _fit(problem: Problem, rows: Float[np.ndarray, "nv T"], taken: np.ndarray | 
     left = np.maximum(1 - share, 0.1)
     gain = np.interp(frequency, np.asarray(records.omega) / (2 * np.pi), problem.gain)
     degrees = np.full(len(frequency), max(1.0, weights / count)) * left.mean(1)
-    return noise.fit_spectrum(frequency, power / left, gain, degrees, rate / 2)
+    lowest = max(LOWEST_RESOLVED * rate / count, LOWEST_FREQUENCY)
+    return noise.fit_spectrum(frequency, power / left, gain, degrees, rate / 2, lowest)
 
 
 def _onto(wanted: np.ndarray, own: np.ndarray, values: np.ndarray) -> np.ndarray:

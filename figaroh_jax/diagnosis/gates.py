@@ -12,16 +12,16 @@ from .contenders import Contender
 from .problem import Problem
 from .screening import Screen
 from .step import Step
+from .thresholds import CLEARLY, CONFIDENT, GAIN, SAME, UNSURE
 
-__all__ = ["CONFIDENT", "GAIN", "ambiguous", "exists", "passes", "rivals", "simpler"]
-
-GAIN, CONFIDENT, UNSURE = 0.004, 1.64, 1.7
-SAME = 0.5  # overlap from which two causes explain the same misfit
-CLEARLY = 3.0  # t from which data tell effects apart that are the same while the joint moves
+__all__ = ["ambiguous", "exists", "gains", "passes", "physical_sign", "rivals", "simpler"]
 
 
 def exists(problem: Problem, effect: Effect) -> bool:
-    """Whether such an effect can exist and be seen: amplitudes in bounds, forces no larger than the joint's torque."""
+    """Whether the data can show such an effect: shapes inside their bounds, forces no larger than the joint's torque.
+
+    A wrong sign (`physical_sign`) does not count here: such an effect is no cause, but it may stand in the fit.
+    """
     position = np.asarray(problem.records.position)
     if not effect.shown_by(position.min((0, 1)), position.max((0, 1))):
         return False
@@ -36,19 +36,30 @@ def exists(problem: Problem, effect: Effect) -> bool:
     return max(forces) <= np.sqrt((problem.torque[..., int(effect.at[0])] ** 2).mean())
 
 
+def physical_sign(effect: Effect) -> bool:
+    """Whether no parameter has a sign that physics forbids: a rotor of negative inertia, a torque before its time."""
+    return all(float(getattr(effect, name)) >= p.lower for name, p in effect.parameters().items())
+
+
 def _within(parameter: Parameter, value: float) -> bool:
-    """Whether a parameter lies in its bounds; one that enters nonlinearly must not lean against them."""
+    """Whether a parameter lies in its bounds, whatever its sign; one that enters nonlinearly not against them."""
     if parameter.linear:
-        return parameter.lower <= value <= parameter.upper
+        # zero is a bound of the sign, any other one of the size
+        return (parameter.lower == 0 or parameter.lower <= value) and value <= parameter.upper
     margin = 1e-3 * abs(value)
     return parameter.choice or parameter.lower + margin < value < parameter.upper - margin
 
 
+def gains(step: Step, one: Contender) -> bool:
+    """Whether the cause predicts what it was not fitted to, at its joints and on the whole: by enough, and surely."""
+    before, after = (v.own(step.rows, one.joints) for v in (step.verdicts, one.verdicts))
+    gain, surely = 1 - after.sum() / before.sum(), t_value(before, after) > CONFIDENT
+    return bool(gain > GAIN and surely and one.verdicts.heldout < step.verdicts.heldout)
+
+
 def passes(step: Step, contenders: list[Contender], one: Contender) -> bool:
-    """Whether the cause predicts what it was not fitted to: by enough, surely, and in most of the folds."""
-    gain = 1 - one.verdicts.heldout / step.verdicts.heldout
-    surely = t_value(step.verdicts.blocks, one.verdicts.blocks) > CONFIDENT
-    return gain > GAIN and surely and _recurs(step, contenders, one)
+    """Whether the cause predicts what it was not fitted to, and in most of the folds."""
+    return gains(step, one) and _recurs(step, contenders, one)
 
 
 def _recurs(step: Step, contenders: list[Contender], one: Contender) -> bool:

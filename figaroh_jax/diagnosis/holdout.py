@@ -5,21 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..effects.base import Effect
 from ..recordings.signals import Signals
 from ..recordings.stacked import open_rows
 from ..results import Trace
+from .comparison import Hypothesis, judge
 from .design import kind, sensor_response
 from .estimates import amplitude_places
 from .problem import Problem
 from .search import Found
 from .shifts import torque_change
 from .state import State, batched, extended_state
-from .step import stand
+from .step import Step, stand
 
-__all__ = ["held_out", "predicted", "residual_rms", "traces"]
+__all__ = ["fold_error", "held_out", "held_squares", "part_error", "predicted", "residual_rms", "traces"]
 
 
 def held_out(problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> list[float]:
@@ -28,17 +29,27 @@ def held_out(problem: Problem, start: State, causes: list[Effect], whitening: Fl
     sqrt(sum e^2 / sum tau^2) over the holdout recordings with torque; without any, over the folds, each predicted by
     a fit to the others.
     """
+    squares, power = held_squares(problem, start, causes, whitening)
+    return [float(np.sqrt(own.sum() / power.sum())) for own in squares]
+
+
+def held_squares(
+    problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]
+) -> tuple[list[Float[np.ndarray, " nv"]], Float[np.ndarray, " nv"]]:
+    """Squares of each joint's error on data not fitted, as `held_out` takes them, and of its torque."""
     out, step = [], None
+    mask = problem.held if problem.held.any() else np.asarray(problem.records.judged)
     for effect in [None, *causes]:
         grown = start if step is None or effect is None else extended_state(problem, step.state, effect)
         step = stand(problem, grown, whitening, step)
-        state = step.state
+        state, part = step.state, problem.layout.part
         if problem.held.any():
-            error = (problem.torque - predicted(problem, state)) * problem.held
-            out.append(float(np.sqrt((error**2).sum() / ((problem.torque * problem.held) ** 2).sum())))
+            error = problem.torque - predicted(problem, state)
         else:
-            out.append(_fold_error(problem, state, step.verdicts.folds))
-    return out
+            parts = judge(step.rows._replace(fold=part), Hypothesis(step.rows.X, state.prior)).folds
+            error = _left_out(problem, state, parts, part)
+        out.append(((error * mask) ** 2).sum((0, 1)))
+    return out, ((problem.torque * mask) ** 2).sum((0, 1))
 
 
 def predicted(problem: Problem, state: State) -> Float[np.ndarray, "n M nv"]:
@@ -48,7 +59,7 @@ def predicted(problem: Problem, state: State) -> Float[np.ndarray, "n M nv"]:
 
 def residual_rms(problem: Problem, state: State) -> Float[np.ndarray, " nv"]:
     """RMS of what the state leaves of the fitted rows of each joint, N m or N."""
-    weight = np.asarray(problem.records.weight)
+    weight = np.asarray(problem.records.judged)
     squares = ((problem.torque - predicted(problem, state)) ** 2 * weight).sum((0, 1))
     return np.sqrt(squares / np.maximum(weight.sum((0, 1)), 1))
 
@@ -96,11 +107,27 @@ def _share(problem: Problem, state: State, effect: Effect, place: list[int]) -> 
     return open_rows(problem.records, state.torque(np.where(own, state.theta, 0.0)) - state.known, response)
 
 
-def _fold_error(problem: Problem, state: State, folds: Float[np.ndarray, "folds P"]) -> float:
-    weight = problem.records.weight
-    response, fold = state.response(problem.records.omega), problem.layout.fold.reshape(weight.shape[:2])
-    error = problem.torque * weight
-    power = (error**2).sum()
+def fold_error(
+    problem: Problem, state: State, folds: Float[np.ndarray, "folds P"], fold: Int[np.ndarray, " T"]
+) -> float:
+    """Relative RMS error (N m over N m, all joints) of each fold, predicted with the coefficients without it."""
+    judged = np.asarray(problem.records.judged)
+    error = _left_out(problem, state, folds, fold) * judged
+    return float(np.sqrt((error**2).sum() / ((problem.torque * judged) ** 2).sum()))
+
+
+def part_error(problem: Problem, step: Step) -> float:
+    """As `fold_error`, of the parts by which the gain is told where no recording is kept out."""
+    part = problem.layout.part
+    folds = judge(step.rows._replace(fold=part), Hypothesis(step.rows.X, step.state.prior)).folds
+    return fold_error(problem, step.state, folds, part)
+
+
+def _left_out(
+    problem: Problem, state: State, folds: Float[np.ndarray, "folds P"], fold: Int[np.ndarray, " T"]
+) -> Float[np.ndarray, "n M nv"]:
+    response, error = state.response(problem.records.omega), problem.torque
+    fold = fold.reshape(error.shape[:2])
     for k, theta in enumerate(folds):
-        error = error - open_rows(problem.records, state.torque(theta), response) * weight * (fold == k)[..., None]
-    return float(np.sqrt((error**2).sum() / power))
+        error = error - open_rows(problem.records, state.torque(theta), response) * (fold == k)[..., None]
+    return error

@@ -81,7 +81,25 @@ def joint_fit(
     step = inverse @ (tall.T @ residual.reshape(-1) + pull)
     values = [float(getattr(e, n)) for e in causes for n in shapes(type(e))]
     covariance = inverse @ (_scatter(rows, J, residual) + np.diag(precision)) @ inverse
+    covariance = _widened(covariance, inverse, rows, residual, J.shape[2])
     return Fitted(np.append(state.theta, values) + step, covariance, _places(problem, state, causes))
+
+
+def _widened(
+    covariance: Float[np.ndarray, "P P"],
+    inverse: Float[np.ndarray, "P P"],
+    rows: Rows,
+    residual: Float[np.ndarray, "nv T"],
+    count: int,
+) -> Float[np.ndarray, "P P"]:
+    """The covariance with no standard deviation below that of independent rows of the residual's size.
+
+    Scores of a few blocks, from a residual that the fit has made smaller, may miss by chance what they scatter by.
+    """
+    level = max(1.0, float((residual**2).sum()) / max(rows.size - count, rows.size / 2))
+    least = np.sqrt(level * np.maximum(np.diag(inverse), 0.0))
+    wider = np.maximum(least / np.maximum(np.sqrt(np.maximum(np.diag(covariance), 0.0)), 1e-300), 1.0)
+    return covariance * np.outer(wider, wider)
 
 
 def _scatter(rows: Rows, J: Float[np.ndarray, "nv T P"], residual: Float[np.ndarray, "nv T"]) -> np.ndarray:

@@ -3,30 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..recordings.signals import Signals, align
+from ..recordings.signals import Signals, align, common_rows
 from ..recordings.stacked import Records
 from .problem import Layout
+from .thresholds import SAME_MOTION
 
-__all__ = ["describe_folds", "held_rows", "layout"]
+__all__ = ["checked_repeats", "describe_folds", "held_rows", "layout"]
 
 BLOCK, SHORT_BLOCK, SHORT = 1.0, 0.3, 9.99  # s: of a block, of a block in recordings shorter than the third
+FOLDS, SLICE = 5, 2.0  # where the excitations are few: folds, and seconds that one takes in turn
 QUARTERS = 4
+SLICED, QUARTERED = True, False
 FEWEST_EXCITATIONS = 3
 
 
 def layout(signals: Sequence[Signals], records: Records) -> Layout:
-    """Partners of every row, blocks of about a second, folds of one excitation (or quarters where they are few).
+    """Partners of every row, blocks of about a second, folds of one excitation (or slices in turn where they are few).
 
     Holdout recordings stand behind the others and belong to no block and no fold.
     """
     n, _, count, _ = records.shape
     partner = _partners(signals, records)
     repeats = bool((partner >= 0).any())
-    weight = np.asarray(records.weight)
+    weight = records.fitted
     if repeats:
         target = np.maximum(partner, 0)
         flat = weight.reshape(n * count, -1)
@@ -34,7 +38,41 @@ def layout(signals: Sequence[Signals], records: Records) -> Layout:
         paired = (flat[target] * (partner >= 0)[..., None]).max(0).T
     else:
         partner, paired = partner[:0], np.ones((weight.shape[2], n * count))
-    return Layout(partner, paired, _blocks(signals, records), _folds(signals, records), repeats)
+    fold, part = _folds(signals, records, SLICED), _folds(signals, records, QUARTERED)
+    return Layout(partner, paired, _blocks(signals, records), fold, part, repeats)
+
+
+def checked_repeats(signals: Sequence[Signals]) -> list[Signals]:
+    """The recordings, each repeat with a note of how near it is; one that moves otherwise loses its label.
+
+    What two recordings of other motions differ by is no noise: without the label they are two excitations.
+    """
+    out, leaders = [], {}
+    for one in signals:
+        leader = leaders.setdefault(one.repeat, one) if one.repeat and one.role == "fit" else one
+        if leader is one:
+            out.append(one)
+            continue
+        apart, note = _compared(leader, one)
+        if apart > SAME_MOTION:
+            text = f"{one.name} does not repeat {leader.name}: {note}; taken as another excitation"
+            out.append(replace(one, repeat=None, notes=(*one.notes, text)))
+        else:
+            out.append(replace(one, notes=(*one.notes, f"{one.name} repeats {leader.name}: {note}")))
+    return out
+
+
+def _compared(first: Signals, second: Signals) -> tuple[float, str]:
+    """Difference of two repeats' positions over the joint's own range (standard deviations), and all of it in words."""
+    own, other = common_rows(first, second)
+    q, p = first.position[first.rows.index[own]], second.position[second.rows.index[other]]
+    apart, motion = (q - p).std(axis=0), q.std(axis=0)
+    late = 1e3 * float(np.mean(second.rows.row_times[other] - first.rows.row_times[own]))
+    text = f"its clock is {late:+.4g} ms off, positions within {apart.max():.2g} rad (or m)"
+    if first.torque is not None and second.torque is not None:
+        torque = first.torque[first.rows.index[own]] - second.torque[second.rows.index[other]]
+        text += f", torques within {torque.std(axis=0).max():.2g} N m (or N)"
+    return float((apart / np.maximum(motion, 1e-3 * max(float(motion.max()), 1e-12))).max()), text
 
 
 def held_rows(signals: Sequence[Signals], records: Records) -> Float[np.ndarray, "n M nv"]:
@@ -88,13 +126,23 @@ def _blocks(signals: Sequence[Signals], records: Records) -> Int[np.ndarray, " T
     return block.reshape(-1)
 
 
-def _folds(signals: Sequence[Signals], records: Records) -> Int[np.ndarray, " T"]:
+def _folds(signals: Sequence[Signals], records: Records, sliced: bool) -> Int[np.ndarray, " T"]:
+    """One excitation each; where they are few, `sliced` in turn, or quarters that follow one another.
+
+    A model that is fitted around a slice is asked to interpolate, one fitted beside a quarter to extrapolate: causes
+    are told apart better by the first, what they gain is told more honestly by the second.
+    """
     n, _, count, _ = records.shape
     fitted = [s for s in signals if s.role == "fit"]
     labels = excitations(fitted)
-    fold = np.full((n, count), -1)
+    enough = max(labels) + 1 >= FEWEST_EXCITATIONS
+    fold, first = np.full((n, count), -1), {}
     for k, one in enumerate(fitted):
-        quarter = np.minimum(np.arange(count) * QUARTERS // max(one.rows.kept, 1), QUARTERS - 1)
-        fold[k] = labels[k] if max(labels) + 1 >= FEWEST_EXCITATIONS else labels[k] * QUARTERS + quarter
+        late = align(fitted[first.setdefault(labels[k], k)], one) if one.repeat else 0
+        row = np.maximum(np.arange(count) - late, 0)  # repeats share their slices
+        slices = row / float(records.rate) // SLICE % FOLDS
+        quarter = labels[k] * QUARTERS + np.minimum(row * QUARTERS // max(one.rows.kept, 1), QUARTERS - 1)
+        fold[k] = labels[k] if enough else slices if sliced else quarter
         fold[k, one.rows.kept :] = -1
-    return fold.reshape(-1)
+    used = np.unique(fold[fold >= 0])
+    return np.where(fold < 0, -1, np.searchsorted(used, fold)).reshape(-1)

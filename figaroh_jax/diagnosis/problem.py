@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import equinox as eqx
@@ -19,6 +19,8 @@ from .shifts import links_torque, rigid_torque
 
 __all__ = ["Layout", "Problem", "family_of"]
 
+_OF_THE_MOTION = ("torque", "gain", "motion", "families", "fixed")  # cached, and the same for all weights of the rows
+
 
 class Layout(eqx.Module):
     """Which rows repeat, belong together or are left out together; T = recordings x rows."""
@@ -26,7 +28,8 @@ class Layout(eqx.Module):
     partner: Int[np.ndarray, "partners T"]
     paired: Float[np.ndarray, "nv T"]
     block: Int[np.ndarray, " T"]
-    fold: Int[np.ndarray, " T"]
+    fold: Int[np.ndarray, " T"]  # by which causes are chosen: excitations, or slices in turn where they are few
+    part: Int[np.ndarray, " T"]  # by which the gain is told: excitations, or quarters that follow one another
     repeats: bool = eqx.field(static=True)
 
 
@@ -48,6 +51,12 @@ class Problem:
     def model(self) -> RobotModel:
         """The robot."""
         return self.backend.robot
+
+    def weighted(self, weight: Float[np.ndarray, "n M nv"]) -> Problem:
+        """The problem with other weights of its rows; what the motion alone says is not computed anew."""
+        other = replace(self, records=eqx.tree_at(lambda r: r.weight, self.records, weight))
+        other.__dict__.update({k: v for k, v in self.__dict__.items() if k in _OF_THE_MOTION})
+        return other
 
     @cached_property
     def torque(self) -> Float[np.ndarray, "n M nv"]:

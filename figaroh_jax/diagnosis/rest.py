@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,27 +11,58 @@ from jaxtyping import Float
 from ..estimation import noise
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Rows
-from ..results import Name, Verdict
+from ..recordings.stacked import filter_rows
+from ..results import Name, Part, Verdict
+from .comparison import ground, judge_grown, t_value
+from .flexible import dependences, families
+from .holdout import residual_rms
 from .problem import Problem
 from .screening import draw_noise
+from .state import State
+from .step import Step
+from .thresholds import (
+    CONFIDENT,
+    FITTED,
+    FITTED_SHARE,
+    LEAST_BEYOND,
+    LEAST_SHARE,
+    LINE_P,
+    OWN_SHARE,
+    REPEATED,
+    REPEATED_SHARE,
+    REST_P,
+    STANDSTILL,
+    T_REST,
+    UNREPEATED,
+)
+from .weights import relative_speed
 
-__all__ = ["Rest", "excess", "lines", "rest_of", "verdict", "wrong_law"]
+__all__ = [
+    "Significance",
+    "excess",
+    "lines",
+    "parts_of",
+    "predictable",
+    "relative_rest",
+    "significance",
+    "verdict",
+    "wrong_law",
+]
 
-CERTAIN = 0.01
-LINE = 1e-3
-REPEATED, REPEATED_SHARE = 0.08, 0.05  # excess that repeats: absolute, and as a share of the first excess
-FITTED, FITTED_SHARE = 0.03, 0.03  # excess that a flexible model or the catalogue still scores on
-UNREPEATED = 0.01  # the same where no recording repeats another
-OWN_SHARE = 0.03  # of what a cause has removed: a rest at its own place that speaks against its law
-EXPLAINED = 0.9  # share that causes must remove before they are named beside a rest
 
+class Significance(NamedTuple):
+    """Whether what is left is more than noise, and where it is in words without a cause's name."""
 
-class Rest(NamedTuple):
-    """Significance and size of what is left: excess is power over the noise's, as a share of it."""
-
-    significant: bool
-    excess: float
+    there: bool
     text: str
+
+
+def relative_rest(problem: Problem, state: State, noise: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
+    """RMS of what the state leaves beyond the noise (N m or N), relative to the RMS torque of each joint."""
+    judged = np.asarray(problem.records.judged)
+    torque = np.sqrt(((problem.torque * judged) ** 2).sum((0, 1)) / np.maximum(judged.sum((0, 1)), 1))
+    left = np.sqrt(np.maximum(residual_rms(problem, state) ** 2 - noise**2, 0.0))
+    return left / np.maximum(torque, 1e-9 * max(float(torque.max()), 1e-300))
 
 
 def excess(
@@ -55,30 +87,121 @@ def excess(
     return float(products.sum() / share.sum()), float(ndtr(-z)), products.sum(1) / share
 
 
-def rest_of(
+def significance(
     now: tuple[float, float, Float[np.ndarray, " nv"]],
     first: float,
     p_catalogue: float,
     flexible: tuple[float, Name, float],
     line: tuple[float, float, int],
     joints: tuple[str, ...],
-) -> Rest:
-    """Whether the rest is significant, and a description without a cause's name."""
+    predicted: bool,
+    tolerable: bool,
+) -> Significance:
+    """Whether the rest is more than noise and more than what is `tolerable`.
+
+    Power that repeats is no noise. Where no recording repeats another the noise is an estimate, and what is left above
+    it counts only if smooth functions of the motion have `predicted` it on data that they were not fitted to.
+    """
     size, p_repeat, own = now
-    repeats = p_repeat < CERTAIN and size > max(REPEATED, REPEATED_SHARE * first)
-    # without repeats the noise was taken from a model that has fitted part of any misfit
-    least = FITTED if p_repeat < 1 else UNREPEATED
-    scored = min(flexible[0], p_catalogue) < CERTAIN and size > max(least, FITTED_SHARE * first)
-    vibrates = line[0] < LINE
-    worst = int(np.argmax(own))
-    text = ""
-    if repeats or scored:
+    repeated = p_repeat < 1
+    repeats = p_repeat < REST_P and size > max(REPEATED, REPEATED_SHARE * first)
+    p = min(flexible[0], p_catalogue) if repeated else flexible[0]
+    scored = p < REST_P and size > max(FITTED if repeated else UNREPEATED, FITTED_SHARE * first)
+    vibrates = line[0] < LINE_P
+    worst, text = int(np.argmax(own)), ""
+    there = bool((repeats or (scored and (repeated or predicted))) and not tolerable)
+    if there:
         text = f"mostly at {joints[worst]} ({own[worst]:.2g} times the noise power)"
-        if flexible[0] < CERTAIN:
+        if flexible[0] < REST_P:
             text += f"; strongest dependence: {flexible[1].effect} at {flexible[1].at[0]}"
     if vibrates:
         text += f"{'; ' if text else ''}a spectral line at {line[1]:.3g} Hz at {joints[line[2]]}"
-    return Rest(bool(repeats or scored or vibrates), size, text)
+    return Significance(there or vibrates, text)
+
+
+def predictable(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"]) -> bool:
+    """Whether smooth functions of the motion predict what is left at some joint on data they were not fitted to."""
+    base = ground(step.rows, step.verdicts, step.state.prior, step.folded)
+    for group in families(problem, step.state, whitening):
+        joints = group.columns.joints
+        own = judge_grown(step.rows, base, joints, group.columns.Z[0])
+        worse, better = (v.own(step.rows, joints) for v in (step.verdicts, own))
+        if better.sum() < worse.sum() and t_value(worse, better) > T_REST:
+            return True
+    return False
+
+
+def parts_of(
+    problem: Problem,
+    step: Step,
+    whitening: Float[np.ndarray, "F nv"],
+    line: tuple[float, float, int],
+    names: Sequence[str],
+) -> tuple[Part, ...]:
+    """What the power beyond the noise goes with at each joint, judged on held-out data; `names` are the recordings'.
+
+    Shares are of that power, by what each predicts alone: what goes with two things counts twice.
+    """
+    base = ground(step.rows, step.verdicts, step.state.prior, step.folded)
+    weight, speed = (
+        np.moveaxis(x, 2, 0).reshape(len(step.rows.y), -1)
+        for x in (np.asarray(problem.records.weight), relative_speed(problem))
+    )
+    out = []
+    for joint, at in enumerate(problem.model.joint_names):
+        used = weight[joint] > 0
+        beyond = (step.verdicts.error[joint][used] / weight[joint][used]) ** 2 - 1
+        total = float(beyond.sum())
+        if total <= LEAST_BEYOND * used.sum():
+            continue
+        shares = [(float(beyond[speed[joint][used] < STANDSTILL].sum()) / total, "standstill", None, None)]
+        for kind, columns in _dependences(problem, step.state, joint):
+            rows = _rows_at(problem, step.state, columns, whitening, joint)
+            grown = judge_grown(step.rows, base, (joint,), rows[:, None])
+            worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, grown))
+            if t_value(worse, better) > CONFIDENT:
+                file = _recording_of(worse - better, step, problem, names) if kind == "recording" else None
+                shares.append((float((worse - better).sum()) / total, kind, None, file))
+        if line[0] < LINE_P and line[2] == joint:
+            shares.append((_share_of_line(problem, step, line), "frequency", (0.9 * line[1], 1.1 * line[1]), None))
+        kept = sorted((s for s in shares if s[0] > LEAST_SHARE), reverse=True, key=lambda s: s[0])
+        out += [Part(kind, (at,), min(share, 1.0), band, file) for share, kind, band, file in kept]
+    return tuple(out)
+
+
+def _dependences(problem: Problem, state: State, joint: int) -> list[tuple[str, Float[np.ndarray, "k nN"]]]:
+    """Smooth functions of the joint's position, velocity, load and time, and a constant for each recording."""
+    n, samples, _, _ = problem.records.shape
+    kinds = [(kind, np.stack(columns)) for kind, columns in dependences(state.motion, joint).items()]
+    fitted = np.flatnonzero(problem.records.fitted.any((1, 2)))
+    if len(fitted) > 1:
+        kinds.append(("recording", np.repeat(np.eye(n)[fitted], samples, axis=1)))
+    return kinds
+
+
+def _rows_at(
+    problem: Problem, state: State, columns: Float[np.ndarray, "k nN"], whitening: np.ndarray, joint: int
+) -> Float[np.ndarray, "k T"]:
+    n, samples, _, _ = problem.records.shape
+    response = (whitening[:, joint] * state.response(problem.records.omega))[None]
+    rows = filter_rows(problem.records, columns.reshape(-1, n, samples), response)
+    return (rows * np.asarray(problem.records.weight)[:, :, joint]).reshape(len(columns), -1)
+
+
+def _recording_of(drop: Float[np.ndarray, " blocks"], step: Step, problem: Problem, names: Sequence[str]) -> str:
+    """The recording whose blocks a constant of its own helps most."""
+    block = step.rows.block.reshape(problem.records.shape[0], -1)
+    each = [drop[np.unique(own[own >= 0])].sum() if (own >= 0).any() else -np.inf for own in block]
+    return names[int(np.argmax(each))]
+
+
+def _share_of_line(problem: Problem, step: Step, line: tuple[float, float, int]) -> float:
+    n, _, count, _ = problem.records.shape
+    frequency, power = noise.periodogram(
+        step.verdicts.residual[line[2]].reshape(n, count).T, float(problem.records.rate)
+    )
+    near = np.abs(frequency / line[1] - 1) < 0.1
+    return float(power[near].sum() / max(power.sum(), 1e-300))
 
 
 def wrong_law(at: tuple[str, ...], drop: float, flexible: tuple[float, Name, float]) -> bool:
@@ -87,19 +210,14 @@ def wrong_law(at: tuple[str, ...], drop: float, flexible: tuple[float, Name, flo
     The right law leaves noise; one that only resembles it leaves a share of what it stands for.
     """
     p, (_, places), score = flexible
-    return p < CERTAIN and (not at or places[0] in at) and score > OWN_SHARE * drop
+    return p < REST_P and (not at or places[0] in at) and score > OWN_SHARE * drop
 
 
-def verdict(named: bool, rest: Rest, first: float, wrong: bool = False) -> Verdict:
-    """The contract's four words from the causes and the rest; `wrong`: the first cause leaves a rest of its own."""
-    if not named:
-        return "unknown" if rest.significant else "nothing"
-    if wrong:
-        return "unknown"
-    if not rest.significant:
-        return "named"
-    share = 1 - max(rest.excess, 0.0) / first if first > 0.02 else 0.0
-    return "named+rest" if share > EXPLAINED else "unknown"
+def verdict(named: bool, rest: bool) -> Verdict:
+    """The contract's four words: whether a cause is named, and whether something is left that is not noise."""
+    if named:
+        return "named+rest" if rest else "named"
+    return "unknown" if rest else "nothing"
 
 
 def lines(problem: Problem, residual: Float[np.ndarray, "nv T"]) -> tuple[float, float, int]:

@@ -175,6 +175,8 @@ def family_p(
     The larger of two nulls: noise drawn from the spectrum (its coefficients redrawn for each part), and fair signs of
     whole blocks of the residual, the prior's rows among the blocks.
     """
+    if not found.scores:
+        return 1.0  # every candidate is forbidden, or stands in the model already
     highest = max(float(result.z.max()) for result in found.scores)
     parts = block_scores(rows, linear, found.stock, found.H)
     signs = generator.choice([-1.0, 1.0], (draws, len(parts)))
@@ -190,7 +192,10 @@ def draw_noise(
     draws: int,
     generator: np.random.Generator,
 ) -> Float[np.ndarray, "draws nv T"]:
-    """Whitened rows of noise with the spectrum, its coefficients redrawn from their covariance (single precision)."""
+    """Whitened rows of noise with the spectrum, its coefficients redrawn from their covariance (single precision).
+
+    Rows of little weight have the noise of all others: their weight stands for what is beyond it there.
+    """
     records = problem.records
     n, _, count, nv = records.shape
     frequency = np.fft.rfftfreq(count, 1 / float(records.rate))
@@ -202,7 +207,7 @@ def draw_noise(
     shape[:, [0, -1] if count % 2 == 0 else [0]] *= np.sqrt(2)
     white = generator.standard_normal((draws, nv, n, len(frequency), 2), np.float32).view(np.complex64)[..., 0]
     rows = np.fft.irfft(white * shape[:, None].astype(np.float32), count, axis=-1)
-    return (rows * np.moveaxis(np.asarray(records.weight, np.float32), 2, 0)).reshape(draws, nv, -1)
+    return (rows * np.moveaxis(records.fitted.astype(np.float32), 2, 0)).reshape(draws, nv, -1)
 
 
 def _link_columns(rows: Rows, link: int, model: RobotModel) -> Columns:

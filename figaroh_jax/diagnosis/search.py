@@ -13,22 +13,20 @@ from ..effects.base import Effect
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Prior
 from ..results import Name
-from .comparison import Hypothesis, Verdicts, ground, judge, shares_of_wins, t_value
-from .contenders import Contender, contend, for_refit, shortlist
+from .comparison import Hypothesis, Verdicts, ground, judge, overlap, shares_of_wins, t_value
+from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places
 from .flexible import friction_width
-from .gates import CONFIDENT, GAIN, ambiguous, exists, passes, rivals, simpler
+from .gates import ambiguous, exists, gains, passes, physical_sign, rivals, simpler
 from .problem import Problem
 from .screening import DRAWS, Null, Screen, catalogue, family_p, screen
 from .state import State, with_width
 from .step import Step, stand, with_cause, with_causes
+from .thresholds import AGAIN, CONFIDENT, GAIN, MOST_CAUSES, MUCH, OTHER, SMALLEST
 
-__all__ = ["Found", "Search", "eliminate", "find_causes"]
+__all__ = ["Found", "Search", "eliminate", "find_causes", "judged_without"]
 
-MUCH = 0.5  # share of the best's drop from which another cause explains much of the same
-SMALLEST = 0.005  # share of the first cause's drop below which a later one may be what the first left over
-MOST = 12
 NEAR, CLOSER = 4, 800  # times the level: p-values below which few draws cannot tell from it; draws that can
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
 
@@ -45,7 +43,13 @@ class Found:
     t: float
     confidence: float
     ambiguous: tuple[Name, ...]
+    joints: tuple[int, ...] = ()  # by whose rows it is judged
     alike: tuple[Name, ...] = ()  # what else explains much of the same misfit, though not as well
+
+    @property
+    def nuisance(self) -> bool:
+        """Whether physics forbids its sign: it stands in the fit and is no cause."""
+        return not physical_sign(self.effect)
 
 
 class Search(NamedTuple):
@@ -79,22 +83,25 @@ def find_causes(
     step, found = stand(problem, state, whitening), []
     null = Null(problem, spectrum, whitening, generator)
     p_values, screens, screened, groups = [], [], None, None
-    while len(found) < MOST:
-        progress("screening the catalogue", len(found) / MOST)
+    failed: dict[Name, float] = {}  # share of its joints' squares that a candidate scored when it last failed
+    while len(found) < MOST_CAUSES:
+        progress("screening the catalogue", len(found) / MOST_CAUSES)
         groups = catalogue(problem, step.state, step.rows, whitening, forbid, groups)
         screened = screen(step.rows, step.linear, groups, screened)
         p_values.append(_chance(step, screened, null, alpha, generator, not found))
         screens = screens or [screened]
         if p_values[-1] > alpha:
             break
-        progress("comparing causes on held-out data", len(found) / MOST)
-        contenders = _contenders(problem, step, screened, whitening)
-        best = _best(problem, step, contenders, found)
-        if best is None:
+        progress("comparing causes on held-out data", len(found) / MOST_CAUSES)
+        contenders = _contenders(problem, step, screened, whitening, failed)
+        chosen = _chosen(problem, step, contenders, found)
+        if not chosen:
             break
-        found.append(_found(step, contenders, best, screened, p_values[-1], generator))
-        step = with_cause(problem, step, best.effect, whitening)
-        if kind(best.effect) != "columns":
+        before = step
+        for best in chosen[: MOST_CAUSES - len(found)]:
+            found.append(_found(before, contenders, best, screened, p_values[-1], generator))
+            step = with_cause(problem, step, best.effect, whitening)
+        if any(kind(best.effect) != "columns" for best in chosen):
             problem = friction_width(problem, step.state, whitening)
             step, groups, screened = stand(problem, with_width(problem, step.state), whitening), None, None
     return Search(problem, with_width(problem, state), step, found, p_values[0], p_values[-1], screens[0])
@@ -118,13 +125,48 @@ def _chance(
 
 
 def _contenders(
-    problem: Problem, step: Step, screened: Screen, whitening: Float[np.ndarray, "F nv"]
+    problem: Problem, step: Step, screened: Screen, whitening: Float[np.ndarray, "F nv"], failed: dict[Name, float]
 ) -> list[Contender]:
-    """The shortlist with exact shapes, without what cannot exist, the best on held-out data first."""
+    """The shortlist with exact shapes, without what cannot exist, the best on held-out data first.
+
+    A candidate that has failed is tried again where it scores more of what its joints leave than it did then.
+    """
     base = ground(step.rows, step.verdicts, step.state.prior, step.folded)
-    ready = for_refit(problem, step, base, whitening)
-    all_of_them = [contend(problem, step, whitening, base, ready, *entry) for entry in shortlist(step, screened)]
-    return sorted((c for c in all_of_them if exists(problem, c.effect)), key=lambda c: c.verdicts.heldout)
+    ready, squares, out = for_refit(problem, step, base, whitening), (step.verdicts.error**2).sum(1), []
+    for group, order, score in shortlist(step, screened):
+        share = score / squares[list(acting(group.effect, len(squares), group.columns.joints))].sum()
+        if share <= AGAIN * failed.get(group.name, 0.0):
+            continue
+        one = contend(problem, step, whitening, base, ready, group, order)
+        if exists(problem, one.effect):
+            out.append(one)
+        else:
+            failed[group.name] = share
+        if not gains(step, one):
+            failed[group.name] = share
+    return sorted(out, key=lambda c: c.verdicts.heldout)
+
+
+def _chosen(problem: Problem, step: Step, contenders: list[Contender], before: list[Found]) -> list[Contender]:
+    """The best cause, and the best of other joints that explain another misfit."""
+    first = _best(problem, step, contenders, before)
+    if first is None:
+        return []
+    chosen = [first]
+    while first.effect.acts_on in ("joint", "pair") and kind(first.effect) == "columns":
+        free = [c for c in contenders if all(_apart(step, c, one) for one in chosen)]
+        other = _best(problem, step, free, before)
+        if other is None:
+            break
+        chosen.append(other)
+    return chosen
+
+
+def _apart(step: Step, one: Contender, other: Contender) -> bool:
+    """Whether a cause acts at other joints than another one and changes another part of the residual."""
+    local = one.effect.acts_on in ("joint", "pair") and kind(one.effect) == "columns"
+    elsewhere = local and not set(one.joints) & set(other.joints)
+    return elsewhere and abs(overlap(step.verdicts, one.verdicts, other.verdicts)) < OTHER
 
 
 def _best(problem: Problem, step: Step, contenders: list[Contender], before: list[Found]) -> Contender | None:
@@ -156,6 +198,7 @@ def _found(
         t=t_value(step.verdicts.blocks, best.verdicts.blocks),
         confidence=float(wins[0]) * (1 - p),
         ambiguous=ambiguous(step, best, alike, screened),
+        joints=best.joints,
         alike=tuple(c.name for c in alike if step.verdicts.cost - c.verdicts.cost > MUCH * drop),
     )
 
@@ -166,15 +209,15 @@ def eliminate(problem: Problem, start: State, found: list[Found], whitening: Flo
         return found
     full = with_causes(problem, start, [f.effect for f in found], whitening)
     for one in list(found[:-1]):
-        without = _without(problem, start, full, found, one, whitening)
-        gain = 1 - full.verdicts.heldout / without.heldout
-        if gain < GAIN or t_value(without.blocks, full.verdicts.blocks) < CONFIDENT:
+        without = judged_without(problem, start, full, found, one, whitening)
+        worse, better = (v.own(full.rows, one.joints) for v in (without, full.verdicts))
+        if 1 - better.sum() / worse.sum() < GAIN or t_value(worse, better) < CONFIDENT:
             found = [f for f in found if f is not one]
             full = with_causes(problem, start, [f.effect for f in found], whitening)
     return found
 
 
-def _without(
+def judged_without(
     problem: Problem, start: State, full: Step, found: list[Found], one: Found, whitening: Float[np.ndarray, "F nv"]
 ) -> Verdicts:
     """What the data say of all causes but one."""

@@ -27,10 +27,11 @@ class Spectrum(NamedTuple):
     coefficients: Float[np.ndarray, "terms nv"]
     covariance: Float[np.ndarray, "nv terms terms"]
     nyquist: float  # Hz, of the rows
+    lowest: float = 0.0  # Hz: what the recordings resolve; below, the power is held constant
 
     def power(self, frequency: Float[np.ndarray, " freqs"]) -> Float[np.ndarray, "freqs nv"]:
-        """Power at `frequency` (Hz), N^2 m^2 or N^2 a row; constant beyond the rows' Nyquist frequency."""
-        return np.exp(_basis(np.minimum(frequency, self.nyquist), self.nyquist) @ self.coefficients)
+        """Power at `frequency` (Hz), N^2 m^2 or N^2 a row; constant beyond what the rows resolve, at both ends."""
+        return np.exp(_basis(np.clip(frequency, self.lowest, self.nyquist), self.nyquist) @ self.coefficients)
 
     def redrawn(self, generator: np.random.Generator) -> Spectrum:
         """The spectrum with its coefficients drawn from their covariance."""
@@ -57,13 +58,14 @@ def fit_spectrum(
     gain: Float[np.ndarray, " freqs"],
     degrees: Float[np.ndarray, " freqs"],
     nyquist: float,
+    lowest: float = 0.0,
 ) -> Spectrum:
     """Smooth spectrum of noise that has passed a filter of power gain `gain`.
 
     Gamma GLM with log link: log S = log gain + a0 + a1 log(f + .05) + Legendre polynomials 2 to 5 of log f above
     .3 Hz, by iteratively reweighted least squares. `degrees` counts the periodograms averaged at each frequency.
     """
-    used = gain > 1e-3
+    used = (gain > 1e-3) & (frequency >= min(lowest, nyquist / 4))
     basis, weight = _basis(frequency[used], nyquist), degrees[used]
     observed = np.maximum(power[used] / gain[used, None], 1e-300)
     curvature = basis.T @ (weight[:, None] * basis) + np.diag([1e-9, 1e-2] + [1e-1] * (basis.shape[1] - 2))
@@ -75,7 +77,7 @@ def fit_spectrum(
         ratio = np.minimum(observed / np.exp(basis @ coefficients), 20.0)
         coefficients += inverse @ (basis.T @ (weight[:, None] * (ratio - 1)))
     covariance = np.broadcast_to(inverse, (power.shape[1], *inverse.shape))
-    return Spectrum(coefficients, covariance, nyquist)
+    return Spectrum(coefficients, covariance, nyquist, lowest)
 
 
 def white(variance: Float[np.ndarray, " nv"], nyquist: float) -> Spectrum:

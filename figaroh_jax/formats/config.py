@@ -265,11 +265,21 @@ class Actuator(_Keys):
     gains: Literal["known", "free"] = "known"
 
 
+class Tolerance(_Keys):
+    """What is good enough: a misfit below it is `nothing`."""
+
+    torque: Annotated[Number, Field(ge=0, lt=1)] = 0.01  # share of each joint's RMS torque
+    offset: Annotated[Number, Field(ge=0)] = 0.001  # rad
+    geometry: Annotated[Number, Field(ge=0)] = 0.0005  # m
+    position: Annotated[Number, Field(ge=0)] = 0.001  # rad, of rollouts
+
+
 class Diagnose(_Keys):
     """What is looked for."""
 
     forbid: tuple[Effect, ...] = ()  # effects left out of the catalogue
     alpha: Annotated[Number, Field(gt=0, lt=1)] = 0.05
+    tolerance: Tolerance = Tolerance()
 
 
 class Bound(_Keys):

@@ -32,13 +32,19 @@ class Records(eqx.Module):
     torque: Float[Leaf, "n N nv"]  # N m or N, as measured
     source: Int[Leaf, "n L"]  # sample that stands at each place of the extended record
     kept: Int[Leaf, "n M"]  # place of each row in the extended record
-    weight: Float[Leaf, "n M nv"]  # 1: a row of the fit; 0: gated, gap, padding, holdout
+    weight: Float[Leaf, "n M nv"]  # what a row of the fit is multiplied by, at most 1; 0: not fitted
+    judged: Float[Leaf, "n M nv"]  # 1: a row whose error counts in N m; 0: gated, gap, padding, holdout
     low_pass: Float[Leaf, " F"]  # response of the row filter
     omega: Float[Leaf, " F"]  # rad/s
     dt: Float[Leaf, ""] | float  # s, of the samples
     rate: Float[Leaf, ""] | float  # Hz, of the rows
     cutoff: Float[Leaf, ""] | float  # Hz
     carried: Float[Leaf, "n links 10"] | None = None  # known bodies on the links, at and in their joint frames
+
+    @property
+    def fitted(self) -> Float[np.ndarray, "n M nv"]:
+        """1 for the rows of the fit, whatever their weight."""
+        return (np.asarray(self.weight) > 0).astype(float)
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
@@ -104,6 +110,7 @@ def stack(signals: Sequence[Signals], model: RobotModel | None = None) -> Record
     pad, samples = reach(first.dt, first.cutoff), max(s.time.size for s in signals)
     count = max(s.rows.kept for s in signals)
     length = fast_length(samples + 2 * pad)
+    weight = _padded([s.rows.weight * (s.role == "fit") for s in signals], count, hold=False)
     return Records(
         time=_padded([s.time for s in signals], samples),
         position=_padded([s.position for s in signals], samples),
@@ -112,7 +119,8 @@ def stack(signals: Sequence[Signals], model: RobotModel | None = None) -> Record
         torque=_padded([np.zeros_like(s.velocity) if s.torque is None else s.torque for s in signals], samples),
         source=np.stack([_extended(s, pad, length) for s in signals]),
         kept=_padded([s.rows.index + pad for s in signals], count),
-        weight=_padded([s.rows.weight * (s.role == "fit") for s in signals], count, hold=False),
+        weight=weight,
+        judged=weight,
         low_pass=gain(length, first.dt, first.cutoff),
         omega=2 * np.pi * np.fft.rfftfreq(length, first.dt),
         dt=first.dt,

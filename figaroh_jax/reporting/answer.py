@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..results import Cause, Diagnosis, Estimate, Name
+from ..results import Cause, Diagnosis, Estimate, Name, Rest
 
-__all__ = ["answer", "cause", "to_json", "write_predictions"]
+__all__ = ["answer", "cause", "rest", "to_json", "write_predictions"]
 
 
 def answer(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -27,6 +27,7 @@ def answer(diagnosis: Diagnosis) -> dict[str, Any]:
             "after": [_number(value) for value in diagnosis.after],
             "noise": [_number(value) for value in diagnosis.noise],
         },
+        "rest": rest(diagnosis.rest),
         "next_experiment": _experiment(diagnosis),
         "notes": list(diagnosis.notes),
     }
@@ -65,9 +66,24 @@ def cause(found: Cause) -> dict[str, Any]:
     return {
         **_name(found.name),
         "parameters": {name: _estimate(estimate) for name, estimate in found.parameters.items()},
+        "found": found.found,
         "confidence": _number(found.confidence),
         "gain": {"holdout_before": _number(gain.before), "holdout_after": _number(gain.after), "unit": gain.unit},
         "ambiguous_with": [_name(other) for other in found.ambiguous_with],
+    }
+
+
+def rest(left: Rest) -> dict[str, Any]:
+    """What no cause explains, as it stands in `answer.json`."""
+    parts = []
+    for part in left.parts:
+        where = {} if part.band is None else {"band": [_number(edge) for edge in part.band]}
+        where |= {} if part.file is None else {"file": part.file}
+        parts.append({"kind": part.kind, "at": list(part.at), "share": _number(part.share), **where})
+    return {
+        "relative": [_number(value) for value in left.relative],
+        "parts": parts,
+        "nearest": [{**_name(o.name), "share": _number(o.share), "why_not": o.why_not} for o in left.nearest],
     }
 
 

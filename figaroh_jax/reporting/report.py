@@ -60,6 +60,21 @@ class _Joint(NamedTuple):
         return _share(self.noise, self.full)
 
 
+class _Goes(NamedTuple):
+    """A share of a joint's rest and what it goes with, in words."""
+
+    share: float
+    words: str
+
+
+class _Left(NamedTuple):
+    """What no cause explains at a joint: RMS over that of its torque, and what it goes with."""
+
+    name: str
+    relative: float
+    parts: list[_Goes]
+
+
 def write_report(diagnosis: Diagnosis, path: Path, title: str) -> None:
     """Write the page of a diagnosis to `path`; `title` is the robot's name, as the verdict's sentence says it."""
     path.write_text(_page(diagnosis, title), encoding="utf-8")
@@ -78,6 +93,8 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
         sentence=_glued(wording.sentence(diagnosis, title)),
         largest=max(_finite(gain.before), _finite(gain.after)),
         joints=_joints(diagnosis),
+        rests=_rests(diagnosis),
+        largest_rest=max([_finite(float(x)) for x in diagnosis.rest.relative], default=0.0),
         recordings=diagnosis.traces,
         shown=roles.index("holdout") if "holdout" in roles else 0,
         doubted=[cause for cause in diagnosis.causes if cause.ambiguous_with],
@@ -103,6 +120,7 @@ def page_template(name: str) -> Any:
         "first_upper": lambda words: words[:1].upper() + words[1:],
         "interval": lambda estimate: _glued(wording.interval(estimate)),
         "meaning": wording.effect_meaning,
+        "nearest_of": wording.nearest,
         "number": wording.number,
         "p_value": lambda value: _glued(wording.p_value(value)),
         "percent": lambda value: f"{value:.0f}" if 10 <= value < 1e4 else wording.number(value, 2),
@@ -127,6 +145,15 @@ def _joints(diagnosis: Diagnosis) -> list[_Joint]:
         felt = [(label, float(rms[index])) for label, rms in shares.items() if rms[index] > 1e-3 * max(before, 1e-12)]
         joints.append(_Joint(name, unit, before, after, noise, causes, felt, name in opened))
     return joints
+
+
+def _rests(diagnosis: Diagnosis) -> list[_Left]:
+    """What no cause explains, joint by joint."""
+    goes: dict[str, list[_Goes]] = {name: [] for name in diagnosis.joints}
+    for part in diagnosis.rest.parts:
+        goes[part.at[0]].append(_Goes(part.share, wording.dependence(part)))
+    sizes = zip(diagnosis.joints, diagnosis.rest.relative, strict=False)
+    return [_Left(name, float(size), goes[name]) for name, size in sizes]
 
 
 def _opened(diagnosis: Diagnosis) -> set[str]:

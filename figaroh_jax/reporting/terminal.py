@@ -75,8 +75,11 @@ def summary(diagnosis: Diagnosis, robot: str = "the robot") -> RenderableType:
     head = Text.assemble((diagnosis.verdict, _STYLE[diagnosis.verdict]), f"  {wording.sentence(diagnosis, robot)}")
     parts: list[RenderableType] = [head]
     parts += [_cause(number, cause) for number, cause in enumerate(diagnosis.causes, 1)]
-    if diagnosis.rest:
-        parts.append(Text(f"\nUnexplained residual: {diagnosis.rest}"))
+    if diagnosis.verdict in ("named+rest", "unknown"):
+        parts += [Text(), *(Text(line) for line in wording.rest(diagnosis))]
+    if diagnosis.rest.nearest:
+        parts.append(Text("\nFound, but not named:"))
+        parts += [Padding(Text(wording.nearest(near)), (0, 0, 0, 3), expand=False) for near in diagnosis.rest.nearest]
     parts += [Text(), _residuals(diagnosis), Text()]
     parts.append(Text(f"Held out: {diagnosis.holdout_scheme}. {wording.p_value(diagnosis.p_value)}.", style="dim"))
     if diagnosis.experiment is not None:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..results import Cause, Diagnosis, Estimate, Name
+from ..results import Cause, Diagnosis, Estimate, Name, Nearest, Part
 
 if TYPE_CHECKING:
     from ..calibration.calibrated import Calibration
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 __all__ = [
     "aside",
     "calibration_sentence",
+    "dependence",
     "distances",
     "effect_equation",
     "effect_meaning",
@@ -22,10 +23,12 @@ __all__ = [
     "error",
     "interval",
     "level",
+    "nearest",
     "number",
     "p_value",
     "phrase",
     "place",
+    "rest",
     "sentence",
     "unit",
 ]
@@ -47,6 +50,32 @@ def sentence(diagnosis: Diagnosis, robot: str) -> str:
         return f"{subject} has an error that no effect in the catalogue explains.{found}"
     rest = ". Part of the residual remains unexplained" if diagnosis.verdict == "named+rest" else ""
     return f"{subject} is missing {_list(diagnosis.causes)}: {fall}{rest}."
+
+
+def rest(diagnosis: Diagnosis) -> list[str]:
+    """What no cause explains, in sentences: how large and where, what it goes with, which causes came near."""
+    left, out = diagnosis.rest, []
+    if len(left.relative) and max(left.relative) > 0:
+        worst = max(range(len(left.relative)), key=lambda k: left.relative[k])
+        size = f"Unexplained residual: {error(float(left.relative[worst]), 'relative RMS')} of the torque of"
+        out.append(f"{size} {diagnosis.joints[worst]}{f'; {left.text}' if left.text else ''}.")
+    for joint in dict.fromkeys(part.at for part in left.parts):
+        own = [part for part in left.parts if part.at == joint]
+        shares = ", ".join(f"{dependence(part)} ({100 * part.share:.0f} %)" for part in own)
+        out.append(f"What is left at {place(joint)} goes with {shares}.")
+    return out
+
+
+def dependence(part: Part) -> str:
+    """What a part of a rest goes with, in words."""
+    if part.band is not None:
+        return f"a line at {number(part.band[0], 3)} to {number(part.band[1], 3)} Hz"
+    return f"the recording {part.file}" if part.file else part.kind
+
+
+def nearest(near: Nearest) -> str:
+    """A cause that came near and why it is not named: "torque ripple at joint_2: its gain is not sure"."""
+    return f"{phrase(near.name)}: {near.why_not}"
 
 
 def calibration_sentence(calibration: Calibration) -> str:

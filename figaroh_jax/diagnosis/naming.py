@@ -1,0 +1,246 @@
+"""Which of the causes that a search has put in are named where a rest stays, and why the others are not.
+
+Beside a rest the best of the catalogue is often a stand-in for something else. A right law differs from a stand-in in
+that it takes much of what its own joints leave on held-out data, surely, and with one amplitude: one that would rather
+vary with position, speed, load or time stands for another law.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..effects.base import Effect
+from ..recordings.stacked import filter_rows, filtered_rows, open_rows
+from ..results import Name
+from .comparison import Hypothesis, Verdicts, ground, judge, judge_grown, t_value
+from .design import kind, sensor_response, shapes
+from .estimates import Fitted, amplitude_places, torque_slope
+from .flexible import smooth_functions
+from .gates import physical_sign
+from .joint import Joint
+from .problem import Problem
+from .search import Found, judged_without
+from .shifts import torque_change
+from .state import State, batched
+from .step import Step
+from .thresholds import (
+    BESIDE_SMOOTH,
+    GAIN_NAMED,
+    GAIN_NAMED_ROBOT,
+    MODULATION,
+    MODULATION_HELD_OUT,
+    SHARE_NAMED,
+    T_NAMED,
+)
+
+__all__ = ["Standing", "cause_torque", "reason_against", "standings"]
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What the data say of one cause with all others in, on held-out squares of the joints where it acts."""
+
+    name: Name
+    whole: bool  # whether it acts on the whole robot, or through a link on many joints
+    physical: bool  # whether its sign is one that exists
+    gain: float
+    t: float
+    share: float  # RMS torque over that of the joint, where it is largest
+    modulation: float = 0.0  # squares that an amplitude which varies gains, over those of the cause
+    modulation_held_out: float = 0.0
+    beside_smooth: float = 1.0  # gain of a cause of the whole robot beside smooth functions at every joint
+    inertia_alone: bool = False  # a coupling of inertia, without friction of its own
+
+
+def reason_against(one: Standing, rest: bool, tolerance: float) -> str:
+    """Why the cause is not named, in words with the number that failed; empty where it is.
+
+    Beside a `rest` it must explain much of its joints' error with one amplitude; without one it must only be there.
+    """
+    least = GAIN_NAMED_ROBOT if one.whole else GAIN_NAMED
+    checks = [
+        (one.physical, "its sign is one that physics forbids"),
+        (one.gain > 0, f"it predicts held-out data no better (gain {one.gain:.2g})"),
+        (
+            one.share >= tolerance,
+            f"its torque is {one.share:.2%} of the joint's, below the tolerance of {tolerance:.2%}",
+        ),
+    ]
+    if rest:
+        checks += [
+            (one.t >= T_NAMED, f"its gain on held-out data is not sure: t = {one.t:.1f} of {T_NAMED:g}"),
+            (one.gain >= least, f"it takes {one.gain:.0%} of the held-out error where it acts, {least:.0%} are needed"),
+            (
+                one.modulation <= MODULATION and one.modulation_held_out <= MODULATION_HELD_OUT,
+                "its amplitude would rather vary with position, speed, load or time"
+                f" ({max(one.modulation, one.modulation_held_out):.2f} of its gain more)",
+            ),
+            (one.share >= SHARE_NAMED, f"its torque is {one.share:.1%} of the joint's, {SHARE_NAMED:.0%} are needed"),
+            (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion do as well"),
+            (not one.inertia_alone, "a coupling without friction of its own may be a rotor's or a link's inertia"),
+        ]
+    return next((reason for passed, reason in checks if not passed), "")
+
+
+def standings(
+    problem: Problem, start: State, found: list[Found], joint: Joint, whitening: Float[np.ndarray, "F nv"]
+) -> list[Standing]:
+    """Each cause's standing in the fit of all of them."""
+    if not found:
+        return []
+    full, places = joint.step, amplitude_places(joint.step.state, joint.causes, problem.model)
+    grown = _Grown(problem, full, whitening, ground(full.rows, full.verdicts, full.state.prior, full.folded))
+    out = []
+    for one, effect, place, at in zip(found, joint.causes, places, joint.fitted.places, strict=True):
+        without = judged_without(problem, start, full, found, one, whitening)
+        worse, better = (v.own(full.rows, one.joints) for v in (without, full.verdicts))
+        whole = effect.acts_on not in ("joint", "pair")
+        torque = cause_torque(problem, full.state, effect, place)
+        modulation = _modulation(grown, effect, torque, without, one.joints, whole)
+        out.append(
+            Standing(
+                name=one.name,
+                whole=whole,
+                physical=physical_sign(effect),
+                gain=1 - float(better.sum() / max(worse.sum(), 1e-300)),
+                t=t_value(worse, better),
+                share=_share_of_torque(problem, full.state, torque, effect),
+                modulation=modulation[0],
+                modulation_held_out=modulation[1],
+                beside_smooth=_beside_smooth(grown, effect, place, one.joints) if whole else 1.0,
+                inertia_alone=effect.name == "coupled_transmission" and _inertia_alone(effect, joint.fitted, at),
+            )
+        )
+    return out
+
+
+class _Grown(NamedTuple):
+    """The fit of all causes, and what judging further columns beside it needs."""
+
+    problem: Problem
+    step: Step
+    whitening: Float[np.ndarray, "F nv"]
+    base: object  # comparison.Ground
+
+    @property
+    def response(self) -> np.ndarray:
+        return self.whitening * self.step.state.response(self.problem.records.omega)[:, None]
+
+
+def cause_torque(problem: Problem, state: State, effect: Effect, place: list[int]) -> Float[np.ndarray, "nN nv"]:
+    """Torque of one cause at all samples, before the sensors, N m or N."""
+    if kind(effect) == "position":
+        return np.asarray(torque_change(batched(effect), state.motion, problem.records)[0])
+    if kind(effect) == "response":
+        return np.asarray(state.motion.total)
+    own = np.isin(np.arange(len(state.theta)), place)
+    return state.torque(np.where(own, state.theta, 0.0)) - state.known
+
+
+def _share_of_torque(problem: Problem, state: State, torque: np.ndarray, effect: Effect) -> float:
+    response = state.response(problem.records.omega)
+    if kind(effect) == "response":
+        own = sensor_response({effect.name: batched(effect)}, problem.records.omega)[effect.name][0]
+        response = response * (1 - 1 / own)
+    fitted = np.asarray(problem.records.judged)
+    rows = open_rows(problem.records, torque, response) * fitted
+    size, whole = ((x**2).sum((0, 1)) for x in (rows, problem.torque * fitted))
+    return float(np.sqrt((size / np.maximum(whole, 1e-12 * whole.max())).max()))
+
+
+def _modulation(
+    grown: _Grown, effect: Effect, torque: np.ndarray, without: Verdicts, joints: tuple[int, ...], whole: bool
+) -> tuple[float, float]:
+    """What an amplitude that varies gains more, in the fit and on held-out data, over what the cause gains."""
+    step = grown.step
+    columns = _varied_robot(grown, effect, torque) if whole else _varied_joint(grown, torque, joints)
+    base, more = grown.base, columns
+    if kind(effect) == "response":  # it has no amplitude: its tangent must be free before
+        (name,) = effect.parameters()
+        tangent = torque_slope(grown.problem, step.state, effect, name, grown.whitening)
+        free = judge_grown(step.rows, base, range(len(tangent)), tangent[None])
+        varied = judge_grown(step.rows, base, range(len(tangent)), np.concatenate([tangent[None], more]))
+    else:
+        free = step.verdicts
+        touched = list(range(len(step.rows.y))) if whole else list(joints)
+        varied = judge_grown(step.rows, base, touched, more)
+    drop, held = without.cost - free.cost, without.own(step.rows, joints).sum() - free.own(step.rows, joints).sum()
+    more_drop = free.cost - varied.cost
+    more_held = free.own(step.rows, joints).sum() - varied.own(step.rows, joints).sum()
+    return float(more_drop / max(drop, 1e-9)), float(more_held / max(held, 1e-9))
+
+
+def _varied_joint(grown: _Grown, torque: np.ndarray, joints: tuple[int, ...]) -> Float[np.ndarray, "8 rows T"]:
+    """The cause's torque times x and 2 x^2 - 1, x each joint's position, speed, load and time from -1 to 1."""
+    problem, motion, records = grown.problem, grown.step.state.motion, grown.problem.records
+    n, samples, _, _ = records.shape
+    q, v, load = (np.asarray(x) for x in (motion.angle, motion.velocity, motion.load))
+    out = []
+    for joint in joints:
+        varying = [_unit(x) for x in (q[:, joint], np.abs(v[:, joint]), load[:, joint], np.asarray(motion.time))]
+        columns = np.stack([torque[:, joint] * f for x in varying for f in (x, 2 * x**2 - 1)])
+        rows = filter_rows(records, columns.reshape(-1, n, samples), grown.response[:, joint][None])
+        out.append((rows * np.asarray(problem.records.weight)[:, :, joint]).reshape(len(columns), -1))
+    return np.stack(out, axis=1)
+
+
+def _varied_robot(grown: _Grown, effect: Effect, torque: np.ndarray) -> Float[np.ndarray, "k nv T"]:
+    """The cause's rows times time, and those of each joint alone but one."""
+    problem, state = grown.problem, grown.step.state
+    if kind(effect) == "response":
+        (name,) = effect.parameters()
+        rows = torque_slope(problem, state, effect, name, grown.whitening)
+    else:
+        rows = filtered_rows(problem.records, torque, grown.response)
+    time = _unit(
+        np.take_along_axis(np.asarray(problem.records.time), problem.records.row_samples(), axis=1).reshape(-1)
+    )
+    felt = [k for k in range(len(rows)) if np.any(rows[k])]
+    alone = [rows * (np.arange(len(rows)) == k)[:, None] for k in felt[1:]]
+    return np.stack([rows * time, *alone])
+
+
+def _beside_smooth(grown: _Grown, effect: Effect, place: list[int], joints: tuple[int, ...]) -> float:
+    """Gain of the cause beside smooth functions of each joint's own motion."""
+    problem, step = grown.problem, grown.step
+    if kind(effect) == "position":
+        return 1.0
+    rows = step.rows
+    n, samples, _, nv = problem.records.shape
+    blocks = []
+    for joint, functions in enumerate(smooth_functions(step.state.motion)):
+        own = filter_rows(problem.records, functions.reshape(-1, n, samples), grown.response[:, joint][None])
+        own = (own * np.asarray(problem.records.weight)[:, :, joint]).reshape(len(functions), -1)
+        full = np.zeros((nv, own.shape[1], len(own)))
+        full[joint] = own.T
+        blocks.append(full)
+    X = np.concatenate([rows.X, *blocks], axis=2)
+    prior = step.state.prior.extended(X.shape[2] - rows.X.shape[2])
+    if kind(effect) == "response":
+        (name,) = effect.parameters()
+        tangent = torque_slope(problem, step.state, effect, name, grown.whitening)
+        y = rows.y + tangent * float(getattr(effect, name))  # the rows as they are without the cause, to first order
+        without = judge(rows._replace(y=y), Hypothesis(X, prior))
+        X, prior = np.concatenate([X, tangent[..., None]], axis=2), prior.extended(1)
+        within = judge(rows._replace(y=y), Hypothesis(X, prior))
+    else:
+        within = judge(rows, Hypothesis(X, prior))
+        fewer = prior._replace(mean=np.delete(prior.mean, place), precision=np.delete(prior.precision, place))
+        without = judge(rows, Hypothesis(np.delete(X, place, axis=2), fewer))
+    return 1 - float(within.own(rows, joints).sum() / max(without.own(rows, joints).sum(), 1e-300))
+
+
+def _inertia_alone(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
+    """Whether neither friction of a coupling is surely there (two standard deviations)."""
+    names = [n for n, p in effect.parameters().items() if p.linear] + shapes(type(effect))
+    std = dict(zip(names, np.sqrt(np.diag(fitted.covariance)[list(place)]), strict=True))
+    return all(abs(float(getattr(effect, n))) < 2 * std[n] for n in ("damping", "friction"))
+
+
+def _unit(x: np.ndarray) -> np.ndarray:
+    low, high = x.min(), x.max()
+    return 2 * (x - low) / max(high - low, 1e-9) - 1

@@ -1,0 +1,64 @@
+"""Every number that decides what is named, and what it is compared with.
+
+Squares are those of whitened rows (noise has one a row) unless a comment says otherwise; a gain is the share of squares
+that is gone on data that was not fitted.
+"""
+
+from __future__ import annotations
+
+__all__: list[str] = []
+
+# Weights of rows by speed (`weights`)
+REVERSAL = 0.25  # periods of the cutoff around a change of the velocity's sign in which a joint's rows are left out
+REVERSALS_AT_MOST = 1 / 3  # of a joint's rows; a joint that mostly stands still keeps them
+SPEED_EDGES = (0.0, 0.015, 0.03, 0.05, 0.08, 0.12, 0.2, 0.35, 1.0)  # of a joint's top speed: the bins
+FAST = 0.12  # of a joint's top speed, from which its residual is the measure of slower rows
+LEAST_FACTOR = 1.3  # of the mean square: a bin that is worse by less is as good as the fast ones
+ROWS_OF_A_BIN = 15.0  # rows at which a bin's own factor and none are believed alike
+WEIGHT_ROUNDS = 2  # of weights and spectrum in turn
+
+# The noise and what the fit is weighted by (`floor`, `noise`)
+LOWEST_RESOLVED = 2.0  # periods in a recording: below that frequency the spectrum of the noise is held constant
+LOWEST_FREQUENCY = 0.02  # Hz, the same for long recordings
+WHITE_GAIN = 0.02  # relative fall of the folds' error in N m from which rows are weighted by their residual alone
+SAME_MOTION = 0.05  # of a joint's range (standard deviation): repeats that differ by more are none
+
+# The search (`contenders`, `gates`, `search`)
+SHORTLIST = 8  # candidates compared exactly, of the whole robot
+SHARE_OF_BEST = 0.35  # of the best rank: what another candidate needs, of the robot or of its own place
+BEST_OF_A_PLACE = 2  # candidates compared exactly of each joint, pair or link
+SHIFTS = 2  # candidates of a position sensor tried at a step: each is a fit of its own
+GAIN = 0.01  # of the held-out squares of the joints where the cause acts
+CONFIDENT = 1.64  # t of the blocks: that the cause predicts better
+UNSURE = 1.7  # t below which two causes predict alike
+SAME = 0.5  # overlap from which two causes explain the same misfit
+CLEARLY = 3.0  # t from which data tell effects apart that are the same while the joint moves
+MUCH = 0.5  # share of the best's drop from which another cause explains much of the same
+SMALLEST = 0.0005  # share of the first cause's drop below which a later one may be what the first left over
+TRUSTED = 0.05  # of the inertials, relative: up to it a link's own inertia may be the cause
+MOST_CAUSES = 16
+AGAIN = 1.2  # times its share of its joints' squares when it failed: from here a candidate is tried again
+OTHER = 0.2  # overlap up to which causes at other joints are taken in at once
+CERTAIN = 0.2  # of alpha: what a name needs, for p is not uniform under coloured noise
+
+# Naming beside a rest (`naming`)
+T_NAMED = 2.3  # t of the held-out squares of the cause's joints
+GAIN_NAMED = 0.25  # gain there with all other causes in
+GAIN_NAMED_ROBOT = 0.04  # the same of a cause that acts on the whole robot
+MODULATION, MODULATION_HELD_OUT = 0.3, 0.2  # squares that an amplitude which varies gains, over those of the cause
+SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
+BESIDE_SMOOTH = 0.01  # gain of a cause of the whole robot beside smooth functions at every joint
+
+# The rest (`rest`)
+REST_P = 0.01  # p-value of a rest
+LINE_P = 1e-3  # p-value of a line in the spectrum
+REPEATED, REPEATED_SHARE = 0.08, 0.05  # excess that repeats: absolute, and as a share of the first excess
+FITTED, FITTED_SHARE = 0.03, 0.03  # excess that a flexible model or the catalogue still scores on
+UNREPEATED = 0.01  # the same where no recording repeats another
+T_REST = 2.3  # t of the blocks: that smooth functions predict the rest on data they were not fitted to
+LEAST_BEYOND = 0.05  # times the noise power: below, nothing is said of what a joint's rest goes with
+LEAST_SHARE = 0.05  # of the power beyond the noise: a dependence that is told
+FEW_CAUSES = 3  # found together: beyond, the model is wrong in more ways than one, and a stand-in more likely
+NO_REST = 0.15  # excess over the noise up to which a cause need only be there to be named
+OWN_SHARE = 0.03  # of what a cause has removed: a rest at its own place that speaks against its law
+STANDSTILL = 0.08  # of a joint's top speed: rows at and around rest
