@@ -91,8 +91,13 @@ def _run(args: argparse.Namespace) -> int:
         os.environ.setdefault(name, value)
     _set_up_jax(cache=not args.no_cache)
     from .reporting import terminal
-    from .runs import JOBS, REPORT
+    from .runs import JOBS, REPORT, export_loop
 
+    if args.command == "export":
+        text = export_loop(args.task, args.simulator, args.out)
+        with _standard_output():
+            sys.stdout.write(text)
+        return 0
     job = JOBS["diagnose" if args.command == "demo" else args.command]
     with resources.as_file(resources.files("figaroh_jax") / "demo") as demo:
         task_file = args.task or demo / "task.yaml"
@@ -168,6 +173,9 @@ def _parser() -> argparse.ArgumentParser:
         if name == "calibrate":
             command.add_argument("--level", help="frames, joint_offset or full, in place of what predicts best")
             command.add_argument("--no-priors", dest="priors", action="store_false", help="plain least squares")
+    export = commands.add_parser("export", parents=[common], help="a rollout's model in the words of a simulator")
+    export.add_argument("task", type=Path, metavar="MODEL_DIR", help="`model` of a run directory")
+    export.add_argument("--for", dest="simulator", required=True, metavar="NAME", help="mujoco, newton, isaaclab, ...")
     demo = commands.add_parser("demo", parents=[common], help="the main job on an embedded recording, no file needed")
     demo.set_defaults(task=None)
     return parser

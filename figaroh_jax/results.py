@@ -153,8 +153,11 @@ class Diagnosis:
     rest: Rest = field(default_factory=lambda: Rest(np.zeros(0)))
     notes: tuple[str, ...] = ()  # what was dropped or assumed while reading the data
     prismatic: tuple[bool, ...] = ()  # per joint; empty: every joint is revolute
+    of_positions: bool = False  # a rollout: residuals and traces are positions, not torques
 
     @property
     def torque_units(self) -> tuple[str, ...]:
-        """Unit of torque and residual of each joint: "N m", or "N" at a prismatic one."""
+        """Unit of what is compared at each joint: "N m", or "N" at a prismatic one; "rad" and "m" for rollouts."""
+        if self.of_positions:
+            return tuple("m" if straight else "rad" for straight in self.prismatic or (False,) * len(self.joints))
         return tuple("N" if straight else "N m" for straight in self.prismatic or (False,) * len(self.joints))

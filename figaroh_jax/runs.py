@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
     from .formats.config import Load, Task
     from .identification.result import Identification, Link
     from .results import Diagnosis
+    from .rollouts.identification import RolloutIdentification
+    from .rollouts.loop import Loop
 
 __all__ = [
     "ANSWER",
@@ -28,12 +32,13 @@ __all__ = [
     "Job",
     "calibrate_file",
     "diagnose_file",
+    "export_loop",
     "identify_file",
     "predictions",
     "write_run",
 ]
 
-ANSWER, RESULT, REPORT = "answer.json", "result.json", "report.html"
+ANSWER, RESULT, REPORT, LOOP = "answer.json", "result.json", "report.html", "loop.json"
 
 
 class Job(NamedTuple):
@@ -63,6 +68,11 @@ def diagnose_file(
     if any(entry.measurement is not None for entry in task.data):
         _native_alone(backend)
         return _diagnose_poses(task, out, progress)
+    from .rollouts.task import is_rollout_task
+
+    if is_rollout_task(task):
+        _native_alone(backend)
+        return _diagnose_rollouts(task, out, progress)
     from .diagnosis.diagnosis import diagnose_task
 
     diagnosis = diagnose_task(task, progress=progress, backend=backend)
@@ -71,17 +81,69 @@ def diagnose_file(
     return diagnosis
 
 
+def _diagnose_rollouts(task: Task, out: Path, progress: Callable[[str, float], None]) -> Diagnosis:
+    from .formats.export import write_model
+    from .reporting.answer import to_json, write_predictions
+    from .reporting.report import write_report
+    from .rollouts.task import diagnose_rollout_task
+
+    found = diagnose_rollout_task(task, progress)
+    progress("writing the report", 1.0)
+    with whole_directory(out, task_inputs(task.file)) as folder:
+        (folder / ANSWER).write_text(to_json(found.diagnosis), encoding="utf-8")
+        write_predictions(folder / "predictions.npz", found.predictions, "position")
+        write_report(found.diagnosis, folder / REPORT, found.diagnosis.model.robot.name)
+        write_model(found.diagnosis.model, folder / "model", found.diagnosis.causes)
+        _write_loop(folder / "model", found.loop)
+    return found.diagnosis
+
+
+def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
+    """The loop of a run's `model` directory in the words of a simulator, as JSON; with `out`, written there too.
+
+    For MuJoCo `out` also gets `robot.xml`, with everything that MuJoCo has words for. Raises `InputError` for another
+    directory, and for a simulator that is not known.
+    """
+    from .rollouts.export import for_simulator, with_drives
+
+    try:
+        content = json.loads((model / LOOP).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise InputError(f"{model}: no readable {LOOP}; name the `model` directory of a rollout's run") from None
+    text = json.dumps(for_simulator(content, simulator), indent=2, ensure_ascii=False) + "\n"
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / f"{simulator}.json").write_text(text, encoding="utf-8")
+        if simulator == "mujoco":
+            (out / "robot.xml").write_text(with_drives(model / "robot.xml", content), encoding="utf-8")
+    return text
+
+
+def _write_loop(folder: Path, loop: Loop) -> None:
+    """`loop.json`, every number of the loop, and the drives in `robot.xml`."""
+    from .rollouts.export import described, described_text, with_drives
+
+    (folder / LOOP).write_text(described_text(loop), encoding="utf-8")
+    mjcf = folder / "robot.xml"
+    mjcf.write_text(with_drives(mjcf, described(loop)), encoding="utf-8")
+
+
 def identify_file(
     task_file: Path,
     out: Path,
     progress: Callable[[str, float], None] = lambda phase, fraction: None,
     backend: str = "native",
-) -> Identification:
+) -> Identification | RolloutIdentification:
     """Read a task, identify its robot and write the run directory `out`, as `diagnose_file` does."""
     from .simulators.registry import check_backend
 
     check_backend(backend, "joint_torque_regressor")
     task = _task_for(task_file, out)
+    from .rollouts.task import is_rollout_task
+
+    if is_rollout_task(task):
+        _native_alone(backend)
+        return _identify_rollouts(task, out, progress)
     from .formats.export import write_model
     from .identification.identification import identify_task
     from .identification.parameter_files import write_parameters
@@ -100,6 +162,24 @@ def identify_file(
         write_identification(found, folder / REPORT, found.model.robot.name, model_written=not wrong)
         if not wrong:
             write_model(found.model, folder / "model")
+    return found
+
+
+def _identify_rollouts(task: Task, out: Path, progress: Callable[[str, float], None]) -> RolloutIdentification:
+    from .formats.export import write_model
+    from .reporting.answer import write_predictions
+    from .rollouts.identification import identify_rollout_task
+
+    found = identify_rollout_task(task, progress)
+    progress("writing the report", 1.0)
+    with whole_directory(out, task_inputs(task.file)) as folder:
+        (folder / RESULT).write_text(found.to_json(), encoding="utf-8")
+        lines = html.escape("\n".join(found.lines()))
+        page = f"<!doctype html><meta charset='utf-8'><title>{RESULT}</title><pre>{lines}</pre>\n"
+        (folder / REPORT).write_text(page, encoding="utf-8")
+        write_predictions(folder / "predictions.npz", found.predictions, "position")
+        write_model(found.model, folder / "model")
+        _write_loop(folder / "model", found.loop)
     return found
 
 
@@ -249,13 +329,22 @@ def _show_diagnosis(diagnosis: Diagnosis | PoseDiagnosis) -> None:
         show_calibration(diagnosis.calibration, diagnosis.verdict)
 
 
-def _identification_json(found: Identification) -> str:
+def _identification_json(found: Identification | RolloutIdentification) -> str:
+    from .rollouts.identification import RolloutIdentification
+
+    if isinstance(found, RolloutIdentification):
+        return found.to_json()
     from .identification.result import to_json
 
     return to_json(found)
 
 
-def _show_identification(found: Identification) -> None:
+def _show_identification(found: Identification | RolloutIdentification) -> None:
+    from .rollouts.identification import RolloutIdentification
+
+    if isinstance(found, RolloutIdentification):
+        print("\n".join(found.lines()))
+        return
     from .reporting.terminal import show_identification
 
     show_identification(found, found.model.robot.name)

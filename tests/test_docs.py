@@ -25,7 +25,8 @@ def test_the_page_of_effects_has_the_row_of_each_effect_of_torques(name: str) ->
 @pytest.mark.parametrize("name", KINEMATIC)
 def test_the_page_of_effects_has_the_row_of_each_effect_of_poses(name: str) -> None:
     effect = KINEMATIC[name]
-    apart = effect.separated_by.format(at="the joint") or "–"
+    wording = effect.separated_by_postures or effect.separated_by
+    apart = wording.format(at="the joint") or "–"
     row = f"| `{name}` | {effect.acts_on} | {effect.equation} | {apart} |"
     assert row in PAGE.splitlines(), row
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import reference
 import robots
-from scipy import signal
+from scipy import optimize, signal
 
 from figaroh_jax.effects.base import place
 from figaroh_jax.effects.catalogue import find
@@ -326,6 +326,48 @@ def test_wrong_shapes_are_refused(chain: RobotModel):
         simulate(extend(chain), lambda t, q, v: q, np.zeros(3), np.zeros(3), DT)
     with pytest.raises(InputError, match="last axis must hold the 3 joints"):
         simulate(extend(chain), np.zeros((5, 2)), np.zeros(2), np.zeros(2), DT)
+
+
+def test_a_bristle_gives_way_until_it_holds(rod: RobotModel):
+    """At rest a torque below the level bends the bristle by -distance log(1 - share): Dahl's curve, with gravity."""
+    model = put(rod, "viscous_friction", "hinge", damping=12.0)
+    model = put(model, "coulomb_friction", "hinge", force=2.0)
+    model = put(model, "presliding", "hinge", force=2.0, distance=0.02)
+    run = simulate(model, np.full((3000, 1), 1.2), np.zeros(1), np.zeros(1), DT)
+    held = optimize.brentq(lambda q: GRAVITY * np.sin(q) + 2.0 * (1 - np.exp(-q / 0.02)) - 1.2, 0, 0.1)
+    np.testing.assert_allclose(run.position[-1, 0], held, rtol=0, atol=2e-5)
+
+
+def test_a_saturated_drive_gives_its_limit(rod: RobotModel):
+    start, command = np.zeros(1), np.linspace(-4.0, 5.0, 300)[:, None]
+    run = simulate(put(rod, "torque_saturation", "hinge", share=1.0, limit=2.0), command, start, start, DT)
+    bare = simulate(extend(rod), np.clip(command, -2.0, 2.0), start, start, DT)
+    np.testing.assert_allclose(run.position, bare.position, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(run.torque, np.clip(command, -2.0, 2.0), rtol=0, atol=1e-12)
+
+
+def test_sensors_that_err_are_in_the_predicted_reading(rod: RobotModel):
+    t, dt = np.arange(800) * 2e-3, 2e-3
+    q, v, a = 0.8 * np.sin(3 * t), 2.4 * np.cos(3 * t), -7.2 * np.sin(3 * t)
+
+    def reading(q: np.ndarray, a: np.ndarray) -> np.ndarray:
+        return INERTIA * a + GRAVITY * np.sin(q)
+
+    def predicted(name: str, **parameters: float) -> np.ndarray:
+        model = put(rod, name, *(["hinge"] if find(name).acts_on == "joint" else []), **parameters)
+        return np.asarray(predict(model, t, q[:, None], v[:, None], a[:, None], dt))[:, 0]
+
+    inside = slice(10, -10)
+    cases = {
+        "encoder_offset": ({"offset": 0.05}, reading(q - 0.05, a)),
+        "encoder_scale": ({"scale": 0.02}, reading(0.98 * q, 0.98 * a)),
+        "torque_saturation": ({"share": 1.0, "limit": 1.5}, np.clip(reading(q, a), -1.5, 1.5)),
+    }
+    for name, (parameters, expected) in cases.items():
+        np.testing.assert_allclose(predicted(name, **parameters)[inside], expected[inside], rtol=0, atol=1e-6)
+    late = t * (1 + 1e-3)  # the torque is that of a time that runs ahead; to first order in the rate
+    expected = reading(0.8 * np.sin(3 * late), -7.2 * np.sin(3 * late))
+    np.testing.assert_allclose(predicted("clock_error", rate=1e-3)[inside], expected[inside], rtol=0, atol=3e-5)
 
 
 def test_double_precision_needs_no_setting_of_the_caller(chain: RobotModel, tmp_path: Path):

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..effects.kinematic import CATALOGUE, HISTORY, Column, KinematicEffect, Postures, columns_of
+from ..effects.base import Effect
+from ..effects.kinematic import CATALOGUE, HISTORY, Column, Postures, columns_of, shape_of
 from ..recordings.poses import PoseRecording
 from ..results import Name
 from ..rigid.model import RobotModel
@@ -48,7 +49,7 @@ Moves = list[tuple[int, Float[np.ndarray, "6 samples"]]]
 class Block(NamedTuple):
     """An effect at a place with one value of its shape parameter."""
 
-    effect: KinematicEffect
+    effect: type[Effect]
     columns: tuple[Column, ...]
     sizes: tuple[float, ...]
     shape: float
@@ -92,7 +93,7 @@ def blocks_of(
         if effect.name in GEOMETRY or effect.name in forbid:
             continue
         for at in _places(effect, chain, frames):
-            for shape in effect.shape[1]:
+            for shape in shape_of(effect)[1]:
                 columns = columns_of(effect, model, at, shape)
                 sizes = sizes_of(columns, postures)
                 if effect is HISTORY:  # of joints that move
@@ -126,9 +127,7 @@ def known_frames(
     return found
 
 
-def _places(
-    effect: KinematicEffect, chain: Sequence[int], frames: Mapping[str, tuple[int, int]]
-) -> list[tuple[int, ...]]:
+def _places(effect: type[Effect], chain: Sequence[int], frames: Mapping[str, tuple[int, int]]) -> list[tuple[int, ...]]:
     if effect.acts_on == "robot":
         return [()]
     if effect.acts_on == "frame":
@@ -147,7 +146,7 @@ def effects_on(postures: Sequence[Postures], measured: Measured, blocks: Sequenc
     def jacobian(unknowns: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, "rows all"]:
         return moved_rows(measured, twist_rows(measured, unknowns), moved) * sizes
 
-    handicap = [0.01 * (len(b.columns) - 1) + 0.005 * np.log(len(b.effect.shape[1])) for b in blocks]
+    handicap = [0.01 * (len(b.columns) - 1) + 0.005 * np.log(len(shape_of(b.effect)[1])) for b in blocks]
     return Effects(tuple(block.columns for block in blocks), jacobian, sizes, np.array(handicap))
 
 

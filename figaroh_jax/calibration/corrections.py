@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..compiled.batching import program
-from ..effects.kinematic import Column, Postures
+from ..effects.kinematic import Column, Postures, shape_of
 from ..estimation import marginal
 from ..recordings.devices import Device
 from ..results import Cause, Estimate, Gain, Name
@@ -114,8 +114,8 @@ def causes_of(
     for block in named:
         values = {c.parameter: by_name[c.label] for c in block.columns}
         estimates = {key: Estimate(p.value, p.std, p.unit) for key, p in values.items()}
-        if block.effect.shape[0]:
-            estimates[block.effect.shape[0]] = Estimate(float(block.shape), block.shape_std, "1")
+        if shape_of(block.effect)[0]:
+            estimates[shape_of(block.effect)[0]] = Estimate(float(block.shape), block.shape_std, "1")
         share = np.mean([any(blocks[j].name == block.name for j in f.choice.effects) for f in folds])
         found.append(Cause(block.name, estimates, float(share), gain))
     return tuple(found)
@@ -131,8 +131,8 @@ def twists_of(model: RobotModel, final: Measured, at: np.ndarray) -> dict[str, n
     """Constant twist of each joint: offsets and geometry, not what depends on the posture."""
     scale = np.asarray(final.problem.scale)
     twists: dict[str, np.ndarray] = {}
-    q, none = np.zeros((1, model.nv)), np.zeros(0)
-    one = Postures(q, q, none, none, none, none, 1.0)
+    q, none = np.zeros((1, model.nv)), np.zeros((1, 0))
+    one = Postures(q, q, none, none, none, np.zeros(1), 1.0)
     for k, column in enumerate(final.columns):
         if column.effect in ("joint_offset", "link_geometry"):
             ((joint, field),) = column.pieces

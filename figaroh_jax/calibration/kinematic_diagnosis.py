@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import jax
 import numpy as np
 
-from ..effects.kinematic import CATALOGUE, HISTORY, KinematicEffect
+from ..effects.kinematic import CATALOGUE, HISTORY
 from ..estimation import marginal
 from ..recordings.poses import PoseRecording, read_pose_recordings
 from ..recordings.posture_checks import check_pose_recordings
@@ -262,9 +262,10 @@ def _answer(calibration: Calibration, causes: tuple[Cause, ...], p_value: float,
     scale = (1e3, 180.0 / np.pi)
     experiment = None
     doubted = next((c for c in causes if c.ambiguous_with), None)
-    entry: KinematicEffect | None = CATALOGUE.get(doubted.name.effect) if doubted else None
-    if doubted is not None and entry is not None and entry.separated_by:
-        text = entry.separated_by.format(at=" and ".join(doubted.name.at) or "all joints")
+    entry = CATALOGUE.get(doubted.name.effect) if doubted else None
+    wording = entry.separated_by_postures or entry.separated_by if entry else ""
+    if doubted is not None and wording:
+        text = wording.format(at=" and ".join(doubted.name.at) or "all joints")
         pairs = tuple((doubted.name.effect, other.effect) for other in doubted.ambiguous_with)
         experiment = Experiment(text, tuple(dict.fromkeys(pairs)))
     return PoseDiagnosis(

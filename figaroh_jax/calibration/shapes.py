@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from ..effects.kinematic import Postures, columns_of
+from ..effects.kinematic import Postures, columns_of, shape_of
 from ..estimation.marginal import FLAT, Linear, Posterior
 from ..rigid.model import RobotModel
 from .candidates import Block, moved_rows, moves, sizes_of, twist_rows
@@ -50,7 +50,7 @@ def refine(
 
     fitted = np.vstack([linear.jacobian[used][:, free] * scale[:, None], np.diag(root)])
     for k, block in enumerate(once):
-        if len(block.effect.shape[1]) > 1:
+        if len(shape_of(block.effect)[1]) > 1:
             beside = np.hstack([fitted, *(tall(other) for j, other in enumerate(once) if j != k)])
             basis = np.linalg.svd(beside / np.linalg.norm(beside, axis=0).clip(1e-300), full_matrices=False)[0]
             once[k] = _sharpest(model, postures, block, lambda b, basis=basis: _taken(tall(b), basis, e))
@@ -66,7 +66,7 @@ def _taken(Z: Array, basis: Array, e: Array) -> float:
 def _sharpest(model: RobotModel, postures: Sequence[Postures], block: Block, taken) -> Block:
     from scipy.optimize import minimize_scalar
 
-    grid = np.array(block.effect.shape[1])
+    grid = np.array(shape_of(block.effect)[1])
     place = int(np.argmin(np.abs(grid - block.shape)))
     low, high = grid[max(place - 1, 0)], grid[min(place + 1, len(grid) - 1)]
     at = tuple(model.joint_index(name) for name in block.columns[0].at)

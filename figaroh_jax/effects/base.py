@@ -94,7 +94,7 @@ class Motion(eqx.Module):
         return smooth_sign(self.velocity, self.acceleration, self.dt, self.width)
 
     @property
-    def angle(self) -> Float[Array, "samples nv"]:
+    def angle(self) -> Float[Leaf, "samples nv"]:
         """Position of each coordinate, rad or m; zero where no one number tells it (joints of several axes)."""
         if self.model.nq == len(self.model.joint_names):
             return jnp.asarray(self.position)
@@ -194,10 +194,12 @@ class Effect(eqx.Module):
     name: ClassVar[str]
     title: ClassVar[str]  # in plain words, for people
     equation: ClassVar[str]  # as text
-    acts_on: ClassVar[Literal["joint", "pair", "link", "robot"]]
+    acts_on: ClassVar[Literal["joint", "pair", "link", "robot", "frame"]]  # frame: of base or tool, in postures
     follows_torque: ClassVar[bool] = False  # whether its torque depends on the current model's (load or total)
     inertial: ClassVar[bool] = False  # whether its amplitudes are ten parameters of its link: the regressor's columns
     body: ClassVar[bool] = False  # whether these are a body's that exists: mass > 0, pseudo-inertia >= 0
+    levels: ClassVar[tuple[str, ...]] = ("torque", "pose")  # of diagnoses that look for it
+    correction: ClassVar[float] = 1.0  # its linear parameters behind one of what a calibration of postures reports
     searched: ClassVar[bool] = True  # whether a diagnosis looks for it, that is, whether it is in the catalogue
     # relations to other effects, by name; the last two hold both ways, whichever class states them (`related`)
     contains: ClassVar[tuple[str, ...]] = ()  # simpler effects that it can imitate exactly: they are preferred
@@ -208,6 +210,7 @@ class Effect(eqx.Module):
     speed_law: ClassVar[bool] = False  # whether it is a law of dry friction over the speed, one of several alike
     needs_trust: ClassVar[float] = np.inf  # trust in the inertials (relative) above which it is no cause
     separated_by: ClassVar[str] = ""  # the experiment that tells it from what looks alike; {at} stands for the place
+    separated_by_postures: ClassVar[str] = ""  # the same of postures, where it is another one
 
     def torque(self, motion: Motion) -> Float[Array, "samples *rows"]:
         """Torque added, N m or N: `(samples,)` at a joint, `(samples, 2)` at a pair, else `(samples, nv)`."""
@@ -218,9 +221,17 @@ class Effect(eqx.Module):
         """The robot with the effect in it, for effects that change its inertia, gravity or geometry."""
         return model
 
-    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
-        """What the position sensor of joint `at` reads minus the truth, rad or m."""
+    def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
+        """What the position sensor of the (last) joint `at` reads minus the truth, rad or m; of the robot: of each."""
         raise NotImplementedError(f"{self.name} has no form at the position sensor")
+
+    @staticmethod
+    def twist(model: RobotModel, at: tuple[int, ...], shape: float, /) -> Iterator[tuple[str, str, Sequence[Any]]]:
+        """Small twists of joint frames that postures show: name, unit and (tree joint, field of the postures) of each.
+
+        See `kinematic.Column`; `shape` is the value of the parameter that is not linear.
+        """
+        raise NotImplementedError("the effect has no form as a twist")
 
     def torque_error(self, motion: Motion) -> Float[Array, "samples *rows"]:
         """What the torque sensors read beside the torque of the drives, N m or N; columns as in `torque`."""
@@ -283,7 +294,7 @@ class Effect(eqx.Module):
         """`at` as an array."""
         return np.asarray(self.at) if isinstance(self.at, Place) else self.at
 
-    def here(self, signal: Float[Array, "samples nv"], place: int = 0) -> Float[Array, " samples"]:
+    def here(self, signal: Float[Leaf, "samples nv"], place: int = 0) -> Float[Leaf, " samples"]:
         """Column of `signal` at the joint where the effect acts (`place` 1: the second of a pair)."""
         if isinstance(self.at, Place) or (isinstance(signal, np.ndarray) and isinstance(self.at, np.ndarray)):
             return signal[:, self.at[place]]

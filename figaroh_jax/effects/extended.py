@@ -208,7 +208,8 @@ def read_position(effects: tuple[Effect, ...], motion: Motion) -> Float[Array, "
     position = motion.position
     for effect in effects:
         if effect.has("position_error"):
-            position = position.at[:, effect.at[0]].add(effect.position_error(motion))
+            error = effect.position_error(motion)
+            position = position + error if error.ndim == 2 else position.at[:, effect.at[-1]].add(error)
     return position
 
 

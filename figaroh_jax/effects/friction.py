@@ -179,7 +179,12 @@ class FrictionDrift(JointEffect):
 class Bristle(JointEffect):
     """Dry friction with a state: a bristle that bends before it slides, in units of its sliding deflection."""
 
-    memory: Float[Array, ""] | None = eqx.field(default=None, kw_only=True)  # the state, where it is known (`step`)
+    force: Scalar = amplitude("N m", lower=0.0)
+    distance: Scalar = shape("rad", (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1), (2e-5, 0.4))
+    memory: Any = eqx.field(default=None, kw_only=True)  # the state, where it is known (`step`)
+
+    def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        return self.force * (self.bent(motion) - self.here(motion.direction))
 
     def level(self, velocity: Float[Array, "*samples"]) -> Float[Array, "*samples"]:
         """Deflection at which the bristle slides at a speed."""
@@ -216,11 +221,6 @@ class Presliding(Bristle):
     name, title = "presliding", "presliding: friction that lags behind the reversal"
     equation = "force (z - s(v)), z' = v/distance (1 - z s(v))"
     separated_by = "reversals of {at} at several accelerations: presliding is late in position, a delay in time"
-    force: Scalar = amplitude("N m", lower=0.0)
-    distance: Scalar = shape("rad", (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1), (2e-5, 0.4))
-
-    def torque(self, motion: Motion) -> Float[Array, " samples"]:
-        return self.force * (self.bent(motion) - self.here(motion.direction))
 
     def physical(self) -> dict[str, Scalar]:
         force, distance = self.force, self.distance
@@ -239,16 +239,11 @@ class LuGreFriction(Bristle):
     equation = "force (z - s(v)), z' = v/distance (1 - z s(v)/g), g = 1 + rise exp(-(v/speed)^2)"
     separated_by = "slow reversals of {at}, and constant speeds below 0.3 rad/s"
     searched = False  # presliding and Stribeck friction together, which a diagnosis finds one after the other
-    force: Scalar = amplitude("N m", lower=0.0)
-    distance: Scalar = shape("rad", (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1), (2e-5, 0.4))
     rise: Scalar = shape("", (0.1, 0.5), (0.0, 3.0))
     speed: Scalar = shape("rad/s", (0.05, 0.2), (0.012, 0.64))
 
     def level(self, velocity: Float[Array, "*samples"]) -> Float[Array, "*samples"]:
         return 1 + self.rise * jnp.exp(-((velocity / self.speed) ** 2))
-
-    def torque(self, motion: Motion) -> Float[Array, " samples"]:
-        return self.force * (self.bent(motion) - self.here(motion.direction))
 
 
 @register

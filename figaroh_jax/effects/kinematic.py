@@ -1,25 +1,42 @@
-r"""The catalogue at kinematic level: every effect is a small twist on joints, as a function of the posture.
+r"""Effects as postures see them: errors of the joints' positions, and twists of links and frames.
 
-Each entry has its equation, its parameters with units, and where it may act. Notation: S the twist of a unit motion of
-the joint, q its measured position, q' that of the posture before, tau_g and m_g the torque about the axis and the
-moments across it that gravity puts on the joint (N m, positive where it pulls), t the time since the first posture.
-The true position is the measured one plus the effect. A twist `[linear, angular]` (m, rad) is in the joint frame,
+An effect with a `position_error` is one of postures as it stands, whether it is here or in another file of the
+catalogue or a user's own; a few have a form of their own as a `twist`. `columns_of` makes small twists of both.
+Notation: S the twist of a unit motion of the joint, q its measured position, q' that of the posture before, tau_g and
+m_g the torque about the axis and the moments across it that gravity puts on the joint (N m, positive where it pulls),
+t the time since the first posture. An effect's sign is that of all effects: what the sensor reads minus the truth. A
+calibration reports corrections, what has to be added to the reading, where `Effect.correction` is -1: in the equations
+here the true position is the measured one plus the effect. A twist `[linear, angular]` (m, rad) is in the joint frame,
 before the joint moves; a coefficient times its field is what the joint's twist gains.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError, nearest
 from ..rigid.chain import joint_axis
-from ..rigid.model import RobotModel, dofs
+from ..rigid.model import Leaf, RobotModel, dofs
+from . import catalogue as catalogue  # its effects with an error of the position are effects of postures too
+from .base import Effect, JointEffect, Motion, Scalar, amplitude, joint_unit, shape
+from .registry import POSES as CATALOGUE, register
 
-__all__ = ["CATALOGUE", "HISTORY", "Column", "KinematicEffect", "Postures", "columns_of", "find_kinematic"]
+__all__ = [
+    "CATALOGUE",
+    "HISTORY",
+    "Column",
+    "PostureMotion",
+    "Postures",
+    "across",
+    "axis_twist",
+    "columns_of",
+    "find_kinematic",
+    "shape_of",
+]
 
 Array = np.ndarray
 _ORDERS = tuple(np.arange(2.0, 12.5, 0.5))  # of gear errors, per turn of the joint
@@ -53,28 +70,6 @@ class Column(NamedTuple):
         return " ".join([self.effect, *self.at, *(() if alone else (self.parameter,))])
 
 
-class KinematicEffect(NamedTuple):
-    """An effect that can be named: `build` gives its columns at one place, for one value of its shape parameter."""
-
-    name: str
-    title: str
-    equation: str
-    acts_on: Literal["joint", "pair", "robot", "frame"]  # a frame: `at` is its joint and its own index
-    build: Callable[[RobotModel, tuple[int, ...], float], Iterator[tuple[str, str, Sequence[tuple[int, Callable]]]]]
-    shape: tuple[str, tuple[float, ...]] = ("", (0.0,))  # name and grid of the parameter that is not linear
-    separated_by: str = ""
-
-
-def _along(scalar: Callable[[Postures, int], Array]) -> Callable:
-    """Effect along the joint's own motion: S times a scalar of the posture."""
-
-    def field(model: RobotModel, joint: int) -> tuple[int, Callable[[Postures], Array]]:
-        motion = axis_twist(model, joint)
-        return joint, lambda postures: motion[:, None] * scalar(postures, joint)
-
-    return field
-
-
 def axis_twist(model: RobotModel, joint: int) -> Float[np.ndarray, "6"]:
     """Twist S of a unit motion of a joint, in its own frame."""
     twist = np.zeros(6)
@@ -99,19 +94,6 @@ def _move(model: RobotModel) -> Callable[[Postures, int], Array]:
     return lambda postures, j: (postures.before - postures.q)[:, dofs(model.joints).positions[j].start]
 
 
-def _angle(model: RobotModel, j: int) -> str:
-    return "rad" if model.joints[j].kind == "revolute" else "m"
-
-
-def _torque(model: RobotModel, j: int) -> str:
-    return "N m" if model.joints[j].kind == "revolute" else "N"
-
-
-def _offset(model, at, _):
-    (j,) = at
-    yield "offset", _angle(model, j), [_along(lambda p, j: np.ones(len(p.q)))(model, j)]
-
-
 def _geometry(model, at, _):
     (j,) = at
     revolute = model.joints[j].kind == "revolute"
@@ -129,28 +111,6 @@ def _axis_names(vectors: Array, names: str) -> list[str]:
     return [name or f"u{k + 1}" for k, name in enumerate(found)]
 
 
-def _scale(model, at, _):
-    (j,) = at
-    yield "scale", "1", [_along(_position(model))(model, j)]
-
-
-def _eccentricity(model, at, _):
-    (j,) = at
-    for name, wave in (("sine", np.sin), ("cosine", np.cos)):
-        yield name, _angle(model, j), [_along(lambda p, j, wave=wave: wave(_position(model)(p, j)))(model, j)]
-
-
-def _gear(model, at, order):
-    (j,) = at
-    for name, wave in (("sine", np.sin), ("cosine", np.cos)):
-        yield name, _angle(model, j), [_along(lambda p, j, wave=wave: wave(order * _position(model)(p, j)))(model, j)]
-
-
-def _compliance(model, at, _):
-    (j,) = at
-    yield "compliance", f"{_angle(model, j)}/({_torque(model, j)})", [_along(lambda p, j: p.torque[:, j])(model, j)]
-
-
 def _bending(model, at, _):
     (j,) = at
     for name, vector in zip(("bending 1", "bending 2"), across(model, j), strict=True):
@@ -164,11 +124,6 @@ def _thermal(model, at, share):
     way = np.asarray(model.placement[j])[:3, :3].T @ np.asarray(model.placement[j])[:3, 3]
     twist = np.r_[way, np.zeros(3)]
     yield "growth", "1", [(j, lambda p: twist[:, None] * -np.expm1(-p.time / (share * p.duration)))]
-
-
-def _payload(model, at, _):
-    (j,) = at
-    yield "compliance", f"{_angle(model, j)}/({_torque(model, j)})", [_along(lambda p, j: p.payload[:, j])(model, j)]
 
 
 def _base(model, at, _):
@@ -208,148 +163,252 @@ def _turned(axis: Array, q: Array, vector: Array) -> Float[np.ndarray, "3 sample
     return along[:, None] + np.outer(vector - along, np.cos(q)) + np.outer(across, np.sin(q))
 
 
-def _settling(model, at, _):
-    joints = range(len(model.joints))
-    yield "amount", "1", [_along(_move(model))(model, j) for j in joints]
-
-
-def _hysteresis(model, at, _):
-    (j,) = at
-    yield "width", _angle(model, j), [_along(lambda p, j: -np.sign(_move(model)(p, j)))(model, j)]
-
-
-def _backlash(model, at, _):
-    (j,) = at
-    yield "width", _angle(model, j), [_along(lambda p, j: np.sign(p.torque[:, j]))(model, j)]
-
-
-def _coupling(model, at, _):
-    i, j = at
-    field = _along(lambda p, j: _position(model)(p, i))
-    yield "ratio", "1", [field(model, j)]
-
-
-CATALOGUE: dict[str, KinematicEffect] = {
-    effect.name: effect
-    for effect in (
-        KinematicEffect("joint_offset", "zero offset of the encoder", "S c", "joint", _offset),
-        KinematicEffect(
-            "link_geometry", "geometry of the link", "three translations, two rotations", "joint", _geometry
-        ),
-        KinematicEffect(
-            "encoder_scale",
-            "scale of the encoder",
-            "S s q",
-            "joint",
-            _scale,
-            separated_by="postures over more than half a turn of {at}",
-        ),
-        KinematicEffect(
-            "encoder_eccentricity",
-            "eccentricity of the encoder",
-            "S (a sin q + b cos q)",
-            "joint",
-            _eccentricity,
-            separated_by="the same postures with two payloads, and a whole turn of {at}",
-        ),
-        KinematicEffect(
-            "gear_transmission_error",
-            "transmission error of the gear",
-            "S (a sin N q + b cos N q)",
-            "joint",
-            _gear,
-            shape=("order", _ORDERS),
-            separated_by="a dense sweep of {at} alone",
-        ),
-        KinematicEffect(
-            "joint_compliance",
-            "compliance under gravity",
-            "S c tau_g",
-            "joint",
-            _compliance,
-            separated_by="the same postures with two payloads, on both sides of the vertical",
-        ),
-        KinematicEffect(
-            "link_compliance",
-            "bending of the link under gravity",
-            "two rotations across the axis, each in proportion to its moment",
-            "joint",
-            _bending,
-            separated_by="the same postures with two payloads, the link horizontal and vertical",
-        ),
-        KinematicEffect(
-            "thermal_growth",
-            "growth of the link with warmth",
-            "length of the link times g (1 - exp(-t / T))",
-            "joint",
-            _thermal,
-            shape=("share", (0.1, 0.3, 1.0, 10.0)),  # of the whole duration
-            separated_by="one posture measured again and again while the robot warms up",
-        ),
-        KinematicEffect(
-            "payload_deflection",
-            "deflection under the payload",
-            "S c tau_load",
-            "joint",
-            _payload,
-            separated_by="the same postures with and without the payload",
-        ),
-        KinematicEffect(
-            "settling",
-            "reading before the motion had settled",
-            "S a (q' - q) in all joints",
-            "robot",
-            _settling,
-            separated_by="the same postures in another order, and with a longer wait",
-        ),
-        KinematicEffect(
-            "reversal_hysteresis",
-            "hysteresis of the direction of approach",
-            "S w sign(q - q')",
-            "joint",
-            _hysteresis,
-            separated_by="each posture approached with {at} from both sides",
-        ),
-        KinematicEffect(
-            "backlash",
-            "backlash",
-            "S w sign(tau_g)",
-            "joint",
-            _backlash,
-            separated_by="postures of {at} near the vertical, on both sides of it",
-        ),
-        KinematicEffect("joint_coupling", "coupling of two joints", "S_j k q_i", "pair", _coupling),
-        KinematicEffect("base_frame", "place of the base, said to be known", "a fixed twist", "frame", _base),
-        KinematicEffect("tool_frame", "place of the tool frame, said to be known", "a fixed twist", "frame", _tool),
-    )
-}
-
-
 def _history(model, at, sign):
     for j in range(len(model.joints)):
         move = _move(model)
         law = (lambda p, j, move=move: np.sign(move(p, j))) if sign else move
-        yield model.joints[j].name, "1", [_along(law)(model, j)]
+        motion = axis_twist(model, j)
+        yield model.joints[j].name, "1", [(j, lambda p, j=j, law=law, motion=motion: motion[:, None] * law(p, j))]
 
 
-# What depends on the posture before in any way, joint by joint: it competes, so that such an error gets no wrong name,
-# but it is no name itself.
-HISTORY = KinematicEffect(
-    "history", "dependence on the posture before", "S_j h_j(q' - q)", "robot", _history, ("sign", (0.0, 1.0))
-)
+class PostureMotion(Motion):
+    """Postures as the effects see a motion: at rest, each with the one before; columns are tree joints."""
+
+    before: Float[Leaf, "samples nq"]
+    payload: Float[Leaf, "samples nv"]  # what the carried load adds to `load`, N m or N
+
+    @classmethod
+    def of(cls, model: RobotModel, postures: Postures) -> PostureMotion:
+        """The postures of a recording; the drives hold against gravity."""
+        load = -postures.torque
+        rest = np.zeros_like(load)
+        time = postures.time if len(postures.time) == len(postures.q) else np.zeros(len(postures.q))
+        width = np.zeros(load.shape[1])
+        return cls(model, time, postures.q, rest, rest, load, load, 0.0, width, postures.before, -postures.payload)
+
+    @property
+    def angle(self) -> Float[Leaf, "samples nj"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Position of each tree joint, rad or m."""
+        return np.asarray(self.position)[:, self._starts]
+
+    @property
+    def way(self) -> Float[np.ndarray, "samples nj"]:
+        """Motion of each tree joint from the posture before, rad or m."""
+        return (np.asarray(self.position) - np.asarray(self.before))[:, self._starts]
+
+    @property
+    def _starts(self) -> list[int]:
+        return [at.start for at in dofs(self.model.joints).positions]
 
 
-def find_kinematic(name: str) -> KinematicEffect:
-    """The kinematic effect called `name`; raises `InputError` with the nearest known name."""
+@register
+class JointOffset(JointEffect):
+    """A zero of the encoder that is not the model's, as a calibration names it."""
+
+    name, title, equation = "joint_offset", "zero offset of the encoder", "S c"
+    levels, correction = ("pose",), -1.0
+    offset: Scalar = amplitude("rad")
+
+    def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        return self.offset * np.ones(len(motion.time))
+
+
+@register
+class LinkGeometry(JointEffect):
+    """A link whose joint stands elsewhere than the model says."""
+
+    name, title, equation = "link_geometry", "geometry of the link", "three translations, two rotations"
+    levels = ("pose",)
+    twist = staticmethod(_geometry)
+
+
+@register
+class GearTransmissionError(JointEffect):
+    """An error that comes back several times in a turn: teeth, the wave of a harmonic drive."""
+
+    name, title = "gear_transmission_error", "transmission error of the gear"
+    equation = "S (a sin N q + b cos N q)"
+    levels, correction = ("pose",), -1.0
+    separated_by = "a dense sweep of {at} alone"
+    sine: Scalar = amplitude("rad")
+    cosine: Scalar = amplitude("rad")
+    order: Scalar = shape("", _ORDERS)
+
+    def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        angle = self.order * self.here(motion.angle)
+        return self.sine * np.sin(angle) + self.cosine * np.cos(angle)
+
+
+@register
+class JointCompliance(JointEffect):
+    """A joint that gives way under gravity, in proportion to its torque."""
+
+    name, title, equation = "joint_compliance", "compliance under gravity", "S c tau_g"
+    levels = ("pose",)
+    separated_by = "the same postures with two payloads, on both sides of the vertical"
+    compliance: Scalar = amplitude("rad/(N m)")
+
+    def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        return self.compliance * self.here(motion.load)
+
+
+@register
+class LinkCompliance(JointEffect):
+    """A link that bends under gravity."""
+
+    name, title = "link_compliance", "bending of the link under gravity"
+    equation = "two rotations across the axis, each in proportion to its moment"
+    levels = ("pose",)
+    separated_by = "the same postures with two payloads, the link horizontal and vertical"
+    twist = staticmethod(_bending)
+
+
+@register
+class ThermalGrowth(JointEffect):
+    """A link that grows as the robot warms up."""
+
+    name, title = "thermal_growth", "growth of the link with warmth"
+    equation = "length of the link times g (1 - exp(-t / T))"
+    levels = ("pose",)
+    separated_by = "one posture measured again and again while the robot warms up"
+    share: Scalar = shape("", (0.1, 0.3, 1.0, 10.0))  # of the whole duration
+    twist = staticmethod(_thermal)
+
+
+@register
+class PayloadDeflection(JointEffect):
+    """A joint that gives way under a load that is carried."""
+
+    name, title, equation = "payload_deflection", "deflection under the payload", "S c tau_load"
+    levels = ("pose",)
+    separated_by = "the same postures with and without the payload"
+    compliance: Scalar = amplitude("rad/(N m)")
+
+    def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        return self.compliance * self.here(motion.payload)
+
+
+@register
+class Settling(Effect):
+    """Joints read before they have come to rest."""
+
+    name, title, acts_on = "settling", "reading before the motion had settled", "robot"
+    equation = "S a (q' - q) in all joints"
+    levels = ("pose",)
+    separated_by = "the same postures in another order, and with a longer wait"
+    amount: Scalar = amplitude("")
+
+    def position_error(self, motion: Any) -> Float[Leaf, "samples nj"]:
+        return self.amount * motion.way
+
+
+@register
+class ReversalHysteresis(JointEffect):
+    """A joint that stops elsewhere when it comes from the other side."""
+
+    name, title = "reversal_hysteresis", "hysteresis of the direction of approach"
+    equation = "S w sign(q - q')"
+    levels = ("pose",)
+    separated_by = "each posture approached with {at} from both sides"
+    width: Scalar = amplitude("rad")
+
+    def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        return -self.width * np.sign(self.here(motion.way))
+
+
+@register
+class JointCoupling(Effect):
+    """A joint that follows another one in part."""
+
+    name, title, acts_on = "joint_coupling", "coupling of two joints", "pair"
+    equation = "S_j k q_i"
+    levels, correction = ("pose",), -1.0
+    ratio: Scalar = amplitude("")
+
+    def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        return self.ratio * self.here(motion.angle)
+
+
+@register
+class BaseFrame(Effect):
+    """A base frame that is said to be known and stands elsewhere."""
+
+    name, title, acts_on = "base_frame", "place of the base, said to be known", "frame"
+    equation = "a fixed twist"
+    levels = ("pose",)
+    twist = staticmethod(_base)
+
+
+@register
+class ToolFrame(Effect):
+    """A tool frame that is said to be known and stands elsewhere."""
+
+    name, title, acts_on = "tool_frame", "place of the tool frame, said to be known", "frame"
+    equation = "a fixed twist"
+    levels = ("pose",)
+    twist = staticmethod(_tool)
+
+
+class _History(Effect):
+    """What depends on the posture before in any way, joint by joint.
+
+    It competes, so that such an error gets no wrong name, but it is no name itself.
+    """
+
+    name, title, acts_on = "history", "dependence on the posture before", "robot"
+    equation = "S_j h_j(q' - q)"
+    sign: Scalar = shape("", (0.0, 1.0))
+    twist = staticmethod(_history)
+
+
+HISTORY = _History
+
+# the order of a search; effects of a user's own follow
+for _name in (
+    *("joint_offset", "link_geometry", "encoder_scale", "encoder_eccentricity", "gear_transmission_error"),
+    *("joint_compliance", "link_compliance", "thermal_growth", "payload_deflection", "settling"),
+    *("reversal_hysteresis", "backlash", "joint_coupling", "base_frame", "tool_frame"),
+):
+    CATALOGUE[_name] = CATALOGUE.pop(_name)
+
+
+def find_kinematic(name: str) -> type[Effect]:
+    """The effect of postures called `name`; raises `InputError` with the nearest known name."""
     if name not in CATALOGUE:
         raise InputError(f"no kinematic effect '{name}' in the catalogue{nearest(name, CATALOGUE)}")
     return CATALOGUE[name]
 
 
-def columns_of(effect: KinematicEffect, model: RobotModel, at: Sequence[int], shape: float = 0.0) -> tuple[Column, ...]:
-    """The effect's columns at the tree joints `at`."""
+def shape_of(effect: type[Effect]) -> tuple[str, tuple[float, ...]]:
+    """Name and grid of the effect's parameter that is not linear; no name and one point where it has none."""
+    return next(((n, p.grid) for n, p in effect.parameters().items() if not p.linear), ("", (0.0,)))
+
+
+def columns_of(effect: type[Effect], model: RobotModel, at: Sequence[int], shape: float = 0.0) -> tuple[Column, ...]:
+    """The effect's columns at the tree joints `at`, one for each linear parameter as a calibration reports it."""
     names = tuple(model.joints[j].name for j in at) if effect.acts_on in ("joint", "pair") else ()
-    return tuple(
-        Column(effect.name, names, parameter, unit, tuple(pieces))
-        for parameter, unit, pieces in effect.build(model, tuple(at), shape)
-    )
+    parts = effect.twist(model, tuple(at), shape) if effect.has("twist") else _shifts(effect, model, tuple(at), shape)
+    return tuple(Column(effect.name, names, parameter, unit, tuple(pieces)) for parameter, unit, pieces in parts)
+
+
+def _shifts(
+    effect: type[Effect], model: RobotModel, at: tuple[int, ...], shape: float
+) -> Iterator[tuple[str, str, Sequence[tuple[int, Callable]]]]:
+    """Twists along the joints' own motions: what a reading with the effect has to be moved by to be true."""
+    joints = at[-1:] if at else tuple(range(len(model.joints)))
+    unit_shape = {shape_of(effect)[0]: shape} if shape_of(effect)[0] else {}
+    for name, parameter in effect.parameters().items():
+        if parameter.linear:
+            one = effect(np.array(at, int), **{name: effect.correction}, **unit_shape)
+            unit = joint_unit(parameter.unit or "1", bool(at) and model.joints[at[-1]].kind != "revolute")
+            yield name, unit, [(j, _shift(model, j, one)) for j in joints]
+
+
+def _shift(model: RobotModel, joint: int, effect: Effect) -> Callable[[Postures], Float[np.ndarray, "6 samples"]]:
+    motion = axis_twist(model, joint)
+
+    def field(postures: Postures) -> Float[np.ndarray, "6 samples"]:
+        error = np.asarray(effect.position_error(PostureMotion.of(model, postures)))
+        return -motion[:, None] * (error if error.ndim == 1 else error[:, joint])
+
+    return field

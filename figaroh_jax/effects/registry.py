@@ -5,17 +5,26 @@ from __future__ import annotations
 from ..errors import InputError, nearest
 from .base import Effect
 
-__all__ = ["CATALOGUE", "find", "register", "related"]
+__all__ = ["CATALOGUE", "POSES", "find", "register", "related"]
 
-CATALOGUE: dict[str, type[Effect]] = {}
+CATALOGUE: dict[str, type[Effect]] = {}  # that a diagnosis of torques looks for
+POSES: dict[str, type[Effect]] = {}  # that a calibration and a diagnosis of postures look for
 _OTHERS: dict[str, type[Effect]] = {}  # known by name, but nothing that a diagnosis looks for
 
 
 def register(effect: type[Effect]) -> type[Effect]:
-    """Add an effect class to the catalogue under its `name` (usable as a decorator); returns it."""
-    if (CATALOGUE | _OTHERS).get(effect.name, effect).__qualname__ != effect.__qualname__:
+    """Add an effect class to the catalogue under its `name` (usable as a decorator); returns it.
+
+    Its `levels` say which diagnoses look for it: of torques, and of postures where it has an error of the position that
+    is linear in a parameter, or a twist.
+    """
+    if (CATALOGUE | _OTHERS | POSES).get(effect.name, effect).__qualname__ != effect.__qualname__:
         raise InputError(f"an effect called '{effect.name}' is registered already")
-    (CATALOGUE if effect.searched else _OTHERS)[effect.name] = effect
+    if "torque" in effect.levels:
+        (CATALOGUE if effect.searched else _OTHERS)[effect.name] = effect
+    linear = effect.has("position_error") and any(p.linear for p in effect.parameters().values())
+    if "pose" in effect.levels and effect.searched and (effect.has("twist") or linear):
+        POSES[effect.name] = effect
     return effect
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from ..rigid.model import Leaf
 from .base import Effect, JointEffect, Motion, Native, Scalar, amplitude, shape
 from .registry import register
 
@@ -135,11 +136,12 @@ class EncoderOffset(JointEffect):
     """A zero of the encoder that is not the model's."""
 
     name, title = "encoder_offset", "zero offset of the encoder"
+    levels = ("torque",)  # to a calibration it is a `joint_offset`
     equation = "q_measured = q + offset"
     separated_by = "kinematic calibration, or a reference mark of {at}: torque hardly tells it from inertia"
     offset: Scalar = amplitude("rad", lower=-0.2, upper=0.2)
 
-    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
+    def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
         return self.offset * jnp.ones_like(motion.time)
 
 
@@ -148,11 +150,13 @@ class EncoderScale(JointEffect):
     """An encoder that counts too much or too little a turn, or a gear ratio that is not the model's."""
 
     name, title = "encoder_scale", "scale of the encoder"
+    correction = -1.0
     equation = "q_measured = q + scale q"
     separated_by = "motion of {at} over more than half a turn, or kinematic calibration"
+    separated_by_postures = "postures over more than half a turn of {at}"
     scale: Scalar = amplitude("", lower=-0.2, upper=0.2)
 
-    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
+    def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
         return self.scale * self.here(motion.angle)
 
 
@@ -161,11 +165,14 @@ class EncoderEccentricity(JointEffect):
     """An encoder's disc that is not centred: an error that comes back with every turn."""
 
     name, title = "encoder_eccentricity", "eccentricity of the encoder"
+    correction = -1.0
     equation = "q_measured = q + sine sin q + cosine cos q"
     separated_by = "a whole turn of {at}, or kinematic calibration with two payloads"
+    separated_by_postures = "the same postures with two payloads, and a whole turn of {at}"
     sine: Scalar = amplitude("rad", lower=-0.05, upper=0.05)
     cosine: Scalar = amplitude("rad", lower=-0.05, upper=0.05)
 
-    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
+    def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
         q = self.here(motion.angle)
-        return self.sine * jnp.sin(q) + self.cosine * jnp.cos(q)
+        space = np if isinstance(q, np.ndarray) else jnp
+        return self.sine * space.sin(q) + self.cosine * space.cos(q)

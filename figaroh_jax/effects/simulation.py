@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -86,15 +86,15 @@ def _simulate(
     robot = changed_robot(extended)
 
     def advance(
-        state: tuple[Array, Array, Array], step: tuple[Array, Array]
-    ) -> tuple[tuple[Array, Array, Array], tuple[Array, ...]]:
+        state: tuple[Array, Array, Array, list[Array]], step: tuple[Array, Array]
+    ) -> tuple[tuple[Array, Array, Array, list[Array]], tuple[Array, ...]]:
         q, v, a, memory = state
         tau = step[1] if command is None else jnp.asarray(command(step[0], q, v), jnp.float64)
         for effect in extended.effects:
             tau = effect.delivered(tau)
         here = dataclasses.replace(extended, effects=_remembering(extended.effects, memory))
         after = _step(here, robot, step[0], q, v, a, tau, dt)
-        memory = [e.step(after, dt).memory for e in here.effects if e.has("step")]
+        memory: list[Any] = [getattr(e.step(after, dt), "memory") for e in here.effects if e.has("step")]  # noqa: B009
         a = (after - v) / dt
         return (q + dt * after, after, a, memory), (q, v, a, tau)
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..rigid.model import Leaf
 from .base import Effect, JointEffect, Motion, Native, Scalar, amplitude, shape
 from .registry import register
 
@@ -128,7 +129,7 @@ class JointElasticity(JointEffect):
     separated_by = "a chirp of {at} above a third of its resonance, or a sensor on the link side"
     compliance: Scalar = shape("rad/(N m)", (2e-5, 1e-4, 4e-4, 1.5e-3, 5e-3), (1e-7, 1e-2))
 
-    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
+    def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
         return self.compliance * self.here(motion.load)
 
 
@@ -137,11 +138,15 @@ class Backlash(JointEffect):
     """Play in the gear: the motor stands ahead of the link by half of it, on the side to which it pushes."""
 
     name, title = "backlash", "backlash"
+    correction = 2.0  # a calibration reports half of the play
     equation = "q_measured = q + width/2 sign(tau_load)"
     separated_by = "slow reversals of the load of {at}, with a second encoder on the link"
+    separated_by_postures = "postures of {at} near the vertical, on both sides of it"
     width: Scalar = amplitude("rad", lower=0.0, upper=0.05)
 
-    def position_error(self, motion: Motion) -> Float[Array, " samples"]:
-        load = self.here(jnp.asarray(motion.load))
+    def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
+        load = self.here(motion.load)
+        if isinstance(motion.dt, float) and motion.dt == 0.0:  # instants that are no record: the play has been crossed
+            return self.width / 2 * (np if isinstance(load, np.ndarray) else jnp).sign(load)
         ramp = jnp.abs(motion.rate(load)) * jnp.maximum(motion.dt, _CROSSING) / 2
         return self.width / 2 * jnp.clip(load / (ramp + 1e-12), -1.0, 1.0)

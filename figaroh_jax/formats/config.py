@@ -34,11 +34,13 @@ __all__ = [
     "Bound",
     "Diagnose",
     "Identify",
+    "JointDrive",
     "Load",
     "Measurement",
     "Preprocess",
     "RecordingEntry",
     "Robot",
+    "Rollouts",
     "Task",
     "Transmission",
     "Units",
@@ -259,10 +261,50 @@ class Baseline(_Keys):
     effects: tuple[BaselineEffect, ...] = ()
 
 
-class Actuator(_Keys):
-    """Whether a rollout may trust the servo gains."""
+class JointDrive(_Keys):
+    """The drive of a joint that a URDF does not describe: torque = kp (u - q) - kd v, within the limit."""
+
+    kind: Literal["position", "velocity", "torque"] = "position"
+    kp: Positive | None = None  # N m/rad
+    kd: Annotated[Number, Field(ge=0)] = 0.0  # N m s/rad
+    force: Positive | None = None  # limit, N m
+
+    @model_validator(mode="after")
+    def _gains(self) -> JointDrive:
+        if self.kind == "position" and self.kp is None:
+            raise ValueError("kind position needs kp (N m/rad)")
+        if self.kind == "velocity" and not self.kd:
+            raise ValueError("kind velocity needs kd (N m s/rad)")
+        return self
+
+
+class Actuator(BaseModel):
+    """Whether a rollout may trust the servo gains; every other key is a joint with its drive."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
+    __pydantic_extra__: dict[str, JointDrive]
 
     gains: Literal["known", "free"] = "known"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _joints_have_drives(cls, value: Any) -> Any:
+        for key, drive in value.items() if isinstance(value, dict) else ():
+            if key != "gains" and not isinstance(drive, dict | JointDrive):
+                hint = nearest(str(key), ["gains"])
+                raise ValueError(f"unknown key '{key}'{hint}; beside it stand joints, as in joint_1: {{kp: 20, kd: 1}}")
+        return value
+
+    @property
+    def drives(self) -> dict[str, JointDrive]:
+        """The stated drives by joint."""
+        return dict(self.__pydantic_extra__ or {})
+
+
+class Rollouts(_Keys):
+    """How long a simulation runs before it is set on the measured state again."""
+
+    window: Positive | Literal["auto", "whole"] = "auto"  # s
 
 
 class Tolerance(_Keys):
@@ -307,6 +349,7 @@ class Task(_Keys):
     preprocess: Preprocess = Preprocess()
     baseline: Baseline = Baseline()
     actuator: Actuator = Actuator()
+    rollout: Rollouts = Rollouts()
     diagnose: Diagnose = Diagnose()
     identify: Identify = Identify()
     _file: Path = PrivateAttr(default=Path("task"))

@@ -160,8 +160,8 @@ def _physical(effect: Effect) -> Mapping[str, Any]:
 
 
 def _fields(effect: Effect) -> list[str]:
-    known = list(effect.parameters())
-    others = [field.name for field in dataclasses.fields(effect) if field.name not in ("at", *known)]
+    known = list(effect.parameters())  # a state (`memory`) is the simulation's
+    others = [field.name for field in dataclasses.fields(effect) if field.name not in ("at", "memory", *known)]
     if others:
         raise InputError(
             f"effect '{effect.name}' has a field '{others[0]}' that is no parameter; declare it with "

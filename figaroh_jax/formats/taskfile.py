@@ -25,7 +25,8 @@ rotor_inertia coupled_transmission torque_gain torque_offset torque_ripple joint
 backlash torque_delay torque_lag torque_saturation contact external_wrench clock_error encoder_offset encoder_scale
 encoder_eccentricity joint_offset link_geometry gear_transmission_error joint_compliance link_compliance base_frame
 tool_frame outlier thermal_growth payload_deflection settling reversal_hysteresis joint_coupling joint_damping
-friction_loss actuator_gain command_delay actuator_saturation voltage_saturation contact_stiffness contact_friction
+friction_loss actuator_gain command_delay actuator_saturation voltage_saturation dead_band contact_stiffness
+contact_friction
 """.split()
 
 LARGEST = 1 << 18  # bytes

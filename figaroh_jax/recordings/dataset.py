@@ -64,8 +64,10 @@ class Recording:
     trusted: Bool[np.ndarray, "samples nv"] | None = None  # False: torque that counts for nothing (see `cleaning`)
 
 
-def read_recordings(task: Task, model: RobotModel, *, floating: bool = False) -> tuple[Recording, ...]:
-    """Read every recording of a task of torque level, in the task's order.
+def read_recordings(
+    task: Task, model: RobotModel, *, floating: bool = False, rollouts: bool = False
+) -> tuple[Recording, ...]:
+    """Read every recording of a task of torque level, or of `rollouts` (a command in place of torque), in its order.
 
     With `floating` the root may be a free joint: the position then begins with its origin and quaternion (x y z,
     x y z w), the torque with the measured wrench on it, force and torque about its origin in its own axes. Raises
@@ -75,11 +77,16 @@ def read_recordings(task: Task, model: RobotModel, *, floating: bool = False) ->
     _check_names(task, model, floating)
     drive = Drive(task, model)
     recordings = tuple(_read(entry, f"data[{k}]", model, drive) for k, entry in enumerate(task.data))
+    if rollouts:
+        lacking = next((r for r in recordings if r.command is None), None)
+        if lacking is not None:
+            raise InputError(f"{lacking.file}: a rollout needs `command`, what the drives were told at each sample")
+        return recordings
     lacking = next((r for r in recordings if r.role == "fit" and r.torque is None), None)
     if lacking is not None:
         raise InputError(
-            f"{lacking.file}: a fit recording needs `torque` (only `role: holdout` may lack it);"
-            " poses without torque, and commands without torque, are not diagnosed yet"
+            f"{lacking.file}: a fit recording needs `torque` (only `role: holdout` may lack it), or all recordings a "
+            "`command` in its place"
         )
     return recordings
 

@@ -41,10 +41,12 @@ def to_json(diagnosis: Diagnosis) -> str:
 def write_predictions(
     path: Path,
     predictions: Mapping[str, tuple[Float[np.ndarray, "_"], Float[np.ndarray, "_ nv"]]],
+    quantity: str = "torque",
 ) -> None:
     """Write `predictions.npz`: `<name>_time` (s) and `<name>_torque` (N m or N) for each held-out recording.
 
-    `predictions` maps a recording's name (its file stem) to its own time stamps and the extended model's torque there.
+    `predictions` maps a recording's name (its file stem) to its own time stamps and the extended model's torque there;
+    `quantity` is `position` (rad or m) where it comes from a rollout.
     Raises `ValueError` where the two do not belong together.
     """
     arrays: dict[str, np.ndarray] = {}
@@ -55,7 +57,7 @@ def write_predictions(
                 f"predictions of '{name}': time has shape {stamps.shape} and torque {values.shape}; "
                 "expected (samples,) and (samples, joints)"
             )
-        arrays |= {f"{name}_time": stamps, f"{name}_torque": values}
+        arrays |= {f"{name}_time": stamps, f"{name}_{quantity}": values}
     with path.open("wb") as file:  # an open file, for savez would add a suffix to a name without one
         np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
 

@@ -8,7 +8,7 @@ estimate without the fold.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -124,15 +124,14 @@ class _Lanes:
                     done[k] = damping[k] > 1e8
         return [Fit(self.theta[k], self.free[k], self.start[k], cost[k], now[k], bool(done[k])) for k in everyone]
 
-    def step(self, sums: Sums, lane: int, damping: float) -> _Step:
+    def step(self, sums: Sums, lane: int, damping: Any) -> _Step:
         """The damped step within the bounds; entries that would leave them stay where they are."""
         system = System(sums, self.data, self.start[lane])
         free = self.free[lane]
         at, (low, high) = np.maximum(free, 0), self.bounds[np.maximum(free, 0)].T
         fixed = free < 0
-        change = np.zeros(len(free))
-        for _ in range(3):
-            change, starts = system.solve(fixed, damping)
+        change, starts = system.solve(fixed, damping)
+        for _ in range(2):
             wanted = self.theta[lane][at] + change
             out = ~fixed & (
                 ((wanted < low) & (self.theta[lane][at] <= low)) | ((wanted > high) & (self.theta[lane][at] >= high))
@@ -140,6 +139,7 @@ class _Lanes:
             if not out.any():
                 break
             fixed = fixed | out
+            change, starts = system.solve(fixed, damping)
         theta = self.theta[lane].copy()
         mine = free >= 0
         theta[at[mine]] = np.clip(theta[at[mine]] + change[mine], low[mine], high[mine])
@@ -212,19 +212,19 @@ def held_out(found: Fit, data: Windows, folds: np.ndarray) -> np.ndarray:
     """Squares of each block and window as predicted without the fold it is in, (blocks, windows).
 
     `folds` (blocks, windows) numbers them. The estimate without a fold is theta - (H - H_k)^-1 g_k; the residual is
-    taken to first order there. Entries at their bounds stay.
+    taken to first order there. The states at the starts stay, and so do entries at their bounds.
     """
-    whole = System(found.sums, data, found.start)
-    cost, gradient, matrix = found.sums.cost.sum(-1), found.sums.gradient, found.sums.matrix
-    fixed, answer = found.free < 0, np.zeros(folds.shape)
+    cost, count = found.sums.cost.sum(-1), len(found.free)
+    gradient, matrix = found.sums.gradient[..., :count], found.sums.matrix[..., :count, :count]
+    whole, answer = matrix.sum((0, 1)), np.zeros(folds.shape)
+    keep = (found.free >= 0) & (np.diag(whole) > 0)
     for fold in np.unique(folds):
         mine = folds == fold
-        left = Sums(*(np.where(mine.reshape(*mine.shape, *[1] * (x.ndim - 2)), 0.0, x) for x in found.sums))
-        without = System(left, data, found.start)
-        without.gp, without.gs = without.gp - whole.gp, without.gs - whole.gs  # zero at a free optimum
-        change, starts = without.solve(fixed, 1e-9)
-        step = np.concatenate([np.broadcast_to(change, (starts.shape[1], len(change))), starts.T], 1)
-        first = np.einsum("bwp,wp->bw", gradient, step)
-        second = np.einsum("wp,bwpr,wr->bw", step, matrix, step)
+        left = (whole - matrix[mine].sum(0))[np.ix_(keep, keep)]
+        size = np.sqrt(np.maximum(np.diag(left), 1e-300))
+        change = np.zeros(count)
+        right = -gradient[mine].sum(0)[keep] / size
+        change[keep] = np.linalg.lstsq(left / np.outer(size, size), right, rcond=1e-12)[0] / size
+        first, second = gradient @ change, np.einsum("p,bwpr,r->bw", change, matrix, change)
         answer = np.where(mine, cost - 2 * first + second, answer)
     return answer

@@ -378,7 +378,7 @@ def _runge_kutta(
         solutions.append(solution)
         rates.append(State(now.v, a, smooth.rate))
     weights = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
-    mean = State(*(sum(w * r for w, r in zip(weights, parts, strict=True)) for parts in zip(*rates, strict=True)))
+    mean = jax.tree.map(lambda *parts: sum(w * r for w, r in zip(weights, parts, strict=True)), *rates)
     after = State(state.q + loop.dt * mean.q, state.v + loop.dt * mean.v, _next_activation(loop, state.act, mean.act))
     return after, Step(jax.tree.map(lambda *x: jnp.stack(x), *solutions), solutions[-1].a)
 

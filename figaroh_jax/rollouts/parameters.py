@@ -68,7 +68,7 @@ def _get(loop: Loop, name: str) -> Any:
     return np.asarray(getattr(drives if name in _OF_DRIVES else loop.joints, name))
 
 
-def put(loop: Loop, table: Table, theta: Array) -> Loop:
+def put(loop: Loop, table: Table, theta: Array | np.ndarray) -> Loop:
     """The loop with the table's numbers; differentiable in `theta`."""
     for name in dict.fromkeys(entry.name for entry in table):
         pairs = [(place, k) for k, entry in enumerate(table) if entry.name == name for place in entry.at]
@@ -77,7 +77,7 @@ def put(loop: Loop, table: Table, theta: Array) -> Loop:
     return loop
 
 
-def _put(loop: Loop, name: str, at: np.ndarray, new: Array) -> Loop:
+def _put(loop: Loop, name: str, at: np.ndarray, new: Array | np.ndarray) -> Loop:
     if name == "payload":
         own = jnp.asarray(loop.robot.inertia)
         return eqx.tree_at(lambda m: m.robot.inertia, loop, own.at[at].add(new[:, None] * _point(loop, at)))

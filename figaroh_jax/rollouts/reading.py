@@ -159,7 +159,7 @@ def _drives(
         time_constant=np.ones(len(names)) if time is None else time,
         activation_range=free.copy() if activation_range is None else activation_range,
         names=names,
-        activation=activation or ("none",) * len(names),
+        activation=activation or tuple("none" for _ in names),
         early=early or (False,) * len(names),
     )
 
@@ -246,7 +246,7 @@ def _mjcf_drives(mj: Any, robot: RobotModel, path: str) -> Drives:
     names = tuple(mj.actuator(a).name or f"actuator {a}" for a in range(mj.nu))
     way = np.stack([_transmission(mj, robot, a, path, names[a]) for a in range(mj.nu)] or [np.zeros(robot.nv)])
     way = way[: mj.nu]
-    kinds = tuple(_activation(mj, a, path, names[a]) for a in range(mj.nu))
+    kinds: tuple[Activation, ...] = tuple(_activation(mj, a, path, names[a]) for a in range(mj.nu))
     gain, bias = mj.actuator_gainprm[:, :3].copy(), mj.actuator_biasprm[:, :3].copy()
     for a in range(mj.nu):
         _refuse_laws(mj, a, path, names[a])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -13,18 +13,21 @@ from scipy import stats
 from ..results import Name, Verdict
 from .causes import BASELINE, CONTAINS, Candidate, Catalogue, catalogue, elastic_loop
 from .data import Run, Stretch, noise_of, windows
-from .fit import Fit, fit, held_out, standard_errors
+from .fit import Fit, System, fit, held_out, standard_errors
 from .loop import Loop
 from .parameters import Entry, Table, values
 from .sensitivity import Windows, predicted
 
-__all__ = ["Named", "Search", "Setting", "largest_forces", "residuals", "search", "setting"]
+__all__ = ["Named", "Search", "Setting", "begun", "largest_forces", "residuals", "search", "setting"]
 
 _WORTH, _SURE, _ALIKE = 0.004, 1.64, 1.7  # held-out gain and t of a name; t below which two causes are alike
 _CLEAR = 3.0  # t of a name beside which more than noise is left
 _SHORT = 6  # candidates that are fitted where a linear screening can order them
 _GROUP = 25  # rows whose mean shows a slow misfit
 _MOST = 6  # causes
+_EARLY, _LATE = 4, 12  # iterations of a race among all starts, and of its leaders
+_LIMITS = ("actuator_saturation", "voltage_saturation")
+_SHAPED = ("stribeck_friction",)  # without an amplitude their shape shows nothing
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,8 @@ class Named(NamedTuple):
     t: float
     gain: float
     alike: tuple[Name, ...]
+    before: float = float("nan")  # held-out RMS, rad or m
+    after: float = float("nan")
 
 
 @dataclass
@@ -74,6 +79,7 @@ class Search:
     proxy: list[Named] = field(default_factory=list)  # best, not named
     nearest: list[tuple[Name, float, str]] = field(default_factory=list)
     table: list[tuple[str, float]] = field(default_factory=list)  # chi2/N after each step
+    held: list[float] = field(default_factory=list)  # held-out RMS of the baseline and after each cause, rad or m
 
 
 def setting(
@@ -104,7 +110,7 @@ def setting(
     count = loop.robot.nv
     return Setting(
         loop, tuple(fitted), data, tuple(noise), Catalogue(known.table, keep), tuple(free),
-        _folds(data, stretches), 8 if count == 1 else 1, len(free) + 5, stretches, block,
+        _folds(data, stretches), 8 if count == 1 else 1, len(free) + (5 if count == 1 else 8), stretches, block,
     )  # fmt: skip
 
 
@@ -175,8 +181,7 @@ def search(
     """Baseline, then one cause after another while held-out data gain; what is left decides the verdict."""
     structure = Structure(here.loop, here.known.table, here.data)
     progress("fitting the baseline", 0.1)
-    theta = values(here.loop, here.known.table)
-    first = fit(*structure, theta[None], [here.baseline], width=here.width, lanes=here.lanes)[0]
+    first = begun(here)
     weight = np.asarray(here.data.weight)
     now = _State(structure, first, here.baseline, excess(residuals(structure, first), weight))
     begin, found, p_value, steps, nearest = now, [], 1.0, [("baseline", _level(first, weight))], []
@@ -193,6 +198,28 @@ def search(
         if now.excess < 1.0:
             break
     return _judged(here, begin, now, found, p_value, steps, nearest)
+
+
+def begun(here: Setting) -> Fit:
+    """The baseline's fit."""
+    begins: Any = _begins(here, values(here.loop, here.known.table))
+    structure = Structure(here.loop, here.known.table, here.data)
+    fits = fit(*structure, begins, [here.baseline] * len(begins), width=here.width, lanes=here.lanes)
+    return min(fits, key=lambda f: f.cost)
+
+
+def _begins(here: Setting, theta: np.ndarray) -> np.ndarray:
+    """Where the baseline's fit starts: at the model; where the gains are free, also stiffer and heavier."""
+    gains = [k for k in here.baseline if here.known.table[k].name == "scale"]
+    if not gains:
+        return theta[None]
+    rotors = [k for k in here.baseline if here.known.table[k].name == "armature"]
+    begins = []
+    for stiff, heavy in ((1.0, 1.0), (4.0, 1.0), (1.0, 8.0), (4.0, 8.0)):
+        begins.append(theta.copy())
+        begins[-1][gains] *= stiff
+        begins[-1][rotors] = np.maximum(begins[-1][rotors], 1e-3) * heavy
+    return np.array(begins)
 
 
 def _level(found: Fit, weight: np.ndarray) -> float:
@@ -217,16 +244,34 @@ def _tried(here: Setting, now: _State, named: Sequence[Candidate], forbid: Seque
             thetas.append(_start_values(now.fit.theta, c, start))
             free.append(_free(now.free, c.entries))
             owner.append(c)
-    start = np.repeat(now.fit.start[None], len(thetas), 0)
-    fits = fit(*now.structure, np.array(thetas), free, start, width=here.width, lanes=here.lanes) if thetas else []
     found = []
-    for c in left:
-        mine = [f for f, o in zip(fits, owner, strict=True) if o is c]
-        best = min(mine, key=lambda f: f.cost)
-        found.append(_tried_one(here, now.structure, c, best, _free(now.free, c.entries)))
-    if here.loop.robot.nv == 1 and len(now.structure.table) == len(here.known.table):
+    for k, best in _raced(here, now, np.array(thetas), free, [(c.effect, c.at) for c in owner]):
+        found.append(_tried_one(here, now.structure, owner[k], best, free[k]))
+    rigid = len(now.structure.table) == len(here.known.table)
+    if here.loop.robot.nv == 1 and rigid and all(one.state.excess >= 1.0 for one in found):
         found += _elastic(here, now, forbid)
     return found
+
+
+def _raced(
+    here: Setting, now: _State, thetas: np.ndarray, free: Sequence[Sequence[int]], owner: Sequence[tuple]
+) -> list[tuple[int, Fit]]:
+    """The fits that lead after a few steps, finished: one of each candidate, with its place among the starts."""
+    if not len(thetas):
+        return []
+    start = np.repeat(now.fit.start[None], len(thetas), 0)
+    lanes = here.lanes * 3 if here.lanes > 1 else 1
+    early = fit(*now.structure, thetas, free, start, width=here.width, lanes=lanes, iterations=_EARLY)
+    leads: dict[Any, int] = {}
+    for k in np.argsort([f.cost for f in early]):
+        leads.setdefault(owner[k], int(k))
+    order = list(leads.values())[: max(here.lanes, _SHORT)]
+    states = np.stack([early[k].theta for k in order]), np.stack([early[k].start for k in order])
+    last = fit(
+        *now.structure, states[0], [free[k] for k in order], states[1],
+        width=here.width, lanes=here.lanes, iterations=_LATE,
+    )  # fmt: skip
+    return list(zip(order, last, strict=True))
 
 
 def _tried_one(here: Setting, structure: Structure, c: Candidate, best: Fit, free: Sequence[int]) -> _Tried:
@@ -236,17 +281,46 @@ def _tried_one(here: Setting, structure: Structure, c: Candidate, best: Fit, fre
 
 
 def _screened(here: Setting, now: _State, left: Sequence[Candidate]) -> list[Candidate]:
-    """The candidates that one linear step from their starts makes the best."""
-    scores = {}
-    for c in left:
-        for start in c.starts:
-            theta = _start_values(now.fit.theta, c, start)
-            one = fit(
-                *now.structure, theta[None], [_free(now.free, c.entries)], now.fit.start[None],
-                width=here.width, lanes=here.lanes, iterations=2,
-            )[0]  # fmt: skip
-            scores[id(c)] = min(scores.get(id(c), np.inf), one.cost)
-    return sorted(left, key=lambda c: scores[id(c)])[:_SHORT]
+    """The candidates that one linear step from the present model promises most, several to one linearisation.
+
+    A limit of a drive changes the model before it can be differentiated: each is linearised at one start of its own.
+    """
+    scores: dict[int, float] = {}
+    room = here.width - len(now.free)
+    limits = [k for k, c in enumerate(left) if c.effect in _LIMITS]
+    packs, filled = [], 0
+    for k in [k for k in range(len(left)) if k not in limits]:
+        if not packs or filled + len(left[k].entries) > room:
+            packs.append([])
+            filled = 0
+        packs[-1].append(k)
+        filled += len(left[k].entries)
+    for pack in packs:
+        for variant in range(max([1, *(len(left[k].starts) for k in pack if left[k].effect in _SHAPED)])):
+            theta = now.fit.theta.copy()
+            for k in pack:
+                if left[k].effect in _SHAPED:
+                    theta[left[k].entries[1]] = left[k].starts[variant][1]
+            _score(here, now, theta, [(k, left[k]) for k in pack], scores)
+    for k in limits:
+        theta = _start_values(now.fit.theta, left[k], left[k].starts[len(left[k].starts) // 2])
+        _score(here, now, theta, [(k, left[k])], scores)
+    return [left[k] for k in sorted(scores, key=lambda k: scores[k])[:_SHORT]]
+
+
+def _score(
+    here: Setting, now: _State, theta: np.ndarray, pack: Sequence[tuple[int, Candidate]], scores: dict[int, float]
+) -> None:
+    """Cost after a linear step of each candidate of the pack beside what is free already."""
+    columns = _free(now.free, [entry for _, c in pack for entry in c.entries])
+    start = now.fit.start[None]
+    one = fit(*now.structure, theta[None], [columns], start, width=here.width, lanes=here.lanes, iterations=0)[0]
+    for k, c in pack:
+        mine = set(now.free) | set(c.entries)
+        fixed = np.array([entry < 0 or entry not in mine for entry in one.free])
+        system = System(one.sums, now.structure.data, one.start)
+        cost = one.cost - system.decrease(*system.solve(fixed, 1e-6))
+        scores[k] = min(scores.get(k, np.inf), cost)
 
 
 def _elastic(here: Setting, now: _State, forbid: Sequence[str]) -> list[_Tried]:
@@ -295,14 +369,14 @@ def _t(worse: np.ndarray, better: np.ndarray) -> float:
 def _best(
     here: Setting, now: _State, tried: Sequence[_Tried], nearest: list[tuple[Name, float, str]]
 ) -> tuple[tuple[Named, _State] | None, float]:
-    """The cause to name next with the state it makes, and the family-wise p of the largest gain."""
+    """The cause to name next with the state it makes, and p of what is left before it being noise."""
     before = held_out(now.fit, now.structure.data, here.folds)
     gains = [(before.sum() - one.sse.sum()) / before.sum() for one in tried]
     ts = [_t(before, one.sse) for one in tried]
     nearest.clear()
     if not tried:
         return None, 1.0
-    p = float(min(1.0, len(tried) * stats.norm.sf(max(ts))))
+    p = float(max(stats.norm.sf(4 * now.excess), 1e-12))
     sure = _SURE if now.excess >= 1.0 else 2.5
     passing = [k for k in range(len(tried)) if gains[k] > _WORTH and ts[k] > sure and _sized(here, tried[k])]
     for k in np.argsort(gains)[::-1][:3]:
@@ -326,7 +400,14 @@ def _best(
         near = tried[other].sse.sum() - best.sse.sum() < 0.1 * (before.sum() - best.sse.sum())
         if other != k and not contained and noise and near and _t(tried[other].sse, best.sse) < _ALIKE:
             alike.append(Name(tried[other].candidate.effect, tried[other].candidate.at))
-    return (Named(best.candidate, ts[k], float(gains[k]), tuple(alike)), best.state), p
+    named = Named(best.candidate, ts[k], float(gains[k]), tuple(alike), _rms(here, before), _rms(here, best.sse))
+    return (named, best.state), p
+
+
+def _rms(here: Setting, squares: np.ndarray) -> float:
+    """Whitened squares as an RMS of position: rad, or m."""
+    count = (np.asarray(here.data.weight) > 0).sum()
+    return float(np.sqrt(max(squares.sum(), 0.0) / count * np.mean(here.noise[0] ** 2)))
 
 
 def _sized(here: Setting, one: _Tried) -> bool:
@@ -335,6 +416,11 @@ def _sized(here: Setting, one: _Tried) -> bool:
     column = int(np.flatnonzero(found.free == one.candidate.entries[0])[0])
     error = standard_errors(found, one.state.structure.data)[column]
     value = found.theta[one.candidate.entries[0]]
+    if one.candidate.effect == "backlash":  # without a width it is an elasticity
+        width = one.candidate.entries[2]
+        spread = standard_errors(found, one.state.structure.data)[int(np.flatnonzero(found.free == width)[0])]
+        if not found.theta[width] > 3 * spread:
+            return False
     neutral = 1.0 if one.candidate.effect == "actuator_gain" else 0.0
     if one.candidate.effect in (*BASELINE, "actuator_saturation", "voltage_saturation", "joint_elasticity", "backlash"):
         return bool(np.isfinite(error) and error < 0.5 * abs(value) + 1e-12)
@@ -345,7 +431,8 @@ def _judged(
     here: Setting, begin: _State, now: _State, found: list[Named], p_value: float, steps: list, nearest: list
 ) -> Search:
     """`named` where the rest is noise; `named+rest` where the names hold without each of three recordings or more."""
-    result = Search("nothing", found, now.structure, begin.fit, now.fit, p_value, [], list(nearest), steps)
+    held = [_rms(here, held_out(begin.fit, begin.structure.data, here.folds)), *(n.after for n in found)]
+    result = Search("nothing", found, now.structure, begin.fit, now.fit, p_value, [], list(nearest), steps, held)
     if now.excess < 1.0:
         result.verdict = "named" if found else "nothing"
         return result

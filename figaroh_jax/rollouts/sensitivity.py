@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..compiled.batching import program
 from .loop import Loop, State, advance, integrated, mobility, observe
 from .parameters import Table, put
 from .simulation import delayed
@@ -89,8 +90,7 @@ def _rollout(loop: Loop, data: Windows, state: State, warm: Array, weight: Array
     return jax.lax.scan(one, (state, warm), _seen(loop, data, block))
 
 
-@eqx.filter_jit
-def predicted(loop: Loop, table: Table, theta: Array, data: Windows, start: Array) -> Array:
+def _predicted(loop: Loop, table: Table, theta: Array, data: Windows, start: Array) -> Array:
     """Readings (lanes, rows, ny, windows) of the parameters (lanes, entries) and starts (lanes, 2 nv, windows)."""
     rates = data.reading.shape[1] > len(loop.measured)
 
@@ -110,14 +110,17 @@ def predicted(loop: Loop, table: Table, theta: Array, data: Windows, start: Arra
     return jax.vmap(lane)(theta, start)
 
 
-@eqx.filter_jit
-def linear_sums(loop: Loop, table: Table, theta: Array, free: Array, data: Windows, start: Array) -> Sums:
+def _linear_sums(loop: Loop, table: Table, theta: Array, free: Array, data: Windows, start: Array) -> Sums:
     """Sums of squares, gradients and normal matrices of each lane.
 
     `theta` (lanes, entries) are all numbers of the table, `free` (lanes, columns) which of them each lane
     differentiates, `start` (lanes, 2 nv, windows) the states at the windows' starts.
     """
     return Sums(*jax.vmap(lambda t, f, s: _lane(loop, table, t, f, data, s))(theta, free, start))
+
+
+predicted = program(_predicted, static_argnums=1)
+linear_sums = program(_linear_sums, static_argnums=1)
 
 
 def _lane(loop: Loop, table: Table, theta: Array, free: Array, data: Windows, start: Array) -> tuple[Array, ...]:
@@ -200,20 +203,18 @@ def _linearised(
         return jnp.concatenate([after.q, after.v, after.act] if active else [after.q, after.v])
 
     _, pushed = jax.linearize(move, *here, theta)
-    none = State(*(jnp.zeros_like(x) for x in here))
 
-    def by_state(one: Array) -> Array:
-        parts = jnp.split(one, [loop.robot.nv, 2 * loop.robot.nv])
+    def one(state: Array, k: Array) -> Array:
+        parts = jnp.split(state, [loop.robot.nv, 2 * loop.robot.nv])
         moved = [jnp.broadcast_to(p[:, None], x.shape) for p, x in zip(parts, here, strict=False) if p.size]
-        return pushed(*moved, *([] if active else [none.act]), jnp.zeros_like(theta))
+        own = jnp.where(k < 0, 0.0, jax.nn.one_hot(k, len(theta), dtype=theta.dtype))
+        return pushed(*moved, *([] if active else [jnp.zeros_like(here.act)]), own)
 
-    def by_parameter(k: Array) -> Array:
-        return pushed(*none, jnp.zeros_like(theta).at[k].set(1.0))
-
-    def shaped(x: Array) -> Array:  # (columns, size, steps windows)
-        return jnp.moveaxis(x.reshape(*x.shape[:2], count, windows), (0, 1, 2), (2, 1, 0))
-
-    return shaped(jax.vmap(by_state)(jnp.eye(size))), shaped(jax.vmap(by_parameter)(free))
+    tangents = jnp.concatenate([jnp.eye(size), jnp.zeros((len(free), size))])
+    entries = jnp.concatenate([jnp.full(size, -1), free])
+    both = jax.vmap(one)(tangents, entries)  # (size + columns, size, steps windows)
+    both = jnp.moveaxis(both.reshape(*both.shape[:2], count, windows), (0, 1, 2), (2, 1, 0))
+    return both[:, :, :size], both[:, :, size:]
 
 
 def _spread(a: Array, b: Array, spread: Array, substeps: int) -> tuple[Array, Array]:

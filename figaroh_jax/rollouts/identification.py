@@ -1,0 +1,148 @@
+"""Identification of a loop from commands and positions: the baseline's numbers, their intervals, what trades off."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import numpy as np
+
+from ..errors import InputError
+from .data import Run
+from .fit import Fit, System, standard_errors
+from .loop import Loop
+from .parameters import BOUNDS, UNITS, put
+from .search import Setting, Structure, begun, residuals
+from .task import diagnosis_setting, extended_of, read_rollouts, simulated
+
+if TYPE_CHECKING:
+    from ..effects.extended import ExtendedModel
+    from ..formats.config import Task
+
+__all__ = ["RolloutIdentification", "identify_rollout_task"]
+
+_LOOSE = 0.5  # relative standard deviation beyond which a number is not identified
+_TRADE = 0.95  # correlation beyond which two numbers trade off
+
+
+class RolloutIdentification(NamedTuple):
+    """The fitted loop and what `result.json` says of it."""
+
+    result: dict[str, Any]
+    loop: Loop
+    model: ExtendedModel
+    predictions: dict[str, tuple[np.ndarray, np.ndarray]]
+
+    def to_json(self) -> str:
+        """The text of `result.json`."""
+        return json.dumps(self.result, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+    def lines(self) -> list[str]:
+        """A short summary for people."""
+        fit, found = self.result["fit"], self.result["base_parameters"]
+        lines = [
+            f"{p['expression']:<32} {p['value']:.5g} +- {p['std'] or 0:.2g} {p['unit']}  {p['status']}" for p in found
+        ]
+        lines += [f"RMS position error: {', '.join(f'{1e3 * x:.3g}' for x in fit['rms'])} mrad or mm"]
+        return lines + list(self.result["notes"])
+
+
+def identify_rollout_task(
+    task: Task, progress: Callable[[str, float], None] = lambda phase, share: None
+) -> RolloutIdentification:
+    """Fit the baseline of a task of commands and positions: friction, armature, gains, delay and whatever it names.
+
+    The baseline's `effects` may name any rollout effect at a joint. Every number has a standard deviation from the
+    exact sensitivities, inflated by the residual's power, and a verdict: identified, unidentifiable, or on its bound.
+    """
+    progress("reading", 0.0)
+    loop, runs, notes = read_rollouts(task)
+    here = diagnosis_setting(task, loop, runs)
+    with jax.enable_x64(True):
+        progress("fitting", 0.2)
+        first = begun(here)
+        if not np.isfinite(first.cost):
+            raise InputError(f"{task.robot.model}: the simulation diverges with the model's own gains; check kp and kd")
+        final = put(here.loop, here.known.table, first.theta)
+        held = {run.name: (run, simulated(final, run)) for run in runs if run.holdout}
+        result = _result(here, first, held, notes)
+    predictions = {name: (run.time, read) for name, (run, read) in held.items()}
+    return RolloutIdentification(result, final, extended_of(final), predictions)
+
+
+def _result(
+    here: Setting, first: Fit, held: dict[str, tuple[Run, np.ndarray]], notes: tuple[str, ...]
+) -> dict[str, Any]:
+    structure = Structure(here.loop, here.known.table, here.data)
+    error = residuals(structure, first)[:, : len(here.noise[0])]
+    count = np.maximum((np.asarray(here.data.weight)[:, : len(here.noise[0])] > 0).sum((0, 2)), 1)
+    rms = np.sqrt((error**2).sum((0, 2)) / count) * here.noise[0]
+    level = max(1.0, first.squares / (np.asarray(here.data.weight) > 0).sum())
+    covariance = System(first.sums, here.data, first.start).covariance(first.free < 0)
+    size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    free = [k for k in range(len(first.free)) if first.free[k] >= 0]
+    told = [k for k in free if np.isfinite(size[k])]
+    correlation = covariance[np.ix_(told, told)] / np.outer(size[told], size[told]) if told else np.zeros((0, 0))
+    singular = np.linalg.svd(correlation, compute_uv=False) if told else np.array([1.0])
+    names = [_expression(here, int(first.free[k])) for k in range(len(first.free)) if first.free[k] >= 0]
+    errors = standard_errors(first, here.data, level)
+    parameters = [_parameter(here, first, k, float(errors[k])) for k in free]
+    return {
+        "rank": sum(p["status"] == "identified" for p in parameters),
+        "condition": float(np.sqrt(singular[0] / max(singular[-1], 1e-300))),
+        "base_parameters": parameters,
+        "links": [],
+        "effects": [],
+        "fit": {"rms": rms.tolist(), "relative": _relative(here, rms), "noise": here.noise[0].tolist()},
+        "holdout": {name: _held(run, read) for name, (run, read) in held.items()},
+        "notes": [*notes, *_trades([names[free.index(k)] for k in told], correlation)],
+        "unit": "rad",
+    }
+
+
+def _expression(here: Setting, entry: int) -> str:
+    one = here.known.table[entry]
+    names, place = here.loop.robot.dof_names, one.at[0]
+    if one.name in ("scale", "delay", "dead_band", "voltage", "force_limit"):
+        place = int(np.abs(np.asarray(here.loop.drives.transmission)[place]).argmax())
+    return f"{one.name} {here.loop.robot.link_names[place] if one.name == 'payload' else names[place]}"
+
+
+def _parameter(here: Setting, first: Fit, column: int, error: float) -> dict[str, Any]:
+    entry = int(first.free[column])
+    value, name = float(first.theta[entry]), here.known.table[entry].name
+    low, high = BOUNDS[name]
+    known = np.isfinite(error) and error < _LOOSE * max(abs(value), 1e-12)
+    status = "identified" if known else "unidentifiable"
+    if value <= low or value >= high:
+        status = "on its bound"
+    return {
+        "expression": _expression(here, entry),
+        "value": value,
+        "std": error if np.isfinite(error) else None,
+        "unit": UNITS[name],
+        "status": status,
+    }
+
+
+def _relative(here: Setting, rms: np.ndarray) -> list[float]:
+    spread = np.concatenate([run.position for run in here.runs]).std(0)
+    return (rms / np.maximum(spread, 1e-12)).tolist()
+
+
+def _held(run: Run, read: np.ndarray) -> dict[str, list[float]]:
+    error, spread = np.sqrt(((run.position - read) ** 2).mean(0)), run.position.std(0)
+    share = error / np.maximum(spread, 1e-12)
+    return {"rms": error.tolist(), "relative": share.tolist(), "r2": (1 - share**2).tolist()}
+
+
+def _trades(names: list[str], correlation: np.ndarray) -> list[str]:
+    """Pairs that the data hardly tell apart, in words."""
+    return [
+        f"{names[i]} and {names[j]} trade off (correlation {correlation[i, j]:+.3f}): only a combination is identified"
+        for i in range(len(names))
+        for j in range(i)
+        if abs(correlation[i, j]) > _TRADE
+    ]

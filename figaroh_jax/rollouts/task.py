@@ -1,0 +1,301 @@
+"""A task file whose recordings hold a command and a position: the loop, its recordings, the diagnosis, the answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..effects.base import Effect, place
+from ..effects.catalogue import find
+from ..effects.extended import ExtendedModel, extend
+from ..errors import InputError
+from ..formats.config import robot_options
+from ..recordings.dataset import Recording, read_recordings
+from ..results import Cause, Diagnosis, Estimate, Experiment, Gain, Name, Trace
+from .causes import BASELINE
+from .data import Run, Stretch, regular, windows
+from .fit import standard_errors
+from .loop import Loop
+from .parameters import UNITS, put
+from .reading import load_loop
+from .search import Named, Search, Setting, Structure, residuals, search, setting
+from .sensitivity import predicted
+
+if TYPE_CHECKING:
+    from ..formats.config import Task
+
+__all__ = [
+    "RolloutDiagnosis",
+    "diagnose_rollout_task",
+    "diagnosis_setting",
+    "extended_of",
+    "is_rollout_task",
+    "read_rollouts",
+    "simulated",
+]
+
+_TURN = 12.0  # a command that many times beyond what the joint did is in other units
+
+
+class RolloutDiagnosis(NamedTuple):
+    """The diagnosis, the loop with its causes, and what it predicts of the held-out recordings."""
+
+    diagnosis: Diagnosis
+    loop: Loop
+    predictions: dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+def is_rollout_task(task: Task) -> bool:
+    """Whether the recordings that are fitted hold a command and no torque."""
+    fitted = [entry for entry in task.data if entry.role == "fit"]
+    return all(e.command is not None and e.torque is None and e.measurement is None for e in fitted)
+
+
+def diagnose_rollout_task(
+    task: Task, progress: Callable[[str, float], None] = lambda phase, share: None
+) -> RolloutDiagnosis:
+    """Diagnose what a task of commands and positions describes; `InputError` before any work where it is wrong."""
+    progress("reading", 0.0)
+    loop, runs, notes = read_rollouts(task)
+    here = diagnosis_setting(task, loop, runs)
+    with jax.enable_x64(True):
+        found = search(here, progress, forbid=task.diagnose.forbid)
+        if not np.isfinite(found.first.cost):
+            raise InputError(
+                f"{task.robot.model}: the simulation diverges with the model's own gains: they contradict its inertia "
+                "and time step; check kp, kd (their units and signs) and armature"
+            )
+        progress("measuring the gain", 0.9)
+        return _answer(task, here, runs, found, notes)
+
+
+def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
+    """The loop of a task and its recordings."""
+    options = robot_options(task.robot)
+    options["root"] = None if task.robot.root == "fixed" and task.robot.model.suffix == ".xml" else options["root"]
+    drives = {name: drive.model_dump() for name, drive in task.actuator.drives.items()}
+    loop, left_out = load_loop(task.robot.model, drives, **options)
+    if not loop.drives.names:
+        raise InputError(
+            f"{task.file}: actuator: robot '{task.robot.model.name}' has no actuators; state each joint's drive, as in "
+            "actuator: {joint_1: {kind: position, kp: 20.0, kd: 0.5}}"
+        )
+    recordings = read_recordings(task, loop.robot, rollouts=True)
+    runs = tuple(_run(task, loop, r) for r in recordings)
+    periods = {regular(str(r.file), r.time) for r in recordings}
+    if max(periods) > 1.02 * min(periods):
+        raise InputError(f"{task.file}: data: the periods of the recordings differ ({sorted(periods)} s)")
+    period = float(np.mean(list(periods)))
+    steps = max(1, int(np.ceil(period / float(loop.dt) - 1e-6)))
+    loop = eqx.tree_at(lambda m: m.dt, loop, np.float64(period / steps))
+    notes = [f"{task.robot.model.name}: not simulated: {note}" for note in left_out]
+    notes.append(f"simulated in steps of {1e3 * period / steps:.3g} ms, {steps} to a sample")
+    return loop, runs, tuple(notes)
+
+
+def _run(task: Task, loop: Loop, recording: Recording) -> Run:
+    if recording.command is None:
+        raise InputError(f"{recording.file}: a rollout needs `command`")
+    way = np.abs(np.asarray(loop.drives.transmission))
+    columns = way.argmax(1)
+    command = recording.command[:, columns]
+    gain, bias = np.asarray(loop.drives.gain), np.asarray(loop.drives.bias)
+    for k, column in enumerate(columns):
+        follows = gain[k, 0] != 0 and bias[k, 1] != 0
+        reach = max(np.abs(recording.position[:, column]).max(), 0.3)
+        if follows and np.abs(command[:, k]).max() > _TURN * reach:
+            row = int(np.abs(command[:, k]).argmax())
+            raise InputError(
+                f"{recording.file}: the command of joint {loop.robot.dof_names[column]} reaches {command[row, k]:.4g}"
+                f" rad in row {row} (from 0), but the joint never leaves +-{reach:.3g} rad: is it in degrees or counts?"
+                " Say `units: {position: deg}`, or convert it to the unit of the position"
+            )
+    return Run(
+        recording.name, recording.time, command, recording.position, recording.velocity, recording.role == "holdout"
+    )
+
+
+def diagnosis_setting(task: Task, loop: Loop, runs: Sequence[Run]) -> Setting:
+    known, given = task.baseline, task.baseline.model_fields_set
+    rotor = known.rotor if "rotor" in given else bool(np.asarray(loop.joints.armature).any())
+    names = [n for n, on in zip(BASELINE, (rotor, known.viscous, known.coulomb), strict=True) if on]
+    more = [(entry.effect, entry.at[0]) for entry in known.effects if entry.at]
+    return setting(
+        loop, runs, baseline=names, more=more, gains_known=task.actuator.gains == "known", forbid=task.diagnose.forbid
+    )
+
+
+def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes: tuple[str, ...]) -> RolloutDiagnosis:
+    loop, n = here.loop, here.loop.robot.nv
+    first = Structure(here.loop, here.known.table, here.data)
+    scale = here.noise[0]
+    before, after = (_rms(s, f, scale) for s, f in ((first, found.first), (found.structure, found.last)))
+    named = found.verdict in ("named", "named+rest")
+    last = (found.structure, found.last) if named else (first, found.first)
+    final = put(last[0].loop, last[0].table, last[1].theta)
+    start = put(here.loop, here.known.table, found.first.theta)
+    held = {run.name: (simulated(start, run), simulated(final, run)) for run in runs if run.holdout}
+    gain = _gain(held, runs, found)
+    diagnosis = Diagnosis(
+        verdict=found.verdict,
+        causes=tuple(_cause(one, found, here) for one in found.named) if named else (),
+        p_value=found.p_value,
+        joints=tuple(loop.robot.dof_names[k] for k in loop.measured),
+        before=before,
+        after=after if named else before,
+        noise=scale,
+        holdout=gain,
+        holdout_scheme="recordings kept out of the fit" if held else "quarters of the recording left out in turn",
+        experiment=_experiment(found),
+        candidates=(),
+        traces=_traces(here, runs, first, found, last, held),
+        baseline=extended_of(start),
+        model=extended_of(final if n == final.robot.nv else start),
+        rest=_rest(found, before if not named else after, scale, loop),
+        notes=notes,
+        prismatic=tuple(j.kind == "prismatic" for j in loop.robot.joints if not j.follows),
+        of_positions=True,
+    )
+    predictions = {run.name: (run.time, held[run.name][1]) for run in runs if run.holdout}
+    return RolloutDiagnosis(diagnosis, final, predictions)
+
+
+def simulated(loop: Loop, run: Run) -> np.ndarray:
+    """Readings of the encoders (rows, joints) that the loop predicts from a recording's first state and command."""
+    noise = [np.full(run.position.shape[1], 1e-3)]
+    data = windows(loop, [run], [Stretch(0, 0, len(run.time))], noise, 0.3)
+    with jax.enable_x64(True):
+        read = predicted(loop, (), jnp.zeros((1, 0)), data, np.asarray(data.start)[None])
+    return np.asarray(read)[0, : len(run.time), :, 0]
+
+
+def _rms(structure: Structure, fitted: Any, scale: np.ndarray) -> np.ndarray:
+    error = residuals(structure, fitted)[:, : len(scale)]
+    count = (np.asarray(structure.data.weight)[:, : len(scale)] > 0).sum((0, 2))
+    return np.sqrt((error**2).sum((0, 2)) / count) * scale
+
+
+def _gain(held: dict[str, tuple[np.ndarray, np.ndarray]], runs: Sequence[Run], found: Search) -> Gain:
+    measured = {run.name: run.position for run in runs if run.holdout}
+    if measured:
+        before, after = (
+            float(np.sqrt(np.mean(np.concatenate([((measured[k] - v[i]) ** 2).ravel() for k, v in held.items()]))))
+            for i in (0, 1)
+        )
+        return Gain(before, after, "rad")
+    if not found.named:
+        return Gain(found.held[0], found.held[0], "rad")
+    return Gain(found.held[0], found.held[-1], "rad")
+
+
+def _cause(one: Named, found: Search, here: Setting) -> Cause:
+    structure, fitted = found.structure, found.last
+    weight = np.asarray(structure.data.weight)
+    level = max(1.0, fitted.squares / (weight > 0).sum())
+    errors = standard_errors(fitted, structure.data, level)
+    parameters = {}
+    for name, entry in zip(one.candidate.reported, one.candidate.entries, strict=True):
+        column = int(np.flatnonzero(fitted.free == entry)[0])
+        value, error = float(fitted.theta[entry]), float(errors[column])
+        unit = UNITS[structure.table[entry].name]
+        if one.candidate.effect == "joint_spring" and name == "offset":
+            stiffness = float(fitted.theta[one.candidate.entries[0]])
+            name, value, error, unit = "rest", -value / stiffness, error / abs(stiffness), "rad"
+        if one.candidate.effect == "actuator_gain":
+            value -= 1.0
+        parameters[name] = Estimate(value, error, unit)
+    at = one.candidate.at
+    sure = 1.0 / (1 + len(one.alike)) * (0.98 if found.verdict == "named" else 0.8)
+    gain = Gain(one.before, one.after, "rad")
+    note = _NOTES.get(one.candidate.effect, "")
+    return Cause(Name(one.candidate.effect, at), parameters, sure, gain, one.alike, note)
+
+
+_NOTES = {
+    "command_delay": "positions that are stamped late by as much look the same",
+    "joint_damping": "a wrong velocity gain of the drive looks the same",
+}
+
+
+def _experiment(found: Search) -> Experiment | None:
+    texts = {
+        "stribeck_friction": "slow constant-velocity sweeps of {at} below 0.3 rad/s",
+        "load_dependent_friction": "the same motion of {at} with and without a known payload",
+        "payload": "the same motion with {at} carrying a known mass, or without what is fixed to it",
+        "actuator_gain": "the same motion with {at} carrying a known mass: else gains and inertias scale together",
+        "command_delay": "steps of {at} small enough not to saturate its drive",
+        "joint_elasticity": "a chirp of {at} above a third of its resonance, and an encoder on the link",
+    }
+    for one in found.named or found.proxy:
+        if one.alike or found.proxy:
+            other = one.alike[0].effect if one.alike else "what is not in the catalogue"
+            text = texts.get(one.candidate.effect, "steps of {at} of two sizes, and slow sweeps")
+            pair = ((one.candidate.effect, other),)
+            return Experiment(text.format(at=one.candidate.at[0]), pair if one.alike else ())
+    return None
+
+
+def _rest(found: Search, left: np.ndarray, noise: np.ndarray, loop: Loop) -> str:
+    if found.verdict in ("nothing", "named"):
+        return ""
+    ratio = left / noise
+    k = int(ratio.argmax())
+    joint = loop.robot.dof_names[loop.measured[k]]
+    text = f"Unexplained residual, mostly at {joint}: {1e3 * left[k]:.3g} mrad against {1e3 * noise[k]:.3g} of noise"
+    proxy = ", ".join(str(Name(n.candidate.effect, n.candidate.at)) for n in found.proxy)
+    return f"{text}; best proxy, not a cause: {proxy}" if proxy else text
+
+
+def _traces(
+    here: Setting, runs: Sequence[Run], first: Structure, found: Search, last: tuple[Structure, Any], held: dict
+) -> tuple[Trace, ...]:
+    traces, fitted = [], [r for r in runs if not r.holdout]
+    with jax.enable_x64(True):
+        both = [
+            np.asarray(predicted(s.loop, s.table, f.theta[None], s.data, f.start[None])[0])
+            for s, f in ((first, found.first), last)
+        ]
+    for w, stretch in enumerate(here.stretches):
+        run, rows = fitted[stretch.run], slice(stretch.first, stretch.first + stretch.rows)
+        ny = run.position.shape[1]
+        before, after = (x[: stretch.rows, :ny, w] for x in both)
+        traces.append(_trace(run, "fit", rows, before, after))
+    for run in runs:
+        if run.holdout:
+            traces.append(_trace(run, "holdout", slice(None), *held[run.name]))
+    return tuple(traces)
+
+
+def _trace(run: Run, role: Any, rows: slice, before: np.ndarray, after: np.ndarray) -> Trace:
+    time, position = run.time[rows], run.position[rows]
+    velocity = np.gradient(position, time, axis=0) if run.velocity is None else run.velocity[rows]
+    return Trace(run.name, role, time, position, velocity, position, before, after)
+
+
+def extended_of(loop: Loop) -> ExtendedModel:
+    """The robot and what acts at its joints as effects, for the files that carry them."""
+    own: list[Effect] = []
+    wanted = {
+        "rotor_inertia": {"inertia": "armature"},
+        "viscous_friction": {"damping": "damping"},
+        "coulomb_friction": {"force": "friction"},
+        "stribeck_friction": {"force": "stribeck_force", "speed": "stribeck_speed"},
+        "load_dependent_friction": {"ratio": "load_ratio"},
+        "joint_spring": {"stiffness": "stiffness", "offset": "offset"},
+    }
+    robot = jax.tree.map(np.asarray, loop.robot)
+    for k, name in enumerate(robot.dof_names):
+        for effect, fields in wanted.items():
+            numbers = {field: float(np.asarray(getattr(loop.joints, leaf))[k]) for field, leaf in fields.items()}
+            if effect == "joint_spring":
+                numbers["offset"] -= numbers["stiffness"] * float(np.asarray(loop.joints.rest)[k])
+            if next(iter(numbers.values())):
+                own.append(place(find(effect), robot, [name], **numbers))
+            elif effect == "joint_spring" and numbers["offset"]:
+                own.append(place(find("torque_offset"), robot, [name], offset=numbers["offset"]))
+    return extend(robot, *own)
