@@ -39,7 +39,7 @@ kills: .venv/developed ## commands killed at random moments, and every call that
 	$(BIN)/python benchmarks/kills.py $(ARGS)
 
 audit: .venv/developed ## known vulnerabilities of what is installed
-	$(BIN)/pip-audit --local --skip-editable $(ARGS)
+	$(BIN)/pip-audit --local --skip-editable --strict $(ARGS)
 
 format: .venv/developed
 	$(BIN)/ruff check --fix .

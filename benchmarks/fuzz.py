@@ -195,8 +195,8 @@ def text_input(name: str) -> Callable[[Bench, Source, list[bytes]], bytes]:
                     "utf-8", "replace"
                 )
             return b'"'.join(parts)
-        if source.once_in(3):  # an element once more, or somewhere else
-            lines = text.splitlines(keepends=True)
+        lines = text.splitlines(keepends=True)
+        if lines and source.once_in(3):  # an element once more, or somewhere else
             lines.insert(source.random.randrange(len(lines)), source.of(lines))
             return b"".join(lines)
         return mutated_bytes(text, source)
@@ -221,7 +221,7 @@ def odd_array(right: np.ndarray, source: Source) -> np.ndarray:
     ]
     try:
         return np.asarray(source.of(kinds)())
-    except (ValueError, TypeError, OverflowError):
+    except (ValueError, TypeError, IndexError, OverflowError):
         return right
 
 

@@ -12,7 +12,7 @@ from scipy import signal
 
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.config import Preprocess
-from figaroh_jax.recordings import signals
+from figaroh_jax.recordings import resampling, signals
 from figaroh_jax.recordings.dataset import Recording
 from figaroh_jax.recordings.resampling import differentiate, to_recording_times
 from figaroh_jax.recordings.rowfilter import filter_rows, frequencies, low_pass, row_filter
@@ -261,3 +261,21 @@ def test_preprocessing_that_does_not_fit_the_recording_is_refused(preprocess, wo
     with pytest.raises(InputError, match=words) as error:
         signals.prepare(moving(), preprocess)
     assert "run.npz" in str(error.value)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e9, "ns"), (1e6, "us"), (1e3, "ms")])
+def test_stamps_in_another_unit_are_refused_before_the_memory_is_asked_for(factor: float, unit: str):
+    t = np.arange(40_000 if unit == "ms" else 2000) / 250
+    q = np.sin(t)[:, None] * np.ones(3)
+    wild = recording(t * factor, q, q)
+    with pytest.raises(InputError, match=rf"run.npz: its stamps span .* add units: {{time: {unit}}}"):
+        signals.prepare(wild, Preprocess(cutoff=15), signals.Rates(180.0, 4, 15.0))
+
+
+def test_an_interpolation_in_blocks_is_the_same_to_the_last_bit(monkeypatch: pytest.MonkeyPatch):
+    x = np.random.default_rng(0).standard_normal((500, 2))
+    at = np.linspace(0.3, 4.5, 700)
+    whole = resampling.band_limited(x, at, start=0.0, rate=100.0, passed=20.0, stopped=60.0)
+    monkeypatch.setattr(resampling, "_AT_ONCE", 1000)
+    pieces = resampling.band_limited(x, at, start=0.0, rate=100.0, passed=20.0, stopped=60.0)
+    np.testing.assert_array_equal(pieces, whole)

@@ -7,7 +7,7 @@ joints, sites, couplings and limits. Geoms count where a body has its inertia fr
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +82,8 @@ def compile_mjcf(path: str | Path) -> Any:
     mujoco = engine()
     _check_counts(Path(path), read_xml(path, "mujoco"))
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
+        with _unlogged(mujoco):
+            spec = mujoco.MjSpec.from_file(str(path))
         if spec.flexes:
             raise InputError(f"{path}: has a flex, '{spec.flexes[0].name}'; a robot here is a tree of rigid bodies")
         _drop_looks(mujoco, spec)
@@ -91,6 +92,17 @@ def compile_mjcf(path: str | Path) -> Any:
         raise
     except Exception as error:  # MuJoCo's own kinds, and what its Python layer makes of bytes that are no UTF-8
         raise InputError(f"{path}: MuJoCo does not compile it: {' '.join(str(error).split())}") from None
+
+
+@contextmanager
+def _unlogged(mujoco: Any) -> Iterator[None]:
+    """MuJoCo writes what it warns of into a file of the working directory, which is the user's."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda text: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _check_counts(path: Path, root: Any) -> None:

@@ -15,6 +15,7 @@ __all__ = ["Grid", "band_limited", "differentiate", "even_grid", "sampling_rate"
 
 EVEN = 0.02  # stamps within this share of a step of a straight line count as even
 GAP_STEPS = 5
+_AT_ONCE = 1 << 22  # weights of an interpolation that are held at once
 STOP_BAND = 100.0  # dB
 BETA = 0.1102 * (STOP_BAND - 8.7)  # Kaiser 1974
 LENGTH = (STOP_BAND - 7.95) / (2.285 * 2 * np.pi)  # kernel length times transition width
@@ -75,10 +76,15 @@ def band_limited(
     half = min(int(np.ceil(length / 2 * rate)), len(x) - 1)
     extended = np.concatenate([2 * x[:1] - x[half:0:-1], x, 2 * x[-1:] - x[-2 : -half - 2 : -1]])
     where = (np.asarray(at) - start) * rate
-    nearest = np.clip(np.rint(where).astype(int), 0, len(x) - 1)
-    taps = nearest[:, None] + np.arange(-half, half + 1)
-    weights = _kernel((taps - where[:, None]) / rate, (passed + stopped) / 2, length)
-    return np.stack([np.einsum("tk,tk->t", extended[taps + half, j], weights) for j in range(x.shape[1])], axis=1)
+    out = np.empty((len(where), x.shape[1]))
+    block = max(1, _AT_ONCE // (2 * half + 1))
+    for first in range(0, len(where), block):
+        some = where[first : first + block]
+        taps = np.clip(np.rint(some).astype(int), 0, len(x) - 1)[:, None] + np.arange(-half, half + 1)
+        weights = _kernel((taps - some[:, None]) / rate, (passed + stopped) / 2, length)
+        for j in range(x.shape[1]):
+            out[first : first + block, j] = np.einsum("tk,tk->t", extended[taps + half, j], weights)
+    return out
 
 
 def _kernel(lag: Float[np.ndarray, "times taps"], cutoff: float, length: float) -> Float[np.ndarray, "times taps"]:

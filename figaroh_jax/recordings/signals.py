@@ -47,6 +47,7 @@ __all__ = [
 DEFAULT_CUTOFF = 20.0  # Hz
 WORKING = 13.2  # working rate over cutoff; the five-point differences are off by 0.2 % at the cutoff there
 ROWS = 3.3  # output rate over cutoff
+MOST_NUMBERS = 1 << 25  # of one signal at the working rate: 256 MiB, hours of a robot
 FEWEST_ROWS = 10
 STILL = 1e-12  # of rad or m: what a joint that stands still moves by rounding
 
@@ -128,6 +129,7 @@ def prepare(
     grouped = model if model is not None and model.nq != model.nv else None
     if grouped is not None:
         position = continued(grouped, position, str(recording.file))
+    _refuse_endless(recording, time, rates)
     grid = even_grid(time, position, *([] if torque is None else [torque]))
     at, columns = _resample(grid, rates, shift)
     dt = 1 / rates.working
@@ -165,6 +167,23 @@ def prepare(
         rows=eqx.tree_at(lambda r: r.weight, rows, weight),
         load=recording.load,
         notes=recording.notes + _gap_notes(recording, grid.gaps, rates.cutoff),
+    )
+
+
+def _refuse_endless(recording: Recording, time: Float[np.ndarray, " samples"], rates: Rates) -> None:
+    """Raise `InputError` where the stamps span more than can be computed with: they are not in seconds, or one is off.
+
+    A step between samples of 10 us to 1 s says in which unit they are.
+    """
+    seconds, step = float(time[-1] - time[0]), float(np.median(np.diff(time)))
+    samples = seconds * max(rates.working, sampling_rate(time))
+    if samples * len(recording.joints) <= MOST_NUMBERS:
+        return
+    units = [unit for unit, size in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)) if 1e-5 <= step * size <= 1]
+    advice = f"the stamps look like {units[0]}: add units: {{time: {units[0]}}}" if units else "is a stamp far off?"
+    raise InputError(
+        f"{recording.file}: its stamps span {seconds:.3g} s with {step:.3g} s between samples, which at"
+        f" {rates.working:.4g} Hz would be {samples:.2g} samples of {len(recording.joints)} joints; {advice}"
     )
 
 

@@ -31,10 +31,12 @@ __all__ = [
     "Samples",
     "announced",
     "as_reference",
+    "capabilities_of",
     "file_format",
     "having",
     "host_samples",
     "names",
+    "tried",
 ]
 
 Reference = Literal["local", "world", "local_world_aligned"]
@@ -254,13 +256,28 @@ def announced(name: str) -> Any:  # type[Backend]: a protocol, which no run-time
     try:
         return found[0].load()
     except AttributeError as error:
-        raise InputError(f"backend '{name}': its entry point {found[0].value} names no class ({error})") from None
+        raise InputError(f"backend '{name}': its entry point {found[0].value} names no class ({error})") from error
     except ImportError as error:
         missing = error.name or found[0].value
         raise InputError(
             f"backend '{name}' needs the package '{missing}', which cannot be imported ({error}); "
             f"install it with: pip install 'figaroh-jax[{name}]'"
         ) from None
+    except Exception as error:  # whatever its module does when it is imported
+        raise InputError(
+            f"backend '{name}': its package {found[0].value.partition(':')[0]} fails when it is imported"
+            f" ({type(error).__name__}: {error}); ask those who made it, or choose another backend"
+        ) from error
+
+
+def capabilities_of(name: str) -> Capabilities:
+    """What the backend called `name` can do; raises `InputError` where its class does not say."""
+    found = getattr(announced(name), "capabilities", None)
+    if not isinstance(found, Capabilities):
+        raise InputError(
+            f"backend '{name}': its class says no `capabilities` (a figaroh_jax.simulators.contract.Capabilities)"
+        )
+    return found
 
 
 def having(function: str) -> tuple[str, ...]:
@@ -268,12 +285,61 @@ def having(function: str) -> tuple[str, ...]:
     able = ["native"]
     for name in names()[1:]:
         try:
-            capabilities = announced(name).capabilities
+            capabilities = capabilities_of(name)
         except InputError:
             continue
         if function in capabilities.functions:
             able.append(name)
     return tuple(able)
+
+
+def tried(backend: Backend) -> Backend:
+    """The backend itself once a first call of its dynamics has answered as the contract asks.
+
+    Raises `InputError` for an answer of another shape, one that is not finite, or a regressor that is not that of the
+    torques. Backends of this library are passed on as they are: its tests hold them to more than this.
+    """
+    if type(backend).__module__.partition(".")[0] in _OWN:
+        return backend
+    q = random_configuration(backend.robot, 0, (2,))
+    rates = np.random.default_rng(0).uniform(-1, 1, (2, 2, backend.nv))
+    state, square = (q, *rates), (2, backend.nv, backend.nv)
+    found = {
+        function: _answer(backend, function, arguments, shape)
+        for function, arguments, shape in (
+            ("inverse_dynamics", state, (2, backend.nv)),
+            ("mass_matrix", (q,), square),
+            ("joint_torque_regressor", state, (2, backend.nv, 10 * len(backend.link_names))),
+        )
+        if function in type(backend).capabilities.functions
+    }
+    if {"inverse_dynamics", "joint_torque_regressor"} <= set(found):
+        told = found["joint_torque_regressor"] @ np.ravel(np.asarray(backend.inertias, float))
+        off, size = np.abs(told - found["inverse_dynamics"]).max(), np.abs(found["inverse_dynamics"]).max()
+        if off > 1e-6 * (1 + size):
+            raise InputError(
+                f"backend '{backend.name}': its joint_torque_regressor times its inertias differs from its"
+                f" inverse_dynamics by {off:.3g} N m; both are the rigid body's torques"
+            )
+    return backend
+
+
+_OWN = ("figaroh_jax", "figaroh_jax_mujoco", "figaroh_jax_mjx", "figaroh_jax_pinocchio")
+
+
+def _answer(backend: Backend, function: str, arguments: tuple[Any, ...], shape: tuple[int, ...]) -> np.ndarray:
+    who = f"backend '{backend.name}': {function}"
+    try:
+        answer = np.asarray(getattr(backend, function)(*arguments), float)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{who} fails at its first call ({type(error).__name__}: {error})") from error
+    if answer.shape != shape:
+        raise InputError(f"{who} gives shape {answer.shape} for two samples; {shape} is expected")
+    if not np.isfinite(answer).all():
+        raise InputError(f"{who} gives {answer[~np.isfinite(answer)][0]} at a configuration within the limits")
+    return answer
 
 
 def _lacks(backend: Backend, function: str) -> NoReturn:

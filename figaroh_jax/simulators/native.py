@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..rigid import derivatives, dynamics, kinematics, regressor
 from ..rigid.derivatives import TorqueDerivatives
 from ..rigid.model import RobotModel
-from .contract import Backend, Capabilities, Reference, as_reference, file_format
+from .contract import Backend, Capabilities, Reference, as_reference, file_format, tried
 
 __all__ = ["NativeBackend", "as_backend"]
 
@@ -100,4 +100,4 @@ class NativeBackend(Backend):
 
 def as_backend(model: RobotModel | Backend) -> Backend:
     """The backend itself, or `native` for a plain robot."""
-    return NativeBackend(model) if isinstance(model, RobotModel) else model
+    return NativeBackend(model) if isinstance(model, RobotModel) else tried(model)

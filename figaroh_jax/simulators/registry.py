@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..formats.robotfile import read_robot
 from ..formats.xmlfile import find_in_packages
 from ..rigid.model import RobotModel
-from .contract import GROUP, Backend, announced, having, names
+from .contract import GROUP, Backend, announced, capabilities_of, having, names
 
 __all__ = ["GROUP", "backend", "backend_class", "check_backend", "having", "names"]
 
@@ -54,7 +54,8 @@ def backend_class(name: str) -> type[Backend]:
 
 def check_backend(name: str, *functions: str) -> None:
     """Raise `InputError` unless the backend called `name` is installed and gives the functions of the contract."""
+    capabilities = getattr(backend_class(name), "capabilities", None) or capabilities_of(name)
     for function in functions:
-        if function not in backend_class(name).capabilities.functions:
+        if function not in capabilities.functions:
             able = ", ".join(having(function))
             raise InputError(f"backend '{name}' has no {function}; backends that do: {able}")
