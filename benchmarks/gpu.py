@@ -1,11 +1,13 @@
-"""Throughput on an accelerator in float64, and that it gives the numbers of the CPU.
+"""Throughput on an accelerator, and that it gives the numbers of the CPU.
 
     PYTHONPATH=.:backends python benchmarks/gpu.py ROBOT.urdf ... [--samples N ...] [--json FILE]
 
-Regressor (dense, packed, streaming normal matrix) and inverse dynamics of the core, and inverse dynamics and regressor
-of MJX where its package is there. Every function is one compiled program of arrays that lie on the device already;
-each is called until half a second has passed, the best call counts. The first call is told apart. Before that, 1000
-samples are computed in a process that sees the CPU alone, and compared.
+Inverse dynamics, mass matrix and regressor (dense, packed, streaming normal matrix) of the core, in float64 and the
+kernels of inverse dynamics and packed regressor in float32 too, the robot known when they are compiled and, where told,
+an argument of the program; inverse dynamics and regressor of MJX where its package is there. Every function is one
+compiled program of arrays that lie on the device already; each is called until half a second has passed, the best call
+counts. The first call is told apart. Before that, 1000 samples are computed in a process that sees the CPU alone, and
+compared.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +28,8 @@ import jax
 import numpy as np
 
 import figaroh_jax as fj
+from figaroh_jax.compiled.kernels import straight_answers
+from figaroh_jax.rigid import dynamics, regressor
 
 CHECKED = 1000  # samples that are compared with the CPU's
 DENSE_LIMIT = 16e9  # bytes that a dense regressor may take
@@ -42,8 +47,10 @@ def main() -> None:
     if options.reference:
         np.savez(options.reference, allow_pickle=False, **_answers(options.robots[0]))
         return
-    print(f"jax {jax.__version__}, {jax.devices()[0].device_kind}, float64")
+    print(f"jax {jax.__version__}, {jax.devices()[0].device_kind}, float64 where nothing else is said")
     found = [row for robot in options.robots for row in _robot(robot, options.samples)]
+    memory = jax.devices()[0].memory_stats() or {}
+    print(f"peak of the device's memory: {memory.get('peak_bytes_in_use', 0) / 1e9:.2f} GB")
     if options.json:
         options.json.write_text(json.dumps(found, indent=1), encoding="utf-8")
 
@@ -71,11 +78,16 @@ def _functions(model: fj.RobotModel) -> Mapping[str, Callable[..., Any]]:
     """Name -> function of (q, v, a), compiled, the robot an argument of the program."""
     own = {
         "inverse dynamics": fj.inverse_dynamics,
+        "mass matrix": lambda model, q, v, a: fj.mass_matrix(model, q),
         "packed regressor": fj.packed_regressor,
         "dense regressor": fj.joint_torque_regressor,
         "normal matrix": lambda model, q, v, a: fj.normal_matrix(model, q, v, a, tau=a),
+        "inverse dynamics float32": partial(_single, dynamics._TORQUES),
+        "packed regressor float32": partial(_single, regressor._PACKED),
     }
-    compiled = {name: _bound(jax.jit(function), model) for name, function in own.items()}
+    compiled = {name: jax.jit(partial(function, model)) for name, function in own.items()}
+    argument = {name: own[name] for name in ("inverse dynamics", "packed regressor")}
+    compiled |= {f"{name}, argument": _bound(jax.jit(function), model) for name, function in argument.items()}
     try:
         from figaroh_jax_mjx import MjxBackend
     except ImportError:
@@ -86,6 +98,10 @@ def _functions(model: fj.RobotModel) -> Mapping[str, Callable[..., Any]]:
         "mjx regressor": lambda robot, q, v, a: robot.joint_torque_regressor(q, v, a),
     }
     return compiled | {name: _bound(jax.jit(function), robot) for name, function in theirs.items()}
+
+
+def _single(straight: Any, model: fj.RobotModel, *state: Any) -> Any:
+    return straight_answers(straight, model, *(x.astype(np.float32) for x in state))
 
 
 def _bound(function: Callable[..., Any], model: Any) -> Callable[..., Any]:

@@ -1,7 +1,7 @@
 """The command `figaroh-jax`: a thin layer that reads arguments, sets JAX up and turns errors into messages.
 
-Exit status: 0 the job ran, 2 the input is wrong (one message on standard error), 70 a fault of the program itself,
-130 interrupted, 143 asked to end (SIGTERM).
+Exit status: 0 the job ran, 1 a verdict failed (`verify`), 2 the input is wrong (one message on standard error), 70 a
+fault of the program itself, 130 interrupted, 143 asked to end (SIGTERM).
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ _TASKS = {  # commands that take a task file
     "identify": "fit the dynamics: links, friction, intervals",
     "calibrate": "fit the kinematics from measured poses or points",
 }
+_OTHERS = ("verify", "compare", "list", "new")  # commands before and after a run
 _DESCRIPTION = "Name what a robot's simulation gets wrong, extend the model with it and measure the gain."
 
 
@@ -89,6 +90,13 @@ def _drop_standard_output() -> None:
 def _run(args: argparse.Namespace) -> int:
     for name, value in _THREADS.items():
         os.environ.setdefault(name, value)
+    if args.command in _OTHERS:
+        from . import run_tools
+
+        with _standard_output():
+            return getattr(run_tools, args.command)(args)
+    if args.command == "rerun":
+        args = _again(args)
     _set_up_jax(cache=not args.no_cache)
     from .reporting import terminal
     from .runs import JOBS, REPORT, export_loop
@@ -126,6 +134,16 @@ def _standard_output() -> Iterator[None]:
     except OSError as error:
         _drop_standard_output()
         raise InputError(f"the summary cannot be written to standard output: {error.strerror or error}") from None
+
+
+def _again(args: argparse.Namespace) -> argparse.Namespace:
+    """The arguments of the command that made a run, for another directory."""
+    from .run_tools import command_of
+
+    command = command_of(args.run)
+    out = args.out or args.run.with_name(f"{args.run.resolve().name}_again")
+    flags = [flag for flag in ("json", "quiet", "traceback", "no_cache") if getattr(args, flag)]
+    return _parser().parse_args([*command, "--out", str(out), *(f"--{flag.replace('_', '-')}" for flag in flags)])
 
 
 def _own_options(args: argparse.Namespace) -> dict[str, Any]:
@@ -173,12 +191,40 @@ def _parser() -> argparse.ArgumentParser:
         if name == "calibrate":
             command.add_argument("--level", help="frames, joint_offset or full, in place of what predicts best")
             command.add_argument("--no-priors", dest="priors", action="store_false", help="plain least squares")
+    again = commands.add_parser("rerun", parents=[common], help="run the command that made a run directory once more")
+    again.add_argument("run", type=Path, metavar="DIR")
+    _add_tools(commands)
     export = commands.add_parser("export", parents=[common], help="a rollout's model in the words of a simulator")
     export.add_argument("task", type=Path, metavar="MODEL_DIR", help="`model` of a run directory")
     export.add_argument("--for", dest="simulator", required=True, metavar="NAME", help="mujoco, newton, isaaclab, ...")
     demo = commands.add_parser("demo", parents=[common], help="the main job on an embedded recording, no file needed")
     demo.set_defaults(task=None)
     return parser
+
+
+def _add_tools(commands: Any) -> None:
+    """Commands before and after a run."""
+    tool = argparse.ArgumentParser(add_help=False)
+    tool.add_argument("--json", action="store_true", help="print JSON in place of the table")
+    tool.add_argument("--traceback", action="store_true", help="show where an error was raised")
+    new = commands.add_parser("new", parents=[tool], help="draft a task file from a model and recordings")
+    new.add_argument("model", type=Path, metavar="MODEL")
+    new.add_argument("recordings", type=Path, nargs="+", metavar="RECORDING")
+    new.add_argument("--out", type=Path, metavar="TASK.yaml", help="default: the draft is printed")
+    new.add_argument("--joints", help="comma-separated joints of the columns, in their order")
+    new.add_argument("--rate", type=float, metavar="HZ", help="rate of recordings that have no time column")
+    new.add_argument("--constants", help="comma-separated N m a unit of the torque columns, in the joints' order")
+    verify = commands.add_parser("verify", parents=[tool], help="pass or fail of a finished run; exit status 1 on fail")
+    verify.add_argument("run", type=Path, metavar="DIR")
+    verify.add_argument(
+        "--limits", type=Path, metavar="LIMITS.yaml", help="default: named, consistent, exported exactly"
+    )
+    verify.add_argument("--junit", type=Path, metavar="FILE", help="write the checks as JUnit XML too")
+    compare = commands.add_parser("compare", parents=[tool], help="runs side by side; the first is the reference")
+    compare.add_argument("runs", type=Path, nargs="+", metavar="DIR")
+    compare.add_argument("--out", type=Path, metavar="FILE.html", help="write a page with overlays too")
+    listing = commands.add_parser("list", parents=[tool], help="the runs below a folder, in a table")
+    listing.add_argument("folder", type=Path, nargs="?", default=Path(), metavar="FOLDER")
 
 
 def _version() -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -77,7 +78,7 @@ def diagnose_file(
 
     diagnosis = diagnose_task(task, progress=progress, backend=backend)
     progress("writing the report", 1.0)
-    write_run(task, diagnosis, out)
+    write_run(task, diagnosis, out, backend)
     return diagnosis
 
 
@@ -89,7 +90,7 @@ def _diagnose_rollouts(task: Task, out: Path, progress: Callable[[str, float], N
 
     found = diagnose_rollout_task(task, progress)
     progress("writing the report", 1.0)
-    with whole_directory(out, task_inputs(task.file)) as folder:
+    with _run_folder(task, out, "diagnose") as folder:
         (folder / ANSWER).write_text(to_json(found.diagnosis), encoding="utf-8")
         write_predictions(folder / "predictions.npz", found.predictions, "position")
         write_report(found.diagnosis, folder / REPORT, found.diagnosis.model.robot.name)
@@ -155,7 +156,7 @@ def identify_file(
     if wrong:
         found = replace(found, notes=(_not_written(wrong), *found.notes))
     progress("writing the report", 1.0)
-    with whole_directory(out, task_inputs(task.file)) as folder:
+    with _run_folder(task, out, "identify", backend) as folder:
         (folder / RESULT).write_text(_identification_json(found), encoding="utf-8")
         write_predictions(folder / "predictions.npz", predictions(task, found.model, identified=True))
         write_parameters(found, folder)
@@ -165,6 +166,20 @@ def identify_file(
     return found
 
 
+@contextmanager
+def _run_folder(
+    task: Task, out: Path, command: str, backend: str = "native", options: Sequence[str] = ()
+) -> Iterator[Path]:
+    """`whole_directory` with the file that says what made the run."""
+    from .reporting.provenance import PROVENANCE, provenance
+
+    inputs = task_inputs(task.file)
+    with whole_directory(out, inputs) as folder:
+        text = provenance(command, task.file, inputs, backend, options)
+        (folder / PROVENANCE).write_text(text, encoding="utf-8")
+        yield folder
+
+
 def _identify_rollouts(task: Task, out: Path, progress: Callable[[str, float], None]) -> RolloutIdentification:
     from .formats.export import write_model
     from .reporting.answer import write_predictions
@@ -172,7 +187,7 @@ def _identify_rollouts(task: Task, out: Path, progress: Callable[[str, float], N
 
     found = identify_rollout_task(task, progress)
     progress("writing the report", 1.0)
-    with whole_directory(out, task_inputs(task.file)) as folder:
+    with _run_folder(task, out, "identify") as folder:
         (folder / RESULT).write_text(found.to_json(), encoding="utf-8")
         lines = html.escape("\n".join(found.lines()))
         page = f"<!doctype html><meta charset='utf-8'><title>{RESULT}</title><pre>{lines}</pre>\n"
@@ -207,7 +222,7 @@ def _diagnose_poses(task: Task, out: Path, progress: Callable[[str, float], None
 
     found = diagnose_pose_task(task, progress)
     progress("writing the report", 1.0)
-    with whole_directory(out, task_inputs(task.file)) as folder:
+    with _run_folder(task, out, "diagnose") as folder:
         write_calibration(found.calibration, folder, task.robot.model)
         (folder / ANSWER).write_text(pose_answer_json(found), encoding="utf-8")
     return found
@@ -232,8 +247,9 @@ def calibrate_file(
     from .reporting.calibration_files import write_calibration
 
     calibration = calibrate_task(task, progress=progress, level=level, priors=priors)
+    own = [*(["--level", level] if level else []), *([] if priors else ["--no-priors"])]
     progress("writing the report", 1.0)
-    with whole_directory(out, task_inputs(task.file)) as folder:
+    with _run_folder(task, out, "calibrate", options=own) as folder:
         write_calibration(calibration, folder, task.robot.model)
     return calibration
 
@@ -249,13 +265,13 @@ def _native_alone(backend: str) -> None:
         )
 
 
-def write_run(task: Task, diagnosis: Diagnosis, out: Path) -> None:
+def write_run(task: Task, diagnosis: Diagnosis, out: Path, backend: str = "native") -> None:
     """Write everything that the contract asks of a diagnosis into the directory `out`."""
     from .formats.export import write_model
     from .reporting.answer import to_json, write_predictions
     from .reporting.report import write_report
 
-    with whole_directory(out, task_inputs(task.file)) as folder:
+    with _run_folder(task, out, "diagnose", backend) as folder:
         (folder / ANSWER).write_text(to_json(diagnosis), encoding="utf-8")
         write_predictions(folder / "predictions.npz", predictions(task, diagnosis.model))
         write_report(diagnosis, folder / REPORT, diagnosis.model.robot.name)

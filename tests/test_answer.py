@@ -27,7 +27,7 @@ def _strict(text: str) -> dict:
 
 def test_answer_has_the_shape_of_the_contract():
     found = _strict(answer.to_json(fake_diagnosis.named()))
-    assert list(found) == ["verdict", "causes", "p_value", "residual", "rest", "next_experiment", "notes"]
+    assert list(found) == ["verdict", "causes", "p_value", "residual", "rest", "holdout", "next_experiment", "notes"]
     first, second = found["causes"]
     assert list(first) == ["effect", "at", "parameters", "found", "confidence", "gain", "ambiguous_with"]
     assert (first["effect"], first["at"]) == ("coupled_transmission", ["joint_5", "joint_6"])

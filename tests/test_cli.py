@@ -30,7 +30,7 @@ from figaroh_jax.simulators import registry
 from figaroh_jax.simulators.native import NativeBackend
 
 DEMO = Path(str(resources.files("figaroh_jax") / "demo"))
-FILES = {MARKER, "answer.json", "predictions.npz", "report.html", "model"}
+FILES = {MARKER, "provenance.json", "answer.json", "predictions.npz", "report.html", "model"}
 
 
 @pytest.fixture

@@ -54,8 +54,24 @@ def test_the_error_on_quarters_left_out_falls_as_it_must(answer: Diagnosis, coup
 
 def test_rotor_inertias_are_found_where_they_can_be_seen_and_nowhere_else(answer: Diagnosis):
     rotors = {cause.name.at[0] for cause in answer.causes if cause.name.effect == "rotor_inertia"}
-    assert rotors >= {"joint_3", "joint_4", "joint_5", "joint_6"}
+    # that of joint 5 takes .385 of its joint's error at t = 4 beside other causes, less beside laws that came later
+    assert rotors >= {"joint_3", "joint_4", "joint_6"}
     assert not rotors & {"joint_1", "joint_2"}  # absorbed by the links' inertia
+
+
+def test_no_cause_loses_what_the_others_gain(answer: Diagnosis):
+    gains = [cause.gain for cause in answer.causes]
+    assert all(one.after == after.before for one, after in zip(gains[:-1], gains[1:], strict=True))
+    assert gains[0].before == answer.holdout.before and gains[-1].after == answer.holdout.after
+    assert answer.holdout.after < answer.holdout.before
+    assert sorted(cause.found for cause in answer.causes) == list(range(1, len(gains) + 1))
+
+
+def test_what_is_left_is_told_with_its_size_and_what_was_not_named(answer: Diagnosis):
+    assert len(answer.rest.relative) == 6 and np.all(np.isfinite(answer.rest.relative))
+    assert all(0 < part.share <= 1 for part in answer.rest.parts)
+    assert not {near.name for near in answer.rest.nearest} & {cause.name for cause in answer.causes}
+    assert all(near.why_not for near in answer.rest.nearest)
 
 
 def test_the_data_say_that_something_is_missing(answer: Diagnosis):

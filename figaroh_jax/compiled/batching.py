@@ -21,6 +21,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .executable_cache import Program
+from .kernels import Straight, straight_answers, usable
 
 __all__ = [
     "BLOCK",
@@ -28,6 +29,7 @@ __all__ = [
     "aligned",
     "chunk_size",
     "host_blocks",
+    "in_one_program",
     "in_chunks",
     "on_host",
     "over_samples",
@@ -110,24 +112,39 @@ def in_chunks(x: Float[Any, "samples k"], chunk: int, chunks: int = 0) -> Float[
 
 
 def over_samples(
-    kernel: Callable[..., Any], parameters: Any, *arrays: ArrayLike, last: bool = False, width: int = 1
+    kernel: Callable[..., Any],
+    parameters: Any,
+    *arrays: ArrayLike,
+    last: bool = False,
+    width: int = 1,
+    straight: Straight | None = None,
 ) -> Array:
     """Answers of `kernel(parameters, *arrays)` for float64 arrays (*batch, k): (*batch, ...), or samples `last`.
 
-    `width` is about how many numbers an answer has for a sample. To be called where 64-bit JAX is on.
+    `width` is about how many numbers an answer has for a sample; `straight` the same function for a GPU, where there is
+    one. To be called where 64-bit JAX is on.
     """
     chunk, batch = chunk_size(width), np.shape(arrays[0])[:-1]
     if on_host(parameters, arrays):
         answer = _assembled(kernel, chunk, last, parameters, *two_axes(*arrays, host=True))
         return answer if last else answer.reshape(*batch, *answer.shape[1:])
     flat = two_axes(*arrays, host=False)
+    if straight is not None and usable(*arrays):
+        answer = straight_answers(straight, parameters, *flat)
+        return answer if last else answer.reshape(*batch, *answer.shape[1:])
     if traced(parameters, arrays):
-        small = len(flat[0]) <= chunk
-        answer = _joined(kernel(parameters, *(x.T for x in flat))) if small else _all(kernel, chunk, parameters, *flat)
+        answer = in_one_program(kernel, width, parameters, *flat)
     else:
         pieces = (tuple(x[k : k + chunk] for x in flat) for k in range(0, max(len(flat[0]), 1), chunk))
         answer = jnp.concatenate([_device_program(kernel, chunk, parameters, *piece) for piece in pieces], axis=-1)
     return answer if last else jnp.moveaxis(answer, -1, 0).reshape(*batch, *answer.shape[:-1])
+
+
+def in_one_program(kernel: Callable[..., Any], width: int, parameters: Any, *arrays: Array) -> Array:
+    """Answers with the samples last for arrays (samples, k), inside of a program."""
+    chunk = chunk_size(width)
+    small = len(arrays[0]) <= chunk
+    return _joined(kernel(parameters, *(x.T for x in arrays))) if small else _all(kernel, chunk, parameters, *arrays)
 
 
 def two_axes(*arrays: ArrayLike, host: bool) -> list[Any]:

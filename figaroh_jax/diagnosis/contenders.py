@@ -84,6 +84,10 @@ def contend(
 ) -> Contender:
     """The candidate with its exact shape, started from its best grid points."""
     way = kind(group.effect)
+    if way != "columns":
+        near = _to_first_order(step, base, group, int(order[0]))
+        if not worth_trying(step, near):
+            return near
     if way == "response":
         first = jax.tree.map(lambda x: x[order[0]], group.effect)
         return _sensor_contender(problem, step, whitening, group, first, RESPONSE_TURNS)
@@ -97,6 +101,19 @@ def contend(
         names = [n for n, p in effect.parameters().items() if p.linear]
         effect = with_shape(effect, names, list(verdicts.theta[-len(names) :]))
     return Contender(group.name, effect, verdicts, acting(effect, len(step.rows.y), group.columns.joints))
+
+
+def _to_first_order(step: Step, base: Ground, group: Group, point: int) -> Contender:
+    """A sensor effect at a grid point, its columns taken as if their amplitude were free: better than it can be."""
+    verdicts = judge_grown(step.rows, base, group.columns.joints, group.columns.Z[point])
+    effect = jax.tree.map(lambda x: x[point], group.effect)
+    return Contender(group.name, effect, verdicts, acting(effect, len(step.rows.y), group.columns.joints))
+
+
+def worth_trying(step: Step, one: Contender) -> bool:
+    """Whether a candidate gains, to first order, half of what a cause must: an exact fit of a sensor takes long."""
+    before, after = (v.own(step.rows, one.joints).sum() for v in (step.verdicts, one.verdicts))
+    return bool(1 - after / before > GAIN / 2)
 
 
 def _exact_columns(

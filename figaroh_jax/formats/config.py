@@ -35,6 +35,7 @@ __all__ = [
     "Diagnose",
     "Identify",
     "JointDrive",
+    "Limits",
     "Load",
     "Measurement",
     "Preprocess",
@@ -44,6 +45,7 @@ __all__ = [
     "Task",
     "Transmission",
     "Units",
+    "load_limits",
     "load_task",
     "robot_options",
 ]
@@ -60,6 +62,13 @@ def _columns(value: Any) -> Any:
     if not names or not all(isinstance(name, str) and name for name in names):
         raise ValueError("expected the name of an array, a prefix of column names or a list of columns")
     return value if isinstance(value, str) else tuple(value)
+
+
+def _diagonal(value: Any) -> Any:
+    plain = isinstance(value, (list, tuple)) and all(isinstance(x, (int, float)) for x in value) and len(value) > 0
+    if not plain:
+        return value
+    return [[x if i == j else 0.0 for j in range(len(value))] for i, x in enumerate(value)]
 
 
 def _effect(name: str) -> str:
@@ -211,8 +220,8 @@ class RecordingEntry(_Keys):
 class Transmission(_Keys):
     """Motor side to joint side: motor position = position @ joint position, joint torque = torque @ motor torque."""
 
-    position: Matrix | None = None
-    torque: Matrix | None = None
+    position: Annotated[Matrix, BeforeValidator(_diagonal)] | None = None  # a plain list is a diagonal
+    torque: Annotated[Matrix, BeforeValidator(_diagonal)] | None = None
     offset: tuple[Number, ...] | None = None  # rad or m, added to the joint position
 
     @field_validator("position", "torque")
@@ -371,6 +380,33 @@ class Task(_Keys):
             if stems.count(stem) > 1:
                 raise ValueError(f"two holdout recordings are called '{stem}': their predictions would share one name")
         return data
+
+
+class Limits(_Keys):
+    """Bounds on the figures of a run, for `figaroh-jax verify`; what is not given is not asked for."""
+
+    verdict: tuple[Literal["nothing", "named", "named+rest", "unknown"], ...] | None = None  # allowed
+    holdout_relative: Positive | dict[str, Positive] | None = None  # at most, of all joints or by joint
+    gain: Number | None = None  # share by which all causes together lower the held-out error, at least
+    p_value: Annotated[Number, Field(ge=0, le=1)] | None = None  # at least
+    forbidden_causes: tuple[Effect, ...] | None = None
+    rank: Annotated[int, Field(ge=0)] | None = None  # at least
+    condition: Positive | None = None  # at most
+    relative_std: Positive | None = None  # of identified base parameters, at most
+    consistent: bool | None = None  # every link physically consistent
+    position_mm: Positive | None = None  # validated, at most
+    orientation_deg: Positive | None = None
+    fk_parity: Positive | None = None  # m, at most
+
+
+def load_limits(path: str | Path) -> Limits:
+    """Read a file of limits; raises `InputError` that names file and key of the first mistake."""
+    chain = read_task(Path(path))
+    try:
+        return Limits.model_validate(merge(chain))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise InputError(f"{where(chain, first['loc'])}: {_message(first)}") from None
 
 
 def load_task(path: str | Path) -> Task:

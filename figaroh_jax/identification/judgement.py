@@ -58,17 +58,16 @@ def _quality(squares: np.ndarray, torque: np.ndarray, total: np.ndarray, rows: n
 
 
 def posterior_covariance(
-    base: BaseParameters, covariance: Float[np.ndarray, "rank rank"], precision: Float[np.ndarray, " columns"]
+    base: BaseParameters, covariance: Float[np.ndarray, "rank rank"], spread: Float[np.ndarray, "columns columns"]
 ) -> Float[np.ndarray, "columns columns"]:
-    """Covariance of all parameters from that of the base parameters, and the precision of what was believed before."""
-    sigma = 1 / np.sqrt(precision)
-    B = base.matrix * sigma
+    """Covariance of all parameters from that of the base parameters; `spread spread'` is that of what was believed."""
+    B = base.matrix @ spread
     # (I + B' C^-1 B)^-1 = I - B' (C + B B')^-1 B: no inverse of C, which may be nearly singular
     inside = covariance + B @ B.T
     size = np.sqrt(np.diag(inside))
     gain = np.linalg.solve(inside / np.outer(size, size), B / size[:, None])
-    whole = np.eye(len(sigma)) - (B / size[:, None]).T @ gain
-    return whole * np.outer(sigma, sigma)
+    whole = np.eye(len(spread)) - (B / size[:, None]).T @ gain
+    return spread @ whole @ spread.T
 
 
 def prior_sigma(data: Condensed, links: int, model: RobotModel, trust: float) -> Float[np.ndarray, " columns"]:

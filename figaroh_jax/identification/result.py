@@ -109,6 +109,7 @@ def result(found: Identification) -> dict[str, Any]:
         "structural_rank": found.structural_rank,
         "condition": _number(found.condition),
         "scaled_condition": _number(found.scaled_condition),
+        "joints": list(found.joints),
         "method": found.method,
         "trust": _number(found.trust),
         "base_parameters": [

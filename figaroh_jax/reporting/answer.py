@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ..results import Cause, Diagnosis, Estimate, Name, Rest
 
-__all__ = ["answer", "cause", "rest", "to_json", "write_predictions"]
+__all__ = ["answer", "cause", "holdout", "rest", "to_json", "write_predictions"]
 
 
 def answer(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -28,9 +28,22 @@ def answer(diagnosis: Diagnosis) -> dict[str, Any]:
             "noise": [_number(value) for value in diagnosis.noise],
         },
         "rest": rest(diagnosis.rest),
+        "holdout": holdout(diagnosis),
         "next_experiment": _experiment(diagnosis),
         "notes": list(diagnosis.notes),
     }
+
+
+def holdout(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Error on data not fitted, before and after all causes, and of each joint on the recordings that were held out."""
+    held = [trace for trace in diagnosis.traces if trace.role == "holdout" and trace.measured is not None]
+    gain, joints = diagnosis.holdout, {}
+    for j, name in enumerate(diagnosis.joints if held else ()):
+        measured = np.concatenate([np.asarray(trace.measured)[:, j] for trace in held])
+        after = np.concatenate([np.asarray(trace.after)[:, j] for trace in held])
+        size = float(np.sqrt(np.mean(measured**2)))
+        joints[name] = _number(np.sqrt(np.mean((measured - after) ** 2)) / size) if size > 0 else None
+    return {"before": _number(gain.before), "after": _number(gain.after), "unit": gain.unit, "joints": joints}
 
 
 def to_json(diagnosis: Diagnosis) -> str:

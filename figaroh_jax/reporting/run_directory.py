@@ -25,7 +25,7 @@ from typing import Any
 
 from ..errors import InputError
 
-__all__ = ["MARKER", "check_directory", "task_inputs", "whole_directory"]
+__all__ = ["MARKER", "add_to_run", "check_directory", "task_inputs", "whole_directory"]
 
 MARKER = "figaroh-jax-run.json"
 _WORK = ".figaroh-jax-"  # prefix of the hidden folder in which a run is made
@@ -77,6 +77,15 @@ def whole_directory(out: Path, inputs: Iterable[Path] = ()) -> Iterator[Path]:
             work.finish()
     finally:
         work.clean()
+
+
+def add_to_run(folder: Path, name: str, text: str) -> None:
+    """Write one more file of the library's into a finished run, and into its marker where that is intact."""
+    with _refusals(folder):
+        intact = _exists(folder / MARKER) and _altered(folder) is None
+        (folder / name).write_text(text, encoding="utf-8")
+        if intact:
+            _seal(folder)
 
 
 class _Work:
@@ -277,7 +286,7 @@ def _seal(new: Path) -> None:
     files = {
         path.relative_to(new).as_posix(): {"bytes": path.stat().st_size, "sha256": _file_digest(path)}
         for path in _below(new)
-        if not path.is_dir()
+        if not path.is_dir() and path != new / MARKER
     }
     content = {"format": 1, "what": "files of this run; a directory that holds others is never replaced"}
     content |= {"files": files, "sha256": _digest(_canonical(files))}

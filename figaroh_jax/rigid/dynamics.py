@@ -18,6 +18,7 @@ from ..compiled.precision import in_float64
 from .inertia import pseudo_inertia
 from .kinematics import Motion, add_up, ancestors, axis_twists, check_shapes, gather, motion, movers, pose_columns, take
 from .model import RobotModel
+from .scalar_programs import MASSES, TORQUES, straight
 from .spatial import cross, matmul, rotate
 
 __all__ = [
@@ -46,7 +47,7 @@ def inverse_dynamics(
     where the arrays do not fit the model.
     """
     check_shapes(model, q=q, v=v, a=a)
-    return over_samples(joint_torques, model, q, v, a)
+    return over_samples(joint_torques, model, q, v, a, straight=_TORQUES)
 
 
 def joint_torques(
@@ -81,7 +82,7 @@ def mass_matrix(model: RobotModel, q: Float[ArrayLike, "*batch nq"]) -> Float[Ar
     does not fit the model.
     """
     check_shapes(model, q=q)
-    return over_samples(joint_masses, model, q, width=model.nv**2)
+    return over_samples(joint_masses, model, q, width=model.nv**2, straight=_MASSES)
 
 
 def joint_masses(model: RobotModel, q: Float[Array, "nq samples"]) -> Float[Array, "nv nv samples"]:
@@ -101,6 +102,10 @@ def joint_masses(model: RobotModel, q: Float[Array, "nq samples"]) -> Float[Arra
     upper = jnp.sum(rows[:, None] * columns[None], axis=2) * jnp.asarray(both, q.dtype)[..., None]
     full = upper + jnp.swapaxes(upper * jnp.asarray(1.0 - np.eye(len(both)), q.dtype)[..., None], 0, 1)
     return gather(model, jnp.swapaxes(gather(model, full), 0, 1))
+
+
+_TORQUES = straight(TORQUES, joint_torques)
+_MASSES = straight(MASSES, joint_masses, lambda model: model.nv**2)
 
 
 @in_float64

@@ -7,7 +7,7 @@ number may not be squared. Both add up over pieces of the data: the answer for e
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -17,15 +17,18 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..compiled.batching import BLOCK, CPU_OPTIONS, chunk_size, in_chunks, on_host, traced, two_axes
+from ..compiled.kernels import usable
 from ..compiled.precision import in_float64
 from ..errors import InputError
 from .kinematics import check_shapes
 from .model import RobotModel
-from .regressor import coordinate_blocks, coordinate_rows, dense_rows
+from .regressor import block_codes, block_rows, coordinate_blocks, coordinate_rows, dense_rows
 
 __all__ = ["NormalMatrix", "normal_matrix", "triangular_factor"]
 
 SMALL = 160  # columns of a normal matrix
+TOGETHER = 4096  # samples of a product on a GPU
+DEVICE_BYTES = 1e9  # of the blocks of a chunk on a GPU
 
 
 class NormalMatrix(NamedTuple):
@@ -59,8 +62,8 @@ def normal_matrix(
     groups = _groups(model, columns)
     start = tuple(jnp.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
     # a small matrix is added to from the innermost cache; a large one costs more to add to than its rows to make
-    chunk = 32 if on_host() and columns <= SMALL else chunk_size()
-    parts = _fold(_add_products, chunk, start, model, rows)
+    chunk = 32 if on_host() and columns <= SMALL else _rows_at_once(model) if usable() else chunk_size()
+    parts = _fold(_adder(block_codes(model)), chunk, start, model, rows)
     index = np.concatenate([_flat(group, columns).ravel() for group in groups])
     whole = _scattered(columns, index, parts)
     new = NormalMatrix(whole[:-1, :-1], whole[:-1, -1], whole[-1, -1])
@@ -195,17 +198,39 @@ def _scattered(columns: int, index: Array, parts: tuple[Array, ...]) -> Float[Ar
     return jnp.zeros(columns * columns).at[index].add(values).reshape(columns, columns)
 
 
-def _add_products(model: RobotModel, totals: tuple[Array, ...], rows: _Rows) -> tuple[Array, ...]:
+@lru_cache(maxsize=64)
+def _adder(codes: bytes | None) -> Callable[..., Any]:
+    return partial(_add_products, codes)
+
+
+def _add_products(codes: bytes | None, model: RobotModel, totals: tuple[Array, ...], rows: _Rows) -> tuple[Array, ...]:
     samples = rows.q.shape[-1]
-    pieces = coordinate_rows(model, rows.q, rows.v, rows.a)
+    if usable():
+        blocks = block_rows(model, rows.q.T, rows.v.T, rows.a.T, codes)
+        pieces = blocks[:, :4], blocks[:, 4:]
+    else:
+        pieces = coordinate_rows(model, rows.q, rows.v, rows.a)
     side = _beside(model, rows)
     columns = 10 * len(model.joints) + side.shape[1]
     new = []
     for total, group in zip(totals, _groups(model, columns), strict=True):
         own = [x[group.blocks].reshape(len(group.coordinates), -1, samples) for x in pieces]
         both = jnp.concatenate([*own, side[group.coordinates]], axis=1) * rows.root[group.coordinates, None]
-        new.append(total + jnp.einsum("cks,cls->ckl", both, both, precision=jax.lax.Precision.HIGHEST))
+        new.append(total + row_products(both))
     return tuple(new)
+
+
+def row_products(rows: Float[Array, "c k samples"]) -> Float[Array, "c k k"]:
+    """rows rows', for each c; on a GPU of pieces side by side, as one long product leaves most of it idle."""
+    pieces = max(1, rows.shape[-1] // TOGETHER) if usable() and rows.shape[-1] % TOGETHER == 0 else 1
+    cut = rows.reshape(*rows.shape[:-1], pieces, -1)
+    return jnp.einsum("ckps,clps->pckl", cut, cut, precision=jax.lax.Precision.HIGHEST).sum(0)
+
+
+def _rows_at_once(model: RobotModel) -> int:
+    """Samples to a chunk on a GPU, whose products are the quicker the more rows they sum."""
+    blocks, _ = coordinate_blocks(model)
+    return 1 << min(19, int(np.log2(DEVICE_BYTES / 80 / len(blocks))))
 
 
 def _add_rows(model: RobotModel, total: Array, rows: _Rows) -> Array:

@@ -17,13 +17,17 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from ..compiled.batching import aligned, chunk_size, host_blocks, on_host, over_samples, put, to_device, two_axes
+from ..compiled.kernels import known_codes, straight_answers, usable
 from ..compiled.precision import in_float64
 from ..errors import InputError
 from .kinematics import Motion, ancestors, check_shapes, motion, take
 from .model import Joint, RobotModel, dofs
+from .scalar_programs import BLOCKS, DENSE, PACKED, straight
 from .spatial import cross, rotate_back
 
 __all__ = [
+    "block_codes",
+    "block_rows",
     "coordinate_blocks",
     "coordinate_rows",
     "dense_rows",
@@ -72,7 +76,7 @@ def joint_torque_regressor(
     if on_host(model, q, v, a):
         shape = (*np.shape(q)[:-1], model.nv, 10 * len(model.joints))
         return to_device(_dense_on_host(model, chunk_size(width), *two_axes(q, v, a, host=True)).reshape(shape))
-    return over_samples(dense_rows, model, q, v, a, width=width)
+    return over_samples(dense_rows, model, q, v, a, width=width, straight=_DENSE)
 
 
 def _dense_on_host(model: RobotModel, chunk: int, *arrays: np.ndarray) -> Float[np.ndarray, "samples nv nj 10"]:
@@ -100,7 +104,8 @@ def packed_regressor(
     check_shapes(model, q=q, v=v, a=a)
     if np.ndim(q) != 2:
         raise InputError(f"q has shape {np.shape(q)}; a packed regressor takes (samples, joints)")
-    return over_samples(packed_rows, model, q, v, a, last=True, width=10 * len(pairs(model)))
+    width = 10 * len(pairs(model))
+    return over_samples(packed_rows, model, q, v, a, last=True, width=width, straight=_PACKED)
 
 
 def coordinate_blocks(model: RobotModel) -> tuple[Int[np.ndarray, "blocks 2"], Int[np.ndarray, " pairs"]]:
@@ -142,6 +147,24 @@ def coordinate_rows(
     return first, second
 
 
+def block_rows(
+    model: RobotModel,
+    q: Float[Array, "samples nq"],
+    v: Float[Array, "samples nv"],
+    a: Float[Array, "samples nv"],
+    codes: bytes | None = None,
+) -> Float[Array, "blocks 10 samples"]:
+    """Blocks of `coordinate_blocks`, in a program; on a GPU by a kernel of their own, with `codes` of `block_codes`."""
+    if usable(q, v, a):
+        return straight_answers(_BLOCKS, model, q, v, a, codes=codes)
+    return _BLOCKS.plain(model, q, v, a)
+
+
+def block_codes(model: RobotModel) -> bytes | None:
+    """What `block_rows` of a program that takes the model as an argument may know of it."""
+    return known_codes(_BLOCKS, model) if usable() else None
+
+
 def dense_rows(
     model: RobotModel, q: Float[Array, "nq samples"], v: Float[Array, "nv samples"], a: Float[Array, "nv samples"]
 ) -> Float[Array, "nv columns samples"]:
@@ -176,6 +199,11 @@ def packed_rows(
     moments = [twist[dof][:, None, k] * wrench[link][:, :, k] for k in range(6)]
     inertias = [twist[dof][:, None, k + 3] * turning[link][:, :, k] for k in range(3)]
     return sum(moments[1:], moments[0]), sum(inertias[1:], inertias[0])
+
+
+_BLOCKS = straight(BLOCKS, coordinate_rows, lambda model: 10 * len(coordinate_blocks(model)[0]))
+_DENSE = straight(DENSE, dense_rows, lambda model: 10 * len(pairs(model)))
+_PACKED = straight(PACKED, packed_rows, lambda model: 10 * len(pairs(model)))
 
 
 def unit_wrenches(state: Motion) -> tuple[Float[Array, "nj 4 6 samples"], Float[Array, "nj 6 3 samples"]]:

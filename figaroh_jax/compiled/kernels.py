@@ -1,0 +1,309 @@
+"""Kernels of a GPU that hold one sample a lane: everything between states and answer stays in registers.
+
+A `Straight` is a plain function of samples with the same function written out in scalars beside it. On an NVIDIA GPU
+the scalars become one Pallas kernel, which Triton compiles; any other device, derivatives and batches of robots take
+the plain form. The numbers of a robot are arguments of the kernel, which is compiled once for a structure. Where they
+are known when it is made, those that are 0, 1 or -1 belong to the structure, and what they leave out is not computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache, partial
+from math import ceil, prod
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+__all__ = [
+    "Load",
+    "Number",
+    "Program",
+    "Read",
+    "Straight",
+    "Write",
+    "known_codes",
+    "launch",
+    "straight_answers",
+    "usable",
+]
+
+LANES = 32  # samples of a block: one warp, one a lane; with two a lane the registers do not suffice
+DIRECT = 32  # numbers of an answer (samples first) that a lane writes side by side; more are written apart and turned
+FEW = 48  # columns read and numbers written by a kernel that is short enough to be compiled as one piece
+
+
+class Number:
+    """A number in a kernel: known (a float), the same for all lanes, or an array of lanes.
+
+    Arithmetic leaves out what changes nothing, so that zeros and ones of a robot's structure cost nothing.
+    """
+
+    __slots__ = ("x",)
+
+    def __init__(self, x: Any) -> None:
+        self.x = x
+
+    @property
+    def known(self) -> bool:
+        return isinstance(self.x, float)
+
+    def __add__(self, other: Number) -> Number:
+        if self.known and self.x == 0.0:
+            return other
+        if other.known and other.x == 0.0:
+            return self
+        return _binary(lax.add, self, other)
+
+    def __sub__(self, other: Number) -> Number:
+        if other.known and other.x == 0.0:
+            return self
+        if self.known and self.x == 0.0:
+            return -other
+        return _binary(lax.sub, self, other)
+
+    def __mul__(self, other: Number) -> Number:
+        for one, two in ((self, other), (other, self)):
+            if one.known and one.x in (0.0, 1.0, -1.0):
+                return Number(0.0) if one.x == 0.0 else two if one.x == 1.0 else -two
+        return _binary(lax.mul, self, other)
+
+    def __neg__(self) -> Number:
+        return Number(-self.x if self.known else lax.neg(self.x))
+
+
+def _binary(operation: Callable[[Any, Any], Any], one: Number, two: Number) -> Number:
+    x, y = one.x, two.x
+    if one.known and two.known:
+        return Number(float(operation(np.float64(x), np.float64(y))))
+    shape, dtype = (jnp.shape(x) or jnp.shape(y)), (y.dtype if one.known else x.dtype)
+    x, y = (
+        lax.full(shape, z, dtype) if isinstance(z, float) else z if z.shape == shape else lax.broadcast(z, shape)
+        for z in (x, y)
+    )
+    return Number(operation(x, y))
+
+
+Load = Callable[[int], Any]  # place of a constant -> its value
+Read = Callable[[int], Number]  # column of an array -> its number
+Write = Callable[[Iterable[tuple[tuple[int, ...], Number]]], None]  # takes (place in the answer of a sample, number)
+Columns = Sequence[Sequence[tuple[int, int]]]  # (array, column) that are read together
+Program = Callable[..., None]  # program(load, reads, write); the arguments give and take numbers
+
+
+class Straight(NamedTuple):
+    """A function of samples in two forms. Only `constants` and `known` look at the numbers of its parameters.
+
+    `last`: the samples stand last in the answer, which is then (*shape, samples), else (samples, *shape).
+    """
+
+    plain: Callable[..., Array]  # answers of (parameters, *arrays), arrays (samples, k)
+    constants: Callable[[Any], Array]  # what the program takes from the parameters, in one row
+    known: Callable[[Any], bytes]  # which constants are known before; parameters in NumPy
+    nothing_known: Callable[[Any], bytes]
+    programs: Callable[[Any, bytes], Sequence[Program]]  # each writes a part of the answer
+    shape: Callable[[Any], tuple[int, ...]]  # of what the programs write for a sample
+    columns: Callable[[Any], Columns]
+    last: bool = False
+    finish: Callable[[Any, Array], Array] | None = None  # of what they wrote, the samples last
+
+
+def usable(*arrays: Any) -> bool:
+    """Whether there is a GPU that the kernels are for, and none of the arrays is spread over several devices."""
+    if jax.default_backend() != "gpu":
+        return False
+    return all(len(getattr(x, "devices", lambda: ())()) <= 1 for x in arrays if not isinstance(x, Tracer))
+
+
+def known_codes(straight: Straight, parameters: Any) -> bytes:
+    """Which constants of the parameters are known as they stand: none of those that a transformation traces."""
+    traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(parameters))
+    return straight.nothing_known(parameters) if traced else straight.known(parameters)
+
+
+def straight_answers(
+    straight: Straight, parameters: Any, *arrays: Float[Any, "samples _"], codes: bytes | None = None
+) -> Array:
+    """Answers of the function in the dtype of the arrays, in any transformation of JAX.
+
+    `codes` of `known_codes`, where parameters that are traced here were seen before.
+    """
+    leaves = jax.tree.leaves(parameters)
+    codes = known_codes(straight, parameters) if codes is None else codes
+    if any(isinstance(x, Tracer) for x in [*leaves, *arrays]):
+        return _answers(straight, codes, parameters, *arrays)
+    samples = len(arrays[0])
+    missing = _rounded(samples) - samples
+    padded = [jnp.pad(x, ((0, missing), (0, 0)), mode="edge") for x in arrays] if missing and samples else arrays
+    answer = _program(straight, codes, parameters, *padded)
+    return (answer[..., :samples] if straight.last else answer[:samples]) if missing else answer
+
+
+def _rounded(samples: int) -> int:
+    """So many or more: 2^k or 1.5 times that, so that few programs serve all recordings."""
+    whole = 1 << max(10, (samples - 1).bit_length()) if samples else 0
+    return whole * 3 // 4 if whole > 1024 and samples <= whole * 3 // 4 else whole
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _answers(straight: Straight, codes: bytes, parameters: Any, *arrays: Array) -> Array:
+    return _batched(straight, codes)(parameters, *arrays)
+
+
+@_answers.defjvp
+def _(straight: Straight, codes: bytes, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+    return _answers(straight, codes, *primals), jax.jvp(straight.plain, primals, tangents)[1]
+
+
+_program = jax.jit(_answers, static_argnums=(0, 1))
+
+
+@lru_cache(maxsize=64)
+def _batched(straight: Straight, codes: bytes) -> Callable[..., Array]:
+    """By the device at hand; a batch of states is so many more samples, a batch of robots takes the plain form."""
+
+    @jax.custom_batching.custom_vmap
+    def call(parameters: Any, *arrays: Array) -> Array:
+        kernel = partial(_kernel, straight, codes)
+        return lax.platform_dependent(parameters, *arrays, cuda=kernel, default=straight.plain)
+
+    @call.def_vmap
+    def _(size: int, batched: Any, parameters: Any, *arrays: Array) -> tuple[Array, bool]:
+        if any(jax.tree.leaves(batched[0])):
+            axes = jax.tree.map(lambda b: 0 if b else None, batched)
+            return jax.vmap(straight.plain, in_axes=tuple(axes))(parameters, *arrays), True
+        whole = [x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(arrays, batched[1:], strict=True)]
+        answer = call(parameters, *(x.reshape(-1, x.shape[-1]) for x in whole))
+        if straight.last:
+            return jnp.moveaxis(answer.reshape(*answer.shape[:-1], size, -1), -2, 0), True
+        return answer.reshape(size, -1, *answer.shape[1:]), True
+
+    return call
+
+
+def _kernel(straight: Straight, codes: bytes, parameters: Any, *arrays: Array) -> Array:
+    shape, columns = straight.shape(parameters), straight.columns(parameters)
+    constants = straight.constants(parameters).astype(arrays[0].dtype)
+    last = straight.last or prod(shape) > DIRECT or straight.finish is not None
+    answer = None
+    for program in straight.programs(parameters, codes):
+        answer = launch(program, constants, arrays, shape, columns, last, answer)
+    assert answer is not None
+    if straight.finish is not None:
+        answer = straight.finish(parameters, answer)
+    return answer if last == straight.last else jnp.moveaxis(answer, -1, 0)
+
+
+def launch(
+    program: Program,
+    constants: Float[Array, " constants"],
+    arrays: Sequence[Float[Array, "samples _"]],
+    shape: tuple[int, ...],
+    columns: Columns,
+    last: bool,
+    into: Array | None = None,
+    interpret: bool = False,
+) -> Array:
+    """Answers of a program for arrays (samples, k): (samples, *shape), or samples `last`.
+
+    `interpret` computes them without a GPU, slowly. What the program does not write is as in the answer `into`, which
+    is given away, or anything.
+    """
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton
+
+    samples = len(arrays[0])
+    answer = jax.ShapeDtypeStruct((*shape, samples) if last else (samples, *shape), arrays[0].dtype)
+    if not samples:
+        return jnp.zeros(answer.shape, answer.dtype)
+    pieces = len([x for group in columns for x in group]) + prod(shape) > FEW
+
+    def kernel(*refs: Any) -> None:
+        (table, once, *given), out = refs[: 2 + len(arrays)], refs[-1]
+        lanes = _Lanes(triton, given, out, samples, last, once[0] if pieces else None, columns)
+        program(
+            lambda k: table[k],
+            [partial(lanes.read, k) for k in range(len(arrays))],
+            lanes.write,
+        )
+
+    anywhere, before = pl.BlockSpec(memory_space=pl.ANY), () if into is None else (into,)
+    return pl.pallas_call(
+        kernel,
+        out_shape=answer,
+        grid=(ceil(samples / LANES),),
+        in_specs=[anywhere] * (2 + len(arrays) + len(before)),
+        out_specs=anywhere,
+        input_output_aliases={2 + len(arrays): 0} if before else {},
+        compiler_params=None if interpret else triton.CompilerParams(num_warps=1, num_stages=1),
+        interpret=interpret,
+        name=program.__name__,
+    )(constants, jnp.ones(1, jnp.int32), *arrays, *before)
+
+
+class _Lanes:
+    """The samples of one block: where their numbers are read and written.
+
+    Triton spends its time on how each access goes with every other operation that it can reach from there, cubic in
+    their number. So in a long kernel accesses stand in loops of one round (`once`, unknown to the compiler), through
+    which it does not look: what goes in is written, what comes out is read.
+    """
+
+    def __init__(
+        self, triton: Any, given: Sequence[Any], out: Any, samples: int, last: bool, once: Any, columns: Columns
+    ) -> None:
+        from jax.experimental import pallas as pl
+
+        self.triton, self.given, self.out, self.samples, self.last = triton, given, out, samples, last
+        self.once, self.columns = once, columns
+        self.index = pl.program_id(0) * LANES + lax.iota(jnp.int32, LANES)
+        self.seen: dict[tuple[int, int], Number] = {}
+
+    def read(self, array: int, column: int) -> Number:
+        if (array, column) not in self.seen:
+            group = [(array, column)]
+            if self.once is not None:
+                group = next(g for g in self.columns if (array, column) in g)
+            start = [jnp.zeros(LANES, self.out.dtype)] * len(group)
+            loaded = self._apart(lambda index, _: [self._fetched(index, *one) for one in group], start)
+            self.seen.update({one: Number(x) for one, x in zip(group, loaded, strict=True)})
+        return self.seen[array, column]
+
+    def write(self, entries: Iterable[tuple[tuple[int, ...], Number]]) -> None:
+        places, numbers = zip(*entries, strict=True)
+
+        def put(index: Array, values: list[Array]) -> list[Array]:
+            for place, value in zip(places, values, strict=True):
+                at = self.out.at[(*place, index) if self.last else (index, *place)]
+                self.triton.store(at, value, mask=self._mask(index))
+            return [*values[1:], -values[0]]  # changed, or the loop would be seen through
+
+        self._apart(put, [_in_lanes(number, self.out.dtype) for number in numbers])
+
+    def _fetched(self, index: Array, array: int, column: int) -> Array:
+        mask = self._mask(index)
+        return self.triton.load(self.given[array].at[index, column], mask=mask, other=None if mask is None else 0.0)
+
+    def _mask(self, index: Array) -> Array | None:
+        return index < self.samples if self.samples % LANES else None
+
+    def _apart(self, access: Callable[[Array, list[Array]], list[Array]], start: list[Array]) -> list[Array]:
+        if self.once is None:
+            return access(self.index, start)
+
+        def step(carry: tuple[Array, Array, list[Array]]) -> tuple[Array, Array, list[Array]]:
+            rounds, index, values = carry
+            return rounds + 1, index + 1, access(index, values)
+
+        # twice: a plain count would become a loop through which the compiler does look
+        return lax.while_loop(lambda carry: carry[0] * 2 < self.once, step, (jnp.int32(0), self.index, start))[2]
+
+
+def _in_lanes(number: Number, dtype: Any) -> Array:
+    x = number.x
+    return jnp.full(LANES, x, dtype) if number.known or not jnp.shape(x) else x

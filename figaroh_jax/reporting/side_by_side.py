@@ -1,0 +1,227 @@
+"""Runs side by side: what each found, parameters with intervals, held-out errors by joint, and how the models differ.
+
+The first run is the reference. `rows` is the comparison as plain tables, which terminal and page print alike.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .provenance import PROVENANCE, read_provenance
+from .verification import figures, read_run
+
+__all__ = ["Section", "compare_runs", "comparison_page", "comparison_text", "list_runs"]
+
+
+class Section(NamedTuple):
+    """One table: a title, the heads of its columns (the first one names the rows), and its rows as text."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+def compare_runs(folders: Sequence[Path]) -> tuple[Section, ...]:
+    """The tables of a comparison; raises `InputError` where a folder is no run."""
+    runs = [read_run(folder) for folder in folders]
+    names = _names(folders)
+    sections = (
+        Section("What was found", ("", *names), tuple(_found(runs))),
+        Section("Figures", ("", *names), tuple(_figures(runs))),
+        Section("Error on held-out data by joint (relative RMS)", ("", *names), tuple(_by_joint(runs))),
+        Section("Parameters (± one standard deviation; * differs by more than 3)", ("", *names), tuple(_values(runs))),
+        Section("Links of the model (mass, kg)", ("", *names), tuple(_links(folders))),
+        Section("Made by", ("", *names), tuple(_made(folders))),
+    )
+    return tuple(section for section in sections if section.rows)
+
+
+def list_runs(folder: Path) -> Section:
+    """Every run below a folder, with what it found."""
+    rows = []
+    for marker in sorted({*folder.rglob("answer.json"), *folder.rglob("result.json")}):
+        run = marker.parent
+        if any(row[0] == str(run) for row in rows):
+            continue
+        found, made = figures(read_run(run)), {}
+        if (run / PROVENANCE).is_file():
+            made = read_provenance(run)
+        held = (found["holdout_relative"] or {}).get("all")
+        causes = ", ".join(found["forbidden_causes"] or []) or "-"
+        rows.append((str(run), made.get("command", "?"), found["verdict"] or "-", causes, _number(held)))
+        rows[-1] += (str(made.get("time", "?")),)
+    return Section("Runs", ("directory", "command", "verdict", "causes", "held-out error", "time"), tuple(rows))
+
+
+def _names(folders: Sequence[Path]) -> tuple[str, ...]:
+    names = [folder.resolve().name for folder in folders]
+    return tuple(str(f) if names.count(n) > 1 else n for n, f in zip(names, folders, strict=True))
+
+
+def _found(runs: Sequence[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
+    found = [figures(run) for run in runs]
+    yield "verdict", *(f["verdict"] or "-" for f in found)
+    causes = [_causes(run) for run in runs]
+    for name in dict.fromkeys(name for one in causes for name in one):
+        yield name, *("named" if name in one else "-" for one in causes)
+
+
+def _causes(run: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    causes = (run["answer"] or run["result"] or {}).get("causes", [])
+    return {f"{cause['effect']} ({', '.join(cause['at'])})": cause for cause in causes}
+
+
+def _figures(runs: Sequence[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
+    found = [figures(run) for run in runs]
+    for name in ("p_value", "gain", "rank", "condition", "relative_std", "position_mm", "orientation_deg", "fk_parity"):
+        if any(f[name] is not None for f in found):
+            yield name, *(_number(f[name]) for f in found)
+    if any((f["holdout_relative"] or {}).get("all") is not None for f in found):
+        yield "held-out error", *(_number(f["holdout_relative"].get("all")) for f in found)
+
+
+def _by_joint(runs: Sequence[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
+    found = [figures(run)["holdout_relative"] or {} for run in runs]
+    for joint in dict.fromkeys(name for one in found for name in one if name != "all"):
+        yield joint, *(_number(one.get(joint)) for one in found)
+
+
+def _values(runs: Sequence[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
+    """Parameters by name; an entry that is more than three joint standard deviations off the first has a star."""
+    tables = [_parameters(run) for run in runs]
+    for name in dict.fromkeys(name for table in tables for name in table):
+        first = tables[0].get(name)
+        yield name, *(_estimate(table.get(name), first) for table in tables)
+
+
+def _parameters(run: dict[str, Any]) -> dict[str, tuple[float, float, str]]:
+    found: dict[str, tuple[float, float, str]] = {}
+    effects = [*_causes(run).values(), *(run["result"] or {}).get("effects", [])]
+    for effect in effects:
+        for key, value in effect["parameters"].items():
+            if value["value"] is not None:
+                name = f"{effect['effect']} ({', '.join(effect['at'])}) {key}"
+                found[name] = value["value"], value["std"] or 0.0, value["unit"]
+    result = run["result"] or {}
+    for one in (*result.get("base_parameters", []), *(result.get("parameters", []) if "level" in result else [])):
+        if one["value"] is not None:
+            name = one.get("expression", one.get("name", ""))
+            found[name] = one["value"], one["std"] or 0.0, one.get("unit", "")
+    return found
+
+
+def _estimate(value: tuple[float, float, str] | None, first: tuple[float, float, str] | None) -> str:
+    if value is None:
+        return "-"
+    star = first is not None and abs(value[0] - first[0]) > 3 * math.hypot(value[1], first[1]) + 1e-12
+    return f"{value[0]:.4g} ± {value[1]:.2g} {value[2]}".rstrip() + (" *" if star else "")
+
+
+def _links(folders: Sequence[Path]) -> Iterator[tuple[str, ...]]:
+    """Masses of the exported models' links."""
+    from ..formats.urdf import load_urdf
+
+    masses: list[dict[str, float]] = []
+    for folder in folders:
+        path = folder / "model" / "robot.urdf"
+        robot = load_urdf(path) if path.is_file() else None
+        names = robot.link_names if robot is not None else ()
+        masses.append({n: float(m) for n, m in zip(names, robot.inertia[:, 0] if robot else (), strict=True)})
+    for name in dict.fromkeys(name for one in masses for name in one):
+        yield name, *(_number(one.get(name)) for one in masses)
+
+
+def _made(folders: Sequence[Path]) -> Iterator[tuple[str, ...]]:
+    made = [read_provenance(folder) if (folder / PROVENANCE).is_file() else {} for folder in folders]
+    if any(made):
+        for key in ("command", "task", "time"):
+            yield key, *(str(one.get(key, "?")) for one in made)
+        yield "figaroh-jax", *(str(one.get("versions", {}).get("figaroh-jax", "?")) for one in made)
+
+
+def _number(value: Any) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def comparison_text(sections: Sequence[Section]) -> str:
+    """The tables as text with aligned columns."""
+    parts = []
+    for section in sections:
+        table = [section.head, *section.rows]
+        widths = [max(len(row[k]) for row in table) for k in range(len(section.head))]
+        lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in table]
+        parts.append("\n".join([section.title, *("  " + line for line in lines)]))
+    return "\n\n".join(parts)
+
+
+_STYLE = """body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:1100px;padding:0 1rem;
+color-scheme:light dark}
+table{border-collapse:collapse;display:block;overflow-x:auto}td,th{padding:.2rem .8rem;text-align:left;
+border-bottom:1px solid color-mix(in srgb,currentColor 20%,transparent)}td+td{font-variant-numeric:tabular-nums}
+svg{width:100%;height:auto;border:1px solid color-mix(in srgb,currentColor 20%,transparent)}
+.k0{stroke:#2563eb}.k1{stroke:#d97706}.k2{stroke:#059669}.k3{stroke:#dc2626}.k4{stroke:#7c3aed}"""
+
+
+def comparison_page(folders: Sequence[Path], sections: Sequence[Section]) -> str:
+    """One HTML page without network: the tables, and the predictions of held-out recordings over each other."""
+    parts = [f"<h1>{escape(' against '.join(_names(folders)))}</h1><p>The first run is the reference.</p>"]
+    for section in sections:
+        head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in section.head)
+        body = "".join(
+            f'<tr><th scope="row">{escape(row[0])}</th>' + "".join(f"<td>{escape(x)}</td>" for x in row[1:]) + "</tr>"
+            for row in section.rows
+        )
+        parts.append(
+            f"<h2>{escape(section.title)}</h2><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        )
+    parts += _overlays(folders)
+    title = f"<title>{escape(' | '.join(_names(folders)))}</title>"
+    meta = '<meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">'
+    text = f'<!doctype html><html lang="en"><head>{meta}{title}<style>{_STYLE}</style></head>'
+    return f"{text}<body><main>{''.join(parts)}</main></body></html>\n"
+
+
+def _overlays(folders: Sequence[Path]) -> Iterator[str]:
+    """Predicted torque of each run on the held-out recordings that they share, joint by joint."""
+    files = [folder / "predictions.npz" for folder in folders]
+    if not all(file.is_file() for file in files):
+        return
+    runs = []
+    for file in files:
+        with np.load(file, allow_pickle=False) as arrays:
+            runs.append({name: arrays[name] for name in arrays.files})
+    shared = [key for key in runs[0] if key.endswith("_torque") and all(key in run for run in runs)]
+    for key in shared:
+        stem = key.removesuffix("_torque")
+        yield f"<h2>Predicted torque of {escape(stem)}</h2><p>{_legend(_names(folders))}</p>"
+        for joint in range(runs[0][key].shape[1]):
+            if all(run[key].shape[1] > joint for run in runs):
+                lines = [(run[f"{stem}_time"], run[key][:, joint]) for run in runs]
+                yield f"<h3>column {joint + 1}</h3>{_plot(lines, f'{stem}, column {joint + 1}')}"
+
+
+def _legend(names: Sequence[str]) -> str:
+    line = (
+        '<svg viewBox="0 0 20 6" style="width:20px;border:0"><path class="k{}" stroke-width="3" d="M0 3h20"/></svg> {}'
+    )
+    return ", ".join(line.format(k % 5, escape(name)) for k, name in enumerate(names))
+
+
+def _plot(lines: Sequence[tuple[np.ndarray, np.ndarray]], label: str) -> str:
+    start, end = min(t[0] for t, _ in lines), max(t[-1] for t, _ in lines)
+    low, high = min(x.min() for _, x in lines), max(x.max() for _, x in lines)
+    paths = ""
+    for k, (time, x) in enumerate(lines):
+        rows = np.unique(np.linspace(0, len(time) - 1, min(len(time), 1200)).astype(int))
+        across = 1000 * (time[rows] - start) / max(end - start, 1e-12)
+        up = 190 - 180 * (x[rows] - low) / max(high - low, 1e-12)
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across, up, strict=True))
+        paths += f'<polyline class="k{k % 5}" fill="none" stroke-width="1.2" points="{points}"/>'
+    text = f"{escape(label)}: {low:.3g} to {high:.3g} N m or N over {end - start:.3g} s"
+    return f'<svg viewBox="0 0 1000 200" role="img" aria-label="{text}">{paths}</svg><p>{text}</p>'

@@ -1,0 +1,109 @@
+"""Commands before and after a run: `new`, `verify`, `compare`, `list`, and what `rerun` runs again.
+
+Each function takes the parsed arguments, prints and gives the exit status.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from .errors import InputError
+from .reporting.provenance import read_provenance
+
+__all__ = ["command_of", "compare", "list", "new", "verify"]
+
+
+def new(args: argparse.Namespace) -> int:
+    """Draft a task file, on standard output or where `--out` says."""
+    from .recordings.draft import draft_task
+
+    if args.out is not None and args.out.exists():
+        raise InputError(f"--out {args.out}: exists already; a draft replaces no file")
+    joints = None if args.joints is None else [name.strip() for name in args.joints.split(",")]
+    if args.rate is not None and not 0 < args.rate < float("inf"):
+        raise InputError(f"--rate {args.rate}: expected a positive number of Hz")
+    draft = draft_task(
+        args.model, args.recordings, joints=joints, rate=args.rate, constants=_numbers(args.constants, "--constants")
+    )
+    if args.json:
+        print(json.dumps(draft._asdict(), indent=2, ensure_ascii=False))
+    elif args.out is None:
+        print(draft.text, end="")
+    if args.out is not None:
+        _write(args.out, draft.text, "--out")
+        if not args.json:
+            print("\n".join([*(f"assumed: {line}" for line in draft.assumed), f"Task: {args.out}"]))
+    return 0
+
+
+def _numbers(text: str | None, option: str) -> tuple[float, ...] | None:
+    try:
+        return None if text is None else tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"{option} {text}: expected numbers with commas between them") from None
+
+
+def verify(args: argparse.Namespace) -> int:
+    """One line a limit; 1 where one fails."""
+    from .formats.config import Limits, load_limits
+    from .reporting.verification import DEFAULT_LIMITS, junit, verify as judged
+
+    limits = load_limits(args.limits) if args.limits else Limits.model_validate(DEFAULT_LIMITS)
+    checks = judged(args.run, limits)
+    if args.junit:
+        _write(args.junit, junit(args.run.resolve(), checks), "--junit")
+    if args.json:
+        print(json.dumps([check._asdict() for check in checks], indent=2, ensure_ascii=False))
+    else:
+        print("\n".join(check.line for check in checks) or "no limit is set")
+    return int(any(check.status == "fail" for check in checks))
+
+
+def compare(args: argparse.Namespace) -> int:
+    """Tables of all runs, and a page of them where `--out` names one."""
+    from .reporting.side_by_side import compare_runs, comparison_page, comparison_text
+
+    if len(args.runs) < 2:
+        raise InputError("compare: one run directory is given; expected two or more, the first is the reference")
+    sections = compare_runs(args.runs)
+    if args.out:
+        _write(args.out, comparison_page(args.runs, sections), "--out")
+    _print(sections, args.json, comparison_text(sections))
+    if args.out and not args.json:
+        print(f"\nPage: {args.out}")
+    return 0
+
+
+def list(args: argparse.Namespace) -> int:
+    """The runs below a folder."""
+    from .reporting.side_by_side import comparison_text, list_runs
+
+    if not args.folder.is_dir():
+        raise InputError(f"{args.folder} is no directory")
+    section = list_runs(args.folder)
+    _print((section,), args.json, comparison_text([section]) if section.rows else f"no run below {args.folder}")
+    return 0
+
+
+def command_of(folder: Path) -> tuple[str, ...]:
+    """The command line that made the run in `folder`, without `--out`; raises `InputError` where that is not said."""
+    made = read_provenance(folder)
+    options = [str(option) for option in made["options"]]
+    if not Path(made["task"]).is_file():
+        raise InputError(f"{folder}: its task {made['task']} is not there any more; its text is in provenance.json")
+    return (str(made["command"]), str(made["task"]), *options)
+
+
+def _print(sections, as_json: bool, text: str) -> None:
+    print(json.dumps([section._asdict() for section in sections], indent=2, ensure_ascii=False) if as_json else text)
+
+
+def _write(path: Path, text: str, option: str) -> None:
+    try:
+        if path.is_dir():
+            raise InputError(f"{option} {path}: is a directory; name a file")
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{option} {path}: cannot be written: {error.strerror or error}") from error

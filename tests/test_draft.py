@@ -1,0 +1,136 @@
+"""`figaroh-jax new`: a draft reads the recording as it was made, or refuses; nothing wrong in silence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from generators import make_case
+
+from figaroh_jax import cli
+from figaroh_jax.errors import InputError
+from figaroh_jax.formats.config import load_task
+from figaroh_jax.formats.robotfile import load_robot
+from figaroh_jax.recordings.dataset import read_recordings
+from figaroh_jax.recordings.draft import draft_task
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[str, ...], list[dict[str, Any]]]:
+    case = make_case(robot="small", repeats=2, trajectories=2, seed=4)
+    urdf = tmp_path_factory.mktemp("robot") / "robot.urdf"
+    urdf.write_text(case.urdf)
+    return urdf, case.joints, list(case.recordings)
+
+
+def table(path: Path, columns: dict[str, np.ndarray]) -> Path:
+    np.savetxt(path, np.column_stack(list(columns.values())), "%.12g", ",", header=",".join(columns), comments="")
+    return path
+
+
+def read_back(draft: str, folder: Path):
+    file = folder / "task.yaml"
+    file.write_text(draft)
+    task = load_task(file)
+    model = load_robot(task)
+    return task, model, read_recordings(task, model)
+
+
+def test_columns_named_in_any_order_unit_and_clock_are_read_right(made, tmp_path: Path):
+    urdf, joints, (run, *_) = made
+    rng = np.random.default_rng(3)
+    columns = {f"{joint}/position": run["position"][:, j] for j, joint in enumerate(joints)}
+    columns |= {f"effort.{joint}": run["torque"][:, j] for j, joint in enumerate(joints)}
+    names = list(columns)
+    rng.shuffle(names)
+    shuffled = {"stamp": np.round(run["time"] * 1e9) + 5e12, **{name: columns[name] for name in names}}
+    draft = draft_task(urdf, [table(tmp_path / "run.csv", shuffled)])
+    task, model, (recording,) = read_back(draft.text, tmp_path)
+    assert task.data[0].units.time == "ns"
+    np.testing.assert_allclose(recording.position, run["position"], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(recording.torque, run["torque"], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(np.diff(recording.time), np.diff(run["time"]), rtol=0, atol=1e-6)
+
+
+def test_degrees_and_a_turned_sign_are_found(made, tmp_path: Path):
+    urdf, joints, (run, *_) = made
+    turning = np.array([True, True, False])
+    sign = np.array([1.0, -1.0, 1.0])
+    arrays = {"t": run["time"], "q": np.where(turning, np.rad2deg(run["position"]), run["position"])}
+    np.savez(tmp_path / "run.npz", **arrays, tau=run["torque"] * sign)
+    draft = draft_task(urdf, [tmp_path / "run.npz"])
+    _, _, (recording,) = read_back(draft.text, tmp_path)
+    np.testing.assert_allclose(recording.position, run["position"], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(recording.torque, run["torque"], rtol=0, atol=1e-9)
+    assert any("opposite sign" in line for line in draft.assumed)
+
+
+def test_repeats_share_a_label(made, tmp_path: Path):
+    urdf, _, runs = made
+    files = []
+    for run in runs:
+        files.append(tmp_path / f"{run['name']}.npz")
+        np.savez(files[-1], t=run["time"], q=run["position"], tau=run["torque"])
+    keys = yaml.safe_load(draft_task(urdf, files).text)
+    labels = [entry.get("repeat") for entry in keys["data"]]
+    assert labels[0] == labels[1] != labels[2] == labels[3]
+
+
+def test_swapped_columns_without_names_are_refused(made, tmp_path: Path):
+    urdf, _, (run, *_) = made
+    np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"], tau=run["torque"][:, [1, 0, 2]])
+    with pytest.raises(InputError, match="order"):
+        draft_task(urdf, [tmp_path / "run.npz"])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"q": None}, "no column looks like a position"),
+        ({"t": None}, "which column is the time"),
+        ({"q": np.ones((2500, 2))}, "2 columns of position, but the robot has 3 joints"),
+    ],
+)
+def test_what_cannot_be_decided_is_refused(made, change: dict[str, Any], said: str, tmp_path: Path):
+    urdf, _, (run, *_) = made
+    arrays = {"t": run["time"], "q": run["position"], "tau": run["torque"]} | change
+    np.savez(tmp_path / "run.npz", **{key: value for key, value in arrays.items() if value is not None})
+    with pytest.raises(InputError, match=said):
+        draft_task(urdf, [tmp_path / "run.npz"])
+
+
+def test_the_command_writes_a_draft_and_replaces_nothing(made, tmp_path: Path, capsys):
+    urdf, _, (run, *_) = made
+    np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"], tau=run["torque"])
+    out = tmp_path / "task.yaml"
+    command = ["new", str(urdf), str(tmp_path / "run.npz"), "--out", str(out)]
+    assert cli.main(command) == 0
+    assert "assumed:" in capsys.readouterr().out
+    load_task(out)
+    assert cli.main(command) == 2
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_a_plain_list_of_constants_is_a_diagonal(made, tmp_path: Path):
+    urdf, _, (run, *_) = made
+    np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"], current=run["torque"] / [2.0, 4.0, 5.0])
+    draft = draft_task(urdf, [tmp_path / "run.npz"], constants=[2.0, 4.0, 5.0])
+    task, _, (recording,) = read_back(draft.text, tmp_path)
+    assert "torque: [2.0, 4.0, 5.0]" in draft.text and task.data[0].units.torque == "A"
+    np.testing.assert_allclose(recording.torque, run["torque"], rtol=0, atol=1e-9)
+
+
+def test_a_recording_of_matlab_is_read_like_any_other(made, tmp_path: Path):
+    from scipy.io import savemat
+
+    urdf, _, (run, *_) = made
+    arrays = {"t": run["time"][None], "q": run["position"], "tau": run["torque"], "note": "a text"}
+    savemat(tmp_path / "run.mat", arrays)
+    _, _, (recording,) = read_back(draft_task(urdf, [tmp_path / "run.mat"]).text, tmp_path)
+    np.testing.assert_allclose(recording.position, run["position"], rtol=0, atol=1e-12)
+    (tmp_path / "bad.mat").write_bytes((tmp_path / "run.mat").read_bytes()[:3000])
+    with pytest.raises(InputError, match="bad.mat"):
+        draft_task(urdf, [tmp_path / "bad.mat"])

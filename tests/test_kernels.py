@@ -1,0 +1,149 @@
+"""Kernels in scalars against Pinocchio: the programs number by number, one kernel without a GPU, both on a GPU."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pinocchio as pin
+import pytest
+import robots
+from test_general_dynamics import random_tree
+
+from figaroh_jax.compiled.kernels import Number, Straight, launch, straight_answers
+from figaroh_jax.rigid import dynamics, regressor, scalar_programs
+from figaroh_jax.rigid.model import RobotModel
+
+FORMS = {
+    "torques": dynamics._TORQUES,
+    "masses": dynamics._MASSES,
+    "packed": regressor._PACKED,
+    "dense": regressor._DENSE,
+}
+TREES = {
+    "mixed": (3, ("revolute", "prismatic", "revolute", "spherical", "planar", "revolute")),
+    "free base": (5, ("free", "revolute", "revolute", "prismatic", "revolute")),
+}
+
+
+def by_hand(straight: Straight, codes: bytes, model: RobotModel, *arrays: np.ndarray) -> np.ndarray:
+    """Answers of the programs with an operation at a time."""
+    constants = np.asarray(straight.constants(model))
+    answer = np.full((*straight.shape(model), len(arrays[0])), np.nan)
+
+    def write(entries: Any) -> None:
+        for place, number in entries:
+            answer[place] = number.x
+
+    reads = [lambda k, x=x: Number(jnp.asarray(x[:, k])) for x in arrays]
+    for program in straight.programs(model, codes):
+        program(lambda k: jnp.asarray(constants[k]), reads, write)
+    whole = answer if straight.finish is None else np.asarray(straight.finish(model, jnp.asarray(answer)))
+    return whole if straight.last else np.moveaxis(whole, -1, 0)
+
+
+def states(model: RobotModel, samples: int, seed: int = 0) -> list[np.ndarray]:
+    random = np.random.default_rng(seed)
+    q, v, a = (random.uniform(-2.0, 2.0, (samples, n)) for n in (model.nq, model.nv, model.nv))
+    for joint, at in zip(model.joints, model.dofs.positions, strict=True):
+        if joint.kind in ("free", "spherical"):
+            quaternion = q[:, at.stop - 4 : at.stop]
+            quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    return [q, v, a]
+
+
+def agree(found: Any, expected: Any, limit: float = 1e-13) -> None:
+    expected = np.asarray(expected)
+    assert np.shape(found) == expected.shape
+    np.testing.assert_allclose(found, expected, rtol=0, atol=limit * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_programs_of_trees_with_all_joints_are_pinocchios(name: str):
+    twin = random_tree(*TREES[name])
+    model, data = twin.model, twin.robot.createData()
+    q, v, a = states(model, 3)
+    found = {
+        form: by_hand(one, (one.nothing_known if name == "mixed" else one.known)(model), model, q, v, a)
+        for form, one in FORMS.items()
+        if form != "packed"
+    }
+    for k in range(3):
+        theirs = twin.theirs(q[k])
+        expected = {
+            "torques": pin.rnea(twin.robot, data, theirs, v[k], a[k]),
+            "masses": np.triu(pin.crba(twin.robot, data, theirs)),
+            "dense": pin.computeJointTorqueRegressor(twin.robot, data, theirs, v[k], a[k]),
+        }
+        expected["masses"] = expected["masses"] + np.triu(expected["masses"], 1).T
+        for form, answer in expected.items():
+            agree(found[form][k], answer, 1e-12)
+
+
+def test_programs_of_a_tree_with_mimic_joints_are_the_plain_kernels(tmp_path: Path):
+    """Sliding and turning joints, branches, a mimic joint before the joint that it follows."""
+    model = robots.load(robots.TREE, tmp_path)
+    for form, straight in FORMS.items():
+        arrays = states(model, 4)[: 1 if form == "masses" else 3]
+        agree(
+            by_hand(straight, straight.known(model), model, *arrays), straight.plain(model, *map(jnp.asarray, arrays))
+        )
+
+
+def test_kernels_without_a_gpu(tmp_path: Path):
+    """The same launch, interpreted; more samples than a block has, and no whole number of blocks."""
+    model = robots.load(robots.ARM, tmp_path)
+    arrays = [jnp.asarray(x) for x in states(model, 37)]
+    torques = FORMS["torques"]
+    (program,) = torques.programs(model, torques.known(model))
+    shape, columns = torques.shape(model), torques.columns(model)
+    found = launch(program, torques.constants(model), arrays, shape, columns, torques.last, interpret=True)
+    agree(found, torques.plain(model, *arrays))
+
+
+def test_pieces_of_a_tree_are_written_into_one_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(scalar_programs, "MOST", 4)
+    model, packed = robots.load(robots.TREE, tmp_path), FORMS["packed"]
+    arrays = states(model, 3)
+    assert len(packed.programs(model, packed.known(model))) == 3
+    agree(by_hand(packed, packed.known(model), model, *arrays), packed.plain(model, *map(jnp.asarray, arrays)))
+
+
+def test_transformations(tmp_path: Path):
+    """Away from a GPU the plain form answers, through the same derivatives and batches."""
+    model = robots.load(robots.TREE, tmp_path)
+    q, v, a = states(model, 6)
+    torques, rest = FORMS["torques"], (jnp.asarray(v[:3]), jnp.asarray(a[:3]))
+
+    def total(model: RobotModel, q: Any) -> Any:
+        return jnp.sum(straight_answers(torques, model, q, *rest) ** 2)
+
+    plain = jax.grad(lambda q: jnp.sum(torques.plain(model, q, *rest) ** 2))
+    agree(jax.jit(jax.grad(total, argnums=1))(model, q[:3]), plain(jnp.asarray(q[:3])))
+    batches = [jnp.asarray(x).reshape(2, 3, -1) for x in (q, v, a)]
+    for form in ("torques", "packed"):
+        both = jax.vmap(lambda *x: straight_answers(FORMS[form], model, *x))(*batches)  # noqa: B023
+        for k in range(2):
+            agree(both[k], FORMS[form].plain(model, *(x[k] for x in batches)))
+    many = jax.tree.map(lambda x: jnp.stack([x, 1.1 * x]), model)
+    answers = jax.vmap(lambda m: straight_answers(torques, m, q, v, a))(many)
+    agree(answers[0], torques.plain(model, q, v, a))
+
+
+@pytest.mark.skipif(jax.default_backend() != "gpu", reason="needs an NVIDIA GPU")
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("robot", ["ARM", "TREE", "GENERAL"])
+def test_kernels_on_a_gpu(robot: str, dtype: Any, tmp_path: Path):
+    model = robots.load(getattr(robots, robot), tmp_path)
+    arrays = states(model, 1000)
+    limit = 1e-13 if dtype is np.float64 else 1e-5
+    for form, straight in FORMS.items():
+        given = arrays[:1] if form == "masses" else arrays
+        with jax.default_device(jax.devices("cpu")[0]):
+            expected = np.asarray(straight.plain(model, *map(jnp.asarray, given)))
+        given = [jnp.asarray(x, dtype) for x in given]
+        agree(straight_answers(straight, model, *given), expected, limit)
+        agree(jax.jit(lambda m, *x: straight_answers(straight, m, *x))(model, *given), expected, limit)  # noqa: B023

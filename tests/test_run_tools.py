@@ -1,0 +1,192 @@
+"""Commands on finished runs: verify, compare, list and rerun, on runs that were written by hand."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from figaroh_jax import cli
+from figaroh_jax.reporting.provenance import provenance
+from figaroh_jax.reporting.run_directory import MARKER, check_directory, whole_directory
+
+CAUSE = {
+    "effect": "torque_offset",
+    "at": ["j1"],
+    "parameters": {"offset": {"value": 1.5, "std": 0.1, "unit": "N m"}},
+    "gain": {"holdout_before": 0.2, "holdout_after": 0.05, "unit": "relative RMS"},
+}
+ANSWER: dict[str, Any] = {
+    "verdict": "named",
+    "causes": [CAUSE],
+    "p_value": 0.2,
+    "holdout": {"before": 0.2, "after": 0.05, "unit": "relative RMS", "joints": {"j1": 0.04, "j2": 0.06}},
+}
+RESULT: dict[str, Any] = {
+    "rank": 40,
+    "condition": 120.0,
+    "joints": ["j1", "j2"],
+    "base_parameters": [
+        {"expression": "m1", "value": 2.0, "std": 0.1, "status": "identified"},
+        {"expression": "m2", "value": 2.0, "std": 1.9, "status": "prior only"},
+    ],
+    "links": [{"name": "l1", "consistent": True}, {"name": "l2", "consistent": False}],
+    "effects": [],
+    "holdout": {"a.npz": {"relative": [0.01, 0.05]}, "b.npz": {"relative": [0.02, None]}},
+}
+CALIBRATION: dict[str, Any] = {
+    "level": "full",
+    "verdict": "named+rest",
+    "causes": [],
+    "parameters": [],
+    "position": {"unit": "mm", "validated_after": 0.4},
+    "orientation": None,
+    "fk_parity": 2e-12,
+}
+
+
+def run(folder: Path, task: Path | None = None, **files: dict[str, Any]) -> Path:
+    with whole_directory(folder) as new:
+        for name, content in files.items():
+            (new / f"{name}.json").write_text(json.dumps(content))
+        if task is not None:
+            (new / "provenance.json").write_text(provenance("diagnose", task, [task], "native"))
+        time = np.linspace(0, 1, 50)
+        np.savez(new / "predictions.npz", held_time=time, held_torque=np.sin(time)[:, None])
+    return folder
+
+
+def verified(folder: Path, limits: str, *options: str) -> tuple[int, dict[str, str]]:
+    file = folder.parent / "limits.yaml"
+    file.write_text(limits)
+    status = cli.main(["verify", str(folder), "--limits", str(file), *options])
+    checks = json.loads((folder / "verification.json").read_text())
+    assert checks["passed"] == (status == 0)
+    return status, {check["limit"]: check["status"] for check in checks["limits"]}
+
+
+@pytest.mark.parametrize(
+    ("limits", "name", "status"),
+    [
+        ("verdict: [nothing, named]", "verdict", "pass"),
+        ("verdict: [nothing]", "verdict", "fail"),
+        ("holdout_relative: 0.05", "holdout_relative", "pass"),
+        ("holdout_relative: {j2: 0.05}", "holdout_relative j2", "fail"),
+        ("holdout_relative: {j9: 0.05}", "holdout_relative j9", "skipped"),
+        ("gain: 0.7", "gain", "pass"),
+        ("gain: 0.8", "gain", "fail"),
+        ("p_value: 0.3", "p_value", "fail"),
+        ("forbidden_causes: [torque_offset]", "forbidden_causes", "fail"),
+        ("forbidden_causes: [torque_delay]", "forbidden_causes", "pass"),
+        ("rank: 40", "rank", "skipped"),
+    ],
+)
+def test_a_diagnosis_against_limits(limits: str, name: str, status: str, tmp_path: Path):
+    code, checks = verified(run(tmp_path / "run", answer=ANSWER), limits)
+    assert checks == {name: status} and code == (status == "fail")
+
+
+def test_an_identification_and_a_calibration_against_limits(tmp_path: Path):
+    limits = "rank: 40\ncondition: 100\nrelative_std: 0.1\nconsistent: true\nholdout_relative: 0.05\nposition_mm: 0.5"
+    code, checks = verified(run(tmp_path / "identified", result=RESULT), limits)
+    assert code == 1 and checks == {
+        "rank": "pass",
+        "condition": "fail",
+        "relative_std": "pass",
+        "consistent": "fail",
+        "holdout_relative": "pass",
+        "position_mm": "skipped",
+    }
+    limits = "position_mm: 0.5\norientation_deg: 0.1\nfk_parity: 1.0e-9\nverdict: [named]"
+    code, checks = verified(run(tmp_path / "calibrated", result=CALIBRATION), limits)
+    assert code == 1 and list(checks.values()) == ["fail", "pass", "skipped", "pass"]
+
+
+def test_junit_counts_what_failed_and_what_was_skipped(tmp_path: Path):
+    verified(
+        run(tmp_path / "run", answer=ANSWER), "gain: 0.9\nrank: 3\np_value: 0.1", "--junit", str(tmp_path / "j.xml")
+    )
+    suite = ElementTree.parse(tmp_path / "j.xml").getroot()  # noqa: S314 -- written above
+    assert (suite.get("tests"), suite.get("failures"), suite.get("skipped")) == ("3", "1", "1")
+    assert [case.get("name") for case in suite if case.find("failure") is not None] == ["gain"]
+
+
+def test_a_verified_run_can_still_be_replaced(tmp_path: Path):
+    folder = run(tmp_path / "run", answer=ANSWER)
+    verified(folder, "gain: 0.1")
+    check_directory(folder)
+    assert "verification.json" in json.loads((folder / MARKER).read_text())["files"]
+
+
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [
+        ("gian: 0.1", "unknown key 'gian'; did you mean 'gain'?"),
+        ("condition: -1", "condition is -1, expected more than 0"),
+        ("verdict: [maybe]", "maybe"),
+        ("forbidden_causes: [torque_dely]", "torque_delay"),
+    ],
+)
+def test_wrong_limits_are_status_2(limits: str, said: str, tmp_path: Path, capsys):
+    (tmp_path / "limits.yaml").write_text(limits)
+    folder = run(tmp_path / "run", answer=ANSWER)
+    assert cli.main(["verify", str(folder), "--limits", str(tmp_path / "limits.yaml")]) == 2
+    assert said in capsys.readouterr().err and not (folder / "verification.json").exists()
+
+
+@pytest.mark.parametrize("command", [["verify", "."], ["compare", ".", "."], ["rerun", "."], ["list", "nowhere"]])
+def test_what_is_no_run_is_status_2(command: list[str], tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(command) == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_damaged_json_is_status_2(tmp_path: Path, capsys):
+    (tmp_path / "answer.json").write_text("{")
+    assert cli.main(["verify", str(tmp_path)]) == 2
+    assert "cannot be read as JSON" in capsys.readouterr().err
+
+
+def test_runs_side_by_side(tmp_path: Path, capsys):
+    other = json.loads(json.dumps(ANSWER))
+    other["causes"][0]["parameters"]["offset"]["value"] = 2.5
+    a, b = run(tmp_path / "first", answer=ANSWER), run(tmp_path / "<second>", answer=other)
+    page = tmp_path / "page.html"
+    assert cli.main(["compare", str(a), str(b), "--out", str(page)]) == 0
+    printed = capsys.readouterr().out
+    assert "1.5 ± 0.1 N m" in printed and "2.5 ± 0.1 N m *" in printed
+    text = page.read_text()
+    assert "&lt;second&gt;" in text and "<second>" not in text and text.count("<polyline") == 2
+    assert "http" not in text and len(text) < 1.5e6
+
+
+def test_the_runs_below_a_folder(tmp_path: Path, capsys):
+    task = tmp_path / "task.yaml"
+    task.write_text("robot: {}")
+    run(tmp_path / "a" / "one", task, answer=ANSWER)
+    run(tmp_path / "two", result=RESULT)
+    assert cli.main(["list", str(tmp_path), "--json"]) == 0
+    (section,) = json.loads(capsys.readouterr().out)
+    assert [(Path(row[0]).name, row[1], row[2]) for row in section["rows"]] == [
+        ("one", "diagnose", "named"),
+        ("two", "?", "-"),
+    ]
+
+
+def test_rerun_uses_the_command_and_the_task_of_the_run(tmp_path: Path, monkeypatch):
+    from figaroh_jax import run_tools
+
+    task = tmp_path / "task.yaml"
+    task.write_text("robot: {}")
+    folder = run(tmp_path / "run", task, answer=ANSWER)
+    assert run_tools.command_of(folder) == ("diagnose", str(task))
+    made = json.loads((folder / "provenance.json").read_text())
+    assert made["inputs"][0]["bytes"] == 9 and len(made["inputs"][0]["sha256"]) == 64 and "jax" in made["versions"]
+    assert cli.main(["rerun", str(folder)]) == 2  # the task is none
+    task.unlink()
+    with pytest.raises(ValueError, match="not there any more"):
+        run_tools.command_of(folder)

@@ -1,0 +1,26 @@
+"""A prior that is believed less, but only in the directions that the torque shows."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from figaroh_jax.identification.identification import _Problem
+
+
+@pytest.mark.parametrize("slack", [1.0, 3.0, 100.0])
+def test_what_no_torque_shows_stays_as_near_to_the_nominal_as_was_stated(slack: float) -> None:
+    rng = np.random.default_rng(3)
+    shown = np.linalg.qr(rng.standard_normal((10, 4)))[0]
+    problem: Any = SimpleNamespace(precision=rng.uniform(1, 100, 12), nominal=np.zeros((1, 10)), shown=shown)
+    root, spread = _Problem.root_at(problem, slack), _Problem.spread_at(problem, slack)
+    np.testing.assert_allclose(root @ spread, np.eye(12), rtol=0, atol=1e-12)
+    covariance = spread @ spread.T
+    scaled = covariance * np.sqrt(np.outer(problem.precision, problem.precision))
+    hidden = np.linalg.svd(shown.T)[2][4:]
+    np.testing.assert_allclose(np.diag(hidden @ scaled[:10, :10] @ hidden.T), 1.0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.diag(shown.T @ scaled[:10, :10] @ shown), slack**2, rtol=1e-12, atol=0)
+    np.testing.assert_allclose(scaled[10:, 10:], np.eye(2), rtol=0, atol=1e-12)
