@@ -41,7 +41,7 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 PACKAGE = str(ROOT / "figaroh_jax")
-SECONDS, BYTES = 10, 2 << 30
+SECONDS, WAITING, BYTES = 10, 300, 2 << 30
 
 WORDS = """
 nan inf -inf 1e400 1e200 -1 0 0x1p999 1_0 1:1:1 ~ null true yes !!timestamp !!int !!float !!bool !!set !!binary
@@ -400,14 +400,14 @@ class Late(BaseException):
 
 @contextlib.contextmanager
 def limits() -> Iterator[None]:
-    """Ten seconds of the processor for what is inside, and a minute for what waits."""
+    """Ten seconds of the processor for what is inside, and five minutes for what waits (the machine may be busy)."""
 
     def late(number: int, frame: Any) -> None:
         raise Late
 
     signal.signal(signal.SIGPROF, late)
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
-    faulthandler.dump_traceback_later(6 * SECONDS, exit=True)  # a library that does not come back
+    faulthandler.dump_traceback_later(WAITING, exit=True)  # a library that does not come back
     try:
         yield
     finally:

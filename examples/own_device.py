@@ -8,15 +8,11 @@ Run `python examples/own_device.py`; it takes about a quarter of a minute.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import figaroh_jax as fj
-from figaroh_jax.recordings.devices import own_device
-from figaroh_jax.recordings.poses import PoseRecording
 
 
 # the device: predicted minus measured, m
@@ -32,7 +28,7 @@ HOOK, ZEROS = np.array([0.02, 0.01, 0.06]), np.array([0.3, 0.31, 0.28])
 
 def main() -> None:
     """Make postures and readings, calibrate, print what was found."""
-    robot = fj.load_urdf(Path(fj.__file__).parent / "demo" / "robot.urdf")
+    robot = fj.load_urdf(fj.DEMO)
     rng = np.random.default_rng(1)
     q = rng.uniform(-1.5, 1.5, (60, robot.nv))
     error = np.array([OFFSET.get(name, 0.0) for name in robot.joint_names])
@@ -42,10 +38,9 @@ def main() -> None:
     guess = np.round(np.concatenate([EYELETS.ravel(), HOOK, ZEROS]), 1)  # with a tape measure
     names = [f"{what} {axis}" for what in ("eyelet 1", "eyelet 2", "eyelet 3", "hook") for axis in "xyz"]
     names += [f"zero {k}" for k in (1, 2, 3)]
-    device = own_device(draw_wire, {n: (g, "m", 0.05) for n, g in zip(names, guess, strict=True)}, (0, 0, 0))
-    base = next(frame.name for frame in robot.frames if frame.parent < 0)
-    time = np.arange(float(len(q)))
-    seen = PoseRecording("wire", Path("wire"), time, q, "own", reading, base, robot.link_names[-1], device=device)
+    device = fj.own_device(draw_wire, {n: (g, "m", 0.05) for n, g in zip(names, guess, strict=True)}, (0, 0, 0))
+    hand = robot.link_names[-1]
+    seen = fj.postures(q=q, device=device, measured=reading, base_frame="base", tool_frame=hand, name="wire")
     found = fj.calibrate(robot, [seen])
     assert found.position is not None
     print(f"{found.verdict}: {found.position.validated_before:.2f} -> {found.position.validated_after:.2f} mm")

@@ -12,12 +12,17 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .calibration.calibration import calibrate as calibrate, calibrate_task as calibrate_task
-    from .diagnosis.diagnosis import diagnose as diagnose, diagnose_task as diagnose_task
     from .effects.base import Effect as Effect, Motion as Motion, amplitude as amplitude, place as place, shape as shape
     from .effects.catalogue import CATALOGUE as CATALOGUE, register as register
-    from .effects.extended import ExtendedModel as ExtendedModel, extend as extend
+    from .effects.extended import ExtendedModel as ExtendedModel, extend as extend, predict as predict
     from .effects.simulation import simulate as simulate
     from .errors import InputError as InputError
+    from .estimation import (
+        accelerators as accelerators,
+        least_squares as least_squares,
+        regression as regression,
+        states as states,
+    )
     from .fitting.blockwise import BlockLevenbergMarquardt as BlockLevenbergMarquardt
     from .fitting.data import (
         PoseData as PoseData,
@@ -33,7 +38,14 @@ if TYPE_CHECKING:
     from .formats.mjcf import load_mjcf as load_mjcf
     from .formats.robotfile import load_extended as load_extended, load_robot as load_robot
     from .formats.urdf import load_urdf as load_urdf
+    from .identification import (
+        acceleration_free as acceleration_free,
+        instruments as instruments,
+        payloads as payloads,
+        wrenches as wrenches,
+    )
     from .identification.identification import identify as identify, identify_task as identify_task
+    from .recordings import cleaning as cleaning, devices as devices
     from .recordings.arrays import postures as postures, recording as recording
     from .recordings.dataset import Recording as Recording, read_recordings as read_recordings
     from .recordings.devices import Device as Device, own_device as own_device
@@ -53,6 +65,7 @@ if TYPE_CHECKING:
     from .rigid.normal_equations import normal_matrix as normal_matrix, triangular_factor as triangular_factor
     from .rigid.regressor import joint_torque_regressor as joint_torque_regressor, packed_regressor as packed_regressor
     from .simulators.registry import backend as backend
+    from .tasks import diagnose as diagnose, diagnose_task as diagnose_task
 
 __version__ = "0.1.0"
 
@@ -64,17 +77,17 @@ _MODULES = {
     "fitting.data": ("PoseData", "TorqueData", "pose_data", "residual", "torque_data"),
     "fitting.blockwise": ("BlockLevenbergMarquardt",),
     "fitting.fit": ("Fit", "fit"),
-    "fitting.linear": ("fit_linear", "linear_basis", "linear_limits"),
+    "fitting.linear": ("LinearFit", "fit_linear", "linear_basis", "linear_limits"),
     "recordings.arrays": ("postures", "recording"),
     "recordings.devices": ("Device", "own_device"),
     "recordings.dataset": ("Recording", "read_recordings"),
-    "diagnosis.diagnosis": ("diagnose", "diagnose_task"),
+    "tasks": ("diagnose", "diagnose_task"),
     "rigid.dynamics": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
     "effects.base": ("Effect", "Motion", "amplitude", "place", "shape"),
     "effects.catalogue": ("CATALOGUE", "register"),
     "errors": ("InputError",),
     "formats.export": ("load_model", "write_model"),
-    "effects.extended": ("ExtendedModel", "extend"),
+    "effects.extended": ("ExtendedModel", "extend", "predict"),
     "identification.identification": ("identify", "identify_task"),
     "rigid.kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
     "formats.mjcf": ("load_mjcf",),
@@ -88,6 +101,19 @@ _MODULES = {
     "rigid.normal_equations": ("normal_matrix", "triangular_factor"),
     "formats.urdf": ("load_urdf",),
 }
+# Namespaces of what few need: modules by a short name.
+_SPACES = {
+    "acceleration_free": "identification.acceleration_free",
+    "accelerators": "estimation.accelerators",
+    "cleaning": "recordings.cleaning",
+    "devices": "recordings.devices",
+    "instruments": "identification.instruments",
+    "least_squares": "estimation.least_squares",
+    "payloads": "identification.payloads",
+    "regression": "estimation.regression",
+    "states": "estimation.states",
+    "wrenches": "identification.wrenches",
+}
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 
@@ -97,10 +123,12 @@ def __getattr__(name: str) -> Any:
         value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
         globals()[name] = value
         return value
+    if name in _SPACES:
+        return importlib.import_module(f"{__name__}.{_SPACES[name]}")
     if not name.startswith("_") and importlib.util.find_spec(f"{__name__}.{name}"):
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOME])
+    return sorted([*globals(), *_HOME, *_SPACES])

@@ -121,3 +121,16 @@ def test_a_plain_list_of_constants_is_a_diagonal(made, tmp_path: Path):
     task, _, (recording,) = read_back(draft.text, tmp_path)
     assert "torque: [2.0, 4.0, 5.0]" in draft.text and task.data[0].units.torque == "A"
     np.testing.assert_allclose(recording.torque, run["torque"], rtol=0, atol=1e-9)
+
+
+def test_a_recording_of_matlab_is_read_like_any_other(made, tmp_path: Path):
+    from scipy.io import savemat
+
+    urdf, _, (run, *_) = made
+    arrays = {"t": run["time"][None], "q": run["position"], "tau": run["torque"], "note": "a text"}
+    savemat(tmp_path / "run.mat", arrays)
+    _, _, (recording,) = read_back(draft_task(urdf, [tmp_path / "run.mat"]).text, tmp_path)
+    np.testing.assert_allclose(recording.position, run["position"], rtol=0, atol=1e-12)
+    (tmp_path / "bad.mat").write_bytes((tmp_path / "run.mat").read_bytes()[:3000])
+    with pytest.raises(InputError, match="bad.mat"):
+        draft_task(urdf, [tmp_path / "bad.mat"])

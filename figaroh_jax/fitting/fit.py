@@ -6,6 +6,7 @@ rows of the data (`data`). Optimistix solves it, and differentiates it through t
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -33,6 +34,7 @@ from .free import Free, apply, select
 __all__ = ["Estimate", "Fit", "fit"]
 
 NULL = 1e-12  # of the largest eigenvalue of the information: below it a direction is not determined
+STATIONARY = 1e-5  # share of the gradient at the start that may be left where a fit within limits has converged
 HIDDEN = 1e-6  # share of a number in such directions above which it is not determined
 
 
@@ -302,7 +304,9 @@ def _limits(free: Free, bounds: Mapping[str, tuple[float, float]]) -> tuple[np.n
 def _bounded(problem: _Problem, lower: np.ndarray, upper: np.ndarray, max_steps: int) -> Fit:
     if traced(problem):
         raise InputError("a fit with bounds runs on the host, not under jit, grad or vmap; see `fit_linear`")
-    from jaxopt import ScipyBoundedMinimize
+    with warnings.catch_warnings():  # that jaxopt is no longer maintained is known, and said where it is required
+        warnings.simplefilter("ignore", DeprecationWarning)
+        from jaxopt import ScipyBoundedMinimize
 
     start = jnp.zeros(len(problem.free.names))
     scale = float(_cost(start, problem)) or 1.0
@@ -314,8 +318,11 @@ def _bounded(problem: _Problem, lower: np.ndarray, upper: np.ndarray, max_steps:
         options={"ftol": 1e-15, "gtol": 1e-9, "maxcor": 30},
     )
     found = search.run(start, bounds=(lower, upper))
-    good = optimistix.RESULTS.successful
-    result = good if bool(found.state.success) else optimistix.RESULTS.nonlinear_max_steps_reached
+    # judged by the gradient that the limits leave: a line search that rounding ends says nothing of the point
+    slopes = [np.asarray(jax.grad(_cost)(y, problem)) for y in (start, jnp.asarray(found.params))]
+    left = np.asarray(found.params) - np.clip(found.params - slopes[1], lower, upper)
+    good = bool(found.state.success) or np.abs(left).max() <= STATIONARY * np.abs(slopes[0]).max()
+    result = optimistix.RESULTS.successful if good else optimistix.RESULTS.nonlinear_max_steps_reached
     return _finished(problem, jnp.asarray(found.params), result, {"num_steps": jnp.asarray(found.state.iter_num)})
 
 

@@ -63,7 +63,7 @@ def linear_basis(model: RobotModel | ExtendedModel, data: TorqueData, tolerance:
         raise InputError("linear_basis decides ranks on the host: call it outside of jit, grad and vmap")
     with jax.enable_x64(True):
         X, _, weight = _rows(whole, data)
-    rows = np.asarray(jnp.moveaxis(X, 2, -1))[np.asarray(weight) > 0]
+    rows = np.asarray(X)[np.asarray(weight) > 0]
     names = column_names(whole.robot, tuple(_batched(effect) for effect in whole.effects))
     factor = np.linalg.qr(rows, mode="r")
     base = base_parameters(factor, names, **({} if tolerance is None else {"tolerance": tolerance}))
@@ -145,7 +145,8 @@ def fit_linear(
     variance = jnp.einsum("ck,kl,cl->c", kept, jnp.linalg.inv(H), kept)
     values = kept @ z
     if limits is not None:
-        values = jnp.clip(values, *limits)  # on a limit exactly
+        nearest = jnp.where(values - limits[0] < limits[1] - values, *limits)
+        values = jnp.where(active, nearest, jnp.clip(values, *limits))  # on a limit exactly
     return LinearFit(values, jnp.sqrt(variance), jnp.sqrt(squares(z) / total), active, converged)
 
 

@@ -580,6 +580,8 @@ def _other_reading(look: _Look, motion: Sampled) -> Finding | None:
 
 def _belongs(fit: _Fit, heavy: np.ndarray) -> bool:
     """Whether nearly every joint that carries something follows the model, at a size that is no accident."""
+    if not heavy.any():
+        return False
     like = np.array([one.correlation for one in fit.own])[heavy]
     slope = np.array([one.slope for one in fit.own])[heavy]
     return bool(np.median(like) > LIKE and np.mean(like > UNLIKE) > 0.6 and np.median(slope) > 0.1)

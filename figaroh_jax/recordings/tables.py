@@ -1,4 +1,4 @@
-"""Recording files as named columns: `.npz`, `.csv` and `.parquet` behind one look-up.
+"""Recording files as named columns: `.npz`, `.csv`, `.parquet` and `.mat` behind one look-up.
 
 Whatever the format, `Table.matrix` gives the (samples, width) array of a name, of a list of columns or of a prefix.
 """
@@ -21,7 +21,7 @@ from ..formats.files import plain_file
 
 __all__ = ["Table", "read_table"]
 
-FORMATS = (".npz", ".csv", ".parquet")
+FORMATS = (".npz", ".csv", ".parquet", ".mat")
 LARGEST_FILE = 2 << 30  # bytes
 LARGEST = 1 << 29  # bytes of one array, or of all columns of a table, once the numbers are float64; of a CSV file
 LARGEST_HEAD = 1 << 20  # bytes of a CSV file's first line
@@ -79,7 +79,7 @@ class Table(NamedTuple):
 
     def _known(self, name: str, key: str) -> str:
         if name not in self.names:
-            what = "array" if self.file.suffix.lower() == ".npz" else "column"
+            what = "array" if self.file.suffix.lower() in (".npz", ".mat") else "column"
             raise InputError(f"{self.file}: no {what} '{name}' ({key}){nearest(name, self.names)}")
         return name
 
@@ -91,7 +91,7 @@ def read_table(file: Path, key: str) -> Table:
         raise InputError(f"{file} ({key}): recordings are {', '.join(FORMATS)}, not '{file.suffix or file.name}'")
     plain_file(file, f"{file} ({key})", "a recording file", LARGEST if suffix == ".csv" else LARGEST_FILE, FORMATS)
     try:
-        return {".npz": _npz, ".csv": _csv, ".parquet": _parquet}[suffix](file)
+        return {".npz": _npz, ".csv": _csv, ".parquet": _parquet, ".mat": _mat}[suffix](file)
     except InputError:
         raise
     except OSError as error:
@@ -121,6 +121,30 @@ def _npz(file: Path) -> Table:
         return _numbers(values, file, name)
 
     return Table(file, tuple(entries), read)
+
+
+def _mat(file: Path) -> Table:
+    """MATLAB's files before version 7.3; a row vector is a column."""
+    from scipy.io import loadmat, whosmat
+
+    try:
+        sizes = {name: math.prod(shape) * 8 for name, shape, kind in whosmat(file) if kind in _MATLAB_NUMBERS}
+    except NotImplementedError:
+        raise InputError(f"{file}: is of MATLAB's version 7.3; save it by save(..., '-v7')") from None
+
+    def read(name: str) -> np.ndarray:
+        if sizes[name] > LARGEST:
+            raise InputError(f"{file}: array '{name}' of {sizes[name] / 2**30:.1f} GiB is too large")
+        try:
+            values = np.asarray(loadmat(file, variable_names=[name])[name])
+        except Exception as error:  # scipy and zlib each have their own ways to say "damaged"
+            raise InputError(f"{file}: array '{name}' cannot be read: {error}") from error
+        return _numbers(values.ravel() if values.ndim == 2 and values.shape[0] == 1 else values, file, name)
+
+    return Table(file, tuple(sizes), read)
+
+
+_MATLAB_NUMBERS = ("double", "single", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 
 
 def _check_size(version: tuple[int, int], stored: Any, file: Path, name: str) -> None:

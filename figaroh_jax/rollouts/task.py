@@ -135,6 +135,9 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
     first = Structure(here.loop, here.known.table, here.data)
     scale = here.noise[0]
     before, after = (_rms(s, f, scale) for s, f in ((first, found.first), (found.structure, found.last)))
+    wanted = task.diagnose.tolerance
+    if "position" in wanted.model_fields_set and (before <= wanted.position).all():  # good enough, as the task says
+        found.verdict, found.named, found.proxy = "nothing", [], []
     named = found.verdict in ("named", "named+rest")
     last = (found.structure, found.last) if named else (first, found.first)
     final = put(last[0].loop, last[0].table, last[1].theta)

@@ -1,0 +1,77 @@
+"""The diagnosis as Python calls it, at every level of data: torques, or postures that a device measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from .errors import InputError
+
+if TYPE_CHECKING:
+    from .calibration.kinematic_diagnosis import PoseDiagnosis
+    from .formats.config import Baseline, Preprocess, Task
+    from .recordings.dataset import Recording
+    from .recordings.poses import PoseRecording
+    from .results import Diagnosis
+    from .rigid.model import RobotModel
+    from .simulators.contract import Backend
+
+__all__ = ["diagnose", "diagnose_task"]
+
+
+def diagnose_task(
+    task: Task, progress: Callable[[str, float], None] = lambda phase, share: None, backend: str = "native"
+) -> Diagnosis | PoseDiagnosis:
+    """Diagnose what a task file describes (`load_task`), recordings of torque or of measured postures alike.
+
+    The rigid body's torques are those of the named backend. Raises `InputError` before any work where the task is
+    wrong. The answer has `verdict` and `causes` at either level.
+    """
+    if any(entry.measurement is not None for entry in task.data):
+        from .calibration.kinematic_diagnosis import diagnose_pose_task
+
+        if backend != "native":
+            raise InputError(f"backend '{backend}': postures are diagnosed with 'native' alone")
+        return diagnose_pose_task(task, progress)
+    from .diagnosis.diagnosis import diagnose_task as of_torques
+
+    return of_torques(task, progress, backend)
+
+
+def diagnose(
+    model: RobotModel | Backend,
+    recordings: Sequence[Recording] | Sequence[PoseRecording],
+    preprocess: Preprocess | None = None,
+    known: Baseline | None = None,
+    *,
+    trust: float = 0.10,
+    forbid: Sequence[str] = (),
+    alpha: float = 0.05,
+    progress: Callable[[str, float], None] = lambda phase, share: None,
+    **options: Any,
+) -> Diagnosis | PoseDiagnosis:
+    """What the robot's model gets wrong in the recordings, named where it can be: torques, or measured postures.
+
+    `recordings` are those of `recording` and `postures`, or of `read_recordings`. `model` is the robot, or a backend of
+    it (torques). `preprocess`, `known` (what the baseline contains) and `trust` (how far the nominal inertials are
+    believed, relative one sigma) are of torques alone; `forbid` names effects left out of the catalogue, `alpha` is the
+    level of the test for the whole of it.
+    """
+    from .recordings.poses import PoseRecording
+
+    postures = [one for one in recordings if isinstance(one, PoseRecording)]
+    if postures:
+        from .calibration.kinematic_diagnosis import diagnose_poses
+        from .simulators.native import as_backend
+
+        if len(postures) < len(recordings):
+            raise InputError("recordings of torque and postures are diagnosed each by themselves")
+        if preprocess is not None or known is not None or options:
+            raise InputError("postures have no preprocess, baseline or further options: leave them out")
+        return diagnose_poses(as_backend(model).robot, postures, forbid, alpha, progress)
+    from .diagnosis.diagnosis import diagnose as of_torques
+    from .formats.config import Preprocess
+
+    torques: Any = recordings
+    settings = {"trust": trust, "forbid": forbid, "alpha": alpha, "progress": progress, **options}
+    return of_torques(model, torques, preprocess or Preprocess(), known, **settings)

@@ -1,0 +1,52 @@
+"""The examples run, are short, and use public names alone."""
+
+from __future__ import annotations
+
+import ast
+import runpy
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+# these have tests of their own, or make what the package ships
+ELSEWHERE = {"make_demo", "own_device", "own_effect"}
+SLOW = {"calibrate_tracker", "diagnose_arrays", "identify_arrays", "real_calibrations", "real_identifications"}
+SAYS = {
+    "dynamics_and_gradients": "by the mass of each link",
+    "batch": "200 resamples",
+    "friction_by_gradient": "damping 1.2",
+    "export_to_mujoco": "figaroh_jax [",
+    "calibrate_tracker": "joint_offset elbow: -0.02",
+    "diagnose_arrays": "joint_spring (shoulder)",
+    "identify_arrays": "base parameters",
+    "real_calibrations": "TALOS: 16 parameters, 1.430 mm",
+    "real_identifications": "TX40",
+}
+NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if n != "make_demo"])
+def test_an_example_is_short_and_imports_nothing_private(name: str):
+    text = (EXAMPLES / f"{name}.py").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 60
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom):
+            assert not (node.module or "").startswith("figaroh_jax"), f"{name}: {ast.unparse(node)}"
+        if isinstance(node, ast.Import):
+            assert not any(alias.name.startswith("figaroh_jax.") for alias in node.names)
+
+
+def cases() -> list:
+    return [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in NAMES if n not in ELSEWHERE]
+
+
+@pytest.mark.parametrize("name", cases())
+def test_an_example_runs(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, data_dir: Path
+):
+    if name == "friction_by_gradient":
+        pytest.importorskip("optax")
+    monkeypatch.setenv("FIGAROH_JAX_DATA", str(data_dir))
+    runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+    assert SAYS[name] in capsys.readouterr().out
