@@ -16,7 +16,7 @@ from ..effects.extended import ExtendedModel, extend
 from ..errors import InputError
 from ..formats.config import robot_options
 from ..recordings.dataset import Recording, read_recordings
-from ..results import Cause, Diagnosis, Estimate, Experiment, Gain, Name, Trace
+from ..results import Cause, Diagnosis, Estimate, Experiment, Gain, Name, Rest, Trace
 from .causes import BASELINE
 from .data import Run, Stretch, regular, windows
 from .fit import standard_errors
@@ -216,7 +216,7 @@ def _cause(one: Named, found: Search, here: Setting) -> Cause:
     sure = 1.0 / (1 + len(one.alike)) * (0.98 if found.verdict == "named" else 0.8)
     gain = Gain(one.before, one.after, "rad")
     note = _NOTES.get(one.candidate.effect, "")
-    return Cause(Name(one.candidate.effect, at), parameters, sure, gain, one.alike, note)
+    return Cause(Name(one.candidate.effect, at), parameters, sure, gain, one.alike, note=note)
 
 
 _NOTES = {
@@ -243,15 +243,15 @@ def _experiment(found: Search) -> Experiment | None:
     return None
 
 
-def _rest(found: Search, left: np.ndarray, noise: np.ndarray, loop: Loop) -> str:
+def _rest(found: Search, left: np.ndarray, noise: np.ndarray, loop: Loop) -> Rest:
     if found.verdict in ("nothing", "named"):
-        return ""
+        return Rest(np.zeros(0))
     ratio = left / noise
     k = int(ratio.argmax())
     joint = loop.robot.dof_names[loop.measured[k]]
     text = f"Unexplained residual, mostly at {joint}: {1e3 * left[k]:.3g} mrad against {1e3 * noise[k]:.3g} of noise"
     proxy = ", ".join(str(Name(n.candidate.effect, n.candidate.at)) for n in found.proxy)
-    return f"{text}; best proxy, not a cause: {proxy}" if proxy else text
+    return Rest(np.zeros(0), text=f"{text}; best proxy, not a cause: {proxy}" if proxy else text)
 
 
 def _traces(
