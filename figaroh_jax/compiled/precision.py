@@ -39,7 +39,7 @@ def in_float64(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if jax.config.jax_enable_x64:
+        if jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]  # JAX adds it as it runs
             return function(*args, **kwargs)
         if traced(args, kwargs):
             return _bridged(function, args, kwargs)
@@ -177,7 +177,10 @@ def _jvp(primals: Any, tangents: Any, *, jaxpr: ClosedJaxpr) -> Any:
         given = (tangents[k] for k in moving)
         found = iter(_scoped.bind(*primals, *given, jaxpr=_forward(jaxpr, moving)))
         floats = [jnp.issubdtype(aval.dtype, jnp.inexact) for aval in jaxpr.out_avals]
-        return out, [next(found) if f else ad.Zero.from_primal_value(x) for f, x in zip(floats, out, strict=True)]
+        return out, [
+            next(found) if f else ad.Zero(aval.to_tangent_aval())
+            for f, aval in zip(floats, jaxpr.out_avals, strict=True)
+        ]
 
 
 ad.primitive_jvps[_scoped] = _jvp
