@@ -76,11 +76,14 @@ class Nearest:
     why_not: str
 
 
+Dependence = Literal["standstill", "position", "velocity", "load", "time", "frequency", "recording"]
+
+
 @dataclass(frozen=True)
 class Part:
     """What a share of the power beyond the noise goes with, at a joint."""
 
-    kind: Literal["standstill", "position", "velocity", "load", "time", "frequency", "recording"]
+    kind: Dependence
     at: tuple[str, ...]
     share: float
     band: tuple[float, float] | None = None  # Hz, of a frequency

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 from .errors import InputError
 
@@ -36,6 +36,36 @@ def diagnose_task(
     from .diagnosis.diagnosis import diagnose_task as of_torques
 
     return of_torques(task, progress, backend)
+
+
+@overload
+def diagnose(
+    model: RobotModel | Backend,
+    recordings: Sequence[Recording],
+    preprocess: Preprocess | None = ...,
+    known: Baseline | None = ...,
+    *,
+    trust: float = ...,
+    forbid: Sequence[str] = ...,
+    alpha: float = ...,
+    progress: Callable[[str, float], None] = ...,
+    **options: Any,
+) -> Diagnosis: ...
+
+
+@overload
+def diagnose(
+    model: RobotModel | Backend,
+    recordings: Sequence[PoseRecording],
+    preprocess: Preprocess | None = ...,
+    known: Baseline | None = ...,
+    *,
+    trust: float = ...,
+    forbid: Sequence[str] = ...,
+    alpha: float = ...,
+    progress: Callable[[str, float], None] = ...,
+    **options: Any,
+) -> PoseDiagnosis: ...
 
 
 def diagnose(

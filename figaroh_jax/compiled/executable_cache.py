@@ -201,7 +201,8 @@ def _checked_cache(store: Store) -> bool:
     class Checked(CacheInterface):
         _path = store.folder  # pyright: ignore[reportAssignmentType]  # for a line in JAX's log
 
-        def get(self, key: str) -> bytes | None:
+        # JAX annotates nothing here, its abstract body returns None
+        def get(self, key: str) -> bytes | None:  # pyright: ignore[reportIncompatibleMethodOverride]
             return store.get(key)
 
         def put(self, key: str, value: bytes) -> None:

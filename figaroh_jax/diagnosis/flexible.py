@@ -12,7 +12,7 @@ from ..effects.base import Motion
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Rows, fit, with_columns
 from ..recordings.stacked import filtered_rows
-from ..results import Name
+from ..results import Dependence, Name
 from .bank import Columns
 from .problem import Problem
 from .screening import Group, Null, family_p, screen
@@ -161,7 +161,7 @@ def smooth_functions(motion: Motion) -> list[Float[np.ndarray, "k nN"]]:
     return out
 
 
-def dependences(motion: Motion, joint: int) -> dict[str, list[Float[np.ndarray, " nN"]]]:
+def dependences(motion: Motion, joint: int) -> dict[Dependence, list[Float[np.ndarray, " nN"]]]:
     """Smooth functions of what a rest of the joint may go with: position, velocity, load, time."""
     own, load = _smooth(motion, joint), _unit(np.asarray(motion.load)[:, joint])
     s, speed = np.asarray(motion.direction)[:, joint], _unit(np.abs(np.asarray(motion.velocity)[:, joint]))

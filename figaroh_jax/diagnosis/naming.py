@@ -16,7 +16,7 @@ from jaxtyping import Float
 from ..effects.base import Effect
 from ..recordings.stacked import filter_rows, filtered_rows, open_rows
 from ..results import Name
-from .comparison import Hypothesis, Verdicts, ground, judge, judge_grown, t_value
+from .comparison import Ground, Hypothesis, Verdicts, ground, judge, judge_grown, t_value
 from .design import kind, sensor_response, shapes
 from .estimates import Fitted, amplitude_places, torque_slope
 from .flexible import smooth_functions
@@ -124,7 +124,7 @@ class _Grown(NamedTuple):
     problem: Problem
     step: Step
     whitening: Float[np.ndarray, "F nv"]
-    base: object  # comparison.Ground
+    base: Ground
 
     @property
     def response(self) -> np.ndarray:

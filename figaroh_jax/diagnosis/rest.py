@@ -12,7 +12,7 @@ from ..estimation import noise
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Rows
 from ..recordings.stacked import filter_rows
-from ..results import Name, Part, Verdict
+from ..results import Dependence, Name, Part, Verdict
 from .comparison import ground, judge_grown, t_value
 from .flexible import dependences, families
 from .holdout import residual_rms
@@ -48,6 +48,9 @@ __all__ = [
     "verdict",
     "wrong_law",
 ]
+
+
+_Share = tuple[float, Dependence, tuple[float, float] | None, str | None]  # share, kind, band in Hz, file
 
 
 class Significance(NamedTuple):
@@ -154,7 +157,8 @@ def parts_of(
         total = float(beyond.sum())
         if total <= LEAST_BEYOND * used.sum():
             continue
-        shares = [(float(beyond[speed[joint][used] < STANDSTILL].sum()) / total, "standstill", None, None)]
+        still = float(beyond[speed[joint][used] < STANDSTILL].sum()) / total
+        shares: list[_Share] = [(still, "standstill", None, None)]
         for kind, columns in _dependences(problem, step.state, joint):
             rows = _rows_at(problem, step.state, columns, whitening, joint)
             grown = judge_grown(step.rows, base, (joint,), rows[:, None])
@@ -169,10 +173,12 @@ def parts_of(
     return tuple(out)
 
 
-def _dependences(problem: Problem, state: State, joint: int) -> list[tuple[str, Float[np.ndarray, "k nN"]]]:
+def _dependences(problem: Problem, state: State, joint: int) -> list[tuple[Dependence, Float[np.ndarray, "k nN"]]]:
     """Smooth functions of the joint's position, velocity, load and time, and a constant for each recording."""
     n, samples, _, _ = problem.records.shape
-    kinds = [(kind, np.stack(columns)) for kind, columns in dependences(state.motion, joint).items()]
+    kinds: list[tuple[Dependence, np.ndarray]] = [
+        (kind, np.stack(columns)) for kind, columns in dependences(state.motion, joint).items()
+    ]
     fitted = np.flatnonzero(problem.records.fitted.any((1, 2)))
     if len(fitted) > 1:
         kinds.append(("recording", np.repeat(np.eye(n)[fitted], samples, axis=1)))

@@ -28,6 +28,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ..errors import InputError
@@ -351,7 +352,7 @@ def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **par
 
 def fixed(effect: Effect) -> Effect:
     """The effect with its place static, where it stands at one known place."""
-    if isinstance(effect.at, (Place, jax.core.Tracer)) or np.ndim(effect.at) != 1:
+    if isinstance(effect.at, (Place, Tracer)) or np.ndim(effect.at) != 1:
         return effect
     return eqx.tree_at(lambda e: e.at, effect, Place(tuple(np.asarray(effect.at).tolist())))
 

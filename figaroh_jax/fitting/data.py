@@ -80,7 +80,10 @@ class TorqueData(eqx.Module):
         axes = (0, 0, 0, 0, None if self.carried is None else 0)
         motion = self.time, self.position, self.velocity, self.acceleration, self.carried
         torque = jax.vmap(lambda *one: self._torque(model, *one), in_axes=axes)(*(_traceable(x) for x in motion))
-        return torque if self.source is None else jax.vmap(self._rows)(torque, self.source, self.kept)
+        if self.source is None:
+            return torque
+        assert self.kept is not None
+        return jax.vmap(self._rows)(torque, self.source, self.kept)
 
     def _torque(self, model: ExtendedModel, time: Any, q: Any, v: Any, a: Any, carried: Any) -> Array:
         if carried is not None:
@@ -88,7 +91,7 @@ class TorqueData(eqx.Module):
         return read_sensors(model, time, q, v, a, jnp.asarray(self.dt))
 
     def _rows(self, torque: Array, source: Array, kept: Array) -> Array:
-        return filtered(torque.T, source, kept, jnp.asarray(self.response)).T
+        return jnp.asarray(filtered(torque.T, source, kept, jnp.asarray(self.response))).T
 
 
 def _traceable(x: Any) -> Any:

@@ -328,7 +328,7 @@ def _bounded(problem: _Problem, lower: np.ndarray, upper: np.ndarray, max_steps:
 
 @eqx.filter_jit
 def _cost(y: Array, problem: _Problem) -> Array:
-    return 0.5 * sum(jnp.sum(x**2) for x in _rows(y, problem))
+    return jnp.asarray(0.5 * sum(jnp.sum(x**2) for x in _rows(y, problem)))
 
 
 _finished = eqx.filter_jit(_fit_at)

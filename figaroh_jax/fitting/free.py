@@ -21,6 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..effects.base import Effect
@@ -45,7 +46,7 @@ class Part(NamedTuple):
 
     kind: str
     key: tuple[Any, ...]  # which effect and parameter, or which device
-    index: tuple[int, ...]  # in the flat array
+    index: tuple[int, ...]  # pyright: ignore[reportIncompatibleMethodOverride]  # in the flat array
     shape: tuple[int, ...]  # of the array
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -119,8 +120,8 @@ def _only(part: Part, places: Any) -> Part:
         wanted = [places] if isinstance(places, str) else list(places)
         words = [set(_words(name)) for name in part.names]
         keep = [k for k, own in enumerate(words) if any(set(w.split()) <= own for w in wanted)]
-    picked = (tuple(x[k] for k in keep) for x in (part.index, part.names, part.units, part.sizes))
-    index, names, units, sizes = picked
+    index, sizes = tuple(part.index[k] for k in keep), tuple(part.sizes[k] for k in keep)
+    names, units = (tuple(x[k] for k in keep) for x in (part.names, part.units))
     return Part(part.kind, part.key, index, part.shape, names, units, sizes)
 
 
@@ -162,7 +163,7 @@ def _part(kind: str, places: Sequence[str], words: Sequence[str], units: Sequenc
 
 
 def _inertia_sizes(robot: RobotModel) -> np.ndarray:
-    if isinstance(robot.inertia, jax.core.Tracer):
+    if isinstance(robot.inertia, Tracer):
         mass = np.ones((len(robot.joints), 1))
     else:
         ten = np.asarray(robot.inertia)
@@ -202,7 +203,7 @@ def _effect_parts(model: ExtendedModel, friction: bool) -> Iterator[Part]:
 
 def _effect_size(effect: Effect, name: str) -> float:
     value = getattr(effect, name)
-    known = 0.0 if isinstance(value, jax.core.Tracer) else float(np.max(np.abs(np.asarray(value))))
+    known = 0.0 if isinstance(value, Tracer) else float(np.max(np.abs(np.asarray(value))))
     if effect.parameters()[name].linear:
         return 1.0
     return 0.1 * known or 0.1

@@ -19,7 +19,7 @@ from ..effects.base import Effect, Motion, columns, movable
 from ..effects.extended import ExtendedModel, extend
 from ..errors import InputError
 from ..estimation.accelerators import coordinates
-from ..estimation.base_parameters import base_parameters
+from ..estimation.base_parameters import TOLERANCE, base_parameters
 from ..estimation.columns import column_names
 from ..recordings.rowfilter import filtered
 from ..rigid.model import RobotModel
@@ -65,8 +65,8 @@ def linear_basis(model: RobotModel | ExtendedModel, data: TorqueData, tolerance:
         X, _, weight = _rows(whole, data)
     rows = np.asarray(X)[np.asarray(weight) > 0]
     names = column_names(whole.robot, tuple(_batched(effect) for effect in whole.effects))
-    factor = np.linalg.qr(rows, mode="r")
-    base = base_parameters(factor, names, **({} if tolerance is None else {"tolerance": tolerance}))
+    factor = np.asarray(np.linalg.qr(rows, mode="r"))
+    base = base_parameters(factor, names, tolerance=TOLERANCE if tolerance is None else tolerance)
     if base.rank == 0:
         raise InputError("the data shows no parameter: nothing moves, or every row was left out")
     into = coordinates(factor[:, None], base).into
@@ -93,9 +93,9 @@ def fit_linear(
     data: TorqueData,
     basis: Basis,
     *,
-    counts: Float[Array, " blocks"] | None = None,
-    lower: Float[Array, " rank"] | None = None,
-    upper: Float[Array, " rank"] | None = None,
+    counts: Float[Array | np.ndarray, " blocks"] | None = None,
+    lower: Float[Array | np.ndarray, " rank"] | None = None,
+    upper: Float[Array | np.ndarray, " rank"] | None = None,
 ) -> LinearFit:
     """Base parameters weighed by joint; a function of arrays alone, for `jax.vmap` over data, robots or `counts`.
 
@@ -150,7 +150,7 @@ def fit_linear(
     return LinearFit(values, jnp.sqrt(variance), jnp.sqrt(squares(z) / total), active, converged)
 
 
-def _limits(lower: Array | None, upper: Array | None, rank: int) -> tuple[Array, Array]:
+def _limits(lower: Array | np.ndarray | None, upper: Array | np.ndarray | None, rank: int) -> tuple[Array, Array]:
     low = jnp.full(rank, -jnp.inf) if lower is None else jnp.broadcast_to(jnp.asarray(lower, float), (rank,))
     high = jnp.full(rank, jnp.inf) if upper is None else jnp.broadcast_to(jnp.asarray(upper, float), (rank,))
     return low, high
@@ -207,6 +207,7 @@ def _rows(model: ExtendedModel, data: TorqueData) -> tuple[Array, Array, Array]:
     n = len(data.position)
     X = jnp.stack([_columns(model, terms, data, k) for k in range(n)])
     if data.source is not None and data.kept is not None:
+        assert data.response is not None
         rows = [filtered(jnp.moveaxis(X[k], 0, -1), data.source[k], data.kept[k], data.response) for k in range(n)]
         X = jnp.stack([jnp.moveaxis(jnp.asarray(one), -1, 0) for one in rows])
     y = jnp.asarray(data.torque)

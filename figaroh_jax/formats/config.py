@@ -291,7 +291,8 @@ class Actuator(BaseModel):
     """Whether a rollout may trust the servo gains; every other key is a joint with its drive."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
-    __pydantic_extra__: dict[str, JointDrive]
+    # as pydantic documents it: the field says to type checkers that it is no argument
+    __pydantic_extra__: dict[str, JointDrive] = Field(init=False)  # pyright: ignore[reportIncompatibleVariableOverride]
 
     gains: Literal["known", "free"] = "known"
 

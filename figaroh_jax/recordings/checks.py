@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from ..errors import InputError
 from ..rigid.model import RobotModel, prismatic
-from .dataset import Recording
+from .dataset import Memory, Recording
 from .likeness import (
     Likeness,
     Sampled,
@@ -30,7 +30,10 @@ from .likeness import (
 )
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from ..formats.config import RecordingEntry, Task
+
 
 __all__ = ["Finding", "check_recording", "check_recordings", "position_findings", "report_findings"]
 
@@ -79,7 +82,7 @@ def check_recordings(task: Task, model: RobotModel, recordings: Sequence[Recordi
 
     Raises `InputError` with every finding that cannot be right.
     """
-    entries = {entry.file: entry for entry in task.data}
+    entries: dict[Path | Memory, RecordingEntry] = {entry.file: entry for entry in task.data}
     found = [
         (recording.file.name, finding)
         for recording in recordings
@@ -230,7 +233,7 @@ def _far(look: _Look, far: np.ndarray, over: np.ndarray) -> Iterator[Finding]:
     position, worst = look.position, int(np.argmax(np.where(far, over, 0.0)))
     straight = np.array(prismatic(look.model))
     factor = np.where(straight, 1e-3, DEGREE)
-    fits = (position * factor >= low - 0.2).all(axis=0) & (position * factor <= high + 0.2).all(axis=0)
+    fits = np.asarray(((position * factor >= low - 0.2) & (position * factor <= high + 0.2)).all(axis=0))
     top = position[:, worst][np.argmax(np.abs(position[:, worst]))]
     said = (
         f"position of {_named(look, far)} cannot be right: {look.joints[worst]} reads {top:.5g} {_unit(look, worst)},"
