@@ -72,28 +72,28 @@ class Source:
 
 def mutated_bytes(data: bytes, source: Source) -> bytes:
     """A few changes that know nothing of the format."""
-    data = bytearray(data)
+    out = bytearray(data)
     for _ in range(source.random.choice((1, 1, 2, 4, 8))):
-        at = source.random.randrange(len(data) + 1)
+        at = source.random.randrange(len(out) + 1)
         kind = source.random.randrange(8)
-        if kind == 0 and data:
-            data[at % len(data)] ^= 1 << source.random.randrange(8)
+        if kind == 0 and out:
+            out[at % len(out)] ^= 1 << source.random.randrange(8)
         elif kind == 1:
-            data[at:at] = source.of(WORDS).encode("utf-8", "surrogatepass")
+            out[at:at] = source.of(WORDS).encode("utf-8", "surrogatepass")
         elif kind == 2:
-            del data[at : at + source.random.randrange(1, 40)]
+            del out[at : at + source.random.randrange(1, 40)]
         elif kind == 3:
-            data[at:at] = data[at : at + source.random.randrange(1, 60)] * source.random.choice((1, 1, 2, 50))
+            out[at:at] = out[at : at + source.random.randrange(1, 60)] * source.random.choice((1, 1, 2, 50))
         elif kind == 4:
-            data[at : at + 1] = bytes([source.random.randrange(256)])
+            out[at : at + 1] = bytes([source.random.randrange(256)])
         elif kind == 5:
-            del data[at:]
+            del out[at:]
         elif kind == 6:
-            data[at:at] = str(source.of(NUMBERS)).encode()
+            out[at:at] = str(source.of(NUMBERS)).encode()
         else:
-            other = source.random.randrange(len(data) + 1)
-            data[at:at] = data[other : other + 30]
-    return bytes(data)
+            other = source.random.randrange(len(out) + 1)
+            out[at:at] = out[other : other + 30]
+    return bytes(out)
 
 
 def mutated_tree(tree: Any, source: Source) -> Any:

@@ -45,7 +45,8 @@ def run(case: str, seed: int, *, forbid: bool) -> tuple[str, Search, float]:
         loop, _ = load_loop(file.name)
     start = time.process_time()
     left_out = (case,) if forbid else ()
-    here = setting(loop, [Run(case, *(recording[k] for k in ("t", "u", "q", "dq")))], forbid=left_out)
+    t, u, q, dq = (recording[k] for k in ("t", "u", "q", "dq"))
+    here = setting(loop, [Run(case, t, u, q, dq)], forbid=left_out)
     found = search(here, forbid=left_out)
     names = "+".join(n.candidate.effect for n in found.named)
     return f"{found.verdict} {names}".strip(), found, time.process_time() - start

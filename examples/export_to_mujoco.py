@@ -1,5 +1,8 @@
 """The extended robot in MuJoCo: written as MJCF, loaded there, stepped beside our own simulation."""
 
+# mujoco's stubs lack what its C module holds
+# pyright: reportAttributeAccessIssue=false
+
 import tempfile
 from pathlib import Path
 

@@ -51,6 +51,7 @@ def test_columns_named_in_any_order_unit_and_clock_are_read_right(made, tmp_path
     task, model, (recording,) = read_back(draft.text, tmp_path)
     assert task.data[0].units.time == "ns"
     np.testing.assert_allclose(recording.position, run["position"], rtol=0, atol=1e-9)
+    assert recording.torque is not None
     np.testing.assert_allclose(recording.torque, run["torque"], rtol=0, atol=1e-6)
     np.testing.assert_allclose(np.diff(recording.time), np.diff(run["time"]), rtol=0, atol=1e-6)
 
@@ -64,6 +65,7 @@ def test_degrees_and_a_turned_sign_are_found(made, tmp_path: Path):
     draft = draft_task(urdf, [tmp_path / "run.npz"])
     _, _, (recording,) = read_back(draft.text, tmp_path)
     np.testing.assert_allclose(recording.position, run["position"], rtol=0, atol=1e-9)
+    assert recording.torque is not None
     np.testing.assert_allclose(recording.torque, run["torque"], rtol=0, atol=1e-9)
     assert any("opposite sign" in line for line in draft.assumed)
 
@@ -120,6 +122,7 @@ def test_a_plain_list_of_constants_is_a_diagonal(made, tmp_path: Path):
     draft = draft_task(urdf, [tmp_path / "run.npz"], constants=[2.0, 4.0, 5.0])
     task, _, (recording,) = read_back(draft.text, tmp_path)
     assert "torque: [2.0, 4.0, 5.0]" in draft.text and task.data[0].units.torque == "A"
+    assert recording.torque is not None
     np.testing.assert_allclose(recording.torque, run["torque"], rtol=0, atol=1e-9)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -334,7 +335,8 @@ def test_a_bristle_gives_way_until_it_holds(rod: RobotModel):
     model = put(model, "coulomb_friction", "hinge", force=2.0)
     model = put(model, "presliding", "hinge", force=2.0, distance=0.02)
     run = simulate(model, np.full((3000, 1), 1.2), np.zeros(1), np.zeros(1), DT)
-    held = optimize.brentq(lambda q: GRAVITY * np.sin(q) + 2.0 * (1 - np.exp(-q / 0.02)) - 1.2, 0, 0.1)
+    left = lambda q: GRAVITY * np.sin(q) + 2.0 * (1 - np.exp(-q / 0.02)) - 1.2  # noqa: E731
+    held = cast(float, optimize.brentq(left, 0, 0.1))
     np.testing.assert_allclose(run.position[-1, 0], held, rtol=0, atol=2e-5)
 
 

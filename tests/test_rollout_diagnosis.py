@@ -29,18 +29,18 @@ def task(folder: Path, case: str, more: str = "", role: str = "fit") -> Path:
     """A task file on one recording that is fitted and one, with other noise, that is not."""
     (folder / "arm.xml").write_text(NOMINAL)
     for name, seed in (("seen", 7), ("unseen", 8)):
-        np.savez(folder / f"{name}.npz", **servo_arm.record(case, seed))
+        np.savez(folder / f"{name}.npz", **servo_arm.record(case, seed))  # pyright: ignore[reportArgumentType]
     columns = "time: t, command: u, position: q, velocity: dq"
     data = f"data:\n  - {{file: seen.npz, {columns}}}\n  - {{file: unseen.npz, {columns}, role: holdout}}\n"
     (folder / "task.yaml").write_text(f"robot: {{model: arm.xml}}\n{data}{more}")
     return folder / "task.yaml"
 
 
-def short(seconds: float) -> tuple[Run, np.ndarray]:
+def short(seconds: float) -> tuple[Run, int]:
     record = servo_arm.record("none", 3)
     rows = round(seconds / servo_arm.DT)
-    run = Run("short", *(record[k][:rows] for k in ("t", "u", "q", "dq")))
-    return run, rows
+    t, u, q, dq = (record[k][:rows] for k in ("t", "u", "q", "dq"))
+    return Run("short", t, u, q, dq), rows
 
 
 def test_sums_are_those_of_finite_differences(tmp_path: Path):
