@@ -4,8 +4,7 @@ A QR factorisation of every chunk, which `regression.condense` makes on the host
 are not, but they square the condition number. So the rows are first brought to coordinates in which they are well
 conditioned, Z = X_b R^-1 with the columns X_b of the structural base parameters and R their triangular factor at random
 states: the products of Z lose next to nothing (as the second pass of CholeskyQR2; Yamamoto and others, 2015), and
-X = Z R B with the matrix B of the base parameters. Each joint has coordinates of its own, of the columns that its rows
-can show alone: on a tree these are few.
+X = Z R B with the matrix B of the base parameters.
 """
 
 from __future__ import annotations
@@ -18,15 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from ..compiled.batching import CPU_OPTIONS
 from ..effects.base import Effect
 from ..errors import InputError
 from ..rigid.model import RobotModel
-from ..rigid.normal_equations import row_products
-from ..rigid.regressor import block_codes, block_rows, coordinate_blocks, dense_rows
-from .base_parameters import BaseParameters, base_parameters
+from ..rigid.regressor import dense_rows
+from .base_parameters import BaseParameters
 from .columns import term_columns
 from .regression import FOLDS, Condensed
 from .states import States, check_piece
@@ -47,9 +45,9 @@ class Coordinates(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """What is added up over the samples, for each fold: products of [Z tau] joint by joint, rows and torque of each."""
+    """What is added up over the samples, for each fold and joint: products of [Z tau], rows and torque."""
 
-    products: tuple[Any, ...]
+    products: Any
     rows: Any
     torque: Any
 
@@ -71,30 +69,6 @@ def coordinates(structure: Float[np.ndarray, "samples nv columns"], base: BasePa
     return Coordinates(into, R @ base.matrix)
 
 
-class _Own(NamedTuple):
-    """Of a joint: the columns that its rows can show, and its coordinates in these."""
-
-    columns: Int[np.ndarray, " own"]
-    frame: Coordinates
-
-
-class _Shown(NamedTuple):
-    """What a program is made for: the columns of each joint, and what is known of the model (`block_codes`)."""
-
-    columns: tuple[tuple[int, ...], ...]
-    codes: bytes | None
-
-
-def _frames(states: States) -> list[_Own]:
-    frames, names = [], states.names
-    for j, used in enumerate(states.used):
-        own = np.flatnonzero(used)
-        rows = states.structure[:, j, own]
-        base = base_parameters(np.asarray(np.linalg.qr(rows, mode="r")), [names[k] for k in own])
-        frames.append(_Own(own, coordinates(rows[:, None], base)))
-    return frames
-
-
 def condense_on_devices(
     states: States, devices: Sequence[Any] | None = None, folds: int = FOLDS, chunk: int | None = None
 ) -> Condensed:
@@ -106,18 +80,16 @@ def condense_on_devices(
     `InputError` where a piece has a wrong shape or holds a number that is not finite.
     """
     mesh = Mesh(np.array(list(devices or jax.devices())), ("samples",))
-    frames, nv = _frames(states), states.model.nv
-    sizes = [own.frame.into.shape[1] + 1 for own in frames]
+    frame = coordinates(states.structure, states.structural)
+    nv, size = states.model.nv, frame.into.shape[1] + 1
     with jax.enable_x64(True):
-        products = tuple(jnp.zeros((folds, size, size)) for size in sizes)
-        total = _Sums(products, jnp.zeros((folds, nv)), jnp.zeros((folds, nv)))
+        total = _Sums(jnp.zeros((folds, nv, size, size)), jnp.zeros((folds, nv)), jnp.zeros((folds, nv)))
         everywhere = NamedSharding(mesh, PartitionSpec())
         width = np.broadcast_to(np.asarray(states.width, float), (nv,))
-        fixed = jax.device_put((states.model, states.terms, width, [own.frame.into for own in frames]), everywhere)
+        fixed = jax.device_put((states.model, states.terms, width, frame.into), everywhere)
         total, before = jax.device_put(total, everywhere), None
-        chunk = chunk or _chunk(mesh, sum(sum(own.frame.into.shape) + 1 for own in frames))
-        shown = _Shown(tuple(tuple(own.columns.tolist()) for own in frames), block_codes(states.model))
-        program = _program(mesh, chunk, folds, shown)
+        chunk = chunk or _chunk(mesh, nv, sum(frame.into.shape) + 1)
+        program = _program(mesh, chunk, folds)
         chunks = 0
         for number, part in enumerate(states.source()):
             check_piece(states.model, part, number, values=False)
@@ -126,11 +98,11 @@ def condense_on_devices(
             jax.block_until_ready(before)  # one piece ahead: no more wait in memory
             before = total.rows
         sums = jax.device_get(total)
-    if not all(np.isfinite(x).all() for x in jax.tree.leaves(sums)):
+    if not all(np.isfinite(x).all() for x in sums):
         for number, part in enumerate(states.source()):
             check_piece(states.model, part, number)
         raise InputError("the rows of the states are not finite: numbers too large, or a model that moves no mass")
-    return _condensed(states, frames, sums)
+    return _condensed(states, frame, sums)
 
 
 def fit_states(
@@ -160,10 +132,10 @@ def fit_states(
     return BatchFit(into @ theta, jnp.sqrt(variance), rms)
 
 
-def _chunk(mesh: Mesh, width: int) -> int:
+def _chunk(mesh: Mesh, nv: int, width: int) -> int:
     if mesh.devices.flat[0].platform == "cpu":
         return HOST_CHUNK
-    return 1 << max(8, int(np.log2(DEVICE_BYTES / 8 / width)))
+    return 1 << max(8, int(np.log2(DEVICE_BYTES / 8 / nv / width)))
 
 
 def _spread(part: Sequence[Any], chunk: int, mesh: Mesh) -> tuple[Any, ...]:
@@ -179,17 +151,17 @@ def _spread(part: Sequence[Any], chunk: int, mesh: Mesh) -> tuple[Any, ...]:
 
 
 @lru_cache(maxsize=16)
-def _program(mesh: Mesh, chunk: int, folds: int, shown: _Shown) -> Callable[..., _Sums]:
+def _program(mesh: Mesh, chunk: int, folds: int) -> Callable[..., _Sums]:
     def local(fixed: Any, part: tuple[Array, ...], before: Array) -> _Sums:
         """Sums over this device's share of a piece, which begins after so many chunks."""
         chunks = [x.reshape(-1, chunk, *x.shape[1:]) for x in part]
         first = before + jax.lax.axis_index("samples") * len(chunks[0])
 
         def step(total: _Sums, k: Array) -> tuple[_Sums, None]:
-            new, fold = _sums(shown, fixed, *(x[k] for x in chunks)), (first + k) % folds
-            return jax.tree.map(lambda x, y: x.at[fold].add(y), total, new), None
+            new, fold = _sums(fixed, *(x[k] for x in chunks)), (first + k) % folds
+            return _Sums(*(x.at[fold].add(y) for x, y in zip(total, new, strict=True))), None
 
-        shapes = jax.eval_shape(lambda *x: _sums(shown, fixed, *x), *(x[0] for x in chunks))
+        shapes = jax.eval_shape(lambda *x: _sums(fixed, *x), *(x[0] for x in chunks))
         zero = jax.tree.map(lambda x: jnp.zeros((folds, *x.shape), x.dtype), shapes)
         return jax.lax.psum(jax.lax.scan(step, zero, jnp.arange(len(chunks[0])))[0], "samples")
 
@@ -203,21 +175,12 @@ def _program(mesh: Mesh, chunk: int, folds: int, shown: _Shown) -> Callable[...,
     return jax.jit(program, compiler_options=options)
 
 
-def _sums(shown: _Shown, fixed: Any, q: Array, v: Array, a: Array, tau: Array, there: Array) -> _Sums:
-    """Rows of a joint hold its own columns alone: blocks of the regressor, then those of the effects."""
-    model, terms, width, frames = fixed
-    blocks, _ = coordinate_blocks(model)
-    inertial = block_rows(model, q, v, a, shown.codes).reshape(10 * len(blocks), -1)
-    place = {(int(row), 10 * int(link) + k): 10 * n + k for n, (row, link) in enumerate(blocks) for k in range(10)}
-    beside = [jnp.moveaxis(x, 0, -1) for x in term_columns(model, terms, width, q, v, a)]
-    beside = jnp.concatenate([jnp.zeros((model.nv, 0, len(q))), *beside], axis=1)
-    products, first = [], 10 * len(model.joints)
-    for j, (columns, into) in enumerate(zip(shown.columns, frames, strict=True)):
-        parts = [inertial[np.array([place[j, k] for k in columns if k < first], int)]]
-        parts += [beside[j, np.array([k - first for k in columns if k >= first], int)]]
-        Z = jnp.einsum("kr,ks->rs", into, jnp.concatenate(parts), precision=jax.lax.Precision.HIGHEST)
-        products.append(row_products((jnp.concatenate([Z, tau[:, j][None]]) * there)[None])[0])
-    return _Sums(tuple(products), jnp.broadcast_to(there.sum(), tau.shape[1:]), there @ tau)
+def _sums(fixed: Any, q: Array, v: Array, a: Array, tau: Array, there: Array) -> _Sums:
+    model, terms, width, into = fixed
+    Z, y = _rows(model, terms, width, into, q, v, a, tau)
+    both = jnp.concatenate([Z, y[:, None]], axis=1) * there
+    products = jnp.einsum("jks,jls->jkl", both, both, precision=jax.lax.Precision.HIGHEST)
+    return _Sums(products, jnp.broadcast_to(there.sum(), y.shape[:1]), y @ there)
 
 
 def _rows(
@@ -230,17 +193,14 @@ def _rows(
     return jnp.einsum("kr,jks->jrs", into, columns, precision=jax.lax.Precision.HIGHEST), jnp.asarray(tau).T
 
 
-def _condensed(states: States, frames: Sequence[_Own], sums: _Sums) -> Condensed:
-    backs = []
-    for own in frames:
-        back = np.zeros((len(own.frame.back) + 1, len(own.columns) + 1))
-        back[:-1, :-1], back[-1, -1] = own.frame.back, 1.0
-        backs.append(back)
-    folds = range(len(sums.rows))
+def _condensed(states: States, frame: Coordinates, sums: _Sums) -> Condensed:
+    back = np.zeros((len(frame.back) + 1, len(states.names) + 1))
+    back[:-1, :-1], back[-1, -1] = frame.back, 1.0
+    own = tuple(np.flatnonzero(row) for row in states.used)
     factors = tuple(
-        tuple(_root(G[fold]) @ back for G, back in zip(sums.products, backs, strict=True)) for fold in folds
+        tuple(_root(G) @ back[:, [*mine, -1]] for G, mine in zip(fold, own, strict=True)) for fold in sums.products
     )
-    return Condensed(states.names, tuple(own.columns for own in frames), factors, sums.rows, sums.torque)
+    return Condensed(states.names, own, factors, sums.rows, sums.torque)
 
 
 def _root(products: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
