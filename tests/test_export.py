@@ -321,7 +321,7 @@ def edited(change: Callable[[dict], object]) -> Callable[[Path], None]:
     ("damage", "message"),
     [
         (lambda folder: (folder / "effects.yaml").unlink(), "effects.yaml does not exist"),
-        (lambda folder: (folder / "robot.urdf").unlink(), "robot.urdf: cannot be read"),
+        (lambda folder: (folder / "robot.urdf").unlink(), "robot.urdf does not exist"),
         (edited(lambda keys: keys.pop("joints")), "the key 'joints' is missing"),
         (edited(lambda keys: keys["joints"][0].update(name="hop")), "no joint 'hop'; did you mean 'hip'"),
         (edited(lambda keys: keys["effects"][0].update(effect="viscous")), "did you mean 'viscous_friction'"),
