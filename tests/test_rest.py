@@ -66,6 +66,7 @@ RIGHT = Standing(Name("torque_ripple", ("elbow",)), whole=False, physical=True, 
         ({"modulation": 0.5}, "vary"),
         ({"modulation_held_out": 0.25}, "vary"),
         ({"physical": False}, "physics forbids"),
+        ({"beside_rest": False}, "named only where none does"),
         ({"whole": True, "gain": 0.05}, ""),
         ({"whole": True, "gain": 0.05, "beside_smooth": 0.0}, "smooth functions"),
     ],
@@ -82,6 +83,7 @@ def test_beside_a_rest_a_cause_is_named_by_what_it_alone_explains(changes: dict[
         ({"gain": 0.0}, "no better"),
         ({"physical": False}, "physics"),
         ({"share": 0.005}, "tolerance"),
+        ({"beside_rest": False}, ""),
     ],
 )
 def test_without_a_rest_a_cause_need_only_be_there(changes: dict[str, float], word: str) -> None:

@@ -54,6 +54,7 @@ class Standing:
     modulation_held_out: float = 0.0
     beside_smooth: float = 1.0  # gain of a cause of the whole robot beside smooth functions at every joint
     inertia_alone: bool = False  # a coupling of inertia, without friction of its own
+    beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
 
 
 def reason_against(one: Standing, rest: bool, tolerance: float) -> str:
@@ -81,6 +82,7 @@ def reason_against(one: Standing, rest: bool, tolerance: float) -> str:
             ),
             (one.share >= SHARE_NAMED, f"its torque is {one.share:.1%} of the joint's, {SHARE_NAMED:.0%} are needed"),
             (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion do as well"),
+            (one.beside_rest, "a rest that stays may look like it: it is named only where none does"),
             (not one.inertia_alone, "a coupling without friction of its own may be a rotor's or a link's inertia"),
         ]
     return next((reason for passed, reason in checks if not passed), "")
@@ -106,6 +108,7 @@ def standings(
                 name=one.name,
                 whole=whole,
                 physical=physical_sign(effect),
+                beside_rest=effect.beside_rest,
                 gain=1 - float(better.sum() / max(worse.sum(), 1e-300)),
                 t=t_value(worse, better),
                 share=_share_of_torque(problem, full.state, torque, effect),

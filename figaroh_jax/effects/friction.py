@@ -165,6 +165,7 @@ class FrictionDrift(JointEffect):
     """Friction above its later level that falls off as the joint warms up."""
 
     name, title = "friction_drift", "friction that drifts with the warmth"
+    beside_rest = False  # a rest that changes in the course of a recording looks like it
     equation = "(force s(v) + damping v) exp(-t/time)"
     separated_by = "the same motion of {at} at the start and again after the robot has warmed up"
     force: Scalar = amplitude("N m")
@@ -219,6 +220,7 @@ class Presliding(Bristle):
     """Dry friction that builds up over a small distance after each reversal (Dahl 1968, exponent 1)."""
 
     name, title = "presliding", "presliding: friction that lags behind the reversal"
+    beside_rest = False  # most of any rest stands at reversals, where it acts
     equation = "force (z - s(v)), z' = v/distance (1 - z s(v))"
     separated_by = "reversals of {at} at several accelerations: presliding is late in position, a delay in time"
 
