@@ -173,7 +173,7 @@ def run(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_command_writes_a_whole_run(run: Path, capsys: pytest.CaptureFixture[str]):
     names = {path.name for path in run.iterdir()}
     tables = {"parameters.csv", "parameters.yaml", "parameters.npz", "predictions.npz"}
-    assert names == {"result.json", "report.html", "model"} | tables
+    assert names == {"result.json", "report.html", "model", "provenance.json", "figaroh-jax-run.json"} | tables
     answer = json.loads((run / "result.json").read_text())
     with np.load(run / "parameters.npz") as file:
         assert file["base_values"].tolist() == [b["value"] for b in answer["base_parameters"]]
