@@ -159,8 +159,8 @@ def test_an_effect_exists_within_its_bounds_only(model: RobotModel) -> None:
     assert not known("torque_delay", delay=0.06) and not known("torque_delay", delay=-0.004)  # at its bound; acausal
     assert known("stribeck_friction", "turn", force=0.1, speed=0.1)
     # a wrong sign stays in a search, as a nuisance; it is never named
-    assert not physical_sign(place(find("stribeck_friction"), model, "turn", force=-0.1, speed=0.1))
-    assert physical_sign(place(find("stribeck_friction"), model, "turn", force=0.1, speed=0.1))
+    assert not physical_sign(place(find("stribeck_friction"), model, ("turn",), force=-0.1, speed=0.1))
+    assert physical_sign(place(find("stribeck_friction"), model, ("turn",), force=0.1, speed=0.1))
     assert not known("torque_offset", "turn", offset=1e3)  # more than the joint ever feels
 
 
