@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from functools import lru_cache
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -275,8 +276,8 @@ def test_a_backend_needs_a_robot() -> None:
 
 
 def test_a_backend_whose_library_is_missing_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    entry = registry.metadata.EntryPoint("bullet", "no_such_library:Backend", registry.GROUP)
-    monkeypatch.setattr(registry.metadata, "entry_points", lambda group: [entry])
+    entry = metadata.EntryPoint("bullet", "no_such_library:Backend", registry.GROUP)
+    monkeypatch.setattr(metadata, "entry_points", lambda group: [entry])
     with pytest.raises(InputError, match=r"'bullet' needs the package 'no_such_library'.*pip install"):
         registry.backend("bullet", source("arm")[0])
 

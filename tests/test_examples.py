@@ -15,7 +15,7 @@ SLOW = {"calibrate_tracker", "diagnose_arrays", "identify_arrays", "real_calibra
 SAYS = {
     "dynamics_and_gradients": "by the mass of each link",
     "batch": "200 resamples",
-    "friction_by_gradient": "damping 1.2",
+    "friction_by_gradient": "damping 1.19",
     "export_to_mujoco": "figaroh_jax [",
     "calibrate_tracker": "joint_offset elbow: -0.02",
     "diagnose_arrays": "joint_spring (shoulder)",
