@@ -61,16 +61,17 @@ def test_tiago_arm_predicts_the_last_part_of_its_recording(data_dir: Path, tmp_p
     """figaroh: 1.028 N m (1.024 weighted)."""
     found = identify_task(fj.load_task(real_tasks.tiago_task(tmp_path, data_dir)))
     assert pooled(found.holdout["last.npz"]) <= 1.00
-    # the best robot of bodies is 1.5 % above: the free fit has a negative rotor (benchmarks/recordings.py)
-    assert physical(found) and pooled(found.fit) <= 1.04 * pooled(found.unconstrained)
+    # the free fit has a negative rotor, and the stated trust holds where no torque shows: without it 1.033
+    assert physical(found) and pooled(found.fit) <= 1.05 * pooled(found.unconstrained)
 
 
 def test_panda_predicts_the_last_part_of_its_recording(data_dir: Path, tmp_path: Path):
     found = identify_task(fj.load_task(real_tasks.panda_task(tmp_path, data_dir)))
     reached = np.array([0.996, 0.999, 0.999, 0.999, 0.995, 0.999, 0.97])
     assert (np.round(found.holdout["last.npz"].r2, 3) >= reached).all()
-    # the best robot of bodies is 5.3 % above: the free fit has a negative moment about the last axis
-    assert physical(found) and pooled(found.fit) <= 1.07 * pooled(found.unconstrained)
+    # the free fit has a negative moment about the last axis, and the stated trust holds where no torque shows: the
+    # error held out is 4 % above that without trust, the fit's 11 % above the free one
+    assert physical(found) and pooled(found.fit) <= 1.12 * pooled(found.unconstrained)
 
 
 def test_ur10e_predicts_other_runs(data_dir: Path, tmp_path: Path):

@@ -125,16 +125,22 @@ def test_fewer_excitations_are_left_out_quarter_by_quarter(labels: list[str | No
     motions = [swing, other if labels[-1] is None else swing]
     signals = [made_signals(8.0, m, repeat=label) for m, label in zip(motions, labels, strict=False)]
     found = layout(signals, stack(signals))
-    quarters = 1 + found.fold.max()
+    quarters = 1 + found.part.max()
     assert quarters == (8 if labels == [None, None] else 4)
-    sizes = np.bincount(found.fold)
+    sizes = np.bincount(found.part)
     assert sizes.max() - sizes.min() <= 2
-    for fold in by_recording(found.fold, signals):
-        assert set(np.diff(fold)) == {0, 1} and fold[-1] - fold[0] == 3
+    for part in by_recording(found.part, signals):
+        assert set(np.diff(part)) == {0, 1} and part[-1] - part[0] == 3
     if labels == ["A", "A"]:  # a quarter is left out of both repeats at once
-        first, second = by_recording(found.fold, signals)
+        first, second = by_recording(found.part, signals)
         np.testing.assert_array_equal(first, second)
     assert describe_folds(signals) == "each recording's quarters left out in turn"
+
+
+def test_the_search_leaves_out_two_seconds_in_turn() -> None:
+    signals = [made_signals(12.0), made_signals(9.0, other)]
+    for fold, one in zip(by_recording(layout(signals, stack(signals)).fold, signals), signals, strict=True):
+        np.testing.assert_array_equal(fold, np.arange(one.rows.kept) * ROW // 2.0 % 5)
 
 
 def test_held_rows_are_those_of_holdout_recordings_with_torque() -> None:
