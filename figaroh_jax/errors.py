@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 from itertools import islice
+from typing import Any
 
 _MOST_KNOWN, _MOST_LISTED, _LONGEST_WORD = 1000, 100, 100  # a file may hold ten thousand names of any length
 
@@ -15,6 +16,28 @@ class InputError(ValueError):
 
 class NotSupported(InputError):
     """A backend was asked for what its library does not give; the message names those that do."""
+
+
+def check_real(name: str, array: Any) -> None:
+    """Raise `InputError` naming an array that holds anything but real numbers: complex ones, text, objects.
+
+    Converted to float64, complex numbers would lose their imaginary part and text would be read as numbers.
+    """
+    kind = getattr(getattr(array, "dtype", None), "kind", None)
+    if kind is None:
+        import numpy as np
+
+        try:
+            kind = np.asarray(array).dtype.kind
+        except (TypeError, ValueError) as error:  # rows of different lengths
+            raise InputError(f"{name} is no array of numbers: {str(error)[:200]}") from None
+        except Exception as error:  # a list of what JAX traces: NumPy may not look into it, JAX checks it later
+            if type(error).__module__.partition(".")[0] != "jax":
+                raise
+            return
+    if kind not in "biufV":  # V: bfloat16 and the like
+        held = {"c": "complex numbers", "U": "text", "S": "bytes", "O": "objects"}.get(kind, f"data of kind '{kind}'")
+        raise InputError(f"{name} holds {held}; real ones are expected")
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from .errors import InputError
 from .reporting.provenance import read_provenance
+from .reporting.run_directory import write_file
 
 __all__ = ["command_of", "compare", "list", "new", "verify"]
 
@@ -32,7 +33,7 @@ def new(args: argparse.Namespace) -> int:
     elif args.out is None:
         print(draft.text, end="")
     if args.out is not None:
-        _write(args.out, draft.text, "--out")
+        write_file(args.out, draft.text, "--out")
         if not args.json:
             print("\n".join([*(f"assumed: {line}" for line in draft.assumed), f"Task: {args.out}"]))
     return 0
@@ -48,12 +49,12 @@ def _numbers(text: str | None, option: str) -> tuple[float, ...] | None:
 def verify(args: argparse.Namespace) -> int:
     """One line a limit; 1 where one fails."""
     from .formats.config import Limits, load_limits
-    from .reporting.verification import DEFAULT_LIMITS, junit, verify as judged
+    from .reporting.verification import DEFAULT_LIMITS, JUNIT, junit, verify as judged
 
     limits = load_limits(args.limits) if args.limits else Limits.model_validate(DEFAULT_LIMITS)
     checks = judged(args.run, limits)
     if args.junit:
-        _write(args.junit, junit(args.run.resolve(), checks), "--junit")
+        write_file(args.junit, junit(args.run.resolve(), checks), "--junit", JUNIT)
     if args.json:
         print(json.dumps([check._asdict() for check in checks], indent=2, ensure_ascii=False))
     else:
@@ -63,13 +64,13 @@ def verify(args: argparse.Namespace) -> int:
 
 def compare(args: argparse.Namespace) -> int:
     """Tables of all runs, and a page of them where `--out` names one."""
-    from .reporting.side_by_side import compare_runs, comparison_page, comparison_text
+    from .reporting.side_by_side import PAGE, compare_runs, comparison_page, comparison_text
 
     if len(args.runs) < 2:
         raise InputError("compare: one run directory is given; expected two or more, the first is the reference")
     sections = compare_runs(args.runs)
     if args.out:
-        _write(args.out, comparison_page(args.runs, sections), "--out")
+        write_file(args.out, comparison_page(args.runs, sections), "--out", PAGE)
     _print(sections, args.json, comparison_text(sections))
     if args.out and not args.json:
         print(f"\nPage: {args.out}")
@@ -98,12 +99,3 @@ def command_of(folder: Path) -> tuple[str, ...]:
 
 def _print(sections, as_json: bool, text: str) -> None:
     print(json.dumps([section._asdict() for section in sections], indent=2, ensure_ascii=False) if as_json else text)
-
-
-def _write(path: Path, text: str, option: str) -> None:
-    try:
-        if path.is_dir():
-            raise InputError(f"{option} {path}: is a directory; name a file")
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{option} {path}: cannot be written: {error.strerror or error}") from error

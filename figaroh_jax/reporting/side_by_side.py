@@ -16,7 +16,9 @@ import numpy as np
 from .provenance import PROVENANCE, read_provenance
 from .verification import figures, read_run
 
-__all__ = ["Section", "compare_runs", "comparison_page", "comparison_text", "list_runs"]
+__all__ = ["PAGE", "Section", "compare_runs", "comparison_page", "comparison_text", "list_runs"]
+
+PAGE = '<meta name="generator" content="figaroh-jax compare">'  # by which such a page is known
 
 
 class Section(NamedTuple):
@@ -182,7 +184,7 @@ def comparison_page(folders: Sequence[Path], sections: Sequence[Section]) -> str
         )
     parts += _overlays(folders)
     title = f"<title>{escape(' | '.join(_names(folders)))}</title>"
-    meta = '<meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">'
+    meta = f'<meta charset="utf-8">{PAGE}<meta name="viewport" content="width=device-width,initial-scale=1">'
     text = f'<!doctype html><html lang="en"><head>{meta}{title}<style>{_STYLE}</style></head>'
     return f"{text}<body><main>{''.join(parts)}</main></body></html>\n"
 

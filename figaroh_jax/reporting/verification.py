@@ -15,9 +15,10 @@ from .run_directory import add_to_run
 if TYPE_CHECKING:
     from ..formats.config import Limits
 
-__all__ = ["DEFAULT_LIMITS", "VERIFICATION", "Check", "figures", "junit", "read_run", "verify"]
+__all__ = ["DEFAULT_LIMITS", "JUNIT", "VERIFICATION", "Check", "figures", "junit", "read_run", "verify"]
 
 VERIFICATION = "verification.json"
+JUNIT = 'name="figaroh-jax verify '  # by which such a file is known
 DEFAULT_LIMITS: dict[str, Any] = {"verdict": ["nothing", "named"], "consistent": True, "fk_parity": 1e-9}
 
 
