@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from itertools import islice
 from typing import Any
 
@@ -23,7 +24,8 @@ def check_real(name: str, array: Any) -> None:
 
     Converted to float64, complex numbers would lose their imaginary part and text would be read as numbers.
     """
-    kind = getattr(getattr(array, "dtype", None), "kind", None)
+    dtype = getattr(array, "dtype", None)
+    kind = "R" if getattr(dtype, "names", None) else getattr(dtype, "kind", None)
     if kind is None:
         import numpy as np
 
@@ -36,8 +38,22 @@ def check_real(name: str, array: Any) -> None:
                 raise
             return
     if kind not in "biufV":  # V: bfloat16 and the like
-        held = {"c": "complex numbers", "U": "text", "S": "bytes", "O": "objects"}.get(kind, f"data of kind '{kind}'")
+        held = {"c": "complex numbers", "U": "text", "S": "bytes", "O": "objects", "R": "records"}.get(
+            kind, f"data of kind '{kind}'"
+        )
         raise InputError(f"{name} holds {held}; real ones are expected")
+
+
+@contextmanager
+def as_written(what: object) -> Iterator[None]:
+    """What breaks while a file of the library's own is used (changed or damaged since) becomes an `InputError`."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
+        said = f"{type(error).__name__}: {str(error)[:200]}"
+        raise InputError(f"{what}: is not as this library writes it; was it changed or damaged? ({said})") from error
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

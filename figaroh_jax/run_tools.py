@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from .errors import InputError
@@ -91,10 +92,28 @@ def list(args: argparse.Namespace) -> int:
 def command_of(folder: Path) -> tuple[str, ...]:
     """The command line that made the run in `folder`, without `--out`; raises `InputError` where that is not said."""
     made = read_provenance(folder)
-    options = [str(option) for option in made["options"]]
+    options = [*made["options"]]
+    if made["command"] not in _RUNS or not _own_options(options):
+        said = " ".join([made["command"], *options])[:200]
+        raise InputError(f"{folder}: its provenance.json names a command that makes no run: {said}")
     if not Path(made["task"]).is_file():
         raise InputError(f"{folder}: its task {made['task']} is not there any more; its text is in provenance.json")
     return (str(made["command"]), str(made["task"]), *options)
+
+
+_RUNS = ("diagnose", "identify", "calibrate")
+_OPTIONS = {"--backend": 1, "--level": 1, "--no-priors": 0}  # that a run is said to have had, and their words
+
+
+def _own_options(options: Sequence[str]) -> bool:
+    """Whether the words are options that a run writes into its provenance, and nothing else."""
+    waiting = [*options]
+    while waiting:
+        count = _OPTIONS.get(waiting.pop(0))
+        if count is None or any(word.startswith("-") for word in waiting[:count]) or len(waiting) < count:
+            return False
+        del waiting[:count]
+    return True
 
 
 def _print(sections, as_json: bool, text: str) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from .errors import InputError
+from .errors import InputError, as_written
 from .reporting.run_directory import check_directory, refusals, task_inputs, whole_directory, write_file
 
 if TYPE_CHECKING:
@@ -110,13 +110,14 @@ def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
 
     try:
         content = json.loads((model / LOOP).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         raise InputError(f"{model}: no readable {LOOP}; name the `model` directory of a rollout's run") from None
-    text = json.dumps(for_simulator(content, simulator), indent=2, ensure_ascii=False) + "\n"
-    if out is not None:
+    with as_written(model / LOOP):
+        text = json.dumps(for_simulator(content, simulator), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
         files = {f"{simulator}.json": text}
-        if simulator == "mujoco":
+        if simulator == "mujoco" and out is not None:
             files["robot.xml"] = with_drives(model / "robot.xml", content)
+    if out is not None:
         _write_files(out, files)
     return text
 

@@ -160,10 +160,10 @@ def _measurement(
         hint = f"unknown '{unknown}'{nearest(unknown, KINDS)}" if unknown else f"{len(given)} are given"
         raise InputError(f"{source}: exactly one of {', '.join(KINDS)} is needed: {hint}")
     (kind, values), table = next(iter(given.items())), _Table(source)
-    if values is None or len(values) != count:
-        size = "nothing" if values is None else f"{len(values)} rows"
+    values = np.zeros(0) if values is None else _numbers(values, kind, source)
+    if not values.ndim or len(values) != count:
+        size = f"{len(values)} rows" if values.ndim else "one number"
         raise InputError(f"{source}: {kind} has {size}, but q has {count}")
-    values = _numbers(values, kind, source)
     if kind == "device":
         return "own", values
     if kind in ("plane", "socket"):
