@@ -516,7 +516,7 @@ def command_line(bench: Bench, words: list[str]) -> None:
     assert not told, error.getvalue()
 
 
-OURS = ("verification.json", "figaroh-jax-run.json", "task.yaml")  # of runs; the task is the input itself
+OURS = ("verification.json", "figaroh-jax-run.json", "task.yaml", "effects.yaml")  # of runs; inputs themselves
 
 
 def _differs(path: Path, data: bytes) -> bool:
@@ -757,7 +757,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=int(time.time()) << 20)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=list(KINDS))
-    parser.add_argument("--guide", type=int, default=3, help="of so many inputs one is traced for its coverage")
+    parser.add_argument("--guide", type=int, default=5, help="of so many inputs one is traced for its coverage")
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()) / "fuzz-findings")
     parser.add_argument("--replay", type=Path)
     parser.add_argument("--worker", type=int, help=argparse.SUPPRESS)
