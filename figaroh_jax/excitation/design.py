@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -19,6 +19,7 @@ from .limits import ALLOWED, Limits, Torque, Use, checked, limits_of, unmeetable
 from .motions import Basis, Trajectory
 from .objectives import condition_objective, information_objective, prediction_objective, smooth_condition_objective
 from .sampling import Sampler
+from .separation import Causes, Separated, causes, separated, separation_objective
 from .solvers import GramObjective, Problem, solve
 
 __all__ = ["Design", "Stage", "best_motion", "excite", "random_motion"]
@@ -28,7 +29,8 @@ CHECKED = 8  # motions, the best first, until one is feasible at 1 kHz
 ROUNDING = 1e-6  # of a limit
 STEP = 0.98  # by which a motion is made smaller until it meets its limits
 
-Objective = Literal["information", "prediction", "condition"]
+Objective = Literal["information", "prediction", "condition", "separate"]
+Cause = tuple[str, Sequence[str], Mapping[str, float]]  # effect, place, sizes
 Progress = Callable[[str, float], None]
 
 
@@ -60,6 +62,7 @@ class Design:
     information: Float[np.ndarray, "rank rank"]  # of all motions and the prior
     condition: float  # of the weighted rows of all motions
     scaled_condition: float  # the same with columns of length one
+    separated: tuple[Separated, ...] = ()  # causes told apart by all motions together
     notes: tuple[str, ...] = ()
 
     @property
@@ -76,9 +79,10 @@ class Design:
     def std_before(self) -> Float[np.ndarray, " rank"]:
         """The same before any motion; infinite where nothing is known."""
         prior = np.asarray(self.learned.prior)
-        if np.linalg.matrix_rank(prior) < len(prior):
+        size = np.sqrt(np.diag(prior))
+        if not (size > 0).all() or np.linalg.cond(prior / np.outer(size, size)) > 1e14:
             return np.full(len(prior), np.inf)
-        return np.sqrt(np.diag(np.linalg.inv(prior)))
+        return np.sqrt(np.diag(np.linalg.inv(prior / np.outer(size, size)))) / size
 
     @property
     def met(self) -> bool:
@@ -94,6 +98,8 @@ def excite(
     *,
     objective: Objective | GramObjective = "information",
     predict: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]] = (),
+    separate: Sequence[tuple[Cause, Cause]] = (),
+    trust: float = 0.10,
     trajectories: int = 1,
     start: Sequence[float] | None = None,
     starts: int = 4,
@@ -105,7 +111,8 @@ def excite(
 
     `limits` and `learned` None: as `limits_of` and `learn` have them of the model. `objective` "information" makes the
     log determinant large, "prediction" the error on the motions `predict` (arrays q, v, a) small, "condition" the
-    condition number of the weighted rows; or a function of the Gram matrix of your own (`solvers.GramObjective`).
+    condition number of the weighted rows, "separate" the pairs of causes `separate` easy to tell apart (`trust` is then
+    the relative sigma of a link that is a cause); or a function of the Gram matrix (`solvers.GramObjective`).
     `start` is the posture at the beginning (rad or m; None: chosen), `starts` how many random motions are improved,
     `rate` (Hz) the samples of a design, whose noise is independent. Raises `InputError` where no motion meets the
     limits, the start is outside of them, or `predict` is needed and empty.
@@ -123,14 +130,23 @@ def excite(
         wanted = _wanted(learned, sampler, predict) if objective == "prediction" else None
         stages: list[Stage] = []
         before = learned
+        given = None
+        if separate:
+            given = causes(learned, separate, _typical(learned, sampler, basis, limits, begin, rate), trust)
+        elif objective == "separate":
+            raise InputError("objective: separate needs pairs of causes (`separate`)")
+        seen = None if given is None else np.zeros((len(given.columns),) * 2)
         for k in range(trajectories):
-            own = _objectives(objective, np.asarray(before.prior), wanted)
+            own = _objectives(objective, np.asarray(before.prior), wanted, given, seen)
             generator = np.random.default_rng([seed, k])
 
             def told(share: float, k: int = k) -> None:
                 progress(f"trajectory {k + 1} of {trajectories}", (k + share) / trajectories)
 
-            stage = best_motion(torque, before, sampler, own, basis, limits, begin, starts, rate, generator, told)
+            rows = (given.sampler, given.columns) if given is not None and objective == "separate" else (sampler, None)
+            stage = best_motion(torque, before, rows, own, basis, limits, begin, starts, rate, generator, told)
+            if given is not None:
+                seen = seen + gram_of(before, given.sampler, stage.motion.states(rate), given.columns)
             before = before.with_prior(gram_of(before, sampler, stage.motion.states(rate)))
             stages.append(replace(stage, logdet=float(np.linalg.slogdet(np.asarray(before.prior))[1])))
         gram = np.asarray(before.prior) - np.asarray(learned.prior)
@@ -144,12 +160,16 @@ def excite(
             information=np.asarray(before.prior),
             condition=float(np.sqrt(np.linalg.cond(gram))),
             scaled_condition=float(np.sqrt(np.linalg.cond(gram / np.outer(size, size)))),
+            separated=() if given is None else separated(given, seen, np.asarray(learned.prior)),
         )
 
 
-def gram_of(learned: Learned, sampler: Sampler, states: Any) -> Float[np.ndarray, "rank rank"]:
-    """Information of the motion alone; `information_matrix` by the sampler's programs."""
-    rows = sampler.rows(np.stack([np.asarray(x) for x in states]))[:, np.array(learned.independent)]
+def gram_of(
+    learned: Learned, sampler: Sampler, states: Any, columns: np.ndarray | None = None
+) -> Float[np.ndarray, "n n"]:
+    """Gram matrix of weighted rows: of the base parameters, their information; `columns` names others."""
+    kept = np.array(learned.independent) if columns is None else columns
+    rows = sampler.rows(np.stack([np.asarray(x) for x in states]))[:, kept]
     own = rows * np.sqrt(np.asarray(learned.weight))[:, None, None]
     flat = own.swapaxes(0, 1).reshape(own.shape[1], -1)
     return flat @ flat.T
@@ -166,6 +186,16 @@ def torque_of(model: RobotModel | ExtendedModel, learned: Learned, sampler: Samp
 def _among(effect: Effect, terms: Sequence[Effect]) -> bool:
     same = (at for term in terms if type(term) is type(effect) for at in np.asarray(term.at))
     return any(np.array_equal(np.asarray(effect.at), at) for at in same)
+
+
+def _typical(
+    learned: Learned, sampler: Sampler, basis: Basis, limits: Limits, start: np.ndarray | None, rate: float
+) -> Float[np.ndarray, "3 samples nv"]:
+    """States of a random motion within the limits."""
+    kept = np.array(learned.independent)
+    objective = information_objective(np.asarray(learned.prior))
+    problem = Problem(learned, sampler, objective, kept, basis, limits, start, rate)
+    return problem.states(random_motion(problem, np.random.default_rng(0)))
 
 
 def _inside(robot: RobotModel, start: np.ndarray, limits: Limits) -> np.ndarray:
@@ -187,7 +217,11 @@ def _wanted(
 
 
 def _objectives(
-    objective: Objective | GramObjective, prior: np.ndarray, wanted: np.ndarray | None
+    objective: Objective | GramObjective,
+    prior: np.ndarray,
+    wanted: np.ndarray | None,
+    given: Causes | None,
+    seen: np.ndarray | None,
 ) -> tuple[GramObjective, ...]:
     """One after another; all but the last are steps on the way."""
     if callable(objective):
@@ -197,6 +231,10 @@ def _objectives(
     if objective == "prediction":
         assert wanted is not None
         return (prediction_objective(prior, wanted),)
+    if objective == "separate":
+        assert given is not None and seen is not None
+        own = separation_objective(given, np.asarray(given.prior))
+        return (lambda G: own(G + seen),)
     return smooth_condition_objective(), condition_objective()
 
 
@@ -225,7 +263,7 @@ def random_motion(problem: Problem, generator: np.random.Generator, amplitude: f
 def best_motion(
     torque: Torque,
     learned: Learned,
-    sampler: Sampler,
+    rows: tuple[Sampler, np.ndarray | None],
     objectives: Sequence[GramObjective],
     basis: Basis,
     limits: Limits,
@@ -234,9 +272,9 @@ def best_motion(
     rate: float,
     generator: np.random.Generator,
     progress: Callable[[float], None] = lambda share: None,
-    columns: np.ndarray | None = None,
 ) -> Stage:
     """The best of several random motions after each was improved; feasible at 1 kHz where that is possible at all."""
+    sampler, columns = rows
     columns = np.array(learned.independent) if columns is None else columns
     problems = [Problem(learned, sampler, one, columns, basis, limits, start, rate) for one in objectives]
     final = problems[-1]

@@ -6,7 +6,7 @@ velocity, acceleration and torque in their limits. Zero or less is allowed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -69,7 +69,7 @@ class Use:
 
 def limits_of(
     robot: RobotModel,
-    position: Given | Mapping[str, Sequence[float]] = "model",
+    position: Given | Mapping[str, float | tuple[float, float]] = "model",
     velocity: Given = "model",
     acceleration: Given = None,
     torque: Given = "model",

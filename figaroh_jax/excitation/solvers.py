@@ -65,7 +65,8 @@ class Problem:
         self.matrix = self.basis.at(self.basis.instants(self.rate))
         self.nv = self.learned.robot.nv
         self.root = np.sqrt(np.asarray(self.learned.weight))
-        peaks = self.basis.peaks(self.rate)
+        first, *others = self.basis.peaks(self.rate)
+        peaks = (first if self.start is not None else np.append(0.0, first), *others)
         self.rows = [
             (kind, self.basis.at(times)[k])
             for k, (kind, times) in enumerate(zip(KINDS, peaks, strict=False))
@@ -167,8 +168,8 @@ class Problem:
         own = [] if self.start is not None else [by_start]
         return value, np.concatenate([*own, by_weights.ravel()])
 
-    def linear_matrix(self) -> tuple[np.ndarray, np.ndarray]:
-        """A and b with A x <= b where position, velocity and acceleration keep their limits."""
+    def linear_matrix(self, margin: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+        """A and b with A x <= b where position, velocity and acceleration keep their limits, less a margin."""
         free, size = (self.nv if self.start is None else 0), self.basis.size
         blocks, bounds = [], []
         for kind, functions in self.rows:
@@ -185,7 +186,8 @@ class Problem:
                         assert self.start is not None
                         offset = (self.start[j] - self.limits.middle[j]) / limit[j]
                 blocks += [block, -block]
-                bounds += [np.full(len(functions), 1.0 - offset), np.full(len(functions), 1.0 + offset)]
+                room = 1.0 - margin.get(kind, 0.0)
+                bounds += [np.full(len(functions), room - offset), np.full(len(functions), room + offset)]
         size = free + self.nv * size
         return (np.concatenate(blocks), np.concatenate(bounds)) if blocks else (np.zeros((0, size)), np.zeros(0))
 
@@ -217,9 +219,9 @@ def solve(
     problem: Problem, x: Float[np.ndarray, " n"], margin: dict[str, float] | None = None, *, iterations: int = 200
 ) -> Float[np.ndarray, " n"]:
     """The numbers of the best motion found from x, within the limits at the samples of the design."""
-    A, b = problem.linear_matrix()
+    A, b = problem.linear_matrix(margin or {})
     if len(b) <= FEW_ROWS:
-        found = _sequential(problem, x, A, b, margin or {}, iterations)
+        found = _sequential(problem, x, A, b, iterations)
         if not problem.torque or _torque_share(problem, found) <= 1.0 - (margin or {}).get("torque", 0.0):
             return found
         x = found
@@ -231,13 +233,10 @@ def _torque_share(problem: Problem, x: np.ndarray) -> float:
     return float((np.abs(torque) / problem.limits.torque).max())
 
 
-def _sequential(
-    problem: Problem, x: np.ndarray, A: np.ndarray, b: np.ndarray, margin: dict[str, float], iterations: int
-) -> np.ndarray:
+def _sequential(problem: Problem, x: np.ndarray, A: np.ndarray, b: np.ndarray, iterations: int) -> np.ndarray:
     from scipy.optimize import minimize  # slow to import
 
-    keep = b - max([0.0, *(margin.get(kind, 0.0) for kind in KINDS[:3])])
-    rows = {"type": "ineq", "fun": lambda x: keep - A @ x, "jac": lambda x: -A}
+    rows = {"type": "ineq", "fun": lambda x: b - A @ x, "jac": lambda x: -A}
     options = {"maxiter": iterations, "ftol": 1e-6}
     kept = [rows] if len(b) else []
     return minimize(problem.value, x, jac=problem.slope, method="SLSQP", constraints=kept, options=options).x
