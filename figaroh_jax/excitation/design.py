@@ -145,7 +145,7 @@ def excite(
 
             rows = (given.sampler, given.columns) if given is not None and objective == "separate" else (sampler, None)
             stage = best_motion(torque, before, rows, own, basis, limits, begin, starts, rate, generator, told)
-            if given is not None:
+            if given is not None and seen is not None:
                 seen = seen + gram_of(before, given.sampler, stage.motion.states(rate), given.columns)
             before = before.with_prior(gram_of(before, sampler, stage.motion.states(rate)))
             stages.append(replace(stage, logdet=float(np.linalg.slogdet(np.asarray(before.prior))[1])))
@@ -160,7 +160,7 @@ def excite(
             information=np.asarray(before.prior),
             condition=float(np.sqrt(np.linalg.cond(gram))),
             scaled_condition=float(np.sqrt(np.linalg.cond(gram / np.outer(size, size)))),
-            separated=() if given is None else separated(given, seen, np.asarray(learned.prior)),
+            separated=() if given is None or seen is None else separated(given, seen, np.asarray(learned.prior)),
         )
 
 

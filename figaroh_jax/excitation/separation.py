@@ -171,7 +171,7 @@ def _arranged(
             sizes.append(told)
             for block in rival.blocks:
                 cases.append(_Case(len(pairs) - 1, truth.truth, size, block, rival.precision))
-                others += [*truth.truth, *block]
+                others += [*truth.truth.tolist(), *block.tolist()]
     columns = np.array([*kept, *dict.fromkeys(others)])
     behind = {int(column): k + len(kept) for k, column in enumerate(columns[len(kept) :])}
     local = tuple(
