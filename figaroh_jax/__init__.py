@@ -32,6 +32,12 @@ if TYPE_CHECKING:
     )
     from .excitation.limits import limits_of as limits_of
     from .excitation.motions import Trajectory as Trajectory, fourier as fourier, quintic as quintic, spline as spline
+    from .excitation.postures import (
+        Instrument as Instrument,
+        PostureDesign as PostureDesign,
+        excite_postures as excite_postures,
+    )
+    from .excitation.task import excite_task as excite_task
     from .fitting.blockwise import BlockLevenbergMarquardt as BlockLevenbergMarquardt
     from .fitting.data import (
         PoseData as PoseData,
@@ -100,6 +106,8 @@ _MODULES = {
     "excitation.design": ("Design", "excite"),
     "excitation.information": ("Learned", "expected_std", "information", "learn"),
     "excitation.limits": ("limits_of",),
+    "excitation.postures": ("Instrument", "PostureDesign", "excite_postures"),
+    "excitation.task": ("excite_task",),
     "excitation.motions": ("Trajectory", "fourier", "quintic", "spline"),
     "identification.identification": ("identify", "identify_task"),
     "rigid.kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),

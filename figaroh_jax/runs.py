@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .calibration.kinematic_diagnosis import PoseDiagnosis
     from .effects.extended import ExtendedModel
     from .excitation.design import Design
+    from .excitation.postures import PostureDesign
     from .formats.config import Load, Task
     from .identification.result import Identification, Link
     from .results import Diagnosis
@@ -267,21 +268,25 @@ def excite_file(
     out: Path,
     progress: Callable[[str, float], None] = lambda phase, fraction: None,
     backend: str = "native",
-) -> Design:
+) -> Design | PostureDesign:
     """Read a task, design what its `excite` block asks for and write the run directory `out`, as `diagnose_file` does.
 
     A design that does not meet a limit at 1 kHz is written too, and says so; the command then ends with status 1.
     """
     _native_alone(backend, "a design differentiates the regressor in closed form")
     task = _task_for(task_file, out, recordings=False)
+    from .excitation.postures import PostureDesign
     from .excitation.task import excite_task
     from .formats.config import robot_options
     from .formats.robotfile import load_extended
-    from .reporting.excitation_files import write_design
+    from .reporting.excitation_files import write_design, write_postures
 
     found = excite_task(task, progress)
     progress("writing the report", 1.0)
     with _run_folder(task, out, "excite") as folder:
+        if isinstance(found, PostureDesign):
+            write_postures(found, folder)
+            return found
         write_design(found, folder, load_extended(task.robot.model, **robot_options(task.robot)).model)
     return found
 
@@ -410,19 +415,19 @@ def _show_calibration(calibration: Calibration) -> None:
     show_calibration(calibration)
 
 
-def _design_json(found: Design) -> str:
+def _design_json(found: Design | PostureDesign) -> str:
     from .reporting.excitation_files import to_json
 
     return to_json(found)
 
 
-def _show_design(found: Design) -> None:
+def _show_design(found: Design | PostureDesign) -> None:
     from .reporting.excitation_files import summary_lines
 
     print("\n".join(summary_lines(found)))
 
 
-def _design_failure(found: Design) -> str | None:
+def _design_failure(found: Design | PostureDesign) -> str | None:
     from .reporting.excitation_files import failure
 
     return failure(found)

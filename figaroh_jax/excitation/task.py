@@ -18,6 +18,7 @@ from .design import Design, excite
 from .information import Learned, learn
 from .limits import limits_of
 from .motions import Basis, fourier, quintic, spline
+from .postures import ACCURACY, Instrument, PostureDesign, excite_postures
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Excite, Task
@@ -27,7 +28,9 @@ __all__ = ["excite_task"]
 DEFAULT_NOISE = 0.01  # of the largest torque
 
 
-def excite_task(task: Task, progress: Callable[[str, float], None] = lambda phase, share: None) -> Design:
+def excite_task(
+    task: Task, progress: Callable[[str, float], None] = lambda phase, share: None
+) -> Design | PostureDesign:
     """Design what the `excite` block of a task asks for; raises `InputError` where it is wrong, before any work.
 
     Recordings of the task are what is known already: their information is the prior, their residuals are the noise.
@@ -40,9 +43,9 @@ def excite_task(task: Task, progress: Callable[[str, float], None] = lambda phas
         raise InputError(
             f"{task.file}: no `excite` block: it says what is to be designed, as in excite: {{duration: 10}}"
         )
+    robot = load_robot(task)
     if asked.kind == "postures":
-        raise InputError(f"{task.file}: excite.kind: postures are not designed by this version; kind: trajectory is")
-    load_robot(task)  # another kind of file is refused there
+        return _postures(task, asked, robot, progress)
     model, (known, notes) = load_extended(task.robot.model, **robot_options(task.robot)).model, stated_baseline(task)
     basis = basis_of(asked)
     bounds = asked.limits
@@ -71,6 +74,48 @@ def excite_task(task: Task, progress: Callable[[str, float], None] = lambda phas
         rate=asked.rate,
         progress=progress,
     )
+    return replace(found, notes=(*said, *found.notes))
+
+
+def _postures(task: Task, asked: Excite, robot: RobotModel, progress: Callable[[str, float], None]) -> PostureDesign:
+    """Postures for the device of the block, or of the recordings."""
+    measurement = asked.measurement or next((one.measurement for one in task.data if one.measurement), None)
+    if measurement is None:
+        raise InputError(
+            f"{task.file}: excite.measurement is missing: postures are chosen for a device, as in"
+            " measurement: {pose: pose, base_frame: base_link, tool_frame: tool0}"
+        )
+    kinds = {"pose": "pose", "camera": "pose", "position": "position"}
+    if measurement.kind not in kinds:
+        raise InputError(
+            f"{task.file}: excite.measurement: postures that touch a {measurement.kind} are where it is; they are not"
+            " designed. Expected: pose, position or camera"
+        )
+    if measurement.tool_frame is None:
+        raise InputError(f"{task.file}: excite.measurement.tool_frame is missing: which frame is measured?")
+    base = measurement.base_frame or next((f.name for f in robot.frames if f.parent < 0), robot.frames[0].name)
+    for name in (base, measurement.tool_frame):
+        robot.frame_index(name)
+    place, turn = measurement.accuracy.position, measurement.accuracy.orientation
+    instrument = Instrument(
+        "pose" if kinds[measurement.kind] == "pose" else "position",
+        base,
+        measurement.tool_frame,
+        tuple(measurement.unknown),
+        (place or ACCURACY[0], turn or ACCURACY[1]),
+    )
+    limits = limits_of(robot, asked.limits.position)
+    found = excite_postures(
+        robot,
+        instrument,
+        count=asked.postures,
+        candidates=asked.candidates,
+        position_limit=limits.position,
+        progress=progress,
+    )
+    said = ["neither collisions nor what the device can see from its place are looked at: check each posture before"]
+    if place is None:
+        said.append(f"no accuracy is given: {1e3 * ACCURACY[0]:g} mm and {1e3 * ACCURACY[1]:g} mrad are taken")
     return replace(found, notes=(*said, *found.notes))
 
 

@@ -13,20 +13,22 @@ from jaxtyping import Float
 
 from ..excitation.design import Design, Stage, torque_of
 from ..excitation.limits import CHECK_RATE
+from ..excitation.postures import PostureDesign
 from ..excitation.sampling import Sampler
 from ..rigid.model import prismatic
 from .report import page_template
 
-__all__ = ["answer", "failure", "summary_lines", "to_json", "write_design"]
+__all__ = ["answer", "failure", "summary_lines", "to_json", "write_design", "write_postures"]
 
 ANSWER, PAGE = "excitation.json", "report.html"
 POINTS = 50.0  # Hz of the points of a JointTrajectory, which controllers join by quintics
 _DRAWN = 400  # points of a curve on the page
 
 
-def to_json(found: Design) -> str:
+def to_json(found: Design | PostureDesign) -> str:
     """The text of `excitation.json`."""
-    return json.dumps(answer(found), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    content = answer(found) if isinstance(found, Design) else posture_answer(found)
+    return json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def answer(found: Design) -> dict[str, Any]:
@@ -57,6 +59,34 @@ def answer(found: Design) -> dict[str, Any]:
     }
 
 
+def posture_answer(found: PostureDesign) -> dict[str, Any]:
+    """The answer of a design of postures."""
+    return {
+        "format": 1,
+        "kind": "postures",
+        "robot": found.model.name,
+        "joints": list(found.model.dof_names),
+        "measurement": {
+            "kind": found.instrument.kind,
+            "base_frame": found.instrument.base_frame,
+            "tool_frame": found.instrument.tool_frame,
+            "accuracy": list(found.instrument.accuracy),
+        },
+        "postures": found.position.tolist(),
+        "logdet": _number(found.logdet),
+        "bound": _number(found.bound),
+        "efficiency": _number(found.efficiency),
+        "efficiency_of_candidates": _number(found.chosen_efficiency),
+        "efficiency_of_random": _number(found.random_efficiency),
+        "candidates": found.candidates,
+        "parameters": [
+            {"parameter": one.name, "unit": one.unit, "std": _number(std)}
+            for one, std in zip(found.parameters, found.std, strict=True)
+        ],
+        "notes": list(found.notes),
+    }
+
+
 def _stage(k: int, stage: Stage) -> dict[str, Any]:
     basis = stage.motion.basis
     return {
@@ -80,8 +110,10 @@ def _number(value: Any) -> float | None:
     return plain if math.isfinite(plain) else None
 
 
-def failure(found: Design) -> str | None:
+def failure(found: Design | PostureDesign) -> str | None:
     """What is not met at 1 kHz, in words; None where everything is."""
+    if isinstance(found, PostureDesign):
+        return None
     wrong = [
         f"trajectory {k + 1}: {use.kind} of '{use.joint}' is {use.value:.4g} at {use.time:.3f} s, {use.share - 1:.1%}"
         f" over its limit {use.limit:.4g}"
@@ -93,8 +125,45 @@ def failure(found: Design) -> str | None:
     return "; ".join(wrong) or None
 
 
-def summary_lines(found: Design) -> list[str]:
+def posture_lines(found: PostureDesign) -> list[str]:
+    """The design of postures in a few lines."""
+    lines = [
+        f"{found.model.name}: {len(found.position)} postures for {len(found.parameters)} parameters that a"
+        f" {found.instrument.kind} can tell; {found.efficiency:.1%} of the certified bound of {found.candidates}"
+        f" candidates (random choices {found.random_efficiency:.1%})"
+    ]
+    for unit, scale, name in (("m", 1e3, "mm"), ("rad", 1e3, "mrad")):
+        own = [std for one, std in zip(found.parameters, found.std, strict=True) if one.unit == unit]
+        if own:
+            lines.append(f"expected standard deviations: {scale * min(own):.2g} to {scale * max(own):.2g} {name}")
+    return [*lines, *(f"Note: {note}" for note in found.notes)]
+
+
+def write_postures(found: PostureDesign, folder: Path) -> None:
+    """Write the postures, the answer and the page into the directory."""
+    from markupsafe import Markup
+
+    (folder / ANSWER).write_text(to_json(found), encoding="utf-8")
+    header = ",".join(found.model.dof_names)
+    np.savetxt(folder / "postures.csv", found.position, delimiter=",", header=header, comments="", fmt="%.9g")
+    page = resources.files("figaroh_jax") / "page"
+    text = page_template("postures.html").render(
+        d=found,
+        robot=found.model.name,
+        lines=posture_lines(found),
+        parameters=[
+            (one.name, 1e3 * std, "mm" if one.unit == "m" else "mrad")
+            for one, std in zip(found.parameters, found.std.tolist(), strict=True)
+        ],
+        css=Markup((page / "report.css").read_text("utf-8")),
+    )
+    (folder / PAGE).write_text(text, encoding="utf-8")
+
+
+def summary_lines(found: Design | PostureDesign) -> list[str]:
     """The design in a few lines."""
+    if isinstance(found, PostureDesign):
+        return posture_lines(found)
     better = found.std_before / found.std
     seconds = sum(stage.motion.duration for stage in found.stages)
     lines = [
