@@ -115,7 +115,8 @@ class _Setting(NamedTuple):
 class _Searched(NamedTuple):
     """What a search has found, all of it in one fit, and what that leaves."""
 
-    here: _Setting
+    before: _Setting  # as it was set out with
+    here: _Setting  # with the width of friction that the causes leave
     search: Search
     found: list[Found]
     joint: Joint
@@ -176,13 +177,13 @@ def _searched(
     causes that could be named.
     """
 
-    def ended(here: _Setting, search: Search) -> _Searched:
-        here = here._replace(problem=search.problem, start=search.start)
+    def ended(before: _Setting, search: Search) -> _Searched:
+        here = before._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
         found, joint = _fitted_together(here, search.found, forbid)
         left, beyond, line = _left(here, search, found, joint, tolerance, generator)
         strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
-        return _Searched(here, search, found, joint, left, line, strict)
+        return _Searched(before, here, search, found, joint, left, line, strict)
 
     like_a_rest = [name for name, effect in CATALOGUE.items() if not effect.beside_rest]
     first = ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator))
@@ -210,12 +211,13 @@ def _judged(searched: _Searched, names: Sequence[str], tolerance: float) -> _Jud
 
     What is not named is no part of the answer's model: the others are fitted anew without it.
     """
-    here, _, found, joint, left, line, strict = searched
+    before, here, _, found, joint, left, line, strict = searched
     problem, whitening = here.problem, here.whitening
     each = standings(problem, here.start, found, joint, whitening)
     against = {f.name: reason_against(one, strict, tolerance) for f, one in zip(found, each, strict=True)}
     named = [f for f in found if not against[f.name]]
-    here, joint = _as_predicts_best(here, named)
+    same = before.problem is here.problem
+    here, joint = _as_predicts_best([here] if same else [here, before], named)
     gaining = _without_losses(here, named, joint)
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= dict.fromkeys(gaining.worse, "the error on the data held out does not fall with it")
@@ -229,19 +231,20 @@ def _judged(searched: _Searched, names: Sequence[str], tolerance: float) -> _Jud
     return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text), here)
 
 
-def _as_predicts_best(here: _Setting, named: list[Found]) -> tuple[_Setting, Joint]:
-    """The named causes in one fit, its rows weighted by speed or all alike, by the error in N m on parts left out.
+def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple[_Setting, Joint]:
+    """The named causes in one fit as predicts parts left out best, by their error in N m.
 
-    Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows.
+    Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows, and
+    the width of friction beside all causes need not be that beside the named ones.
     """
     best = None
-    for weight in (np.asarray(here.problem.records.weight), np.asarray(here.problem.records.judged)):
-        one = here._replace(problem=here.problem.weighted(weight))
-        joint = polished(one.problem, one.start, [f.effect for f in named], one.whitening)
-        error = part_error(one.problem, joint.step)
-        best = (error, one, joint) if best is None or error < best[0] else best
-        if (weight == np.asarray(here.problem.records.judged)).all():
-            break
+    for here in settings:
+        weights = [np.asarray(here.problem.records.weight), np.asarray(here.problem.records.judged)]
+        for weight in weights[: 1 if np.array_equal(weights[0], weights[1]) else 2]:
+            one = here._replace(problem=here.problem.weighted(weight))
+            joint = polished(one.problem, one.start, [f.effect for f in named], one.whitening)
+            error = part_error(one.problem, joint.step)
+            best = (error, one, joint) if best is None or error < best[0] else best
     assert best is not None
     return best[1:]
 
