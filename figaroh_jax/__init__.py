@@ -23,6 +23,21 @@ if TYPE_CHECKING:
         regression as regression,
         states as states,
     )
+    from .excitation.design import Design as Design, excite as excite
+    from .excitation.information import (
+        Learned as Learned,
+        expected_std as expected_std,
+        information as information,
+        learn as learn,
+    )
+    from .excitation.limits import limits_of as limits_of
+    from .excitation.motions import Trajectory as Trajectory, fourier as fourier, quintic as quintic, spline as spline
+    from .excitation.postures import (
+        Instrument as Instrument,
+        PostureDesign as PostureDesign,
+        excite_postures as excite_postures,
+    )
+    from .excitation.task import excite_task as excite_task
     from .fitting.blockwise import BlockLevenbergMarquardt as BlockLevenbergMarquardt
     from .fitting.data import (
         PoseData as PoseData,
@@ -88,6 +103,12 @@ _MODULES = {
     "errors": ("InputError",),
     "formats.export": ("load_model", "write_model"),
     "effects.extended": ("ExtendedModel", "extend", "predict"),
+    "excitation.design": ("Design", "excite"),
+    "excitation.information": ("Learned", "expected_std", "information", "learn"),
+    "excitation.limits": ("limits_of",),
+    "excitation.postures": ("Instrument", "PostureDesign", "excite_postures"),
+    "excitation.task": ("excite_task",),
+    "excitation.motions": ("Trajectory", "fourier", "quintic", "spline"),
     "identification.identification": ("identify", "identify_task"),
     "rigid.kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
     "formats.mjcf": ("load_mjcf",),

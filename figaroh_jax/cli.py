@@ -1,7 +1,7 @@
 """The command `figaroh-jax`: a thin layer that reads arguments, sets JAX up and turns errors into messages.
 
-Exit status: 0 the job ran, 1 a verdict failed (`verify`), 2 the input is wrong (one message on standard error), 70 a
-fault of the program itself, 130 interrupted, 143 asked to end (SIGTERM).
+Exit status: 0 the job ran, 1 a verdict failed (`verify`) or a limit is not met (`excite`), 2 the input is wrong (one
+message on standard error), 70 a fault of the program itself, 130 interrupted, 143 asked to end (SIGTERM).
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ _TASKS = {  # commands that take a task file
     "diagnose": "the main job, on a task file of yours",
     "identify": "fit the dynamics: links, friction, intervals",
     "calibrate": "fit the kinematics from measured poses or points",
+    "excite": "design the motion that tells most, within limits",
 }
 _OTHERS = ("verify", "compare", "list", "new")  # commands before and after a run
 _DESCRIPTION = "Name what a robot's simulation gets wrong, extend the model with it and measure the gain."
@@ -118,7 +119,10 @@ def _run(args: argparse.Namespace) -> int:
         else:
             job.show(found)
             print(f"Report: {out / REPORT}")
-    return 0
+    failed = job.failure(found)
+    if failed is not None:
+        print(f"figaroh-jax: limit not met: {_one_line(failed)}", file=sys.stderr)
+    return 0 if failed is None else 1
 
 
 @contextmanager

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from .calibration.calibrated import Calibration
     from .calibration.kinematic_diagnosis import PoseDiagnosis
     from .effects.extended import ExtendedModel
+    from .excitation.design import Design
+    from .excitation.postures import PostureDesign
     from .formats.config import Load, Task
     from .identification.result import Identification, Link
     from .results import Diagnosis
@@ -34,6 +36,7 @@ __all__ = [
     "Job",
     "calibrate_file",
     "diagnose_file",
+    "excite_file",
     "export_loop",
     "identify_file",
     "predictions",
@@ -50,6 +53,7 @@ class Job(NamedTuple):
     run: Callable[..., Any]  # (task file, run directory, progress, backend), and the command's own options by name
     to_json: Callable[[Any], str]
     show: Callable[[Any], None]
+    failure: Callable[[Any], str | None] = lambda found: None  # what ends the command with status 1, in words
 
 
 def diagnose_file(
@@ -213,12 +217,17 @@ def _identify_rollouts(task: Task, out: Path, progress: Callable[[str, float], N
     return found
 
 
-def _task_for(task_file: Path, out: Path) -> Task:
-    """The task of a run that is to be written to `out`: it can become a run directory and holds no file of the task."""
+def _task_for(task_file: Path, out: Path, *, recordings: bool = True) -> Task:
+    """The task of a run that is to be written to `out`: it can become a run directory and holds no file of the task.
+
+    `recordings`: whether the command needs some.
+    """
     from .formats.config import load_task
 
     check_directory(out)
     task = load_task(task_file)
+    if recordings and not task.data:
+        raise InputError(f"{task_file}: data is missing: this command needs recordings; only `excite` does without")
     check_directory(out, task_inputs(task_file))
     return task
 
@@ -269,14 +278,42 @@ def calibrate_file(
     return calibration
 
 
-def _native_alone(backend: str) -> None:
+def excite_file(
+    task_file: Path,
+    out: Path,
+    progress: Callable[[str, float], None] = lambda phase, fraction: None,
+    backend: str = "native",
+) -> Design | PostureDesign:
+    """Read a task, design what its `excite` block asks for and write the run directory `out`, as `diagnose_file` does.
+
+    A design that does not meet a limit at 1 kHz is written too, and says so; the command then ends with status 1.
+    """
+    _native_alone(backend, "a design differentiates the regressor in closed form")
+    task = _task_for(task_file, out, recordings=False)
+    from .excitation.postures import PostureDesign
+    from .excitation.task import excite_task
+    from .formats.config import robot_options
+    from .formats.robotfile import load_extended
+    from .reporting.excitation_files import write_design, write_postures
+
+    found = excite_task(task, progress)
+    progress("writing the report", 1.0)
+    with _run_folder(task, out, "excite") as folder:
+        if isinstance(found, PostureDesign):
+            write_postures(found, folder)
+            return found
+        write_design(found, folder, load_extended(task.robot.model, **robot_options(task.robot)).model)
+    return found
+
+
+def _native_alone(backend: str, why: str = "") -> None:
     if backend != "native":
         from .simulators.registry import backend_class
 
         backend_class(backend)  # one that is not installed is refused there, with the list of those that are
+        why = why or "a calibration differentiates by the placements of the links"
         raise InputError(
-            f"--backend {backend}: a calibration differentiates by the placements of the links, which the contract of "
-            "backends does not ask for; only 'native' does it"
+            f"--backend {backend}: {why}, which the contract of backends does not ask for; only 'native' does it"
         )
 
 
@@ -393,8 +430,27 @@ def _show_calibration(calibration: Calibration) -> None:
     show_calibration(calibration)
 
 
+def _design_json(found: Design | PostureDesign) -> str:
+    from .reporting.excitation_files import to_json
+
+    return to_json(found)
+
+
+def _show_design(found: Design | PostureDesign) -> None:
+    from .reporting.excitation_files import summary_lines
+
+    print("\n".join(summary_lines(found)))
+
+
+def _design_failure(found: Design | PostureDesign) -> str | None:
+    from .reporting.excitation_files import failure
+
+    return failure(found)
+
+
 JOBS = {
     "diagnose": Job("diagnosis", diagnose_file, _diagnosis_json, _show_diagnosis),
     "identify": Job("identification", identify_file, _identification_json, _show_identification),
     "calibrate": Job("calibration", calibrate_file, _calibration_json, _show_calibration),
+    "excite": Job("excitation", excite_file, _design_json, _show_design, _design_failure),
 }

@@ -11,12 +11,20 @@ import pytest
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 # these have tests of their own, or make what the package ships
 ELSEWHERE = {"make_demo", "own_device", "own_effect"}
-SLOW = {"calibrate_tracker", "diagnose_arrays", "identify_arrays", "real_calibrations", "real_identifications"}
+SLOW = {
+    "calibrate_tracker",
+    "design_a_motion",
+    "diagnose_arrays",
+    "identify_arrays",
+    "real_calibrations",
+    "real_identifications",
+}
 SAYS = {
     "dynamics_and_gradients": "by the mass of each link",
     "batch": "200 resamples",
     "friction_by_gradient": "damping 1.19",
     "export_to_mujoco": "figaroh_jax [",
+    "design_a_motion": "own optimiser",
     "calibrate_tracker": "joint_offset elbow: -0.02",
     "diagnose_arrays": "joint_spring (shoulder)",
     "identify_arrays": "base parameters",

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect, place
-from ..effects.catalogue import find
+from ..effects.catalogue import CATALOGUE, find
 from ..effects.plausibility import implausible
 from ..errors import InputError
 from ..estimation.noise import Spectrum
@@ -35,7 +35,7 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .holdout import held_out, held_squares, part_error, residual_rms, traces
+from .holdout import held_squares, part_error, residual_rms, traces
 from .joint import Joint, polished, sized
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import reason_against, standings
@@ -96,14 +96,10 @@ def diagnose(
         signals.sort(key=lambda s: s.role == "holdout")
         here = _setting(as_backend(model), signals, known, trust, forbid, progress)
         generator = np.random.default_rng(seed)
-        search = find_causes(*here[:4], forbid, CERTAIN * alpha, progress, generator)
-        here = here._replace(problem=search.problem, start=search.start)
-        progress("fitting all causes together", 0.8)
-        found, joint = _fitted_together(here, search.found, forbid)
-        names = [s.name for s in signals]
-        judged = _judged(here, search, found, joint, names, tolerance, generator)
+        searched = _searched(here, forbid, CERTAIN * alpha, tolerance, progress, generator)
+        judged = _judged(searched, [s.name for s in signals], tolerance)
         progress("measuring the gain", 0.9)
-        return _answer(here, signals, search, judged)
+        return _answer(searched.here, signals, searched.search, judged)
 
 
 class _Setting(NamedTuple):
@@ -116,12 +112,24 @@ class _Setting(NamedTuple):
     white: bool  # whether the rows are weighted by their joint's residual, not by the noise's spectrum
 
 
+class _Searched(NamedTuple):
+    """What a search has found, all of it in one fit, and what that leaves."""
+
+    before: _Setting  # as it was set out with
+    here: _Setting  # with the width of friction that the causes leave
+    search: Search
+    found: list[Found]
+    joint: Joint
+    left: Significance
+    line: tuple[float, float, int]
+    strict: bool  # whether a rest stays, beside which a cause must show more to be named
+
+
 class _Judged(NamedTuple):
     """What the diagnosis stands by."""
 
     word: Verdict
-    found: list[Found]
-    joint: Joint  # all of them in one fit
+    causes: _Gaining
     rest: Rest
     here: _Setting  # with the weights of the answer's fit
 
@@ -155,6 +163,39 @@ def _setting(
     return _Setting(problem, start, spectrum, whitening, white)
 
 
+def _searched(
+    here: _Setting,
+    forbid: Sequence[str],
+    alpha: float,
+    tolerance: float,
+    progress: Callable[[str, float], None],
+    generator: np.random.Generator,
+) -> _Searched:
+    """The causes that the data show, first without the effects that any rest looks like (`Effect.beside_rest`).
+
+    Those are looked for where a rest stays, and kept where it is gone with them: beside a rest they take the place of
+    causes that could be named.
+    """
+
+    def ended(before: _Setting, search: Search) -> _Searched:
+        here = before._replace(problem=search.problem, start=search.start)
+        progress("fitting all causes together", 0.8)
+        found, joint = _fitted_together(here, search.found, forbid)
+        left, beyond, line = _left(here, search, found, joint, tolerance, generator)
+        strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
+        return _Searched(before, here, search, found, joint, left, line, strict)
+
+    like_a_rest = [name for name, effect in CATALOGUE.items() if not effect.beside_rest]
+    first = ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator))
+    if not first.strict:
+        return first
+    more = find_causes(*here[:4], forbid, alpha, progress, generator, first.search)
+    if len(more.found) == len(first.search.found):
+        return first
+    second = ended(here, more)
+    return first if second.strict else second
+
+
 def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) -> tuple[list[Found], Joint]:
     """The causes that the others do not make needless and that surely have a size, all in one fit."""
     found = eliminate(here.problem, here.start, found, here.whitening)
@@ -165,29 +206,21 @@ def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) 
     return kept, joint
 
 
-def _judged(
-    here: _Setting,
-    search: Search,
-    found: list[Found],
-    joint: Joint,
-    names: Sequence[str],
-    tolerance: float,
-    generator: np.random.Generator,
-) -> _Judged:
+def _judged(searched: _Searched, names: Sequence[str], tolerance: float) -> _Judged:
     """The verdict by what is left beside all causes; of these, the ones that stand beside it are named.
 
     What is not named is no part of the answer's model: the others are fitted anew without it.
     """
+    before, here, _, found, joint, left, line, strict = searched
     problem, whitening = here.problem, here.whitening
-    left, beyond, line = _left(here, search, found, joint, tolerance, generator)
     each = standings(problem, here.start, found, joint, whitening)
-    strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
     against = {f.name: reason_against(one, strict, tolerance) for f, one in zip(found, each, strict=True)}
     named = [f for f in found if not against[f.name]]
-    here, joint = _as_predicts_best(here, named)
-    named, joint, worse = _without_losses(here, named, joint)
-    problem, whitening = here.problem, here.whitening
-    against |= dict.fromkeys(worse, "the error on the data held out does not fall with it")
+    same = before.problem is here.problem
+    here, joint = _as_predicts_best([here] if same else [here, before], named)
+    gaining = _without_losses(here, named, joint)
+    named, joint, problem = gaining.named, gaining.joint, here.problem
+    against |= dict.fromkeys(gaining.worse, "the error on the data held out does not fall with it")
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
@@ -195,45 +228,69 @@ def _judged(
     text = left.text or (f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else "")
     parts = parts_of(problem, joint.step, whitening, line, names)
     nearest = tuple(sorted(nearest, key=lambda one: -one.share))
-    return _Judged(verdict(bool(named), rest), named, joint, Rest(relative, parts, nearest, text), here)
+    return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text), here)
 
 
-def _as_predicts_best(here: _Setting, named: list[Found]) -> tuple[_Setting, Joint]:
-    """The named causes in one fit, its rows weighted by speed or all alike, by the error in N m on parts left out.
+def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple[_Setting, Joint]:
+    """The named causes in one fit as predicts parts left out best, by their error in N m.
 
-    Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows.
+    Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows, and
+    the width of friction beside all causes need not be that beside the named ones.
     """
     best = None
-    for weight in (np.asarray(here.problem.records.weight), np.asarray(here.problem.records.judged)):
-        one = here._replace(problem=here.problem.weighted(weight))
-        joint = polished(one.problem, one.start, [f.effect for f in named], one.whitening)
-        error = part_error(one.problem, joint.step)
-        best = (error, one, joint) if best is None or error < best[0] else best
-        if (weight == np.asarray(here.problem.records.judged)).all():
-            break
+    for here in settings:
+        weights = [np.asarray(here.problem.records.weight), np.asarray(here.problem.records.judged)]
+        for weight in weights[: 1 if np.array_equal(weights[0], weights[1]) else 2]:
+            one = here._replace(problem=here.problem.weighted(weight))
+            joint = polished(one.problem, one.start, [f.effect for f in named], one.whitening)
+            error = part_error(one.problem, joint.step)
+            best = (error, one, joint) if best is None or error < best[0] else best
     assert best is not None
     return best[1:]
 
 
-def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> tuple[list[Found], Joint, list[Name]]:
-    """The causes without those that do not lower the error on the data held out, and the names of these.
+class _Gaining(NamedTuple):
+    """Causes that all lower the error on the data held out, with that error."""
 
-    Each must lower the error of the joints where it acts, and all together that of the robot: a joint of large torque
-    hides what happens at the others.
+    named: list[Found]
+    joint: Joint
+    order: list[int]  # of the named, by what each gains as it comes in
+    gains: list[float]  # relative RMS error before the first of that order, and after each
+    worse: list[Name]  # those that did not
+
+
+def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> _Gaining:
+    """The causes without those that do not lower the error on the data held out.
+
+    Each must lower the error of the joints where it acts, for a joint of large torque hides what happens at the
+    others; and that of the robot, as it comes in.
     """
     worse: list[Name] = []
-    while named:
-        squares, _ = held_squares(here.problem, here.start, joint.causes, here.whitening)
-        falls, places = [a - b for a, b in pairwise(squares)], [list(f.joints) for f in named]
-        whole = [fall.sum() for fall in falls]
+    while True:
+        order, squares, power = _by_gain(here, joint.causes)
+        falls, places = [a - b for a, b in pairwise(squares)], [list(named[k].joints) for k in order]
         own = [f[at].sum() / a[at].sum() for at, f, a in zip(places, falls, squares, strict=False)]
-        if min(own) > 0 and sum(whole) >= 0:
-            break
-        least = int(np.argmin(own if min(own) <= 0 else whole))
+        whole = [f.sum() for f in falls]
+        if not named or (min(own) > 0 and min(whole) > 0):
+            gains = [float(np.sqrt(s.sum() / power.sum())) for s in squares]
+            return _Gaining(named, joint, order, gains, worse)
+        least = order[int(np.argmin(own if min(own) <= 0 else whole))]
         worse.append(named[least].name)
         named = [f for k, f in enumerate(named) if k != least]
         joint = polished(here.problem, here.start, [f.effect for f in named], here.whitening)
-    return named, joint, worse
+
+
+def _by_gain(
+    here: _Setting, causes: Sequence[Effect]
+) -> tuple[list[int], list[Float[np.ndarray, " nv"]], Float[np.ndarray, " nv"]]:
+    """The order of what each cause gains on held-out data as it comes in; squares of the error, and of the torque."""
+    order = list(range(len(causes)))
+    squares, power = held_squares(here.problem, here.start, list(causes), here.whitening)
+    drops = [float((before - after).sum()) for before, after in pairwise(squares)]
+    ranked = sorted(order, key=lambda k: -drops[k])
+    if ranked != order:
+        squares, power = held_squares(here.problem, here.start, [causes[k] for k in ranked], here.whitening)
+    return ranked, squares, power
 
 
 def _left(
@@ -261,10 +318,10 @@ def _left(
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:
     here, seen = judged.here, stand(searched.problem, searched.start, searched.whitening)
-    problem, model, last = here.problem, here.problem.model, judged.joint.step
+    named, joint, order, gains, _ = judged.causes
+    problem, model, last = here.problem, here.problem.model, joint.step
     first = stand(problem, here.start, here.whitening)
-    order, gains = _by_gain(here, judged)
-    found, joint = [judged.found[k] for k in order], judged.joint
+    found = [named[k] for k in order]
     causes = [joint.causes[k] for k in order]
     noise = noise_rms(problem, here.spectrum)
     return Diagnosis(
@@ -289,24 +346,13 @@ def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judg
         holdout_scheme=_scheme(signals),
         experiment=next_experiment(judged.word, found, problem, here.start, causes, here.whitening),
         candidates=explain(seen.rows, seen.linear, search.screened, noise),
-        traces=traces(problem, signals, first.state, last.state, joint.causes, judged.found),
+        traces=traces(problem, signals, first.state, last.state, joint.causes, named),
         baseline=fitted_model(problem, first.state, []),
         model=fitted_model(problem, last.state, joint.causes),
         rest=judged.rest,
         notes=_notes(signals, here),
         prismatic=prismatic(model),
     )
-
-
-def _by_gain(here: _Setting, judged: _Judged) -> tuple[list[int], list[float]]:
-    """The causes in the order of what each gains on held-out data as it comes in; the error before and after each."""
-    causes, order = judged.joint.causes, list(range(len(judged.found)))
-    gains = held_out(here.problem, here.start, causes, here.whitening)
-    drops = [before - after for before, after in pairwise(gains)]
-    ranked = sorted(order, key=lambda k: -drops[k])
-    if ranked != order:
-        gains = held_out(here.problem, here.start, [causes[k] for k in ranked], here.whitening)
-    return ranked, gains
 
 
 def _baseline_effects(model: RobotModel, known: Baseline | None) -> tuple[list[str], list[Effect]]:

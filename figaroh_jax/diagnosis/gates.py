@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..effects.base import Effect, Parameter
-from ..effects.catalogue import related
+from ..effects.catalogue import find, related
 from ..results import Name
 from .comparison import overlap, t_value
 from .contenders import Contender
@@ -30,7 +30,10 @@ def exists(problem: Problem, effect: Effect) -> bool:
         return False
     if not all(_within(effect.parameters()[name], value) for name, value in values.items()):
         return False
-    forces = [abs(values[n]) for n, p in effect.parameters().items() if p.linear and p.unit == "N m"]
+    # an offset beside a stiffness is where the spring would rest: the two together are the torque
+    shared = {name for inside in type(effect).contains for name in find(inside).parameters()}
+    own = {n: p for n, p in effect.parameters().items() if p.linear and n not in shared}
+    forces = [abs(values[n]) for n, p in own.items() if p.unit == "N m"]
     if effect.acts_on != "joint" or not forces:
         return True
     return max(forces) <= np.sqrt((problem.torque[..., int(effect.at[0])] ** 2).mean())

@@ -20,23 +20,17 @@ from .shifts import torque_change
 from .state import State, batched, extended_state
 from .step import Step, stand
 
-__all__ = ["fold_error", "held_out", "held_squares", "part_error", "predicted", "residual_rms", "traces"]
-
-
-def held_out(problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> list[float]:
-    """Relative RMS error on data not fitted: of the baseline, then after each cause (filtered torque, all joints).
-
-    sqrt(sum e^2 / sum tau^2) over the holdout recordings with torque; without any, over the folds, each predicted by
-    a fit to the others.
-    """
-    squares, power = held_squares(problem, start, causes, whitening)
-    return [float(np.sqrt(own.sum() / power.sum())) for own in squares]
+__all__ = ["fold_error", "held_squares", "part_error", "predicted", "residual_rms", "traces"]
 
 
 def held_squares(
     problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]
 ) -> tuple[list[Float[np.ndarray, " nv"]], Float[np.ndarray, " nv"]]:
-    """Squares of each joint's error on data not fitted, as `held_out` takes them, and of its torque."""
+    """Squares of each joint's error on data not fitted, of the baseline, then after each cause; and of its torque.
+
+    Of the filtered torque (N m or N), over the holdout recordings with torque; without any, over parts of the others,
+    each predicted by a fit to the rest.
+    """
     out, step = [], None
     mask = problem.held if problem.held.any() else np.asarray(problem.records.judged)
     for effect in [None, *causes]:

@@ -73,16 +73,23 @@ def find_causes(
     alpha: float,
     progress: Callable[[str, float], None] = lambda phase, share: None,
     generator: np.random.Generator | None = None,
+    after: Search | None = None,
 ) -> Search:
     """Accept the best cause until none passes the gates, or until noise explains what the catalogue still scores.
+
+    `after` is a search with more of the catalogue forbidden, which this one takes up where it ended.
 
     A sensor that is late or that winds up rounds the reversals of dry friction, so that their width is fitted anew
     once such a cause is in: the old one would be made up for by a friction that is not there.
     """
     generator = generator or np.random.default_rng(0)
-    step, found = stand(problem, state, whitening), []
+    if after is None:
+        step, found, p_values, screens = stand(problem, state, whitening), [], [], []
+    else:
+        problem, step, found = after.problem, after.step, list(after.found)
+        p_values, screens = [after.p_value], [after.screened]
     null = Null(problem, spectrum, whitening, generator)
-    p_values, screens, screened, groups = [], [], None, None
+    screened, groups = None, None
     failed: dict[Name, float] = {}  # share of its joints' squares that a candidate scored when it last failed
     while len(found) < MOST_CAUSES:
         progress("screening the catalogue", len(found) / MOST_CAUSES)

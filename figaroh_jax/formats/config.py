@@ -33,15 +33,19 @@ __all__ = [
     "BaselineEffect",
     "Bound",
     "Diagnose",
+    "Excite",
     "Identify",
     "JointDrive",
     "Limits",
     "Load",
     "Measurement",
+    "MotionBasis",
+    "MotionLimits",
     "Preprocess",
     "RecordingEntry",
     "Robot",
     "Rollouts",
+    "SizedEffect",
     "Task",
     "Transmission",
     "Units",
@@ -350,11 +354,85 @@ class Identify(_Keys):
     infeasible: Literal["refuse", "write"] = "refuse"  # whether `model/` is written with links that cannot exist
 
 
+class MotionBasis(_Keys):
+    """What designed motions are made of: exactly one of the three."""
+
+    fourier: Annotated[int, Field(ge=2)] | None = None  # harmonics
+    base: Positive | None = None  # Hz of the first harmonic; None: one period a motion
+    spline: Annotated[int, Field(ge=2)] | None = None  # free control points
+    quintic: Annotated[int, Field(ge=2)] | None = None  # waypoints, the start among them
+
+    @model_validator(mode="after")
+    def _one(self) -> MotionBasis:
+        given = [name for name in ("fourier", "spline", "quintic") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"expected exactly one of fourier, spline, quintic; given: {', '.join(given) or 'none'}")
+        if self.base is not None and self.fourier is None:
+            raise ValueError("base is the first frequency of a Fourier series; it goes with fourier alone")
+        return self
+
+
+class MotionLimits(_Keys):
+    """What a designed motion may use: `model` is what the robot's file says, a number or a map by joint replaces it."""
+
+    position: Literal["model"] | Positive | dict[str, Positive | tuple[Number, Number]] = "model"  # rad or m
+    velocity: Literal["model"] | Positive | dict[str, Positive] = "model"
+    acceleration: Positive | dict[str, Positive] | None = None  # rad/s^2 or m/s^2; None: no limit
+    torque: Literal["model"] | Positive | dict[str, Positive] = "model"  # N m or N
+    clearance: Positive | None = None  # m
+
+    @field_validator("clearance")
+    @classmethod
+    def _no_distances(cls, value: float | None) -> float | None:
+        if value is not None:
+            raise ValueError(
+                "distances between bodies are not looked at by this version; leave it out, narrow limits.position to"
+                " where the robot is clear, and check the trajectory in your simulator before it is run"
+            )
+        return value
+
+
+class SizedEffect(_Keys):
+    """A cause that is to be told from another, and how large it is taken to be."""
+
+    effect: Effect
+    at: tuple[str, ...] = ()
+    size: dict[str, Number] = {}  # its parameters; by default as large as twice the noise
+
+
+class Excite(_Keys):
+    """What `excite` designs."""
+
+    kind: Literal["trajectory", "postures"] = "trajectory"
+    duration: Positive = 10.0  # s of each trajectory
+    trajectories: Annotated[int, Field(ge=1, le=50)] = 1
+    basis: MotionBasis = MotionBasis(fourier=5)
+    limits: MotionLimits = MotionLimits()
+    objective: Literal["information", "prediction", "condition", "separate"] = "information"
+    predict: tuple[Path, ...] = ()  # motions that matter
+    separate: tuple[tuple[SizedEffect, SizedEffect], ...] = ()
+    noise: Positive | dict[str, Positive] | None = None  # share of the largest torque; None: of the recordings, or 0.01
+    start: tuple[Number, ...] | None = None  # posture at the beginning, rad or m; None: chosen
+    starts: Annotated[int, Field(ge=1, le=1000)] = 4  # random motions that are improved
+    rate: Positive = 20.0  # Hz of a design's samples, whose noise is independent
+    postures: Annotated[int, Field(ge=2, le=1000)] = 30
+    candidates: Annotated[int, Field(ge=10, le=100_000)] = 500  # random postures to choose from
+    measurement: Measurement | None = None  # of postures: the device; None: that of the recordings
+
+    @model_validator(mode="after")
+    def _complete(self) -> Excite:
+        if self.objective == "prediction" and not self.predict:
+            raise ValueError("objective: prediction needs `predict`, the motions that matter")
+        if self.objective == "separate" and not self.separate:
+            raise ValueError("objective: separate needs `separate`, pairs of causes that are to be told apart")
+        return self
+
+
 class Task(_Keys):
     """A whole task file."""
 
     robot: Robot
-    data: tuple[RecordingEntry, ...]
+    data: tuple[RecordingEntry, ...] = ()  # needed by all but `excite`
     transmission: Transmission | None = None
     preprocess: Preprocess = Preprocess()
     baseline: Baseline = Baseline()
@@ -362,12 +440,20 @@ class Task(_Keys):
     rollout: Rollouts = Rollouts()
     diagnose: Diagnose = Diagnose()
     identify: Identify = Identify()
+    excite: Excite | None = None
     _file: Path = PrivateAttr(default=Path("task"))
 
     @property
     def file(self) -> Path:
         """The file that the task was read from."""
         return self._file
+
+    @model_validator(mode="before")
+    @classmethod
+    def _data_or_excite(cls, value: Any) -> Any:
+        if isinstance(value, dict) and "data" not in value and not value.get("excite"):
+            raise ValueError("data is missing")
+        return value
 
     @field_validator("data")
     @classmethod

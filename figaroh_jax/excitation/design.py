@@ -1,0 +1,328 @@
+"""Designs of motions: from several starts, one motion after another, within limits that are checked at 1 kHz."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from ..effects.base import Effect
+from ..effects.extended import ExtendedModel
+from ..errors import InputError
+from ..rigid.model import RobotModel
+from .information import Learned, learn
+from .limits import ALLOWED, Limits, Torque, Use, checked, limits_of, unmeetable
+from .motions import Basis, Trajectory
+from .objectives import condition_objective, information_objective, prediction_objective, smooth_condition_objective
+from .sampling import Sampler
+from .separation import Causes, Separated, causes, separated, separation_objective
+from .solvers import GramObjective, Problem, solve
+
+__all__ = ["Design", "Stage", "best_motion", "excite", "random_motion"]
+
+TIGHTENED = 3  # times that a motion is designed again with a margin
+CHECKED = 8  # motions, the best first, until one is feasible at 1 kHz
+ROUNDING = 1e-6  # of a limit
+STEP = 0.98  # by which a motion is made smaller until it meets its limits
+
+Objective = Literal["information", "prediction", "condition", "separate"]
+Cause = tuple[str, Sequence[str], Mapping[str, float]]  # effect, place, sizes
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One motion of a design."""
+
+    motion: Trajectory
+    uses: tuple[Use, ...]  # of each limit at 1 kHz
+    logdet: float  # of the information of this motion, all before it, and the prior
+    starts: tuple[float, ...]  # objective that each start reached
+    evaluations: int
+
+    @property
+    def met(self) -> bool:
+        """Whether every limit is met at 1 kHz, within a thousandth."""
+        return all(use.share <= 1.0 + ALLOWED for use in self.uses)
+
+
+@dataclass(frozen=True)
+class Design:
+    """Motions designed one after another, and what they tell."""
+
+    learned: Learned
+    limits: Limits
+    objective: str
+    rate: float  # Hz at which the noise is independent
+    stages: tuple[Stage, ...]
+    information: Float[np.ndarray, "rank rank"]  # of all motions and the prior
+    condition: float  # of the weighted rows of all motions
+    scaled_condition: float  # the same with columns of length one
+    separated: tuple[Separated, ...] = ()  # causes told apart by all motions together
+    notes: tuple[str, ...] = ()
+
+    @property
+    def logdet(self) -> float:
+        """Log determinant of the information of all motions and the prior."""
+        return float(np.linalg.slogdet(self.information)[1])
+
+    @property
+    def std(self) -> Float[np.ndarray, " rank"]:
+        """Standard deviation of each base parameter to be expected after the motions."""
+        return np.sqrt(np.diag(np.linalg.inv(self.information)))
+
+    @property
+    def std_before(self) -> Float[np.ndarray, " rank"]:
+        """The same before any motion; infinite where nothing is known."""
+        prior = np.asarray(self.learned.prior)
+        size = np.sqrt(np.diag(prior))
+        if not (size > 0).all() or np.linalg.cond(prior / np.outer(size, size)) > 1e14:
+            return np.full(len(prior), np.inf)
+        return np.sqrt(np.diag(np.linalg.inv(prior / np.outer(size, size)))) / size
+
+    @property
+    def met(self) -> bool:
+        """Whether every limit is met at 1 kHz by every motion."""
+        return all(stage.met for stage in self.stages)
+
+
+def excite(
+    model: RobotModel | ExtendedModel,
+    basis: Basis,
+    limits: Limits | None = None,
+    learned: Learned | None = None,
+    *,
+    objective: Objective | GramObjective = "information",
+    predict: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]] = (),
+    separate: Sequence[tuple[Cause, Cause]] = (),
+    trust: float = 0.10,
+    trajectories: int = 1,
+    start: Sequence[float] | None = None,
+    starts: int = 4,
+    rate: float = 20.0,
+    seed: int = 0,
+    progress: Progress = lambda phase, share: None,
+) -> Design:
+    """Motions of `basis` that tell most about what is to be learned, each given those before it.
+
+    `limits` and `learned` None: as `limits_of` and `learn` have them of the model. `objective` "information" makes the
+    log determinant large, "prediction" the error on the motions `predict` (arrays q, v, a) small, "condition" the
+    condition number of the weighted rows, "separate" the pairs of causes `separate` easy to tell apart (`trust` is then
+    the relative sigma of a link that is a cause); or a function of the Gram matrix (`solvers.GramObjective`).
+    `start` is the posture at the beginning (rad or m; None: chosen), `starts` how many random motions are improved,
+    `rate` (Hz) the samples of a design, whose noise is independent. Raises `InputError` where no motion meets the
+    limits, the start is outside of them, or `predict` is needed and empty.
+    """
+    robot = model.robot if isinstance(model, ExtendedModel) else model
+    limits = limits_of(robot) if limits is None else limits
+    learned = learn(model) if learned is None else learned
+    begin = None if start is None else _inside(robot, np.asarray(start, float), limits)
+    sampler = Sampler(robot, learned.terms, np.asarray(learned.width))
+    torque = torque_of(model, learned, sampler)
+    problem = unmeetable(torque, robot, limits)
+    if problem is not None:
+        raise InputError(problem)
+    with jax.enable_x64(True):
+        wanted = _wanted(learned, sampler, predict) if objective == "prediction" else None
+        stages: list[Stage] = []
+        before = learned
+        given = None
+        if separate:
+            given = causes(learned, separate, _typical(learned, sampler, basis, limits, begin, rate), trust)
+        elif objective == "separate":
+            raise InputError("objective: separate needs pairs of causes (`separate`)")
+        seen = None if given is None else np.zeros((len(given.columns),) * 2)
+        for k in range(trajectories):
+            own = _objectives(objective, np.asarray(before.prior), wanted, given, seen)
+            generator = np.random.default_rng([seed, k])
+
+            def told(share: float, k: int = k) -> None:
+                progress(f"trajectory {k + 1} of {trajectories}", (k + share) / trajectories)
+
+            rows = (given.sampler, given.columns) if given is not None and objective == "separate" else (sampler, None)
+            stage = best_motion(torque, before, rows, own, basis, limits, begin, starts, rate, generator, told)
+            if given is not None and seen is not None:
+                seen = seen + gram_of(before, given.sampler, stage.motion.states(rate), given.columns)
+            before = before.with_prior(gram_of(before, sampler, stage.motion.states(rate)))
+            stages.append(replace(stage, logdet=float(np.linalg.slogdet(np.asarray(before.prior))[1])))
+        gram = np.asarray(before.prior) - np.asarray(learned.prior)
+        size = np.sqrt(np.diag(gram))
+        return Design(
+            learned=learned,
+            limits=limits,
+            objective=objective if isinstance(objective, str) else "own",
+            rate=rate,
+            stages=tuple(stages),
+            information=np.asarray(before.prior),
+            condition=float(np.sqrt(np.linalg.cond(gram))),
+            scaled_condition=float(np.sqrt(np.linalg.cond(gram / np.outer(size, size)))),
+            separated=() if given is None or seen is None else separated(given, seen, np.asarray(learned.prior)),
+        )
+
+
+def gram_of(
+    learned: Learned, sampler: Sampler, states: Any, columns: np.ndarray | None = None
+) -> Float[np.ndarray, "n n"]:
+    """Gram matrix of weighted rows: of the base parameters, their information; `columns` names others."""
+    kept = np.array(learned.independent) if columns is None else columns
+    rows = sampler.rows(np.stack([np.asarray(x) for x in states]))[:, kept]
+    own = rows * np.sqrt(np.asarray(learned.weight))[:, None, None]
+    flat = own.swapaxes(0, 1).reshape(own.shape[1], -1)
+    return flat @ flat.T
+
+
+def torque_of(model: RobotModel | ExtendedModel, learned: Learned, sampler: Sampler) -> Torque:
+    """Torques of states: by the sampler's programs where they know all effects of the model, else by the model."""
+    theta = np.asarray(learned.theta)
+    if isinstance(model, ExtendedModel) and any(not _among(effect, learned.terms) for effect in model.effects):
+        return lambda states: np.asarray(model.inverse_dynamics(*states))
+    return lambda states: sampler.torque(states, theta)
+
+
+def _among(effect: Effect, terms: Sequence[Effect]) -> bool:
+    same = (at for term in terms if type(term) is type(effect) for at in np.asarray(term.at))
+    return any(np.array_equal(np.asarray(effect.at), at) for at in same)
+
+
+def _typical(
+    learned: Learned, sampler: Sampler, basis: Basis, limits: Limits, start: np.ndarray | None, rate: float
+) -> Float[np.ndarray, "3 samples nv"]:
+    """States of a random motion within the limits."""
+    kept = np.array(learned.independent)
+    objective = information_objective(np.asarray(learned.prior))
+    problem = Problem(learned, sampler, objective, kept, basis, limits, start, rate)
+    return problem.states(random_motion(problem, np.random.default_rng(0)))
+
+
+def _inside(robot: RobotModel, start: np.ndarray, limits: Limits) -> np.ndarray:
+    if start.shape != (robot.nv,):
+        raise InputError(f"start: {start.size} numbers for the {robot.nv} joints {', '.join(robot.dof_names)}")
+    for name, x, (low, high) in zip(robot.dof_names, start, limits.position, strict=True):
+        if not low <= x <= high:
+            raise InputError(f"start: '{name}' at {x:g} is outside of its limits {low:g} to {high:g}")
+    return start
+
+
+def _wanted(
+    learned: Learned, sampler: Sampler, predict: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
+) -> np.ndarray:
+    """Mean Gram matrix of the motions that are to be predicted."""
+    if not predict:
+        raise InputError("objective: prediction needs the motions that matter (`predict`)")
+    return np.sum([gram_of(learned, sampler, motion) / len(motion[0]) for motion in predict], axis=0) / len(predict)
+
+
+def _objectives(
+    objective: Objective | GramObjective,
+    prior: np.ndarray,
+    wanted: np.ndarray | None,
+    given: Causes | None,
+    seen: np.ndarray | None,
+) -> tuple[GramObjective, ...]:
+    """One after another; all but the last are steps on the way."""
+    if callable(objective):
+        return (objective,)
+    if objective == "information":
+        return (information_objective(prior),)
+    if objective == "prediction":
+        assert wanted is not None
+        return (prediction_objective(prior, wanted),)
+    if objective == "separate":
+        assert given is not None and seen is not None
+        own = separation_objective(given, np.asarray(given.prior))
+        return (lambda G: own(G + seen),)
+    return smooth_condition_objective(), condition_objective()
+
+
+def random_motion(problem: Problem, generator: np.random.Generator, amplitude: float = 0.9) -> Float[np.ndarray, " n"]:
+    """Numbers of a random motion that keeps its limits of position, velocity and acceleration."""
+    limits, nv = problem.limits, problem.nv
+    reach = np.where(np.isfinite(limits.reach), limits.reach, np.pi)
+    start = problem.start
+    if start is None:
+        start = limits.middle + 0.5 * reach * generator.uniform(-1, 1, nv)
+    weights = generator.standard_normal((nv, problem.basis.size))
+    motion = Trajectory(start, weights, problem.basis)
+    x = problem.numbers(motion)
+    still = problem.shares(problem.numbers(Trajectory(start, 0 * weights, problem.basis)))
+    shares = problem.shares(x)
+    scale = np.full(nv, np.inf)
+    for kind, share in shares.items():
+        moved = share - still[kind]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            room = np.where(moved > 0, 1 - still[kind], 1 + still[kind]) / np.abs(moved)
+        scale = np.minimum(scale, np.nanmin(np.where(np.abs(moved) > 0, room, np.inf), axis=0))
+    scale = np.where(np.isfinite(scale), scale, 1.0)
+    return problem.numbers(Trajectory(start, weights * (amplitude * scale)[:, None], problem.basis))
+
+
+def best_motion(
+    torque: Torque,
+    learned: Learned,
+    rows: tuple[Sampler, np.ndarray | None],
+    objectives: Sequence[GramObjective],
+    basis: Basis,
+    limits: Limits,
+    start: np.ndarray | None,
+    starts: int,
+    rate: float,
+    generator: np.random.Generator,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Stage:
+    """The best of several random motions after each was improved; feasible at 1 kHz where that is possible at all."""
+    sampler, columns = rows
+    columns = np.array(learned.independent) if columns is None else columns
+    problems = [Problem(learned, sampler, one, columns, basis, limits, start, rate) for one in objectives]
+    final = problems[-1]
+    found: list[tuple[float, np.ndarray]] = []
+    for k in range(starts):
+        progress(k / starts)
+        x = random_motion(final, generator)
+        for problem in problems:
+            x = solve(problem, x)
+        found.append((final.value(x), x))
+    reached = tuple(value for value, _ in found)
+    tried: list[tuple[bool, float, Trajectory, tuple[Use, ...]]] = []
+    for _, x in sorted(found, key=lambda one: one[0])[:CHECKED]:
+        motion, uses = _feasible(torque, final, x)
+        met = all(use.share <= 1.0 + ALLOWED for use in uses)
+        tried.append((not met, final.value(final.numbers(motion)), motion, uses))
+        if met:
+            break
+    _, _, motion, uses = min(tried, key=lambda one: one[:2])
+    return Stage(motion, uses, np.nan, reached, sum(problem.evaluations for problem in problems))
+
+
+def _feasible(torque: Torque, problem: Problem, x: Float[np.ndarray, " n"]) -> tuple[Trajectory, tuple[Use, ...]]:
+    """The motion of x, designed again with margins for what it exceeds at 1 kHz, at last made a little smaller."""
+    margin: dict[str, float] = {}
+    motion = problem.trajectory(x)
+    uses = checked(torque, problem.learned.robot, motion, problem.limits)
+    for _ in range(TIGHTENED):
+        over = {use.kind: use.share - 1.0 for use in uses if use.share > 1.0}
+        if max(over.values(), default=0.0) < ALLOWED:
+            break
+        margin = {kind: margin.get(kind, 0.0) + 1.2 * over.get(kind, 0.0) for kind in {*margin, *over}}
+        motion = problem.trajectory(solve(problem, problem.numbers(motion), margin))
+        uses = checked(torque, problem.learned.robot, motion, problem.limits)
+    return _smaller(torque, problem, motion, uses)
+
+
+def _smaller(
+    torque: Torque, problem: Problem, motion: Trajectory, uses: tuple[Use, ...]
+) -> tuple[Trajectory, tuple[Use, ...]]:
+    """The motion shrunk towards its start until it meets its limits; as it was where standing still does not either."""
+    first, limits = (motion, uses), problem.limits
+    start = np.clip(motion.start, limits.position[:, 0], limits.position[:, 1])
+    for _ in range(100):
+        worst = max((use.share for use in uses), default=0.0)
+        if worst <= 1.0 + ROUNDING:
+            return motion, uses
+        shrink = max(STEP, 1.0 / worst) if worst < 1.02 else STEP
+        motion = Trajectory(start, np.asarray(motion.weights) * shrink, motion.basis)
+        uses = checked(torque, problem.learned.robot, motion, limits)
+    return first

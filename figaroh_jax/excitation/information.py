@@ -1,0 +1,197 @@
+"""What a motion tells about a robot: the information on its base parameters and friction, and what follows from it.
+
+The rows are those that identification fits: the regressor of the rigid body and the columns of the friction, divided by
+the noise of each joint. All here are functions of the parameters of a motion for `jit`, `grad` and `vmap`; `learn`,
+which chooses what is to be learned, works on the host.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..compiled.batching import program
+from ..compiled.precision import in_float64
+from ..effects.base import Effect
+from ..effects.extended import ExtendedModel, require_single_axes
+from ..errors import InputError, nearest
+from ..estimation.base_parameters import base_parameters
+from ..estimation.columns import column_names, friction_terms, random_states
+from ..estimation.priors import rigid_prior
+from ..rigid.dynamics import inverse_dynamics
+from ..rigid.model import Leaf, RobotModel
+from ..rigid.regressor import joint_torque_regressor
+from .motions import Trajectory
+from .sampling import Sampler, term_blocks
+
+if TYPE_CHECKING:
+    from ..formats.config import Baseline
+
+__all__ = ["Learned", "condition", "expected_std", "information", "information_matrix", "learn"]
+
+SMOOTH = 0.03  # rad/s or m/s: half width of dry friction's reversal, so that its columns have a gradient
+UNKNOWN_DRIVE = 1e-6  # precision of what nothing is known of, 1/(N m)^2 and the like
+
+States = tuple[Any, Any, Any]
+
+
+class Learned(eqx.Module):
+    """What is to be learned of a robot, how noisy its torques are, and what is known before."""
+
+    robot: RobotModel
+    terms: tuple[Effect, ...]  # friction and the like, with a leading axis of their joints
+    weight: Float[Leaf, " nv"]  # inverse variance of a sample of each joint's torque
+    prior: Float[Leaf, "rank rank"]  # information before any motion
+    width: Float[Leaf, " nv"]  # half width of dry friction's reversal, rad/s or m/s
+    theta: Float[Leaf, " columns"]  # what the torques of the model as it stands follow from
+    names: tuple[str, ...] = eqx.field(static=True)  # of all columns
+    independent: tuple[int, ...] = eqx.field(static=True)  # the columns that are kept
+    expressions: tuple[str, ...] = eqx.field(static=True)  # base parameters in names
+
+    @property
+    def rank(self) -> int:
+        """Number of base parameters, friction with them."""
+        return len(self.independent)
+
+    def with_prior(self, information: Float[Leaf, "rank rank"]) -> Learned:
+        """The same after an experiment of this information."""
+        return eqx.tree_at(lambda one: one.prior, self, self.prior + information)
+
+
+def learn(
+    model: RobotModel | ExtendedModel,
+    known: Baseline | None = None,
+    *,
+    noise: float | Mapping[str, float] = 0.01,
+    sigma: Sequence[float] | np.ndarray | None = None,
+    trust: float | None = 0.10,
+    order: Sequence[int] | None = None,
+    width: float = SMOOTH,
+) -> Learned:
+    """Base parameters of the robot and of its friction, weighted by the noise of the torques.
+
+    `known` says which friction there is (default: viscous and Coulomb); `noise` is one sigma of a sample, as a share of
+    each joint's largest torque (`effort_limit` of the model, or what typical motions take where it has none), `sigma`
+    the same in N m or N; `trust` how far the nominal inertials are believed (relative one sigma), None for not at all;
+    `order` prefers columns in the choice of base parameters. Raises `InputError` for a robot with joints of several
+    degrees of freedom and for joints that are not there.
+    """
+    from ..formats.config import Baseline
+
+    robot, effects = (model.robot, model.effects) if isinstance(model, ExtendedModel) else (model, ())
+    require_single_axes(robot, "a motion that is designed")
+    terms = friction_terms(robot, known or Baseline())
+    names = column_names(robot, terms)
+    sampler = Sampler(robot, terms, np.full(robot.nv, width))
+    samples = max(64, 4 * len(names) // robot.nv)
+    structure = sampler.rows(np.stack(random_states(robot, samples)))  # what any motion at all could show
+    base = base_parameters(structure.swapaxes(1, 2).reshape(-1, len(names)), names, order)
+    own = 10 * len(robot.joints)
+    scale = _sigmas(robot, noise) if sigma is None else np.asarray(sigma, float)
+    if scale.shape != (robot.nv,) or not (scale > 0).all():
+        raise InputError(f"noise: {robot.nv} standard deviations above zero are needed, one for each joint")
+    prior = np.zeros((base.rank, base.rank))
+    if trust is not None:
+        precision = np.append(rigid_prior(robot, trust)[1], np.full(len(names) - own, UNKNOWN_DRIVE))
+        prior = np.linalg.inv((base.matrix / precision) @ base.matrix.T)
+    return Learned(
+        robot=robot,
+        terms=terms,
+        weight=1 / scale**2,
+        prior=(prior + prior.T) / 2,
+        width=np.full(robot.nv, width),
+        theta=np.append(np.asarray(robot.inertia, float).ravel(), _drives(terms, effects)),
+        names=names,
+        independent=tuple(base.independent.tolist()),
+        expressions=base.expressions,
+    )
+
+
+def _sigmas(robot: RobotModel, noise: float | Mapping[str, float]) -> Float[np.ndarray, " nv"]:
+    """One sigma of each joint's torque, N m or N."""
+    largest = np.array(robot.effort_limit, float)
+    if not (np.isfinite(largest) & (largest > 0)).all():
+        typical = np.abs(np.asarray(inverse_dynamics(robot, *random_states(robot, 256)))).max(axis=0)
+        largest = np.where(np.isfinite(largest) & (largest > 0), largest, typical)
+    if not isinstance(noise, Mapping):
+        return float(noise) * largest
+    for name in noise:
+        if name not in robot.dof_names:
+            raise InputError(f"noise: no moving joint '{name}'{nearest(name, robot.dof_names)}")
+    missing = [name for name in robot.dof_names if name not in noise]
+    if missing:
+        raise InputError(f"noise: {', '.join(missing)} missing; give each joint's, or one number for all")
+    return np.array([noise[name] for name in robot.dof_names]) * largest
+
+
+def _drives(terms: Sequence[Effect], effects: Sequence[Effect]) -> Float[np.ndarray, " drives"]:
+    """Amplitudes that the model's own effects give the columns of `terms`; zero where it has none."""
+    values: list[float] = []
+    for term in terms:
+        for at in np.asarray(term.at):
+            same = [e for e in effects if type(e) is type(term) and np.array_equal(np.asarray(e.at), at)]
+            linear = [name for name, parameter in term.parameters().items() if parameter.linear]
+            values += [sum(float(getattr(e, name)) for e in same) for name in linear]
+    return np.array(values)
+
+
+def _states(motion: Trajectory | States, rate: float) -> States:
+    return motion.states(rate) if isinstance(motion, Trajectory) else motion
+
+
+@in_float64
+def information_matrix(learned: Learned, motion: Trajectory | States, rate: float = 20.0) -> Float[Array, "rank rank"]:
+    """Information on the base parameters: of the motion, sampled at `rate` (Hz) with independent noise, and before it.
+
+    `motion` is a `Trajectory`, or its arrays q, v, a of shape (samples, nv).
+    """
+    return _gram(learned, *(jnp.asarray(x) for x in _states(motion, rate))) + jnp.asarray(learned.prior)
+
+
+@program
+def _gram(
+    learned: Learned, q: Float[Array, "samples nv"], v: Float[Array, "samples nv"], a: Float[Array, "samples nv"]
+) -> Float[Array, "rank rank"]:
+    W = jnp.concatenate(
+        [
+            joint_torque_regressor(learned.robot, q, v, a),
+            *term_blocks(learned.robot, learned.terms, learned.width, q, v, a),
+        ],
+        axis=2,
+    )[:, :, np.array(learned.independent)]
+    return jnp.einsum("sjk,j,sjl->kl", W, jnp.asarray(learned.weight), W)
+
+
+@in_float64
+def information(
+    model: RobotModel, motion: Trajectory | States, learned: Learned | None = None, rate: float = 20.0
+) -> Float[Array, ""]:
+    """Log determinant of the information on the base parameters and friction: what a design makes as large as it can.
+
+    A pure function of the parameters of the motion. An increase by 1 makes the geometric mean of the standard
+    deviations smaller by the factor exp(-1 / (2 rank)). `learned` None: as `learn(model)` has it, which needs a model
+    that is not being traced.
+    """
+    matrix = information_matrix(learn(model) if learned is None else learned, motion, rate)
+    return 2.0 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(matrix))))
+
+
+@in_float64
+def condition(learned: Learned, motion: Trajectory | States, rate: float = 20.0) -> Float[Array, ""]:
+    """Condition number of the weighted rows of the base parameters, without the prior.
+
+    It hangs on units and on which columns were kept: good for comparison with others, not as an objective.
+    """
+    values = jnp.linalg.eigvalsh(_gram(learned, *(jnp.asarray(x) for x in _states(motion, rate))))
+    return jnp.sqrt(values[-1] / values[0])
+
+
+@in_float64
+def expected_std(learned: Learned, motion: Trajectory | States, rate: float = 20.0) -> Float[Array, " rank"]:
+    """Standard deviation of each base parameter (its unit) after a fit to the motion and to what was known before."""
+    return jnp.sqrt(jnp.diagonal(jnp.linalg.inv(information_matrix(learned, motion, rate))))

@@ -1,0 +1,380 @@
+r"""Postures that calibrate best: D-optimal among candidates, then better ones between them, with a certified bound.
+
+A posture i tells $M_i = J_i' W J_i$ of the parameters, with J the Jacobian that `calibrate` fits with. Chosen one by
+one (greedy), then one exchanged for another as long as $\log\det \sum M_i$ grows (Fedorov 1972), then moved within the
+joint limits along the slope of the exact Jacobians. No choice of n candidates can be better than
+$f(w) + \sum_{n \text{ largest}} g_i - p$ with $f(w) = \log\det \sum w_i M_i, \; g_i = \mathrm{tr}(M_i M(w)^{-1})$, for
+any weights $0 \le w_i \le 1$ that add up to n: f is concave, and that is its tangent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..calibration import posefit
+from ..calibration.candidates import geometry_columns
+from ..calibration.gauge import find_gauge
+from ..calibration.posegroups import Measured, assemble, postures_of
+from ..effects.kinematic import Column
+from ..errors import InputError
+from ..recordings.arrays import postures as recorded
+from ..rigid.chain import chain_between
+from ..rigid.kinematics import forward_kinematics
+from ..rigid.model import RobotModel
+
+__all__ = [
+    "Instrument",
+    "PostureDesign",
+    "certified_bound",
+    "choose",
+    "excite_postures",
+    "exchanged",
+    "greedy",
+    "in_order",
+]
+
+MARKER = (0.1, 0.05, 0.08)  # m, of a point in the tool frame, where the task does not say
+ACCURACY = (1e-4, 1e-3)  # m, rad
+STEP = 1e-5  # rad or m, of the differences between exact Jacobians
+PIECE = 128  # postures of a program, few enough to be compiled quickly
+_RIDGE = 1e-9
+_SWEEPS, _ASCENTS, _MOVES = 20, 300, 60
+_GAIN = 1e-9  # of the log determinant, below which nothing is exchanged
+
+Level = Literal["frames", "joint_offset", "full"]
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """What measures the postures: as in the `measurement` of a task."""
+
+    kind: Literal["pose", "position"]
+    base_frame: str
+    tool_frame: str
+    unknown: tuple[str, ...] = ("base_frame", "tool_frame")
+    accuracy: tuple[float, float] = ACCURACY  # one sigma, m and rad
+
+
+class _Parameter(NamedTuple):
+    """A parameter that is calibrated: what, where, unit."""
+
+    name: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class PostureDesign:
+    """Postures in the order in which they are to be measured, and what they tell."""
+
+    model: RobotModel
+    instrument: Instrument
+    position: Float[np.ndarray, "postures nv"]  # rad or m
+    parameters: tuple[_Parameter, ...]  # those that postures can tell
+    std: Float[np.ndarray, " parameters"]  # to be expected, m or rad
+    logdet: float
+    bound: float  # that no choice among the candidates exceeds
+    chosen_logdet: float  # of the choice among the candidates, before the postures were moved
+    random_logdet: float  # median of random choices
+    candidates: int
+    notes: tuple[str, ...] = ()
+
+    @property
+    def efficiency(self) -> float:
+        """exp((logdet - bound) / parameters): 1 is the bound of the candidates, which moved postures may exceed."""
+        return self._share(self.logdet)
+
+    @property
+    def chosen_efficiency(self) -> float:
+        """The same of the choice among the candidates."""
+        return self._share(self.chosen_logdet)
+
+    @property
+    def random_efficiency(self) -> float:
+        """The same of random choices, the median."""
+        return self._share(self.random_logdet)
+
+    def _share(self, logdet: float) -> float:
+        return float(np.exp((logdet - self.bound) / len(self.parameters)))
+
+
+class _Calibrated:
+    """Rows of postures, weighted by the accuracy, in the parameters that postures can tell."""
+
+    def __init__(self, model: RobotModel, instrument: Instrument, level: Level, position: np.ndarray) -> None:
+        self.model, self.instrument = model, instrument
+        chain = sorted(chain_between(model, instrument.base_frame, instrument.tool_frame).joints)
+        every = geometry_columns(model, chain)
+        columns = [c for c in every if level == "full" or (level == "joint_offset" and c.effect == "joint_offset")]
+        self.columns: Sequence[Column] = columns
+        self.measured = self._assembled(np.resize(position, (PIECE, position.shape[1])))
+        names = [_Parameter(c.label, c.unit) for c in columns]
+        names += [_Parameter(name, unit) for name, unit in self.measured.own]
+        self.names = names
+        J = self._jacobian(self.measured.problem)
+        flat = J.reshape(-1, J.shape[2])
+        # the devices' own first: they are estimated at every level
+        order = [*range(len(columns), len(names)), *range(len(columns))]
+        dependent = find_gauge(flat, order).dependent
+        self.kept = np.array([k for k in range(len(names)) if k not in dependent])
+
+    def _assembled(self, position: np.ndarray) -> Measured:
+        seen = self.seen(position)
+        given: dict[str, Any] = {self.instrument.kind: seen, "unknown": self.instrument.unknown}
+        base, tool = self.instrument.base_frame, self.instrument.tool_frame
+        recording = recorded(q=position, base_frame=base, tool_frame=tool, **given)
+        several = (recording,)
+        return assemble(self.model, several, postures_of(self.model, several), self.columns, [1.0] * len(self.columns))
+
+    def seen(self, position: np.ndarray) -> np.ndarray:
+        """What the device sees of the nominal robot: poses, or points of a marker."""
+        model, poses = self.model, np.asarray(forward_kinematics(self.model, position))
+        world = np.concatenate([np.broadcast_to(np.eye(4), (len(position), 1, 4, 4)), poses], axis=1)
+        base, tool = (
+            world[:, model.frames[k].parent + 1] @ np.asarray(model.frame_placement)[k]
+            for k in (model.frame_index(self.instrument.base_frame), model.frame_index(self.instrument.tool_frame))
+        )
+        found = np.linalg.solve(base, tool)
+        if self.instrument.kind == "pose":
+            return found
+        return (found @ np.array([*MARKER, 1.0]))[:, None, :3]
+
+    def rows(self, position: np.ndarray) -> Float[np.ndarray, "postures rows parameters"]:
+        """Weighted Jacobian of each posture, by one program for any number of them."""
+        missing = -len(position) % PIECE
+        full = np.concatenate([position, np.repeat(position[-1:], missing, axis=0)])
+        parts = [self._piece(full[k : k + PIECE]) for k in range(0, len(full), PIECE)]
+        return np.concatenate(parts)[: len(position)][:, :, self.kept]
+
+    def _piece(self, position: Float[np.ndarray, "piece nv"]) -> Float[np.ndarray, "piece rows unknowns"]:
+        (group,) = self.measured.problem.groups
+        seen = self.seen(position)
+        assert not len(group.at), "columns of the geometry are the same in all postures"
+        samples, rows = len(position), np.shape(group.measured)[1]
+        replaced = (position.T, seen, np.ones((samples, rows), bool), np.zeros((0, 6, samples)))
+        fresh = eqx.tree_at(lambda g: (g.position, g.datum, g.measured, g.fields), group, replaced)
+        problem = eqx.tree_at(lambda p: p.groups, self.measured.problem, (fresh,))
+        return self._jacobian(problem)
+
+    def _jacobian(self, problem: posefit.Problem) -> Float[np.ndarray, "postures rows unknowns"]:
+        with jax.enable_x64(True):
+            _, J = posefit.linearise(problem, np.zeros(len(problem.scale)))
+        samples = np.shape(problem.groups[0].position)[1]
+        J = (J / np.asarray(problem.scale))[: samples * np.shape(problem.groups[0].measured)[1]]
+        J = J.reshape(-1, samples, J.shape[1]).swapaxes(0, 1)
+        sigma = np.where(np.arange(J.shape[1]) < 3, *self.instrument.accuracy)
+        return J / sigma[:, None]
+
+
+def excite_postures(
+    model: RobotModel,
+    instrument: Instrument,
+    *,
+    count: int = 30,
+    candidates: int = 500,
+    level: Level = "full",
+    position_limit: Float[np.ndarray, "nv 2"] | None = None,
+    polish: bool = True,
+    seed: int = 0,
+    progress: Callable[[str, float], None] = lambda phase, share: None,
+) -> PostureDesign:
+    """The `count` postures that tell most of a robot's kinematics (`level`) by what the instrument measures.
+
+    Candidates are random within the joint limits (`position_limit`, default the model's; a turn where it has none).
+    Raises `InputError` where frames are not there, and where so few postures cannot tell all that can be told.
+    """
+    limits = np.array(model.position_limit if position_limit is None else position_limit, float)
+    limits = np.where(np.isfinite(limits), limits, [-np.pi, np.pi])
+    generator = np.random.default_rng(seed)
+    q = generator.uniform(limits[:, 0], limits[:, 1], (candidates, model.nv))
+    progress("rows of the candidates", 0.05)
+    calibrated = _Calibrated(model, instrument, level, q)
+    J = calibrated.rows(q)
+    size = np.sqrt((J**2).sum(axis=(0, 1)))  # of a column; the choice does not hang on units
+    rank = len(calibrated.kept)
+    if count * J.shape[1] < rank:
+        least = int(np.ceil(rank / J.shape[1]))
+        raise InputError(
+            f"excite.postures: {count} postures cannot tell {rank} parameters; at least {least} are needed"
+        )
+    if count > candidates:
+        raise InputError(f"excite.candidates: {candidates} candidates for {count} postures; give more than that")
+    scaled = J / size
+    progress("choosing among the candidates", 0.2)
+    chosen = exchanged(scaled, greedy(scaled, count))
+    shift = 2 * float(np.log(size).sum())
+    own = _logdet(scaled[chosen]) + shift
+    progress("certifying", 0.6)
+    bound = max(certified_bound(scaled, count, chosen) + shift, own)
+    randoms = [_logdet(scaled[generator.permutation(candidates)[:count]]) + shift for _ in range(100)]
+    position = q[chosen]
+    if polish:
+        progress("moving the postures", 0.7)
+        position = _moved(calibrated, position, limits, size)
+    final = calibrated.rows(position)
+    position = position[in_order(position, np.asarray(model.velocity_limit, float))]
+    spread = np.linalg.inv(_information(final / size)) / np.outer(size, size)
+    return PostureDesign(
+        model=model,
+        instrument=instrument,
+        position=position,
+        parameters=tuple(calibrated.names[k] for k in calibrated.kept),
+        std=np.sqrt(np.diag(spread)),
+        logdet=_logdet(final / size) + shift,
+        bound=bound,
+        chosen_logdet=own,
+        random_logdet=float(np.median(randoms)),
+        candidates=candidates,
+    )
+
+
+def _information(J: Float[np.ndarray, "postures rows p"]) -> Float[np.ndarray, "p p"]:
+    flat = J.reshape(-1, J.shape[2])
+    return flat.T @ flat
+
+
+def _logdet(J: Float[np.ndarray, "postures rows p"]) -> float:
+    return float(np.linalg.slogdet(_information(J))[1])
+
+
+def greedy(J: Float[np.ndarray, "candidates rows p"], count: int) -> Int[np.ndarray, " count"]:
+    """Candidates one after another, each the one that adds most to the log determinant."""
+    inverse = np.eye(J.shape[2]) / _RIDGE
+    chosen: list[int] = []
+    for _ in range(count):
+        gain = _gains(J, inverse)
+        gain[chosen] = -np.inf
+        chosen.append(int(np.argmax(gain)))
+        inverse = _added(inverse, J[chosen[-1]], 1.0)
+    return np.array(chosen)
+
+
+def _gains(J: Float[np.ndarray, "candidates rows p"], inverse: Float[np.ndarray, "p p"]) -> Float[np.ndarray, " n"]:
+    """What each candidate adds to the log determinant."""
+    middle = (J @ inverse) @ J.swapaxes(1, 2)
+    return np.linalg.slogdet(np.eye(J.shape[1]) + middle)[1]
+
+
+def _added(inverse: np.ndarray, rows: Float[np.ndarray, "rows p"], sign: float) -> Float[np.ndarray, "p p"]:
+    """Inverse of the information with (sign 1) or without (-1) some rows."""
+    V = inverse @ rows.T
+    middle = np.eye(len(rows)) + sign * (rows @ V)
+    return inverse - sign * V @ np.linalg.solve(middle, V.T)
+
+
+def exchanged(
+    J: Float[np.ndarray, "candidates rows p"], chosen: Int[np.ndarray, " count"]
+) -> Int[np.ndarray, " count"]:
+    """Candidates exchanged one for one, each posture in turn for the best of all, until nothing gains."""
+    chosen = np.array(chosen)
+    for _ in range(_SWEEPS):
+        better = False
+        information = _information(J[chosen])
+        inverse = np.linalg.inv(information + _RIDGE * np.eye(len(information)))
+        for k in range(len(chosen)):
+            without = _added(inverse, J[chosen[k]], -1.0)
+            gain = _gains(J, without)
+            before = gain[chosen[k]]
+            gain[np.delete(chosen, k)] = -np.inf
+            best = int(np.argmax(gain))
+            if gain[best] > before + _GAIN:
+                chosen[k], better = best, True
+                inverse = _added(without, J[best], 1.0)
+        if not better:
+            break
+    return chosen
+
+
+def certified_bound(
+    J: Float[np.ndarray, "candidates rows p"], count: int, chosen: Int[np.ndarray, " count"] | None = None
+) -> float:
+    """A log determinant that no `count` of the candidates exceed; tightened by ascent of the relaxed weights."""
+    n, p = len(J), J.shape[2]
+    w = np.full(n, count / n)
+    if chosen is not None:
+        w = 0.5 * w
+        w[chosen] += 0.5
+    best = np.inf
+    for _ in range(_ASCENTS):
+        root = np.sqrt(w)[:, None, None]
+        L = np.linalg.cholesky(_information(J * root) + 1e-14 * np.eye(p))
+        half = np.linalg.solve(L, J.reshape(-1, p).T)
+        g = (half**2).sum(axis=0).reshape(n, -1).sum(axis=1)
+        value = 2 * float(np.log(np.diag(L)).sum())
+        best = min(best, value + float(np.sort(g)[-count:].sum()) - float(g @ w))
+        if best - value < 1e-4 * p:
+            break
+        w = _capped(w * (g / p * count), count)
+    return best
+
+
+def _capped(w: Float[np.ndarray, " n"], count: int) -> Float[np.ndarray, " n"]:
+    """Weights scaled to add up to `count`, none above one."""
+    w = np.maximum(w, 1e-12)
+    full = np.zeros(len(w), bool)
+    for _ in range(len(w)):
+        scale = (count - full.sum()) / w[~full].sum()
+        over = ~full & (w * scale > 1.0)
+        if not over.any():
+            return np.where(full, 1.0, w * scale)
+        full |= over
+    return np.minimum(w, 1.0)
+
+
+def _moved(
+    calibrated: _Calibrated, position: np.ndarray, limits: Float[np.ndarray, "nv 2"], size: Float[np.ndarray, " p"]
+) -> Float[np.ndarray, "postures nv"]:
+    """Postures moved within the joint limits to where they tell most together."""
+    from scipy.optimize import minimize  # slow to import
+
+    count, nv = position.shape
+    ways = np.concatenate([np.zeros((1, nv)), STEP * np.eye(nv), -STEP * np.eye(nv)])
+
+    def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
+        q = x.reshape(count, nv)
+        J = calibrated.rows((q[None] + ways[:, None]).reshape(-1, nv)) / size
+        J = J.reshape(len(ways), count, *J.shape[1:])
+        information = _information(J[0])
+        half = np.linalg.solve(information, J[0].reshape(-1, J.shape[3]).T).T.reshape(J.shape[1:])
+        slope = np.einsum("dcrp,crp->cd", J[1 : 1 + nv] - J[1 + nv :], half) / STEP
+        return -float(np.linalg.slogdet(information)[1]), -slope.ravel()
+
+    box = np.tile(limits, (count, 1))
+    options = {"maxiter": _MOVES, "maxcor": 20}
+    found = minimize(objective, position.ravel(), jac=True, method="L-BFGS-B", bounds=box, options=options)
+    return found.x.reshape(count, nv)
+
+
+def in_order(
+    position: Float[np.ndarray, "postures nv"], speed: Float[np.ndarray, " nv"]
+) -> Int[np.ndarray, " postures"]:
+    """An order with short ways between postures (time at full speed): the nearest next, then parts turned round."""
+    speed = np.where(np.isfinite(speed) & (speed > 0), speed, 1.0)
+    way = np.abs((position[:, None] - position[None]) / speed).max(axis=2)
+    left, order = set(range(1, len(position))), [0]
+    while left:
+        order.append(min(left, key=lambda k: way[order[-1], k]))
+        left.remove(order[-1])
+    better = True
+    while better:
+        better = False
+        for i in range(1, len(order) - 1):
+            for j in range(i + 1, len(order)):
+                a, b, c = order[i - 1], order[i], order[j]
+                after = way[b, order[j + 1]] - way[c, order[j + 1]] if j + 1 < len(order) else 0.0
+                if way[a, c] + after < way[a, b] - 1e-12:
+                    order[i : j + 1] = order[i : j + 1][::-1]
+                    better = True
+    return np.array(order)
+
+
+def choose(J: Float[np.ndarray, "candidates rows p"], count: int) -> tuple[Int[np.ndarray, " count"], float]:
+    """The best `count` of candidates by their weighted Jacobians, of any device, and the share of the bound."""
+    chosen = exchanged(J, greedy(J, count))
+    return chosen, float(np.exp((_logdet(J[chosen]) - certified_bound(J, count, chosen)) / J.shape[2]))

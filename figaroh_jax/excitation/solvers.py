@@ -1,0 +1,260 @@
+r"""Maximising a function of a motion's rows within limits.
+
+Few linear rows: sequential quadratic programming (SLSQP). Rows of torque, or thousands of linear ones: the augmented
+Lagrangian $f + \sum \max(0, \lambda + \mu c)^2 / 2\mu$ (Nocedal and Wright 2006, section 17.4) by L-BFGS-B. Objective
+and torques come from one pass over the rows. Limits are kept at the samples of the design, tightened by what the motion
+exceeds them between, and at last the motion is made smaller until it meets them at 1 kHz.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from .information import Learned
+from .limits import KINDS, Limits
+from .motions import Basis, Trajectory
+from .sampling import Sampler
+
+__all__ = ["FEW_ROWS", "GramObjective", "Problem", "solve"]
+
+# f and its gradient by the (symmetric) Gram matrix of the weighted rows
+GramObjective = Callable[[Float[np.ndarray, "n n"]], tuple[float, Float[np.ndarray, "n n"]]]
+
+FEW_ROWS = 600  # linear rows that SLSQP takes
+OUTER, INNER = 8, 40
+PENALTY, GROWTH = 10.0, 3.0
+CLOSE = 2e-3  # of a limit, at the samples of the design
+
+
+@dataclass
+class _Seen:
+    """What the gradient at a point takes from its value."""
+
+    x: np.ndarray
+    states: np.ndarray
+    shape: tuple[int, ...]
+    own: np.ndarray
+    by_gram: np.ndarray
+    by_torque: np.ndarray | None = None
+    slope: np.ndarray | float = 0.0
+
+
+@dataclass
+class Problem:
+    """A function of the Gram matrix of a motion's rows, and the limits of the motion.
+
+    The numbers of a motion are the start (where it is free) and the weights, joint by joint.
+    """
+
+    learned: Learned
+    sampler: Sampler
+    objective: GramObjective
+    columns: np.ndarray  # columns of the sampler that the Gram matrix is of
+    basis: Basis
+    limits: Limits
+    start: Float[np.ndarray, " nv"] | None  # None: free
+    rate: float = 20.0  # Hz, of the rows
+    evaluations: int = 0
+    _seen: _Seen | None = None
+
+    def __post_init__(self) -> None:
+        self.matrix = self.basis.at(self.basis.instants(self.rate))
+        self.nv = self.learned.robot.nv
+        self.root = np.sqrt(np.asarray(self.learned.weight))
+        first, *others = self.basis.peaks(self.rate)
+        peaks = (first if self.start is not None else np.append(0.0, first), *others)
+        self.rows = [
+            (kind, self.basis.at(times)[k])
+            for k, (kind, times) in enumerate(zip(KINDS, peaks, strict=False))
+            if np.isfinite(self.limits.of(kind)).any()
+        ]
+        self.torque = np.isfinite(self.limits.torque).any()
+
+    def trajectory(self, x: Float[np.ndarray, " n"]) -> Trajectory:
+        """The motion of the numbers x."""
+        start, weights = self._split(x)
+        return Trajectory(start, weights, self.basis)
+
+    def numbers(self, motion: Trajectory) -> Float[np.ndarray, " n"]:
+        """The numbers of a motion."""
+        own = [] if self.start is not None else [np.asarray(motion.start)]
+        return np.concatenate([*own, np.asarray(motion.weights).ravel()])
+
+    def _split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        start = x[: self.nv] if self.start is None else self.start
+        return start, x[len(x) - self.nv * self.basis.size :].reshape(self.nv, -1)
+
+    def states(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "3 samples nv"]:
+        """q, v, a at the samples of the design."""
+        start, weights = self._split(x)
+        out = self.matrix @ weights.T
+        out[0] += start
+        return out
+
+    def to_numbers(self, by_states: Float[np.ndarray, "3 samples nv"]) -> Float[np.ndarray, " n"]:
+        """Gradient by the numbers, of one by the states."""
+        weights = np.einsum("ksb,ksj->jb", self.matrix, by_states).ravel()
+        return weights if self.start is not None else np.concatenate([by_states[0].sum(0), weights])
+
+    def gram(self, rows: Float[np.ndarray, "nv columns samples"]) -> tuple[np.ndarray, np.ndarray]:
+        """Weighted rows of the columns that count, and their Gram matrix."""
+        own = rows[:, self.columns] * self.root[:, None, None]
+        flat = own.swapaxes(0, 1).reshape(own.shape[1], -1)
+        return own, flat @ flat.T
+
+    def value(self, x: Float[np.ndarray, " n"]) -> float:
+        """The objective."""
+        return self.lagrangian(x, None)
+
+    def slope(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Its gradient."""
+        return self.gradient(x, None)
+
+    def lagrangian(self, x: Float[np.ndarray, " n"], penalty: Penalty | None) -> float:
+        """The objective with what the penalty makes of the limits."""
+        self.evaluations += 1
+        states = self.states(x)
+        rows = self.sampler.rows(states)
+        own, gram = self.gram(rows)
+        value, by_gram = self.objective(gram)
+        self._seen = _Seen(x.copy(), states, rows.shape, own, by_gram)
+        if penalty is not None:
+            if self.torque:
+                torque = (np.asarray(self.learned.theta) @ rows[:, : len(self.learned.theta)]).T
+                more, self._seen.by_torque = penalty.of("torque", torque / self.limits.torque)
+                value += more
+            more, self._seen.slope = self._linear(x, penalty)
+            value += more
+        return value
+
+    def gradient(self, x: Float[np.ndarray, " n"], penalty: Penalty | None) -> Float[np.ndarray, " n"]:
+        """Gradient of `lagrangian`; what was computed for its value at the same point is not computed again."""
+        if self._seen is None or not np.array_equal(self._seen.x, x):
+            self.lagrangian(x, penalty)
+        seen = self._seen
+        assert seen is not None
+        cotangent = np.zeros(seen.shape)
+        cotangent[:, self.columns] = 2.0 * self.root[:, None, None] * (seen.by_gram @ seen.own)
+        if seen.by_torque is not None:
+            theta = np.asarray(self.learned.theta)
+            cotangent[:, : len(theta)] += (seen.by_torque / self.limits.torque).T[:, None] * theta[:, None]
+        return self.to_numbers(self.sampler.back(seen.states, cotangent)) + seen.slope
+
+    def forget(self) -> None:
+        """The multipliers have changed, and with them the value at every point."""
+        self._seen = None
+
+    def shares(self, x: Float[np.ndarray, " n"]) -> dict[str, Float[np.ndarray, "rows nv"]]:
+        """Position (from the middle), velocity and acceleration as shares of their limits."""
+        start, weights = self._split(x)
+        out = {}
+        for kind, functions in self.rows:
+            moved = functions @ weights.T
+            out[kind] = (moved + (start - self.limits.middle if kind == "position" else 0.0)) / self.limits.of(kind)
+        return out
+
+    def _linear(self, x: np.ndarray, penalty: Penalty) -> tuple[float, np.ndarray]:
+        shares, value = self.shares(x), 0.0
+        by_start, by_weights = np.zeros(self.nv), np.zeros((self.nv, self.basis.size))
+        for kind, functions in self.rows:
+            more, slope = penalty.of(kind, shares[kind])
+            value, slope = value + more, slope / self.limits.of(kind)
+            by_weights += slope.T @ functions
+            by_start += slope.sum(0) * (kind == "position")
+        own = [] if self.start is not None else [by_start]
+        return value, np.concatenate([*own, by_weights.ravel()])
+
+    def linear_matrix(self, margin: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+        """A and b with A x <= b where position, velocity and acceleration keep their limits, less a margin."""
+        free, size = (self.nv if self.start is None else 0), self.basis.size
+        blocks, bounds = [], []
+        for kind, functions in self.rows:
+            limit = self.limits.of(kind)
+            for j in np.flatnonzero(np.isfinite(limit)):
+                block = np.zeros((len(functions), free + self.nv * size))
+                block[:, free + j * size : free + (j + 1) * size] = functions / limit[j]
+                offset = 0.0
+                if kind == "position":
+                    if free:
+                        block[:, j] = 1.0 / limit[j]
+                        offset = -self.limits.middle[j] / limit[j]
+                    else:
+                        assert self.start is not None
+                        offset = (self.start[j] - self.limits.middle[j]) / limit[j]
+                blocks += [block, -block]
+                room = 1.0 - margin.get(kind, 0.0)
+                bounds += [np.full(len(functions), room - offset), np.full(len(functions), room + offset)]
+        size = free + self.nv * size
+        return (np.concatenate(blocks), np.concatenate(bounds)) if blocks else (np.zeros((0, size)), np.zeros(0))
+
+
+class Penalty:
+    """Multipliers of all rows, both signs, and the margin that each kind keeps."""
+
+    def __init__(self, margin: dict[str, float]) -> None:
+        self.mu, self.margin = PENALTY, margin
+        self.multipliers: dict[str, np.ndarray] = {}
+        self.violation: dict[str, np.ndarray] = {}
+
+    def of(self, kind: str, share: Float[np.ndarray, "rows nv"]) -> tuple[float, Float[np.ndarray, "rows nv"]]:
+        """Value and gradient by the shares."""
+        both = np.stack([share, -share]) - (1.0 - self.margin.get(kind, 0.0))
+        self.violation[kind] = both
+        lam = self.multipliers.setdefault(kind, np.zeros_like(both))
+        push = np.maximum(0.0, lam + self.mu * both)
+        return float(((push**2).sum() - (lam**2).sum()) / (2 * self.mu)), push[0] - push[1]
+
+    def step(self) -> float:
+        """Multipliers of the point last seen; the largest violation there."""
+        for kind, violation in self.violation.items():
+            self.multipliers[kind] = np.maximum(0.0, self.multipliers[kind] + self.mu * violation)
+        return max((float(v.max()) for v in self.violation.values()), default=0.0)
+
+
+def solve(
+    problem: Problem, x: Float[np.ndarray, " n"], margin: dict[str, float] | None = None, *, iterations: int = 200
+) -> Float[np.ndarray, " n"]:
+    """The numbers of the best motion found from x, within the limits at the samples of the design."""
+    A, b = problem.linear_matrix(margin or {})
+    if len(b) <= FEW_ROWS:
+        found = _sequential(problem, x, A, b, iterations)
+        if not problem.torque or _torque_share(problem, found) <= 1.0 - (margin or {}).get("torque", 0.0):
+            return found
+        x = found
+    return _augmented(problem, x, margin or {})
+
+
+def _torque_share(problem: Problem, x: np.ndarray) -> float:
+    torque = problem.sampler.torque(problem.states(x), np.asarray(problem.learned.theta))
+    return float((np.abs(torque) / problem.limits.torque).max())
+
+
+def _sequential(problem: Problem, x: np.ndarray, A: np.ndarray, b: np.ndarray, iterations: int) -> np.ndarray:
+    from scipy.optimize import minimize  # slow to import
+
+    rows = {"type": "ineq", "fun": lambda x: b - A @ x, "jac": lambda x: -A}
+    options = {"maxiter": iterations, "ftol": 1e-6}
+    kept = [rows] if len(b) else []
+    return minimize(problem.value, x, jac=problem.slope, method="SLSQP", constraints=kept, options=options).x
+
+
+def _augmented(problem: Problem, x: np.ndarray, margin: dict[str, float]) -> np.ndarray:
+    from scipy.optimize import minimize  # slow to import
+
+    penalty, before = Penalty(margin), np.inf
+    options = {"maxiter": INNER, "maxcor": 20}
+    for outer in range(OUTER):
+        problem.forget()
+        x = minimize(problem.lagrangian, x, args=(penalty,), jac=problem.gradient, method="L-BFGS-B", options=options).x
+        problem.lagrangian(x, penalty)  # the rows of the point itself
+        worst = penalty.step()
+        if worst < CLOSE and outer >= 2:
+            break
+        if worst > 0.5 * before:
+            penalty.mu *= GROWTH
+        before = worst
+    return x

@@ -1,0 +1,199 @@
+"""`excite` as a task file asks for it: what is to be learned, limits, what recordings have told already."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import InputError
+from ..rigid.model import RobotModel
+from .design import Design, excite
+from .information import Learned, learn
+from .limits import limits_of
+from .motions import Basis, fourier, quintic, spline
+from .postures import ACCURACY, Instrument, PostureDesign, excite_postures
+
+if TYPE_CHECKING:
+    from ..formats.config import Baseline, Excite, Task
+
+__all__ = ["excite_task"]
+
+DEFAULT_NOISE = 0.01  # of the largest torque
+
+
+def excite_task(
+    task: Task, progress: Callable[[str, float], None] = lambda phase, share: None
+) -> Design | PostureDesign:
+    """Design what the `excite` block of a task asks for; raises `InputError` where it is wrong, before any work.
+
+    Recordings of the task are what is known already: their information is the prior, their residuals are the noise.
+    """
+    from ..formats.config import robot_options
+    from ..formats.robotfile import load_extended, load_robot, stated_baseline
+
+    asked = task.excite
+    if asked is None:
+        raise InputError(
+            f"{task.file}: no `excite` block: it says what is to be designed, as in excite: {{duration: 10}}"
+        )
+    robot = load_robot(task)
+    if asked.kind == "postures":
+        return _postures(task, asked, robot, progress)
+    model, (known, notes) = load_extended(task.robot.model, **robot_options(task.robot)).model, stated_baseline(task)
+    basis = basis_of(asked)
+    bounds = asked.limits
+    limits = limits_of(model.robot, bounds.position, bounds.velocity, bounds.acceleration, bounds.torque)
+    noise = DEFAULT_NOISE if asked.noise is None else asked.noise
+    learned = learn(model, known, noise=noise, trust=task.robot.trust)
+    said = [*notes]
+    if task.data:
+        progress("what the recordings tell", 0.0)
+        learned, text = with_recordings(task, model.robot, known, learned, asked.noise is None)
+        said.append(text)
+    elif asked.noise is None:
+        said.append(f"neither recordings nor noise are given: one sigma is {DEFAULT_NOISE:.0%} of the largest torque")
+    found = excite(
+        model,
+        basis,
+        limits,
+        learned,
+        objective=asked.objective,
+        predict=[read_motion(path, model.robot) for path in asked.predict],
+        separate=[tuple((one.effect, one.at, one.size) for one in pair) for pair in asked.separate],  # pyright: ignore[reportArgumentType]
+        trust=task.robot.trust,
+        trajectories=asked.trajectories,
+        start=asked.start,
+        starts=asked.starts,
+        rate=asked.rate,
+        progress=progress,
+    )
+    return replace(found, notes=(*said, *found.notes))
+
+
+def _postures(task: Task, asked: Excite, robot: RobotModel, progress: Callable[[str, float], None]) -> PostureDesign:
+    """Postures for the device of the block, or of the recordings."""
+    measurement = asked.measurement or next((one.measurement for one in task.data if one.measurement), None)
+    if measurement is None:
+        raise InputError(
+            f"{task.file}: excite.measurement is missing: postures are chosen for a device, as in"
+            " measurement: {pose: pose, base_frame: base_link, tool_frame: tool0}"
+        )
+    kinds = {"pose": "pose", "camera": "pose", "position": "position"}
+    if measurement.kind not in kinds:
+        raise InputError(
+            f"{task.file}: excite.measurement: postures that touch a {measurement.kind} are where it is; they are not"
+            " designed. Expected: pose, position or camera"
+        )
+    if measurement.tool_frame is None:
+        raise InputError(f"{task.file}: excite.measurement.tool_frame is missing: which frame is measured?")
+    base = measurement.base_frame or next((f.name for f in robot.frames if f.parent < 0), robot.frames[0].name)
+    for name in (base, measurement.tool_frame):
+        robot.frame_index(name)
+    place, turn = measurement.accuracy.position, measurement.accuracy.orientation
+    instrument = Instrument(
+        "pose" if kinds[measurement.kind] == "pose" else "position",
+        base,
+        measurement.tool_frame,
+        tuple(measurement.unknown),
+        (place or ACCURACY[0], turn or ACCURACY[1]),
+    )
+    limits = limits_of(robot, asked.limits.position)
+    found = excite_postures(
+        robot,
+        instrument,
+        count=asked.postures,
+        candidates=asked.candidates,
+        position_limit=limits.position,
+        progress=progress,
+    )
+    said = ["neither collisions nor what the device can see from its place are looked at: check each posture before"]
+    if place is None:
+        said.append(f"no accuracy is given: {1e3 * ACCURACY[0]:g} mm and {1e3 * ACCURACY[1]:g} mrad are taken")
+    return replace(found, notes=(*said, *found.notes))
+
+
+def basis_of(asked: Excite) -> Basis:
+    """The basis that a task names."""
+    given = asked.basis
+    if given.fourier is not None:
+        return fourier(given.fourier, given.base or 1.0 / asked.duration, asked.duration)
+    if given.spline is not None:
+        return spline(given.spline, asked.duration)
+    assert given.quintic is not None
+    return quintic(given.quintic, asked.duration)
+
+
+def read_motion(path: Path, robot: RobotModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """q, v, a of a `.npz` with the arrays `q`, `v`, `a`, or `t` (s) and `q`, from which a spline gives the others."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: np.asarray(file[name], float) for name in ("t", "q", "v", "a") if name in file.files}
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as .npz ({error}); q, v, a or t, q are expected") from None
+    if "q" not in arrays or not ({"v", "a"} <= arrays.keys() or "t" in arrays):
+        raise InputError(f"{path}: holds {', '.join(arrays) or 'none'} of q, v, a, t; q, v, a or t, q are expected")
+    if {"v", "a"} <= arrays.keys():
+        q, v, a = (arrays[name] for name in ("q", "v", "a"))
+    else:
+        from scipy.interpolate import make_interp_spline  # slow to import
+
+        curve = make_interp_spline(arrays["t"], arrays["q"], 5)
+        q, v, a = (np.asarray(curve.derivative(k)(arrays["t"])) if k else arrays["q"] for k in range(3))
+    for name, values in (("q", q), ("v", v), ("a", a)):
+        if values.ndim != 2 or values.shape[1] != robot.nv or values.shape != q.shape:
+            raise InputError(f"{path}: {name} has shape {values.shape}; (samples, {robot.nv}) is expected")
+        if not np.isfinite(values).all():
+            raise InputError(f"{path}: {name} holds a number that is not finite")
+    return q, v, a
+
+
+def with_recordings(
+    task: Task, robot: RobotModel, known: Baseline, learned: Learned, noise_too: bool
+) -> tuple[Learned, str]:
+    """What is known after the recordings, in words too: their information is the prior, their residual the noise."""
+    from ..estimation.base_parameters import base_parameters
+    from ..estimation.columns import friction_terms, structural_columns
+    from ..estimation.intervals import coloured_covariance
+    from ..estimation.least_squares import WeightedByJoint, solve
+    from ..estimation.regression import Regression, condense
+    from ..recordings.checks import check_recordings
+    from ..recordings.dataset import read_recordings
+    from ..recordings.signals import prepare_all
+    from ..simulators.native import NativeBackend
+
+    recordings = read_recordings(task, robot)
+    check_recordings(task, robot, recordings)
+    for one in recordings:
+        if one.torque is None and one.role == "fit":
+            raise InputError(f"{one.file}: no torque; recordings of `excite` tell what is known of the dynamics")
+    with jax.enable_x64(True):
+        terms = friction_terms(robot, known)
+        signals = prepare_all(tuple(recordings), task.preprocess, slowed=False, model=robot)
+        regression = Regression(NativeBackend(robot), terms, np.zeros(robot.nv), signals)
+        used = np.asarray(np.abs(structural_columns(robot, terms)).max(axis=0) > 0)
+        data = condense(regression, used)
+        base = base_parameters(data.factor()[:, :-1], data.names)
+        found = solve(data, WeightedByJoint(), kept=base.independent)
+        covariance = coloured_covariance(regression, found.parameters, base.independent, found.weight)
+        A = data.factor(found.weight)
+        own = A[:, base.independent]
+        inflation = max(1.0, float(np.trace(covariance @ (own.T @ own))) / base.rank)
+        seen = A[:, np.array(learned.independent)]
+        learned = learned.with_prior(seen.T @ seen / inflation)
+    text = f"{len(recordings)} recordings count as known already"
+    if noise_too:
+        learned = with_noise(learned, 1 / np.sqrt(found.weight))
+        text += "; the noise is the residual of their fit"
+    return learned, text
+
+
+def with_noise(learned: Learned, sigma: Float[np.ndarray, " nv"]) -> Learned:
+    """The same with other standard deviations of the torques, N m or N."""
+    return eqx.tree_at(lambda one: one.weight, learned, 1 / np.asarray(sigma) ** 2)

@@ -1,0 +1,213 @@
+"""Designed motions: bases, information, gradients, limits at 1 kHz; compared with Pinocchio and finite differences."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import reference
+import robots
+
+from figaroh_jax.errors import InputError
+from figaroh_jax.excitation import information as info
+from figaroh_jax.excitation.design import excite, random_motion
+from figaroh_jax.excitation.limits import limits_of
+from figaroh_jax.excitation.motions import Basis, Trajectory, fourier, quintic, spline
+from figaroh_jax.excitation.objectives import (
+    condition_objective,
+    information_objective,
+    prediction_objective,
+    smooth_condition_objective,
+)
+from figaroh_jax.excitation.sampling import Sampler
+from figaroh_jax.excitation.solvers import Penalty, Problem
+from figaroh_jax.formats.config import Baseline
+from figaroh_jax.rigid.model import RobotModel
+from figaroh_jax.rigid.regressor_gradient import regressor_pullback
+
+BASES = [fourier(3, 0.5, 4.0), spline(5, 4.0), quintic(4, 4.0)]
+ARM = robots.robot(
+    *robots.LINKS[:3],
+    robots.joint("turn", "base", "a", axis="1 2 -1", more='<limit lower="-2" upper="2" velocity="2" effort="60"/>'),
+    robots.joint("bend", "a", "b", axis="0 1 1", more='<limit lower="-1.5" upper="2" velocity="3" effort="20"/>'),
+)
+COUPLED = robots.robot(
+    *robots.LINKS[:4],
+    robots.joint("hip", "base", "a", axis="0 1 0"),
+    robots.joint("finger", "a", "b", "prismatic", "1 1 0", more=robots.LIMIT),
+    robots.joint("copy", "b", "c", axis="1 0 1", more='<mimic joint="hip" multiplier="-1.5" offset="0.3"/>'),
+)
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
+    return robots.load(ARM, tmp_path_factory.mktemp("arm"))
+
+
+def a_motion(model: RobotModel, basis: Basis = BASES[0], seed: int = 0) -> Trajectory:
+    generator = np.random.default_rng(seed)
+    return Trajectory(0.3 * generator.normal(size=model.nv), generator.normal(size=(model.nv, basis.size)), basis)
+
+
+@pytest.mark.parametrize("basis", BASES, ids=lambda basis: basis.kind)
+def test_velocity_and_acceleration_are_the_derivatives_of_a_motion_that_begins_and_ends_at_rest(basis: Basis):
+    time, h = np.linspace(0.1, 3.9, 57), 1e-5
+    before, now, after = (basis.at(time + s * h) for s in (-1, 0, 1))
+    np.testing.assert_allclose((after[:2] - before[:2]) / (2 * h), now[1:], rtol=0, atol=1e-5)
+    ends = basis.at(np.array([0.0, basis.duration]))
+    np.testing.assert_allclose(ends[0, 0], 0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(ends[1:], 0, rtol=0, atol=1e-9)
+
+
+def test_times_of_peaks_hold_the_largest_values_of_a_quintic():
+    basis, weights = quintic(4, 4.0), np.random.default_rng(0).normal(size=3)
+    dense = np.abs(basis.at(np.linspace(0, 4, 40001)) @ weights).max(axis=1)
+    told = [np.abs(basis.at(times)[k] @ weights).max() for k, times in enumerate(basis.peaks(1.0))]
+    np.testing.assert_allclose(told[1:], dense[1:], rtol=1e-6)
+    assert told[0] == pytest.approx(dense[0], rel=1e-6) or dense[0] == 0
+
+
+@pytest.mark.parametrize("text", [ARM, COUPLED], ids=["arm", "sliding and mimic joints"])
+def test_gradient_by_the_regressor_is_that_of_pinocchios_regressor(text: str, tmp_path: Path):
+    model, generator = robots.load(text, tmp_path), np.random.default_rng(1)
+    state = generator.normal(size=(3, model.nv, 5))
+    C = generator.normal(size=(model.nv, 10 * len(model.joints), 5))
+
+    def total(x: np.ndarray) -> float:
+        return float(np.einsum("sjk,jks->", reference.regressor(model, *x.swapaxes(1, 2)), C))
+
+    slope, h = regressor_pullback(model, state[0], state[1], state[2], C), 1e-6
+    for at in [(0, 0, 1), (0, 1, 3), (1, 0, 2), (1, 1, 4), (2, 1, 0)]:
+        step = np.zeros_like(state)
+        step[at] = h
+        assert slope[at] == pytest.approx((total(state + step) - total(state - step)) / (2 * h), rel=1e-6, abs=1e-6)
+
+
+def test_information_is_the_log_determinant_of_pinocchios_rows(arm: RobotModel):
+    learned, motion = info.learn(arm, noise={"turn": 0.02, "bend": 0.01}), a_motion(arm)
+    q, v, a = motion.states(20.0)
+    friction = np.zeros((len(q), 2, 4))
+    for joint in range(2):
+        friction[:, joint, joint] = v[:, joint]
+        friction[:, joint, 2 + joint] = np.tanh(v[:, joint] / (info.SMOOTH + 1e-9))
+    rows = np.concatenate([reference.regressor(arm, q, v, a), friction], axis=2) / np.array([1.2, 0.2])[:, None]
+    kept = rows.reshape(-1, rows.shape[2])[:, list(learned.independent)]
+    assert np.linalg.matrix_rank(rows.reshape(-1, rows.shape[2])) == learned.rank
+    expected = np.linalg.slogdet(kept.T @ kept + learned.prior)[1]
+    assert float(info.information(arm, motion, learned)) == pytest.approx(expected, rel=1e-9)
+    std = np.sqrt(np.diag(np.linalg.inv(kept.T @ kept + learned.prior)))
+    np.testing.assert_allclose(info.expected_std(learned, motion), std, rtol=1e-6)
+    assert float(info.condition(learned, motion)) == pytest.approx(np.linalg.cond(kept), rel=1e-6)
+
+
+def test_prior_is_the_covariance_that_trust_gives_the_base_parameters(arm: RobotModel):
+    learned = info.learn(arm, Baseline(viscous=False, coulomb=False), trust=0.2)
+    generator = np.random.default_rng(0)
+    q, v, a = generator.normal(size=(3, 40, 2))
+    W = reference.regressor(arm, q, v, a).reshape(-1, 20)
+    kept = W[:, list(learned.independent)]
+    spread = np.linalg.lstsq(kept, W, rcond=None)[0]  # base parameters of all parameters
+    from figaroh_jax.estimation.priors import rigid_prior
+
+    covariance = (spread / rigid_prior(arm, 0.2)[1]) @ spread.T
+    np.testing.assert_allclose(np.linalg.inv(learned.prior), covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_gradient_is_that_of_finite_differences_and_of_the_solvers_own_programs(arm: RobotModel):
+    with jax.enable_x64(True):
+        learned, motion = info.learn(arm), a_motion(arm)
+        quick = {"xla_backend_optimization_level": 0}  # compiled in a third of the time
+        slope = jax.jit(jax.grad(lambda m: info.information(arm, m, learned)), compiler_options=quick)(motion)
+        generator, h = np.random.default_rng(2), 1e-6
+        way = Trajectory(generator.normal(size=2), generator.normal(size=motion.weights.shape), motion.basis)
+        ends = [
+            float(info.information(arm, jax.tree.map(lambda x, d: x + s * h * d, motion, way), learned))  # noqa: B023
+            for s in (-1, 1)
+        ]
+        along = sum(float(np.sum(x * d)) for x, d in zip(jax.tree.leaves(slope), jax.tree.leaves(way), strict=True))
+        assert along == pytest.approx((ends[1] - ends[0]) / (2 * h), rel=1e-5)
+        prior = np.asarray(learned.prior)
+        sampler = Sampler(arm, learned.terms, np.asarray(learned.width))
+        kept = np.array(learned.independent)
+        objective = information_objective(prior)
+        problem = Problem(learned, sampler, objective, kept, motion.basis, limits_of(arm), None)
+        x = problem.numbers(motion)
+        own = np.concatenate([np.asarray(y).ravel() for y in jax.tree.leaves(slope)])
+        np.testing.assert_allclose(problem.slope(x), -own / learned.rank, rtol=1e-6, atol=1e-9)
+        assert problem.value(x) == pytest.approx(-float(info.information(arm, motion, learned)) / learned.rank)
+        penalty = Penalty({})
+        penalty.mu = 1.0
+        for name in ("position", "velocity", "torque"):
+            assert np.isfinite(limits_of(arm).of(name)).all()
+        step = generator.normal(size=x.shape)
+        ends = [problem.lagrangian(x + s * h * step, penalty) for s in (-1, 1)]
+        assert problem.gradient(x, penalty) @ step == pytest.approx((ends[1] - ends[0]) / (2 * h), rel=1e-5)
+
+
+def test_gradients_by_the_gram_matrix_are_those_of_finite_differences():
+    generator = np.random.default_rng(3)
+    G, M, wanted, step = (x @ x.T for x in generator.normal(size=(4, 5, 9)))
+    for objective in (
+        information_objective(M),
+        prediction_objective(M, wanted),
+        condition_objective(),
+        smooth_condition_objective(),
+    ):
+        h = 1e-6
+        change = (objective(G + h * step)[0] - objective(G - h * step)[0]) / (2 * h)
+        assert np.sum(objective(G)[1] * step) == pytest.approx(change, rel=1e-5)
+
+
+def test_a_designed_motion_tells_more_than_random_ones_and_meets_its_limits_by_pinocchio(arm: RobotModel):
+    limits = limits_of(arm, acceleration={"turn": 6.0, "bend": 8.0}, torque={"turn": 45.0, "bend": 14.0})
+    found = excite(arm, BASES[0], limits, trajectories=2, starts=2, start=[0.1, 0.2])
+    learned = found.learned
+    for stage in found.stages:
+        assert stage.met
+        np.testing.assert_allclose(stage.motion.start, [0.1, 0.2], rtol=0, atol=1e-12)
+        q, v, a = (np.asarray(x) for x in stage.motion.states(1000.0))
+        torque = reference.inverse_dynamics(arm, q, v, a)
+        assert (q >= limits.position[:, 0] - 2e-3).all() and (q <= limits.position[:, 1] + 2e-3).all()
+        for values, limit in ((v, limits.velocity), (a, limits.acceleration), (torque, limits.torque)):
+            assert (np.abs(values) <= 1.001 * limit).all()
+        used = {use.kind: use.share for use in stage.uses}
+        assert used["torque"] == pytest.approx((np.abs(torque) / limits.torque).max(), rel=1e-6)
+        assert max(used.values()) > 0.98  # something is used to the full
+    assert found.stages[1].logdet > found.stages[0].logdet
+    problem = Problem(
+        learned,
+        Sampler(arm, learned.terms, np.asarray(learned.width)),
+        information_objective(np.asarray(learned.prior)),
+        np.array(learned.independent),
+        BASES[0],
+        limits,
+        np.array([0.1, 0.2]),
+    )
+    generator = np.random.default_rng(4)
+    randoms = []
+    for x in (random_motion(problem, generator, amplitude=0.7) for _ in range(40)):
+        torque = reference.inverse_dynamics(arm, *problem.states(x))
+        if (np.abs(torque) <= limits.torque).all():
+            randoms.append(-learned.rank * problem.value(x))
+    assert len(randoms) > 3
+    assert found.stages[0].logdet > max(randoms) + 1.0
+    assert (found.std < found.std_before).all()
+
+
+def test_what_no_motion_meets_is_refused_with_the_joint_and_by_how_much(arm: RobotModel):
+    with pytest.raises(InputError, match=r"limits.torque: holding still takes .* times the limit of '(turn|bend)'"):
+        excite(arm, BASES[0], limits_of(arm, torque=0.01))
+    with pytest.raises(InputError, match="start: 'turn' at 3 is outside of its limits -2 to 2"):
+        excite(arm, BASES[0], start=[3.0, 0.0])
+    with pytest.raises(InputError, match="limits.velocity: 0 for 'bend'"):
+        limits_of(arm, velocity={"bend": 0.0})
+    with pytest.raises(InputError, match="limits.torque: no moving joint 'bent'; did you mean 'bend'"):
+        limits_of(arm, torque={"bent": 1.0})
+    with pytest.raises(InputError, match="a base of 0.5 Hz fits"):
+        fourier(3, 0.45, 4.0)
+    with pytest.raises(InputError, match="noise: bend missing"):
+        info.learn(arm, noise={"turn": 0.1})
+    with pytest.raises(InputError, match="needs the motions that matter"):
+        excite(arm, BASES[0], objective="prediction")

@@ -1,0 +1,126 @@
+"""Postures for a calibration: the bound against brute force, the rows against differences of Pinocchio's poses."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import reference
+import robots
+
+from figaroh_jax.cli import main
+from figaroh_jax.errors import InputError
+from figaroh_jax.excitation import postures
+from figaroh_jax.excitation.postures import Instrument, excite_postures
+from figaroh_jax.rigid.model import RobotModel
+
+LIMIT = '<limit lower="-2" upper="2" velocity="3" effort="40"/>'
+WRIST = robots.robot(
+    *robots.LINKS[:4],
+    robots.joint("turn", "base", "a", axis="0 0 1", more=LIMIT),
+    robots.joint("bend", "a", "b", axis="0 1 0", more=LIMIT),
+    robots.joint("roll", "b", "c", axis="1 0 0", more=LIMIT),
+)
+DEVICE = Instrument("pose", "base", "c")
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
+    return robots.load(WRIST, tmp_path_factory.mktemp("arm"))
+
+
+def test_no_choice_exceeds_the_bound_and_the_exchange_is_near_the_best_of_all_choices():
+    generator = np.random.default_rng(0)
+    for count, p in ((4, 5), (6, 8)):
+        J = generator.normal(size=(11, 2, p)) * generator.uniform(0.2, 2.0, (11, 1, 1))
+        every = [
+            np.linalg.slogdet(np.einsum("crp,crq->pq", J[list(some)], J[list(some)]))[1]
+            for some in itertools.combinations(range(11), count)
+        ]
+        chosen = postures.exchanged(J, postures.greedy(J, count))
+        own = np.linalg.slogdet(np.einsum("crp,crq->pq", J[chosen], J[chosen]))[1]
+        assert len(set(chosen.tolist())) == count
+        assert own <= max(every) + 1e-9
+        assert own >= max(every) - 0.02 * p  # nearly always the best itself
+        for start in (None, chosen):
+            bound = postures.certified_bound(J, count, start)
+            assert max(every) - 1e-6 <= bound <= max(every) + 0.3 * p
+
+
+def test_information_of_a_posture_is_that_of_differences_of_the_poses(arm: RobotModel):
+    """The offset of a joint moves the tool as the joint does: Pinocchio's poses tell its column."""
+    q = np.random.default_rng(1).uniform(-1.5, 1.5, (40, 3))
+    calibrated = postures._Calibrated(arm, DEVICE, "joint_offset", q)
+    rows = calibrated.rows(q)
+    names = [calibrated.names[k].name for k in calibrated.kept]
+    assert "joint_offset bend" in names
+    h = 1e-6
+    ends = [reference.forward_kinematics(arm, q + s * h * np.array([0.0, 1.0, 0.0]))[:, 2] for s in (-1, 1)]
+    moved = (ends[1] - ends[0])[:, :3, 3] / (2 * h)
+    turned = (ends[1] - ends[0])[:, :3, :3] @ ends[0][:, :3, :3].swapaxes(1, 2) / (2 * h)
+    axis = np.stack([turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]], 1)
+    column = rows[:, :, names.index("joint_offset bend")] * np.repeat(postures.ACCURACY, 3)
+    # the device's axes are turned against the base by a constant rotation: lengths and angles are the same
+    np.testing.assert_allclose(np.linalg.norm(column[:, :3], axis=1), np.linalg.norm(moved, axis=1), rtol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(column[:, 3:], axis=1), np.linalg.norm(axis, axis=1), rtol=1e-5)
+
+
+def test_designed_postures_stay_within_the_limits_and_tell_more_than_random_ones(arm: RobotModel):
+    limits = np.array([[-1.0, 1.0], [-0.5, 1.2], [-2.0, 0.5]])
+    found = excite_postures(arm, DEVICE, count=10, candidates=100, position_limit=limits)
+    assert (found.position >= limits[:, 0]).all() and (found.position <= limits[:, 1]).all()
+    assert found.random_logdet < found.chosen_logdet <= found.bound + 1e-9
+    assert found.logdet >= found.chosen_logdet - 1e-9
+    assert 0.95 < found.chosen_efficiency <= 1.0 + 1e-9
+    # the device's frames turn about the middle of the candidates
+    candidates = np.random.default_rng(0).uniform(limits[:, 0], limits[:, 1], (100, 3))
+    calibrated = postures._Calibrated(arm, DEVICE, "full", candidates)
+    rows = calibrated.rows(found.position)
+    flat = rows.reshape(-1, rows.shape[2])
+    assert np.linalg.slogdet(flat.T @ flat)[1] == pytest.approx(found.logdet, rel=1e-9)
+    np.testing.assert_allclose(found.std, np.sqrt(np.diag(np.linalg.inv(flat.T @ flat))), rtol=1e-6)
+
+
+def test_the_order_of_postures_has_shorter_ways_than_the_one_given():
+    q = np.random.default_rng(2).uniform(-2, 2, (20, 3))
+    order = postures.in_order(q, np.ones(3))
+    assert sorted(order.tolist()) == list(range(20))
+    length = [np.abs(np.diff(x, axis=0)).max(axis=1).sum() for x in (q, q[order])]
+    assert length[1] < 0.7 * length[0]
+
+
+def test_the_command_writes_postures_with_their_share_of_the_bound(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "robot.urdf").write_text(WRIST)
+    device = "measurement: {pose: pose, base_frame: base, tool_frame: c, unknown: [base_frame, tool_frame]}"
+    block = f"{{kind: postures, postures: 10, candidates: 100, {device}}}"
+    (tmp_path / "task.yaml").write_text(f"robot: {{model: robot.urdf}}\nexcite: {block}\n")
+    assert main(["excite", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    assert "10 postures for" in capsys.readouterr().out
+    answer = json.loads((tmp_path / "run" / "excitation.json").read_text())
+    table = np.loadtxt(tmp_path / "run" / "postures.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(table, answer["postures"], rtol=1e-7, atol=1e-8)
+    assert answer["efficiency_of_random"] < answer["efficiency"]
+    assert "certified" in (tmp_path / "run" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("block", "message"),
+    [
+        ("{kind: postures}", "excite.measurement is missing"),
+        ("{kind: postures, measurement: {plane: n, tool_frame: c}}", "postures that touch a plane are where it is"),
+        ("{kind: postures, measurement: {pose: p, tool_frame: d}}", "has no frame 'd'"),
+        ("{kind: postures, postures: 2, measurement: {pose: p, tool_frame: c}}", "2 postures cannot tell"),
+        ("{kind: postures, measurement: {pose: p, base_frame: c, tool_frame: c}}", "no joint moves tool_frame"),
+    ],
+)
+def test_what_cannot_be_chosen_is_one_message(tmp_path: Path, block: str, message: str):
+    from figaroh_jax.excitation.task import excite_task
+    from figaroh_jax.formats.config import load_task
+
+    (tmp_path / "robot.urdf").write_text(WRIST)
+    (tmp_path / "task.yaml").write_text(f"robot: {{model: robot.urdf}}\nexcite: {block}\n")
+    with pytest.raises(InputError, match=message):
+        excite_task(load_task(tmp_path / "task.yaml"))

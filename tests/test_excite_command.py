@@ -1,0 +1,124 @@
+"""`figaroh-jax excite`: what it writes, its exit status, and the messages for what is wrong in a task."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import reference
+import yaml
+from test_excitation import ARM
+
+from figaroh_jax.cli import main
+from figaroh_jax.errors import InputError
+from figaroh_jax.formats.config import load_task
+from figaroh_jax.formats.urdf import load_urdf
+
+BASIS = "basis: {fourier: 2}, duration: 2"
+
+
+def task_of(folder: Path, keys: str, more: str = "") -> Path:
+    (folder / "robot.urdf").write_text(ARM)
+    file = folder / "task.yaml"
+    file.write_text(f"robot: {{model: robot.urdf}}\nexcite: {{{keys}}}\n{more}")
+    return file
+
+
+def test_the_run_holds_the_motion_at_1_khz_with_its_torques_and_a_joint_trajectory(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    file = task_of(tmp_path, f"{BASIS}, limits: {{acceleration: 7.0}}, starts: 1, trajectories: 2, noise: 0.02")
+    assert main(["excite", str(file), "--out", str(tmp_path / "run"), "--json", "--quiet"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer == json.loads((tmp_path / "run" / "excitation.json").read_text())
+    assert answer["met"] and answer["objective"] == "information" and len(answer["trajectories"]) == 2
+    model = load_urdf(tmp_path / "robot.urdf")
+    for k, told in enumerate(answer["trajectories"]):
+        with np.load(tmp_path / "run" / f"trajectory_{k + 1}.npz") as motion:
+            t, q, v, a, torque = (motion[name] for name in ("t", "q", "v", "a", "torque"))
+        assert t.shape == (2001,) and t[-1] == 2.0
+        np.testing.assert_allclose(torque, reference.inverse_dynamics(model, q, v, a), rtol=0, atol=1e-9)
+        assert np.abs(a).max() <= 7.0 * 1.001
+        share = next(use["share"] for use in told["use_at_1_kHz"] if use["limit"] == "acceleration")
+        assert share == pytest.approx(np.abs(a).max() / 7.0, rel=1e-6)
+        table = np.loadtxt(tmp_path / "run" / f"trajectory_{k + 1}.csv", delimiter=",", skiprows=1)
+        np.testing.assert_allclose(table, np.column_stack([t, q, v, a, torque]), rtol=1e-7, atol=1e-8)
+        message = yaml.safe_load((tmp_path / "run" / f"trajectory_{k + 1}.yaml").read_text())
+        assert message["joint_names"] == ["turn", "bend"] and len(message["points"]) == 101
+        last = message["points"][50]
+        assert last["time_from_start"] == {"sec": 1, "nanosec": 0}
+        np.testing.assert_allclose(last["positions"], q[1000], rtol=1e-7, atol=1e-8)
+    for one in answer["parameters"]:
+        assert one["std"] < one["std_before"]
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "within limits" in page and "1 kHz" in page and page.count("<polyline") == 12
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ("limits: {clearance: 0.02}", "excite.limits.clearance: distances between bodies are not looked at"),
+        ("limits: {speed: 2}", "unknown key 'speed'"),
+        ("basis: {fourier: 5, spline: 3}", "exactly one of fourier, spline, quintic; given: fourier, spline"),
+        ("objective: prediction", "needs `predict`"),
+        ("objective: separate", "needs `separate`"),
+        ("trajectories: 0", "excite.trajectories is 0, expected at least 1"),
+        ("noise: -1", "more than 0"),
+    ],
+)
+def test_a_mistake_in_the_block_is_named_with_its_key(tmp_path: Path, keys: str, message: str):
+    with pytest.raises(InputError) as error:
+        load_task(task_of(tmp_path, keys))
+    assert message in str(error.value), error.value
+
+
+def test_a_task_without_recordings_is_for_excite_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    file = task_of(tmp_path, "duration: 4")
+    assert main(["identify", str(file), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert "data is missing: this command needs recordings" in capsys.readouterr().err
+    file.write_text("robot: {model: robot.urdf}\n")
+    assert main(["excite", str(file), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert "data is missing" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ("limits: {torque: 0.05}", "holding still takes"),
+        ("start: [0.0, 3.0]", "start: 'bend' at 3 is outside of its limits"),
+        ("start: [0.0]", "start: 1 numbers for the 2 joints turn, bend"),
+        ("limits: {velocity: {bent: 1.0}}", "no moving joint 'bent'; did you mean 'bend'?"),
+        ("basis: {fourier: 3, base: 0.3}, duration: 4", "a base of 0.25 Hz fits"),
+        (
+            "objective: separate, separate: [[{effect: torque_delay}, {effect: rotor_inertia, at: [turn]}]]",
+            "'torque_delay' has no torque of an instant",
+        ),
+        ("objective: prediction, predict: [no.npz]", "no.npz: cannot be read as .npz"),
+    ],
+)
+def test_what_cannot_be_designed_ends_in_one_message_and_nothing_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], keys: str, message: str
+):
+    file = task_of(tmp_path, keys if "basis" in keys else f"{BASIS}, {keys}")
+    assert main(["excite", str(file), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_limit_that_is_not_met_at_1_khz_ends_with_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    # standing still at this start takes more torque than is allowed, so no motion from there meets the limit
+    model = load_urdf(task_of(tmp_path, "duration: 2").with_name("robot.urdf"))
+    start = np.array([1.0, 0.5])
+    held = np.abs(reference.inverse_dynamics(model, start[None], 0 * start[None], 0 * start[None]))[0]
+    easy = np.abs(reference.inverse_dynamics(model, *np.zeros((3, 1, 2))))[0]
+    assert held[0] > easy[0] + 0.5
+    limit = float((held[0] + easy[0]) / 2)
+    keys = f"{BASIS}, starts: 1, start: [1.0, 0.5], limits: {{torque: {{turn: {limit}, bend: 60.0}}}}"
+    file = task_of(tmp_path, keys)
+    assert main(["excite", str(file), "--out", str(tmp_path / "run"), "--quiet"]) == 1
+    said = capsys.readouterr().err
+    assert "limit not met: trajectory 1: " in said and "torque of 'turn' is" in said and "over its limit" in said
+    assert json.loads((tmp_path / "run" / "excitation.json").read_text())["met"] is False
