@@ -72,7 +72,7 @@ FUNCTIONS: dict[str, tuple[Callable[[Any, Any], Any], Any]] = {
     "frame_placement": (lambda m, x: fj.frame_placement(m, x[0], LAST), ROBOT),
     "frame_jacobian": (lambda m, x: fj.frame_jacobian(m, x[0], LAST), ROBOT),
     "predict": (
-        lambda m, x: fj.predict(m, jnp.arange(6) / 50.0, *(jnp.tile(y, (2, 1)) for y in x[:3]), 0.02),
+        lambda m, x: fj.predict(m, jnp.arange(6) / 50.0, *(jnp.tile(y, (2, 1)) for y in x[:3]), dt=0.02),
         EXTENDED,
     ),
     "simulate": (lambda m, x: fj.simulate(m, jnp.tile(x[3], (2, 1)), x[0][0], x[1][0], 0.002).position, EXTENDED),
