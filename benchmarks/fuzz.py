@@ -343,6 +343,7 @@ COMMANDS = {  # what may follow each: right words often, wrong ones now and then
     "diagnose": ("task.yaml", "poses.yaml"),
     "identify": ("task.yaml",),
     "calibrate": ("poses.yaml", "task.yaml"),
+    "excite": ("task.yaml",),
     "rerun": ("runs/first", "runs/second"),
     "demo": (),
     "verify": ("runs/first", "runs/second"),
