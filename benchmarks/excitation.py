@@ -9,6 +9,7 @@ wheel, so it does not run here.
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import sys
 import tempfile
@@ -306,6 +307,80 @@ def pays(draws: int = 60) -> None:
         print(f"{name:16s} {'  '.join(cells)}")
 
 
+def ranking(triples: int = 200) -> None:
+    """Real runs of a UR10e: does the information of three of the 18 rank the error on the other 15?
+
+    Weighted least squares of base parameters and friction, the nominal links believed within 100 %; the noise is the
+    residual of a fit to all runs. The design criterion sees positions alone, no torque of the runs that it ranks.
+    """
+    from scipy.stats import spearmanr
+
+    import figaroh_jax as fj
+    from figaroh_jax.estimation.base_parameters import base_parameters
+    from figaroh_jax.estimation.columns import structural_columns
+    from figaroh_jax.estimation.regression import Regression, condense
+    from figaroh_jax.recordings.signals import prepare_all
+    from figaroh_jax.simulators.native import NativeBackend
+
+    model = arms()["UR10e"]
+    gains = (10.0, 10.6956, 8.4566, 9.0029, 9.48, 10.1232)  # N m/A, published with the data
+    learned = fj.learn(model, trust=1.0)
+    kept, own = np.array(learned.independent), 10 * len(model.joints)
+    structure = structural_columns(model, learned.terms)
+    used = np.asarray(np.abs(structure).max(axis=0) > 0)
+    base = base_parameters(structure.reshape(-1, structure.shape[2]), learned.names)
+    assert tuple(base.independent) == learned.independent
+    nominal = base.matrix[:, :own] @ np.asarray(model.inertia).ravel()
+    data = []
+    for file in sorted((DATA / "ur10e_innopolis" / "id").glob("*.npz")):
+        z = np.load(file)
+        try:
+            run = fj.recording(q=z["q"], tau=z["i"] * gains, time=z["t"], name=file.stem)
+            signals = prepare_all((run,), fj.Preprocess(cutoff=5), slowed=False, model=model)
+            data.append(condense(Regression(NativeBackend(model), learned.terms, np.zeros(6), signals), used))
+        except fj.InputError as error:
+            print(f"left out: {error}")
+    count = len(data)
+
+    def fit(some: Any, weight: np.ndarray) -> np.ndarray:
+        G, b = np.array(learned.prior), np.asarray(learned.prior) @ nominal
+        for k in some:
+            A = data[k].factor(weight)
+            G, b = G + A[:, kept].T @ A[:, kept], b + A[:, kept].T @ A[:, -1]
+        size = np.sqrt(np.diag(G))
+        theta = np.zeros(len(learned.names))
+        theta[kept] = np.linalg.solve(G / np.outer(size, size), b / size) / size
+        return theta
+
+    def error(some: Any) -> float:
+        theta = fit(some, weight)
+        others = [data[k] for k in range(count) if k not in some]
+        squares = sum(one.squares(theta) for one in others) * weight
+        return float(np.sqrt(squares.sum() / sum(one.rows for one in others).sum()))
+
+    weight = np.ones(6)
+    for _ in range(5):
+        theta = fit(range(count), weight)
+        weight = sum(one.rows for one in data) / sum(one.squares(theta) for one in data)
+    grams = [one.factor(weight)[:, kept] for one in data]
+    grams = [A.T @ A for A in grams]
+
+    def told_by(some: Any) -> float:
+        return float(np.linalg.slogdet(np.asarray(learned.prior) + sum(grams[k] for k in some))[1])
+
+    every = list(itertools.combinations(range(count), 3))
+    best, worst = max(every, key=told_by), min(every, key=told_by)
+    some = [every[k] for k in np.random.default_rng(0).permutation(len(every))[:triples]]
+    errors, scores = [error(t) for t in some], [told_by(t) for t in some]
+    ends = f"best 3 {error(best):.3f}, worst 3 {error(worst):.3f}"
+    print(f"{count} runs; error on the others in sigmas of a fit to all: {ends}")
+    print(f"{triples} random triples: median {np.median(errors):.3f}, best {min(errors):.3f}, worst {max(errors):.3f}")
+    print(f"rank correlation of log determinant and error: {spearmanr(scores, errors).statistic:.2f}")
+    alone = [error((k,)) for k in range(count)]
+    told = [told_by((k,)) for k in range(count)]
+    print(f"single runs: rank correlation {spearmanr(told, alone).statistic:.2f}")
+
+
 def peer() -> None:
     """FIGAROH's problem: information and condition number, warm."""
     on_peer_problem(1)
@@ -323,6 +398,7 @@ PARTS = {
     "postures": postures,
     "separation": separation,
     "pays": pays,
+    "ranking": ranking,
 }
 
 
