@@ -17,6 +17,7 @@ import contextlib
 import faulthandler
 import io
 import json
+import logging
 import os
 import pickle
 import random
@@ -138,6 +139,7 @@ class Bench:
         import tasks
 
         self.folder, self.accepted, self.most = folder, 0, 0
+        logging.disable(logging.CRITICAL)  # warnings of the check of recordings
         tasks.write(folder)
         from figaroh_jax.effects.extended import extend
         from figaroh_jax.formats.export import write_model
@@ -162,6 +164,55 @@ class Bench:
         self.texts = {name: (folder / name).read_bytes() for name in ("robot.urdf", "robot.xml", "task.yaml")}
         self.texts["effects.yaml"] = (folder / "model" / "effects.yaml").read_bytes()
         self.canary = folder / "ran"
+        self._rollout()
+        self._runs()
+
+    def _rollout(self) -> None:
+        """A servo arm: commands and positions, an MJCF with an actuator, a URDF with drives that the task states."""
+        from generators import servo_arm
+
+        (self.folder / "arm.xml").write_text(servo_arm.model_text())
+        for name, seed in (("servo1", 7), ("servo2", 8)):
+            arrays = servo_arm.record("none", seed)
+            np.savez(self.folder / f"{name}.npz", **{key: x[:400] for key, x in arrays.items()})  # pyright: ignore
+        columns = {"time": "t", "command": "u", "position": "q", "velocity": "dq"}
+        self.rollout = {
+            "robot": {"model": "arm.xml"},
+            "data": [{"file": "servo1.npz", **columns}, {"file": "servo2.npz", "role": "holdout", **columns}],
+            "actuator": {"joint": {"kind": "position", "kp": 60.0, "kd": 1.0, "force": 30.0}, "gains": "known"},
+        }
+
+    def _runs(self) -> None:
+        """Two finished runs, with the files that the commands on runs read."""
+        from test_run_tools import ANSWER, CALIBRATION, RESULT, run
+
+        from figaroh_jax.rollouts.reading import load_loop
+        from figaroh_jax.runs import _write_loop
+
+        for name in ("first", "second"):
+            run(self.folder / "runs" / name, self.folder / "task.yaml", answer=ANSWER, result=RESULT)
+        loop_folder = self.folder / "loop"
+        loop_folder.mkdir()
+        shutil.copy(self.folder / "arm.xml", loop_folder / "robot.xml")
+        _write_loop(loop_folder, load_loop(self.folder / "arm.xml")[0])
+        first = self.folder / "runs" / "first"
+        self.run_files: dict[str, Any] = {
+            "answer.json": json.dumps(ANSWER, indent=1),
+            "result.json": json.dumps(RESULT, indent=1),
+            "calibration.json": json.dumps(CALIBRATION, indent=1),
+            "provenance.json": (first / "provenance.json").read_text(),
+            "figaroh-jax-run.json": (first / "figaroh-jax-run.json").read_text(),
+        }
+        self.loop_text = (loop_folder / "loop.json").read_text()
+        self.kept = {path: path.read_bytes() for path in self.folder.rglob("*") if path.is_file()}
+
+    def mend(self) -> None:
+        """The files as they were."""
+        for path, data in self.kept.items():
+            with contextlib.suppress(OSError):
+                if not path.is_file() or path.read_bytes() != data:
+                    path.parent.mkdir(exist_ok=True, parents=True)
+                    path.write_bytes(data)
 
     def planted(self) -> bytes:
         """A pickle that makes the canary when it is read."""
@@ -175,7 +226,7 @@ class Bench:
 
 def yaml_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
     if source.once_in(2):
-        tree = source.of((bench.task, bench.poses))
+        tree = source.of((bench.task, bench.poses, bench.rollout))
         for _ in range(source.random.choice((1, 1, 2, 3))):
             tree = mutated_tree(tree, source)
         text = yaml.dump(tree, allow_unicode=True, sort_keys=False).encode("utf-8", "surrogatepass")
@@ -288,39 +339,116 @@ def parquet_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
     return mutated_bytes(data, source) if source.once_in(2) else data
 
 
+COMMANDS = {  # what may follow each: right words often, wrong ones now and then
+    "diagnose": ("task.yaml", "poses.yaml"),
+    "identify": ("task.yaml",),
+    "calibrate": ("poses.yaml", "task.yaml"),
+    "rerun": ("runs/first", "runs/second"),
+    "demo": (),
+    "verify": ("runs/first", "runs/second"),
+    "compare": ("runs/first", "runs/second", "runs/first"),
+    "list": (".", "runs"),
+    "export": ("loop", "model"),
+    "new": ("robot.urdf", "run1.npz", "run2.npz", "arm.xml", "robot.xml"),
+}
+OPTIONS = (
+    "--out --json --quiet --backend --level --no-priors --no-cache --help --traceback --for --limits --junit --joints"
+    " --rate --constants --version"
+).split()
+PLACES = (".", "", "..", "out", "out/../out", "n" * 300, "o/" * 200, "task.yaml", "task.yaml/x", "/", "runs/first")
+
+
 def argv_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
-    words = [source.of(("diagnose", "identify", "calibrate", "demo", "", "x")), source.of(("task.yaml", "", ".", "\1"))]
-    for _ in range(source.random.randrange(5)):
-        option = source.of(
-            ("--out", "--json", "--quiet", "--backend", "--level", "--no-priors", "--no-cache", "--help")
-        )
+    """Words of a command line; `--out /` and the like stay in the bench's folder or are refused."""
+    command = source.of(COMMANDS) if not source.once_in(20) else source.of(("", "x", "--", "-"))
+    words = [command]
+    known = COMMANDS.get(command, ()) or ("task.yaml",)
+    for _ in range(source.random.choice((0, 1, 1, 2, 2, 3))):
+        words.append(source.of(known) if not source.once_in(5) else source.of(("", ".", "\1", *PLACES, *WORDS)))
+    for _ in range(source.random.choice((0, 0, 1, 2, 3))):
+        option = source.of(OPTIONS)
         words.append(option)
-        if option in ("--out", "--backend", "--level"):
-            path = source.of(
-                (".", "", "..", "out", "out/../out", "n" * 300, "o/" * 200, "task.yaml", "task.yaml/x", "/")
-            )
-            words.append(source.of((path, path, source.of(WORDS))))
+        values = {
+            "--for": ("mujoco", "newton", "isaaclab", "genesis", "drake", "x"),
+            "--limits": ("limits.yaml", "task.yaml"),
+            "--joints": ("shoulder,elbow,slide", "shoulder", ",,", "x"),
+            "--rate": ("250", "0", "nan", "-1", "1e400", "x"),
+            "--constants": ("1,2,3", "nan,1,1", "1", "1e400,0,0", "x"),
+        }
+        if option in values:
+            words.append(source.of(values[option]))
+        elif option in ("--out", "--backend", "--level", "--junit"):
+            words.append(source.of((*PLACES, source.of(WORDS))))
     return json.dumps(words).encode()
+
+
+def json_input(files: Callable[[Bench], dict[str, str]]) -> Callable[[Bench, Source, list[bytes]], bytes]:
+    """One of several JSON files changed; its name stands on the first line."""
+
+    def make(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
+        texts = files(bench)
+        name = source.of(texts)
+        if source.once_in(3):
+            return name.encode() + b"\n" + mutated_bytes(texts[name].encode(), source)
+        tree = json.loads(texts[name])
+        for _ in range(source.random.choice((1, 1, 2, 4))):
+            tree = mutated_tree(tree, source)
+        return name.encode() + b"\n" + json.dumps(tree).encode("utf-8", "replace")
+
+    return make
+
+
+def limits_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
+    tree: Any = {
+        "verdict": ["named"],
+        "consistent": True,
+        "fk_parity": 1e-9,
+        "holdout": 0.1,
+        "holdout_joint": {"j1": 0.05},
+        "condition": 1e3,
+    }
+    for _ in range(source.random.choice((0, 1, 1, 2, 3))):
+        tree = mutated_tree(tree, source)
+    text = yaml.dump(tree, allow_unicode=True, sort_keys=False).encode("utf-8", "surrogatepass")
+    return mutated_bytes(text, source) if source.once_in(3) else text
+
+
+def call_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
+    """A call of a function of arrays: the seed says which arrays, so that the input can be replayed."""
+    return json.dumps([source.of(CALLS), source.random.randrange(2**32)]).encode()
+
+
+def draft_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
+    kind = source.of((npz_input, npz_input, csv_input))
+    return (b"npz" if kind is npz_input else b"csv") + b"\n" + kind(bench, source, seen)
 
 
 def read_task(bench: Bench, file: Path) -> None:
     """Everything that the commands read before they compute."""
     from figaroh_jax.formats.config import load_task
     from figaroh_jax.formats.robotfile import load_robot, stated_baseline
+    from figaroh_jax.recordings.checks import check_recordings
     from figaroh_jax.recordings.dataset import read_recordings
     from figaroh_jax.recordings.poses import read_pose_recordings
+    from figaroh_jax.recordings.posture_checks import check_pose_recordings
     from figaroh_jax.reporting.run_directory import check_directory, task_inputs
 
     task = load_task(file)
     check_directory(bench.folder / "out", task_inputs(file))
+    from figaroh_jax.rollouts.task import is_rollout_task, read_rollouts
+
+    if is_rollout_task(task):
+        read_rollouts(task)
+        return
     robot = load_robot(task)
     stated_baseline(task)
     if any(entry.measurement is not None for entry in task.data):
-        read_pose_recordings(task, robot)
+        check_pose_recordings(task, robot, read_pose_recordings(task, robot))
     else:
         from figaroh_jax.recordings.signals import choose_rates, prepare
 
         recordings = read_recordings(task, robot)
+        check_recordings(task, robot, recordings)
         rates = choose_rates(recordings, task.preprocess)
         for recording in recordings:
             prepare(recording, task.preprocess, rates)
@@ -356,6 +484,11 @@ def read_model(bench: Bench, file: Path) -> None:
 
 def run_command(bench: Bench, file: Path) -> None:
     """A command line whose jobs read everything and then stop."""
+    command_line(bench, json.loads(file.read_bytes()))
+
+
+def command_line(bench: Bench, words: list[str]) -> None:
+    """One command line, in the bench's folder; what it changes there is mended."""
     from figaroh_jax import cli, runs
 
     def job(task_file: Path, out: Path, progress: Any, backend: str, **options: Any) -> None:
@@ -363,9 +496,6 @@ def run_command(bench: Bench, file: Path) -> None:
         read_task(bench, task_file)
         raise runs.InputError("stop")
 
-    words = json.loads(file.read_bytes())
-    if words[0] == "demo" and len(words) > 1:
-        del words[1]
     before = {name: entry._replace(run=job) for name, entry in runs.JOBS.items()}
     original = dict(runs.JOBS)
     runs.JOBS.update(before)
@@ -378,8 +508,107 @@ def run_command(bench: Bench, file: Path) -> None:
     finally:
         os.chdir(here)
         runs.JOBS.update(original)
-    assert status in (0, 2), f"status {status}: {error.getvalue()}"
-    assert "Traceback" not in error.getvalue() and "internal error" not in error.getvalue(), error.getvalue()
+        changed = [path.name for path, data in bench.kept.items() if _differs(path, data) and path.name not in OURS]
+        bench.mend()
+    assert not changed, f"files of the user's were changed: {changed}"
+    assert status in (0, 2) or (status == 1 and words[0] == "verify"), f"status {status}: {error.getvalue()}"
+    told = "internal error" in error.getvalue() or ("Traceback" in error.getvalue() and "--traceback" not in words)
+    assert not told, error.getvalue()
+
+
+OURS = ("verification.json", "figaroh-jax-run.json", "task.yaml", "effects.yaml")  # of runs; inputs themselves
+
+
+def _differs(path: Path, data: bytes) -> bool:
+    return not path.is_file() or path.stat().st_size != len(data) or path.read_bytes() != data
+
+
+def read_run_files(bench: Bench, file: Path) -> None:
+    """The commands on runs, where one file of a run is damaged."""
+    name, _, data = file.read_bytes().partition(b"\n")
+    name = b"result.json" if name == b"calibration.json" else name
+    where = bench.folder / ("loop" if name == b"loop.json" else "runs/second") / name.decode()
+    right = where.read_bytes() if where.is_file() else None
+    where.write_bytes(data)
+    if right is not None:
+        bench.kept[where] = data
+    lines = [["verify", "runs/second", "--json"], ["compare", "runs/first", "runs/second", "--out", "page.html"]]
+    lines += [["list", "runs"], ["rerun", "runs/second", "--quiet"], ["diagnose", "task.yaml", "--out", "runs/second"]]
+    if name == b"loop.json":
+        lines = [["export", "loop", "--for", simulator] for simulator in ("mujoco", "newton", "isaaclab")]
+        lines[0] += ["--out", "exported"]
+    try:
+        for words in lines:
+            command_line(bench, words)
+    finally:
+        for made in ("page.html", "exported"):
+            path = bench.folder / made
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        if right is None:
+            where.unlink(missing_ok=True)
+        else:
+            bench.kept[where] = right
+        bench.mend()
+
+
+def read_limits(bench: Bench, file: Path) -> None:
+    command_line(bench, ["verify", "runs/first", "--limits", file.name])
+
+
+def draft(bench: Bench, file: Path) -> None:
+    """`new` on a recording that is malformed."""
+    suffix, _, data = file.read_bytes().partition(b"\n")
+    recording = bench.folder / f"drafted.{suffix.decode()}"
+    recording.write_bytes(data)
+    command_line(bench, ["new", "robot.urdf", recording.name])
+    command_line(bench, ["new", "robot.urdf", recording.name, "--joints", "shoulder,elbow,slide", "--rate", "250"])
+
+
+CALLS = (
+    "recording postures residual torque_data predict integrate inverse_dynamics mass_matrix regressor normal_matrix"
+    " frame_placement gravity effect"
+).split()
+
+
+def call(bench: Bench, file: Path) -> None:
+    """A public function on odd arrays; what it gives has the right shape, and no NaN where none went in."""
+    import figaroh_jax as fj
+    from figaroh_jax.rigid import derivatives, manifold
+
+    name, seed = json.loads(file.read_bytes())
+    source = Source(seed)
+    model = fj.load_urdf(bench.folder / "robot.urdf")
+    given: dict[str, Any] = {key: np.array(bench.arrays[key]) for key in ("q", "dq", "tau")}
+    for key in source.random.sample(list(given), source.random.choice((0, 1, 1, 2))):
+        given[key] = source.of((odd_array(given[key], source), odd_array(given[key], source), junk(source)))
+    q, v, tau = given.values()
+    time = odd_array(bench.arrays["t"], source) if source.once_in(3) else bench.arrays["t"]
+    units = source.of((None, None, {"position": "deg"}, {"position": source.of(WORDS)}, {source.of(WORDS): "s"}))
+    last = model.frames[-1].name if not source.once_in(6) else source.of(WORDS)
+    frames = {"base_frame": "base", "tool_frame": last}
+    calls: dict[str, Callable[[], Any]] = {
+        "recording": lambda: fj.recording(q=q, v=v, tau=tau, time=time, model=model, units=units),
+        "postures": lambda: fj.postures(q=q, position=v, units=units, **frames),
+        "residual": lambda: fj.residual(model, fj.recording(q=q, tau=tau, time=time)),
+        "torque_data": lambda: fj.torque_data(model, fj.recording(q=q, tau=tau, rate=100)),
+        "predict": lambda: fj.predict(fj.extend(model), time, q, v, tau, 0.01),
+        "integrate": lambda: manifold.integrate(model, q, v),
+        "inverse_dynamics": lambda: fj.inverse_dynamics(model, q, v, tau),
+        "mass_matrix": lambda: fj.mass_matrix(model, q),
+        "regressor": lambda: fj.joint_torque_regressor(model, q, v, tau),
+        "normal_matrix": lambda: fj.normal_matrix(model, q, v, tau, tau, weight=source.of((None, v, 1.0, "x"))),
+        "frame_placement": lambda: fj.frame_placement(model, q, last),
+        "gravity": lambda: derivatives.gravity_vector(model, q),
+        "effect": lambda: fj.place(
+            fj.CATALOGUE[source.of((*fj.CATALOGUE, "x"))] if source.once_in(2) else fj.CATALOGUE["viscous_friction"],
+            model,
+            source.of((["elbow"], ["x"], [], None, "elbow", ["elbow", "elbow"])),
+            **source.of(
+                ({}, {"damping": source.of(NUMBERS)}, {"damping": source.of(WORDS)}, {"x" + source.of(WORDS): 1})
+            ),
+        ),
+    }
+    calls[name]()
 
 
 KINDS: dict[str, tuple[str, int, Callable[..., bytes], Callable[[Bench, Path], None]]] = {
@@ -390,7 +619,12 @@ KINDS: dict[str, tuple[str, int, Callable[..., bytes], Callable[[Bench, Path], N
     "csv": ("fuzzed.csv", 5, csv_input, read_recording),
     "parquet": ("fuzzed.parquet", 3, parquet_input, read_recording),
     "effects": ("effects.yaml", 2, text_input("effects.yaml"), read_model),
-    "argv": ("argv.json", 2, argv_input, run_command),
+    "argv": ("argv.json", 6, argv_input, run_command),
+    "run": ("run.bin", 2, json_input(lambda bench: bench.run_files), read_run_files),
+    "loop": ("loop.bin", 1, json_input(lambda bench: {"loop.json": bench.loop_text}), read_run_files),
+    "limits": ("limits.yaml", 1, limits_input, read_limits),
+    "new": ("draft.bin", 2, draft_input, draft),
+    "call": ("call.json", 3, call_input, call),
 }
 
 
@@ -489,10 +723,10 @@ def work(args: argparse.Namespace) -> int:
         if found:
             (args.keep / f"{kind}-{seed}").write_bytes(kind.encode() + b"\n" + data)
             print(json.dumps({"seed": seed, "kind": kind, "found": found}), flush=True)
-        elif len(coverage.lines) > before and len(data) < 100_000:
+        elif len(coverage.lines) > before and len(data) < 100_000 and kind not in ("run", "loop", "new", "call"):
             corpus[kind].append(data)
-        if not (folder / "robot.urdf").exists() or number % 500 == 0:
-            (folder / "task.yaml").write_bytes(bench.texts["task.yaml"])
+        if kind == "task" or number % 500 == 0:
+            bench.mend()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
     print(
         json.dumps({"done": done, "accepted": bench.accepted, "lines": len(coverage.lines), "peak_MiB": peak}),
@@ -523,7 +757,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=int(time.time()) << 20)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=list(KINDS))
-    parser.add_argument("--guide", type=int, default=3, help="of so many inputs one is traced for its coverage")
+    parser.add_argument("--guide", type=int, default=5, help="of so many inputs one is traced for its coverage")
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()) / "fuzz-findings")
     parser.add_argument("--replay", type=Path)
     parser.add_argument("--worker", type=int, help=argparse.SUPPRESS)

@@ -1,13 +1,14 @@
 """Commands killed at random moments, and every call by which they write refused once: the old or the new run is there.
 
-    python benchmarks/kills.py                       # 200 kills, every write refused in four ways: about ten minutes
-    python benchmarks/kills.py --kills 20 --failures 20
+    python benchmarks/kills.py                       # 200 kills, 50 refusals of each kind of call that writes
+    python benchmarks/kills.py --kills 20 --failures 2
 
 A folder holds a task with its files, things of the user's beside them, and an earlier run. Each kill is a fresh process
 that runs one command and gets SIGKILL, SIGTERM or SIGINT at a random moment; each failure is a command in which one of
 the calls that open, write, synchronise, rename, make or remove something raises (no space, input/output error,
-interrupted call, Ctrl-C). After each, the checksums of all that is the user's are as before, and the run directory is
-the earlier run or the new one, whole. What the commands compute is computed once, before; the rest is as ever.
+interrupted call, Ctrl-C). After each, the checksums of all that is the user's are as before, the run directory is the
+earlier run or the new one, whole, and every single file is absent or whole. What a killed process leaves hidden is gone
+once each command has run again. What the commands compute is computed once, before; the rest is as ever.
 """
 
 from __future__ import annotations
@@ -28,12 +29,22 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
-COMMANDS = ("diagnose", "identify", "calibrate", "demo")
+COMMANDS = ("diagnose", "identify", "calibrate", "demo", "rerun", "verify", "compare", "list", "new", "export")
+LINES = {  # of the commands that take no task
+    "rerun": ["runs/kept", "--out", "runs/out", "--quiet"],
+    "verify": ["runs/out"],
+    "compare": ["runs/out", "runs/kept", "--out", "runs/page.html"],
+    "list": ["runs"],
+    "new": ["robot.urdf", "run1.npz", "--joints", "shoulder,elbow,slide", "--out", "runs/task.yaml"],
+    "export": ["loop", "--for", "mujoco", "--out", "runs/exported"],
+}
+ENDS = {"page.html": "</html>\n", "task.yaml": "\n", "mujoco.json": "}\n", "robot.xml": "</mujoco>\n"}
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 ERRORS: tuple[Callable[[], BaseException], ...] = (
     lambda: OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
@@ -87,9 +98,33 @@ def prepare(folder: Path) -> None:
     demo = ROOT / "figaroh_jax" / "demo"
     found["demo"] = replace(fake_diagnosis.named(), model=extend(load_urdf(demo / "robot.urdf")))
     (folder.parent / "found.pickle").write_bytes(pickle.dumps(found))
+    from generators import servo_arm
+
+    from figaroh_jax.rollouts.reading import load_loop
+    from figaroh_jax.runs import _write_loop
+
+    (folder / "loop").mkdir()
+    (folder / "loop" / "robot.xml").write_text(servo_arm.model_text())
+    _write_loop(folder / "loop", load_loop(folder / "loop" / "robot.xml")[0])
+    _right_recording(folder / "run1.npz", found["diagnose"].model)
+    (folder / "runs").mkdir()
+    os.chdir(folder)
+    assert command(folder, "diagnose", "runs/kept") == 0
 
 
-def command(folder: Path, name: str) -> int:
+def _right_recording(file: Path, model: Any) -> None:
+    """The recording's torque as the model has it, so that a draft can be made of it."""
+    import numpy as np
+
+    import figaroh_jax as fj
+
+    arrays = dict(np.load(file))
+    acceleration = np.gradient(arrays["dq"], arrays["t"], axis=0)
+    arrays["tau"] = np.asarray(fj.inverse_dynamics(model.robot, arrays["q"], arrays["dq"], acceleration))
+    np.savez(file, **arrays)
+
+
+def command(folder: Path, name: str, out: str = "runs/out") -> int:
     """One command in the user's folder; what it would compute is there."""
     from figaroh_jax import cli
     from figaroh_jax.calibration import calibration
@@ -97,12 +132,16 @@ def command(folder: Path, name: str) -> int:
     from figaroh_jax.identification import identification
 
     found = pickle.loads((folder.parent / "found.pickle").read_bytes())
-    diagnosis.diagnose_task = lambda *args, **more: found[name]
+    diagnosis.diagnose_task = lambda *args, **more: found["demo" if name == "demo" else "diagnose"]
     identification.identify_task = lambda *args, **more: found["identify"]
     calibration.calibrate_task = lambda *args, **more: found["calibrate"]
     os.chdir(folder)
+    if name in LINES:
+        for made in ("runs/task.yaml", "runs/exported/mujoco.json", "runs/exported/robot.xml"):
+            Path(made).unlink(missing_ok=True)
+        return cli.main([name, *LINES[name]])
     task = [] if name == "demo" else ["poses.yaml" if name == "calibrate" else "task.yaml"]
-    return cli.main([name, *task, "--out", "runs/out", "--quiet"])
+    return cli.main([name, *task, "--out", out, "--quiet"])
 
 
 def checksums(folder: Path) -> dict[str, str]:
@@ -116,14 +155,18 @@ def checksums(folder: Path) -> dict[str, str]:
 
 
 def whole(out: Path) -> str | None:
-    """The kind of run in the directory; None where it is not whole."""
+    """The kind of run in the directory; None where it is not whole, or a single file beside it is not."""
     from figaroh_jax.reporting import run_directory
 
+    for path in (*out.parent.glob("*.*"), *(out.parent / "exported").glob("*")):
+        if path.is_file() and path.name in ENDS and not path.read_text().endswith(ENDS[path.name]):
+            return None
     if not out.is_dir() or run_directory._altered(out) is not None:
         return None
     names = {path.name for path in out.iterdir()}
     written = run_directory._written(out) or {}
-    if set(written) - {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}:
+    there = {"verification.json"}  # the marker lists it before it is there
+    if set(written) - there - {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}:
         return None
     return "answer" if "answer.json" in names else "parameters" if "parameters.csv" in names else "calibration"
 
@@ -162,19 +205,20 @@ def kills(folder: Path, count: int, source: random.Random) -> Counter[str]:
     for name in COMMANDS:
         begin = time.monotonic()
         status = ended(child(folder, name), 600)
+        assert name in LINES or whole(out), name
         assert status == 0, f"{name} ended with {status}"
         lasts[name] = time.monotonic() - begin
     number = 0
     while counted["killed"] < count and number < 5 * count:
         number += 1
         name = COMMANDS[number % len(COMMANDS)]
-        old = whole(out)
+        old, before_it = whole(out), _hidden(out)
         pid = child(folder, name)
         moment = source.uniform(0, 0.9) * lasts[name]
         if number % 3:  # once it has begun to write, and a little later
             begin = time.monotonic()
-            while time.monotonic() - begin < 10 * lasts[name] and not list(out.parent.glob(".figaroh-jax-*/new")):
-                time.sleep(0.001)
+            while time.monotonic() - begin < 2 * lasts[name] and _hidden(out) <= before_it:
+                time.sleep(0.0005)
             moment = source.uniform(0, 0.25) * lasts[name]
         status = ended(pid, moment)
         number_of_signal = source.choice(SIGNALS)
@@ -190,12 +234,21 @@ def kills(folder: Path, count: int, source: random.Random) -> Counter[str]:
         counted["run not whole"] += new is None
         counted["file of the user's touched"] += checksums(folder) != before
         counted["the other run is there"] += new != old
-        litter = list(out.parent.glob(".figaroh-jax-*"))
-        counted["hidden folder left by SIGKILL"] += bool(litter) and number_of_signal == signal.SIGKILL
-        counted["hidden folder left otherwise"] += bool(litter) and number_of_signal != signal.SIGKILL
-        for left in litter:
-            shutil.rmtree(left)
+        litter = bool(_hidden(out) - before_it)
+        counted["hidden things left by SIGKILL"] += litter and number_of_signal == signal.SIGKILL
+        counted["hidden things left otherwise"] += litter and number_of_signal != signal.SIGKILL
+        counted[name] += status != 0
+    for left in out.parent.glob(".figaroh-jax-*"):
+        os.utime(left, (0, 0))  # those that say nothing are removed after a minute
+    for name in COMMANDS:
+        assert ended(child(folder, name), 600) == 0, f"{name} after all kills"
+    counted["hidden things left once all commands have run again"] = len(_hidden(out))
     return counted
+
+
+def _hidden(out: Path) -> set[Path]:
+    """What is hidden beside the run directory, in it and beside exported files."""
+    return {path for folder in (out.parent, out, out.parent / "exported") for path in folder.glob(".figaroh-jax-*")}
 
 
 class Refusing:
@@ -217,6 +270,8 @@ class Refusing:
         original = getattr(module, name)
 
         def call(*args: Any, **more: Any) -> Any:
+            if name == "open" and not args[1] & (os.O_WRONLY | os.O_RDWR):
+                return original(*args, **more)
             named = [os.fsdecode(x) for x in args[:2] if isinstance(x, (str, bytes, os.PathLike))]
             if named and not any(self.below in text for text in named):
                 return original(*args, **more)
@@ -227,9 +282,12 @@ class Refusing:
     def opened(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def call(file: Any, mode: str = "r", *args: Any, **more: Any) -> Any:
             writes = any(letter in mode for letter in "wax+")
-            if not writes or not isinstance(file, (str, os.PathLike)) or self.below not in os.fspath(file):
+            numbered = isinstance(file, int)
+            path = os.readlink(f"/proc/self/fd/{file}") if numbered else file
+            if not writes or not isinstance(path, (str, os.PathLike)) or self.below not in str(Path(path).absolute()):
                 return original(file, mode, *args, **more)
-            stream = self.point("open", lambda: original(file, mode, *args, **more))
+            open_it = partial(original, file, mode, *args, **more)
+            stream = open_it() if numbered else self.point("open", open_it)
             inner = stream.write
             return _Writing(stream, lambda data: self.point("write", lambda: inner(data)))
 
@@ -255,6 +313,9 @@ class _Writing:
         return iter(self.stream)
 
 
+_CALLS = ("mkdir", "rename", "replace", "link", "unlink", "rmdir", "fsync", "open")
+
+
 @contextlib.contextmanager
 def refusing(
     out: Path, chosen: int, error: Callable[[], BaseException], after: bool, one_step: bool
@@ -266,7 +327,7 @@ def refusing(
     from figaroh_jax.reporting import run_directory
 
     switch = Refusing(out, chosen, error, after)
-    changed = [(os, name, switch.wrap(os, name)) for name in ("mkdir", "rename", "replace", "unlink", "rmdir", "fsync")]
+    changed = [(os, name, switch.wrap(os, name)) for name in _CALLS]
     if one_step:
         changed += [(run_directory, "_exchange", switch.wrap(run_directory, "_exchange"))]
     else:
@@ -282,34 +343,43 @@ def refusing(
             setattr(module, name, value)
 
 
+WRITING = ("diagnose", "rerun", "verify", "compare", "new", "export")  # whose calls are refused
+
+
 def failures(folder: Path, count: int, source: random.Random) -> Counter[str]:
-    """Refuse each of the calls that write, one a run; count what was found after each."""
+    """Refuse calls that write, one a run, `count` of each kind; count what was found after each."""
     out, counted = folder / "runs" / "out", Counter[str]()
     before, kinds = checksums(folder), Counter[str]()
-    points = []
-    for one_step in (True, False):
-        with refusing(out, -1, ERRORS[0], False, one_step) as all_of_them, contextlib.redirect_stdout(io.StringIO()):
-            assert command(folder, "diagnose") == 0
-        each = range(len(all_of_them.calls))
-        points += [(k, error, after, one_step) for k in each for error in ERRORS for after in (False, True)]
-    source.shuffle(points)
-    for chosen, error, after, one_step in points[:count]:
+    points: dict[str, list[tuple[Any, ...]]] = {}
+    for name in WRITING:
+        for one_step in (True, False) if name == "diagnose" else (True,):
+            with refusing(out, -1, ERRORS[0], False, one_step) as switch, contextlib.redirect_stdout(io.StringIO()):
+                assert command(folder, name) in (0, 1), name
+            for k, kind in enumerate(switch.calls):
+                ways = [(name, k, kind, error, after, one_step) for error in ERRORS for after in (False, True)]
+                points.setdefault(kind, []).extend(ways)
+    for some in points.values():
+        source.shuffle(some)
+    chosen = [point for some in points.values() for point in (some * -(-count // len(some)))[:count]]
+    for name, number, kind, error, after, one_step in chosen:
         errors = io.StringIO()
-        with refusing(out, chosen, error, after, one_step) as switch, contextlib.redirect_stderr(errors):
+        with refusing(out, number, error, after, one_step) as switch, contextlib.redirect_stderr(errors):
             with contextlib.redirect_stdout(io.StringIO()):
-                status = command(folder, "diagnose")
-        kinds[switch.calls[chosen]] += 1
-        counted["failures"] += 1
-        counted["run not whole"] += whole(out) is None
+                status = command(folder, name)
+        refused = len(switch.calls) > number
+        kinds[switch.calls[number] if refused else f"{kind} not reached"] += 1
+        counted["failures"] += refused
+        counted[f"{name}: run not whole"] += whole(out) is None
         counted["file of the user's touched"] += checksums(folder) != before
-        counted["status other than 0, 2, 130"] += status not in (0, 2, 130)
-        counted["no single line of message"] += status == 2 and errors.getvalue().count("\n") != 1
-        for left in [*out.parent.glob(".figaroh-jax-*"), *out.parent.glob("out-*")]:
-            counted[f"left beside: {'hidden folder' if left.name[0] == '.' else 'the finished run'}"] += 1
-            shutil.rmtree(left)
+        counted[f"{name}: status other than 0, 1, 2, 130"] += status not in (0, 1, 2, 130)
+        counted[f"{name}: no single line of message"] += status == 2 and errors.getvalue().count("\n") != 1
+        for left in [*_hidden(out), *out.parent.glob("out-*")]:
+            counted[f"left beside: {'hidden' if left.name[0] == '.' else 'the finished run'}"] += 1
+            shutil.rmtree(left) if left.is_dir() else left.unlink()
         if whole(out) is None:
             shutil.rmtree(out, ignore_errors=True)
-    print(f"calls refused: {dict(kinds)} of {dict(Counter(all_of_them.calls))} in a run")
+            assert command(folder, "diagnose") == 0
+    print(f"calls refused: {dict(kinds)}")
     return counted
 
 
@@ -317,7 +387,7 @@ def main() -> int:
     """Both studies; status 1 where a run was not whole or a file of the user's was touched."""
     parser = argparse.ArgumentParser(description="Kill commands and refuse their writes; see what is left.")
     parser.add_argument("--kills", type=int, default=200)
-    parser.add_argument("--failures", type=int, default=400)
+    parser.add_argument("--failures", type=int, default=50, help="of each kind of call")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
@@ -336,10 +406,14 @@ def main() -> int:
         import figaroh_jax.calibration.calibration
         import figaroh_jax.diagnosis.diagnosis
         import figaroh_jax.identification.identification
+        import figaroh_jax.recordings.draft
         import figaroh_jax.reporting.calibration_files
         import figaroh_jax.reporting.identification_report
         import figaroh_jax.reporting.report
-        import figaroh_jax.reporting.terminal  # noqa: F401
+        import figaroh_jax.reporting.side_by_side
+        import figaroh_jax.reporting.terminal
+        import figaroh_jax.reporting.verification
+        import figaroh_jax.rollouts.export  # noqa: F401
 
         source = random.Random(args.seed)
         wrong = 0
@@ -347,8 +421,8 @@ def main() -> int:
         for name, study, count in (("kills", kills, args.kills), ("failures", failures, args.failures)):
             counted = study(folder, count, source) if count else Counter()
             print(f"{name}: { ({key: value for key, value in counted.items() if value}) }", flush=True)
-            bad = ("run not whole", "file of the user's touched", "status other than 0, 2, 130")
-            wrong += sum(counted[key] for key in (*bad, "no single line of message", "did not end when asked to"))
+            bad = ("not whole", "of the user's touched", "status other", "no single line", "did not end", "run again")
+            wrong += sum(value for key, value in counted.items() if any(words in key for words in bad))
         os.chdir(here)
     return wrong > 0
 

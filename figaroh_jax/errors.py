@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from itertools import islice
+from typing import Any
 
 _MOST_KNOWN, _MOST_LISTED, _LONGEST_WORD = 1000, 100, 100  # a file may hold ten thousand names of any length
 
@@ -15,6 +17,43 @@ class InputError(ValueError):
 
 class NotSupported(InputError):
     """A backend was asked for what its library does not give; the message names those that do."""
+
+
+def check_real(name: str, array: Any) -> None:
+    """Raise `InputError` naming an array that holds anything but real numbers: complex ones, text, objects.
+
+    Converted to float64, complex numbers would lose their imaginary part and text would be read as numbers.
+    """
+    dtype = getattr(array, "dtype", None)
+    kind = "R" if getattr(dtype, "names", None) else getattr(dtype, "kind", None)
+    if kind is None:
+        import numpy as np
+
+        try:
+            kind = np.asarray(array).dtype.kind
+        except (TypeError, ValueError) as error:  # rows of different lengths
+            raise InputError(f"{name} is no array of numbers: {str(error)[:200]}") from None
+        except Exception as error:  # a list of what JAX traces: NumPy may not look into it, JAX checks it later
+            if type(error).__module__.partition(".")[0] != "jax":
+                raise
+            return
+    if kind not in "biufV":  # V: bfloat16 and the like
+        held = {"c": "complex numbers", "U": "text", "S": "bytes", "O": "objects", "R": "records"}.get(
+            kind, f"data of kind '{kind}'"
+        )
+        raise InputError(f"{name} holds {held}; real ones are expected")
+
+
+@contextmanager
+def as_written(what: object) -> Iterator[None]:
+    """What breaks while a file of the library's own is used (changed or damaged since) becomes an `InputError`."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
+        said = f"{type(error).__name__}: {str(error)[:200]}"
+        raise InputError(f"{what}: is not as this library writes it; was it changed or damaged? ({said})") from error
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from .errors import InputError
 from .reporting.provenance import read_provenance
+from .reporting.run_directory import write_file
 
 __all__ = ["command_of", "compare", "list", "new", "verify"]
 
@@ -32,7 +34,7 @@ def new(args: argparse.Namespace) -> int:
     elif args.out is None:
         print(draft.text, end="")
     if args.out is not None:
-        _write(args.out, draft.text, "--out")
+        write_file(args.out, draft.text, "--out")
         if not args.json:
             print("\n".join([*(f"assumed: {line}" for line in draft.assumed), f"Task: {args.out}"]))
     return 0
@@ -48,12 +50,12 @@ def _numbers(text: str | None, option: str) -> tuple[float, ...] | None:
 def verify(args: argparse.Namespace) -> int:
     """One line a limit; 1 where one fails."""
     from .formats.config import Limits, load_limits
-    from .reporting.verification import DEFAULT_LIMITS, junit, verify as judged
+    from .reporting.verification import DEFAULT_LIMITS, JUNIT, junit, verify as judged
 
     limits = load_limits(args.limits) if args.limits else Limits.model_validate(DEFAULT_LIMITS)
     checks = judged(args.run, limits)
     if args.junit:
-        _write(args.junit, junit(args.run.resolve(), checks), "--junit")
+        write_file(args.junit, junit(args.run.resolve(), checks), "--junit", JUNIT)
     if args.json:
         print(json.dumps([check._asdict() for check in checks], indent=2, ensure_ascii=False))
     else:
@@ -63,13 +65,13 @@ def verify(args: argparse.Namespace) -> int:
 
 def compare(args: argparse.Namespace) -> int:
     """Tables of all runs, and a page of them where `--out` names one."""
-    from .reporting.side_by_side import compare_runs, comparison_page, comparison_text
+    from .reporting.side_by_side import PAGE, compare_runs, comparison_page, comparison_text
 
     if len(args.runs) < 2:
         raise InputError("compare: one run directory is given; expected two or more, the first is the reference")
     sections = compare_runs(args.runs)
     if args.out:
-        _write(args.out, comparison_page(args.runs, sections), "--out")
+        write_file(args.out, comparison_page(args.runs, sections), "--out", PAGE)
     _print(sections, args.json, comparison_text(sections))
     if args.out and not args.json:
         print(f"\nPage: {args.out}")
@@ -90,20 +92,29 @@ def list(args: argparse.Namespace) -> int:
 def command_of(folder: Path) -> tuple[str, ...]:
     """The command line that made the run in `folder`, without `--out`; raises `InputError` where that is not said."""
     made = read_provenance(folder)
-    options = [str(option) for option in made["options"]]
+    options = [*made["options"]]
+    if made["command"] not in _RUNS or not _own_options(options):
+        said = " ".join([made["command"], *options])[:200]
+        raise InputError(f"{folder}: its provenance.json names a command that makes no run: {said}")
     if not Path(made["task"]).is_file():
         raise InputError(f"{folder}: its task {made['task']} is not there any more; its text is in provenance.json")
     return (str(made["command"]), str(made["task"]), *options)
 
 
+_RUNS = ("diagnose", "identify", "calibrate")
+_OPTIONS = {"--backend": 1, "--level": 1, "--no-priors": 0}  # that a run is said to have had, and their words
+
+
+def _own_options(options: Sequence[str]) -> bool:
+    """Whether the words are options that a run writes into its provenance, and nothing else."""
+    waiting = [*options]
+    while waiting:
+        count = _OPTIONS.get(waiting.pop(0))
+        if count is None or any(word.startswith("-") for word in waiting[:count]) or len(waiting) < count:
+            return False
+        del waiting[:count]
+    return True
+
+
 def _print(sections, as_json: bool, text: str) -> None:
     print(json.dumps([section._asdict() for section in sections], indent=2, ensure_ascii=False) if as_json else text)
-
-
-def _write(path: Path, text: str, option: str) -> None:
-    try:
-        if path.is_dir():
-            raise InputError(f"{option} {path}: is a directory; name a file")
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{option} {path}: cannot be written: {error.strerror or error}") from error

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Callable, Iterator, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from .errors import InputError
-from .reporting.run_directory import check_directory, task_inputs, whole_directory
+from .errors import InputError, as_written
+from .reporting.run_directory import check_directory, refusals, task_inputs, whole_directory, write_file
 
 if TYPE_CHECKING:
     from .calibration.calibrated import Calibration
@@ -113,15 +114,29 @@ def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
 
     try:
         content = json.loads((model / LOOP).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         raise InputError(f"{model}: no readable {LOOP}; name the `model` directory of a rollout's run") from None
-    text = json.dumps(for_simulator(content, simulator), indent=2, ensure_ascii=False) + "\n"
+    with as_written(model / LOOP):
+        text = json.dumps(for_simulator(content, simulator), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        files = {f"{simulator}.json": text}
+        if simulator == "mujoco" and out is not None:
+            files["robot.xml"] = with_drives(model / "robot.xml", content)
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / f"{simulator}.json").write_text(text, encoding="utf-8")
-        if simulator == "mujoco":
-            (out / "robot.xml").write_text(with_drives(model / "robot.xml", content), encoding="utf-8")
+        _write_files(out, files)
     return text
+
+
+def _write_files(out: Path, files: Mapping[str, str]) -> None:
+    """Files into a folder that may be there, all or none; one that says something else stops it."""
+    for name, text in files.items():
+        path = out / name
+        with refusals(out):
+            if os.path.lexists(path) and not (path.is_file() and path.read_bytes() == text.encode()):
+                raise InputError(f"--out {out}: {name} is there and says something else; name another folder")
+    with refusals(out):
+        out.mkdir(parents=True, exist_ok=True)
+    for name, text in files.items():
+        write_file(out / name, text, "--out")
 
 
 def _write_loop(folder: Path, loop: Loop) -> None:

@@ -308,6 +308,49 @@ def robots_inertial(text: str) -> str:
     return text[text.index("<inertial>") : text.index("</inertial>") + len("</inertial>")]
 
 
+WITHOUT_TYPES = """
+import numpy as np, figaroh_jax as fj
+from figaroh_jax.rigid import derivatives, manifold
+m, c = fj.load_urdf(fj.DEMO), np.full((20, 4), 0.3 + 0.1j)
+x, last, none = c.real, m.frames[-1].name, np.zeros((2, 0, 4))
+refused = {
+    "tau holds complex": lambda: fj.recording(q=x, tau=c, rate=100),
+    "time holds complex": lambda: fj.recording(q=x, tau=x, time=c[:, 0]),
+    "position holds complex": lambda: fj.postures(q=x, position=c[:, :3], base_frame="base", tool_frame="hand"),
+    "q holds text": lambda: fj.mass_matrix(m, [["1", "2", "3", "4"]]),
+    "q holds objects": lambda: fj.mass_matrix(m, [[None] * 4]),
+    "q is no array of numbers": lambda: fj.mass_matrix(m, [[0.1], [0.1, 0.2]]),
+    "q has shape ()": lambda: derivatives.coriolis_matrix(m, 3.0, none),
+}
+complex_ones = {
+    "q": [lambda: fj.inverse_dynamics(m, c, x, x), lambda: fj.mass_matrix(m, c), lambda: fj.frame_placement(m, c, last),
+          lambda: derivatives.gravity_vector(m, c), lambda: fj.backend("native", m).mass_matrix(c)],
+    "v": [lambda: fj.joint_torque_regressor(m, x, c, x), lambda: derivatives.coriolis_matrix(m, x, c),
+          lambda: manifold.integrate(m, x, c)],
+    "a": [lambda: derivatives.dynamics_derivatives(m, x, x, c), lambda: fj.packed_regressor(m, x, x, c)],
+    "tau": [lambda: fj.normal_matrix(m, x, x, x, c), lambda: fj.forward_dynamics(m, x, x, c)],
+    "weight": [lambda: fj.normal_matrix(m, x, x, x, x, weight=c)],
+    "time": [lambda: fj.predict(fj.extend(m), c[:, 0], x, x, x, 0.01)],
+}
+calls = [(f"{name} holds complex numbers", call) for name, some in complex_ones.items() for call in some]
+for words, call in [*refused.items(), *calls]:
+    try:
+        call()
+        print("accepted:", words)
+    except fj.InputError as error:
+        if words not in str(error):
+            print("other message:", words, "|", error)
+assert derivatives.coriolis_matrix(m, none, none).shape == (2, 0, 4, 4)
+assert {x.shape for x in derivatives.dynamics_derivatives(m, none, none, none)} == {(2, 0, 4, 4)}
+"""
+
+
+def test_no_imaginary_part_is_dropped_no_text_is_a_number_and_no_samples_give_empty_answers():
+    """In an interpreter of its own, where nothing but the library checks the arguments."""
+    run = subprocess.run([sys.executable, "-c", WITHOUT_TYPES], capture_output=True, text=True)
+    assert run.returncode == 0 and run.stdout == "", run.stdout + run.stderr
+
+
 def test_the_one_minute_fuzz_finds_nothing_in_its_first_inputs(tmp_path: Path):
     command = [
         sys.executable,

@@ -7,6 +7,7 @@ import sys
 import warnings
 from pathlib import Path
 
+import gradients
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -118,3 +119,25 @@ def test_plain_grad_takes_an_extended_model():
     slope = jax.grad(lambda m: m.inverse_dynamics(v, v, v).sum())(model)
     np.testing.assert_allclose(slope.effects[0].damping, v[robot.joint_index("elbow")], rtol=0, atol=1e-14)
     assert all(jnp.issubdtype(x.dtype, jnp.inexact) for x in jax.tree.leaves(slope))
+
+
+def test_every_public_function_has_a_gradient_that_is_checked_or_nothing_to_differentiate():
+    named = {name for name in gradients.FUNCTIONS if "." not in name}
+    assert named | gradients.OTHERS == set(fj.__all__) and not named & gradients.OTHERS
+
+
+def _gradients(mode: str, *names: str) -> None:
+    script = Path(__file__).with_name("gradients.py")
+    done = subprocess.run([sys.executable, str(script), mode, *names], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["x64", "default"])
+@pytest.mark.parametrize("name", [*gradients.FUNCTIONS])
+def test_plain_grad_of_every_public_function_in_a_fresh_interpreter(mode: str, name: str):
+    _gradients(mode, name)
+
+
+def test_plain_grad_of_the_mass_matrix_in_a_fresh_interpreter():
+    _gradients("x64", "mass_matrix")

@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -295,3 +296,93 @@ def test_a_refusal_of_the_file_system_outside_the_run_is_no_internal_error(monke
     assert cli.main(["demo"]) == 2
     message = capsys.readouterr().err
     assert "internal" not in message and "No space left on device: '/some/where'" in message
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next_one_and_nothing_else(tmp_path: Path):
+    code = f"""
+import os, signal
+from contextlib import suppress
+from pathlib import Path
+from figaroh_jax.reporting.run_directory import whole_directory
+with whole_directory(Path({str(tmp_path)!r}) / "out") as new:
+    (new / "answer.json").write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    subprocess.run([sys.executable, "-c", code])
+    (left,) = tmp_path.glob(".figaroh-jax-*")
+    other, empty = tmp_path / ".figaroh-jax-mine", tmp_path / ".figaroh-jax-empty"
+    other.mkdir()
+    (other / "thesis.tex").write_text("years of work")
+    empty.mkdir()
+    with run_directory.whole_directory(tmp_path / "elsewhere"):  # a run that is under way
+        (held,) = set(tmp_path.glob(".figaroh-jax-*")) - {left, other, empty}
+        write(tmp_path / "third")
+        assert held.is_dir()
+    assert not left.exists() and not held.exists() and (other / "thesis.tex").is_file() and empty.is_dir()
+
+
+def test_a_file_of_the_user_s_is_never_replaced_by_one_of_ours(tmp_path: Path):
+    file = tmp_path / "page.html"
+    run_directory.write_file(file, "<page>1", "--out", "<page>")
+    run_directory.write_file(file, "<page>2", "--out", "<page>")
+    assert file.read_text() == "<page>2"
+    file.write_text("thesis")
+    for own in ("<page>", None):
+        with pytest.raises(InputError, match="was not written by this command"):
+            run_directory.write_file(file, "<page>3", "--out", own)
+    run_directory.write_file(file, "thesis", "--out")
+    for name, words in (("", "is a directory"), ("n" * 300, "too long"), ("a\0b", "null byte"), ("x/y", "vanished")):
+        with pytest.raises(InputError, match=words):
+            run_directory.write_file(tmp_path / name, "text", "--out")
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"] and file.read_text() == "thesis"
+
+
+@pytest.mark.parametrize("call", ["open", "fsync", "replace", "link"])
+def test_a_refusal_leaves_the_file_that_was_there(tmp_path: Path, monkeypatch, call: str):
+    def full(*args, **more):
+        raise OSError(errno.ENOSPC, "full")
+
+    file = tmp_path / "page.html"
+    if call != "link":
+        file.write_text("<page>1")
+    monkeypatch.setattr(os, call, full)
+    if call == "link":  # a file system without second names
+        run_directory.write_file(file, "<page>2", "--out", "<page>")
+        assert file.read_text() == "<page>2"
+    else:
+        with pytest.raises(InputError, match="the disk is full"):
+            run_directory.write_file(file, "<page>2", "--out", "<page>")
+        assert file.read_text() == "<page>1"
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_file_is_added_to_a_run_only_where_it_is_the_run_s(tmp_path: Path):
+    out = tmp_path / "out"
+    write(out)
+    for text in ("first", "second"):
+        run_directory.add_to_run(out, "verification.json", text)
+        run_directory.check_directory(out)
+    (out / "verification.json").write_text("mine")
+    with pytest.raises(InputError, match="was not written by this run"):
+        run_directory.add_to_run(out, "verification.json", "third")
+    assert (out / "verification.json").read_text() == "mine"
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace", "link", "unlink"])
+def test_a_run_is_whole_wherever_a_file_s_addition_stops(tmp_path: Path, monkeypatch, call: str):
+    out = tmp_path / "out"
+    for count in range(6):
+        write(out)
+        run_directory.add_to_run(out, "verification.json", "first")
+        calls, original = [], getattr(os, call)
+
+        def stop(*args, original=original, calls=calls, count=count, **more):
+            calls.append(args)
+            if len(calls) > count:
+                raise KeyboardInterrupt
+            return original(*args, **more)
+
+        with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
+            patch.setattr(os, call, stop)
+            run_directory.add_to_run(out, "verification.json", "second")
+        run_directory.check_directory(out)

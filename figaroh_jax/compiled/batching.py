@@ -142,6 +142,8 @@ def over_samples(
 
 def in_one_program(kernel: Callable[..., Any], width: int, parameters: Any, *arrays: Array) -> Array:
     """Answers with the samples last for arrays (samples, k), inside of a program."""
+    if not len(arrays[0]):  # kernels have one sample at least
+        return in_one_program(kernel, width, parameters, *(jnp.zeros((1, x.shape[1])) for x in arrays))[..., :0]
     chunk = chunk_size(width)
     small = len(arrays[0]) <= chunk
     return _joined(kernel(parameters, *(x.T for x in arrays))) if small else _all(kernel, chunk, parameters, *arrays)

@@ -21,7 +21,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..compiled.precision import in_float64
-from ..errors import InputError
+from ..errors import InputError, check_real
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.kinematics import states
 from ..rigid.model import RobotModel
@@ -106,6 +106,7 @@ def predict(
     of several degrees of freedom: no one sensor reads their position.
     """
     require_single_axes(extended.robot, "a record of sensors")
+    check_real("time", time)
     motion = states(extended.robot, position=position, velocity=velocity, acceleration=acceleration)
     if motion[0].ndim != 2 or motion[0].shape[0] < 5:
         raise InputError(f"a record of 5 samples or more is needed, got the shape {motion[0].shape}")

@@ -466,6 +466,11 @@ class Task(_Keys):
         for stem in stems:
             if stems.count(stem) > 1:
                 raise ValueError(f"two holdout recordings are called '{stem}': their predictions would share one name")
+        first: dict[str, int] = {}
+        for k, entry in enumerate(data):
+            place = first.setdefault(repr(entry), k)
+            if place != k:
+                raise ValueError(f"entries {place} and {k} (from 0) are the same recording, which would count twice")
         return data
 
 

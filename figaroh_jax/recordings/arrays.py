@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from ..errors import InputError, nearest
+from ..errors import InputError, check_real, nearest
 from ..rigid.model import RobotModel
 from . import poses
 from .dataset import Memory, Recording, unit_factors
@@ -160,10 +160,10 @@ def _measurement(
         hint = f"unknown '{unknown}'{nearest(unknown, KINDS)}" if unknown else f"{len(given)} are given"
         raise InputError(f"{source}: exactly one of {', '.join(KINDS)} is needed: {hint}")
     (kind, values), table = next(iter(given.items())), _Table(source)
-    if values is None or len(values) != count:
-        size = "nothing" if values is None else f"{len(values)} rows"
+    values = np.zeros(0) if values is None else _numbers(values, kind, source)
+    if not values.ndim or len(values) != count:
+        size = f"{len(values)} rows" if values.ndim else "one number"
         raise InputError(f"{source}: {kind} has {size}, but q has {count}")
-    values = np.array(values, float)
     if kind == "device":
         return "own", values
     if kind in ("plane", "socket"):
@@ -178,10 +178,7 @@ def _measurement(
 
 
 def _matrix(x: ArrayLike, key: str, source: Memory) -> np.ndarray:
-    try:
-        array = np.array(x, float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{source}: {key} is no array of numbers: {error}") from None
+    array = _numbers(x, key, source)
     if array.ndim != 2:
         raise InputError(f"{source}: {key} has shape {array.shape}, expected (samples, joints)")
     wrong = np.argwhere(~np.isfinite(array))
@@ -189,6 +186,14 @@ def _matrix(x: ArrayLike, key: str, source: Memory) -> np.ndarray:
         row, column = wrong[0]
         raise InputError(f"{source}: {key} is {array[row, column]} in row {row}, column {column} (from 0)")
     return array
+
+
+def _numbers(x: ArrayLike, key: str, source: Memory) -> np.ndarray:
+    check_real(f"{source}: {key}", x)
+    try:
+        return np.array(x, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{source}: {key} is no array of numbers: {error}") from None
 
 
 def _check_columns(
@@ -223,7 +228,7 @@ def _clock(time: Any, rate: float | None, samples: int, source: Memory, seconds:
         if rate is None or not 0 < rate < np.inf:
             raise InputError(f"{source}: rate is {rate}; expected a number of Hz above zero")
         return np.arange(samples) / rate
-    stamps = np.asarray(time, float) * seconds
+    stamps = _numbers(time, "time", source) * seconds
     if stamps.shape != (samples,):
         raise InputError(f"{source}: time has shape {stamps.shape}, expected ({samples},)")
     wrong = np.flatnonzero(~np.isfinite(stamps[1:]) | ~(np.diff(stamps) > 0))

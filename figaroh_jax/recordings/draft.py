@@ -35,6 +35,7 @@ _WORDS = {
 _TIMES = ("t", "time", "timestamp", "timestamps", "stamp", "stamps", "sec", "seconds", "clock", "header.stamp")
 _CLOCKS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SLOW, _FAST = 15.0, 14000.0  # Hz; their ratio is below a thousand, so that one unit of time alone fits
+_HUGE = 1e12  # beyond it no column is a recording in any unit
 CONFIRMED = 0.5  # of a torque's variance that its own joint explains, before it says anything of the order
 
 
@@ -128,9 +129,6 @@ def _read(table: Table, model: RobotModel, joints: Sequence[str] | None, rate: f
         if kind != "velocity":
             torque, current, named = values, kind == "current", named and by_name
     time, entry = _stamps(table, clock, rate, len(position), entry)
-    if not np.isfinite(position).all() or (torque is not None and not np.isfinite(torque).all()):
-        row = int(np.argmin(np.isfinite(position).all(axis=1)))
-        raise InputError(f"{table.file}: holds NaN (row {row}); clean it first")
     return _Read(table.file, entry, names, named, time, position, torque, current)
 
 
@@ -233,7 +231,12 @@ def _number(name: str) -> tuple[int, ...]:
 
 
 def _matrix(table: Table, source: Any, joints: Sequence[str], key: str) -> Float[np.ndarray, "samples joints"]:
-    return np.asarray(table.matrix(source, joints, key), float)
+    values = np.asarray(table.matrix(source, joints, key), float)
+    wrong = np.argwhere(~(np.abs(values) < _HUGE))
+    if len(wrong) and key != "velocity":  # which no draft uses
+        row, column = wrong[0]
+        raise InputError(f"{table.file}: {key} of {joints[column]} is {values[row, column]:.4g} in row {row} (from 0)")
+    return values
 
 
 # What the values say

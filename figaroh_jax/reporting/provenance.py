@@ -43,7 +43,10 @@ def read_provenance(folder: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(content, dict) or not {"command", "task", "options"} <= content.keys():
             raise ValueError("keys are missing")
-    except (OSError, ValueError) as error:
+        words = [content["command"], content["task"], *content["options"]]
+        if not all(isinstance(word, str) and "\0" not in word for word in words):
+            raise ValueError("command, task and options are no words")
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: what made this run cannot be read ({error}); name a run directory") from None
     return content
 

@@ -3,7 +3,9 @@
 A finished run holds a marker, `figaroh-jax-run.json`, with the size and the SHA-256 of every file that was written.
 An existing directory is replaced only where its marker is intact and nothing in it was added or changed since; what a
 user put there stops the run before any work. A new run is made in a hidden folder beside the directory and takes its
-place in one step of the file system (`renameat2` with `RENAME_EXCHANGE`) where the system has it.
+place in one step of the file system (`renameat2` with `RENAME_EXCHANGE`) where the system has it. That folder holds a
+file which its process keeps locked: what a killed process left is known by the open lock, and the next run removes it.
+Single files (`write_file`) replace nothing but what the library wrote.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import shutil
 import stat
 import sys
 import tempfile
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
@@ -25,11 +28,19 @@ from typing import Any
 
 from ..errors import InputError
 
-__all__ = ["MARKER", "add_to_run", "check_directory", "task_inputs", "whole_directory"]
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+__all__ = ["MARKER", "add_to_run", "check_directory", "refusals", "task_inputs", "whole_directory", "write_file"]
 
 MARKER = "figaroh-jax-run.json"
 _WORK = ".figaroh-jax-"  # prefix of the hidden folder in which a run is made
+_OWNER = "owner.json"  # in it, locked by the process that makes the run
+_ABANDONED = 60.0  # s, after which a hidden folder whose file says nothing belongs to nobody
 _LARGEST_MARKER = 1 << 20  # bytes
+_BEGINNING = 4096  # bytes of a file that are looked at
 _OLD_RUNS = ("answer.json", "result.json")  # what versions without a marker left
 _REFERENCES = re.compile(rb"""\b(?:file|filename)\s*=\s*["']([^"'\0]{1,1000})["']""")  # of an XML file to others
 _REASONS = {
@@ -54,7 +65,7 @@ def check_directory(out: Path, inputs: Iterable[Path] = ()) -> None:
     It must be absent, empty or an earlier run that holds exactly what was written; no symbolic link, no mount point,
     not the working directory or above it, and no part of it among `inputs` (files and folders that the job reads).
     """
-    with _refusals(out):
+    with refusals(out):
         place = _place(out)
         _restore(place)
         problem = _occupied(place) or _holds(place, inputs) or _not_writable(place)
@@ -72,7 +83,7 @@ def whole_directory(out: Path, inputs: Iterable[Path] = ()) -> Iterator[Path]:
     check_directory(out, inputs)
     work = _Work(_place(out), out)
     try:
-        with _refusals(out):
+        with refusals(out):
             yield work.begin()
             work.finish()
     finally:
@@ -80,12 +91,98 @@ def whole_directory(out: Path, inputs: Iterable[Path] = ()) -> Iterator[Path]:
 
 
 def add_to_run(folder: Path, name: str, text: str) -> None:
-    """Write one more file of the library's into a finished run, and into its marker where that is intact."""
-    with _refusals(folder):
-        intact = _exists(folder / MARKER) and _altered(folder) is None
-        (folder / name).write_text(text, encoding="utf-8")
-        if intact:
-            _seal(folder)
+    """Write one more file of the library's into a finished run, and into the list of its marker.
+
+    A file of that name which is not as a run wrote it is refused (`InputError`). Whatever comes between, the run is
+    whole: the marker, which may list what is not there, is changed first.
+    """
+    data = text.encode("utf-8")
+    with refusals(folder):
+        files = _written(folder) if _exists(folder / MARKER) else None
+        path, known = folder / name, (files or {}).get(name)
+        if _exists(path) and (known is None or not _unchanged(path, known)):
+            raise InputError(f"{_shown(path)}: is there and was not written by this run; move it away")
+        if files is None:
+            _whole_file(path, data, replace=False)
+            return
+        if _exists(path):
+            path.unlink()
+        files[name] = {"bytes": len(data), "sha256": _digest(data)}
+        _whole_file(folder / MARKER, _marker_text(files).encode(), replace=True)
+        _whole_file(path, data, replace=False)
+
+
+def write_file(path: Path, text: str, option: str, own: str | None = None) -> None:
+    """Write one file, whole or not at all. Raises `InputError` where another file is there or the system refuses.
+
+    A file that is there is replaced where it says the same, or where its beginning holds `own`, a text that only the
+    library writes.
+    """
+    data, shown = text.encode("utf-8"), f"{option} {_shown(path)}"
+    try:
+        if path.is_dir():
+            raise InputError(f"{shown}: is a directory; name a file")
+        place = path.resolve()
+        there = _exists(place)
+        if there and not place.is_file():  # /dev/stdout, a pipe: nothing is lost there
+            place.write_bytes(data)
+            return
+        if there and place.stat().st_size == len(data) and place.read_bytes() == data:
+            return
+        if there and (own is None or own.encode() not in _beginning(place)):
+            raise InputError(f"{shown}: is there and was not written by this command; name another file")
+        _whole_file(place, data, replace=there)
+    except FileExistsError:
+        raise InputError(f"{shown}: was made by somebody else meanwhile; name another file") from None
+    except (OSError, RuntimeError) as error:
+        said = _reason(error) if isinstance(error, OSError) else "its links form a loop"
+        raise InputError(f"{shown}: {said}") from error
+    except ValueError as error:
+        if isinstance(error, InputError) or "null" not in str(error):
+            raise
+        raise InputError(f"{shown}: the name holds a null byte; name a file") from None
+
+
+def _beginning(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(_BEGINNING)
+
+
+def _whole_file(path: Path, data: bytes, *, replace: bool) -> None:
+    """Put a file in its place in one step; without `replace` one that is there raises `FileExistsError`."""
+    beside = path.with_name(_beside(path.name))
+    if _exists(beside):  # of a process that was killed: nobody else uses such a name
+        beside.unlink()
+    try:
+        with open(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666), "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        if replace:
+            os.replace(beside, path)
+        elif not _linked(beside, path):
+            if _exists(path):
+                raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+            os.rename(beside, path)
+    finally:
+        with suppress(OSError):
+            os.unlink(beside)
+
+
+def _beside(name: str) -> str:
+    """The name under which a file of this name is written first; short enough wherever the name itself is."""
+    return f"{_WORK}{_digest(os.fsencode(name))[:24]}"
+
+
+def _linked(a: Path, b: Path) -> bool:
+    """Give the file a second name that nothing has yet; False where the file system cannot."""
+    try:
+        os.link(a, b)
+    except FileExistsError:
+        raise
+    except OSError:
+        return False
+    return True
 
 
 class _Work:
@@ -96,14 +193,19 @@ class _Work:
         self.folder: Path | None = None
         self.parents: list[Path] = []  # made for this run
         self.own: int | None = None  # inode of the directory that is being made
+        self.lock: int | None = None
 
     def begin(self) -> Path:
         """The empty directory to write into."""
         _make_parents(self.place.parent, self.parents)
+        _sweep(self.place.parent)
         self.folder = Path(tempfile.mkdtemp(prefix=_WORK, dir=self.place.parent))
+        self.lock = _locked(self.folder / _OWNER, os.O_CREAT | os.O_EXCL)
         new = self.folder / "new"
         new.mkdir()
         self.own = new.stat().st_ino
+        content = {"format": 1, "what": "a run is being made here", "place": self.place.name, "new": self.own}
+        (self.folder / _OWNER).write_text(json.dumps(content), encoding="utf-8")
         return new
 
     def finish(self) -> None:
@@ -127,6 +229,9 @@ class _Work:
         """Remove what is left: the half-written run, or of the earlier one exactly the files that were written."""
         with suppress(OSError):
             self._clean_work()
+        if self.lock is not None:
+            with suppress(OSError):
+                os.close(self.lock)
         for folder in reversed(self.parents):
             with suppress(OSError):
                 folder.rmdir()
@@ -142,13 +247,68 @@ class _Work:
                 shutil.rmtree(folder, ignore_errors=True)
             elif _exists(folder):
                 _remove_run(folder, self.place)
-        for folder in (earlier.parent, self.folder):
+        with suppress(OSError):
+            earlier.parent.rmdir()
+        if set(os.listdir(self.folder)) <= {_OWNER}:
+            (self.folder / _OWNER).unlink(missing_ok=True)
+            self.folder.rmdir()
+
+
+def _locked(owner: Path, flags: int = 0) -> int | None:
+    """The file, open and locked until it is closed or its process ends; None where another process has it."""
+    handle = os.open(owner, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | flags, 0o600)
+    try:
+        if fcntl is not None:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:  # somebody has it, or the file system has no locks
+        if not flags:
+            os.close(handle)
+            return None
+    return handle
+
+
+def _sweep(parent: Path) -> None:
+    """Remove the hidden folders that killed runs left here, as each of them would have done; others are left alone."""
+    if fcntl is None:
+        return
+    for folder in parent.iterdir():
+        if folder.name.startswith(_WORK) and stat.S_ISDIR(folder.lstat().st_mode):
             with suppress(OSError):
-                folder.rmdir()
+                _sweep_one(folder)
+
+
+def _sweep_one(folder: Path) -> None:
+    owner = folder / _OWNER
+    silent = not _exists(owner) or not owner.lstat().st_size
+    if silent and time.time() - folder.lstat().st_mtime < _ABANDONED:
+        return  # another process may be about to write into it
+    if not _exists(owner):
+        folder.rmdir()  # where it is empty
+        return
+    lock = _locked(owner)
+    if lock is None:
+        return
+    try:
+        content = _content(owner) if not silent else {}
+        name, own = content.get("place", folder.name), content.get("new")
+        if isinstance(name, str) and PurePosixPath(name).name == name and name not in ("", ".."):
+            left = _Work(folder.with_name(name), folder.with_name(name))
+            left.folder, left.own = folder, own if isinstance(own, int) else None
+            left.clean()
+    finally:
+        os.close(lock)
+
+
+def _content(owner: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(owner.read_bytes()[:_LARGEST_MARKER])
+    except (ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) and content.get("format") == 1 else {}
 
 
 @contextmanager
-def _refusals(out: Path) -> Iterator[None]:
+def refusals(out: Path) -> Iterator[None]:
     """What the file system refuses becomes one message about `out`."""
     try:
         yield
@@ -224,6 +384,8 @@ def _altered(place: Path) -> str | None:
     for path in _below(place):
         name = path.relative_to(place).as_posix()
         info = path.lstat()
+        if name in _LEFT and stat.S_ISREG(info.st_mode):
+            continue
         if name == MARKER or stat.S_ISDIR(info.st_mode) and name in folders:
             continue
         if name not in written:
@@ -288,11 +450,15 @@ def _seal(new: Path) -> None:
         for path in _below(new)
         if not path.is_dir() and path != new / MARKER
     }
-    content = {"format": 1, "what": "files of this run; a directory that holds others is never replaced"}
-    content |= {"files": files, "sha256": _digest(_canonical(files))}
-    (new / MARKER).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    (new / MARKER).write_text(_marker_text(files), encoding="utf-8")
     for path in [*_below(new), new]:
         _synchronise(path)
+
+
+def _marker_text(files: dict[str, Any]) -> str:
+    content = {"format": 1, "what": "files of this run; a directory that holds others is never replaced"}
+    content |= {"files": files, "sha256": _digest(_canonical(files))}
+    return json.dumps(content, indent=1) + "\n"
 
 
 def _synchronise(path: Path) -> None:
@@ -373,6 +539,8 @@ def _remove_run(folder: Path, place: Path) -> None:
     """Remove an earlier run file by file, each only as it was written; what else turns up gets a name of its own."""
     with suppress(OSError):
         written = _written(folder) or {}
+        for name in _LEFT if written else ():
+            (folder / name).unlink(missing_ok=True)
         for name, entry in written.items():
             path = folder / name
             if _exists(path) and _unchanged(path, entry):
@@ -467,3 +635,6 @@ def _referred(file: Path) -> Iterator[Path]:
                 seen.add(named)
                 waiting.append(named)
                 yield named
+
+
+_LEFT = tuple(_beside(name) for name in (MARKER, "verification.json"))  # what a killed `add_to_run` may leave

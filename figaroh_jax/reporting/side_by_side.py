@@ -13,10 +13,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..errors import InputError, as_written
 from .provenance import PROVENANCE, read_provenance
+from .run_directory import MARKER
 from .verification import figures, read_run
 
-__all__ = ["Section", "compare_runs", "comparison_page", "comparison_text", "list_runs"]
+__all__ = ["PAGE", "Section", "compare_runs", "comparison_page", "comparison_text", "list_runs"]
+
+PAGE = '<meta name="generator" content="figaroh-jax compare">'  # by which such a page is known
 
 
 class Section(NamedTuple):
@@ -31,6 +35,11 @@ def compare_runs(folders: Sequence[Path]) -> tuple[Section, ...]:
     """The tables of a comparison; raises `InputError` where a folder is no run."""
     runs = [read_run(folder) for folder in folders]
     names = _names(folders)
+    with as_written(" or ".join(map(str, folders))):
+        return _sections(folders, runs, names)
+
+
+def _sections(folders: Sequence[Path], runs: Sequence[dict[str, Any]], names: tuple[str, ...]) -> tuple[Section, ...]:
     sections = (
         Section("What was found", ("", *names), tuple(_found(runs))),
         Section("Figures", ("", *names), tuple(_figures(runs))),
@@ -43,20 +52,29 @@ def compare_runs(folders: Sequence[Path]) -> tuple[Section, ...]:
 
 
 def list_runs(folder: Path) -> Section:
-    """Every run below a folder, with what it found."""
-    rows = []
+    """Every run below a folder, with what it found; files of the same names that no run wrote are passed over."""
+    rows: list[tuple[str, ...]] = []
     for marker in sorted({*folder.rglob("answer.json"), *folder.rglob("result.json")}):
         run = marker.parent
         if any(row[0] == str(run) for row in rows):
             continue
-        found, made = figures(read_run(run)), {}
-        if (run / PROVENANCE).is_file():
-            made = read_provenance(run)
-        held = (found["holdout_relative"] or {}).get("all")
-        causes = ", ".join(found["forbidden_causes"] or []) or "-"
-        rows.append((str(run), made.get("command", "?"), found["verdict"] or "-", causes, _number(held)))
-        rows[-1] += (str(made.get("time", "?")),)
+        try:
+            with as_written(run):
+                rows.append(_row(run))
+        except InputError:
+            if any((run / name).is_file() for name in (PROVENANCE, MARKER)):
+                rows.append((str(run), "?", "cannot be read", "-", "-", "?"))
     return Section("Runs", ("directory", "command", "verdict", "causes", "held-out error", "time"), tuple(rows))
+
+
+def _row(run: Path) -> tuple[str, ...]:
+    found, made = figures(read_run(run)), {}
+    if (run / PROVENANCE).is_file():
+        made = read_provenance(run)
+    held = (found["holdout_relative"] or {}).get("all")
+    causes = ", ".join(found["forbidden_causes"] or []) or "-"
+    figure = (made.get("command", "?"), found["verdict"] or "-", causes, _number(held), made.get("time", "?"))
+    return (str(run), *map(str, figure))
 
 
 def _names(folders: Sequence[Path]) -> tuple[str, ...]:
@@ -180,9 +198,10 @@ def comparison_page(folders: Sequence[Path], sections: Sequence[Section]) -> str
         parts.append(
             f"<h2>{escape(section.title)}</h2><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
         )
-    parts += _overlays(folders)
+    with as_written(" or ".join(str(folder / "predictions.npz") for folder in folders)):
+        parts += _overlays(folders)
     title = f"<title>{escape(' | '.join(_names(folders)))}</title>"
-    meta = '<meta charset="utf-8"><meta name="viewport" content="width=device-width,initial-scale=1">'
+    meta = f'<meta charset="utf-8">{PAGE}<meta name="viewport" content="width=device-width,initial-scale=1">'
     text = f'<!doctype html><html lang="en"><head>{meta}{title}<style>{_STYLE}</style></head>'
     return f"{text}<body><main>{''.join(parts)}</main></body></html>\n"
 

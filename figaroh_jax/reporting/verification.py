@@ -9,15 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from xml.etree import ElementTree
 
-from ..errors import InputError
+from ..errors import InputError, as_written
 from .run_directory import add_to_run
 
 if TYPE_CHECKING:
     from ..formats.config import Limits
 
-__all__ = ["DEFAULT_LIMITS", "VERIFICATION", "Check", "figures", "junit", "read_run", "verify"]
+__all__ = ["DEFAULT_LIMITS", "JUNIT", "VERIFICATION", "Check", "figures", "junit", "read_run", "verify"]
 
 VERIFICATION = "verification.json"
+JUNIT = 'name="figaroh-jax verify '  # by which such a file is known
 DEFAULT_LIMITS: dict[str, Any] = {"verdict": ["nothing", "named"], "consistent": True, "fk_parity": 1e-9}
 
 
@@ -41,9 +42,11 @@ def verify(folder: Path, limits: Limits, *, write: bool = True) -> tuple[Check, 
 
     Raises `InputError` where `folder` is no finished run.
     """
-    found = figures(read_run(folder))
+    with as_written(folder):
+        found = figures(read_run(folder))
     given = {name: getattr(limits, name) for name in type(limits).model_fields if getattr(limits, name) is not None}
-    checks = tuple(check for name, bound in given.items() for check in _judged(name, bound, found))
+    with as_written(folder):
+        checks = tuple(check for name, bound in given.items() for check in _judged(name, bound, found))
     if write:
         passed = all(check.status != "fail" for check in checks)
         content = {"passed": passed, "limits": [check._asdict() for check in checks]}
@@ -74,6 +77,8 @@ def figures(run: dict[str, Any]) -> dict[str, Any]:
     answer, result = run["answer"] or {}, run["result"] or {}
     causes = answer.get("causes") if run["answer"] else result.get("causes")
     verdict = answer.get("verdict", result.get("verdict") if "level" in result else None)
+    if verdict is not None and not isinstance(verdict, str):
+        raise TypeError("the verdict is no text")
     return {
         "verdict": verdict,
         "p_value": _finite(answer.get("p_value")),

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from ..compiled.batching import sized_program
 from ..compiled.precision import in_float64
 from .dynamics import inverse_dynamics, mass_matrix
+from .kinematics import states
 from .manifold import bracket, integrate
 from .model import RobotModel
 
@@ -35,7 +36,7 @@ class TorqueDerivatives(NamedTuple):
 @in_float64
 def gravity_vector(model: RobotModel, q: Float[ArrayLike, "*batch nq"]) -> Float[Array, "*batch nv"]:
     """Torques (N m, N) that hold the robot still at `q`, in float64."""
-    q = jnp.asarray(q, jnp.float64)
+    (q,) = states(model, q=q)
     rest = jnp.zeros((*q.shape[:-1], model.nv))
     return inverse_dynamics(model, q, rest, rest)
 
@@ -51,7 +52,7 @@ def coriolis_matrix(
     (the connection of the metric M that is free of torsion; Christoffel's symbols where each joint has one degree of
     freedom). The bracket is zero but for joints of several degrees of freedom.
     """
-    return _coriolis_matrix(model, jnp.asarray(q, jnp.float64), jnp.asarray(v, jnp.float64))
+    return _coriolis_matrix(model, *states(model, q=q, v=v))
 
 
 @sized_program
@@ -89,7 +90,7 @@ def dynamics_derivatives(
     a: Float[ArrayLike, "*batch nv"],
 ) -> TorqueDerivatives:
     """Derivatives of the torques of `inverse_dynamics` by configuration, velocity and acceleration, in float64."""
-    return _dynamics_derivatives(model, *(jnp.asarray(x, jnp.float64) for x in (q, v, a)))
+    return _dynamics_derivatives(model, *states(model, q=q, v=v, a=a))
 
 
 @sized_program

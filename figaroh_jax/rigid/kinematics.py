@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from ..compiled.batching import over_samples, traced
 from ..compiled.precision import in_float64
-from ..errors import InputError
+from ..errors import InputError, check_real
 from .model import Joint, RobotModel, dofs
 from .spatial import cross, matmul, quaternion_rotation, rotate_back, sine_cosine
 
@@ -270,11 +270,13 @@ def states(model: RobotModel, **arrays: Float[ArrayLike, "..."]) -> list[Float[A
 
 
 def check_shapes(model: RobotModel, **arrays: Float[ArrayLike, "..."]) -> None:
-    """Raise `InputError` naming the array (`q=`, `v=`, ...) that does not fit the model or the first array.
+    """Raise `InputError` naming the array (`q=`, `v=`, ...) that is not real or does not fit the model or the first.
 
     The last axis of `q` holds the model's `nq` numbers, with unit quaternions; that of every other its `nv`.
     """
     first = next(iter(arrays))
+    for name, array in arrays.items():
+        check_real(name, array)
     for name, array in arrays.items():
         shape, expected = np.shape(array), np.shape(arrays[first])
         width = model.nq if name == "q" else model.nv

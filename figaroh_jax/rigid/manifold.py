@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..compiled.precision import in_float64
-from ..errors import InputError
+from ..errors import InputError, check_real
 from .model import DOF_NAMES, Joint, RobotModel
 
 __all__ = ["bracket", "difference", "integrate", "neutral", "random_configuration"]
@@ -106,6 +106,7 @@ def bracket(model: RobotModel, v: Float[Array, "*batch nv"], w: Float[Array, "*b
 def _check(model: RobotModel, **arrays: ArrayLike) -> None:
     batches = set()
     for name, array in arrays.items():
+        check_real(name, array)
         width, shape = model.nv if name == "v" else model.nq, np.shape(array)
         if shape[-1:] != (width,):
             raise InputError(f"{name} has shape {shape}; its last axis must hold {width} numbers")

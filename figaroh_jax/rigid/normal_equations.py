@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from ..compiled.batching import BLOCK, CPU_OPTIONS, chunk_size, in_chunks, on_host, traced, two_axes
 from ..compiled.kernels import usable
 from ..compiled.precision import in_float64
-from ..errors import InputError
+from ..errors import InputError, check_real
 from .kinematics import check_shapes
 from .model import RobotModel
 from .regressor import block_codes, block_rows, coordinate_blocks, coordinate_rows, dense_rows
@@ -120,6 +120,9 @@ def _rows(
 ) -> _Rows:
     given = {"q": q, "v": v, "a": a} | ({} if tau is None else {"tau": tau})
     check_shapes(model, **given)
+    for name, x in (("weight", weight), ("extra", extra)):
+        if x is not None:
+            check_real(name, x)
     shape = (*np.shape(q)[:-1], model.nv)
     if extra is not None and np.shape(extra)[:-1] != shape:
         raise InputError(f"extra has shape {np.shape(extra)}; expected {(*shape, 'columns')}, a row for each torque")

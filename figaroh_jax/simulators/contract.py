@@ -17,7 +17,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from ..errors import InputError, NotSupported, nearest
+from ..errors import InputError, NotSupported, check_real, nearest
 from ..rigid.derivatives import TorqueDerivatives
 from ..rigid.manifold import difference, integrate, random_configuration
 from ..rigid.model import RobotModel
@@ -359,6 +359,8 @@ class Samples(tuple[np.ndarray, ...]):
 
 def check_samples(backend: Backend, **arrays: ArrayLike) -> tuple[int, ...]:
     """Batch axes of the arrays `q=`, `v=`, ...; raises `InputError` where a shape does not fit the robot or another."""
+    for name, array in arrays.items():
+        check_real(name, array)
     batch = np.shape(next(iter(arrays.values())))[:-1]
     for name, array in arrays.items():
         width, shape = backend.nq if name.startswith("q") else backend.nv, np.shape(array)
