@@ -9,6 +9,7 @@ wheel, so it does not run here.
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import sys
 import tempfile
@@ -96,7 +97,7 @@ def on_peer_problem(starts: int, objective: str = "information", seed: int = 0) 
 
     model, basis, limits, learned = peer_problem()
     since = time.process_time()
-    posture = [0.0, -1.2, 1.0, -0.5, 0.3, 0.0]
+    posture = POSTURE
     found = excite(model, basis, limits, learned, objective=objective, start=posture, starts=starts, seed=seed)  # pyright: ignore
     return found, spent(since)
 
@@ -110,14 +111,278 @@ def told(name: str, found: Any, cpu: float) -> None:
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--cold", action="store_true", help="one start in a fresh process, programs compiled")
-    args = parser.parse_args()
-    if args.cold:
-        told("one start, cold", *on_peer_problem(1))
-        print(f"whole process {time.process_time():.2f} CPU s")
-        return
+def arms() -> dict[str, Any]:
+    """UR10e and Panda (fingers locked)."""
+    from figaroh_jax.formats.urdf import load_urdf
+
+    ur10, panda = DATA / "ur10e_innopolis" / "ur10e.urdf", DATA / "panda_gaz2019" / "panda.urdf"
+    joints = [f"panda_joint{k}" for k in range(1, 8)]
+    return {"UR10e": load_urdf(ur10), "Panda": load_urdf(panda, joints=joints)}
+
+
+def limits() -> None:
+    """All limits at once (position, velocity, 8 rad/s^2, torque), 10 s, five harmonics or nine control points."""
+    from figaroh_jax.excitation.design import excite
+    from figaroh_jax.excitation.information import learn
+    from figaroh_jax.excitation.limits import limits_of
+    from figaroh_jax.excitation.motions import fourier, spline
+
+    for name, model in arms().items():
+        learned, bounds = learn(model, trust=None), limits_of(model, acceleration=8.0)
+        for basis in (fourier(5, 0.1, 10.0), spline(9, 10.0)):
+            for seed in range(3):
+                since = time.process_time()
+                found = excite(model, basis, bounds, learned, starts=1, seed=seed)
+                told(f"{name} {basis.kind} seed {seed}", found, spent(since))
+
+
+def sequence() -> None:
+    """Four motions one after another on FIGAROH's problem, weighted, with friction: worth how many repeats."""
+    from figaroh_jax.excitation.design import excite, gram_of
+    from figaroh_jax.excitation.information import learn
+    from figaroh_jax.excitation.sampling import Sampler
+
+    model, basis, bounds, _ = peer_problem()
+    learned = learn(model, trust=None)
+    since = time.process_time()
+    found = excite(model, basis, bounds, learned, trajectories=4, starts=6, start=POSTURE)
+    cpu = spent(since)
+    sampler = Sampler(model, learned.terms, np.asarray(learned.width))
+    gram = gram_of(learned, sampler, found.stages[0].motion.states(20.0))
+    alone = np.linalg.slogdet(gram)[1]
+    for k, stage in enumerate(found.stages[1:], 2):
+        repeats = np.exp((stage.logdet - alone) / learned.rank)
+        print(f"{k} trajectories: logdet {stage.logdet:.1f}, worth {repeats:.2f} repeats of the first")
+    print(f"{cpu:.1f} CPU s for 4 trajectories of 6 starts")
+
+
+def postures() -> None:
+    """30 postures of 500 candidates, moved; the bound is that of 5000 others."""
+    from figaroh_jax.excitation.postures import Instrument, _Calibrated, certified_bound, excite_postures
+
+    cases = {"UR10e": ("base", "wrist_3_link"), "Panda": ("panda_link0", "panda_link7")}
+    for name, model in arms().items():
+        device = Instrument("pose", *cases[name])
+        excite_postures(model, device)
+        since = time.process_time()
+        found = excite_postures(model, device)
+        cpu = spent(since)
+        low, high = np.clip(np.array(model.position_limit), -2 * np.pi, 2 * np.pi).T
+        q = np.random.default_rng(0).uniform(low, high, (500, model.nv))
+        calibrated = _Calibrated(model, device, "full", q)
+        more = np.random.default_rng(1).uniform(low, high, (5000, model.nv))
+        J = calibrated.rows(more)
+        size = np.sqrt((J**2).sum(axis=(0, 1)))
+        bound = certified_bound(J / size, 30) + 2 * np.log(size).sum()
+        share = np.exp((np.array([found.random_logdet, found.chosen_logdet, found.logdet]) - bound) / J.shape[2])
+        print(
+            f"{name}: {J.shape[2]} parameters; of the bound of 5000: random {share[0]:.3f}, chosen of 500"
+            f" {share[1]:.4f}, moved {share[2]:.4f}; {cpu:.2f} CPU s"
+        )
+
+
+PAIRS = {
+    "rotor / link": (("rotor_inertia", ("elbow_joint",), {"inertia": 0.1}), ("link_inertia", ("forearm_link",), {})),
+    "gain / link": (("torque_gain", ("elbow_joint",), {"gain": 0.02}), ("link_inertia", ("forearm_link",), {})),
+    "Stribeck / power law": (
+        ("stribeck_friction", ("elbow_joint",), {"force": 2.1, "speed": 0.1}),
+        ("power_law_friction", ("elbow_joint",), {"force": 2.1}),
+    ),
+}
+
+
+def separation() -> None:
+    """Pairs of causes at the UR10e's elbow, 10 s: sigmas of a random motion, the D-optimal one and the designed one."""
+    from figaroh_jax.excitation.design import excite, gram_of, random_motion
+    from figaroh_jax.excitation.information import learn
+    from figaroh_jax.excitation.limits import limits_of
+    from figaroh_jax.excitation.motions import fourier
+    from figaroh_jax.excitation.objectives import information_objective
+    from figaroh_jax.excitation.sampling import Sampler
+    from figaroh_jax.excitation.separation import causes, separated
+    from figaroh_jax.excitation.solvers import Problem
+
+    model = arms()["UR10e"]
+    learned, bounds, basis = learn(model), limits_of(model, acceleration=8.0), fourier(5, 0.1, 10.0)
+    problem = Problem(
+        learned,
+        Sampler(model, learned.terms, np.asarray(learned.width)),
+        information_objective(np.asarray(learned.prior)),
+        np.array(learned.independent),
+        basis,
+        bounds,
+        None,
+    )
+    states = [problem.states(random_motion(problem, np.random.default_rng(k))) for k in range(11)]
+    most = excite(model, basis, bounds, learned, starts=2).stages[0].motion.states(20.0)
+    for name, pair in PAIRS.items():
+        given = causes(learned, [pair], states[0])
+
+        def forth(motion: Any, given: Any = given) -> float:
+            G = gram_of(learned, given.sampler, motion, given.columns)
+            return separated(given, G, np.asarray(learned.prior))[0].sigmas
+
+        since = time.process_time()
+        found = excite(model, basis, bounds, learned, objective="separate", separate=[pair], starts=3)
+        cpu = spent(since)
+        usual = np.median([forth(motion) for motion in states])
+        one = found.separated[0]
+        print(
+            f"{name:22s} random {usual:5.2f}  D-optimal {forth(most):5.2f}  designed {one.sigmas:5.2f} sigmas"
+            f" ({one.repeats} repeats)  {cpu:.1f} CPU s"
+        )
+
+
+POSTURE = [0.0, -1.2, 1.0, -0.5, 0.3, 0.0]
+
+
+def pays(draws: int = 60) -> None:
+    """Simulated identifications on FIGAROH's problem with friction: error of the torque predicted on unseen motions.
+
+    The truth is Pinocchio's, with Coulomb and viscous friction, 30 % more Coulomb friction at rest (Stribeck), torque
+    noise of 1 % of the largest torque and an encoder error of 2 mrad; the fit is plain weighted least squares in NumPy.
+    """
+    sys.path.insert(0, str(ROOT / "backends"))
+    from figaroh_jax_pinocchio import PinocchioBackend
+
+    from figaroh_jax.excitation.design import excite, random_motion
+    from figaroh_jax.excitation.information import learn
+    from figaroh_jax.excitation.objectives import information_objective
+    from figaroh_jax.excitation.sampling import Sampler
+    from figaroh_jax.excitation.solvers import Problem
+
+    model, basis, bounds, plain = peer_problem()
+    learned, robot = learn(model, trust=None), PinocchioBackend.build(model)
+    sigma = 1 / np.sqrt(np.asarray(learned.weight))
+    kept = np.array(learned.independent)
+    sampler = Sampler(model, learned.terms, np.asarray(learned.width))
+    problem = Problem(
+        learned, sampler, information_objective(np.asarray(learned.prior)), kept, basis, bounds, np.array(POSTURE)
+    )
+    generator = np.random.default_rng(7)
+    randoms = [problem.states(random_motion(problem, generator)) for _ in range(25)]
+    unseen, randoms = randoms[:10], randoms[10:]
+    level = 3.0 * sigma
+
+    def torque(states: np.ndarray, stribeck: float) -> np.ndarray:
+        q, v, a = states
+        dry = level * np.tanh(v / 0.03) * (1 + stribeck * np.exp(-((v / 0.1) ** 2)))
+        return np.asarray(robot.inverse_dynamics(q, v, a)) + dry + 0.5 * level * v
+
+    def rows(states: np.ndarray) -> np.ndarray:
+        q, v, a = states
+        friction = np.concatenate([np.eye(6) * v[:, None], np.eye(6) * np.tanh(v / 0.03)[:, None]], axis=2)
+        return np.concatenate([np.asarray(robot.joint_torque_regressor(q, v, a)), friction], axis=2)[:, :, kept]
+
+    def error(states: np.ndarray, stribeck: float, encoder: float) -> float:
+        squares = []
+        for k in range(draws):
+            noise = np.random.default_rng([11, k])
+            read = states + np.array([encoder, 0, 0])[:, None, None] * noise.standard_normal(states.shape)
+            y = torque(states, stribeck) + sigma * noise.standard_normal(states.shape[1:])
+            A = (rows(read) / sigma[:, None]).reshape(-1, len(kept))
+            size = np.linalg.norm(A, axis=0)
+            fit = np.linalg.lstsq(A / size, (y / sigma).ravel(), rcond=None)[0] / size
+            for motion, (W, truth) in zip(unseen, tests[stribeck], strict=True):
+                squares.append((((W @ fit - truth) / sigma) ** 2).mean() if motion is not None else 0.0)
+        return float(np.sqrt(np.mean(squares)))
+
+    tests = {s: [(rows(motion), torque(motion, s)) for motion in unseen] for s in (0.0, 0.3)}
+    seen = [tuple(motion) for motion in randoms]  # motions of the kind that matters, none of them judged on
+    same = {"start": POSTURE, "starts": 8}
+    designs = {
+        "condition": excite(model, basis, bounds, plain, objective="condition", **same),
+        "information": excite(model, basis, bounds, learned, **same),
+        "prediction": excite(model, basis, bounds, learned, objective="prediction", predict=seen, **same),
+    }
+    motions = {name: np.stack(found.stages[0].motion.states(20.0)) for name, found in designs.items()}
+    kinds = {"noise": (0.0, 0.0), "+ Stribeck": (0.3, 0.0), "+ encoder": (0.0, 2e-3)}
+    table = {"random, median": [np.median([error(m, *k) for m in randoms[:7]]) for k in kinds.values()]}
+    table |= {name: [error(m, *k) for k in kinds.values()] for name, m in motions.items()}
+    print(f"condition number of the condition design in FIGAROH's columns: {designs['condition'].condition:.2f}")
+    for name, values in table.items():
+        cells = (
+            f"{key} {x:.3f} ({x / y - 1:+.0%})" for key, x, y in zip(kinds, values, table["condition"], strict=True)
+        )
+        print(f"{name:16s} {'  '.join(cells)}")
+
+
+def ranking(triples: int = 200) -> None:
+    """Real runs of a UR10e: does the information of three of the 18 rank the error on the other 15?
+
+    Weighted least squares of base parameters and friction, the nominal links believed within 100 %; the noise is the
+    residual of a fit to all runs. The design criterion sees positions alone, no torque of the runs that it ranks.
+    """
+    from scipy.stats import spearmanr
+
+    import figaroh_jax as fj
+    from figaroh_jax.estimation.base_parameters import base_parameters
+    from figaroh_jax.estimation.columns import structural_columns
+    from figaroh_jax.estimation.regression import Regression, condense
+    from figaroh_jax.recordings.signals import prepare_all
+    from figaroh_jax.simulators.native import NativeBackend
+
+    model = arms()["UR10e"]
+    gains = (10.0, 10.6956, 8.4566, 9.0029, 9.48, 10.1232)  # N m/A, published with the data
+    learned = fj.learn(model, trust=1.0)
+    kept, own = np.array(learned.independent), 10 * len(model.joints)
+    structure = structural_columns(model, learned.terms)
+    used = np.asarray(np.abs(structure).max(axis=0) > 0)
+    base = base_parameters(structure.reshape(-1, structure.shape[2]), learned.names)
+    assert tuple(base.independent) == learned.independent
+    nominal = base.matrix[:, :own] @ np.asarray(model.inertia).ravel()
+    data = []
+    for file in sorted((DATA / "ur10e_innopolis" / "id").glob("*.npz")):
+        z = np.load(file)
+        try:
+            run = fj.recording(q=z["q"], tau=z["i"] * gains, time=z["t"], name=file.stem)
+            signals = prepare_all((run,), fj.Preprocess(cutoff=5), slowed=False, model=model)
+            data.append(condense(Regression(NativeBackend(model), learned.terms, np.zeros(6), signals), used))
+        except fj.InputError as error:
+            print(f"left out: {error}")
+    count = len(data)
+
+    def fit(some: Any, weight: np.ndarray) -> np.ndarray:
+        G, b = np.array(learned.prior), np.asarray(learned.prior) @ nominal
+        for k in some:
+            A = data[k].factor(weight)
+            G, b = G + A[:, kept].T @ A[:, kept], b + A[:, kept].T @ A[:, -1]
+        size = np.sqrt(np.diag(G))
+        theta = np.zeros(len(learned.names))
+        theta[kept] = np.linalg.solve(G / np.outer(size, size), b / size) / size
+        return theta
+
+    def error(some: Any) -> float:
+        theta = fit(some, weight)
+        others = [data[k] for k in range(count) if k not in some]
+        squares = sum(one.squares(theta) for one in others) * weight
+        return float(np.sqrt(squares.sum() / sum(one.rows for one in others).sum()))
+
+    weight = np.ones(6)
+    for _ in range(5):
+        theta = fit(range(count), weight)
+        weight = sum(one.rows for one in data) / sum(one.squares(theta) for one in data)
+    grams = [one.factor(weight)[:, kept] for one in data]
+    grams = [A.T @ A for A in grams]
+
+    def told_by(some: Any) -> float:
+        return float(np.linalg.slogdet(np.asarray(learned.prior) + sum(grams[k] for k in some))[1])
+
+    every = list(itertools.combinations(range(count), 3))
+    best, worst = max(every, key=told_by), min(every, key=told_by)
+    some = [every[k] for k in np.random.default_rng(0).permutation(len(every))[:triples]]
+    errors, scores = [error(t) for t in some], [told_by(t) for t in some]
+    ends = f"best 3 {error(best):.3f}, worst 3 {error(worst):.3f}"
+    print(f"{count} runs; error on the others in sigmas of a fit to all: {ends}")
+    print(f"{triples} random triples: median {np.median(errors):.3f}, best {min(errors):.3f}, worst {max(errors):.3f}")
+    print(f"rank correlation of log determinant and error: {spearmanr(scores, errors).statistic:.2f}")
+    alone = [error((k,)) for k in range(count)]
+    told = [told_by((k,)) for k in range(count)]
+    print(f"single runs: rank correlation {spearmanr(told, alone).statistic:.2f}")
+
+
+def peer() -> None:
+    """FIGAROH's problem: information and condition number, warm."""
     on_peer_problem(1)
     for seed in range(3):
         told(f"one start, seed {seed}", *on_peer_problem(1, seed=seed))
@@ -126,8 +391,36 @@ def main() -> None:
     print(f"peer, quoted: {PEER}")
 
 
+PARTS = {
+    "peer": peer,
+    "limits": limits,
+    "sequence": sequence,
+    "postures": postures,
+    "separation": separation,
+    "pays": pays,
+    "ranking": ranking,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("parts", nargs="*", choices=[[], *PARTS], help=f"default: all of {', '.join(PARTS)}")
+    parser.add_argument("--cold", action="store_true", help="one start in a fresh process, programs compiled")
+    args = parser.parse_args()
+    if args.cold:
+        told("one start, cold", *on_peer_problem(1))
+        print(f"whole process {time.process_time():.2f} CPU s")
+        return
+    for part in args.parts or PARTS:
+        print(f"== {part}")
+        PARTS[part]()
+
+
 if __name__ == "__main__":
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
     sys.path.insert(0, str(ROOT))
     import jax
 

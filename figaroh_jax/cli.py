@@ -109,6 +109,8 @@ def _run(args: argparse.Namespace) -> int:
         with _standard_output():
             sys.stdout.write(text)
         return 0
+    if args.command == "excite" and args.task is None:
+        args.task = _task_of_run(args.of_run)
     job = JOBS["diagnose" if args.command == "demo" else args.command]
     with resources.as_file(resources.files("figaroh_jax") / "demo") as demo:
         task_file = args.task or demo / "task.yaml"
@@ -152,8 +154,19 @@ def _again(args: argparse.Namespace) -> argparse.Namespace:
     return _parser().parse_args([*command, "--out", str(out), *(f"--{flag.replace('_', '-')}" for flag in flags)])
 
 
+def _task_of_run(run: Path | None) -> Path:
+    """The task file of a finished run."""
+    from .run_tools import command_of
+
+    if run is None:
+        raise InputError("excite needs a TASK.yaml, or --from with the run directory of a diagnosis")
+    return Path(command_of(run)[1])
+
+
 def _own_options(args: argparse.Namespace) -> dict[str, Any]:
     """Options that one command alone has."""
+    if args.command == "excite":
+        return {"of_run": args.of_run}
     return {"level": args.level, "priors": args.priors} if args.command == "calibrate" else {}
 
 
@@ -193,7 +206,10 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, explained in _TASKS.items():
         command = commands.add_parser(name, parents=[common], help=explained)
-        command.add_argument("task", type=Path, metavar="TASK.yaml")
+        command.add_argument("task", type=Path, metavar="TASK.yaml", nargs="?" if name == "excite" else None)
+        if name == "excite":
+            of_run = "a finished diagnosis: the motion that tells apart what it could not"
+            command.add_argument("--from", dest="of_run", type=Path, metavar="RUN_DIR", help=of_run)
         if name == "calibrate":
             command.add_argument("--level", help="frames, joint_offset or full, in place of what predicts best")
             command.add_argument("--no-priors", dest="priors", action="store_false", help="plain least squares")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .calibration.calibrated import Calibration
     from .calibration.kinematic_diagnosis import PoseDiagnosis
     from .effects.extended import ExtendedModel
-    from .excitation.design import Design
+    from .excitation.design import Cause, Design
     from .excitation.postures import PostureDesign
     from .formats.config import Load, Task
     from .identification.result import Identification, Link
@@ -283,9 +283,12 @@ def excite_file(
     out: Path,
     progress: Callable[[str, float], None] = lambda phase, fraction: None,
     backend: str = "native",
+    *,
+    of_run: Path | None = None,
 ) -> Design | PostureDesign:
     """Read a task, design what its `excite` block asks for and write the run directory `out`, as `diagnose_file` does.
 
+    `of_run` is a finished diagnosis: the motion is then one that tells its causes from what they are ambiguous with.
     A design that does not meet a limit at 1 kHz is written too, and says so; the command then ends with status 1.
     """
     _native_alone(backend, "a design differentiates the regressor in closed form")
@@ -296,14 +299,39 @@ def excite_file(
     from .formats.robotfile import load_extended
     from .reporting.excitation_files import write_design, write_postures
 
-    found = excite_task(task, progress)
+    separate = () if of_run is None else ambiguous_pairs(of_run)
+    found = excite_task(task, progress, separate=separate)
     progress("writing the report", 1.0)
-    with _run_folder(task, out, "excite") as folder:
+    own = [] if of_run is None else ["--from", str(of_run.resolve())]
+    with _run_folder(task, out, "excite", options=own) as folder:
         if isinstance(found, PostureDesign):
             write_postures(found, folder)
             return found
         write_design(found, folder, load_extended(task.robot.model, **robot_options(task.robot)).model)
     return found
+
+
+def ambiguous_pairs(folder: Path) -> list[tuple[Cause, Cause]]:
+    """The causes of a finished diagnosis with what each is ambiguous with: effect, place, sizes.
+
+    Raises `InputError` for another directory, and where nothing is ambiguous.
+    """
+    from .effects.registry import find
+
+    try:
+        answer = json.loads((folder / ANSWER).read_text(encoding="utf-8"))
+        causes = [(one["effect"], one["at"], one["parameters"], one["ambiguous_with"]) for one in answer["causes"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"--from {folder}: no readable {ANSWER}; name the run directory of a diagnosis") from None
+    pairs: list[tuple[Cause, Cause]] = []
+    for effect, at, parameters, others in causes:
+        known = find(effect).parameters()
+        size = {n: p["value"] for n, p in parameters.items() if n in known and p.get("value") is not None}
+        size = {} if find(effect).inertial else size
+        pairs += [((effect, tuple(at), size), (other["effect"], tuple(other["at"]), {})) for other in others]
+    if not pairs:
+        raise InputError(f"--from {folder}: no cause of this diagnosis is ambiguous; there is nothing to tell apart")
+    return pairs
 
 
 def _native_alone(backend: str, why: str = "") -> None:

@@ -211,3 +211,38 @@ def test_what_no_motion_meets_is_refused_with_the_joint_and_by_how_much(arm: Rob
         info.learn(arm, noise={"turn": 0.1})
     with pytest.raises(InputError, match="needs the motions that matter"):
         excite(arm, BASES[0], objective="prediction")
+
+
+def test_an_identification_from_the_designed_motion_predicts_better_than_from_random_ones(arm: RobotModel):
+    """Torques are Pinocchio's with friction and noise; the fit is plain least squares in NumPy."""
+    found = excite(arm, BASES[0], limits_of(arm, acceleration=8.0), starts=2, start=[0.1, 0.2])
+    learned = found.learned
+    sigma, kept = 1 / np.sqrt(np.asarray(learned.weight)), np.array(learned.independent)
+    sampler = Sampler(arm, learned.terms, np.asarray(learned.width))
+    objective = information_objective(np.asarray(learned.prior))
+    problem = Problem(learned, sampler, objective, kept, BASES[0], found.limits, np.array([0.1, 0.2]))
+    generator = np.random.default_rng(5)
+    randoms = [problem.states(random_motion(problem, generator)) for _ in range(9)]
+    unseen, randoms = randoms[:4], randoms[4:]
+
+    def rows(states: np.ndarray) -> np.ndarray:
+        q, v, a = states
+        friction = np.concatenate([np.eye(2) * v[:, None], np.eye(2) * np.tanh(v / info.SMOOTH)[:, None]], axis=2)
+        return (np.concatenate([reference.regressor(arm, q, v, a), friction], axis=2)[:, :, kept]) / sigma[:, None]
+
+    def torque(states: np.ndarray) -> np.ndarray:
+        q, v, a = states
+        return (reference.inverse_dynamics(arm, q, v, a) + 0.4 * v + 0.7 * np.tanh(v / info.SMOOTH)) / sigma
+
+    tests = [(rows(motion), torque(motion)) for motion in unseen]
+
+    def error(states: np.ndarray) -> float:
+        A, truth, squares = rows(states).reshape(-1, len(kept)), torque(states), []
+        for k in range(40):
+            y = truth + np.random.default_rng([6, k]).standard_normal(truth.shape)
+            fit = np.linalg.lstsq(A, y.ravel(), rcond=None)[0]
+            squares += [((W @ fit - own) ** 2).mean() for W, own in tests]
+        return float(np.sqrt(np.mean(squares)))
+
+    designed = np.stack([np.asarray(x) for x in found.stages[0].motion.states(20.0)])
+    assert error(designed) < 0.7 * np.median([error(motion) for motion in randoms])

@@ -122,3 +122,26 @@ def test_a_limit_that_is_not_met_at_1_khz_ends_with_status_1(tmp_path: Path, cap
     said = capsys.readouterr().err
     assert "limit not met: trajectory 1: " in said and "torque of 'turn' is" in said and "over its limit" in said
     assert json.loads((tmp_path / "run" / "excitation.json").read_text())["met"] is False
+
+
+def test_a_diagnosis_that_could_not_tell_two_causes_apart_gets_the_motion_that_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    file = task_of(tmp_path, f"{BASIS}, starts: 1")
+    run = tmp_path / "diagnosis"
+    run.mkdir()
+    cause = {"effect": "rotor_inertia", "at": ["turn"], "parameters": {"inertia": {"value": 0.3, "std": 0.1}}}
+    cause |= {"ambiguous_with": [{"effect": "link_inertia", "at": ["a"]}]}
+    (run / "answer.json").write_text(json.dumps({"causes": [cause]}))
+    (run / "provenance.json").write_text(json.dumps({"command": "diagnose", "task": str(file), "options": []}))
+    assert main(["excite", "--from", str(run), "--out", str(tmp_path / "run"), "--quiet", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["objective"] == "separate"
+    first = answer["separated"][0]
+    assert (first["cause"], first["rival"]) == ("rotor_inertia at turn", "link_inertia at a")
+    assert first["size"] == {"inertia": 0.3} and first["seconds"] == 2.0 * first["repeats"]
+    (run / "answer.json").write_text(json.dumps({"causes": [cause | {"ambiguous_with": []}]}))
+    assert main(["excite", "--from", str(run), "--out", str(tmp_path / "other"), "--quiet"]) == 2
+    assert "no cause of this diagnosis is ambiguous" in capsys.readouterr().err
+    assert main(["excite", "--out", str(tmp_path / "other"), "--quiet"]) == 2
+    assert "excite needs a TASK.yaml, or --from" in capsys.readouterr().err

@@ -22,7 +22,7 @@ from .sampling import Sampler
 from .separation import Causes, Separated, causes, separated, separation_objective
 from .solvers import GramObjective, Problem, solve
 
-__all__ = ["Design", "Stage", "best_motion", "excite", "random_motion"]
+__all__ = ["Cause", "Design", "Stage", "best_motion", "excite", "random_motion"]
 
 TIGHTENED = 3  # times that a motion is designed again with a margin
 CHECKED = 8  # motions, the best first, until one is feasible at 1 kHz

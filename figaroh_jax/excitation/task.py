@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,14 +14,14 @@ from jaxtyping import Float
 
 from ..errors import InputError
 from ..rigid.model import RobotModel
-from .design import Design, excite
+from .design import Cause, Design, excite
 from .information import Learned, learn
 from .limits import limits_of
 from .motions import Basis, fourier, quintic, spline
 from .postures import ACCURACY, Instrument, PostureDesign, excite_postures
 
 if TYPE_CHECKING:
-    from ..formats.config import Baseline, Excite, Task
+    from ..formats.config import Baseline, Excite, SizedEffect, Task
 
 __all__ = ["excite_task"]
 
@@ -29,16 +29,22 @@ DEFAULT_NOISE = 0.01  # of the largest torque
 
 
 def excite_task(
-    task: Task, progress: Callable[[str, float], None] = lambda phase, share: None
+    task: Task,
+    progress: Callable[[str, float], None] = lambda phase, share: None,
+    *,
+    separate: Sequence[tuple[Cause, Cause]] = (),
 ) -> Design | PostureDesign:
     """Design what the `excite` block of a task asks for; raises `InputError` where it is wrong, before any work.
 
+    `separate`: pairs of causes (effect, place, sizes) that are to be told apart, in place of the block's objective.
     Recordings of the task are what is known already: their information is the prior, their residuals are the noise.
     """
     from ..formats.config import robot_options
     from ..formats.robotfile import load_extended, load_robot, stated_baseline
 
     asked = task.excite
+    if separate:
+        asked = excite_block(asked)
     if asked is None:
         raise InputError(
             f"{task.file}: no `excite` block: it says what is to be designed, as in excite: {{duration: 10}}"
@@ -64,9 +70,9 @@ def excite_task(
         basis,
         limits,
         learned,
-        objective=asked.objective,
+        objective="separate" if separate else asked.objective,
         predict=[read_motion(path, model.robot) for path in asked.predict],
-        separate=[tuple((one.effect, one.at, one.size) for one in pair) for pair in asked.separate],  # pyright: ignore[reportArgumentType]
+        separate=separate or [(told(a), told(b)) for a, b in asked.separate],
         trust=task.robot.trust,
         trajectories=asked.trajectories,
         start=asked.start,
@@ -75,6 +81,18 @@ def excite_task(
         progress=progress,
     )
     return replace(found, notes=(*said, *found.notes))
+
+
+def told(one: SizedEffect) -> Cause:
+    """A cause of a task: effect, place, sizes."""
+    return one.effect, one.at, one.size
+
+
+def excite_block(asked: Excite | None) -> Excite:
+    """The block of a task that has one, else its defaults; of a motion."""
+    from ..formats.config import Excite
+
+    return Excite() if asked is None else asked.model_copy(update={"kind": "trajectory"})
 
 
 def _postures(task: Task, asked: Excite, robot: RobotModel, progress: Callable[[str, float], None]) -> PostureDesign:
