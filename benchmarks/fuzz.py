@@ -343,6 +343,7 @@ COMMANDS = {  # what may follow each: right words often, wrong ones now and then
     "diagnose": ("task.yaml", "poses.yaml"),
     "identify": ("task.yaml",),
     "calibrate": ("poses.yaml", "task.yaml"),
+    "excite": ("task.yaml",),
     "rerun": ("runs/first", "runs/second"),
     "demo": (),
     "verify": ("runs/first", "runs/second"),
@@ -534,6 +535,7 @@ def read_run_files(bench: Bench, file: Path) -> None:
         bench.kept[where] = data
     lines = [["verify", "runs/second", "--json"], ["compare", "runs/first", "runs/second", "--out", "page.html"]]
     lines += [["list", "runs"], ["rerun", "runs/second", "--quiet"], ["diagnose", "task.yaml", "--out", "runs/second"]]
+    lines = random.Random(data).sample(lines, 2)
     if name == b"loop.json":
         lines = [["export", "loop", "--for", simulator] for simulator in ("mujoco", "newton", "isaaclab")]
         lines[0] += ["--out", "exported"]
@@ -710,7 +712,7 @@ def work(args: argparse.Namespace) -> int:
     kinds = [kind for kind, (_, weight, _, _) in KINDS.items() for _ in range(weight) if kind in args.kinds]
     end = time.monotonic() + 60 * args.minutes
     for number in range(args.count):
-        if time.monotonic() > end:
+        if time.monotonic() > end or (args.keep / "stop").exists():
             break
         seed = args.seed + args.worker + number * args.workers
         source = Source(seed)

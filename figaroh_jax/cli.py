@@ -94,8 +94,10 @@ def _run(args: argparse.Namespace) -> int:
     if args.command in _OTHERS:
         from . import run_tools
 
+        status = 0  # also where the reader has gone
         with _standard_output():
-            return getattr(run_tools, args.command)(args)
+            status = getattr(run_tools, args.command)(args)
+        return status
     if args.command == "rerun":
         args = _again(args)
     _set_up_jax(cache=not args.no_cache)

@@ -101,7 +101,7 @@ def command_of(folder: Path) -> tuple[str, ...]:
     return (str(made["command"]), str(made["task"]), *options)
 
 
-_RUNS = ("diagnose", "identify", "calibrate")
+_RUNS = ("diagnose", "identify", "calibrate", "excite")
 _OPTIONS = {"--backend": 1, "--level": 1, "--no-priors": 0}  # that a run is said to have had, and their words
 
 

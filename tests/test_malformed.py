@@ -45,6 +45,7 @@ YAML = {
     "a mapping as a key": ("{{a: 1}: 2}\n", "line 1", "a key is a list or a mapping"),
     "a timestamp that is none": ("a: !!timestamp abc\n", "cannot be read as YAML"),
     "a bool that is none": ("a: !!bool maybe\n", "cannot be read as YAML"),
+    "half of a character": ('"\\uD800": 1\n', "line 1", "half of a character"),
     "an int that is none": ("a: !!int abc\n", "cannot be read as YAML"),
     "a set of a scalar": ("a: !!set abc\n", ""),
     "a mapping of a scalar": ("a: !!map abc\n", ""),

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
@@ -175,6 +178,68 @@ def test_the_runs_below_a_folder(tmp_path: Path, capsys):
         ("one", "diagnose", "named"),
         ("two", "?", "-"),
     ]
+
+
+def test_files_of_the_same_name_that_no_run_wrote_are_passed_over(tmp_path: Path, capsys):
+    run(tmp_path / "one", answer=ANSWER)
+    for name, text in (("mine", "[1, 2]"), ("yours", '{"causes": 3}')):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "answer.json").write_text(text)
+    damaged = run(tmp_path / "two", answer=ANSWER)
+    (damaged / "answer.json").write_text('{"causes": 3}')
+    assert cli.main(["list", str(tmp_path), "--json"]) == 0
+    (section,) = json.loads(capsys.readouterr().out)
+    assert [(Path(row[0]).name, row[2]) for row in section["rows"]] == [("one", "named"), ("two", "cannot be read")]
+
+
+def test_a_reader_that_goes_away_and_a_full_disk_at_standard_output(tmp_path: Path):
+    command = [sys.executable, "-m", "figaroh_jax", "list", str(tmp_path)]
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, "")
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "No space left" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        {"command": "verify"},
+        {"command": "rerun"},
+        {"command": ["diagnose"]},
+        {"options": ["--help"]},
+        {"options": ["--out", "elsewhere"]},
+        {"options": ["--backend"]},
+        {"task": [[]]},
+        {"task": "a\0b"},
+    ],
+)
+def test_a_provenance_that_names_no_run_s_command_is_status_2(made: dict[str, Any], tmp_path: Path, capsys):
+    task = tmp_path / "task.yaml"
+    task.write_text("robot: {}")
+    folder = run(tmp_path / "run", task, answer=ANSWER)
+    file = folder / "provenance.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | made))
+    assert cli.main(["rerun", str(folder), "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "provenance.json" in said and "internal" not in said
+
+
+def test_compare_and_verify_replace_no_file_of_the_user_s(tmp_path: Path, capsys):
+    one, two = (run(tmp_path / name, answer=ANSWER) for name in ("one", "two"))
+    thesis = tmp_path / "thesis.tex"
+    thesis.write_text("years of work")
+    assert cli.main(["compare", str(one), str(two), "--out", str(thesis)]) == 2
+    assert cli.main(["verify", str(one), "--junit", str(thesis)]) == 2
+    assert cli.main(["new", str(one), str(two), "--out", str(thesis)]) == 2
+    assert thesis.read_text() == "years of work" and "was not written by this command" in capsys.readouterr().err
+    page, junit = tmp_path / "page.html", tmp_path / "checks.xml"
+    for _ in range(2):
+        assert cli.main(["compare", str(one), str(two), "--out", str(page)]) == 0
+        assert cli.main(["verify", str(one), "--junit", str(junit)]) == 0
 
 
 def test_rerun_uses_the_command_and_the_task_of_the_run(tmp_path: Path, monkeypatch):

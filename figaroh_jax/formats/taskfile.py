@@ -47,6 +47,8 @@ class _Loader(yaml.SafeLoader):
         node = super().compose_scalar_node(anchor)
         if len(node.value) > LONGEST_NUMBER and node.tag in _NUMBERS:
             node.tag = "tag:yaml.org,2002:str"
+        if any("\ud800" <= c <= "\udfff" for c in node.value):  # written as an escape
+            raise InputError(f"{_line(node)}: {node.value[:60]!a} holds half of a character, which is no text")
         return node
 
     def construct_mapping(self, node, deep=False):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
+from ..effects.plausibility import implausible
 from ..errors import InputError
 from .data import Run
 from .fit import Fit, System, standard_errors
@@ -67,6 +68,7 @@ def identify_rollout_task(
             raise InputError(f"{task.robot.model}: the simulation diverges with the model's own gains; check kp and kd")
         final = put(here.loop, here.known.table, first.theta)
         held = {run.name: (run, simulated(final, run)) for run in runs if run.holdout}
+        notes = (*notes, *implausible(loop.robot, extended_of(final), task.robot.trust))
         result = _result(here, first, held, notes)
     predictions = {name: (run.time, read) for name, (run, read) in held.items()}
     return RolloutIdentification(result, final, extended_of(final), predictions)

@@ -13,6 +13,7 @@ import numpy as np
 from ..effects.base import Effect, place
 from ..effects.catalogue import find
 from ..effects.extended import ExtendedModel, extend
+from ..effects.plausibility import implausible
 from ..errors import InputError
 from ..formats.config import robot_options
 from ..recordings.dataset import Recording, read_recordings
@@ -144,6 +145,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
     start = put(here.loop, here.known.table, found.first.theta)
     held = {run.name: (simulated(start, run), simulated(final, run)) for run in runs if run.holdout}
     gain = _gain(held, runs, found)
+    model = extended_of(final if n == final.robot.nv else start)
     diagnosis = Diagnosis(
         verdict=found.verdict,
         causes=tuple(_cause(one, found, here) for one in found.named) if named else (),
@@ -158,9 +160,9 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
         candidates=(),
         traces=_traces(here, runs, first, found, last, held),
         baseline=extended_of(start),
-        model=extended_of(final if n == final.robot.nv else start),
+        model=model,
         rest=_rest(found, before if not named else after, scale, loop),
-        notes=notes,
+        notes=(*notes, *implausible(loop.robot, model, task.robot.trust)),
         prismatic=tuple(j.kind == "prismatic" for j in loop.robot.joints if not j.follows),
         of_positions=True,
     )
