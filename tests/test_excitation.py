@@ -162,7 +162,7 @@ def test_gradients_by_the_gram_matrix_are_those_of_finite_differences():
 
 def test_a_designed_motion_tells_more_than_random_ones_and_meets_its_limits_by_pinocchio(arm: RobotModel):
     limits = limits_of(arm, acceleration={"turn": 6.0, "bend": 8.0}, torque={"turn": 45.0, "bend": 14.0})
-    found = excite(arm, BASES[0], limits, trajectories=2, starts=2, start=[0.1, 0.2])
+    found = excite(arm, BASES[0], limits, trajectories=2, starts=1, start=[0.1, 0.2])
     learned = found.learned
     for stage in found.stages:
         assert stage.met

@@ -71,6 +71,7 @@ def test_separation_is_what_least_squares_leaves_of_the_cause_and_its_gradient_t
     assert np.sum(objective(G)[1] * change) == pytest.approx(slope, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_motion_designed_for_two_causes_tells_them_apart_better_than_one_that_tells_most_of_all(arm: RobotModel):
     basis, limits, learned = fourier(3, 0.5, 4.0), limits_of(arm, acceleration=8.0), info.learn(arm)
     pairs = [(ROTOR, INERTIA)]
@@ -92,6 +93,7 @@ def test_effects_that_no_instant_shows_are_refused(arm: RobotModel):
         excite(arm, fourier(3, 0.5, 4.0), objective="separate")
 
 
+@pytest.mark.slow
 def test_a_task_asks_for_a_separation(tmp_path: Path):
     from figaroh_jax.excitation.task import excite_task
     from figaroh_jax.formats.config import load_task

@@ -25,6 +25,7 @@ from .solvers import GramObjective, Problem, solve
 __all__ = ["Cause", "Design", "Stage", "best_motion", "excite", "random_motion"]
 
 TIGHTENED = 3  # times that a motion is designed again with a margin
+SCREENED = 8  # random motions, the best of which a start improves
 CHECKED = 8  # motions, the best first, until one is feasible at 1 kHz
 ROUNDING = 1e-6  # of a limit
 STEP = 0.98  # by which a motion is made smaller until it meets its limits
@@ -281,7 +282,7 @@ def best_motion(
     found: list[tuple[float, np.ndarray]] = []
     for k in range(starts):
         progress(k / starts)
-        x = random_motion(final, generator)
+        x = min((random_motion(final, generator) for _ in range(SCREENED)), key=problems[0].value)
         for problem in problems:
             x = solve(problem, x)
         found.append((final.value(x), x))
