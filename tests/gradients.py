@@ -38,7 +38,7 @@ def prepared() -> Any:
 def _fitted(model: Any, x: jax.Array) -> Any:
     """Base parameters by what was measured."""
     data, basis = prepared()
-    moved = eqx.tree_at(lambda d: d.torque, data, data.torque + x[0, 0, 0])
+    moved = eqx.tree_at(lambda d: d.torque, data, jnp.asarray(data.torque) + x[0, 0, 0])
     return fj.fit_linear(model, moved, basis).values
 
 
@@ -55,7 +55,7 @@ def _residual(model: Any, x: jax.Array) -> jax.Array:
 def _fit(model: Any, x: jax.Array) -> Any:
     """Two frictions fitted, differentiated through the solution."""
     data, _ = prepared()
-    moved = eqx.tree_at(lambda d: d.torque, data, data.torque * x[0, 0, 0])
+    moved = eqx.tree_at(lambda d: d.torque, data, jnp.asarray(data.torque) * x[0, 0, 0])
     return fj.fit(model, moved, free="effects").values
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import equinox as eqx
 import numpy as np
 import pytest
+from generators import servo_arm
 from tasks import URDF
 
 from figaroh_jax.effects.base import Effect, place
@@ -13,6 +16,8 @@ from figaroh_jax.effects.extended import extend
 from figaroh_jax.effects.plausibility import implausible
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.rigid.model import RobotModel
+from figaroh_jax.rollouts.reading import load_loop
+from figaroh_jax.rollouts.task import extended_of
 
 
 @pytest.fixture(scope="module")
@@ -59,3 +64,13 @@ def test_drives_beyond_the_effort_limit_are_named(robot: RobotModel, effect: str
 def test_a_payload_heavier_than_the_robot_is_named(robot: RobotModel):
     placed = place(find("payload"), robot, ["rod"], mass=8.0)
     assert any("more than the whole robot" in note for note in implausible(robot, extend(robot, placed), 0.1))
+
+
+def test_frictions_of_a_rollout_are_held_against_the_effort_limit(tmp_path: Path):
+    file = tmp_path / "arm.xml"
+    file.write_text(servo_arm.model_text().replace('axis="0 1 0"', 'axis="0 1 0" actuatorfrcrange="-30 30"'))
+    loop, _ = load_loop(file)
+    assert implausible(loop.robot, extended_of(loop), 0.1) == ()
+    stuck = eqx.tree_at(lambda loop: loop.joints.friction, loop, np.full(1, 400.0))
+    (note,) = implausible(stuck.robot, extended_of(stuck), 0.1)
+    assert "400 N m is above the model's effort limit of 30" in note

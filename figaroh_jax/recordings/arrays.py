@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["postures", "recording"]
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_SLOWEST = 5.0  # s between samples
 KINDS = ("pose", "position", "plane", "socket", "camera", "device")
 
 
@@ -73,11 +74,13 @@ def recording(
     angle, speed = known.pop("position", "rad"), known.pop("velocity", None)
     if known:
         raise InputError(f"{source}: units has no '{next(iter(known))}'; known: position, velocity, time")
+    stamps = _clock(time, rate, samples, source, seconds)
+    _check_pace(stamps, source)
     return Recording(
         name=name,
         file=source,
         joints=names,
-        time=_clock(time, rate, samples, source, seconds),
+        time=stamps,
         position=arrays["q"] * _factors(angle, model, arrays["q"].shape[1], source),
         velocity=arrays["v"] * _factors(speed or angle, model, columns, source, "v") if "v" in arrays else None,
         torque=arrays.get("tau"),
@@ -217,6 +220,17 @@ def _factors(unit: str, model: RobotModel | None, columns: int, source: Memory, 
     if model is not None:
         return unit_factors(unit, False, model, of)
     return np.full(columns, {"deg": np.pi / 180, "mm": 1e-3}.get(unit.split("/")[0], 1.0))
+
+
+def _check_pace(stamps: np.ndarray, source: Memory) -> None:
+    """Refuse samples so far apart that they are no record of a motion; their unit is then another one."""
+    step = float(np.median(np.diff(stamps)))
+    if step > _SLOWEST:
+        unit = next((unit for unit, factor in SECONDS.items() if step * factor <= 0.1), "ns")
+        raise InputError(
+            f"{source}: one sample in {step:.4g} s is no record of a motion; stamps that look like {unit}:"
+            f' units={{"time": "{unit}"}}'
+        )
 
 
 def _clock(time: Any, rate: float | None, samples: int, source: Memory, seconds: float) -> np.ndarray:

@@ -227,14 +227,20 @@ class _Work:
 
     def clean(self) -> None:
         """Remove what is left: the half-written run, or of the earlier one exactly the files that were written."""
+        if fcntl is None:
+            self._release()  # Windows removes no open file
         with suppress(OSError):
             self._clean_work()
-        if self.lock is not None:
-            with suppress(OSError):
-                os.close(self.lock)
+        self._release()
         for folder in reversed(self.parents):
             with suppress(OSError):
                 folder.rmdir()
+
+    def _release(self) -> None:
+        lock, self.lock = self.lock, None
+        if lock is not None:
+            with suppress(OSError):
+                os.close(lock)
 
     def _clean_work(self) -> None:
         if self.folder is None:
