@@ -23,6 +23,7 @@ BOTH = ("base_frame", "tool_frame")
 JOINTS, COLUMNS = 6, 7
 
 
+@pytest.mark.slow
 def test_calibration_through_mjx_gives_the_same_parameters(tmp_path: Path):
     MjxBackend = pytest.importorskip("figaroh_jax_mjx").MjxBackend
     rng = np.random.default_rng(21)

@@ -427,7 +427,7 @@ def test_relations_hold_both_ways_whichever_class_states_them():
     assert related("payload", "indistinguishable_from") == ("link_inertia",)
     assert related("torque_ripple", "excludes") == ()
     for effect in CATALOGUE.values():
-        for relation in ("contains", "indistinguishable_from", "excludes"):
+        for relation in ("contains", "resembles", "indistinguishable_from", "excludes"):
             assert all(find(name) for name in getattr(effect, relation))
 
 

@@ -14,6 +14,7 @@ from test_excitation import ARM
 from figaroh_jax.cli import main
 from figaroh_jax.errors import InputError
 from figaroh_jax.excitation import solvers
+from figaroh_jax.excitation.task import excite_task
 from figaroh_jax.formats.config import load_task
 from figaroh_jax.formats.urdf import load_urdf
 
@@ -149,3 +150,24 @@ def test_a_diagnosis_that_could_not_tell_two_causes_apart_gets_the_motion_that_d
     assert "no cause of this diagnosis is ambiguous" in capsys.readouterr().err
     assert main(["excite", "--out", str(tmp_path / "other"), "--quiet"]) == 2
     assert "excite needs a TASK.yaml, or --from" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_recordings_count_as_known_and_give_the_noise(tmp_path: Path):
+    """A recording with a known noise, its torques Pinocchio's."""
+    generator = np.random.default_rng(0)
+    t = np.arange(0, 20, 0.01)
+    waves = [(0.5 * k, generator.normal(size=2) / k, generator.uniform(0, 6, 2)) for k in range(1, 5)]
+    q, v, a = (sum(w**d * c * np.sin(w * t[:, None] + p + d * np.pi / 2) for w, c, p in waves) for d in range(3))
+    model = load_urdf(task_of(tmp_path, "duration: 2").with_name("robot.urdf"))
+    noise = np.array([0.3, 0.1])
+    torque = reference.inverse_dynamics(model, q, v, a) + 0.5 * v + noise * generator.standard_normal(q.shape)
+    np.savez(tmp_path / "run.npz", t=t, q=q, torque=torque)
+    data = "data: [{file: run.npz, time: t, position: q, torque: torque}]\npreprocess: {cutoff: 10}\n"
+    alone = excite_task(load_task(task_of(tmp_path, f"{BASIS}, starts: 1, noise: 0.01")))
+    after = excite_task(load_task(task_of(tmp_path, f"{BASIS}, starts: 1", data)))
+    sigma = 1 / np.sqrt(np.asarray(after.learned.weight))
+    # what a low pass at 10 Hz leaves of white noise at 100 Hz
+    np.testing.assert_allclose(sigma, noise * np.sqrt(10 / 50), rtol=0.25)
+    assert (after.std_before < alone.std_before).all() and (after.std < after.std_before).all()
+    assert "1 recording counts as known already; the noise is the residual of their fit" in after.notes

@@ -103,7 +103,7 @@ TREES = {
 }
 
 
-@pytest.fixture(params=TREES)
+@pytest.fixture(params=[pytest.param("humanoid", marks=pytest.mark.slow), "one of each", "drawn"])
 def twin(request: pytest.FixtureRequest) -> Twin:
     return random_tree(*TREES[request.param])
 

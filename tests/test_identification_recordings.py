@@ -42,7 +42,10 @@ def test_tx40_cross_validated_error_beats_figaroh(gated: bool, limit: float, dat
     assert physical(found) and pooled(found.fit) <= 1.01 * pooled(found.unconstrained)
 
 
-@pytest.mark.parametrize("backend", ["mujoco", "pinocchio", pytest.param("mjx", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "backend",
+    ["mujoco", pytest.param("pinocchio", marks=pytest.mark.slow), pytest.param("mjx", marks=pytest.mark.slow)],
+)
 def test_every_backend_identifies_the_same_parameters(backend: str, data_dir: Path, folder: Path):
     want, got = tx40(folder, data_dir), tx40(folder, data_dir, backend=backend)
     assert [one.expression for one in got.base] == [one.expression for one in want.base]

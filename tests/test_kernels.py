@@ -114,7 +114,7 @@ def test_pieces_of_a_tree_are_written_into_one_answer(tmp_path: Path, monkeypatc
 
 def test_transformations(tmp_path: Path):
     """Away from a GPU the plain form answers, through the same derivatives and batches."""
-    model = robots.load(robots.TREE, tmp_path)
+    model = robots.load(robots.ARM, tmp_path)
     q, v, a = states(model, 6)
     torques, rest = FORMS["torques"], (jnp.asarray(v[:3]), jnp.asarray(a[:3]))
 

@@ -66,7 +66,7 @@ def test_momentum_and_energy_are_pinocchios(arm: tuple[fj.RobotModel, Path]):
     assert not D.any()
 
 
-@pytest.mark.parametrize("form", ["momentum", "energy"])
+@pytest.mark.parametrize("form", ["momentum", pytest.param("energy", marks=pytest.mark.slow)])
 def test_forms_without_acceleration_find_the_parameters_where_differences_spoil_the_torque_form(
     form: Literal["momentum", "energy"], arm: tuple[fj.RobotModel, Path]
 ):

@@ -88,7 +88,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("integrator", ["implicitfast", "Euler"])
+@pytest.mark.parametrize("integrator", ["implicitfast", pytest.param("Euler", marks=pytest.mark.slow)])
 def test_seven_joints_with_friction_are_mujocos(tmp_path: Path, integrator: str):
     path = written(tmp_path, chain(7, integrator))
     loop, notes = load_loop(path)
@@ -99,7 +99,10 @@ def test_seven_joints_with_friction_are_mujocos(tmp_path: Path, integrator: str)
     assert notes == ()
 
 
-@pytest.mark.parametrize("integrator", ["implicitfast", "Euler", pytest.param("RK4", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "integrator",
+    ["implicitfast", pytest.param("Euler", marks=pytest.mark.slow), pytest.param("RK4", marks=pytest.mark.slow)],
+)
 def test_cart_with_every_kind_of_actuator_is_mujocos(tmp_path: Path, integrator: str):
     path = written(tmp_path, CART.replace("{integrator}", integrator))
     loop, _ = load_loop(path)
@@ -114,7 +117,7 @@ def test_cart_with_every_kind_of_actuator_is_mujocos(tmp_path: Path, integrator:
     np.testing.assert_allclose(rollout(loop, command, np.zeros(2)).position, truth, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("root", ["", "<freejoint/>"])
+@pytest.mark.parametrize("root", [pytest.param("", marks=pytest.mark.slow), "<freejoint/>"])
 def test_legs_with_limits_are_mujocos(tmp_path: Path, root: str):
     path = written(tmp_path, LEGS.replace("{root}", root).replace("{integrator}", "implicitfast"))
     loop, _ = load_loop(path)

@@ -63,7 +63,7 @@ def test_normal_matrix_and_factor_are_those_of_the_dense_rows(samples: int, tree
     assert_relatively_equal(R.T @ R, expected)
 
 
-@pytest.mark.parametrize("name", ["tx40", "panda", "talos"])
+@pytest.mark.parametrize("name", ["tx40", pytest.param("panda", marks=pytest.mark.slow), "talos"])
 def test_normal_matrix_and_factor_of_real_robots(name: str, data_dir: Path) -> None:
     from figaroh_jax.formats.urdf import load_urdf
 
@@ -145,7 +145,7 @@ for count in (5, 50):
 """
 
 
-@pytest.mark.parametrize("kind", ["normal", "factor"])
+@pytest.mark.parametrize("kind", ["normal", pytest.param("factor", marks=pytest.mark.slow)])
 def test_memory_does_not_grow_from_a_hundred_thousand_samples_to_a_million(kind: str, data_dir: Path) -> None:
     """Peak resident memory in MB; the dense regressor of the million would take 2880."""
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "JAX_PLATFORMS": "cpu"}

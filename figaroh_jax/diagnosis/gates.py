@@ -72,10 +72,12 @@ def _recurs(step: Step, contenders: list[Contender], one: Contender) -> bool:
     return float(np.mean(ranks < 3)) >= 2 / 3
 
 
-def simpler(step: Step, contenders: list[Contender], one: Contender) -> bool:
-    """Whether an effect that this one contains does as well."""
-    inside = [c for c in contenders if c.name.effect in type(one.effect).contains and c.name.at == one.name.at]
-    return any(_member(step, one, c) for c in inside)
+def simpler(step: Step, contenders: list[Contender], one: Contender) -> list[Contender]:
+    """The simpler effects that this one can imitate and that do as well, the best first."""
+    kind = type(one.effect)
+    inside = [c for c in contenders if c.name.effect in kind.contains and c.name.at == one.name.at]
+    like = [c for c in rivals(step, contenders, one) if c.name.effect in kind.resembles and physical_sign(c.effect)]
+    return [c for c in (*inside, *like) if _member(step, one, c)]
 
 
 def rivals(step: Step, contenders: list[Contender], one: Contender) -> list[Contender]:
@@ -85,10 +87,16 @@ def rivals(step: Step, contenders: list[Contender], one: Contender) -> list[Cont
 
 
 def _member(step: Step, best: Contender, other: Contender) -> bool:
-    """Whether the data cannot tell the other from the best: held-out blocks and penalised squares alike."""
+    """Whether the data cannot tell the other from the best: held-out blocks and penalised squares alike.
+
+    Of two that resemble each other, one has more numbers to follow a misfit with: squares alone do not tell them apart.
+    """
+    worse = t_value(other.verdicts.blocks, best.verdicts.blocks)
+    if other.name.effect in type(best.effect).resembles or best.name.effect in type(other.effect).resembles:
+        return worse < CLEARLY
     drop = step.verdicts.cost - best.verdicts.cost
     close = other.verdicts.cost - best.verdicts.cost < max(0.1 * drop, 15)
-    return close and t_value(other.verdicts.blocks, best.verdicts.blocks) < UNSURE
+    return close and worse < UNSURE
 
 
 def ambiguous(step: Step, best: Contender, rivals: list[Contender], screened: Screen) -> tuple[Name, ...]:

@@ -186,7 +186,13 @@ def _best(problem: Problem, step: Step, contenders: list[Contender], before: lis
     passing = [c for c in contenders if passes(step, contenders, c) and step.verdicts.cost - c.verdicts.cost > least]
     while passing and problem.trust > passing[0].effect.needs_trust:
         passing = [c for c in passing[1:] if c not in rivals(step, passing, passing[0])]
-    return next((c for c in passing if not simpler(step, passing, c)), None)
+    for one in passing:
+        instead = simpler(step, passing, one)
+        if not instead:
+            return one
+        if type(one.effect).resembles:
+            return instead[0]
+    return None
 
 
 def _found(

@@ -63,6 +63,7 @@ class ExternalWrench(PointEffect):
     name, title = "external_wrench", "a constant force from outside"
     equation = "-J(q)' (force_x, force_y, force_z) at the point (x, y, z) of the link"
     separated_by = "the same motion with {at} free, or with the base turned"
+    resembles = ("gravity_tilt", "payload")  # six numbers that follow any constant load of a few postures
     force_x: Scalar = amplitude("N")
     force_y: Scalar = amplitude("N")
     force_z: Scalar = amplitude("N")

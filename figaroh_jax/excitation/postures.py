@@ -301,11 +301,11 @@ def certified_bound(
         w = 0.5 * w
         w[chosen] += 0.5
     best = np.inf
+    each = (J.swapaxes(1, 2) @ J).reshape(n, p * p)
     for _ in range(_ASCENTS):
-        root = np.sqrt(w)[:, None, None]
-        L = np.linalg.cholesky(_information(J * root) + 1e-14 * np.eye(p))
-        half = np.linalg.solve(L, J.reshape(-1, p).T)
-        g = (half**2).sum(axis=0).reshape(n, -1).sum(axis=1)
+        L = np.linalg.cholesky((w @ each).reshape(p, p))
+        half = np.linalg.inv(L)
+        g = each @ (half.T @ half).ravel()
         value = 2 * float(np.log(np.diag(L)).sum())
         best = min(best, value + float(np.sort(g)[-count:].sum()) - float(g @ w))
         if best - value < 1e-4 * p:

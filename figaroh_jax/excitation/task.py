@@ -205,7 +205,8 @@ def with_recordings(
         inflation = max(1.0, float(np.trace(covariance @ (own.T @ own))) / base.rank)
         seen = A[:, np.array(learned.independent)]
         learned = learned.with_prior(seen.T @ seen / inflation)
-    text = f"{len(recordings)} recordings count as known already"
+    many = len(recordings) > 1
+    text = f"{len(recordings)} recording{'s count' if many else ' counts'} as known already"
     if noise_too:
         learned = with_noise(learned, 1 / np.sqrt(found.weight))
         text += "; the noise is the residual of their fit"

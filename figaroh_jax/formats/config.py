@@ -416,7 +416,7 @@ class Excite(_Keys):
     starts: Annotated[int, Field(ge=1, le=1000)] = 4  # random motions that are improved
     rate: Positive = 20.0  # Hz of a design's samples, whose noise is independent
     postures: Annotated[int, Field(ge=2, le=1000)] = 30
-    candidates: Annotated[int, Field(ge=10, le=100_000)] = 500  # random postures to choose from
+    candidates: Annotated[int, Field(ge=10, le=20_000)] = 500  # random postures to choose from
     measurement: Measurement | None = None  # of postures: the device; None: that of the recordings
 
     @model_validator(mode="after")

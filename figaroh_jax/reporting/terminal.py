@@ -84,6 +84,8 @@ def summary(diagnosis: Diagnosis, robot: str = "the robot") -> RenderableType:
     parts.append(Text(f"Held out: {diagnosis.holdout_scheme}. {wording.p_value(diagnosis.p_value)}.", style="dim"))
     if diagnosis.experiment is not None:
         parts.append(Text(f"Measure next: {diagnosis.experiment.text}"))
+        if diagnosis.experiment.separates:
+            parts.append(Text("`figaroh-jax excite --from RUN` designs a motion that separates them", style="dim"))
     parts += [Text(f"Note: {note}", style="dim") for note in diagnosis.notes]
     return Group(*parts)
 
