@@ -28,7 +28,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -130,6 +130,7 @@ def command(folder: Path, name: str, out: str = "runs/out") -> int:
     from figaroh_jax.calibration import calibration
     from figaroh_jax.diagnosis import diagnosis
     from figaroh_jax.identification import identification
+    from figaroh_jax.reporting.side_by_side import PAGE
 
     found = pickle.loads((folder.parent / "found.pickle").read_bytes())
     diagnosis.diagnose_task = lambda *args, **more: found["demo" if name == "demo" else "diagnose"]
@@ -139,6 +140,8 @@ def command(folder: Path, name: str, out: str = "runs/out") -> int:
     if name in LINES:
         for made in ("runs/task.yaml", "runs/exported/mujoco.json", "runs/exported/robot.xml"):
             Path(made).unlink(missing_ok=True)
+        if name == "compare":  # an earlier page, which is replaced
+            Path("runs/page.html").write_text(f"{PAGE}</html>\n")
         return cli.main([name, *LINES[name]])
     task = [] if name == "demo" else ["poses.yaml" if name == "calibrate" else "task.yaml"]
     return cli.main([name, *task, "--out", out, "--quiet"])
@@ -254,13 +257,13 @@ def _hidden(out: Path) -> set[Path]:
 class Refusing:
     """Stands in the place of the calls that write: the chosen one raises, before it does anything or after."""
 
-    def __init__(self, out: Path, chosen: int, error: Callable[[], BaseException], after: bool) -> None:
+    def __init__(self, out: Path, chosen: tuple[str, int], error: Callable[[], BaseException], after: bool) -> None:
         self.below, self.chosen, self.error, self.after = str(out.parent), chosen, error, after
         self.calls: list[str] = []
 
     def point(self, name: str, act: Callable[[], Any]) -> Any:
         self.calls.append(name)
-        if len(self.calls) - 1 != self.chosen:
+        if (name, self.calls.count(name)) != self.chosen:  # the so-manieth of its kind
             return act()
         if self.after:
             act()
@@ -318,7 +321,7 @@ _CALLS = ("mkdir", "rename", "replace", "link", "unlink", "rmdir", "fsync", "ope
 
 @contextlib.contextmanager
 def refusing(
-    out: Path, chosen: int, error: Callable[[], BaseException], after: bool, one_step: bool
+    out: Path, chosen: tuple[str, int], error: Callable[[], BaseException], after: bool, one_step: bool
 ) -> Iterator[Refusing]:
     """The calls of this process that write below the run directory's parent, one of them refused.
 
@@ -346,28 +349,34 @@ def refusing(
 WRITING = ("diagnose", "rerun", "verify", "compare", "new", "export")  # whose calls are refused
 
 
-def failures(folder: Path, count: int, source: random.Random) -> Counter[str]:
+def failures(folder: Path, count: int, source: random.Random, calls: Sequence[str] = ()) -> Counter[str]:
     """Refuse calls that write, one a run, `count` of each kind; count what was found after each."""
     out, counted = folder / "runs" / "out", Counter[str]()
     before, kinds = checksums(folder), Counter[str]()
     points: dict[str, list[tuple[Any, ...]]] = {}
     for name in WRITING:
         for one_step in (True, False) if name == "diagnose" else (True,):
-            with refusing(out, -1, ERRORS[0], False, one_step) as switch, contextlib.redirect_stdout(io.StringIO()):
+            with (
+                refusing(out, ("", 0), ERRORS[0], False, one_step) as switch,
+                contextlib.redirect_stdout(io.StringIO()),
+            ):
                 assert command(folder, name) in (0, 1), name
-            for k, kind in enumerate(switch.calls):
-                ways = [(name, k, kind, error, after, one_step) for error in ERRORS for after in (False, True)]
+            for kind, number in Counter(switch.calls).items():
+                ways = [(name, k + 1, kind) for k in range(number)]
+                ways = [(*way, error, after, one_step) for way in ways for error in ERRORS for after in (False, True)]
                 points.setdefault(kind, []).extend(ways)
+    for kind in [kind for kind in points if calls and kind not in calls]:
+        del points[kind]
     for some in points.values():
         source.shuffle(some)
     chosen = [point for some in points.values() for point in (some * -(-count // len(some)))[:count]]
     for name, number, kind, error, after, one_step in chosen:
         errors = io.StringIO()
-        with refusing(out, number, error, after, one_step) as switch, contextlib.redirect_stderr(errors):
+        with refusing(out, (kind, number), error, after, one_step) as switch, contextlib.redirect_stderr(errors):
             with contextlib.redirect_stdout(io.StringIO()):
                 status = command(folder, name)
-        refused = len(switch.calls) > number
-        kinds[switch.calls[number] if refused else f"{kind} not reached"] += 1
+        refused = switch.calls.count(kind) >= number
+        kinds[kind if refused else f"{kind} not reached"] += 1
         counted["failures"] += refused
         counted[f"{name}: run not whole"] += whole(out) is None
         counted["file of the user's touched"] += checksums(folder) != before
@@ -388,6 +397,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Kill commands and refuse their writes; see what is left.")
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--failures", type=int, default=50, help="of each kind of call")
+    parser.add_argument("--calls", nargs="*", default=(), help="refuse these alone: rename, link, ...")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
@@ -418,7 +428,8 @@ def main() -> int:
         source = random.Random(args.seed)
         wrong = 0
         here = os.getcwd()
-        for name, study, count in (("kills", kills, args.kills), ("failures", failures, args.failures)):
+        refused = partial(failures, calls=args.calls)
+        for name, study, count in (("kills", kills, args.kills), ("failures", refused, args.failures)):
             counted = study(folder, count, source) if count else Counter()
             print(f"{name}: { ({key: value for key, value in counted.items() if value}) }", flush=True)
             bad = ("not whole", "of the user's touched", "status other", "no single line", "did not end", "run again")

@@ -341,6 +341,7 @@ def smooth_sign(
 def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **parameters: float) -> Effect:
     """The effect at the joints, pair or link named in `at`, with parameters by name (the others at their default)."""
     wanted = {"joint": 1, "pair": 2, "link": 1, "robot": 0}[effect.acts_on]
+    at = [at] if isinstance(at, str) else [*(at or ())]
     if len(at) != wanted:
         raise InputError(f"effect '{effect.name}' acts on a {effect.acts_on}: `at` takes {wanted} names, got {len(at)}")
     index = model.link_index if effect.acts_on == "link" else model.joint_index
@@ -349,7 +350,17 @@ def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **par
         known = ", ".join(effect.parameters())
         raise InputError(f"effect '{effect.name}' has no parameter '{sorted(unknown)[0]}'; known: {known}")
     indices = np.asarray([index(name) for name in at], dtype=np.int64)
-    return effect(indices, **{name: np.float64(value) for name, value in parameters.items()})
+    return effect(indices, **{name: _number(effect, name, value) for name, value in parameters.items()})
+
+
+def _number(effect: type[Effect], name: str, value: Any) -> np.float64:
+    try:
+        number = np.float64(value)
+    except (TypeError, ValueError):
+        number = None
+    if number is None or np.ndim(number) or np.isnan(number):
+        raise InputError(f"effect '{effect.name}': {name} is {str(value)[:60]!r}; a number is expected")
+    return number
 
 
 def fixed(effect: Effect) -> Effect:
