@@ -43,7 +43,7 @@ from .problem import Problem
 from .rest import Significance, excess, lines, parts_of, predictable, relative_rest, significance, verdict, wrong_law
 from .search import Found, Search, eliminate, find_causes
 from .state import State, baseline, with_width
-from .step import stand
+from .step import stand, with_causes
 from .thresholds import CERTAIN, FEW_CAUSES, NO_REST, WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_reversals
 
@@ -171,10 +171,10 @@ def _searched(
     progress: Callable[[str, float], None],
     generator: np.random.Generator,
 ) -> _Searched:
-    """The causes that the data show, first without the effects that any rest looks like (`Effect.beside_rest`).
+    """The causes that the data show; where a rest stays, without the effects that any rest looks like.
 
-    Those are looked for where a rest stays, and kept where it is gone with them: beside a rest they take the place of
-    causes that could be named.
+    Beside a rest those (`Effect.beside_rest`) are not named, and take the place of causes that could be: the search is
+    taken up again from where the first of them came in.
     """
 
     def ended(before: _Setting, search: Search) -> _Searched:
@@ -185,15 +185,15 @@ def _searched(
         strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
         return _Searched(before, here, search, found, joint, left, line, strict)
 
+    first = ended(here, find_causes(*here[:4], forbid, alpha, progress, generator))
+    taken = next((k for k, f in enumerate(first.search.found) if not f.effect.beside_rest), None)
+    if taken is None or not first.strict:
+        return first
+    kept = first.search.found[:taken]
+    step = with_causes(here.problem, here.start, [f.effect for f in kept], here.whitening)
+    begun = first.search._replace(problem=here.problem, start=here.start, step=step, found=kept)
     like_a_rest = [name for name, effect in CATALOGUE.items() if not effect.beside_rest]
-    first = ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator))
-    if not first.strict:
-        return first
-    more = find_causes(*here[:4], forbid, alpha, progress, generator, first.search)
-    if len(more.found) == len(first.search.found):
-        return first
-    second = ended(here, more)
-    return first if second.strict else second
+    return ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun))
 
 
 def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) -> tuple[list[Found], Joint]:

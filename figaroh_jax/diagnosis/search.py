@@ -77,7 +77,7 @@ def find_causes(
 ) -> Search:
     """Accept the best cause until none passes the gates, or until noise explains what the catalogue still scores.
 
-    `after` is a search with more of the catalogue forbidden, which this one takes up where it ended.
+    `after` is a search of other effects, which this one takes up where it stands.
 
     A sensor that is late or that winds up rounds the reversals of dry friction, so that their width is fitted anew
     once such a cause is in: the old one would be made up for by a friction that is not there.
