@@ -35,7 +35,19 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
-COMMANDS = ("diagnose", "identify", "calibrate", "demo", "rerun", "verify", "compare", "list", "new", "export")
+COMMANDS = (
+    "diagnose",
+    "identify",
+    "calibrate",
+    "excite",
+    "demo",
+    "rerun",
+    "verify",
+    "compare",
+    "list",
+    "new",
+    "export",
+)
 LINES = {  # of the commands that take no task
     "rerun": ["runs/kept", "--out", "runs/out", "--quiet"],
     "verify": ["runs/out"],
@@ -44,6 +56,10 @@ LINES = {  # of the commands that take no task
     "new": ["robot.urdf", "run1.npz", "--joints", "shoulder,elbow,slide", "--out", "runs/task.yaml"],
     "export": ["loop", "--for", "mujoco", "--out", "runs/exported"],
 }
+EXCITE = """robot: {model: robot.urdf}
+excite: {basis: {quintic: 3}, duration: 2, starts: 1, limits: {acceleration: 7}, noise: 0.02}
+"""
+TASKS = {"calibrate": "poses.yaml", "excite": "excite.yaml"}  # those of the other commands: task.yaml
 ENDS = {"page.html": "</html>\n", "task.yaml": "\n", "mujoco.json": "}\n", "robot.xml": "</mujoco>\n"}
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 ERRORS: tuple[Callable[[], BaseException], ...] = (
@@ -62,6 +78,7 @@ def prepare(folder: Path) -> None:
 
     from figaroh_jax.calibration.calibration import calibrate_task
     from figaroh_jax.effects.extended import extend
+    from figaroh_jax.excitation.task import excite_task
     from figaroh_jax.formats.config import load_task
     from figaroh_jax.formats.urdf import load_urdf
     from figaroh_jax.identification.identification import identify_task
@@ -95,6 +112,8 @@ def prepare(folder: Path) -> None:
         "identify": identify_task(load_task(folder / "task.yaml")),
         "calibrate": calibrate_task(load_task(folder / "poses.yaml"), level="frames"),
     }
+    (folder / "excite.yaml").write_text(EXCITE)
+    found["excite"] = excite_task(load_task(folder / "excite.yaml"))
     demo = ROOT / "figaroh_jax" / "demo"
     found["demo"] = replace(fake_diagnosis.named(), model=extend(load_urdf(demo / "robot.urdf")))
     (folder.parent / "found.pickle").write_bytes(pickle.dumps(found))
@@ -129,12 +148,14 @@ def command(folder: Path, name: str, out: str = "runs/out") -> int:
     from figaroh_jax import cli
     from figaroh_jax.calibration import calibration
     from figaroh_jax.diagnosis import diagnosis
+    from figaroh_jax.excitation import task as excitation
     from figaroh_jax.identification import identification
     from figaroh_jax.reporting.side_by_side import PAGE
 
     found = pickle.loads((folder.parent / "found.pickle").read_bytes())
     diagnosis.diagnose_task = lambda *args, **more: found["demo" if name == "demo" else "diagnose"]
     identification.identify_task = lambda *args, **more: found["identify"]
+    excitation.excite_task = lambda *args, **more: found["excite"]
     calibration.calibrate_task = lambda *args, **more: found["calibrate"]
     os.chdir(folder)
     if name in LINES:
@@ -143,7 +164,7 @@ def command(folder: Path, name: str, out: str = "runs/out") -> int:
         if name == "compare":  # an earlier page, which is replaced
             Path("runs/page.html").write_text(f"{PAGE}</html>\n")
         return cli.main([name, *LINES[name]])
-    task = [] if name == "demo" else ["poses.yaml" if name == "calibrate" else "task.yaml"]
+    task = [] if name == "demo" else [TASKS.get(name, "task.yaml")]
     return cli.main([name, *task, "--out", out, "--quiet"])
 
 
@@ -171,7 +192,8 @@ def whole(out: Path) -> str | None:
     there = {"verification.json"}  # the marker lists it before it is there
     if set(written) - there - {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}:
         return None
-    return "answer" if "answer.json" in names else "parameters" if "parameters.csv" in names else "calibration"
+    kinds = {"answer.json": "answer", "parameters.csv": "parameters", "excitation.json": "excitation"}
+    return next((kind for file, kind in kinds.items() if file in names), "calibration")
 
 
 def child(folder: Path, name: str, act: Callable[[], None] = lambda: None) -> int:

@@ -35,6 +35,12 @@ def prepared() -> Any:
     return data, fj.linear_basis(ROBOT, data)
 
 
+@lru_cache
+def learned() -> fj.Learned:
+    """What a motion is to tell; made before anything is traced."""
+    return fj.learn(ROBOT)
+
+
 def _fitted(model: Any, x: jax.Array) -> Any:
     """Base parameters by what was measured."""
     data, basis = prepared()
@@ -81,6 +87,8 @@ FUNCTIONS: dict[str, tuple[Callable[[Any, Any], Any], Any]] = {
     "fit": (_fit, EXTENDED),
     "ExtendedModel.inverse_dynamics": (lambda m, x: m.inverse_dynamics(x[0], x[1], x[2]), EXTENDED),
     "ExtendedModel.forward_dynamics": (lambda m, x: m.forward_dynamics(x[0], x[1], x[3]), EXTENDED),
+    "information": (lambda m, x: fj.information(m, (x[0], x[1], x[2]), learned()), ROBOT),
+    "expected_std": (lambda m, x: fj.expected_std(learned(), (x[0], x[1], x[2])), ROBOT),
     "rigid.derivatives.gravity_vector": (lambda m, x: derivatives.gravity_vector(m, x[0]), ROBOT),
     "rigid.derivatives.coriolis_matrix": (lambda m, x: derivatives.coriolis_matrix(m, x[0], x[1]), ROBOT),
     "rigid.derivatives.dynamics_derivatives": (
@@ -100,8 +108,6 @@ OTHERS = frozenset(
     " Design Instrument Learned PostureDesign Trajectory excite excite_postures excite_task fourier learn limits_of"
     " quintic spline".split()
 )
-# by the parameters of a motion: the one in tests/test_excitation.py, the other is not checked yet
-ELSEWHERE = frozenset(("information", "expected_std"))
 
 
 def _moved(tree: Any, way: Any, step: float) -> Any:
@@ -124,6 +130,8 @@ def checked(name: str) -> tuple[float, float]:
     function, model = FUNCTIONS[name]
     if name in ("residual", "fit", "fit_linear"):
         prepared()
+    if name in ("information", "expected_std"):
+        learned()
     rng = np.random.default_rng(1)
     state = jnp.asarray(np.stack(STATE))
     sizes = [rng.standard_normal(np.shape(x)) for x in jax.tree.leaves(jax.eval_shape(function, model, state))]
