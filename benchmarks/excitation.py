@@ -338,8 +338,8 @@ def ranking(triples: int = 200) -> None:
             run = fj.recording(q=z["q"], tau=z["i"] * gains, time=z["t"], name=file.stem)
             signals = prepare_all((run,), fj.Preprocess(cutoff=5), slowed=False, model=model)
             data.append(condense(Regression(NativeBackend(model), learned.terms, np.zeros(6), signals), used))
-        except fj.InputError as error:
-            print(f"left out: {error}")
+        except fj.InputError as refused:
+            print(f"left out: {refused}")
     count = len(data)
 
     def fit(some: Any, weight: np.ndarray) -> np.ndarray:
@@ -355,13 +355,13 @@ def ranking(triples: int = 200) -> None:
     def error(some: Any) -> float:
         theta = fit(some, weight)
         others = [data[k] for k in range(count) if k not in some]
-        squares = sum(one.squares(theta) for one in others) * weight
-        return float(np.sqrt(squares.sum() / sum(one.rows for one in others).sum()))
+        squares = np.sum([one.squares(theta) for one in others], axis=0) * weight
+        return float(np.sqrt(squares.sum() / np.sum([one.rows for one in others])))
 
     weight = np.ones(6)
     for _ in range(5):
         theta = fit(range(count), weight)
-        weight = sum(one.rows for one in data) / sum(one.squares(theta) for one in data)
+        weight = np.sum([one.rows for one in data], axis=0) / np.sum([one.squares(theta) for one in data], axis=0)
     grams = [one.factor(weight)[:, kept] for one in data]
     grams = [A.T @ A for A in grams]
 
@@ -375,10 +375,10 @@ def ranking(triples: int = 200) -> None:
     ends = f"best 3 {error(best):.3f}, worst 3 {error(worst):.3f}"
     print(f"{count} runs; error on the others in sigmas of a fit to all: {ends}")
     print(f"{triples} random triples: median {np.median(errors):.3f}, best {min(errors):.3f}, worst {max(errors):.3f}")
-    print(f"rank correlation of log determinant and error: {spearmanr(scores, errors).statistic:.2f}")
+    print(f"rank correlation of log determinant and error: {spearmanr(scores, errors)[0]:.2f}")
     alone = [error((k,)) for k in range(count)]
     told = [told_by((k,)) for k in range(count)]
-    print(f"single runs: rank correlation {spearmanr(told, alone).statistic:.2f}")
+    print(f"single runs: rank correlation {spearmanr(told, alone)[0]:.2f}")
 
 
 def peer() -> None:

@@ -60,8 +60,9 @@ def recording(
     """
     source = Memory(name)
     names = tuple(joints or (model.dof_names if model is not None else ()))
-    given = {"q": q, "v": v, "tau": tau, "command": command}
-    arrays = {key: _matrix(x, key, source) for key, x in given.items() if x is not None or key == "q"}
+    given = {"v": v, "tau": tau, "command": command}
+    arrays = {"q": _matrix(q, "q", source)}
+    arrays |= {key: _matrix(x, key, source) for key, x in given.items() if x is not None}
     samples = len(arrays["q"])
     wrong = next((key for key, x in arrays.items() if len(x) != samples), None)
     if wrong:
