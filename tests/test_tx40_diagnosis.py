@@ -79,10 +79,8 @@ def test_the_data_say_that_something_is_missing(answer: Diagnosis):
     assert answer.verdict in ("named", "named+rest")
 
 
-@pytest.mark.parametrize(
-    "backend",
-    ["mujoco", pytest.param("pinocchio", marks=pytest.mark.slow), pytest.param("mjx", marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["mujoco", "pinocchio", "mjx"])
 def test_every_backend_gives_the_same_verdict_causes_and_parameters(
     backend: str, answer: Diagnosis, data_dir: Path, tmp_path: Path
 ):
