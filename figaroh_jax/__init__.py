@@ -59,7 +59,7 @@ if TYPE_CHECKING:
         payloads as payloads,
         wrenches as wrenches,
     )
-    from .identification.identification import identify as identify, identify_task as identify_task
+    from .identification.identification import identify_task as identify_task
     from .recordings import cleaning as cleaning, devices as devices
     from .recordings.arrays import postures as postures, recording as recording
     from .recordings.dataset import Recording as Recording, read_recordings as read_recordings
@@ -80,7 +80,7 @@ if TYPE_CHECKING:
     from .rigid.normal_equations import normal_matrix as normal_matrix, triangular_factor as triangular_factor
     from .rigid.regressor import joint_torque_regressor as joint_torque_regressor, packed_regressor as packed_regressor
     from .simulators.registry import backend as backend
-    from .tasks import diagnose as diagnose, diagnose_task as diagnose_task
+    from .tasks import diagnose as diagnose, diagnose_task as diagnose_task, identify as identify
 
 __version__ = "0.1.0"
 
@@ -96,7 +96,7 @@ _MODULES = {
     "recordings.arrays": ("postures", "recording"),
     "recordings.devices": ("Device", "own_device"),
     "recordings.dataset": ("Recording", "read_recordings"),
-    "tasks": ("diagnose", "diagnose_task"),
+    "tasks": ("diagnose", "diagnose_task", "identify"),
     "rigid.dynamics": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
     "effects.base": ("Effect", "Motion", "amplitude", "place", "shape"),
     "effects.catalogue": ("CATALOGUE", "register"),
@@ -109,7 +109,7 @@ _MODULES = {
     "excitation.postures": ("Instrument", "PostureDesign", "excite_postures"),
     "excitation.task": ("excite_task",),
     "excitation.motions": ("Trajectory", "fourier", "quintic", "spline"),
-    "identification.identification": ("identify", "identify_task"),
+    "identification.identification": ("identify_task",),
     "rigid.kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
     "formats.mjcf": ("load_mjcf",),
     "rigid.model": ("Frame", "Joint", "RobotModel"),

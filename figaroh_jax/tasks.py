@@ -1,8 +1,9 @@
-"""The diagnosis as Python calls it, at every level of data: torques, or postures that a device measured."""
+"""Diagnosis and identification as Python calls them: recordings are checked before any work."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, overload
 
 from .errors import InputError
@@ -10,13 +11,15 @@ from .errors import InputError
 if TYPE_CHECKING:
     from .calibration.kinematic_diagnosis import PoseDiagnosis
     from .formats.config import Baseline, Preprocess, Task
+    from .identification.identification import Fit
+    from .identification.result import Identification
     from .recordings.dataset import Recording
     from .recordings.poses import PoseRecording
     from .results import Diagnosis
     from .rigid.model import RobotModel
     from .simulators.contract import Backend
 
-__all__ = ["diagnose", "diagnose_task"]
+__all__ = ["diagnose", "diagnose_task", "identify"]
 
 
 def diagnose_task(
@@ -103,5 +106,44 @@ def diagnose(
     from .formats.config import Preprocess
 
     torques: Any = recordings
+    notes = _checked(model, torques)
     settings = {"trust": trust, "forbid": forbid, "alpha": alpha, "progress": progress, **options}
-    return of_torques(model, torques, preprocess or Preprocess(), known, **settings)
+    found = of_torques(model, torques, preprocess or Preprocess(), known, **settings)
+    return replace(found, notes=(*notes, *found.notes))
+
+
+def identify(
+    model: RobotModel | Backend,
+    recordings: Sequence[Recording],
+    preprocess: Preprocess | None = None,
+    known: Baseline | None = None,
+    *,
+    trust: float = 0.10,
+    fit: Fit = "physical",
+    joints: Sequence[str] | None = None,
+    bounds: Mapping[str, Mapping[str, Any]] | None = None,
+    progress: Callable[[str, float], None] = lambda phase, share: None,
+) -> Identification:
+    """Fit the dynamics of `model`, a robot or a backend of it, to recordings (joint side, SI units).
+
+    `known` says which friction is fitted beside the links, `trust` how far the nominal inertials are believed (relative
+    one sigma; less if cross-validation says so), `joints` whose torque is fitted (default: all that have one), `bounds`
+    what CAD says of links: least and most mass, a box of the centre of mass. `fit` "physical" finds the best robot
+    whose links are bodies, "log_cholesky" the same by Levenberg-Marquardt, "unconstrained" leaves the links free.
+    Raises `InputError` where a recording cannot be right (units, order or sign of columns, clock, standstill), shows
+    too little, or the fit that was asked for fails.
+    """
+    from .identification.identification import identify as of_torques
+
+    notes = _checked(model, recordings)
+    settings: Any = {"trust": trust, "fit": fit, "joints": joints, "bounds": bounds, "progress": progress}
+    found = of_torques(model, recordings, preprocess, known, **settings)
+    return replace(found, notes=(*notes, *found.notes))
+
+
+def _checked(model: RobotModel | Backend, recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Warnings about the recordings; `InputError` where one cannot be right."""
+    from .recordings.checks import check_recordings
+    from .simulators.native import as_backend
+
+    return check_recordings(None, as_backend(model).robot, recordings)

@@ -13,6 +13,7 @@ import pytest
 from generators import make_case
 from spoiled import KINDS, Base, said
 
+import figaroh_jax as fj
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.config import load_task
 from figaroh_jax.formats.robotfile import load_robot
@@ -138,3 +139,17 @@ def test_torque_and_frames_without_jax_are_those_of_pinocchio(base: Base):
         pose = data.oMf[other.getFrameId("ram")]
         np.testing.assert_allclose(origin[k], pose.translation, rtol=0, atol=1e-12)
         np.testing.assert_allclose(turned[k], pose.rotation, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("job", [fj.diagnose, fj.identify])
+def test_recordings_from_arrays_are_checked_too(job: Any):
+    robot = load_urdf(fj.DEMO)
+    t = np.arange(600) / 100.0
+    q = 0.7 * np.sin(2 * np.pi * 0.5 * t[:, None] + np.arange(4))
+    torque = np.asarray(fj.inverse_dynamics(robot, q, np.gradient(q, t, axis=0), np.zeros_like(q)))
+    degrees = fj.recording(q=np.rad2deg(q), tau=torque, time=t)
+    with pytest.raises(InputError, match=r"looks like degrees|look like degrees|deg"):
+        job(robot, [degrees])
+    still = fj.recording(q=np.broadcast_to(q[:1], q.shape), tau=torque, time=t)
+    with pytest.raises(InputError, match="no joint moves"):
+        job(robot, [still])

@@ -77,12 +77,12 @@ class _Look(NamedTuple):
         return high - low
 
 
-def check_recordings(task: Task, model: RobotModel, recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """Warnings about the recordings of a task of torque level, also sent to the log `figaroh_jax`.
+def check_recordings(task: Task | None, model: RobotModel, recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Warnings about recordings of torque, of a task or from arrays, also sent to the log `figaroh_jax`.
 
     Raises `InputError` with every finding that cannot be right.
     """
-    entries: dict[Path | Memory, RecordingEntry] = {entry.file: entry for entry in task.data}
+    entries: dict[Path | Memory, RecordingEntry] = {entry.file: entry for entry in task.data} if task else {}
     found = [
         (recording.file.name, finding)
         for recording in recordings
