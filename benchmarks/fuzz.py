@@ -602,7 +602,7 @@ def call(bench: Bench, file: Path) -> None:
         "frame_placement": lambda: fj.frame_placement(model, q, last),
         "gravity": lambda: derivatives.gravity_vector(model, q),
         "effect": lambda: fj.place(
-            fj.CATALOGUE[source.of((*fj.CATALOGUE, "x"))] if source.once_in(2) else fj.CATALOGUE["viscous_friction"],
+            fj.CATALOGUE[source.of(tuple(fj.CATALOGUE)) if source.once_in(2) else "viscous_friction"],
             model,
             source.of((["elbow"], ["x"], [], None, "elbow", ["elbow", "elbow"])),
             **source.of(

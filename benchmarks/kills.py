@@ -143,6 +143,16 @@ def _right_recording(file: Path, model: Any) -> None:
     np.savez(file, **arrays)
 
 
+def made_before(folder: Path, name: str) -> None:
+    """What the command finds in the place of the single file that it writes: nothing, or an earlier page."""
+    from figaroh_jax.reporting.side_by_side import PAGE
+
+    for made in ("runs/task.yaml", "runs/exported/mujoco.json", "runs/exported/robot.xml"):
+        (folder / made).unlink(missing_ok=True)
+    if name == "compare":
+        (folder / "runs" / "page.html").write_text(f"{PAGE}</html>\n")
+
+
 def command(folder: Path, name: str, out: str = "runs/out") -> int:
     """One command in the user's folder; what it would compute is there."""
     from figaroh_jax import cli
@@ -150,7 +160,6 @@ def command(folder: Path, name: str, out: str = "runs/out") -> int:
     from figaroh_jax.diagnosis import diagnosis
     from figaroh_jax.excitation import task as excitation
     from figaroh_jax.identification import identification
-    from figaroh_jax.reporting.side_by_side import PAGE
 
     found = pickle.loads((folder.parent / "found.pickle").read_bytes())
     diagnosis.diagnose_task = lambda *args, **more: found["demo" if name == "demo" else "diagnose"]
@@ -159,10 +168,6 @@ def command(folder: Path, name: str, out: str = "runs/out") -> int:
     calibration.calibrate_task = lambda *args, **more: found["calibrate"]
     os.chdir(folder)
     if name in LINES:
-        for made in ("runs/task.yaml", "runs/exported/mujoco.json", "runs/exported/robot.xml"):
-            Path(made).unlink(missing_ok=True)
-        if name == "compare":  # an earlier page, which is replaced
-            Path("runs/page.html").write_text(f"{PAGE}</html>\n")
         return cli.main([name, *LINES[name]])
     task = [] if name == "demo" else [TASKS.get(name, "task.yaml")]
     return cli.main([name, *task, "--out", out, "--quiet"])
@@ -207,6 +212,7 @@ def child(folder: Path, name: str, act: Callable[[], None] = lambda: None) -> in
         for stream in (1, 2):
             os.dup2(null, stream)
         act()
+        made_before(folder, name)
         os._exit(command(folder, name))
     os._exit(99)
 
@@ -378,6 +384,7 @@ def failures(folder: Path, count: int, source: random.Random, calls: Sequence[st
     points: dict[str, list[tuple[Any, ...]]] = {}
     for name in WRITING:
         for one_step in (True, False) if name == "diagnose" else (True,):
+            made_before(folder, name)
             with (
                 refusing(out, ("", 0), ERRORS[0], False, one_step) as switch,
                 contextlib.redirect_stdout(io.StringIO()),
@@ -394,6 +401,7 @@ def failures(folder: Path, count: int, source: random.Random, calls: Sequence[st
     chosen = [point for some in points.values() for point in (some * -(-count // len(some)))[:count]]
     for name, number, kind, error, after, one_step in chosen:
         errors = io.StringIO()
+        made_before(folder, name)
         with refusing(out, (kind, number), error, after, one_step) as switch, contextlib.redirect_stderr(errors):
             with contextlib.redirect_stdout(io.StringIO()):
                 status = command(folder, name)
