@@ -14,7 +14,7 @@ from test_excitation import ARM
 from figaroh_jax.cli import main
 from figaroh_jax.errors import InputError
 from figaroh_jax.excitation import solvers
-from figaroh_jax.excitation.task import excite_task
+from figaroh_jax.excitation.task import excite_task, read_motion
 from figaroh_jax.formats.config import load_task
 from figaroh_jax.formats.urdf import load_urdf
 
@@ -98,7 +98,7 @@ def test_a_task_without_recordings_is_for_excite_alone(tmp_path: Path, capsys: p
             "objective: separate, separate: [[{effect: torque_delay}, {effect: rotor_inertia, at: [turn]}]]",
             "'torque_delay' has no torque of an instant",
         ),
-        ("objective: prediction, predict: [no.npz]", "no.npz: cannot be read as .npz"),
+        ("objective: prediction, predict: [no.npz]", "no.npz (excite.predict) does not exist"),
     ],
 )
 def test_what_cannot_be_designed_ends_in_one_message_and_nothing_is_written(
@@ -171,3 +171,27 @@ def test_recordings_count_as_known_and_give_the_noise(tmp_path: Path):
     np.testing.assert_allclose(sigma, noise * np.sqrt(10 / 50), rtol=0.25)
     assert (after.std_before < alone.std_before).all() and (after.std < after.std_before).all()
     assert "1 recording counts as known already; the noise is the residual of their fit" in after.notes
+
+
+def test_a_motion_that_matters_is_read_with_its_derivatives_or_refused_by_name(tmp_path: Path):
+    (tmp_path / "robot.urdf").write_text(ARM)
+    robot, t = load_urdf(tmp_path / "robot.urdf"), np.linspace(0.0, 2.0, 400)
+    q = np.sin(np.outer(t, [2.0, 3.0]))
+
+    def read(**arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+        np.savez(tmp_path / "motion.npz", **arrays)  # pyright: ignore[reportArgumentType]
+        return read_motion(tmp_path / "motion.npz", robot)
+
+    _, v, a = read(t=t, q=q)
+    np.testing.assert_allclose(v, np.array([2.0, 3.0]) * np.cos(np.outer(t, [2.0, 3.0])), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(a, -np.array([4.0, 9.0]) * q, rtol=0, atol=1e-4)
+    for wrong, message in (
+        ({"t": t[::-1], "q": q}, "t must increase"),
+        ({"t": np.where(t > 1, np.nan, t), "q": q}, "motion.npz"),
+        ({"t": t, "q": np.where(t[:, None] > 1, np.nan, q)}, "motion.npz"),
+        ({"q": q}, "q, v, a or t, q are expected"),
+        ({"t": t, "q": q[:, :1]}, "expected"),
+        ({"q": q, "v": q[:5], "a": q}, "v has shape"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read(**wrong)

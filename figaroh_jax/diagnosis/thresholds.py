@@ -35,7 +35,6 @@ SAME = 0.5  # overlap from which two causes explain the same misfit
 CLEARLY = 3.0  # t from which data tell effects apart that are the same while the joint moves
 MUCH = 0.5  # share of the best's drop from which another cause explains much of the same
 SMALLEST = 0.0005  # share of the first cause's drop below which a later one may be what the first left over
-TRUSTED = 0.05  # of the inertials, relative: up to it a link's own inertia may be the cause
 MOST_CAUSES = 16
 AGAIN = 1.2  # times its share of its joints' squares when it failed: from here a candidate is tried again
 OTHER = 0.2  # overlap up to which causes at other joints are taken in at once

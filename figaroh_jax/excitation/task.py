@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
+from ..recordings.tables import read_table
 from ..rigid.model import RobotModel
 from .design import Cause, Design, excite
 from .information import Learned, learn
@@ -61,8 +62,8 @@ def excite_task(
     said = [*notes]
     if task.data:
         progress("what the recordings tell", 0.0)
-        learned, text = with_recordings(task, model.robot, known, learned, asked.noise is None)
-        said.append(text)
+        learned, texts = with_recordings(task, model.robot, known, learned, asked.noise is None)
+        said += texts
     elif asked.noise is None:
         said.append(f"neither recordings nor noise are given: one sigma is {DEFAULT_NOISE:.0%} of the largest torque")
     found = excite(
@@ -149,32 +150,35 @@ def basis_of(asked: Excite) -> Basis:
 
 
 def read_motion(path: Path, robot: RobotModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """q, v, a of a `.npz` with the arrays `q`, `v`, `a`, or `t` (s) and `q`, from which a spline gives the others."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: np.asarray(file[name], float) for name in ("t", "q", "v", "a") if name in file.files}
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as .npz ({error}); q, v, a or t, q are expected") from None
-    if "q" not in arrays or not ({"v", "a"} <= arrays.keys() or "t" in arrays):
-        raise InputError(f"{path}: holds {', '.join(arrays) or 'none'} of q, v, a, t; q, v, a or t, q are expected")
-    if {"v", "a"} <= arrays.keys():
-        q, v, a = (arrays[name] for name in ("q", "v", "a"))
-    else:
-        from scipy.interpolate import make_interp_spline  # slow to import
+    """q, v, a of a file with these arrays, or with `t` (s) and `q`, from which a quintic spline gives the others."""
+    key = "excite.predict"
+    table = read_table(path, key)
+    if "q" not in table.names or not ({"v", "a"} <= set(table.names) or "t" in table.names):
+        raise InputError(f"{path} ({key}): holds {', '.join(table.names) or 'nothing'}; q, v, a or t, q are expected")
+    whole = {"v", "a"} <= set(table.names)
+    joints = robot.dof_names
+    arrays = {name: table.matrix(name, joints, key) for name in (("q", "v", "a") if whole else ("q",))}
+    for name, values in arrays.items():
+        if values.shape != (len(arrays["q"]), robot.nv):
+            raise InputError(f"{path} ({key}): {name} has shape {values.shape}; (samples, {robot.nv}) is expected")
+        wrong = np.argwhere(~np.isfinite(values))
+        if len(wrong):
+            row, column = wrong[0]
+            raise InputError(f"{path} ({key}): {name} is {values[row, column]} in row {row}, column {column} (from 0)")
+    if whole:
+        return arrays["q"], arrays["v"], arrays["a"]
+    from scipy.interpolate import make_interp_spline  # slow to import
 
-        curve = make_interp_spline(arrays["t"], arrays["q"], 5)
-        q, v, a = (np.asarray(curve.derivative(k)(arrays["t"])) if k else arrays["q"] for k in range(3))
-    for name, values in (("q", q), ("v", v), ("a", a)):
-        if values.ndim != 2 or values.shape[1] != robot.nv or values.shape != q.shape:
-            raise InputError(f"{path}: {name} has shape {values.shape}; (samples, {robot.nv}) is expected")
-        if not np.isfinite(values).all():
-            raise InputError(f"{path}: {name} holds a number that is not finite")
-    return q, v, a
+    time = table.vector("t", key)
+    if len(time) != len(arrays["q"]) or len(time) < 6 or not (np.diff(time) > 0).all():
+        raise InputError(f"{path} ({key}): t must increase, one stamp for each row of q, six at the least")
+    curve = make_interp_spline(time, arrays["q"], 5)
+    return arrays["q"], np.asarray(curve.derivative(1)(time)), np.asarray(curve.derivative(2)(time))
 
 
 def with_recordings(
     task: Task, robot: RobotModel, known: Baseline, learned: Learned, noise_too: bool
-) -> tuple[Learned, str]:
+) -> tuple[Learned, tuple[str, ...]]:
     """What is known after the recordings, in words too: their information is the prior, their residual the noise."""
     from ..estimation.base_parameters import base_parameters
     from ..estimation.columns import friction_terms, structural_columns
@@ -187,7 +191,7 @@ def with_recordings(
     from ..simulators.native import NativeBackend
 
     recordings = read_recordings(task, robot)
-    check_recordings(task, robot, recordings)
+    warnings = check_recordings(task, robot, recordings)
     for one in recordings:
         if one.torque is None and one.role == "fit":
             raise InputError(f"{one.file}: no torque; recordings of `excite` tell what is known of the dynamics")
@@ -210,7 +214,7 @@ def with_recordings(
     if noise_too:
         learned = with_noise(learned, 1 / np.sqrt(found.weight))
         text += "; the noise is the residual of their fit"
-    return learned, text
+    return learned, (*warnings, text)
 
 
 def with_noise(learned: Learned, sigma: Float[np.ndarray, " nv"]) -> Learned:
