@@ -22,7 +22,6 @@ OUTSIDE = {
     "pydantic": {"formats.config"},
     "rich": {"reporting.terminal"},
     "jinja2": {"reporting.report"},
-    "plotly": {"reporting.report"},
     "jaxopt": {"diagnosis.refit", "fitting.fit"},
     "clarabel": {"estimation.conic"},
     "sklearn": {"estimation.least_squares"},
