@@ -34,6 +34,7 @@ _TASKS = {  # commands that take a task file
     "calibrate": "fit the kinematics from measured poses or points",
     "excite": "design the motion that tells most, within limits",
 }
+_READING = 0.03  # of a command's work, for the progress bar
 _OTHERS = ("verify", "compare", "list", "new")  # commands before and after a run
 _DESCRIPTION = "Name what a robot's simulation gets wrong, extend the model with it and measure the gain."
 
@@ -101,6 +102,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.command == "rerun":
         args = _again(args)
     _set_up_jax(cache=not args.no_cache)
+    from .recordings.tables import listener
     from .reporting import terminal
     from .runs import JOBS, REPORT, export_loop
 
@@ -116,6 +118,7 @@ def _run(args: argparse.Namespace) -> int:
         task_file = args.task or demo / "task.yaml"
         out = args.out or Path(f"{args.task.stem if args.task else 'demo'}_{job.noun}")
         with terminal.Progress(quiet=args.quiet) as progress:
+            listener.set(lambda phase, share: progress(phase, _READING * share))
             found = job.run(task_file, out, progress, args.backend, **_own_options(args))
     with _standard_output():
         if args.json:
@@ -236,6 +239,10 @@ def _add_tools(commands: Any) -> None:
     new.add_argument("--joints", help="comma-separated joints of the columns, in their order")
     new.add_argument("--rate", type=float, metavar="HZ", help="rate of recordings that have no time column")
     new.add_argument("--constants", help="comma-separated N m a unit of the torque columns, in the joints' order")
+    new.add_argument("--unit", choices=("rad", "deg", "m", "mm"), help="unit of the positions, where nothing tells it")
+    new.add_argument("--topic", metavar="NAME", help="topic of bags that hold several topics of joints")
+    new.add_argument("--kp", help="comma-separated gains of position servos (N m/rad), for a command without torque")
+    new.add_argument("--interactive", action="store_true", help="ask for what the recordings cannot decide")
     verify = commands.add_parser("verify", parents=[tool], help="pass or fail of a finished run; exit status 1 on fail")
     verify.add_argument("run", type=Path, metavar="DIR")
     verify.add_argument(

@@ -14,14 +14,14 @@ MODULES = {".".join(path.relative_to(PACKAGE).with_suffix("").parts): path for p
 # Only these may touch a file format, a simulator, the terminal or the page.
 OUTSIDE = {
     "yaml": {"formats.taskfile", "formats.export"},
-    "yourdfpy": {"formats.urdf"},
     "mujoco": {"formats.mjcf"},
     "pinocchio": set(),
-    "pyarrow": {"recordings.tables"},
+    "pyarrow": {"recordings.containers"},
+    "h5py": {"recordings.containers"},
+    "rosbags": {"recordings.bags"},
     "pydantic": {"formats.config"},
     "rich": {"reporting.terminal"},
     "jinja2": {"reporting.report"},
-    "plotly": {"reporting.report"},
     "jaxopt": {"diagnosis.refit", "fitting.fit"},
     "clarabel": {"estimation.conic"},
     "sklearn": {"estimation.least_squares"},

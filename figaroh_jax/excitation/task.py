@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
-from ..recordings.tables import read_table
+from ..recordings.reading import read_table
 from ..rigid.model import RobotModel
 from .clearance import Box, Capsule, Clearance, clearance_of
 from .design import Cause, Design, excite

@@ -148,7 +148,7 @@ class Units(_Keys):
     time: Literal["s", "ms", "us", "ns"] = "s"
     position: Literal["rad", "deg", "m", "mm"] = "rad"
     velocity: Literal["rad/s", "deg/s", "m/s", "mm/s"] | None = None  # None: as the position
-    torque: Literal["N m", "Nm", "N", "A"] = "N m"
+    torque: Literal["N m", "Nm", "N", "A", "mA", "%"] = "N m"  # A, mA, %: transmission.torque is N m an A, N m a %
     measurement: Literal["m", "mm"] = "m"
 
 
@@ -196,10 +196,24 @@ class Measurement(_Keys):
         return self
 
 
+_LOGS: dict[str, dict[str, Any]] = {  # what the columns of a robot's own log are
+    "rtde": {
+        "time": "timestamp",
+        "position": "actual_q",
+        "torque": "actual_current",
+        "units": {"torque": "A"},
+    },
+    "libfranka": {"time": "time", "position": "q", "torque": "tau_J", "units": {"time": "ms"}},
+}
+
+
 class RecordingEntry(_Keys):
     """One recording: a file and the names of its arrays or columns."""
 
     file: Path
+    format: Literal["rtde", "libfranka"] | None = None  # a robot's own log: its columns are known by name
+    topic: str | None = None  # of a ROS bag or an MCAP file; None: the one topic of joints
+    episode: Annotated[int, Field(ge=0)] | None = None  # of a LeRobot folder
     position: Columns
     time: str | None = None  # s
     rate: Positive | None = None  # Hz
@@ -211,6 +225,28 @@ class RecordingEntry(_Keys):
     role: Literal["fit", "holdout"] = "fit"
     units: Units = Units()
     measurement: Measurement | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _columns_of_logs(cls, value: Any) -> Any:
+        known = _LOGS.get(str(value.get("format"))) if isinstance(value, dict) else None
+        if known is None:
+            return value
+        own = {key: name for key, name in known.items() if key != "time" or "rate" not in value}
+        if "torque" in value and isinstance(own.get("units"), dict):
+            own["units"] = {key: unit for key, unit in own["units"].items() if key != "torque"}
+        units = value.get("units", {})
+        return own | value | ({"units": own["units"] | units} if isinstance(units, dict) else {})
+
+    @property
+    def place(self) -> Path:
+        """The file, or the episode in it, by which messages name the recording."""
+        return self.file if self.episode is None else self.file / f"episode_{self.episode}"
+
+    @property
+    def name(self) -> str:
+        """By which predictions name the recording."""
+        return self.file.stem if self.episode is None else f"{self.file.name}_episode_{self.episode}"
 
     @model_validator(mode="after")
     def _one_clock(self) -> RecordingEntry:
@@ -477,7 +513,7 @@ class Task(_Keys):
             raise ValueError("expected at least one recording")
         if all(entry.role == "holdout" for entry in data):
             raise ValueError("no recording has role: fit")
-        stems = [entry.file.stem for entry in data if entry.role == "holdout"]
+        stems = [entry.name for entry in data if entry.role == "holdout"]
         for stem in stems:
             if stems.count(stem) > 1:
                 raise ValueError(f"two holdout recordings are called '{stem}': their predictions would share one name")

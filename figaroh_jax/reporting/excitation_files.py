@@ -164,7 +164,7 @@ def write_postures(found: PostureDesign, folder: Path) -> None:
     header = ",".join(found.model.dof_names)
     np.savetxt(folder / "postures.csv", found.position, delimiter=",", header=header, comments="", fmt="%.9g")
     page = resources.files("figaroh_jax") / "page"
-    text = page_template("postures.html").render(
+    text = page_template("postures.html", folder).render(
         d=found,
         robot=found.model.name,
         lines=posture_lines(found),
@@ -225,7 +225,7 @@ def write_design(found: Design, folder: Path, model: Any) -> None:
         _write_table(folder / f"{name}.csv", learned.robot.dof_names, time, {"q": q, "v": v, "a": a, "torque": tau})
         (folder / f"{name}.yaml").write_text(joint_trajectory(learned.robot.dof_names, stage), encoding="utf-8")
         drawn.append((time, {"position": q, "velocity": v, "torque": tau}))
-    (folder / PAGE).write_text(_page(found, drawn), encoding="utf-8")
+    (folder / PAGE).write_text(_page(found, drawn, folder), encoding="utf-8")
 
 
 def _write_table(
@@ -249,12 +249,12 @@ def joint_trajectory(joints: tuple[str, ...], stage: Stage) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _page(found: Design, drawn: list[tuple[np.ndarray, dict[str, np.ndarray]]]) -> str:
+def _page(found: Design, drawn: list[tuple[np.ndarray, dict[str, np.ndarray]]], folder: Path) -> str:
     from markupsafe import Markup
 
     page = resources.files("figaroh_jax") / "page"
     sliding = prismatic(found.learned.robot)
-    return page_template("excitation.html").render(
+    return page_template("excitation.html", folder).render(
         d=found,
         robot=found.learned.robot.name,
         joints=list(found.learned.robot.dof_names),
