@@ -101,8 +101,9 @@ def _call(folder: Path, out: Path, case: Case, job: Job, command: str, limit: fl
         record = _timed(words, limit)
         kept = out / job.folder
         kept.mkdir(parents=True, exist_ok=True)
-        if (answer / "answer.json").is_file():
-            shutil.copy(answer / "answer.json", kept)
+        for file in ("answer.json", "result.json"):
+            if (answer / file).is_file():
+                shutil.copy(answer / file, kept)
         (kept / "run.json").write_text(json.dumps({"command": command, **record}))
     return f"{job.folder}: exit {record['exit']}, {record['cpu_s']:.0f} CPU s{_brief(kept)}"
 
