@@ -22,10 +22,11 @@ OUTSIDE = {
     "pydantic": {"formats.config"},
     "rich": {"reporting.terminal"},
     "jinja2": {"reporting.report"},
-    "plotly": {"reporting.report"},
     "jaxopt": {"diagnosis.refit", "fitting.fit"},
     "clarabel": {"estimation.conic"},
     "sklearn": {"estimation.least_squares"},
+    "coal": {"excitation.meshes"},
+    "trimesh": {"formats.collision"},
 }
 
 

@@ -419,8 +419,9 @@ def _torques(robot: RobotModel, reads: Sequence[_Read]) -> tuple[list[float] | N
         said = "rollouts of the command" if known else "neither diagnose nor identify can use them without"
         return None, [f"the recordings hold no torque: {said}"]
     lowest = np.min([read.torque.min(axis=0) for read in reads if read.torque is not None], axis=0)
-    if (lowest >= 0).all() and robot.nv > 1:
-        raise InputError(f"{reads[0].file}: the torque is nowhere negative: an absolute value tells no direction")
+    highest = np.max([read.torque.max(axis=0) for read in reads if read.torque is not None], axis=0)
+    if ((lowest >= 0) | (highest <= 0)).all() and robot.nv > 1:
+        raise InputError(f"{reads[0].file}: no joint's torque changes its sign: an absolute value tells no direction")
     _order(robot, reads, motions)
     scales = [_scale(robot, motions, j) for j in range(robot.nv)]
     current = any(read.current for read in reads)
