@@ -63,7 +63,7 @@ def test_the_run_holds_the_motion_at_1_khz_with_its_torques_and_a_joint_trajecto
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ("limits: {clearance: 0.02}", "excite.limits.clearance: distances between bodies are not looked at"),
+        ("ignore: [[a, b]]", "ignore: distances are looked at where limits.clearance"),
         ("limits: {speed: 2}", "unknown key 'speed'"),
         ("basis: {fourier: 5, spline: 3}", "exactly one of fourier, spline, quintic; given: fourier, spline"),
         ("objective: prediction", "needs `predict`"),

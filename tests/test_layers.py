@@ -25,6 +25,8 @@ OUTSIDE = {
     "jaxopt": {"diagnosis.refit", "fitting.fit"},
     "clarabel": {"estimation.conic"},
     "sklearn": {"estimation.least_squares"},
+    "coal": {"excitation.meshes"},
+    "trimesh": {"formats.collision"},
 }
 
 

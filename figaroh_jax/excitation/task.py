@@ -15,6 +15,7 @@ from jaxtyping import Float
 from ..errors import InputError
 from ..recordings.reading import read_table
 from ..rigid.model import RobotModel
+from .clearance import Box, Capsule, Clearance, clearance_of
 from .design import Cause, Design, excite
 from .information import Learned, learn
 from .limits import limits_of
@@ -56,10 +57,13 @@ def excite_task(
     model, (known, notes) = load_extended(task.robot.model, **robot_options(task.robot)).model, stated_baseline(task)
     basis = basis_of(asked)
     bounds = asked.limits
-    limits = limits_of(model.robot, bounds.position, bounds.velocity, bounds.acceleration, bounds.torque)
+    clearance, around = clearance_asked(task, asked, model.robot)
+    limits = limits_of(
+        model.robot, bounds.position, bounds.velocity, bounds.acceleration, bounds.torque, clearance=clearance
+    )
     noise = DEFAULT_NOISE if asked.noise is None else asked.noise
     learned = learn(model, known, noise=noise, trust=task.robot.trust)
-    said = [*notes]
+    said = [*notes, *around]
     if task.data:
         progress("what the recordings tell", 0.0)
         learned, texts = with_recordings(task, model.robot, known, learned, asked.noise is None)
@@ -82,6 +86,28 @@ def excite_task(
         progress=progress,
     )
     return replace(found, notes=(*said, *found.notes))
+
+
+def clearance_asked(task: Task, asked: Excite, robot: RobotModel) -> tuple[Clearance | None, tuple[str, ...]]:
+    """The distances that a task asks for, and what is to be said of them."""
+    from ..formats.collision import read_shapes
+
+    margin = asked.limits.clearance
+    if margin is None:
+        return None, ("no limits.clearance is given: distances between bodies are not looked at",)
+    shapes, notes = read_shapes(task.robot.model)
+    limits = limits_of(robot, asked.limits.position)
+    found = clearance_of(
+        robot,
+        shapes,
+        margin=margin,
+        bodies=[Capsule(one.link, one.at, one.to or one.at, one.radius) for one in asked.bodies],
+        floor=asked.floor,
+        boxes=[Box(one.name, one.size, one.at, one.turn) for one in asked.boxes],
+        ignore=asked.ignore,
+        position=limits.position,
+    )
+    return found, (*notes, *found.notes)
 
 
 def told(one: SizedEffect) -> Cause:

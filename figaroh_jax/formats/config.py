@@ -415,17 +415,25 @@ class MotionLimits(_Keys):
     velocity: Literal["model"] | Positive | dict[str, Positive] = "model"
     acceleration: Positive | dict[str, Positive] | None = None  # rad/s^2 or m/s^2; None: no limit
     torque: Literal["model"] | Positive | dict[str, Positive] = "model"  # N m or N
-    clearance: Positive | None = None  # m
+    clearance: Positive | None = None  # m, between bodies that no joint joins, the floor, boxes; None: not looked at
 
-    @field_validator("clearance")
-    @classmethod
-    def _no_distances(cls, value: float | None) -> float | None:
-        if value is not None:
-            raise ValueError(
-                "distances between bodies are not looked at by this version; leave it out, narrow limits.position to"
-                " where the robot is clear, and check the trajectory in your simulator before it is run"
-            )
-        return value
+
+class Body(_Keys):
+    """A capsule or a sphere on a link, in the place of its collision shapes."""
+
+    link: str  # or any frame of the model
+    at: Vector = (0.0, 0.0, 0.0)  # m, in that frame: the middle of a sphere, one end of a capsule's axis
+    to: Vector | None = None  # the other end
+    radius: Positive  # m
+
+
+class Obstacle(_Keys):
+    """A box that stands in the world."""
+
+    name: str
+    size: tuple[Positive, Positive, Positive]  # edges, m
+    at: Vector  # its middle, m
+    turn: Vector = (0.0, 0.0, 0.0)  # roll, pitch, yaw, rad
 
 
 class SizedEffect(_Keys):
@@ -454,9 +462,16 @@ class Excite(_Keys):
     postures: Annotated[int, Field(ge=2, le=1000)] = 30
     candidates: Annotated[int, Field(ge=10, le=20_000)] = 500  # random postures to choose from
     measurement: Measurement | None = None  # of postures: the device; None: that of the recordings
+    floor: Number | None = None  # its height in the world, m
+    boxes: tuple[Obstacle, ...] = ()
+    bodies: tuple[Body, ...] = ()  # for links without collision shapes, or in the place of theirs
+    ignore: tuple[tuple[str, str], ...] = ()  # pairs of bodies whose distance is not looked at
 
     @model_validator(mode="after")
     def _complete(self) -> Excite:
+        around = [name for name in ("floor", "boxes", "bodies", "ignore") if name in self.model_fields_set]
+        if around and self.limits.clearance is None:
+            raise ValueError(f"{around[0]}: distances are looked at where limits.clearance (m) says which to keep")
         if self.objective == "prediction" and not self.predict:
             raise ValueError("objective: prediction needs `predict`, the motions that matter")
         if self.objective == "separate" and not self.separate:

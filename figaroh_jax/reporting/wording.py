@@ -180,12 +180,20 @@ def interval(estimate: Estimate) -> str:
     if not (math.isfinite(half) and half > 0.0):
         return _with_unit(number(estimate.value), estimate.unit)
     power = math.floor(math.log10(half))
-    decimals = max(0, 1 - power)
-    if decimals > 6 or abs(estimate.value) >= 1e6:  # digits that nobody would count
-        scale = math.floor(math.log10(max(abs(estimate.value), half)))
-        pair = Estimate(estimate.value / 10.0**scale, estimate.std / 10.0**scale, "")
-        return _with_unit(f"({interval(pair)}) × 10{_superscript(scale)}", estimate.unit)
-    return _with_unit(_minus(f"{estimate.value:.{decimals}f} ± {half:.{decimals}f}"), estimate.unit)
+    decimals, large = max(0, 1 - power), max(abs(estimate.value), half)
+    scale = math.floor(math.log10(large))
+    if scale < -4 or large >= 1e6:
+        decimals = max(0, 1 - power + scale)
+        pair = _value_and_half(estimate.value / 10.0**scale, half / 10.0**scale, decimals)
+        return _with_unit(f"({pair}) × 10{_superscript(scale)}", estimate.unit)
+    return _with_unit(_value_and_half(estimate.value, half, decimals), estimate.unit)
+
+
+def _value_and_half(value: float, half: float, decimals: int) -> str:
+    """Both with as many decimals as the half width has two digits; six at most, which is more than anybody reads."""
+    if decimals > 6:
+        return _minus(f"{value:.6f} ± {half:.1g}")
+    return _minus(f"{value:.{decimals}f} ± {half:.{decimals}f}")
 
 
 def error(value: float, of: str) -> str:
