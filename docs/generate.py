@@ -22,8 +22,7 @@ from figaroh_jax.formats import reference  # noqa: E402
 from figaroh_jax.recordings.migration import KEYS  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
-SIZES = {"mass": 0.5, "com_x": 0.05, "com_y": 0.02, "com_z": 0.05, "height": 0.35, "x": 0.1, "rate": 1e-3}
-SHOWN = {"torque_delay": 0.004, "torque_lag": 0.004, "compliance": 2e-4}
+SIZES = {"mass": 0.5, "com_x": 0.05, "com_y": 0.02, "com_z": 0.05, "height": 0.35, "x": 0.1, "rate": 1e-3, "speed": 0.4}
 
 
 def page(path: str, text: str) -> None:
@@ -65,7 +64,8 @@ def signature(name: str, effect: Any) -> str | None:
     axes = [("time, s", t[20:-20]), ("position, rad", q[20:-20, j]), ("velocity, rad/s", v[20:-20, j])]
     parts = [drawing(x, added, label, 8 + 215 * k) for k, (label, x) in enumerate(axes)]
     text = f"Torque that {escape(name)} adds at the joint {robot.joint_names[j]}, against time, position and velocity"
-    style = "<style>text{font:11px sans-serif;fill:#777}polyline{fill:none;stroke:#0072b2}path{stroke:#bbb;fill:none}</style>"
+    lines = "polyline{fill:none;stroke:#0072b2}path{stroke:#bbb;fill:none}"
+    style = f"<style>text{{font:11px sans-serif;fill:#777}}{lines}</style>"
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 650 170" role="img" aria-label="{text}">{style}'
         f"{''.join(parts)}</svg>"
@@ -92,13 +92,17 @@ def said_by(effect: Any) -> str:
         source = inspect.getsource(effect.native)
     except (TypeError, OSError):
         source = ""
-    elements = [e for e in ("damping", "frictionloss", "armature", "stiffness", "springref", "bias") if f'"{e}"' in source]
+    elements = [
+        e for e in ("damping", "frictionloss", "armature", "stiffness", "springref", "bias") if f'"{e}"' in source
+    ]
     if effect.inertial or effect.body:
         return "MuJoCo, URDF and every simulator: it is an inertia of a link"
     if not elements:
         return "no simulator's file: `model/effects.yaml` holds it, and `fj.simulate` steps it"
     urdf = [e for e in elements if e in ("damping", "frictionloss")]
-    return f"MuJoCo ({', '.join(elements)})" + (f", URDF ({', '.join(urdf).replace('frictionloss', 'friction')})" if urdf else "")
+    return f"MuJoCo ({', '.join(elements)})" + (
+        f", URDF ({', '.join(urdf).replace('frictionloss', 'friction')})" if urdf else ""
+    )
 
 
 def effect_page(name: str, effect: Any, kinematic: bool) -> str:
@@ -124,8 +128,8 @@ def effect_page(name: str, effect: Any, kinematic: bool) -> str:
             "|---|---|",
             *(rows or ["| – | |"]),
             "",
-            f"**What hides it**: {words(hidden)}; and whatever the baseline absorbs, which the report lists under *What this"
-            " data could reveal*.",
+            f"**What hides it**: {words(hidden)}; and whatever the baseline absorbs, which the report lists under"
+            " *What this data could reveal*.",
             "",
             f"**How to excite it**: {apart.format(at=f'the {effect.acts_on}')}.",
             "",

@@ -250,11 +250,11 @@ def _identification(
     if not recordings:
         keys["data"] = [{"file": "RECORDING.csv", "position": "q", "torque": "tau", "rate": rate or 1000.0}]
     cutoff, gate = get("cut_off_frequency_butterworth", "cutoff_frequency"), get("dq_lim_def")
-    keys["preprocess"] = {"cutoff": float(cutoff)} if cutoff else {}
+    preprocess: dict[str, Any] = {"cutoff": float(cutoff)} if cutoff else {}
     if isinstance(gate, list) and joints and len(gate) == len(joints):
-        keys["preprocess"]["gate"] = dict(zip(joints, map(float, gate), strict=True))
+        preprocess["gate"] = dict(zip(joints, map(float, gate), strict=True))
     friction = get("has_friction", "friction")
-    keys["baseline"] = {
+    baseline: dict[str, Any] = {
         "viscous": friction is not False,
         "coulomb": friction is not False,
         "rotor": bool(get("has_actuator_inertia", "actuator_inertia")),
@@ -262,7 +262,8 @@ def _identification(
     }
     pair = get("coupled_joints") or (list(joints[-2:]) if joints and get("has_coupled_wrist") else None)
     if pair:
-        keys["baseline"]["effects"] = [{"effect": "coupled_transmission", "at": pair}]
+        baseline["effects"] = [{"effect": "coupled_transmission", "at": pair}]
+    keys |= {"preprocess": preprocess, "baseline": baseline}
     points, seconds = get("n_wps", "waypoints"), get("t_s", "segment_duration")
     if points and seconds:
         keys["excite"] = {"basis": {"quintic": int(points)}, "duration": float(seconds) * (int(points) - 1)}
