@@ -97,8 +97,9 @@ def test_a_task_without_recordings_is_for_excite_alone(tmp_path: Path, capsys: p
         ("limits: {velocity: {bent: 1.0}}", "no moving joint 'bent'; did you mean 'bend'?"),
         ("basis: {fourier: 3, base: 0.3}, duration: 4", "a base of 0.25 Hz fits"),
         (
-            "objective: separate, separate: [[{effect: torque_delay}, {effect: rotor_inertia, at: [turn]}]]",
-            "'torque_delay' has no torque of an instant",
+            "objective: separate,"
+            " separate: [[{effect: joint_elasticity, at: [turn]}, {effect: rotor_inertia, at: [bend]}]]",
+            "'joint_elasticity' has no torque of an instant",
         ),
         ("objective: prediction, predict: [no.npz]", "no.npz (excite.predict) does not exist"),
     ],

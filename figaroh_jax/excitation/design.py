@@ -19,7 +19,7 @@ from .limits import ALLOWED, Limits, Torque, Use, checked, limits_of, unmeetable
 from .motions import Basis, Trajectory
 from .objectives import condition_objective, information_objective, prediction_objective, smooth_condition_objective
 from .sampling import CHUNK, Sampler
-from .separation import Causes, Separated, causes, separated, separation_objective
+from .separation import Causes, Separated, causes, check_told, separated, separation_objective
 from .solvers import NEAR, GramObjective, Penalty, Problem, solve
 
 __all__ = ["Cause", "Design", "Stage", "best_motion", "excite", "random_motion"]
@@ -136,10 +136,12 @@ def excite(
         before = learned
         given = None
         if separate:
-            given = causes(learned, separate, _typical(learned, sampler, basis, limits, begin, rate), trust)
+            usual = _typical(learned, sampler, basis, limits, begin, rate)
+            given = causes(learned, separate, np.stack(usual.states(rate)), trust)
+            check_told(given, _shown(learned, given, usual, limits, rate))
         elif objective == "separate":
             raise InputError("objective: separate needs pairs of causes (`separate`)")
-        seen = None if given is None else np.zeros((len(given.columns),) * 2)
+        seen = None if given is None else np.zeros((len(given.columns) + len(given.shifts),) * 2)
         for k in range(trajectories):
             own = _objectives(objective, np.asarray(before.prior), wanted, given, seen)
             generator = np.random.default_rng([seed, k])
@@ -147,10 +149,12 @@ def excite(
             def told(share: float, k: int = k) -> None:
                 progress(f"trajectory {k + 1} of {trajectories}", (k + share) / trajectories)
 
-            rows = (given.sampler, given.columns) if given is not None and objective == "separate" else (sampler, None)
+            rows = (sampler, None, ())
+            if given is not None and objective == "separate":
+                rows = (given.sampler, given.columns, given.shifts)
             stage = best_motion(torque, before, rows, own, basis, limits, begin, starts, rate, generator, told)
             if given is not None and seen is not None:
-                seen = seen + gram_of(before, given.sampler, stage.motion.states(rate), given.columns)
+                seen = seen + _shown(before, given, stage.motion, limits, rate)
             before = before.with_prior(gram_of(before, sampler, stage.motion.states(rate)))
             stages.append(replace(stage, logdet=float(np.linalg.slogdet(np.asarray(before.prior))[1])))
         gram = np.asarray(before.prior) - np.asarray(learned.prior)
@@ -192,14 +196,25 @@ def _among(effect: Effect, terms: Sequence[Effect]) -> bool:
     return any(np.array_equal(np.asarray(effect.at), at) for at in same)
 
 
+def _shown(learned: Learned, given: Causes, motion: Trajectory, limits: Limits, rate: float) -> np.ndarray:
+    """Gram matrix of what is learned and of the causes in a motion."""
+
+    def nothing(G: np.ndarray) -> tuple[float, np.ndarray]:
+        return 0.0, G
+
+    kept = (given.columns, motion.basis, limits, None, rate)
+    problem = Problem(learned, given.sampler, nothing, *kept, shifts=given.shifts)
+    return problem.gram(given.sampler.rows(problem.states(problem.numbers(motion))))[1]
+
+
 def _typical(
     learned: Learned, sampler: Sampler, basis: Basis, limits: Limits, start: np.ndarray | None, rate: float
-) -> Float[np.ndarray, "3 samples nv"]:
-    """States of a random motion within the limits."""
+) -> Trajectory:
+    """A random motion within the limits."""
     kept = np.array(learned.independent)
     objective = information_objective(np.asarray(learned.prior))
     problem = Problem(learned, sampler, objective, kept, basis, limits, start, rate)
-    return problem.states(random_motion(problem, np.random.default_rng(0)))
+    return problem.trajectory(random_motion(problem, np.random.default_rng(0)))
 
 
 def _inside(robot: RobotModel, start: np.ndarray, limits: Limits) -> np.ndarray:
@@ -236,20 +251,35 @@ def _objectives(
     wanted: np.ndarray | None,
     given: Causes | None,
     seen: np.ndarray | None,
-) -> tuple[GramObjective, ...]:
-    """One after another; all but the last are steps on the way."""
+) -> tuple[tuple[GramObjective, ...], ...]:
+    """Ways to a motion, which starts take in turn: objectives one after another, the last is the one that counts."""
     if callable(objective):
-        return (objective,)
+        return ((objective,),)
     if objective == "information":
-        return (information_objective(prior),)
+        return ((information_objective(prior),),)
     if objective == "prediction":
         assert wanted is not None
-        return (prediction_objective(prior, wanted),)
+        own = prediction_objective(prior, wanted)
+        return (information_objective(prior), own), (own,)
     if objective == "separate":
         assert given is not None and seen is not None
-        own = separation_objective(given, np.asarray(given.prior))
-        return (lambda G: own(G + seen),)
-    return smooth_condition_objective(), condition_objective()
+        apart = separation_objective(given, np.asarray(given.prior))
+
+        def told(G: np.ndarray) -> tuple[float, np.ndarray]:
+            return apart(G + seen)
+
+        return (_leading(information_objective(np.asarray(given.prior)), given.learned), told), (told,)
+    return ((smooth_condition_objective(), condition_objective()),)
+
+
+def _leading(objective: GramObjective, size: int) -> GramObjective:
+    """The objective of the first columns, those of what is learned, in a Gram matrix of more."""
+
+    def own(G: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = objective(G[:size, :size])
+        return value, np.pad(slope, (0, len(G) - size))
+
+    return own
 
 
 def _free_start(limits: Limits, nv: int, generator: np.random.Generator) -> Float[np.ndarray, " nv"]:
@@ -304,8 +334,8 @@ def _distances_count(limits: Limits) -> bool:
 def best_motion(
     torque: Torque,
     learned: Learned,
-    rows: tuple[Sampler, np.ndarray | None],
-    objectives: Sequence[GramObjective],
+    rows: tuple[Sampler, np.ndarray | None, tuple[float, ...]],
+    ways: Sequence[Sequence[GramObjective]],
     basis: Basis,
     limits: Limits,
     start: np.ndarray | None,
@@ -315,16 +345,17 @@ def best_motion(
     progress: Callable[[float], None] = lambda share: None,
 ) -> Stage:
     """The best of several random motions after each was improved; feasible at 1 kHz where that is possible at all."""
-    sampler, columns = rows
+    sampler, columns, shifts = rows
     columns = np.array(learned.independent) if columns is None else columns
-    given = (learned, sampler), (columns, basis, limits, start, rate)
-    final = Problem(*given[0], objectives[-1], *given[1])
+    kept = (columns, basis, limits, start, rate)
+    final = Problem(learned, sampler, ways[0][-1], *kept, shifts=shifts)
     few = _few_samples(final)
-    problems = [Problem(*given[0], one, *given[1], samples=few) for one in objectives]
+    made = [[Problem(learned, sampler, one, *kept, shifts=shifts, samples=few) for one in way] for way in ways]
     found: list[tuple[float, np.ndarray, Penalty]] = []
     for k in range(starts):
         progress(k / starts)
-        x, penalty = min((random_motion(final, generator) for _ in range(SCREENED)), key=problems[0].value), Penalty()
+        problems, penalty = made[k % len(made)], Penalty()
+        x = min((random_motion(final, generator) for _ in range(SCREENED)), key=problems[0].value)
         for problem in problems:
             penalty = Penalty()
             x = solve(problem, x, penalty)
@@ -339,12 +370,13 @@ def best_motion(
         if met:
             break
     _, _, motion, uses = min(tried, key=lambda one: one[:2])
-    return Stage(motion, uses, np.nan, reached, sum(problem.evaluations for problem in (*problems, final)))
+    evaluations = sum(problem.evaluations for way in (*made, [final]) for problem in way)
+    return Stage(motion, uses, np.nan, reached, evaluations)
 
 
 def _few_samples(problem: Problem) -> int | None:
     """Samples that show what a motion tells nearly as well as all do, whole chunks of them; None: all are needed."""
-    every = len(problem.matrix[0])
+    every = problem.count
     few = CHUNK * int(np.ceil(WAVE * problem.basis.waves / CHUNK))
     enough = few * problem.nv >= OVER * len(problem.columns)
     return few if enough and few <= 0.7 * every else None

@@ -61,6 +61,7 @@ class Problem:
     limits: Limits
     start: Float[np.ndarray, " nv"] | None  # None: free
     rate: float = 20.0  # Hz, of the rows
+    shifts: tuple[float, ...] = ()  # s: torques of so long before are further columns
     samples: int | None = None  # at which these many are evaluated, each for several; None: at all
     evaluations: int = 0
     _seen: _Seen | None = None
@@ -69,7 +70,9 @@ class Problem:
         every = self.basis.instants(self.rate)
         count = len(every) if self.samples is None else self.samples
         times = every if self.samples is None else (np.arange(count) + 0.5) / count * self.basis.duration
-        self.matrix = self.basis.at(times)
+        self.count = count
+        late = [np.maximum(times - shift, 0.0) for shift in self.shifts if shift > 0]
+        self.matrix = self.basis.at(np.concatenate([times, *late]))
         self.nv = self.learned.robot.nv
         self.root = np.sqrt(np.asarray(self.learned.weight) * len(every) / count)
         first, *others = self.basis.peaks(self.rate)
@@ -108,8 +111,13 @@ class Problem:
         return weights if self.start is not None else np.concatenate([by_states[0].sum(0), weights])
 
     def gram(self, rows: Float[np.ndarray, "nv columns samples"]) -> tuple[np.ndarray, np.ndarray]:
-        """Weighted rows of the columns that count, and their Gram matrix."""
-        own = rows[:, self.columns] * self.root[:, None, None]
+        """Weighted rows of the columns that count (then late torques), and their Gram matrix."""
+        own = rows[:, self.columns, : self.count]
+        if self.shifts:
+            torque = np.asarray(self.learned.theta) @ rows[:, : len(self.learned.theta)]
+            late = torque.reshape(self.nv, len(self.shifts), self.count)
+            own = np.concatenate([own, late], axis=1)
+        own = own * self.root[:, None, None]
         flat = own.swapaxes(0, 1).reshape(own.shape[1], -1)
         return own, flat @ flat.T
 
@@ -131,7 +139,7 @@ class Problem:
         self._seen = _Seen(x.copy(), states, rows.shape, own, by_gram)
         if penalty is not None:
             if self.limits.clearance is not None:
-                distance, back = self.limits.clearance.with_gradient(states[0])
+                distance, back = self.limits.clearance.with_gradient(states[0, : self.count])
                 more, slope = penalty.one_sided("clearance", (self.limits.clearance.margin - distance) / NEAR)
                 value += more
                 self._seen.by_position = back(-slope / NEAR)
@@ -150,13 +158,18 @@ class Problem:
         seen = self._seen
         assert seen is not None
         cotangent = np.zeros(seen.shape)
-        cotangent[:, self.columns] = 2.0 * self.root[:, None, None] * (seen.by_gram @ seen.own)
+        by_rows = 2.0 * self.root[:, None, None] * (seen.by_gram @ seen.own)
+        cotangent[:, self.columns, : self.count] = by_rows[:, : len(self.columns)]
+        if self.shifts:
+            theta = np.asarray(self.learned.theta)
+            late = by_rows[:, len(self.columns) :].reshape(self.nv, 1, -1)
+            cotangent[:, : len(theta)] += late * theta[:, None]
         if seen.by_torque is not None:
             theta = np.asarray(self.learned.theta)
             cotangent[:, : len(theta)] += (seen.by_torque / self.limits.torque).T[:, None] * theta[:, None]
         by_states = self.sampler.back(seen.states, cotangent)
         if seen.by_position is not None:
-            by_states[0] += seen.by_position
+            by_states[0, : self.count] += seen.by_position
         return self.to_numbers(by_states) + seen.slope
 
     def forget(self) -> None:
@@ -266,7 +279,9 @@ def _meets_the_rest(problem: Problem, x: np.ndarray, margin: dict[str, float]) -
     """Whether torques and distances keep their limits, which SLSQP was not told."""
     states, clearance = problem.states(x), problem.limits.clearance
     if clearance is not None and clearance.rows.names:
-        if clearance.distances(states[0]).min() < clearance.margin + NEAR * margin.get("clearance", 0.0):
+        if clearance.distances(states[0, : problem.count]).min() < clearance.margin + NEAR * margin.get(
+            "clearance", 0.0
+        ):
             return False
     if not problem.torque:
         return True
