@@ -41,12 +41,25 @@ def violations(tab: browser.Page, source: str) -> list[dict[str, Any]]:
     )
 
 
+def docs_pictures(page: Path, folder: Path) -> int:
+    """The first screen in light and dark, as the docs show it."""
+    with tempfile.TemporaryDirectory() as profile, browser.page(Path(profile)) as tab:
+        for name, dark in (("report", False), ("report_dark", True)):
+            tab.open(page.resolve(), *SIZES["wide"], dark=dark)
+            time.sleep(1.5)
+            tab.screenshot(folder / f"{name}.png")
+    return 0
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("pages", nargs="+", type=Path)
     parser.add_argument("--shots", type=Path, help="folder of the screenshots")
     parser.add_argument("--axe", type=Path, help="another axe.min.js than that of axe-core-python")
+    parser.add_argument("--docs", type=Path, help="write report.png and report_dark.png of the first page, and stop")
     asked = parser.parse_args()
+    if asked.docs:
+        return docs_pictures(asked.pages[0] / "report.html", asked.docs)
     source = asked.axe.read_text(encoding="utf-8") if asked.axe else axe_source()
     if asked.shots:
         asked.shots.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,7 @@ from .reporting.run_directory import write_file
 if TYPE_CHECKING:
     from .recordings.draft import Draft
 
-__all__ = ["command_of", "compare", "list", "new", "verify"]
+__all__ = ["command_of", "compare", "list", "migrate", "new", "verify"]
 
 
 def new(args: argparse.Namespace) -> int:
@@ -46,6 +46,24 @@ def new(args: argparse.Namespace) -> int:
         write_file(args.out, draft.text, "--out")
         if not args.json:
             print("\n".join([*(f"assumed: {line}" for line in draft.assumed), f"Task: {args.out}"]))
+    return 0
+
+
+def migrate(args: argparse.Namespace) -> int:
+    """Translate a configuration of FIGAROH, and say what became of each of its keys."""
+    from .recordings.migration import migrate as translated
+
+    if args.out is not None and args.out.exists():
+        raise InputError(f"--out {args.out}: exists already; a translation replaces no file")
+    found = translated(args.config, args.model, args.recordings, job=args.job)
+    if args.out is not None:
+        write_file(args.out, found.text, "--out")
+    if args.json:
+        print(json.dumps(found._asdict(), indent=2, ensure_ascii=False))
+    elif args.out is None:
+        print(found.text, end="")
+    else:
+        print("\n".join([*found.keys, f"Task: {args.out}"]))
     return 0
 
 

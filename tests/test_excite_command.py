@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import reference
 import yaml
+from schema import matches
 from test_excitation import ARM
 
 from figaroh_jax.cli import main
@@ -35,6 +36,7 @@ def test_the_run_holds_the_motion_at_1_khz_with_its_torques_and_a_joint_trajecto
     assert main(["excite", str(file), "--out", str(tmp_path / "run"), "--json", "--quiet"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer == json.loads((tmp_path / "run" / "excitation.json").read_text())
+    matches("excite", answer)
     assert answer["met"] and answer["objective"] == "information" and len(answer["trajectories"]) == 2
     model = load_urdf(tmp_path / "robot.urdf")
     for k, told in enumerate(answer["trajectories"]):

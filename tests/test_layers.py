@@ -13,13 +13,13 @@ PACKAGE = ROOT / "figaroh_jax"
 MODULES = {".".join(path.relative_to(PACKAGE).with_suffix("").parts): path for path in sorted(PACKAGE.rglob("*.py"))}
 # Only these may touch a file format, a simulator, the terminal or the page.
 OUTSIDE = {
-    "yaml": {"formats.taskfile", "formats.export"},
+    "yaml": {"formats.taskfile", "formats.export", "recordings.migration"},
     "mujoco": {"formats.mjcf"},
     "pinocchio": set(),
     "pyarrow": {"recordings.containers"},
     "h5py": {"recordings.containers"},
     "rosbags": {"recordings.bags"},
-    "pydantic": {"formats.config"},
+    "pydantic": {"formats.config", "formats.reference"},
     "rich": {"reporting.terminal"},
     "jinja2": {"reporting.report"},
     "jaxopt": {"diagnosis.refit", "fitting.fit"},

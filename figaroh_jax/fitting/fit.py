@@ -64,7 +64,7 @@ class Fit(eqx.Module):
     @property
     def std(self) -> Float[np.ndarray, " numbers"]:
         """One sigma of each number; inf where nothing determines it."""
-        size = np.sqrt(np.maximum(np.asarray(jnp.diagonal(self.covariance, axis1=-2, axis2=-1)), 0.0))
+        size = np.sqrt(np.maximum(np.diagonal(np.asarray(self.covariance), axis1=-2, axis2=-1), 0.0))
         return np.where(np.asarray(self.hidden) > HIDDEN, np.inf, size)
 
     @property

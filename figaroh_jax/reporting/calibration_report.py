@@ -51,7 +51,7 @@ _MAGNIFY = 20
 
 def _picture(calibration: Calibration) -> str:
     affected = {name for cause in calibration.causes for name in cause.name.at} | calibration.twists.keys()
-    return robot_picture(calibration.model, affected=affected, nominal=nominal_of(calibration), magnify=_MAGNIFY)
+    return robot_picture(calibration.model, affected=affected, nominal=nominal_of(calibration), magnify=float(_MAGNIFY))
 
 
 def _shown(calibration: Calibration) -> list[Shown]:

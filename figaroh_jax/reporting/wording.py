@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import inspect
 import math
+import shutil
+import sys
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +24,7 @@ __all__ = [
     "effect_meaning",
     "effect_title",
     "error",
+    "fitted",
     "interval",
     "level",
     "nearest",
@@ -105,6 +109,25 @@ def distances(calibration: Calibration) -> str:
         f"Mean error of the {which}socket distances: {number(before, 3)} mm before,"
         f" {number(after, 3)} mm after calibration."
     )
+
+
+def fitted(text: str) -> str:
+    """The text with no line longer than the terminal, what is too long continued indented; untouched in a pipe or file.
+
+    A program's own output (`sys.__stdout__`) is looked at, for the text may be collected before it is written.
+    """
+    real = sys.__stdout__
+    if real is None or real.closed or not real.isatty():
+        return text
+    width = max(shutil.get_terminal_size().columns, 20)
+    lines = []
+    for line in text.splitlines():
+        inner = " " * (len(line) - len(line.lstrip()) + 4)
+        whole = (
+            textwrap.wrap(line, width, subsequent_indent=inner, drop_whitespace=True) if len(line) > width else [line]
+        )
+        lines += whole
+    return "\n".join(lines) + ("\n" if text.endswith("\n") else "")
 
 
 def level(name: str) -> str:
