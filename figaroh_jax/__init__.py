@@ -63,8 +63,8 @@ if TYPE_CHECKING:
     from .recordings import cleaning as cleaning, devices as devices
     from .recordings.arrays import postures as postures, recording as recording
     from .recordings.dataset import Recording as Recording, read_recordings as read_recordings
-    from .recordings.poses import PoseRecording as PoseRecording
     from .recordings.devices import Device as Device, own_device as own_device
+    from .recordings.poses import PoseRecording as PoseRecording
     from .reporting.report import write_report as write_report
     from .results import Cause as Cause, Diagnosis as Diagnosis
     from .rigid.dynamics import (
