@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from .recordings.arrays import postures as postures, recording as recording
     from .recordings.dataset import Recording as Recording, read_recordings as read_recordings
     from .recordings.devices import Device as Device, own_device as own_device
+    from .recordings.poses import PoseRecording as PoseRecording
     from .reporting.report import write_report as write_report
     from .results import Cause as Cause, Diagnosis as Diagnosis
     from .rigid.dynamics import (
@@ -96,6 +97,7 @@ _MODULES = {
     "recordings.arrays": ("postures", "recording"),
     "recordings.devices": ("Device", "own_device"),
     "recordings.dataset": ("Recording", "read_recordings"),
+    "recordings.poses": ("PoseRecording",),
     "tasks": ("diagnose", "diagnose_task", "identify"),
     "rigid.dynamics": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
     "effects.base": ("Effect", "Motion", "amplitude", "place", "shape"),

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -214,7 +215,7 @@ def _weights(effect: Effect, name: str, value: float) -> Float[np.ndarray, " shi
     """Of the torques of the moments before, what a response adds to the torque."""
     omega = 2 * np.pi * np.linspace(0.0, FASTEST, 60)
     changed = type(effect)(effect.at, **{name: value})
-    wanted = np.asarray(changed.torque_response(omega), complex) - 1.0
+    wanted = np.asarray(changed.torque_response(jnp.asarray(omega)), complex) - 1.0
     turned = np.outer(omega, SHIFTS)
     tall = np.concatenate([np.cos(turned), -np.sin(turned)])
     return np.linalg.lstsq(tall, np.concatenate([np.real(wanted), np.imag(wanted)]), rcond=None)[0]

@@ -20,10 +20,10 @@ from .design import Cause, Design, excite
 from .information import Learned, learn
 from .limits import limits_of
 from .motions import Basis, fourier, quintic, spline
-from .postures import ACCURACY, Instrument, PostureDesign, excite_postures
+from .postures import ACCURACY, Instrument, PostureDesign, View, excite_postures
 
 if TYPE_CHECKING:
-    from ..formats.config import Baseline, Excite, SizedEffect, Task
+    from ..formats.config import Baseline, Excite, Sight, SizedEffect, Task
 
 __all__ = ["excite_task"]
 
@@ -148,7 +148,9 @@ def _postures(task: Task, asked: Excite, robot: RobotModel, progress: Callable[[
         measurement.tool_frame,
         tuple(measurement.unknown),
         (place or ACCURACY[0], turn or ACCURACY[1]),
+        _view(asked.view, measurement.mount if measurement.kind == "camera" else "world"),
     )
+    clearance, said = clearance_asked(task, asked, robot)
     limits = limits_of(robot, asked.limits.position)
     found = excite_postures(
         robot,
@@ -156,12 +158,21 @@ def _postures(task: Task, asked: Excite, robot: RobotModel, progress: Callable[[
         count=asked.postures,
         candidates=asked.candidates,
         position_limit=limits.position,
+        clearance=clearance,
         progress=progress,
     )
-    said = ["neither collisions nor what the device can see from its place are looked at: check each posture before"]
+    if asked.view is None:
+        said = (*said, "no view is given: what the device can see from its place is not looked at")
     if place is None:
-        said.append(f"no accuracy is given: {1e3 * ACCURACY[0]:g} mm and {1e3 * ACCURACY[1]:g} mrad are taken")
+        said = (*said, f"no accuracy is given: {1e3 * ACCURACY[0]:g} mm and {1e3 * ACCURACY[1]:g} mrad are taken")
     return replace(found, notes=(*said, *found.notes))
+
+
+def _view(given: Sight | None, mount: str | None) -> View | None:
+    if given is None:
+        return None
+    hand = "hand" if mount == "hand" else "world"
+    return View(given.place, given.axis, hand, given.cone, given.tilt, given.near, given.far)
 
 
 def basis_of(asked: Excite) -> Basis:

@@ -436,6 +436,17 @@ class Obstacle(_Keys):
     turn: Vector = (0.0, 0.0, 0.0)  # roll, pitch, yaw, rad
 
 
+class Sight(_Keys):
+    """What the device of postures can see, in its base frame."""
+
+    place: Vector  # m: of a fixed device, or of the board that a device in the hand looks at
+    axis: Vector | None = None  # its line of sight, or the board's normal; None: any direction
+    cone: Annotated[Positive, Field(le=3.15)] = 0.5  # rad, half angle of what the device sees
+    tilt: Annotated[Positive, Field(le=3.15)] = 1.0  # rad, between the target's normal and the line of sight
+    near: Positive = 0.1  # m
+    far: Positive = 10.0
+
+
 class SizedEffect(_Keys):
     """A cause that is to be told from another, and how large it is taken to be."""
 
@@ -462,6 +473,7 @@ class Excite(_Keys):
     postures: Annotated[int, Field(ge=2, le=1000)] = 30
     candidates: Annotated[int, Field(ge=10, le=20_000)] = 500  # random postures to choose from
     measurement: Measurement | None = None  # of postures: the device; None: that of the recordings
+    view: Sight | None = None  # of postures: what the device sees; None: everything
     floor: Number | None = None  # its height in the world, m
     boxes: tuple[Obstacle, ...] = ()
     bodies: tuple[Body, ...] = ()  # for links without collision shapes, or in the place of theirs
