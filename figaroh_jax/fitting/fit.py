@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from math import prod
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,7 +21,7 @@ from jaxtyping import Array, Float
 
 from ..calibration import posefit
 from ..calibration.posesolver import NormalEquations, cut_weights, normal_equations
-from ..compiled.batching import traced
+from ..compiled.batching import DRAFT_OPTIONS, FEW, on_host, traced
 from ..compiled.precision import in_float64
 from ..effects.extended import ExtendedModel, extend
 from ..errors import InputError
@@ -35,6 +36,7 @@ __all__ = ["Estimate", "Fit", "fit"]
 
 NULL = 1e-12  # of the largest eigenvalue of the information: below it a direction is not determined
 STATIONARY = 1e-5  # share of the gradient at the start that may be left where a fit within limits has converged
+SEVERAL = 8  # devices or sets of recordings in a small problem
 HIDDEN = 1e-6  # share of a number in such directions above which it is not determined
 
 
@@ -155,17 +157,28 @@ def fit(
 
 @in_float64
 def _solved(problem: _Problem, solver: Any, max_steps: int) -> Fit:
-    return _solve(problem, solver, max_steps)
+    return (_solve_quick if _brief(problem) else _solve)(problem, solver, max_steps)
 
 
-@eqx.filter_jit
-def _solve(problem: _Problem, solver: Any, max_steps: int) -> Fit:
+def _brief(problem: _Problem) -> bool:
+    """Whether so few rows are fitted that a program costs more to optimise than it then saves."""
+    if not on_host(problem):
+        return False  # the compiler's options are those of the caller's program
+    arrays = (x for x in jax.tree.leaves(problem.data) if eqx.is_array(x))
+    return max((prod(x.shape[:-1]) for x in arrays), default=0) <= FEW and len(problem.data) <= SEVERAL
+
+
+def _least_squares(problem: _Problem, solver: Any, max_steps: int) -> Fit:
     adjoint = optimistix.ImplicitAdjoint(linear_solver=lineax.AutoLinearSolver(well_posed=False))
     start = jnp.zeros(len(problem.free.names))
     found = optimistix.least_squares(
         _rows, solver, start, args=problem, adjoint=adjoint, max_steps=max_steps, throw=False
     )
     return _fit_at(problem, found.value, found.result, found.stats)
+
+
+_solve = eqx.filter_jit(_least_squares)
+_solve_quick = eqx.filter_jit(_least_squares, compiler_options=DRAFT_OPTIONS)
 
 
 def _fit_at(problem: _Problem, y: Array, result: Any, stats: dict[str, Any]) -> Fit:
