@@ -23,6 +23,20 @@ if TYPE_CHECKING:
         regression as regression,
         states as states,
     )
+    from .estimation.blockwise import BlockLevenbergMarquardt as BlockLevenbergMarquardt
+    from .estimation.data import (
+        PoseData as PoseData,
+        TorqueData as TorqueData,
+        pose_data as pose_data,
+        residual as residual,
+        torque_data as torque_data,
+    )
+    from .estimation.fit import Fit as Fit, fit as fit
+    from .estimation.linear import (
+        fit_linear as fit_linear,
+        linear_basis as linear_basis,
+        linear_limits as linear_limits,
+    )
     from .excitation.design import Design as Design, excite as excite
     from .excitation.information import (
         Learned as Learned,
@@ -38,16 +52,6 @@ if TYPE_CHECKING:
         excite_postures as excite_postures,
     )
     from .excitation.task import excite_task as excite_task
-    from .fitting.blockwise import BlockLevenbergMarquardt as BlockLevenbergMarquardt
-    from .fitting.data import (
-        PoseData as PoseData,
-        TorqueData as TorqueData,
-        pose_data as pose_data,
-        residual as residual,
-        torque_data as torque_data,
-    )
-    from .fitting.fit import Fit as Fit, fit as fit
-    from .fitting.linear import fit_linear as fit_linear, linear_basis as linear_basis, linear_limits as linear_limits
     from .formats.config import Baseline as Baseline, Preprocess as Preprocess, load_task as load_task
     from .formats.export import load_model as load_model, write_model as write_model
     from .formats.mjcf import load_mjcf as load_mjcf
@@ -89,10 +93,10 @@ DEMO = f"{__path__[0]}/demo/robot.urdf"  # a small arm, for examples
 _MODULES = {
     "calibration.calibration": ("calibrate", "calibrate_task"),
     "formats.config": ("Baseline", "Preprocess", "load_task"),
-    "fitting.data": ("PoseData", "TorqueData", "pose_data", "residual", "torque_data"),
-    "fitting.blockwise": ("BlockLevenbergMarquardt",),
-    "fitting.fit": ("Fit", "fit"),
-    "fitting.linear": ("LinearFit", "fit_linear", "linear_basis", "linear_limits"),
+    "estimation.data": ("PoseData", "TorqueData", "pose_data", "residual", "torque_data"),
+    "estimation.blockwise": ("BlockLevenbergMarquardt",),
+    "estimation.fit": ("Fit", "fit"),
+    "estimation.linear": ("LinearFit", "fit_linear", "linear_basis", "linear_limits"),
     "recordings.arrays": ("postures", "recording"),
     "recordings.devices": ("Device", "own_device"),
     "recordings.dataset": ("Recording", "read_recordings"),

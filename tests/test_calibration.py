@@ -87,7 +87,7 @@ def test_the_badly_measured_posture_is_named_and_left_out(calibrated: Calibratio
 
 
 def test_calibrated_robot_predicts_postures_it_has_not_seen(calibrated: Calibration, wrong: tuple[Path, poses.Truth]):
-    from figaroh_jax.calibration.gravity import gravity_moments
+    from figaroh_jax.estimation.gravity import gravity_moments
     from figaroh_jax.rigid.kinematics import frame_placement
 
     task, real = wrong

@@ -109,7 +109,7 @@ def test_what_is_not_there_cannot_be_free(free, message: str, robot: fj.RobotMod
 
 def test_everything_can_be_free_at_once(robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...]):
     """The derivative of the rows by each number is that of the model that `free` makes of it."""
-    from figaroh_jax.fitting.free import apply, select
+    from figaroh_jax.estimation.free import apply, select
 
     model = fj.extend(robot, place(robot, "stribeck_friction", "elbow", force=1.0, speed=0.2))
     kinds = ("inertia", "effects", "joint_offset", "link_geometry", "frames", "tool_frame", "base", "gravity")

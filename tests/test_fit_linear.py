@@ -35,7 +35,7 @@ def case() -> tuple[fj.ExtendedModel, fj.TorqueData, Any]:
 
 def rows(model: fj.ExtendedModel, data: fj.TorqueData, basis: Any) -> tuple[np.ndarray, np.ndarray]:
     """Columns of the kept parameters (rows nv rank) and torque, by the derivative of the public residual."""
-    from figaroh_jax.fitting.free import apply, select
+    from figaroh_jax.estimation.free import apply, select
 
     free = select(model, (data,), ("inertia", "effects"))
     at = lambda y: fj.residual(apply(free, model, (data,), y)[0], data)  # noqa: E731

@@ -17,6 +17,9 @@ from jaxtyping import Bool, Float
 from ..effects.kinematic import HISTORY
 from ..errors import InputError, nearest
 from ..estimation import marginal
+from ..estimation.gravity import without_far_masses
+from ..estimation.posegroups import Measured, assemble, postures_of
+from ..estimation.posesolver import Solution, solve
 from ..recordings.poses import PoseRecording, read_pose_recordings
 from ..recordings.posture_checks import check_pose_recordings
 from ..rigid.chain import chain_between
@@ -25,10 +28,7 @@ from . import corrections, levels
 from .calibrated import Calibration, Error, Outlier
 from .candidates import Block, blocks_of, effects_on, empty_columns, geometry_columns, known_frames
 from .distances import socket_distances
-from .gravity import without_far_masses
 from .outliers import find_outliers
-from .posegroups import Measured, assemble, postures_of
-from .posesolver import Solution, solve
 from .shapes import refine
 
 if TYPE_CHECKING:

@@ -12,6 +12,8 @@ from jaxtyping import Array, Float
 from ..compiled.batching import program
 from ..effects.kinematic import Column, Postures, shape_of
 from ..estimation import marginal
+from ..estimation.posefit import DRAFT_OPTIONS
+from ..estimation.posegroups import Measured
 from ..recordings.devices import Device
 from ..results import Cause, Estimate, Gain, Name
 from ..rigid.model import RobotModel
@@ -19,8 +21,6 @@ from . import levels
 from .calibrated import Outlier, Parameter, Shown
 from .candidates import Block
 from .gauge import Gauge, find_gauge
-from .posefit import DRAFT_OPTIONS
-from .posegroups import Measured
 
 __all__ = [
     "causes_of",

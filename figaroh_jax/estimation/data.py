@@ -21,13 +21,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Shaped
 
-from ..calibration.posefit import ties
-from ..calibration.posegroups import devices_of
 from ..compiled.precision import in_float64
 from ..effects.base import Motion
 from ..effects.extended import ExtendedModel, changed_robot, extend, opened, read_position, read_sensors
 from ..errors import InputError
-from ..estimation.regression import BLOCK, BLOCK_PERIODS
 from ..recordings.dataset import Recording
 from ..recordings.devices import Device
 from ..recordings.poses import PoseRecording
@@ -38,6 +35,9 @@ from ..rigid.dynamics import inverse_dynamics
 from ..rigid.kinematics import frame_pose, placements
 from ..rigid.model import Leaf, RobotModel
 from ..rigid.spatial import matmul
+from .posefit import ties
+from .posegroups import devices_of
+from .regression import BLOCK, BLOCK_PERIODS
 
 if TYPE_CHECKING:
     from ..formats.config import Preprocess

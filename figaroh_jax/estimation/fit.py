@@ -19,18 +19,18 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float
 
-from ..calibration import posefit
-from ..calibration.posesolver import NormalEquations, cut_weights, normal_equations
 from ..compiled.batching import DRAFT_OPTIONS, FEW, on_host, traced
 from ..compiled.precision import in_float64
 from ..effects.extended import ExtendedModel, extend
 from ..errors import InputError
-from ..estimation.priors import rigid_prior
 from ..rigid.chain import chain_between
 from ..rigid.model import Leaf, RobotModel
+from . import posefit
 from .blockwise import BlockLevenbergMarquardt, normal_of
 from .data import Data, PoseData, as_data
 from .free import Free, apply, select
+from .posesolver import NormalEquations, cut_weights, normal_equations
+from .priors import rigid_prior
 
 __all__ = ["Estimate", "Fit", "fit"]
 

@@ -23,12 +23,12 @@ from ..compiled.precision import in_float64
 from ..effects.base import Effect, Motion, columns, movable
 from ..effects.extended import ExtendedModel, extend
 from ..errors import InputError
-from ..estimation.accelerators import coordinates
-from ..estimation.base_parameters import TOLERANCE, base_parameters
-from ..estimation.columns import column_names
 from ..recordings.rowfilter import filtered
 from ..rigid.model import RobotModel
 from ..rigid.regressor import dense_rows
+from .accelerators import coordinates
+from .base_parameters import TOLERANCE, base_parameters
+from .columns import column_names
 from .data import TorqueData
 
 __all__ = ["Basis", "LinearFit", "fit_linear", "linear_basis", "linear_limits"]
