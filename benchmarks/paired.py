@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import parity  # beside this file
 
@@ -37,7 +38,7 @@ def tasks(folder: Path) -> dict[str, Path]:
     header = [name.strip() for name in lines[0].split(",")]
     measurement["position"] = header[1:4]
     data = [{"file": str(talos / "talos_left_arm_02_10_contact.csv"), "position": header[4:13]}]
-    task = {"robot": {"model": str(talos / "talos_full_v2.urdf"), "joints": joints}}
+    task: dict[str, Any] = {"robot": {"model": str(talos / "talos_full_v2.urdf"), "joints": joints}}
     task["data"] = [one | {"measurement": measurement | {"unknown": ["base_frame", "tool_frame"]}} for one in data]
     (folder / "talos.yaml").write_text(json.dumps(task))
     return {"diagnose": file, "identify": file, "calibrate": folder / "talos.yaml"}

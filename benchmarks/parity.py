@@ -52,7 +52,7 @@ def _torques(folder: Path) -> Iterator[dict[str, Any]]:
         (here / "robot.urdf").write_text(one.urdf)
         data = []
         for run in one.recordings:
-            np.savez_compressed(here / f"{run.name}.npz", **run.arrays)
+            np.savez_compressed(here / f"{run.name}.npz", **run.arrays)  # pyright: ignore[reportArgumentType]
             data.append({"file": f"{run.name}.npz", **run.entry})
         task = one.task | {"robot": {"model": "robot.urdf", **one.task["robot"]}, "data": data}
         (here / "task.yaml").write_text(json.dumps(task))
@@ -130,15 +130,7 @@ def _smaller(folder: Path) -> None:
     for file in folder.glob("*.npz"):
         with np.load(file) as arrays:
             kept = {key: x if key == "t" else x.astype(np.float32) for key, x in arrays.items()}
-        np.savez_compressed(file, **kept)
-
-
-def _smaller(folder: Path) -> None:
-    """Recordings in single precision, for both versions alike."""
-    for file in folder.glob("*.npz"):
-        with np.load(file) as arrays:
-            kept = {key: x if key == "t" else x.astype(np.float32) for key, x in arrays.items()}
-        np.savez_compressed(file, **kept)
+        np.savez_compressed(file, **kept)  # pyright: ignore[reportArgumentType]
 
 
 def run(folder: Path, out: Path, sides: dict[str, Path], jobs: int, only: list[str]) -> None:

@@ -13,6 +13,7 @@ import poses
 import pytest
 import yaml
 
+import figaroh_jax as fj
 from figaroh_jax import cli
 from figaroh_jax.calibration.calibrated import Calibration
 from figaroh_jax.calibration.calibration import calibrate_task
@@ -70,6 +71,19 @@ def test_offsets_and_compliance_are_found_and_named(calibrated: Calibration):
     soft = causes["joint_compliance (j2)"].parameters["compliance"]
     assert abs(soft.value - 2e-4) < 4.0 * soft.std
     assert {cause.name.effect for cause in calibrated.causes} == {"outlier", "joint_offset", "joint_compliance"}
+
+
+def test_a_calibration_is_a_view_of_its_fit(calibrated: Calibration):
+    """Numbers, their sigmas and the rows of its data are those of the public residual of its model."""
+    fit = calibrated.solution
+    for one in calibrated.parameters:
+        assert fit.parameters[one.name][:2] == pytest.approx((one.value, one.std), rel=1e-12, abs=1e-15)
+    assert fit.model.robot is calibrated.model and not fit.reason
+    assert [effect.name for effect in fit.model.effects] == ["joint_compliance"]
+    stiff = fj.extend(fit.model.robot)
+    theirs, ours, without = (np.sqrt(np.mean(np.asarray(x) ** 2)) for x in (fit.rows, *(fj.residual(m, fit.data) for m in (fit.model, stiff))))  # fmt: skip  # noqa: E501
+    # the calibration takes gravity as the nominal robot has it, the residual as the corrected one does
+    assert ours == pytest.approx(theirs, rel=0.3) and without > 3.0 * ours
 
 
 def test_offsets_of_the_first_and_the_last_joint_are_a_gauge(calibrated: Calibration):

@@ -62,6 +62,14 @@ def linear_basis(model: RobotModel | ExtendedModel, data: TorqueData, tolerance:
 
     One basis serves all robots of one structure and all recordings of about one motion. Raises `InputError` where the
     data shows no parameter.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> t = np.arange(1000)[:, None] / 250.0
+    >>> run = fj.recording(q=0.5 * np.sin(t * np.array([3.0, 4.0, 5.0, 6.0])), tau=np.cos(t) * np.ones(4), rate=250)
+    >>> basis = fj.linear_basis(robot, fj.torque_data(robot, run))
+    >>> basis.matrix.shape == (len(basis.names), 40)
+    True
     """
     whole = model if isinstance(model, ExtendedModel) else extend(model)
     if traced(whole, data):
@@ -83,6 +91,15 @@ def linear_limits(model: ExtendedModel, basis: Basis) -> tuple[Float[np.ndarray,
     """Least and greatest value of each kept parameter that physics allows: friction takes energy, rotors have inertia.
 
     Links have no limits here: a base parameter is a sum of several links'.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> model = fj.extend(robot, fj.place(fj.CATALOGUE["viscous_friction"], robot, ["elbow"]))
+    >>> t = np.arange(1000)[:, None] / 250.0
+    >>> run = fj.recording(q=0.5 * np.sin(t * np.array([3.0, 4.0, 5.0, 6.0])), tau=np.cos(t) * np.ones(4), rate=250)
+    >>> lower, upper = fj.linear_limits(model, fj.linear_basis(model, fj.torque_data(model, run)))
+    >>> float(lower[-1]), float(upper[-1])
+    (0.0, inf)
     """
     lower = [-np.inf] * (10 * len(model.robot.joints))
     for effect in model.effects:
