@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 export XLA_FLAGS ?= --xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1
 
-.PHONY: demo test test-slow lint types bench fuzz kills audit format clean
+.PHONY: demo test test-slow lint types bench fuzz kills audit docs pictures format clean
 
 demo: .venv/installed ## the main job on the embedded recording
 	$(BIN)/figaroh-jax demo --out runs/demo
@@ -41,18 +41,29 @@ kills: .venv/developed ## commands killed at random moments, and every call that
 audit: .venv/developed ## known vulnerabilities of what is installed
 	$(BIN)/pip-audit --local --skip-editable --strict $(ARGS)
 
+docs: .venv/documented ## the site in site/, with every warning an error
+	$(BIN)/mkdocs build --strict
+
+pictures: .venv/developed ## the docs' screenshots, from the demo
+	$(BIN)/figaroh-jax demo --out runs/demo --quiet
+	$(BIN)/python benchmarks/pages.py runs/demo --docs docs/images
+
 format: .venv/developed
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf .venv .cache .pytest_cache .ruff_cache .hypothesis runs build dist
+	rm -rf .venv .cache .pytest_cache .ruff_cache .hypothesis runs site build dist
 
 .venv/bin/python:
 	@test -n "$(PYTHON)" || { echo "make: needs Python >= 3.11 with venv (on Debian: apt-get install python3-venv);" \
 		"name it with make PYTHON=/path/to/python3" >&2; exit 2; }
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade "pip>=25.1"
+
+.venv/documented: pyproject.toml | .venv/developed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --group docs
+	@touch $@
 
 # A stamp is newer than pyproject.toml once what it names is installed, so a second run installs nothing.
 .venv/installed: pyproject.toml | .venv/bin/python

@@ -101,8 +101,9 @@ def _call(folder: Path, out: Path, case: Case, job: Job, command: str, limit: fl
         record = _timed(words, limit)
         kept = out / job.folder
         kept.mkdir(parents=True, exist_ok=True)
-        if (answer / "answer.json").is_file():
-            shutil.copy(answer / "answer.json", kept)
+        for file in ("answer.json", "result.json"):
+            if (answer / file).is_file():
+                shutil.copy(answer / file, kept)
         (kept / "run.json").write_text(json.dumps({"command": command, **record}))
     return f"{job.folder}: exit {record['exit']}, {record['cpu_s']:.0f} CPU s{_brief(kept)}"
 
@@ -223,13 +224,21 @@ def grade(case: Case, answer: dict[str, Any] | None, twin: dict[str, Any] | None
         if hit is not None:
             sizes.append(size_error(truth, hit, old))
             inside += _inside(truth, hit) if old is None else []
-    false = [(n, c) for n, c in new if not any(accepts(t, n) for t in truths)]
+    told_before = _alternatives(twin)  # the twin's answer left it open whether it is this
+    false = [(n, c) for n, c in new if n not in told_before and not any(accepts(t, n) for t in truths)]
     names, wrong = tuple(n for n, _ in new), tuple(n for n, _ in false)
     if truths and all(h is not None for h in hits):
         return Grade("more" if wrong else "right", names, wrong, tuple(sizes), tuple(inside))
     if any(_in_set(t, c) for t in truths for _, c in false):
         return Grade("set", names, tuple(n for n, c in false if not any(_in_set(t, c) for t in truths)))
     return Grade("wrong" if false else "silent", names, wrong)
+
+
+def _alternatives(twin: dict[str, Any] | None) -> set[Name]:
+    """Names that an answer gives as possible in place of those that it puts first."""
+    if twin is None:
+        return set()
+    return {(o["effect"], tuple(o["at"])) for _, cause in causes(twin) for o in cause.get("ambiguous_with", ())}
 
 
 def _in_set(truth: dict[str, Any], cause: dict[str, Any]) -> bool:

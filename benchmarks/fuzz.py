@@ -465,7 +465,7 @@ def read_robot_file(bench: Bench, file: Path) -> None:
 
 
 def read_recording(bench: Bench, file: Path) -> None:
-    from figaroh_jax.recordings.tables import read_table
+    from figaroh_jax.recordings.reading import read_table
 
     table = read_table(file, "data[0].file")
     joints = ("shoulder", "elbow", "slide")

@@ -7,13 +7,14 @@ message on standard error), 70 a fault of the program itself, 130 interrupted, 1
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import signal
 import sys
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -34,8 +35,15 @@ _TASKS = {  # commands that take a task file
     "calibrate": "fit the kinematics from measured poses or points",
     "excite": "design the motion that tells most, within limits",
 }
-_OTHERS = ("verify", "compare", "list", "new")  # commands before and after a run
+_READING = 0.03  # of a command's work, for the progress bar
+_OTHERS = ("verify", "compare", "list", "new", "migrate")  # commands before and after a run
 _DESCRIPTION = "Name what a robot's simulation gets wrong, extend the model with it and measure the gain."
+
+
+_STATUS = (
+    "Exit status: 0 the job ran, whatever it found; 1 a limit failed (verify) or is not met (excite); 2 the input is"
+    " wrong; 70 a fault of the program; 130 interrupted; 143 asked to end."
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -94,20 +102,20 @@ def _run(args: argparse.Namespace) -> int:
     if args.command in _OTHERS:
         from . import run_tools
 
-        status = 0  # also where the reader has gone
-        with _standard_output():
+        shown = io.StringIO()  # first the verdict, then the text: a reader that has gone changes no exit status
+        with redirect_stdout(shown):
             status = getattr(run_tools, args.command)(args)
+        _write_out(shown.getvalue())
         return status
     if args.command == "rerun":
         args = _again(args)
     _set_up_jax(cache=not args.no_cache)
-    from .reporting import terminal
+    from .recordings.tables import listener
+    from .reporting import terminal, wording
     from .runs import JOBS, REPORT, export_loop
 
     if args.command == "export":
-        text = export_loop(args.task, args.simulator, args.out)
-        with _standard_output():
-            sys.stdout.write(text)
+        _write_out(export_loop(args.task, args.simulator, args.out))
         return 0
     if args.command == "excite" and args.task is None:
         args.task = _task_of_run(args.of_run)
@@ -116,17 +124,25 @@ def _run(args: argparse.Namespace) -> int:
         task_file = args.task or demo / "task.yaml"
         out = args.out or Path(f"{args.task.stem if args.task else 'demo'}_{job.noun}")
         with terminal.Progress(quiet=args.quiet) as progress:
+            listener.set(lambda phase, share: progress(phase, _READING * share))
             found = job.run(task_file, out, progress, args.backend, **_own_options(args))
     with _standard_output():
         if args.json:
             sys.stdout.write(job.to_json(found))
         else:
-            job.show(found)
-            print(f"Report: {out / REPORT}")
+            job.show(found, args.verbose)
+            print(wording.fitted(f"Report: {out / REPORT}"))
     failed = job.failure(found)
     if failed is not None:
         print(f"figaroh-jax: limit not met: {_one_line(failed)}", file=sys.stderr)
     return 0 if failed is None else 1
+
+
+def _write_out(text: str) -> None:
+    from .reporting.wording import fitted
+
+    with _standard_output():
+        sys.stdout.write(fitted(text))
 
 
 @contextmanager
@@ -150,7 +166,7 @@ def _again(args: argparse.Namespace) -> argparse.Namespace:
 
     command = command_of(args.run)
     out = args.out or args.run.with_name(f"{args.run.resolve().name}_again")
-    flags = [flag for flag in ("json", "quiet", "traceback", "no_cache") if getattr(args, flag)]
+    flags = [flag for flag in ("json", "verbose", "quiet", "traceback", "no_cache") if getattr(args, flag)]
     return _parser().parse_args([*command, "--out", str(out), *(f"--{flag.replace('_', '-')}" for flag in flags)])
 
 
@@ -192,6 +208,7 @@ def _parser() -> argparse.ArgumentParser:
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--out", type=Path, metavar="DIR", help="run directory; an earlier run there is replaced")
     common.add_argument("--json", action="store_true", help="print the answer as JSON in place of the summary")
+    common.add_argument("--verbose", action="store_true", help="show the notes of the summary, which else are counted")
     common.add_argument("--quiet", action="store_true", help="no progress on standard error")
     common.add_argument("--traceback", action="store_true", help="show where an error was raised")
     common.add_argument(
@@ -201,7 +218,7 @@ def _parser() -> argparse.ArgumentParser:
         help="simulator of the rigid body: native (default), mujoco, pinocchio, mjx or another one that is installed",
     )
     common.add_argument("--no-cache", action="store_true", help="keep no compiled programs for the next run")
-    parser = argparse.ArgumentParser(prog="figaroh-jax", description=_DESCRIPTION)
+    parser = argparse.ArgumentParser(prog="figaroh-jax", description=_DESCRIPTION, epilog=_STATUS)
     parser.add_argument("--version", action="version", version=_version())
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, explained in _TASKS.items():
@@ -236,6 +253,18 @@ def _add_tools(commands: Any) -> None:
     new.add_argument("--joints", help="comma-separated joints of the columns, in their order")
     new.add_argument("--rate", type=float, metavar="HZ", help="rate of recordings that have no time column")
     new.add_argument("--constants", help="comma-separated N m a unit of the torque columns, in the joints' order")
+    new.add_argument("--unit", choices=("rad", "deg", "m", "mm"), help="unit of the positions, where nothing tells it")
+    new.add_argument("--topic", metavar="NAME", help="topic of bags that hold several topics of joints")
+    new.add_argument("--kp", help="comma-separated gains of position servos (N m/rad), for a command without torque")
+    new.add_argument("--interactive", action="store_true", help="ask for what the recordings cannot decide")
+    migrate = commands.add_parser("migrate", parents=[tool], help="a configuration of FIGAROH as a task file")
+    migrate.add_argument("config", type=Path, metavar="CONFIG.yaml")
+    migrate.add_argument("model", type=Path, metavar="MODEL")
+    migrate.add_argument("recordings", type=Path, nargs="*", metavar="RECORDING")
+    migrate.add_argument(
+        "--job", choices=("identify", "calibrate"), help="of a configuration of both; default: identify"
+    )
+    migrate.add_argument("--out", type=Path, metavar="TASK.yaml", help="default: the task is printed")
     verify = commands.add_parser("verify", parents=[tool], help="pass or fail of a finished run; exit status 1 on fail")
     verify.add_argument("run", type=Path, metavar="DIR")
     verify.add_argument(

@@ -7,14 +7,19 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from .errors import InputError
 from .reporting.provenance import read_provenance
 from .reporting.run_directory import write_file
 
-__all__ = ["command_of", "compare", "list", "new", "verify"]
+if TYPE_CHECKING:
+    from .recordings.draft import Draft
+
+__all__ = ["command_of", "compare", "list", "migrate", "new", "verify"]
 
 
 def new(args: argparse.Namespace) -> int:
@@ -23,12 +28,16 @@ def new(args: argparse.Namespace) -> int:
 
     if args.out is not None and args.out.exists():
         raise InputError(f"--out {args.out}: exists already; a draft replaces no file")
-    joints = None if args.joints is None else [name.strip() for name in args.joints.split(",")]
-    if args.rate is not None and not 0 < args.rate < float("inf"):
-        raise InputError(f"--rate {args.rate}: expected a positive number of Hz")
-    draft = draft_task(
-        args.model, args.recordings, joints=joints, rate=args.rate, constants=_numbers(args.constants, "--constants")
-    )
+
+    def drafted() -> Draft:
+        joints = None if args.joints is None else [name.strip() for name in args.joints.split(",")]
+        if args.rate is not None and not 0 < args.rate < float("inf"):
+            raise InputError(f"--rate {args.rate}: expected a positive number of Hz")
+        constants, gains = _numbers(args.constants, "--constants"), _numbers(args.kp, "--kp")
+        known = {"rate": args.rate, "unit": args.unit, "topic": args.topic, "constants": constants, "gains": gains}
+        return draft_task(args.model, args.recordings, joints=joints, **known)
+
+    draft = _asked(args, drafted) if args.interactive else drafted()
     if args.json:
         print(json.dumps(draft._asdict(), indent=2, ensure_ascii=False))
     elif args.out is None:
@@ -38,6 +47,44 @@ def new(args: argparse.Namespace) -> int:
         if not args.json:
             print("\n".join([*(f"assumed: {line}" for line in draft.assumed), f"Task: {args.out}"]))
     return 0
+
+
+def migrate(args: argparse.Namespace) -> int:
+    """Translate a configuration of FIGAROH, and say what became of each of its keys."""
+    from .recordings.migration import migrate as translated
+
+    if args.out is not None and args.out.exists():
+        raise InputError(f"--out {args.out}: exists already; a translation replaces no file")
+    found = translated(args.config, args.model, args.recordings, job=args.job)
+    if args.out is not None:
+        write_file(args.out, found.text, "--out")
+    if args.json:
+        print(json.dumps(found._asdict(), indent=2, ensure_ascii=False))
+    elif args.out is None:
+        print(found.text, end="")
+    else:
+        print("\n".join([*found.keys, f"Task: {args.out}"]))
+    return 0
+
+
+def _asked(args: argparse.Namespace, drafted: Callable[[], Draft]) -> Draft:
+    """The draft, once the user has answered what the recordings cannot decide; an empty answer gives up."""
+    from .recordings.draft import Undecided
+
+    while True:
+        try:
+            return drafted()
+        except Undecided as question:
+            print(f"{question}\n--{question.option} = ", end="", file=sys.stderr, flush=True)
+            answer = sys.stdin.readline().strip()
+            if not answer:
+                raise
+            try:
+                setattr(args, question.option, float(answer) if question.option == "rate" else answer)
+            except ValueError:
+                raise InputError(f"--rate {answer}: expected a positive number of Hz") from None
+            if question.option == "unit" and answer not in ("rad", "deg", "m", "mm"):
+                raise InputError(f"--unit {answer}: expected rad, deg, m or mm") from None
 
 
 def _numbers(text: str | None, option: str) -> tuple[float, ...] | None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from .errors import InputError, as_written
 from .reporting.run_directory import check_directory, refusals, task_inputs, whole_directory, write_file
+from .reporting.wording import fitted
 
 if TYPE_CHECKING:
     from .calibration.calibrated import Calibration
@@ -52,7 +53,7 @@ class Job(NamedTuple):
     noun: str  # of the run directory's default name
     run: Callable[..., Any]  # (task file, run directory, progress, backend), and the command's own options by name
     to_json: Callable[[Any], str]
-    show: Callable[[Any], None]
+    show: Callable[[Any, bool], None]  # with the notes, or with their number
     failure: Callable[[Any], str | None] = lambda found: None  # what ends the command with status 1, in words
 
 
@@ -415,14 +416,14 @@ def _diagnosis_json(diagnosis: Diagnosis | PoseDiagnosis) -> str:
     return pose_answer_json(diagnosis)
 
 
-def _show_diagnosis(diagnosis: Diagnosis | PoseDiagnosis) -> None:
+def _show_diagnosis(diagnosis: Diagnosis | PoseDiagnosis, verbose: bool = False) -> None:
     from .reporting.terminal import show, show_calibration
     from .results import Diagnosis
 
     if isinstance(diagnosis, Diagnosis):
-        show(diagnosis, diagnosis.model.robot.name)
+        show(diagnosis, diagnosis.model.robot.name, verbose=verbose)
     else:
-        show_calibration(diagnosis.calibration, diagnosis.verdict)
+        show_calibration(diagnosis.calibration, diagnosis.verdict, verbose=verbose)
 
 
 def _identification_json(found: Identification | RolloutIdentification) -> str:
@@ -435,15 +436,15 @@ def _identification_json(found: Identification | RolloutIdentification) -> str:
     return to_json(found)
 
 
-def _show_identification(found: Identification | RolloutIdentification) -> None:
+def _show_identification(found: Identification | RolloutIdentification, verbose: bool = False) -> None:
     from .rollouts.identification import RolloutIdentification
 
     if isinstance(found, RolloutIdentification):
-        print("\n".join(found.lines()))
+        print(fitted("\n".join(found.lines())))
         return
     from .reporting.terminal import show_identification
 
-    show_identification(found, found.model.robot.name)
+    show_identification(found, found.model.robot.name, verbose=verbose)
 
 
 def _calibration_json(calibration: Calibration) -> str:
@@ -452,10 +453,10 @@ def _calibration_json(calibration: Calibration) -> str:
     return to_json(calibration)
 
 
-def _show_calibration(calibration: Calibration) -> None:
+def _show_calibration(calibration: Calibration, verbose: bool = False) -> None:
     from .reporting.terminal import show_calibration
 
-    show_calibration(calibration)
+    show_calibration(calibration, verbose=verbose)
 
 
 def _design_json(found: Design | PostureDesign) -> str:
@@ -464,10 +465,10 @@ def _design_json(found: Design | PostureDesign) -> str:
     return to_json(found)
 
 
-def _show_design(found: Design | PostureDesign) -> None:
+def _show_design(found: Design | PostureDesign, verbose: bool = False) -> None:
     from .reporting.excitation_files import summary_lines
 
-    print("\n".join(summary_lines(found)))
+    print(fitted("\n".join(summary_lines(found))))
 
 
 def _design_failure(found: Design | PostureDesign) -> str | None:

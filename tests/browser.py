@@ -18,7 +18,7 @@ _FLAGS = (
     "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
     "--disable-component-update --disable-sync --disable-dev-shm-usage --hide-scrollbars"
 ).split()
-_PATIENCE = 30.0  # s for one answer of the browser; a loaded machine parses the plotting library slowly
+_PATIENCE = 90.0  # s for one answer of the browser; a loaded machine parses the plotting library slowly
 
 
 def find() -> str | None:

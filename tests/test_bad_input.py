@@ -265,7 +265,7 @@ RECORDINGS: dict[str, tuple[Spoil, list[str]]] = {
     "missing file": (missing("run1.npz"), ["run1.npz", "data[0].file", "'run2.npz'"]),
     "directory": (directory("run1.npz"), ["run1.npz", "directory"]),
     "empty file": (lambda folder: (folder / "run1.npz").write_bytes(b""), ["run1.npz", "empty"]),
-    "unknown format": (key("data.0.file", "run1.bag"), ["run1.bag", ".npz", ".csv", ".parquet"]),
+    "unknown format": (key("data.0.file", "run1.xls"), ["run1.xls", ".npz", ".csv", ".parquet"]),
     "no npz": (content("run.npz", b"PK but not a zip"), ["run.npz", ".npz"]),
     "pickle called npz": (content("run.npz", pickle.dumps({"q": [1, 2]})), ["run.npz"]),
     "object array": (npz(q=np.array([[1, "a"], [None, 2]], dtype=object)), ["run1.npz", "'q'", "objects"]),

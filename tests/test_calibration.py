@@ -12,6 +12,7 @@ import pinocchio as pin
 import poses
 import pytest
 import yaml
+from schema import matches
 
 import figaroh_jax as fj
 from figaroh_jax import cli
@@ -123,6 +124,7 @@ def test_run_directory_holds_what_the_contract_asks(wrong: tuple[Path, poses.Tru
     out = tmp_path / "run"
     assert cli.main(["calibrate", str(wrong[0]), "--out", str(out), "--quiet", "--json"]) == 0
     result = json.loads((out / "result.json").read_text())
+    matches("calibrate", result)
     assert result.pop("fk_parity") < 1e-9  # of the written model, so in the file alone
     assert result == json.loads(capsys.readouterr().out)
     assert result["level"] == "full" and result["orientation"] is None and result["verdict"] == "named"

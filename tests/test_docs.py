@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
+from figaroh_jax import cli
 from figaroh_jax.effects.catalogue import CATALOGUE
 from figaroh_jax.effects.kinematic import CATALOGUE as KINEMATIC
+from figaroh_jax.formats import reference
+from figaroh_jax.formats.config import Limits, Task
 
 OWN = {name: effect for name, effect in CATALOGUE.items() if effect.__module__.startswith("figaroh_jax.effects.")}
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "effects.md").read_text("utf-8")
@@ -34,3 +43,95 @@ def test_the_page_of_effects_has_the_row_of_each_effect_of_poses(name: str) -> N
 def test_the_page_of_effects_lists_nothing_else() -> None:
     listed = [line.split("`")[1] for line in PAGE.splitlines() if line.startswith("| `")]
     assert sorted(listed) == sorted([*OWN, *KINEMATIC])
+
+
+# The site
+
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+PAGES = sorted(DOCS.glob("*.md")) + [DOCS.parent / "README.md"]
+
+
+def blocks(language: str) -> list[tuple[str, str]]:
+    """Every code block of a language, with the page and the line where it stands."""
+    found = []
+    for page in PAGES:
+        text = page.read_text("utf-8")
+        for match in re.finditer(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+            found.append((f"{page.name}:{text[: match.start()].count(chr(10)) + 1}", match[1]))
+    return found
+
+
+@pytest.mark.parametrize(("place", "text"), blocks("yaml"), ids=[place for place, _ in blocks("yaml")])
+def test_every_yaml_block_holds_keys_that_are_read(place: str, text: str, tmp_path: Path) -> None:
+    if text.startswith("--8<--"):
+        assert (DOCS.parent / "examples" / "github_actions.yml").is_file()
+        return
+    content = yaml.safe_load(text)
+    if "limits.yaml" in text:
+        Limits.model_validate(content)
+        return
+    whole: dict[str, Any] = {"robot": {"model": "robot.urdf"}}
+    whole["data"] = [{"file": "run.csv", "time": "t", "position": "q"}]
+    Task.model_validate(whole | content)
+
+
+@pytest.mark.parametrize(("place", "text"), blocks("console"), ids=[place for place, _ in blocks("console")])
+def test_every_command_in_a_console_block_is_one_with_its_options(place: str, text: str) -> None:
+    for line in text.splitlines():
+        words = shlex.split(line.removeprefix("$ "), comments=True)
+        if line.startswith("$ figaroh-jax"):
+            cli._parser().parse_args(words[1:])
+        elif line.startswith("$ make"):
+            assert re.search(rf"^{words[1]}:", (DOCS.parent / "Makefile").read_text("utf-8"), re.MULTILINE), place
+        elif line.startswith("$"):
+            assert words[:2] == ["pip", "install"], f"{place}: {line}"
+
+
+def test_every_python_block_of_the_readme_runs_on_the_demo() -> None:
+    """One after another in one interpreter, with the demo's robot and arrays in place of a user's."""
+    texts = [text for place, text in blocks("python") if place.startswith("README")]
+    before = (
+        "import jax, numpy as np, figaroh_jax as fj\n"
+        "rng = np.random.default_rng(0); q, v, a, tau = rng.normal(size=(4, 2500, 4))\n"
+        "t = np.arange(2500) / 250.0\n"
+        "w = 2 * np.pi * np.array([0.31, 0.43, 0.57, 0.71])\n"
+        "q, v, a = np.sin(w * t[:, None]), w * np.cos(w * t[:, None]), -w**2 * np.sin(w * t[:, None])\n"
+    )
+    script = "\n".join([before, *texts])
+    for name in ("robot.urdf", "robot.xml"):
+        script = script.replace(f'load_urdf("{name}")', "load_urdf(fj.DEMO)")
+    kept = [line for line in script.splitlines() if not _NEEDS_A_RUN.search(line)]
+    place = next(k for k, line in enumerate(kept) if "fj.torque_data" in line)
+    kept.insert(place, "tau = np.asarray(fj.inverse_dynamics(model, q, v, a))")
+    run = subprocess.run([sys.executable, "-c", "\n".join(kept)], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr[-1500:]
+
+
+# a minute's diagnosis and files of a user, which tests of their own cover
+_NEEDS_A_RUN = re.compile(r'diagnosis|load_model\("run|load_extended\(|^\s+print\(cause')
+
+
+def test_every_key_has_its_line_in_the_reference() -> None:
+    """`reference.keys` raises for a key without one; here the other way round, and the page itself."""
+    assert {key.path for key in reference.keys()} == set(reference.KEYS)
+    assert {key.path for key in reference.limits_keys()} == set(reference.LIMITS)
+    page = reference.markdown()
+    assert all(f"| `{path}` |" in page for path in [*reference.KEYS, *reference.LIMITS])
+
+
+def test_links_between_pages_lead_somewhere() -> None:
+    made = {"task.md"} | {f"effect/{name}.md" for name in [*OWN, *KINEMATIC, "index"]}
+    for page in DOCS.glob("*.md"):
+        for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text("utf-8")):
+            assert target in made or (DOCS / target).is_file(), f"{page.name}: {target}"
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning_and_has_a_page_for_every_effect(tmp_path: Path) -> None:
+    pytest.importorskip("material")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(tmp_path)]
+    run = subprocess.run(command, cwd=DOCS.parent, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr[-2000:]
+    assert {f"{name}.html" for name in [*OWN, *KINEMATIC]} <= {path.name for path in (tmp_path / "effect").iterdir()}
+    assert {f"{name}.svg" for name in OWN} <= {path.name for path in (tmp_path / "effect").iterdir()}

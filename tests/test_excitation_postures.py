@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ import robots
 from figaroh_jax.cli import main
 from figaroh_jax.errors import InputError
 from figaroh_jax.excitation import postures
-from figaroh_jax.excitation.postures import Instrument, excite_postures
+from figaroh_jax.excitation.clearance import Capsule, clearance_of
+from figaroh_jax.excitation.postures import Instrument, View, excite_postures
 from figaroh_jax.rigid.model import RobotModel
 
 LIMIT = '<limit lower="-2" upper="2" velocity="3" effort="40"/>'
@@ -82,6 +84,33 @@ def test_designed_postures_stay_within_the_limits_and_tell_more_than_random_ones
     flat = rows.reshape(-1, rows.shape[2])
     assert np.linalg.slogdet(flat.T @ flat)[1] == pytest.approx(found.logdet, rel=1e-9)
     np.testing.assert_allclose(found.std, np.sqrt(np.diag(np.linalg.inv(flat.T @ flat))), rtol=1e-6)
+
+
+@pytest.mark.parametrize("mount", ["hand", "world"])
+def test_designed_postures_are_seen_and_clear(arm: RobotModel, mount: Literal["hand", "world"]):
+    """Angles and distances by Pinocchio's poses; spheres of the last link and the base stay apart."""
+    place, axis = ((0.3, 0.6, 0.0), (0.0, 0.0, 1.0)) if mount == "hand" else ((1.5, 0.4, 0.7), (-1.0, 0.0, -0.2))
+    view = View(place, axis, mount, cone=1.0, tilt=1.3, near=0.3, far=2.5)
+    bodies = [Capsule("c", (0, 0, 0), (0, 0, 0.1), 0.05), Capsule("base", (0, 0, 0), (0, 0, 0.2), 0.1)]
+    clearance = clearance_of(arm, margin=0.1, bodies=bodies, floor=-0.2)
+    device = Instrument("pose", "base", "c", view=view)
+    found = excite_postures(arm, device, count=10, candidates=100, clearance=clearance)
+    assert found.logdet >= found.chosen_logdet - 1e-6
+    pose = np.asarray(reference.forward_kinematics(arm, found.position))[:, 2]
+    way = np.array(place) - pose[:, :3, 3]
+    far = np.linalg.norm(way, axis=1)
+    at_tool = np.arccos((way * pose[:, :3, 2]).sum(1) / far)
+    at_place = np.arccos(-(way @ axis) / far / np.linalg.norm(axis))
+    device_angle, target_angle = (at_tool, at_place) if mount == "hand" else (at_place, at_tool)
+    assert (device_angle <= 1.0).all() and (target_angle <= 1.3).all()
+    assert (far >= 0.3).all() and (far <= 2.5).all()
+    ends = np.stack([pose[:, :3, 3], pose[:, :3, 3] + 0.1 * pose[:, :3, 2]], 1)
+    assert (ends[..., 2] >= -0.2 + 0.05 + 0.1 - 1e-9).all()
+    column = np.linspace(0, 0.2, 41)[:, None] * np.array([0, 0, 1.0])
+    apart = np.linalg.norm(ends[:, :, None] - column, axis=3).min(axis=(1, 2)) - 0.15
+    assert (apart >= 0.1 - 1e-6).all()
+    with pytest.raises(InputError, match="0 of .* random postures are seen by the device and clear"):
+        excite_postures(arm, Instrument("pose", "base", "c", view=View((9.0, 9.0, 9.0), far=1.0)), count=10)
 
 
 def test_the_order_of_postures_has_shorter_ways_than_the_one_given():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import reference
 import yaml
+from schema import matches
 from test_excitation import ARM
 
 from figaroh_jax.cli import main
@@ -35,6 +36,7 @@ def test_the_run_holds_the_motion_at_1_khz_with_its_torques_and_a_joint_trajecto
     assert main(["excite", str(file), "--out", str(tmp_path / "run"), "--json", "--quiet"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer == json.loads((tmp_path / "run" / "excitation.json").read_text())
+    matches("excite", answer)
     assert answer["met"] and answer["objective"] == "information" and len(answer["trajectories"]) == 2
     model = load_urdf(tmp_path / "robot.urdf")
     for k, told in enumerate(answer["trajectories"]):
@@ -61,7 +63,7 @@ def test_the_run_holds_the_motion_at_1_khz_with_its_torques_and_a_joint_trajecto
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ("limits: {clearance: 0.02}", "excite.limits.clearance: distances between bodies are not looked at"),
+        ("ignore: [[a, b]]", "ignore: distances are looked at where limits.clearance"),
         ("limits: {speed: 2}", "unknown key 'speed'"),
         ("basis: {fourier: 5, spline: 3}", "exactly one of fourier, spline, quintic; given: fourier, spline"),
         ("objective: prediction", "needs `predict`"),
@@ -95,8 +97,9 @@ def test_a_task_without_recordings_is_for_excite_alone(tmp_path: Path, capsys: p
         ("limits: {velocity: {bent: 1.0}}", "no moving joint 'bent'; did you mean 'bend'?"),
         ("basis: {fourier: 3, base: 0.3}, duration: 4", "a base of 0.25 Hz fits"),
         (
-            "objective: separate, separate: [[{effect: torque_delay}, {effect: rotor_inertia, at: [turn]}]]",
-            "'torque_delay' has no torque of an instant",
+            "objective: separate,"
+            " separate: [[{effect: joint_elasticity, at: [turn]}, {effect: rotor_inertia, at: [bend]}]]",
+            "'joint_elasticity' has no torque of an instant",
         ),
         ("objective: prediction, predict: [no.npz]", "no.npz (excite.predict) does not exist"),
     ],

@@ -61,6 +61,7 @@ def test_an_experiment_for_a_law_of_friction_moves_its_joint(setting: tuple[Prob
     told = next_experiment("named", [found(FRICTION, effect, other)], problem, state, [effect], whitening)
     assert told is not None and told.separates == (("power_law_friction", "stribeck_friction"),)
     assert "as informative as" in told.text and "more recordings of the current motion" in told.text
+    assert "figaroh-jax excite --from RUN_DIR" in told.text
 
 
 def test_what_no_motion_tells_apart_is_said_so(setting: tuple[Problem, State, np.ndarray]):

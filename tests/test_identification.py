@@ -11,6 +11,7 @@ import pinocchio as pin
 import pytest
 import simulated_arm
 import tasks
+from schema import matches
 from simulated_arm import Truth, recording
 
 import figaroh_jax as fj
@@ -199,6 +200,7 @@ def test_command_writes_a_whole_run(run: Path, capsys: pytest.CaptureFixture[str
     tables = {"parameters.csv", "parameters.yaml", "parameters.npz", "predictions.npz"}
     assert names == {"result.json", "report.html", "model", "provenance.json", "figaroh-jax-run.json"} | tables
     answer = json.loads((run / "result.json").read_text())
+    matches("identify", answer)
     with np.load(run / "parameters.npz") as file:
         assert file["base_values"].tolist() == [b["value"] for b in answer["base_parameters"]]
     page = (run / "report.html").read_text()

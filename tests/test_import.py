@@ -30,17 +30,14 @@ def test_dynamics_load_no_file_format_backend_or_plot():
     assert run.stdout == run.stderr == ""
 
 
-def test_reading_a_urdf_loads_no_mesh_library_and_leaves_yourdfpy_whole(tmp_path: Path):
+def test_reading_a_urdf_loads_no_mesh_library(tmp_path: Path):
     box = "<link name='a'><visual><geometry><box size='1 2 3'/></geometry></visual></link>"
     joint = "<link name='b'/><joint name='j' type='continuous'><parent link='a'/><child link='b'/></joint>"
     (tmp_path / "box.urdf").write_text(f"<robot name='r'>{box}{joint}</robot>")
     code = (
         "import sys, figaroh_jax as fj\n"
         "fj.load_urdf('box.urdf')\n"
-        "assert not [name for name in sys.modules if 'trimesh' in name]\n"
-        "import trimesh, yourdfpy\n"
-        "scene = yourdfpy.URDF.load('box.urdf').scene\n"
-        "assert isinstance(scene, trimesh.Scene) and scene.extents.tolist() == [1, 2, 3]\n"
+        "assert not {'trimesh', 'yourdfpy'} & set(sys.modules)\n"
     )
     run = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr

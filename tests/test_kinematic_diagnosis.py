@@ -13,6 +13,7 @@ import poses
 import pytest
 import test_calibration as tasks
 from generators import postures
+from schema import matches
 
 from figaroh_jax import cli
 from figaroh_jax.effects.kinematic import CATALOGUE
@@ -137,6 +138,7 @@ def test_offsets_are_named_by_the_command_with_the_answer_of_the_contract(folder
     assert cli.main(["diagnose", str(task), "--out", str(out), "--quiet"]) == 0
     assert capsys.readouterr().out.startswith("named")
     answer = json.loads((out / "answer.json").read_text())
+    matches("diagnose", answer)
     assert {(c["effect"], *c["at"]) for c in answer["causes"]} == {("joint_offset", "j3"), ("joint_offset", "j5")}
     for cause, value in zip(answer["causes"], (-0.03, 0.02), strict=True):
         found = cause["parameters"]["offset"]

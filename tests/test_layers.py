@@ -13,18 +13,20 @@ PACKAGE = ROOT / "figaroh_jax"
 MODULES = {".".join(path.relative_to(PACKAGE).with_suffix("").parts): path for path in sorted(PACKAGE.rglob("*.py"))}
 # Only these may touch a file format, a simulator, the terminal or the page.
 OUTSIDE = {
-    "yaml": {"formats.taskfile", "formats.export"},
-    "yourdfpy": {"formats.urdf"},
+    "yaml": {"formats.taskfile", "formats.export", "recordings.migration"},
     "mujoco": {"formats.mjcf"},
     "pinocchio": set(),
-    "pyarrow": {"recordings.tables"},
-    "pydantic": {"formats.config"},
+    "pyarrow": {"recordings.containers"},
+    "h5py": {"recordings.containers"},
+    "rosbags": {"recordings.bags"},
+    "pydantic": {"formats.config", "formats.reference"},
     "rich": {"reporting.terminal"},
     "jinja2": {"reporting.report"},
-    "plotly": {"reporting.report"},
     "jaxopt": {"diagnosis.refit", "estimation.fit"},
     "clarabel": {"estimation.conic"},
     "sklearn": {"estimation.least_squares"},
+    "coal": {"excitation.meshes"},
+    "trimesh": {"formats.collision"},
 }
 
 

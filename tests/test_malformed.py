@@ -23,7 +23,7 @@ from figaroh_jax.formats.mjcf import load_mjcf
 from figaroh_jax.formats.robotfile import load_extended
 from figaroh_jax.formats.taskfile import read_yaml
 from figaroh_jax.formats.urdf import load_urdf
-from figaroh_jax.recordings.tables import read_table
+from figaroh_jax.recordings.reading import read_table
 
 ROOT = Path(__file__).resolve().parents[1]
 MJCF = """<mujoco><worldbody><body name="link" pos="0 0 1"><inertial pos="0 0 .1" mass="1" diaginertia=".1 .1 .1"/>

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import base64
+import importlib.util
 import json
 import re
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from urllib.parse import unquote
 
 import browser
 import fake_diagnosis
 import numpy as np
 import pytest
 
+from figaroh_jax import DEMO
+from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.reporting import report
+from figaroh_jax.reporting.picture import robot_picture
+from figaroh_jax.reporting.provenance import provenance
 from figaroh_jax.reporting.wording import error, interval, phrase, sentence
 from figaroh_jax.results import Diagnosis, Estimate, Gain, Name, Nearest, Part, Rest
 
@@ -62,6 +69,8 @@ def test_sentence_names_nothing_where_nothing_or_no_name_was_found():
         (Estimate(0.5, float("nan"), "s"), "0.5 s"),
         (Estimate(2.5e-9, 1e-10, "rad"), "(2.50 ± 0.20) × 10⁻⁹ rad"),
         (Estimate(3.2e7, 1e6, "N m/rad"), "(3.20 ± 0.20) × 10⁷ N m/rad"),
+        (Estimate(1.5, 1e-9, "rad"), "1.500000 ± 2e−09 rad"),
+        (Estimate(1.5e-6, 1e-14, "s"), "(1.500000 ± 2e−08) × 10⁻⁶ s"),
     ],
 )
 def test_interval_shows_the_digits_that_count(estimate: Estimate, text: str):
@@ -88,7 +97,7 @@ def test_page_escapes_every_name_that_a_user_chooses(tmp_path: Path):
     path = _written(_hostile(), tmp_path, HOSTILE)
     own = _own(path)
     assert "<img" not in own and "{{ 7" in own and "49" not in re.findall(r"<h1.*?</h1>", own)[0]
-    assert own.count("</script>") == 2 and path.read_text("utf-8").count("</script>") == 3
+    assert own.count("</script>") == 4 and path.read_text("utf-8").count("</script>") == 5
 
 
 def test_page_stays_light_beside_the_plotting_library(tmp_path: Path):
@@ -214,8 +223,68 @@ def test_browser_runs_nothing_that_a_name_smuggles_in(tab: browser.Page, tmp_pat
     assert tab.problems == []
 
 
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_axe_finds_no_violation(tab: browser.Page, dark: bool, tmp_path: Path):
+    """Names, contrast, order of headings, nesting: the rules of axe-core; `benchmarks/pages.py` unfolds every plot."""
+    axe = importlib.util.find_spec("axe_core_python")
+    assert axe is not None and axe.submodule_search_locations
+    tab.open(_written(VARIANTS["partly"], tmp_path), *LAPTOP, dark=dark)
+    tab.value("document.querySelectorAll('details.more').forEach((d) => { d.open = true; })")
+    tab.value(Path(axe.submodule_search_locations[0], "axe.min.js").read_text("utf-8") + ";undefined")
+    rules = "{runOnly: ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa', 'best-practice']}"
+    found = tab.value(
+        f"axe.run({{exclude: ['.main-svg']}}, {rules}).then((r) => r.violations.map((v) => v.id + v.nodes[0].html))"
+    )
+    assert found == []
+
+
+def test_browser_zooms_the_plots_beside_the_time_and_gives_the_parameters_as_csv(tab: browser.Page, tmp_path: Path):
+    tab.open(_written(VARIANTS["named"], tmp_path), *LAPTOP)
+    tab.value("document.querySelector('details.joint[open]').scrollIntoView()")
+    tab.wait("document.querySelector('details.joint[data-drawn]') !== null")
+    drawn = "document.querySelector('details.joint[data-drawn]')"
+    tab.value(f"Plotly.relayout({drawn}.querySelector('.tall'), {{'xaxis.range': [1.0, 2.0]}}).then(() => null)")
+    shown = f"{drawn}.querySelector('[data-plot=position]').data[0].y.filter((y) => y !== null).length"
+    tab.wait(f"{shown} < 150")
+    tab.value("HTMLAnchorElement.prototype.click = function () { window.saved = [this.download, this.href]; }")
+    tab.value("document.querySelector('button[data-to=file]').dispatchEvent(new Event('click'))")
+    name, address = tab.value("window.saved")
+    rows = unquote(address).split("utf-8,")[1].splitlines()
+    cause = VARIANTS["named"].causes[0]
+    first, estimate = next(iter(cause.parameters.items()))
+    assert name == "parameters.csv" and rows[0] == "effect,at,parameter,value,std,unit"
+    expected = [cause.name.effect, " ".join(cause.name.at), first, repr(estimate.value), repr(estimate.std)]
+    assert rows[1].split(",")[:5] == expected
+    assert tab.problems == []
+
+
+def test_what_made_a_run_stands_at_the_foot_and_the_page_stays_below_its_size(tmp_path: Path):
+    task = tmp_path / "task.yaml"
+    task.write_text("robot: {}")
+    (tmp_path / "provenance.json").write_text(provenance("diagnose", task, [task], "native"))
+    rng = np.random.default_rng(2)
+    wide = {key: rng.normal(size=(6000, 6)) for key in ("position", "velocity", "before", "after", "measured")}
+    traces = tuple(
+        replace(trace, time=np.arange(6000) * 0.01, shares={}, **wide) for trace in VARIANTS["named"].traces * 8
+    )
+    path = _written(replace(VARIANTS["named"], traces=traces), tmp_path)
+    assert "What made this run" in _own(path) and "sha256" in _own(path)
+    assert path.stat().st_size < 1_500_000
+
+
+def test_a_picture_shows_the_robot_and_names_what_is_affected():
+    model = load_urdf(DEMO)
+    text = robot_picture(model, affected={"elbow"})
+    found = ElementTree.fromstring(text)  # noqa: S314 (the library's own text)
+    assert "affected: elbow" in found.attrib["aria-label"] and len(found.findall("circle")) == len(model.joints)
+    assert [one.text for one in found.findall("text")] == ["elbow"]
+    moved = robot_picture(model, affected=(), nominal=model, magnify=20.0)
+    assert moved.count('class="nominal"') == len(model.joints) + 1
+
+
 def test_browser_prints_every_joint(tab: browser.Page, tmp_path: Path):
     tab.open(_written(VARIANTS["named"], tmp_path), *LAPTOP)
+    tab.wait("window.Plotly !== undefined")
     assert tab.pdf().startswith(b"%PDF")
     assert tab.value("document.querySelectorAll('details.joint[data-drawn]').length") == 6
     assert tab.problems == []

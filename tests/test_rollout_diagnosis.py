@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 from generators import servo_arm
+from schema import matches
 
 from figaroh_jax.cli import main
 from figaroh_jax.errors import InputError
@@ -119,6 +120,7 @@ def test_noise_is_found_under_a_motion_and_a_jump_of_the_clock_is_told():
 def test_diagnose_names_what_is_hidden_and_nothing_else(tmp_path: Path, case: str):
     assert main(["diagnose", str(task(tmp_path, case)), "--out", str(tmp_path / "run"), "--quiet"]) == 0
     answer = json.loads((tmp_path / "run" / "answer.json").read_text())
+    matches("diagnose", answer)
     names = [cause["effect"] for cause in answer["causes"]]
     assert (answer["verdict"], names) == (("nothing", []) if case == "none" else ("named", [case]))
     made = np.load(tmp_path / "run" / "predictions.npz")
@@ -130,6 +132,7 @@ def test_diagnose_names_what_is_hidden_and_nothing_else(tmp_path: Path, case: st
 def test_identify_gives_the_joints_numbers_with_their_intervals(tmp_path: Path):
     assert main(["identify", str(task(tmp_path, "none")), "--out", str(tmp_path / "run"), "--quiet"]) == 0
     result = json.loads((tmp_path / "run" / "result.json").read_text())
+    matches("identify", result)
     for one in result["base_parameters"]:
         truth = {"armature joint": 0.05, "damping joint": 0.4, "friction joint": 0.3}[one["expression"]]
         assert one["status"] == "identified"

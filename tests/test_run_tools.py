@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
-from figaroh_jax import cli
+from figaroh_jax import DEMO, cli
 from figaroh_jax.reporting.provenance import provenance
 from figaroh_jax.reporting.run_directory import MARKER, check_directory, whole_directory
 
@@ -255,3 +258,72 @@ def test_rerun_uses_the_command_and_the_task_of_the_run(tmp_path: Path, monkeypa
     task.unlink()
     with pytest.raises(ValueError, match="not there any more"):
         run_tools.command_of(folder)
+
+
+WORKFLOW = Path(__file__).resolve().parents[1] / "examples" / "github_actions.yml"
+
+
+def steps(folder: Path, *left_out: str) -> dict[str, int]:
+    """Exit status of each step of the example that runs a command, but for those left out."""
+    job = yaml.safe_load(WORKFLOW.read_text(encoding="utf-8"))["jobs"]["verify"]
+    python = folder / "bin"
+    python.mkdir()
+    command = python / "figaroh-jax"
+    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m figaroh_jax "$@"\n')
+    command.chmod(0o755)
+    environment = os.environ | {"PATH": f"{python}{os.pathsep}{os.environ['PATH']}"}
+    found = {}
+    for step in job["steps"]:
+        if "run" in step and step["name"] not in ("install", *left_out):
+            done = subprocess.run(["bash", "-e", "-c", step["run"]], cwd=folder, env=environment, capture_output=True)
+            found[step["name"]] = done.returncode
+    return found
+
+
+def test_the_steps_of_the_ci_example_run_on_finished_runs(tmp_path: Path):
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "robot" / "limits.yaml").write_text("gain: 0.7\n")
+    run(tmp_path / "robot" / "reference", answer=ANSWER)
+    run(tmp_path / "run", answer=ANSWER)
+    assert steps(tmp_path, "diagnose") == {"verify": 0, "compare": 0}
+    assert (tmp_path / "verify.xml").is_file() and "reference" in (tmp_path / "compare.html").read_text()
+
+
+@pytest.mark.slow
+def test_the_steps_of_the_ci_example_run_from_the_recordings(tmp_path: Path):
+    shutil.copytree(DEMO.parent, tmp_path / "robot")
+    (tmp_path / "robot" / "limits.yaml").write_text("verdict: [nothing]\n")
+    run(tmp_path / "robot" / "reference", answer=ANSWER)
+    assert steps(tmp_path) == {"diagnose": 0, "verify": 1, "compare": 0}  # the demo has a cause to be named
+    shown = (tmp_path / "compare.html").read_text()
+    assert "stribeck_friction (shoulder)" in shown
+
+
+def test_a_reader_that_has_gone_changes_no_verdict(tmp_path: Path):
+    folder = run(tmp_path / "run", answer=ANSWER)
+    (tmp_path / "limits.yaml").write_text("gain: 0.9\n")
+    command = [sys.executable, "-m", "figaroh_jax", "verify", str(folder), "--limits", str(tmp_path / "limits.yaml")]
+    out, into = os.pipe()
+    os.close(out)  # nobody reads
+    try:
+        done = subprocess.run(command, stdout=into, stderr=subprocess.PIPE, text=True)
+    finally:
+        os.close(into)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
+def test_no_line_is_longer_than_the_terminal(tmp_path: Path):
+    import pty
+
+    folder = run(tmp_path / "run", answer=ANSWER)
+    command = [sys.executable, "-m", "figaroh_jax", "compare", str(folder), str(folder)]
+    leader, follower = pty.openpty()
+    done = subprocess.run(command, stdout=follower, env=os.environ | {"COLUMNS": "48"})
+    os.close(follower)
+    text = b""
+    with suppress(OSError):  # a terminal that has ended is an error to read
+        while block := os.read(leader, 4096):
+            text += block
+    os.close(leader)
+    assert done.returncode == 0
+    assert max(map(len, text.decode().splitlines())) <= 48 and "torque_offset" in text.decode()

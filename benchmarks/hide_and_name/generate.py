@@ -61,7 +61,7 @@ def wishes(kinds: Sequence[str], clean: int, sizes: Sequence[float] | None = Non
     from generators import CLOSED_LOOP_EFFECTS, EFFECTS, FOREIGN, postures
 
     families = {
-        "inverse": (*EFFECTS, *MORE, *FOREIGN),
+        "inverse": tuple(dict.fromkeys((*EFFECTS, *MORE, *FOREIGN))),
         "closed_loop": CLOSED_LOOP_EFFECTS,
         "kinematic": (*postures.EFFECTS, *postures.FOREIGN),
     }

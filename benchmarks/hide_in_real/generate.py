@@ -42,13 +42,7 @@ def _robot(
     folder: Path, real: RealSet, seed: int, effects: Sequence[str] | None, sizes: Sequence[float]
 ) -> list[dict[str, Any]]:
     """The twin and the cases of one robot."""
-    place = folder / real.name
-    place.mkdir(parents=True, exist_ok=True)
-    (place / "robot.urdf").write_text(real.urdf)
-    for recording in real.recordings:
-        _save(place / f"{recording.name}.npz", recording.arrays)
-    twin = {"name": f"{real.name}/twin", "group": real.name, "task": _task(real), "truth": []}
-    twin["model"] = f"{real.name}/robot.urdf"
+    twin = twin_of(folder, real)
     baseline, scenes = fit(real, [scene_of(real, r) for r in real.recordings])
     cases = [twin]
     for effect in effects or _twelve(real, scenes, seed):
@@ -69,6 +63,17 @@ def _robot(
                 | {"left": shown.left, "sigmas": shown.sigmas, "visible": shown.visible}
             )
     return cases
+
+
+def twin_of(folder: Path, real: RealSet) -> dict[str, Any]:
+    """Write the untouched recordings and the robot; the case that holds them."""
+    place = folder / real.name
+    place.mkdir(parents=True, exist_ok=True)
+    (place / "robot.urdf").write_text(real.urdf)
+    for recording in real.recordings:
+        _save(place / f"{recording.name}.npz", recording.arrays)
+    model = f"{real.name}/robot.urdf"
+    return {"name": f"{real.name}/twin", "group": real.name, "task": _task(real), "truth": [], "model": model}
 
 
 def _save(path: Path, arrays: dict[str, Any]) -> None:

@@ -263,11 +263,14 @@ def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> _Gainin
     """The causes without those that do not lower the error on the data held out.
 
     Each must lower the error of the joints where it acts, for a joint of large torque hides what happens at the
-    others; and that of the robot, as it comes in.
+    others; and that of the robot, as it comes in: by what it gains alone, or else after all the others, for some
+    show only beside another.
     """
     worse: list[Name] = []
+    later: list[Name] = []  # come in behind the others
     while True:
-        order, squares, power = _by_gain(here, joint.causes)
+        order = _by_gain(here, joint.causes, [f.name in later for f in named])
+        squares, power = held_squares(here.problem, here.start, [joint.causes[k] for k in order], here.whitening)
         falls, places = [a - b for a, b in pairwise(squares)], [list(named[k].joints) for k in order]
         own = [f[at].sum() / a[at].sum() for at, f, a in zip(places, falls, squares, strict=False)]
         whole = [f.sum() for f in falls]
@@ -275,22 +278,19 @@ def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> _Gainin
             gains = [float(np.sqrt(s.sum() / power.sum())) for s in squares]
             return _Gaining(named, joint, order, gains, worse)
         least = order[int(np.argmin(own if min(own) <= 0 else whole))]
+        if named[least].name not in later and len(named) > 1:
+            later.append(named[least].name)
+            continue
         worse.append(named[least].name)
         named = [f for k, f in enumerate(named) if k != least]
         joint = polished(here.problem, here.start, [f.effect for f in named], here.whitening)
 
 
-def _by_gain(
-    here: _Setting, causes: Sequence[Effect]
-) -> tuple[list[int], list[Float[np.ndarray, " nv"]], Float[np.ndarray, " nv"]]:
-    """The order of what each cause gains on held-out data as it comes in; squares of the error, and of the torque."""
-    order = list(range(len(causes)))
-    squares, power = held_squares(here.problem, here.start, list(causes), here.whitening)
+def _by_gain(here: _Setting, causes: Sequence[Effect], later: Sequence[bool]) -> list[int]:
+    """The order of what each cause gains on held-out data as it comes in, those that come `later` behind the others."""
+    squares, _ = held_squares(here.problem, here.start, list(causes), here.whitening)
     drops = [float((before - after).sum()) for before, after in pairwise(squares)]
-    ranked = sorted(order, key=lambda k: -drops[k])
-    if ranked != order:
-        squares, power = held_squares(here.problem, here.start, [causes[k] for k in ranked], here.whitening)
-    return ranked, squares, power
+    return sorted(range(len(causes)), key=lambda k: (later[k], -drops[k]))
 
 
 def _left(

@@ -63,9 +63,22 @@ def next_experiment(
     best = max(tried, key=lambda text: tried[text])
     if tried[best] - now < ENOUGH**2:
         wording = find(one.name.effect).separated_by.format(at=" and ".join(one.name.at) or "the robot")
-        return Experiment(f"{wording} (none of the motions simulated on the model distinguishes them)", pairs)
+        said = f"{wording} (none of the motions simulated on the model distinguishes them){_designed(one)}"
+        return Experiment(said, pairs)
     worth = (tried[best] - now) / max(again - now, TINY)
-    return Experiment(f"{best}: as informative as {worth:.2g} more recordings of the current motion", pairs)
+    said = f"{best}: as informative as {worth:.2g} more recordings of the current motion{_designed(one)}"
+    return Experiment(said, pairs)
+
+
+def _designed(one: Found) -> str:
+    """The command that designs a motion for the pair, where such a design knows both causes."""
+    for name in (one.name, *one.ambiguous):
+        effect = find(name.effect)
+        shaped = sum(not parameter.linear for parameter in effect.parameters().values())
+        known = any(effect.has(form) for form in ("torque", "torque_error", "change", "torque_response"))
+        if shaped > 1 or not known:
+            return ""
+    return "; figaroh-jax excite --from RUN_DIR (this run's directory) designs a motion that tells them apart"
 
 
 class _Idea(NamedTuple):

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect
+from ..estimation.rows import Prior
 from ..recordings.stacked import filter_rows, filtered_rows, open_rows
 from ..results import Name
 from .comparison import Ground, Hypothesis, Verdicts, ground, judge, judge_grown, t_value
@@ -21,12 +22,13 @@ from .design import kind, sensor_response, shapes
 from .estimates import Fitted, amplitude_places, torque_slope
 from .flexible import smooth_functions
 from .gates import physical_sign
+from .holdout import residual_rms
 from .joint import Joint
 from .problem import Problem
-from .search import Found, judged_without
+from .search import Found, judged_without, stood_without
 from .shifts import torque_change
 from .state import State, batched
-from .step import Step
+from .step import Step, stand
 from .thresholds import (
     BESIDE_SMOOTH,
     GAIN_NAMED,
@@ -95,10 +97,13 @@ def standings(
     if not found:
         return []
     full, places = joint.step, amplitude_places(joint.step.state, joint.causes, problem.model)
-    grown = _Grown(problem, full, whitening, ground(full.rows, full.verdicts, full.state.prior, full.folded))
+    size = residual_rms(problem, stand(problem, start, whitening).state)
+    grown = _Grown(problem, full, whitening, ground(full.rows, full.verdicts, full.state.prior, full.folded), size)
     out = []
     for one, effect, place, at in zip(found, joint.causes, places, joint.fitted.places, strict=True):
-        without = judged_without(problem, start, full, found, one, whitening)
+        late = kind(effect) == "response"
+        bare = stood_without(problem, start, found, one, whitening) if late else None
+        without = bare.verdicts if bare else judged_without(problem, start, full, found, one, whitening)
         worse, better = (v.own(full.rows, one.joints) for v in (without, full.verdicts))
         whole = effect.acts_on not in ("joint", "pair")
         torque = cause_torque(problem, full.state, effect, place)
@@ -114,7 +119,7 @@ def standings(
                 share=_share_of_torque(problem, full.state, torque, effect),
                 modulation=modulation[0],
                 modulation_held_out=modulation[1],
-                beside_smooth=_beside_smooth(grown, effect, place, one.joints) if whole else 1.0,
+                beside_smooth=_beside_smooth(grown, bare, effect, place, one.joints) if whole else 1.0,
                 inertia_alone=effect.name == "coupled_transmission" and _inertia_alone(effect, joint.fitted, at),
             )
         )
@@ -128,6 +133,7 @@ class _Grown(NamedTuple):
     step: Step
     whitening: Float[np.ndarray, "F nv"]
     base: Ground
+    size: Float[np.ndarray, " nv"]  # RMS of what the model leaves without any cause, N m or N
 
     @property
     def response(self) -> np.ndarray:
@@ -207,34 +213,45 @@ def _varied_robot(grown: _Grown, effect: Effect, torque: np.ndarray) -> Float[np
     return np.stack([rows * time, *alone])
 
 
-def _beside_smooth(grown: _Grown, effect: Effect, place: list[int], joints: tuple[int, ...]) -> float:
-    """Gain of the cause beside smooth functions of each joint's own motion."""
-    problem, step = grown.problem, grown.step
+def _beside_smooth(
+    grown: _Grown, bare: Step | None, effect: Effect, place: list[int], joints: tuple[int, ...]
+) -> float:
+    """Gain of the cause beside smooth functions of each joint's own motion; `bare` is the fit without a late sensor."""
+    step = grown.step
     if kind(effect) == "position":
         return 1.0
-    rows = step.rows
+    within = judge(step.rows, _with_smooth(grown, step))
+    if bare is None:
+        X, prior, _ = _with_smooth(grown, step)
+        fewer = prior._replace(mean=np.delete(prior.mean, place), precision=np.delete(prior.precision, place))
+        without = judge(step.rows, Hypothesis(np.delete(X, place, axis=2), fewer))
+    else:
+        without = judge(bare.rows, _with_smooth(grown, bare))
+    return 1 - float(within.own(step.rows, joints).sum() / max(without.own(step.rows, joints).sum(), 1e-300))
+
+
+def _with_smooth(grown: _Grown, step: Step) -> Hypothesis:
+    """The columns of a fit and smooth functions of each joint's own motion, as its sensors read them.
+
+    Each function is expected to be no larger than what the model leaves without any cause: many free functions of
+    few rows predict the rows left out so badly that nothing could be compared beside them.
+    """
+    problem, whitening, rows = grown.problem, grown.whitening, step.rows
     n, samples, _, nv = problem.records.shape
+    response = whitening * step.state.response(problem.records.omega)[:, None]
     blocks = []
     for joint, functions in enumerate(smooth_functions(step.state.motion)):
-        own = filter_rows(problem.records, functions.reshape(-1, n, samples), grown.response[:, joint][None])
+        own = filter_rows(problem.records, functions.reshape(-1, n, samples), response[:, joint][None])
         own = (own * np.asarray(problem.records.weight)[:, :, joint]).reshape(len(functions), -1)
         full = np.zeros((nv, own.shape[1], len(own)))
         full[joint] = own.T
         blocks.append(full)
-    X = np.concatenate([rows.X, *blocks], axis=2)
-    prior = step.state.prior.extended(X.shape[2] - rows.X.shape[2])
-    if kind(effect) == "response":
-        (name,) = effect.parameters()
-        tangent = torque_slope(problem, step.state, effect, name, grown.whitening)
-        y = rows.y + tangent * float(getattr(effect, name))  # the rows as they are without the cause, to first order
-        without = judge(rows._replace(y=y), Hypothesis(X, prior))
-        X, prior = np.concatenate([X, tangent[..., None]], axis=2), prior.extended(1)
-        within = judge(rows._replace(y=y), Hypothesis(X, prior))
-    else:
-        within = judge(rows, Hypothesis(X, prior))
-        fewer = prior._replace(mean=np.delete(prior.mean, place), precision=np.delete(prior.precision, place))
-        without = judge(rows, Hypothesis(np.delete(X, place, axis=2), fewer))
-    return 1 - float(within.own(rows, joints).sum() / max(without.own(rows, joints).sum(), 1e-300))
+    prior, size = (
+        step.state.prior,
+        np.concatenate([np.full(b.shape[2], s) for b, s in zip(blocks, grown.size, strict=True)]),
+    )
+    more = Prior(np.append(prior.mean, np.zeros(len(size))), np.append(prior.precision, size**-2.0))
+    return Hypothesis(np.concatenate([rows.X, *blocks], axis=2), more)
 
 
 def _inertia_alone(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:

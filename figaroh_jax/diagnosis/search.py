@@ -25,7 +25,7 @@ from .state import State, with_width
 from .step import Step, stand, with_cause, with_causes
 from .thresholds import AGAIN, CONFIDENT, GAIN, MOST_CAUSES, MUCH, OTHER, SMALLEST
 
-__all__ = ["Found", "Search", "eliminate", "find_causes", "judged_without"]
+__all__ = ["Found", "Search", "eliminate", "find_causes", "judged_without", "stood_without"]
 
 NEAR, CLOSER = 4, 800  # times the level: p-values below which few draws cannot tell from it; draws that can
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
@@ -235,9 +235,15 @@ def judged_without(
 ) -> Verdicts:
     """What the data say of all causes but one."""
     if kind(one.effect) != "columns":
-        others = [f.effect for f in found if f is not one]
-        return with_causes(problem, start, others, whitening).verdicts
+        return stood_without(problem, start, found, one, whitening).verdicts
     place = amplitude_places(full.state, [f.effect for f in found], problem.model)[found.index(one)]
     X, prior = np.delete(full.rows.X, place, axis=2), full.state.prior
     fewer = Prior(np.delete(prior.mean, place), np.delete(prior.precision, place))
     return judge(full.rows, Hypothesis(X, fewer))
+
+
+def stood_without(
+    problem: Problem, start: State, found: list[Found], one: Found, whitening: Float[np.ndarray, "F nv"]
+) -> Step:
+    """All causes but one, each as the search found it."""
+    return with_causes(problem, start, [f.effect for f in found if f is not one], whitening)

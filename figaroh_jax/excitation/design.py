@@ -18,16 +18,19 @@ from .information import Learned, learn
 from .limits import ALLOWED, Limits, Torque, Use, checked, limits_of, unmeetable
 from .motions import Basis, Trajectory
 from .objectives import condition_objective, information_objective, prediction_objective, smooth_condition_objective
-from .sampling import Sampler
-from .separation import Causes, Separated, causes, separated, separation_objective
-from .solvers import GramObjective, Problem, solve
+from .sampling import CHUNK, Sampler
+from .separation import Causes, Separated, causes, check_told, separated, separation_objective
+from .solvers import NEAR, GramObjective, Penalty, Problem, solve
 
 __all__ = ["Cause", "Design", "Stage", "best_motion", "excite", "random_motion"]
 
 TIGHTENED = 3  # times that a motion is designed again with a margin
 SCREENED = 8  # random motions, the best of which a start improves
+WAVE, OVER = 8, 4  # samples of a wave, rows of a column: enough to look for a motion, which all samples then improve
+TRIED = 400  # random postures in which a motion may begin
 CHECKED = 8  # motions, the best first, until one is feasible at 1 kHz
 ROUNDING = 1e-6  # of a limit
+CLEAR_RATE = 40.0  # Hz at which a random motion touches nothing: what begins on the wrong side of a body stays there
 STEP = 0.98  # by which a motion is made smaller until it meets its limits
 
 Objective = Literal["information", "prediction", "condition", "separate"]
@@ -48,7 +51,7 @@ class Stage:
     @property
     def met(self) -> bool:
         """Whether every limit is met at 1 kHz, within a thousandth."""
-        return all(use.share <= 1.0 + ALLOWED for use in self.uses)
+        return all(use.met for use in self.uses)
 
 
 @dataclass(frozen=True)
@@ -133,10 +136,12 @@ def excite(
         before = learned
         given = None
         if separate:
-            given = causes(learned, separate, _typical(learned, sampler, basis, limits, begin, rate), trust)
+            usual = _typical(learned, sampler, basis, limits, begin, rate)
+            given = causes(learned, separate, np.stack(usual.states(rate)), trust)
+            check_told(given, _shown(learned, given, usual, limits, rate))
         elif objective == "separate":
             raise InputError("objective: separate needs pairs of causes (`separate`)")
-        seen = None if given is None else np.zeros((len(given.columns),) * 2)
+        seen = None if given is None else np.zeros((len(given.columns) + len(given.shifts),) * 2)
         for k in range(trajectories):
             own = _objectives(objective, np.asarray(before.prior), wanted, given, seen)
             generator = np.random.default_rng([seed, k])
@@ -144,10 +149,12 @@ def excite(
             def told(share: float, k: int = k) -> None:
                 progress(f"trajectory {k + 1} of {trajectories}", (k + share) / trajectories)
 
-            rows = (given.sampler, given.columns) if given is not None and objective == "separate" else (sampler, None)
+            rows = (sampler, None, ())
+            if given is not None and objective == "separate":
+                rows = (given.sampler, given.columns, given.shifts)
             stage = best_motion(torque, before, rows, own, basis, limits, begin, starts, rate, generator, told)
             if given is not None and seen is not None:
-                seen = seen + gram_of(before, given.sampler, stage.motion.states(rate), given.columns)
+                seen = seen + _shown(before, given, stage.motion, limits, rate)
             before = before.with_prior(gram_of(before, sampler, stage.motion.states(rate)))
             stages.append(replace(stage, logdet=float(np.linalg.slogdet(np.asarray(before.prior))[1])))
         gram = np.asarray(before.prior) - np.asarray(learned.prior)
@@ -189,14 +196,25 @@ def _among(effect: Effect, terms: Sequence[Effect]) -> bool:
     return any(np.array_equal(np.asarray(effect.at), at) for at in same)
 
 
+def _shown(learned: Learned, given: Causes, motion: Trajectory, limits: Limits, rate: float) -> np.ndarray:
+    """Gram matrix of what is learned and of the causes in a motion."""
+
+    def nothing(G: np.ndarray) -> tuple[float, np.ndarray]:
+        return 0.0, G
+
+    kept = (given.columns, motion.basis, limits, None, rate)
+    problem = Problem(learned, given.sampler, nothing, *kept, shifts=given.shifts)
+    return problem.gram(given.sampler.rows(problem.states(problem.numbers(motion))))[1]
+
+
 def _typical(
     learned: Learned, sampler: Sampler, basis: Basis, limits: Limits, start: np.ndarray | None, rate: float
-) -> Float[np.ndarray, "3 samples nv"]:
-    """States of a random motion within the limits."""
+) -> Trajectory:
+    """A random motion within the limits."""
     kept = np.array(learned.independent)
     objective = information_objective(np.asarray(learned.prior))
     problem = Problem(learned, sampler, objective, kept, basis, limits, start, rate)
-    return problem.states(random_motion(problem, np.random.default_rng(0)))
+    return problem.trajectory(random_motion(problem, np.random.default_rng(0)))
 
 
 def _inside(robot: RobotModel, start: np.ndarray, limits: Limits) -> np.ndarray:
@@ -205,6 +223,16 @@ def _inside(robot: RobotModel, start: np.ndarray, limits: Limits) -> np.ndarray:
     for name, x, (low, high) in zip(robot.dof_names, start, limits.position, strict=True):
         if not low <= x <= high:
             raise InputError(f"start: '{name}' at {x:g} is outside of its limits {low:g} to {high:g}")
+    clearance = limits.clearance
+    if clearance is not None and clearance.rows.names:
+        near = clearance.distances(start[None])[0]
+        row = int(near.argmin())
+        if near[row] < clearance.margin:
+            what = "overlap by" if near[row] < 0 else "are apart by only"
+            raise InputError(
+                f"start: {clearance.name(row)} {what} {abs(near[row]):.3f} m (by the capsules around their shapes);"
+                f" limits.clearance is {clearance.margin:g} m: begin elsewhere"
+            )
     return start
 
 
@@ -223,29 +251,62 @@ def _objectives(
     wanted: np.ndarray | None,
     given: Causes | None,
     seen: np.ndarray | None,
-) -> tuple[GramObjective, ...]:
-    """One after another; all but the last are steps on the way."""
+) -> tuple[tuple[GramObjective, ...], ...]:
+    """Ways to a motion, which starts take in turn: objectives one after another, the last is the one that counts."""
     if callable(objective):
-        return (objective,)
+        return ((objective,),)
     if objective == "information":
-        return (information_objective(prior),)
+        return ((information_objective(prior),),)
     if objective == "prediction":
         assert wanted is not None
-        return (prediction_objective(prior, wanted),)
+        own = prediction_objective(prior, wanted)
+        return (information_objective(prior), own), (own,)
     if objective == "separate":
         assert given is not None and seen is not None
-        own = separation_objective(given, np.asarray(given.prior))
-        return (lambda G: own(G + seen),)
-    return smooth_condition_objective(), condition_objective()
+        apart = separation_objective(given, np.asarray(given.prior))
+
+        def told(G: np.ndarray) -> tuple[float, np.ndarray]:
+            return apart(G + seen)
+
+        return (_leading(information_objective(np.asarray(given.prior)), given.learned), told), (told,)
+    return ((smooth_condition_objective(), condition_objective()),)
+
+
+def _leading(objective: GramObjective, size: int) -> GramObjective:
+    """The objective of the first columns, those of what is learned, in a Gram matrix of more."""
+
+    def own(G: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = objective(G[:size, :size])
+        return value, np.pad(slope, (0, len(G) - size))
+
+    return own
+
+
+def _free_start(limits: Limits, nv: int, generator: np.random.Generator) -> Float[np.ndarray, " nv"]:
+    """A random posture in the middle half of the range, clear of everything where that is asked for."""
+    reach = np.where(np.isfinite(limits.reach), limits.reach, np.pi)
+    clearance = limits.clearance
+    if clearance is None or not _distances_count(limits):
+        return limits.middle + 0.5 * reach * generator.uniform(-1, 1, nv)
+    tried = limits.middle + 0.5 * reach * generator.uniform(-1, 1, (TRIED, nv))
+    near = clearance.distances(tried)
+    clear = np.flatnonzero(near.min(axis=1) >= clearance.margin)
+    if len(clear):
+        return tried[clear[0]]
+    best = int(near.min(axis=1).argmax())
+    raise InputError(
+        f"limits.clearance: none of {TRIED} postures keeps {clearance.margin:g} m; in the best of them"
+        f" {clearance.name(int(near[best].argmin()))} are {near[best].min():.3f} m apart. Lower the margin, or give a"
+        " start and narrower limits.position"
+    )
 
 
 def random_motion(problem: Problem, generator: np.random.Generator, amplitude: float = 0.9) -> Float[np.ndarray, " n"]:
     """Numbers of a random motion that keeps its limits of position, velocity and acceleration."""
     limits, nv = problem.limits, problem.nv
-    reach = np.where(np.isfinite(limits.reach), limits.reach, np.pi)
     start = problem.start
     if start is None:
-        start = limits.middle + 0.5 * reach * generator.uniform(-1, 1, nv)
+        start = _free_start(limits, nv, generator)
     weights = generator.standard_normal((nv, problem.basis.size))
     motion = Trajectory(start, weights, problem.basis)
     x = problem.numbers(motion)
@@ -257,15 +318,24 @@ def random_motion(problem: Problem, generator: np.random.Generator, amplitude: f
         with np.errstate(divide="ignore", invalid="ignore"):
             room = np.where(moved > 0, 1 - still[kind], 1 + still[kind]) / np.abs(moved)
         scale = np.minimum(scale, np.nanmin(np.where(np.abs(moved) > 0, room, np.inf), axis=0))
-    scale = np.where(np.isfinite(scale), scale, 1.0)
-    return problem.numbers(Trajectory(start, weights * (amplitude * scale)[:, None], problem.basis))
+    scale = amplitude * np.where(np.isfinite(scale), scale, 1.0)
+    for smaller in (1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1) if _distances_count(limits) else ():
+        motion = Trajectory(start, weights * (smaller * scale)[:, None], problem.basis)
+        assert limits.clearance is not None
+        if (limits.clearance.distances(np.asarray(motion.states(CLEAR_RATE)[0])) > 0).all():
+            return problem.numbers(motion)
+    return problem.numbers(Trajectory(start, weights * scale[:, None], problem.basis))
+
+
+def _distances_count(limits: Limits) -> bool:
+    return limits.clearance is not None and bool(limits.clearance.rows.names)
 
 
 def best_motion(
     torque: Torque,
     learned: Learned,
-    rows: tuple[Sampler, np.ndarray | None],
-    objectives: Sequence[GramObjective],
+    rows: tuple[Sampler, np.ndarray | None, tuple[float, ...]],
+    ways: Sequence[Sequence[GramObjective]],
     basis: Basis,
     limits: Limits,
     start: np.ndarray | None,
@@ -275,42 +345,64 @@ def best_motion(
     progress: Callable[[float], None] = lambda share: None,
 ) -> Stage:
     """The best of several random motions after each was improved; feasible at 1 kHz where that is possible at all."""
-    sampler, columns = rows
+    sampler, columns, shifts = rows
     columns = np.array(learned.independent) if columns is None else columns
-    problems = [Problem(learned, sampler, one, columns, basis, limits, start, rate) for one in objectives]
-    final = problems[-1]
-    found: list[tuple[float, np.ndarray]] = []
+    kept = (columns, basis, limits, start, rate)
+    final = Problem(learned, sampler, ways[0][-1], *kept, shifts=shifts)
+    few = _few_samples(final)
+    made = [[Problem(learned, sampler, one, *kept, shifts=shifts, samples=few) for one in way] for way in ways]
+    found: list[tuple[float, np.ndarray, Penalty]] = []
     for k in range(starts):
         progress(k / starts)
+        problems, penalty = made[k % len(made)], Penalty()
         x = min((random_motion(final, generator) for _ in range(SCREENED)), key=problems[0].value)
         for problem in problems:
-            x = solve(problem, x)
-        found.append((final.value(x), x))
-    reached = tuple(value for value, _ in found)
+            penalty = Penalty()
+            x = solve(problem, x, penalty)
+        found.append((problems[-1].value(x), x, penalty))
+    reached = tuple(value for value, _, _ in found)
     tried: list[tuple[bool, float, Trajectory, tuple[Use, ...]]] = []
-    for _, x in sorted(found, key=lambda one: one[0])[:CHECKED]:
-        motion, uses = _feasible(torque, final, x)
-        met = all(use.share <= 1.0 + ALLOWED for use in uses)
+    for _, x, penalty in sorted(found, key=lambda one: one[0])[:CHECKED]:
+        x = x if few is None else solve(final, x, penalty)
+        motion, uses = _feasible(torque, final, x, penalty)
+        met = all(use.met for use in uses)
         tried.append((not met, final.value(final.numbers(motion)), motion, uses))
         if met:
             break
     _, _, motion, uses = min(tried, key=lambda one: one[:2])
-    return Stage(motion, uses, np.nan, reached, sum(problem.evaluations for problem in problems))
+    evaluations = sum(problem.evaluations for way in (*made, [final]) for problem in way)
+    return Stage(motion, uses, np.nan, reached, evaluations)
 
 
-def _feasible(torque: Torque, problem: Problem, x: Float[np.ndarray, " n"]) -> tuple[Trajectory, tuple[Use, ...]]:
+def _few_samples(problem: Problem) -> int | None:
+    """Samples that show what a motion tells nearly as well as all do, whole chunks of them; None: all are needed."""
+    every = problem.count
+    few = CHUNK * int(np.ceil(WAVE * problem.basis.waves / CHUNK))
+    enough = few * problem.nv >= OVER * len(problem.columns)
+    return few if enough and few <= 0.7 * every else None
+
+
+def _feasible(
+    torque: Torque, problem: Problem, x: Float[np.ndarray, " n"], penalty: Penalty
+) -> tuple[Trajectory, tuple[Use, ...]]:
     """The motion of x, designed again with margins for what it exceeds at 1 kHz, at last made a little smaller."""
-    margin: dict[str, float] = {}
+    margin = penalty.margin
     motion = problem.trajectory(x)
-    uses = checked(torque, problem.learned.robot, motion, problem.limits)
+    uses = checked(torque, problem.learned.robot, motion, problem.limits, meshes=False)
     for _ in range(TIGHTENED):
-        over = {use.kind: use.share - 1.0 for use in uses if use.share > 1.0}
+        over = {use.kind: _excess(use) for use in uses if use.share > 1.0}
         if max(over.values(), default=0.0) < ALLOWED:
             break
         margin = {kind: margin.get(kind, 0.0) + 1.2 * over.get(kind, 0.0) for kind in {*margin, *over}}
-        motion = problem.trajectory(solve(problem, problem.numbers(motion), margin))
-        uses = checked(torque, problem.learned.robot, motion, problem.limits)
+        penalty.margin = margin
+        motion = problem.trajectory(solve(problem, problem.numbers(motion), penalty))
+        uses = checked(torque, problem.learned.robot, motion, problem.limits, meshes=False)
     return _smaller(torque, problem, motion, uses)
+
+
+def _excess(use: Use) -> float:
+    """What exceeds a limit, in the unit of the rows of the solver."""
+    return (use.limit - use.value) / NEAR if use.kind == "clearance" else use.share - 1.0
 
 
 def _smaller(
@@ -322,8 +414,8 @@ def _smaller(
     for _ in range(100):
         worst = max((use.share for use in uses), default=0.0)
         if worst <= 1.0 + ROUNDING:
-            return motion, uses
+            return motion, checked(torque, problem.learned.robot, motion, limits)
         shrink = max(STEP, 1.0 / worst) if worst < 1.02 else STEP
         motion = Trajectory(start, np.asarray(motion.weights) * shrink, motion.basis)
-        uses = checked(torque, problem.learned.robot, motion, limits)
+        uses = checked(torque, problem.learned.robot, motion, limits, meshes=False)
     return first

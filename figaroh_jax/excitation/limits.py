@@ -1,7 +1,7 @@
 """Limits of a motion: what the model and the task give, as rows of an optimiser, and the check at 1 kHz.
 
 A row is the share of its limit that a motion uses, less one: position from the middle of its range in half ranges,
-velocity, acceleration and torque in their limits. Zero or less is allowed.
+velocity, acceleration and torque in their limits, of distances what is missing of the margin. Zero or less is allowed.
 """
 
 from __future__ import annotations
@@ -15,13 +15,16 @@ from jaxtyping import Float
 
 from ..errors import InputError, nearest
 from ..rigid.model import RobotModel
+from .clearance import Clearance
 from .motions import Trajectory
 
-__all__ = ["KINDS", "CHECK_RATE", "Limits", "Torque", "Use", "checked", "limits_of", "unmeetable"]
+__all__ = ["ALLOWED", "CHECK_RATE", "KINDS", "Limits", "Torque", "Use", "checked", "limits_of", "unmeetable"]
 
 KINDS = ("position", "velocity", "acceleration", "torque")
 CHECK_RATE = 1000.0  # Hz
 ALLOWED = 1e-3  # of a limit: what may be exceeded at 1 kHz
+_EXACT = 20  # samples of 1 kHz between two at which meshes are looked at
+_SKIPPED = 10  # samples of 1 kHz, between two that are always looked at
 _POSTURES = 512  # at which the torque of standing still is looked at
 
 # torques (samples, nv) of states (3, samples, nv)
@@ -37,6 +40,7 @@ class Limits:
     velocity: Float[np.ndarray, " nv"]
     acceleration: Float[np.ndarray, " nv"]
     torque: Float[np.ndarray, " nv"]  # N m or N
+    clearance: Clearance | None = None  # distances between bodies
 
     @property
     def middle(self) -> Float[np.ndarray, " nv"]:
@@ -60,11 +64,16 @@ class Use:
     """The largest share of a limit that a motion uses, and where."""
 
     kind: str
-    joint: str
-    share: float  # 1: the limit
+    joint: str  # of distances: the two bodies
+    share: float  # 1: the limit; of distances the margin by the distance, and more where it is less than the margin
     time: float  # s
     value: float  # rad, rad/s, rad/s^2, N m (m, N)
     limit: float
+
+    @property
+    def met(self) -> bool:
+        """Whether the limit is met within a thousandth."""
+        return self.share <= 1.0 + ALLOWED
 
 
 def limits_of(
@@ -74,9 +83,12 @@ def limits_of(
     acceleration: Given = None,
     torque: Given = "model",
     *,
+    clearance: Clearance | None = None,
     scale: float = 1.0,
 ) -> Limits:
     """Limits of the model or stated ones (a number, or a map by joint; None: none), all times `scale`.
+
+    `clearance`: distances between bodies, as `clearance_of` has them.
 
     Raises `InputError` where a joint is not there, or a limit leaves no room.
     """
@@ -96,7 +108,7 @@ def limits_of(
     middle, half = span.sum(axis=1, keepdims=True) / 2, np.diff(span) / 2
     with np.errstate(invalid="ignore"):
         scaled = np.where(np.isfinite(span), middle + np.array([-1.0, 1.0]) * half * scale, span)
-    return Limits(scaled, *(given[kind] * scale for kind in KINDS[1:]))
+    return Limits(scaled, **{kind: given[kind] * scale for kind in KINDS[1:]}, clearance=clearance)
 
 
 def _by_joint(robot: RobotModel, kind: str, given: Any, own: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
@@ -148,22 +160,87 @@ def unmeetable(torque: Torque, robot: RobotModel, limits: Limits, seed: int = 0)
     )
 
 
-def checked(torque: Torque, robot: RobotModel, motion: Trajectory, limits: Limits) -> tuple[Use, ...]:
-    """The largest use of each limit at 1 kHz; `torque` gives that of states (3, samples, nv), N m or N."""
+def checked(
+    torque: Torque, robot: RobotModel, motion: Trajectory, limits: Limits, *, meshes: bool = True
+) -> tuple[Use, ...]:
+    """The largest use of each limit at 1 kHz; `torque` gives that of states (3, samples, nv), N m or N.
+
+    Torques and distances are looked at 100 times a second, and at 1 kHz wherever what lies between two of these
+    instants could be larger than the largest of them. `meshes`: pairs of bodies that are left to their meshes too.
+    """
     time = motion.basis.instants(CHECK_RATE)
-    q, v, a = (np.asarray(x) for x in motion.at(time))
-    values = {"position": q - limits.middle, "velocity": v, "acceleration": a}
-    if np.isfinite(limits.torque).any():
-        values["torque"] = torque(np.stack([q, v, a]))
+    states = np.stack([np.asarray(x) for x in motion.at(time)])
     uses = []
-    for kind, moved in values.items():
-        limit = limits.of(kind)
-        if not np.isfinite(limit).any():
-            continue
-        share = np.abs(moved) / limit
-        at, joint = (int(k) for k in np.unravel_index(int(np.argmax(share)), share.shape))
-        real = (q if kind == "position" else moved)[at, joint]
-        bound = limits.position[joint, int(moved[at, joint] > 0)] if kind == "position" else limit[joint]
-        name = robot.dof_names[joint]
-        uses.append(Use(kind, name, float(share[at, joint]), float(time[at]), float(real), float(bound)))
+    for kind, moved in zip(KINDS, (states[0] - limits.middle, states[1], states[2]), strict=False):
+        if np.isfinite(limits.of(kind)).any():
+            shares, at = np.abs(moved) / limits.of(kind), np.arange(len(time))
+            uses.append(_largest(kind, robot, limits, shares, time[at], states[0] if kind == "position" else moved))
+    if np.isfinite(limits.torque).any():
+        tau, at = _looked(lambda k: torque(states[:, k]), lambda x: np.abs(x) / limits.torque, len(time))
+        uses.append(_largest("torque", robot, limits, np.abs(tau) / limits.torque, time[at], tau))
+    if limits.clearance is not None:
+        uses += _distances(limits.clearance, states[0], time, meshes)
     return tuple(uses)
+
+
+def _largest(
+    kind: str, robot: RobotModel, limits: Limits, share: np.ndarray, time: np.ndarray, values: np.ndarray
+) -> Use:
+    at, joint = (int(k) for k in np.unravel_index(int(np.argmax(share)), share.shape))
+    real = float(values[at, joint])
+    middle = float(limits.middle[joint])
+    bound = limits.position[joint, int(real > middle)] if kind == "position" else limits.of(kind)[joint]
+    return Use(kind, robot.dof_names[joint], float(share[at, joint]), float(time[at]), real, float(bound))
+
+
+def _looked(
+    values: Callable[[np.ndarray], np.ndarray], size: Callable[[np.ndarray], np.ndarray], count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values at every tenth sample, and at those between where the size could exceed the largest; and the samples."""
+    coarse = np.unique(np.append(np.arange(0, count, _SKIPPED), count - 1))
+    first = values(coarse)
+    shares = size(first)
+    change = np.abs(np.diff(shares, axis=0))
+    around = np.maximum(np.maximum(change, np.roll(change, 1, 0)), np.roll(change, -1, 0))
+    could = np.maximum(shares[:-1], shares[1:]) + around >= shares.max() - 1e-12
+    between = [np.arange(coarse[k] + 1, coarse[k + 1]) for k in np.flatnonzero(could.any(axis=1))]
+    fine = np.concatenate([np.zeros(0, int), *between])
+    if not len(fine):
+        return first, coarse
+    return np.concatenate([first, values(fine)]), np.concatenate([coarse, fine])
+
+
+def _distances(clearance: Clearance, q: Float[np.ndarray, "samples nv"], time: np.ndarray, meshes: bool) -> list[Use]:
+    """The nearest two bodies: by their capsules, and by their meshes where these are counted on."""
+    margin, rows, uses = clearance.margin, clearance.rows, []
+    if rows.names:
+        near, at = _looked(lambda k: clearance.distances(q[k]), lambda d: -d, len(time))
+        s, row = (int(k) for k in np.unravel_index(int(np.argmin(near)), near.shape))
+        uses.append(_nearness(clearance.name(row), float(near[s, row]), float(time[at[s]]), margin))
+    if not meshes:
+        return uses
+    for pair, some in [*_unsure(clearance, q), *((p, np.arange(0, len(q), _EXACT)) for p in clearance.exact)]:
+        exact = clearance.exact_distances(q[some], [pair])
+        assert exact is not None, "meshes are counted on where they can be looked at alone"
+        s, name = int(np.argmin(exact)), " - ".join(clearance.links[k].name for k in pair)
+        uses.append(_nearness(f"{name} (meshes)", float(exact[s, 0]), float(time[some[s]]), margin))
+    return uses
+
+
+def _unsure(clearance: Clearance, q: Float[np.ndarray, "samples nv"]) -> list[tuple[tuple[int, int], np.ndarray]]:
+    """Pairs whose capsules alone do not keep the margin, and the samples at which they do not (100 a second)."""
+    rows, out = clearance.rows, []
+    if not len(rows.slack) or not rows.slack.any():
+        return out
+    some = np.arange(0, len(q), _SKIPPED)
+    own = clearance.distances(q[some])[:, : len(rows.slack)] - rows.slack
+    for k, pair in enumerate(clearance.pairs):
+        near = (own[:, rows.pair == k] < clearance.margin).any(axis=1)
+        out += [(pair, some[near])] if near.any() and rows.slack[rows.pair == k].any() else []
+    return out
+
+
+def _nearness(bodies: str, distance: float, time: float, margin: float) -> Use:
+    """How much of a margin two bodies use: the margin by their distance, with the same slope below the margin."""
+    share = margin / distance if distance >= margin else 2.0 - distance / margin
+    return Use("clearance", bodies, share, time, distance, margin)

@@ -41,6 +41,11 @@ class Basis(NamedTuple):
         """Numbers of one joint beside the posture in which it begins."""
         return {"fourier": 2 * self.number - 2, "spline": self.number, "quintic": self.number - 1}[self.kind]
 
+    @property
+    def waves(self) -> float:
+        """Waves of the fastest function in a motion."""
+        return self.number * self.base * self.duration if self.kind == "fourier" else self.number / 2
+
     def at(self, time: Float[ArrayLike, " samples"]) -> Float[np.ndarray, "3 samples size"]:
         """Position, velocity and acceleration of each function at the times (s)."""
         functions, scale = _scaled(self)

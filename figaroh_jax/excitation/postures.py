@@ -28,10 +28,12 @@ from ..recordings.arrays import postures as recorded
 from ..rigid.chain import chain_between
 from ..rigid.kinematics import forward_kinematics
 from ..rigid.model import RobotModel
+from .clearance import Clearance, link_poses
 
 __all__ = [
     "Instrument",
     "PostureDesign",
+    "View",
     "certified_bound",
     "choose",
     "excite_postures",
@@ -45,10 +47,47 @@ ACCURACY = (1e-4, 1e-3)  # m, rad
 STEP = 1e-5  # rad or m, of the differences between exact Jacobians
 PIECE = 128  # postures of a program, few enough to be compiled quickly
 _RIDGE = 1e-9
-_SWEEPS, _ASCENTS, _MOVES = 20, 300, 60
+_SWEEPS, _ASCENTS, _MOVES = 20, 300, 40
+_DRAWN = 200_000  # random postures at the most, until enough candidates are seen and clear
+_BATCH = 4_000
+_NEARBY = 0.15  # of the range of a joint: where further candidates are looked for once some are known
+_INSIDE = 0.01  # of a cosine, 1 cm or 1 mm: what moving postures keep from the edge of what is allowed
+_WALL = 300.0  # weight of what postures violate while they move
 _GAIN = 1e-9  # of the log determinant, below which nothing is exchanged
 
 Level = Literal["frames", "joint_offset", "full"]
+
+
+@dataclass(frozen=True)
+class View:
+    """What a device can see of its target (a board, a reflector), all of it in the base frame, m and rad.
+
+    `mount` "world": the device stands at `place` and looks along `axis` (None: around itself); the target is the tool
+    frame, whose z axis points to the device within `tilt`. "hand": the device is the tool frame and looks along its z
+    axis; the target is at `place`, and `axis` is its normal.
+    """
+
+    place: tuple[float, float, float]
+    axis: tuple[float, float, float] | None = None
+    mount: Literal["hand", "world"] = "world"
+    cone: float = 0.5  # half angle of what the device sees
+    tilt: float = 1.0  # largest angle between the target's normal and the line of sight
+    near: float = 0.1
+    far: float = 10.0
+
+    def room(self, tool: Float[np.ndarray, "postures 4 4"]) -> Float[np.ndarray, "postures 4"]:
+        """What is left of cone, tilt (cosines) and distances (m); below zero where the target is not seen."""
+        place, z = np.array(self.place), tool[:, :3, 2]
+        way = place - tool[:, :3, 3]
+        length = np.maximum(np.linalg.norm(way, axis=1), 1e-9)
+        sight = way / length[:, None]  # from the tool to the place
+        along = np.ones(len(tool))  # cosine at the place
+        if self.axis is not None:
+            along = -(sight @ (np.array(self.axis) / np.linalg.norm(self.axis)))
+        at_tool = (sight * z).sum(1)
+        device, target = (at_tool, along) if self.mount == "hand" else (along, at_tool)
+        inside = np.stack([device - np.cos(self.cone), target - np.cos(self.tilt)], 1)
+        return np.column_stack([inside, length - self.near, self.far - length])
 
 
 @dataclass(frozen=True)
@@ -60,6 +99,7 @@ class Instrument:
     tool_frame: str
     unknown: tuple[str, ...] = ("base_frame", "tool_frame")
     accuracy: tuple[float, float] = ACCURACY  # one sigma, m and rad
+    view: View | None = None  # None: everything is seen
 
 
 class _Parameter(NamedTuple):
@@ -180,19 +220,23 @@ def excite_postures(
     candidates: int = 500,
     level: Level = "full",
     position_limit: Float[np.ndarray, "nv 2"] | None = None,
+    clearance: Clearance | None = None,
     polish: bool = True,
     seed: int = 0,
     progress: Callable[[str, float], None] = lambda phase, share: None,
 ) -> PostureDesign:
     """The `count` postures that tell most of a robot's kinematics (`level`) by what the instrument measures.
 
-    Candidates are random within the joint limits (`position_limit`, default the model's; a turn where it has none).
+    Candidates are random within the joint limits (`position_limit`, default the model's; a turn where it has none),
+    seen by the device (`instrument.view`) and clear of all that `clearance` keeps apart.
     Raises `InputError` where frames are not there, and where so few postures cannot tell all that can be told.
     """
     limits = np.array(model.position_limit if position_limit is None else position_limit, float)
     limits = np.where(np.isfinite(limits), limits, [-np.pi, np.pi])
     generator = np.random.default_rng(seed)
-    q = generator.uniform(limits[:, 0], limits[:, 1], (candidates, model.nv))
+    allowed = _Allowed(model, instrument, clearance)
+    q = allowed.candidates(limits, candidates, count, generator)
+    candidates = len(q)
     progress("rows of the candidates", 0.05)
     calibrated = _Calibrated(model, instrument, level, q)
     J = calibrated.rows(q)
@@ -216,7 +260,7 @@ def excite_postures(
     position = q[chosen]
     if polish:
         progress("moving the postures", 0.7)
-        position = _moved(calibrated, position, limits, size)
+        position = _moved(calibrated, position, limits, size, allowed)
     final = calibrated.rows(position)
     position = position[in_order(position, np.asarray(model.velocity_limit, float))]
     spread = np.linalg.inv(_information(final / size)) / np.outer(size, size)
@@ -327,28 +371,108 @@ def _capped(w: Float[np.ndarray, " n"], count: int) -> Float[np.ndarray, " n"]:
     return np.minimum(w, 1.0)
 
 
+class _Allowed:
+    """Which postures are seen and clear, and what is missing where they are not."""
+
+    def __init__(self, model: RobotModel, instrument: Instrument, clearance: Clearance | None) -> None:
+        self.model, self.instrument, self.clearance = model, instrument, clearance
+        self.frames = [model.frame_index(name) for name in (instrument.base_frame, instrument.tool_frame)]
+        self.free = instrument.view is None and clearance is None
+
+    def room(self, q: Float[np.ndarray, "postures nv"]) -> Float[np.ndarray, "postures k"]:
+        """Below zero where a posture is not allowed: of the view (cosines, m), then of the clearance (0.1 m)."""
+        parts = [np.ones((len(q), 1))]
+        if self.instrument.view is not None:
+            poses = np.moveaxis(link_poses(self.model, q), 3, 0)
+            world = np.concatenate([np.broadcast_to(np.eye(4), (len(q), 1, 4, 4)), poses], axis=1)
+            frames = self.model.frames
+            base, tool = (
+                world[:, frames[k].parent + 1] @ np.asarray(self.model.frame_placement)[k] for k in self.frames
+            )
+            parts.append(self.instrument.view.room(np.linalg.solve(base, tool)))
+        if self.clearance is not None:
+            parts.append((self.clearance.distances(q) - self.clearance.margin) / 0.1)
+        return np.concatenate(parts, axis=1)
+
+    def met(self, q: Float[np.ndarray, "postures nv"]) -> np.ndarray:
+        """Which postures are seen and clear; by the meshes too where these are counted on."""
+        good = np.asarray((self.room(q) >= 0).all(axis=1))
+        clearance = self.clearance
+        if clearance is None or clearance.mesh_distance is None or not good.any():
+            return good
+        unsure = [p for p, s in zip(clearance.pairs, clearance.slack, strict=True) if s > 0] + list(clearance.exact)
+        if unsure:
+            near = clearance.exact_distances(q[good], unsure)
+            assert near is not None
+            good[good] = (near >= clearance.margin).all(axis=1)
+        return good
+
+    def candidates(
+        self, limits: Float[np.ndarray, "nv 2"], wanted: int, least: int, generator: np.random.Generator
+    ) -> Float[np.ndarray, "candidates nv"]:
+        """Random postures; where few of them are allowed, others near those that are."""
+        if self.free:
+            return generator.uniform(limits[:, 0], limits[:, 1], (wanted, self.model.nv))
+        found, drawn, best = np.zeros((0, self.model.nv)), 0, -np.inf
+        while len(found) < wanted and drawn < _DRAWN:
+            some = generator.uniform(limits[:, 0], limits[:, 1], (_BATCH, self.model.nv))
+            if len(found) >= 10 and len(found) < wanted * drawn / _DRAWN * 4:  # too seldom: look beside those known
+                near = found[generator.integers(len(found), size=_BATCH)]
+                some = near + _NEARBY * np.diff(limits)[:, 0] * generator.standard_normal(near.shape)
+                some = np.clip(some, limits[:, 0], limits[:, 1])
+            room = self.room(some)
+            best = max(best, float(np.median(room.min(axis=1))))
+            found, drawn = np.concatenate([found, some[(room >= 0).all(axis=1)]]), drawn + _BATCH
+        found = found[:wanted]
+        found = found[self.met(found)]
+        if len(found) < max(least, 2):
+            raise InputError(
+                f"excite: {len(found)} of {drawn} random postures are seen by the device and clear, {least} are needed;"
+                " widen the view (cone, tilt, near, far), bring its place into reach, or lower limits.clearance"
+            )
+        return found
+
+
 def _moved(
-    calibrated: _Calibrated, position: np.ndarray, limits: Float[np.ndarray, "nv 2"], size: Float[np.ndarray, " p"]
+    calibrated: _Calibrated,
+    position: np.ndarray,
+    limits: Float[np.ndarray, "nv 2"],
+    size: Float[np.ndarray, " p"],
+    allowed: _Allowed,
 ) -> Float[np.ndarray, "postures nv"]:
-    """Postures moved within the joint limits to where they tell most together."""
+    """Postures moved within the joint limits to where they tell most together, and back where that is not allowed."""
     from scipy.optimize import minimize  # slow to import
 
     count, nv = position.shape
-    ways = np.concatenate([np.zeros((1, nv)), STEP * np.eye(nv), -STEP * np.eye(nv)])
+    ways = np.concatenate([np.zeros((1, nv)), STEP * np.eye(nv)])
 
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-        q = x.reshape(count, nv)
-        J = calibrated.rows((q[None] + ways[:, None]).reshape(-1, nv)) / size
+        around = (x.reshape(count, nv)[None] + ways[:, None]).reshape(-1, nv)
+        J = calibrated.rows(around) / size
         J = J.reshape(len(ways), count, *J.shape[1:])
         information = _information(J[0])
         half = np.linalg.solve(information, J[0].reshape(-1, J.shape[3]).T).T.reshape(J.shape[1:])
-        slope = np.einsum("dcrp,crp->cd", J[1 : 1 + nv] - J[1 + nv :], half) / STEP
-        return -float(np.linalg.slogdet(information)[1]), -slope.ravel()
+        slope = -2 * np.einsum("dcrp,crp->cd", J[1:] - J[0], half) / STEP
+        value = -float(np.linalg.slogdet(information)[1])
+        if not allowed.free:
+            beyond = np.minimum(allowed.room(around).reshape(len(ways), count, -1) - _INSIDE, 0.0)
+            walls = _WALL * (beyond**2).sum(axis=2)
+            value, slope = value + float(walls[0].sum()), slope + (walls[1:] - walls[0]).T / STEP
+        return value, slope.ravel()
 
     box = np.tile(limits, (count, 1))
-    options = {"maxiter": _MOVES, "maxcor": 20}
+    options = {"maxiter": _MOVES, "maxcor": 20, "ftol": 1e-6}
     found = minimize(objective, position.ravel(), jac=True, method="L-BFGS-B", bounds=box, options=options)
-    return found.x.reshape(count, nv)
+    moved = found.x.reshape(count, nv)
+    if allowed.free:
+        return moved
+    for share in (1.0, 0.9, 0.7, 0.4, 0.0):  # back towards the candidate, which is allowed
+        tried = position + share * (moved - position)
+        good = allowed.met(tried) if share else np.ones(count, bool)
+        position, moved = np.where(good[:, None], tried, position), np.where(good[:, None], tried, moved)
+        if good.all():
+            break
+    return position
 
 
 def in_order(

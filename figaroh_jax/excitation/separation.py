@@ -4,14 +4,20 @@ With X the weighted rows of what is fitted anyway (prior $M_0$), $z$ the torque 
 of its rival at the point g of the rival's shapes, what no fit of the rival makes up for is
 $$T_g = \min_{\theta, b} |z - X \theta - Z_g b|^2 + \theta' M_0 \theta = u' (G + M_0) u, \quad u = (-\theta, -b, 1)$$
 in the Gram matrix G of all these columns, so its gradient by G is $u u'$. A design makes the smallest T of all pairs,
-both ways, large; $t = \sqrt T$ is the separation in standard deviations, and n repeats give $\sqrt n \, t$.
+both ways (but for a link as the true cause, of which only a guess could be told), large;
+$t = \sqrt T$ is the separation in standard deviations, and n repeats give $\sqrt n \, t$.
+
+A cause that changes the torque in time (a delay, a lag: a response $H(\omega)$) is written as torques of some moments
+before, $\sum_k w_k \tau(t - s_k) \approx H \tau$, by least squares of $\sum w_k e^{-i \omega s_k} - H(\omega)$ over
+the frequencies of motions; the columns are then $\tau(t - s_k)$, of the model as it stands.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -23,13 +29,17 @@ from .information import Learned
 from .sampling import Sampler
 from .solvers import GramObjective
 
-__all__ = ["ENOUGH", "Causes", "Pair", "Separated", "causes", "separated", "separation_objective"]
+__all__ = ["ENOUGH", "Causes", "Pair", "Separated", "causes", "check_told", "separated", "separation_objective"]
 
 ENOUGH = 4.0  # standard deviations at which a name is sure
 LOUD = 2.0  # times the noise: RMS torque of a cause whose size is not given
 LINK = 0.2  # share by which a link's inertia is taken to be wrong
 LOOSE = 5.0  # times the stated trust, of a link that is a cause itself
 SHARPNESS = 8.0  # of the soft minimum over rivals
+SHIFTS = (0.0, 0.012, 0.025, 0.04, 0.06)  # s before, whose torques delays and lags are made of
+FASTEST = 8.0  # Hz up to which they are
+AROUND = 3.0  # times a delay or lag, up and down, that its rival may have
+NOTHING = 1e-8  # share of the squares of a cause's torque
 _RIDGE = 1e-10
 
 
@@ -54,13 +64,13 @@ class Separated:
 
 @dataclass(frozen=True)
 class _Case:
-    """Columns of one fit of a rival to a true cause."""
+    """Combinations of the columns in one fit of a rival to a true cause."""
 
     pair: int
-    truth: np.ndarray  # columns of the true cause
-    size: np.ndarray  # amplitudes
-    rival: np.ndarray
-    precision: np.ndarray  # prior of the rival's columns
+    truth: np.ndarray  # (n,) torque of the true cause, less that of a rival that has no amplitude
+    rival: np.ndarray  # (n, k) columns of the rival
+    precision: np.ndarray  # (k,) prior of the rival
+    counts: bool = True  # in a design; how a link is wrong, and by how much, nobody knows beforehand
 
 
 @dataclass(frozen=True)
@@ -70,6 +80,7 @@ class Causes:
     pairs: tuple[Pair, ...]
     sizes: tuple[dict[str, float], ...]
     columns: np.ndarray  # of the sampler: what is learned first
+    shifts: tuple[float, ...]  # s: torques of so long before follow as further columns
     learned: int
     cases: tuple[_Case, ...]
     sampler: Sampler
@@ -87,6 +98,15 @@ class _Cause:
         shapes = [name for name, p in kind.parameters().items() if not p.linear]
         if len(shapes) > 1:
             raise InputError(f"separate: '{effect.name}' has several shapes, which no design searches yet")
+        self.response, self.inertial = effect.has("torque_response"), kind.inertial
+        if self.response and shapes and not self.linear:
+            points = np.array(kind.parameters()[shapes[0]].grid, float)
+            true = float(size.get(shapes[0], points[len(points) // 2]))
+            some = true * np.geomspace(1 / AROUND, AROUND, 15)  # what a rival may be: it has no amplitude of its own
+            self.weights = np.stack([_weights(effect, shapes[0], x) for x in (*some, true)])
+            self.blocks, self.truth, self.size = [np.zeros(0, int)] * len(some), np.zeros(0, int), np.zeros(0)
+            self.precision, self.told = np.zeros(0), {shapes[0]: true}
+            return
         if not self.linear or not (effect.has("torque") or effect.has("torque_error") or effect.has("change")):
             raise InputError(f"separate: '{effect.name}' has no torque of an instant in which a size is linear")
         self.precision = np.zeros(len(self.linear))
@@ -112,6 +132,16 @@ class _Cause:
         self.blocks, self.truth = every[: self.grid], every[-1]
         self.size = np.array([size.get(name, np.nan) for name in self.linear])
         self.told = {name: float(values[-1]) for name in shapes}
+
+    def combined(self, columns: np.ndarray, late: int, point: int, size: np.ndarray | None) -> np.ndarray:
+        """Combinations (n, k) of the sampler's columns and so many late torques; of a given size one alone."""
+        out = np.zeros((len(columns) + late, 1 if self.response else len(self.truth)))
+        if self.response:
+            out[len(columns) :, 0] = self.weights[point]
+            return out
+        block = self.truth if point < 0 else self.blocks[point]
+        out[[int(np.flatnonzero(columns == c)[0]) for c in block], np.arange(len(block))] = 1.0
+        return out if size is None else (out @ size)[:, None]
 
     @property
     def width(self) -> int:
@@ -159,42 +189,48 @@ def _arranged(
     sampler: Sampler,
     rows: np.ndarray,
 ) -> Causes:
-    kept = list(learned.independent)
-    others: list[int] = []
+    every = [int(c) for both in sides for side in both for block in (side.truth, *side.blocks) for c in block]
+    columns = np.array([*learned.independent, *dict.fromkeys(c for c in every if c not in learned.independent)])
+    shifts = SHIFTS if any(side.response for both in sides for side in both) else ()
     pairs, sizes, cases = [], [], []
     for both, names in zip(sides, titles, strict=True):
         for k in (0, 1):
             truth, rival = both[k], both[1 - k]
-            size = _loud(truth, rows)
+            size = _loud(truth, names[k], rows)
             told = truth.told | (dict(zip(truth.linear, size.tolist(), strict=True)) if truth.term is not None else {})
             pairs.append(Pair(names[k], names[1 - k]))
             sizes.append(told)
-            for block in rival.blocks:
-                cases.append(_Case(len(pairs) - 1, truth.truth, size, block, rival.precision))
-                others += [*truth.truth.tolist(), *block.tolist()]
-    columns = np.array([*kept, *dict.fromkeys(others)])
-    behind = {int(column): k + len(kept) for k, column in enumerate(columns[len(kept) :])}
-    local = tuple(
-        _Case(
-            c.pair,
-            np.array([behind[int(x)] for x in c.truth]),
-            c.size,
-            np.array([behind[int(x)] for x in c.rival]),
-            c.precision,
-        )
-        for c in cases
-    )
-    return Causes(tuple(pairs), tuple(sizes), columns, len(kept), local, sampler, np.asarray(learned.prior))
+            z = truth.combined(columns, len(shifts), -1, size)[:, 0]
+            for point in range(len(rival.blocks)):
+                R, left = rival.combined(columns, len(shifts), point, None), z
+                if rival.response:
+                    R, left = R[:, :0], z - R[:, 0]
+                counts = not truth.inertial or rival.inertial
+                cases.append(_Case(len(pairs) - 1, left, R, rival.precision, counts))
+    first = len(learned.independent)
+    return Causes(tuple(pairs), tuple(sizes), columns, shifts, first, tuple(cases), sampler, np.asarray(learned.prior))
 
 
-def _loud(cause: _Cause, rows: Float[np.ndarray, "nv columns samples"]) -> Float[np.ndarray, " amplitudes"]:
+def _weights(effect: Effect, name: str, value: float) -> Float[np.ndarray, " shifts"]:
+    """Of the torques of the moments before, what a response adds to the torque."""
+    omega = 2 * np.pi * np.linspace(0.0, FASTEST, 60)
+    changed = type(effect)(effect.at, **{name: value})
+    wanted = np.asarray(changed.torque_response(jnp.asarray(omega)), complex) - 1.0
+    turned = np.outer(omega, SHIFTS)
+    tall = np.concatenate([np.cos(turned), -np.sin(turned)])
+    return np.linalg.lstsq(tall, np.concatenate([np.real(wanted), np.imag(wanted)]), rcond=None)[0]
+
+
+def _loud(cause: _Cause, name: str, rows: Float[np.ndarray, "nv columns samples"]) -> Float[np.ndarray, " amplitudes"]:
     """Sizes of the cause; those not given make a torque of twice the noise where it acts."""
-    if np.isfinite(cause.size).all():
-        return cause.size
     own = rows[:, cause.truth]
     rms = np.sqrt((own**2).mean(axis=2).max(axis=0))
+    if len(rms) and not (rms > 0).any():
+        raise InputError(f"separate: no motion shows {name}: it makes no torque within these limits")
+    if np.isfinite(cause.size).all():
+        return cause.size
     if not (rms > 0).all():
-        raise InputError("separate: no motion shows a cause at its place: it has no torque there")
+        raise InputError(f"separate: no motion shows all parameters of {name}: give their sizes")
     return np.where(np.isfinite(cause.size), cause.size, LOUD / rms)
 
 
@@ -204,27 +240,38 @@ def _fits(
     """T of each case, and u with T = u' G u + theta' M0 theta."""
     p, T, U = given.learned, [], []
     for case in given.cases:
-        z = np.zeros(len(G))
-        z[case.truth] = case.size
-        fitted = np.concatenate([np.arange(p), case.rival])
-        M = G[np.ix_(fitted, fitted)].copy()
-        M[:p, :p] += prior
-        M[np.arange(p, len(fitted)), np.arange(p, len(fitted))] += case.precision
+        z, R = case.truth, case.rival
+        GR, Gz = G @ R, G @ z
+        M = np.block([[G[:p, :p] + prior, GR[:p]], [GR[:p].T, R.T @ GR + np.diag(case.precision)]])
         scale = np.sqrt(np.maximum(np.diag(M), np.finfo(float).tiny))
-        c = G[fitted] @ z
+        c = np.concatenate([Gz[:p], R.T @ Gz])
         fit = np.linalg.solve(M / np.outer(scale, scale) + _RIDGE * np.eye(len(M)), c / scale) / scale
-        u = z.copy()
-        u[fitted] -= fit
-        T.append(max(float(z @ G @ z - c @ fit), np.finfo(float).tiny))
+        u = z - R @ fit[p:]
+        u[:p] -= fit[:p]
+        T.append(max(float(z @ Gz - c @ fit), np.finfo(float).tiny))
         U.append(u)
     return np.array(T), np.array(U)
+
+
+def check_told(given: Causes, G: Float[np.ndarray, "n n"]) -> None:
+    """Refuse causes that what is fitted anyway, or the rival, makes up for in whatever motion (G: of a usual one)."""
+    T, _ = _fits(G, given, given.prior)
+    for case, t in zip(given.cases, T, strict=True):
+        if t < NOTHING * float(case.truth @ G @ case.truth):
+            pair = given.pairs[case.pair]
+            raise InputError(
+                f"separate: no motion tells {pair.truth} from {pair.rival}: what is fitted anyway (`baseline`) and the"
+                " rival make the same torques; leave one of them out of the baseline, or another pair"
+            )
 
 
 def separation_objective(given: Causes, prior: Float[np.ndarray, "p p"]) -> GramObjective:
     """Less the logarithm of the smallest separation of all pairs, softly; in a design it is made small."""
 
+    wanted = replace(given, cases=tuple(case for case in given.cases if case.counts))
+
     def objective(G: Float[np.ndarray, "n n"]) -> tuple[float, Float[np.ndarray, "n n"]]:
-        T, U = _fits(G, given, prior)
+        T, U = _fits(G, wanted, prior)
         logs = -SHARPNESS * np.log(T)
         share = np.exp(logs - logs.max())
         value = (np.log(share.sum()) + logs.max()) / (2 * SHARPNESS)

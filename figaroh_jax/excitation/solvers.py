@@ -26,7 +26,9 @@ GramObjective = Callable[[Float[np.ndarray, "n n"]], tuple[float, Float[np.ndarr
 
 FEW_ROWS = 600  # linear rows that SLSQP takes
 OUTER, INNER = 8, 40
+AGAIN = 4  # outer steps from multipliers that are nearly right
 PENALTY, GROWTH = 10.0, 3.0
+NEAR = 0.05  # m: a distance that misses its margin by this violates it as much as a whole limit
 CLOSE = 2e-3  # of a limit, at the samples of the design
 
 
@@ -40,6 +42,7 @@ class _Seen:
     own: np.ndarray
     by_gram: np.ndarray
     by_torque: np.ndarray | None = None
+    by_position: np.ndarray | None = None  # of the distances
     slope: np.ndarray | float = 0.0
 
 
@@ -58,13 +61,20 @@ class Problem:
     limits: Limits
     start: Float[np.ndarray, " nv"] | None  # None: free
     rate: float = 20.0  # Hz, of the rows
+    shifts: tuple[float, ...] = ()  # s: torques of so long before are further columns
+    samples: int | None = None  # at which these many are evaluated, each for several; None: at all
     evaluations: int = 0
     _seen: _Seen | None = None
 
     def __post_init__(self) -> None:
-        self.matrix = self.basis.at(self.basis.instants(self.rate))
+        every = self.basis.instants(self.rate)
+        count = len(every) if self.samples is None else self.samples
+        times = every if self.samples is None else (np.arange(count) + 0.5) / count * self.basis.duration
+        self.count = count
+        late = [np.maximum(times - shift, 0.0) for shift in self.shifts if shift > 0]
+        self.matrix = self.basis.at(np.concatenate([times, *late]))
         self.nv = self.learned.robot.nv
-        self.root = np.sqrt(np.asarray(self.learned.weight))
+        self.root = np.sqrt(np.asarray(self.learned.weight) * len(every) / count)
         first, *others = self.basis.peaks(self.rate)
         peaks = (first if self.start is not None else np.append(0.0, first), *others)
         self.rows = [
@@ -101,8 +111,13 @@ class Problem:
         return weights if self.start is not None else np.concatenate([by_states[0].sum(0), weights])
 
     def gram(self, rows: Float[np.ndarray, "nv columns samples"]) -> tuple[np.ndarray, np.ndarray]:
-        """Weighted rows of the columns that count, and their Gram matrix."""
-        own = rows[:, self.columns] * self.root[:, None, None]
+        """Weighted rows of the columns that count (then late torques), and their Gram matrix."""
+        own = rows[:, self.columns, : self.count]
+        if self.shifts:
+            torque = np.asarray(self.learned.theta) @ rows[:, : len(self.learned.theta)]
+            late = torque.reshape(self.nv, len(self.shifts), self.count)
+            own = np.concatenate([own, late], axis=1)
+        own = own * self.root[:, None, None]
         flat = own.swapaxes(0, 1).reshape(own.shape[1], -1)
         return own, flat @ flat.T
 
@@ -123,6 +138,11 @@ class Problem:
         value, by_gram = self.objective(gram)
         self._seen = _Seen(x.copy(), states, rows.shape, own, by_gram)
         if penalty is not None:
+            if self.limits.clearance is not None:
+                distance, back = self.limits.clearance.with_gradient(states[0, : self.count])
+                more, slope = penalty.one_sided("clearance", (self.limits.clearance.margin - distance) / NEAR)
+                value += more
+                self._seen.by_position = back(-slope / NEAR)
             if self.torque:
                 torque = (np.asarray(self.learned.theta) @ rows[:, : len(self.learned.theta)]).T
                 more, self._seen.by_torque = penalty.of("torque", torque / self.limits.torque)
@@ -138,11 +158,19 @@ class Problem:
         seen = self._seen
         assert seen is not None
         cotangent = np.zeros(seen.shape)
-        cotangent[:, self.columns] = 2.0 * self.root[:, None, None] * (seen.by_gram @ seen.own)
+        by_rows = 2.0 * self.root[:, None, None] * (seen.by_gram @ seen.own)
+        cotangent[:, self.columns, : self.count] = by_rows[:, : len(self.columns)]
+        if self.shifts:
+            theta = np.asarray(self.learned.theta)
+            late = by_rows[:, len(self.columns) :].reshape(self.nv, 1, -1)
+            cotangent[:, : len(theta)] += late * theta[:, None]
         if seen.by_torque is not None:
             theta = np.asarray(self.learned.theta)
             cotangent[:, : len(theta)] += (seen.by_torque / self.limits.torque).T[:, None] * theta[:, None]
-        return self.to_numbers(self.sampler.back(seen.states, cotangent)) + seen.slope
+        by_states = self.sampler.back(seen.states, cotangent)
+        if seen.by_position is not None:
+            by_states[0, : self.count] += seen.by_position
+        return self.to_numbers(by_states) + seen.slope
 
     def forget(self) -> None:
         """The multipliers have changed, and with them the value at every point."""
@@ -195,18 +223,32 @@ class Problem:
 class Penalty:
     """Multipliers of all rows, both signs, and the margin that each kind keeps."""
 
-    def __init__(self, margin: dict[str, float]) -> None:
-        self.mu, self.margin = PENALTY, margin
+    def __init__(self, margin: dict[str, float] | None = None) -> None:
+        self.mu, self.margin, self.warm = PENALTY, margin or {}, False
         self.multipliers: dict[str, np.ndarray] = {}
         self.violation: dict[str, np.ndarray] = {}
+
+    def one_sided(self, kind: str, excess: Float[np.ndarray, "rows k"]) -> tuple[float, Float[np.ndarray, "rows k"]]:
+        """Value and gradient by what exceeds a bound."""
+        beyond = excess + self.margin.get(kind, 0.0)
+        self.violation[kind] = beyond
+        lam = self._of(kind, beyond)
+        push = np.maximum(0.0, lam + self.mu * beyond)
+        return float(((push**2).sum() - (lam**2).sum()) / (2 * self.mu)), push
 
     def of(self, kind: str, share: Float[np.ndarray, "rows nv"]) -> tuple[float, Float[np.ndarray, "rows nv"]]:
         """Value and gradient by the shares."""
         both = np.stack([share, -share]) - (1.0 - self.margin.get(kind, 0.0))
         self.violation[kind] = both
-        lam = self.multipliers.setdefault(kind, np.zeros_like(both))
+        lam = self._of(kind, both)
         push = np.maximum(0.0, lam + self.mu * both)
         return float(((push**2).sum() - (lam**2).sum()) / (2 * self.mu)), push[0] - push[1]
+
+    def _of(self, kind: str, like: np.ndarray) -> np.ndarray:
+        """Multipliers of a kind; none yet where they were those of fewer samples."""
+        if kind not in self.multipliers or self.multipliers[kind].shape != like.shape:
+            self.multipliers[kind] = np.zeros_like(like)
+        return self.multipliers[kind]
 
     def step(self) -> float:
         """Multipliers of the point last seen; the largest violation there."""
@@ -216,21 +258,35 @@ class Penalty:
 
 
 def solve(
-    problem: Problem, x: Float[np.ndarray, " n"], margin: dict[str, float] | None = None, *, iterations: int = 200
+    problem: Problem, x: Float[np.ndarray, " n"], penalty: Penalty | None = None, *, iterations: int = 200
 ) -> Float[np.ndarray, " n"]:
-    """The numbers of the best motion found from x, within the limits at the samples of the design."""
-    A, b = problem.linear_matrix(margin or {})
-    if len(b) <= FEW_ROWS:
+    """The numbers of the best motion found from x, within the limits at the samples of the design.
+
+    `penalty` holds the margins to be kept; one that has served already (for fewer samples or smaller margins) is where
+    the multipliers begin, and is changed.
+    """
+    penalty = Penalty() if penalty is None else penalty
+    A, b = problem.linear_matrix(penalty.margin)
+    if len(b) <= FEW_ROWS and not penalty.warm:
         found = _sequential(problem, x, A, b, iterations)
-        if not problem.torque or _torque_share(problem, found) <= 1.0 - (margin or {}).get("torque", 0.0):
+        if _meets_the_rest(problem, found, penalty.margin):
             return found
         x = found
-    return _augmented(problem, x, margin or {})
+    return _augmented(problem, x, penalty)
 
 
-def _torque_share(problem: Problem, x: np.ndarray) -> float:
-    torque = problem.sampler.torque(problem.states(x), np.asarray(problem.learned.theta))
-    return float((np.abs(torque) / problem.limits.torque).max())
+def _meets_the_rest(problem: Problem, x: np.ndarray, margin: dict[str, float]) -> bool:
+    """Whether torques and distances keep their limits, which SLSQP was not told."""
+    states, clearance = problem.states(x), problem.limits.clearance
+    if clearance is not None and clearance.rows.names:
+        if clearance.distances(states[0, : problem.count]).min() < clearance.margin + NEAR * margin.get(
+            "clearance", 0.0
+        ):
+            return False
+    if not problem.torque:
+        return True
+    torque = problem.sampler.torque(states, np.asarray(problem.learned.theta))
+    return bool((np.abs(torque) / problem.limits.torque).max() <= 1.0 - margin.get("torque", 0.0))
 
 
 def _sequential(problem: Problem, x: np.ndarray, A: np.ndarray, b: np.ndarray, iterations: int) -> np.ndarray:
@@ -242,19 +298,25 @@ def _sequential(problem: Problem, x: np.ndarray, A: np.ndarray, b: np.ndarray, i
     return minimize(problem.value, x, jac=problem.slope, method="SLSQP", constraints=kept, options=options).x
 
 
-def _augmented(problem: Problem, x: np.ndarray, margin: dict[str, float]) -> np.ndarray:
+def _augmented(problem: Problem, x: np.ndarray, penalty: Penalty) -> np.ndarray:
     from scipy.optimize import minimize  # slow to import
 
-    penalty, before = Penalty(margin), np.inf
+    before, again, stuck = np.inf, penalty.warm, 0
     options = {"maxiter": INNER, "maxcor": 20}
-    for outer in range(OUTER):
+    for outer in range(AGAIN if again else OUTER):
         problem.forget()
         x = minimize(problem.lagrangian, x, args=(penalty,), jac=problem.gradient, method="L-BFGS-B", options=options).x
         problem.lagrangian(x, penalty)  # the rows of the point itself
         worst = penalty.step()
-        if worst < CLOSE and outer >= 2:
+        if worst < CLOSE and (again or outer >= 2):
+            break
+        stuck = stuck + 1 if worst > 0.9 * before else 0
+        if stuck >= 2 and not again:  # between samples something is in the way: more of them show it
+            penalty.multipliers.clear()
+            penalty.mu = PENALTY * GROWTH
             break
         if worst > 0.5 * before:
             penalty.mu *= GROWTH
         before = worst
+    penalty.warm = True
     return x

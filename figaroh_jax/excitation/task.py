@@ -13,16 +13,17 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
-from ..recordings.tables import read_table
+from ..recordings.reading import read_table
 from ..rigid.model import RobotModel
+from .clearance import Box, Capsule, Clearance, clearance_of
 from .design import Cause, Design, excite
 from .information import Learned, learn
 from .limits import limits_of
 from .motions import Basis, fourier, quintic, spline
-from .postures import ACCURACY, Instrument, PostureDesign, excite_postures
+from .postures import ACCURACY, Instrument, PostureDesign, View, excite_postures
 
 if TYPE_CHECKING:
-    from ..formats.config import Baseline, Excite, SizedEffect, Task
+    from ..formats.config import Baseline, Excite, Sight, SizedEffect, Task
 
 __all__ = ["excite_task"]
 
@@ -56,10 +57,13 @@ def excite_task(
     model, (known, notes) = load_extended(task.robot.model, **robot_options(task.robot)).model, stated_baseline(task)
     basis = basis_of(asked)
     bounds = asked.limits
-    limits = limits_of(model.robot, bounds.position, bounds.velocity, bounds.acceleration, bounds.torque)
+    clearance, around = clearance_asked(task, asked, model.robot)
+    limits = limits_of(
+        model.robot, bounds.position, bounds.velocity, bounds.acceleration, bounds.torque, clearance=clearance
+    )
     noise = DEFAULT_NOISE if asked.noise is None else asked.noise
     learned = learn(model, known, noise=noise, trust=task.robot.trust)
-    said = [*notes]
+    said = [*notes, *around]
     if task.data:
         progress("what the recordings tell", 0.0)
         learned, texts = with_recordings(task, model.robot, known, learned, asked.noise is None)
@@ -82,6 +86,28 @@ def excite_task(
         progress=progress,
     )
     return replace(found, notes=(*said, *found.notes))
+
+
+def clearance_asked(task: Task, asked: Excite, robot: RobotModel) -> tuple[Clearance | None, tuple[str, ...]]:
+    """The distances that a task asks for, and what is to be said of them."""
+    from ..formats.collision import read_shapes
+
+    margin = asked.limits.clearance
+    if margin is None:
+        return None, ("no limits.clearance is given: distances between bodies are not looked at",)
+    shapes, notes = read_shapes(task.robot.model)
+    limits = limits_of(robot, asked.limits.position)
+    found = clearance_of(
+        robot,
+        shapes,
+        margin=margin,
+        bodies=[Capsule(one.link, one.at, one.to or one.at, one.radius) for one in asked.bodies],
+        floor=asked.floor,
+        boxes=[Box(one.name, one.size, one.at, one.turn) for one in asked.boxes],
+        ignore=asked.ignore,
+        position=limits.position,
+    )
+    return found, (*notes, *found.notes)
 
 
 def told(one: SizedEffect) -> Cause:
@@ -122,7 +148,9 @@ def _postures(task: Task, asked: Excite, robot: RobotModel, progress: Callable[[
         measurement.tool_frame,
         tuple(measurement.unknown),
         (place or ACCURACY[0], turn or ACCURACY[1]),
+        _view(asked.view, measurement.mount if measurement.kind == "camera" else "world"),
     )
+    clearance, said = clearance_asked(task, asked, robot)
     limits = limits_of(robot, asked.limits.position)
     found = excite_postures(
         robot,
@@ -130,12 +158,21 @@ def _postures(task: Task, asked: Excite, robot: RobotModel, progress: Callable[[
         count=asked.postures,
         candidates=asked.candidates,
         position_limit=limits.position,
+        clearance=clearance,
         progress=progress,
     )
-    said = ["neither collisions nor what the device can see from its place are looked at: check each posture before"]
+    if asked.view is None:
+        said = (*said, "no view is given: what the device can see from its place is not looked at")
     if place is None:
-        said.append(f"no accuracy is given: {1e3 * ACCURACY[0]:g} mm and {1e3 * ACCURACY[1]:g} mrad are taken")
+        said = (*said, f"no accuracy is given: {1e3 * ACCURACY[0]:g} mm and {1e3 * ACCURACY[1]:g} mrad are taken")
     return replace(found, notes=(*said, *found.notes))
+
+
+def _view(given: Sight | None, mount: str | None) -> View | None:
+    if given is None:
+        return None
+    hand = "hand" if mount == "hand" else "world"
+    return View(given.place, given.axis, hand, given.cone, given.tilt, given.near, given.far)
 
 
 def basis_of(asked: Excite) -> Basis:

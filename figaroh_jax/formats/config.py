@@ -148,7 +148,7 @@ class Units(_Keys):
     time: Literal["s", "ms", "us", "ns"] = "s"
     position: Literal["rad", "deg", "m", "mm"] = "rad"
     velocity: Literal["rad/s", "deg/s", "m/s", "mm/s"] | None = None  # None: as the position
-    torque: Literal["N m", "Nm", "N", "A"] = "N m"
+    torque: Literal["N m", "Nm", "N", "A", "mA", "%"] = "N m"  # A, mA, %: transmission.torque is N m an A, N m a %
     measurement: Literal["m", "mm"] = "m"
 
 
@@ -196,10 +196,24 @@ class Measurement(_Keys):
         return self
 
 
+_LOGS: dict[str, dict[str, Any]] = {  # what the columns of a robot's own log are
+    "rtde": {
+        "time": "timestamp",
+        "position": "actual_q",
+        "torque": "actual_current",
+        "units": {"torque": "A"},
+    },
+    "libfranka": {"time": "time", "position": "q", "torque": "tau_J", "units": {"time": "ms"}},
+}
+
+
 class RecordingEntry(_Keys):
     """One recording: a file and the names of its arrays or columns."""
 
     file: Path
+    format: Literal["rtde", "libfranka"] | None = None  # a robot's own log: its columns are known by name
+    topic: str | None = None  # of a ROS bag or an MCAP file; None: the one topic of joints
+    episode: Annotated[int, Field(ge=0)] | None = None  # of a LeRobot folder
     position: Columns
     time: str | None = None  # s
     rate: Positive | None = None  # Hz
@@ -211,6 +225,28 @@ class RecordingEntry(_Keys):
     role: Literal["fit", "holdout"] = "fit"
     units: Units = Units()
     measurement: Measurement | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _columns_of_logs(cls, value: Any) -> Any:
+        known = _LOGS.get(str(value.get("format"))) if isinstance(value, dict) else None
+        if known is None:
+            return value
+        own = {key: name for key, name in known.items() if key != "time" or "rate" not in value}
+        if "torque" in value and isinstance(own.get("units"), dict):
+            own["units"] = {key: unit for key, unit in own["units"].items() if key != "torque"}
+        units = value.get("units", {})
+        return own | value | ({"units": own["units"] | units} if isinstance(units, dict) else {})
+
+    @property
+    def place(self) -> Path:
+        """The file, or the episode in it, by which messages name the recording."""
+        return self.file if self.episode is None else self.file / f"episode_{self.episode}"
+
+    @property
+    def name(self) -> str:
+        """By which predictions name the recording."""
+        return self.file.stem if self.episode is None else f"{self.file.name}_episode_{self.episode}"
 
     @model_validator(mode="after")
     def _one_clock(self) -> RecordingEntry:
@@ -379,17 +415,36 @@ class MotionLimits(_Keys):
     velocity: Literal["model"] | Positive | dict[str, Positive] = "model"
     acceleration: Positive | dict[str, Positive] | None = None  # rad/s^2 or m/s^2; None: no limit
     torque: Literal["model"] | Positive | dict[str, Positive] = "model"  # N m or N
-    clearance: Positive | None = None  # m
+    clearance: Positive | None = None  # m, between bodies that no joint joins, the floor, boxes; None: not looked at
 
-    @field_validator("clearance")
-    @classmethod
-    def _no_distances(cls, value: float | None) -> float | None:
-        if value is not None:
-            raise ValueError(
-                "distances between bodies are not looked at by this version; leave it out, narrow limits.position to"
-                " where the robot is clear, and check the trajectory in your simulator before it is run"
-            )
-        return value
+
+class Body(_Keys):
+    """A capsule or a sphere on a link, in the place of its collision shapes."""
+
+    link: str  # or any frame of the model
+    at: Vector = (0.0, 0.0, 0.0)  # m, in that frame: the middle of a sphere, one end of a capsule's axis
+    to: Vector | None = None  # the other end
+    radius: Positive  # m
+
+
+class Obstacle(_Keys):
+    """A box that stands in the world."""
+
+    name: str
+    size: tuple[Positive, Positive, Positive]  # edges, m
+    at: Vector  # its middle, m
+    turn: Vector = (0.0, 0.0, 0.0)  # roll, pitch, yaw, rad
+
+
+class Sight(_Keys):
+    """What the device of postures can see, in its base frame."""
+
+    place: Vector  # m: of a fixed device, or of the board that a device in the hand looks at
+    axis: Vector | None = None  # its line of sight, or the board's normal; None: any direction
+    cone: Annotated[Positive, Field(le=3.15)] = 0.5  # rad, half angle of what the device sees
+    tilt: Annotated[Positive, Field(le=3.15)] = 1.0  # rad, between the target's normal and the line of sight
+    near: Positive = 0.1  # m
+    far: Positive = 10.0
 
 
 class SizedEffect(_Keys):
@@ -418,9 +473,17 @@ class Excite(_Keys):
     postures: Annotated[int, Field(ge=2, le=1000)] = 30
     candidates: Annotated[int, Field(ge=10, le=20_000)] = 500  # random postures to choose from
     measurement: Measurement | None = None  # of postures: the device; None: that of the recordings
+    view: Sight | None = None  # of postures: what the device sees; None: everything
+    floor: Number | None = None  # its height in the world, m
+    boxes: tuple[Obstacle, ...] = ()
+    bodies: tuple[Body, ...] = ()  # for links without collision shapes, or in the place of theirs
+    ignore: tuple[tuple[str, str], ...] = ()  # pairs of bodies whose distance is not looked at
 
     @model_validator(mode="after")
     def _complete(self) -> Excite:
+        around = [name for name in ("floor", "boxes", "bodies", "ignore") if name in self.model_fields_set]
+        if around and self.limits.clearance is None:
+            raise ValueError(f"{around[0]}: distances are looked at where limits.clearance (m) says which to keep")
         if self.objective == "prediction" and not self.predict:
             raise ValueError("objective: prediction needs `predict`, the motions that matter")
         if self.objective == "separate" and not self.separate:
@@ -462,7 +525,7 @@ class Task(_Keys):
             raise ValueError("expected at least one recording")
         if all(entry.role == "holdout" for entry in data):
             raise ValueError("no recording has role: fit")
-        stems = [entry.file.stem for entry in data if entry.role == "holdout"]
+        stems = [entry.name for entry in data if entry.role == "holdout"]
         for stem in stems:
             if stems.count(stem) > 1:
                 raise ValueError(f"two holdout recordings are called '{stem}': their predictions would share one name")

@@ -1,21 +1,16 @@
-"""Robots from URDF files, read by yourdfpy and without any mesh.
+"""Robots from URDF files, without any mesh.
 
 Only what moves and weighs is read: links with their inertias, joints with placement, axis, limit and mimic.
 """
 
 from __future__ import annotations
 
-import io
-import sys
 from collections.abc import Sequence
-from functools import lru_cache
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from ..errors import InputError, nearest
 from ..rigid import inertia
@@ -40,11 +35,13 @@ _UNREAD = {  # by the element that holds them
     "link": ("visual", "collision"),
     "joint": ("dynamics", "calibration", "safety_controller"),
 }
+_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_ROWS = ("ixx ixy ixz", "ixy iyy iyz", "ixz iyz izz")
 _NUMBERS = {  # element: attributes, how many numbers each holds, which must be there
     "origin": {"xyz": 3, "rpy": 3},
     "axis": {"xyz": 3},
     "mass": {"value": 1},
-    "inertia": {"ixx": 1, "ixy": 1, "ixz": 1, "iyy": 1, "iyz": 1, "izz": 1},
+    "inertia": {name: 1 for name in _MOMENTS},
     "limit": {"lower": 1, "upper": 1, "velocity": 1, "effort": 1},
     "mimic": {"multiplier": 1, "offset": 1},
 }
@@ -86,10 +83,13 @@ def load_urdf(
     robot = _read(path)
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # `assemble` checks what comes of it
-            parts = [_link(link) for link in robot.links], [_joint(joint) for joint in robot.joints]
+            parts = (
+                [_link(link) for link in robot.iterchildren("link")],
+                [_joint(joint) for joint in robot.iterchildren("joint")],
+            )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    return assemble(str(path), robot.name, parts, joints, posture, gravity, root)
+    return assemble(str(path), robot.get("name") or Path(path).stem, parts, joints, posture, gravity, root)
 
 
 def urdf_dynamics(path: str | Path) -> dict[str, tuple[float, float]]:
@@ -109,9 +109,7 @@ def urdf_dynamics(path: str | Path) -> dict[str, tuple[float, float]]:
 
 
 def _read(path: str | Path) -> Any:
-    """The robot as yourdfpy's dataclasses, from a file whose every number has been checked."""
-    from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
-
+    """Root element of a file of which every name and number that is read has been checked."""
     root = read_xml(path, "robot")
     refuse_many(str(path), "links", sum(1 for _ in root.iterchildren("link")))
     for part in [part for holder, tags in _UNREAD.items() for tag in tags for part in root.findall(f"{holder}/{tag}")]:
@@ -121,45 +119,7 @@ def _read(path: str | Path) -> Any:
             _check_part(part)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    root.set("name", root.get("name") or Path(path).stem)
-    reader = _yourdfpy().URDF
-    try:
-        return reader.load(io.BytesIO(etree.tostring(root)), build_scene_graph=False, load_meshes=False).robot
-    except Exception as error:  # parts that play no role here (materials, ...) may be anything
-        raise InputError(f"{path}: cannot be read as URDF: {type(error).__name__}: {error}") from error
-
-
-class _Later(ModuleType):
-    """Stands for a package that is loaded when something of it is first used; until `ready`, its names are blanks."""
-
-    ready = False
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return getattr(import_module(self.__name__), name) if self.ready else object
-
-
-@lru_cache(maxsize=1)
-def _yourdfpy() -> Any:
-    """yourdfpy without trimesh, which with all that it loads takes ten times as long as the rest of reading a robot.
-
-    The reader needs `trimesh.transformations` alone. While yourdfpy is imported, a stand-in takes the place of trimesh
-    (where that is not loaded yet): submodules are found, its own names, which stand in annotations, are blanks. From
-    then on the stand-in passes on to the real one, so that yourdfpy shows scenes as ever.
-    """
-    spec = find_spec("trimesh")
-    if {"trimesh", "yourdfpy"} & set(sys.modules) or spec is None or spec.submodule_search_locations is None:
-        return import_module("yourdfpy")
-    later = _Later("trimesh")
-    later.__path__ = list(spec.submodule_search_locations)
-    sys.modules["trimesh"] = later
-    try:
-        return import_module("yourdfpy")
-    finally:
-        for name in [n for n in sys.modules if n.partition(".")[0] == "trimesh"]:
-            del sys.modules[name]
-        later.ready = True
+    return root
 
 
 def _check_part(part: Any) -> None:
@@ -214,41 +174,59 @@ def _check_numbers(element: Any, attribute: str, count: int, where: str) -> None
 
 
 def _link(link: Any) -> LinkPart:
-    if link.inertial is None:
-        return LinkPart(link.name, np.zeros(10))
-    mass, about_com = link.inertial.mass, link.inertial.inertia
+    name, inertial = str(link.get("name")), link.find("inertial")
+    if inertial is None:
+        return LinkPart(name, np.zeros(10))
+    mass = float(inertial.find("mass").get("value"))
+    moments = {key: float(value) for key, value in inertial.find("inertia").attrib.items() if key in _MOMENTS}
+    about_com = np.array([[moments[key] for key in row.split()] for row in _ROWS])
     if mass < 0.0:
-        raise InputError(f"link '{link.name}': its mass is {mass:g} kg; it cannot be negative")
-    moments = np.linalg.eigvalsh(about_com)
-    if moments[0] < -_ROUNDED * max(1.0, moments[-1]):
-        raise InputError(f"link '{link.name}': its inertia has a negative principal moment, {moments[0]:.3g} kg m^2")
-    origin = np.eye(4) if link.inertial.origin is None else link.inertial.origin
-    return LinkPart(link.name, inertia.transform(inertia.from_com(mass, np.zeros(3), about_com), origin))
+        raise InputError(f"link '{name}': its mass is {mass:g} kg; it cannot be negative")
+    principal = np.linalg.eigvalsh(about_com)
+    if principal[0] < -_ROUNDED * max(1.0, principal[-1]):
+        raise InputError(f"link '{name}': its inertia has a negative principal moment, {principal[0]:.3g} kg m^2")
+    return LinkPart(name, inertia.transform(inertia.from_com(mass, np.zeros(3), about_com), _origin(inertial)))
 
 
 def _joint(joint: Any) -> JointPart:
-    kind = _KINDS[joint.type]
-    if kind in ("revolute", "prismatic", "planar") and np.linalg.norm(joint.axis) < 1e-9:
-        raise InputError(f"joint '{joint.name}': its axis is zero; a direction is expected")
-    origin = np.eye(4) if joint.origin is None else joint.origin
-    mimic = joint.mimic and (joint.mimic.joint, joint.mimic.multiplier, joint.mimic.offset)
-    return JointPart(joint.name, kind, joint.parent, joint.child, origin, joint.axis, _limit(joint), mimic)
+    name, kind = str(joint.get("name")), _KINDS[joint.get("type")]
+    axis = _vector(joint.find("axis"), "xyz", "1 0 0")
+    if kind in ("revolute", "prismatic", "planar") and np.linalg.norm(axis) < 1e-9:
+        raise InputError(f"joint '{name}': its axis is zero; a direction is expected")
+    parent, child = (str(joint.find(end).get("link")) for end in ("parent", "child"))
+    given = joint.find("mimic")
+    mimic = None
+    if given is not None:
+        mimic = str(given.get("joint")), float(given.get("multiplier", 1.0)), float(given.get("offset", 0.0))
+    return JointPart(name, kind, parent, child, _origin(joint), axis, _limit(joint), mimic)
+
+
+def _vector(element: Any, attribute: str, default: str) -> Float[np.ndarray, "3"]:
+    text = default if element is None else element.get(attribute, default)
+    return np.array([float(word) for word in text.split()])
+
+
+def _origin(part: Any) -> Float[np.ndarray, "4 4"]:
+    """Placement by the `<origin>` of an element: R = Rz(yaw) Ry(pitch) Rx(roll), the identity where there is none."""
+    origin = part.find("origin")
+    (cr, cp, cy), (sr, sp, sy) = (f(_vector(origin, "rpy", "0 0 0")) for f in (np.cos, np.sin))
+    placement = np.eye(4)
+    placement[:3, :3] = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    placement[:3, 3] = _vector(origin, "xyz", "0 0 0")
+    return placement
 
 
 def _limit(joint: Any) -> tuple[float, float, float, float]:
     """Lower, upper, velocity and effort limit; infinite where the file gives none."""
-    given = joint.limit
-    lower, upper, velocity, effort = (
-        bound if given is None or value is None else value
-        for bound, value in (
-            (-np.inf, given and given.lower),
-            (np.inf, given and given.upper),
-            (np.inf, given and given.velocity),
-            (np.inf, given and given.effort),
-        )
-    )
-    if joint.type not in _BOUNDED:
+    given = joint.find("limit")
+    attributes = {} if given is None else given.attrib
+    lower, upper = float(attributes.get("lower", -np.inf)), float(attributes.get("upper", np.inf))
+    if joint.get("type") not in _BOUNDED:
         lower, upper = -np.inf, np.inf
     if lower > upper:
-        raise InputError(f"joint '{joint.name}': its lower limit {lower:g} is above the upper one {upper:g}")
-    return lower, upper, velocity, effort
+        raise InputError(f"joint '{joint.get('name')}': its lower limit {lower:g} is above the upper one {upper:g}")
+    return lower, upper, float(attributes.get("velocity", np.inf)), float(attributes.get("effort", np.inf))

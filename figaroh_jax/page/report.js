@@ -19,16 +19,6 @@
     return (name) => style.getPropertyValue("--" + name).trim();
   };
 
-  // plotly.js is parsed only when the first plot is wanted, so that the page itself opens at once.
-  const plotly = () => {
-    if (!window.Plotly) {
-      const script = document.createElement("script");
-      script.textContent = document.getElementById("plotly").textContent;
-      document.head.append(script);
-    }
-    return window.Plotly;
-  };
-
   const layout = (colour, extra) => {
     const axis = (title) => ({
       title: { text: title, font: { size: 12 }, standoff: 6 }, gridcolor: colour("line"), zerolinecolor: colour("line"),
@@ -78,16 +68,16 @@
       marker: { color: colour(tone), size: 4, symbol, opacity: printing ? 1 : 0.6 },
     });
     const traces = [
-      points("before", series.residualBefore, "before", "circle-open"),
-      points("after", series.residualAfter, "after", "circle"),
+      points("before", series.residualBeforeShown || series.residualBefore, "before", "circle-open"),
+      points("after", series.residualAfterShown || series.residualAfter, "after", "circle"),
     ];
     const text = key + ", " + (key === "velocity" ? joint.angle + "/s" : joint.angle);
     const axes = { xaxis: { text, options: {} }, yaxis: { text: "residual, " + joint.unit, options: {} } };
     return [traces, layout(colour, { axes, shapes: floor(colour, joint.noise, { x: "paper", y: "y" }) })];
   };
 
-  const draw = (details) => {
-    const library = plotly();
+  const draw = (details, which = () => true) => {
+    const library = window.Plotly;
     if (!library) throw new Error("no plotting library");
     const index = Number(details.dataset.joint);
     const stored = data.recordings[choice ? Number(choice.value) : 0][index];
@@ -97,7 +87,14 @@
       series.residualAfter = minus(series.measured, series.after);
     }
     const colour = colours();
-    for (const plot of details.querySelectorAll(".plot")) {
+    const range = printing ? null : details.shown;
+    if (range) {
+      const inside = series.time.map((t) => t >= range[0] && t <= range[1]);
+      for (const key of ["residualBefore", "residualAfter"]) {
+        if (series[key]) series[key + "Shown"] = series[key].map((x, k) => (inside[k] ? x : null));
+      }
+    }
+    for (const plot of [...details.querySelectorAll(".plot")].filter(which)) {
       const kind = plot.dataset.plot;
       plot.closest("figure").hidden = kind !== "time" && !series.measured;
       const make = kind === "time" ? againstTime : against.bind(null, kind);
@@ -107,21 +104,34 @@
         modeBarButtons: [["zoom2d", "pan2d", "resetScale2d", "toImage"]],
       };
       library.react(plot, traces, frame, options);
+      if (kind === "time" && !plot.dataset.linked) {
+        plot.dataset.linked = "";
+        plot.on("plotly_relayout", (change) => follow(details, change));
+      }
       if (printing) library.Plots.resize(plot);
     }
     details.dataset.drawn = "";
   };
 
-  const attempt = (details) => {
+  // A stretch of time that is zoomed into is the stretch that the plots beside it show.
+  const follow = (details, change) => {
+    const [from, to] = change["xaxis.range"] || [change["xaxis.range[0]"], change["xaxis.range[1]"]];
+    if (from === undefined && !change["xaxis.autorange"]) return;
+    details.shown = from === undefined ? null : [from, to];
+    attempt(details, (plot) => plot.dataset.plot !== "time");
+  };
+
+  const attempt = async (details, which) => {
     try {
-      draw(details);
+      await unpackPlotly();
+      draw(details, which);
     } catch (error) {
       document.getElementById("trouble").hidden = false;
       console.error(error);
     }
   };
   const all = [...document.querySelectorAll("details.joint")];
-  const redraw = () => all.filter((details) => "drawn" in details.dataset).forEach(attempt);
+  const redraw = () => all.filter((details) => "drawn" in details.dataset).forEach((details) => attempt(details));
 
   const watcher = new IntersectionObserver((entries) => {
     for (const { isIntersecting, target } of entries) {
@@ -132,7 +142,7 @@
     watcher.observe(details);
     details.addEventListener("toggle", () => details.open && !("drawn" in details.dataset) && attempt(details));
   }
-  if (choice) choice.addEventListener("change", redraw);
+  if (choice) choice.addEventListener("change", () => { all.forEach((d) => { d.shown = null; }); redraw(); });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 
   const unfold = () => {
@@ -142,13 +152,14 @@
   addEventListener("hashchange", unfold);
   unfold();
 
+  addEventListener("load", () => setTimeout(unpackPlotly, 300)); // a print waits for nothing
   let closed = [];
   addEventListener("beforeprint", () => {
     printing = true;
     closed = [...document.querySelectorAll("details:not([open])")];
     closed.forEach((details) => { details.open = true; });
     root.classList.add("printing");
-    all.forEach(attempt);
+    all.forEach((details) => { if (window.Plotly) draw(details); else attempt(details); });
   });
   addEventListener("afterprint", () => {
     printing = false;

@@ -82,7 +82,7 @@ def check_recordings(task: Task | None, model: RobotModel, recordings: Sequence[
 
     Raises `InputError` with every finding that cannot be right.
     """
-    entries: dict[Path | Memory, RecordingEntry] = {entry.file: entry for entry in task.data} if task else {}
+    entries: dict[Path | Memory, RecordingEntry] = {entry.place: entry for entry in task.data} if task else {}
     found = [
         (recording.file.name, finding)
         for recording in recordings

@@ -19,7 +19,8 @@ from ..formats.assembly import ROOT_JOINT
 from ..rigid.inertia import from_com, transform
 from ..rigid.model import RobotModel
 from .groupmotion import position_names
-from .tables import Table, read_table
+from .reading import read_table
+from .tables import Source, Table
 
 if TYPE_CHECKING:
     from ..formats.config import Load, RecordingEntry, Task
@@ -166,7 +167,7 @@ class Drive:
 
 
 def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive) -> Recording:
-    table = read_table(entry.file, f"{key}.file")
+    table = read_table(entry.file, f"{key}.file", Source(entry.format, entry.topic, entry.episode))
     units = entry.units
     angle = unit_factors(units.position, drive.position is not None, model)
     position = _columns(table, entry.position, position_names(model), f"{key}.position") * angle
@@ -178,12 +179,17 @@ def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive) -> R
 
     velocity, torque = optional("velocity", model.dof_names), optional("torque", model.dof_names)
     command = optional("command", position_names(model))
-    if torque is not None and units.torque == "A" and drive.torque is None:
-        raise InputError(f"{entry.file}: {key}.units.torque is A: transmission.torque must say what one ampere gives")
+    if torque is not None and units.torque in _NO_TORQUE and drive.torque is None:
+        raise InputError(
+            f"{entry.file}: {key}.units.torque is {units.torque}: transmission.torque must say what one"
+            f" {_NO_TORQUE[units.torque]} gives, as a list of N m (or N) a unit in the order of the joints"
+        )
+    if torque is not None and units.torque == "mA":
+        torque = torque * 1e-3
     rate = unit_factors(units.velocity or units.position, drive.position is not None, model, of="v")
     return Recording(
-        name=entry.file.stem,
-        file=entry.file,
+        name=entry.name,
+        file=entry.place,
         joints=model.dof_names,
         time=time,
         position=drive.joint_motion(position) + drive.offset,
@@ -194,6 +200,9 @@ def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive) -> R
         repeat=entry.repeat,
         role=entry.role,
     )
+
+
+_NO_TORQUE = {"A": "ampere", "mA": "ampere", "%": "per cent"}
 
 
 def unit_factors(

@@ -19,24 +19,46 @@ from ..formats.config import RecordingEntry
 from ..formats.robotfile import read_robot
 from ..rigid.model import RobotModel, prismatic
 from .checks import DEGREE, Finding, check_recording, position_findings
+from .containers import lerobot_episodes
 from .dataset import Recording
 from .likeness import Sampled, likeness, rigid_torque, sampled
-from .tables import Table, read_table
+from .reading import BAGS, kind_of, read_table
+from .tables import Source, Table
 
-__all__ = ["Draft", "draft_task"]
+__all__ = ["Draft", "Undecided", "draft_task"]
 
 _WORDS = {
-    "command": {"cmd", "command", "commanded", "des", "desired", "target", "ref", "reference", "setpoint", "goal"},
+    "command": {
+        "cmd",
+        "command",
+        "commanded",
+        "des",
+        "desired",
+        "target",
+        "ref",
+        "reference",
+        "setpoint",
+        "goal",
+        "action",
+    },
     "velocity": {"dq", "qd", "vel", "velocity", "velocities", "speed", "qdot", "v"},
-    "current": {"i", "current", "currents", "cur", "amp", "amps"},
+    "current": {"i", "current", "currents", "cur", "amp", "amps", "percent", "load"},
     "torque": {"tau", "torque", "torques", "effort", "efforts", "eff", "trq", "force", "j"},
-    "position": {"q", "pos", "position", "positions", "angle", "angles", "theta"},
+    "position": {"q", "pos", "position", "positions", "angle", "angles", "theta", "state"},
 }
 _TIMES = ("t", "time", "timestamp", "timestamps", "stamp", "stamps", "sec", "seconds", "clock", "header.stamp")
 _CLOCKS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SLOW, _FAST = 15.0, 14000.0  # Hz; their ratio is below a thousand, so that one unit of time alone fits
 _HUGE = 1e12  # beyond it no column is a recording in any unit
 CONFIRMED = 0.5  # of a torque's variance that its own joint explains, before it says anything of the order
+
+
+class Undecided(InputError):
+    """What the data cannot decide; `option` is the option of the command by which a user does."""
+
+    def __init__(self, option: str, text: str) -> None:
+        super().__init__(text)
+        self.option = option
 
 
 class Draft(NamedTuple):
@@ -56,7 +78,8 @@ class _Read(NamedTuple):
     time: Float[np.ndarray, " samples"]
     position: Float[np.ndarray, "samples joints"]
     torque: Float[np.ndarray, "samples joints"] | None
-    current: bool
+    current: str  # unit of a torque that is none: "A", "mA", "%"; else empty
+    command: Float[np.ndarray, "samples joints"] | None = None
 
 
 def draft_task(
@@ -66,35 +89,44 @@ def draft_task(
     joints: Sequence[str] | None = None,
     rate: float | None = None,
     constants: Sequence[float] | None = None,
+    unit: str | None = None,
+    topic: str | None = None,
+    gains: Sequence[float] | None = None,
 ) -> Draft:
     """A task for `diagnose` and `identify` on these recordings; `joints` names their columns, `rate` (Hz) their clock.
 
-    `constants` are N m a unit of each torque column, in the order of the joints.
+    `constants` are N m a unit of each torque column, `gains` the proportional gains of the position servos (N m/rad),
+    both in the order of the joints; `unit` (rad, deg, m, mm) is that of the positions, `topic` that of bags.
 
-    Raises `InputError` for what cannot be read, and for what the data do not decide.
+    Raises `InputError` for what cannot be read, and `Undecided` for what the data do not decide.
     """
     whole = read_robot(model)
     for name in joints or ():
         if name not in whole.joint_names:
             raise InputError(f"--joints: robot '{whole.name}' has no joint '{name}'{nearest(name, whole.joint_names)}")
-    tables = [read_table(file, "recording") for file in files]
-    reads = [_read(table, whole, joints, rate) for table in tables]
+    reads = [_read(table, whole, joints, rate, entry) for table, entry in _tables(files, topic)]
     if len({read.joints for read in reads}) > 1:
         raise InputError("the recordings hold different joints; draft a task for each kind")
     robot = read_robot(model, reads[0].joints)
     assumed = [*dict.fromkeys(_clock_said(reads))]
-    unit = _unit_of_position(robot, reads)
+    _doubt_percent(reads, unit)
+    unit = unit or _unit_of_position(robot, reads)
     factor = np.where(np.array(prismatic(robot)), {"deg": 1.0, "mm": 1e-3}.get(unit, 1.0), _degrees(unit))
-    reads = [read._replace(position=read.position * factor) for read in reads]
+    reads = [
+        read._replace(position=read.position * factor, command=None if read.command is None else read.command * factor)
+        for read in reads
+    ]
     if constants is not None and len(constants) != robot.nv:
         raise InputError(
             f"--constants: {len(constants)} numbers, expected one for each of {', '.join(robot.dof_names)}"
         )
     signs, said = _torques(robot, reads) if constants is None else ([*constants], ["torque constants as given"])
+    drives, more = _drives(model, robot, reads, gains)
+    said += more
     _refuse_what_is_wrong(robot, reads, signs)
     labels = _repeats(reads)
     assumed += [_unit_said(unit, robot), *said]
-    return Draft(_text(model, robot, whole, reads, unit, signs, labels, assumed), tuple(assumed))
+    return Draft(_text(model, robot, whole, reads, unit, signs, labels, assumed, drives), tuple(assumed))
 
 
 def _degrees(unit: str) -> float:
@@ -104,9 +136,39 @@ def _degrees(unit: str) -> float:
 # Columns
 
 
-def _read(table: Table, model: RobotModel, joints: Sequence[str] | None, rate: float | None) -> _Read:
-    clock = _time(table) if rate is None else None
-    kinds = _kinds(table, clock)
+def _tables(files: Sequence[Path], topic: str | None) -> Iterator[tuple[Table, dict[str, Any]]]:
+    """Every recording with the keys of a task that say which it is; of a folder of episodes the first few."""
+    for file in files:
+        path = file.resolve()
+        if kind_of(file) == "lerobot":
+            for episode in lerobot_episodes(file)[:_EPISODES]:
+                source = Source(episode=episode)
+                yield read_table(file, "recording", source), {"file": str(path), "episode": episode}
+            continue
+        if kind_of(file) in BAGS:
+            try:
+                table = read_table(file, "recording", Source(topic=topic))
+            except InputError as error:
+                raise (Undecided("topic", str(error)) if "must name the one" in str(error) else error) from None
+            yield table, {"file": str(path)} | ({} if topic is None else {"topic": topic})
+            continue
+        table = read_table(file, "recording")
+        form = next((form for form, mark in _LOG_MARKS.items() if mark & set(table.names)), None)
+        if form is not None:
+            table = read_table(file, "recording", Source(form=form))
+        yield table, {"file": str(path)} | ({} if form is None else {"format": form})
+
+
+_EPISODES = 8
+_LOG_MARKS = {"rtde": {"actual_q_0"}, "libfranka": {"tau_J[0]", "state.tau_J[0]"}}
+
+
+def _read(
+    table: Table, model: RobotModel, joints: Sequence[str] | None, rate: float | None, entry: dict[str, Any]
+) -> _Read:
+    form = entry.get("format")
+    clock = (_LOGGED[form]["time"] if form else _time(table)) if rate is None else None
+    kinds = _logged(table, _LOGGED[form]) if form else _kinds(table, clock)
     if "position" not in kinds:
         raise InputError(
             f"{table.file}: no column looks like a position (q, pos, position, angle...); its columns are"
@@ -114,10 +176,11 @@ def _read(table: Table, model: RobotModel, joints: Sequence[str] | None, rate: f
         )
     names, sources, named = _of_joints(table, kinds["position"], model, joints, "position")
     position = _matrix(table, sources, names, "position")
-    entry: dict[str, Any] = {"file": str(table.file.resolve()), "position": sources}
-    torque, current = None, False
-    for kind in ("torque", "current", "velocity"):
-        if kind not in kinds or (kind == "current" and torque is not None):
+    if form is None or sources != _LOGGED[form]["position"]:
+        entry = entry | {"position": sources}
+    torque, current, command = None, "", None
+    for kind in ("torque", "current", "velocity", "command"):
+        if kind not in kinds or (kind in ("current", "command") and torque is not None):
             continue
         own, source, by_name = _of_joints(table, kinds[kind], model, list(names), kind)
         if own != names:
@@ -125,11 +188,37 @@ def _read(table: Table, model: RobotModel, joints: Sequence[str] | None, rate: f
         values = _matrix(table, source, names, kind)
         if len(values) != len(position):
             raise InputError(f"{table.file}: {kind} has {len(values)} samples, position {len(position)}")
-        entry["velocity" if kind == "velocity" else "torque"] = source
-        if kind != "velocity":
-            torque, current, named = values, kind == "current", named and by_name
+        key = "torque" if kind == "current" else kind
+        if form is None or source != _LOGGED[form].get(key):
+            entry[key] = source
+        if kind == "command":
+            command = values
+        elif kind != "velocity":
+            torque, named = values, named and by_name
+            current = _unit_of_current(source) if kind == "current" else ""
     time, entry = _stamps(table, clock, rate, len(position), entry)
-    return _Read(table.file, entry, names, named, time, position, torque, current)
+    if form is not None and rate is None:
+        del entry["time"]
+    return _Read(table.file, entry, names, named, time, position, torque, current, command)
+
+
+_LOGGED = {
+    "rtde": {"time": "timestamp", "position": "actual_q", "current": "actual_current", "torque": "actual_current"},
+    "libfranka": {"time": "time", "position": "q", "torque": "tau_J"},
+}
+
+
+def _logged(table: Table, known: dict[str, str]) -> dict[str, list[str]]:
+    """The columns of a robot's own log, by the prefixes of its format."""
+    wanted = {k: prefix for k, prefix in known.items() if k != "time" and not (k == "torque" and "current" in known)}
+    pattern = {kind: re.compile(re.escape(prefix) + r"[_\[]\d+\]?") for kind, prefix in wanted.items()}
+    found = {kind: [name for name in table.names if mark.fullmatch(name)] for kind, mark in pattern.items()}
+    return {kind: names for kind, names in found.items() if names}
+
+
+def _unit_of_current(source: Any) -> str:
+    words = set(_words(" ".join([source] if isinstance(source, str) else source)))
+    return "%" if words & {"percent", "load"} else "mA" if "ma" in words else "A"
 
 
 def _words(name: str) -> list[str]:
@@ -138,10 +227,14 @@ def _words(name: str) -> list[str]:
 
 def _time(table: Table) -> str:
     found = [name for name in table.names if name.lower() in _TIMES]
+    if not found and "received" in table.names:  # when a bag got a message that has no stamp of its own
+        return "received"
     found = found or [n for n in table.names if set(_words(n)) & {*_TIMES} and not set(_words(n)) & {"des", "cmd"}]
     if len(found) != 1:
         what = f"several columns look like one: {', '.join(found)}" if found else "no column looks like one"
-        raise InputError(f"{table.file}: which column is the time? {what}; give --rate HZ, or rename it to 'time'")
+        raise Undecided(
+            "rate", f"{table.file}: which column is the time? {what}; give --rate HZ, or rename it to 'time'"
+        )
     return found[0]
 
 
@@ -158,9 +251,10 @@ def _stamps(
     step = float(np.median(np.diff(time)))
     unit = next((u for u, s in _CLOCKS.items() if _SLOW <= 1 / (step * s) <= _FAST), None)
     if unit is None:
-        raise InputError(
+        raise Undecided(
+            "rate",
             f"{table.file}: '{clock}' steps by {step:.4g}, which is no rate from {_SLOW:g} to {_FAST:g} Hz in s, ms, us"
-            " or ns; give --rate HZ"
+            " or ns; give --rate HZ",
         )
     return (time - time[0]) * _CLOCKS[unit], entry | {"time": clock} | (
         {"units": {"time": unit}} if unit != "s" else {}
@@ -175,9 +269,18 @@ def _kinds(table: Table, clock: str | None) -> dict[str, list[str]]:
         kind = next(
             (k for k, known in _WORDS.items() if known & set(words) and not (k == "torque" and words == ["j"])), None
         )
-        if name != clock and kind is not None:
-            found.setdefault(kind, []).append(name)
+        kind = name.partition(".")[0] if name.partition(".")[0] in _OF_BAGS else kind
+        if name != clock and kind is not None and not name.startswith("/") and not _has_parts(name, table.names):
+            found.setdefault("torque" if kind == "effort" else kind, []).append(name)
     return {kind: _plainest(names) for kind, names in found.items()}
+
+
+_OF_BAGS = ("position", "velocity", "effort", "command")
+
+
+def _has_parts(name: str, names: Sequence[str]) -> bool:
+    """Whether the columns of an array are named one by one too."""
+    return any(other.startswith(f"{name}.") for other in names)
 
 
 def _plainest(names: list[str]) -> list[str]:
@@ -199,7 +302,8 @@ def _of_joints(
         names = tuple(joint for joint in model.joint_names if joint in by_name)
         if len(names) < len(columns) and joints is None:
             rest = [c for c in columns if c not in by_name.values()]
-            raise InputError(f"{table.file}: {kind}: which joints are {', '.join(rest)}? Name all joints by --joints")
+            text = f"{table.file}: {kind}: which joints are {', '.join(rest)}? Name all joints by --joints"
+            raise Undecided("joints", text)
         return names, [by_name[joint] for joint in names], True
     if len(columns) == 1 and table.read(columns[0]).ndim == 2:
         count, source = table.read(columns[0]).shape[1], columns[0]
@@ -210,9 +314,10 @@ def _of_joints(
             raise InputError(f"{table.file}: several sets of columns look like {kind}: {', '.join(columns[:8])}")
         count, source = len(columns), numbered
     if joints is None and count != len(model.joint_names):
-        raise InputError(
+        raise Undecided(
+            "joints",
             f"{table.file}: {count} columns of {kind}, but the robot has {len(model.joint_names)} joints"
-            f" ({', '.join(model.joint_names)}); name theirs in the columns' order by --joints"
+            f" ({', '.join(model.joint_names)}); name theirs in the columns' order by --joints",
         )
     if count != len(wanted):
         raise InputError(f"{table.file}: {count} columns of {kind}, but --joints names {len(wanted)}")
@@ -262,9 +367,22 @@ def _unit_of_position(robot: RobotModel, reads: Sequence[_Read]) -> str:
         return best
     if span > 20:
         return "deg"
-    raise InputError(
-        f"{reads[0].file}: positions span {span:.3g}: rad or degrees? Neither limits nor torque tell; convert to rad"
+    raise Undecided(
+        "unit",
+        f"{reads[0].file}: positions span {span:.3g}: rad or degrees? Neither limits nor torque tell; give --unit",
     )
+
+
+def _doubt_percent(reads: Sequence[_Read], unit: str | None) -> None:
+    """LeRobot may keep positions as degrees or as a share of the range of motion, -100 to 100, which look alike."""
+    for read in reads if unit is None else ():
+        span = np.abs(read.position).max()
+        if "episode" in read.entry and 7.0 < span <= 101.0:
+            raise Undecided(
+                "unit",
+                f"{read.file}: positions reach {span:.3g}: LeRobot keeps degrees or, by default, a share of the range"
+                " of motion (-100 to 100), which no file tells; give --unit deg where they are degrees",
+            )
 
 
 def _unlike(robot: RobotModel, read: _Read, unit: str) -> float:
@@ -297,10 +415,13 @@ def _torques(robot: RobotModel, reads: Sequence[_Read]) -> tuple[list[float] | N
     motions = [sampled(read.time, read.position, read.torque) for read in reads if read.torque is not None]
     motions = [motion for motion in motions if motion is not None]
     if not motions:
-        return None, ["the recordings hold no torque: neither diagnose nor identify can use them without"]
+        known = all(read.command is not None for read in reads)
+        said = "rollouts of the command" if known else "neither diagnose nor identify can use them without"
+        return None, [f"the recordings hold no torque: {said}"]
     lowest = np.min([read.torque.min(axis=0) for read in reads if read.torque is not None], axis=0)
-    if (lowest >= 0).all() and robot.nv > 1:
-        raise InputError(f"{reads[0].file}: the torque is nowhere negative: an absolute value tells no direction")
+    highest = np.max([read.torque.max(axis=0) for read in reads if read.torque is not None], axis=0)
+    if ((lowest >= 0) | (highest <= 0)).all() and robot.nv > 1:
+        raise InputError(f"{reads[0].file}: no joint's torque changes its sign: an absolute value tells no direction")
     _order(robot, reads, motions)
     scales = [_scale(robot, motions, j) for j in range(robot.nv)]
     current = any(read.current for read in reads)
@@ -311,10 +432,11 @@ def _torques(robot: RobotModel, reads: Sequence[_Read]) -> tuple[list[float] | N
             n for n, s in zip(names, scales, strict=True) if s.told != "gravity" or s.error > 0.3 * abs(s.value)
         ]
         if open_joints:
-            raise InputError(
+            raise Undecided(
+                "constants",
                 f"{reads[0].file}: what holds the torque is no N m, and the motion does not tell the constants of"
                 f" {', '.join(open_joints)}; those found: {_constants(names, scales)} N m a unit. Give all of them"
-                " by --constants (data sheet: torque constant times gear ratio), N m a unit in the order of the joints"
+                " by --constants (data sheet: torque constant times gear ratio), N m a unit in the order of the joints",
             )
         said = [f"torque constants by the model's gravity, no surer than its masses: {_constants(names, scales)}"]
         return [s.value for s in scales], said
@@ -446,6 +568,32 @@ def _shape(read: _Read) -> Float[np.ndarray, " _"]:
     return ((x - x.mean(axis=0)) / (x.std(axis=0).max() or 1.0)).ravel()
 
 
+def _drives(
+    model: Path, robot: RobotModel, reads: Sequence[_Read], gains: Sequence[float] | None
+) -> tuple[dict[str, Any], list[str]]:
+    """The `actuator` block of rollouts, which have a command in place of torque."""
+    if any(read.torque is not None or read.command is None for read in reads):
+        return {}, []
+    for read in reads:
+        assert read.command is not None
+        for j, name in enumerate(robot.dof_names):
+            if np.std(read.command[:, j]) > 1e-3 and np.corrcoef(read.command[:, j], read.position[:, j])[0, 1] < 0.5:
+                raise InputError(
+                    f"{read.file}: the position of {name} does not follow its command: order, sign or unit?"
+                )
+    if gains is not None:
+        if len(gains) != robot.nv:
+            raise InputError(f"--kp: {len(gains)} numbers, expected one for each of {', '.join(robot.dof_names)}")
+        return {n: {"kind": "position", "kp": k} for n, k in zip(robot.dof_names, gains, strict=True)}, []
+    if model.suffix.lower() == ".xml":
+        return {}, ["the drives are the model's actuators"]
+    raise Undecided(
+        "kp",
+        f"{model}: a command without torque is simulated with its drives, which a URDF does not describe: give the"
+        f" gains of the position servos by --kp (N m/rad, in the order {', '.join(robot.dof_names)}), or an MJCF",
+    )
+
+
 # Words
 
 
@@ -504,6 +652,7 @@ def _text(
     signs: list[float] | None,
     labels: Sequence[str | None],
     assumed: Sequence[str],
+    drives: dict[str, Any],
 ) -> str:
     from ..formats.export import dump_yaml
 
@@ -521,6 +670,10 @@ def _text(
             "# From what the columns hold to N m at the joints.",
             dump_yaml({"transmission": {"torque": [float(x) for x in signs]}}),
         ]
+    if drives:
+        parts += ["# The loop that turns the command into torque: N m/rad.", dump_yaml({"actuator": drives})]
+    if all(read.torque is None for read in reads):
+        return "\n".join(part.rstrip("\n") for part in parts) + "\n"
     rotor = _geared(robot, reads, signs)
     parts += [
         "# The position's steps and rate allow this low pass (Hz).",
@@ -538,6 +691,6 @@ def _entry(read: _Read, unit: str, label: str | None, converted: bool) -> dict[s
     units = dict(read.entry.get("units", {}))
     if unit != "rad":
         units["position"] = unit
-    if read.current and converted:
-        units["torque"] = "A"
+    if read.current and (converted or read.current != "A"):
+        units["torque"] = read.current
     return entry | ({"units": units} if units else {}) | ({"repeat": label} if label else {}) | {"role": "fit"}

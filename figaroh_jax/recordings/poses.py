@@ -23,7 +23,8 @@ from ..errors import InputError
 from ..rigid.model import RobotModel
 from . import dataset
 from .devices import Device
-from .tables import Table, read_table
+from .reading import read_table
+from .tables import Source, Table
 
 if TYPE_CHECKING:
     from ..formats.config import Load, Measurement, RecordingEntry, Task
@@ -69,7 +70,7 @@ def _read(task: Task, entry: RecordingEntry, key: str, model: RobotModel, drive:
         raise InputError(
             f"{task.file}: {key} has no `measurement`: calibration needs what was measured at each posture"
         )
-    table = read_table(entry.file, f"{key}.file")
+    table = read_table(entry.file, f"{key}.file", Source(entry.format, entry.topic, entry.episode))
     factors = dataset.unit_factors(entry.units.position, drive.position is not None, model)
     position = drive.joint_motion(dataset.joint_columns(table, entry.position, model, f"{key}.position") * factors)
     position = position + drive.offset
@@ -79,8 +80,8 @@ def _read(task: Task, entry: RecordingEntry, key: str, model: RobotModel, drive:
     kind, values = _values(table, measurement, f"{key}.measurement", len(position), scale)
     accuracy = measurement.accuracy
     return PoseRecording(
-        name=entry.file.stem,
-        file=entry.file,
+        name=entry.name,
+        file=entry.place,
         time=_time(table, entry, key, len(position)),
         position=position,
         kind=kind,

@@ -32,7 +32,7 @@ FEWEST = 8
 
 def check_pose_recordings(task: Task, model: RobotModel, recordings: Sequence[PoseRecording]) -> tuple[str, ...]:
     """Warnings about recordings of postures, also sent to the log `figaroh_jax`; `InputError` where they are wrong."""
-    entries: dict[Path | Memory, RecordingEntry] = {entry.file: entry for entry in task.data}
+    entries: dict[Path | Memory, RecordingEntry] = {entry.place: entry for entry in task.data}
     found = [(r.file.name, f) for r in recordings for f in check_pose_recording(r, model, entries.get(r.file))]
     return report_findings(found)
 

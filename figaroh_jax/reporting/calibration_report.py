@@ -11,6 +11,8 @@ import numpy as np
 
 from ..calibration.calibrated import Calibration, Shown, quality_of
 from . import wording
+from .calibration_view import nominal_of
+from .picture import robot_picture
 from .report import page_template, plotly_source
 
 __all__ = ["write_calibration_report"]
@@ -21,7 +23,9 @@ def write_calibration_report(calibration: Calibration, path: Path) -> None:
     from markupsafe import Markup
 
     page = resources.files("figaroh_jax") / "page"
-    text = page_template("calibration.html").render(
+    text = page_template("calibration.html", path.parent).render(
+        picture=Markup(_picture(calibration)),
+        magnify=_MAGNIFY,
         c=calibration,
         robot=calibration.model.name,
         sentence=wording.calibration_sentence(calibration),
@@ -40,6 +44,14 @@ def write_calibration_report(calibration: Calibration, path: Path) -> None:
         figure=Markup(_figure(calibration)),
     )
     path.write_text(text, encoding="utf-8")
+
+
+_MAGNIFY = 20
+
+
+def _picture(calibration: Calibration) -> str:
+    affected = {name for cause in calibration.causes for name in cause.name.at} | calibration.twists.keys()
+    return robot_picture(calibration.model, affected=affected, nominal=nominal_of(calibration), magnify=float(_MAGNIFY))
 
 
 def _shown(calibration: Calibration) -> list[Shown]:
@@ -86,5 +98,4 @@ def _arrows(shown: list[Shown], which: str, stretch: int) -> dict[str, Any]:
             for k, axis in enumerate("xyz"):
                 ends[axis] += [float(point[k]), float(point[k] + stretch * error[k]), None]
             text += [f"{part.name}, row {row}: {1e3 * np.linalg.norm(error):.3g} mm"] * 3
-    width = 4 if which == "before" else 8  # the short ones stay visible
-    return {"type": "scatter3d", "mode": "lines", "name": which, "line": {"width": width}, "text": text} | ends
+    return {"name": which, "text": text} | ends

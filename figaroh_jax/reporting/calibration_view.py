@@ -9,18 +9,17 @@ from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
 
 from ..calibration.calibrated import Calibration
 from ..calibration.corrections import twist_pose
 from ..errors import InputError
-from ..rigid.kinematics import forward_kinematics
 from ..rigid.model import RobotModel
+from .picture import segments
 
 if TYPE_CHECKING:
     import viser  # pyright: ignore[reportMissingImports]
 
-__all__ = ["nominal_of", "segments", "show"]
+__all__ = ["nominal_of", "show"]
 
 _COLOURS = {"nominal": (213, 94, 0), "calibrated": (0, 114, 178)}
 
@@ -32,13 +31,6 @@ def nominal_of(calibration: Calibration) -> RobotModel:
         if joint.name in calibration.twists:
             placement[k] = placement[k] @ np.linalg.inv(twist_pose(calibration.twists[joint.name]))
     return eqx.tree_at(lambda m: m.placement, calibration.model, placement)
-
-
-def segments(model: RobotModel, q: Float[np.ndarray, " nv"]) -> Float[np.ndarray, "nj 2 3"]:
-    """From the parent's joint (or the world's origin) to every joint, m."""
-    origins = np.concatenate([np.zeros((1, 3)), np.asarray(forward_kinematics(model, q))[:, :3, 3]])
-    parents = np.array([joint.parent for joint in model.joints]) + 1
-    return np.stack([origins[parents], origins[1:]], axis=1)
 
 
 def show(calibration: Calibration, magnify: float = 20.0, port: int = 8080) -> viser.ViserServer:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..excitation.design import Design, Stage, torque_of
-from ..excitation.limits import CHECK_RATE
+from ..excitation.limits import CHECK_RATE, Limits, Use
 from ..excitation.postures import PostureDesign
 from ..excitation.sampling import Sampler
 from ..rigid.model import prismatic
@@ -45,7 +45,7 @@ def answer(found: Design) -> dict[str, Any]:
         "met": found.met,
         "rate": found.rate,
         "noise": [_number(1 / math.sqrt(w)) for w in np.asarray(found.learned.weight)],
-        "trajectories": [_stage(k, stage) for k, stage in enumerate(found.stages)],
+        "trajectories": [_stage(k, stage, found.limits) for k, stage in enumerate(found.stages)],
         "parameters": [
             {"expression": name, "std_before": _number(before), "std": _number(after)}
             for name, before, after in zip(found.learned.expressions, found.std_before, found.std, strict=True)
@@ -87,9 +87,11 @@ def posture_answer(found: PostureDesign) -> dict[str, Any]:
     }
 
 
-def _stage(k: int, stage: Stage) -> dict[str, Any]:
+def _stage(k: int, stage: Stage, limits: Limits) -> dict[str, Any]:
     basis = stage.motion.basis
-    return {
+    near = nearest_bodies(stage, limits)
+    own = {} if near is None else {"clearance": {"rate": POINTS, "distance": np.round(near[1], 6).tolist()}}
+    return own | {
         "file": f"trajectory_{k + 1}.csv",
         "duration": stage.motion.duration,
         "logdet": _number(stage.logdet),
@@ -105,6 +107,15 @@ def _stage(k: int, stage: Stage) -> dict[str, Any]:
     }
 
 
+def nearest_bodies(stage: Stage, limits: Limits) -> tuple[np.ndarray, np.ndarray] | None:
+    """Times (s) and the least distance (m) of two bodies by what surrounds them; None where none are looked at."""
+    clearance = limits.clearance
+    if clearance is None or not clearance.rows.names:
+        return None
+    time = stage.motion.basis.instants(POINTS)
+    return time, clearance.distances(np.asarray(stage.motion.at(time)[0])).min(axis=1)
+
+
 def _number(value: Any) -> float | None:
     plain = float(value)
     return plain if math.isfinite(plain) else None
@@ -115,14 +126,20 @@ def failure(found: Design | PostureDesign) -> str | None:
     if isinstance(found, PostureDesign):
         return None
     wrong = [
-        f"trajectory {k + 1}: {use.kind} of '{use.joint}' is {use.value:.4g} at {use.time:.3f} s, {use.share - 1:.1%}"
-        f" over its limit {use.limit:.4g}"
+        f"trajectory {k + 1}: {_excess(use)}"
         for k, stage in enumerate(found.stages)
         if not stage.met
         for use in stage.uses
         if use.share > 1.0
     ]
     return "; ".join(wrong) or None
+
+
+def _excess(use: Use) -> str:
+    if use.kind == "clearance":
+        return f"{use.joint} are {use.value:.4g} m apart at {use.time:.3f} s; the clearance is {use.limit:.4g} m"
+    over = f"{use.share - 1:.1%} over its limit {use.limit:.4g}"
+    return f"{use.kind} of '{use.joint}' is {use.value:.4g} at {use.time:.3f} s, {over}"
 
 
 def posture_lines(found: PostureDesign) -> list[str]:
@@ -147,7 +164,7 @@ def write_postures(found: PostureDesign, folder: Path) -> None:
     header = ",".join(found.model.dof_names)
     np.savetxt(folder / "postures.csv", found.position, delimiter=",", header=header, comments="", fmt="%.9g")
     page = resources.files("figaroh_jax") / "page"
-    text = page_template("postures.html").render(
+    text = page_template("postures.html", folder).render(
         d=found,
         robot=found.model.name,
         lines=posture_lines(found),
@@ -174,12 +191,19 @@ def summary_lines(found: Design | PostureDesign) -> list[str]:
     if np.isfinite(better).all():
         lines.append(f"expected standard deviations fall {np.exp(np.log(better).mean()):.3g} times (geometric mean)")
     for k, stage in enumerate(found.stages):
-        used = ", ".join(f"{use.kind} {use.share:.1%} ({use.joint})" for use in stage.uses)
+        used = ", ".join(
+            f"{use.kind} {use.share:.1%} ({use.joint})" if use.kind != "clearance" else _apart(use)
+            for use in stage.uses
+        )
         lines.append(f"trajectory {k + 1}: largest use at 1 kHz: {used or 'no limits'}")
     for s in found.separated:
         times = "one run" if s.repeats == 1 else f"{s.repeats} repeats"
         lines.append(f"{s.truth} is told from {s.rival} by {s.sigmas:.2g} standard deviations; {times} for a sure name")
     return [*lines, *(f"Note: {note}" for note in found.notes)]
+
+
+def _apart(use: Use) -> str:
+    return f"{use.joint} {1e3 * use.value:.0f} mm apart (at least {1e3 * use.limit:.0f})"
 
 
 def _count(found: Design) -> str:
@@ -201,7 +225,7 @@ def write_design(found: Design, folder: Path, model: Any) -> None:
         _write_table(folder / f"{name}.csv", learned.robot.dof_names, time, {"q": q, "v": v, "a": a, "torque": tau})
         (folder / f"{name}.yaml").write_text(joint_trajectory(learned.robot.dof_names, stage), encoding="utf-8")
         drawn.append((time, {"position": q, "velocity": v, "torque": tau}))
-    (folder / PAGE).write_text(_page(found, drawn), encoding="utf-8")
+    (folder / PAGE).write_text(_page(found, drawn, folder), encoding="utf-8")
 
 
 def _write_table(
@@ -225,12 +249,12 @@ def joint_trajectory(joints: tuple[str, ...], stage: Stage) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _page(found: Design, drawn: list[tuple[np.ndarray, dict[str, np.ndarray]]]) -> str:
+def _page(found: Design, drawn: list[tuple[np.ndarray, dict[str, np.ndarray]]], folder: Path) -> str:
     from markupsafe import Markup
 
     page = resources.files("figaroh_jax") / "page"
     sliding = prismatic(found.learned.robot)
-    return page_template("excitation.html").render(
+    return page_template("excitation.html", folder).render(
         d=found,
         robot=found.learned.robot.name,
         joints=list(found.learned.robot.dof_names),
@@ -239,6 +263,7 @@ def _page(found: Design, drawn: list[tuple[np.ndarray, dict[str, np.ndarray]]]) 
         failure=failure(found),
         parameters=list(zip(found.learned.expressions, found.std_before.tolist(), found.std.tolist(), strict=True)),
         curves=[_curves(found, time, arrays) for time, arrays in drawn],
+        near=[_near_curve(stage, found.limits) for stage in found.stages],
         css=Markup((page / "report.css").read_text("utf-8")),
     )
 
@@ -254,6 +279,16 @@ def _curves(found: Design, time: np.ndarray, arrays: dict[str, np.ndarray]) -> l
             own.append(_curve(kind, time, values[:, j], ends))
         out.append(own)
     return out
+
+
+def _near_curve(stage: Stage, limits: Limits) -> dict[str, Any] | None:
+    """The least distance between bodies against time, and the margin."""
+    near = nearest_bodies(stage, limits)
+    if near is None or limits.clearance is None:
+        return None
+    return _curve(
+        "clearance", near[0], np.minimum(near[1], 10 * limits.clearance.margin), np.array([limits.clearance.margin])
+    )
 
 
 def _curve(kind: str, time: np.ndarray, values: np.ndarray, ends: np.ndarray) -> dict[str, Any]:

@@ -41,7 +41,7 @@ def write_identification(found: Identification, path: Path, title: str, *, model
     roles = [trace.role for trace in found.traces]
     kinds = {"given links": found.nominal, "free links": found.unconstrained, "fit": found.fit}
     judged = list(found.holdout.values())[-1] if found.holdout else found.validated
-    text = page_template("identification.html").render(
+    text = page_template("identification.html", path.parent).render(
         d=found,
         robot=title,
         columns=kinds | {"cross-validated": found.validated} | found.holdout,

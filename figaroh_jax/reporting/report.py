@@ -1,13 +1,12 @@
 """The report: one HTML page that holds all it needs, to be opened from a disk, on a phone, or printed.
 
-The page is a template of `figaroh_jax/page`; plotly.js, which draws the plots, is taken from the installed plotly
-package as text, because importing that package would cost more than writing the page.
+The page is a template of `figaroh_jax/page`; plotly.js, which draws the plots, is its basic bundle (npm's
+plotly.js-basic-dist-min 4.1.1), packed into the page.
 """
 
 from __future__ import annotations
 
 import base64
-import importlib.util
 import json
 import math
 from collections.abc import Sequence
@@ -18,13 +17,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..results import Candidate, Diagnosis, Trace
+from ..errors import InputError
+from ..results import Candidate, Diagnosis, Part, Trace
 from . import wording
+from .picture import robot_picture
+from .provenance import read_provenance
 
 __all__ = ["page_template", "plot_data", "plotly_source", "write_report"]
 
 _POINTS = 1500  # of a trace at most: more cannot be told apart on a screen
-_PAGE_POINTS = 100_000  # of all traces of a channel together, so that a humanoid's page stays light
+_PAGE_POINTS = 45_000  # of all traces of a channel together, so that a humanoid's page stays light
 _STEPS = 32767  # of a channel's range on each side of its middle; finer than any plot shows
 
 _BADGES = {
@@ -77,18 +79,20 @@ class _Left(NamedTuple):
 
 def write_report(diagnosis: Diagnosis, path: Path, title: str) -> None:
     """Write the page of a diagnosis to `path`; `title` is the robot's name, as the verdict's sentence says it."""
-    path.write_text(_page(diagnosis, title), encoding="utf-8")
+    path.write_text(_page(diagnosis, title, path.parent), encoding="utf-8")
 
 
-def _page(diagnosis: Diagnosis, title: str) -> str:
+def _page(diagnosis: Diagnosis, title: str, folder: Path | None = None) -> str:
     from markupsafe import Markup
 
     page = resources.files("figaroh_jax") / "page"
     roles = [trace.role for trace in diagnosis.traces]
     gain = diagnosis.holdout
-    return page_template("report.html").render(
+    return page_template("report.html", folder).render(
         d=diagnosis,
         robot=title,
+        picture=Markup(_picture(diagnosis)),
+        anatomy=_anatomy(diagnosis),
         badge=_BADGES[diagnosis.verdict],
         sentence=_glued(wording.sentence(diagnosis, title)),
         largest=max(_finite(gain.before), _finite(gain.after)),
@@ -106,8 +110,36 @@ def _page(diagnosis: Diagnosis, title: str) -> str:
     )
 
 
-def page_template(name: str) -> Any:
-    """The page `name` of `figaroh_jax/page` with the filters that put numbers and names into words."""
+_KINDS = ("position", "velocity", "load", "standstill", "frequency", "time", "recording")
+
+
+def _picture(diagnosis: Diagnosis) -> str:
+    """The robot with the joints that the causes name, or those where most is left, in colour."""
+    if diagnosis.model is None:
+        return ""
+    affected = {name for cause in diagnosis.causes for name in cause.name.at}
+    return robot_picture(diagnosis.model.robot, affected=affected or _opened(diagnosis))
+
+
+def _anatomy(diagnosis: Diagnosis) -> list[tuple[str, list[tuple[float, str]]]]:
+    """What is left at each joint by what it goes with: the kinds found as columns, shares as cells."""
+    kinds = [kind for kind in _KINDS if any(part.kind == kind for part in diagnosis.rest.parts)]
+    if not kinds:
+        return []
+
+    def cell(joint: str, kind: str) -> tuple[float, str]:
+        parts: list[Part] = [p for p in diagnosis.rest.parts if p.kind == kind and p.at[:1] == (joint,)]
+        return (max(p.share for p in parts), "; ".join(wording.dependence(p) for p in parts)) if parts else (0.0, "")
+
+    head = ("", [(0.0, kind) for kind in kinds])
+    return [head, *((joint, [cell(joint, kind) for kind in kinds]) for joint in diagnosis.joints)]
+
+
+def page_template(name: str, folder: Path | None = None) -> Any:
+    """The page `name` of `figaroh_jax/page` with the filters that put numbers and names into words.
+
+    What made the run in `folder` stands at its foot.
+    """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     pages = PackageLoader("figaroh_jax", "page")
@@ -131,6 +163,7 @@ def page_template(name: str) -> Any:
         "title_of": wording.effect_title,
         "visible": lambda value: "never" if value == math.inf else wording.number(value, 2),
     }
+    environment.globals["made"] = None if folder is None else _made_by(folder)
     return environment.get_template(name)
 
 
@@ -184,7 +217,7 @@ def _rank(candidate: Candidate) -> float:
 def plot_data(floor: Float[np.ndarray, " nv"], units: Sequence[str], traces: Sequence[Trace]) -> str:
     """What the plots are drawn from, as JSON that may stand inside a script element."""
     count = len(units) * max(len(traces), 1)
-    points = min(_POINTS, max(200, _PAGE_POINTS // count))
+    points = min(_POINTS, max(60, _PAGE_POINTS // count))
     joints = [
         {"noise": _finite(float(noise)), "unit": unit, "angle": "m" if unit == "N" else "rad"}
         for noise, unit in zip(floor, units, strict=True)
@@ -229,13 +262,17 @@ def _packed(values: Float[np.ndarray, " samples"]) -> dict[str, Any]:
 
 
 def plotly_source() -> str:
-    """Source of plotly.js; empty without the plotly package, and the page then says that it cannot draw."""
-    found = importlib.util.find_spec("plotly")
-    folders = found.submodule_search_locations if found else None
-    source = Path(folders[0], "package_data", "plotly.min.js") if folders else None
-    if source is None or not source.is_file():
-        return ""
-    return source.read_text("utf-8").replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    """plotly.js, deflated and in base64: a tenth of the whole library, and the page unpacks it when it draws."""
+    packed = (resources.files("figaroh_jax") / "page" / "plotly-basic.min.js.gz").read_bytes()
+    return base64.b64encode(packed).decode("ascii")
+
+
+def _made_by(folder: Path) -> dict[str, Any] | None:
+    """What made the run in `folder`, for the foot of its page; None where that is not said."""
+    try:
+        return read_provenance(folder)
+    except InputError:
+        return None
 
 
 def _glued(text: str) -> str:

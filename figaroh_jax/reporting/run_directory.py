@@ -617,7 +617,13 @@ def task_inputs(task_file: Path) -> list[Path]:
                 named = file.resolve().parent / text
                 if named.is_file():
                     found += [named, *(_referred(named) if named.suffix.lower() in (".xml", ".urdf") else ())]
+                elif any((named / marker).is_file() for marker in _RECORDED):
+                    found += [file for file in sorted(named.rglob("*")) if file.suffix in _READ and file.is_file()]
     return found
+
+
+_RECORDED = ("metadata.yaml", "meta/info.json")  # by which a folder is a recording: a ROS 2 bag, LeRobot
+_READ = (".yaml", ".json", ".jsonl", ".parquet", ".db3", ".mcap")
 
 
 def _texts(keys: Any) -> Iterator[str]:

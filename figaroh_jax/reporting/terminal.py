@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ..identification.result import FittedEffect, Identification
-from ..results import Cause, Diagnosis
+from ..results import Cause, Diagnosis, Estimate
 from . import wording
 
 if TYPE_CHECKING:
@@ -65,13 +66,24 @@ class Progress:
         self._phase = phase
 
 
-def show(diagnosis: Diagnosis, robot: str = "the robot") -> None:
+def show(diagnosis: Diagnosis, robot: str = "the robot", *, verbose: bool = False) -> None:
     """Print the summary on standard output."""
-    Console(file=sys.stdout).print(summary(diagnosis, robot))
+    Console(file=sys.stdout).print(summary(diagnosis, robot, verbose=verbose))
 
 
-def summary(diagnosis: Diagnosis, robot: str = "the robot") -> RenderableType:
-    """The diagnosis in a few lines: verdict, causes with parameters, residual per joint, what to measure next."""
+def _notes(notes: Sequence[str], verbose: bool) -> list[RenderableType]:
+    """The notes, or how many there are."""
+    if verbose:
+        return [Text(f"Note: {note}", style="dim") for note in notes]
+    count = f"{len(notes)} note{'s'[: len(notes) != 1]}"
+    return [Text(f"{count} on the data: in the report, or with --verbose", style="dim")] if notes else []
+
+
+def summary(diagnosis: Diagnosis, robot: str = "the robot", *, verbose: bool = False) -> RenderableType:
+    """The diagnosis in a few lines: verdict, causes with parameters, residual per joint, what to measure next.
+
+    The notes on the data are counted; `verbose` shows them.
+    """
     head = Text.assemble((diagnosis.verdict, _STYLE[diagnosis.verdict]), f"  {wording.sentence(diagnosis, robot)}")
     parts: list[RenderableType] = [head]
     parts += [_cause(number, cause) for number, cause in enumerate(diagnosis.causes, 1)]
@@ -86,16 +98,16 @@ def summary(diagnosis: Diagnosis, robot: str = "the robot") -> RenderableType:
         parts.append(Text(f"Measure next: {diagnosis.experiment.text}"))
         if diagnosis.experiment.separates:
             parts.append(Text("`figaroh-jax excite --from RUN` designs a motion that separates them", style="dim"))
-    parts += [Text(f"Note: {note}", style="dim") for note in diagnosis.notes]
+    parts += _notes(diagnosis.notes, verbose)
     return Group(*parts)
 
 
-def show_calibration(calibration: Calibration, verdict: str = "") -> None:
+def show_calibration(calibration: Calibration, verdict: str = "", *, verbose: bool = False) -> None:
     """Print the summary of a calibration, or of a diagnosis of poses with its verdict, on standard output."""
-    Console(file=sys.stdout).print(calibration_summary(calibration, verdict))
+    Console(file=sys.stdout).print(calibration_summary(calibration, verdict, verbose=verbose))
 
 
-def calibration_summary(calibration: Calibration, verdict: str = "") -> RenderableType:
+def calibration_summary(calibration: Calibration, verdict: str = "", *, verbose: bool = False) -> RenderableType:
     """The calibration in a few lines: how much better, why this level, outliers and causes, what to know."""
     word = (verdict, _STYLE[verdict]) if verdict else (calibration.level, "bold blue")
     head = Text.assemble(word, f"  {wording.calibration_sentence(calibration)}\n")
@@ -117,7 +129,7 @@ def calibration_summary(calibration: Calibration, verdict: str = "") -> Renderab
                 Text(f"   not distinguishable from {wording.aside(cause.name, cause.ambiguous_with)}", style="yellow")
             )
     parts.append(Text(f"\nHeld out: {calibration.scheme}. {wording.distances(calibration)}".rstrip(), style="dim"))
-    return Group(*parts, *(Text(f"Note: {note}", style="dim") for note in calibration.notes))
+    return Group(*parts, *_notes(calibration.notes, verbose))
 
 
 def _cause(number: int, cause: Cause) -> RenderableType:
@@ -130,7 +142,7 @@ def _cause(number: int, cause: Cause) -> RenderableType:
             f"{wording.error(gain.after, gain.unit)}, confidence {cause.confidence:.2f}",
         )
     ]
-    lines += [Text(f"{name}  {wording.interval(value)}") for name, value in cause.parameters.items()]
+    lines += [Text(line) for line in _aligned(cause.parameters)]
     if cause.ambiguous_with:
         lines.append(
             Text(f"not distinguishable from {wording.aside(cause.name, cause.ambiguous_with)}", style="yellow")
@@ -138,6 +150,16 @@ def _cause(number: int, cause: Cause) -> RenderableType:
     if cause.note:
         lines.append(Text(cause.note, style="dim"))
     return Group(lines[0], *(Padding(line, (0, 0, 0, 3), expand=False) for line in lines[1:]))
+
+
+def _aligned(parameters: Mapping[str, Estimate]) -> list[str]:
+    """One parameter a line, names, values and intervals below each other."""
+    sizes = {name: wording.interval(value).partition(" ± ") for name, value in parameters.items()}
+    widths = max(map(len, sizes), default=0), max((len(v) for v, mark, _ in sizes.values() if mark), default=0)
+    return [
+        f"{name:<{widths[0]}}  {value:>{widths[1] if mark else 0}}{mark}{rest}"
+        for name, (value, mark, rest) in sizes.items()
+    ]
 
 
 def _residuals(diagnosis: Diagnosis) -> RenderableType:
@@ -159,12 +181,12 @@ def _plain(text: str) -> str:
     return text.replace("[", "(").replace("]", ")")  # the progress bar reads brackets as its own markup
 
 
-def show_identification(found: Identification, robot: str = "the robot") -> None:
+def show_identification(found: Identification, robot: str = "the robot", *, verbose: bool = False) -> None:
     """Print the summary of an identification on standard output."""
-    Console(file=sys.stdout).print(identification_summary(found, robot))
+    Console(file=sys.stdout).print(identification_summary(found, robot, verbose=verbose))
 
 
-def identification_summary(found: Identification, robot: str = "the robot") -> RenderableType:
+def identification_summary(found: Identification, robot: str = "the robot", *, verbose: bool = False) -> RenderableType:
     """The identification in a few lines: rank, error of each joint, friction, notes."""
     base = [one.status for one in found.base]
     wrong = [link.name for link in found.links if not link.consistent]
@@ -178,8 +200,7 @@ def identification_summary(found: Identification, robot: str = "the robot") -> R
     parts: list[RenderableType] = [head, Text(links, style="yellow" if wrong else "")]
     parts += [Text(), _qualities(found), Text()]
     parts += [Text(_effect(effect)) for effect in found.effects]
-    parts += [Text(f"Note: {note}", style="dim") for note in found.notes]
-    return Group(*parts)
+    return Group(*parts, *_notes(found.notes, verbose))
 
 
 def _effect(effect: FittedEffect) -> str:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import inspect
 import math
+import shutil
+import sys
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +24,7 @@ __all__ = [
     "effect_meaning",
     "effect_title",
     "error",
+    "fitted",
     "interval",
     "level",
     "nearest",
@@ -107,6 +111,25 @@ def distances(calibration: Calibration) -> str:
     )
 
 
+def fitted(text: str) -> str:
+    """The text with no line longer than the terminal, what is too long continued indented; untouched in a pipe or file.
+
+    A program's own output (`sys.__stdout__`) is looked at, for the text may be collected before it is written.
+    """
+    real = sys.__stdout__
+    if real is None or real.closed or not real.isatty():
+        return text
+    width = max(shutil.get_terminal_size().columns, 20)
+    lines = []
+    for line in text.splitlines():
+        inner = " " * (len(line) - len(line.lstrip()) + 4)
+        whole = (
+            textwrap.wrap(line, width, subsequent_indent=inner, drop_whitespace=True) if len(line) > width else [line]
+        )
+        lines += whole
+    return "\n".join(lines) + ("\n" if text.endswith("\n") else "")
+
+
 def level(name: str) -> str:
     """A level of calibration in words."""
     words = {"joint_offset": "joint offsets", "full": "full geometry", "chosen": "as selected within each fold"}
@@ -157,12 +180,20 @@ def interval(estimate: Estimate) -> str:
     if not (math.isfinite(half) and half > 0.0):
         return _with_unit(number(estimate.value), estimate.unit)
     power = math.floor(math.log10(half))
-    decimals = max(0, 1 - power)
-    if decimals > 6 or abs(estimate.value) >= 1e6:  # digits that nobody would count
-        scale = math.floor(math.log10(max(abs(estimate.value), half)))
-        pair = Estimate(estimate.value / 10.0**scale, estimate.std / 10.0**scale, "")
-        return _with_unit(f"({interval(pair)}) × 10{_superscript(scale)}", estimate.unit)
-    return _with_unit(_minus(f"{estimate.value:.{decimals}f} ± {half:.{decimals}f}"), estimate.unit)
+    decimals, large = max(0, 1 - power), max(abs(estimate.value), half)
+    scale = math.floor(math.log10(large))
+    if scale < -4 or large >= 1e6:
+        decimals = max(0, 1 - power + scale)
+        pair = _value_and_half(estimate.value / 10.0**scale, half / 10.0**scale, decimals)
+        return _with_unit(f"({pair}) × 10{_superscript(scale)}", estimate.unit)
+    return _with_unit(_value_and_half(estimate.value, half, decimals), estimate.unit)
+
+
+def _value_and_half(value: float, half: float, decimals: int) -> str:
+    """Both with as many decimals as the half width has two digits; six at most, which is more than anybody reads."""
+    if decimals > 6:
+        return _minus(f"{value:.6f} ± {half:.1g}")
+    return _minus(f"{value:.{decimals}f} ± {half:.{decimals}f}")
 
 
 def error(value: float, of: str) -> str:

@@ -1,0 +1,77 @@
+"""Recording files: NumPy, text, MATLAB, HDF5, Parquet, ROS bags and LeRobot folders behind one function."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from ..errors import InputError
+from ..formats.files import plain_file
+from .bags import read_bag
+from .containers import read_hdf5, read_lerobot, read_mat, read_npz, read_parquet
+from .tables import LARGEST, Source, Table
+from .textfiles import read_text
+
+__all__ = ["BAGS", "FORMATS", "TEXT", "kind_of", "read_table"]
+
+LARGEST_FILE = 2 << 30  # bytes
+TEXT = (".csv", ".tsv", ".txt", ".log", ".dat")
+_HDF5 = (".h5", ".hdf5", ".hdf")
+_FOLDERS = ("rosbag2", "lerobot")
+BAGS = (".bag", ".mcap", ".db3", "rosbag2")
+FORMATS = (".npz", ".csv", ".parquet", ".mat", *TEXT[1:], *_HDF5, *BAGS[:3])
+_OWNERS = {"topic": "ROS bags and MCAP files", "episode": "LeRobot folders"}
+_WHOLE = Source()
+
+
+def read_table(file: Path, key: str, source: Source = _WHOLE) -> Table:
+    """Open a recording; raises `InputError` that names the file, and the task's `key` that asks for it."""
+    suffix = kind_of(file)
+    if suffix not in _READERS:
+        raise InputError(f"{file} ({key}): recordings are {', '.join(FORMATS)}, not '{file.suffix or file.name}'")
+    if suffix not in _FOLDERS:
+        plain_file(file, f"{file} ({key})", "a recording file", LARGEST if suffix in TEXT else LARGEST_FILE, FORMATS)
+    for name, given, where in (("topic", source.topic, BAGS), ("episode", source.episode, ("lerobot",))):
+        if given is not None and suffix not in where:
+            raise InputError(f"{file} ({key}): `{name}` is of {_OWNERS[name]}, which this file is not")
+    try:
+        return _READERS[suffix](file, source)
+    except InputError:
+        raise
+    except ModuleNotFoundError as error:
+        package, extra = _EXTRAS[suffix]
+        raise InputError(
+            f"{file} ({key}): reading it needs the package {package}: pip install 'figaroh-jax[{extra}]' ({error})"
+        ) from None
+    except OSError as error:
+        raise InputError(f"{file} ({key}) cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # zipfile, zlib, numpy, Arrow, ... each have their own ways to say "damaged"
+        raise InputError(f"{file} ({key}) is damaged or of another format: {error}") from error
+
+
+def kind_of(file: Path) -> str:
+    """The suffix of a file; "rosbag2" or "lerobot" for a folder that is one."""
+    if os.path.isfile(file / "metadata.yaml"):
+        return "rosbag2"
+    if os.path.isfile(file / "meta" / "info.json"):
+        return "lerobot"
+    return file.suffix.lower()
+
+
+_READERS: dict[str, Callable[[Path, Source], Table]] = {
+    ".npz": lambda file, source: read_npz(file),
+    ".mat": lambda file, source: read_mat(file),
+    ".parquet": lambda file, source: read_parquet(file),
+    "lerobot": read_lerobot,
+    **dict.fromkeys(_HDF5, lambda file, source: read_hdf5(file)),
+    **dict.fromkeys(TEXT, lambda file, source: read_text(file, source.form)),
+    **dict.fromkeys(BAGS, lambda file, source: read_bag(file, source.topic)),
+}
+_EXTRAS = {
+    ".parquet": ("pyarrow", "parquet"),
+    "lerobot": ("pyarrow", "parquet"),
+    ".mat": ("h5py", "hdf5"),
+    **dict.fromkeys(_HDF5, ("h5py", "hdf5")),
+    **dict.fromkeys(BAGS, ("rosbags", "ros")),
+}

@@ -1,0 +1,243 @@
+"""Text tables: any delimiter, header rows, units and comments above the numbers, decimal commas, ISO times.
+
+The file is read in blocks of whole lines, so that only the numbers are ever held, and progress is told.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterator, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import InputError
+from .tables import LARGEST_HEAD, Table, check_columns, told
+
+__all__ = ["LIBFRANKA", "read_text"]
+
+LIBFRANKA = "libfranka"
+_DELIMITERS = (",", ";", "\t", "|", None)  # None: white space
+_BLOCK = 1 << 23  # bytes read at once
+_LEAD = 60  # lines above the numbers, at most
+_DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+([eE][+-]?\d+)?\s*")
+_NOT_NUMBERS = ("", "na", "n/a", "null", "none", "-")
+
+
+class _Layout(NamedTuple):
+    """How the lines of a file are read."""
+
+    names: tuple[str, ...]
+    delimiter: str | None  # None: white space
+    skipped: int  # lines above the first row of numbers
+    decimal: str  # "," or "."
+
+
+def read_text(file: Path, form: str | None = None) -> Table:
+    """A text table with named columns; a column that is not numbers is refused only where it is asked for.
+
+    `form` is a format whose columns have names of their own ("libfranka"). A file without a header has the columns
+    `column_1`, `column_2`, ... Raises `InputError` that names the line for a file that is no table.
+    """
+    layout = _layout(file)
+    names = _libfranka(layout.names) if form == LIBFRANKA else layout.names
+    check_columns(file, len(names))
+    numbers, texts = _read(file, layout)
+
+    def read(name: str) -> np.ndarray:
+        if names.count(name) > 1:
+            raise InputError(f"{file}: the column '{name}' stands there twice")
+        column = names.index(name)
+        return numbers[:, column] if column not in texts else _as_time(file, name, texts[column])
+
+    return Table(file, names, read)
+
+
+def _layout(file: Path) -> _Layout:
+    lines = _first_lines(file)
+    delimiter = _delimiter(lines)
+    rows = [_cells(line, delimiter) for line in lines]
+    decimal = "." if delimiter == "," else _decimal(rows)
+    first = next((k for k, row in enumerate(rows) if _is_data(row, decimal)), None)
+    if first is None:
+        if len(lines) < 2:
+            raise InputError(f"{file} is not a table of numbers with a header line: it has {len(lines)} line(s)")
+        first = 1  # names and rows of text: each column says what is wrong with it once it is asked for
+    width = len(rows[first])
+    heads = [k for k in range(first) if len(rows[k]) == width and lines[k].strip()]
+    if not heads:
+        if first:
+            raise InputError(
+                f"{file}: line {first + 1} has {width} cells, but no line above it has as many names; a header line"
+                " with one name for each column is expected"
+            )
+        return _Layout(tuple(f"column_{k + 1}" for k in range(width)), delimiter, 0, decimal)
+    names = tuple(name.strip().strip('"').strip() for name in rows[heads[0]])
+    return _Layout((names[0].lstrip("#%").strip(), *names[1:]), delimiter, first, decimal)
+
+
+def _first_lines(file: Path) -> list[str]:
+    with file.open("rb") as stream:
+        head = stream.readline(LARGEST_HEAD)
+        if len(head) == LARGEST_HEAD:
+            raise InputError(
+                f"{file}: its first line is longer than {LARGEST_HEAD >> 20} MiB; names of columns are expected"
+            )
+        lines = [head, *(stream.readline(LARGEST_HEAD) for _ in range(_LEAD))]
+    try:
+        return [line.decode("utf-8-sig").rstrip("\r\n") for line in lines if line]
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file}: its first lines are no text in UTF-8 ({error}); save it as UTF-8") from None
+
+
+def _cells(line: str, delimiter: str | None) -> list[str]:
+    text = line.strip()
+    if text[:1] in "#%" and text:
+        text = text[1:].strip()
+    if delimiter is None:
+        return text.split()
+    return next(csv.reader([text], delimiter=delimiter), []) if '"' in text else text.split(delimiter)
+
+
+def _delimiter(lines: Sequence[str]) -> str | None:
+    """What splits most lines into one number of cells, that of the last lines, and into most cells."""
+    best, delimiter = (0, 1), ","
+    tail = [line for line in lines if line.strip()][-20:]
+    for one in _DELIMITERS:
+        counts = [len(_cells(line, one)) for line in tail]
+        same = sum(count == counts[-1] for count in counts) if counts else 0
+        if counts and counts[-1] > 1 and same >= 0.5 * len(counts) and (same, counts[-1]) > best:
+            best, delimiter = (same, counts[-1]), one
+    comma_decimals = delimiter == "," and any(";" in line for line in tail)
+    return ";" if comma_decimals and len({line.count(";") for line in tail}) == 1 else delimiter
+
+
+def _decimal(rows: Sequence[Sequence[str]]) -> str:
+    cells = [cell for row in rows[-20:] for cell in row]
+    return "," if sum(_DECIMAL_COMMA.fullmatch(cell) is not None for cell in cells) > 0.2 * max(len(cells), 1) else "."
+
+
+def _is_data(row: Sequence[str], decimal: str) -> bool:
+    """Whether a line is a row of numbers: names and units may hold one or two, a row has them mostly."""
+    filled = [cell for cell in row if cell.strip().lower() not in _NOT_NUMBERS]
+    return len(filled) > 0 and sum(_number(cell, decimal) is not None for cell in filled) > 0.5 * len(filled)
+
+
+def _number(cell: str, decimal: str = ".") -> float | None:
+    try:
+        return float(cell.replace(",", ".") if decimal == "," else cell)
+    except ValueError:
+        return None
+
+
+def _blocks(file: Path, skipped: int) -> Iterator[tuple[str, float]]:
+    """Whole lines of the file below the header, and the share of the file that is read."""
+    size, left = max(file.stat().st_size, 1), b""
+    with file.open("rb") as stream:
+        for _ in range(skipped):
+            stream.readline()
+        while block := stream.read(_BLOCK):
+            whole, mark, rest = (left + block).rpartition(b"\n")
+            left = rest
+            if mark:
+                yield _decoded(file, whole), stream.tell() / size
+    if left.strip():
+        yield _decoded(file, left), 1.0
+
+
+def _decoded(file: Path, block: bytes) -> str:
+    try:
+        return block.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file}: is no text in UTF-8 ({error}); save it as UTF-8") from None
+
+
+def _read(file: Path, layout: _Layout) -> tuple[Float[np.ndarray, "rows columns"], dict[int, list[str]]]:
+    """The numbers of all columns, and the cells of those that hold text."""
+    parts: list[np.ndarray] = []
+    texts: dict[int, list[str]] = {}
+    row = 0
+    for block, share in _blocks(file, layout.skipped):
+        numbers = _fast(block, layout) if not texts else None
+        if numbers is None:
+            numbers = _slowly(file, block, layout, texts, row)
+        parts.append(numbers)
+        row += len(numbers)
+        if share < 1.0 or len(parts) > 1:
+            told(f"reading {file.name}", share)
+    if not row:
+        raise InputError(f"{file} is not a table of numbers with a header line: no row stands below its header")
+    return np.concatenate(parts), texts
+
+
+def _fast(block: str, layout: _Layout) -> np.ndarray | None:
+    """Rows of a block whose every cell is a number; None where one is not."""
+    text = block.replace(",", ".") if layout.decimal == "," else block
+    try:
+        found = np.loadtxt(io.StringIO(text), delimiter=layout.delimiter, ndmin=2, quotechar='"', comments=None)
+    except ValueError:
+        return None
+    return found if found.shape[1:] == (len(layout.names),) and len(found) else None
+
+
+def _slowly(file: Path, block: str, layout: _Layout, texts: dict[int, list[str]], before: int) -> np.ndarray:
+    """Rows of a block cell by cell: empty ones are NaN, a column with a word is kept as text."""
+    lines = [line for line in block.splitlines() if line.strip()]
+    split = (
+        [line.split() for line in lines]
+        if layout.delimiter is None
+        else [*csv.reader(lines, delimiter=layout.delimiter)]
+    )
+    width = len(layout.names)
+    out = np.full((len(split), width), np.nan)
+    for k, cells in enumerate(split):
+        if len(cells) != width:
+            if len(cells) == width + 1 and not cells[-1].strip():
+                cells = cells[:-1]  # a delimiter at the end of the line
+            else:
+                raise InputError(
+                    f"{file} is not a CSV table: row {before + k} (from 0) has {len(cells)} cells, its header {width}"
+                )
+        for column, cell in enumerate(cells):
+            value = None if column in texts else _number(cell, layout.decimal)
+            if value is not None:
+                out[k, column] = value
+            elif column in texts:
+                texts[column].append(cell)
+            elif cell.strip().lower() not in _NOT_NUMBERS:
+                texts[column] = [""] * (before + k) + [cell]
+    for cells in texts.values():
+        cells += [""] * (before + len(split) - len(cells))
+    return out
+
+
+def _as_time(file: Path, name: str, cells: Sequence[str]) -> Float[np.ndarray, " rows"]:
+    """Seconds since the first of ISO times; an `InputError` that shows the first cell that is neither."""
+    try:
+        stamps = [datetime.fromisoformat(cell.strip().replace(" UTC", "+00:00")) for cell in cells]
+        return np.array([(stamp - stamps[0]).total_seconds() for stamp in stamps])
+    except (ValueError, TypeError):
+        row = next((k for k, cell in enumerate(cells) if cell and _number(cell) is None and not _iso(cell)), 0)
+        shown = f"'{cells[row]}'"[:40] if cells[row] else "an empty cell"
+        raise InputError(f"{file}: '{name}', row {row} (from 0): {shown} is not a number") from None
+
+
+def _iso(cell: str) -> bool:
+    try:
+        return bool(datetime.fromisoformat(cell.strip().replace(" UTC", "+00:00")))
+    except ValueError:
+        return False
+
+
+def _libfranka(names: Sequence[str]) -> tuple[str, ...]:
+    """The columns of libfranka's logs, old and new, under one name each: `time` (ms), `q[0]`, ..., `cmd.tau_J_d[0]`."""
+    found: list[str] = []
+    for name in names:
+        plain = {"duration": "time", "success rate": "success_rate"}.get(name, name.removeprefix("state."))
+        found.append(f"cmd.{plain}" if "sent commands" in found or plain in found else plain)
+    return tuple(found)

@@ -1,0 +1,111 @@
+"""A static picture of the robot: an SVG of its links as lines, the joints that a finding names in colour.
+
+Seen from the side that shows most of the robot, with the nominal one beside a corrected one where they differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from html import escape
+
+import numpy as np
+from jaxtyping import Float
+
+from ..rigid.kinematics import forward_kinematics
+from ..rigid.model import RobotModel
+
+__all__ = ["robot_picture", "segments"]
+
+_WIDTH, _HEIGHT, _EDGE = 460.0, 300.0, 34.0
+_AZIMUTHS = np.deg2rad(np.arange(20, 200, 15))
+_ELEVATION = np.deg2rad(18.0)
+
+
+def segments(model: RobotModel, q: Float[np.ndarray, " nv"]) -> Float[np.ndarray, "nj 2 3"]:
+    """From the parent's joint (or the world's origin) to every joint, m."""
+    origins = np.concatenate([np.zeros((1, 3)), np.asarray(forward_kinematics(model, q))[:, :3, 3]])
+    parents = np.array([joint.parent for joint in model.joints]) + 1
+    return np.stack([origins[parents], origins[1:]], axis=1)
+
+
+def robot_picture(
+    model: RobotModel,
+    q: Float[np.ndarray, " nq"] | None = None,
+    affected: Collection[str] = (),
+    nominal: RobotModel | None = None,
+    magnify: float = 1.0,
+) -> str:
+    """SVG of the robot at `q` (default: the middle of its range), the joints and links in `affected` in colour.
+
+    With `nominal` that robot is drawn behind, and `model` is drawn `magnify` times as far from it as it is.
+    """
+    q = _middle(model) if q is None else q
+    lines = np.concatenate([segments(model, q), _tips(model, q)])
+    behind = None if nominal is None else np.concatenate([segments(nominal, q), _tips(nominal, q)])
+    if behind is not None:
+        lines = behind + magnify * (lines - behind)
+    flat = _projected(lines if behind is None else np.concatenate([lines, behind]))
+    count = len(model.joints)
+    parts = [_line(line, "nominal") for line in flat[len(lines) :]]
+    parts += [_line(line, "link") for line in flat[count : len(lines)]]
+    for joint, line in zip(model.joints, flat[:count], strict=True):
+        parts.append(_line(line, "hit" if joint.link in affected and joint.name not in affected else "link"))
+    for joint, line in zip(model.joints, flat[:count], strict=True):
+        hit = joint.name in affected or joint.link in affected
+        parts.append(_joint(joint.name, line[1], hit))
+    named = ", ".join(joint.name for joint in model.joints if joint.name in affected or joint.link in affected)
+    text = f"{model.name}, {count} joints; affected: {named or 'none'}"
+    view = f'viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}"'
+    return f'<svg class="robot" {view} role="img" aria-label="{escape(text)}">{"".join(parts)}</svg>'
+
+
+def _tips(model: RobotModel, q: Float[np.ndarray, " nq"]) -> Float[np.ndarray, "tips 2 3"]:
+    """From each joint that carries no other to the farthest frame fixed to it."""
+    poses = np.asarray(forward_kinematics(model, q))
+    lines = []
+    for k in set(range(len(model.joints))) - {joint.parent for joint in model.joints}:
+        places = [
+            np.asarray(p)[:3, 3] for f, p in zip(model.frames, model.frame_placement, strict=True) if f.parent == k
+        ]
+        far = max(places, key=lambda place: float(np.linalg.norm(place)), default=np.zeros(3))
+        lines.append([poses[k, :3, 3], poses[k, :3, :3] @ far + poses[k, :3, 3]])
+    return np.array(lines).reshape(-1, 2, 3)
+
+
+def _middle(model: RobotModel) -> Float[np.ndarray, " nq"]:
+    """The middle of every joint's range within half a turn, bent a little, so that no links hide each other."""
+    if model.nq != model.nv:
+        from ..rigid.manifold import neutral
+
+        return np.asarray(neutral(model))
+    limits = np.clip(np.nan_to_num(np.asarray(model.position_limit)), -1.2, 1.2)
+    middle = limits.mean(axis=1)
+    return np.clip(middle + 0.35 * np.resize([1.0, -1.0, 1.0], len(middle)), limits[:, 0], limits[:, 1])
+
+
+def _projected(lines: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, "n 2 2"]:
+    """Screen coordinates from the direction in which the robot spreads most."""
+    views = []
+    for azimuth in _AZIMUTHS:
+        across = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        into = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        up = np.array([0.0, 0.0, np.cos(_ELEVATION)]) + np.sin(_ELEVATION) * into
+        views.append(np.stack([lines @ across, -(lines @ up)], axis=-1))
+    flat = max(views, key=lambda view: float(np.linalg.norm(view[:, 1] - view[:, 0], axis=-1).sum()))
+    low, high = flat.min(axis=(0, 1)), flat.max(axis=(0, 1))
+    room = np.array([_WIDTH - 2 * _EDGE - 60.0, _HEIGHT - 2 * _EDGE])
+    scale = float(np.min(room / np.maximum(high - low, 1e-9)))
+    shift = np.array([_WIDTH - 60.0, _HEIGHT]) / 2 - scale * (low + high) / 2
+    return scale * flat + shift
+
+
+def _line(line: Float[np.ndarray, "2 2"], kind: str) -> str:
+    (a, b), (c, d) = line
+    return f'<path class="{kind}" d="M{a:.1f} {b:.1f}L{c:.1f} {d:.1f}"/>'
+
+
+def _joint(name: str, at: Float[np.ndarray, "2"], hit: bool) -> str:
+    kind, size = ("hit", 7) if hit else ("joint", 4)
+    label = f'<text x="{at[0] + 10:.1f}" y="{at[1] - 9:.1f}">{escape(name)}</text>' if hit else ""
+    place = f'cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="{size}"'
+    return f'<circle class="{kind}" {place}><title>{escape(name)}</title></circle>{label}'

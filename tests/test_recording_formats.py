@@ -1,0 +1,406 @@
+"""Recordings as users have them: written by the libraries that made them, read back as the same numbers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from generators import make_case
+
+from figaroh_jax.errors import InputError
+from figaroh_jax.formats.config import load_task
+from figaroh_jax.formats.robotfile import load_robot
+from figaroh_jax.recordings.dataset import Recording, read_recordings
+from figaroh_jax.recordings.draft import Undecided, draft_task
+from figaroh_jax.recordings.reading import read_table
+from figaroh_jax.recordings.tables import listener
+
+NAMES = ("lift", "swing", "slide")
+ROBOTS: dict[str, Any] = {}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[str, ...], dict[str, Any]]:
+    case = make_case(robot="small", repeats=1, trajectories=1, seed=4)
+    urdf = tmp_path_factory.mktemp("robot") / "robot.urdf"
+    urdf.write_text(case.urdf)
+    return urdf, case.joints, case.recordings[0]
+
+
+def drafted(urdf: Path, file: Path, folder: Path, **known: Any) -> tuple[dict[str, Any], Recording]:
+    """The first entry of a draft, and the recording that the draft reads."""
+    task_file = folder / "task.yaml"
+    task_file.write_text(draft_task(urdf, [file], **known).text)
+    task = load_task(task_file)
+    recording, *_ = read_recordings(task, load_robot(task))
+    return task.data[0].model_dump(exclude_defaults=True), recording
+
+
+def assert_read(recording: Recording, run: dict[str, Any], atol: float = 1e-9) -> None:
+    assert recording.torque is not None
+    np.testing.assert_allclose(recording.position, run["position"], rtol=0, atol=atol)
+    np.testing.assert_allclose(recording.torque, run["torque"], rtol=0, atol=atol)
+    np.testing.assert_allclose(np.diff(recording.time), np.diff(run["time"]), rtol=0, atol=2e-6)
+
+
+# ROS
+
+
+def bag(path: Path, joints: tuple[str, ...], run: dict[str, Any], plugin: str) -> Path:
+    """A ROS 2 bag of joint states with joints in another order, a message sent twice, and a wrench."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kinds = store.types
+    state, header = kinds["sensor_msgs/msg/JointState"], kinds["std_msgs/msg/Header"]
+    stamp, wrench = kinds["builtin_interfaces/msg/Time"], kinds["geometry_msgs/msg/WrenchStamped"]
+    vector, pure = kinds["geometry_msgs/msg/Vector3"], kinds["geometry_msgs/msg/Wrench"]
+    order = np.arange(len(joints))[::-1]
+    start = 1_700_000_000_000_000_000
+    with Writer(path, version=9, storage_plugin=getattr(StoragePlugin, plugin)) as writer:
+        states = writer.add_connection("/joint_states", state.__msgtype__, typestore=store)
+        forces = writer.add_connection("/ft", wrench.__msgtype__, typestore=store)
+        for k, t in enumerate(run["time"]):
+            now = start + round(t * 1e9)
+            head = header(stamp(now // 10**9, now % 10**9), "")
+            message = state(
+                head,
+                [joints[j] for j in order],
+                run["position"][k, order],
+                np.zeros(len(joints)),
+                run["torque"][k, order],
+            )
+            data = store.serialize_cdr(message, state.__msgtype__)
+            for _ in range(2 if k == 3 else 1):
+                writer.write(states, now + 1000, data)
+            force = wrench(head, pure(vector(float(k), 0.0, 0.0), vector(0.0, 0.0, 1.0)))
+            writer.write(forces, now + 1000, store.serialize_cdr(force, wrench.__msgtype__))
+    return path
+
+
+@pytest.mark.parametrize("plugin", ["MCAP", "SQLITE3"])
+def test_a_bag_of_ros_2_is_drafted_and_read(made, tmp_path: Path, plugin: str):
+    urdf, joints, run = made
+    folder = bag(tmp_path / "bag", joints, run, plugin)
+    entry, recording = drafted(urdf, folder, tmp_path)
+    assert entry["time"] == "stamp" and "topic" not in entry
+    assert_read(recording, run)
+    single = next(file for file in folder.iterdir() if file.suffix in (".mcap", ".db3"))
+    assert_read(drafted(urdf, single, tmp_path)[1], run)
+    table = read_table(folder, "data")
+    np.testing.assert_array_equal(table.read("/ft:force.x"), np.arange(len(run["time"])))
+    with pytest.raises(InputError, match="no topic '/joint_state'; did you mean '/joint_states'"):
+        draft_task(urdf, [folder], topic="/joint_state")
+
+
+def test_a_file_of_another_mcap_writer_is_read(made, tmp_path: Path):
+    from mcap_ros2.writer import Writer
+
+    urdf, joints, run = made
+    text = (
+        "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"
+        "================================================================================\nMSG: std_msgs/Header\n"
+        "builtin_interfaces/Time stamp\nstring frame_id\n"
+        "================================================================================\n"
+        "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+    )
+    with (tmp_path / "run.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        schema = writer.register_msgdef("sensor_msgs/msg/JointState", text)
+        for k, t in enumerate(run["time"]):
+            now = 1_700_000_000_000_000_000 + round(t * 1e9)
+            writer.write_message(
+                topic="/arm/joint_states",
+                schema=schema,
+                message={
+                    "header": {"stamp": {"sec": now // 10**9, "nanosec": now % 10**9}, "frame_id": ""},
+                    "name": list(joints),
+                    "position": run["position"][k].tolist(),
+                    "velocity": [],
+                    "effort": run["torque"][k].tolist(),
+                },
+                log_time=now,
+                publish_time=now,
+            )
+        writer.finish()
+    assert_read(drafted(urdf, tmp_path / "run.mcap", tmp_path)[1], run)
+
+
+def test_a_bag_of_ros_1_with_controller_states_is_read(made, tmp_path: Path):
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    urdf, joints, run = made
+    name = "control_msgs/msg/JointTrajectoryControllerState"
+    text = "\n".join(
+        [
+            "std_msgs/Header header",
+            "string[] joint_names",
+            *(f"trajectory_msgs/JointTrajectoryPoint {part}" for part in ("desired", "actual", "error")),
+        ]
+    )
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(text, name))
+    kinds = store.types
+    header, stamp = kinds["std_msgs/msg/Header"], kinds["builtin_interfaces/msg/Time"]
+    point, duration = kinds["trajectory_msgs/msg/JointTrajectoryPoint"], kinds["builtin_interfaces/msg/Duration"]
+    none = np.zeros(0)
+    with Writer(tmp_path / "run.bag") as writer:
+        connection = writer.add_connection("/arm/state", name, typestore=store)
+        for k, t in enumerate(run["time"]):
+            now = 1_600_000_000_000_000_000 + round(t * 1e9)
+            points = [
+                point(run["position"][k] + off, none, none, effort, duration(0, 0))
+                for off, effort in ((0.01, none), (0.0, run["torque"][k]), (0.01, none))
+            ]
+            message = kinds[name](header(k, stamp(now // 10**9, now % 10**9), ""), list(joints), *points)
+            writer.write(connection, now, store.serialize_ros1(message, name))
+    assert_read(drafted(urdf, tmp_path / "run.bag", tmp_path)[1], run)
+    np.testing.assert_allclose(
+        read_table(tmp_path / "run.bag", "data").read(f"command.{joints[0]}"), run["position"][:, 0] + 0.01, rtol=1e-12
+    )
+
+
+# LeRobot
+
+
+def lerobot(folder: Path, joints: tuple[str, ...], run: dict[str, Any], version: str) -> Path:
+    """Three episodes, a third of the recording each; version 2 keeps one file each, version 3 one file of all."""
+    import pandas as pd
+
+    names = {"motors": [f"{joint}.pos" for joint in joints]} if version == "v2.1" else [f"{j}.pos" for j in joints]
+    features = {
+        "observation.state": {"dtype": "float32", "shape": [len(joints)], "names": names},
+        "observation.effort": {
+            "dtype": "float32",
+            "shape": [len(joints)],
+            "names": [f"{joint}.effort" for joint in joints],
+        },
+    }
+    (folder / "meta").mkdir(parents=True)
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps({"codebase_version": version, "features": features}))
+    frames = []
+    for episode, rows in enumerate(np.array_split(np.arange(len(run["time"])), 3)):
+        frames.append(
+            pd.DataFrame(
+                {
+                    "observation.state": list(run["position"][rows]),
+                    "observation.effort": list(run["torque"][rows]),
+                    "timestamp": run["time"][rows] - run["time"][rows[0]],
+                    "episode_index": episode,
+                }
+            )
+        )
+        if version == "v2.1":
+            frames[-1].to_parquet(folder / "data" / "chunk-000" / f"episode_{episode:06d}.parquet")
+    if version == "v3.0":
+        pd.concat(frames).to_parquet(folder / "data" / "chunk-000" / "file-000.parquet")
+    return folder
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_a_folder_of_lerobot_is_drafted_episode_by_episode(made, tmp_path: Path, version: str):
+    urdf, joints, run = made
+    folder = lerobot(tmp_path / "set", joints, run, version)
+    text = draft_task(urdf, [folder]).text
+    (tmp_path / "task.yaml").write_text(text)
+    task = load_task(tmp_path / "task.yaml")
+    assert [entry.episode for entry in task.data] == [0, 1, 2]
+    recordings = read_recordings(task, load_robot(task))
+    assert [recording.name for recording in recordings] == ["set_episode_0", "set_episode_1", "set_episode_2"]
+    whole = np.concatenate([recording.position for recording in recordings])
+    np.testing.assert_allclose(whole, run["position"], rtol=0, atol=1e-12)
+    with pytest.raises(InputError, match="3 episodes; `episode` must say which, 0 to 2"):
+        read_table(folder, "data")
+
+
+def test_degrees_and_per_cent_of_lerobot_look_alike_and_are_asked_for(made, tmp_path: Path):
+    urdf, joints, run = made
+    folder = lerobot(tmp_path / "set", joints, run | {"position": np.rad2deg(run["position"])}, "v3.0")
+    with pytest.raises(Undecided, match="share of the range of motion"):
+        draft_task(urdf, [folder])
+
+
+# Logs of robots
+
+
+def test_a_log_of_rtde_is_known_by_its_columns(made, tmp_path: Path):
+    urdf, _, run = made
+    constants = [11.0, 9.0, 8.0]
+    head = ["timestamp", *(f"actual_q_{k}" for k in range(3)), *(f"actual_current_{k}" for k in range(3)), "speed"]
+    rows = np.column_stack([run["time"] + 4e3, run["position"], run["torque"] / constants, np.ones(len(run["time"]))])
+    np.savetxt(tmp_path / "robot_data.csv", rows, "%.15g", " ", header=" ".join(head), comments="")
+    entry, recording = drafted(urdf, tmp_path / "robot_data.csv", tmp_path, constants=constants)
+    assert entry["format"] == "rtde" and entry["units"]["torque"] == "A"
+    assert_read(recording, run)
+    text = (tmp_path / "task.yaml").read_text()
+    (tmp_path / "task.yaml").write_text(text[: text.index("transmission")])
+    with pytest.raises(InputError, match="transmission.torque must say what one ampere gives, as a list"):
+        task = load_task(tmp_path / "task.yaml")
+        read_recordings(task, load_robot(task))
+
+
+@pytest.mark.parametrize("age", ["old", "new"])
+def test_logs_of_libfranka_are_known_by_their_columns(made, tmp_path: Path, age: str):
+    """Columns as `logToCSV` wrote them (commands under the names of states) and as it writes them today."""
+    urdf, _, run = made
+    time = np.round(run["time"] * 1e3).astype(int)
+    state = {name: [f"{name}[{k}]" for k in range(3)] for name in ("q", "q_d", "dq", "tau_J")}
+    zero = np.zeros_like(run["position"])
+    values = [run["position"], run["position"], zero, run["torque"]]
+    if age == "old":
+        names = ["duration", "success rate", *sum(state.values(), []), "sent commands", *state["q_d"]]
+    else:
+        names = [
+            "time",
+            "success_rate",
+            *(f"state.{n}" for n in sum(state.values(), [])),
+            *(f"cmd.{n}" for n in state["q_d"]),
+        ]
+    lines = [", ".join(names) if age == "old" else ",".join(names)]
+    for k in range(len(time)):
+        cells = [str(time[k]), "1", *(repr(float(x)) for part in values for x in part[k])]
+        cells += [""] * (age == "old") + [repr(float(x)) for x in run["position"][k]]
+        lines.append(",".join(cells))
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    entry, recording = drafted(urdf, tmp_path / "log.csv", tmp_path)
+    assert entry["format"] == "libfranka"
+    assert_read(recording, run)
+
+
+# Containers
+
+
+def test_hdf5_and_new_files_of_matlab_are_read(made, tmp_path: Path):
+    import h5py
+
+    urdf, _, run = made
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        group = file.create_group("run")
+        for name, key in (("time", "time"), ("q", "position"), ("tau", "torque")):
+            group[name] = run[key]
+    entry, recording = drafted(urdf, tmp_path / "run.h5", tmp_path)
+    assert entry["position"] == "run/q"
+    assert_read(recording, run)
+    with h5py.File(tmp_path / "run.mat", "w", userblock_size=512) as file:
+        for name, key in (("time", "time"), ("q", "position"), ("tau", "torque")):
+            file[f"log/{name}"] = np.atleast_2d(run[key].T)
+    head = b"MATLAB 7.3 MAT-file".ljust(124) + bytes([0, 2]) + b"IM"
+    whole = (tmp_path / "run.mat").read_bytes()
+    (tmp_path / "run.mat").write_bytes(head.ljust(512, b"\0") + whole[512:])
+    assert_read(drafted(urdf, tmp_path / "run.mat", tmp_path)[1], run)
+
+
+def test_fields_of_structs_of_matlab_are_read(made, tmp_path: Path):
+    from scipy.io import savemat
+
+    urdf, _, run = made
+    log = {"t": run["time"], "q": run["position"], "tau": run["torque"], "note": "a text"}
+    savemat(tmp_path / "run.mat", {"log": log})
+    entry, recording = drafted(urdf, tmp_path / "run.mat", tmp_path)
+    assert entry["position"] == "log.q"
+    assert_read(recording, run)
+
+
+def test_parquet_of_pandas_is_read(made, tmp_path: Path):
+    import pandas as pd
+
+    urdf, joints, run = made
+    frame = pd.DataFrame({f"pos_{j}": run["position"][:, k] for k, j in enumerate(joints)})
+    frame = frame.assign(**{f"effort_{j}": run["torque"][:, k] for k, j in enumerate(joints)})
+    frame["stamp"] = pd.to_datetime("2024-05-01") + pd.to_timedelta(run["time"], unit="s")
+    frame.to_parquet(tmp_path / "run.parquet")
+    assert_read(drafted(urdf, tmp_path / "run.parquet", tmp_path)[1], run)
+
+
+# Text
+
+
+HEADS = {"two rows above": "# robot arm, cell 3\n# t0 = 4\n", "none above": ""}
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t", " ", "|"])
+@pytest.mark.parametrize("above", HEADS)
+def test_tables_of_any_delimiter_with_lines_above_and_units_below_the_names(made, tmp_path, delimiter: str, above: str):
+    urdf, joints, run = made
+    names = ["t", *(f"q_{joint}" for joint in joints), *(f"tau_{joint}" for joint in joints)]
+    units = ["[s]"] + ["[rad]"] * 3 + ["[Nm]"] * 3
+    rows = np.column_stack([run["time"], run["position"], run["torque"]])
+    text = HEADS[above] + delimiter.join(names) + "\n" + (delimiter.join(units) + "\n" if above else "")
+    body = "\n".join(delimiter.join(map(repr, row)) for row in rows.tolist())
+    (tmp_path / "run.csv").write_text(f"{text}{body}\n", encoding="utf-8-sig")
+    assert_read(drafted(urdf, tmp_path / "run.csv", tmp_path)[1], run)
+
+
+def test_decimal_commas_iso_times_empty_cells_and_words(tmp_path: Path):
+    file = tmp_path / "run.csv"
+    rows = [f"2024-05-01T10:00:00.{10 * k:03d}Z;{k},5;;ok" for k in range(50)]
+    file.write_text("time;q1;gap;state\n" + "\n".join(rows) + "\n")
+    table = read_table(file, "data")
+    np.testing.assert_allclose(table.read("time"), 0.01 * np.arange(50), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(table.read("q1"), np.arange(50) + 0.5)
+    assert np.isnan(table.read("gap")).all()
+    with pytest.raises(InputError, match="'state', row 0 .from 0.: 'ok' is not a number"):
+        table.read("state")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("t,q\n0,1\n1,2,3\n2,4\n", "row 1 .from 0. has 3 cells, its header 2"),
+        ("t,q\n", "1 line"),
+        ("a title\n0,1\n1,2\n", "a header line with one name for each column is expected"),
+    ],
+)
+def test_what_is_no_table_is_said_with_its_row(tmp_path: Path, text: str, said: str):
+    (tmp_path / "run.csv").write_text(text)
+    with pytest.raises(InputError, match=said):
+        read_table(tmp_path / "run.csv", "data")
+
+
+def test_numbers_without_a_header_are_columns_by_number(tmp_path: Path):
+    np.savetxt(tmp_path / "run.txt", np.arange(12.0).reshape(4, 3))
+    table = read_table(tmp_path / "run.txt", "data")
+    assert table.names == ("column_1", "column_2", "column_3")
+    np.testing.assert_array_equal(table.read("column_2"), [1, 4, 7, 10])
+
+
+def test_long_files_are_read_in_blocks_and_tell_how_far(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("figaroh_jax.recordings.textfiles._BLOCK", 1000)
+    rows = np.random.default_rng(1).normal(size=(500, 3))
+    np.savetxt(tmp_path / "run.csv", rows, "%.17g", ",", header="a,b,c", comments="")
+    shares: list[float] = []
+    token = listener.set(lambda phase, share: shares.append(share))
+    try:
+        table = read_table(tmp_path / "run.csv", "data")
+    finally:
+        listener.reset(token)
+    np.testing.assert_array_equal(np.column_stack([table.read(n) for n in "abc"]), rows)
+    assert len(shares) > 20 and np.all(np.diff(shares) >= 0) and shares[-1] == 1.0
+
+
+def test_a_format_whose_package_is_missing_names_the_extra(tmp_path: Path, monkeypatch):
+    import sys
+
+    (tmp_path / "run.h5").write_bytes(b"1")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(InputError, match=r"pip install 'figaroh-jax\[hdf5\]'"):
+        read_table(tmp_path / "run.h5", "data")
+
+
+# Rollouts: a command and no torque
+
+
+def test_a_command_without_torque_is_drafted_as_a_rollout(made, tmp_path: Path):
+    urdf, joints, run = made
+    np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"], action=run["position"] + 0.01)
+    with pytest.raises(Undecided, match="give the gains of the position servos by --kp"):
+        draft_task(urdf, [tmp_path / "run.npz"])
+    (tmp_path / "task.yaml").write_text(draft_task(urdf, [tmp_path / "run.npz"], gains=[9.0, 8.0, 7.0]).text)
+    task = load_task(tmp_path / "task.yaml")
+    assert task.data[0].command == "action" and task.actuator.drives[joints[1]].kp == 8.0
