@@ -14,7 +14,8 @@ from figaroh_jax.effects import registry
 FILES = {"calibrate_task", "load_mjcf", "write_report"}
 DESIGN = {"excite", "excite_postures", "excite_task", "expected_std", "fourier", "information", "learn", "limits_of"}
 DESIGN |= {"quintic", "spline"}  # `examples/design_a_motion.py` shows them together
-LONG = {"calibrate", "diagnose", "diagnose_task", "identify", "identify_task", "rollout_data"}
+LONG = {"calibrate", "diagnose", "diagnose_task", "identify", "identify_task", "linear_basis", "linear_limits"}
+LONG |= {"rollout", "rollout_data", "select", "simulate", "triangular_factor"}
 FUNCTIONS = [n for n in fj.__all__ if callable(getattr(fj, n)) and not inspect.isclass(getattr(fj, n))]
 SHOWN = [*sorted(set(FUNCTIONS) - FILES - DESIGN), "BlockLevenbergMarquardt"]
 
