@@ -35,7 +35,7 @@ def main() -> None:
     frames = ("base_link", "gripper_left_base_link")
     told("TALOS", tracked(f"{folder}/talos_full_v2.urdf", f"{folder}/{csv}", TALOS, np.s_[4:13], np.s_[1:4], *frames))
     folder, csv = "tiago_mocap", "qualysis_base_hand_calibration.csv"
-    frames = ("universe", "arm_7_link")
+    frames = ("base_footprint_joint", "arm_7_link")
     told("TIAGo", tracked(f"{folder}/tiago_no_hand.urdf", f"{folder}/{csv}", TIAGO, np.s_[12:20], np.s_[:3], *frames))
     z, robot = np.load(DATA / "irb120_wu2015" / "irb120_wu.npz"), fj.load_urdf(DATA / "irb120_wu2015" / "irb120.urdf")
     base = next(frame.name for frame in robot.frames if frame.parent < 0)

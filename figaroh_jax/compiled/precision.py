@@ -134,9 +134,14 @@ def _program(jaxpr: ClosedJaxpr) -> Callable[..., Any]:
 
 
 @_scoped.def_impl
-def _(*args: Any, jaxpr: ClosedJaxpr) -> Sequence[Any]:
+def _run(*args: Any, jaxpr: ClosedJaxpr) -> Sequence[Any]:
     with jax.enable_x64(True):
         return _program(jaxpr)(*args)
+
+
+# From JAX 0.11 on, work that holds an operation of a higher level (a solve with a derivative of its own, say) is asked
+# for a form without: a program of its own, which `jit` brings down.
+_scoped.to_lojax = _run
 
 
 @_scoped.def_abstract_eval
