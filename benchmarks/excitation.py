@@ -128,7 +128,7 @@ TOUCHING = {  # pairs that are nearer than 20 mm by their construction
 
 
 def clearance() -> None:
-    """All limits and 20 mm between all bodies and the floor, 10 s; one start, three seeds; meshes by coal afterwards."""
+    """All limits, 20 mm between all bodies and the floor, 10 s; one start, three seeds; meshes by coal afterwards."""
     from figaroh_jax.excitation.clearance import clearance_of
     from figaroh_jax.excitation.design import excite
     from figaroh_jax.excitation.information import learn
@@ -394,13 +394,15 @@ class _Runs:
 class _Fit:
     """Penalised least squares of one shape of a cause."""
 
-    def __init__(self, X: np.ndarray, prior: np.ndarray, Z: np.ndarray, precision: Any, repeats: int) -> None:
+    def __init__(
+        self, X: np.ndarray, prior: np.ndarray, Z: np.ndarray, precision: np.ndarray | None, repeats: int
+    ) -> None:
         self.fixed = Z[:, 0] if precision is None else None
         self.A = X if precision is None else np.concatenate([X, Z], axis=1)
         k = 0 if precision is None else Z.shape[1]
         P = np.zeros((len(prior) + k,) * 2)
         P[: len(prior), : len(prior)] = prior
-        if k:
+        if precision is not None:
             P[len(prior) :, len(prior) :] = np.diag(precision)
         M = repeats * self.A.T @ self.A + P
         size = np.sqrt(np.diag(M))
@@ -409,10 +411,11 @@ class _Fit:
         self.volume = 0.5 * gone
         # beside the links' own prior: what the columns take of the squares, and what a true size adds to them
         self.freedom, self.taken = 0.0, np.zeros((k, k))
-        if k:
+        if precision is not None:
             base = repeats * X.T @ X + prior
             V = repeats * Z.T @ Z - repeats**2 * (Z.T @ X) @ np.linalg.solve(base, X.T @ Z)
-            root = 1 / np.sqrt(np.asarray(precision))
+            precision = np.asarray(precision)
+            root = 1 / np.sqrt(precision)
             inner = np.maximum(np.linalg.eigvalsh(root[:, None] * (V + V.T) / 2 * root), 0.0)
             self.freedom = float((inner / (1 + inner)).sum())
             self.taken = V - V @ np.linalg.solve(V + np.diag(precision), V)
