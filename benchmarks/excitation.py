@@ -158,6 +158,69 @@ def clearance() -> None:
                     print(f"{'':28s} meshes at 5 Hz: nearest {near.min():.4f} m, {int((near <= 0).sum())} collisions")
 
 
+def ipopt(iterations: int = 150) -> None:
+    """All limits at once on the UR10e (10 s, five harmonics): ours, and IPOPT from a random motion and from ours.
+
+    IPOPT has the same objective, its gradient and the exact Jacobian of all rows at 20 Hz, dense; it needs cyipopt (the
+    package `cyipopt-wheels` holds one with IPOPT inside). Its rows are not tightened between samples.
+    """
+    try:
+        from cyipopt import minimize_ipopt  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        print("cyipopt is not installed: left out")
+        return
+    from figaroh_jax.excitation.design import excite, random_motion
+    from figaroh_jax.excitation.information import learn
+    from figaroh_jax.excitation.limits import limits_of
+    from figaroh_jax.excitation.motions import fourier
+    from figaroh_jax.excitation.objectives import information_objective
+    from figaroh_jax.excitation.sampling import Sampler
+    from figaroh_jax.excitation.solvers import Problem
+
+    model = arms()["UR10e"]
+    learned, bounds, basis = learn(model, trust=None), limits_of(model, acceleration=8.0), fourier(5, 0.1, 10.0)
+    sampler, theta = Sampler(model, learned.terms, np.asarray(learned.width)), np.asarray(learned.theta)
+    objective, kept = information_objective(np.asarray(learned.prior)), np.array(learned.independent)
+    problem = Problem(learned, sampler, objective, kept, basis, bounds, None)
+    A, b = problem.linear_matrix({})
+
+    def room(x: np.ndarray) -> np.ndarray:
+        share = sampler.torque(problem.states(x), theta) / bounds.torque
+        return np.concatenate([b - A @ x, (1 - share).ravel(), (1 + share).ravel()])
+
+    def slopes(x: np.ndarray) -> np.ndarray:
+        states, n = problem.states(x), model.nv
+        out = np.zeros((states.shape[1], n, len(x)))
+        for j in range(n):
+            cotangent = np.zeros((n, len(learned.names), states.shape[1]))
+            cotangent[j, : len(theta)] = theta[:, None] / bounds.torque[j]
+            by = sampler.back(states, cotangent)
+            out[:, j, :n] = by[0]
+            out[:, j, n:] = np.einsum("ksb,ksj->sjb", problem.matrix, by).reshape(len(by[0]), -1)
+        flat = out.reshape(-1, len(x))
+        return np.concatenate([-A, -flat, flat])
+
+    since = time.process_time()
+    found = excite(model, basis, bounds, learned, starts=1)
+    told("ours", found, spent(since))
+    begins = {
+        "IPOPT from a random motion": random_motion(problem, np.random.default_rng([0, 0])),
+        "IPOPT from ours": problem.numbers(found.stages[0].motion),
+    }
+    rows = {"type": "ineq", "fun": room, "jac": slopes}
+    for name, x in begins.items():
+        since = time.process_time()
+        options = {"max_iter": iterations, "hessian_approximation": "limited-memory", "tol": 1e-5, "print_level": 0}
+        end = minimize_ipopt(problem.value, x, jac=problem.slope, constraints=[rows], options=options)
+        logdet = -learned.rank * problem.value(end.x)
+        std = np.exp((logdet - found.logdet) / (2 * learned.rank)) - 1
+        print(
+            f"{name}: logdet {logdet:.2f}, standard deviations {std:+.2%} smaller than ours, rows at 20 Hz"
+            f" {-room(end.x).min():.1e} over, {spent(since):.1f} CPU s",
+            flush=True,
+        )
+
+
 def limits() -> None:
     """All limits at once (position, velocity, 8 rad/s^2, torque), 10 s, five harmonics or nine control points."""
     from figaroh_jax.excitation.design import excite
@@ -667,6 +730,7 @@ PARTS = {
     "peer": peer,
     "limits": limits,
     "clearance": clearance,
+    "ipopt": ipopt,
     "sequence": sequence,
     "postures": postures,
     "separation": separation,
