@@ -1,6 +1,6 @@
 """Bootstrap of the TX40's identification: one call of `jax.vmap` over all resamples beside a loop of single calls.
 
-    python benchmarks/bootstrap.py [resamples]
+    python benchmarks/bootstrap.py [resamples]           # plain python, a minute; recordings from $FIGAROH_JAX_DATA
 
 Base parameters with friction, rotors, offsets and the coupled wrist; blocks of half a second are drawn with
 replacement. With a GPU in JAX's list of devices the call runs there too. Prints seconds (compilation apart), their
@@ -9,18 +9,20 @@ ratio, and how far the bootstrap's standard deviations lie from those of white r
 
 from __future__ import annotations
 
+import os
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-import jax
-import numpy as np
-
-import figaroh_jax as fj
-
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "benchmarks")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "benchmarks")]
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads cost more than they gain on matrices of this size
+
+import jax  # noqa: E402
+import numpy as np  # noqa: E402
+
+import figaroh_jax as fj  # noqa: E402
 
 
 def problem(folder: Path) -> tuple[fj.ExtendedModel, fj.TorqueData]:

@@ -157,7 +157,7 @@ class Peer:
 
 def run_speed() -> None:
     from figaroh_jax.calibration.candidates import geometry_columns
-    from figaroh_jax.calibration.posegroups import postures_of
+    from figaroh_jax.estimation.posegroups import postures_of
 
     path, model, frames = _ur10e()
     columns = geometry_columns(model, range(6))
@@ -180,10 +180,10 @@ class Ours:
     """One level fitted by plain least squares: what can be told apart, closed-form start, one solve."""
 
     def __init__(self, model, records: list[PoseRecording], level: str = "full", weight: float = 1e4) -> None:
-        from figaroh_jax.calibration import posefit
         from figaroh_jax.calibration.candidates import geometry_columns
         from figaroh_jax.calibration.gauge import find_gauge
-        from figaroh_jax.calibration.posegroups import assemble, postures_of
+        from figaroh_jax.estimation import posefit
+        from figaroh_jax.estimation.posegroups import assemble, postures_of
         from figaroh_jax.rigid.chain import chain_between
 
         chain = chain_between(model, records[0].base_frame, records[0].tool_frame).joints
@@ -196,7 +196,7 @@ class Ours:
         self.weights = np.full(len(jacobian), weight)
 
     def solve(self):
-        from figaroh_jax.calibration.posesolver import solve
+        from figaroh_jax.estimation.posesolver import solve
 
         return solve(self.problem, self.weights, 1.0 - self.free, self.free, np.zeros(len(self.free)))
 

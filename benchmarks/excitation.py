@@ -120,6 +120,107 @@ def arms() -> dict[str, Any]:
     return {"UR10e": load_urdf(ur10), "Panda": load_urdf(panda, joints=joints)}
 
 
+MESHES = os.environ.get("FIGAROH_JAX_MESHES")  # `robots` of the package example-robot-data, whose URDF have meshes
+TOUCHING = {  # pairs that are nearer than 20 mm by their construction
+    "UR10": [("upper_arm_link", "base_link"), ("wrist_1_link", "wrist_3_link"), ("wrist_2_link", "forearm_link")],
+    "Panda": [("panda_link5", "panda_link7")],
+}
+
+
+def clearance() -> None:
+    """All limits, 20 mm between all bodies and the floor, 10 s; one start, three seeds; meshes by coal afterwards."""
+    from figaroh_jax.excitation.clearance import clearance_of
+    from figaroh_jax.excitation.design import excite
+    from figaroh_jax.excitation.information import learn
+    from figaroh_jax.excitation.limits import limits_of
+    from figaroh_jax.excitation.motions import fourier, spline
+    from figaroh_jax.formats.collision import read_shapes
+    from figaroh_jax.formats.urdf import load_urdf
+
+    if MESHES is None:
+        print("FIGAROH_JAX_MESHES does not say where robots with meshes are: left out")
+        return
+    files = {"UR10": "ur_description/urdf/ur10_robot.urdf", "Panda": "panda_description/urdf/panda.urdf"}
+    for name, file in files.items():
+        joints = None if name == "UR10" else [f"panda_joint{k}" for k in range(1, 8)]
+        model = load_urdf(Path(MESHES) / file, joints=joints)
+        shapes, _ = read_shapes(Path(MESHES) / file)
+        kept = clearance_of(model, shapes, margin=0.02, ignore=TOUCHING[name], floor=-0.05)
+        learned, bounds = learn(model, trust=None), limits_of(model, acceleration=8.0, clearance=kept)
+        for basis in (fourier(5, 0.1, 10.0), spline(9, 10.0)):
+            for seed in range(3):
+                since = time.process_time()
+                found = excite(model, basis, bounds, learned, starts=1, seed=seed)
+                told(f"{name} {basis.kind} seed {seed}", found, spent(since))
+                q = np.asarray(found.stages[0].motion.at(np.arange(0, 10, 0.2))[0])
+                near = kept.exact_distances(q, kept.pairs)
+                if near is not None:
+                    print(f"{'':28s} meshes at 5 Hz: nearest {near.min():.4f} m, {int((near <= 0).sum())} collisions")
+
+
+def ipopt(iterations: int = 150) -> None:
+    """All limits at once on the UR10e (10 s, five harmonics): ours, and IPOPT from a random motion and from ours.
+
+    IPOPT has the same objective, its gradient and the exact Jacobian of all rows at 20 Hz, dense; it needs cyipopt (the
+    package `cyipopt-wheels` holds one with IPOPT inside). Its rows are not tightened between samples.
+    """
+    try:
+        from cyipopt import minimize_ipopt  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        print("cyipopt is not installed: left out")
+        return
+    from figaroh_jax.excitation.design import excite, random_motion
+    from figaroh_jax.excitation.information import learn
+    from figaroh_jax.excitation.limits import limits_of
+    from figaroh_jax.excitation.motions import fourier
+    from figaroh_jax.excitation.objectives import information_objective
+    from figaroh_jax.excitation.sampling import Sampler
+    from figaroh_jax.excitation.solvers import Problem
+
+    model = arms()["UR10e"]
+    learned, bounds, basis = learn(model, trust=None), limits_of(model, acceleration=8.0), fourier(5, 0.1, 10.0)
+    sampler, theta = Sampler(model, learned.terms, np.asarray(learned.width)), np.asarray(learned.theta)
+    objective, kept = information_objective(np.asarray(learned.prior)), np.array(learned.independent)
+    problem = Problem(learned, sampler, objective, kept, basis, bounds, None)
+    A, b = problem.linear_matrix({})
+
+    def room(x: np.ndarray) -> np.ndarray:
+        share = sampler.torque(problem.states(x), theta) / bounds.torque
+        return np.concatenate([b - A @ x, (1 - share).ravel(), (1 + share).ravel()])
+
+    def slopes(x: np.ndarray) -> np.ndarray:
+        states, n = problem.states(x), model.nv
+        out = np.zeros((states.shape[1], n, len(x)))
+        for j in range(n):
+            cotangent = np.zeros((n, len(learned.names), states.shape[1]))
+            cotangent[j, : len(theta)] = theta[:, None] / bounds.torque[j]
+            by = sampler.back(states, cotangent)
+            out[:, j, :n] = by[0]
+            out[:, j, n:] = np.einsum("ksb,ksj->sjb", problem.matrix, by).reshape(len(by[0]), -1)
+        flat = out.reshape(-1, len(x))
+        return np.concatenate([-A, -flat, flat])
+
+    since = time.process_time()
+    found = excite(model, basis, bounds, learned, starts=1)
+    told("ours", found, spent(since))
+    begins = {
+        "IPOPT from a random motion": random_motion(problem, np.random.default_rng([0, 0])),
+        "IPOPT from ours": problem.numbers(found.stages[0].motion),
+    }
+    rows = {"type": "ineq", "fun": room, "jac": slopes}
+    for name, x in begins.items():
+        since = time.process_time()
+        options = {"max_iter": iterations, "hessian_approximation": "limited-memory", "tol": 1e-5, "print_level": 0}
+        end = minimize_ipopt(problem.value, x, jac=problem.slope, constraints=[rows], options=options)
+        logdet = -learned.rank * problem.value(end.x)
+        std = np.exp((logdet - found.logdet) / (2 * learned.rank)) - 1
+        print(
+            f"{name}: logdet {logdet:.2f}, standard deviations {std:+.2%} smaller than ours, rows at 20 Hz"
+            f" {-room(end.x).min():.1e} over, {spent(since):.1f} CPU s",
+            flush=True,
+        )
+
+
 def limits() -> None:
     """All limits at once (position, velocity, 8 rad/s^2, torque), 10 s, five harmonics or nine control points."""
     from figaroh_jax.excitation.design import excite
@@ -234,7 +335,7 @@ def separation() -> None:
         )
 
 
-def chooser(draws: int = 100) -> None:
+def chooser(draws: int = 100, names: tuple[str, ...] = tuple(PAIRS)) -> None:
     """Four pairs of causes at the UR10e's elbow, 10 s, 20 harmonics: 100 simulated runs with either as the truth.
 
     Torques are Pinocchio's; each run has its own link errors (10 % of the inertias), noise of 1 % of the largest torque
@@ -248,7 +349,7 @@ def chooser(draws: int = 100) -> None:
 
     model = arms()["UR10e"]
     learned, bounds, basis = learn(model), limits_of(model, acceleration=8.0), fourier(20, 0.1, 10.0)
-    for name, pair in PAIRS.items():
+    for name, pair in ((name, PAIRS[name]) for name in names):
         since = time.process_time()
         found = excite(model, basis, bounds, learned, objective="separate", separate=[pair], starts=3, rate=50.0)
         cpu = spent(since)
@@ -336,41 +437,51 @@ class _Runs:
             amplitude = 0.2 * self.inertia[10 * self.forearm : 10 * self.forearm + 10]
         else:
             amplitude = np.array([next(x for key, x in size.items() if key not in ("speed", "exponent"))])
-        own = len(self.prior) - 2 * self.q.shape[1]
-        spread = np.linalg.cholesky(np.linalg.inv(self.prior))[:, :own]
+        links = len(self.prior) - 2 * self.q.shape[1]
+        spread = np.linalg.cholesky(np.linalg.inv(self.prior))[:, :links]
         fits = [[_Fit(self.X, self.prior, *one, repeats) for one in self.columns(k, None)] for k in (side, 1 - side)]
         right, better, sure = 0, [], 0
         for k in range(draws):
             noise = np.random.default_rng([3, side, repeats, k])
-            y = self.X @ (spread @ noise.standard_normal(own)) + Z @ amplitude
+            y = self.X @ (spread @ noise.standard_normal(links)) + Z @ amplitude
             y = y + noise.standard_normal((repeats, len(y))).mean(0)
             (a, sse_a), (b, sse_b) = (_best(some, y, repeats) for some in fits)
             right, sure = right + (a > b), sure + (a > b + 4)
             better.append(sse_b - sse_a)
-        mean = np.mean(better) + fits[1][0].freedom - fits[0][0].freedom
+        own, other = fits[0][0], fits[1][0]
+        mean = np.mean(better) + other.freedom - own.freedom
+        mean += float(amplitude @ own.taken @ amplitude) if own.fixed is None else 0.0
         return right / draws, float(np.sqrt(max(mean, 0.0))), sure / draws
 
 
 class _Fit:
     """Penalised least squares of one shape of a cause."""
 
-    def __init__(self, X: np.ndarray, prior: np.ndarray, Z: np.ndarray, precision: Any, repeats: int) -> None:
+    def __init__(
+        self, X: np.ndarray, prior: np.ndarray, Z: np.ndarray, precision: np.ndarray | None, repeats: int
+    ) -> None:
         self.fixed = Z[:, 0] if precision is None else None
         self.A = X if precision is None else np.concatenate([X, Z], axis=1)
         k = 0 if precision is None else Z.shape[1]
         P = np.zeros((len(prior) + k,) * 2)
         P[: len(prior), : len(prior)] = prior
-        if k:
+        if precision is not None:
             P[len(prior) :, len(prior) :] = np.diag(precision)
         M = repeats * self.A.T @ self.A + P
         size = np.sqrt(np.diag(M))
         self.inverse, self.repeats = np.linalg.inv(M / np.outer(size, size)) / np.outer(size, size), repeats
         gone = np.linalg.slogdet(P / np.outer(size, size))[1] - np.linalg.slogdet(M / np.outer(size, size))[1]
         self.volume = 0.5 * gone
-        base = repeats * X.T @ X + prior
-        width = np.sqrt(np.diag(base))
-        before = len(prior) - np.trace(np.linalg.solve(base / np.outer(width, width), prior / np.outer(width, width)))
-        self.freedom = float(len(M) - np.trace(self.inverse @ P) - before)
+        # beside the links' own prior: what the columns take of the squares, and what a true size adds to them
+        self.freedom, self.taken = 0.0, np.zeros((k, k))
+        if precision is not None:
+            base = repeats * X.T @ X + prior
+            V = repeats * Z.T @ Z - repeats**2 * (Z.T @ X) @ np.linalg.solve(base, X.T @ Z)
+            precision = np.asarray(precision)
+            root = 1 / np.sqrt(precision)
+            inner = np.maximum(np.linalg.eigvalsh(root[:, None] * (V + V.T) / 2 * root), 0.0)
+            self.freedom = float((inner / (1 + inner)).sum())
+            self.taken = V - V @ np.linalg.solve(V + np.diag(precision), V)
 
     def __call__(self, y: np.ndarray) -> tuple[float, float]:
         y = y if self.fixed is None else y - self.fixed
@@ -534,6 +645,77 @@ def ranking(triples: int = 200) -> None:
     print(f"single runs: rank correlation {spearmanr(told, alone)[0]:.2f}")
 
 
+def gpu(starts: int = 256, outer: int = 5, inner: int = 100, compared: int = 4) -> None:
+    """FIGAROH's problem from many starts at once, one program on the device, beside the same on the CPU.
+
+    An augmented Lagrangian of the linear rows, minimised by Adam; all starts step together. Needs no package beside
+    JAX's own and optax; `compared` of the starts are run on the CPU too, and the best is improved there by SLSQP.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    from figaroh_jax.excitation.design import random_motion
+    from figaroh_jax.excitation.objectives import information_objective
+    from figaroh_jax.excitation.sampling import Sampler
+    from figaroh_jax.excitation.solvers import Problem, solve
+    from figaroh_jax.rigid.regressor import joint_torque_regressor
+
+    model, basis, bounds, learned = peer_problem()
+    kept, start = np.array(learned.independent), np.array(POSTURE)
+    sampler = Sampler(model, learned.terms, np.asarray(learned.width))
+    problem = Problem(learned, sampler, information_objective(np.asarray(learned.prior)), kept, basis, bounds, start)
+    A, b = problem.linear_matrix({})
+    generator = np.random.default_rng(0)
+    x0 = np.stack([random_motion(problem, generator) for _ in range(starts)])
+
+    def lagrangian(x: Any, lam: Any, mu: float) -> Any:
+        q, v, a = (jnp.asarray(phi) @ x.reshape(model.nv, -1).T for phi in problem.matrix)
+        W = joint_torque_regressor(model, q + start, v, a)[..., kept].reshape(-1, len(kept))
+        value = -jnp.linalg.slogdet(W.T @ W)[1] / len(kept)
+        push = jnp.maximum(0.0, lam + mu * (A @ x - b))
+        return value + jnp.sum(push**2 - lam**2) / (2 * mu)
+
+    def improved(x: Any) -> Any:
+        def step(carry: Any, k: Any) -> Any:
+            x, m, s, lam, mu = carry
+            g = jax.grad(lagrangian)(x, lam, mu)
+            m, s = 0.9 * m + 0.1 * g, 0.999 * s + 0.001 * g**2
+            rate = 0.03 * 0.02 ** (k / (outer * inner))
+            x = x - rate * (m / (1 - 0.9 ** (k + 1))) / (jnp.sqrt(s / (1 - 0.999 ** (k + 1))) + 1e-9)
+            last = (k + 1) % inner == 0
+            lam = jnp.where(last, jnp.maximum(0.0, lam + mu * (A @ x - b)), lam)
+            return (x, m, s, lam, jnp.where(last, 2 * mu, mu)), None
+
+        zero = jnp.zeros_like(x)
+        begin = (x, zero, zero, jnp.zeros(len(b)), jnp.asarray(3.0))
+        return jax.lax.scan(step, begin, jnp.arange(outer * inner, dtype=float))[0][0]
+
+    devices = {"cpu": x0[:compared]}
+    if jax.default_backend() != "cpu":
+        devices = {jax.default_backend(): x0, **devices}
+    ends = {}
+    for device, given in devices.items():
+        with jax.default_device(jax.devices(device)[0]):
+            run = jax.jit(jax.vmap(improved))
+            since = time.perf_counter()
+            run(jnp.asarray(given)).block_until_ready()
+            first = time.perf_counter() - since
+            ends[device] = np.asarray(run(jnp.asarray(given)).block_until_ready())
+            took = time.perf_counter() - since - first
+        print(f"{device}: {len(given)} starts in {took:.2f} s ({first:.1f} s the first time, with compilation)")
+    every = ends[next(iter(devices))]
+    values = [np.array([-learned.rank * problem.value(x) for x in end[:compared]]) for end in ends.values()]
+    print(f"log determinants of the same {compared} starts: {np.abs(values[0] - values[-1]).max():.2e} apart at most")
+    over = (every @ A.T - b).max(axis=1)
+    told = np.array([-learned.rank * problem.value(x) for x in every])
+    best = int(np.argmax(np.where(over < 0.02, told, -np.inf)))
+    final = solve(problem, every[best])
+    print(
+        f"best of {len(every)}: {told[best]:.2f} (rows {over[best]:.1e} over), improved by SLSQP"
+        f" {-learned.rank * problem.value(final):.2f}; median {np.median(told):.2f}"
+    )
+
+
 def peer() -> None:
     """FIGAROH's problem: information and condition number, warm."""
     on_peer_problem(1)
@@ -547,12 +729,15 @@ def peer() -> None:
 PARTS = {
     "peer": peer,
     "limits": limits,
+    "clearance": clearance,
+    "ipopt": ipopt,
     "sequence": sequence,
     "postures": postures,
     "separation": separation,
     "chooser": chooser,
     "pays": pays,
     "ranking": ranking,
+    "gpu": gpu,
 }
 
 
@@ -565,13 +750,14 @@ def main() -> None:
         told("one start, cold", *on_peer_problem(1))
         print(f"whole process {time.process_time():.2f} CPU s")
         return
-    for part in args.parts or PARTS:
+    for part in args.parts or [name for name in PARTS if name != "gpu"]:
         print(f"== {part}")
         PARTS[part]()
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    if "gpu" not in sys.argv:
+        os.environ.setdefault("JAX_PLATFORMS", "cpu")
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")

@@ -12,17 +12,41 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .calibration.calibration import calibrate as calibrate, calibrate_task as calibrate_task
-    from .effects.base import Effect as Effect, Motion as Motion, amplitude as amplitude, place as place, shape as shape
+    from .effects.base import (
+        Effect as Effect,
+        JointEffect as JointEffect,
+        Motion as Motion,
+        amplitude as amplitude,
+        place as place,
+        shape as shape,
+    )
     from .effects.catalogue import CATALOGUE as CATALOGUE, register as register
     from .effects.extended import ExtendedModel as ExtendedModel, extend as extend, predict as predict
     from .effects.simulation import simulate as simulate
     from .errors import InputError as InputError
     from .estimation import (
         accelerators as accelerators,
+        columns as columns,
         least_squares as least_squares,
         regression as regression,
         states as states,
     )
+    from .estimation.blockwise import BlockLevenbergMarquardt as BlockLevenbergMarquardt
+    from .estimation.data import (
+        PoseData as PoseData,
+        TorqueData as TorqueData,
+        pose_data as pose_data,
+        residual as residual,
+        torque_data as torque_data,
+    )
+    from .estimation.fit import fit as fit
+    from .estimation.linear import (
+        fit_linear as fit_linear,
+        linear_basis as linear_basis,
+        linear_limits as linear_limits,
+    )
+    from .estimation.selection import select as select
+    from .estimation.solution import Fit as Fit
     from .excitation.design import Design as Design, excite as excite
     from .excitation.information import (
         Learned as Learned,
@@ -38,17 +62,7 @@ if TYPE_CHECKING:
         excite_postures as excite_postures,
     )
     from .excitation.task import excite_task as excite_task
-    from .fitting.blockwise import BlockLevenbergMarquardt as BlockLevenbergMarquardt
-    from .fitting.data import (
-        PoseData as PoseData,
-        TorqueData as TorqueData,
-        pose_data as pose_data,
-        residual as residual,
-        torque_data as torque_data,
-    )
-    from .fitting.fit import Fit as Fit, fit as fit
-    from .fitting.linear import fit_linear as fit_linear, linear_basis as linear_basis, linear_limits as linear_limits
-    from .formats.config import Baseline as Baseline, Preprocess as Preprocess, load_task as load_task
+    from .formats.config import Baseline as Baseline, Load as Load, Preprocess as Preprocess, load_task as load_task
     from .formats.export import load_model as load_model, write_model as write_model
     from .formats.mjcf import load_mjcf as load_mjcf
     from .formats.robotfile import load_extended as load_extended, load_robot as load_robot
@@ -66,7 +80,7 @@ if TYPE_CHECKING:
     from .recordings.devices import Device as Device, own_device as own_device
     from .recordings.poses import PoseRecording as PoseRecording
     from .reporting.report import write_report as write_report
-    from .results import Cause as Cause, Diagnosis as Diagnosis
+    from .results import Cause as Cause, Diagnosis as Diagnosis, Selection as Selection
     from .rigid.dynamics import (
         forward_dynamics as forward_dynamics,
         inverse_dynamics as inverse_dynamics,
@@ -80,6 +94,9 @@ if TYPE_CHECKING:
     from .rigid.model import Frame as Frame, Joint as Joint, RobotModel as RobotModel
     from .rigid.normal_equations import normal_matrix as normal_matrix, triangular_factor as triangular_factor
     from .rigid.regressor import joint_torque_regressor as joint_torque_regressor, packed_regressor as packed_regressor
+    from .rollouts.measured import RolloutData as RolloutData, rollout_data as rollout_data
+    from .rollouts.reading import load_loop as load_loop
+    from .rollouts.simulation import rollout as rollout
     from .simulators.registry import backend as backend
     from .tasks import diagnose as diagnose, diagnose_task as diagnose_task, identify as identify
 
@@ -89,18 +106,20 @@ DEMO = f"{__path__[0]}/demo/robot.urdf"  # a small arm, for examples
 
 _MODULES = {
     "calibration.calibration": ("calibrate", "calibrate_task"),
-    "formats.config": ("Baseline", "Preprocess", "load_task"),
-    "fitting.data": ("PoseData", "TorqueData", "pose_data", "residual", "torque_data"),
-    "fitting.blockwise": ("BlockLevenbergMarquardt",),
-    "fitting.fit": ("Fit", "fit"),
-    "fitting.linear": ("LinearFit", "fit_linear", "linear_basis", "linear_limits"),
+    "formats.config": ("Baseline", "Load", "Preprocess", "load_task"),
+    "estimation.data": ("PoseData", "TorqueData", "pose_data", "residual", "torque_data"),
+    "estimation.blockwise": ("BlockLevenbergMarquardt",),
+    "estimation.fit": ("fit",),
+    "estimation.selection": ("select",),
+    "estimation.solution": ("Fit",),
+    "estimation.linear": ("LinearFit", "fit_linear", "linear_basis", "linear_limits"),
     "recordings.arrays": ("postures", "recording"),
     "recordings.devices": ("Device", "own_device"),
     "recordings.dataset": ("Recording", "read_recordings"),
     "recordings.poses": ("PoseRecording",),
     "tasks": ("diagnose", "diagnose_task", "identify"),
     "rigid.dynamics": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
-    "effects.base": ("Effect", "Motion", "amplitude", "place", "shape"),
+    "effects.base": ("Effect", "JointEffect", "Motion", "amplitude", "place", "shape"),
     "effects.catalogue": ("CATALOGUE", "register"),
     "errors": ("InputError",),
     "formats.export": ("load_model", "write_model"),
@@ -112,13 +131,16 @@ _MODULES = {
     "excitation.task": ("excite_task",),
     "excitation.motions": ("Trajectory", "fourier", "quintic", "spline"),
     "identification.identification": ("identify_task",),
+    "rollouts.measured": ("RolloutData", "rollout_data"),
+    "rollouts.reading": ("load_loop",),
+    "rollouts.simulation": ("rollout",),
     "rigid.kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
     "formats.mjcf": ("load_mjcf",),
     "rigid.model": ("Frame", "Joint", "RobotModel"),
     "simulators.registry": ("backend",),
     "rigid.regressor": ("joint_torque_regressor", "packed_regressor"),
     "reporting.report": ("write_report",),
-    "results": ("Cause", "Diagnosis"),
+    "results": ("Cause", "Diagnosis", "Selection"),
     "formats.robotfile": ("load_extended", "load_robot"),
     "effects.simulation": ("simulate",),
     "rigid.normal_equations": ("normal_matrix", "triangular_factor"),
@@ -129,6 +151,7 @@ _SPACES = {
     "acceleration_free": "identification.acceleration_free",
     "accelerators": "estimation.accelerators",
     "cleaning": "recordings.cleaning",
+    "columns": "estimation.columns",
     "devices": "recordings.devices",
     "instruments": "identification.instruments",
     "least_squares": "estimation.least_squares",

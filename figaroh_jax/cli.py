@@ -110,7 +110,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.command == "rerun":
         args = _again(args)
     _set_up_jax(cache=not args.no_cache)
-    from .recordings.tables import listener
+    from .recordings.progress import listener
     from .reporting import terminal, wording
     from .runs import JOBS, REPORT, export_loop
 
@@ -139,10 +139,12 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _write_out(text: str) -> None:
-    from .reporting.wording import fitted
+    if sys.stdout.isatty():
+        from .reporting.wording import fitted
 
+        text = fitted(text)
     with _standard_output():
-        sys.stdout.write(fitted(text))
+        sys.stdout.write(text)
 
 
 @contextmanager

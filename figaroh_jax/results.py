@@ -19,6 +19,7 @@ __all__ = [
     "Nearest",
     "Part",
     "Rest",
+    "Selection",
     "Trace",
     "Verdict",
 ]
@@ -36,9 +37,8 @@ class Name(NamedTuple):
         return f"{self.effect} ({', '.join(self.at)})" if self.at else self.effect
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """Value and one standard deviation, in `unit`."""
+class Estimate(NamedTuple):
+    """Value and one standard deviation (inf: not determined), in `unit`."""
 
     value: float
     std: float
@@ -135,12 +135,19 @@ class Trace:
     shares: dict[str, Float[np.ndarray, "samples nv"]] = field(default_factory=dict)  # torque of each cause
 
 
-@dataclass(frozen=True)
-class Diagnosis:
-    """Verdict, causes by their gain, and everything the report needs to show why."""
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """What a search among effects decides, the same for every job; reports and JSON files are views of it."""
 
     verdict: Verdict
-    causes: tuple[Cause, ...]
+    causes: tuple[Cause, ...]  # diagnoses of torque: by their gain
+    solution: Any = None  # estimation.solution.Fit of the model with the causes in it, where the job has one
+
+
+@dataclass(frozen=True)
+class Diagnosis(Selection):
+    """Verdict, causes by their gain, and everything the report needs to show why."""
+
     p_value: float
     joints: tuple[str, ...]
     before: Float[np.ndarray, " nv"]  # RMS residual of the baseline per joint, N m or N

@@ -29,6 +29,11 @@ def diagnose_task(
 
     The rigid body's torques are those of the named backend. Raises `InputError` before any work where the task is
     wrong. The answer has `verdict` and `causes` at either level.
+
+    >>> import figaroh_jax as fj
+    >>> found = fj.diagnose_task(fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml")))
+    >>> found.verdict, found.causes[0].name.effect
+    ('named', 'coupled_transmission')
     """
     if any(entry.measurement is not None for entry in task.data):
         from .calibration.kinematic_diagnosis import diagnose_pose_task
@@ -89,6 +94,13 @@ def diagnose(
     it (torques). `preprocess`, `known` (what the baseline contains) and `trust` (how far the nominal inertials are
     believed, relative one sigma) are of torques alone; `forbid` names effects left out of the catalogue, `alpha` is the
     level of the test for the whole of it.
+
+    >>> import figaroh_jax as fj
+    >>> task = fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml"))
+    >>> robot = fj.load_robot(task)
+    >>> found = fj.diagnose(robot, fj.read_recordings(task, robot), fj.Preprocess(cutoff=15, rate=50), task.baseline)
+    >>> found.verdict
+    'named'
     """
     from .recordings.poses import PoseRecording
 
@@ -132,6 +144,13 @@ def identify(
     whose links are bodies, "log_cholesky" the same by Levenberg-Marquardt, "unconstrained" leaves the links free.
     Raises `InputError` where a recording cannot be right (units, order or sign of columns, clock, standstill), shows
     too little, or the fit that was asked for fails.
+
+    >>> import figaroh_jax as fj
+    >>> task = fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml"))
+    >>> robot = fj.load_robot(task)
+    >>> found = fj.identify(robot, fj.read_recordings(task, robot), fj.Preprocess(cutoff=15))
+    >>> bool((found.fit.relative < found.nominal.relative + 1e-9).all())
+    True
     """
     from .identification.identification import identify as of_torques
 

@@ -14,6 +14,7 @@ import pytest
 import yaml
 from schema import matches
 
+import figaroh_jax as fj
 from figaroh_jax import cli
 from figaroh_jax.calibration.calibrated import Calibration
 from figaroh_jax.calibration.calibration import calibrate_task
@@ -73,6 +74,19 @@ def test_offsets_and_compliance_are_found_and_named(calibrated: Calibration):
     assert {cause.name.effect for cause in calibrated.causes} == {"outlier", "joint_offset", "joint_compliance"}
 
 
+def test_a_calibration_is_a_view_of_its_fit(calibrated: Calibration):
+    """Numbers, their sigmas and the rows of its data are those of the public residual of its model."""
+    fit = calibrated.solution
+    for one in calibrated.parameters:
+        assert fit.parameters[one.name][:2] == pytest.approx((one.value, one.std), rel=1e-12, abs=1e-15)
+    assert fit.model.robot is calibrated.model and not fit.reason
+    assert [effect.name for effect in fit.model.effects] == ["joint_compliance"]
+    stiff = fj.extend(fit.model.robot)
+    theirs, ours, without = (np.sqrt(np.mean(np.asarray(x) ** 2)) for x in (fit.rows, *(fj.residual(m, fit.data) for m in (fit.model, stiff))))  # fmt: skip  # noqa: E501
+    # the calibration takes gravity as the nominal robot has it, the residual as the corrected one does
+    assert ours == pytest.approx(theirs, rel=0.3) and without > 3.0 * ours
+
+
 def test_offsets_of_the_first_and_the_last_joint_are_a_gauge(calibrated: Calibration):
     status = {p.name: p.status for p in calibrated.parameters}
     assert status["joint_offset j1"] == status["joint_offset j6"] == "gauge"
@@ -88,7 +102,7 @@ def test_the_badly_measured_posture_is_named_and_left_out(calibrated: Calibratio
 
 
 def test_calibrated_robot_predicts_postures_it_has_not_seen(calibrated: Calibration, wrong: tuple[Path, poses.Truth]):
-    from figaroh_jax.calibration.gravity import gravity_moments
+    from figaroh_jax.estimation.gravity import gravity_moments
     from figaroh_jax.rigid.kinematics import frame_placement
 
     task, real = wrong

@@ -11,9 +11,9 @@ import numpy as np
 import poses
 import pytest
 
-from figaroh_jax.calibration import posefit
-from figaroh_jax.calibration.posesolver import solve
 from figaroh_jax.compiled.batching import program
+from figaroh_jax.estimation import posefit
+from figaroh_jax.estimation.posesolver import solve
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.recordings.devices import Points
 from figaroh_jax.rigid import lie

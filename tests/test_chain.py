@@ -12,8 +12,8 @@ import pytest
 import reference
 import robots
 
-from figaroh_jax.calibration.gravity import gravity_moments, without_far_masses
 from figaroh_jax.errors import InputError
+from figaroh_jax.estimation.gravity import gravity_moments, without_far_masses
 from figaroh_jax.rigid.chain import chain_between, chain_pose, joint_response
 from figaroh_jax.rigid.lie import log_so3
 

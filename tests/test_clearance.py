@@ -218,3 +218,19 @@ def test_a_designed_motion_keeps_its_distances_and_the_run_shows_them(
     file.write_text("robot: {model: robot.urdf}\nexcite: {floor: 0.0}\n")
     assert main(["excite", str(file), "--out", str(tmp_path / "other"), "--quiet"]) == 2
     assert "floor: distances are looked at where limits.clearance" in capsys.readouterr().err
+
+
+def test_the_view_draws_the_robot_and_the_capsules_that_were_kept_apart(arm: RobotModel):
+    from figaroh_jax.reporting.motion_view import capsule_lines, skeleton
+
+    q = postures(arm, 1)[0]
+    poses = np.asarray(forward_kinematics(arm, q))
+    lines = skeleton(arm, q)
+    np.testing.assert_allclose(lines[:, 1], poses[:, :3, 3], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(lines[1:, 0], poses[:-1, :3, 3], rtol=0, atol=1e-12)
+    found = clearance_of(arm, margin=0.01, bodies=BODIES[3:], floor=-1.5)
+    points = capsule_lines(found, q).reshape(-1, 3)
+    start, end = (poses[2][:3, :3] @ x + poses[2][:3, 3] for x in np.array(BODIES[3][1:3]))
+    t = np.clip((points - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
+    away = np.linalg.norm(points - start - t[:, None] * (end - start), axis=1)
+    np.testing.assert_allclose(away, BODIES[3].radius, rtol=0, atol=1e-9)

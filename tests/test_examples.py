@@ -15,7 +15,10 @@ SLOW = {
     "calibrate_tracker",
     "design_a_motion",
     "diagnose_arrays",
+    "free_flyer",
     "identify_arrays",
+    "own_friction",
+    "payload_and_gains",
     "real_calibrations",
     "real_identifications",
 }
@@ -27,7 +30,10 @@ SAYS = {
     "design_a_motion": "own optimiser",
     "calibrate_tracker": "joint_offset elbow: -0.02",
     "diagnose_arrays": "joint_spring (shoulder)",
+    "free_flyer": "39 of 42 base parameters",
     "identify_arrays": "base parameters",
+    "own_friction": "named grease_friction (shoulder)",
+    "payload_and_gains": "payload 1.700 kg",
     "real_calibrations": "TALOS: 16 parameters, 1.430 mm",
     "real_identifications": "TX40",
 }
@@ -43,6 +49,13 @@ def test_an_example_is_short_and_imports_nothing_private(name: str):
             assert not (node.module or "").startswith("figaroh_jax"), f"{name}: {ast.unparse(node)}"
         if isinstance(node, ast.Import):
             assert not any(alias.name.startswith("figaroh_jax.") for alias in node.names)
+
+
+def test_a_law_of_ones_own_takes_25_lines_at_most():
+    """Registered, fitted, diagnosed, exported: what a user writes who has recordings."""
+    text = (EXAMPLES / "own_friction.py").read_text(encoding="utf-8")
+    own = text[text.rindex("@fj.register") :].splitlines()
+    assert len([line for line in own if line.strip() and "__name__" not in line]) <= 25
 
 
 def cases() -> list:

@@ -109,11 +109,11 @@ def test_what_is_not_there_cannot_be_free(free, message: str, robot: fj.RobotMod
 
 def test_everything_can_be_free_at_once(robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...]):
     """The derivative of the rows by each number is that of the model that `free` makes of it."""
-    from figaroh_jax.fitting.free import apply, select
+    from figaroh_jax.estimation.free import apply, chosen_of
 
     model = fj.extend(robot, place(robot, "stribeck_friction", "elbow", force=1.0, speed=0.2))
     kinds = ("inertia", "effects", "joint_offset", "link_geometry", "frames", "tool_frame", "base", "gravity")
-    chosen = select(model, tracked, kinds)
+    chosen = chosen_of(model, tracked, kinds)
     counts = {kind: sum(len(p.index) for p in chosen.parts if p.kind == kind) for kind in kinds}
     assert counts == {
         "inertia": 40,

@@ -35,9 +35,9 @@ def case() -> tuple[fj.ExtendedModel, fj.TorqueData, Any]:
 
 def rows(model: fj.ExtendedModel, data: fj.TorqueData, basis: Any) -> tuple[np.ndarray, np.ndarray]:
     """Columns of the kept parameters (rows nv rank) and torque, by the derivative of the public residual."""
-    from figaroh_jax.fitting.free import apply, select
+    from figaroh_jax.estimation.free import apply, chosen_of
 
-    free = select(model, (data,), ("inertia", "effects"))
+    free = chosen_of(model, (data,), ("inertia", "effects"))
     at = lambda y: fj.residual(apply(free, model, (data,), y)[0], data)  # noqa: E731
     X = np.asarray(jax.jit(jax.jacfwd(at))(jnp.zeros(len(free.names))))
     return X[:, list(basis.kept)].reshape(-1, 4, len(basis.kept)), np.asarray(data.torque).reshape(-1, 4)

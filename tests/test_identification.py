@@ -71,6 +71,30 @@ def test_every_link_can_exist_and_the_rank_is_the_structural_one(found: Identifi
     assert any(p.status == "prior only" and p.absorbed_in for p in found.parameters)
 
 
+def test_an_identification_is_a_view_of_its_fit(truth: Truth, found: Identification):
+    fit, each = found.solution, [(p.value, p.std) for p in found.parameters]
+    start = np.zeros(len(each))
+    start[: 10 * len(found.links)] = np.asarray(truth.nominal.inertia).reshape(-1)
+    np.testing.assert_allclose(fit.values + start, [value for value, _ in each], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(fit.std, [std for _, std in each], rtol=1e-12, atol=0)
+    assert fit.parameters["viscous_friction elbow damping"].unit == "N m s/rad" and not fit.reason
+    weighted = fit.rows.reshape(-1, len(found.joints))
+    assert np.sqrt(np.mean(weighted**2)) == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_solver_that_gives_up_is_a_result_with_a_reason(truth: Truth, monkeypatch: pytest.MonkeyPatch):
+    from figaroh_jax.estimation.conic import NotConverged
+    from figaroh_jax.identification import identification
+
+    def gives_up(*arguments: object) -> None:
+        raise NotConverged("the constrained fit did not converge")
+
+    monkeypatch.setattr(identification, "physical_fit", gives_up)
+    found = identify(truth.nominal, [recording(truth, seed=1)], SETTINGS)
+    assert found.solution.reason and any("do not trust" in note for note in found.notes)
+    assert not json.loads(to_json(found))["converged"]
+
+
 def test_result_holds_what_the_contract_asks(found: Identification):
     answer = json.loads(to_json(found))
     assert {"rank", "condition", "base_parameters", "links", "effects", "fit", "holdout"} <= set(answer)

@@ -22,7 +22,7 @@ OUTSIDE = {
     "pydantic": {"formats.config", "formats.reference"},
     "rich": {"reporting.terminal"},
     "jinja2": {"reporting.report"},
-    "jaxopt": {"diagnosis.refit", "fitting.fit"},
+    "jaxopt": {"diagnosis.refit", "estimation.fit"},
     "clarabel": {"estimation.conic"},
     "sklearn": {"estimation.least_squares"},
     "coal": {"excitation.meshes"},
@@ -105,6 +105,7 @@ def test_options_of_one_kind_of_device_are_set_where_the_device_is_known():
         "compiled.executable_cache",
         "rigid.normal_equations",
         "estimation.accelerators",
+        "estimation.fit",
     }
     for path in (ROOT / "backends").rglob("*.py"):
         assert "compiler_options=" not in path.read_text(encoding="utf-8"), path

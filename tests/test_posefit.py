@@ -11,8 +11,8 @@ import pinocchio as pin
 import poses
 import pytest
 
-from figaroh_jax.calibration import posefit, starts
-from figaroh_jax.calibration.posesolver import solve
+from figaroh_jax.estimation import posefit, starts
+from figaroh_jax.estimation.posesolver import solve
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.recordings.devices import Camera, Device, Distance, Planes, Points, Poses, Sockets, own_device
 from figaroh_jax.rigid.chain import chain_between

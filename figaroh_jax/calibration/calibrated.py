@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..results import Cause
+from ..results import Selection
 from ..rigid.model import RobotModel
 
 __all__ = [
@@ -64,32 +64,42 @@ class SocketDistance(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
-    """The calibrated robot, what was estimated and how well it predicts."""
+class Calibration(Selection):
+    """The calibrated robot, what was estimated and how well it predicts; `solution.model` is that robot."""
 
     level: str
-    model: RobotModel  # with corrected placements
     twists: dict[str, Float[np.ndarray, "6"]]  # correction of each joint's placement, in the joint frame, m and rad
     frames: dict[str, Float[np.ndarray, "*shape"]]  # metrology: poses (4 4) or points, by name
     parameters: tuple[Parameter, ...]
     position: Error | None
     orientation: Error | None
     outliers: tuple[Outlier, ...]
-    verdict: str
-    causes: tuple[Cause, ...]
     table: dict[str, tuple[float, float]]  # held-out RMS of each level and of the chosen one, m and rad
     classes: tuple[tuple[str, ...], ...]  # parameters that the data cannot tell apart
     rank: int
     condition: float
     noise: tuple[float, float]  # m, rad
-    converged: bool
-    steps: int
     scheme: str  # how the validation was held out
     notes: tuple[str, ...]
     points: tuple[Shown, ...]
     distances: tuple[SocketDistance, ...] = ()
     correlations: tuple[tuple[str, str, float], ...] = ()  # of identified parameters, the strongest
     posture: dict[str, float] = field(default_factory=dict)  # of the joints that are locked, rad or m
+
+    @property
+    def model(self) -> RobotModel:
+        """The robot with corrected placements."""
+        return self.solution.model.robot
+
+    @property
+    def converged(self) -> bool:
+        """Whether the solver ended where it should."""
+        return not self.solution.failure
+
+    @property
+    def steps(self) -> int:
+        """Of the solver."""
+        return int(self.solution.stats["num_steps"])
 
 
 @dataclass(frozen=True, eq=False)

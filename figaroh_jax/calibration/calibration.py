@@ -17,6 +17,9 @@ from jaxtyping import Bool, Float
 from ..effects.kinematic import HISTORY
 from ..errors import InputError, nearest
 from ..estimation import marginal
+from ..estimation.gravity import without_far_masses
+from ..estimation.posegroups import Measured, assemble, postures_of
+from ..estimation.posesolver import Solution, solve
 from ..recordings.poses import PoseRecording, read_pose_recordings
 from ..recordings.posture_checks import check_pose_recordings
 from ..rigid.chain import chain_between
@@ -25,10 +28,7 @@ from . import corrections, levels
 from .calibrated import Calibration, Error, Outlier
 from .candidates import Block, blocks_of, effects_on, empty_columns, geometry_columns, known_frames
 from .distances import socket_distances
-from .gravity import without_far_masses
 from .outliers import find_outliers
-from .posegroups import Measured, assemble, postures_of
-from .posesolver import Solution, solve
 from .shapes import refine
 
 if TYPE_CHECKING:
@@ -71,6 +71,15 @@ def calibrate(
     Level and effects are those that predict best. `level` ("frames", "joint_offset" or "full") asks for one in their
     place, and for no effects: it is fitted, and the notes say so where it predicts worse than the frames alone. Without
     `priors` its identifiable parameters are fitted by plain least squares.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> q = np.random.default_rng(0).uniform(-1.4, 1.4, (30, robot.nv))
+    >>> seen = np.asarray(fj.frame_placement(robot, q + [0.0, 0.02, 0.0, 0.0], "hand")) @ [0.05, 0.02, 0.03, 1.0]
+    >>> run = fj.postures(q=q, position=seen[:, :3], base_frame="base", tool_frame="hand")
+    >>> found = fj.calibrate(robot, [run], level="joint_offset")
+    >>> round(found.solution.parameters["joint_offset shoulder"].value, 4)
+    0.02
     """
     if level is not None and level not in levels.LEVELS:
         raise InputError(f"no level '{level}' of calibration{nearest(level, levels.LEVELS)}")
@@ -203,11 +212,14 @@ class Run:
         causes = corrections.causes_of(parameters, level, self.extension, self.blocks, table, self.folds)
         twists = corrections.twists_of(self.model, final, linear.at)
         names = [c.label for c in final.columns] + [name for name, _ in final.own]
-        if not solution.converged:
-            self.notes.append("the solver did not converge within its steps: do not trust these values")
+        found = corrections.solution_of(
+            self.model, self.recordings, final, linear, posterior, solution, self.used, free, self.extension
+        )
+        if found.failure:
+            self.notes.append(f"{found.failure}: do not trust these values")
         return Calibration(
+            solution=found,
             level=level,
-            model=corrections.corrected(self.model, twists),
             twists=twists,
             frames=corrections.frames_of(final, linear.at),
             parameters=parameters,
@@ -222,8 +234,6 @@ class Run:
             rank=gauge.rank,
             condition=gauge.condition,
             noise=(float(posterior.noise[0]), float(posterior.noise[1])),
-            converged=solution.converged,
-            steps=solution.steps,
             scheme=scheme,
             notes=tuple(self.notes),
             distances=socket_distances(

@@ -15,13 +15,13 @@ from jaxtyping import Float
 
 from ..effects.base import Effect
 from ..effects.kinematic import CATALOGUE, HISTORY, Column, Postures, axis_twist, columns_of, shape_of
+from ..estimation import posefit
+from ..estimation.posegroups import Measured
 from ..recordings.poses import PoseRecording
 from ..results import Name
 from ..rigid.model import RobotModel, dofs
-from . import posefit
 from .kinematic_scores import Waves
 from .levels import Effects
-from .posegroups import Measured
 
 __all__ = [
     "GEOMETRY",

@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..compiled.batching import program
+from ..effects.base import Effect
+from ..effects.extended import extend
 from ..effects.kinematic import Column, Postures, shape_of
 from ..estimation import marginal
+from ..estimation.data import PoseData
+from ..estimation.posefit import DRAFT_OPTIONS, ties
+from ..estimation.posegroups import Measured, shared
+from ..estimation.posesolver import Solution
+from ..estimation.solution import Fit, numbers
 from ..recordings.devices import Device
+from ..recordings.poses import PoseRecording
 from ..results import Cause, Estimate, Gain, Name
 from ..rigid.model import RobotModel
 from . import levels
 from .calibrated import Outlier, Parameter, Shown
 from .candidates import Block
 from .gauge import Gauge, find_gauge
-from .posefit import DRAFT_OPTIONS
-from .posegroups import Measured
 
 __all__ = [
     "causes_of",
@@ -33,6 +40,7 @@ __all__ = [
     "outlier_cause",
     "parameters_of",
     "shown_of",
+    "solution_of",
     "twist_pose",
     "twists_of",
 ]
@@ -60,6 +68,91 @@ def identifiable(measured: Measured) -> list[Column]:
     gauge, order = gauge_of(measured, linear, measured.fitted, np.ones(len(linear.at), bool))
     held = {order[k] for k in gauge.dependent}
     return [column for k, column in enumerate(measured.columns) if k not in held]
+
+
+def solution_of(
+    model: RobotModel,
+    recordings: Sequence[PoseRecording],
+    final: Measured,
+    linear: marginal.Linear,
+    posterior: marginal.Posterior,
+    found: Solution,
+    used: np.ndarray,
+    free: np.ndarray,
+    named: Sequence[Block],
+) -> Fit:
+    """The calibration as a fit: corrected robot, devices in their places, numbers with their covariance.
+
+    Effects at the joints' sensors stand in the model; those that move links (twists) have no form there.
+    """
+    scale = np.asarray(final.problem.scale)
+    each = [(c.label, c.unit) for c in final.columns] + list(final.own)
+    kept = np.array([k for k in np.flatnonzero(free) if each[k][0]], int)  # empty columns have no name
+    names, units = zip(*(each[k] for k in kept), strict=True)
+    covariance = (marginal.honest_covariance(posterior, linear.prior) * scale[:, None] * scale)[np.ix_(kept, kept)]
+    weight = np.where(linear.posture >= 0, posterior.weight[linear.posture], 1.0)
+    weight = np.where(used, np.sqrt(weight) / posterior.noise[linear.channel], 0.0)
+    return Fit(
+        model=extend(
+            corrected(model, twists_of(model, final, linear.at)), *_effects_of(model, final, linear.at, named)
+        ),
+        data=_data_of(recordings, final, linear.at * scale, weight),
+        values=(linear.at * scale)[kept],
+        covariance=covariance,
+        hidden=np.zeros(len(kept)),
+        cost=np.float64(found.cost),
+        rows=_by_posture(final, weight * linear.residual),
+        rank=len(kept),
+        outcome=None,
+        stats={"num_steps": found.steps},
+        free=numbers("calibration", names, units, tuple(scale[kept].tolist())),
+        failure="" if found.converged else "the solver did not converge within its steps",
+    )
+
+
+def _by_posture(final: Measured, rows: np.ndarray) -> np.ndarray:
+    """Rows in the order of `PoseData.residual`: each device's posture by posture, then its constraints."""
+    found, first = [], 0
+    for group in final.problem.groups:
+        samples, count = np.shape(group.measured)
+        found.append(rows[first : first + samples * count].reshape(count, samples).T.reshape(-1))
+        first += samples * count
+        tied = ties(group.device)
+        found.append(rows[first : first + tied])
+        first += tied
+    return np.concatenate(found)
+
+
+def _effects_of(model: RobotModel, final: Measured, at: np.ndarray, named: Sequence[Block]) -> Iterator[Effect]:
+    """The named effects that have a form at the joints' sensors, with their sizes."""
+    size = dict(zip((c.label for c in final.columns), at * np.asarray(final.problem.scale), strict=False))
+    for block in named:
+        if block.effect.has("position_error"):
+            joints = np.array([model.joint_index(name) for name in block.columns[0].at], int)
+            values = {c.parameter: np.float64(block.effect.correction * size[c.label]) for c in block.columns}
+            curved = shape_of(block.effect)[0]
+            yield block.effect(joints, **values, **({curved: np.float64(block.shape)} if curved else {}))
+
+
+def _data_of(
+    recordings: Sequence[PoseRecording], final: Measured, values: np.ndarray, weight: np.ndarray
+) -> tuple[PoseData, ...]:
+    """What every device measured, the device where the fit puts it."""
+    data, first, row = [], len(final.columns), 0
+    for group, members in zip(final.problem.groups, shared(recordings), strict=True):
+        own = values[first : first + len(group.device.unknowns())]
+        first += len(own)
+        samples, count = np.shape(group.measured)
+        mine, tied = weight[row : row + samples * count].reshape(count, samples).T, ties(group.device)
+        row += samples * count
+        held = float(weight[row]) if tied else 1.0
+        row += tied
+        one = recordings[members[0]]
+        position = np.asarray(group.position).T
+        moved = group.device.moved(jnp.asarray(own))
+        begins = tuple(np.cumsum([0, *(len(recordings[k].position) for k in members[:-1])]).tolist())
+        data.append(PoseData(position, group.datum, mine, moved, held, one.base_frame, one.tool_frame, begins))
+    return tuple(data)
 
 
 def parameters_of(final: Measured, linear, posterior, gauge: Gauge, order: list[int]) -> tuple[Parameter, ...]:

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..estimation.marginal import Linear
+from ..estimation.posegroups import Measured
 from ..recordings.devices import Sockets
 from ..recordings.poses import PoseRecording
 from .calibrated import SocketDistance
-from .posegroups import Measured
 
 __all__ = ["socket_distances"]
 

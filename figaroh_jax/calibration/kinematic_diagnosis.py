@@ -19,7 +19,7 @@ from ..effects.kinematic import CATALOGUE, HISTORY
 from ..estimation import marginal
 from ..recordings.poses import PoseRecording, read_pose_recordings
 from ..recordings.posture_checks import check_pose_recordings
-from ..results import Cause, Estimate, Experiment, Gain, Name
+from ..results import Cause, Estimate, Experiment, Gain, Name, Selection, Verdict
 from ..rigid.model import RobotModel
 from . import levels
 from .calibrated import Calibration
@@ -40,11 +40,9 @@ _NOISY = 1.5  # times the device's stated accuracy: the rest is no noise
 
 
 @dataclass(frozen=True, eq=False)
-class PoseDiagnosis:
+class PoseDiagnosis(Selection):
     """Verdict and causes, with the calibration that they stand on."""
 
-    verdict: str
-    causes: tuple[Cause, ...]
     p_value: float
     before: tuple[float | None, float | None]  # RMS of the frames alone: mm, deg
     after: tuple[float | None, float | None]
@@ -313,7 +311,7 @@ def _gain(calibration: Calibration) -> Gain:
 
 
 def _answer(calibration: Calibration, causes: tuple[Cause, ...], p_value: float, rest: bool) -> PoseDiagnosis:
-    verdict = ("named+rest" if rest else "named") if causes else ("unknown" if rest else "nothing")
+    verdict: Verdict = ("named+rest" if rest else "named") if causes else ("unknown" if rest else "nothing")
     errors = (calibration.position, calibration.orientation)
     scale = (1e3, 180.0 / np.pi)
     experiment = None
@@ -325,6 +323,7 @@ def _answer(calibration: Calibration, causes: tuple[Cause, ...], p_value: float,
         pairs = tuple((doubted.name.effect, other.effect) for other in doubted.ambiguous_with)
         experiment = Experiment(text, tuple(dict.fromkeys(pairs)))
     return PoseDiagnosis(
+        solution=calibration.solution,
         verdict=verdict,
         causes=causes,
         p_value=p_value,

@@ -16,12 +16,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..effects.kinematic import Column
-from ..estimation import marginal
+from ..estimation import marginal, posefit
 from ..estimation.marginal import FLAT, Linear, Posterior
-from . import posefit
+from ..estimation.posegroups import Measured
+from ..estimation.posesolver import solve
 from .kinematic_scores import Waves, row_noise, waves_shown
-from .posegroups import Measured
-from .posesolver import solve
 
 __all__ = [
     "EFFECT",

@@ -14,9 +14,9 @@ from jaxtyping import Bool
 
 from ..effects.kinematic import Postures, columns_of, shape_of
 from ..estimation.marginal import FLAT, Linear, Posterior
+from ..estimation.posegroups import Measured
 from ..rigid.model import RobotModel
 from .candidates import Block, moved_rows, moves, sizes_of, twist_rows
-from .posegroups import Measured
 
 __all__ = ["refine"]
 

@@ -133,7 +133,18 @@ class Motion(eqx.Module):
 
 
 def amplitude(unit: str, lower: float = -np.inf, upper: float = np.inf) -> Any:
-    """Declare a parameter in which the torque is linear; outside of its bounds the effect is not one that exists."""
+    """Declare a parameter in which the torque is linear; outside of its bounds the effect is not one that exists.
+
+    >>> import figaroh_jax as fj
+    >>> class Drag(fj.Effect):
+    ...     name, title, acts_on, equation = "drag", "drag of the air", "joint", "c v |v|"
+    ...     drag: float = fj.amplitude("N m s2/rad2", lower=0.0)
+    ...     def torque(self, motion):
+    ...         v = self.here(motion.velocity)
+    ...         return self.drag * v * abs(v)
+    >>> Drag.parameters()["drag"].unit
+    'N m s2/rad2'
+    """
     return eqx.field(default=0.0, metadata={"parameter": Parameter(unit, True, lower, upper)})
 
 
@@ -147,6 +158,14 @@ def shape(
     """Declare a parameter in which the torque is not linear; `choice` takes the grid's values alone.
 
     It is searched within `bounds` but not in the `hole`, where the effect is another one.
+
+    >>> import figaroh_jax as fj
+    >>> class Notch(fj.Effect):
+    ...     name, title, acts_on, equation = "notch", "a notch", "joint", "k q exp(-(q / w)^2)"
+    ...     depth: float = fj.amplitude("N m/rad")
+    ...     width: float = fj.shape("rad", (0.05, 0.1, 0.2))
+    >>> Notch.parameters()["width"].grid
+    (0.05, 0.1, 0.2)
     """
     lower, upper = bounds or (min(grid), max(grid))
     parameter = Parameter(unit, False, lower, upper, tuple(grid), choice, hole)
@@ -339,7 +358,14 @@ def smooth_sign(
 
 
 def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **parameters: float) -> Effect:
-    """The effect at the joints, pair or link named in `at`, with parameters by name (the others at their default)."""
+    """The effect at the joints, pair or link named in `at`, with parameters by name (the others at their default).
+
+    >>> import figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> friction = fj.place(fj.CATALOGUE["viscous_friction"], robot, ["elbow"], damping=1.5)
+    >>> float(friction.damping)
+    1.5
+    """
     wanted = {"joint": 1, "pair": 2, "link": 1, "robot": 0}[effect.acts_on]
     at = [at] if isinstance(at, str) else [*(at or ())]
     if len(at) != wanted:

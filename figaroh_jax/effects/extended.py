@@ -76,6 +76,12 @@ def extend(
 
     `width` (rad/s or m/s, one for all joints or one each) is the half width of a reversal within which the joints' dry
     friction is smooth; None keeps the model's, 0 for a plain robot.
+
+    >>> import figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> model = fj.extend(robot, fj.place(fj.CATALOGUE["viscous_friction"], robot, ["elbow"], damping=1.5))
+    >>> model.effects[0].name
+    'viscous_friction'
     """
     robot, present = (model.robot, model.effects) if isinstance(model, ExtendedModel) else (model, ())
     if width is None:
@@ -104,6 +110,12 @@ def predict(
     read less the sensors' errors (differentiated by five-point central differences; their load is that of the motion
     as read). Friction sits at the motor and follows the motion as read. Raises `InputError` for a robot with joints
     of several degrees of freedom: no one sensor reads their position.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> model = fj.extend(fj.load_urdf(fj.DEMO))
+    >>> t, still = np.arange(50) / 100.0, np.zeros((50, 4))
+    >>> fj.predict(model, t, still, still, still, 0.01).shape
+    (50, 4)
     """
     require_single_axes(extended.robot, "a record of sensors")
     check_real("time", time)

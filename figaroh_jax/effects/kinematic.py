@@ -15,6 +15,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -171,6 +173,11 @@ def _history(model, at, sign):
         yield model.joints[j].name, "1", [(j, lambda p, j=j, law=law, motion=motion: motion[:, None] * law(p, j))]
 
 
+def _library(array: Any) -> Any:
+    """NumPy on the host, where it costs no program, and JAX under its transformations."""
+    return jnp if isinstance(array, jax.Array) else np
+
+
 class PostureMotion(Motion):
     """Postures as the effects see a motion: at rest, each with the one before; columns are tree joints."""
 
@@ -189,12 +196,12 @@ class PostureMotion(Motion):
     @property
     def angle(self) -> Float[Leaf, "samples nj"]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Position of each tree joint, rad or m."""
-        return np.asarray(self.position)[:, self._starts]
+        return self.position[:, self._starts]
 
     @property
-    def way(self) -> Float[np.ndarray, "samples nj"]:
+    def way(self) -> Float[Leaf, "samples nj"]:
         """Motion of each tree joint from the posture before, rad or m."""
-        return (np.asarray(self.position) - np.asarray(self.before))[:, self._starts]
+        return (self.position - self.before)[:, self._starts]
 
     @property
     def _starts(self) -> list[int]:
@@ -236,7 +243,7 @@ class GearTransmissionError(JointEffect):
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
         angle = self.order * self.here(motion.angle)
-        return self.sine * np.sin(angle) + self.cosine * np.cos(angle)
+        return self.sine * _library(angle).sin(angle) + self.cosine * _library(angle).cos(angle)
 
 
 @register
@@ -313,7 +320,8 @@ class ReversalHysteresis(JointEffect):
     width: Scalar = amplitude("rad")
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
-        return -self.width * np.sign(self.here(motion.way))
+        way = self.here(motion.way)
+        return -self.width * _library(way).sign(way)
 
 
 @register

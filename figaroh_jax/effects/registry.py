@@ -17,6 +17,16 @@ def register(effect: type[Effect]) -> type[Effect]:
 
     Its `levels` say which diagnoses look for it: of torques, and of postures where it has an error of the position that
     is linear in a parameter, or a twist.
+
+    >>> import figaroh_jax as fj
+    >>> @fj.register
+    ... class Drag(fj.Effect):
+    ...     name, title, acts_on, equation = "drag", "drag of the air", "joint", "c v |v|"
+    ...     drag: float = fj.amplitude("N m s2/rad2", lower=0.0)
+    ...     def torque(self, motion):
+    ...         return self.drag * self.here(motion.velocity) * abs(self.here(motion.velocity))
+    >>> fj.CATALOGUE["drag"] is Drag
+    True
     """
     if (CATALOGUE | _OTHERS | POSES).get(effect.name, effect).__qualname__ != effect.__qualname__:
         raise InputError(f"an effect called '{effect.name}' is registered already")

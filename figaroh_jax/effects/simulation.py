@@ -63,6 +63,11 @@ def simulate(
     and the levels F hold the state at the step's beginning. Dry friction of an effect on the whole robot counts as
     friction of the joints. Differentiable with respect to model, command and start. Joints of several degrees of
     freedom are not simulated.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> model = fj.extend(fj.load_urdf(fj.DEMO))
+    >>> fj.simulate(model, np.zeros((20, 4)), np.zeros(4), np.zeros(4), 1e-3).position.shape
+    (20, 4)
     """
     require_single_axes(extended.robot, "a simulation")
     q, v = states(extended.robot, position=position, velocity=velocity)

@@ -16,10 +16,14 @@ from jaxtyping import Float
 from ..errors import InputError
 from ..rigid.inertia import pseudo_inertia
 
-__all__ = ["Body", "Constraints", "constrained"]
+__all__ = ["Body", "Constraints", "NotConverged", "constrained"]
 
 MARGIN = 1e-7  # least eigenvalue of a scaled pseudo-inertia: a body on the very border could not be inverted
 _UPPER = [(i, j) for j in range(4) for i in range(j + 1)]  # Clarabel's order of a triangle
+
+
+class NotConverged(InputError):
+    """The solver gave up on a problem that may have a solution."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +111,7 @@ def _check(status: str) -> None:
         return
     if "PrimalInfeasible" in status:
         raise InputError("no parameters satisfy all constraints together: bounds, equalities and bodies contradict")
-    raise InputError(f"the constrained fit did not converge (Clarabel: {status}); the data may hold hardly any motion")
+    raise NotConverged(f"the constrained fit did not converge (Clarabel: {status}); there may be hardly any motion")
 
 
 def _scale(factor: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " columns"]:

@@ -18,12 +18,12 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..calibration import posefit
 from ..calibration.candidates import geometry_columns
 from ..calibration.gauge import find_gauge
-from ..calibration.posegroups import Measured, assemble, postures_of
 from ..effects.kinematic import Column
 from ..errors import InputError
+from ..estimation import posefit
+from ..estimation.posegroups import Measured, assemble, postures_of
 from ..recordings.arrays import postures as recorded
 from ..rigid.chain import chain_between
 from ..rigid.kinematics import forward_kinematics

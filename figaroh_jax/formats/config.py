@@ -565,7 +565,12 @@ def load_limits(path: str | Path) -> Limits:
 
 
 def load_task(path: str | Path) -> Task:
-    """Read and check a task file; raises `InputError` that names file and key of the first mistake."""
+    """Read and check a task file; raises `InputError` that names file and key of the first mistake.
+
+    >>> import figaroh_jax as fj
+    >>> fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml")).preprocess.cutoff
+    15.0
+    """
     chain = read_task(Path(path))
     try:
         task = Task.model_validate(merge(chain))

@@ -55,6 +55,13 @@ def write_model(extended: ExtendedModel, directory: str | Path, causes: Sequence
 
     `causes` give the standard deviations of the effects that they name; those of the others are null. What a format
     cannot carry stands in `effects.yaml`, at the effect and under `warnings`.
+
+    >>> import tempfile, figaroh_jax as fj
+    >>> model = fj.extend(fj.load_urdf(fj.DEMO))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     fj.write_model(model, folder)
+    ...     fj.load_model(folder).robot.nv
+    4
     """
     directory = Path(directory)
     texts = model_files(extended, causes)
@@ -188,6 +195,12 @@ def load_model(directory: str | Path) -> ExtendedModel:
 
     Effects of your own must have been registered (`effects.register`) before. Raises `InputError` for a folder that
     holds no such model, and for effects, joints or links that are not known.
+
+    >>> import tempfile, figaroh_jax as fj
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     fj.write_model(fj.extend(fj.load_urdf(fj.DEMO)), folder)
+    ...     fj.load_model(folder).robot.joint_names[0]
+    'waist'
     """
     directory = Path(directory)
     if not directory.is_dir():

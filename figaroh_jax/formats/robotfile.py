@@ -71,6 +71,11 @@ def load_extended(
     Arguments as in `read_robot`. Effects of mimic joints act at the joint that they follow; those of locked joints do
     no work. `inverse_dynamics` of the model is MuJoCo's `mj_inverse` of the same file, and Pinocchio's `rnea` with the
     URDF's damping and friction.
+
+    >>> import figaroh_jax as fj
+    >>> model, notes = fj.load_extended(fj.DEMO)
+    >>> model.robot.nv
+    4
     """
     if _is_urdf(path):
         robot = read_robot(path, joints, posture, gravity, root, packages)
@@ -93,7 +98,12 @@ def load_extended(
 
 
 def load_robot(task: Task) -> RobotModel:
-    """The robot of a task, joints locked and ordered as it says; gravity is an MJCF's own where the task gives none."""
+    """The robot of a task, joints locked and ordered as it says; gravity is an MJCF's own where the task gives none.
+
+    >>> import figaroh_jax as fj
+    >>> fj.load_robot(fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml"))).nv
+    4
+    """
     if task.robot.model.suffix.lower() not in (".urdf", ".xml"):
         raise InputError(f"{task.file}: robot.model {task.robot.model}: expected a .urdf or an .xml (MJCF) file")
     from .config import robot_options

@@ -74,6 +74,10 @@ def load_urdf(
     `package://my_robot/robot.urdf` is found.
 
     Raises `InputError` naming the file and the joint or link that is wrong.
+
+    >>> import figaroh_jax as fj
+    >>> fj.load_urdf(fj.DEMO).joint_names
+    ('waist', 'shoulder', 'elbow', 'wrist')
     """
     path = find_in_packages(path, packages)
     robot = _read(path)

@@ -20,7 +20,7 @@ from ..effects.plausibility import implausible
 from ..errors import InputError, nearest
 from ..estimation.base_parameters import BaseParameters, base_parameters, essential
 from ..estimation.columns import friction_terms, structural_columns
-from ..estimation.conic import Body
+from ..estimation.conic import Body, NotConverged
 from ..estimation.consistency import bodies, log_cholesky_fit, physical_fit, project
 from ..estimation.intervals import coloured_covariance
 from ..estimation.least_squares import Solution, WeightedByJoint, solve
@@ -35,15 +35,16 @@ from ..simulators.native import as_backend
 from ..simulators.registry import backend as make_backend
 from .judgement import (
     Judged,
+    Solved,
     correlations,
     described_effects,
     described_links,
     dropped,
-    extended,
     posterior_covariance,
     predicted,
     prior_sigma,
     quality,
+    solution_of,
 )
 from .result import Identification, Quality
 from .reversal import with_reversal_widths
@@ -99,7 +100,13 @@ class _Problem:
 def identify_task(
     task: Task, progress: Callable[[str, float], None] = lambda phase, share: None, backend: str = "native"
 ) -> Identification:
-    """Identify what a task file describes, by the named backend; `InputError` before any work where it is wrong."""
+    """Identify what a task file describes, by the named backend; `InputError` before any work where it is wrong.
+
+    >>> import figaroh_jax as fj
+    >>> found = fj.identify_task(fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml")))
+    >>> found.rank <= found.structural_rank, found.solution.reason
+    (True, '')
+    """
     from ..formats.robotfile import load_robot, stated_baseline
 
     progress("reading", 0.0)
@@ -162,7 +169,8 @@ def identify(
         problem = _problem(regression, data, base, start, covariance, trust, fit, bounds)
         progress("fitting", 0.6)
         chosen, validated = _validated(problem)
-        theta = _fitted(problem, None, chosen)
+        last = _fitted(problem, None, chosen)
+        theta = last.theta
         progress("judging", 0.85)
         if chosen > 1:
             notes.append(
@@ -175,10 +183,15 @@ def identify(
         ten = theta[:own].reshape(-1, 10)
         given = _given_links(problem)
         traces, holdout, outlying = predicted(regression, theta, given)
+        if last.failure:
+            notes.append(f"{last.failure}: do not trust these values")
+        rows = [np.asarray(t.after) - t.measured for t in traces if t.role == "fit" and t.measured is not None]
+        weighted = np.concatenate([(row * np.sqrt(problem.weight)).reshape(-1) for row in rows])
+        solution = solution_of(regression, last, posterior, base.rank, weighted)
         kept = essential(data.factor(start.weight)[:, [*base.independent, -1]])
         return Identification(
+            solution=solution,
             joints=model.dof_names,
-            rank=base.rank,
             structural_rank=structural.rank,
             condition=base.condition,
             scaled_condition=base.scaled_condition,
@@ -195,7 +208,6 @@ def identify(
             trust=chosen * trust,
             width=regression.width,
             method=fit,
-            model=extended(regression, theta),
             essential=tuple(base.expressions[k] for k in kept),
             traces=traces,
             correlations=correlations(base, covariance),
@@ -301,7 +313,7 @@ def _least(terms: Sequence[Effect]) -> Float[np.ndarray, " drives"]:
     return np.array(out)
 
 
-def _fitted(problem: _Problem, folds: Sequence[int] | None, slack: float) -> Float[np.ndarray, " columns"]:
+def _fitted(problem: _Problem, folds: Sequence[int] | None, slack: float) -> Solved:
     """All columns fitted to the rows of `folds` (None: all), the nominal believed `slack` times less."""
     root = np.sqrt(problem.inflation) * problem.root_at(slack)
     rows = np.column_stack([root, root @ problem.mean])
@@ -309,15 +321,17 @@ def _fitted(problem: _Problem, folds: Sequence[int] | None, slack: float) -> Flo
     factor = np.asarray(np.linalg.qr(np.concatenate([own, rows]), mode="r"))
     if problem.fit == "unconstrained":
         length = np.linalg.norm(factor[:, :-1], axis=0)
-        return np.linalg.lstsq(factor[:, :-1] / length, factor[:, -1], rcond=None)[0] / length
+        return Solved(np.linalg.lstsq(factor[:, :-1] / length, factor[:, -1], rcond=None)[0] / length)
     if problem.fit == "log_cholesky":
         if any(b.box is not None or b.least_mass > 0 or np.isfinite(b.greatest_mass) for b in problem.links):
             raise InputError("identify.bounds: the fit 'log_cholesky' knows no bounds; use 'physical'")
         found = log_cholesky_fit(factor, problem.nominal)
-        if not found.converged:
-            raise InputError(f"identify.fit: log_cholesky has not converged in {found.steps} steps; use 'physical'")
-        return found.parameters
-    return physical_fit(factor, problem.links, problem.bounded)
+        failure = "" if found.converged else f"log_cholesky has not converged in {found.steps} steps; try 'physical'"
+        return Solved(found.parameters, failure, found.steps)
+    try:
+        return Solved(physical_fit(factor, problem.links, problem.bounded))
+    except NotConverged as error:
+        return Solved(problem.mean, str(error))
 
 
 def _given_links(problem: _Problem) -> Float[np.ndarray, " columns"]:
@@ -337,7 +351,7 @@ def _validated(problem: _Problem) -> tuple[float, Quality]:
         squares = np.zeros(len(problem.weight))
         for fold in folds:
             others = [k for k in folds if k != fold]
-            theta = _fitted(problem, others, slack) if others else problem.mean
+            theta = _fitted(problem, others, slack).theta if others else problem.mean
             squares += problem.data.squares(theta, [fold])
         cost = float(squares @ problem.weight)
         if best is None or cost < best[0] * (1 - 1e-3):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,8 +15,10 @@ from ..effects.base import Effect, joint_unit
 from ..effects.extended import ExtendedModel, extend
 from ..estimation.base_parameters import TEN, BaseParameters
 from ..estimation.consistency import inconsistencies
+from ..estimation.free import Free, chosen_of
 from ..estimation.priors import rigid_prior
 from ..estimation.regression import Condensed, Piece, Regression
+from ..estimation.solution import Fit
 from ..formats.native import place_names
 from ..recordings.groupmotion import coordinate_positions
 from ..recordings.signals import Signals
@@ -25,6 +28,7 @@ from .result import BaseParameter, FittedEffect, Link, Parameter, Quality, Statu
 
 __all__ = [
     "Judged",
+    "Solved",
     "correlations",
     "described_effects",
     "described_links",
@@ -34,6 +38,7 @@ __all__ = [
     "predicted",
     "prior_sigma",
     "quality",
+    "solution_of",
 ]
 
 NOTABLE = 0.95  # correlation that is reported
@@ -171,6 +176,43 @@ def extended(regression: Regression, theta: Float[np.ndarray, " columns"]) -> Ex
     links = 10 * len(regression.model.joints)
     robot = eqx.tree_at(lambda m: m.inertia, regression.model, theta[:links].reshape(-1, 10))
     return extend(robot, *fitted_effects(regression.terms, theta[links:]), width=regression.width)
+
+
+class Solved(NamedTuple):
+    """All columns as a solver left them, and why it did not end well (empty where it did)."""
+
+    theta: Float[np.ndarray, " columns"]
+    failure: str = ""
+    steps: int = 1
+
+
+def solution_of(
+    regression: Regression,
+    found: Solved,
+    posterior: Float[np.ndarray, "columns columns"],
+    rank: int,
+    rows: Float[np.ndarray, " rows"],
+) -> Fit:
+    """The identification as a fit of links and effects: changes from the given links, and from no effect at all."""
+    model = extended(regression, found.theta)
+    free = chosen_of(model, (), ("inertia", "effects") if model.effects else "inertia")
+    linear = [p for p in free.parts if p.kind == "inertia" or model.effects[p.key[0]].parameters()[p.key[1]].linear]
+    start = np.zeros(len(found.theta))
+    start[: 10 * len(regression.model.joints)] = np.asarray(regression.model.inertia).reshape(-1)
+    return Fit(
+        model=model,
+        data=(),
+        values=found.theta - start,
+        covariance=posterior,
+        hidden=np.zeros(len(start)),
+        cost=0.5 * float(np.nansum(rows**2)),
+        rows=rows,
+        rank=rank,
+        outcome=None,
+        stats={"num_steps": found.steps},
+        free=Free(tuple(linear)),
+        failure=found.failure,
+    )
 
 
 def described_effects(

@@ -10,6 +10,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..effects.extended import ExtendedModel
+from ..estimation.solution import Fit
 from ..results import Estimate, Name, Trace
 
 __all__ = ["BaseParameter", "FittedEffect", "Identification", "Link", "Parameter", "Quality", "Status", "to_json"]
@@ -71,8 +73,8 @@ class Quality:
 class Identification:
     """The fitted robot, what can be trusted of it, and how well it predicts."""
 
+    solution: Fit  # of links and effects, with the covariance of all of them
     joints: tuple[str, ...]
-    rank: int
     structural_rank: int  # what some motion could show
     condition: float
     scaled_condition: float
@@ -89,12 +91,21 @@ class Identification:
     trust: float  # relative one sigma of the nominal inertials that predicts best
     width: Float[np.ndarray, " nv"]  # half width of the reversal of dry friction, rad/s or m/s
     method: str
-    model: Any  # extended.ExtendedModel
     essential: tuple[str, ...] = ()  # base parameters that matter: the others may be zero (`base_parameters.essential`)
     traces: tuple[Trace, ...] = ()
     correlations: tuple[tuple[str, str, float], ...] = ()  # of base parameters, the strongest
     notes: tuple[str, ...] = ()
     prismatic: tuple[bool, ...] = field(default=())
+
+    @property
+    def model(self) -> ExtendedModel:
+        """The robot with its fitted links and effects."""
+        return self.solution.model
+
+    @property
+    def rank(self) -> int:
+        """Base parameters that the torques show."""
+        return int(self.solution.rank)
 
     @property
     def torque_units(self) -> tuple[str, ...]:
@@ -111,6 +122,7 @@ def result(found: Identification) -> dict[str, Any]:
         "scaled_condition": _number(found.scaled_condition),
         "joints": list(found.joints),
         "method": found.method,
+        "converged": not found.solution.failure,
         "trust": _number(found.trust),
         "base_parameters": [
             {"expression": b.expression, "value": _number(b.value), "std": _number(b.std), "status": b.status}

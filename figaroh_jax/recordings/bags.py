@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError, nearest
-from .tables import Table, told
+from .progress import told
+from .tables import Table
 
 __all__ = ["read_bag"]
 

@@ -74,6 +74,12 @@ def read_recordings(
     x y z w), the torque with the measured wrench on it, force and torque about its origin in its own axes. Raises
     `InputError` that names the file, the key, the row or the joint: missing or damaged files and columns, NaN, wrong
     shapes, time that does not increase, names that the model does not know, a fit recording without torque.
+
+    >>> import figaroh_jax as fj
+    >>> task = fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml"))
+    >>> runs = fj.read_recordings(task, fj.load_robot(task))
+    >>> runs[0].name, runs[0].torque.shape[1]
+    ('first_1', 4)
     """
     _check_names(task, model, floating)
     drive = Drive(task, model)

@@ -315,6 +315,12 @@ def own_device(
     the device leaves open, in the order in which the function takes it: its start, its unit, and about how far off
     that is.
     Put it into `PoseRecording(kind="own", device=...)`.
+
+    >>> import jax.numpy as jnp, figaroh_jax as fj
+    >>> wire = lambda pose, unknown, length: jnp.linalg.norm(pose[:3, 3] - unknown)[None] - length
+    >>> device = fj.own_device(wire, {f"eyelet {axis}": (1.0, "m", 0.1) for axis in "xyz"})
+    >>> [name for name, unit, size in device.unknowns()]
+    ['eyelet x', 'eyelet y', 'eyelet z']
     """
     names = tuple((name, unit, float(size)) for name, (_, unit, size) in unknowns.items())
     return _Own(np.array([start for start, _, _ in unknowns.values()], float), residual, names, tuple(channels))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from contextvars import ContextVar
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ from jaxtyping import Float
 
 from ..errors import InputError, nearest
 
-__all__ = ["Source", "Table", "check_columns", "listener", "numbers", "told"]
+__all__ = ["Source", "Table", "check_columns", "numbers"]
 
 LARGEST = 1 << 29  # bytes of one array, or of all columns of a table, once the numbers are float64; of a CSV file
 LARGEST_HEAD = 1 << 20  # bytes of a CSV file's first line
@@ -88,14 +87,6 @@ class Table(NamedTuple):
             what = "array" if self.file.suffix.lower() in (".npz", ".mat") else "column"
             raise InputError(f"{self.file}: no {what} '{name}' ({key}){nearest(name, self.names)}")
         return name
-
-
-listener: ContextVar[Callable[[str, float], None]] = ContextVar("listener", default=lambda phase, share: None)
-
-
-def told(phase: str, share: float) -> None:
-    """Say to whoever listens (`listener`) that `share` of a file is read."""
-    listener.get()(phase, share)
 
 
 def check_columns(file: Path, count: int) -> None:

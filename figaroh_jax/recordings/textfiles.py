@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
-from .tables import LARGEST_HEAD, Table, check_columns, told
+from .progress import told
+from .tables import LARGEST_HEAD, Table, check_columns
 
 __all__ = ["LIBFRANKA", "read_text"]
 

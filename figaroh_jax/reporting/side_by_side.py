@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import InputError, as_written
+from ..rigid.inertia import to_com
 from .provenance import PROVENANCE, read_provenance
 from .run_directory import MARKER
 from .verification import figures, read_run
@@ -39,14 +40,21 @@ def compare_runs(folders: Sequence[Path]) -> tuple[Section, ...]:
         return _sections(folders, runs, names)
 
 
+_PARAMETERS = "Parameters (± one standard deviation; * differs by more than 3)"
+
+
 def _sections(folders: Sequence[Path], runs: Sequence[dict[str, Any]], names: tuple[str, ...]) -> tuple[Section, ...]:
     sections = (
-        Section("What was found", ("", *names), tuple(_found(runs))),
-        Section("Figures", ("", *names), tuple(_figures(runs))),
-        Section("Error on held-out data by joint (relative RMS)", ("", *names), tuple(_by_joint(runs))),
-        Section("Parameters (± one standard deviation; * differs by more than 3)", ("", *names), tuple(_values(runs))),
-        Section("Links of the model (mass, kg)", ("", *names), tuple(_links(folders))),
-        Section("Made by", ("", *names), tuple(_made(folders))),
+        Section("What was found", ("cause", *names), tuple(_found(runs))),
+        Section("Figures", ("figure", *names), tuple(_figures(runs))),
+        Section("Error on held-out data by joint (relative RMS)", ("joint", *names), tuple(_by_joint(runs))),
+        Section(
+            "Parameters (± one standard deviation; * differs by more than 3)",
+            ("parameter", *names),
+            tuple(_values(runs)),
+        ),
+        Section("Links of the models", ("link", *names), tuple(_links(folders))),
+        Section("Made by", ("made by", *names), tuple(_made(folders))),
     )
     return tuple(section for section in sections if section.rows)
 
@@ -142,17 +150,32 @@ def _estimate(value: tuple[float, float, str] | None, first: tuple[float, float,
 
 
 def _links(folders: Sequence[Path]) -> Iterator[tuple[str, ...]]:
-    """Masses of the exported models' links."""
+    """Mass, centre of mass and principal moments of the exported models' links, and how far each is off the first."""
     from ..formats.urdf import load_urdf
 
-    masses: list[dict[str, float]] = []
+    tables: list[dict[str, tuple[float, ...]]] = []
     for folder in folders:
         path = folder / "model" / "robot.urdf"
+        table: dict[str, tuple[float, ...]] = {}
         robot = load_urdf(path) if path.is_file() else None
-        names = robot.link_names if robot is not None else ()
-        masses.append({n: float(m) for n, m in zip(names, robot.inertia[:, 0] if robot else (), strict=True)})
-    for name in dict.fromkeys(name for one in masses for name in one):
-        yield name, *(_number(one.get(name)) for one in masses)
+        for link, ten in zip(robot.link_names, np.asarray(robot.inertia), strict=True) if robot is not None else ():
+            mass, com, about = to_com(ten) if ten[0] > 0 else (0.0, np.zeros(3), np.zeros((3, 3)))
+            table[f"{link}: mass, kg"] = (float(mass),)
+            table[f"{link}: centre of mass, mm"] = tuple(1e3 * float(x) for x in com)
+            table[f"{link}: principal moments, kg m²"] = tuple(float(x) for x in np.linalg.eigvalsh(about))
+        tables.append(table)
+    for name in dict.fromkeys(name for one in tables for name in one):
+        yield name, *(_values_of(one.get(name), tables[0].get(name)) for one in tables)
+
+
+def _values_of(values: tuple[float, ...] | None, first: tuple[float, ...] | None) -> str:
+    """Numbers of a model, with their change against the first run's."""
+    if values is None:
+        return "-"
+    text = " ".join(f"{x:.4g}" for x in values)
+    if first is None or values is first or np.allclose(values, first, rtol=1e-9, atol=0):
+        return text
+    return f"{text} ({' '.join(f'{x - y:+.2g}' for x, y in zip(values, first, strict=True))})"
 
 
 def _made(folders: Sequence[Path]) -> Iterator[tuple[str, ...]]:
@@ -180,7 +203,7 @@ def comparison_text(sections: Sequence[Section]) -> str:
 
 _STYLE = """body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:1100px;padding:0 1rem;
 color-scheme:light dark}
-table{border-collapse:collapse;display:block;overflow-x:auto}td,th{padding:.2rem .8rem;text-align:left;
+table{border-collapse:collapse}.scroll{overflow-x:auto}td,th{padding:.2rem .8rem;text-align:left;
 border-bottom:1px solid color-mix(in srgb,currentColor 20%,transparent)}td+td{font-variant-numeric:tabular-nums}
 svg{width:100%;height:auto;border:1px solid color-mix(in srgb,currentColor 20%,transparent)}
 .k0{stroke:#2563eb}.k1{stroke:#d97706}.k2{stroke:#059669}.k3{stroke:#dc2626}.k4{stroke:#7c3aed}"""
@@ -195,9 +218,10 @@ def comparison_page(folders: Sequence[Path], sections: Sequence[Section]) -> str
             f'<tr><th scope="row">{escape(row[0])}</th>' + "".join(f"<td>{escape(x)}</td>" for x in row[1:]) + "</tr>"
             for row in section.rows
         )
-        parts.append(
-            f"<h2>{escape(section.title)}</h2><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-        )
+        title = escape(section.title)
+        table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        scroll = f'<div class="scroll" tabindex="0" role="group" aria-label="{title}">{table}</div>'
+        parts.append(f"<h2>{title}</h2>{scroll}")
     with as_written(" or ".join(str(folder / "predictions.npz") for folder in folders)):
         parts += _overlays(folders)
     title = f"<title>{escape(' | '.join(_names(folders)))}</title>"

@@ -45,6 +45,12 @@ def inverse_dynamics(
     rad/s, rad/s^2 (m for sliding); computed in float64. Torques of joints that share a coordinate add up, each times
     its ratio. A free joint's six are the force and the torque about its origin, in its own axes. Raises `InputError`
     where the arrays do not fit the model.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> q, v, a = np.zeros((3, 5, robot.nv))
+    >>> fj.inverse_dynamics(robot, q, v, a).shape
+    (5, 4)
     """
     check_shapes(model, q=q, v=v, a=a)
     return over_samples(joint_torques, model, q, v, a, straight=_TORQUES)
@@ -80,6 +86,11 @@ def mass_matrix(model: RobotModel, q: Float[ArrayLike, "*batch nq"]) -> Float[Ar
     Composite bodies (Featherstone 2008, section 6.2): entry (j, k), j above k or k itself, is the rate of joint j in
     the momentum of all that joint k carries, for a unit rate of joint k. Raises `InputError` where the shape of `q`
     does not fit the model.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> fj.mass_matrix(robot, np.zeros((5, robot.nv))).shape
+    (5, 4, 4)
     """
     check_shapes(model, q=q)
     return over_samples(joint_masses, model, q, width=model.nv**2, straight=_MASSES)
@@ -119,6 +130,13 @@ def forward_dynamics(
 
     Cholesky solve with the mass matrix, in float64. Where a joint moves no mass that matrix is singular and the answer
     is NaN or huge: give the link an inertia (or the joint a rotor). Raises `InputError` where the shapes do not fit.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> q, v, a = 0.3 * np.ones((3, robot.nv))
+    >>> tau = fj.inverse_dynamics(robot, q, v, a)
+    >>> bool(np.allclose(fj.forward_dynamics(robot, q, v, tau), a))
+    True
     """
     check_shapes(model, q=q, v=v, tau=tau)
     return over_samples(joint_accelerations, model, q, v, tau, width=model.nv**2)

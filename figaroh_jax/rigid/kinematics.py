@@ -307,6 +307,11 @@ def forward_kinematics(model: RobotModel, q: Float[ArrayLike, "*batch nq"]) -> F
     """Poses `world_T_joint` of all tree joints (m; q in rad, m for a prismatic joint), in float64.
 
     Raises `InputError` where `q` does not fit the model.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> fj.forward_kinematics(robot, np.zeros((5, robot.nv))).shape
+    (5, 4, 4, 4)
     """
     check_shapes(model, q=q)
     return over_samples(placements, model, q)
@@ -317,6 +322,11 @@ def frame_placement(model: RobotModel, q: Float[ArrayLike, "*batch nq"], name: s
     """Pose `world_T_frame` of the frame called `name` (a link or a joint of the model), m and rad, in float64.
 
     Raises `InputError` where there is no such frame or `q` does not fit the model.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> fj.frame_placement(robot, np.zeros(robot.nv), "hand").shape
+    (4, 4)
     """
     index = model.frame_index(name)
     check_shapes(model, q=q)
@@ -358,6 +368,11 @@ def frame_jacobian(
     `local_world_aligned`: of its origin, in world axes; `local`: of its origin, in its own axes; `world`: of the point
     of its body at the world's origin, in world axes. m or 1 per rad or m, in float64. Raises `InputError` where there
     is no such frame or reference or `q` does not fit the model.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> fj.frame_jacobian(robot, np.zeros(robot.nv), "hand", "local").shape
+    (6, 4)
     """
     index = model.frame_index(name)
     if reference not in _JACOBIANS:

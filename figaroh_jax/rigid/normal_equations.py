@@ -56,6 +56,12 @@ def normal_matrix(
     that follow those of `joint_torque_regressor`, for friction and the like; `total` is the answer for earlier pieces
     of the data. Each coordinate's rows enter with the columns of the links that it moves alone, in batches of equally
     many. Raises `InputError` where the shapes do not fit.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> q, v, a, tau = np.random.default_rng(0).normal(size=(4, 50, robot.nv))
+    >>> fj.normal_matrix(robot, q, v, a, tau)[0].shape
+    (40, 40)
     """
     rows = _rows(model, q, v, a, tau, weight, extra)
     columns = 10 * len(model.joints) + (0 if extra is None else np.shape(extra)[-1]) + 1
@@ -86,6 +92,12 @@ def triangular_factor(
     Rank, conditioning and least squares follow from R as from A, without the squared condition number of
     `normal_matrix`, whose arguments these are. One small QR factorisation a chunk, on top of the R so far (TSQR;
     Demmel, Grigori, Hoemmen and Langou, 2012). Without `tau` its column is left out.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> q, v, a, tau = np.random.default_rng(0).normal(size=(4, 50, robot.nv))
+    >>> fj.triangular_factor(robot, q, v, a, tau).shape
+    (41, 41)
     """
     rows = _rows(model, q, v, a, tau, weight, extra)
     columns = 10 * len(model.joints) + sum(np.shape(x)[-1] for x in (extra,) if x is not None) + (tau is not None)

@@ -70,6 +70,13 @@ def joint_torque_regressor(
     coordinate add up, each times its ratio. A free joint's six rows are the force and the torque about its origin, in
     its own axes. Atkeson, An and Hollerbach (1986), in classical accelerations. Raises `InputError` where the arrays
     do not fit the model.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> q, v, a = 0.3 * np.ones((3, robot.nv))
+    >>> W = fj.joint_torque_regressor(robot, q, v, a)
+    >>> bool(np.allclose(W @ robot.inertia.ravel(), fj.inverse_dynamics(robot, q, v, a)))
+    True
     """
     check_shapes(model, q=q, v=v, a=a)
     width = 10 * len(pairs(model))
@@ -100,6 +107,12 @@ def packed_regressor(
 
     A row belongs to a degree of freedom, not to a coordinate: mimic joints have rows of their own, without their ratio.
     Units and errors as `joint_torque_regressor`.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> q, v, a = 0.3 * np.ones((3, 5, robot.nv))
+    >>> fj.packed_regressor(robot, q, v, a).shape
+    (10, 10, 5)
     """
     check_shapes(model, q=q, v=v, a=a)
     if np.ndim(q) != 2:

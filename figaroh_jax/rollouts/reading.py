@@ -39,6 +39,11 @@ def load_loop(
     actuators, and states those of a URDF: `{joint: {kind: position, kp: 17.8, kd: 0.6, force: 3.35}}`. `law` is "soft"
     for an MJCF (its `frictionloss`) and "hard" otherwise, unless given. Raises `InputError` for actuators that this
     version does not simulate, with the actuator's name.
+
+    >>> import figaroh_jax as fj
+    >>> loop, notes = fj.load_loop(fj.DEMO, {"elbow": {"kind": "position", "kp": 20.0, "kd": 0.5}}, joints=["elbow"])
+    >>> loop.drives.names
+    ('elbow',)
     """
     if str(path).lower().endswith(".urdf"):
         robot = read_robot(path, joints, posture, gravity, root)

@@ -21,7 +21,7 @@ from .loop import Loop, State, advance, integrated, mobility, observe
 from .parameters import Table, put
 from .simulation import delayed
 
-__all__ = ["Sums", "Windows", "linear_sums", "predicted", "state_size"]
+__all__ = ["Sums", "Windows", "began", "linear_sums", "predicted", "read_of", "state_size"]
 
 
 class Windows(eqx.Module):
@@ -57,7 +57,8 @@ def state_size(loop: Loop) -> int:
     return 2 * loop.robot.nv + (len(loop.drives.names) if active else 0)
 
 
-def _begin(loop: Loop, data: Windows, start: Array) -> State:
+def began(loop: Loop, data: Windows, start: Array) -> State:
+    """The states (2 nv, windows) with the activations of the drives."""
     n = loop.robot.nv
     q, v = start[:n], start[n:]
     kinds = np.array(loop.drives.activation)[:, None]
@@ -74,7 +75,8 @@ def _seen(loop: Loop, data: Windows, block: Array) -> Array:
     return delayed(fine, jnp.asarray(loop.drives.delay), loop.dt)[data.lead * data.substeps :]
 
 
-def _read(loop: Loop, state: State, rates: bool) -> Array:
+def read_of(loop: Loop, state: State, rates: bool) -> Array:
+    """What the encoders read, then their rates."""
     read = observe(loop, state)
     if not rates:
         return read
@@ -101,9 +103,9 @@ def _predicted(loop: Loop, table: Table, theta: Array, data: Windows, start: Arr
         def chunk(carry: tuple[State, Array], block: Array) -> Any:
             carry, (states, _) = _rollout(here, data, *carry, weight, block)
             rows = jax.tree.map(lambda x: x[:: data.substeps], states)
-            return carry, jax.vmap(lambda q, v, act: _read(here, State(q, v, act), rates))(*rows)
+            return carry, jax.vmap(lambda q, v, act: read_of(here, State(q, v, act), rates))(*rows)
 
-        state = _begin(here, data, start)
+        state = began(here, data, start)
         read = jax.lax.scan(chunk, (state, jnp.zeros_like(state.v)), jnp.arange(len(data.reading) // data.block))[1]
         return read.reshape(-1, *read.shape[2:])
 
@@ -128,7 +130,7 @@ def _lane(loop: Loop, table: Table, theta: Array, free: Array, data: Windows, st
     rates = data.reading.shape[1] > len(loop.measured)
     here = put(loop, table, theta)
     weight = mobility(here)
-    state = _begin(here, data, start)
+    state = began(here, data, start)
     spread = jnp.concatenate([jnp.zeros((size, len(free))), jnp.eye(size)[:, : 2 * n]], 1)
     spread = jnp.broadcast_to(spread[..., None], (*spread.shape, windows))
     if size > 2 * n:  # activations start with the command; an integrator's with the position
@@ -146,7 +148,7 @@ def _lane(loop: Loop, table: Table, theta: Array, free: Array, data: Windows, st
         first = data.block * block
         truth, precise = (jax.lax.dynamic_slice_in_dim(x, first, data.block) for x in (data.reading, data.weight))
         at_rows = jax.tree.map(lambda x: x[:: data.substeps], states)
-        read = jax.vmap(lambda q, v, act: _read(here, State(q, v, act), rates))(*at_rows)
+        read = jax.vmap(lambda q, v, act: read_of(here, State(q, v, act), rates))(*at_rows)
         slope = jnp.einsum("yx,txpw->typw", look, rows)
         slope = slope.at[:, :, : len(free)].add(direct[None, :, :, None]) * precise[:, :, None]
         error = (truth - read) * precise

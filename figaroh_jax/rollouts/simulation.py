@@ -40,6 +40,11 @@ def rollout(
     step of what was held `delay` before. Position, velocity and reading k are those at k dt, before that step. Forward
     and reverse mode work: `jax.grad` of a loss over the readings, `jax.jvp`, `jax.vmap`. Raises `InputError` where the
     shapes do not fit and, outside of `jit`, where the motion diverges, with the joint and the step.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> loop, _ = fj.load_loop(fj.DEMO, {"elbow": {"kind": "position", "kp": 20.0, "kd": 0.5}}, joints=["elbow"])
+    >>> fj.rollout(loop, np.zeros((20, 1)), np.zeros(1)).reading.shape
+    (20, 1)
     """
     with jax.enable_x64(True):
         u = jnp.asarray(command, jnp.float64)

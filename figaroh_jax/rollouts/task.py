@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from ..formats.config import Task
 
 __all__ = [
+    "EFFECTS",
     "RolloutDiagnosis",
     "diagnose_rollout_task",
     "diagnosis_setting",
@@ -40,6 +41,14 @@ __all__ = [
     "simulated",
 ]
 
+EFFECTS = {  # parameters of effects and the fields of `Joints` that hold them
+    "rotor_inertia": {"inertia": "armature"},
+    "viscous_friction": {"damping": "damping"},
+    "coulomb_friction": {"force": "friction"},
+    "stribeck_friction": {"force": "stribeck_force", "speed": "stribeck_speed"},
+    "load_dependent_friction": {"ratio": "load_ratio"},
+    "joint_spring": {"stiffness": "stiffness", "offset": "offset"},
+}
 _TURN = 12.0  # a command that many times beyond what the joint did is in other units
 
 
@@ -284,17 +293,9 @@ def _trace(run: Run, role: Any, rows: slice, before: np.ndarray, after: np.ndarr
 def extended_of(loop: Loop) -> ExtendedModel:
     """The robot and what acts at its joints as effects, for the files that carry them."""
     own: list[Effect] = []
-    wanted = {
-        "rotor_inertia": {"inertia": "armature"},
-        "viscous_friction": {"damping": "damping"},
-        "coulomb_friction": {"force": "friction"},
-        "stribeck_friction": {"force": "stribeck_force", "speed": "stribeck_speed"},
-        "load_dependent_friction": {"ratio": "load_ratio"},
-        "joint_spring": {"stiffness": "stiffness", "offset": "offset"},
-    }
     robot = jax.tree.map(np.asarray, loop.robot)
     for k, name in enumerate(robot.dof_names):
-        for effect, fields in wanted.items():
+        for effect, fields in EFFECTS.items():
             numbers = {field: float(np.asarray(getattr(loop.joints, leaf))[k]) for field, leaf in fields.items()}
             if effect == "joint_spring":
                 numbers["offset"] -= numbers["stiffness"] * float(np.asarray(loop.joints.rest)[k])

@@ -31,6 +31,10 @@ def backend(
     is fixed. `packages` are the folders of packages by which a path such as `package://my_robot/robot.urdf` is found;
     meshes are never needed. Raises `InputError` where no backend of that name is installed (the message lists those
     that are), where the library that it adapts is missing, or for a wrong model.
+
+    >>> import figaroh_jax as fj
+    >>> fj.backend("native", fj.DEMO).robot.nv
+    4
     """
     chosen = backend_class(name)
     if model is None:

@@ -4,6 +4,7 @@ r"""Measured data as pytrees with a pure residual by the model: what `fit`, a us
 |---|---|---|
 | `TorqueData` | `torque_data` of recordings | torque of the model less the measured one, both low-passed alike |
 | `PoseData` | `pose_data` of postures | predicted less measured of every device, m or rad |
+| `RolloutData` | `rollout_data` of commands and positions | simulated less read, in sigmas of the encoders |
 
 Rows are weighted: the inverse of one sigma where it is known, 0 where nothing was measured. Whatever has a method
 `residual(model)` is data, yours too.
@@ -21,13 +22,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Shaped
 
-from ..calibration.posefit import ties
-from ..calibration.posegroups import devices_of
 from ..compiled.precision import in_float64
-from ..effects.base import Motion
 from ..effects.extended import ExtendedModel, changed_robot, extend, opened, read_position, read_sensors
+from ..effects.kinematic import PostureMotion
 from ..errors import InputError
-from ..estimation.regression import BLOCK, BLOCK_PERIODS
 from ..recordings.dataset import Recording
 from ..recordings.devices import Device
 from ..recordings.poses import PoseRecording
@@ -38,11 +36,13 @@ from ..rigid.dynamics import inverse_dynamics
 from ..rigid.kinematics import frame_pose, placements
 from ..rigid.model import Leaf, RobotModel
 from ..rigid.spatial import matmul
+from .posefit import ties
+from .posegroups import devices_of
 
 if TYPE_CHECKING:
     from ..formats.config import Preprocess
 
-__all__ = ["Data", "PoseData", "TorqueData", "as_data", "pose_data", "residual", "torque_data"]
+__all__ = ["Data", "Open", "PoseData", "TorqueData", "as_data", "pose_data", "residual", "torque_data"]
 
 
 @runtime_checkable
@@ -51,6 +51,19 @@ class Data(Protocol):
 
     def residual(self, model: ExtendedModel) -> Float[Array, " rows"]:
         """Weighted rows, pure: JAX transforms it by every array of `model` and of the data."""
+        ...
+
+
+@runtime_checkable
+class Open(Protocol):
+    """Data that leave numbers open, which a fit may estimate: frames of devices, states at the start of rollouts."""
+
+    def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        """Name, unit and typical size of each."""
+        ...
+
+    def moved(self, numbers: Float[Array, " unknowns"]) -> Any:
+        """The data with the numbers changed by so much."""
         ...
 
 
@@ -108,11 +121,12 @@ class PoseData(eqx.Module):
     tied: Float[Leaf, ""] | float = 1.0  # weight of the device's constraints
     base_frame: str = eqx.field(static=True, default="")
     tool_frame: str = eqx.field(static=True, default="")
+    begins: tuple[int, ...] = eqx.field(static=True, default=(0,))  # first posture of each recording
 
     def residual(self, model: ExtendedModel) -> Float[Array, " rows"]:
         """Predicted less measured times the weight, posture by posture, then the device's constraints."""
         unknown = jnp.zeros(len(self.device.unknowns()))
-        poses = tool_poses(model, jnp.asarray(self.position), self.base_frame, self.tool_frame)
+        poses = tool_poses(model, jnp.asarray(self.position), self.base_frame, self.tool_frame, self.begins)
         datum = jax.tree.map(jnp.asarray, self.datum)
         device: Device = jax.tree.map(jnp.asarray, self.device)
         rows = jax.vmap(lambda pose, seen: device.residual(pose, unknown, seen))(poses, datum)
@@ -122,13 +136,25 @@ class PoseData(eqx.Module):
             return rows.reshape(-1)
         return jnp.concatenate([rows.reshape(-1), self.tied * device.constraint(unknown)])
 
+    def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        """Name, unit and typical size of what the device leaves open."""
+        return self.device.unknowns()
+
+    def moved(self, numbers: Float[Array, " unknowns"]) -> PoseData:
+        """The data with the device's frames moved."""
+        return eqx.tree_at(lambda d: d.device, self, self.device.moved(numbers))
+
 
 def tool_poses(
-    model: ExtendedModel, q: Float[Array, "postures nq"], base_frame: str, tool_frame: str
+    model: ExtendedModel,
+    q: Float[Array, "postures nq"],
+    base_frame: str,
+    tool_frame: str,
+    begins: tuple[int, ...] = (0,),
 ) -> Float[Array, "postures 4 4"]:
     """Poses of the tool frame in the base frame (m) where the position sensors read `q`; to be traced in float64."""
     robot = changed_robot(model)
-    poses = placements(robot, true_position(model, robot, q).T)
+    poses = placements(robot, true_position(model, robot, q, begins).T)
     start, end = (
         frame_pose(poses, robot, k, robot.frames[k].parent)
         for k in (robot.frame_index(base_frame), robot.frame_index(tool_frame))
@@ -141,13 +167,18 @@ def tool_poses(
     return jnp.concatenate([top, bottom], axis=1)
 
 
-def true_position(model: ExtendedModel, robot: RobotModel, q: Float[Array, "postures nq"]) -> Array:
-    """Where the joints stand while their sensors read `q`, at rest under gravity."""
+def true_position(
+    model: ExtendedModel, robot: RobotModel, q: Float[Array, "postures nq"], begins: tuple[int, ...] = (0,)
+) -> Array:
+    """Where the joints stand while their sensors read `q`, at rest under gravity; no load is carried."""
     if not any(effect.has("position_error") for effect in model.effects):
         return q
     still = jnp.zeros((len(q), robot.nv))
     load = inverse_dynamics(robot, q, still, still)
-    motion = Motion(robot, jnp.zeros(len(q)), q, still, still, load, load, 0.0, jnp.asarray(model.width))
+    first = np.isin(np.arange(len(q)), begins)[:, None]
+    before = jnp.where(first, q, jnp.roll(q, 1, axis=0))
+    rest = still, still, load, load, 0.0, jnp.asarray(model.width)
+    motion = PostureMotion(robot, jnp.zeros(len(q)), q, *rest, before, still)
     return q - (read_position(model.effects, motion) - q)
 
 
@@ -173,6 +204,7 @@ def torque_data(
     True
     """
     from ..formats.config import Preprocess
+    from .regression import BLOCK, BLOCK_PERIODS  # a calibration has no use for it
 
     robot = model.robot if isinstance(model, ExtendedModel) else model
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
@@ -213,6 +245,14 @@ def pose_data(
 
     Recordings of one kind with the same frames share a device. `sigma` is one sigma of positions (m) and orientations
     (rad); by default the recordings' `accuracy`, else 1: rows in m and rad. Held-out recordings have weight zero.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> q = np.random.default_rng(0).uniform(-1, 1, (12, robot.nv))
+    >>> seen = np.asarray(fj.frame_placement(robot, q, "hand"))[:, :3, 3]
+    >>> (data,) = fj.pose_data(robot, fj.postures(q=q, position=seen, base_frame="base", tool_frame="hand"))
+    >>> bool(abs(fj.residual(robot, data)).max() < 1e-6)
+    True
     """
     robot = model.robot if isinstance(model, ExtendedModel) else model
     given = [recordings] if isinstance(recordings, PoseRecording) else list(recordings)
@@ -223,7 +263,9 @@ def pose_data(
         weight = np.asarray(measured, float) * fit[:, None] / np.asarray(scale)[np.array(device.channels())]
         position = np.concatenate([given[k].position for k in members])
         first = given[members[0]]
-        found.append(PoseData(position, datum, weight, device, 1.0 / scale[0], first.base_frame, first.tool_frame))
+        frames = first.base_frame, first.tool_frame
+        begins = np.cumsum([0, *(len(given[k].position) for k in members[:-1])])
+        found.append(PoseData(position, datum, weight, device, 1.0 / scale[0], *frames, tuple(begins.tolist())))
     return tuple(found)
 
 

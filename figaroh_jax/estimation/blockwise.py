@@ -2,7 +2,7 @@ r"""Levenberg-Marquardt on normal equations that are added up block by block, wi
 
 Optimistix's own takes the QR factor of the whole Jacobian. This one asks `args.normal(y)` for $J'J$, $J'r$ and the
 cost, which `fit` gives for postures in closed form, a block of them at a time: the Jacobian of all rows never exists.
-Where `args` has no such method, they are made of the Jacobian of `fn`. See `calibration.posesolver` for the steps.
+Where `args` has no such method, they are made of the Jacobian of `fn`. See `posesolver` for the steps.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Float
 
-from ..calibration.posesolver import NormalEquations, State, attempt, beginning, stuck
+from .posesolver import NormalEquations, State, attempt, beginning, stuck
 
 __all__ = ["BlockLevenbergMarquardt", "normal_of"]
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from math import prod
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,60 +19,25 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float
 
-from ..calibration import posefit
-from ..calibration.posesolver import NormalEquations, cut_weights, normal_equations
-from ..compiled.batching import traced
+from ..compiled.batching import DRAFT_OPTIONS, FEW, on_host, traced
 from ..compiled.precision import in_float64
 from ..effects.extended import ExtendedModel, extend
 from ..errors import InputError
-from ..estimation.priors import rigid_prior
 from ..rigid.chain import chain_between
 from ..rigid.model import Leaf, RobotModel
+from . import posefit
 from .blockwise import BlockLevenbergMarquardt, normal_of
 from .data import Data, PoseData, as_data
-from .free import Free, apply, select
+from .free import Free, apply, chosen_of
+from .posesolver import NormalEquations, cut_weights, normal_equations
+from .priors import rigid_prior
+from .solution import Fit
 
-__all__ = ["Estimate", "Fit", "fit"]
+__all__ = ["Fit", "fit"]
 
 NULL = 1e-12  # of the largest eigenvalue of the information: below it a direction is not determined
 STATIONARY = 1e-5  # share of the gradient at the start that may be left where a fit within limits has converged
-HIDDEN = 1e-6  # share of a number in such directions above which it is not determined
-
-
-class Estimate(NamedTuple):
-    """A fitted number: its change from the model that was given, one sigma (inf: not determined), its unit."""
-
-    value: float
-    std: float
-    unit: str
-
-
-class Fit(eqx.Module):
-    """What a fit found; a pytree, differentiable through the solution, and a batch of fits under `jax.vmap`."""
-
-    model: ExtendedModel  # with the numbers in it
-    data: tuple[Data, ...]  # with the devices' frames put in
-    values: Float[Array, " numbers"]  # change of each number, SI units
-    covariance: Float[Array, "numbers numbers"]  # for rows of equal variance; without gradient
-    hidden: Float[Array, " numbers"]  # share of each number in directions that nothing determines
-    cost: Float[Array, ""]  # half of the squares of rows and prior
-    rows: Float[Array, " rows"]  # weighted residual of the data
-    rank: Any  # directions that data and prior determine
-    result: optimistix.RESULTS  # `optimistix.RESULTS.successful`, or why not
-    stats: dict[str, Any]
-    free: Free = eqx.field(static=True)
-
-    @property
-    def std(self) -> Float[np.ndarray, " numbers"]:
-        """One sigma of each number; inf where nothing determines it."""
-        size = np.sqrt(np.maximum(np.diagonal(np.asarray(self.covariance), axis1=-2, axis2=-1), 0.0))
-        return np.where(np.asarray(self.hidden) > HIDDEN, np.inf, size)
-
-    @property
-    def parameters(self) -> dict[str, Estimate]:
-        """Each number by its name."""
-        each = zip(self.free.names, np.asarray(self.values), self.std, self.free.units, strict=True)
-        return {name: Estimate(float(value), float(std), unit) for name, value, std, unit in each}
+SEVERAL = 8  # devices or sets of recordings in a small problem
 
 
 class _Closed(eqx.Module):
@@ -121,14 +87,15 @@ def fit(
     """The model that fits the data best in what is `free`, with covariance and the solver's verdict; pure.
 
     `free`: one or several of `inertia`, `friction`, `effects`, `joint_offset`, `link_geometry`, `frames` (what the
-    measuring devices leave open), `tool_frame`, `base`, `gravity`; or a mapping from these to places, `{"joint_offset":
-    ["elbow"], "frames": True}`. `data` as for `residual`. `prior`: one sigma about the given model by the same names
-    (SI units; for `inertia` relative, as `robot.trust`). `bounds`: limits of a number's change, by its name or how
-    that begins: L-BFGS-B of jaxopt then searches. `solver`: any least-squares solver or minimiser of optimistix; by
-    default `optimistix.LevenbergMarquardt`, or for postures alone `BlockLevenbergMarquardt`, which is faster there.
+    measuring devices leave open), `tool_frame`, `base`, `gravity`, and of rollouts `start` and `drives`; or a mapping
+    from these to places, `{"joint_offset": ["elbow"], "frames": True}`. `data` as for `residual`. `prior`: one sigma
+    about the given model by the same names (SI units; for `inertia` relative, as `robot.trust`). `bounds`: limits of a
+    number's change, by its name or how that begins: L-BFGS-B of jaxopt then searches. `solver`: any least-squares
+    solver or minimiser of optimistix; by default `optimistix.LevenbergMarquardt`, or for postures alone
+    `BlockLevenbergMarquardt`, which is faster there.
 
-    A solver that fails says so in `result`; `InputError` is wrong input. Differentiable by model and data through the
-    condition of the minimum, and mapped by `jax.vmap`; bounded fits are not differentiable.
+    A solver that fails says so in `result` (`reason` in words); `InputError` is wrong input. Differentiable by model
+    and data through the condition of the minimum, and mapped by `jax.vmap`; bounded fits are not differentiable.
 
     >>> import numpy as np, figaroh_jax as fj
     >>> robot = fj.load_urdf(fj.DEMO)
@@ -142,7 +109,7 @@ def fit(
     """
     whole = model if isinstance(model, ExtendedModel) else extend(model)
     parts = as_data(whole, data)
-    chosen = select(whole, parts, free)
+    chosen = chosen_of(whole, parts, free)
     precision = _precision(chosen, whole, prior or {}) * chosen.sizes**2
     closed = None if traced(whole, parts) else _closed_form(chosen, whole, parts)
     problem = _Problem(whole, parts, precision, closed, chosen)
@@ -155,17 +122,28 @@ def fit(
 
 @in_float64
 def _solved(problem: _Problem, solver: Any, max_steps: int) -> Fit:
-    return _solve(problem, solver, max_steps)
+    return (_solve_quick if _brief(problem) else _solve)(problem, solver, max_steps)
 
 
-@eqx.filter_jit
-def _solve(problem: _Problem, solver: Any, max_steps: int) -> Fit:
+def _brief(problem: _Problem) -> bool:
+    """Whether so few rows are fitted that a program costs more to optimise than it then saves."""
+    if not on_host(problem):
+        return False  # the compiler's options are those of the caller's program
+    arrays = (x for x in jax.tree.leaves(problem.data) if eqx.is_array(x))
+    return max((prod(x.shape[:-1]) for x in arrays), default=0) <= FEW and len(problem.data) <= SEVERAL
+
+
+def _least_squares(problem: _Problem, solver: Any, max_steps: int) -> Fit:
     adjoint = optimistix.ImplicitAdjoint(linear_solver=lineax.AutoLinearSolver(well_posed=False))
     start = jnp.zeros(len(problem.free.names))
     found = optimistix.least_squares(
         _rows, solver, start, args=problem, adjoint=adjoint, max_steps=max_steps, throw=False
     )
     return _fit_at(problem, found.value, found.result, found.stats)
+
+
+_solve = eqx.filter_jit(_least_squares)
+_solve_quick = eqx.filter_jit(_least_squares, compiler_options=DRAFT_OPTIONS)  # pyright: ignore[reportCallIssue]
 
 
 def _fit_at(problem: _Problem, y: Array, result: Any, stats: dict[str, Any]) -> Fit:

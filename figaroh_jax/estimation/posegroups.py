@@ -23,7 +23,7 @@ from ..rigid.model import RobotModel
 from . import posefit, starts
 from .gravity import gravity_moments
 
-__all__ = ["Measured", "assemble", "devices_of", "postures_of"]
+__all__ = ["Measured", "assemble", "devices_of", "postures_of", "shared"]
 
 
 class Measured(NamedTuple):
@@ -94,7 +94,7 @@ def assemble(
     """The problem of all recordings with the given columns; `sizes` is the typical size of each coefficient."""
     first = np.cumsum([0, *(len(r.position) for r in recordings)])
     groups, meta = [], []
-    for members in _shared(recordings):
+    for members in shared(recordings):
         group, which, rows = _group(model, [recordings[k] for k in members], [postures[k] for k in members], columns)
         groups.append(group)
         posture = np.concatenate([first[k] + np.arange(len(recordings[k].position)) for k in members])
@@ -127,7 +127,7 @@ def assemble(
     )
 
 
-def _shared(recordings: Sequence[PoseRecording]) -> list[list[int]]:
+def shared(recordings: Sequence[PoseRecording]) -> list[list[int]]:
     """Recordings that share a device, by their index."""
     groups: dict[Any, list[int]] = {}
     for k, r in enumerate(recordings):
@@ -140,7 +140,7 @@ def devices_of(
     model: RobotModel, recordings: Sequence[PoseRecording]
 ) -> list[tuple[list[int], Device, Any, Bool[np.ndarray, "postures rows"]]]:
     """For each device its recordings (indices), the device as it starts, what it measured, and which rows."""
-    return [(members, *_device(model, [recordings[k] for k in members])) for members in _shared(recordings)]
+    return [(members, *_device(model, [recordings[k] for k in members])) for members in shared(recordings)]
 
 
 def _device(model: RobotModel, recordings: list[PoseRecording]) -> tuple[Device, np.ndarray, np.ndarray]:

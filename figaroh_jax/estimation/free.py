@@ -7,6 +7,7 @@
 | `joint_offset` | one for each tree joint, rad or m | of the joint's position |
 | `link_geometry` | twist of each tree joint in its own frame, m and rad | moves the joint on its link |
 | `frames` | what each measuring device leaves open | its base frame, tool frame, markers, sockets |
+| `start`, `drives` | what rollouts leave open | state at the start of each, numbers of the drives |
 | `tool_frame` | twist of each frame of the model, m and rad | moves the frame on its link |
 | `base` | twist at the world's origin, m and rad | moves the whole robot |
 | `gravity` | three, m/s^2 | added to gravity |
@@ -29,11 +30,15 @@ from ..effects.extended import ExtendedModel
 from ..errors import InputError, nearest
 from ..rigid import lie
 from ..rigid.model import DOF_NAMES, RobotModel
-from .data import Data, PoseData
+from .data import Data, Open, PoseData
 
-__all__ = ["KINDS", "Free", "Part", "apply", "select"]
+__all__ = ["KINDS", "Free", "Part", "apply", "chosen_of"]
 
-KINDS = ("inertia", "friction", "effects", "joint_offset", "link_geometry", "frames", "tool_frame", "base", "gravity")
+KINDS = (
+    *("inertia", "friction", "effects", "joint_offset", "link_geometry", "frames", "tool_frame", "base", "gravity"),
+    *("start", "drives"),
+)
+OPEN = ("frames", "start", "drives")  # left open by the data, not by the model
 TEN = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 TEN_UNITS = ("kg", *("kg m",) * 3, *("kg m2",) * 6)
 TWIST = ("x", "y", "z", "rx", "ry", "rz")
@@ -83,7 +88,7 @@ class Free(NamedTuple):
             first = last
 
 
-def select(model: ExtendedModel, data: Sequence[Data], free: Any) -> Free:
+def chosen_of(model: ExtendedModel, data: Sequence[Data], free: Any) -> Free:
     """What `free` names: one or several of `KINDS`, or a mapping from them to True or to the places meant.
 
     Places are names of links (`inertia`), joints (`joint_offset`, `link_geometry`, `friction`, `effects`), effects or
@@ -149,8 +154,8 @@ def _parts(kind: str, model: ExtendedModel, data: Sequence[Data]) -> Iterator[Pa
     elif kind == "tool_frame":
         names = [frame.name for frame in robot.frames]
         yield _part(kind, names, TWIST, TWIST_UNITS, np.full((len(names), 6), 1e-2))
-    elif kind == "frames":
-        yield from _device_parts(data)
+    elif kind in OPEN:
+        yield from _open_parts(kind, data)
     else:
         yield from _effect_parts(model, friction=kind == "friction")
 
@@ -177,14 +182,18 @@ def _single_axes(robot: RobotModel, kind: str) -> None:
         raise InputError(f"free: {kind}: joint '{wrong.name}' is {wrong.kind}; joints of one axis have one")
 
 
-def _device_parts(data: Sequence[Data]) -> Iterator[Part]:
+def _open_parts(kind: str, data: Sequence[Data]) -> Iterator[Part]:
+    """What the data leave open, by `unknowns` of which the names begin with the kind; of devices all are `frames`."""
     for k, one in enumerate(data):
-        unknowns = one.device.unknowns() if isinstance(one, PoseData) else ()
-        if unknowns:
-            names, units, sizes = zip(*unknowns, strict=True)
+        unknowns = one.unknowns() if isinstance(one, Open) else ()
+        device = isinstance(one, PoseData)
+        words = ["frames" if device else name.split()[0] for name, _, _ in unknowns]
+        mine = [i for i, word in enumerate(words) if word == kind]
+        if mine:
+            names, units, sizes = zip(*(unknowns[i] for i in mine), strict=True)
             mark = f" {k + 1}" if len(data) > 1 else ""
             marked = tuple(f"{name}{mark}" for name in names)
-            yield Part("frames", (k,), tuple(range(len(names))), (len(names),), marked, units, sizes)
+            yield Part(kind, (k,), tuple(mine), (len(unknowns),), marked, units, sizes)
 
 
 def _effect_parts(model: ExtendedModel, friction: bool) -> Iterator[Part]:
@@ -218,9 +227,9 @@ def apply(
         if part.kind == "effect":
             where = lambda m, key=part.key: getattr(m.effects[key[0]], key[1])  # noqa: E731
             model = eqx.tree_at(where, model, jnp.asarray(where(model)) + whole)
-        elif part.kind == "frames":
-            moved = eqx.tree_at(lambda d: d.device, data[part.key[0]], data[part.key[0]].device.moved(whole))
-            data = (*data[: part.key[0]], moved, *data[part.key[0] + 1 :])
+        elif part.kind in OPEN:
+            one: Any = data[part.key[0]]
+            data = (*data[: part.key[0]], one.moved(whole), *data[part.key[0] + 1 :])
         elif part.kind in ("joint_offset", "link_geometry"):
             here = whole if part.kind == "link_geometry" else _along(model.robot, whole)
             twist = here if twist is None else twist + here

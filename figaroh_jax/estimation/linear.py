@@ -7,23 +7,28 @@ blocks of time; a bootstrap resample is a count of each block, and needs neither
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import groupby
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..compiled.batching import traced
+from ..compiled.linear_algebra import symmetric_solve
 from ..compiled.precision import in_float64
 from ..effects.base import Effect, Motion, columns, movable
 from ..effects.extended import ExtendedModel, extend
 from ..errors import InputError
-from ..estimation.accelerators import coordinates
-from ..estimation.base_parameters import TOLERANCE, base_parameters
-from ..estimation.columns import column_names
 from ..recordings.rowfilter import filtered
 from ..rigid.model import RobotModel
 from ..rigid.regressor import dense_rows
+from .accelerators import coordinates
+from .base_parameters import TOLERANCE, base_parameters
+from .columns import column_names
 from .data import TorqueData
 
 __all__ = ["Basis", "LinearFit", "fit_linear", "linear_basis", "linear_limits"]
@@ -57,6 +62,14 @@ def linear_basis(model: RobotModel | ExtendedModel, data: TorqueData, tolerance:
 
     One basis serves all robots of one structure and all recordings of about one motion. Raises `InputError` where the
     data shows no parameter.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> t = np.arange(1000)[:, None] / 250.0
+    >>> run = fj.recording(q=0.5 * np.sin(t * np.array([3.0, 4.0, 5.0, 6.0])), tau=np.cos(t) * np.ones(4), rate=250)
+    >>> basis = fj.linear_basis(robot, fj.torque_data(robot, run))
+    >>> basis.matrix.shape == (len(basis.names), 40)
+    True
     """
     whole = model if isinstance(model, ExtendedModel) else extend(model)
     if traced(whole, data):
@@ -78,6 +91,15 @@ def linear_limits(model: ExtendedModel, basis: Basis) -> tuple[Float[np.ndarray,
     """Least and greatest value of each kept parameter that physics allows: friction takes energy, rotors have inertia.
 
     Links have no limits here: a base parameter is a sum of several links'.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> model = fj.extend(robot, fj.place(fj.CATALOGUE["viscous_friction"], robot, ["elbow"]))
+    >>> t = np.arange(1000)[:, None] / 250.0
+    >>> run = fj.recording(q=0.5 * np.sin(t * np.array([3.0, 4.0, 5.0, 6.0])), tau=np.cos(t) * np.ones(4), rate=250)
+    >>> lower, upper = fj.linear_limits(model, fj.linear_basis(model, fj.torque_data(model, run)))
+    >>> float(lower[-1]), float(upper[-1])
+    (0.0, inf)
     """
     lower = [-np.inf] * (10 * len(model.robot.joints))
     for effect in model.effects:
@@ -122,68 +144,87 @@ def fit_linear(
         raise InputError(f"counts has shape {weight.shape}; the data has {len(rows)} blocks")
     G, total = jnp.einsum("b,bjkl->jkl", weight, products), jnp.maximum(weight @ rows, 1e-300)
     kept = jnp.asarray(basis.into)[np.array(basis.kept)]  # kept parameters of the coordinates
-    limits = None if lower is None and upper is None else _limits(lower, upper, len(kept))
+    low, high, limited = _limits(lower, upper, len(kept))
+    held = kept[limited]  # of the parameters that have a limit
 
-    def solved(scale: Array) -> tuple[Array, Array, Array, Array]:
+    def solved(scale: Array, side: Array) -> _Turn:
         A = jnp.einsum("jkl,j->kl", G, scale)
         H, h = A[:-1, :-1], A[:-1, -1]
-        if limits is None:
-            none = jnp.zeros(len(h), bool)
-            return jnp.linalg.solve(H, h), none, jnp.ones((), bool), H
-        return *_within(H, h, kept, *limits), H
+        if not len(limited):
+            return _Turn(symmetric_solve(H, h[:, None])[:, 0], H, side, jnp.ones((), bool))
+        both = symmetric_solve(H, jnp.column_stack([h, held.T]))
+        z, response = both[:, 0], both[:, 1:]
+        pull, side, found = _within(held @ response, held @ z, low[limited], high[limited], side)
+        return _Turn(z - response @ pull, H, side, found)
 
     def squares(z: Array) -> Array:
         y = jnp.append(z, -1.0)
         return jnp.maximum(jnp.einsum("k,jkl,l->j", y, G, y), 1e-24 * G[:, -1, -1] + 1e-300)
 
-    def turn(_: Array, scale: Array) -> Array:
-        return total / squares(solved(scale)[0])
+    def turn(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        one = solved(*state)
+        return total / squares(one.z), one.side
 
     present = jnp.where(G[:, -1, -1] > 0, 1.0, 0.0)
-    scale = jax.lax.fori_loop(0, TURNS, turn, present)
-    z, active, converged, H = solved(scale)
-    variance = jnp.einsum("ck,kl,cl->c", kept, jnp.linalg.inv(H), kept)
-    values = kept @ z
-    if limits is not None:
-        nearest = jnp.where(values - limits[0] < limits[1] - values, *limits)
-        values = jnp.where(active, nearest, jnp.clip(values, *limits))  # on a limit exactly
-    return LinearFit(values, jnp.sqrt(variance), jnp.sqrt(squares(z) / total), active, converged)
+    start = present, jnp.zeros(len(limited), int)
+    last = solved(*jax.lax.fori_loop(0, TURNS, turn, start))
+    variance = jnp.sum(kept.T * symmetric_solve(last.H, kept.T), axis=0)
+    values, active = kept @ last.z, jnp.zeros(len(kept), bool).at[limited].set(last.side != 0)
+    nearest = jnp.where(values - low < high - values, low, high)
+    values = jnp.where(active, nearest, jnp.clip(values, low, high))  # on a limit exactly
+    return LinearFit(values, jnp.sqrt(variance), jnp.sqrt(squares(last.z) / total), active, last.found)
 
 
-def _limits(lower: Array | np.ndarray | None, upper: Array | np.ndarray | None, rank: int) -> tuple[Array, Array]:
+class _Turn(NamedTuple):
+    """A solution at some weights of the joints."""
+
+    z: Array
+    H: Array
+    side: Array  # of each limited parameter: -1 on its lower limit, 1 on its upper one
+    found: Array  # whether that is settled
+
+
+def _limits(
+    lower: Array | np.ndarray | None, upper: Array | np.ndarray | None, rank: int
+) -> tuple[Array, Array, Int[np.ndarray, " limited"]]:
+    """Both limits of every parameter, and which have one: all where a transformation holds the limits."""
+    given = [x for x in (lower, upper) if x is not None]
     low = jnp.full(rank, -jnp.inf) if lower is None else jnp.broadcast_to(jnp.asarray(lower, float), (rank,))
     high = jnp.full(rank, jnp.inf) if upper is None else jnp.broadcast_to(jnp.asarray(upper, float), (rank,))
-    return low, high
+    if traced(*given):
+        return low, high, np.arange(rank)
+    finite = [np.broadcast_to(np.isfinite(np.asarray(x)), rank) for x in given]
+    return low, high, np.flatnonzero(np.any(finite, axis=0)) if finite else np.zeros(0, int)
 
 
-def _within(H: Array, h: Array, kept: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:
-    """z of least z'Hz/2 - h'z with `kept @ z` between the limits, which of them hold, and whether that was found."""
-    back = jnp.linalg.inv(kept)
-    Q, c = back.T @ H @ back, back.T @ h
-    size = jnp.sqrt(jnp.diagonal(Q))
-    Q, c, low, high = Q / size[:, None] / size, c / size, low * size, high * size
+def _within(K: Array, c: Array, low: Array, high: Array, side: Array) -> tuple[Array, Array, Array]:
+    """Multipliers that bring the parameters c - K pull between their limits, where they stand, whether that was found.
 
-    def at(side: Array) -> tuple[Array, Array]:
-        """Parameters and multipliers where those on a side stand on their limit."""
+    The active set starts at `side`; K is the covariance of the parameters.
+    """
+    size = jnp.sqrt(jnp.diagonal(K))
+    K, c, low, high = K / size[:, None] / size, c / size, low / size, high / size
+
+    def at(side: Array) -> Array:
+        """Multipliers where those on a side stand on their limit."""
         held = side != 0
-        fixed = jnp.where(side < 0, low, jnp.where(side > 0, high, 0.0))
-        fixed = jnp.where(held, fixed, 0.0)
-        matrix = jnp.where(held[:, None] | held, jnp.eye(len(side)), Q)
-        p = jnp.linalg.solve(matrix, jnp.where(held, fixed, c - Q @ fixed))
-        return p, jnp.where(held, c - Q @ p, 0.0)
+        limit = jnp.where(side < 0, low, jnp.where(side > 0, high, 0.0))
+        matrix = jnp.where(held[:, None] & held, K, jnp.eye(len(side)))
+        return symmetric_solve(matrix, jnp.where(held, c - jnp.where(held, limit, 0.0), 0.0)[:, None])[:, 0]
 
-    def better(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        side, _, count = state
-        p, pull = at(side)
+    def better(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        side, _, _, count = state
+        pull = at(side)
+        p = c - K @ pull
         new = jnp.where(pull + (p - high) > 0, 1, jnp.where(pull + (p - low) < 0, -1, 0))
-        return new, jnp.all(new == side), count + 1
+        return new, pull, jnp.all(new == side), count + 1
 
-    def going(state: tuple[Array, Array, Array]) -> Array:
-        return ~state[1] & (state[2] < ACTIVE_TURNS)
+    def going(state: tuple[Array, Array, Array, Array]) -> Array:
+        return ~state[2] & (state[3] < ACTIVE_TURNS)
 
-    side, done, _ = jax.lax.while_loop(going, better, (jnp.zeros(len(c), int), jnp.zeros((), bool), jnp.zeros((), int)))
-    p, _ = at(side)
-    return back @ (p / size), side != 0, done
+    begin = side, jnp.zeros(len(c)), jnp.zeros((), bool), jnp.zeros((), int)
+    side, pull, done, _ = jax.lax.while_loop(going, better, begin)
+    return pull / size, side, done
 
 
 def _products(model: ExtendedModel, data: TorqueData, basis: Basis) -> tuple[Array, Array]:
@@ -222,13 +263,20 @@ def _columns(model: ExtendedModel, terms: tuple[Effect, ...], data: TorqueData, 
     robot, zero = model.robot, jnp.zeros(v.shape)
     blocks = [jnp.moveaxis(dense_rows(robot, q.T, v.T, a.T), -1, 0)]
     motion = Motion(robot, t, q, v, a, zero, zero, jnp.asarray(data.dt), jnp.asarray(model.width))
-    for term in terms:
-        torque = jnp.moveaxis(columns(term, motion), 0, -1)
-        if term.acts_on not in ("link", "robot"):
-            torque = torque.reshape(len(q), -1, torque.shape[-1])
-            torque = jnp.zeros((*v.shape, torque.shape[-1])).at[:, term.places].add(torque)
-        blocks.append(torque)
+    for same in _alike(terms):
+        many = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(one) for one in x]), *same)
+        torques = jax.vmap(lambda one: jnp.moveaxis(columns(one, motion), 0, -1))(many)
+        for term, torque in zip(same, torques, strict=True):
+            if term.acts_on not in ("link", "robot"):
+                torque = torque.reshape(len(q), -1, torque.shape[-1])
+                torque = jnp.zeros((*v.shape, torque.shape[-1])).at[:, term.places].add(torque)
+            blocks.append(torque)
     return jnp.concatenate(blocks, axis=2)
+
+
+def _alike(terms: Sequence[Effect]) -> list[list[Effect]]:
+    """Neighbours of one class together: their equation is traced once."""
+    return [list(same) for _, same in groupby(terms, key=lambda term: (type(term), jax.tree.structure(term)))]
 
 
 def _batched(effect: Effect) -> Effect:

@@ -1,0 +1,282 @@
+"""Answers of two versions of the package side by side: verdicts, causes, parameters, held-out errors.
+
+    python benchmarks/parity.py make --cases DIR [--seeds 31 32]                    # needs Pinocchio and the recordings
+    python benchmarks/parity.py run --cases DIR --out OUT --jobs 60 before=/path/a now=/path/b
+    python benchmarks/parity.py table --cases DIR --out OUT
+
+`make` writes folders that hold everything: twelve public sets ($FIGAROH_JAX_DATA: seven of torque, five of postures),
+four identifications, and 64 hidden effects (`hidden_effects.py`: sixteen effects, TX40 with the first seed and Panda
+with the second, with and without repeats). `run` starts a process for each case and version and goes on where it was
+stopped. `table` prints what differs, and of what is hidden who finds it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+ONE_THREAD |= {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"}
+CLOSE = 1e-6  # relative, of parameters that are the same
+
+
+def make(folder: Path, seeds: list[int]) -> None:
+    """Write all cases and `cases.json`."""
+    sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(ROOT / "tests")]
+    folder.mkdir(parents=True, exist_ok=True)
+    cases = [*_torques(folder), *_postures(folder), *_identifications(folder), *_hidden(folder, seeds)]
+    (folder / "cases.json").write_text(json.dumps(cases, indent=1))
+    print(f"{len(cases)} cases, {sum(f.stat().st_size for f in folder.rglob('*') if f.is_file()) / 1e6:.0f} MB")
+
+
+def _torques(folder: Path) -> Iterator[dict[str, Any]]:
+    from benchmarks.hide_in_real.recordings import SETS
+
+    for name, load in SETS.items():
+        one, here = load(), folder / name
+        here.mkdir(exist_ok=True)
+        (here / "robot.urdf").write_text(one.urdf)
+        data = []
+        for run in one.recordings:
+            np.savez_compressed(here / f"{run.name}.npz", **run.arrays)  # pyright: ignore[reportArgumentType]
+            data.append({"file": f"{run.name}.npz", **run.entry})
+        task = one.task | {"robot": {"model": "robot.urdf", **one.task["robot"]}, "data": data}
+        (here / "task.yaml").write_text(json.dumps(task))
+        yield {"name": name, "task": f"{name}/task.yaml", "command": "diagnose"}
+
+
+def _postures(folder: Path) -> Iterator[dict[str, Any]]:
+    import calibration
+
+    files = {"talos_contact": "talos_contact/talos_full_v2.urdf", "tiago_mocap, 34": "tiago_mocap/tiago_no_hand.urdf"}
+    files |= {"irb120_wu2015": "irb120_wu2015/irb120.urdf", "panda_handeye_board": "panda_handeye_board/panda.urdf"}
+    files |= {"mukca panda_3": "mukca_panda/panda.urdf"}
+    for title, file in files.items():
+        model, recordings = calibration.SETS[title]()
+        name = title.split(",")[0].replace(" ", "_")
+        here, data = folder / name, []
+        here.mkdir(exist_ok=True)
+        shutil.copy(calibration.DATA / file, here / "robot.urdf")
+        for k, r in enumerate(recordings):
+            np.savez_compressed(here / f"{k}.npz", q=r.position, seen=r.values)
+            measurement = {r.kind: "seen", "base_frame": r.base_frame, "tool_frame": r.tool_frame}
+            measurement |= {"unknown": list(r.unknown)} | ({"distance": r.distance} if r.distance else {})
+            data.append({"file": f"{k}.npz", "position": "q", "role": r.role, "measurement": measurement})
+        robot = {"model": "robot.urdf", "joints": list(model.joint_names)}
+        (here / "task.yaml").write_text(json.dumps({"robot": robot, "data": data}))
+        for command in ("diagnose", "calibrate"):
+            yield {"name": f"{name} {command}", "task": f"{name}/task.yaml", "command": command}
+
+
+def _identifications(folder: Path) -> Iterator[dict[str, Any]]:
+    import calibration
+    import real_tasks
+    import yaml
+
+    for name in ("tx40", "tiago", "panda", "ur10e"):
+        here = folder / f"identify_{name}"
+        here.mkdir(exist_ok=True)
+        task = yaml.safe_load(getattr(real_tasks, f"{name}_task")(here, calibration.DATA).read_text())
+        robot = Path(task["robot"]["model"])
+        shutil.copy(robot, here / "robot.urdf")
+        task["robot"]["model"] = "robot.urdf"
+        for entry in task["data"]:
+            file = here / entry["file"]  # of a file elsewhere its own path
+            if file.parent != here:
+                shutil.copy(file, here / file.name)
+            entry["file"] = file.name
+        (here / "task.yaml").write_text(json.dumps(task))
+        yield {"name": f"{name} identify", "task": f"{here.name}/task.yaml", "command": "identify"}
+
+
+def _hidden(folder: Path, seeds: list[int]) -> Iterator[dict[str, Any]]:
+    import hidden_effects
+
+    for robot, seed in zip(("tx40", "panda"), seeds, strict=True):
+        args = argparse.Namespace(closed_loop=False, clean=0, foreign=False, robots=[robot])
+        args.layouts, args.seeds, args.size, args.noise, args.left_out = (
+            list(hidden_effects.LAYOUTS),
+            [seed],
+            0.05,
+            1.0,
+            0,
+        )
+        args.effects = list(hidden_effects.EFFECTS[:16])  # those that the first version knew
+        for label, case, _ in hidden_effects._cases(args):
+            name = label.replace(" ", "_").replace("(", "").replace(")", "").replace(",", "")
+            case.write(folder / name)
+            _smaller(folder / name)
+            _smaller(folder / name)
+            truth = [{"effect": one.effect, "at": list(one.at)} for one in case.truth]
+            yield {"name": label, "task": f"{name}/task.yaml", "command": "diagnose", "truth": truth}
+
+
+def _smaller(folder: Path) -> None:
+    """Recordings in single precision, for both versions alike."""
+    for file in folder.glob("*.npz"):
+        with np.load(file) as arrays:
+            kept = {key: x if key == "t" else x.astype(np.float32) for key, x in arrays.items()}
+        np.savez_compressed(file, **kept)  # pyright: ignore[reportArgumentType]
+
+
+def run(folder: Path, out: Path, sides: dict[str, Path], jobs: int, only: list[str]) -> None:
+    """Every case by every version, `jobs` processes at a time."""
+    cases = json.loads((folder / "cases.json").read_text())
+    wanted = [c for c in cases if not only or any(word in c["name"] for word in only)]
+    todo = [(c, s) for c in wanted for s in sides if not _kept(out, c, s).is_file()]
+    print(f"{len(todo)} runs to make", flush=True)
+    with ThreadPoolExecutor(jobs) as pool:
+        for k, line in enumerate(pool.map(lambda one: _called(folder, out, one[0], one[1], sides[one[1]]), todo), 1):
+            print(f"[{k}/{len(todo)}] {line}", flush=True)
+
+
+def _kept(out: Path, case: dict[str, Any], side: str) -> Path:
+    return out / side / f"{case['name'].replace('/', '_')}.json"
+
+
+def _called(folder: Path, out: Path, case: dict[str, Any], side: str, source: Path) -> str:
+    """One process; keeps its answer with seconds and memory."""
+    environment = os.environ | ONE_THREAD | {"PYTHONPATH": str(source), "JAX_PLATFORMS": "cpu"}
+    with tempfile.TemporaryDirectory() as scratch:
+        task, answer = str((folder / case["task"]).resolve()), Path(scratch) / "out"
+        words = [sys.executable, "-m", "figaroh_jax", case["command"], task, "--out", str(answer), "--quiet"]
+        environment["XDG_CACHE_HOME"] = str(out / "cache" / side)
+        start = time.monotonic()
+        process = subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        assert process.stderr is not None
+        said = process.stderr.read().decode(errors="replace")[-1000:]
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        found = next((answer / n for n in ("answer.json", "result.json") if (answer / n).is_file()), None)
+        record = {"exit": process.returncode, "cpu_s": _cpu(used), "peak_mb": used.ru_maxrss / 1024, "said": said}
+        record |= {"wall_s": time.monotonic() - start, "answer": json.loads(found.read_text()) if found else None}
+    kept = _kept(out, case, side)
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    kept.write_text(json.dumps(record))
+    return f"{side} {case['name']}: exit {record['exit']}, {record['cpu_s']:.0f} CPU s"
+
+
+def _cpu(used: resource.struct_rusage) -> float:
+    return used.ru_utime + used.ru_stime
+
+
+def table(folder: Path, out: Path) -> None:
+    """Case by case, the two versions that `out` holds."""
+    sides = sorted(p.name for p in out.iterdir() if p.is_dir() and p.name != "cache")
+    counts: dict[str, int] = {}
+    found = {side: 0 for side in sides}
+    named = {side: 0 for side in sides}
+    for case in json.loads((folder / "cases.json").read_text()):
+        if not all(_kept(out, case, side).is_file() for side in sides):
+            continue
+        both = [json.loads(_kept(out, case, side).read_text()) for side in sides]
+        answers = [one["answer"] for one in both]
+        word = _compared(*answers) if all(answers) else f"exit {[one['exit'] for one in both]}"
+        kind = word.split(",")[0].split(":")[0]
+        counts[kind] = counts.get(kind, 0) + 1
+        right = ""
+        if "truth" in case and all(answers):
+            hits = {s: _right(case["truth"], a) for s, a in zip(sides, answers, strict=True)}
+            for side, hit in hits.items():
+                found[side] += hit == "right"
+                named[side] += hit == "wrong"
+            right = f"  [{' | '.join(f'{s}: {h}' for s, h in hits.items())}]"
+        print(f"{case['name']}: {word}{right}")
+    print(", ".join(f"{count} {kind}" for kind, count in sorted(counts.items())))
+    for side in sides:
+        print(f"{side}: {found[side]} hidden effects right, {named[side]} wrong")
+
+
+def _names(answer: dict[str, Any]) -> list[str]:
+    return [f"{c['effect']}({','.join(c['at'])})" for c in answer.get("causes", [])]
+
+
+def _right(truth: list[dict[str, Any]], answer: dict[str, Any]) -> str:
+    wanted = {f"{t['effect']}({','.join(t['at'])})" for t in truth}
+    alike = {f"{t['effect']}({','.join(t['at'])})" for c in answer["causes"] for t in c["ambiguous_with"]}
+    names = _names(answer)
+    if not names:
+        return answer["verdict"]
+    return "right" if names[0] in wanted else ("in the set" if wanted & alike else "wrong")
+
+
+def _compared(before: dict[str, Any], now: dict[str, Any]) -> str:
+    """What is the same of two answers, and by how much their parameters and held-out errors differ."""
+    said = [[a.get("verdict"), sorted(_names(a))] for a in (before, now)]
+    held = [_held(a) for a in (before, now)]
+    error = f"held-out error {held[0]:.5g} -> {held[1]:.5g}" if None not in held else ""
+    if said[0] != said[1]:
+        text = " -> ".join(f"{verdict} {', '.join(names) or '-'}" for verdict, names in said)
+        return f"different: {text}; {error}"
+    sizes = [_sizes(a) for a in (before, now)]
+    common = sorted(set(sizes[0]) & set(sizes[1]))
+    apart = [abs(sizes[0][k][0] - sizes[1][k][0]) for k in common]
+    relative = [d / max(abs(sizes[0][k][0]), abs(sizes[1][k][0]), 1e-12) for d, k in zip(apart, common, strict=True)]
+    sigmas = [d / sizes[1][k][1] for d, k in zip(apart, common, strict=True) if sizes[1][k][1]]
+    worst = max(relative, default=0.0)
+    only = len(set(sizes[0]) ^ set(sizes[1]))
+    if worst <= CLOSE and not only:
+        return f"same: {said[1][0] or 'result'}, parameters within {worst:.0e}"
+    most = f", {max(sigmas):.1e} sigma" if sigmas else ""
+    more = f", {only} only in one" if only else ""
+    return f"same verdict: {said[1][0] or 'result'}, parameters apart by {worst:.1e}{most}{more}; {error}"
+
+
+def _held(answer: dict[str, Any]) -> float | None:
+    if answer.get("position"):
+        return answer["position"]["validated_after"]
+    if answer.get("cross_validation"):
+        return float(np.sqrt(np.mean([x**2 for x in answer["cross_validation"]["rms"] if x is not None])))
+    causes = answer.get("causes") or []
+    return min((c["gain"]["holdout_after"] for c in causes), default=None)
+
+
+def _sizes(answer: dict[str, Any]) -> dict[str, tuple[float, float]]:
+    """Value and sigma of every parameter by its name."""
+    found = {}
+    for cause in answer.get("causes", []):
+        for name, p in cause["parameters"].items():
+            found[f"{cause['effect']} {cause['at']} {name}"] = p["value"], p["std"] or 0.0
+    own = answer.get("parameters") or []
+    for p in [*own, *answer.get("base_parameters", [])]:
+        name = p.get("name") or p["expression"]
+        if p["value"] is not None and p.get("status") != "gauge":
+            found[name] = p["value"], p["std"] or 0.0
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("step", choices=["make", "run", "table"])
+    parser.add_argument("sides", nargs="*", metavar="NAME=FOLDER")
+    parser.add_argument("--cases", type=Path, required=True)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--seeds", type=int, nargs=2, default=[31, 32])
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--only", nargs="+", default=[], metavar="WORD")
+    args = parser.parse_args()
+    if args.step == "make":
+        make(args.cases, args.seeds)
+    elif args.step == "run":
+        sides = {name: Path(folder).resolve() for name, folder in (one.split("=", 1) for one in args.sides)}
+        run(args.cases, args.out.resolve(), sides, args.jobs, args.only)
+    else:
+        table(args.cases, args.out)
+
+
+if __name__ == "__main__":
+    main()

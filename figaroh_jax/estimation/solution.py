@@ -1,0 +1,76 @@
+"""What a fit found, the same for every job: the model, its numbers with their uncertainty, and why the solver ended."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..effects.extended import ExtendedModel
+from ..results import Estimate
+from .free import Free, Part
+
+if TYPE_CHECKING:
+    import optimistix
+
+    from .data import Data
+
+__all__ = ["HIDDEN", "Fit", "numbers"]
+
+HIDDEN = 1e-6  # share of a number in directions that nothing determines, above which it is not determined
+
+
+class Fit(eqx.Module):
+    """What a fit found; one of `fit` is a pytree, differentiable through the solution, and a batch under `jax.vmap`."""
+
+    model: ExtendedModel  # with the numbers in it
+    data: tuple[Data, ...]  # with the devices' frames put in
+    values: Float[Array | np.ndarray, " numbers"]  # change of each number from the model that was given, SI units
+    covariance: Float[Array | np.ndarray, "numbers numbers"]  # for rows of equal variance; without gradient
+    hidden: Float[Array | np.ndarray, " numbers"]  # share of each number in directions that nothing determines
+    cost: Float[Array | np.ndarray, ""] | float  # half of the squares of rows and prior
+    rows: Float[Array | np.ndarray, " rows"]  # weighted residual of the data
+    rank: Any  # directions that data and prior determine
+    outcome: Any  # of optimistix; None of another solver
+    stats: dict[str, Any]
+    free: Free = eqx.field(static=True)
+    failure: str = eqx.field(static=True, default="")  # why another solver did not end well
+
+    @property
+    def result(self) -> optimistix.RESULTS:
+        """`optimistix.RESULTS.successful`, or why not."""
+        if self.outcome is not None:
+            return self.outcome
+        import optimistix  # slow to import
+
+        return optimistix.RESULTS.nonlinear_divergence if self.failure else optimistix.RESULTS.successful
+
+    @property
+    def reason(self) -> str:
+        """Why the solver did not end well, in words; empty where it did."""
+        import optimistix
+
+        if self.failure or self.outcome is None:
+            return self.failure
+        return "" if self.outcome == optimistix.RESULTS.successful else optimistix.RESULTS[self.outcome]
+
+    @property
+    def std(self) -> Float[np.ndarray, " numbers"]:
+        """One sigma of each number; inf where nothing determines it."""
+        size = np.sqrt(np.maximum(np.diagonal(np.asarray(self.covariance), axis1=-2, axis2=-1), 0.0))
+        return np.where(np.asarray(self.hidden) > HIDDEN, np.inf, size)
+
+    @property
+    def parameters(self) -> dict[str, Estimate]:
+        """Each number by its name: change, one sigma, unit."""
+        each = zip(self.free.names, np.asarray(self.values), self.std, self.free.units, strict=True)
+        return {name: Estimate(float(value), float(std), unit) for name, value, std, unit in each}
+
+
+def numbers(kind: str, names: Sequence[str], units: Sequence[str], sizes: Sequence[float]) -> Free:
+    """Numbers of an engine that has coordinates of its own: named, but not to be given to `fit`."""
+    count = len(names)
+    return Free((Part(kind, (), tuple(range(count)), (count,), tuple(names), tuple(units), tuple(sizes)),))
