@@ -95,7 +95,7 @@ def tx40(data_dir: Path, folder: Path) -> tuple[Any, ...]:
         terms = friction_terms(robot, task.baseline)
         regression = Regression(as_backend(robot), terms, np.zeros(robot.nv), signals)
         used = np.abs(structural_columns(robot, terms)).max(axis=0) > 0
-        engine = solve(condense(regression, used), WeightedByJoint(20), kept=np.array(basis.kept))
+        engine = solve(condense(regression, used), WeightedByJoint(60, 1e-10), kept=np.array(basis.kept))
     weighted = fj.torque_data(model, recordings, task.preprocess, noise=np.asarray(linear.rms))
     own = fj.fit(model, weighted, ("inertia", "effects"), solver=SOLVERS["optimistix"])
     return model, data, basis, linear, engine, own

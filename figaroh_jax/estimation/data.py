@@ -38,7 +38,6 @@ from ..rigid.model import Leaf, RobotModel
 from ..rigid.spatial import matmul
 from .posefit import ties
 from .posegroups import devices_of
-from .regression import BLOCK, BLOCK_PERIODS
 
 if TYPE_CHECKING:
     from ..formats.config import Preprocess
@@ -205,6 +204,7 @@ def torque_data(
     True
     """
     from ..formats.config import Preprocess
+    from .regression import BLOCK, BLOCK_PERIODS  # a calibration has no use for it
 
     robot = model.robot if isinstance(model, ExtendedModel) else model
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)

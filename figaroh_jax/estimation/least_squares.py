@@ -47,6 +47,7 @@ class WeightedByJoint:
     """Rows of a joint weigh by the inverse of its own mean squared residual, found in turns."""
 
     iterations: int = 10
+    tolerance: float = 1e-3  # relative change of the weights at which they stay
 
 
 @dataclass(frozen=True)
@@ -220,7 +221,7 @@ def _by_joint(data: Condensed, kept: np.ndarray, method: WeightedByJoint):
     for turn in range(1, method.iterations + 1):
         theta = _placed(len(data.names), kept, _least(data.factor(weight)[:, [*kept, -1]]))
         new = joint_weights(data, theta)
-        done = bool(np.allclose(new, weight, rtol=1e-3, atol=0))
+        done = bool(np.allclose(new, weight, rtol=method.tolerance, atol=0))
         weight = new
         if done:
             return theta, weight, turn, True
