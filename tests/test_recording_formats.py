@@ -393,6 +393,34 @@ def test_a_format_whose_package_is_missing_names_the_extra(tmp_path: Path, monke
         read_table(tmp_path / "run.h5", "data")
 
 
+@pytest.mark.parametrize("form", ["mcap", "db3", "h5"])
+def test_damaged_files_are_one_message(made, tmp_path: Path, form: str):
+    """Bytes changed at random, and files cut off: an answer or an `InputError`, whatever the library raises."""
+    import h5py
+
+    _, joints, run = made
+    short = {key: run[key][:60] for key in ("time", "position", "torque")}
+    file = tmp_path / f"run.{form}"
+    if form in ("mcap", "db3"):
+        folder = bag(tmp_path / "bag", joints, short, "MCAP" if form == "mcap" else "SQLITE3")
+        next(one for one in folder.iterdir() if one.suffix == file.suffix).rename(file)
+    else:
+        with h5py.File(file, "w") as opened:
+            opened["q"] = short["position"]
+    whole, rng = file.read_bytes(), np.random.default_rng(3)
+    for k in range(25):
+        damaged = bytearray(whole[: rng.integers(1, len(whole))] if k % 5 == 0 else whole)
+        for at in rng.integers(0, len(damaged), 12):
+            damaged[at] = rng.integers(0, 256)
+        file.write_bytes(damaged)
+        try:
+            table = read_table(file, "data")
+            for name in table.names:
+                table.read(name)
+        except InputError as error:
+            assert file.name in str(error)
+
+
 # Rollouts: a command and no torque
 
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+import numpy as np
 
 from ..errors import InputError
 from ..formats.files import plain_file
@@ -35,8 +38,21 @@ def read_table(file: Path, key: str, source: Source = _WHOLE) -> Table:
     for name, given, where in (("topic", source.topic, BAGS), ("episode", source.episode, ("lerobot",))):
         if given is not None and suffix not in where:
             raise InputError(f"{file} ({key}): `{name}` is of {_OWNERS[name]}, which this file is not")
+    with _damage(file, key, suffix):
+        table = _READERS[suffix](file, source)
+
+    def read(name: str) -> np.ndarray:
+        with _damage(file, key, suffix):
+            return table.read(name)
+
+    return table._replace(read=read)
+
+
+@contextmanager
+def _damage(file: Path, key: str, suffix: str) -> Iterator[None]:
+    """What a library raises over a file that is damaged, or that it is missing for, as one message."""
     try:
-        return _READERS[suffix](file, source)
+        yield
     except InputError:
         raise
     except ModuleNotFoundError as error:
