@@ -129,6 +129,12 @@ KEYS: dict[str, tuple[str, str, str]] = {
     "excite.bodies[].at": ("m", "[0, 0, 0.1]", "the capsule begins at the frame's origin"),
     "excite.bodies[].to": ("m", "[0, 0, 0.3]", "the body is a sphere"),
     "excite.bodies[].radius": ("m", "0.06", "a body needs it"),
+    "excite.view.place": ("m", "[1.5, 0, 1.0]", "what the device of postures can see is not looked at"),
+    "excite.view.axis": ("", "[-1, 0, 0]", "a fixed device sees in any direction"),
+    "excite.view.cone": ("rad", "0.4", "the device sees within 0.5 rad of its axis"),
+    "excite.view.tilt": ("rad", "0.8", "the target may be turned away by 1 rad"),
+    "excite.view.near": ("m", "0.3", "from a distance of 0.1 m"),
+    "excite.view.far": ("m", "3.0", "to a distance of 10 m"),
     "excite.ignore": ("", "[[hand, forearm]]", "every pair of bodies that no joint joins keeps clear"),
     "excite.measurement": ("", "{position: p, tool_frame: tool0}", "the device of the recordings"),
 }
