@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import chi2
 
 from ..errors import InputError
 from .loop import Loop
@@ -15,7 +16,7 @@ from .sensitivity import Windows
 __all__ = ["Run", "Stretch", "noise_of", "regular", "windows"]
 
 _LEAD = 0.2  # s of command kept before a window: no delay is longer
-_SMOOTH = 1.3  # times the noise's squares: up to here a cubic follows the rows
+_SMOOTH = 0.99  # level of the squares left by a cubic, up to which it follows the rows
 
 
 class Run(NamedTuple):
@@ -120,18 +121,16 @@ def windows(
 
 def _smooth_rows(run: Run, row: int, noise: Float[np.ndarray, " nv"]) -> int:
     """The most rows around one (5 to 129) that a cubic follows within the noise of every joint."""
-    found = 5
-    for rows in (9, 17, 33, 65, 129):
+    for rows in (129, 65, 33, 17, 9):
         first = min(max(row - rows // 2, 0), max(len(run.time) - rows, 0))
         near = run.position[first : first + rows]
         if len(near) < rows:
-            break
+            continue
         t = np.linspace(-1, 1, rows)
         left = near - np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyfit(t, near, 3)).T
-        if np.any((left**2).sum(0) > _SMOOTH * (rows - 4) * np.maximum(noise, 1e-12) ** 2):
-            break
-        found = rows
-    return found
+        if np.all((left**2).sum(0) <= chi2.ppf(_SMOOTH, rows - 4) * np.maximum(noise, 1e-12) ** 2):
+            return rows
+    return 5
 
 
 def _state(
