@@ -282,6 +282,33 @@ def postures() -> None:
         )
 
 
+def views() -> None:
+    """30 postures of TALOS' torso and left arm (9 joints, poses measured), and of a Panda with a camera in its hand.
+
+    The camera looks at a board on the table at 0.2 to 1 m, within 0.35 rad of its axis and 0.9 rad of the normal.
+    """
+    from figaroh_jax.excitation.postures import Instrument, View, excite_postures
+    from figaroh_jax.formats.urdf import load_urdf
+
+    names = ["torso_1_joint", "torso_2_joint", *(f"arm_left_{k}_joint" for k in range(1, 8))]
+    talos = load_urdf(DATA / "talos_contact" / "talos_full_v2.urdf", joints=names)
+    board = View((0.5, 0.0, 0.0), (0.0, 0.0, 1.0), "hand", cone=0.35, tilt=0.9, near=0.2, far=1.0)
+    cases = {
+        "TALOS": (talos, Instrument("pose", "base_link", "arm_left_7_link")),
+        "Panda, camera": (arms()["Panda"], Instrument("pose", "panda_link0", "panda_link7", view=board)),
+    }
+    for name, (model, device) in cases.items():
+        excite_postures(model, device)
+        since = time.process_time()
+        found = excite_postures(model, device)
+        print(
+            f"{name}: {len(found.parameters)} parameters, {found.candidates} candidates; of their bound: random"
+            f" {found.random_efficiency:.3f}, chosen {found.chosen_efficiency:.4f}, moved {found.efficiency:.4f};"
+            f" {spent(since):.2f} CPU s",
+            flush=True,
+        )
+
+
 PAIRS = {
     "rotor / link": (("rotor_inertia", ("elbow_joint",), {"inertia": 0.1}), ("link_inertia", ("forearm_link",), {})),
     "gain / link": (("torque_gain", ("elbow_joint",), {"gain": 0.02}), ("link_inertia", ("forearm_link",), {})),
@@ -733,6 +760,7 @@ PARTS = {
     "ipopt": ipopt,
     "sequence": sequence,
     "postures": postures,
+    "views": views,
     "separation": separation,
     "chooser": chooser,
     "pays": pays,

@@ -1,7 +1,8 @@
 """The package's import graph: folders and modules of the root as nodes, imports inside functions counted.
 
 `python benchmarks/import_graph.py [CHECKOUT]` prints nodes, layers (length of the longest chain), edges, pairs of
-modules that import each other across nodes, and circles; another checkout can be measured beside this one.
+modules that import each other across nodes, and circles; then, for a few names, how many functions of how many modules
+take it as a parameter, and how many calls in those hand it on. Another checkout can be measured beside this one.
 """
 
 from __future__ import annotations
@@ -31,6 +32,25 @@ def imports(path: Path, root: Path, modules: set[str], types: bool = False) -> I
                     yield (name if name in modules else base), inside
 
 
+def handed_on(files: dict[str, Path], wanted: str) -> tuple[int, int, int]:
+    """Functions that take a parameter of this name, their modules, and calls in them that hand it on."""
+    functions, modules, calls = 0, set[str](), 0
+    for name, path in files.items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+                if any(one.arg == wanted for one in arguments):
+                    functions, modules = functions + 1, modules | {name}
+                    inside = (x for x in ast.walk(node) if isinstance(x, ast.Call))
+                    calls += sum(_hands(call, wanted) for call in inside)
+    return functions, len(modules), calls
+
+
+def _hands(call: ast.Call, wanted: str) -> bool:
+    given = [*call.args, *(keyword.value for keyword in call.keywords)]
+    return any(isinstance(one, ast.Name) and one.id == wanted for one in given)
+
+
 def main(root: Path) -> None:
     """Print the graph of the package under `root`."""
     files = {
@@ -54,6 +74,9 @@ def main(root: Path) -> None:
     except CycleError as error:
         shape = "a circle: " + " -> ".join(error.args[1])
     total = sum(map(len, graph.values()))
+    for name in ("model", "position", "rate", "effect"):
+        functions, modules, calls = handed_on(files, name)
+        print(f"{name}: {functions} functions of {modules} modules take it, {calls} calls hand it on")
     print(f"{len(graph)} nodes, {shape}, {total} edges ({len(edges)} between modules), {lazy} imports inside functions")
 
 

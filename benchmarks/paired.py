@@ -50,7 +50,7 @@ def measured(command: str, task: Path, source: Path, cache: Path) -> tuple[float
     environment["XDG_CACHE_HOME"] = str(cache)
     with tempfile.TemporaryDirectory() as out:
         words = [sys.executable, "-m", "figaroh_jax", command, str(task), "--out", f"{out}/run", "--quiet"]
-        process = subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL)
+        process = subprocess.Popen(words, env=environment, cwd=out, stdout=subprocess.DEVNULL)
         _, status, used = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:

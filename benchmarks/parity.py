@@ -156,7 +156,9 @@ def _called(folder: Path, out: Path, case: dict[str, Any], side: str, source: Pa
         words = [sys.executable, "-m", "figaroh_jax", case["command"], task, "--out", str(answer), "--quiet"]
         environment["XDG_CACHE_HOME"] = str(out / "cache" / side)
         start = time.monotonic()
-        process = subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        process = subprocess.Popen(
+            words, env=environment, cwd=scratch, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        )
         assert process.stderr is not None
         said = process.stderr.read().decode(errors="replace")[-1000:]
         _, status, used = os.wait4(process.pid, 0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -85,7 +84,7 @@ def drive_table(found: Identification) -> DriveTable:
         if (joint, kind) not in values:
             return ""
         estimate = values[joint, kind]
-        return wording.interval(replace(estimate, unit="") if common[kind] else estimate)
+        return wording.interval(estimate._replace(unit="") if common[kind] else estimate)
 
     columns = [(SHORT.get(kind, wording.effect_title(kind)), wording.unit(common[kind])) for kind in kinds]
     rows = [(joint, [cell(joint, kind) for kind in kinds]) for joint in found.joints]
