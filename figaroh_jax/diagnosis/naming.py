@@ -73,7 +73,7 @@ def reason_against(one: Standing, rest: bool, tolerance: float) -> str:
             f"its torque is {one.share:.2%} of the joint's, below the tolerance of {tolerance:.2%}",
         ),
     ]
-    if rest:
+    if rest or not one.beside_rest:  # what any rest looks like is never taken on less
         checks += [
             (one.t >= T_NAMED, f"its gain on held-out data is not sure: t = {one.t:.1f} of {T_NAMED:g}"),
             (one.gain >= least, f"it takes {one.gain:.0%} of the held-out error where it acts, {least:.0%} are needed"),
@@ -84,7 +84,7 @@ def reason_against(one: Standing, rest: bool, tolerance: float) -> str:
             ),
             (one.share >= SHARE_NAMED, f"its torque is {one.share:.1%} of the joint's, {SHARE_NAMED:.0%} are needed"),
             (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion do as well"),
-            (one.beside_rest, "a rest that stays may look like it: it is named only where none does"),
+            (one.beside_rest or not rest, "a rest that stays may look like it: it is named only where none does"),
             (not one.inertia_alone, "a coupling without friction of its own may be a rotor's or a link's inertia"),
         ]
     return next((reason for passed, reason in checks if not passed), "")

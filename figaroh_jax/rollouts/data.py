@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from ..errors import InputError
 from .loop import Loop
@@ -14,6 +15,7 @@ from .sensitivity import Windows
 __all__ = ["Run", "Stretch", "noise_of", "regular", "windows"]
 
 _LEAD = 0.2  # s of command kept before a window: no delay is longer
+_SMOOTH = 1.3  # times the noise's squares: up to here a cubic follows the rows
 
 
 class Run(NamedTuple):
@@ -70,11 +72,18 @@ def _step(values: np.ndarray) -> np.ndarray:
 
 
 def windows(
-    loop: Loop, runs: Sequence[Run], stretches: Sequence[Stretch], noise: Sequence[np.ndarray], block: float
+    loop: Loop,
+    runs: Sequence[Run],
+    stretches: Sequence[Stretch],
+    noise: Sequence[np.ndarray],
+    block: float,
+    *,
+    smooth: bool = False,
 ) -> Windows:
     """Windows of equal length in rows of one period; shorter ones are padded and count for nothing there.
 
-    `noise` holds the standard deviations of positions, and of velocities where they count.
+    `noise` holds the standard deviations of positions, and of velocities where they count. `smooth` starts each from
+    as many rows as a polynomial follows, for windows whose start is not fitted.
     """
     period = regular(runs[0].name, runs[0].time)
     substeps = max(1, round(period / float(loop.dt)))
@@ -93,7 +102,8 @@ def windows(
         parts = [run.position] + ([run.velocity] if len(noise) > 1 and run.velocity is not None else [])
         reading.append(np.concatenate([p[here] for p in parts], 1))
         weight.append(np.concatenate([counted[:, None] / s for s in noise], 1))
-        state, certainty = _state(loop, run, stretch.first, noise, period)
+        rows_of_state = _smooth_rows(run, stretch.first, noise[0]) if smooth else 5
+        state, certainty = _state(loop, run, stretch.first, noise, period, rows_of_state)
         start.append(state)
         precision.append(certainty)
     return Windows(
@@ -108,13 +118,31 @@ def windows(
     )
 
 
-def _state(loop: Loop, run: Run, row: int, noise: Sequence[np.ndarray], period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Position and velocity at a row by a line through five rows, and how precise they are."""
+def _smooth_rows(run: Run, row: int, noise: Float[np.ndarray, " nv"]) -> int:
+    """The most rows around one (5 to 129) that a cubic follows within the noise of every joint."""
+    found = 5
+    for rows in (9, 17, 33, 65, 129):
+        first = min(max(row - rows // 2, 0), max(len(run.time) - rows, 0))
+        near = run.position[first : first + rows]
+        if len(near) < rows:
+            break
+        t = np.linspace(-1, 1, rows)
+        left = near - np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyfit(t, near, 3)).T
+        if np.any((left**2).sum(0) > _SMOOTH * (rows - 4) * np.maximum(noise, 1e-12) ** 2):
+            break
+        found = rows
+    return found
+
+
+def _state(
+    loop: Loop, run: Run, row: int, noise: Sequence[np.ndarray], period: float, rows: int = 5
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position and velocity at a row by a polynomial through the rows around it, and how precise they are."""
     n = loop.robot.nv
-    first = min(max(row - 2, 0), max(len(run.time) - 5, 0))
-    near = slice(first, first + 5)
+    first = min(max(row - rows // 2, 0), max(len(run.time) - rows, 0))
+    near = slice(first, first + rows)
     t = (np.arange(first, first + len(run.position[near])) - row) * period
-    line = np.polyfit(t, run.position[near], min(2, len(t) - 1))
+    line = np.polyfit(t, run.position[near], min(2 if rows <= 5 else 3, len(t) - 1))
     q, v = line[-1], line[-2]
     q = np.where(np.ptp(run.position[near], axis=0) == 0, run.position[row], q)
     sigma = np.maximum(noise[0], 1e-9)

@@ -19,7 +19,7 @@ from ..formats.config import robot_options
 from ..recordings.dataset import Recording, read_recordings
 from ..results import Cause, Diagnosis, Estimate, Experiment, Gain, Name, Rest, Trace
 from .causes import BASELINE
-from .data import Run, Stretch, regular, windows
+from .data import Run, Stretch, noise_of, regular, windows
 from .fit import standard_errors
 from .loop import Loop
 from .parameters import UNITS, put
@@ -181,8 +181,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
 
 def simulated(loop: Loop, run: Run) -> np.ndarray:
     """Readings of the encoders (rows, joints) that the loop predicts from a recording's first state and command."""
-    noise = [np.full(run.position.shape[1], 1e-3)]
-    data = windows(loop, [run], [Stretch(0, 0, len(run.time))], noise, 0.3)
+    data = windows(loop, [run], [Stretch(0, 0, len(run.time))], [noise_of(run.position)], 0.3, smooth=True)
     with jax.enable_x64(True):
         read = predicted(loop, (), jnp.zeros((1, 0)), data, np.asarray(data.start)[None])
     return np.asarray(read)[0, : len(run.time), :, 0]
