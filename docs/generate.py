@@ -142,7 +142,7 @@ def effect_page(name: str, effect: Any, kinematic: bool) -> str:
 def api(name: str, what: Any) -> str:
     """The entry of a public name; an example in a docstring is code, not text."""
     doc = inspect.getdoc(what) or ""
-    if ">>>" in doc and inspect.isclass(what):
+    if ">>>" in doc:
         return f"## {name}\n\n```text\n{doc}\n```"
     return f"## {name}\n\n::: {what.__module__}.{what.__qualname__}"
 
