@@ -92,7 +92,9 @@ def test_the_motion_designed_for_an_open_pair_brings_the_right_name(tmp_path: Pa
     with np.load(tmp_path / "motion" / "trajectory_1.npz") as motion:
         time, *states = (motion[name][::5] for name in ("t", "q", "v", "a"))
     for seed in range(3):
-        np.savez(tmp_path / f"told{seed}.npz", t=time, q=states[0], tau=_measured(states[0], states[1], states[2], 10 + seed))
+        np.savez(
+            tmp_path / f"told{seed}.npz", t=time, q=states[0], tau=_measured(states[0], states[1], states[2], 10 + seed)
+        )
     second = _task(tmp_path, "second.yaml", [f"told{k}" for k in range(3)])
     assert main(["diagnose", str(second), "--out", str(tmp_path / "second"), "--quiet"]) == 0
     answer = json.loads((tmp_path / "second" / "answer.json").read_text())

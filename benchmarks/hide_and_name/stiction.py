@@ -9,7 +9,7 @@ What is recorded: the encoder, and the drive's torque with the noise and the ste
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -21,6 +21,7 @@ from generators.closed_loop import _hide_one, _physics
 from generators.inverse import Wanted, choose
 from generators.laws import Hidden
 from generators.motion import PERIOD, Motion, excitation, tracked
+from scipy.signal import butter, sosfiltfilt
 
 Array = np.ndarray
 mj: Any = mujoco  # its stubs lack these names
@@ -28,7 +29,8 @@ STEP = 5e-4  # s, of the simulation
 CONTROL = 2  # steps between two commands
 SAMPLE = 8  # steps of a recorded sample: 250 Hz
 WARM_UP = 2.0  # s
-SPEED = 80.0  # rad/s, bandwidth of the position loop
+SPEEDS = (80.0, 50.0, 30.0, 20.0)  # rad/s, bandwidth of the position loop: the first with which no joint shakes
+SHAKES = 0.1  # RMS speed above 20 Hz over that below, beyond which a joint does: no drive is left tuned so
 STUCK = 0.02  # rad or m, error at which the proportional part alone breaks a joint loose
 SMOOTH = 100.0  # Hz, low pass of the speed that the loop feels
 
@@ -43,6 +45,7 @@ class Loop:
     forward: bool  # the nominal inverse dynamics, not gravity alone, as feed-forward
     noise: float  # of the torque reading, share of the joint's RMS torque
     bits: float  # steps of the torque reading over the joint's largest torque
+    speed: float = SPEEDS[0]  # rad/s, bandwidth of the position loop
 
 
 def loop_of(rng: np.random.Generator) -> Loop:
@@ -69,6 +72,10 @@ def make_stiction_case(
     time = scene.grid(PERIOD)
     hidden = [_hide_one(made, model, motions, time, rngs[2], item) for item in wanted]
     loop, runs = loop_of(rngs[4]), []
+    for speed in SPEEDS:
+        loop = replace(loop, speed=speed)
+        if not _shaking(_run(made, model, motions[0], hidden, loop)):
+            break
     for number, motion in enumerate(motions):
         for repeat in range(repeats):
             run = _run(made, model, tracked(motion, rngs[3], 1e-4), hidden, loop)
@@ -79,6 +86,14 @@ def make_stiction_case(
     truth = tuple(Truth(h.effect, h.at, h.parameters(h.scale)) for h in hidden)
     baseline = {"rotor": True} if any(h.effect == "coupled_transmission" for h in hidden) else {}
     return Case(robot, made.urdf, made.joints, tuple(runs), truth, 0.02 if trusted else 0.10, seed, {}, baseline)
+
+
+def _shaking(run: dict[str, Any]) -> bool:
+    """Whether a joint oscillates beside its motion: chatter does away with dry friction, so nothing would be clean."""
+    step = run["time"][1] - run["time"][0]
+    v = np.diff(run["position"], axis=0) / step
+    slow = sosfiltfilt(butter(4, 20.0, fs=1 / step, output="sos"), v, axis=0)
+    return bool(np.any(np.std(v - slow, axis=0) > SHAKES * np.std(slow, axis=0)))
 
 
 def _run(made: robots.Robot, model: pin.Model, motion: Motion, hidden: list[Hidden], loop: Loop) -> dict[str, Any]:
@@ -95,8 +110,10 @@ def _run(made: robots.Robot, model: pin.Model, motion: Motion, hidden: list[Hidd
     forward = robots.torque(made.model, q, *((v, a) if loop.forward else (0 * v, 0 * a)))
     forward = forward + 0.8 * (made.viscous * v + made.coulomb * np.tanh(v / 0.02))
     needed = np.abs(robots.torque(made.model, q, v, a)).max(0) + made.viscous * np.abs(v).max(0) + made.coulomb
-    inertia = np.diagonal(plant.inertia_along(made.model, structure.armature, q[:1])[0])
-    gains = np.maximum(inertia * SPEED**2, made.coulomb / STUCK), 2 * inertia * SPEED
+    # what a drive feels while the other joints give way: on axes that nearly coincide much less than the diagonal
+    inertia = 1 / np.diagonal(np.linalg.inv(plant.inertia_along(made.model, structure.armature, q[:1])[0]))
+    stiffness = np.maximum(inertia * loop.speed**2, made.coulomb / STUCK)
+    gains = stiffness, 2 * np.sqrt(inertia * stiffness)
     reading, torque = _simulate(compiled, physics, (q, v), forward, gains, loop, loop.limit * needed)
     fine = -WARM_UP + STEP * np.arange(len(torque))
     if late:
