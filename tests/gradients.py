@@ -106,8 +106,9 @@ OTHERS = frozenset(
     " load_model load_robot load_task load_urdf own_device place pose_data postures read_recordings recording register"
     " shape torque_data write_model write_report"
     " Design Instrument Learned PostureDesign Trajectory excite excite_postures excite_task fourier learn limits_of"
-    " quintic spline".split()
-)
+    " quintic spline"
+    " JointEffect Load PoseRecording RolloutData Selection load_loop rollout_data select".split()
+) | {"rollout"}  # its gradients stand in test_rollouts and test_rollout_data
 
 
 def _moved(tree: Any, way: Any, step: float) -> Any:
