@@ -139,6 +139,8 @@ def _brief(kept: Path) -> str:
     answer = read(kept)
     if answer is None:
         return ", no answer"
+    if "verdict" not in answer:  # of another command than a diagnosis
+        return ""
     return f", {answer['verdict']} {'; '.join(_word(name) for name, _ in causes(answer))}"
 
 
