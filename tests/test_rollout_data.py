@@ -47,6 +47,7 @@ def with_sizes(model: fj.ExtendedModel, damping: float, inertia: float) -> fj.Ex
     return eqx.tree_at(where, model, [jnp.asarray(damping), jnp.asarray(inertia)])
 
 
+@pytest.mark.slow  # nearly a minute of compilation
 def test_a_fit_finds_what_mujoco_hid_and_its_derivative_is_that_of_differences(case):
     model, data = case
     found = fj.fit(model, data, {"effects": ["damping", "inertia"], "start": True})
