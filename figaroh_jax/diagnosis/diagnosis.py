@@ -269,8 +269,7 @@ def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> _Gainin
     worse: list[Name] = []
     later: list[Name] = []  # come in behind the others
     while True:
-        order = _by_gain(here, joint.causes, [f.name in later for f in named])
-        squares, power = held_squares(here.problem, here.start, [joint.causes[k] for k in order], here.whitening)
+        order, squares, power = _by_gain(here, joint.causes, [f.name in later for f in named])
         falls, places = [a - b for a, b in pairwise(squares)], [list(named[k].joints) for k in order]
         own = [f[at].sum() / a[at].sum() for at, f, a in zip(places, falls, squares, strict=False)]
         whole = [f.sum() for f in falls]
@@ -286,11 +285,20 @@ def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> _Gainin
         joint = polished(here.problem, here.start, [f.effect for f in named], here.whitening)
 
 
-def _by_gain(here: _Setting, causes: Sequence[Effect], later: Sequence[bool]) -> list[int]:
-    """The order of what each cause gains on held-out data as it comes in, those that come `later` behind the others."""
-    squares, _ = held_squares(here.problem, here.start, list(causes), here.whitening)
+def _by_gain(
+    here: _Setting, causes: Sequence[Effect], later: Sequence[bool]
+) -> tuple[list[int], list[Float[np.ndarray, " nv"]], Float[np.ndarray, " nv"]]:
+    """The order of what each cause gains on held-out data as it comes in, those that come `later` behind the others.
+
+    With the squares of the error in that order, and of the torque.
+    """
+    order = list(range(len(causes)))
+    squares, power = held_squares(here.problem, here.start, list(causes), here.whitening)
     drops = [float((before - after).sum()) for before, after in pairwise(squares)]
-    return sorted(range(len(causes)), key=lambda k: (later[k], -drops[k]))
+    ranked = sorted(order, key=lambda k: (later[k], -drops[k]))
+    if ranked != order:
+        squares, power = held_squares(here.problem, here.start, [causes[k] for k in ranked], here.whitening)
+    return ranked, squares, power
 
 
 def _left(
