@@ -110,8 +110,9 @@ def _run(made: robots.Robot, model: pin.Model, motion: Motion, hidden: list[Hidd
     forward = robots.torque(made.model, q, *((v, a) if loop.forward else (0 * v, 0 * a)))
     forward = forward + 0.8 * (made.viscous * v + made.coulomb * np.tanh(v / 0.02))
     needed = np.abs(robots.torque(made.model, q, v, a)).max(0) + made.viscous * np.abs(v).max(0) + made.coulomb
-    # what a drive feels while the other joints give way: on axes that nearly coincide much less than the diagonal
-    inertia = 1 / np.diagonal(np.linalg.inv(plant.inertia_along(made.model, structure.armature, q[:1])[0]))
+    # what a drive feels while the other joints give way: on axes that nearly coincide much less than the diagonal;
+    # of the true robot, for a nominal link may have no inertia about its own axis
+    inertia = 1 / np.diagonal(np.linalg.inv(plant.inertia_along(changed, structure.armature, q[:1])[0]))
     stiffness = np.maximum(inertia * loop.speed**2, made.coulomb / STUCK)
     gains = stiffness, 2 * np.sqrt(inertia * stiffness)
     reading, torque = _simulate(compiled, physics, (q, v), forward, gains, loop, loop.limit * needed)
