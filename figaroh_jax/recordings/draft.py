@@ -19,10 +19,9 @@ from ..formats.config import RecordingEntry
 from ..formats.robotfile import read_robot
 from ..rigid.model import RobotModel, prismatic
 from .checks import DEGREE, Finding, check_recording, position_findings
-from .containers import lerobot_episodes
 from .dataset import Recording
 from .likeness import Sampled, likeness, rigid_torque, sampled
-from .reading import BAGS, kind_of, read_table
+from .reading import BAGS, kind_of, lerobot_episodes, read_table
 from .tables import Source, Table
 
 __all__ = ["Draft", "Undecided", "draft_task"]
@@ -141,7 +140,7 @@ def _tables(files: Sequence[Path], topic: str | None) -> Iterator[tuple[Table, d
     for file in files:
         path = file.resolve()
         if kind_of(file) == "lerobot":
-            for episode in lerobot_episodes(file)[:_EPISODES]:
+            for episode in lerobot_episodes(file, "recording")[:_EPISODES]:
                 source = Source(episode=episode)
                 yield read_table(file, "recording", source), {"file": str(path), "episode": episode}
             continue
