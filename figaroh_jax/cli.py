@@ -255,6 +255,7 @@ def _add_tools(commands: Any) -> None:
     new.add_argument("--joints", help="comma-separated joints of the columns, in their order")
     new.add_argument("--rate", type=float, metavar="HZ", help="rate of recordings that have no time column")
     new.add_argument("--constants", help="comma-separated N m a unit of the torque columns, in the joints' order")
+    new.add_argument("--gears", help="comma-separated motor turns a joint turn, where positions are those of motors")
     new.add_argument("--unit", choices=("rad", "deg", "m", "mm"), help="unit of the positions, where nothing tells it")
     new.add_argument("--topic", metavar="NAME", help="topic of bags that hold several topics of joints")
     new.add_argument("--kp", help="comma-separated gains of position servos (N m/rad), for a command without torque")

@@ -35,7 +35,8 @@ def new(args: argparse.Namespace) -> int:
             raise InputError(f"--rate {args.rate}: expected a positive number of Hz")
         constants, gains = _numbers(args.constants, "--constants"), _numbers(args.kp, "--kp")
         known = {"rate": args.rate, "unit": args.unit, "topic": args.topic, "constants": constants, "gains": gains}
-        return draft_task(args.model, args.recordings, joints=joints, **known)
+        gears = _numbers(args.gears, "--gears")
+        return draft_task(args.model, args.recordings, joints=joints, gears=gears, **known)
 
     draft = _asked(args, drafted) if args.interactive else drafted()
     if args.json:
@@ -69,7 +70,7 @@ def migrate(args: argparse.Namespace) -> int:
 
 def _asked(args: argparse.Namespace, drafted: Callable[[], Draft]) -> Draft:
     """The draft, once the user has answered what the recordings cannot decide; an empty answer gives up."""
-    from .recordings.draft import Undecided
+    from .recordings.draft_columns import Undecided
 
     while True:
         try:
