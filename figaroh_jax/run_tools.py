@@ -1,4 +1,4 @@
-"""Commands before and after a run: `new`, `verify`, `compare`, `list`, and what `rerun` runs again.
+"""Commands before and after a run: `new`, `verify`, `compare`, `list`, `view`, and what `rerun` runs again.
 
 Each function takes the parsed arguments, prints and gives the exit status.
 """
@@ -19,7 +19,7 @@ from .reporting.run_directory import write_file
 if TYPE_CHECKING:
     from .recordings.draft import Draft
 
-__all__ = ["command_of", "compare", "list", "migrate", "new", "verify"]
+__all__ = ["command_of", "compare", "list", "migrate", "new", "verify", "view"]
 
 
 def new(args: argparse.Namespace) -> int:
@@ -123,6 +123,21 @@ def compare(args: argparse.Namespace) -> int:
     _print(sections, args.json, comparison_text(sections))
     if args.out and not args.json:
         print(f"\nPage: {args.out}")
+    return 0
+
+
+def view(args: argparse.Namespace) -> int:
+    """The robot of a run in a browser, until the command is interrupted."""
+    from .reporting.robot_view import show_run
+
+    if not 0 < args.port < 65536:
+        raise InputError(f"--port {args.port}: expected a number from 1 to 65535")
+    server = show_run(args.run, args.port)
+    print(f"The robot of {args.run}: http://localhost:{args.port} (Ctrl-C ends)", file=sys.stderr, flush=True)
+    try:
+        server.sleep_forever()
+    finally:
+        server.stop()
     return 0
 
 
