@@ -35,7 +35,7 @@ def diagnose_task(
     >>> found.verdict, found.causes[0].name.effect
     ('named', 'coupled_transmission')
     """
-    if any(entry.measurement is not None for entry in task.data):
+    if task.of_postures:
         from .calibration.kinematic_diagnosis import diagnose_pose_task
 
         if backend != "native":
