@@ -47,7 +47,7 @@ from .judgement import (
     solution_of,
 )
 from .result import Identification, Quality
-from .reversal import with_reversal_widths
+from .reversal import widths_to_try, with_reversal_widths
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess, Task
@@ -248,10 +248,11 @@ def _condensed(
     regression: Regression, used: Bool[np.ndarray, "nv columns"]
 ) -> tuple[Regression, Condensed, BaseParameters, Solution]:
     """The regression with its reversal widths, condensed; its base parameters and their weighted fit."""
-    data = condense(regression, used)
+    wide = condense(regression, used, widths=widths_to_try(regression))
+    data = wide.restricted(range(len(regression.names)))
     base = _base(data)
     first = solve(data, WeightedByJoint(), kept=base.independent)
-    widened = with_reversal_widths(regression, used, base.independent, first.weight)
+    widened = with_reversal_widths(regression, wide, base.independent, first.weight)
     if (widened.width != regression.width).any():
         regression, data = widened, condense(widened, used)
         base = _base(data)
