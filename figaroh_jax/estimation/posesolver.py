@@ -51,22 +51,22 @@ class Solution(NamedTuple):
 class NormalEquations(NamedTuple):
     """J'J, J'r and half of r'r of weighted rows."""
 
-    matrix: Float[Array, "unknowns unknowns"]
-    gradient: Float[Array, " unknowns"]
-    cost: Float[Array, ""]
+    matrix: Float[Any, "unknowns unknowns"]
+    gradient: Float[Any, " unknowns"]
+    cost: Float[Any, ""]
 
 
 class State(NamedTuple):
     """Where a search stands."""
 
-    at: Float[Array, " unknowns"]
-    step: Float[Array, " unknowns"]  # to be tried
+    at: Float[Any, " unknowns"]
+    step: Float[Any, " unknowns"]  # to be tried
     normal: NormalEquations
-    damping: Float[Array, ""]
-    growth: Float[Array, ""]
-    decrease: Float[Array, ""]  # that the step promises
-    steps: Int[Array, ""]
-    converged: Bool[Array, ""]
+    damping: Float[Any, ""]
+    growth: Float[Any, ""]
+    decrease: Float[Any, ""]  # that the step promises
+    steps: Int[Any, ""]
+    converged: Bool[Any, ""]
 
 
 def solve(
@@ -184,7 +184,7 @@ def attempt(normal_at: Callable[[Array], NormalEquations], state: State) -> Stat
     return State(at, step, normal, damping, growth, decrease, state.steps + 1, done)
 
 
-def beginning(start: Float[Array, " unknowns"]) -> State:
+def beginning(start: Float[Any, " unknowns"]) -> State:
     """The state before the first trial, which is the start itself."""
     lib = _library(start)
     zero, one = lib.zeros_like(start), lib.ones((), start.dtype)
@@ -192,7 +192,7 @@ def beginning(start: Float[Array, " unknowns"]) -> State:
     return State(start, zero, nowhere, _DAMPING * one, 2.0 * one, one, lib.zeros((), int), lib.zeros((), bool))
 
 
-def stuck(state: State) -> Bool[Array, ""]:
+def stuck(state: State) -> Bool[Any, ""]:
     """Whether no damping helps any more."""
     return state.damping >= _STUCK
 
@@ -211,7 +211,7 @@ def _going(state: State, max_steps: Any) -> Any:
 _minimise = program(_search, kept=True)
 
 
-def _damped(normal: NormalEquations, damping: Array) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
+def _damped(normal: NormalEquations, damping: Any) -> tuple[Float[Any, " unknowns"], Float[Any, ""]]:
     """Step at a damping, and the decrease of the cost that it promises; by a Cholesky factor of unit diagonal."""
     lib = _library(normal.gradient)
     size = lib.sqrt(lib.diagonal(normal.matrix))

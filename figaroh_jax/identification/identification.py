@@ -55,9 +55,10 @@ if TYPE_CHECKING:
 __all__ = ["Fit", "identify", "identify_task"]
 
 Fit = Literal["physical", "log_cholesky", "unconstrained"]
-# A direction may be loosened from where the data tell it to 3 standard deviations of the stated prior: what noise puts
-# into it stays below 3. At 1 the Panda's held-out error is 8 % above that of a prior loosened everywhere, at 1/3 4 %.
-SHOWN = 1 / 3
+# A direction is loosened as far as the noise of the data moves it by no more than so many stated standard deviations.
+# Of .5, 1, 2, 3 this one, chosen by the cross-validated error of the Panda and TIAGo; see `benchmarks/README.md`.
+MOVED = 2.0
+SHOWN = 0.01  # information of the data in a direction below which it stays as stated; 1 is the prior's own (a root)
 TRUSTS = (1.0, 3.0, 10.0, 100.0)  # multiples of the stated trust that cross-validation chooses from
 DRIVE_PRECISION = 1e-6
 DEAD = 0.5  # share of samples at one single value: such a torque is not measured
@@ -79,21 +80,33 @@ class _Problem:
     nominal: Float[np.ndarray, "links 10"]
 
     shown: Float[np.ndarray, "links10 shown"]  # directions, in prior standard deviations, that the torque shows
+    told: Float[np.ndarray, " shown"]  # root of the information that the data have on each, the prior having one
+
+    def loosened(self, slack: float) -> Float[np.ndarray, " shown"]:
+        r"""Standard deviation of each shown direction, in stated ones, with the nominal believed `slack` times less.
+
+        With the data's root information s and the deviation d an estimate is the share $k = d^2 s^2 / (1 + d^2 s^2)$ of
+        what the data alone say, whose noise is $1 / s$: $k / s$ stays below `MOVED`.
+        """
+        room = np.maximum(1.0 - MOVED * self.told, 1e-12)
+        return np.sqrt(np.clip(MOVED / (self.told * room), 1.0, slack**2))
 
     def root_at(self, slack: float) -> Float[np.ndarray, "columns columns"]:
-        """R with R'R the precision of the prior, the nominal links believed `slack` times less where torque shows it.
+        """R with R'R the precision of the prior, the nominal links believed up to `slack` times less (`loosened`).
 
         A direction that no torque shows stays as near to the nominal as was stated, however little that is believed
         elsewhere: nothing would hold it.
         """
         root, own = np.diag(np.sqrt(self.precision)), self.nominal.size
-        root[:own, :own] -= (1 - 1 / slack) * (self.shown @ self.shown.T) * np.sqrt(self.precision[:own])
+        tighter = self.shown * (1 - 1 / self.loosened(slack))
+        root[:own, :own] -= (tighter @ self.shown.T) * np.sqrt(self.precision[:own])
         return root
 
     def spread_at(self, slack: float) -> Float[np.ndarray, "columns columns"]:
         """S with SS' the covariance of that prior: the inverse of `root_at`."""
         spread, own = np.diag(1 / np.sqrt(self.precision)), self.nominal.size
-        spread[:own, :own] += (slack - 1) * (self.shown @ self.shown.T) / np.sqrt(self.precision[:own, None])
+        wider = self.shown * (self.loosened(slack) - 1)
+        spread[:own, :own] += (wider @ self.shown.T) / np.sqrt(self.precision[:own, None])
         return spread
 
 
@@ -298,8 +311,9 @@ def _problem(
     inflation = max(inflation, 1e-3)
     factor = data.factor(start.weight)[:, : nominal.size] / np.sqrt(inflation * precision[: nominal.size])
     size, direction = np.linalg.svd(factor, full_matrices=False)[1:]
-    shown = direction[size > SHOWN].T
-    return _Problem(data, base, start.weight, mean, precision, inflation, lower, links, fit, nominal, shown)
+    shown = size > SHOWN
+    prior = (mean, precision, inflation, lower, links, fit, nominal)
+    return _Problem(data, base, start.weight, *prior, direction[shown].T, size[shown])
 
 
 def _least(terms: Sequence[Effect]) -> Float[np.ndarray, " drives"]:
