@@ -113,13 +113,7 @@ class _Problem:
 def identify_task(
     task: Task, progress: Callable[[str, float], None] = lambda phase, share: None, backend: str = "native"
 ) -> Identification:
-    """Identify what a task file describes, by the named backend; `InputError` before any work where it is wrong.
-
-    >>> import figaroh_jax as fj
-    >>> found = fj.identify_task(fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml")))
-    >>> found.rank <= found.structural_rank, found.solution.reason
-    (True, '')
-    """
+    """Identify what a task file of torques describes, by the named backend; see `tasks.identify_task`."""
     from ..formats.robotfile import load_robot, stated_baseline
 
     progress("reading", 0.0)
@@ -137,6 +131,7 @@ def identify_task(
         joints=options.joints,
         bounds={name: bound.model_dump(exclude_none=True) for name, bound in options.bounds.items()},
         progress=progress,
+        check=False,
     )
     return replace(found, notes=(*notes, *implausible(model, found.model, task.robot.trust), *found.notes))
 
@@ -152,25 +147,36 @@ def identify(
     joints: Sequence[str] | None = None,
     bounds: Mapping[str, Mapping[str, Any]] | None = None,
     progress: Callable[[str, float], None] = lambda phase, share: None,
+    check: bool = True,
 ) -> Identification:
     """Fit the dynamics of `model`, a robot or a backend of it, to recordings (joint side, SI units).
 
     `known` says which friction is fitted beside the links, `trust` how far the nominal inertials are believed (relative
     one sigma; less if cross-validation says so), `joints` whose torque is fitted (default: all that have one), `bounds`
-    what CAD says of links (`consistency.bodies`). `fit` "physical" finds the best robot whose links are bodies,
-    "log_cholesky" the same by Levenberg-Marquardt, "unconstrained" leaves the links free. Raises `InputError` where the
-    input is wrong, the recordings show too little, or the fit that was asked for fails.
+    what CAD says of links: least and most mass, a box of the centre of mass (`consistency.bodies`). `fit` "physical"
+    finds the best robot whose links are bodies, "log_cholesky" the same by Levenberg-Marquardt, "unconstrained" leaves
+    the links free. `check` compares the recordings with the model first. Raises `InputError` where a recording cannot
+    be right (units, order or sign of columns, clock, standstill), shows too little, or the fit asked for fails.
+
+    >>> import figaroh_jax as fj
+    >>> task = fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml"))
+    >>> robot = fj.load_robot(task)
+    >>> found = fj.identify(robot, fj.read_recordings(task, robot), fj.Preprocess(cutoff=15))
+    >>> bool((found.fit.relative < found.nominal.relative + 1e-9).all())
+    True
     """
     from ..formats.config import Baseline, Preprocess
 
     backend = as_backend(model)
     model = backend.robot
+    warned = check_recordings(None, model, recordings) if check else ()
     with jax.enable_x64(True):
         progress("preparing signals", 0.05)
         # the cutoff alone: a band guessed from the motion costs accuracy where friction makes the motion sharp
         signals = prepare_all(tuple(recordings), preprocess or Preprocess(), slowed=False, model=model)
         terms = friction_terms(model, known or Baseline())
-        refused, notes = _refused(model, recordings, joints)
+        refused, left_out = _refused(model, recordings, joints)
+        notes = [*warned, *left_out]
         regression = Regression(backend, terms, np.zeros(model.nv), signals, refused)
         structure = structural_columns(model, terms)
         used = np.asarray(np.abs(structure).max(axis=0) > 0)
