@@ -335,8 +335,51 @@ def parquet_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
         columns[source.of((*columns, "", "x" * 300))] = source.of(odd)()
     memory = io.BytesIO()
     parquet.write_table(pa.table(columns), memory, compression=source.of(("snappy", "gzip", "none")))
-    data = memory.getvalue()
-    return mutated_bytes(data, source) if source.once_in(2) else data
+    return mutated_binary(memory.getvalue(), 4, 8, source)
+
+
+def mutated_binary(data: bytes, head: int, foot: int, source: Source) -> bytes:
+    """As it is, a few changes, or random bytes between a head and a foot that stay: what crashes readers in C."""
+    if source.once_in(3):
+        return data
+    if source.once_in(2) or len(data) <= head + foot:
+        return mutated_bytes(data, source)
+    inside = np.frombuffer(data[head : len(data) - foot], np.uint8).copy()
+    count = source.of((1, 10, 100, len(inside)))
+    inside[source.array.integers(0, len(inside), count)] = source.array.integers(0, 256, count)
+    return data[:head] + inside.tobytes() + data[len(data) - foot :]
+
+
+def mat_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
+    from scipy.io import savemat
+
+    arrays: dict[str, Any] = dict(bench.arrays)
+    for _ in range(source.random.choice((0, 1, 2))):
+        arrays[source.of((*arrays, "log", "a" * 31))] = odd_array(bench.arrays[source.of(bench.arrays)], source)
+    arrays["log"] = {name: arrays[name] for name in list(arrays)[:2]}
+    memory = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            savemat(memory, arrays, do_compression=source.once_in(2), format=source.of(("5", "5", "4")))
+        except (TypeError, ValueError, AttributeError):  # what MATLAB has no kind for
+            savemat(memory := io.BytesIO(), bench.arrays)
+    return mutated_binary(memory.getvalue(), 128, 0, source)
+
+
+def hdf5_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
+    import h5py
+
+    memory = io.BytesIO()
+    with h5py.File(memory, "w") as opened:
+        for name, values in bench.arrays.items():
+            odd = odd_array(values, source) if source.once_in(3) else values
+            try:
+                packed = {"compression": "gzip", "chunks": True} if source.once_in(2) and odd.size > 9 else {}
+                opened.create_dataset(name, data=odd, **packed)
+            except (TypeError, ValueError):  # what HDF5 has no kind for
+                opened.create_dataset(name, data=values)
+    return mutated_binary(memory.getvalue(), 8, 0, source)
 
 
 COMMANDS = {  # what may follow each: right words often, wrong ones now and then
@@ -620,6 +663,8 @@ KINDS: dict[str, tuple[str, int, Callable[..., bytes], Callable[[Bench, Path], N
     "npz": ("fuzzed.npz", 5, npz_input, read_recording),
     "csv": ("fuzzed.csv", 5, csv_input, read_recording),
     "parquet": ("fuzzed.parquet", 3, parquet_input, read_recording),
+    "mat": ("fuzzed.mat", 3, mat_input, read_recording),
+    "hdf5": ("fuzzed.h5", 3, hdf5_input, read_recording),
     "effects": ("effects.yaml", 2, text_input("effects.yaml"), read_model),
     "argv": ("argv.json", 6, argv_input, run_command),
     "run": ("run.bin", 2, json_input(lambda bench: bench.run_files), read_run_files),

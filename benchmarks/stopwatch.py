@@ -165,7 +165,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as top:
         if asked.wheel:
             command, extra = installed(asked.wheel, Path(top) / "venv")
-            print(f"pip install: {extra:.0f} s", flush=True)
+            print(f"pip install: {extra:.0f} s, load {os.getloadavg()[0]:.1f}", flush=True)
         for seed, (name, write) in enumerate(FORMATS.items()):
             folder = Path(top) / f"case{seed}"
             folder.mkdir()
@@ -173,7 +173,8 @@ def main() -> int:
             within = extra + seconds <= 300 and commands + 1 <= 3
             good += said.startswith("right") and within
             print(
-                f"{name}: {seconds:.0f} s ({extra + seconds:.0f} s from pip install), {commands + 1} commands; {said}",
+                f"{name}: {seconds:.0f} s ({extra + seconds:.0f} s from pip install), {commands + 1} commands,"
+                f" load {os.getloadavg()[0]:.1f}; {said}",
                 flush=True,
             )
     print(f"{good} of {len(FORMATS)} within 300 s and 3 commands, no file edited")

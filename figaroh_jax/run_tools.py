@@ -1,4 +1,4 @@
-"""Commands before and after a run: `new`, `verify`, `compare`, `list`, and what `rerun` runs again.
+"""Commands before and after a run: `new`, `verify`, `compare`, `list`, `view`, and what `rerun` runs again.
 
 Each function takes the parsed arguments, prints and gives the exit status.
 """
@@ -19,7 +19,7 @@ from .reporting.run_directory import write_file
 if TYPE_CHECKING:
     from .recordings.draft import Draft
 
-__all__ = ["command_of", "compare", "list", "migrate", "new", "verify"]
+__all__ = ["command_of", "compare", "list", "migrate", "new", "verify", "view"]
 
 
 def new(args: argparse.Namespace) -> int:
@@ -35,7 +35,8 @@ def new(args: argparse.Namespace) -> int:
             raise InputError(f"--rate {args.rate}: expected a positive number of Hz")
         constants, gains = _numbers(args.constants, "--constants"), _numbers(args.kp, "--kp")
         known = {"rate": args.rate, "unit": args.unit, "topic": args.topic, "constants": constants, "gains": gains}
-        return draft_task(args.model, args.recordings, joints=joints, **known)
+        gears = _numbers(args.gears, "--gears")
+        return draft_task(args.model, args.recordings, joints=joints, gears=gears, **known)
 
     draft = _asked(args, drafted) if args.interactive else drafted()
     if args.json:
@@ -69,7 +70,7 @@ def migrate(args: argparse.Namespace) -> int:
 
 def _asked(args: argparse.Namespace, drafted: Callable[[], Draft]) -> Draft:
     """The draft, once the user has answered what the recordings cannot decide; an empty answer gives up."""
-    from .recordings.draft import Undecided
+    from .recordings.draft_columns import Undecided
 
     while True:
         try:
@@ -122,6 +123,21 @@ def compare(args: argparse.Namespace) -> int:
     _print(sections, args.json, comparison_text(sections))
     if args.out and not args.json:
         print(f"\nPage: {args.out}")
+    return 0
+
+
+def view(args: argparse.Namespace) -> int:
+    """The robot of a run in a browser, until the command is interrupted."""
+    from .reporting.robot_view import show_run
+
+    if not 0 < args.port < 65536:
+        raise InputError(f"--port {args.port}: expected a number from 1 to 65535")
+    server = show_run(args.run, args.port)
+    print(f"The robot of {args.run}: http://localhost:{args.port} (Ctrl-C ends)", file=sys.stderr, flush=True)
+    try:
+        server.sleep_forever()
+    finally:
+        server.stop()
     return 0
 
 

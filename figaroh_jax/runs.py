@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -199,15 +198,14 @@ def _run_folder(
 def _identify_rollouts(task: Task, out: Path, progress: Callable[[str, float], None]) -> RolloutIdentification:
     from .formats.export import write_model
     from .reporting.answer import write_predictions
+    from .reporting.rollout_report import write_rollouts
     from .rollouts.identification import identify_rollout_task
 
     found = identify_rollout_task(task, progress)
     progress("writing the report", 1.0)
     with _run_folder(task, out, "identify") as folder:
         (folder / RESULT).write_text(found.to_json(), encoding="utf-8")
-        lines = html.escape("\n".join(found.lines()))
-        page = f"<!doctype html><meta charset='utf-8'><title>{RESULT}</title><pre>{lines}</pre>\n"
-        (folder / REPORT).write_text(page, encoding="utf-8")
+        write_rollouts(found, folder / REPORT, found.model.robot.name)
         write_predictions(folder / "predictions.npz", found.predictions, "position")
         write_model(found.model, folder / "model")
         _write_loop(folder / "model", found.loop)
@@ -430,12 +428,15 @@ def _identification_json(found: Identification | RolloutIdentification) -> str:
 
 def _show_identification(found: Identification | RolloutIdentification, verbose: bool = False) -> None:
     from .identification.result import Identification
-    from .reporting.terminal import show_identification
 
     if isinstance(found, Identification):
+        from .reporting.terminal import show_identification
+
         show_identification(found, found.model.robot.name, verbose=verbose)
     else:
-        print(fitted("\n".join(found.lines())))
+        from .reporting.rollout_report import show_rollouts
+
+        show_rollouts(found, found.model.robot.name, verbose=verbose)
 
 
 def _calibration_json(calibration: Calibration) -> str:

@@ -16,6 +16,7 @@ from figaroh_jax.formats.config import load_task
 from figaroh_jax.formats.robotfile import load_robot
 from figaroh_jax.recordings.dataset import read_recordings
 from figaroh_jax.recordings.draft import draft_task
+from figaroh_jax.recordings.draft_columns import Undecided
 
 
 @pytest.fixture(scope="module")
@@ -137,3 +138,50 @@ def test_a_recording_of_matlab_is_read_like_any_other(made, tmp_path: Path):
     (tmp_path / "bad.mat").write_bytes((tmp_path / "run.mat").read_bytes()[:3000])
     with pytest.raises(InputError, match="bad.mat"):
         draft_task(urdf, [tmp_path / "bad.mat"])
+
+
+def test_positions_of_motors_ask_for_gears(made, tmp_path: Path):
+    urdf, _, (run, *_) = made
+    gears = np.array([50.0, -80.0, 200.0])
+    np.savez(tmp_path / "run.npz", t=run["time"], motor_position=run["position"] * gears, tau=run["torque"])
+    with pytest.raises(Undecided, match="named for motors: give --gears"):
+        draft_task(urdf, [tmp_path / "run.npz"])
+    draft = draft_task(urdf, [tmp_path / "run.npz"], gears=[*gears])
+    _, _, (recording,) = read_back(draft.text, tmp_path)
+    np.testing.assert_allclose(recording.position, run["position"], rtol=0, atol=1e-12)
+    assert any("coupled" in line for line in draft.assumed)
+
+
+def test_a_torque_that_the_model_does_not_bear_out_is_taken_where_the_user_says_so(made, tmp_path: Path):
+    """A real drive's friction may hide gravity: refused, until signs and constants are stated."""
+    urdf, _, (run, *_) = made
+    noise = np.random.default_rng(1).normal(size=run["torque"].shape)
+    np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"], tau=noise)
+    with pytest.raises(Undecided, match="does not follow what the model needs") as caught:
+        draft_task(urdf, [tmp_path / "run.npz"])
+    assert caught.value.option == "constants"
+    draft = draft_task(urdf, [tmp_path / "run.npz"], constants=[1.0, 1.0, 1.0])
+    assert any("nothing tells them" in line for line in draft.assumed)
+    assert read_back(draft.text, tmp_path)[2][0].torque is not None
+
+
+def test_a_torque_without_sign_is_left_out_beside_a_command(made, tmp_path: Path):
+    urdf, _, (run, *_) = made
+    arrays = {"t": run["time"], "q": run["position"], "command": run["position"]}
+    np.savez(tmp_path / "run.npz", **arrays, torque_abs=np.abs(run["torque"]))
+    draft = draft_task(urdf, [tmp_path / "run.npz"], gains=[9.0, 8.0, 7.0])
+    assert yaml.safe_load(draft.text)["data"][0].keys() >= {"command"} and "torque_abs:" not in draft.text
+    assert any("torque_abs never changes its sign" in line for line in draft.assumed)
+
+
+def test_measured_postures_are_told_what_to_write(made, tmp_path: Path):
+    urdf, joints, (run, *_) = made
+    points = np.random.default_rng(0).normal(size=(30, 3))
+    columns = {f"{axis}1": points[:, k] for k, axis in enumerate("xyz")}
+    columns |= {joint: run["position"][:30, j] for j, joint in enumerate(joints)}
+    with pytest.raises(InputError, match="a task of `calibrate`") as caught:
+        draft_task(urdf, [table(tmp_path / "postures.csv", columns)])
+    shown = "\n".join(line for line in str(caught.value).splitlines() if line.startswith("  "))
+    shown = shown.replace("MODEL", str(urdf)).replace("BASE", "base").replace("TOOL", "tool0")
+    (tmp_path / "task.yaml").write_text(shown)
+    assert load_task(tmp_path / "task.yaml").data[0].measurement is not None

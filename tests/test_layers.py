@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -57,10 +58,11 @@ class _Used(ast.NodeVisitor):
             self.found.add(node.module.split(".")[0])
 
 
-def _imports(path: Path, *, lazy: bool) -> set[str]:
+@cache
+def _imports(path: Path, *, lazy: bool) -> frozenset[str]:
     used = _Used(path, lazy)
     used.visit(ast.parse(path.read_text(encoding="utf-8")))
-    return used.found
+    return frozenset(used.found)
 
 
 def test_modules_import_each_other_without_cycles():

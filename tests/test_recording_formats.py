@@ -14,7 +14,8 @@ from figaroh_jax.errors import InputError
 from figaroh_jax.formats.config import load_task
 from figaroh_jax.formats.robotfile import load_robot
 from figaroh_jax.recordings.dataset import Recording, read_recordings
-from figaroh_jax.recordings.draft import Undecided, draft_task
+from figaroh_jax.recordings.draft import draft_task
+from figaroh_jax.recordings.draft_columns import Undecided
 from figaroh_jax.recordings.progress import listener
 from figaroh_jax.recordings.reading import read_table
 

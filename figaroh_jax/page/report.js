@@ -54,7 +54,7 @@
     }
     const both = Boolean(series.measured);
     const axes = { xaxis: { text: "time, s", options: { anchor: both ? "y2" : "y" } } };
-    axes.yaxis = { text: "torque, " + joint.unit, options: { domain: both ? [0.46, 1] : [0, 1] } };
+    axes.yaxis = { text: data.quantity + ", " + joint.unit, options: { domain: both ? [0.46, 1] : [0, 1] } };
     if (both) axes.yaxis2 = { text: "residual, " + joint.unit, options: { domain: [0, 0.4] } };
     return [traces, layout(colour, { axes, shapes: both ? floor(colour, joint.noise, { x: "paper", y: "y2" }) : [] })];
   };

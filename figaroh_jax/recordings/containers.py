@@ -145,9 +145,9 @@ def read_parquet(file: Path) -> Table:
             check_columns(file, opened.metadata.num_columns)
             size = 8 * opened.metadata.num_rows * opened.metadata.num_columns
             size = max(size, sum(opened.metadata.row_group(k).total_byte_size for k in range(opened.num_row_groups)))
-        if size > LARGEST:
-            raise InputError(f"{file}: its columns take {size >> 20} MiB; at most {LARGEST >> 20} MiB are read")
-        table = parquet.read_table(file)
+            if size > LARGEST:
+                raise InputError(f"{file}: its columns take {size >> 20} MiB; at most {LARGEST >> 20} MiB are read")
+            table = opened.read()  # `parquet.read_table` would load pandas, where that is installed
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
         raise InputError(f"{file} is not a Parquet file: {error}") from error
     return _arrow(file, table)
@@ -212,7 +212,8 @@ def read_lerobot(folder: Path, source: Source) -> Table:
     chosen = [episode for episode in episodes if episode.number == wanted]
     if not chosen:
         raise InputError(f"{folder}: has no episode {wanted}; there are {_span(known)}")
-    table = parquet.read_table(chosen[0].file)
+    with parquet.ParquetFile(chosen[0].file) as opened:
+        table = opened.read()
     if "episode_index" in table.column_names:
         table = table.filter(table.column("episode_index").to_numpy() == wanted)
     whole = _arrow(folder, table)
@@ -265,7 +266,8 @@ def _episodes(folder: Path, info: dict[str, Any]) -> list[_Episode]:
 
     found = []
     for file in files:
-        column = parquet.read_table(file, columns=["episode_index"]).column("episode_index").to_numpy()
+        with parquet.ParquetFile(file) as opened:
+            column = opened.read(columns=["episode_index"]).column("episode_index").to_numpy()
         found += [_Episode(int(k), file) for k in np.unique(column)]
     return sorted(found)
 

@@ -6,7 +6,6 @@ can. What stays open is refused, what was assumed is said in the draft's comment
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,46 +18,13 @@ from ..formats.config import RecordingEntry
 from ..formats.robotfile import read_robot
 from ..rigid.model import RobotModel, prismatic
 from .checks import DEGREE, Finding, check_recording, position_findings
-from .containers import lerobot_episodes
 from .dataset import Recording
+from .draft_columns import Columns, Undecided, read_columns, without_sign
 from .likeness import Sampled, likeness, rigid_torque, sampled
-from .reading import BAGS, kind_of, read_table
-from .tables import Source, Table
 
 __all__ = ["Draft", "Undecided", "draft_task"]
 
-_WORDS = {
-    "command": {
-        "cmd",
-        "command",
-        "commanded",
-        "des",
-        "desired",
-        "target",
-        "ref",
-        "reference",
-        "setpoint",
-        "goal",
-        "action",
-    },
-    "velocity": {"dq", "qd", "vel", "velocity", "velocities", "speed", "qdot", "v"},
-    "current": {"i", "current", "currents", "cur", "amp", "amps", "percent", "load"},
-    "torque": {"tau", "torque", "torques", "effort", "efforts", "eff", "trq", "force", "j"},
-    "position": {"q", "pos", "position", "positions", "angle", "angles", "theta", "state"},
-}
-_TIMES = ("t", "time", "timestamp", "timestamps", "stamp", "stamps", "sec", "seconds", "clock", "header.stamp")
-_CLOCKS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_SLOW, _FAST = 15.0, 14000.0  # Hz; their ratio is below a thousand, so that one unit of time alone fits
-_HUGE = 1e12  # beyond it no column is a recording in any unit
 CONFIRMED = 0.5  # of a torque's variance that its own joint explains, before it says anything of the order
-
-
-class Undecided(InputError):
-    """What the data cannot decide; `option` is the option of the command by which a user does."""
-
-    def __init__(self, option: str, text: str) -> None:
-        super().__init__(text)
-        self.option = option
 
 
 class Draft(NamedTuple):
@@ -66,20 +32,6 @@ class Draft(NamedTuple):
 
     text: str
     assumed: tuple[str, ...]
-
-
-class _Read(NamedTuple):
-    """One recording: its columns by kind and what they hold, in the model's units."""
-
-    file: Path
-    entry: dict[str, Any]
-    joints: tuple[str, ...]  # of the columns, in their order
-    named: bool  # whether the columns' names hold the joints' names
-    time: Float[np.ndarray, " samples"]
-    position: Float[np.ndarray, "samples joints"]
-    torque: Float[np.ndarray, "samples joints"] | None
-    current: str  # unit of a torque that is none: "A", "mA", "%"; else empty
-    command: Float[np.ndarray, "samples joints"] | None = None
 
 
 def draft_task(
@@ -92,11 +44,13 @@ def draft_task(
     unit: str | None = None,
     topic: str | None = None,
     gains: Sequence[float] | None = None,
+    gears: Sequence[float] | None = None,
 ) -> Draft:
     """A task for `diagnose` and `identify` on these recordings; `joints` names their columns, `rate` (Hz) their clock.
 
-    `constants` are N m a unit of each torque column, `gains` the proportional gains of the position servos (N m/rad),
-    both in the order of the joints; `unit` (rad, deg, m, mm) is that of the positions, `topic` that of bags.
+    `constants` are N m a unit of each torque column, `gears` motor turns a joint turn where positions are those of
+    motors, `gains` the proportional gains of the position servos (N m/rad), all in the order of the joints; `unit`
+    (rad, deg, m, mm) is that of the positions, `topic` that of bags.
 
     Raises `InputError` for what cannot be read, and `Undecided` for what the data do not decide.
     """
@@ -104,250 +58,67 @@ def draft_task(
     for name in joints or ():
         if name not in whole.joint_names:
             raise InputError(f"--joints: robot '{whole.name}' has no joint '{name}'{nearest(name, whole.joint_names)}")
-    reads = [_read(table, whole, joints, rate, entry) for table, entry in _tables(files, topic)]
+    reads = read_columns(files, whole, joints, rate, topic)
     if len({read.joints for read in reads}) > 1:
         raise InputError("the recordings hold different joints; draft a task for each kind")
     robot = read_robot(model, reads[0].joints)
     assumed = [*dict.fromkeys(_clock_said(reads))]
     _doubt_percent(reads, unit)
+    for option, given in (("--constants", constants), ("--gears", gears)):
+        if given is not None and len(given) != robot.nv:
+            raise InputError(f"{option}: {len(given)} numbers, expected one for each of {', '.join(robot.dof_names)}")
+    reads, motors = _joint_side(robot, reads, gears)
     unit = unit or _unit_of_position(robot, reads)
     factor = np.where(np.array(prismatic(robot)), {"deg": 1.0, "mm": 1e-3}.get(unit, 1.0), _degrees(unit))
     reads = [
         read._replace(position=read.position * factor, command=None if read.command is None else read.command * factor)
         for read in reads
     ]
-    if constants is not None and len(constants) != robot.nv:
-        raise InputError(
-            f"--constants: {len(constants)} numbers, expected one for each of {', '.join(robot.dof_names)}"
-        )
     signs, said = _torques(robot, reads) if constants is None else ([*constants], ["torque constants as given"])
     drives, more = _drives(model, robot, reads, gains)
     said += more
-    _refuse_what_is_wrong(robot, reads, signs)
+    said += _refuse_what_is_wrong(robot, reads, signs, stated=constants is not None)
     labels = _repeats(reads)
-    assumed += [_unit_said(unit, robot), *said]
-    return Draft(_text(model, robot, whole, reads, unit, signs, labels, assumed, drives), tuple(assumed))
+    assumed += [*motors, _unit_said(unit, robot), *said]
+    text = _text(model, robot, whole, reads, unit, signs, labels, assumed, drives, gears)
+    return Draft(text, tuple(assumed))
 
 
 def _degrees(unit: str) -> float:
     return DEGREE if unit == "deg" else 1.0
 
 
-# Columns
-
-
-def _tables(files: Sequence[Path], topic: str | None) -> Iterator[tuple[Table, dict[str, Any]]]:
-    """Every recording with the keys of a task that say which it is; of a folder of episodes the first few."""
-    for file in files:
-        path = file.resolve()
-        if kind_of(file) == "lerobot":
-            for episode in lerobot_episodes(file)[:_EPISODES]:
-                source = Source(episode=episode)
-                yield read_table(file, "recording", source), {"file": str(path), "episode": episode}
-            continue
-        if kind_of(file) in BAGS:
-            try:
-                table = read_table(file, "recording", Source(topic=topic))
-            except InputError as error:
-                raise (Undecided("topic", str(error)) if "must name the one" in str(error) else error) from None
-            yield table, {"file": str(path)} | ({} if topic is None else {"topic": topic})
-            continue
-        table = read_table(file, "recording")
-        form = next((form for form, mark in _LOG_MARKS.items() if mark & set(table.names)), None)
-        if form is not None:
-            table = read_table(file, "recording", Source(form=form))
-        yield table, {"file": str(path)} | ({} if form is None else {"format": form})
-
-
-_EPISODES = 8
-_LOG_MARKS = {"rtde": {"actual_q_0"}, "libfranka": {"tau_J[0]", "state.tau_J[0]"}}
-
-
-def _read(
-    table: Table, model: RobotModel, joints: Sequence[str] | None, rate: float | None, entry: dict[str, Any]
-) -> _Read:
-    form = entry.get("format")
-    clock = (_LOGGED[form]["time"] if form else _time(table)) if rate is None else None
-    kinds = _logged(table, _LOGGED[form]) if form else _kinds(table, clock)
-    if "position" not in kinds:
-        raise InputError(
-            f"{table.file}: no column looks like a position (q, pos, position, angle...); its columns are"
-            f" {', '.join(table.names[:12])}{'...' if len(table.names) > 12 else ''}"
-        )
-    names, sources, named = _of_joints(table, kinds["position"], model, joints, "position")
-    position = _matrix(table, sources, names, "position")
-    if form is None or sources != _LOGGED[form]["position"]:
-        entry = entry | {"position": sources}
-    torque, current, command = None, "", None
-    for kind in ("torque", "current", "velocity", "command"):
-        if kind not in kinds or (kind in ("current", "command") and torque is not None):
-            continue
-        own, source, by_name = _of_joints(table, kinds[kind], model, list(names), kind)
-        if own != names:
-            raise InputError(f"{table.file}: {kind} is of {', '.join(own)}, position of {', '.join(names)}")
-        values = _matrix(table, source, names, kind)
-        if len(values) != len(position):
-            raise InputError(f"{table.file}: {kind} has {len(values)} samples, position {len(position)}")
-        key = "torque" if kind == "current" else kind
-        if form is None or source != _LOGGED[form].get(key):
-            entry[key] = source
-        if kind == "command":
-            command = values
-        elif kind != "velocity":
-            torque, named = values, named and by_name
-            current = _unit_of_current(source) if kind == "current" else ""
-    time, entry = _stamps(table, clock, rate, len(position), entry)
-    if form is not None and rate is None:
-        del entry["time"]
-    return _Read(table.file, entry, names, named, time, position, torque, current, command)
-
-
-_LOGGED = {
-    "rtde": {"time": "timestamp", "position": "actual_q", "current": "actual_current", "torque": "actual_current"},
-    "libfranka": {"time": "time", "position": "q", "torque": "tau_J"},
-}
-
-
-def _logged(table: Table, known: dict[str, str]) -> dict[str, list[str]]:
-    """The columns of a robot's own log, by the prefixes of its format."""
-    wanted = {k: prefix for k, prefix in known.items() if k != "time" and not (k == "torque" and "current" in known)}
-    pattern = {kind: re.compile(re.escape(prefix) + r"[_\[]\d+\]?") for kind, prefix in wanted.items()}
-    found = {kind: [name for name in table.names if mark.fullmatch(name)] for kind, mark in pattern.items()}
-    return {kind: names for kind, names in found.items() if names}
-
-
-def _unit_of_current(source: Any) -> str:
-    words = set(_words(" ".join([source] if isinstance(source, str) else source)))
-    return "%" if words & {"percent", "load"} else "mA" if "ma" in words else "A"
-
-
-def _words(name: str) -> list[str]:
-    return [word for word in re.split(r"[^a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()) if word]
-
-
-def _time(table: Table) -> str:
-    found = [name for name in table.names if name.lower() in _TIMES]
-    if not found and "received" in table.names:  # when a bag got a message that has no stamp of its own
-        return "received"
-    found = found or [n for n in table.names if set(_words(n)) & {*_TIMES} and not set(_words(n)) & {"des", "cmd"}]
-    if len(found) != 1:
-        what = f"several columns look like one: {', '.join(found)}" if found else "no column looks like one"
-        raise Undecided(
-            "rate", f"{table.file}: which column is the time? {what}; give --rate HZ, or rename it to 'time'"
-        )
-    return found[0]
-
-
-def _stamps(
-    table: Table, clock: str | None, rate: float | None, samples: int, entry: dict[str, Any]
-) -> tuple[Float[np.ndarray, " samples"], dict[str, Any]]:
-    """Time in s, and the entry with the key that says so."""
-    if clock is None:
-        assert rate is not None
-        return np.arange(samples) / rate, entry | {"rate": rate}
-    time = table.vector(clock, "time")
-    if len(time) != samples or not (np.diff(time) > 0).all():
-        raise InputError(f"{table.file}: '{clock}' is no clock of the positions: it does not increase, or is shorter")
-    step = float(np.median(np.diff(time)))
-    unit = next((u for u, s in _CLOCKS.items() if _SLOW <= 1 / (step * s) <= _FAST), None)
-    if unit is None:
-        raise Undecided(
-            "rate",
-            f"{table.file}: '{clock}' steps by {step:.4g}, which is no rate from {_SLOW:g} to {_FAST:g} Hz in s, ms, us"
-            " or ns; give --rate HZ",
-        )
-    return (time - time[0]) * _CLOCKS[unit], entry | {"time": clock} | (
-        {"units": {"time": unit}} if unit != "s" else {}
-    )
-
-
-def _kinds(table: Table, clock: str | None) -> dict[str, list[str]]:
-    """Columns or arrays by what their names say that they hold."""
-    found: dict[str, list[str]] = {}
-    for name in table.names:
-        words = _words(name)
-        kind = next(
-            (k for k, known in _WORDS.items() if known & set(words) and not (k == "torque" and words == ["j"])), None
-        )
-        kind = name.partition(".")[0] if name.partition(".")[0] in _OF_BAGS else kind
-        if name != clock and kind is not None and not name.startswith("/") and not _has_parts(name, table.names):
-            found.setdefault("torque" if kind == "effort" else kind, []).append(name)
-    return {kind: _plainest(names) for kind, names in found.items()}
-
-
-_OF_BAGS = ("position", "velocity", "effort", "command")
-
-
-def _has_parts(name: str, names: Sequence[str]) -> bool:
-    """Whether the columns of an array are named one by one too."""
-    return any(other.startswith(f"{name}.") for other in names)
-
-
-def _plainest(names: list[str]) -> list[str]:
-    """Of several sets of columns the plain one: `q`, not `q_filt`."""
-    plain = [name for name in names if not _SHADES & set(_words(name))]
-    return plain or names
-
-
-_SHADES = {"filt", "filtered", "raw", "smooth", "smoothed", "est", "estimated", "ext", "external", "residual"}
-
-
-def _of_joints(
-    table: Table, columns: list[str], model: RobotModel, joints: Sequence[str] | None, kind: str
-) -> tuple[tuple[str, ...], Any, bool]:
-    """Joints of a kind's columns in the model's order, what the task says of them, and whether names decided it."""
-    wanted = list(joints or model.joint_names)
-    by_name = {joint: c for joint in wanted for c in columns if _holds(c, joint, model.joint_names)}
-    if by_name and (joints is None or len(by_name) == len(wanted)):
-        names = tuple(joint for joint in model.joint_names if joint in by_name)
-        if len(names) < len(columns) and joints is None:
-            rest = [c for c in columns if c not in by_name.values()]
-            text = f"{table.file}: {kind}: which joints are {', '.join(rest)}? Name all joints by --joints"
-            raise Undecided("joints", text)
-        return names, [by_name[joint] for joint in names], True
-    if len(columns) == 1 and table.read(columns[0]).ndim == 2:
-        count, source = table.read(columns[0]).shape[1], columns[0]
-    else:
-        numbered = sorted(columns, key=_number)
-        prefixes = {re.sub(r"\d+", "#", name) for name in columns}
-        if len(prefixes) > 1 and len(columns) > 1:
-            raise InputError(f"{table.file}: several sets of columns look like {kind}: {', '.join(columns[:8])}")
-        count, source = len(columns), numbered
-    if joints is None and count != len(model.joint_names):
-        raise Undecided(
-            "joints",
-            f"{table.file}: {count} columns of {kind}, but the robot has {len(model.joint_names)} joints"
-            f" ({', '.join(model.joint_names)}); name theirs in the columns' order by --joints",
-        )
-    if count != len(wanted):
-        raise InputError(f"{table.file}: {count} columns of {kind}, but --joints names {len(wanted)}")
-    return tuple(wanted), source, False
-
-
-def _holds(column: str, joint: str, names: Sequence[str]) -> bool:
-    """Whether a column's name holds a joint's, and no longer joint name that contains it."""
-    own = re.search(rf"(?<![A-Za-z0-9]){re.escape(joint)}(?![A-Za-z0-9])", column)
-    longer = [n for n in names if n != joint and joint in n and n in column]
-    return own is not None and not longer
-
-
-def _number(name: str) -> tuple[int, ...]:
-    return tuple(int(digits) for digits in re.findall(r"\d+", name))
-
-
-def _matrix(table: Table, source: Any, joints: Sequence[str], key: str) -> Float[np.ndarray, "samples joints"]:
-    values = np.asarray(table.matrix(source, joints, key), float)
-    wrong = np.argwhere(~(np.abs(values) < _HUGE))
-    if len(wrong) and key != "velocity":  # which no draft uses
-        row, column = wrong[0]
-        raise InputError(f"{table.file}: {key} of {joints[column]} is {values[row, column]:.4g} in row {row} (from 0)")
-    return values
-
-
 # What the values say
 
 
-def _unit_of_position(robot: RobotModel, reads: Sequence[_Read]) -> str:
+def _joint_side(
+    robot: RobotModel, reads: Sequence[Columns], gears: Sequence[float] | None
+) -> tuple[list[Columns], list[str]]:
+    """Positions of the joints where the columns are those of motors, and what is not known of them then."""
+    names = ", ".join(robot.dof_names)
+    if gears is None:
+        motor = next((read for read in reads if read.motor), None)
+        if motor is not None:
+            raise Undecided(
+                "gears",
+                f"{motor.file}: the position's columns are named for motors: give --gears, motor turns a joint turn"
+                f" with their signs, in the order of the joints {names} (1 where they are on the joint side)",
+            )
+        return [*reads], []
+    if not np.isfinite(gears).all() or not np.all(gears):
+        raise InputError(f"--gears: expected numbers other than zero for {names}")
+    ratio = np.asarray(gears)
+    turned = [
+        read._replace(position=read.position / ratio, command=None if read.command is None else read.command / ratio)
+        for read in reads
+    ]
+    return turned, [
+        f"gears as given; order, sign and unit of {names} are taken as they are, and nothing tells whether joints are"
+        " coupled or have other zeros: see transmission.position and transmission.offset"
+    ]
+
+
+def _unit_of_position(robot: RobotModel, reads: Sequence[Columns]) -> str:
     """rad or deg (m or mm) that fits the model's limits and, where both do, the torque."""
     every = np.concatenate([read.position for read in reads])
     straight = np.array(prismatic(robot))
@@ -373,7 +144,7 @@ def _unit_of_position(robot: RobotModel, reads: Sequence[_Read]) -> str:
     )
 
 
-def _doubt_percent(reads: Sequence[_Read], unit: str | None) -> None:
+def _doubt_percent(reads: Sequence[Columns], unit: str | None) -> None:
     """LeRobot may keep positions as degrees or as a share of the range of motion, -100 to 100, which look alike."""
     for read in reads if unit is None else ():
         span = np.abs(read.position).max()
@@ -385,7 +156,7 @@ def _doubt_percent(reads: Sequence[_Read], unit: str | None) -> None:
             )
 
 
-def _unlike(robot: RobotModel, read: _Read, unit: str) -> float:
+def _unlike(robot: RobotModel, read: Columns, unit: str) -> float:
     """Share of the heavy joints' torque that a reading does not explain."""
     straight = np.array(prismatic(robot))
     factor = np.where(straight, 1e-3 if unit == "mm" else 1.0, _degrees(unit))
@@ -410,17 +181,13 @@ class _Scale(NamedTuple):
     told: str  # "gravity", "friction" or nothing
 
 
-def _torques(robot: RobotModel, reads: Sequence[_Read]) -> tuple[list[float] | None, list[str]]:
+def _torques(robot: RobotModel, reads: Sequence[Columns]) -> tuple[list[float] | None, list[str]]:
     """Factor from each torque column to N m (None: they are N m already), and what was assumed."""
     motions = [sampled(read.time, read.position, read.torque) for read in reads if read.torque is not None]
     motions = [motion for motion in motions if motion is not None]
     if not motions:
-        known = all(read.command is not None for read in reads)
-        said = "rollouts of the command" if known else "neither diagnose nor identify can use them without"
-        return None, [f"the recordings hold no torque: {said}"]
-    lowest = np.min([read.torque.min(axis=0) for read in reads if read.torque is not None], axis=0)
-    highest = np.max([read.torque.max(axis=0) for read in reads if read.torque is not None], axis=0)
-    if ((lowest >= 0) | (highest <= 0)).all() and robot.nv > 1:
+        return None, _without_torque(robot, reads)
+    if without_sign(*(read.torque for read in reads if read.torque is not None)):
         raise InputError(f"{reads[0].file}: no joint's torque changes its sign: an absolute value tells no direction")
     _order(robot, reads, motions)
     scales = [_scale(robot, motions, j) for j in range(robot.nv)]
@@ -451,6 +218,19 @@ def _torques(robot: RobotModel, reads: Sequence[_Read]) -> tuple[list[float] | N
         told = [n for n, s in zip(names, scales, strict=True) if s.told]
         said.append(f"no column names a joint; gravity or friction bear the order out at {', '.join(told) or 'none'}")
     return ([-1.0 if n in turned else 1.0 for n in names] if turned else None), said
+
+
+def _without_torque(robot: RobotModel, reads: Sequence[Columns]) -> list[str]:
+    if any(read.command is None for read in reads):
+        return ["the recordings hold no torque: neither diagnose nor identify can use them without"]
+    said = [f"{read.unsigned} never changes its sign: no torque, and left out" for read in reads[:1] if read.unsigned]
+    said.append("the recordings hold no torque: rollouts of the command")
+    if not all(read.named for read in reads):
+        said.append(
+            f"order, sign and unit of {', '.join(robot.dof_names)} are taken as they are: no column names a joint, and"
+            " nothing tells them but that positions follow commands within the limits"
+        )
+    return said
 
 
 def _constants(names: Sequence[str], scales: Sequence[_Scale]) -> str:
@@ -488,7 +268,7 @@ def _friction(motion: Sampled, joint: int) -> float:
     return float(x @ s / size) if size > 0 else 0.0
 
 
-def _order(robot: RobotModel, reads: Sequence[_Read], motions: Sequence[Sampled]) -> None:
+def _order(robot: RobotModel, reads: Sequence[Columns], motions: Sequence[Sampled]) -> None:
     """Refuse torque columns that another joint's motion explains much better than their own."""
     from scipy.optimize import linear_sum_assignment
 
@@ -529,26 +309,42 @@ def _explained(robot: RobotModel, motion: Sampled) -> Float[np.ndarray, "nv nv"]
     return out
 
 
-def _refuse_what_is_wrong(robot: RobotModel, reads: Sequence[_Read], signs: list[float] | None) -> None:
-    """The check of recordings on the draft's own reading: a draft that it would warn of is not written."""
-    factor = np.ones(robot.nv) if signs is None else np.array(signs)
+def _refuse_what_is_wrong(
+    robot: RobotModel, reads: Sequence[Columns], signs: list[float] | None, *, stated: bool
+) -> list[str]:
+    """The check of recordings on the draft's own reading: a draft that it would warn of is not written.
+
+    Where the user has `stated` signs and constants, a torque that does not follow the model is said, and no more.
+    """
+    factor, said = np.ones(robot.nv) if signs is None else np.array(signs), list[str]()
     for read in reads:
         torque = None if read.torque is None else read.torque * factor
         recording = Recording(read.file.stem, read.file, robot.dof_names, read.time, read.position, torque=torque)
         entry = RecordingEntry(file=read.file, position="q", rate=1.0)
         grave = [f for f in check_recording(recording, robot, entry) if f.wrong or _decides(f)]
-        if grave:
+        doubts = [f for f in grave if not f.wrong and f.text.startswith("torque") and _UNLIKE in f.text]
+        if grave and doubts != grave:
             raise InputError(f"{read.file}: {'; '.join(finding.text for finding in grave)}")
+        text = "; ".join(finding.text for finding in doubts)
+        if doubts and not stated:
+            raise Undecided(
+                "constants",
+                f"{read.file}: {text} Where all that is so, say it by --constants (N m a unit in the order of the"
+                " joints; 1 for N m), and the torque is taken as it is",
+            )
+        said += [f"{read.file.name}: {text} Signs and constants are as given, nothing tells them"] if doubts else []
+    return said
+
+
+_UNLIKE = "does not follow"
 
 
 def _decides(finding: Finding) -> bool:
     """Whether a warning is about how the columns are read, not about the motion or its quality."""
-    return any(
-        word in finding.text for word in ("does not belong", "does not follow", "clock", "times what", "outside the")
-    )
+    return any(word in finding.text for word in ("does not belong", _UNLIKE, "clock", "times what", "outside the"))
 
 
-def _repeats(reads: Sequence[_Read]) -> list[str | None]:
+def _repeats(reads: Sequence[Columns]) -> list[str | None]:
     """One label for recordings whose positions are the same motion."""
     shapes = [_shape(read) for read in reads]
     labels: list[str | None] = [None] * len(reads)
@@ -562,14 +358,14 @@ def _repeats(reads: Sequence[_Read]) -> list[str | None]:
     return labels
 
 
-def _shape(read: _Read) -> Float[np.ndarray, " _"]:
+def _shape(read: Columns) -> Float[np.ndarray, " _"]:
     grid = np.linspace(0.0, read.time[-1], 200)
     x = np.column_stack([np.interp(grid, read.time, column) for column in read.position.T])
     return ((x - x.mean(axis=0)) / (x.std(axis=0).max() or 1.0)).ravel()
 
 
 def _drives(
-    model: Path, robot: RobotModel, reads: Sequence[_Read], gains: Sequence[float] | None
+    model: Path, robot: RobotModel, reads: Sequence[Columns], gains: Sequence[float] | None
 ) -> tuple[dict[str, Any], list[str]]:
     """The `actuator` block of rollouts, which have a command in place of torque."""
     if any(read.torque is not None or read.command is None for read in reads):
@@ -597,7 +393,7 @@ def _drives(
 # Words
 
 
-def _clock_said(reads: Sequence[_Read]) -> Iterator[str]:
+def _clock_said(reads: Sequence[Columns]) -> Iterator[str]:
     for read in reads:
         rate = (len(read.time) - 1) / (read.time[-1] - read.time[0])
         unit = read.entry.get("units", {}).get("time", "s")
@@ -609,7 +405,7 @@ def _unit_said(unit: str, robot: RobotModel) -> str:
     return f"positions are in {text}: that fits the limits of {robot.name} and its torque"
 
 
-def _geared(robot: RobotModel, reads: Sequence[_Read], signs: list[float] | None) -> bool:
+def _geared(robot: RobotModel, reads: Sequence[Columns], signs: list[float] | None) -> bool:
     """Whether the torque shows rotors: inertia at a joint's own acceleration that the links do not have."""
     found = 0
     for read in (read for read in reads if read.torque is not None):
@@ -627,7 +423,7 @@ def _geared(robot: RobotModel, reads: Sequence[_Read], signs: list[float] | None
     return bool(found > 0)
 
 
-def _cutoff(reads: Sequence[_Read]) -> float:
+def _cutoff(reads: Sequence[Columns]) -> float:
     """Highest frequency at which the position's steps make less than a tenth of the acceleration (Hz)."""
     best = 20.0
     for read in reads:
@@ -647,12 +443,13 @@ def _text(
     model: Path,
     robot: RobotModel,
     whole: RobotModel,
-    reads: Sequence[_Read],
+    reads: Sequence[Columns],
     unit: str,
     signs: list[float] | None,
     labels: Sequence[str | None],
     assumed: Sequence[str],
     drives: dict[str, Any],
+    gears: Sequence[float] | None = None,
 ) -> str:
     from ..formats.export import dump_yaml
 
@@ -665,10 +462,12 @@ def _text(
     parts += [f"#   columns belong to joints by {order}", ""]
     parts += [dump_yaml({"robot": robot_keys}), "# `role: holdout` keeps a recording out of the fit and predicts it."]
     parts += [dump_yaml({"data": data})]
-    if signs is not None:
+    given = {"position": gears, "torque": signs}
+    sides = {key: [float(x) for x in values] for key, values in given.items() if values is not None}
+    if sides:
         parts += [
-            "# From what the columns hold to N m at the joints.",
-            dump_yaml({"transmission": {"torque": [float(x) for x in signs]}}),
+            "# From what the columns hold to the joints: rad (m) and N m (N).",
+            dump_yaml({"transmission": sides}),
         ]
     if drives:
         parts += ["# The loop that turns the command into torque: N m/rad.", dump_yaml({"actuator": drives})]
@@ -686,7 +485,7 @@ def _text(
     return "\n".join(part.rstrip("\n") for part in parts) + "\n"
 
 
-def _entry(read: _Read, unit: str, label: str | None, converted: bool) -> dict[str, Any]:
+def _entry(read: Columns, unit: str, label: str | None, converted: bool) -> dict[str, Any]:
     entry = {key: value for key, value in read.entry.items() if key != "units"}
     units = dict(read.entry.get("units", {}))
     if unit != "rad":

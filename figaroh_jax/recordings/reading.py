@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,12 @@ import numpy as np
 from ..errors import InputError
 from ..formats.files import plain_file
 from .bags import read_bag
-from .containers import read_hdf5, read_lerobot, read_mat, read_npz, read_parquet
+from .containers import read_npz
+from .reader_process import episodes_apart, read_apart
 from .tables import LARGEST, Source, Table
 from .textfiles import read_text
 
-__all__ = ["BAGS", "FORMATS", "TEXT", "kind_of", "read_table"]
+__all__ = ["BAGS", "FORMATS", "TEXT", "kind_of", "lerobot_episodes", "read_table"]
 
 LARGEST_FILE = 2 << 30  # bytes
 TEXT = (".csv", ".tsv", ".txt", ".log", ".dat")
@@ -48,6 +50,12 @@ def read_table(file: Path, key: str, source: Source = _WHOLE) -> Table:
     return table._replace(read=read)
 
 
+def lerobot_episodes(folder: Path, key: str) -> tuple[int, ...]:
+    """Numbers of the episodes of a LeRobot folder, as far as their files are there."""
+    with _damage(folder, key, "lerobot"):
+        return episodes_apart(folder)
+
+
 @contextmanager
 def _damage(file: Path, key: str, suffix: str) -> Iterator[None]:
     """What a library raises over a file that is damaged, or that it is missing for, as one message."""
@@ -77,10 +85,10 @@ def kind_of(file: Path) -> str:
 
 _READERS: dict[str, Callable[[Path, Source], Table]] = {
     ".npz": lambda file, source: read_npz(file),
-    ".mat": lambda file, source: read_mat(file),
-    ".parquet": lambda file, source: read_parquet(file),
-    "lerobot": read_lerobot,
-    **dict.fromkeys(_HDF5, lambda file, source: read_hdf5(file)),
+    ".mat": partial(read_apart, ".mat"),
+    ".parquet": partial(read_apart, ".parquet"),
+    "lerobot": partial(read_apart, "lerobot"),
+    **dict.fromkeys(_HDF5, partial(read_apart, ".h5")),
     **dict.fromkeys(TEXT, lambda file, source: read_text(file, source.form)),
     **dict.fromkeys(BAGS, lambda file, source: read_bag(file, source.topic)),
 }

@@ -76,7 +76,7 @@ def show_motion(
 
     def draw(_: Any = None) -> None:
         q = np.asarray(motion.at(np.array([slider.value]))[0])[0]
-        server.scene.add_line_segments("/robot", skeleton(model, q), colors=_BODY, line_width=6.0)
+        server.scene.add_line_segments("/robot", skeleton(model, q), colors=_BODY)
         if clearance is not None:
             server.scene.add_line_segments("/capsules", capsule_lines(clearance, q), colors=_SHELL)
 

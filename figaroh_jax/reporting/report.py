@@ -88,6 +88,7 @@ def _page(diagnosis: Diagnosis, title: str, folder: Path | None = None) -> str:
     page = resources.files("figaroh_jax") / "page"
     roles = [trace.role for trace in diagnosis.traces]
     gain = diagnosis.holdout
+    quantity = "position" if diagnosis.of_positions else "torque"
     return page_template("report.html", folder).render(
         d=diagnosis,
         robot=title,
@@ -105,7 +106,8 @@ def _page(diagnosis: Diagnosis, title: str, folder: Path | None = None) -> str:
         candidates=sorted(diagnosis.candidates, key=_rank),
         css=Markup((page / "report.css").read_text("utf-8")),
         js=Markup((page / "report.js").read_text("utf-8")),
-        data=Markup(plot_data(diagnosis.noise, diagnosis.torque_units, diagnosis.traces)),
+        quantity=quantity,
+        data=Markup(plot_data(diagnosis.noise, diagnosis.torque_units, diagnosis.traces, quantity)),
         plotly=Markup(plotly_source()),
     )
 
@@ -161,6 +163,7 @@ def page_template(name: str, folder: Path | None = None) -> Any:
         "share": _share,
         "spaced": lambda name: name.replace("_", " "),
         "title_of": wording.effect_title,
+        "unit": wording.unit,
         "visible": lambda value: "never" if value == math.inf else wording.number(value, 2),
     }
     environment.globals["made"] = None if folder is None else _made_by(folder)
@@ -214,16 +217,19 @@ def _rank(candidate: Candidate) -> float:
     return -candidate.score if math.isfinite(candidate.score) else math.inf
 
 
-def plot_data(floor: Float[np.ndarray, " nv"], units: Sequence[str], traces: Sequence[Trace]) -> str:
-    """What the plots are drawn from, as JSON that may stand inside a script element."""
+def plot_data(
+    floor: Float[np.ndarray, " nv"], units: Sequence[str], traces: Sequence[Trace], quantity: str = "torque"
+) -> str:
+    """What the plots are drawn from, as JSON that may stand inside a script element; `quantity` is compared."""
     count = len(units) * max(len(traces), 1)
     points = min(_POINTS, max(60, _PAGE_POINTS // count))
     joints = [
-        {"noise": _finite(float(noise)), "unit": unit, "angle": "m" if unit == "N" else "rad"}
+        {"noise": _finite(float(noise)), "unit": unit, "angle": "m" if unit in ("N", "m") else "rad"}
         for noise, unit in zip(floor, units, strict=True)
     ]
     recordings = [_series(trace, points) for trace in traces]
-    text = json.dumps({"joints": joints, "recordings": recordings}, allow_nan=False, separators=(",", ":"))
+    content = {"quantity": quantity, "joints": joints, "recordings": recordings}
+    text = json.dumps(content, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")
 
 

@@ -96,7 +96,7 @@ def summary(diagnosis: Diagnosis, robot: str = "the robot", *, verbose: bool = F
     parts.append(Text(f"Held out: {diagnosis.holdout_scheme}. {wording.p_value(diagnosis.p_value)}.", style="dim"))
     if diagnosis.experiment is not None:
         parts.append(Text(f"Measure next: {diagnosis.experiment.text}"))
-        if diagnosis.experiment.separates:
+        if diagnosis.experiment.separates and "excite --from" not in diagnosis.experiment.text:
             parts.append(Text("`figaroh-jax excite --from RUN` designs a motion that separates them", style="dim"))
     parts += _notes(diagnosis.notes, verbose)
     return Group(*parts)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..effects.plausibility import implausible
 from ..errors import InputError
-from .data import Run
+from ..results import Trace
+from .data import Run, Stretch, noise_of, windows
 from .fit import Fit, System, standard_errors
 from .loop import Loop
 from .parameters import BOUNDS, UNITS, put
 from .search import Setting, Structure, begun, residuals
+from .sensitivity import predicted
 from .task import diagnosis_setting, extended_of, read_rollouts, simulated
 
 if TYPE_CHECKING:
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["RolloutIdentification", "identify_rollout_task"]
 
 _LOOSE = 0.5  # relative standard deviation beyond which a number is not identified
+_FAR = 1e3  # rad or m: a simulation that gets there has diverged
 _TRADE = 0.95  # correlation beyond which two numbers trade off
 
 
@@ -35,19 +39,13 @@ class RolloutIdentification(NamedTuple):
     loop: Loop
     model: ExtendedModel
     predictions: dict[str, tuple[np.ndarray, np.ndarray]]
+    joints: tuple[str, ...]  # those that are measured
+    units: tuple[str, ...]  # "rad", or "m" where the joint slides
+    traces: tuple[Trace, ...]  # every recording simulated from its first state, as given and as fitted
 
     def to_json(self) -> str:
         """The text of `result.json`."""
         return json.dumps(self.result, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-
-    def lines(self) -> list[str]:
-        """A short summary for people."""
-        fit, found = self.result["fit"], self.result["base_parameters"]
-        lines = [
-            f"{p['expression']:<32} {p['value']:.5g} +- {p['std'] or 0:.2g} {p['unit']}  {p['status']}" for p in found
-        ]
-        lines += [f"RMS position error: {', '.join(f'{1e3 * x:.3g}' for x in fit['rms'])} mrad or mm"]
-        return lines + list(self.result["notes"])
 
 
 def identify_rollout_task(
@@ -70,8 +68,31 @@ def identify_rollout_task(
         held = {run.name: (run, simulated(final, run)) for run in runs if run.holdout}
         notes = (*notes, *implausible(loop.robot, extended_of(final), task.robot.trust))
         result = _result(here, first, held, notes)
+        progress("simulating the recordings", 0.9)
+        traces = _traces(loop, final, runs)
     predictions = {name: (run.time, read) for name, (run, read) in held.items()}
-    return RolloutIdentification(result, final, extended_of(final), predictions)
+    straight = {name for j in loop.robot.joints if j.kind == "prismatic" for name in (j.name,)}
+    joints = tuple(loop.robot.dof_names[k] for k in loop.measured)
+    units = tuple("m" if name in straight else "rad" for name in joints)
+    return RolloutIdentification(result, final, extended_of(final), predictions, joints, units, traces)
+
+
+def _traces(given: Loop, fitted: Loop, runs: Sequence[Run]) -> tuple[Trace, ...]:
+    """Every recording simulated as a whole, in one batch for each model; what diverges is no number."""
+    stretches = [Stretch(k, 0, len(run.time)) for k, run in enumerate(runs)]
+    noise = np.max([noise_of(run.position) for run in runs], axis=0)
+    data = windows(given, runs, stretches, [noise], 0.3, smooth=True)
+    read = []
+    for loop in (given, fitted):
+        found = np.asarray(predicted(loop, (), jnp.zeros((1, 0)), data, np.asarray(data.start)[None]))[0]
+        read.append(np.where(np.abs(found) < _FAR, found, np.nan))
+    traces = []
+    for k, run in enumerate(runs):
+        before, after = (x[: len(run.time), : run.position.shape[1], k] for x in read)
+        velocity = np.gradient(run.position, run.time, axis=0) if run.velocity is None else run.velocity
+        role = "holdout" if run.holdout else "fit"
+        traces.append(Trace(run.name, role, run.time, run.position, velocity, run.position, before, after))
+    return tuple(traces)
 
 
 def _result(

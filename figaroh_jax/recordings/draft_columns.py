@@ -1,0 +1,334 @@
+"""Which columns of a recording hold what, of which joint, by their names: the first half of a draft.
+
+Clocks, positions, torques, currents and commands are found by the words that loggers use, joints by the names of the
+model. What names leave open is `Undecided`, with the option of the command that decides it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import InputError
+from ..rigid.model import RobotModel
+from .reading import BAGS, kind_of, lerobot_episodes, read_table
+from .tables import Source, Table
+
+__all__ = ["Columns", "Undecided", "read_columns", "without_sign"]
+
+_WORDS = {
+    "command": {
+        "cmd",
+        "command",
+        "commanded",
+        "des",
+        "desired",
+        "target",
+        "ref",
+        "reference",
+        "setpoint",
+        "goal",
+        "action",
+    },
+    "velocity": {"dq", "qd", "vel", "velocity", "velocities", "speed", "qdot", "v"},
+    "current": {"i", "current", "currents", "cur", "amp", "amps", "percent", "load"},
+    "torque": {"tau", "torque", "torques", "effort", "efforts", "eff", "trq", "force", "j"},
+    "position": {"q", "pos", "position", "positions", "angle", "angles", "theta", "state"},
+}
+_TIMES = ("t", "time", "timestamp", "timestamps", "stamp", "stamps", "sec", "seconds", "clock", "header.stamp")
+_CLOCKS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_SLOW, _FAST = 15.0, 14000.0  # Hz; their ratio is below a thousand, so that one unit of time alone fits
+_HUGE = 1e12  # beyond it no column is a recording in any unit
+
+
+class Undecided(InputError):
+    """What the data cannot decide; `option` is the option of the command by which a user does."""
+
+    def __init__(self, option: str, text: str) -> None:
+        super().__init__(text)
+        self.option = option
+
+
+class Columns(NamedTuple):
+    """One recording: its columns by kind and what they hold, in the model's units."""
+
+    file: Path
+    entry: dict[str, Any]
+    joints: tuple[str, ...]  # of the columns, in their order
+    named: bool  # whether the columns' names hold the joints' names
+    time: Float[np.ndarray, " samples"]
+    position: Float[np.ndarray, "samples joints"]
+    torque: Float[np.ndarray, "samples joints"] | None
+    current: str  # unit of a torque that is none: "A", "mA", "%"; else empty
+    command: Float[np.ndarray, "samples joints"] | None = None
+    unsigned: str = ""  # a torque beside the command that is left out: an absolute value
+    motor: bool = False  # whether the names say that positions are those of motors
+
+
+def read_columns(
+    files: Sequence[Path],
+    model: RobotModel,
+    joints: Sequence[str] | None = None,
+    rate: float | None = None,
+    topic: str | None = None,
+) -> list[Columns]:
+    """The columns of every recording, in the joints' order of the model; `draft_task` says what may be given."""
+    return [_read(table, model, joints, rate, entry) for table, entry in _tables(files, topic)]
+
+
+def _tables(files: Sequence[Path], topic: str | None) -> Iterator[tuple[Table, dict[str, Any]]]:
+    """Every recording with the keys of a task that say which it is; of a folder of episodes the first few."""
+    for file in files:
+        path = file.resolve()
+        if kind_of(file) == "lerobot":
+            for episode in lerobot_episodes(file, "recording")[:_EPISODES]:
+                source = Source(episode=episode)
+                yield read_table(file, "recording", source), {"file": str(path), "episode": episode}
+            continue
+        if kind_of(file) in BAGS:
+            try:
+                table = read_table(file, "recording", Source(topic=topic))
+            except InputError as error:
+                raise (Undecided("topic", str(error)) if "must name the one" in str(error) else error) from None
+            yield table, {"file": str(path)} | ({} if topic is None else {"topic": topic})
+            continue
+        table = read_table(file, "recording")
+        form = next((form for form, mark in _LOG_MARKS.items() if mark & set(table.names)), None)
+        if form is not None:
+            table = read_table(file, "recording", Source(form=form))
+        yield table, {"file": str(path)} | ({} if form is None else {"format": form})
+
+
+_EPISODES = 8
+_LOG_MARKS = {"rtde": {"actual_q_0"}, "libfranka": {"tau_J[0]", "state.tau_J[0]"}}
+
+
+def _read(
+    table: Table, model: RobotModel, joints: Sequence[str] | None, rate: float | None, entry: dict[str, Any]
+) -> Columns:
+    form = entry.get("format")
+    if form is None:
+        _refuse_postures(table, model)
+    clock = (_LOGGED[form]["time"] if form else _time(table)) if rate is None else None
+    kinds = _logged(table, _LOGGED[form]) if form else _kinds(table, clock)
+    if "position" not in kinds:
+        raise InputError(
+            f"{table.file}: no column looks like a position (q, pos, position, angle...); its columns are"
+            f" {', '.join(table.names[:12])}{'...' if len(table.names) > 12 else ''}"
+        )
+    names, sources, named = _of_joints(table, kinds["position"], model, joints, "position")
+    position = _matrix(table, sources, names, "position")
+    if form is None or sources != _LOGGED[form]["position"]:
+        entry = entry | {"position": sources}
+    torque, current, command, unsigned = None, "", None, ""
+    for kind in ("torque", "current", "velocity", "command"):
+        if kind not in kinds or (kind in ("current", "command") and torque is not None):
+            continue
+        own, source, by_name = _of_joints(table, kinds[kind], model, list(names), kind)
+        if own != names:
+            raise InputError(f"{table.file}: {kind} is of {', '.join(own)}, position of {', '.join(names)}")
+        values = _matrix(table, source, names, kind)
+        if len(values) != len(position):
+            raise InputError(f"{table.file}: {kind} has {len(values)} samples, position {len(position)}")
+        key = "torque" if kind == "current" else kind
+        if key == "torque" and "command" in kinds and without_sign(values):
+            unsigned = source if isinstance(source, str) else ", ".join(source)
+            continue
+        if form is None or source != _LOGGED[form].get(key):
+            entry[key] = source
+        if kind == "command":
+            command = values
+        elif kind != "velocity":
+            torque, named = values, named and by_name
+            current = _unit_of_current(source) if kind == "current" else ""
+    time, entry = _stamps(table, clock, rate, len(position), entry)
+    if form is not None and rate is None:
+        del entry["time"]
+    motor = bool(_MOTORS & set(_words(" ".join([sources] if isinstance(sources, str) else sources))))
+    return Columns(table.file, entry, names, named, time, position, torque, current, command, unsigned, motor)
+
+
+_MOTORS = {"motor", "motors", "rotor", "rotors"}
+
+
+def without_sign(*torques: Float[np.ndarray, "samples joints"]) -> bool:
+    """Whether no column ever changes its sign, and there are several."""
+    low, high = np.min([x.min(axis=0) for x in torques], axis=0), np.max([x.max(axis=0) for x in torques], axis=0)
+    return len(low) > 1 and bool(((low >= 0) | (high <= 0)).all())
+
+
+def _refuse_postures(table: Table, model: RobotModel) -> None:
+    """Measured postures are a task of `calibrate`, which needs frames that no file names: the message shows it."""
+    kinds = _kinds(table, None)
+    measured = [n for n in table.names if _MEASURED.search(n) and not _holds_any(n, model.joint_names)]
+    if not measured or any(kind in kinds for kind in ("torque", "current", "command", "velocity")):
+        return
+    named = [n for n in table.names if n in model.joint_names]
+    position = f"[{', '.join(named)}]" if named else (kinds.get("position") or ["JOINTS"])[0]
+    whole = table.file.suffix.lower() in (".npz", ".mat", ".h5")
+    shown = measured[0] if whole else f"[{', '.join(measured[:12])}]"
+    kind = "pose" if "pose" in measured[0].lower() or measured[0].startswith("T_") else "position"
+    words = {word for name in (position, *measured) for word in _words(name)}
+    units = {key: unit for key, unit in (("position", "deg"), ("measurement", "mm")) if unit in words}
+    unit = f"    units: {{{', '.join(f'{k}: {u}' for k, u in units.items())}}}\n" if units else ""
+    raise InputError(
+        f"{table.file}: {', '.join(measured[:6])} look like measured poses or points. Postures are a task of"
+        " `calibrate`; `new` drafts motions. Write it as\n"
+        f"  robot: {{model: MODEL}}\n  data:\n  - file: {table.file.name}\n    position: {position}\n{unit}"
+        f"    measurement: {{{kind}: {shown}, base_frame: BASE, tool_frame: TOOL, unknown: [base_frame, tool_frame]}}\n"
+        "BASE and TOOL are frames of the robot; `pose`, `position`, `plane`, `socket` or `camera` is what was measured."
+    )
+
+
+_MEASURED = re.compile(r"^(?:[xyz]\d*|T_\w+|.*(?:pose|xyz|marker|point|board).*)$", re.IGNORECASE)
+
+
+def _holds_any(column: str, names: Sequence[str]) -> bool:
+    return any(_holds(column, name, names) for name in names)
+
+
+_LOGGED = {
+    "rtde": {"time": "timestamp", "position": "actual_q", "current": "actual_current", "torque": "actual_current"},
+    "libfranka": {"time": "time", "position": "q", "torque": "tau_J"},
+}
+
+
+def _logged(table: Table, known: dict[str, str]) -> dict[str, list[str]]:
+    """The columns of a robot's own log, by the prefixes of its format."""
+    wanted = {k: prefix for k, prefix in known.items() if k != "time" and not (k == "torque" and "current" in known)}
+    pattern = {kind: re.compile(re.escape(prefix) + r"[_\[]\d+\]?") for kind, prefix in wanted.items()}
+    found = {kind: [name for name in table.names if mark.fullmatch(name)] for kind, mark in pattern.items()}
+    return {kind: names for kind, names in found.items() if names}
+
+
+def _unit_of_current(source: Any) -> str:
+    words = set(_words(" ".join([source] if isinstance(source, str) else source)))
+    return "%" if words & {"percent", "load"} else "mA" if "ma" in words else "A"
+
+
+def _words(name: str) -> list[str]:
+    return [word for word in re.split(r"[^a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()) if word]
+
+
+def _time(table: Table) -> str:
+    found = [name for name in table.names if name.lower() in _TIMES]
+    if not found and "received" in table.names:  # when a bag got a message that has no stamp of its own
+        return "received"
+    found = found or [n for n in table.names if set(_words(n)) & {*_TIMES} and not set(_words(n)) & {"des", "cmd"}]
+    if len(found) != 1:
+        what = f"several columns look like one: {', '.join(found)}" if found else "no column looks like one"
+        raise Undecided(
+            "rate", f"{table.file}: which column is the time? {what}; give --rate HZ, or rename it to 'time'"
+        )
+    return found[0]
+
+
+def _stamps(
+    table: Table, clock: str | None, rate: float | None, samples: int, entry: dict[str, Any]
+) -> tuple[Float[np.ndarray, " samples"], dict[str, Any]]:
+    """Time in s, and the entry with the key that says so."""
+    if clock is None:
+        assert rate is not None
+        return np.arange(samples) / rate, entry | {"rate": rate}
+    time = table.vector(clock, "time")
+    if len(time) != samples or not (np.diff(time) > 0).all():
+        raise InputError(f"{table.file}: '{clock}' is no clock of the positions: it does not increase, or is shorter")
+    step = float(np.median(np.diff(time)))
+    unit = next((u for u, s in _CLOCKS.items() if _SLOW <= 1 / (step * s) <= _FAST), None)
+    if unit is None:
+        raise Undecided(
+            "rate",
+            f"{table.file}: '{clock}' steps by {step:.4g}, which is no rate from {_SLOW:g} to {_FAST:g} Hz in s, ms, us"
+            " or ns; give --rate HZ",
+        )
+    return (time - time[0]) * _CLOCKS[unit], entry | {"time": clock} | (
+        {"units": {"time": unit}} if unit != "s" else {}
+    )
+
+
+def _kinds(table: Table, clock: str | None) -> dict[str, list[str]]:
+    """Columns or arrays by what their names say that they hold."""
+    found: dict[str, list[str]] = {}
+    for name in table.names:
+        words = _words(name)
+        kind = next(
+            (k for k, known in _WORDS.items() if known & set(words) and not (k == "torque" and words == ["j"])), None
+        )
+        kind = name.partition(".")[0] if name.partition(".")[0] in _OF_BAGS else kind
+        if name != clock and kind is not None and not name.startswith("/") and not _has_parts(name, table.names):
+            found.setdefault("torque" if kind == "effort" else kind, []).append(name)
+    return {kind: _plainest(names) for kind, names in found.items()}
+
+
+_OF_BAGS = ("position", "velocity", "effort", "command")
+
+
+def _has_parts(name: str, names: Sequence[str]) -> bool:
+    """Whether the columns of an array are named one by one too."""
+    return any(other.startswith(f"{name}.") for other in names)
+
+
+def _plainest(names: list[str]) -> list[str]:
+    """Of several sets of columns the plain one: `q`, not `q_filt`."""
+    plain = [name for name in names if not _SHADES & set(_words(name))]
+    return plain or names
+
+
+_SHADES = {"filt", "filtered", "raw", "smooth", "smoothed", "est", "estimated", "ext", "external", "residual"}
+
+
+def _of_joints(
+    table: Table, columns: list[str], model: RobotModel, joints: Sequence[str] | None, kind: str
+) -> tuple[tuple[str, ...], Any, bool]:
+    """Joints of a kind's columns in the model's order, what the task says of them, and whether names decided it."""
+    wanted = list(joints or model.joint_names)
+    by_name = {joint: c for joint in wanted for c in columns if _holds(c, joint, model.joint_names)}
+    if by_name and (joints is None or len(by_name) == len(wanted)):
+        names = tuple(joint for joint in model.joint_names if joint in by_name)
+        if len(names) < len(columns) and joints is None:
+            rest = [c for c in columns if c not in by_name.values()]
+            text = f"{table.file}: {kind}: which joints are {', '.join(rest)}? Name all joints by --joints"
+            raise Undecided("joints", text)
+        return names, [by_name[joint] for joint in names], True
+    if len(columns) == 1 and table.read(columns[0]).ndim == 2:
+        count, source = table.read(columns[0]).shape[1], columns[0]
+    else:
+        numbered = sorted(columns, key=_number)
+        prefixes = {re.sub(r"\d+", "#", name) for name in columns}
+        if len(prefixes) > 1 and len(columns) > 1:
+            raise InputError(f"{table.file}: several sets of columns look like {kind}: {', '.join(columns[:8])}")
+        count, source = len(columns), numbered
+    if joints is None and count != len(model.joint_names):
+        raise Undecided(
+            "joints",
+            f"{table.file}: {count} columns of {kind}, but the robot has {len(model.joint_names)} joints"
+            f" ({', '.join(model.joint_names)}); name theirs in the columns' order by --joints",
+        )
+    if count != len(wanted):
+        raise InputError(f"{table.file}: {count} columns of {kind}, but --joints names {len(wanted)}")
+    return tuple(wanted), source, False
+
+
+def _holds(column: str, joint: str, names: Sequence[str]) -> bool:
+    """Whether a column's name holds a joint's, and no longer joint name that contains it."""
+    own = re.search(rf"(?<![A-Za-z0-9]){re.escape(joint)}(?![A-Za-z0-9])", column)
+    longer = [n for n in names if n != joint and joint in n and n in column]
+    return own is not None and not longer
+
+
+def _number(name: str) -> tuple[int, ...]:
+    return tuple(int(digits) for digits in re.findall(r"\d+", name))
+
+
+def _matrix(table: Table, source: Any, joints: Sequence[str], key: str) -> Float[np.ndarray, "samples joints"]:
+    values = np.asarray(table.matrix(source, joints, key), float)
+    wrong = np.argwhere(~(np.abs(values) < _HUGE))
+    if len(wrong) and key != "velocity":  # which no draft uses
+        row, column = wrong[0]
+        raise InputError(f"{table.file}: {key} of {joints[column]} is {values[row, column]:.4g} in row {row} (from 0)")
+    return values

@@ -1,0 +1,88 @@
+"""The page and the summary of an identification from commands and positions."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import browser
+import numpy as np
+import pytest
+
+from figaroh_jax import DEMO
+from figaroh_jax.effects.extended import extend
+from figaroh_jax.formats.urdf import load_urdf
+from figaroh_jax.reporting.rollout_report import show_rollouts, write_rollouts
+from figaroh_jax.results import Trace
+from figaroh_jax.rollouts.identification import RolloutIdentification
+
+
+def trace(name: str, role: Any, rng: np.random.Generator) -> Trace:
+    t = np.arange(500) * 0.01
+    position = np.sin(t[:, None] * [1.0, 2.0, 3.0, 4.0])
+    far = position + 0.05 * rng.normal(size=position.shape)
+    return Trace(name, role, t, position, np.gradient(position, t, axis=0), position, far, position + 0.001)
+
+
+def found() -> RolloutIdentification:
+    model, rng = extend(load_urdf(DEMO)), np.random.default_rng(1)
+    joints = model.robot.joint_names
+    numbers = [
+        {"expression": f"{kind} {joint}", "value": 0.4, "std": std, "unit": unit, "status": status}
+        for kind, unit in (("armature", "kg m2"), ("friction", "N m"))
+        for joint, std, status in zip(
+            joints, (0.01, 0.02, None, 0.3), ("identified",) * 3 + ("on its bound",), strict=True
+        )
+    ]
+    quality = {"rms": [1e-3] * 4, "relative": [0.02] * 4}
+    result = {
+        "base_parameters": numbers,
+        "fit": quality | {"noise": [1e-4] * 4},
+        "holdout": {"b": quality | {"r2": [0.99] * 4}},
+        "notes": ["armature waist and friction waist trade off (correlation +0.98)", "<b>simulated</b>"],
+    }
+    traces = (trace("a", "fit", rng), trace("b", "holdout", rng))
+    loop: Any = None
+    return RolloutIdentification(result, loop, model, {}, joints, ("rad",) * 4, traces)
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[browser.Page]:
+    if browser.find() is None:
+        pytest.skip("needs Chromium")
+    with browser.page(tmp_path_factory.mktemp("profile")) as page:
+        yield page
+
+
+def test_the_summary_says_the_error_first_and_every_number_with_its_interval(capsys: pytest.CaptureFixture[str]):
+    show_rollouts(found(), "the arm", verbose=False)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("identified  Held-out motions are simulated from the command within 2 %")
+    assert "6 of 8 numbers of the arm are identified" in lines[0]
+    assert any(line.split() == ["Coulomb", "friction", "shoulder", "0.400", "±", "0.039", "N", "m"] for line in lines)
+    assert any("on its bound" in line for line in lines) and lines[-1].startswith("2 notes")
+
+
+@pytest.mark.parametrize(("width", "phone"), [(1300, False), (390, True)])
+def test_the_page_is_accessible_draws_positions_and_fits_its_screen(
+    tab: browser.Page, tmp_path: Path, width: int, phone: bool
+):
+    write_rollouts(found(), tmp_path / "report.html", "the arm")
+    assert (tmp_path / "report.html").stat().st_size < 1_500_000
+    tab.open(tmp_path / "report.html", width, 900, phone=phone)
+    assert tab.value("document.documentElement.scrollWidth") <= width
+    tab.value("document.querySelector('details.joint').scrollIntoView()")
+    tab.wait("document.querySelector('details.joint[data-drawn] .ytitle') !== null")
+    assert tab.value("document.querySelector('details.joint .ytitle').textContent") == "position, rad"
+    axe = importlib.util.find_spec("axe_core_python")
+    assert axe is not None and axe.submodule_search_locations
+    tab.value(Path(axe.submodule_search_locations[0], "axe.min.js").read_text("utf-8") + ";undefined")
+    rules = "{runOnly: ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa', 'best-practice']}"
+    wrong = tab.value(
+        f"axe.run({{exclude: ['.main-svg']}}, {rules}).then((r) => r.violations.map((v) => v.id + v.nodes[0].html))"
+    )
+    assert wrong == [] and tab.problems == []
+    rows = tab.value("[...document.getElementById('parameters').rows].map((r) => r.cells[0].dataset.value)")
+    assert rows[1:3] == ["armature waist", "armature shoulder"]
