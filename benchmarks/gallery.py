@@ -95,8 +95,8 @@ ROBOTS = {
         "motor angles and currents at 5 kHz, 9 s, one motion; nothing is held out but stretches of it",
         hidden("tx40"),
         "The gears couple joints 5 and 6, which the task says; the links' inertials of the file are hardly believed"
-        " (`trust: 1.0`). It holds no rotors, which published identifications of this recording have: that they are named is"
-        " plausible. Laws of friction whose exponent is between 1 and 2 are stand-ins for what happens at the wrist.",
+        " (`trust: 1.0`). It holds no rotors, which published identifications of this recording have: that they are"
+        " named is plausible. Laws of friction whose exponent is between 1 and 2 are stand-ins for what happens at the wrist.",
     ),
     "ur10e": Robot(
         "Universal Robots UR10e",
@@ -121,8 +121,8 @@ ROBOTS = {
         "LGPL-3.0",
         "torque sensors at the joints at 200 Hz; one motion twice, another held out",
         hidden("kuka"),
-        "Offsets of the torque sensors differ between the motions, and the last joint's torque is hardly above its noise:"
-        " that is the rest at joints 0 and 6, which stays without a name.",
+        "Offsets of the torque sensors differ between the motions, and the last joint's torque is hardly above its"
+        " noise: that is the rest at joints 0 and 6, which stays without a name.",
     ),
     "tiago": Robot(
         "PAL TIAGo, arm_1 to arm_4",
@@ -147,8 +147,8 @@ ROBOTS = {
         "BSD-3-Clause",
         "two quasi-direct drives, torque from their currents at 500 Hz; five motions fitted, one held out",
         hidden("dfki_double_pendulum"),
-        "Torques are small against friction, and the drives ring at 4.8 Hz: no effect is named, and that is right as far"
-        " as anybody knows.",
+        "Torques are small against friction, and the drives ring at 4.8 Hz: no effect is named, and that is right as"
+        " far as anybody knows.",
     ),
     "so101": Robot(
         "SO-101 arm",
@@ -207,7 +207,8 @@ ROBOTS = {
                 "measurement": measured("position", "cali_xyz_mm", "base_link", "tool0"),
             },
         ),
-        "The offsets agree with those of the published analysis (-0.0241, -0.0073, -0.0374, -0.0194 rad at joints 2 to 5).",
+        "The offsets agree with those of the published analysis: -0.0241, -0.0073, -0.0374, -0.0194 rad at joints 2"
+        " to 5.",
     ),
 }
 

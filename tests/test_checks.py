@@ -20,7 +20,7 @@ from figaroh_jax.formats.robotfile import load_robot
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.recordings.checks import check_recordings
 from figaroh_jax.recordings.dataset import read_recordings
-from figaroh_jax.recordings.likeness import Sampled, frame_poses, low_pass, rigid_torque, stretch_of_time
+from figaroh_jax.recordings.likeness import Sampled, frame_poses, rigid_torque, stretch_of_time
 
 # its slide takes mm
 NOT_HERE = {"mm on a revolute arm"}
@@ -153,13 +153,3 @@ def test_recordings_from_arrays_are_checked_too(job: Any):
     still = fj.recording(q=np.broadcast_to(q[:1], q.shape), tau=torque, time=t)
     with pytest.raises(InputError, match="no joint moves"):
         job(robot, [still])
-
-
-def test_the_low_pass_is_that_of_scipy_forwards_and_backwards():
-    from scipy.signal import butter, sosfiltfilt
-
-    rng = np.random.default_rng(0)
-    for rows, share in ((5000, 0.002), (2500, 0.02), (300, 0.1), (40, 0.1)):
-        x = np.cumsum(rng.normal(size=(rows, 2)), axis=0) + 0.2 * rng.normal(size=(rows, 2))
-        theirs = sosfiltfilt(butter(2, 2 * share, output="sos"), x, axis=0, padlen=min(rows - 1, int(3 / share)))
-        np.testing.assert_allclose(low_pass(x, share), theirs, rtol=0, atol=1e-4 * np.abs(x).max())

@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ..rigid.model import RobotModel
+from .rowfilter import low_pass
 
 __all__ = [
     "Likeness",
     "Sampled",
     "frame_poses",
     "likeness",
-    "low_pass",
     "matrix_of_likeness",
     "rigid_torque",
     "sampled",
@@ -94,7 +94,7 @@ def sampled(
 
     def smooth(x: np.ndarray) -> np.ndarray:
         even = np.column_stack([np.interp(grid, time, column) for column in x.T])
-        return low_pass(even, min(cutoff / rate, 0.1))
+        return low_pass(even, 1 / rate, min(cutoff, 0.1 * rate), order=2)
 
     q = smooth(position)
     v = np.gradient(q, 1 / rate, axis=0)
@@ -102,22 +102,6 @@ def sampled(
     edge = min(len(time) // 20, int(rate / cutoff) + 1)
     rows = np.unique(np.linspace(edge, len(time) - 1 - edge, min(ROWS, len(time) - 2 * edge)).astype(int))
     return Sampled(q[rows], v[rows], a[rows], None if torque is None else smooth(torque)[rows], rate)
-
-
-def low_pass(x: Float[np.ndarray, "samples columns"], share: float) -> Float[np.ndarray, "samples columns"]:
-    """Butterworth's second order forwards and backwards, by its square in the frequencies; `share` is cutoff over rate.
-
-    The ends are mirrored through their points, as `scipy.signal.sosfiltfilt` does; importing that takes two seconds of
-    the processor, a third of what `figaroh-jax new` takes.
-    """
-    pad = min(len(x) - 1, int(4 / share))
-    longer = np.concatenate([2 * x[:1] - x[pad:0:-1], x, 2 * x[-1:] - x[-2 : -pad - 2 : -1]])
-    size = 1 << (len(longer) - 1).bit_length()
-    line = np.linspace(0, 1, size - len(longer) + 2)[1:-1, None]  # back to the start, so that the spectrum sees no step
-    whole = np.concatenate([longer, longer[-1:] + line * (longer[:1] - longer[-1:])])
-    warped = np.tan(np.pi * np.minimum(np.fft.rfftfreq(size), 0.4999)) / np.tan(np.pi * share)
-    smooth = np.fft.irfft(np.fft.rfft(whole, axis=0) / (1 + warped[:, None] ** 4), size, axis=0)
-    return smooth[pad : pad + len(x)]
 
 
 def rigid_torque(model: RobotModel, motion: Sampled) -> Float[np.ndarray, "rows nv"]:
@@ -174,13 +158,21 @@ class _Body(NamedTuple):
     axis: np.ndarray
 
 
+def _turned(angle: Float[np.ndarray, " rows"], axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "rows 3 3"]:
+    """Rotations by angles (rad) about a unit axis (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    return np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross)
+
+
 def _moved(model: RobotModel, i: int, parent: _Body, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> _Body:
     at_zero, own = np.asarray(model.placement[i], float), np.asarray(model.axis[model.dofs.first[i]], float)
     pose = parent.pose @ at_zero[:3, :3]
     axis, arm = pose @ own, parent.pose @ at_zero[:3, 3]
     spin, turning, pushed = parent.spin, parent.turning, 0.0
     if model.joints[i].kind == "revolute":
-        pose = pose @ _turned(own, q)
+        pose = pose @ _turned(q, own)
         spin = spin + axis * v[:, None]
         turning = turning + axis * a[:, None] + np.cross(parent.spin, axis * v[:, None])
     else:
@@ -188,13 +180,6 @@ def _moved(model: RobotModel, i: int, parent: _Body, q: np.ndarray, v: np.ndarra
         pushed = axis * a[:, None] + 2 * np.cross(parent.spin, axis * v[:, None])
     swung = np.cross(parent.turning, arm) + np.cross(parent.spin, np.cross(parent.spin, arm))
     return _Body(parent.origin + arm, spin, turning, parent.acceleration + swung + pushed, pose, axis)
-
-
-def _turned(axis: Float[np.ndarray, "3"], angle: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "rows 3 3"]:
-    """Rodrigues' formula: rotations about a unit axis."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle)[:, None, None] * cross + (1 - np.cos(angle))[:, None, None] * (cross @ cross)
 
 
 def _wrench(ten: Float[np.ndarray, "10"], body: _Body) -> tuple[np.ndarray, np.ndarray]:

@@ -267,6 +267,10 @@ def _superscript(power: int) -> str:
 
 
 def _entry(effect: str) -> Any:
-    from ..effects import catalogue as effects, kinematic as kinematic_effects
+    from ..effects.catalogue import CATALOGUE
 
-    return effects.CATALOGUE.get(effect) or kinematic_effects.CATALOGUE.get(effect)
+    if effect in CATALOGUE:
+        return CATALOGUE[effect]
+    from ..effects.kinematic import CATALOGUE as OF_POSTURES  # slow to import
+
+    return OF_POSTURES.get(effect)
