@@ -96,7 +96,8 @@ ROBOTS = {
         hidden("tx40"),
         "The gears couple joints 5 and 6, which the task says; the links' inertials of the file are hardly believed"
         " (`trust: 1.0`). It holds no rotors, which published identifications of this recording have: that they are"
-        " named is plausible. Laws of friction whose exponent is between 1 and 2 are stand-ins for what happens at the wrist.",
+        " named is plausible. Laws of friction whose exponent is between 1 and 2 are stand-ins for"
+        " what happens at low speed.",
     ),
     "ur10e": Robot(
         "Universal Robots UR10e",
