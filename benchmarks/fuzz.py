@@ -479,14 +479,14 @@ def read_task(bench: Bench, file: Path) -> None:
 
     task = load_task(file)
     check_directory(bench.folder / "out", task_inputs(file))
-    from figaroh_jax.rollouts.task import is_rollout_task, read_rollouts
+    from figaroh_jax.rollouts.task import read_rollouts
 
-    if is_rollout_task(task):
+    if task.of_rollouts:
         read_rollouts(task)
         return
     robot = load_robot(task)
     stated_baseline(task)
-    if any(entry.measurement is not None for entry in task.data):
+    if task.of_postures:
         check_pose_recordings(task, robot, read_pose_recordings(task, robot))
     else:
         from figaroh_jax.recordings.signals import choose_rates, prepare

@@ -1,4 +1,4 @@
-"""Pages in a browser: their size, the time to load and to draw, accessibility by axe-core, and screenshots.
+"""Pages in a browser: size, time to load, accessibility by axe-core, what the Tab key reaches, screenshots.
 
 `python benchmarks/pages.py RUN_DIR... --shots FOLDER` opens every `report.html` (or a page named itself) in Chromium at
 1300 and 390 px, light and dark, without network, and prints one line each; exit status 1 where axe finds a violation.
@@ -32,6 +32,10 @@ def axe_source() -> str:
 def violations(tab: browser.Page, source: str) -> list[dict[str, Any]]:
     """What axe finds on the page as it stands, with every part unfolded."""
     tab.value("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+    for joint in range(tab.value("document.querySelectorAll('details.joint').length")):
+        one = f"document.querySelectorAll('details.joint')[{joint}]"  # plots are drawn when they come into sight
+        tab.value(f"{one}.scrollIntoView()")
+        tab.wait(f"'drawn' in {one}.dataset")
     time.sleep(0.8)
     tab.value(f"{source};undefined")
     rules = "{runOnly: ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa', 'best-practice']}"
@@ -39,6 +43,37 @@ def violations(tab: browser.Page, source: str) -> list[dict[str, Any]]:
         f"axe.run({{exclude: ['.main-svg']}}, {rules}).then((r) => r.violations.map((v) => ({{id: v.id, help: v.help,"
         " nodes: v.nodes.slice(0, 3).map((n) => n.html.slice(0, 160) + ' | ' + (n.any[0] || {}).message)})))"
     )
+
+
+FOCUSABLE = "a[href], button, select, input, summary, [tabindex='0']"
+SEEN = """(() => {
+  const e = document.activeElement;
+  if (!e || e === document.body) return null;
+  const box = e.getBoundingClientRect(), style = getComputedStyle(e);
+  const ring = (style.outlineStyle !== 'none' && parseFloat(style.outlineWidth) > 0) || style.boxShadow !== 'none';
+  const inside = box.bottom > 0 && box.top < innerHeight && box.right > 0 && box.left < innerWidth;
+  e.dataset.reached = '';
+  return [e.tagName + ' ' + (e.getAttribute('aria-label') || e.textContent.trim()).slice(0, 40), ring, inside];
+})()"""
+
+
+def keyboard(tab: browser.Page) -> list[str]:
+    """What the Tab key does not reach, or reaches without a ring around it or outside of the window."""
+    tab.value("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+    tab.value("(() => { scrollTo(0, 0); document.activeElement.blur(); })()")
+    shown = f'[...document.querySelectorAll("{FOCUSABLE}")].filter((e) => e.checkVisibility() && !e.disabled)'
+    wrong = []
+    for _ in range(tab.value(f"{shown}.length") + 400):
+        tab.press("Tab", 9)
+        found = tab.value(SEEN)
+        if found is None:
+            break
+        name, ring, inside = found
+        wrong += [f"no ring: {name}"] if not ring else []
+        wrong += [f"outside of the window: {name}"] if not inside else []
+    label = "(e.getAttribute('aria-label') || e.textContent.trim()).slice(0, 40)"
+    missed = tab.value(f"{shown}.filter((e) => !('reached' in e.dataset)).map((e) => e.tagName + ' ' + {label})")
+    return [*dict.fromkeys(wrong), *(f"not reached: {name}" for name in missed)]
 
 
 def docs_pictures(page: Path, folder: Path) -> int:
@@ -79,12 +114,15 @@ def main() -> int:
                     wrong = violations(tab, source)
                     if asked.shots:
                         tab.screenshot(asked.shots / f"{label}.png", whole=True)
+                    keys = keyboard(tab) if not dark else []
                     wide = tab.value("document.documentElement.scrollWidth")
-                    found += len(wrong) + len(tab.problems) + (wide > size[0])
+                    found += len(wrong) + len(keys) + len(tab.problems) + (wide > size[0])
                     print(
                         f"{label}: {page.stat().st_size / 1e6:.2f} MB, loaded in {1e3 * loaded:.0f} ms, width {wide},"
                         f" {len(wrong)} violations, {len(tab.problems)} problems on the console"
+                        + ("" if dark else f", {len(keys)} of the keyboard")
                     )
+                    print(*(f"    {key}" for key in keys), sep="\n", end="\n" if keys else "")
                     for one in wrong:
                         print("   ", one["id"], one["help"], *one["nodes"], sep="\n      ")
                     for problem in tab.problems:

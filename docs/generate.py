@@ -20,6 +20,8 @@ import figaroh_jax as fj  # noqa: E402
 from figaroh_jax.effects.kinematic import CATALOGUE as KINEMATIC  # noqa: E402
 from figaroh_jax.formats import reference  # noqa: E402
 from figaroh_jax.recordings.migration import KEYS  # noqa: E402
+from figaroh_jax.reporting.rollout_effects import NOT_LOOKED_FOR, ROLLOUT_EFFECTS  # noqa: E402
+from figaroh_jax.rollouts.parameters import Entry, put, values  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 SIZES = {"mass": 0.5, "com_x": 0.05, "com_y": 0.02, "com_z": 0.05, "height": 0.35, "x": 0.1, "rate": 1e-3, "speed": 0.4}
@@ -62,8 +64,12 @@ def signature(name: str, effect: Any) -> str | None:
     if not np.isfinite(added).all() or np.ptp(added) == 0 and not added.any():
         return None
     axes = [("time, s", t[20:-20]), ("position, rad", q[20:-20, j]), ("velocity, rad/s", v[20:-20, j])]
-    parts = [drawing(x, added, label, 8 + 215 * k) for k, (label, x) in enumerate(axes)]
     text = f"Torque that {escape(name)} adds at the joint {robot.joint_names[j]}, against time, position and velocity"
+    return svg(text, [drawing(x, added, label, 8 + 215 * k) for k, (label, x) in enumerate(axes)])
+
+
+def svg(text: str, parts: Sequence[str]) -> str:
+    """Drawings side by side under a text that says what they show."""
     lines = "polyline{fill:none;stroke:#0072b2}path{stroke:#bbb;fill:none}"
     style = f"<style>text{{font:11px sans-serif;fill:#777}}{lines}</style>"
     return (
@@ -139,6 +145,68 @@ def effect_page(name: str, effect: Any, kinematic: bool) -> str:
     )
 
 
+SERVO = {"elbow": {"kind": "position", "kp": 40.0, "kd": 1.5, "force": 30.0}}
+
+
+def servo_motion() -> tuple[Any, np.ndarray, np.ndarray]:
+    """The elbow of the demo's arm behind a position servo, its command, and where it starts."""
+    loop, _ = fj.load_loop(fj.DEMO, SERVO, joints=["elbow"])
+    t = np.arange(0, 6, float(loop.dt))
+    u = 0.8 * np.sin(2 * np.pi * 0.5 * t) + 0.3 * np.sign(np.sin(2 * np.pi * 0.23 * t + 1.0))
+    return loop, u[:, None], np.array([u[0]])
+
+
+def rollout_signature(name: str, effect: Any) -> str | None:
+    """By what the effect moves the elbow away from where it would be, against time, position and velocity."""
+    if not effect.number:
+        return None
+    loop, u, start = servo_motion()
+    plain = tuple(Entry(number, (0,)) for number in ("friction", "damping", "armature"))
+    base = put(loop, plain, np.array([0.5, 0.3, 0.05]))
+    table = (Entry(effect.number, (0,)),)
+    more = effect.size + (float(values(base, table)[0]) if table[0] in plain else 0.0)
+    without, with_it = (fj.rollout(one, u, start) for one in (base, put(base, table, np.array([more]))))
+    step = slice(None, None, max(1, len(u) // 1200))
+    t, q, v = (np.asarray(x)[step] for x in (without.time, without.position[:, 0], without.velocity[:, 0]))
+    moved = np.asarray(with_it.reading - without.reading)[step, 0]
+    axes = [("time, s", t), ("position, rad", q), ("velocity, rad/s", v)]
+    text = f"By what {escape(name)} moves the elbow of a position servo, rad, against time, position and velocity"
+    return svg(text, [drawing(x, moved, label, 8 + 215 * k) for k, (label, x) in enumerate(axes)])
+
+
+def rollout_page(name: str, effect: Any) -> str:
+    """A page like those of the other effects."""
+    picture = rollout_signature(name, effect)
+    if picture is not None:
+        page(f"effect/{name}_rollout.svg", picture)
+    at = f"the {effect.acts_on}"
+    unknown = ["", "A task may say this name; no diagnosis looks for it yet."] if name in NOT_LOOKED_FOR else []
+    return "\n".join(
+        [
+            f"# {name}, in rollouts" if name in fj.CATALOGUE or name in KINEMATIC else f"# {name}",
+            "",
+            f"{effect.title[:1].upper()}{effect.title[1:]}. {effect.meaning}",
+            *unknown,
+            "",
+            f"Acts on a {effect.acts_on}. Seen in recordings of a command and a position, without torque.",
+            "",
+            f"    {effect.equation}",
+            "",
+            *([f"![signature]({name}_rollout.svg)", ""] if picture is not None else []),
+            "| parameter | unit |",
+            "|---|---|",
+            *(f"| `{key}` | {unit} |" for key, unit in effect.parameters.items()),
+            "",
+            f"**What hides it**: {effect.hidden_by}.",
+            "",
+            f"**How to excite it**: {effect.excite.format(at=at)}.",
+            "",
+            f"**Where it can be said**: {effect.said_by}.",
+            "",
+        ]
+    )
+
+
 def api(name: str, what: Any) -> str:
     """The entry of a public name; an example in a docstring is code, not text."""
     doc = inspect.getdoc(what) or ""
@@ -158,6 +226,9 @@ def main() -> None:
         if name not in own:
             page(f"effect/{name}.md", effect_page(name, effect, kinematic=True))
         index.append(f"| [{name}]({name}.md) | poses |")
+    for name, effect in ROLLOUT_EFFECTS.items():
+        page(f"effect/{name}_rollout.md", rollout_page(name, effect))
+        index.append(f"| [{name}]({name}_rollout.md) | rollouts |")
     page("effect/index.md", "\n".join([*index, ""]))
     table = ["| key of FIGAROH | here |", "|---|---|", *(f"| `{key}` | {text} |" for key, text in KEYS.items())]
     text = (ROOT / "docs" / "migration.md").read_text(encoding="utf-8")

@@ -73,7 +73,7 @@ if TYPE_CHECKING:
         payloads as payloads,
         wrenches as wrenches,
     )
-    from .identification.identification import identify_task as identify_task
+    from .identification.identification import identify as identify
     from .recordings import cleaning as cleaning, devices as devices
     from .recordings.arrays import postures as postures, recording as recording
     from .recordings.dataset import Recording as Recording, read_recordings as read_recordings
@@ -98,7 +98,7 @@ if TYPE_CHECKING:
     from .rollouts.reading import load_loop as load_loop
     from .rollouts.simulation import rollout as rollout
     from .simulators.registry import backend as backend
-    from .tasks import diagnose as diagnose, diagnose_task as diagnose_task, identify as identify
+    from .tasks import diagnose as diagnose, diagnose_task as diagnose_task, identify_task as identify_task
 
 __version__ = "0.1.0"
 
@@ -117,7 +117,7 @@ _MODULES = {
     "recordings.devices": ("Device", "own_device"),
     "recordings.dataset": ("Recording", "read_recordings"),
     "recordings.poses": ("PoseRecording",),
-    "tasks": ("diagnose", "diagnose_task", "identify"),
+    "tasks": ("diagnose", "diagnose_task", "identify_task"),
     "rigid.dynamics": ("forward_dynamics", "inverse_dynamics", "mass_matrix"),
     "effects.base": ("Effect", "JointEffect", "Motion", "amplitude", "place", "shape"),
     "effects.catalogue": ("CATALOGUE", "register"),
@@ -130,7 +130,7 @@ _MODULES = {
     "excitation.postures": ("Instrument", "PostureDesign", "excite_postures"),
     "excitation.task": ("excite_task",),
     "excitation.motions": ("Trajectory", "fourier", "quintic", "spline"),
-    "identification.identification": ("identify_task",),
+    "identification.identification": ("identify",),
     "rollouts.measured": ("RolloutData", "rollout_data"),
     "rollouts.reading": ("load_loop",),
     "rollouts.simulation": ("rollout",),

@@ -71,12 +71,10 @@ def diagnose_file(
 
     check_backend(backend, "joint_torque_regressor")
     task = _task_for(task_file, out)
-    if any(entry.measurement is not None for entry in task.data):
+    if task.of_postures:
         _native_alone(backend)
         return _diagnose_poses(task, out, progress)
-    from .rollouts.task import is_rollout_task
-
-    if is_rollout_task(task):
+    if task.of_rollouts:
         _native_alone(backend)
         return _diagnose_rollouts(task, out, progress)
     from .diagnosis.diagnosis import diagnose_task
@@ -159,9 +157,7 @@ def identify_file(
 
     check_backend(backend, "joint_torque_regressor")
     task = _task_for(task_file, out)
-    from .rollouts.task import is_rollout_task
-
-    if is_rollout_task(task):
+    if task.of_rollouts:
         _native_alone(backend)
         return _identify_rollouts(task, out, progress)
     from .formats.export import write_model
@@ -426,26 +422,22 @@ def _show_diagnosis(diagnosis: Diagnosis | PoseDiagnosis, verbose: bool = False)
 
 
 def _identification_json(found: Identification | RolloutIdentification) -> str:
-    from .rollouts.identification import RolloutIdentification
+    from .identification.result import Identification, to_json
 
-    if isinstance(found, RolloutIdentification):
-        return found.to_json()
-    from .identification.result import to_json
-
-    return to_json(found)
+    return to_json(found) if isinstance(found, Identification) else found.to_json()
 
 
 def _show_identification(found: Identification | RolloutIdentification, verbose: bool = False) -> None:
-    from .rollouts.identification import RolloutIdentification
+    from .identification.result import Identification
 
-    if isinstance(found, RolloutIdentification):
+    if isinstance(found, Identification):
+        from .reporting.terminal import show_identification
+
+        show_identification(found, found.model.robot.name, verbose=verbose)
+    else:
         from .reporting.rollout_report import show_rollouts
 
         show_rollouts(found, found.model.robot.name, verbose=verbose)
-        return
-    from .reporting.terminal import show_identification
-
-    show_identification(found, found.model.robot.name, verbose=verbose)
 
 
 def _calibration_json(calibration: Calibration) -> str:

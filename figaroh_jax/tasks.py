@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, overload
 
@@ -11,36 +11,40 @@ from .errors import InputError
 if TYPE_CHECKING:
     from .calibration.kinematic_diagnosis import PoseDiagnosis
     from .formats.config import Baseline, Preprocess, Task
-    from .identification.identification import Fit
     from .identification.result import Identification
     from .recordings.dataset import Recording
     from .recordings.poses import PoseRecording
     from .results import Diagnosis
     from .rigid.model import RobotModel
+    from .rollouts.identification import RolloutIdentification
     from .simulators.contract import Backend
 
-__all__ = ["diagnose", "diagnose_task", "identify"]
+__all__ = ["diagnose", "diagnose_task", "identify_task"]
 
 
 def diagnose_task(
     task: Task, progress: Callable[[str, float], None] = lambda phase, share: None, backend: str = "native"
 ) -> Diagnosis | PoseDiagnosis:
-    """Diagnose what a task file describes (`load_task`), recordings of torque or of measured postures alike.
+    """Diagnose what a task file describes (`load_task`): torques, measured postures, or commands and positions.
 
     The rigid body's torques are those of the named backend. Raises `InputError` before any work where the task is
-    wrong. The answer has `verdict` and `causes` at either level.
+    wrong. The answer has `verdict` and `causes` in each case.
 
     >>> import figaroh_jax as fj
     >>> found = fj.diagnose_task(fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml")))
     >>> found.verdict, found.causes[0].name.effect
     ('named', 'coupled_transmission')
     """
-    if any(entry.measurement is not None for entry in task.data):
+    if task.of_postures:
         from .calibration.kinematic_diagnosis import diagnose_pose_task
 
-        if backend != "native":
-            raise InputError(f"backend '{backend}': postures are diagnosed with 'native' alone")
+        _native_alone(backend, "postures are diagnosed")
         return diagnose_pose_task(task, progress)
+    if task.of_rollouts:
+        from .rollouts.task import diagnose_rollout_task
+
+        _native_alone(backend, "rollouts are diagnosed")
+        return diagnose_rollout_task(task, progress).diagnosis
     from .diagnosis.diagnosis import diagnose_task as of_torques
 
     return of_torques(task, progress, backend)
@@ -124,40 +128,32 @@ def diagnose(
     return replace(found, notes=(*notes, *found.notes))
 
 
-def identify(
-    model: RobotModel | Backend,
-    recordings: Sequence[Recording],
-    preprocess: Preprocess | None = None,
-    known: Baseline | None = None,
-    *,
-    trust: float = 0.10,
-    fit: Fit = "physical",
-    joints: Sequence[str] | None = None,
-    bounds: Mapping[str, Mapping[str, Any]] | None = None,
-    progress: Callable[[str, float], None] = lambda phase, share: None,
-) -> Identification:
-    """Fit the dynamics of `model`, a robot or a backend of it, to recordings (joint side, SI units).
+def identify_task(
+    task: Task, progress: Callable[[str, float], None] = lambda phase, share: None, backend: str = "native"
+) -> Identification | RolloutIdentification:
+    """Identify what a task file describes (`load_task`): recordings of torque, or of commands and positions.
 
-    `known` says which friction is fitted beside the links, `trust` how far the nominal inertials are believed (relative
-    one sigma; less if cross-validation says so), `joints` whose torque is fitted (default: all that have one), `bounds`
-    what CAD says of links: least and most mass, a box of the centre of mass. `fit` "physical" finds the best robot
-    whose links are bodies, "log_cholesky" the same by Levenberg-Marquardt, "unconstrained" leaves the links free.
-    Raises `InputError` where a recording cannot be right (units, order or sign of columns, clock, standstill), shows
-    too little, or the fit that was asked for fails.
+    The rigid body's regressor is that of the named backend. Raises `InputError` before any work where the task is
+    wrong.
 
     >>> import figaroh_jax as fj
-    >>> task = fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml"))
-    >>> robot = fj.load_robot(task)
-    >>> found = fj.identify(robot, fj.read_recordings(task, robot), fj.Preprocess(cutoff=15))
-    >>> bool((found.fit.relative < found.nominal.relative + 1e-9).all())
-    True
+    >>> found = fj.identify_task(fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml")))
+    >>> found.rank <= found.structural_rank, found.solution.reason
+    (True, '')
     """
-    from .identification.identification import identify as of_torques
+    if task.of_rollouts:
+        from .rollouts.identification import identify_rollout_task
 
-    notes = _checked(model, recordings)
-    settings: Any = {"trust": trust, "fit": fit, "joints": joints, "bounds": bounds, "progress": progress}
-    found = of_torques(model, recordings, preprocess, known, **settings)
-    return replace(found, notes=(*notes, *found.notes))
+        _native_alone(backend, "rollouts are identified")
+        return identify_rollout_task(task, progress)
+    from .identification.identification import identify_task as of_torques
+
+    return of_torques(task, progress, backend)
+
+
+def _native_alone(backend: str, what: str) -> None:
+    if backend != "native":
+        raise InputError(f"backend '{backend}': {what} with 'native' alone")
 
 
 def _checked(model: RobotModel | Backend, recordings: Sequence[Recording]) -> tuple[str, ...]:

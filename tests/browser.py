@@ -66,6 +66,11 @@ class Page:
                 raise AssertionError(f"never true in the page: {expression}; problems: {self.problems}")
             time.sleep(0.05)
 
+    def press(self, key: str, code: int) -> None:
+        """One press of a key that no character belongs to: "Tab", 9."""
+        for kind in ("rawKeyDown", "keyUp"):
+            self._call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+
     def screenshot(self, path: Path, *, whole: bool = False) -> None:
         """PNG of the viewport, or of the whole page."""
         path.write_bytes(base64.b64decode(self._call("Page.captureScreenshot", captureBeyondViewport=whole)["data"]))

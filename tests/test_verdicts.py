@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -13,8 +14,10 @@ from simulated_arm import Truth, recording
 
 from figaroh_jax.estimation.priors import rigid_prior
 from figaroh_jax.formats.config import Preprocess
-from figaroh_jax.identification.identification import identify
+from figaroh_jax.identification import identification
 from figaroh_jax.recordings.dataset import Recording
+
+identify = partial(identification.identify, check=False)  # of arms that no check would let pass
 
 TRUST = 0.1
 CASES = [moving for moving in product((True, False), repeat=3) if any(moving)]

@@ -128,9 +128,11 @@ def _high_orders(model: RobotModel, chain: Sequence[int], postures: Sequence[Pos
             continue
         step, lowest = np.pi / np.ptp(q), shape_of(effect)[1][-1]
         count = min(int((_HIGHEST - lowest) / step), _RESOLVED * len(q))
-        for order in lowest + step * np.arange(1, count + 1):
-            size = tuple(_STEP / np.maximum(np.sqrt(np.mean(wave(order * q) ** 2)), 0.1) for wave in (np.sin, np.cos))
-            found.append(Block(effect, columns_of(effect, model, (j,), float(order)), size, float(order), reach=step))
+        orders = lowest + step * np.arange(1, count + 1)
+        waves = np.stack([wave(np.outer(orders, q)) for wave in (np.sin, np.cos)], axis=1)
+        sizes = _STEP / np.maximum(np.sqrt(np.mean(waves**2, axis=2)), 0.1)
+        for order, size in zip(orders.tolist(), sizes.tolist(), strict=True):
+            found.append(Block(effect, columns_of(effect, model, (j,), order), tuple(size), order, reach=step))
     return found
 
 
@@ -184,8 +186,8 @@ def effects_on(model: RobotModel, postures: Sequence[Postures], measured: Measur
     def jacobian(unknowns: Float[np.ndarray, " unknowns"], which: Sequence[int]) -> Float[np.ndarray, "rows some"]:
         if not len(which):
             return np.zeros((len(measured.posture), 0))
-        for k in which:
-            kept.setdefault(k, [moves(column, postures) for column in blocks[k].columns])
+        for k in set(which) - kept.keys():
+            kept[k] = [moves(column, postures) for column in blocks[k].columns]
         sizes = np.array([size for k in which for size in blocks[k].sizes])
         return moved_rows(measured, twist_rows(measured, unknowns), [m for k in which for m in kept[k]]) * sizes
 

@@ -309,6 +309,13 @@ class _Inner(NamedTuple):
         normal = C.T @ C + np.eye(len(which)) / _EFFECT_WIDTH**2
         return -np.linalg.solve(normal, C.T @ self.residual[0]), normal
 
+    def drops(self, which: Int[Array, "blocks width"]) -> Float[Array, " blocks"]:
+        """What each block of candidates, by itself, takes from the squares of the fitted rows."""
+        C = self.columns[0][:, which]
+        normal = np.einsum("rbi,rbj->bij", C, C, optimize=True) + np.eye(which.shape[1]) / _EFFECT_WIDTH**2
+        pull = np.tensordot(self.residual[0], C, axes=1)
+        return np.sum(pull * np.linalg.solve(normal, pull[..., None])[..., 0], axis=1)
+
     def error(self, which: Array) -> list[Array]:
         residual = self.residual[1] + (self.columns[1][:, which] @ self.solve(which)[0] if len(which) else 0.0)
         channel, item, count = self.shape
@@ -337,12 +344,14 @@ def _score_of(folds: Sequence[_Inner], which: Array | None = None) -> float:
 
 def _screen(folds: Sequence[_Inner], slices: Mapping[int, slice], taken: Sequence[int]) -> list[int]:
     """Blocks by how much of the fitted rows they explain, for their number of columns; not those taken already."""
-    merit = {}
+    merit, by_width = {}, {}
     for k, block in slices.items():
         if k not in taken:
-            which = np.r_[block]
-            drops = [inner.residual[0] @ inner.columns[0][:, which] @ -inner.solve(which)[0] for inner in folds]
-            merit[k] = np.mean(drops) - len(which) * np.log(len(folds[0].residual[0])) / 2
+            by_width.setdefault(block.stop - block.start, []).append(k)
+    for width, mine in by_width.items():  # blocks of one width at once
+        columns = np.array([np.r_[slices[k]] for k in mine])
+        drops = np.mean([inner.drops(columns) for inner in folds], axis=0)
+        merit |= zip(mine, drops - width * np.log(len(folds[0].residual[0])) / 2, strict=True)
     return sorted(merit, key=lambda k: -merit[k])
 
 

@@ -48,17 +48,21 @@ _ALIGNMENT = 64  # bytes; XLA takes such memory over without a copy
 # inside of sums number by number. JAX 0.11 has the newer one alone.
 CPU_OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
 
-DRAFT_OPTIONS = CPU_OPTIONS | {"xla_backend_optimization_level": 0}
+# In one piece: at this level pieces cost more to compile and call each other.
+DRAFT_OPTIONS = CPU_OPTIONS | {"xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_count": 1}
 FEW = 512  # samples; for these the compiler takes longer to optimise a long program than that saves later
 
 
-def program(function: Callable[..., Any], cpu: Mapping[str, Any] = CPU_OPTIONS, **options: Any) -> Callable[..., Any]:
+def program(
+    function: Callable[..., Any], cpu: Mapping[str, Any] = CPU_OPTIONS, kept: bool = False, **options: Any
+) -> Callable[..., Any]:
     """`jax.jit(function, **options)`; on a CPU with the compiler's options `cpu`, unknown to that of other devices.
 
-    Within a program of the caller's, where options cannot be set, it is compiled with the caller's.
+    `kept`: on a CPU it is kept whole between processes (`executable_cache`), which makes a call a tenth of a
+    millisecond longer. Within a program of the caller's, where options cannot be set, it is compiled with the caller's.
     """
     elsewhere = jax.jit(function, **options)
-    on_cpu = jax.jit(function, compiler_options=dict(cpu), **options)
+    on_cpu = Program(function, options=dict(cpu)) if kept else jax.jit(function, compiler_options=dict(cpu), **options)
 
     @wraps(function)
     def call(*arguments: Any) -> Any:

@@ -13,6 +13,8 @@ before the joint moves; a coefficient times its field is what the joint's twist 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -44,7 +46,8 @@ Array = np.ndarray
 _ORDERS = tuple(np.arange(2.0, 12.5, 0.5))  # of gear errors, per turn of the joint
 
 
-class Postures(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Postures:
     """Postures of one recording, in the order in which they were measured, and what gravity does in them."""
 
     q: Float[np.ndarray, "samples nv"]  # rad or m
@@ -54,6 +57,13 @@ class Postures(NamedTuple):
     payload: Float[np.ndarray, "samples nj"]  # as torque, of the carried load alone
     time: Float[np.ndarray, " samples"]  # s
     duration: float  # s, of all recordings together
+    _motions: dict[int, PostureMotion] = field(default_factory=dict, init=False, repr=False)  # by robot
+
+    def motion(self, model: RobotModel) -> PostureMotion:
+        """The postures as effects see them, made once."""
+        if id(model) not in self._motions:
+            self._motions[id(model)] = PostureMotion.of(model, self)
+        return self._motions[id(model)]
 
 
 class Column(NamedTuple):
@@ -407,16 +417,19 @@ def _shifts(
     unit_shape = {shape_of(effect)[0]: shape} if shape_of(effect)[0] else {}
     for name, parameter in effect.parameters().items():
         if parameter.linear:
-            one = effect(np.array(at, int), **{name: effect.correction}, **unit_shape)
+            one = partial(effect, np.array(at, int), **{name: effect.correction}, **unit_shape)
             unit = joint_unit(parameter.unit or "1", bool(at) and model.joints[at[-1]].kind != "revolute")
             yield name, unit, [(j, _shift(model, j, one)) for j in joints]
 
 
-def _shift(model: RobotModel, joint: int, effect: Effect) -> Callable[[Postures], Float[np.ndarray, "6 samples"]]:
+def _shift(
+    model: RobotModel, joint: int, one: Callable[[], Effect]
+) -> Callable[[Postures], Float[np.ndarray, "6 samples"]]:
+    """The field of an effect that is made when it is asked for: of many candidates few ever are."""
     motion = axis_twist(model, joint)
 
     def field(postures: Postures) -> Float[np.ndarray, "6 samples"]:
-        error = np.asarray(effect.position_error(PostureMotion.of(model, postures)))
+        error = np.asarray(one().position_error(postures.motion(model)))
         return -motion[:, None] * (error if error.ndim == 1 else error[:, joint])
 
     return field

@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from ..compiled.batching import CPU_OPTIONS, DRAFT_OPTIONS, FEW, program
 from ..effects.base import Effect, Motion, columns, place, smooth_sign
 from ..effects.catalogue import find
 from ..errors import InputError
@@ -37,6 +37,7 @@ __all__ = [
     "term_columns",
 ]
 
+STATES = 129  # more than a chunk of `batching`, so that the program of the recordings serves random states too
 SHORT_NAMES = {"viscous_friction": "fv", "coulomb_friction": "fc", "rotor_inertia": "Ia", "torque_offset": "off"}
 
 
@@ -87,7 +88,7 @@ def structural_columns(
     model: RobotModel, terms: tuple[Effect, ...], samples: int | None = None, seed: int = 0
 ) -> Float[np.ndarray, "samples nv columns"]:
     """Columns at independent random states: what any motion at all could show."""
-    samples = samples or max(64, 4 * len(column_names(model, terms)) // max(model.nv, 1))
+    samples = samples or max(STATES, 4 * len(column_names(model, terms)) // max(model.nv, 1))
     q, v, a = random_states(model, samples, seed)
     with jax.enable_x64(True):
         motion = motion_at(model, np.arange(samples) * 1.0, q, v, a, 0.0, jnp.zeros(model.nv))
@@ -132,15 +133,18 @@ def columns_of(
     """Columns of the rigid body by its backend, then those of the effects and of the `widths` of dry friction."""
     state = (np.asarray(x) for x in (motion.position, motion.velocity, motion.acceleration))
     rigid = np.asarray(backend.joint_torque_regressor(*state))
-    return np.concatenate([rigid, *(np.asarray(x) for x in _beside(terms, motion, widths))], axis=2)
+    beside = _beside_few if len(motion.time) <= FEW else _beside_many
+    return np.concatenate([rigid, *(np.asarray(x) for x in beside(terms, motion, widths))], axis=2)
 
 
-@eqx.filter_jit
-def _beside(
+def _columns_beside(
     terms: tuple[Effect, ...], motion: Motion, widths: tuple[float, ...]
 ) -> list[Float[Array, "samples nv columns"]]:
     signs = (smooth_sign(motion.velocity, motion.acceleration, motion.dt, w) for w in widths)
     return [*_term_columns(terms, motion), *(sign[:, :, None] for sign in signs)]
+
+
+_beside_few, _beside_many = (program(_columns_beside, options, kept=True) for options in (DRAFT_OPTIONS, CPU_OPTIONS))
 
 
 def term_columns(

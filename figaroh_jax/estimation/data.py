@@ -42,7 +42,7 @@ from .posegroups import devices_of
 if TYPE_CHECKING:
     from ..formats.config import Preprocess
 
-__all__ = ["Data", "Open", "PoseData", "TorqueData", "as_data", "pose_data", "residual", "torque_data"]
+__all__ = ["Data", "PoseData", "TorqueData", "as_data", "pose_data", "residual", "torque_data"]
 
 
 @runtime_checkable
@@ -51,19 +51,6 @@ class Data(Protocol):
 
     def residual(self, model: ExtendedModel) -> Float[Array, " rows"]:
         """Weighted rows, pure: JAX transforms it by every array of `model` and of the data."""
-        ...
-
-
-@runtime_checkable
-class Open(Protocol):
-    """Data that leave numbers open, which a fit may estimate: frames of devices, states at the start of rollouts."""
-
-    def unknowns(self) -> tuple[tuple[str, str, float], ...]:
-        """Name, unit and typical size of each."""
-        ...
-
-    def moved(self, numbers: Float[Array, " unknowns"]) -> Any:
-        """The data with the numbers changed by so much."""
         ...
 
 

@@ -16,7 +16,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -30,9 +30,11 @@ from ..effects.extended import ExtendedModel
 from ..errors import InputError, nearest
 from ..rigid import lie
 from ..rigid.model import DOF_NAMES, RobotModel
-from .data import Data, Open, PoseData
 
-__all__ = ["KINDS", "Free", "Part", "apply", "chosen_of"]
+if TYPE_CHECKING:
+    from .data import Data
+
+__all__ = ["KINDS", "Free", "Open", "Part", "apply", "chosen_of"]
 
 KINDS = (
     *("inertia", "friction", "effects", "joint_offset", "link_geometry", "frames", "tool_frame", "base", "gravity"),
@@ -44,6 +46,19 @@ TEN_UNITS = ("kg", *("kg m",) * 3, *("kg m2",) * 6)
 TWIST = ("x", "y", "z", "rx", "ry", "rz")
 TWIST_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 REACH = 0.2  # m: how far from its joint the mass of a link is taken to be, where a size of its moments is needed
+
+
+@runtime_checkable
+class Open(Protocol):
+    """Data that leave numbers open, which a fit may estimate: frames of devices, states at the start of rollouts."""
+
+    def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        """Name, unit and typical size of each."""
+        ...
+
+    def moved(self, numbers: Float[Array, " unknowns"]) -> Any:
+        """The data with the numbers changed by so much."""
+        ...
 
 
 class Part(NamedTuple):
@@ -186,8 +201,7 @@ def _open_parts(kind: str, data: Sequence[Data]) -> Iterator[Part]:
     """What the data leave open, by `unknowns` of which the names begin with the kind; of devices all are `frames`."""
     for k, one in enumerate(data):
         unknowns = one.unknowns() if isinstance(one, Open) else ()
-        device = isinstance(one, PoseData)
-        words = ["frames" if device else name.split()[0] for name, _, _ in unknowns]
+        words = ["frames" if hasattr(one, "device") else name.split()[0] for name, _, _ in unknowns]
         mine = [i for i, word in enumerate(words) if word == kind]
         if mine:
             names, units, sizes = zip(*(unknowns[i] for i in mine), strict=True)

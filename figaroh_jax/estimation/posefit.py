@@ -197,8 +197,8 @@ def _blocks_rows(chain: Chain, device: Device, own: Array, *blocks: Any) -> tupl
 
 DRAFT = 256  # postures; for fewer the compiler takes longer to optimise than that saves later
 
-_rows_quick = program(_blocks_rows, cpu=DRAFT_OPTIONS)
-_rows_fast = program(_blocks_rows)
+_rows_quick = program(_blocks_rows, cpu=DRAFT_OPTIONS, kept=True)
+_rows_fast = program(_blocks_rows, kept=True)
 
 
 @jax.jit

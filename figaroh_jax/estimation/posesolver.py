@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from ..compiled.batching import program
-from .posefit import DRAFT, DRAFT_OPTIONS, Part, Problem, block_rows, parts_of, ties
+from .posefit import DRAFT, Part, Problem, block_rows, linearise, parts_of, ties
 
 __all__ = [
     "NormalEquations",
@@ -51,22 +51,22 @@ class Solution(NamedTuple):
 class NormalEquations(NamedTuple):
     """J'J, J'r and half of r'r of weighted rows."""
 
-    matrix: Float[Array, "unknowns unknowns"]
-    gradient: Float[Array, " unknowns"]
-    cost: Float[Array, ""]
+    matrix: Float[Any, "unknowns unknowns"]
+    gradient: Float[Any, " unknowns"]
+    cost: Float[Any, ""]
 
 
 class State(NamedTuple):
     """Where a search stands."""
 
-    at: Float[Array, " unknowns"]
-    step: Float[Array, " unknowns"]  # to be tried
+    at: Float[Any, " unknowns"]
+    step: Float[Any, " unknowns"]  # to be tried
     normal: NormalEquations
-    damping: Float[Array, ""]
-    growth: Float[Array, ""]
-    decrease: Float[Array, ""]  # that the step promises
-    steps: Int[Array, ""]
-    converged: Bool[Array, ""]
+    damping: Float[Any, ""]
+    growth: Float[Any, ""]
+    decrease: Float[Any, ""]  # that the step promises
+    steps: Int[Any, ""]
+    converged: Bool[Any, ""]
 
 
 def solve(
@@ -81,11 +81,16 @@ def solve(
 
     Where `free` is 0 an unknown is held at zero. To be called where 64-bit JAX is on.
     """
-    parts, free = parts_of(problem), np.asarray(free, float)
-    weights = cut_weights(problem, parts, np.asarray(row_weights, float))
+    weights, precision, free = (np.asarray(x, float) for x in (row_weights, precision, free))
+    start = np.asarray(start, float) * free
     few = max(np.shape(group.position)[1] for group in problem.groups) <= DRAFT
-    minimise = _minimise_quick if few else _minimise_fast
-    found = minimise(parts, weights, np.asarray(precision, float), free, np.asarray(start, float) * free, max_steps)
+    if few and jax.default_backend() == "cpu":  # on the host, by the program that `linearise` has compiled anyway
+        normal_at, found = partial(_normal_on_host, problem, weights, precision, free), beginning(start)
+        while _going(found, max_steps):
+            found = attempt(normal_at, found)
+    else:
+        parts = parts_of(problem)
+        found = _minimise(parts, cut_weights(problem, parts, weights), precision, free, start, max_steps)
     return Solution(np.asarray(found.at), bool(found.converged), int(found.steps), float(found.normal.cost))
 
 
@@ -147,30 +152,47 @@ def _square(rows: Float[Array, "columns samples"]) -> Float[Array, "columns colu
     return jnp.matmul(rows, rows.T, precision=jax.lax.Precision.HIGHEST)
 
 
+def _normal_on_host(
+    problem: Problem, weights: np.ndarray, precision: np.ndarray, free: np.ndarray, at: np.ndarray
+) -> NormalEquations:
+    residual, jacobian = linearise(problem, at)
+    rows, columns = weights * residual, weights[:, None] * jacobian * free
+    matrix = columns.T @ columns + np.diag(free * precision + 1.0 - free)
+    return NormalEquations(
+        matrix, columns.T @ rows + free * precision * at, 0.5 * (rows @ rows + np.sum(precision * at**2))
+    )
+
+
+def _library(x: Any) -> Any:
+    """NumPy for what lies on the host, JAX for what is traced."""
+    return np if isinstance(x, (np.ndarray, np.generic)) else jnp
+
+
 def attempt(normal_at: Callable[[Array], NormalEquations], state: State) -> State:
     """One trial step: taken where the cost falls, and the next one with the damping that follows."""
-    at = state.at + state.step
+    at, lib = state.at + state.step, _library(state.at)
     normal = normal_at(at)
     gained = (state.normal.cost - normal.cost) / state.decrease
     better = gained > 0.0  # from the infinite cost at the beginning to the first one too
-    at, normal = jax.tree.map(partial(jnp.where, better), (at, normal), (state.at, state.normal))
-    shrink = jnp.clip(1.0 - (2.0 * gained - 1.0) ** 3, 1.0 / 3.0, 1.0)
-    damping = jnp.where(state.steps == 0, state.damping, state.damping * jnp.where(better, shrink, state.growth))
+    at, normal = jax.tree.map(partial(lib.where, better), (at, normal), (state.at, state.normal))
+    shrink = lib.clip(1.0 - (2.0 * gained - 1.0) ** 3, 1.0 / 3.0, 1.0)
+    damping = lib.where(state.steps == 0, state.damping, state.damping * lib.where(better, shrink, state.growth))
     step, decrease = _damped(normal, damping)
-    growth = jnp.where(better, 2.0, 2.0 * state.growth)
-    small = jnp.abs(step).max() <= _STEP * (1.0 + jnp.abs(at).max())
+    growth = lib.where(better, 2.0, 2.0 * state.growth)
+    small = lib.abs(step).max() <= _STEP * (1.0 + lib.abs(at).max())
     done = (damping < 1.0) & (small | (decrease <= _DECREASE * normal.cost))
     return State(at, step, normal, damping, growth, decrease, state.steps + 1, done)
 
 
-def beginning(start: Float[Array, " unknowns"]) -> State:
+def beginning(start: Float[Any, " unknowns"]) -> State:
     """The state before the first trial, which is the start itself."""
-    zero, one = jnp.zeros_like(start), jnp.ones_like(start[0])
-    nowhere = NormalEquations(jnp.eye(len(start), dtype=start.dtype), zero, jnp.inf * one)
-    return State(start, zero, nowhere, _DAMPING * one, 2.0 * one, one, jnp.zeros((), int), jnp.zeros((), bool))
+    lib = _library(start)
+    zero, one = lib.zeros_like(start), lib.ones((), start.dtype)
+    nowhere = NormalEquations(lib.eye(len(start), dtype=start.dtype), zero, lib.inf * one)
+    return State(start, zero, nowhere, _DAMPING * one, 2.0 * one, one, lib.zeros((), int), lib.zeros((), bool))
 
 
-def stuck(state: State) -> Bool[Array, ""]:
+def stuck(state: State) -> Bool[Any, ""]:
     """Whether no damping helps any more."""
     return state.damping >= _STUCK
 
@@ -179,22 +201,33 @@ def _search(
     parts: tuple[Part, ...], weights: Any, precision: Array, free: Array, start: Array, max_steps: Int[Array, ""]
 ) -> State:
     normal_at = partial(normal_equations, parts, weights, precision, free)
-
-    def going(state: State) -> Array:
-        return ~state.converged & (state.steps < max_steps) & ~stuck(state)
-
-    return jax.lax.while_loop(going, partial(attempt, normal_at), beginning(start))
+    return jax.lax.while_loop(partial(_going, max_steps=max_steps), partial(attempt, normal_at), beginning(start))
 
 
-_minimise_quick = program(_search, cpu=DRAFT_OPTIONS)
-_minimise_fast = program(_search)
+def _going(state: State, max_steps: Any) -> Any:
+    return ~state.converged & (state.steps < max_steps) & ~stuck(state)
 
 
-def _damped(normal: NormalEquations, damping: Array) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
+_minimise = program(_search, kept=True)
+
+
+def _damped(normal: NormalEquations, damping: Any) -> tuple[Float[Any, " unknowns"], Float[Any, ""]]:
     """Step at a damping, and the decrease of the cost that it promises; by a Cholesky factor of unit diagonal."""
-    size = jnp.sqrt(jnp.diagonal(normal.matrix))
-    size = jnp.where(size > 0.0, size, 1.0)
-    scaled = normal.matrix / jnp.outer(size, size) + damping * jnp.eye(len(size))
-    factor = jax.scipy.linalg.cho_factor(scaled, lower=True)
-    step = -jax.scipy.linalg.cho_solve(factor, normal.gradient / size) / size
-    return step, 0.5 * jnp.sum(step * (damping * size**2 * step - normal.gradient))
+    lib = _library(normal.gradient)
+    size = lib.sqrt(lib.diagonal(normal.matrix))
+    size = lib.where(size > 0.0, size, 1.0)
+    scaled = normal.matrix / lib.outer(size, size) + damping * lib.eye(len(size))
+    step = -_solved(scaled, normal.gradient / size) / size
+    return step, 0.5 * lib.sum(step * (damping * size**2 * step - normal.gradient))
+
+
+def _solved(matrix: Float[Any, "n n"], right: Float[Any, " n"]) -> Float[Any, " n"]:
+    """By Cholesky's factor; NaN where there is none."""
+    if _library(right) is jnp:
+        return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), right)
+    from scipy.linalg import LinAlgError, cho_factor, cho_solve  # slow to import
+
+    try:
+        return cho_solve(cho_factor(matrix, lower=True, check_finite=False), right, check_finite=False)
+    except LinAlgError:
+        return np.full_like(right, np.nan)

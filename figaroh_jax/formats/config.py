@@ -511,6 +511,17 @@ class Task(_Keys):
         """The file that the task was read from."""
         return self._file
 
+    @property
+    def of_postures(self) -> bool:
+        """Whether recordings are postures, measured by a device."""
+        return any(entry.measurement is not None for entry in self.data)
+
+    @property
+    def of_rollouts(self) -> bool:
+        """Whether the recordings that are fitted hold a command and no torque."""
+        fitted = [entry for entry in self.data if entry.role == "fit"]
+        return all(e.command is not None and e.torque is None and e.measurement is None for e in fitted)
+
     @model_validator(mode="before")
     @classmethod
     def _data_or_excite(cls, value: Any) -> Any:

@@ -10,31 +10,37 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from ..estimation.regression import Regression, condense
+from ..estimation.regression import Condensed, Regression
 
-__all__ = ["WIDTHS", "with_reversal_widths"]
+__all__ = ["WIDTHS", "widths_to_try", "with_reversal_widths"]
 
 WIDTHS = (0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # rad/s or m/s; zero is the column that is there anyway
 GAIN = 10.0  # by which the weighted squares must fall: a smooth reversal has to earn its place
 
 
+def widths_to_try(regression: Regression) -> tuple[float, ...]:
+    """Half widths of which `with_reversal_widths` wants columns beside the regression's own; none without Coulomb."""
+    return WIDTHS if any(name.startswith("fc") for name in regression.names) else ()
+
+
 def with_reversal_widths(
     regression: Regression,
-    used: Bool[np.ndarray, "nv columns"],
+    wide: Condensed,
     kept: Sequence[int] | Int[np.ndarray, " kept"],
     weight: Float[np.ndarray, " nv"],
 ) -> Regression:
     """The regression with the half width that fits best at each joint that has Coulomb friction.
 
-    `kept` are the base columns, `weight` the joints' inverse variances.
+    `wide` is the regression condensed with the columns of `widths_to_try`; `kept` are the base columns, `weight` the
+    joints' inverse variances.
     """
     names, nv = regression.names, regression.model.nv
     coulomb = [names.index(f"fc{j + 1}") if f"fc{j + 1}" in names else None for j in range(nv)]
     if not any(column in kept for column in coulomb if column is not None):
         return regression
-    factor = condense(regression, used, widths=WIDTHS).factor(weight)
+    factor = wide.factor(weight)
     chosen, width = list(kept), np.array(regression.width, float)
     for j, column in enumerate(coulomb):
         if column not in chosen:

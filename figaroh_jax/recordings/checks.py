@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -54,7 +55,8 @@ class Finding(NamedTuple):
     text: str
 
 
-class _Look(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Look:
     """What the checks look at; those of positions alone need no recording."""
 
     position: Float[np.ndarray, "samples nv"]
@@ -70,7 +72,7 @@ class _Look(NamedTuple):
         assert self.series is not None
         return self.series
 
-    @property
+    @cached_property
     def span(self) -> Float[np.ndarray, " nv"]:
         """Range of each joint without its outermost per cent."""
         low, high = np.percentile(self.position, [1, 99], axis=0)

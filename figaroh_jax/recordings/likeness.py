@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..rigid.model import RobotModel
+from .rowfilter import low_pass
 
 __all__ = [
     "Likeness",
@@ -86,18 +87,14 @@ def sampled(
     cutoff: float = CUTOFF,
 ) -> Sampled | None:
     """Rows of a recording on an even grid, low-passed without phase; None where it is too short."""
-    from scipy.signal import butter, sosfiltfilt
-
     if len(time) < FEWEST:
         return None
     rate = (len(time) - 1) / (time[-1] - time[0])
     grid = np.linspace(time[0], time[-1], len(time))
-    sections = butter(2, min(cutoff / rate, 0.1) * 2, output="sos")
-    pad = min(len(time) - 1, int(3 / min(cutoff / rate, 0.1)))
 
     def smooth(x: np.ndarray) -> np.ndarray:
         even = np.column_stack([np.interp(grid, time, column) for column in x.T])
-        return sosfiltfilt(sections, even, axis=0, padlen=pad)
+        return low_pass(even, 1 / rate, min(cutoff, 0.1 * rate), order=2)
 
     q = smooth(position)
     v = np.gradient(q, 1 / rate, axis=0)
@@ -161,15 +158,21 @@ class _Body(NamedTuple):
     axis: np.ndarray
 
 
-def _moved(model: RobotModel, i: int, parent: _Body, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> _Body:
-    from scipy.spatial.transform import Rotation
+def _turned(angle: Float[np.ndarray, " rows"], axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "rows 3 3"]:
+    """Rotations by angles (rad) about a unit axis (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    return np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross)
 
+
+def _moved(model: RobotModel, i: int, parent: _Body, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> _Body:
     at_zero, own = np.asarray(model.placement[i], float), np.asarray(model.axis[model.dofs.first[i]], float)
     pose = parent.pose @ at_zero[:3, :3]
     axis, arm = pose @ own, parent.pose @ at_zero[:3, 3]
     spin, turning, pushed = parent.spin, parent.turning, 0.0
     if model.joints[i].kind == "revolute":
-        pose = pose @ Rotation.from_rotvec(q[:, None] * own).as_matrix()
+        pose = pose @ _turned(q, own)
         spin = spin + axis * v[:, None]
         turning = turning + axis * a[:, None] + np.cross(parent.spin, axis * v[:, None])
     else:

@@ -126,20 +126,21 @@ def frequencies(rows: RowFilter) -> Float[np.ndarray, " freqs"]:
     return 2 * np.pi * np.arange(length // 2 + 1) / (length * np.asarray(rows.dt))
 
 
-def low_pass(x: Float[np.ndarray, "samples cols"], dt: float, cutoff: float) -> Float[np.ndarray, "samples cols"]:
+def low_pass(
+    x: Float[np.ndarray, "samples cols"], dt: float, cutoff: float, order: int = ORDER
+) -> Float[np.ndarray, "samples cols"]:
     """The same low pass on the host, at every sample: `x` every `dt` s, `cutoff` in Hz."""
     pad = min(len(x) - 1, reach(dt, cutoff))
     length = fast_length(len(x) + 2 * pad)
     head, tail = 2 * x[:1] - x[pad:0:-1], 2 * x[-1:] - x[-2 : -pad - 2 : -1]  # reflected in the end: value and slope
-    spectrum = np.fft.rfft(np.concatenate([head, x, tail]).T, n=length) * gain(length, dt, cutoff)
+    spectrum = np.fft.rfft(np.concatenate([head, x, tail]).T, n=length) * gain(length, dt, cutoff, order)
     return np.fft.irfft(spectrum, n=length)[:, pad : pad + len(x)].T
 
 
 def fast_length(least: int) -> int:
-    """The smallest length from `least` that a real FFT is quick at."""
-    from scipy.fft import next_fast_len  # scipy is slow to import
-
-    return int(next_fast_len(least, real=True) or least)
+    """The smallest length from `least` that a real FFT is quick at: a product of twos, threes and fives."""
+    odd = (3**i * 5**k for i in range(20) for k in range(14))
+    return min(n << max(-(-least // n) - 1, 0).bit_length() for n in odd)
 
 
 def reach(dt: float, cutoff: float) -> int:
@@ -147,10 +148,10 @@ def reach(dt: float, cutoff: float) -> int:
     return int(np.ceil(max(REACH / cutoff, LATEST) / dt))
 
 
-def gain(length: int, dt: float, cutoff: float) -> Float[np.ndarray, " freqs"]:
+def gain(length: int, dt: float, cutoff: float, order: int = ORDER) -> Float[np.ndarray, " freqs"]:
     """|H|^2 of the digital Butterworth filter, 1 / (1 + (tan(w dt / 2) / tan(wc dt / 2))^(2 order))."""
     half = np.minimum(np.pi * np.arange(length // 2 + 1) / length, np.pi / 2 - 1e-9)
-    return 1 / (1 + (np.tan(half) / np.tan(np.pi * cutoff * dt)) ** (2 * ORDER))
+    return 1 / (1 + (np.tan(half) / np.tan(np.pi * cutoff * dt)) ** (2 * order))
 
 
 def extension(

@@ -60,7 +60,7 @@ def robot_picture(
 
 
 def _tips(model: RobotModel, q: Float[np.ndarray, " nq"]) -> Float[np.ndarray, "tips 2 3"]:
-    """From each joint that carries no other to the farthest frame fixed to it."""
+    """From each joint that carries no other to the farthest frame fixed to it, or to its centre of mass."""
     poses = np.asarray(forward_kinematics(model, q))
     lines = []
     for k in set(range(len(model.joints))) - {joint.parent for joint in model.joints}:
@@ -68,6 +68,9 @@ def _tips(model: RobotModel, q: Float[np.ndarray, " nq"]) -> Float[np.ndarray, "
             np.asarray(p)[:3, 3] for f, p in zip(model.frames, model.frame_placement, strict=True) if f.parent == k
         ]
         far = max(places, key=lambda place: float(np.linalg.norm(place)), default=np.zeros(3))
+        mass = float(model.inertia[k, 0])
+        if np.linalg.norm(far) < 1e-6 and mass > 0:
+            far = np.asarray(model.inertia[k, 1:4], float) / mass
         lines.append([poses[k, :3, 3], poses[k, :3, :3] @ far + poses[k, :3, 3]])
     return np.array(lines).reshape(-1, 2, 3)
 

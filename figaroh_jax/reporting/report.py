@@ -163,6 +163,7 @@ def page_template(name: str, folder: Path | None = None) -> Any:
         "share": _share,
         "spaced": lambda name: name.replace("_", " "),
         "title_of": wording.effect_title,
+        "unit": wording.unit,
         "visible": lambda value: "never" if value == math.inf else wording.number(value, 2),
     }
     environment.globals["made"] = None if folder is None else _made_by(folder)

@@ -13,12 +13,12 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from ..identification.result import FittedEffect, Identification
 from ..results import Cause, Diagnosis, Estimate
 from . import wording
 
 if TYPE_CHECKING:
     from ..calibration.calibrated import Calibration
+    from ..identification.result import FittedEffect, Identification
 
 __all__ = [
     "Progress",

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..results import Cause, Diagnosis, Estimate, Name, Nearest, Part
+from .rollout_effects import ROLLOUT_EFFECTS
 
 if TYPE_CHECKING:
     from ..calibration.calibrated import Calibration
@@ -156,14 +157,15 @@ def place(at: Sequence[str]) -> str:
 
 def effect_title(effect: str) -> str:
     """The effect's name in plain words, from the catalogue; its own name with spaces where it is not in there."""
-    return getattr(_entry(effect), "title", "") or effect.replace("_", " ")
+    known = _entry(effect) or ROLLOUT_EFFECTS.get(effect)
+    return getattr(known, "title", "") or effect.replace("_", " ")
 
 
 def effect_meaning(effect: str) -> str:
     """What the effect is, in one line: the first paragraph of its docstring in the catalogue."""
     entry = _entry(effect)
     if not isinstance(entry, type):
-        return ""
+        return ROLLOUT_EFFECTS[effect].meaning if entry is None and effect in ROLLOUT_EFFECTS else ""
     text = inspect.cleandoc(entry.__doc__ or "").split("\n\n")[0].replace("\n", " ")
     generated = text.startswith(f"{entry.__name__}(")  # the signature that a dataclass writes
     return "" if generated else text
@@ -171,7 +173,7 @@ def effect_meaning(effect: str) -> str:
 
 def effect_equation(effect: str) -> str:
     """The torque that the effect adds, as text; empty where the catalogue gives none."""
-    return getattr(_entry(effect), "equation", "")
+    return getattr(_entry(effect) or ROLLOUT_EFFECTS.get(effect), "equation", "")
 
 
 def interval(estimate: Estimate) -> str:
@@ -265,6 +267,10 @@ def _superscript(power: int) -> str:
 
 
 def _entry(effect: str) -> Any:
-    from ..effects import catalogue as effects, kinematic as kinematic_effects
+    from ..effects.catalogue import CATALOGUE
 
-    return effects.CATALOGUE.get(effect) or kinematic_effects.CATALOGUE.get(effect)
+    if effect in CATALOGUE:
+        return CATALOGUE[effect]
+    from ..effects.kinematic import CATALOGUE as OF_POSTURES  # slow to import
+
+    return OF_POSTURES.get(effect)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from ..errors import InputError
 from .loop import Loop
@@ -128,7 +128,7 @@ def _smooth_rows(run: Run, row: int, noise: Float[np.ndarray, " nv"]) -> int:
             continue
         t = np.linspace(-1, 1, rows)
         left = near - np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyfit(t, near, 3)).T
-        if np.all((left**2).sum(0) <= chi2.ppf(_SMOOTH, rows - 4) * np.maximum(noise, 1e-12) ** 2):
+        if np.all((left**2).sum(0) <= 2 * gammaincinv((rows - 4) / 2, _SMOOTH) * np.maximum(noise, 1e-12) ** 2):
             return rows
     return 5
 

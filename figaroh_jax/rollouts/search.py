@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from scipy import stats
+from scipy.special import ndtr
 
 from ..results import Name, Verdict
 from .causes import BASELINE, CONTAINS, Candidate, Catalogue, catalogue, elastic_loop
@@ -376,7 +376,7 @@ def _best(
     nearest.clear()
     if not tried:
         return None, 1.0
-    p = float(max(stats.norm.sf(4 * now.excess), 1e-12))
+    p = float(max(ndtr(-4 * now.excess), 1e-12))
     sure = _SURE if now.excess >= 1.0 else 2.5
     passing = [k for k in range(len(tried)) if gains[k] > _WORTH and ts[k] > sure and _sized(here, tried[k])]
     for k in np.argsort(gains)[::-1][:3]:

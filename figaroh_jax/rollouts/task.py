@@ -36,7 +36,6 @@ __all__ = [
     "diagnose_rollout_task",
     "diagnosis_setting",
     "extended_of",
-    "is_rollout_task",
     "read_rollouts",
     "simulated",
 ]
@@ -58,12 +57,6 @@ class RolloutDiagnosis(NamedTuple):
     diagnosis: Diagnosis
     loop: Loop
     predictions: dict[str, tuple[np.ndarray, np.ndarray]]
-
-
-def is_rollout_task(task: Task) -> bool:
-    """Whether the recordings that are fitted hold a command and no torque."""
-    fitted = [entry for entry in task.data if entry.role == "fit"]
-    return all(e.command is not None and e.torque is None and e.measurement is None for e in fitted)
 
 
 def diagnose_rollout_task(

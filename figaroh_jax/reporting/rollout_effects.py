@@ -1,0 +1,137 @@
+"""The effects of rollouts in words: what each is, what hides it, how to excite it, in which simulators it can be said.
+
+The search itself is `rollouts.causes`; a test compares the names.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+__all__ = ["NOT_LOOKED_FOR", "ROLLOUT_EFFECTS", "RolloutEffect"]
+
+
+class RolloutEffect(NamedTuple):
+    """How the documentation and the pages speak of an effect that a command and a position show."""
+
+    title: str
+    meaning: str
+    equation: str
+    acts_on: str
+    parameters: dict[str, str]  # unit of each
+    number: str  # of the loop, for a picture of what it does: a name of `rollouts.parameters`
+    size: float
+    hidden_by: str
+    excite: str
+    said_by: str  # in the files of simulators
+
+
+_NONE = "no simulator's file: `model/loop.json` holds it, and `fj.rollout` simulates it"
+
+ROLLOUT_EFFECTS = {
+    "joint_damping": RolloutEffect(
+        "damping of the joint", "A torque against the velocity, in proportion to it.", "-damping v", "joint",
+        {"damping": "N m s/rad"}, "damping", 0.6,
+        "the drive's own velocity gain kd, which does the same: `actuator: {gains: known}` says that kd is right",
+        "sweeps of {at} at several constant speeds", "MuJoCo (damping), URDF (damping)",
+    ),
+    "friction_loss": RolloutEffect(
+        "dry friction", "A torque against the motion that does not depend on the speed, and holds the joint at rest.",
+        "-force sign(v)", "joint", {"force": "N m"}, "friction", 0.8,
+        "a dead band of the drive at slow motion", "slow reversals of {at}, and rest at several loads",
+        "MuJoCo (frictionloss), URDF (friction)",
+    ),
+    "rotor_inertia": RolloutEffect(
+        "rotor inertia", "The drive's inertia behind its gear, which the links do not have.", "-inertia a", "joint",
+        {"inertia": "kg m2"}, "armature", 0.08, "the inertia of the links beyond the joint",
+        "fast steps of {at} in several postures of the joints beyond it", "MuJoCo (armature)",
+    ),
+    "stribeck_friction": RolloutEffect(
+        "Stribeck friction", "Dry friction that is larger near standstill.",
+        "-force exp(-(v/speed)^2) sign(v)", "joint",
+        {"force": "N m", "speed": "rad/s"}, "stribeck_force", 0.8, "dry friction, where the joint is never slow",
+        "slow constant-velocity sweeps of {at} below 0.3 rad/s", _NONE,
+    ),
+    "load_dependent_friction": RolloutEffect(
+        "friction that depends on the load", "Dry friction in proportion to the torque that the gear carries.",
+        "-ratio |tau_gear| sign(v)", "joint", {"ratio": "1"}, "load_ratio", 0.25,
+        "dry friction, where the load of the joint is always the same",
+        "the same motion of {at} with and without a known payload", _NONE,
+    ),
+    "joint_spring": RolloutEffect(
+        "spring at the joint", "A torque back to a rest position: a cable, a hose, a balancer.",
+        "-stiffness (q - rest)", "joint", {"stiffness": "N m/rad", "rest": "rad"}, "stiffness", 3.0,
+        "gravity, where the joint moves a little only",
+        "{at} over its whole range, with the base turned if that can be",
+        "MuJoCo (stiffness, springref)",
+    ),
+    "torque_offset": RolloutEffect(
+        "constant torque", "A torque that is always there: a pre-load, a drive's offset.", "-offset", "joint",
+        {"offset": "N m"}, "offset", 1.0, "an encoder's offset at a position servo",
+        "{at} at several gains of its drive",
+        "MuJoCo (a drive's constant bias)",
+    ),
+    "encoder_offset": RolloutEffect(
+        "offset of the encoder", "The encoder reads a constant beside the position.",
+        "q_measured = q + offset", "joint",
+        {"offset": "rad"}, "reading", 0.05, "a constant torque at a position servo",
+        "a reference mark of {at}, or gravity in several postures", _NONE,
+    ),
+    "actuator_gain": RolloutEffect(
+        "gain of the drive", "The drive gives more or less torque than its gains say; looked for with `gains: free`.",
+        "(1 + gain) kp (u - q) - kd v", "joint", {"gain": "1"}, "scale", 0.6,
+        "all masses and frictions at once: gains and inertias scale together",
+        "the same motion with {at} carrying a known mass", "MuJoCo (gainprm, biasprm)",
+    ),
+    "command_delay": RolloutEffect(
+        "delay of the command", "The drive sees the command late.", "u(t - delay)", "joint", {"delay": "s"},
+        "delay", 0.04,
+        "positions that are stamped early", "steps of {at} that are small enough not to saturate its drive", _NONE,
+    ),
+    "actuator_saturation": RolloutEffect(
+        "limit of the torque", "The drive gives no more than a limit.", "clip(tau, -limit, limit)", "joint",
+        {"limit": "N m"}, "force_limit", 5.0, "gentle motion, which never asks for as much",
+        "steps of {at} of two sizes", "MuJoCo (forcerange), URDF (effort)",
+    ),
+    "voltage_saturation": RolloutEffect(
+        "limit of the voltage",
+        "The torque is limited before the motor's back-EMF is taken off, so that fast motion gets less.",
+        "clip(kp (u - q), -limit, limit) - kd v", "joint", {"limit": "N m"}, "voltage", 5.0,
+        "gentle motion, and a limit of the torque where the joint is slow",
+        "large steps of {at} in both directions", _NONE,
+    ),
+    "dead_band": RolloutEffect(
+        "dead band of the drive", "The drive gives no torque while the error is small, and less by as much beyond.",
+        "kp (e - clip(e, -band, band)), e = u - q", "joint", {"band": "rad"}, "dead_band", 0.05, "dry friction",
+        "slow ramps of {at} of a few times the band", _NONE,
+    ),
+    "payload": RolloutEffect(
+        "mass at a link", "A body that the model does not have, or has and the robot has not.",
+        "a point mass at the link's centre of mass", "link", {"mass": "kg"}, "payload", 1.0,
+        "the gain of the drive: with `gains: free` the two are told as a pair",
+        "the same motion with and without what is fixed to {at}", "MuJoCo, URDF and every simulator: it is an inertia",
+    ),
+    "joint_elasticity": RolloutEffect(
+        "elasticity of the joint", "A spring between motor and link; the encoder reads the motor.",
+        "tau_link = stiffness (q_motor - q_link)", "joint", {"stiffness": "N m/rad", "damping": "N m s/rad"}, "", 0.0,
+        "motion that is slow against the resonance", "a chirp of {at} above a third of its resonance",
+        "MuJoCo (a second joint with stiffness and damping)",
+    ),
+    "backlash": RolloutEffect(
+        "backlash", "Play of the gear: the link turns freely within a width.",
+        "no torque while |q_motor - q_link| < width/2", "joint",
+        {"stiffness": "N m/rad", "damping": "N m s/rad", "width": "rad"}, "", 0.0,
+        "elasticity, and dry friction", "slow reversals of the load of {at}", _NONE,
+    ),
+    "contact_stiffness": RolloutEffect(
+        "stiffness of a contact", "How hard the ground is.", "force = stiffness depth", "pair of bodies",
+        {"stiffness": "N/m"}, "", 0.0, "everything but a recording with contacts",
+        "landings of two heights", "MuJoCo (solref)",
+    ),
+    "contact_friction": RolloutEffect(
+        "friction of a contact", "How slippery the ground is.", "|force along| <= friction force across",
+        "pair of bodies", {"friction": "1"}, "", 0.0, "everything but a recording with contacts",
+        "pushes beyond sliding", "MuJoCo (friction)",
+    ),
+}  # fmt: skip
+
+NOT_LOOKED_FOR = ("contact_stiffness", "contact_friction")  # names that a task may say; no diagnosis looks for them yet
