@@ -1,5 +1,7 @@
 """An encoder that is noise where it is differentiated twice: least squares is biased, two other forms are not."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -10,12 +12,12 @@ STIFF, SOFT = 60.0, 8.0  # gains of the servo
 DAMPING = 1.5  # N m s/rad
 
 
-def wanted(time: float) -> jnp.ndarray:
+def wanted(time: Any) -> Any:
     """The reference of the one joint that moves, rad."""
     return 0.5 * jnp.sin(2.1 * time + jnp.zeros(1)) + 0.2 * jnp.sin(4.8 * time + 1.0)
 
 
-def control(time: float, q: jnp.ndarray, v: jnp.ndarray) -> jnp.ndarray:
+def control(time: Any, q: Any, v: Any) -> Any:
     """The servo of the recording, which the simulated instruments run under as well; it begins SPAN samples late."""
     return STIFF * (wanted(time + SPAN * DT) - q) - SOFT * v
 
@@ -36,7 +38,7 @@ def main() -> None:
     base = rows.structural
     truth = base.matrix @ np.append(np.ravel(robot.inertia), DAMPING)
     solve, condense, weighted = fj.least_squares.solve, fj.regression.condense, fj.least_squares.WeightedByJoint()
-    first, speed = run.position[SPAN], run.velocity[SPAN]
+    first, speed = np.asarray(run.position)[SPAN], np.asarray(run.velocity)[SPAN]
     windows = fj.acceleration_free.WindowRows(robot, lambda: [(q, v, tau)], DT, "energy", 20, terms)
     found = {
         "least squares": solve(condense(rows, rows.used), weighted, kept=base.independent),

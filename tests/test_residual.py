@@ -158,7 +158,7 @@ def test_links_that_bend_or_grow_move_the_residual_of_postures(tmp_path):
     seen = fj.postures(
         q=np.zeros((3, 2)),
         position=np.zeros((3, 3)),
-        time=[0.0, 1.0, 2.0],
+        time=np.arange(3.0),
         base_frame="base",
         tool_frame="tip",
         unknown=(),

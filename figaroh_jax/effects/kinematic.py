@@ -51,12 +51,12 @@ _ORDERS = tuple(np.arange(2.0, 12.5, 0.5))  # of gear errors, per turn of the jo
 class Postures:
     """Postures of one recording, in the order in which they were measured, and what gravity does in them."""
 
-    q: Float[np.ndarray, "samples nv"]  # rad or m
-    before: Float[np.ndarray, "samples nv"]  # the posture measured before; the first one's own
-    torque: Float[np.ndarray, "samples nj"]  # gravity about each joint's axis, N m or N
-    moment: Float[np.ndarray, "samples nj 3"]  # gravity's moment at each joint, in the joint frame, N m
-    payload: Float[np.ndarray, "samples nj"]  # as torque, of the carried load alone
-    time: Float[np.ndarray, " samples"]  # s
+    q: Float[Leaf, "samples nv"]  # rad or m
+    before: Float[Leaf, "samples nv"]  # the posture measured before; the first one's own
+    torque: Float[Leaf, "samples nj"]  # gravity about each joint's axis, N m or N
+    moment: Float[Leaf, "samples nj 3"]  # gravity's moment at each joint, in the joint frame, N m
+    payload: Float[Leaf, "samples nj"]  # as torque, of the carried load alone
+    time: Float[Leaf, " samples"]  # s
     duration: float  # s, of all recordings together
     _motions: dict[int, PostureMotion] = field(default_factory=dict, init=False, repr=False)  # by robot
 
