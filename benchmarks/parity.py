@@ -270,7 +270,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs=2, default=[31, 32])
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", nargs="+", default=[], metavar="WORD")
-    args = parser.parse_args()
+    args = parser.parse_intermixed_args()  # versions may stand behind options
     if args.step == "make":
         make(args.cases, args.seeds)
     elif args.step == "run":

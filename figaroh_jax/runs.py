@@ -348,18 +348,19 @@ def write_run(task: Task, diagnosis: Diagnosis, out: Path, backend: str = "nativ
 
     with _run_folder(task, out, "diagnose", backend) as folder:
         (folder / ANSWER).write_text(to_json(diagnosis), encoding="utf-8")
-        write_predictions(folder / "predictions.npz", predictions(task, diagnosis.model))
+        write_predictions(folder / "predictions.npz", predictions(task, diagnosis.model, slowed=diagnosis.slowed))
         write_report(diagnosis, folder / REPORT, diagnosis.model.robot.name)
         write_model(diagnosis.model, folder / "model", diagnosis.causes)
 
 
 def predictions(
-    task: Task, extended: ExtendedModel, *, identified: bool = False
+    task: Task, extended: ExtendedModel, *, identified: bool = False, slowed: bool = False
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Time (s) and the extended model's torque (N m or N) of each holdout recording, on its own time stamps.
 
-    The recording's motion is prepared as for the fit, but over its whole length, whatever window the fit kept. Where
-    the model is an identified one, a known payload is carried in addition.
+    The recording's motion is prepared as for the fit (`slowed`: positions taken down to the band of their own motion),
+    but over its whole length, whatever window the fit kept. Where the model is an identified one, a known payload is
+    carried in addition.
     """
     from .effects.extended import predict
     from .recordings.dataset import read_recordings
@@ -373,7 +374,7 @@ def predictions(
     found = {}
     for recording in recordings:
         if recording.role == "holdout":
-            motion = prepare(recording, whole, rates, slowed=not identified, model=extended.robot)
+            motion = prepare(recording, whole, rates, slowed=slowed, model=extended.robot)
             carrying = _carrying(extended, recording.load if identified else None)
             state = motion.position, motion.velocity, motion.acceleration
             if extended.robot.nq == extended.robot.nv:

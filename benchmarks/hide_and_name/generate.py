@@ -103,6 +103,8 @@ def _made(folder: Path, seed: int, wish: Wish) -> dict[str, Any] | None:
     case_seed = blackbox.digest(seed, wish.name)
     try:
         case = (_kinematic if wish.kind == "kinematic" else _dynamic)(folder, wish, case_seed)
+    except np.linalg.LinAlgError:  # a ValueError too, but one of this generator's own
+        raise
     except ValueError:  # no such size at any place
         return None
     known.write_text(json.dumps(case))

@@ -35,16 +35,17 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .holdout import held_squares, part_error, residual_rms, traces
+from .holdout import fold_error, held_squares, part_error, residual_rms, traces
 from .joint import Joint, polished, sized
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import reason_against, standings
 from .problem import Problem
 from .rest import Significance, excess, lines, parts_of, predictable, relative_rest, significance, verdict, wrong_law
 from .search import Found, Search, eliminate, find_causes
+from .standstill import moving_rows, only_sticks
 from .state import State, baseline, with_width
 from .step import stand, with_causes
-from .thresholds import CERTAIN, FEW_CAUSES, NO_REST, WEIGHT_ROUNDS
+from .thresholds import CERTAIN, FEW_CAUSES, LINE_P, NO_REST, SLOWED_GAIN, WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -92,14 +93,14 @@ def diagnose(
     """
     with jax.enable_x64(True):
         progress("preparing signals", 0.03)
-        signals = checked_repeats(prepare_all(tuple(recordings), preprocess))
-        signals.sort(key=lambda s: s.role == "holdout")
-        here = _setting(as_backend(model), signals, known, trust, forbid, progress)
+        backend = as_backend(model)
+        signals, slowed = _signals(backend, recordings, preprocess, known, trust)
+        here = _setting(backend, signals, known, trust, forbid, progress)
         generator = np.random.default_rng(seed)
         searched = _searched(here, forbid, CERTAIN * alpha, tolerance, progress, generator)
         judged = _judged(searched, [s.name for s in signals], tolerance)
         progress("measuring the gain", 0.9)
-        return _answer(searched.here, signals, searched.search, judged)
+        return replace(_answer(searched.here, signals, searched.search, judged), slowed=slowed)
 
 
 class _Setting(NamedTuple):
@@ -131,7 +132,44 @@ class _Judged(NamedTuple):
     word: Verdict
     causes: _Gaining
     rest: Rest
+    sticks: bool  # whether what is left is that of joints at rest
     here: _Setting  # with the weights of the answer's fit
+
+
+def _signals(
+    backend: Backend, recordings: Sequence[Recording], preprocess: Preprocess, known: Baseline | None, trust: float
+) -> tuple[list[Signals], bool]:
+    """The recordings prepared, holdout recordings behind the others, and whether their positions are slowed.
+
+    Each position is taken down to the band of its own motion only where the baseline then predicts left-out parts
+    better, by their error in N m: coarse encoders need it, and it takes the abrupt parts of a fine one away.
+    """
+    both = [
+        sorted(checked_repeats(prepare_all(recordings, preprocess, slowed=slowed)), key=lambda s: s.role == "holdout")
+        for slowed in (False, True)
+    ]
+    plain, slow = both
+    if all(np.array_equal(a.position, b.position) for a, b in zip(plain, slow, strict=True)):
+        return plain, False
+    errors = [_baseline_error(*_begun(backend, signals, known, trust)) for signals in both]
+    return (slow, True) if errors[1] < (1 - SLOWED_GAIN) * errors[0] else (plain, False)
+
+
+def _baseline_error(problem: Problem, start: State) -> float:
+    """Relative error in N m of the baseline on parts left out, each joint weighted by what it leaves."""
+    torque = np.sqrt(((problem.torque * problem.records.judged) ** 2).mean((0, 1)))
+    white = np.ones((len(problem.records.omega), 1)) / np.maximum(torque, 1e-9 * torque.max())
+    residual = residual_rms(problem, stand(problem, start, white).state)
+    step = stand(problem, start, white * torque / np.maximum(residual, 1e-9 * residual.max()))
+    return fold_error(problem, step.state, step.verdicts.folds, problem.layout.fold)
+
+
+def _begun(backend: Backend, signals: Sequence[Signals], known: Baseline | None, trust: float) -> tuple[Problem, State]:
+    """The recordings on one clock, and the baseline."""
+    records = without_reversals(stack(signals, backend.robot))
+    held = held_rows(signals, records)
+    problem = Problem(backend, records, layout(signals, records), trust, np.zeros(backend.robot.nv), held)
+    return problem, baseline(problem, *_baseline_effects(backend.robot, known))
 
 
 def _setting(
@@ -143,12 +181,7 @@ def _setting(
     progress: Callable[[str, float], None],
 ) -> _Setting:
     """The recordings on one clock, the baseline, and the noise; holdout recordings stand behind the others."""
-    model = backend.robot
-    records = without_reversals(stack(signals, model))
-    held = held_rows(signals, records)
-    problem = Problem(backend, records, layout(signals, records), trust, np.zeros(model.nv), held)
-    names, given = _baseline_effects(model, known)
-    start = baseline(problem, names, given)
+    problem, start = _begun(backend, signals, known, trust)
     progress("estimating the noise", 0.08)
     spectrum, whitening = noise_floor(problem, start, forbid)
     problem = friction_width(problem, start, whitening)
@@ -224,11 +257,17 @@ def _judged(searched: _Searched, names: Sequence[str], tolerance: float) -> _Jud
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
-    rest = left.there or (bool(nearest) and float(relative.max()) > tolerance)
-    text = left.text or (f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else "")
+    shown = left.there or (bool(nearest) and float(relative.max()) > tolerance)
+    sticks = (
+        shown
+        and only_sticks(problem, joint.step.state, noise, relative, tolerance)
+        and lines(problem, joint.step.linear.residual * moving_rows(problem))[0] >= LINE_P
+    )
+    rest = shown and not sticks
+    text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
     parts = parts_of(problem, joint.step, whitening, line, names)
     nearest = tuple(sorted(nearest, key=lambda one: -one.share))
-    return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text), here)
+    return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text), sticks, here)
 
 
 def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple[_Setting, Joint]:
@@ -358,7 +397,7 @@ def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judg
         baseline=fitted_model(problem, first.state, []),
         model=fitted_model(problem, last.state, joint.causes),
         rest=judged.rest,
-        notes=_notes(signals, here),
+        notes=(*_notes(signals, here), *([_AT_REST] if judged.sticks else [])),
         prismatic=prismatic(model),
     )
 
@@ -380,6 +419,12 @@ def _baseline_effects(model: RobotModel, known: Baseline | None) -> tuple[list[s
             raise InputError(f"baseline.effects: '{entry.effect}' cannot be fitted as part of the baseline")
         given.append(place(effect, model, entry.at))
     return [name for name, on in switches.items() if on], given
+
+
+_AT_REST = (
+    "at rest the torque differs from the model, as dry friction lets it: there it takes any value up to its limit, and"
+    " no law of the velocity predicts which; where the joints move, nothing is left beyond the tolerance"
+)
 
 
 def _scheme(signals: Sequence[Signals]) -> str:

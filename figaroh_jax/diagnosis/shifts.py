@@ -5,13 +5,14 @@ JAX evaluates inverse dynamics, many samples in one program; the equations of th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..compiled.executable_cache import Program
 from ..effects.base import Effect, Motion
@@ -42,11 +43,11 @@ def links_torque(
     a: Float[Leaf, "*batch nN nv"],
     records: Records,
 ) -> Float[np.ndarray, "*batch nN nv"]:
-    """`rigid_torque` over the samples of all recordings, each with what it is known to carry."""
+    """`rigid_torque` over samples of all recordings, as many of each, with what it is known to carry."""
     torque = rigid_torque(model, q, v, a)
     if records.carried is None:
         return torque
-    torque = torque.reshape(*torque.shape[:-2], *records.position.shape).copy()
+    torque = torque.reshape(*torque.shape[:-2], len(records.carried), -1, torque.shape[-1]).copy()
     bodies = np.unique(records.carried, axis=0)
     for body in bodies[bodies.any((1, 2))]:
         loaded = eqx.tree_at(lambda m: m.inertia, model, model.inertia + body)
@@ -120,9 +121,12 @@ def _compliances(effects: Effect, motion: Motion, records: Records) -> list[_Com
     load = links_torque(motion.model, motion.position, motion.velocity, motion.acceleration, records)
     loads = np.repeat(load[None], len(effects.at), axis=0)
     unit = (_errors(effects, motion, loads + 1) - _errors(effects, motion, loads)).mean(1)
-    shape, dt, out = records.position.shape[:2], float(records.dt), []
-    for c, joint in zip(unit, np.asarray(effects.at)[:, 0].tolist(), strict=True):
-        K, D, M = (c * _slope(motion, one, joint, records).reshape(shape) for one in range(3))
+    joints = np.asarray(effects.at)[:, 0]
+    few = _Few.of(motion, records)
+    slopes = few.slopes(motion.model, joints, lambda q, v, a: links_torque(motion.model, q, v, a, records))
+    own = few.between(np.stack([slopes[k, :, :, j] for k, j in enumerate(joints)]))  # (sensors, 3, n, N)
+    dt, out = float(records.dt), []
+    for K, D, M in unit[:, None, None, None] * own:
         inertial = np.stack([M, -2 * M, M]) / dt**2
         whole = inertial + np.stack([-D / (2 * dt), 1 + K, D / (2 * dt)])
         for part, count in ((inertial, 1), (whole, ENDS)):
@@ -131,14 +135,40 @@ def _compliances(effects: Effect, motion: Motion, records: Records) -> list[_Com
     return out
 
 
-def _slope(motion: Motion, one: int, joint: int, records: Records) -> Float[np.ndarray, " nN"]:
-    """Derivative of a joint's load in its own position, velocity or acceleration (`one`), by central differences."""
-    sides = []
-    for step in (STEP, -STEP):
-        q, v, a = (np.array(x) for x in (motion.position, motion.velocity, motion.acceleration))
-        (q, v, a)[one][:, joint] += step
-        sides.append(links_torque(motion.model, q, v, a, records)[:, joint])
-    return (sides[0] - sides[1]) / (2 * STEP)
+class _Few(NamedTuple):
+    """A motion at every few samples of each recording, for derivatives of its torque that are straight in between.
+
+    The motion is low-passed far below the rate of its samples.
+    """
+
+    at: Int[np.ndarray, " few"]
+    samples: int
+    state: tuple[Float[np.ndarray, "n_few nv"], ...]  # position, velocity and acceleration
+
+    @classmethod
+    def of(cls, motion: Motion, records: Records) -> _Few:
+        n, samples, _, nv = records.shape
+        at = np.append(np.arange(0, samples - 1, EVERY), samples - 1)
+        state = (motion.position, motion.velocity, motion.acceleration)
+        return cls(at, samples, tuple(np.asarray(x).reshape(n, samples, nv)[:, at].reshape(-1, nv) for x in state))
+
+    def slopes(
+        self, model: RobotModel, joints: Int[np.ndarray, " joints"], torque: Callable[..., np.ndarray]
+    ) -> Float[np.ndarray, "joints 3 n_few nv"]:
+        """Derivatives of the torque in position, velocity and acceleration of the joints, by central differences."""
+        moved = [np.broadcast_to(x, (len(joints), 3, 2, *x.shape)).copy() for x in self.state]
+        for k, joint in enumerate(joints):
+            for one in range(3):
+                moved[one][k, one, :, :, joint] += np.array([[STEP], [-STEP]])
+        high, low = np.moveaxis(torque(*moved).reshape(moved[0].shape), 2, 0)
+        return (high - low) / (2 * STEP)
+
+    def between(self, slopes: Float[np.ndarray, "*lead n_few"]) -> Float[np.ndarray, "*lead n N"]:
+        """Values at all samples of each recording."""
+        slopes = slopes.reshape(*slopes.shape[:-1], -1, len(self.at))
+        low = np.minimum(np.arange(self.samples) // EVERY, len(self.at) - 2)
+        share = (np.arange(self.samples) - self.at[low]) / (self.at[low + 1] - self.at[low])
+        return slopes[..., low] * (1 - share) + slopes[..., low + 1] * share
 
 
 def _errors(
@@ -219,37 +249,15 @@ _SLOPES: list[tuple[Any, np.ndarray, np.ndarray]] = []  # the last ones: all sen
 def _load_slopes(motion: Motion, records: Records) -> Float[np.ndarray, "3 nv nv nN"]:
     """Derivatives of the links' torque by position, velocity and acceleration of each joint (second axis).
 
-    By central differences at every few samples (the motion is low-passed far below their rate), straight between.
+    The motion alone decides, not what it is known to carry.
     """
-    inertia = np.asarray(motion.model.inertia)
+    model, inertia = motion.model, np.asarray(motion.model.inertia)
     if not any(position is motion.position and np.array_equal(known, inertia) for position, known, _ in _SLOPES):
-        n, samples, _, nv = records.shape
-        at = np.append(np.arange(0, samples - 1, EVERY), samples - 1)
-        few = [np.asarray(x).reshape(n, samples, nv)[:, at].reshape(-1, nv) for x in _state(motion)]
-        slopes = np.stack([_one_slopes(motion.model, few, one) for one in range(3)])  # (3, nv, n few, nv)
-        slopes = np.moveaxis(slopes.reshape(3, nv, n, len(at), nv), 4, 2)
-        low = np.minimum(np.arange(samples) // EVERY, len(at) - 2)
-        share = (np.arange(samples) - at[low]) / (at[low + 1] - at[low])
-        full = slopes[..., low] * (1 - share) + slopes[..., low + 1] * share
-        _SLOPES[:] = [(motion.position, inertia, full.reshape(3, nv, nv, -1))]
+        few = _Few.of(motion, records)
+        slopes = few.slopes(model, np.arange(records.shape[3]), lambda q, v, a: rigid_torque(model, q, v, a))
+        full = few.between(np.moveaxis(slopes, (1, 3), (0, 2)))  # (3, joint, torque of, n, N)
+        _SLOPES[:] = [(motion.position, inertia, full.reshape(*full.shape[:3], -1))]
     return _SLOPES[0][2]
-
-
-def _state(motion: Motion) -> tuple[Any, Any, Any]:
-    return motion.position, motion.velocity, motion.acceleration
-
-
-def _one_slopes(model: RobotModel, state: list[np.ndarray], one: int) -> Float[np.ndarray, "nv few nv"]:
-    """Derivative of the torque in the position, velocity or acceleration (`one`) of each joint."""
-    out = []
-    for joint in range(state[0].shape[1]):
-        sides = []
-        for step in (STEP, -STEP):
-            moved = [x.copy() if k == one else x for k, x in enumerate(state)]
-            moved[one][:, joint] += step
-            sides.append(rigid_torque(model, *moved))
-        out.append((sides[0] - sides[1]) / (2 * STEP))
-    return np.stack(out)
 
 
 @Program

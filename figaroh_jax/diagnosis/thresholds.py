@@ -21,6 +21,7 @@ WEIGHT_ROUNDS = 2  # of weights and spectrum in turn
 LOWEST_RESOLVED = 2.0  # periods in a recording: below that frequency the spectrum of the noise is held constant
 LOWEST_FREQUENCY = 0.02  # Hz, the same for long recordings
 WHITE_GAIN = 0.02  # relative fall of the folds' error in N m from which rows are weighted by their residual alone
+SLOWED_GAIN = 0.02  # relative fall of the same from which positions are taken down to the band of their own motion
 SAME_MOTION = 0.05  # of a joint's range (standard deviation): repeats that differ by more are none
 
 # The search (`contenders`, `gates`, `search`)
@@ -61,3 +62,5 @@ FEW_CAUSES = 3  # found together: beyond, the model is wrong in more ways than o
 NO_REST = 0.15  # excess over the noise up to which a cause need only be there to be named
 OWN_SHARE = 0.03  # of what a cause has removed: a rest at its own place that speaks against its law
 STANDSTILL = 0.08  # of a joint's top speed: rows at and around rest
+LAW_WIDTHS = (0.04, 0.08)  # of a joint's top speed: friction of low speed that is looked for at rest
+LAW_AT_REST = 0.3  # of the squares at rest that it predicts: from there a law is missing, it is no stick

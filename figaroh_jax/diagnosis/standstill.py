@@ -1,0 +1,93 @@
+"""Dry friction at rest: set-valued, so that what is left of a joint's torque there need be no error of the model.
+
+During a stick the friction takes any value up to its limit, whichever way the joint moved before, and the row filter
+carries that to the rows around. A law of the velocity that the model lacks (Stribeck's) shows at the same speeds, but
+there the velocity predicts the torque; during a stick it does not.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..recordings.stacked import open_rows
+from .holdout import predicted
+from .problem import Problem
+from .state import State
+from .thresholds import LAW_AT_REST, LAW_WIDTHS, REVERSAL, STANDSTILL
+from .weights import relative_speed
+
+__all__ = ["moving_rows", "only_sticks"]
+
+
+def moving_rows(problem: Problem) -> Bool[np.ndarray, "nv T"]:
+    """Rows of each joint that are not at rest."""
+    return np.moveaxis(~resting(problem), 2, 0).reshape(problem.model.nv, -1)
+
+
+def resting(problem: Problem) -> Bool[np.ndarray, "n M nv"]:
+    """Rows of each joint at rest, and within a quarter period of the cutoff of such a row."""
+    records = problem.records
+    still = (relative_speed(problem) < STANDSTILL) & (np.asarray(records.judged) > 0)
+    index = records.row_samples()
+    reach = REVERSAL / float(records.cutoff) / float(records.dt)
+    near = still.copy()
+    for step in range(1, still.shape[1]):
+        close = (index[:, step:] - index[:, :-step] <= reach)[..., None]
+        if not close.any():
+            break
+        near[:, step:] |= still[:, :-step] & close
+        near[:, :-step] |= still[:, step:] & close
+    return near
+
+
+def only_sticks(
+    problem: Problem,
+    state: State,
+    noise: Float[np.ndarray, " nv"],
+    relative: Float[np.ndarray, " nv"],
+    tolerance: float,
+) -> bool:
+    """Whether what the state leaves beyond the `noise` (N m or N) is no larger than tolerable where the joints move,
+    and at rest no law of the velocity.
+
+    `relative` is what it leaves of all rows over each joint's torque: a joint below the tolerance is not looked at.
+    """
+    left, judged = problem.torque - predicted(problem, state), np.asarray(problem.records.judged) > 0
+    still = resting(problem) & judged
+    torque = _rms(problem.torque, judged)
+    moving = np.sqrt(np.maximum(_rms(left, judged & ~still) ** 2 - noise**2, 0.0))
+    looked_at = np.flatnonzero(relative > tolerance)
+    if not len(looked_at) or np.any(moving[looked_at] > tolerance * torque[looked_at]):
+        return False
+    return not any(_law_of_velocity(problem, state, left, still, joint) for joint in looked_at.tolist())
+
+
+def _rms(rows: Float[np.ndarray, "n M nv"], used: Bool[np.ndarray, "n M nv"]) -> Float[np.ndarray, " nv"]:
+    return np.sqrt(((rows * used) ** 2).sum((0, 1)) / np.maximum(used.sum((0, 1)), 1))
+
+
+def _law_of_velocity(
+    problem: Problem, state: State, left: Float[np.ndarray, "n M nv"], still: Bool[np.ndarray, "n M nv"], joint: int
+) -> bool:
+    """Whether more friction at low speed, of one of some widths, predicts much of a joint's rows at rest that it was
+    not fitted to."""
+    records, motion = problem.records, state.motion
+    top = np.abs(np.asarray(motion.velocity)[:, joint]).max()
+    used = still[:, :, joint]
+    fold, y = problem.layout.fold.reshape(used.shape)[used], left[:, :, joint][used]
+    for width in LAW_WIDTHS:
+        slow = np.exp(-((np.asarray(motion.velocity) / (width * top)) ** 2)) * np.asarray(motion.direction)
+        x = open_rows(records, slow, state.response(records.omega))[:, :, joint][used]
+        if x @ y <= 0:  # less friction than sliding: the joint has not broken loose
+            continue
+        error = sum(_left_out(x, y, fold == k) for k in np.unique(fold))
+        if error < (1 - LAW_AT_REST) * (y @ y):
+            return True
+    return False
+
+
+def _left_out(x: Float[np.ndarray, " rows"], y: Float[np.ndarray, " rows"], out: Bool[np.ndarray, " rows"]) -> float:
+    """Squares of the rows left `out`, by the amplitude of the others."""
+    amplitude = (x[~out] @ y[~out]) / max(float(x[~out] @ x[~out]), 1e-300)
+    return float(((y[out] - amplitude * x[out]) ** 2).sum())
