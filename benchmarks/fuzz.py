@@ -393,11 +393,12 @@ COMMANDS = {  # what may follow each: right words often, wrong ones now and then
     "compare": ("runs/first", "runs/second", "runs/first"),
     "list": (".", "runs"),
     "export": ("loop", "model"),
+    "view": ("runs/first", "runs/second"),
     "new": ("robot.urdf", "run1.npz", "run2.npz", "arm.xml", "robot.xml"),
 }
 OPTIONS = (
     "--out --json --quiet --backend --level --no-priors --no-cache --help --traceback --for --limits --junit --joints"
-    " --rate --constants --version"
+    " --rate --constants --gears --unit --kp --port --version"
 ).split()
 PLACES = (".", "", "..", "out", "out/../out", "n" * 300, "o/" * 200, "task.yaml", "task.yaml/x", "/", "runs/first")
 
@@ -417,7 +418,9 @@ def argv_input(bench: Bench, source: Source, seen: list[bytes]) -> bytes:
             "--limits": ("limits.yaml", "task.yaml"),
             "--joints": ("shoulder,elbow,slide", "shoulder", ",,", "x"),
             "--rate": ("250", "0", "nan", "-1", "1e400", "x"),
-            "--constants": ("1,2,3", "nan,1,1", "1", "1e400,0,0", "x"),
+            **dict.fromkeys(("--constants", "--gears", "--kp"), ("1,2,3", "nan,1,1", "1", "1e400,0,0", "x")),
+            "--unit": ("rad", "deg", "x"),
+            "--port": ("0", "8080", "-1", "99999", "x"),
         }
         if option in values:
             words.append(source.of(values[option]))

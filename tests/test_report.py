@@ -223,12 +223,12 @@ def test_browser_runs_nothing_that_a_name_smuggles_in(tab: browser.Page, tmp_pat
     assert tab.problems == []
 
 
-@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
-def test_axe_finds_no_violation(tab: browser.Page, dark: bool, tmp_path: Path):
+@pytest.mark.parametrize(("variant", "dark"), [("partly", False), ("partly", True), ("nothing", False)])
+def test_axe_finds_no_violation(tab: browser.Page, variant: str, dark: bool, tmp_path: Path):
     """Names, contrast, order of headings, nesting: the rules of axe-core; `benchmarks/pages.py` unfolds every plot."""
     axe = importlib.util.find_spec("axe_core_python")
     assert axe is not None and axe.submodule_search_locations
-    tab.open(_written(VARIANTS["partly"], tmp_path), *LAPTOP, dark=dark)
+    tab.open(_written(VARIANTS[variant], tmp_path), *LAPTOP, dark=dark)
     tab.value("document.querySelectorAll('details.more').forEach((d) => { d.open = true; })")
     tab.value(Path(axe.submodule_search_locations[0], "axe.min.js").read_text("utf-8") + ";undefined")
     rules = "{runOnly: ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa', 'best-practice']}"

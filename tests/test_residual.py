@@ -139,3 +139,39 @@ def test_what_was_not_measured_weighs_nothing_and_a_map_over_robots_gives_each_i
     assert rows.shape == (2, 30)
     np.testing.assert_array_equal(rows[:, 12:15], 0.0)
     assert np.abs(rows[0]).max() < 1e-6 < np.abs(rows[1]).max()
+
+
+def test_links_that_bend_or_grow_move_the_residual_of_postures(tmp_path):
+    """A pitching arm whose mass lies beside it: its weight rolls the link; the second joint moves out with warmth."""
+    unit = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    inertial = f'<inertial><mass value="2"/><origin xyz="0 0.5 0"/>{unit}</inertial>'
+    text = (
+        f'<robot name="arm"><link name="base"/><link name="a">{inertial}</link><link name="b"/><link name="tip"/>'
+        '<joint name="pitch" type="revolute"><parent link="base"/><child link="a"/><axis xyz="0 1 0"/>'
+        '<limit lower="-3" upper="3" effort="1" velocity="1"/></joint>'
+        '<joint name="yaw" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0.5 0 0"/>'
+        '<axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>'
+        '<joint name="end" type="fixed"><parent link="b"/><child link="tip"/><origin xyz="0.3 0.4 0"/></joint></robot>'
+    )
+    (tmp_path / "arm.urdf").write_text(text)
+    robot = fj.load_urdf(tmp_path / "arm.urdf")
+    seen = fj.postures(
+        q=np.zeros((3, 2)),
+        position=np.zeros((3, 3)),
+        time=np.arange(3.0),
+        base_frame="base",
+        tool_frame="tip",
+        unknown=(),
+    )
+    (data,) = fj.pose_data(robot, seen)
+    soft = fj.place(fj.effects.kinematic.LinkCompliance, robot, ["pitch"], first=1e-3)
+    warm = fj.place(fj.effects.kinematic.ThermalGrowth, robot, ["yaw"], growth=2e-3, share=0.3)
+    roll = -9.81 * 1e-3  # the weight's moment about x, 2 kg at 0.5 m
+    bent = np.tile([0.8, 0.4 * np.cos(roll), 0.4 * np.sin(roll)], (3, 1))
+    grown = np.outer(-np.expm1(-np.arange(3.0) / 0.6), [2e-3 * 0.5, 0.0, 0.0])
+    found = np.asarray(fj.residual(fj.extend(robot, soft, warm), data)).reshape(3, 3)
+    np.testing.assert_allclose(found, bent + grown, rtol=0, atol=1e-9)
+
+    by = jax.jacfwd(lambda model: fj.residual(model, data))(fj.extend(robot, soft, warm))
+    np.testing.assert_allclose(by.effects[0].first.reshape(3, 3)[:, 2], -9.81 * 0.4 * np.cos(roll), rtol=1e-9)
+    np.testing.assert_allclose(by.effects[1].growth.reshape(3, 3), grown / 2e-3, rtol=0, atol=1e-9)

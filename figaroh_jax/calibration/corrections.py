@@ -156,6 +156,7 @@ def _data_of(
 
 
 def parameters_of(final: Measured, linear, posterior, gauge: Gauge, order: list[int]) -> tuple[Parameter, ...]:
+    """Every number of the fit with its deviation (SI units), and whether data, prior or the gauge decide it."""
     scale = np.asarray(final.problem.scale)
     names = [(c.label, c.unit) for c in final.columns] + list(final.own)
     covariance = marginal.honest_covariance(posterior, linear.prior)
@@ -215,6 +216,7 @@ def causes_of(
 
 
 def outlier_cause(outlier: Outlier) -> Cause:
+    """A posture that was left out, as a cause of its own."""
     size = {"size": Estimate(outlier.size, float("nan"), "1")}
     note = f"row {outlier.row} of {outlier.file} deviates by {outlier.size:.0f} times the noise; it was left out"
     return Cause(Name("outlier", ()), size, 1.0, Gain(float("nan"), float("nan"), "mm"), note=note)
@@ -235,6 +237,7 @@ def twists_of(model: RobotModel, final: Measured, at: np.ndarray) -> dict[str, n
 
 
 def corrected(model: RobotModel, twists: dict[str, np.ndarray]) -> RobotModel:
+    """The model with each joint moved on its link by the twist (m, rad) under its name."""
     placement = np.array(model.placement)
     for k, joint in enumerate(model.joints):
         if joint.name in twists:
@@ -252,6 +255,7 @@ def twist_pose(twist: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
 
 
 def frames_of(final: Measured, at: np.ndarray) -> dict[str, np.ndarray]:
+    """Poses (4 x 4, m) and points (m) of every device where the scaled unknowns `at` put them, by name."""
     values = at * np.asarray(final.problem.scale)
     start, found = len(final.columns), {}
     for g, group in enumerate(final.problem.groups):

@@ -51,6 +51,7 @@ class Number:
 
     @property
     def known(self) -> bool:
+        """Whether the number is written into the program."""
         return isinstance(self.x, float)
 
     def __add__(self, other: Number) -> Number:

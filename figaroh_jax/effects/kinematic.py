@@ -40,6 +40,7 @@ __all__ = [
     "columns_of",
     "find_kinematic",
     "shape_of",
+    "twists_of",
 ]
 
 Array = np.ndarray
@@ -50,12 +51,12 @@ _ORDERS = tuple(np.arange(2.0, 12.5, 0.5))  # of gear errors, per turn of the jo
 class Postures:
     """Postures of one recording, in the order in which they were measured, and what gravity does in them."""
 
-    q: Float[np.ndarray, "samples nv"]  # rad or m
-    before: Float[np.ndarray, "samples nv"]  # the posture measured before; the first one's own
-    torque: Float[np.ndarray, "samples nj"]  # gravity about each joint's axis, N m or N
-    moment: Float[np.ndarray, "samples nj 3"]  # gravity's moment at each joint, in the joint frame, N m
-    payload: Float[np.ndarray, "samples nj"]  # as torque, of the carried load alone
-    time: Float[np.ndarray, " samples"]  # s
+    q: Float[Leaf, "samples nv"]  # rad or m
+    before: Float[Leaf, "samples nv"]  # the posture measured before; the first one's own
+    torque: Float[Leaf, "samples nj"]  # gravity about each joint's axis, N m or N
+    moment: Float[Leaf, "samples nj 3"]  # gravity's moment at each joint, in the joint frame, N m
+    payload: Float[Leaf, "samples nj"]  # as torque, of the carried load alone
+    time: Float[Leaf, " samples"]  # s
     duration: float  # s, of all recordings together
     _motions: dict[int, PostureMotion] = field(default_factory=dict, init=False, repr=False)  # by robot
 
@@ -89,13 +90,14 @@ def axis_twist(model: RobotModel, joint: int) -> Float[np.ndarray, "6"]:
     return twist
 
 
-def across(model: RobotModel, joint: int) -> Float[np.ndarray, "2 3"]:
+def across(model: RobotModel, joint: int) -> Float[Any, "2 3"]:
     """Two unit vectors across the joint's axis, the first one along a frame axis where it can be."""
     axis = joint_axis(model, joint)
-    x = np.eye(3)[np.argmin(np.abs(axis))]
+    lib = _library(axis)
+    x = lib.eye(3)[lib.argmin(lib.abs(axis))]
     x = x - (x @ axis) * axis
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(axis, x)])
+    x = x / lib.linalg.norm(x)
+    return lib.stack([x, lib.cross(axis, x)])
 
 
 def _position(model: RobotModel) -> Callable[[Postures, int], Array]:
@@ -126,16 +128,21 @@ def _axis_names(vectors: Array, names: str) -> list[str]:
 def _bending(model, at, _):
     (j,) = at
     for name, vector in zip(("bending 1", "bending 2"), across(model, j), strict=True):
-        twist = np.r_[np.zeros(3), vector]
+        twist = _library(vector).concatenate([np.zeros(3), vector])
         field = lambda p, twist=twist, vector=vector: twist[:, None] * (p.moment[:, j] @ vector)  # noqa: E731
         yield name, "rad/(N m)", [(j, field)]
 
 
 def _thermal(model, at, share):
     (j,) = at
-    way = np.asarray(model.placement[j])[:3, :3].T @ np.asarray(model.placement[j])[:3, 3]
-    twist = np.r_[way, np.zeros(3)]
-    yield "growth", "1", [(j, lambda p: twist[:, None] * -np.expm1(-p.time / (share * p.duration)))]
+    lib, placement = _library(model.placement), model.placement[j]
+    twist = lib.concatenate([placement[:3, :3].T @ placement[:3, 3], np.zeros(3)])
+
+    def field(p: Postures) -> Any:
+        warm = -p.time / (share * p.duration)
+        return twist[:, None] * -_library(warm).expm1(warm)
+
+    yield "growth", "1", [(j, field)]
 
 
 def _base(model, at, _):
@@ -277,6 +284,8 @@ class LinkCompliance(JointEffect):
     equation = "two rotations across the axis, each in proportion to its moment"
     levels = ("pose",)
     separated_by = "the same postures with two payloads, the link horizontal and vertical"
+    first: Scalar = amplitude("rad/(N m)")  # about the two directions of `across`
+    second: Scalar = amplitude("rad/(N m)")
     twist = staticmethod(_bending)
 
 
@@ -288,6 +297,7 @@ class ThermalGrowth(JointEffect):
     equation = "length of the link times g (1 - exp(-t / T))"
     levels = ("pose",)
     separated_by = "one posture measured again and again while the robot warms up"
+    growth: Scalar = amplitude("")
     share: Scalar = shape("", (0.1, 0.3, 1.0, 10.0))  # of the whole duration
     twist = staticmethod(_thermal)
 
@@ -407,6 +417,23 @@ def columns_of(effect: type[Effect], model: RobotModel, at: Sequence[int], shape
     names = tuple(model.joints[j].name for j in at) if effect.acts_on in ("joint", "pair") else ()
     parts = effect.twist(model, tuple(at), shape) if effect.has("twist") else _shifts(effect, model, tuple(at), shape)
     return tuple(Column(effect.name, names, parameter, unit, tuple(pieces)) for parameter, unit, pieces in parts)
+
+
+def twists_of(effects: Sequence[Effect], model: RobotModel, postures: Postures) -> Float[Any, "nj 6 samples"]:
+    """What the twist of each joint's frame gains by effects with such a form and a size, in the postures; traceable.
+
+    Each of an effect's linear parameters is the coefficient of one of its columns, in the order of both.
+    """
+    total = jnp.zeros((len(model.joints), 6, len(postures.q)))
+    for effect in effects:
+        sizes = [getattr(effect, name) for name, parameter in effect.parameters().items() if parameter.linear]
+        if sizes and effect.has("twist"):
+            curved = getattr(effect, shape_of(type(effect))[0], 0.0)
+            columns = effect.twist(model, tuple(int(k) for k in effect.at), curved)
+            for size, (_, _, pieces) in zip(sizes, columns, strict=True):
+                for joint, field in pieces:
+                    total = total.at[joint].add(size * field(postures))
+    return total
 
 
 def _shifts(

@@ -109,6 +109,7 @@ def random_states(
 
 
 def motion_at(model: RobotModel, time: Any, q: Any, v: Any, a: Any, dt: Any, width: Any) -> Motion:
+    """The motion (rad, rad/s, rad/s^2; m if sliding) at instants `dt` s apart, without load; `width` as in `Motion`."""
     zero = jnp.zeros(jnp.shape(v))
     return Motion(model, jnp.asarray(time), jnp.asarray(q), jnp.asarray(v), jnp.asarray(a), zero, zero, dt, width)
 

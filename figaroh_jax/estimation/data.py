@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from ..compiled.precision import in_float64
 from ..effects.extended import ExtendedModel, changed_robot, extend, opened, read_position, read_sensors
-from ..effects.kinematic import PostureMotion
+from ..effects.kinematic import PostureMotion, Postures, twists_of
 from ..errors import InputError
 from ..recordings.dataset import Recording
 from ..recordings.devices import Device
@@ -32,10 +32,12 @@ from ..recordings.poses import PoseRecording
 from ..recordings.rowfilter import filtered
 from ..recordings.signals import prepare_all
 from ..recordings.stacked import stack
+from ..rigid import lie
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.kinematics import frame_pose, placements
 from ..rigid.model import Leaf, RobotModel
 from ..rigid.spatial import matmul
+from .gravity import gravity_moments
 from .posefit import ties
 from .posegroups import devices_of
 
@@ -109,11 +111,13 @@ class PoseData(eqx.Module):
     base_frame: str = eqx.field(static=True, default="")
     tool_frame: str = eqx.field(static=True, default="")
     begins: tuple[int, ...] = eqx.field(static=True, default=(0,))  # first posture of each recording
+    time: Float[Leaf, " postures"] | None = None  # s, since the first posture of the recording
+    duration: float = eqx.field(static=True, default=1.0)  # s, of all recordings together
 
     def residual(self, model: ExtendedModel) -> Float[Array, " rows"]:
         """Predicted less measured times the weight, posture by posture, then the device's constraints."""
         unknown = jnp.zeros(len(self.device.unknowns()))
-        poses = tool_poses(model, jnp.asarray(self.position), self.base_frame, self.tool_frame, self.begins)
+        poses = self.tool_poses(model)
         datum = jax.tree.map(jnp.asarray, self.datum)
         device: Device = jax.tree.map(jnp.asarray, self.device)
         rows = jax.vmap(lambda pose, seen: device.residual(pose, unknown, seen))(poses, datum)
@@ -122,6 +126,38 @@ class PoseData(eqx.Module):
         if not ties(self.device):
             return rows.reshape(-1)
         return jnp.concatenate([rows.reshape(-1), self.tied * device.constraint(unknown)])
+
+    def tool_poses(self, model: ExtendedModel) -> Float[Array, "postures 4 4"]:
+        """Poses of the tool frame in the base frame (m); to be traced in float64."""
+        robot, q = changed_robot(model), jnp.asarray(self.position)
+        poses = self._joint_poses(model, robot, q)
+        start, end = (
+            frame_pose(poses, robot, k, robot.frames[k].parent)
+            for k in (robot.frame_index(self.base_frame), robot.frame_index(self.tool_frame))
+        )
+        back = jnp.swapaxes(start[:3, :3], 0, 1)
+        rotation = matmul(back, end[:3, :3])
+        place = jnp.sum(back * (end[:3, 3] - start[:3, 3])[None], axis=1)
+        top = jnp.moveaxis(jnp.concatenate([rotation, place[:, None]], axis=1), -1, 0)
+        bottom = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]), (len(q), 1, 4))
+        return jnp.concatenate([top, bottom], axis=1)
+
+    def _joint_poses(self, model: ExtendedModel, robot: RobotModel, q: Array) -> Float[Array, "nj 4 4 postures"]:
+        """With each joint's frame where the effects' twists put it in each posture."""
+        true = true_position(model, robot, q, self.begins)
+        if not any(effect.has("twist") for effect in model.effects):
+            return placements(robot, true.T)
+        torque, moment = gravity_moments(robot, q)
+        time = jnp.zeros(len(q)) if self.time is None else jnp.asarray(self.time)
+        seen = Postures(q, _before(q, self.begins), torque, moment, 0.0 * torque, time, self.duration)
+        twists = jnp.moveaxis(twists_of(model.effects, robot, seen), -1, 0)
+        places = jnp.asarray(robot.placement) @ jax.vmap(jax.vmap(lie.twist_pose))(twists)
+
+        def one(place: Array, position: Array) -> Array:
+            moved = eqx.tree_at(lambda r: r.placement, robot, place)
+            return placements(moved, position[:, None])[..., 0]
+
+        return jax.vmap(one, out_axes=-1)(places, true)
 
     def unknowns(self) -> tuple[tuple[str, str, float], ...]:
         """Name, unit and typical size of what the device leaves open."""
@@ -132,26 +168,10 @@ class PoseData(eqx.Module):
         return eqx.tree_at(lambda d: d.device, self, self.device.moved(numbers))
 
 
-def tool_poses(
-    model: ExtendedModel,
-    q: Float[Array, "postures nq"],
-    base_frame: str,
-    tool_frame: str,
-    begins: tuple[int, ...] = (0,),
-) -> Float[Array, "postures 4 4"]:
-    """Poses of the tool frame in the base frame (m) where the position sensors read `q`; to be traced in float64."""
-    robot = changed_robot(model)
-    poses = placements(robot, true_position(model, robot, q, begins).T)
-    start, end = (
-        frame_pose(poses, robot, k, robot.frames[k].parent)
-        for k in (robot.frame_index(base_frame), robot.frame_index(tool_frame))
-    )
-    back = jnp.swapaxes(start[:3, :3], 0, 1)
-    rotation = matmul(back, end[:3, :3])
-    place = jnp.sum(back * (end[:3, 3] - start[:3, 3])[None], axis=1)
-    top = jnp.moveaxis(jnp.concatenate([rotation, place[:, None]], axis=1), -1, 0)
-    bottom = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]), (len(q), 1, 4))
-    return jnp.concatenate([top, bottom], axis=1)
+def _before(q: Float[Array, "postures nq"], begins: tuple[int, ...]) -> Float[Array, "postures nq"]:
+    """The posture measured before; the first one's own."""
+    first = np.isin(np.arange(len(q)), begins)[:, None]
+    return jnp.where(first, q, jnp.roll(q, 1, axis=0))
 
 
 def true_position(
@@ -162,10 +182,8 @@ def true_position(
         return q
     still = jnp.zeros((len(q), robot.nv))
     load = inverse_dynamics(robot, q, still, still)
-    first = np.isin(np.arange(len(q)), begins)[:, None]
-    before = jnp.where(first, q, jnp.roll(q, 1, axis=0))
     rest = still, still, load, load, 0.0, jnp.asarray(model.width)
-    motion = PostureMotion(robot, jnp.zeros(len(q)), q, *rest, before, still)
+    motion = PostureMotion(robot, jnp.zeros(len(q)), q, *rest, _before(q, begins), still)
     return q - (read_position(model.effects, motion) - q)
 
 
@@ -243,7 +261,7 @@ def pose_data(
     """
     robot = model.robot if isinstance(model, ExtendedModel) else model
     given = [recordings] if isinstance(recordings, PoseRecording) else list(recordings)
-    found = []
+    found, duration = [], max(sum(float(np.ptp(one.time)) for one in given), 1e-9)
     for members, device, datum, measured in devices_of(robot, given):
         scale = sigma or tuple(given[members[0]].accuracy[k] or 1.0 for k in (0, 1))
         fit = np.concatenate([np.full(len(given[k].position), given[k].role == "fit") for k in members])
@@ -252,7 +270,9 @@ def pose_data(
         first = given[members[0]]
         frames = first.base_frame, first.tool_frame
         begins = np.cumsum([0, *(len(given[k].position) for k in members[:-1])])
-        found.append(PoseData(position, datum, weight, device, 1.0 / scale[0], *frames, tuple(begins.tolist())))
+        time = np.concatenate([given[k].time - given[k].time[0] for k in members])
+        rest = tuple(begins.tolist()), time, duration
+        found.append(PoseData(position, datum, weight, device, 1.0 / scale[0], *frames, *rest))
     return tuple(found)
 
 

@@ -250,7 +250,7 @@ def apply(
         else:
             model = eqx.tree_at(lambda m: m.robot, model, _changed(model.robot, part.kind, whole))
     if twist is not None:
-        placement = jnp.asarray(model.robot.placement) @ jax.vmap(_moved)(twist)
+        placement = jnp.asarray(model.robot.placement) @ jax.vmap(lie.twist_pose)(twist)
         model = eqx.tree_at(lambda m: m.robot.placement, model, placement)
     return model, data
 
@@ -272,8 +272,3 @@ def _along(robot: RobotModel, offset: Float[Array, " nj"]) -> Float[Array, "nj 6
     way = offset[:, None] * jnp.asarray(robot.axis)
     turns = np.array([joint.kind == "revolute" for joint in robot.joints])[:, None]
     return jnp.concatenate([jnp.where(turns, 0.0, way), jnp.where(turns, way, 0.0)], axis=1)
-
-
-def _moved(twist: Float[Array, "6"]) -> Float[Array, "4 4"]:
-    """E: the translation, then the rotation."""
-    return lie.pose(lie.exp_so3(twist[3:]), twist[:3])

@@ -2,10 +2,14 @@ r"""What gravity does to each joint in a posture: the torque about its axis and 
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..compiled.batching import traced
 from ..rigid.chain import joint_axis
 from ..rigid.kinematics import ancestors, forward_kinematics
 from ..rigid.model import RobotModel
@@ -31,21 +35,23 @@ def without_far_masses(model: RobotModel) -> tuple[RobotModel, tuple[str, ...]]:
 
 
 def gravity_moments(
-    model: RobotModel, q: Float[np.ndarray, "samples nv"]
-) -> tuple[Float[np.ndarray, "samples nj"], Float[np.ndarray, "samples nj 3"]]:
+    model: RobotModel, q: Float[Any, "samples nv"]
+) -> tuple[Float[Any, "samples nj"], Float[Any, "samples nj 3"]]:
     r"""Force or torque of gravity along each joint's motion (N or N m), and its moment in the joint frame (N m).
 
     $M_j = \sum_{i \text{ above } j} (c_i - o_j) \times m_i g$ over the links that joint j moves.
     """
-    poses = np.asarray(forward_kinematics(model, q))
+    lib: Any = jnp if traced(model, q) else np
+    poses = lib.asarray(forward_kinematics(model, q))
     R, o = poses[..., :3, :3], poses[..., :3, 3]
-    mass, first = np.asarray(model.inertia)[:, 0], np.asarray(model.inertia)[:, 1:4]
-    weighted = np.einsum("nkij,kj->nki", R, first) + mass[:, None] * o  # m c in the world
-    above = ancestors(model.joints)
-    force = np.outer(above @ mass, np.asarray(model.gravity))
-    about = np.einsum("jk,nki->nji", above, weighted) - (above @ mass)[:, None] * o
-    moment = np.einsum("njik,nji->njk", R, np.cross(about, np.asarray(model.gravity)))
-    axes = np.stack([joint_axis(model, j) for j in range(len(model.joints))])
-    along = np.einsum("njik,ji->njk", R, force)
+    inertia, gravity = lib.asarray(model.inertia), lib.asarray(model.gravity)
+    mass, first = inertia[:, 0], inertia[:, 1:4]
+    weighted = lib.einsum("nkij,kj->nki", R, first) + mass[:, None] * o  # m c in the world
+    above = lib.asarray(ancestors(model.joints))
+    force = lib.outer(above @ mass, gravity)
+    about = lib.einsum("jk,nki->nji", above, weighted) - (above @ mass)[:, None] * o
+    moment = lib.einsum("njik,nji->njk", R, lib.cross(about, gravity))
+    axes = lib.stack([joint_axis(model, j) for j in range(len(model.joints))])
+    along = lib.einsum("njik,ji->njk", R, force)
     revolute = np.array([joint.kind == "revolute" for joint in model.joints])
-    return np.einsum("njk,jk->nj", np.where(revolute[:, None], moment, along), axes), moment
+    return lib.einsum("njk,jk->nj", lib.where(revolute[:, None], moment, along), axes), moment

@@ -168,7 +168,7 @@ def _library(x: Any) -> Any:
     return np if isinstance(x, (np.ndarray, np.generic)) else jnp
 
 
-def attempt(normal_at: Callable[[Array], NormalEquations], state: State) -> State:
+def attempt(normal_at: Callable[[Any], NormalEquations], state: State) -> State:
     """One trial step: taken where the cost falls, and the next one with the damping that follows."""
     at, lib = state.at + state.step, _library(state.at)
     normal = normal_at(at)

@@ -92,6 +92,7 @@ def instruments(
 
 
 def tall(X: Float[np.ndarray, "nv T P"]) -> Float[np.ndarray, "nvT P"]:
+    """The rows of all joints, one joint behind the other."""
     return X.reshape(-1, X.shape[-1])
 
 

@@ -172,12 +172,8 @@ def identify(
     warned = check_recordings(None, model, recordings) if check else ()
     with jax.enable_x64(True):
         progress("preparing signals", 0.05)
-        # the cutoff alone: a band guessed from the motion costs accuracy where friction makes the motion sharp
-        signals = prepare_all(tuple(recordings), preprocess or Preprocess(), slowed=False, model=model)
-        terms = friction_terms(model, known or Baseline())
-        refused, left_out = _refused(model, recordings, joints)
-        notes = [*warned, *left_out]
-        regression = Regression(backend, terms, np.zeros(model.nv), signals, refused)
+        regression, left_out = _regression(backend, recordings, preprocess or Preprocess(), known or Baseline(), joints)
+        notes, terms, signals = [*warned, *left_out], regression.terms, regression.signals
         structure = structural_columns(model, terms)
         used = np.asarray(np.abs(structure).max(axis=0) > 0)
         structural = base_parameters(structure.reshape(-1, structure.shape[2]), regression.names)
@@ -233,6 +229,21 @@ def identify(
             notes=(*notes, *dropped(signals, model), *outlying, *(note for one in signals for note in one.notes)),
             prismatic=prismatic(model),
         )
+
+
+def _regression(
+    backend: Backend,
+    recordings: Sequence[Recording],
+    preprocess: Preprocess,
+    known: Baseline,
+    joints: Sequence[str] | None,
+) -> tuple[Regression, list[str]]:
+    """The rows of the recordings, and what is left out of them, in words."""
+    # the cutoff alone: a band guessed from the motion costs accuracy where friction makes the motion sharp
+    signals = prepare_all(tuple(recordings), preprocess, slowed=False, model=backend.robot)
+    refused, notes = _refused(backend.robot, recordings, joints)
+    terms = friction_terms(backend.robot, known)
+    return Regression(backend, terms, np.zeros(backend.robot.nv), signals, refused), notes
 
 
 def _refused(

@@ -160,9 +160,11 @@ class Drive:
         self.offset = np.zeros(model.nq) if offset is None else offset
 
     def joint_motion(self, motor: Float[np.ndarray, "samples nv"]) -> Float[np.ndarray, "samples nv"]:
+        """Position of the joints (rad or m) from that of the drives."""
         return motor if self.position is None else np.linalg.solve(self.position, motor.T).T
 
     def joint_torque(self, motor: Float[np.ndarray, "samples nv"]) -> Float[np.ndarray, "samples nv"]:
+        """Torque of the joints (N m or N) from that of the drives."""
         return motor if self.torque is None else motor @ self.torque.T
 
 
@@ -224,6 +226,7 @@ def unit_factors(
 
 
 def joint_columns(table: Table, source, model: RobotModel, key: str, samples: int | None = None):
+    """Columns of the joints in their order, finite and with `samples` rows; `InputError` names file, key and row."""
     return _columns(table, source, model.joint_names, key, samples)
 
 
@@ -242,6 +245,7 @@ def _columns(table: Table, source, names: Sequence[str], key: str, samples: int 
 
 
 def read_time(table: Table, entry: RecordingEntry, key: str, samples: int) -> Float[np.ndarray, " samples"]:
+    """Time in s, increasing; counted by the rate, or in steps of one, where the entry names no clock."""
     if samples < 2:
         raise InputError(f"{table.file}: {samples} sample{'s'[samples:]}; a recording is a motion over time")
     if entry.time is None:

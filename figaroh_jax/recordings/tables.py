@@ -90,6 +90,7 @@ class Table(NamedTuple):
 
 
 def check_columns(file: Path, count: int) -> None:
+    """`InputError` where a file has more columns than a recording can have."""
     if count > MOST_COLUMNS:
         raise InputError(f"{file}: {count} columns; a recording has at most {MOST_COLUMNS}")
 

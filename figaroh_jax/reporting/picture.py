@@ -14,9 +14,10 @@ from jaxtyping import Float
 from ..rigid.kinematics import forward_kinematics
 from ..rigid.model import RobotModel
 
-__all__ = ["robot_picture", "segments"]
+__all__ = ["middle_posture", "robot_picture", "segments"]
 
 _WIDTH, _HEIGHT, _EDGE = 460.0, 300.0, 34.0
+_LABEL = (110.0, 13.0)  # room of a name
 _AZIMUTHS = np.deg2rad(np.arange(20, 200, 15))
 _ELEVATION = np.deg2rad(18.0)
 
@@ -39,7 +40,7 @@ def robot_picture(
 
     With `nominal` that robot is drawn behind, and `model` is drawn `magnify` times as far from it as it is.
     """
-    q = _middle(model) if q is None else q
+    q = middle_posture(model) if q is None else q
     lines = np.concatenate([segments(model, q), _tips(model, q)])
     behind = None if nominal is None else np.concatenate([segments(nominal, q), _tips(nominal, q)])
     if behind is not None:
@@ -50,9 +51,10 @@ def robot_picture(
     parts += [_line(line, "link") for line in flat[count : len(lines)]]
     for joint, line in zip(model.joints, flat[:count], strict=True):
         parts.append(_line(line, "hit" if joint.link in affected and joint.name not in affected else "link"))
+    labels: list[tuple[float, float]] = []
     for joint, line in zip(model.joints, flat[:count], strict=True):
         hit = joint.name in affected or joint.link in affected
-        parts.append(_joint(joint.name, line[1], hit))
+        parts.append(_joint(joint.name, line[1], hit, _label(line[1], labels) if hit else (0.0, 0.0)))
     named = ", ".join(joint.name for joint in model.joints if joint.name in affected or joint.link in affected)
     text = f"{model.name}, {count} joints; affected: {named or 'none'}"
     view = f'viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}"'
@@ -75,7 +77,7 @@ def _tips(model: RobotModel, q: Float[np.ndarray, " nq"]) -> Float[np.ndarray, "
     return np.array(lines).reshape(-1, 2, 3)
 
 
-def _middle(model: RobotModel) -> Float[np.ndarray, " nq"]:
+def middle_posture(model: RobotModel) -> Float[np.ndarray, " nq"]:
     """The middle of every joint's range within half a turn, bent a little, so that no links hide each other."""
     if model.nq != model.nv:
         from ..rigid.manifold import neutral
@@ -107,8 +109,18 @@ def _line(line: Float[np.ndarray, "2 2"], kind: str) -> str:
     return f'<path class="{kind}" d="M{a:.1f} {b:.1f}L{c:.1f} {d:.1f}"/>'
 
 
-def _joint(name: str, at: Float[np.ndarray, "2"], hit: bool) -> str:
+def _label(at: Float[np.ndarray, "2"], taken: list[tuple[float, float]]) -> tuple[float, float]:
+    """A place for a joint's name beside it, below the names that stand there already."""
+    x, y = float(at[0]) + 10, float(at[1]) - 9
+    while any(abs(x - a) < _LABEL[0] and abs(y - b) < _LABEL[1] for a, b in taken):
+        y += _LABEL[1]
+    taken.append((x, y))
+    return x, y
+
+
+def _joint(name: str, at: Float[np.ndarray, "2"], hit: bool, place_of_name: tuple[float, float]) -> str:
     kind, size = ("hit", 7) if hit else ("joint", 4)
-    label = f'<text x="{at[0] + 10:.1f}" y="{at[1] - 9:.1f}">{escape(name)}</text>' if hit else ""
+    x, y = place_of_name
+    label = f'<text x="{x:.1f}" y="{y:.1f}">{escape(name)}</text>' if hit else ""
     place = f'cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="{size}"'
     return f'<circle class="{kind}" {place}><title>{escape(name)}</title></circle>{label}'

@@ -199,9 +199,11 @@ def _value_and_half(value: float, half: float, decimals: int) -> str:
 
 
 def error(value: float, of: str) -> str:
-    """An error in words: a relative one in percent, any other with its unit."""
+    """An error in words: a relative one in percent, a small angle or length in mrad or mm, any other with its unit."""
     if not math.isfinite(value):
         return "unknown"
+    if of in ("rad", "m") and abs(value) < 0.1:
+        return f"{number(1e3 * value, 3)} m{of}"
     if not of.startswith("relative"):
         return _with_unit(number(value), of)
     percent = 100.0 * value

@@ -7,12 +7,13 @@ kinematic error is such a twist, as a function of the posture (`kinematic_effect
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from ..errors import InputError
@@ -74,13 +75,14 @@ def chain_between(model: RobotModel, base: str, tool: str) -> Chain:
     )
 
 
-def joint_axis(model: RobotModel, joint: int) -> Float[np.ndarray, "3"]:
+def joint_axis(model: RobotModel, joint: int) -> Float[Any, "3"]:
     """Unit axis of a joint of one degree of freedom; raises `InputError` for the others."""
     kind = model.joints[joint].kind
     if kind not in ("revolute", "prismatic"):
         name = model.joints[joint].name
         raise InputError(f"joint '{name}' is {kind}; calibration takes revolute and prismatic joints")
-    return np.asarray(model.axis)[dofs(model.joints).first[joint]]
+    axis = model.axis[dofs(model.joints).first[joint]]
+    return axis if isinstance(axis, Tracer) else np.asarray(axis)
 
 
 def chain_pose(chain: Chain, q: Float[Array, "nq samples"], twists: Float[Array, "n 6 #samples"]) -> ChainPose:

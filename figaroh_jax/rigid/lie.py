@@ -38,6 +38,11 @@ def pose(rotation: Float[Array, "3 3"], translation: Float[Array, "3"]) -> Float
     return jnp.concatenate([top, jnp.array([[0.0, 0.0, 0.0, 1.0]], top.dtype)])
 
 
+def twist_pose(twist: Float[Array, "6"]) -> Float[Array, "4 4"]:
+    """Pose E of a twist `[linear, angular]` (m, rad) as kinematic effects have it: translation, then rotation."""
+    return pose(exp_so3(twist[3:]), twist[:3])
+
+
 def inverse_pose(a_T_b: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
     """Pose the other way round."""
     back = a_T_b[:3, :3].T

@@ -118,18 +118,22 @@ class Robot:
         return Number(self.load(k)) if code == LOADED else Number(float(code))
 
     def of_joint(self, i: int, what: str) -> list[Number]:
+        """Numbers of joint i by name."""
         first = i * _PER_JOINT + self.place[what]
         return [self._at(first + k) for k in range(_SIZES[what])]
 
     def of_dof(self, k: int, what: str) -> Vector:
+        """Three numbers of the degree of freedom k by name."""
         first = len(self.joints) * _PER_JOINT + 6 * k + 3 * list(_PER_DOF).index(what)
         return self._at(first), self._at(first + 1), self._at(first + 2)
 
     def gravity(self) -> Vector:
+        """Gravity in the world, m/s^2."""
         first = len(self.codes) - 3
         return self._at(first), self._at(first + 1), self._at(first + 2)
 
     def matrix(self, i: int, what: str) -> Matrix:
+        """Nine numbers of joint i as rows."""
         x = self.of_joint(i, what)
         return tuple(x[:3]), tuple(x[3:6]), tuple(x[6:])
 
@@ -139,6 +143,7 @@ class Robot:
         return range(first, first + int((self.dofs.joint == i).sum()))
 
     def children(self, i: int) -> list[int]:
+        """Joints that hang on joint i."""
         return [k for k, joint in enumerate(self.joints) if joint.parent == i]
 
 

@@ -167,6 +167,7 @@ class System:
         self.gs = gradient[:, m:] - precision * (start - np.asarray(data.start)).T
 
     def solve(self, fixed: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
+        """Damped step of the parameters (those `fixed` stay) and of the windows' starts (states, windows)."""
         scale = np.einsum("wii->wi", self.hss)
         hss = (
             self.hss + damping * np.einsum("wi,ij->wij", scale, np.eye(scale.shape[1])) + 1e-12 * np.eye(scale.shape[1])
@@ -186,6 +187,7 @@ class System:
         return change, starts.T
 
     def decrease(self, change: np.ndarray, starts: np.ndarray) -> float:
+        """Of the sum of squares, as the quadratic model promises it for a step."""
         s = starts.T
         gain = 2 * (self.gp @ change + (self.gs * s).sum())
         spent = change @ self.hpp @ change + 2 * np.einsum("p,wpi,wi->", change, self.hps, s)

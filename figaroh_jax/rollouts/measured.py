@@ -22,7 +22,7 @@ from ..recordings.dataset import Recording
 from ..rigid.model import Leaf, RobotModel
 from .data import Run, Stretch, noise_of, regular, windows
 from .loop import Loop, State, advance, integrated, mobility
-from .parameters import UNITS, Entry, put, values
+from .parameters import UNITS, Entry, current, put, values
 from .sensitivity import Windows, began, read_of
 from .simulation import delayed
 from .task import EFFECTS, extended_of
@@ -59,7 +59,7 @@ class RolloutData(eqx.Module):
         loop = _with_model(self.loop, model)
         if self.drives:
             table = self._open()
-            loop = put(loop, table, jnp.asarray(values(self.loop, table)) + self.change)
+            loop = put(loop, table, current(self.loop, table) + self.change)
         return _simulated(loop, jax.tree.map(jnp.asarray, self.windows), jnp.asarray(self.start))
 
     def unknowns(self) -> tuple[tuple[str, str, float], ...]:

@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 from .loop import Loop
 
-__all__ = ["BOUNDS", "UNITS", "Entry", "Table", "put", "values"]
+__all__ = ["BOUNDS", "UNITS", "Entry", "Table", "current", "put", "values"]
 
 _OF_DRIVES = ("scale", "delay", "dead_band", "voltage", "time_constant")
 
@@ -53,19 +53,24 @@ def values(loop: Loop, table: Table) -> np.ndarray:
     return np.array([float(_get(loop, entry.name)[entry.at[0]]) for entry in table])
 
 
-def _get(loop: Loop, name: str) -> Any:
+def current(loop: Loop, table: Table) -> Array:
+    """`values` of a loop whose numbers JAX may be tracing."""
+    return jnp.stack([jnp.asarray(_get(loop, entry.name, jnp)[entry.at[0]]) for entry in table])
+
+
+def _get(loop: Loop, name: str, xp: Any = np) -> Any:
     drives = loop.drives
     special = {
-        "kp": lambda: np.asarray(drives.gain)[:, 0],
-        "kd": lambda: -np.asarray(drives.bias)[:, 2],
-        "force_limit": lambda: np.asarray(drives.force_range)[:, 1],
-        "payload": lambda: np.zeros(len(loop.robot.joints)),
-        "gravity_x": lambda: np.asarray(loop.robot.gravity)[:1],
-        "gravity_y": lambda: np.asarray(loop.robot.gravity)[1:2],
+        "kp": lambda: xp.asarray(drives.gain)[:, 0],
+        "kd": lambda: -xp.asarray(drives.bias)[:, 2],
+        "force_limit": lambda: xp.asarray(drives.force_range)[:, 1],
+        "payload": lambda: xp.zeros(len(loop.robot.joints)),
+        "gravity_x": lambda: xp.asarray(loop.robot.gravity)[:1],
+        "gravity_y": lambda: xp.asarray(loop.robot.gravity)[1:2],
     }
     if name in special:
         return special[name]()
-    return np.asarray(getattr(drives if name in _OF_DRIVES else loop.joints, name))
+    return xp.asarray(getattr(drives if name in _OF_DRIVES else loop.joints, name))
 
 
 def put(loop: Loop, table: Table, theta: Array | np.ndarray) -> Loop:

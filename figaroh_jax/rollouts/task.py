@@ -124,6 +124,7 @@ def _run(task: Task, loop: Loop, recording: Recording) -> Run:
 
 
 def diagnosis_setting(task: Task, loop: Loop, runs: Sequence[Run]) -> Setting:
+    """What a search starts from: the baseline that the task states, the gains it knows, what it forbids."""
     known, given = task.baseline, task.baseline.model_fields_set
     rotor = known.rotor if "rotor" in given else bool(np.asarray(loop.joints.armature).any())
     names = [n for n, on in zip(BASELINE, (rotor, known.viscous, known.coulomb), strict=True) if on]
