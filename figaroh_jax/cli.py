@@ -109,10 +109,11 @@ def _run(args: argparse.Namespace) -> int:
         return status
     if args.command == "rerun":
         args = _again(args)
-    if args.command in _TASKS and args.task is not None:
+    task = args.task if args.command in _TASKS else None
+    if task is not None:
         from .formats.taskfile import read_task
 
-        read_task(args.task)  # a file that is missing or no YAML is told before two seconds of imports
+        read_task(task)  # a file that is missing or no YAML is told before two seconds of imports
     _set_up_jax(cache=not args.no_cache)
     from .recordings.progress import listener
     from .reporting import terminal, wording
