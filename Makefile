@@ -47,6 +47,8 @@ docs: .venv/documented ## the site in site/, with every warning an error
 pictures: .venv/developed ## the docs' screenshots, from the demo
 	$(BIN)/figaroh-jax demo --out runs/demo --quiet
 	$(BIN)/python benchmarks/pages.py runs/demo --docs docs/images
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[view]'
+	$(BIN)/python benchmarks/pages.py runs/demo --view docs/images/view.png
 
 format: .venv/developed
 	$(BIN)/ruff check --fix .

@@ -30,8 +30,7 @@ BOTH = ["base_frame", "tool_frame"]
 PANDA = [f"panda_joint{k}" for k in range(1, 8)]
 TIAGO = ["torso_lift_joint", *(f"arm_{k}_joint" for k in range(1, 8))]
 TALOS = ["torso_1_joint", "torso_2_joint", *(f"arm_left_{k}_joint" for k in range(1, 8))]
-SO101 = ("multisine", "prbs_excitation", "friction_gravity")  # fitted
-SO101_HELD = ("step_response", "slow_precision")
+SO101, SO101_HELD = ("multisine",), ("step_response",)
 
 
 class Robot(NamedTuple):
@@ -80,7 +79,7 @@ def so101(folder: Path) -> dict[str, Any]:
         u, q = (np.asarray(z[key], float) for key in ("command", "q"))
         for x in (u, q):
             x[:, 5] = -0.174533 + 1523 * 2 * np.pi / 4096 * x[:, 5]  # the jaw's share of its range
-        rows = slice(0, 2000)  # 40 s
+        rows = slice(0, 1000)  # 20 s
         np.savez(folder / f"{name}.npz", t=z["t"][rows], u=u[rows], q=q[rows])
         role = {"role": "holdout"} if name in SO101_HELD else {}
         data.append({"file": f"{name}.npz", "time": "t", "command": "u", "position": "q"} | role)
@@ -155,7 +154,7 @@ ROBOTS = {
         "SO-101 arm",
         "https://github.com/isaac-sim2real/sage",
         "Apache-2.0",
-        "commands and encoders of six hobby servos at 50 Hz, no torque; three motions fitted, two held out, 40 s each",
+        "commands and encoders of six hobby servos at 50 Hz, no torque; one motion fitted, another held out, 20 s each",
         so101,
     ),
     "talos": Robot(

@@ -130,7 +130,7 @@ def grade(task_text: str, assumed: tuple[str, ...], case: Case, folder: Path) ->
         off |= np.abs(recording.torque - tau).max(axis=0) > 1e-6
     if not off.any():
         return "right"
-    unsure = " ".join(line for line in assumed if "nothing tells" in line or "bear the order out" in line)
+    unsure = " ".join(line for line in assumed if "nothing confirms" in line or "bear the order out" in line)
     borne = unsure.split("bear the order out at")[-1].split(";")[0] if "bear the order out" in unsure else ""
     names = np.array(recording.joints)[off]
     said = all(name in unsure.split("no column")[0] or (borne and name not in borne) for name in names)

@@ -86,13 +86,37 @@ def docs_pictures(page: Path, folder: Path) -> int:
     return 0
 
 
+def view_picture(run: Path, file: Path) -> int:
+    """The robot of a run in its 3D view (extra `view`), rendered without a graphics card."""
+    from figaroh_jax.reporting.robot_view import show_run
+
+    server = show_run(run, VIEW_PORT)
+    software = ("--enable-unsafe-swiftshader", "--use-gl=angle", "--use-angle=swiftshader")
+    try:
+        with tempfile.TemporaryDirectory() as profile, browser.page(Path(profile), software) as tab:
+            tab.open_address(f"http://localhost:{VIEW_PORT}", 1100, 640)
+            time.sleep(10.0)
+            tab.value("document.querySelectorAll('.mantine-Notification-closeButton').forEach((b) => b.click())")
+            time.sleep(2.0)
+            tab.screenshot(file)
+    finally:
+        server.stop()
+    return 0
+
+
+VIEW_PORT = 18099
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("pages", nargs="+", type=Path)
     parser.add_argument("--shots", type=Path, help="folder of the screenshots")
     parser.add_argument("--axe", type=Path, help="another axe.min.js than that of axe-core-python")
     parser.add_argument("--docs", type=Path, help="write report.png and report_dark.png of the first page, and stop")
+    parser.add_argument("--view", type=Path, help="write a picture of the first run's 3D view here, and stop")
     asked = parser.parse_args()
+    if asked.view:
+        return view_picture(asked.pages[0], asked.view)
     if asked.docs:
         return docs_pictures(asked.pages[0] / "report.html", asked.docs)
     source = asked.axe.read_text(encoding="utf-8") if asked.axe else axe_source()

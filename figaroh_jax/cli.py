@@ -109,6 +109,11 @@ def _run(args: argparse.Namespace) -> int:
         return status
     if args.command == "rerun":
         args = _again(args)
+    task = args.task if args.command in _TASKS else None
+    if task is not None:
+        from .formats.taskfile import read_task
+
+        read_task(task)  # a file that is missing or no YAML is told before two seconds of imports
     _set_up_jax(cache=not args.no_cache)
     from .recordings.progress import listener
     from .reporting import terminal, wording
@@ -254,9 +259,11 @@ def _add_tools(commands: Any) -> None:
     new.add_argument("--out", type=Path, metavar="TASK.yaml", help="default: the draft is printed")
     new.add_argument("--joints", help="comma-separated joints of the columns, in their order")
     new.add_argument("--rate", type=float, metavar="HZ", help="rate of recordings that have no time column")
-    new.add_argument("--constants", help="comma-separated N m a unit of the torque columns, in the joints' order")
-    new.add_argument("--gears", help="comma-separated motor turns a joint turn, where positions are those of motors")
-    new.add_argument("--unit", choices=("rad", "deg", "m", "mm"), help="unit of the positions, where nothing tells it")
+    new.add_argument("--constants", help="comma-separated N m per unit of the torque columns, in the joints' order")
+    new.add_argument("--gears", help="comma-separated motor turns per joint turn, where positions are those of motors")
+    new.add_argument(
+        "--unit", choices=("rad", "deg", "m", "mm"), help="unit of the positions, where the recording does not show it"
+    )
     new.add_argument("--topic", metavar="NAME", help="topic of bags that hold several topics of joints")
     new.add_argument("--kp", help="comma-separated gains of position servos (N m/rad), for a command without torque")
     new.add_argument("--interactive", action="store_true", help="ask for what the recordings cannot decide")
@@ -277,7 +284,9 @@ def _add_tools(commands: Any) -> None:
     compare = commands.add_parser("compare", parents=[tool], help="runs side by side; the first is the reference")
     compare.add_argument("runs", type=Path, nargs="+", metavar="DIR")
     compare.add_argument("--out", type=Path, metavar="FILE.html", help="write a page with overlays too")
-    view = commands.add_parser("view", parents=[tool], help="the robot of a run in a browser, what is named in colour")
+    view = commands.add_parser(
+        "view", parents=[tool], help="the robot of a run in a browser, with the named joints in colour"
+    )
     view.add_argument("run", type=Path, metavar="DIR")
     view.add_argument("--port", type=int, default=8080, help="of the address http://localhost:PORT (default 8080)")
     listing = commands.add_parser("list", parents=[tool], help="the runs below a folder, in a table")

@@ -41,13 +41,17 @@ class Page:
 
     def open(self, path: Path, width: int, height: int, *, phone: bool = False, dark: bool = False) -> None:
         """Load a file into a viewport of `width` x `height` CSS pixels and wait until it is loaded."""
+        self.open_address(path.as_uri(), width, height, phone=phone, dark=dark)
+
+    def open_address(self, url: str, width: int, height: int, *, phone: bool = False, dark: bool = False) -> None:
+        """`open` for any address."""
         self.problems, before = [], self._loads
         screen = {"width": width, "height": height, "deviceScaleFactor": 2 if phone else 1, "mobile": phone}
         self._call("Emulation.setDeviceMetricsOverride", **screen)
         self._call("Emulation.setTouchEmulationEnabled", enabled=phone)
         feature = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self._call("Emulation.setEmulatedMedia", features=[feature])
-        self._call("Page.navigate", url=path.as_uri())
+        self._call("Page.navigate", url=url)
         while self._loads == before:
             self._read()
 
@@ -123,15 +127,15 @@ class Page:
 
 
 @contextmanager
-def page(folder: Path) -> Iterator[Page]:
-    """A fresh browser with its profile in the empty directory `folder`; it ends with the context."""
+def page(folder: Path, more: tuple[str, ...] = ()) -> Iterator[Page]:
+    """A fresh browser with its profile in the empty directory `folder` and `more` flags; it ends with the context."""
     browser = find()
     assert browser is not None, "no chromium"
     command_out, command_in = os.pipe()
     answer_out, answer_in = os.pipe()
     # Chromium reads commands from descriptor 3 and answers on descriptor 4; the shell puts the pipes there.
     moved = f'exec "$@" 3<&{command_out} 4>&{answer_in}'
-    arguments = [browser, *_FLAGS, "--remote-debugging-pipe", f"--user-data-dir={folder}", "about:blank"]
+    arguments = [browser, *_FLAGS, *more, "--remote-debugging-pipe", f"--user-data-dir={folder}", "about:blank"]
     process = subprocess.Popen(
         ["bash", "-c", moved, "chromium", *arguments],
         pass_fds=(command_out, answer_in),

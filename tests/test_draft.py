@@ -144,7 +144,7 @@ def test_positions_of_motors_ask_for_gears(made, tmp_path: Path):
     urdf, _, (run, *_) = made
     gears = np.array([50.0, -80.0, 200.0])
     np.savez(tmp_path / "run.npz", t=run["time"], motor_position=run["position"] * gears, tau=run["torque"])
-    with pytest.raises(Undecided, match="named for motors: give --gears"):
+    with pytest.raises(Undecided, match="named after motors: give --gears"):
         draft_task(urdf, [tmp_path / "run.npz"])
     draft = draft_task(urdf, [tmp_path / "run.npz"], gears=[*gears])
     _, _, (recording,) = read_back(draft.text, tmp_path)
@@ -161,7 +161,7 @@ def test_a_torque_that_the_model_does_not_bear_out_is_taken_where_the_user_says_
         draft_task(urdf, [tmp_path / "run.npz"])
     assert caught.value.option == "constants"
     draft = draft_task(urdf, [tmp_path / "run.npz"], constants=[1.0, 1.0, 1.0])
-    assert any("nothing tells them" in line for line in draft.assumed)
+    assert any("nothing confirms them" in line for line in draft.assumed)
     assert read_back(draft.text, tmp_path)[2][0].torque is not None
 
 
@@ -179,7 +179,7 @@ def test_measured_postures_are_told_what_to_write(made, tmp_path: Path):
     points = np.random.default_rng(0).normal(size=(30, 3))
     columns = {f"{axis}1": points[:, k] for k, axis in enumerate("xyz")}
     columns |= {joint: run["position"][:30, j] for j, joint in enumerate(joints)}
-    with pytest.raises(InputError, match="a task of `calibrate`") as caught:
+    with pytest.raises(InputError, match="a task for `calibrate`") as caught:
         draft_task(urdf, [table(tmp_path / "postures.csv", columns)])
     shown = "\n".join(line for line in str(caught.value).splitlines() if line.startswith("  "))
     shown = shown.replace("MODEL", str(urdf)).replace("BASE", "base").replace("TOOL", "tool0")

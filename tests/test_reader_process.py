@@ -68,6 +68,14 @@ def test_tables_in_turn_large_arrays_and_a_killed_process(tmp_path: Path, fresh)
     np.testing.assert_array_equal(parquet.read("a"), first[:, 0])
 
 
+def test_relative_names_are_those_of_the_folder_at_that_time(tmp_path: Path, monkeypatch, fresh):
+    for number, folder in enumerate(("a", "b")):
+        (tmp_path / folder).mkdir()
+        savemat(tmp_path / folder / "run.mat", {"q": np.full(3, float(number))})
+        monkeypatch.chdir(tmp_path / folder)
+        np.testing.assert_array_equal(read_table(Path("run.mat"), "data").read("q"), np.full(3, float(number)))
+
+
 def test_a_forked_process_has_a_reader_of_its_own(tmp_path: Path, fresh):
     savemat(tmp_path / "run.mat", {"q": np.arange(3.0)})
     table = read_table(tmp_path / "run.mat", "data")

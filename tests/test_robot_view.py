@@ -71,7 +71,10 @@ class Server:
     def _keep(self, name: str, *values: Any, **more: Any) -> None:
         self.drawn[name] = (values, more)
 
-    add_line_segments = add_icosphere = add_label = _keep
+    add_line_segments = add_icosphere = add_label = add_grid = _keep
+
+    def on_client_connect(self, look: Any) -> None:
+        self.look = look
 
     def add_slider(self, name: str, *, initial_value: float, min: float, max: float, **_: Any) -> Any:
         control = SimpleNamespace(value=initial_value, min=min, max=max, on_update=lambda call: calls.append(call))
@@ -97,6 +100,9 @@ def test_a_run_is_served_with_its_recordings_and_its_nominal_robot(
     monkeypatch.setitem(sys.modules, "viser", SimpleNamespace(ViserServer=Server))
     server: Any = show_run(written(tmp_path, robots[1]), 18081)
     assert server.options["port"] == 18081
+    client = SimpleNamespace(camera=SimpleNamespace())
+    server.look(client)
+    assert np.linalg.norm(np.subtract(client.camera.position, client.camera.look_at)) < 5.0
     assert {"/links", "/nominal", "/joints/shoulder", "/names/shoulder"} <= set(server.drawn)
     assert server.drawn["/names/shoulder"][0] == ("shoulder: Stribeck friction",)
     moved = server.drawn["/links"][0][0]

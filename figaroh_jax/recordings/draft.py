@@ -101,8 +101,8 @@ def _joint_side(
         if motor is not None:
             raise Undecided(
                 "gears",
-                f"{motor.file}: the position's columns are named for motors: give --gears, motor turns a joint turn"
-                f" with their signs, in the order of the joints {names} (1 where they are on the joint side)",
+                f"{motor.file}: the position columns are named after motors: give --gears, motor turns per joint turn"
+                f" with their signs, in the order {names} (1 where a column is on the joint side already)",
             )
         return [*reads], []
     if not np.isfinite(gears).all() or not np.all(gears):
@@ -113,8 +113,8 @@ def _joint_side(
         for read in reads
     ]
     return turned, [
-        f"gears as given; order, sign and unit of {names} are taken as they are, and nothing tells whether joints are"
-        " coupled or have other zeros: see transmission.position and transmission.offset"
+        f"gears as given; order, sign and unit of {names} are taken as they are, and nothing confirms that joints are"
+        " uncoupled and share the model's zeros: see transmission.position and transmission.offset"
     ]
 
 
@@ -213,7 +213,9 @@ def _torques(robot: RobotModel, reads: Sequence[Columns]) -> tuple[list[float] |
     if turned:
         said.append(f"torque of {', '.join(turned)} has the opposite sign: turned by transmission.torque")
     if unknown:
-        said.append(f"sign and order of the torque of {', '.join(unknown)} are taken as they are: nothing tells them")
+        said.append(
+            f"sign and order of the torque of {', '.join(unknown)} are taken as they are: nothing confirms them"
+        )
     if not all(read.named for read in reads):
         told = [n for n, s in zip(names, scales, strict=True) if s.told]
         said.append(f"no column names a joint; gravity or friction bear the order out at {', '.join(told) or 'none'}")
@@ -223,12 +225,14 @@ def _torques(robot: RobotModel, reads: Sequence[Columns]) -> tuple[list[float] |
 def _without_torque(robot: RobotModel, reads: Sequence[Columns]) -> list[str]:
     if any(read.command is None for read in reads):
         return ["the recordings hold no torque: neither diagnose nor identify can use them without"]
-    said = [f"{read.unsigned} never changes its sign: no torque, and left out" for read in reads[:1] if read.unsigned]
+    said = [
+        f"{read.unsigned} never changes its sign, so it is no torque: left out" for read in reads[:1] if read.unsigned
+    ]
     said.append("the recordings hold no torque: rollouts of the command")
     if not all(read.named for read in reads):
         said.append(
             f"order, sign and unit of {', '.join(robot.dof_names)} are taken as they are: no column names a joint, and"
-            " nothing tells them but that positions follow commands within the limits"
+            " nothing confirms them beyond positions that follow their commands within the limits"
         )
     return said
 
@@ -329,10 +333,10 @@ def _refuse_what_is_wrong(
         if doubts and not stated:
             raise Undecided(
                 "constants",
-                f"{read.file}: {text} Where all that is so, say it by --constants (N m a unit in the order of the"
+                f"{read.file}: {text} If it is, confirm that with --constants (N m per unit, in the order of the"
                 " joints; 1 for N m), and the torque is taken as it is",
             )
-        said += [f"{read.file.name}: {text} Signs and constants are as given, nothing tells them"] if doubts else []
+        said += [f"{read.file.name}: {text} Signs and constants are as given; nothing confirms them"] if doubts else []
     return said
 
 

@@ -177,11 +177,11 @@ def _refuse_postures(table: Table, model: RobotModel) -> None:
     units = {key: unit for key, unit in (("position", "deg"), ("measurement", "mm")) if unit in words}
     unit = f"    units: {{{', '.join(f'{k}: {u}' for k, u in units.items())}}}\n" if units else ""
     raise InputError(
-        f"{table.file}: {', '.join(measured[:6])} look like measured poses or points. Postures are a task of"
-        " `calibrate`; `new` drafts motions. Write it as\n"
+        f"{table.file}: {', '.join(measured[:6])} look like measured poses or points. Postures are a task for"
+        " `calibrate`; `new` drafts motions only. Write the task as\n"
         f"  robot: {{model: MODEL}}\n  data:\n  - file: {table.file.name}\n    position: {position}\n{unit}"
         f"    measurement: {{{kind}: {shown}, base_frame: BASE, tool_frame: TOOL, unknown: [base_frame, tool_frame]}}\n"
-        "BASE and TOOL are frames of the robot; `pose`, `position`, `plane`, `socket` or `camera` is what was measured."
+        "BASE and TOOL are frames of the robot; the measurement is a `pose`, `position`, `plane`, `socket` or `camera`."
     )
 
 

@@ -161,7 +161,7 @@ def _asked(request: dict[str, Any], kind: str, file: Path) -> dict[str, Any]:
             _end()  # a fork does not share its parent's pipes
         if _reader is None:
             _reader = _Reader()
-        answer = _reader.ask(request, seconds)
+        answer = _reader.ask(request | {"here": os.getcwd()}, seconds)
         if answer is None:
             late, how = _reader.late, _end()
             what = f"was not done after {seconds:.0f} s" if late else f"crashed ({how})"
@@ -195,6 +195,7 @@ def _serve() -> None:
         request = json.loads(line)
         values = None
         try:
+            os.chdir(request["here"])  # the name of a file may be relative
             file, source = Path(request["file"]), Source(**request.get("source", {}))
             if request["do"] == "episodes":
                 answer: dict[str, Any] = {"episodes": containers.lerobot_episodes(file)}

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from ..rigid.kinematics import forward_kinematics
 from ..rigid.model import RobotModel
 
-__all__ = ["robot_picture", "segments"]
+__all__ = ["middle_posture", "robot_picture", "segments"]
 
 _WIDTH, _HEIGHT, _EDGE = 460.0, 300.0, 34.0
 _LABEL = (110.0, 13.0)  # room of a name
@@ -40,7 +40,7 @@ def robot_picture(
 
     With `nominal` that robot is drawn behind, and `model` is drawn `magnify` times as far from it as it is.
     """
-    q = _middle(model) if q is None else q
+    q = middle_posture(model) if q is None else q
     lines = np.concatenate([segments(model, q), _tips(model, q)])
     behind = None if nominal is None else np.concatenate([segments(nominal, q), _tips(nominal, q)])
     if behind is not None:
@@ -77,7 +77,7 @@ def _tips(model: RobotModel, q: Float[np.ndarray, " nq"]) -> Float[np.ndarray, "
     return np.array(lines).reshape(-1, 2, 3)
 
 
-def _middle(model: RobotModel) -> Float[np.ndarray, " nq"]:
+def middle_posture(model: RobotModel) -> Float[np.ndarray, " nq"]:
     """The middle of every joint's range within half a turn, bent a little, so that no links hide each other."""
     if model.nq != model.nv:
         from ..rigid.manifold import neutral

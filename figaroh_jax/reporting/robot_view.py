@@ -20,7 +20,7 @@ from ..results import Diagnosis
 from ..rigid.inertia import to_com
 from ..rigid.kinematics import forward_kinematics
 from ..rigid.model import RobotModel
-from .picture import segments
+from .picture import middle_posture, segments
 from .provenance import read_provenance
 from .wording import effect_title
 
@@ -31,7 +31,7 @@ __all__ = ["RobotView", "serve", "show_diagnosis", "show_run", "view_of"]
 
 _PLAIN, _HIT, _NOMINAL, _BODY = (40, 40, 40), (213, 94, 0), (150, 150, 150), (0, 114, 178)
 _DENSITY = 2700.0  # kg/m³, of the spheres that stand for masses
-_CHANGED = 0.01  # relative change of a mass, or share of the robot's size a centre moves, that is drawn
+_MASS, _CENTRE = 0.05, 0.02  # relative change of a mass, and share of the robot's size a centre moves, that is drawn
 _SIZE = 0.025  # of a joint's sphere, of the robot's size
 
 Motions = Mapping[str, tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples nq"]]]
@@ -77,8 +77,8 @@ class RobotView:
         for k, joint in enumerate(self.model.joints):
             pair = [to_com(np.asarray(robot.inertia[k], float))[:2] for robot in (self.nominal, self.model)]
             (m0, c0), (m1, c1) = pair
-            moved = np.linalg.norm(np.asarray(c1) - np.asarray(c0)) > _CHANGED * self.size
-            if abs(m1 - m0) <= _CHANGED * abs(m0) and not moved:
+            moved = np.linalg.norm(np.asarray(c1) - np.asarray(c0)) > _CENTRE * self.size
+            if abs(m1 - m0) <= _MASS * abs(m0) and not moved:
                 continue
             for which, robot, (mass, centre) in (
                 ("nominal", self.nominal, pair[0]),
@@ -173,11 +173,10 @@ def serve(view: RobotView, motions: Motions, port: int, magnify: float) -> viser
     low, high = np.clip(
         np.nan_to_num(np.asarray(view.model.position_limit), posinf=np.pi, neginf=-np.pi), -np.pi, np.pi
     ).T
+    start = middle_posture(view.model) if view.model.nq == view.model.nv else np.zeros(view.model.nv)
     sliders = [
-        server.gui.add_slider(
-            name, min=float(a), max=float(max(b, a + 0.01)), step=0.01, initial_value=float((a + b) / 2)
-        )
-        for name, a, b in zip(view.model.dof_names, low, high, strict=True)
+        server.gui.add_slider(name, min=float(a), max=float(max(b, a + 0.01)), step=0.01, initial_value=float(x))
+        for name, a, b, x in zip(view.model.dof_names, low, high, np.clip(start, low, high), strict=True)
     ]
     size = server.gui.add_slider(
         "differences, times", min=1.0, max=100.0, step=1.0, initial_value=magnify, disabled=not view.moved
@@ -204,6 +203,15 @@ def serve(view: RobotView, motions: Motions, port: int, magnify: float) -> viser
     if motions and view.model.nq == view.model.nv:
         _player(server, sliders, motions)
     draw()
+    corners = segments(view.model, np.array([slider.value for slider in sliders])).reshape(-1, 3)
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    server.scene.add_grid("/floor", width=4 * view.size, height=4 * view.size, cell_size=0.1)
+
+    def look(client: Any) -> None:
+        client.camera.position = tuple(middle + view.size * np.array([1.0, -1.0, 0.5]))
+        client.camera.look_at = tuple(middle)  # after the position, which moves both
+
+    server.on_client_connect(look)
     return server
 
 
