@@ -207,6 +207,22 @@ def rollout_page(name: str, effect: Any) -> str:
     )
 
 
+OUTLIER = """# outlier
+
+A posture that was measured wrongly: a swapped marker, a bumped tripod, a robot still moving.
+
+Acts on single rows. Seen in measured poses; the answer names the file and the row.
+
+    the row's error, by a fit to the other rows, is larger than its noise allows
+
+**What hides it**: too few postures, so that every row pulls the fit towards itself.
+
+**How to excite it**: measure the posture again.
+
+**Where it can be said**: nowhere in a model: the row is left out of the fit.
+"""
+
+
 def api(name: str, what: Any) -> str:
     """The entry of a public name; an example in a docstring is code, not text."""
     doc = inspect.getdoc(what) or ""
@@ -229,6 +245,8 @@ def main() -> None:
     for name, effect in ROLLOUT_EFFECTS.items():
         page(f"effect/{name}_rollout.md", rollout_page(name, effect))
         index.append(f"| [{name}]({name}_rollout.md) | rollouts |")
+    page("effect/outlier.md", OUTLIER)
+    index.append("| [outlier](outlier.md) | poses |")
     page("effect/index.md", "\n".join([*index, ""]))
     table = ["| key of FIGAROH | here |", "|---|---|", *(f"| `{key}` | {text} |" for key, text in KEYS.items())]
     text = (ROOT / "docs" / "migration.md").read_text(encoding="utf-8")

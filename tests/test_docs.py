@@ -145,7 +145,7 @@ def test_every_key_has_its_line_in_the_reference() -> None:
 
 
 def test_links_between_pages_lead_somewhere() -> None:
-    made = {"task.md"} | {f"effect/{name}.md" for name in [*OWN, *KINEMATIC, "index"]}
+    made = {"task.md"} | {f"effect/{name}.md" for name in [*OWN, *KINEMATIC, "outlier", "index"]}
     made |= {f"effect/{name}_rollout.md" for name in ROLLOUT_EFFECTS}
     for page in DOCS.glob("*.md"):
         for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text("utf-8")):
@@ -161,7 +161,7 @@ def test_the_site_builds_without_a_warning_and_has_a_page_for_every_effect(tmp_p
     run = subprocess.run(command, cwd=DOCS.parent, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr[-2000:]
     made = {path.name for path in (tmp_path / "effect").iterdir()}
-    assert {f"{name}.html" for name in [*OWN, *KINEMATIC]} <= made
+    assert {f"{name}.html" for name in [*OWN, *KINEMATIC, "outlier"]} <= made
     assert {f"{name}_rollout.html" for name in ROLLOUT_EFFECTS} <= {
         path.name for path in (tmp_path / "effect").iterdir()
     }
