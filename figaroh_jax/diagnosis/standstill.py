@@ -17,7 +17,7 @@ from .state import State
 from .thresholds import CARRIED, LAW_AT_REST, LAW_WIDTHS, STANDSTILL
 from .weights import relative_speed
 
-__all__ = ["moving_rows", "only_sticks", "resting"]
+__all__ = ["moving_rows", "only_sticks"]
 
 
 def moving_rows(problem: Problem) -> Bool[np.ndarray, "nv T"]:
