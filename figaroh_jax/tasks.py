@@ -67,16 +67,7 @@ def diagnose(
 
 @overload
 def diagnose(
-    model: RobotModel | Backend,
-    recordings: Sequence[PoseRecording],
-    preprocess: Preprocess | None = ...,
-    known: Baseline | None = ...,
-    *,
-    trust: float = ...,
-    forbid: Sequence[str] = ...,
-    alpha: float = ...,
-    progress: Callable[[str, float], None] = ...,
-    **options: Any,
+    model: RobotModel, recordings: Sequence[PoseRecording], *, forbid: Sequence[str] = ..., **more: Any
 ) -> PoseDiagnosis: ...
 
 

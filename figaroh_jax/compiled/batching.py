@@ -48,8 +48,9 @@ _ALIGNMENT = 64  # bytes; XLA takes such memory over without a copy
 # inside of sums number by number. JAX 0.11 has the newer one alone.
 CPU_OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
 
-# In one piece: at this level pieces cost more to compile and call each other.
-DRAFT_OPTIONS = CPU_OPTIONS | {"xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_count": 1}
+DRAFT_OPTIONS = CPU_OPTIONS | {"xla_backend_optimization_level": 0}
+if CPU_OPTIONS:  # in one piece: at this level pieces cost more to compile and call each other; not tried with JAX 0.11
+    DRAFT_OPTIONS |= {"xla_cpu_parallel_codegen_split_count": 1}
 FEW = 512  # samples; for these the compiler takes longer to optimise a long program than that saves later
 
 

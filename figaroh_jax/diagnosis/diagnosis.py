@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..effects.base import Effect, place
 from ..effects.catalogue import CATALOGUE, find
@@ -42,10 +42,10 @@ from .naming import reason_against, standings
 from .problem import Problem
 from .rest import Significance, excess, lines, parts_of, predictable, relative_rest, significance, verdict, wrong_law
 from .search import Found, Search, eliminate, find_causes
-from .standstill import moving_rows, only_sticks
+from .standstill import moving_rows, only_sticks, resting
 from .state import State, baseline, with_width
 from .step import stand, with_causes
-from .thresholds import CERTAIN, FEW_CAUSES, LINE_P, NO_REST, SLOWED_GAIN, WEIGHT_ROUNDS
+from .thresholds import CERTAIN, FEW_CAUSES, LINE_P, NO_REST, RISE_AT_REST, SLOWED_GAIN, WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -251,7 +251,7 @@ def _judged(searched: _Searched, names: Sequence[str], tolerance: float) -> _Jud
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
     here, joint = _as_predicts_best([here] if same else [here, before], named)
-    gaining = _without_losses(here, named, joint)
+    gaining = _gaining(here, named, joint)
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= dict.fromkeys(gaining.worse, "the error on the data held out does not fall with it")
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
@@ -296,10 +296,29 @@ class _Gaining(NamedTuple):
     order: list[int]  # of the named, by what each gains as it comes in
     gains: list[float]  # relative RMS error before the first of that order, and after each
     worse: list[Name]  # those that did not
+    moving: bool  # whether rows at rest are left out of that error
 
 
-def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> _Gaining:
-    """The causes without those that do not lower the error on the data held out.
+def _gaining(here: _Setting, named: list[Found], joint: Joint) -> _Gaining:
+    """The causes that lower the error on the data held out: of all its rows, or else of those where the joints move.
+
+    During a stick no model predicts the torque, and where joints often rest that may be most of the error. The second
+    measure is taken where it keeps more causes and the whole error does not rise with them.
+    """
+    whole = _without_losses(here, named, joint, None)
+    if not whole.worse:
+        return whole
+    moving = _without_losses(here, named, joint, ~resting(here.problem))
+    if len(moving.worse) >= len(whole.worse):
+        return whole
+    squares, _ = held_squares(here.problem, here.start, list(moving.joint.causes), here.whitening)
+    return moving if squares[-1].sum() <= (1 + RISE_AT_REST) * squares[0].sum() else whole
+
+
+def _without_losses(
+    here: _Setting, named: list[Found], joint: Joint, rows: Bool[np.ndarray, "n M nv"] | None
+) -> _Gaining:
+    """The causes without those that do not lower the error on the data held out, of its `rows`.
 
     Each must lower the error of the joints where it acts, for a joint of large torque hides what happens at the
     others; and that of the robot, as it comes in: by what it gains alone, or else after all the others, for some
@@ -308,13 +327,13 @@ def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> _Gainin
     worse: list[Name] = []
     later: list[Name] = []  # come in behind the others
     while True:
-        order, squares, power = _by_gain(here, joint.causes, [f.name in later for f in named])
+        order, squares, power = _by_gain(here, joint.causes, [f.name in later for f in named], rows)
         falls, places = [a - b for a, b in pairwise(squares)], [list(named[k].joints) for k in order]
         own = [f[at].sum() / a[at].sum() for at, f, a in zip(places, falls, squares, strict=False)]
         whole = [f.sum() for f in falls]
         if not named or (min(own) > 0 and min(whole) > 0):
             gains = [float(np.sqrt(s.sum() / power.sum())) for s in squares]
-            return _Gaining(named, joint, order, gains, worse)
+            return _Gaining(named, joint, order, gains, worse, rows is not None)
         least = order[int(np.argmin(own if min(own) <= 0 else whole))]
         if named[least].name not in later and len(named) > 1:
             later.append(named[least].name)
@@ -325,18 +344,18 @@ def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> _Gainin
 
 
 def _by_gain(
-    here: _Setting, causes: Sequence[Effect], later: Sequence[bool]
+    here: _Setting, causes: Sequence[Effect], later: Sequence[bool], rows: Bool[np.ndarray, "n M nv"] | None
 ) -> tuple[list[int], list[Float[np.ndarray, " nv"]], Float[np.ndarray, " nv"]]:
     """The order of what each cause gains on held-out data as it comes in, those that come `later` behind the others.
 
     With the squares of the error in that order, and of the torque.
     """
     order = list(range(len(causes)))
-    squares, power = held_squares(here.problem, here.start, list(causes), here.whitening)
+    squares, power = held_squares(here.problem, here.start, list(causes), here.whitening, rows)
     drops = [float((before - after).sum()) for before, after in pairwise(squares)]
     ranked = sorted(order, key=lambda k: (later[k], -drops[k]))
     if ranked != order:
-        squares, power = held_squares(here.problem, here.start, [causes[k] for k in ranked], here.whitening)
+        squares, power = held_squares(here.problem, here.start, [causes[k] for k in ranked], here.whitening, rows)
     return ranked, squares, power
 
 
@@ -365,7 +384,7 @@ def _left(
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:
     here, seen = judged.here, stand(searched.problem, searched.start, searched.whitening)
-    named, joint, order, gains, _ = judged.causes
+    named, joint, order, gains, _, moving = judged.causes
     problem, model, last = here.problem, here.problem.model, joint.step
     first = stand(problem, here.start, here.whitening)
     found = [named[k] for k in order]
@@ -390,7 +409,7 @@ def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judg
         after=residual_rms(problem, last.state),
         noise=noise,
         holdout=Gain(gains[0], gains[-1]),
-        holdout_scheme=_scheme(signals),
+        holdout_scheme=_scheme(signals) + (", without rows at rest" if moving else ""),
         experiment=next_experiment(judged.word, found, problem, here.start, causes, here.whitening),
         candidates=explain(seen.rows, seen.linear, search.screened, noise),
         traces=traces(problem, signals, first.state, last.state, joint.causes, named),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..effects.base import Effect
 from ..recordings.signals import Signals
@@ -24,15 +24,20 @@ __all__ = ["fold_error", "held_squares", "part_error", "predicted", "residual_rm
 
 
 def held_squares(
-    problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]
+    problem: Problem,
+    start: State,
+    causes: list[Effect],
+    whitening: Float[np.ndarray, "F nv"],
+    rows: Bool[np.ndarray, "n M nv"] | None = None,
 ) -> tuple[list[Float[np.ndarray, " nv"]], Float[np.ndarray, " nv"]]:
     """Squares of each joint's error on data not fitted, of the baseline, then after each cause; and of its torque.
 
     Of the filtered torque (N m or N), over the holdout recordings with torque; without any, over parts of the others,
-    each predicted by a fit to the rest.
+    each predicted by a fit to the rest. `rows` are those that count, by default all.
     """
     out, step = [], None
     mask = problem.held if problem.held.any() else np.asarray(problem.records.judged)
+    mask = mask if rows is None else mask * rows
     for effect in [None, *causes]:
         grown = start if step is None or effect is None else extended_state(problem, step.state, effect)
         step = stand(problem, grown, whitening, step)

@@ -14,23 +14,23 @@ from ..recordings.stacked import open_rows
 from .holdout import predicted
 from .problem import Problem
 from .state import State
-from .thresholds import LAW_AT_REST, LAW_WIDTHS, REVERSAL, STANDSTILL
+from .thresholds import CARRIED, LAW_AT_REST, LAW_WIDTHS, STANDSTILL
 from .weights import relative_speed
 
-__all__ = ["moving_rows", "only_sticks"]
+__all__ = ["moving_rows", "only_sticks", "resting"]
 
 
 def moving_rows(problem: Problem) -> Bool[np.ndarray, "nv T"]:
-    """Rows of each joint that are not at rest."""
+    """1 for the rows of each joint that are far from rest."""
     return np.moveaxis(~resting(problem), 2, 0).reshape(problem.model.nv, -1)
 
 
 def resting(problem: Problem) -> Bool[np.ndarray, "n M nv"]:
-    """Rows of each joint at rest, and within a quarter period of the cutoff of such a row."""
+    """Rows of each joint at rest, and those to which the row filter carries what happens there."""
     records = problem.records
-    still = (relative_speed(problem) < STANDSTILL) & (np.asarray(records.judged) > 0)
+    still = relative_speed(problem) < STANDSTILL
     index = records.row_samples()
-    reach = REVERSAL / float(records.cutoff) / float(records.dt)
+    reach = CARRIED / float(records.cutoff) / float(records.dt)
     near = still.copy()
     for step in range(1, still.shape[1]):
         close = (index[:, step:] - index[:, :-step] <= reach)[..., None]

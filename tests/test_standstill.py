@@ -1,0 +1,85 @@
+"""What a joint at rest leaves is no error of the model where dry friction sticks, and one where a law is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import reference
+import robots
+from synthetic import made_signals, swing
+
+from figaroh_jax.diagnosis.layout import held_rows, layout
+from figaroh_jax.diagnosis.problem import Problem
+from figaroh_jax.diagnosis.rest import relative_rest
+from figaroh_jax.diagnosis.standstill import moving_rows, only_sticks
+from figaroh_jax.diagnosis.state import State, baseline, solved
+from figaroh_jax.recordings.stacked import stack
+from figaroh_jax.rigid.model import RobotModel
+from figaroh_jax.simulators.native import NativeBackend
+
+Law = Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]  # of velocity, top speeds and chance
+SLIDING, NOISE, TOLERANCE = np.array([4.0, 4.0]), 1e-2, 0.01  # N m, N m, share of the torque
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
+    return robots.load(robots.ARM, tmp_path_factory.mktemp("arm"))
+
+
+def stick(v: np.ndarray, top: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """At each rest a friction of its own between the limits, held until the joint moves on."""
+    still = np.abs(v) < 0.05 * top
+    begins = np.diff(still.astype(int), axis=0, prepend=0) > 0
+    episode = np.cumsum(begins.astype(int), axis=0)
+    level = rng.uniform(-1, 1, (episode.max() + 1, v.shape[1])) * SLIDING
+    held = np.take_along_axis(level, episode, axis=0)
+    return np.where(still, held - SLIDING * np.sign(v), 0.0)
+
+
+def stribeck(v: np.ndarray, top: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return 0.6 * SLIDING * np.exp(-((v / (0.06 * top)) ** 2)) * np.sign(v)
+
+
+def spring(v: np.ndarray, top: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A misfit that goes on while the joints move."""
+    return 0.3 * SLIDING * np.sin(np.arange(len(v)) / 97.0)[:, None]
+
+
+def recorded(model: RobotModel, more: Law) -> tuple[Problem, State]:
+    """Torque of Pinocchio with sliding friction and something more, and the model without that."""
+    plain = made_signals(30.0, swing)
+    v, rng = plain.velocity, np.random.default_rng(5)
+    rigid = reference.inverse_dynamics(model, plain.position, v, plain.acceleration)
+    torque = rigid + SLIDING * np.sign(v) + more(v, np.abs(v).max(0), rng)
+    signals = made_signals(30.0, swing, torque + NOISE * rng.standard_normal(torque.shape))
+    records = stack([signals], model)
+    problem = Problem(
+        NativeBackend(model), records, layout([signals], records), 0.1, np.zeros(2), held_rows([signals], records)
+    )
+    state = baseline(problem, ["coulomb_friction"])
+    return problem, solved(problem, state, np.append(state.theta[: -len(SLIDING)], SLIDING))
+
+
+@pytest.mark.parametrize(("more", "sticks"), [(stick, True), (stribeck, False), (spring, False)])
+def test_only_a_stick_is_no_error_of_the_model(model: RobotModel, more: Law, sticks: bool) -> None:
+    problem, state = recorded(model, more)
+    noise = np.full(2, NOISE)
+    relative = relative_rest(problem, state, noise)
+    assert relative.max() > TOLERANCE  # something is left, in all three
+    assert only_sticks(problem, state, noise, relative, TOLERANCE) == sticks
+
+
+def test_what_is_tolerable_everywhere_is_no_stick(model: RobotModel) -> None:
+    problem, state = recorded(model, lambda v, top, rng: 0.0 * v)
+    assert not only_sticks(problem, state, np.full(2, NOISE), np.zeros(2), TOLERANCE)
+
+
+def test_rows_at_rest_are_those_of_low_speed_and_their_neighbours(model: RobotModel) -> None:
+    problem, _ = recorded(model, stick)
+    moving = moving_rows(problem)
+    speed = np.abs(np.asarray(problem.records.velocity)[0, problem.records.row_samples()[0]]).T
+    slow = speed < 0.08 * speed.max(1, keepdims=True)
+    assert not moving[slow].any()
+    assert 0.4 < moving.mean() < 1 - slow.mean()
