@@ -30,7 +30,6 @@ BOTH = ["base_frame", "tool_frame"]
 PANDA = [f"panda_joint{k}" for k in range(1, 8)]
 TIAGO = ["torso_lift_joint", *(f"arm_{k}_joint" for k in range(1, 8))]
 TALOS = ["torso_1_joint", "torso_2_joint", *(f"arm_left_{k}_joint" for k in range(1, 8))]
-SO101, SO101_HELD = ("multisine",), ("step_response",)
 
 
 class Robot(NamedTuple):
@@ -70,20 +69,6 @@ def postures(folder: str, model: str, file: str, entry: dict[str, Any], joints: 
 
 def measured(kind: str, values: Any, base: str, tool: str) -> dict[str, Any]:
     return {kind: values, "base_frame": base, "tool_frame": tool, "unknown": BOTH}
-
-
-def so101(folder: Path) -> dict[str, Any]:
-    data = []
-    for name in (*SO101, *SO101_HELD):
-        z = np.load(DATA / "so101_sage" / f"{name}.npz")
-        u, q = (np.asarray(z[key], float) for key in ("command", "q"))
-        for x in (u, q):
-            x[:, 5] = -0.174533 + 1523 * 2 * np.pi / 4096 * x[:, 5]  # the jaw's share of its range
-        rows = slice(0, 1000)  # 20 s
-        np.savez(folder / f"{name}.npz", t=z["t"][rows], u=u[rows], q=q[rows])
-        role = {"role": "holdout"} if name in SO101_HELD else {}
-        data.append({"file": f"{name}.npz", "time": "t", "command": "u", "position": "q"} | role)
-    return {"robot": {"model": str(DATA / "so101_sage" / "so101.xml")}, "data": data, "actuator": {"gains": "free"}}
 
 
 ROBOTS = {
@@ -149,13 +134,6 @@ ROBOTS = {
         hidden("dfki_double_pendulum"),
         "Torques are small against friction, and the drives ring at 4.8 Hz: no effect is named, and that is right as"
         " far as anybody knows.",
-    ),
-    "so101": Robot(
-        "SO-101 arm",
-        "https://github.com/isaac-sim2real/sage",
-        "Apache-2.0",
-        "commands and encoders of six hobby servos at 50 Hz, no torque; one motion fitted, another held out, 20 s each",
-        so101,
     ),
     "talos": Robot(
         "PAL TALOS, left arm",

@@ -284,9 +284,9 @@ def _add_tools(commands: Any) -> None:
     compare = commands.add_parser("compare", parents=[tool], help="runs side by side; the first is the reference")
     compare.add_argument("runs", type=Path, nargs="+", metavar="DIR")
     compare.add_argument("--out", type=Path, metavar="FILE.html", help="write a page with overlays too")
-    view = commands.add_parser(
-        "view", parents=[tool], help="the robot of a run in a browser, with the named joints in colour"
-    )
+    shown = "the robot of a run in a browser, with the named joints in colour"
+    view = commands.add_parser("view", help=shown)
+    view.add_argument("--traceback", action="store_true", help="show where an error was raised")
     view.add_argument("run", type=Path, metavar="DIR")
     view.add_argument("--port", type=int, default=8080, help="of the address http://localhost:PORT (default 8080)")
     listing = commands.add_parser("list", parents=[tool], help="the runs below a folder, in a table")

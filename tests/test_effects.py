@@ -13,6 +13,7 @@ import pytest
 import reference
 import robots
 
+import figaroh_jax as fj
 from figaroh_jax.effects.base import Effect, Motion, amplitude, columns, joint_unit, place, shape, smooth_sign
 from figaroh_jax.effects.catalogue import CATALOGUE, find, register, related
 from figaroh_jax.errors import InputError
@@ -466,3 +467,21 @@ def test_a_recorded_robot_takes_effects_at_its_names(data_dir: Path):
     tx40 = load_urdf(data_dir / robots.REAL["tx40"])
     pair = place(find("coupled_transmission"), tx40, ["joint_5", "joint_6"], friction=1.0)
     np.testing.assert_array_equal(pair.at, [4, 5])
+
+
+def test_a_law_of_ones_own_says_which_one_contains_it():
+    outer = fj.CATALOGUE["power_law_friction"]
+    before = outer.contains
+    try:
+
+        @fj.register
+        class Churning(fj.JointEffect):
+            name, title, equation = "oil_churning", "losses of churned oil", "drag v |v|"
+            contained_in = ("power_law_friction",)
+            drag: float = fj.amplitude("N m s2/rad2")
+
+        assert fj.register(Churning) is Churning  # once more adds nothing
+        assert outer.contains == (*before, "oil_churning")
+    finally:
+        outer.contains = before
+        fj.CATALOGUE.pop("oil_churning", None)

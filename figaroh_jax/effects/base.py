@@ -223,6 +223,7 @@ class Effect(eqx.Module):
     searched: ClassVar[bool] = True  # whether a diagnosis looks for it, that is, whether it is in the catalogue
     # relations to other effects, by name; the last two hold both ways, whichever class states them (`related`)
     contains: ClassVar[tuple[str, ...]] = ()  # simpler effects that it can imitate exactly: they are preferred
+    contained_in: ClassVar[tuple[str, ...]] = ()  # the same from the other side, for an effect of yours: see `register`
     resembles: ClassVar[tuple[str, ...]] = ()  # simpler effects, anywhere, that it can all but imitate: see `gates`
     indistinguishable_from: ClassVar[tuple[str, ...]] = ()  # the same torque in a moving joint
     excludes: ClassVar[tuple[str, ...]] = ()  # not looked for any more once this one has been accepted

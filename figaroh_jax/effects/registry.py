@@ -15,8 +15,9 @@ _OTHERS: dict[str, type[Effect]] = {}  # known by name, but nothing that a diagn
 def register(effect: type[Effect]) -> type[Effect]:
     """Add an effect class to the catalogue under its `name` (usable as a decorator); returns it.
 
-    Its `levels` say which diagnoses look for it: of torques, and of postures where it has an error of the position that
-    is linear in a parameter, or a twist.
+    Where another one can imitate it exactly (a power law a square law), `contained_in` names that one, and the simpler
+    is preferred. Its `levels` say which diagnoses look for it: of torques, and of postures where it has an error of the
+    position that is linear in a parameter, or a twist.
 
     >>> import figaroh_jax as fj
     >>> @fj.register
@@ -35,6 +36,9 @@ def register(effect: type[Effect]) -> type[Effect]:
     linear = effect.has("position_error") and any(p.linear for p in effect.parameters().values())
     if "pose" in effect.levels and effect.searched and (effect.has("twist") or linear):
         POSES[effect.name] = effect
+    for name in effect.contained_in:
+        outer = find(name)
+        outer.contains = tuple(dict.fromkeys((*outer.contains, effect.name)))
     return effect
 
 
