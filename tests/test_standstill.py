@@ -13,7 +13,7 @@ from synthetic import made_signals, swing
 from figaroh_jax.diagnosis.layout import held_rows, layout
 from figaroh_jax.diagnosis.problem import Problem
 from figaroh_jax.diagnosis.rest import relative_rest
-from figaroh_jax.diagnosis.standstill import moving_rows, only_sticks
+from figaroh_jax.diagnosis.standstill import only_sticks, resting
 from figaroh_jax.diagnosis.state import State, baseline, solved
 from figaroh_jax.recordings.stacked import stack
 from figaroh_jax.rigid.model import RobotModel
@@ -77,8 +77,8 @@ def test_what_is_tolerable_everywhere_is_no_stick(model: RobotModel) -> None:
 
 def test_rows_at_rest_are_those_of_low_speed_and_their_neighbours(model: RobotModel) -> None:
     problem, _ = recorded(model, stick)
-    moving = moving_rows(problem)
-    speed = np.abs(np.asarray(problem.records.velocity)[0, problem.records.row_samples()[0]]).T
-    slow = speed < 0.08 * speed.max(1, keepdims=True)
-    assert not moving[slow].any()
-    assert 0.4 < moving.mean() < 1 - slow.mean()
+    still = resting(problem)[0]
+    speed = np.abs(np.asarray(problem.records.velocity)[0, problem.records.row_samples()[0]])
+    slow = speed < 0.08 * speed.max(0)
+    assert still[slow].all()
+    assert slow.mean() < still.mean() < 0.6

@@ -42,10 +42,10 @@ from .naming import reason_against, standings
 from .problem import Problem
 from .rest import Significance, excess, lines, parts_of, predictable, relative_rest, significance, verdict, wrong_law
 from .search import Found, Search, eliminate, find_causes
-from .standstill import moving_rows, only_sticks
+from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import stand, with_causes
-from .thresholds import CERTAIN, FEW_CAUSES, LINE_P, NO_REST, SLOWED_GAIN, WEIGHT_ROUNDS
+from .thresholds import CERTAIN, FEW_CAUSES, NO_REST, WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ def _signals(
     if all(np.array_equal(a.position, b.position) for a, b in zip(plain, slow, strict=True)):
         return plain, False
     errors = [_baseline_error(*_begun(backend, signals, known, trust)) for signals in both]
-    return (slow, True) if errors[1] < (1 - SLOWED_GAIN) * errors[0] else (plain, False)
+    return (slow, True) if errors[1] < errors[0] else (plain, False)
 
 
 def _baseline_error(problem: Problem, start: State) -> float:
@@ -258,11 +258,7 @@ def _judged(searched: _Searched, names: Sequence[str], tolerance: float) -> _Jud
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
     shown = left.there or (bool(nearest) and float(relative.max()) > tolerance)
-    sticks = (
-        shown
-        and only_sticks(problem, joint.step.state, noise, relative, tolerance)
-        and lines(problem, joint.step.linear.residual * moving_rows(problem))[0] >= LINE_P
-    )
+    sticks = shown and only_sticks(problem, joint.step.state, noise, relative, tolerance)
     rest = shown and not sticks
     text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
     parts = parts_of(problem, joint.step, whitening, line, names)

@@ -17,12 +17,7 @@ from .state import State
 from .thresholds import CARRIED, LAW_AT_REST, LAW_WIDTHS, STANDSTILL
 from .weights import relative_speed
 
-__all__ = ["moving_rows", "only_sticks"]
-
-
-def moving_rows(problem: Problem) -> Bool[np.ndarray, "nv T"]:
-    """1 for the rows of each joint that are far from rest."""
-    return np.moveaxis(~resting(problem), 2, 0).reshape(problem.model.nv, -1)
+__all__ = ["only_sticks", "resting"]
 
 
 def resting(problem: Problem) -> Bool[np.ndarray, "n M nv"]:

@@ -21,7 +21,6 @@ WEIGHT_ROUNDS = 2  # of weights and spectrum in turn
 LOWEST_RESOLVED = 2.0  # periods in a recording: below that frequency the spectrum of the noise is held constant
 LOWEST_FREQUENCY = 0.02  # Hz, the same for long recordings
 WHITE_GAIN = 0.02  # relative fall of the folds' error in N m from which rows are weighted by their residual alone
-SLOWED_GAIN = 0.02  # relative fall of the same from which positions are taken down to the band of their own motion
 SAME_MOTION = 0.05  # of a joint's range (standard deviation): repeats that differ by more are none
 
 # The search (`contenders`, `gates`, `search`)
