@@ -291,7 +291,7 @@ def test_the_steps_of_the_ci_example_run_on_finished_runs(tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_steps_of_the_ci_example_run_from_the_recordings(tmp_path: Path):
-    shutil.copytree(DEMO.parent, tmp_path / "robot")
+    shutil.copytree(Path(DEMO).parent, tmp_path / "robot")
     (tmp_path / "robot" / "limits.yaml").write_text("verdict: [nothing]\n")
     run(tmp_path / "robot" / "reference", answer=ANSWER)
     assert steps(tmp_path) == {"diagnose": 0, "verify": 1, "compare": 0}  # the demo has a cause to be named
