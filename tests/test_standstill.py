@@ -31,7 +31,8 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> RobotModel:
 def stick(v: np.ndarray, top: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """At each rest a friction of its own between the limits, held until the joint moves on."""
     still = np.abs(v) < 0.05 * top
-    episode = np.cumsum(np.diff(still.astype(int), axis=0, prepend=0) > 0, axis=0)
+    begins = np.diff(still.astype(int), axis=0, prepend=0) > 0
+    episode = np.cumsum(begins.astype(int), axis=0)
     level = rng.uniform(-1, 1, (episode.max() + 1, v.shape[1])) * SLIDING
     held = np.take_along_axis(level, episode, axis=0)
     return np.where(still, held - SLIDING * np.sign(v), 0.0)

@@ -134,7 +134,9 @@ preprocess: {{cutoff: 20}}
 
 @pytest.fixture(scope="module")
 def found(task: Path) -> Identification:
-    return fj.identify_task(load_task(task))
+    identified = fj.identify_task(load_task(task))
+    assert isinstance(identified, Identification)
+    return identified
 
 
 def truth_of(folder: Path) -> dict[str, float]:
