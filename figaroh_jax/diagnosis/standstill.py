@@ -14,7 +14,7 @@ from ..recordings.stacked import open_rows
 from .holdout import predicted
 from .problem import Problem
 from .state import State
-from .thresholds import CARRIED, LAW_AT_REST, LAW_WIDTHS, STANDSTILL
+from .thresholds import CARRIED, LAW_AT_REST, LAW_WIDTHS, LEAST_MOVING, STANDSTILL
 from .weights import relative_speed
 
 __all__ = ["only_sticks", "resting"]
@@ -55,7 +55,20 @@ def only_sticks(
     looked_at = np.flatnonzero(relative > tolerance)
     if not len(looked_at) or np.any(moving[looked_at] > tolerance * torque[looked_at]):
         return False
+    seen = (judged & ~still).sum((0, 1)) >= LEAST_MOVING * judged.sum((0, 1))
+    held = _rms(left, still) <= 2 * _friction(state)  # from one limit to the other
+    if not np.all((seen & held)[looked_at]):
+        return False
     return not any(_law_of_velocity(problem, state, left, still, joint) for joint in looked_at.tolist())
+
+
+def _friction(state: State) -> Float[np.ndarray, " nv"]:
+    """RMS of what all friction of the state takes of each joint, N m or N."""
+    _, *shares = state.shares(state.theta)
+    friction = np.zeros(state.rigid.shape[:2])
+    for share, term in zip(shares, state.terms, strict=True):
+        friction = friction + share * term.dissipative
+    return np.sqrt((friction**2).mean(0))
 
 
 def _rms(rows: Float[np.ndarray, "n M nv"], used: Bool[np.ndarray, "n M nv"]) -> Float[np.ndarray, " nv"]:
