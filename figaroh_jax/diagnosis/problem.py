@@ -2,24 +2,121 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from hashlib import blake2b
+from typing import Any, NamedTuple
+from weakref import ref
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 
 from ..effects.base import Effect, Motion
 from ..effects.catalogue import CATALOGUE
-from ..recordings.stacked import Records, open_rows
+from ..recordings.stacked import Records, filter_rows, open_rows
 from ..rigid.model import RobotModel
 from ..simulators.contract import Backend
 from .design import Units, candidates, flattened, kind, shapes, units
 from .shifts import links_torque, rigid_torque
 
-__all__ = ["Layout", "Problem", "family_of"]
+__all__ = ["Layout", "Part", "Problem", "family_of"]
 
 _OF_THE_MOTION = ("torque", "gain", "motion", "families", "fixed")  # cached, and the same for all weights of the rows
+KEPT = 64 << 20  # bytes of filtered columns that are held
+TURNED = 128  # samples that are turned at once: they stay in the processor's cache
+
+
+class Part(NamedTuple):
+    """Columns of a regressor at all samples, without the zeros: a tree leaves many joints of a column untouched."""
+
+    series: Float[np.ndarray, "series nN"]  # by joint, then by column
+    joint: Int[np.ndarray, " series"]
+    column: Int[np.ndarray, " series"]
+    nv: int
+    width: int  # columns
+
+    @classmethod
+    def of(cls, columns: Float[np.ndarray, "nv k nN"]) -> Part:
+        """The part of columns as they are."""
+        joint, column = np.nonzero(columns.any(2))
+        return cls(columns[joint, column], joint, column, *columns.shape[:2])
+
+    @classmethod
+    def of_samples(cls, columns: Float[np.ndarray, "nN nv k"]) -> Part:
+        """The part of columns that lie sample by sample."""
+        joint, column = np.nonzero(columns.any(0))
+        series = np.empty((len(joint), len(columns)))
+        for start in range(0, len(columns), TURNED):
+            few = slice(start, start + TURNED)
+            series[:, few] = columns[few][:, joint, column].T
+        return cls(series, joint, column, *columns.shape[1:])
+
+    @property
+    def samples(self) -> int:
+        """Samples of all recordings."""
+        return self.series.shape[1]
+
+    def torque(self, theta: Float[np.ndarray, " k"], rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Torque (samples, nv) of the coefficients `theta`, N m or N; `rows` are samples."""
+        series = self.series[:, rows]
+        out, ends = np.zeros((series.shape[1], self.nv)), np.searchsorted(self.joint, np.arange(self.nv + 1))
+        for joint in range(self.nv):
+            own = slice(ends[joint], ends[joint + 1])
+            out[:, joint] = theta[self.column[own]] @ series[own]
+        return out
+
+    def dense(self, columns: range) -> Float[np.ndarray, "k nv nN"]:
+        """Some of the columns in the rows of all joints."""
+        out = np.zeros((len(columns), self.nv, self.samples))
+        own = np.flatnonzero((self.column >= columns.start) & (self.column < columns.stop))
+        out[self.column[own] - columns.start, self.joint[own]] = self.series[own]
+        return out
+
+
+class Filtered:
+    """Parts of regressors through the row filter and a response, kept while they are used: most stay the same."""
+
+    def __init__(self) -> None:
+        # filtered columns by the addresses of the series and of the filter, as long as these live, and by the response
+        self._kept: OrderedDict[tuple[int, int, bytes], tuple[ref[Any], ref[Any], np.ndarray]] = OrderedDict()
+
+    def rows(
+        self, records: Records, parts: Sequence[Part], response: Complex[np.ndarray, "F nv"] | Float[np.ndarray, "F nv"]
+    ) -> Float[np.ndarray, "nv T P"]:
+        """Masked rows of the parts side by side."""
+        code = blake2b(np.ascontiguousarray(response).tobytes(), digest_size=16).digest()
+        blocks = [self._block(records, part, response, code) for part in parts]
+        weight = np.moveaxis(np.asarray(records.weight), 2, 0).reshape(records.shape[3], -1, 1)
+        X, first = np.empty((*blocks[0].shape[:2], sum(part.width for part in parts))), 0
+        for block in blocks:
+            np.multiply(block, weight, out=X[:, :, first : first + block.shape[2]])
+            first += block.shape[2]
+        return X
+
+    def _block(self, records: Records, part: Part, response: np.ndarray, code: bytes) -> Float[np.ndarray, "nv T k"]:
+        source = np.asarray(records.source)
+        key = (id(part.series), id(source), code)
+        series, place, block = self._kept.pop(key, (None, None, None))
+        if block is None or series() is not part.series or place() is not source:
+            block = _through(records, part, response)
+        self._kept[key] = ref(part.series), ref(source), block
+        for old in [k for k, (one, other, _) in self._kept.items() if one() is None or other() is None]:
+            del self._kept[old]
+        while len(self._kept) > 1 and sum(own.nbytes for _, _, own in self._kept.values()) > KEPT:
+            self._kept.popitem(last=False)
+        return block
+
+
+def _through(records: Records, part: Part, response: np.ndarray) -> Float[np.ndarray, "nv T k"]:
+    """A part through the row filter and the response, the zeros filled in."""
+    n, samples, count, nv = records.shape
+    rows = filter_rows(records, part.series.reshape(len(part.series), n, samples), response.T[part.joint])
+    block = np.zeros((nv, n * count, part.width))
+    block[part.joint, :, part.column] = rows.reshape(len(rows), n * count)
+    return block
 
 
 class Layout(eqx.Module):
@@ -46,6 +143,7 @@ class Problem:
     trust: float
     width: Float[np.ndarray, " nv"]  # half width of the friction's reversal, rad/s or m/s
     held: Float[np.ndarray, "n M nv"]  # 1: a row of a holdout recording with torque
+    filtered: Filtered = field(default_factory=Filtered, compare=False, repr=False)
 
     @property
     def model(self) -> RobotModel:

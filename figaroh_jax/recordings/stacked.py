@@ -73,9 +73,10 @@ def filter_rows(
     """
     series = torque.shape[:-2]
     factor = np.asarray(records.low_pass) if response is None else np.asarray(records.low_pass) * response
-    flat, out = torque.reshape(-1, *torque.shape[-2:]), np.empty((int(np.prod(series)), *records.kept.shape))
+    count = int(np.prod(series))
+    flat, out = torque.reshape(count, *torque.shape[-2:]), np.empty((count, *records.kept.shape))
     shared = factor.ndim == 1 or factor.size == factor.shape[-1]
-    each = None if shared else np.broadcast_to(factor, (*series, factor.shape[-1])).reshape(len(flat), -1)
+    each = None if shared else np.broadcast_to(factor, (*series, factor.shape[-1])).reshape(count, factor.shape[-1])
     for start in range(0, len(flat), SERIES):
         part = slice(start, start + SERIES)
         own = factor.reshape(-1) if each is None else each[part]
