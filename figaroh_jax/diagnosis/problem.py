@@ -22,9 +22,10 @@ from ..simulators.contract import Backend
 from .design import Units, candidates, flattened, kind, shapes, units
 from .shifts import links_torque, rigid_torque
 
-__all__ = ["Layout", "Part", "Problem", "family_of"]
+__all__ = ["Layout", "Part", "Problem", "family_of", "without_factor"]
 
-_OF_THE_MOTION = ("torque", "gain", "motion", "families", "fixed")  # cached, and the same for all weights of the rows
+# cached, and the same for all weights of the rows
+_OF_THE_MOTION = ("torque", "gain", "motion", "families", "fixed", "plain")
 KEPT = 64 << 20  # bytes of filtered columns that are held
 TURNED = 128  # samples that are turned at once: they stay in the processor's cache
 
@@ -87,9 +88,10 @@ class Filtered:
         self, records: Records, parts: Sequence[Part], response: Complex[np.ndarray, "F nv"] | Float[np.ndarray, "F nv"]
     ) -> Float[np.ndarray, "nv T P"]:
         """Masked rows of the parts side by side."""
+        response, factor = without_factor(response)
         code = blake2b(np.ascontiguousarray(response).tobytes(), digest_size=16).digest()
         blocks = [self._block(records, part, response, code) for part in parts]
-        weight = np.moveaxis(np.asarray(records.weight), 2, 0).reshape(records.shape[3], -1, 1)
+        weight = (np.moveaxis(np.asarray(records.weight), 2, 0) * factor[:, None, None]).reshape(len(factor), -1, 1)
         X, first = np.empty((*blocks[0].shape[:2], sum(part.width for part in parts))), 0
         for block in blocks:
             np.multiply(block, weight, out=X[:, :, first : first + block.shape[2]])
@@ -98,10 +100,11 @@ class Filtered:
 
     def _block(self, records: Records, part: Part, response: np.ndarray, code: bytes) -> Float[np.ndarray, "nv T k"]:
         source = np.asarray(records.source)
-        key = (id(part.series), id(source), code)
-        series, place, block = self._kept.pop(key, (None, None, None))
-        if block is None or series() is not part.series or place() is not source:
-            block = _through(records, part, response)
+        used = np.asarray(records.weight).any((1, 2))
+        key = (id(part.series), id(source), code + used.tobytes())
+        known = self._kept.pop(key, None)
+        same = known is not None and known[0]() is part.series and known[1]() is source
+        block = known[2] if known is not None and same else _through(records, part, response)
         self._kept[key] = ref(part.series), ref(source), block
         for old in [k for k, (one, other, _) in self._kept.items() if one() is None or other() is None]:
             del self._kept[old]
@@ -110,10 +113,18 @@ class Filtered:
         return block
 
 
+def without_factor(response: np.ndarray) -> tuple[np.ndarray, Float[np.ndarray, " nv"]]:
+    """The response and a factor of each joint's rows: a response that no frequency changes is all factor."""
+    if np.iscomplexobj(response) or not (response == response[:1]).all():
+        return response, np.ones(response.shape[1])
+    return np.ones_like(response), response[0]
+
+
 def _through(records: Records, part: Part, response: np.ndarray) -> Float[np.ndarray, "nv T k"]:
     """A part through the row filter and the response, the zeros filled in."""
     n, samples, count, nv = records.shape
-    rows = filter_rows(records, part.series.reshape(len(part.series), n, samples), response.T[part.joint])
+    series = part.series.reshape(len(part.series), n, samples)
+    rows = filter_rows(records, series, response.T[part.joint], fitted=True)
     block = np.zeros((nv, n * count, part.width))
     block[part.joint, :, part.column] = rows.reshape(len(rows), n * count)
     return block
@@ -196,9 +207,35 @@ class Problem:
         """Unit torques of the effects that depend on the measured motion alone."""
         return self.family("fixed", self.motion)
 
+    @cached_property
+    def plain(self) -> dict[str, tuple[Float[np.ndarray, "e k r n M"], Int[np.ndarray, "e r"]]]:
+        """Rows, neither whitened nor weighted, of the effects that depend on the measured motion alone, and joints."""
+        n, samples, _, _ = self.records.shape
+        given = self.fixed | self.family("shaped", self.motion)
+        return {
+            name: (filter_rows(self.records, own.torque.reshape(*own.torque.shape[:3], n, samples), fitted=True), at)
+            for name, own in given.items()
+            for at in [own.joints]
+        }
+
     def family(self, name: str, motion: Motion) -> dict[str, Units]:
-        """Unit torques of a family, on one axis of places and grid points."""
+        """Unit torques of a family, on one axis of places and grid points.
+
+        Of the effects that follow the torque each has a program of its own: it serves one of them as well.
+        """
+        if name == "following":
+            return {n: self.following(n, motion) for n in self.families[name]}
         return units({n: flattened(b) for n, b in self.families[name].items()}, motion, self.records)
+
+    def following(self, effect: str, motion: Motion) -> Units:
+        """Unit torques of one effect that follows the torque of the current model."""
+        return units({effect: flattened(self.families["following"][effect])}, motion, self.records)[effect]
+
+    def with_width(self, width: Float[np.ndarray, " nv"]) -> Problem:
+        """The problem with another width of the friction's reversal, which no candidate's place and grid depends on."""
+        other = replace(self, width=width)
+        other.__dict__.update({k: v for k, v in self.__dict__.items() if k in ("torque", "gain", "families")})
+        return other
 
 
 def family_of(effect: type[Effect]) -> str:

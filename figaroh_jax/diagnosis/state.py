@@ -20,7 +20,7 @@ from ..estimation.priors import body_precision, rigid_prior
 from ..estimation.rows import Prior, Rows, instruments
 from ..recordings.stacked import filtered_rows
 from ..rigid.model import Leaf
-from .design import Units, flattened, kind, local, sensor_response, shapes, units, units_and_slopes
+from .design import Units, batch_size, flattened, kind, local, sensor_response, shapes, units, units_and_slopes
 from .problem import Layout, Part, Problem, family_of
 from .shifts import shifted
 
@@ -39,7 +39,6 @@ __all__ = [
 ]
 
 FRICTION_PRECISION = 1e-6
-BATCH = 4  # effects with a shape in one program
 
 
 @dataclass(frozen=True)
@@ -187,8 +186,9 @@ def unit_torques(problem: Problem, state: State, term: Effect) -> Units:
     if family in ("fixed", "following"):
         place = _places_in(problem.families[family].get(term.name), term)
         if place is not None:
-            known = problem.fixed if family == "fixed" else problem.family(family, state.motion)
-            return Units(known[term.name].torque[place], known[term.name].joints[place])
+            fixed = family == "fixed"
+            known = problem.fixed[term.name] if fixed else problem.following(term.name, state.motion)
+            return Units(known.torque[place], known.joints[place])
     return units({term.name: term}, state.motion, problem.records)[term.name]
 
 
@@ -211,9 +211,9 @@ def _choices(effect: Effect) -> list[str]:
 
 def _shaped_units(term: Effect, motion: Motion) -> Units:
     """By the program of the refits: filled up to its batch."""
-    count, torques = len(term.at), []
-    for start in range(0, count, BATCH):
-        some = np.resize(np.arange(start, min(start + BATCH, count)), BATCH)
+    count, torques, size = len(term.at), [], batch_size(term)
+    for start in range(0, count, size):
+        some = np.resize(np.arange(start, min(start + size, count)), size)
         part = jax.tree.map(lambda x, i=some: np.asarray(x)[i], term)
         values = np.stack([getattr(part, name) for name in shapes(type(term))], axis=1)
         torques.append(units_and_slopes(part, values, motion)[0])

@@ -44,8 +44,10 @@ def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], 
     `before` is where the search stood when this state has grown out of it.
     """
     rows = whitened(problem, state, whitening)
-    grown = before is not None and len(before.state.sensors) == len(state.sensors)
-    folded = grown_sums(rows, before.folded, rows.X) if grown else fold_sums(rows, rows.X)
+    if before is not None and len(before.state.sensors) == len(state.sensors):
+        folded = grown_sums(rows, before.folded, rows.X)
+    else:
+        folded = fold_sums(rows, rows.X)
     return Step(solved(problem, state, coefficients(folded, state.prior)), rows, folded)
 
 

@@ -346,7 +346,8 @@ def torques(robot: Robot, q: Read, v: Read, a: Read, put: Callable[[int, Number]
 class Written(eqx.Module):
     """A robot whose program is written out in scalars: its numbers, and which of them the program knows before.
 
-    Inertial parameters are never known, so that one program serves all that a robot is taken to weigh.
+    Inertial parameters and gravity are never known, so that one program serves all that a robot is taken to weigh, and
+    a tilted base.
     """
 
     table: Float[Leaf, " constants"]
@@ -384,6 +385,7 @@ def _structure(model: RobotModel) -> tuple[Float[np.ndarray, " constants"], byte
     codes = np.where(np.isin(table, (-1.0, 0.0, 1.0)), table, LOADED).astype(np.int8)
     by_joint = codes[: len(model.joints) * _PER_JOINT].reshape(-1, _PER_JOINT)
     by_joint[:, _PLACES["inertia"] : _PLACES["ratio"]] = LOADED
+    codes[-3:] = LOADED
     turned = by_joint[:, : _PLACES["origin"]] == LOADED
     return table, None if turned.sum() > _TURNED * len(model.joints) else codes.tobytes()
 
@@ -396,7 +398,7 @@ def written_torques(
     whole = lambda x: jnp.broadcast_to(jnp.asarray(x, q.dtype), q.shape[1:])  # noqa: E731
     of_lanes = Robot(robot.joints, robot.codes, lambda k: whole(robot.table[k]))
     reads = [lambda k, x=x: Number(x[k]) for x in (q, v, a)]
-    torques(of_lanes, *reads, lambda column, number: out.update({column: whole(number.x)}))
+    torques(of_lanes, reads[0], reads[1], reads[2], lambda column, number: out.update({column: whole(number.x)}))
     return jnp.stack([out[column] for column in sorted(out)])
 
 
