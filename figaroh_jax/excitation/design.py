@@ -31,6 +31,7 @@ TRIED = 400  # random postures in which a motion may begin
 CHECKED = 8  # motions, the best first, until one is feasible at 1 kHz
 ROUNDING = 1e-6  # of a limit
 CLEAR_RATE = 40.0  # Hz at which a random motion touches nothing: what begins on the wrong side of a body stays there
+SMALLER = (1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05, 0.02)  # shares of a random motion that are tried for that
 STEP = 0.98  # by which a motion is made smaller until it meets its limits
 
 Objective = Literal["information", "prediction", "condition", "separate"]
@@ -319,12 +320,14 @@ def random_motion(problem: Problem, generator: np.random.Generator, amplitude: f
             room = np.where(moved > 0, 1 - still[kind], 1 + still[kind]) / np.abs(moved)
         scale = np.minimum(scale, np.nanmin(np.where(np.abs(moved) > 0, room, np.inf), axis=0))
     scale = amplitude * np.where(np.isfinite(scale), scale, 1.0)
-    for smaller in (1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1) if _distances_count(limits) else ():
+    if not _distances_count(limits):
+        return problem.numbers(Trajectory(start, weights * scale[:, None], problem.basis))
+    assert limits.clearance is not None
+    for smaller in SMALLER:
         motion = Trajectory(start, weights * (smaller * scale)[:, None], problem.basis)
-        assert limits.clearance is not None
         if (limits.clearance.distances(np.asarray(motion.states(CLEAR_RATE)[0])) > 0).all():
-            return problem.numbers(motion)
-    return problem.numbers(Trajectory(start, weights * scale[:, None], problem.basis))
+            break
+    return problem.numbers(motion)
 
 
 def _distances_count(limits: Limits) -> bool:
@@ -414,7 +417,9 @@ def _smaller(
     for _ in range(100):
         worst = max((use.share for use in uses), default=0.0)
         if worst <= 1.0 + ROUNDING:
-            return motion, checked(torque, problem.learned.robot, motion, limits)
+            if limits.clearance is not None:
+                uses = checked(torque, problem.learned.robot, motion, limits)
+            return motion, uses
         shrink = max(STEP, 1.0 / worst) if worst < 1.02 else STEP
         motion = Trajectory(start, np.asarray(motion.weights) * shrink, motion.basis)
         uses = checked(torque, problem.learned.robot, motion, limits, meshes=False)
