@@ -22,6 +22,7 @@ from pydantic import (
 )
 
 from ..errors import InputError, nearest
+from .files import USD
 from .taskfile import CONTRACT_EFFECTS, merge, read_task, where
 
 if TYPE_CHECKING:
@@ -593,8 +594,8 @@ def load_task(path: str | Path) -> Task:
 
 
 def robot_options(robot: Robot) -> dict[str, Any]:
-    """Arguments of `read_robot` and `load_extended` beside the file; gravity None is an MJCF's own."""
-    own = robot.model.suffix.lower() == ".xml" and "gravity" not in robot.model_fields_set
+    """Arguments of `read_robot` and `load_extended` beside the file; gravity None is an MJCF's or a stage's own."""
+    own = robot.model.suffix.lower() in (".xml", *USD) and "gravity" not in robot.model_fields_set
     gravity = None if own else robot.gravity
     return {"joints": robot.joints, "posture": dict(robot.posture), "gravity": gravity, "root": robot.root}
 
