@@ -70,7 +70,8 @@ class State:
         """Torque of what each recording is known to carry, N m or N."""
         if self.carried is None:
             return np.zeros((self.rigid.samples, self.rigid.nv))
-        each = np.split(np.arange(self.rigid.samples), len(self.carried))
+        count = self.rigid.samples // len(self.carried)
+        each = [slice(k * count, (k + 1) * count) for k in range(len(self.carried))]
         torques = [self.rigid.torque(ten.reshape(-1), rows) for ten, rows in zip(self.carried, each, strict=True)]
         return np.concatenate(torques)
 
