@@ -11,6 +11,8 @@ JAX evaluates the equations, many effects in one program; samples, shifts and fi
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
+from math import prod
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -19,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
+from ..compiled.batching import CPU_OPTIONS
 from ..compiled.executable_cache import Program
 from ..effects.base import Effect, Motion, columns
 from ..recordings.stacked import Records, filter_rows
@@ -26,7 +29,9 @@ from ..rigid.model import RobotModel
 from .shifts import links_torque, shift_torques, torque_change
 
 __all__ = [
+    "BATCH",
     "Units",
+    "batch_size",
     "candidates",
     "flattened",
     "kind",
@@ -38,6 +43,9 @@ __all__ = [
     "units_and_slopes",
     "with_shape",
 ]
+
+
+BATCH = 4  # effects with a shape in one program, and starts of a refit
 
 
 class Units(NamedTuple):
@@ -62,6 +70,11 @@ def kind(effect: Effect | type[Effect]) -> Literal["columns", "position", "respo
 def shapes(effect: type[Effect]) -> list[str]:
     """Parameters that enter nonlinearly and may take any value between their bounds."""
     return [name for name, p in effect.parameters().items() if not p.linear and not p.choice]
+
+
+def batch_size(effect: Effect | type[Effect]) -> int:
+    """Effects with a shape in one program: as many as a refit starts from."""
+    return min(BATCH, prod(len(p.grid) for p in effect.parameters().values() if not p.linear))
 
 
 def with_shape(effect: Effect, names: list[str], values: list) -> Effect:
@@ -106,7 +119,7 @@ def unit_rows(given: Units, records: Records, whitening: Complex[np.ndarray, "F 
     response = whitening.T[given.joints][:, None]
     if given.response is not None:
         response = response * given.response[:, None, None]
-    rows = filter_rows(records, given.torque.reshape(*given.torque.shape[:3], n, samples), response)
+    rows = filter_rows(records, given.torque.reshape(*given.torque.shape[:3], n, samples), response, fitted=True)
     return rows * np.moveaxis(np.asarray(records.weight), 2, 0)[given.joints][:, None]
 
 
@@ -203,12 +216,12 @@ def _amplitudes(effect: Effect) -> list[str]:
     return [name for name, p in effect.parameters().items() if p.linear]
 
 
-@Program
+@partial(Program, options=CPU_OPTIONS)
 def _unit_torques(batches: dict[str, Effect], motion: Motion) -> dict[str, Float[Array, "effects k nN *rows"]]:
     return {name: jax.vmap(lambda e: columns(e, motion))(batch) for name, batch in batches.items()}
 
 
-@Program
+@partial(Program, options=CPU_OPTIONS)
 def _units_and_slopes(
     effects: Effect, values: Array, motion: Motion
 ) -> tuple[Float[Array, "effects k nN rows"], Float[Array, "effects k nN rows p"]]:
@@ -226,12 +239,12 @@ def _units_and_slopes(
     return jax.vmap(one)(effects, values)
 
 
-@Program
+@partial(Program, options=CPU_OPTIONS)
 def _responses(batches: dict[str, Effect], omega: Array) -> dict[str, Complex[Array, "effects F"]]:
     return {name: jax.vmap(lambda e: e.torque_response(omega))(batch) for name, batch in batches.items()}
 
 
-@Program
+@partial(Program, options=CPU_OPTIONS)
 def _changed(effects: Effect, model: RobotModel) -> list[Float[Array, "effects amplitudes *rest"]]:
     """Leaves of the robot with a unit of each amplitude of each effect."""
     names = _amplitudes(effects)

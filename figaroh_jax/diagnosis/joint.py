@@ -14,7 +14,7 @@ from ..effects.catalogue import CATALOGUE, find
 from ..estimation.rows import Rows
 from ..results import Name
 from .design import kind, shapes, with_shape
-from .estimates import Fitted, amplitude_places, torque_slope, with_amplitudes
+from .estimates import Fitted, amplitude_places, torque_slopes, with_amplitudes
 from .problem import Problem
 from .search import Found
 from .state import State, extended_state, solved
@@ -70,7 +70,7 @@ def joint_fit(
 ) -> Fitted:
     """Gauss-Newton step of all coefficients and shapes at once, and a covariance from the scores of the blocks."""
     causes = with_amplitudes(state, causes, problem.model)
-    slopes = [torque_slope(problem, state, e, name, whitening) for e in causes for name in shapes(type(e))]
+    slopes = [slope for e in causes for slope in torque_slopes(problem, state, e, whitening)]
     J = np.concatenate([rows.X, *[s[..., None] for s in slopes]], axis=2)
     precision = np.append(state.prior.precision, np.zeros(len(slopes)))
     tall = J.reshape(-1, J.shape[2])

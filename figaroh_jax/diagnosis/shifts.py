@@ -6,6 +6,7 @@ JAX evaluates inverse dynamics, many samples in one program; the equations of th
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..compiled.batching import CPU_OPTIONS
 from ..compiled.executable_cache import Program
 from ..effects.base import Effect, Motion
 from ..recordings.stacked import Records
@@ -260,7 +262,7 @@ def _load_slopes(motion: Motion, records: Records) -> Float[np.ndarray, "3 nv nv
     return _SLOPES[0][2]
 
 
-@Program
+@partial(Program, options=CPU_OPTIONS)
 def _unit_errors(effects: Effect, motion: Motion) -> Float[Array, "effects k nN"]:
     names = [name for name, p in effects.parameters().items() if p.linear]
 
@@ -270,6 +272,6 @@ def _unit_errors(effects: Effect, motion: Motion) -> Float[Array, "effects k nN"
     return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(effects, jnp.eye(len(names)))
 
 
-@Program
+@partial(Program, options=CPU_OPTIONS)
 def _error(effect: Effect, motion: Motion) -> Float[Array, " nN"]:
     return effect.position_error(motion)
