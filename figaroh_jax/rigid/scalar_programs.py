@@ -644,8 +644,14 @@ def _empty(joints: tuple[Joint, ...]) -> np.ndarray:
 
 def _rows(model: RobotModel, coordinates: bool) -> np.ndarray:
     """Degree of freedom, or coordinate, and link of the blocks of the regressor that can differ from zero, sorted."""
-    row = model.dofs.column if coordinates else np.arange(model.nd)
-    dof, link = np.nonzero(ancestors(model.joints)[model.dofs.joint] > 0)
+    return _sorted_rows(model.joints, coordinates)
+
+
+@lru_cache(maxsize=64)
+def _sorted_rows(joints: tuple[Joint, ...], coordinates: bool) -> np.ndarray:
+    places = dofs(joints)
+    row = places.column if coordinates else np.arange(len(places.column))
+    dof, link = np.nonzero(ancestors(joints)[places.joint] > 0)
     return np.unique(np.stack([row[dof], link], 1), axis=0)
 
 
@@ -658,19 +664,49 @@ def _dense(model: RobotModel, blocks: Array) -> Array:
 
 
 class _Form(NamedTuple):
-    """Of an answer: its programs, the shape of what they write, what is made of it, whether the samples stand last."""
+    """Of an answer: its programs, the shape of what they write, what is made of it, whether the samples stand last.
 
+    Without `finish` the answer is what they write. `answer` and `places` are its shape and where in it a number goes.
+    """
+
+    name: str
     programs: Callable[[RobotModel, bytes], list[Program]]
     shape: Callable[[RobotModel], tuple[int, ...]]
     finish: Callable[[RobotModel, Array], Array] | None = None
     last: bool = False
+    answer: Callable[[RobotModel], tuple[int, ...]] | None = None
+    places: Callable[[RobotModel, tuple[int, ...]], list[int]] | None = None
 
 
-TORQUES = _Form(_torques, lambda model: (model.nv,))
-PACKED = _Form(partial(_blocks, False), lambda model: (len(_rows(model, False)), 10), last=True)
-BLOCKS = _Form(partial(_blocks, True), lambda model: (len(_rows(model, True)), 10), last=True)
-DENSE = _Form(partial(_blocks, True), lambda model: (len(_rows(model, True)), 10), _dense)
-MASSES = _Form(_masses, lambda model: (model.nv, model.nv), _whole_masses)
+def _dense_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
+    block, column = place
+    row, link = _sorted_rows(model.joints, True)[block]
+    return [10 * (row * len(model.joints) + link) + column]
+
+
+def _mass_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
+    row, column = place
+    return sorted({model.nv * row + column, model.nv * column + row})
+
+
+_ANSWERS = {"rows": lambda model: (len(_rows(model, False)), 10), "blocks": lambda model: (len(_rows(model, True)), 10)}
+
+TORQUES = _Form("torques", _torques, lambda model: (model.nv,))
+PACKED = _Form("packed", partial(_blocks, False), _ANSWERS["rows"], last=True)
+BLOCKS = _Form("blocks", partial(_blocks, True), _ANSWERS["blocks"], last=True)
+DENSE = _Form(
+    "dense",
+    partial(_blocks, True),
+    _ANSWERS["blocks"],
+    _dense,
+    answer=lambda model: (model.nv, 10 * len(model.joints)),
+    places=_dense_places,
+)
+MASSES = _Form("masses", _masses, lambda model: (model.nv, model.nv), _whole_masses, places=_mass_places)
+
+
+def _in_order(shape: Callable[[RobotModel], tuple[int, ...]], model: RobotModel, place: tuple[int, ...]) -> list[int]:
+    return [int(np.ravel_multi_index(place, shape(model)))]
 
 
 def straight(form: _Form, kernel: Callable[..., Any], width: Callable[[RobotModel], int] = lambda model: 1) -> Straight:
@@ -682,5 +718,18 @@ def straight(form: _Form, kernel: Callable[..., Any], width: Callable[[RobotMode
         return answer if form.last else jnp.moveaxis(answer, -1, 0)
 
     read = columns if form is not MASSES else lambda model: [[x for x in g if x[0] == 0] for g in columns(model)]
-    nothing = lambda model: nothing_known(model.joints)  # noqa: E731
-    return Straight(plain, constants, known, nothing, form.programs, form.shape, read, form.last, form.finish)
+    return Straight(
+        name=form.name,
+        structure=lambda model: model.joints,
+        plain=plain,
+        constants=constants,
+        known=known,
+        nothing_known=lambda model: nothing_known(model.joints),
+        programs=form.programs,
+        shape=form.shape,
+        columns=read,
+        last=form.last,
+        finish=form.finish,
+        answer=form.answer or form.shape,
+        places=form.places or partial(_in_order, form.shape),
+    )
