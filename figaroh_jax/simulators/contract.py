@@ -69,6 +69,7 @@ class Capabilities:
     batch: Literal["vectorised", "threads", "loop"] = "loop"  # how many samples are computed
     gpu: bool = False
     contact: bool = False  # the simulator behind it simulates contact (the functions here are the free rigid body's)
+    precision: Literal["float64", "float32"] = "float64"  # of what it computes in; arrays are float64 in any case
     lacking: frozenset[str] = frozenset()  # functions that raise `NotSupported`
 
     @property
