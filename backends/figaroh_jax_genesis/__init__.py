@@ -27,7 +27,7 @@ os.environ.setdefault("QD_LOG_LEVEL", "error")  # its compiler tells of loops on
 import genesis as gs
 from genesis.utils.misc import qd_to_torch
 
-from figaroh_jax.errors import InputError
+from figaroh_jax.errors import InputError, NotSupported
 from figaroh_jax.formats.mujoco_model import frame_poses
 from figaroh_jax.rigid.derivatives import coriolis_from_bias
 from figaroh_jax.rigid.inertia import from_com, to_com
@@ -142,7 +142,15 @@ class GenesisBackend(Backend):
     def frame_jacobian(
         self, q: Float[ArrayLike, "*batch nq"], frame: str, reference: Reference = "local_world_aligned"
     ) -> Float[np.ndarray, "*batch 6 nv"]:
-        """`get_jacobian` of the link, moved to the frame's origin or the world's."""
+        """`get_jacobian` of the link, moved to the frame's origin or the world's.
+
+        Raises `NotSupported` for a robot with a spherical joint, whose columns Genesis leaves zero.
+        """
+        if round := [joint.name for joint in self._robot.joints if joint.kind == "spherical"]:
+            raise NotSupported(
+                f"backend 'genesis' has no frame_jacobian of spherical joints ('{round[0]}'); backends that do: "
+                "native, mujoco, pinocchio"
+            )
         index, axes, samples = self.frame_id(frame), as_reference(reference), host_samples(self, q=q)
         q, parent = samples[0], self._robot.frames[index].parent
         if parent < 0:
@@ -150,8 +158,8 @@ class GenesisBackend(Backend):
         joints = self._poses(q)
         pose = frame_poses(self._robot, joints)[:, index]
         _, entity, links = self._scene
-        own = self._each(lambda: _numpy(entity.get_jacobian(entity.links[links[parent]])), q)
-        own = own @ rates(self._robot, q, np.zeros((len(q), self.nv))).share
+        own = self._each(lambda: _numpy(entity.get_jacobian(entity.links[links[parent]])), q)[..., self._back]
+        own = own @ rates(self._robot, q, np.zeros((len(q), self.nv))).share  # its own: turning in the parent's axes
         point = np.zeros((len(q), 3)) if axes == "world" else pose[:, :3, 3]
         own[:, :3] += np.cross(own[:, 3:], (point - joints[:, parent, :3, 3])[:, :, None], axis=1)
         if axes == "local":
@@ -196,7 +204,7 @@ class GenesisBackend(Backend):
                 entity.control_dofs_force(force)
                 scene.step()
             ends = np.stack([_numpy(entity.get_qpos()), _numpy(entity.get_dofs_velocity())], axis=1)
-            answers.append(ends[: len(own[0])][..., np.argsort(self._dofs())])
+            answers.append(ends[: len(own[0])][..., self._back])
         ends = np.concatenate(answers)
         return samples.restore(ends[:, 0]), samples.restore(ends[:, 1])
 
@@ -247,8 +255,13 @@ class GenesisBackend(Backend):
         first, widths = self._robot.dofs.first, np.bincount(self._robot.dofs.joint)
         return np.concatenate([np.arange(first[i], first[i] + widths[i]) for i in _order(self._scene[1], self._robot)])
 
+    @cached_property
+    def _back(self) -> np.ndarray:
+        """Genesis's degree of freedom of each of ours."""
+        return np.argsort(self._dofs())
+
     def _each(self, read: Any, q: np.ndarray, qd: np.ndarray | None = None) -> np.ndarray:
-        """`read()` of blocks of samples, the environments in their states; degrees of freedom in our order."""
+        """`read()` of blocks of samples, the environments in their states."""
         answers = []
         qd = np.zeros((len(q), self._robot.nd)) if qd is None else qd
         for start in range(0, max(1, len(q)), _ENVIRONMENTS):
@@ -256,8 +269,7 @@ class GenesisBackend(Backend):
             own = q[rows] if len(q) else np.asarray(self.random_configuration(0, (1,)))
             self._place(own, qd[rows] if len(q) else np.zeros((1, self._robot.nd)))
             answers.append(read()[: len(q[rows])])
-        answer, back = np.concatenate(answers), np.argsort(self._dofs())
-        return answer[..., back] if answer.shape[-1] == self._robot.nd else answer
+        return np.concatenate(answers)
 
     def _terms(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
         """Mass matrix and, below it, bias forces in Genesis's coordinates: (n, nd + 1, nd)."""
@@ -269,18 +281,18 @@ class GenesisBackend(Backend):
             bias = qd_to_torch(solver.dyn_state.dofs.qf_bias, None, transpose=True)
             return np.concatenate([_numpy(entity.get_mass_mat()), _numpy(bias)[:, None]], axis=1)
 
-        terms, back = self._each(read, q, qd), np.argsort(self._dofs())
-        return np.concatenate([terms[:, back], terms[:, -1:]], axis=1)
+        terms = self._each(read, q, qd)[..., self._back]
+        return np.concatenate([terms[:, self._back], terms[:, -1:]], axis=1)
 
     def _masses(self, q: np.ndarray) -> np.ndarray:
-        share = rates(self._robot, q, np.zeros((len(q), self.nv))).share
+        share = rates(self._robot, q, np.zeros((len(q), self.nv)), own_turning=True).share
         return np.swapaxes(share, 1, 2) @ self._terms(q, np.zeros((len(q), self._robot.nd)))[:, :-1] @ share
 
     def _torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, only: tuple[int, int] | None = None) -> np.ndarray:
         """Torques of the robot, or of one link with one inertial parameter (the links keep it)."""
         if only:
             self._weigh(unit_inertias(len(self._robot.joints), only))
-        share, drift = rates(self._robot, q, v)
+        share, drift = rates(self._robot, q, v, own_turning=True)
         qd, qdd = (share @ v[..., None])[..., 0], (share @ a[..., None])[..., 0] + drift
         terms = self._terms(q, qd)
         force = (terms[:, :-1] @ qdd[..., None])[..., 0] + terms[:, -1]

@@ -2,7 +2,8 @@
 
 Newton and Genesis write q as this library does (tree order, quaternions apart), with a coordinate for each degree of
 freedom of the tree, mimic joints included. Their velocities of joints with several degrees of freedom are in the axes
-of the parent, the linear one of a free joint that of the body's origin or of its centre of mass. So `qd = J(q) v`,
+of the parent (Genesis: the angular ones in the body's), the linear one of a free joint that of the body's origin
+(Genesis) or of its centre of mass (Newton). So `qd = J(q) v`,
 `qdd = J(q) a + drift(q, v)`, and our torques are `J' f`.
 """
 
@@ -49,9 +50,16 @@ def numbers(robot: RobotModel, q: Float[np.ndarray, "n nq"]) -> list[Float[np.nd
 
 
 def rates(
-    robot: RobotModel, q: Float[np.ndarray, "n nq"], v: Float[np.ndarray, "n nv"], centres: bool = False
+    robot: RobotModel,
+    q: Float[np.ndarray, "n nq"],
+    v: Float[np.ndarray, "n nv"],
+    centres: bool = False,
+    own_turning: bool = False,
 ) -> Rates:
-    """J and drift; with `centres` the linear velocity of a free joint is that of its link's centre of mass."""
+    """J and drift; with `centres` the linear velocity of a free joint is that of its link's centre of mass.
+
+    `own_turning`: the angular velocity of free and spherical joints is in the axes of the body.
+    """
     share = np.zeros((len(q), robot.nd, robot.nv))
     share[:, np.arange(robot.nd), robot.dofs.column] = np.asarray(robot.ratio)[robot.dofs.joint]
     drift = np.zeros((len(q), robot.nd))
@@ -66,14 +74,15 @@ def rates(
         if joint.kind in ("free", "spherical"):
             turn = _rotation(q[:, at.stop - 4 : at.stop])
             width = 6 if joint.kind == "free" else 3
-            share[:, first + width - 3 : first + width, column + width - 3 : column + width] = turn
+            angular = slice(first + width - 3, first + width), slice(column + width - 3, column + width)
+            share[:, *angular] = np.eye(3) if own_turning else turn
         if joint.kind == "free":
             mass = float(robot.inertia[i][0])
             centre = np.asarray(robot.inertia[i][1:4], float) / mass if centres and mass else np.zeros(3)
             share[:, first : first + 3, column : column + 3] = turn  # pyright: ignore[reportPossiblyUnboundVariable]
             share[:, first : first + 3, column + 3 : column + 6] = -turn @ _cross(centre)
-            linear, angular = v[:, column : column + 3], v[:, column + 3 : column + 6]
-            moved = np.cross(angular, linear + np.cross(angular, centre))
+            linear, spin = v[:, column : column + 3], v[:, column + 3 : column + 6]
+            moved = np.cross(spin, linear + np.cross(spin, centre))
             drift[:, first : first + 3] = (turn @ moved[..., None])[..., 0]
     return Rates(share, drift)
 
