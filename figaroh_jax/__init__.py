@@ -145,6 +145,7 @@ _MODULES = {
     "effects.simulation": ("simulate",),
     "rigid.normal_equations": ("normal_matrix", "triangular_factor"),
     "formats.urdf": ("load_urdf",),
+    "formats.usd": ("load_usd",),
 }
 # Namespaces of what few need: modules by a short name.
 _SPACES = {

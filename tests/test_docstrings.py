@@ -11,7 +11,7 @@ import figaroh_jax as fj
 from figaroh_jax.effects import registry
 
 # what takes files that are not here (an MJCF, a task of postures, a finished diagnosis)
-FILES = {"calibrate_task", "load_mjcf", "write_report"}
+FILES = {"calibrate_task", "load_mjcf", "load_usd", "write_report"}
 DESIGN = {"excite", "excite_postures", "excite_task", "expected_std", "fourier", "information", "learn", "limits_of"}
 DESIGN |= {"quintic", "spline"}  # `examples/design_a_motion.py` shows them together
 LONG = {"calibrate", "diagnose", "diagnose_task", "identify", "identify_task", "linear_basis", "linear_limits"}

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import InputError
+from .files import model_format
 from .mjcf import body_name, compile_mjcf, engine
 from .xmlfile import find_in_packages, read_xml
 
@@ -38,13 +39,16 @@ class Shape(NamedTuple):
 
 
 def read_shapes(path: str | Path, packages: Sequence[str | Path] = ()) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
-    """The collision shapes of a `.urdf` or `.xml` (MJCF) file, and what could not be read.
+    """The collision shapes of a `.urdf` or `.xml` (MJCF) file, and what could not be read (all of a USD stage).
 
     Paths such as `package://name/rest` are looked for in `packages` and in the folders above the file. Raises
     `InputError` as the readers of robots do.
     """
     path = find_in_packages(path, packages)
-    return _of_urdf(path, packages) if path.suffix.lower() == ".urdf" else _of_mjcf(path)
+    form = model_format(path)
+    if form == "usd":
+        return (), (f"{path}: collision shapes of USD are not read; give the robot as URDF or MJCF where they matter",)
+    return _of_urdf(path, packages) if form == "urdf" else _of_mjcf(path)
 
 
 def enclosed_points(shape: Shape) -> Float[np.ndarray, "n 3"]:

@@ -22,6 +22,7 @@ from pydantic import (
 )
 
 from ..errors import InputError, nearest
+from .files import USD
 from .taskfile import CONTRACT_EFFECTS, merge, read_task, where
 
 if TYPE_CHECKING:
@@ -447,6 +448,15 @@ class Sight(_Keys):
     far: Positive = 10.0
 
 
+class Touched(_Keys):
+    """A plane or a socket that postures are to touch, in the device's base frame."""
+
+    place: Vector  # m: the socket, or a point on the plane
+    axis: Vector | None = None  # of a plane: its normal, towards the robot; of a socket: the way out of it
+    radius: Positive = 0.3  # m around the place: how much of the plane is there
+    tilt: Annotated[Positive, Field(le=3.15)] = 3.15  # rad, between the tool's z axis and the way in
+
+
 class SizedEffect(_Keys):
     """A cause that is to be told from another, and how large it is taken to be."""
 
@@ -474,6 +484,8 @@ class Excite(_Keys):
     candidates: Annotated[int, Field(ge=10, le=20_000)] = 500  # random postures to choose from
     measurement: Measurement | None = None  # of postures: the device; None: that of the recordings
     view: Sight | None = None  # of postures: what the device sees; None: everything
+    touch: tuple[Touched, ...] = ()  # of postures measured with planes or sockets: where these are
+    point: Vector = (0.0, 0.0, 0.0)  # m, in the tool frame: what touches them
     floor: Number | None = None  # its height in the world, m
     boxes: tuple[Obstacle, ...] = ()
     bodies: tuple[Body, ...] = ()  # for links without collision shapes, or in the place of theirs
@@ -593,8 +605,8 @@ def load_task(path: str | Path) -> Task:
 
 
 def robot_options(robot: Robot) -> dict[str, Any]:
-    """Arguments of `read_robot` and `load_extended` beside the file; gravity None is an MJCF's own."""
-    own = robot.model.suffix.lower() == ".xml" and "gravity" not in robot.model_fields_set
+    """Arguments of `read_robot` and `load_extended` beside the file; gravity None is an MJCF's or a stage's own."""
+    own = robot.model.suffix.lower() in (".xml", *USD) and "gravity" not in robot.model_fields_set
     gravity = None if own else robot.gravity
     return {"joints": robot.joints, "posture": dict(robot.posture), "gravity": gravity, "root": robot.root}
 

@@ -8,7 +8,18 @@ from pathlib import Path
 
 from ..errors import InputError, nearest
 
-__all__ = ["plain_file", "read_file"]
+__all__ = ["USD", "model_format", "plain_file", "read_file"]
+
+USD = (".usd", ".usda", ".usdc", ".usdz")
+
+
+def model_format(path: str | Path) -> str:
+    """Format of a robot's file by its name, `urdf`, `mjcf` or `usd`; `InputError` for other names."""
+    suffix = Path(path).suffix.lower()
+    known = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf"} | dict.fromkeys(USD, "usd")
+    if suffix not in known:
+        raise InputError(f"{path}: a robot model is a .urdf, an .xml (MJCF) or a .usd, .usda, .usdc or .usdz file")
+    return known[suffix]
 
 
 def plain_file(path: Path, name: str, what: str, largest: int, suffixes: tuple[str, ...] = ()) -> int:

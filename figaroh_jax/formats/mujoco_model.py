@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 
 from ..rigid.inertia import from_com, to_com, transform
 from ..rigid.model import RobotModel
+from .files import model_format
 from .mjcf import compile_mjcf, engine, joint_names
 
 __all__ = [
@@ -73,7 +74,7 @@ def compiled(robot: RobotModel, source: Path | None = None) -> Compiled:
     A body with several joints, or a joint that the robot does not have (locked, or held by an equality), has no link of
     its own in MuJoCo; such a robot is built from its arrays.
     """
-    if source is not None and source.suffix.lower() != ".urdf":
+    if source is not None and model_format(source) == "mjcf":
         model = compile_mjcf(source)
         same = sorted(joint_names(model)) == sorted(joint.name for joint in robot.joints)
         if same and (model.body_jntnum <= 1).all():

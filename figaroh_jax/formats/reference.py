@@ -31,7 +31,7 @@ class Key(NamedTuple):
 
 # path: unit, example, what happens without it
 KEYS: dict[str, tuple[str, str, str]] = {
-    "robot.model": ("", "robot.urdf", "the task is refused; .urdf or .xml (MJCF), no meshes are read"),
+    "robot.model": ("", "robot.urdf", "the task is refused; .urdf, .xml (MJCF) or .usd, no meshes are read"),
     "robot.root": ("", "free_flyer", "the root is fixed to the world"),
     "robot.joints": ("", "[shoulder, elbow]", "all joints move, in the order of the model's tree"),
     "robot.posture": ("rad, m", "{finger: 0.02}", "joints that do not move are locked at zero"),

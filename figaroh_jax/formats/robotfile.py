@@ -1,4 +1,4 @@
-"""A robot from a file of either format: its rigid bodies, or those with all that the file says of the joints besides.
+"""A robot from a file of any format: its rigid bodies, or those with all that the file says of the joints besides.
 
 What URDF and MJCF say beyond rigid bodies becomes effects: armature, damping, dry friction, springs, coupled drives,
 compensated gravity, constant forces of the actuators. Their controllers are no part of a robot: the torque of a drive
@@ -20,9 +20,11 @@ from ..errors import InputError
 from ..rigid.model import RobotModel
 from .assembly import LARGEST_NUMBER, Posture, Root
 from .compensation import GravityCompensation
+from .files import model_format
 from .mjcf import actuator_of, body_name, compile_mjcf, compiled_robot, disabled, engine, joint_names, load_mjcf
 from .native import place_names
 from .urdf import load_urdf, urdf_dynamics
+from .usd import load_usd, usd_joints
 from .xmlfile import find_in_packages
 
 if TYPE_CHECKING:
@@ -46,16 +48,17 @@ def read_robot(
     root: Root | None = None,
     packages: Sequence[str | Path] = (),
 ) -> RobotModel:
-    """Rigid bodies of the robot in a `.urdf` or `.xml` (MJCF) file: `load_urdf` or `load_mjcf`.
+    """Rigid bodies of the robot in a `.urdf`, `.xml` (MJCF) or `.usd` file: `load_urdf`, `load_mjcf`, `load_usd`.
 
     `gravity` and `root` None: as the file has them, which for URDF is (0, 0, -9.81) and a fixed root. Raises
     `InputError` for other files, and as those two do.
     """
-    if _is_urdf(path):
+    form = model_format(path)
+    if form == "urdf":
         return load_urdf(
             path, joints, posture, (0.0, 0.0, -9.81) if gravity is None else gravity, root or "fixed", packages
         )
-    return load_mjcf(path, joints, posture, gravity, root, packages)
+    return (load_usd if form == "usd" else load_mjcf)(path, joints, posture, gravity, root, packages)
 
 
 def load_extended(
@@ -77,7 +80,19 @@ def load_extended(
     >>> model.robot.nv
     4
     """
-    if _is_urdf(path):
+    form = model_format(path)
+    if form == "usd":
+        robot = read_robot(path, joints, posture, gravity, root, packages)
+        found = _Joints(robot)
+        acting, notes = usd_joints(path, packages)
+        for name, own in acting.items():
+            if width := found.width(name):
+                for dof in range(width):
+                    found.add(name, dof, rotor=own.armature, damping=(own.damping,), friction=own.friction)
+                if own.stiffness and width == 1:
+                    found.add(name, spring=(own.stiffness, own.rest))
+        return Loaded(extend(robot, *found.effects()), notes)
+    if form == "urdf":
         robot = read_robot(path, joints, posture, gravity, root, packages)
         found = _Joints(robot)
         for name, (damping, friction) in urdf_dynamics(find_in_packages(path, packages)).items():
@@ -104,8 +119,10 @@ def load_robot(task: Task) -> RobotModel:
     >>> fj.load_robot(fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml"))).nv
     4
     """
-    if task.robot.model.suffix.lower() not in (".urdf", ".xml"):
-        raise InputError(f"{task.file}: robot.model {task.robot.model}: expected a .urdf or an .xml (MJCF) file")
+    try:
+        model_format(task.robot.model)
+    except InputError as error:
+        raise InputError(f"{task.file}: robot.model {error}") from None
     from .config import robot_options
 
     return read_robot(task.robot.model, **robot_options(task.robot))
@@ -153,13 +170,6 @@ def _fits_linearly(effect: Effect) -> bool:
     return all(
         p.linear or (p.choice and float(getattr(effect, name)) == p.grid[0]) for name, p in effect.parameters().items()
     )
-
-
-def _is_urdf(path: str | Path) -> bool:
-    suffix = Path(path).suffix.lower()
-    if suffix not in (".urdf", ".xml", ".mjcf"):
-        raise InputError(f"{path}: a robot model is a .urdf or an .xml (MJCF) file")
-    return suffix == ".urdf"
 
 
 class _Joints:

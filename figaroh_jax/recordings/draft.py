@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from ..errors import InputError, nearest
 from ..formats.config import RecordingEntry
+from ..formats.files import USD
 from ..formats.robotfile import read_robot
 from ..rigid.model import RobotModel, prismatic
 from .checks import DEGREE, Finding, check_recording, position_findings
@@ -385,7 +386,7 @@ def _drives(
         if len(gains) != robot.nv:
             raise InputError(f"--kp: {len(gains)} numbers, expected one for each of {', '.join(robot.dof_names)}")
         return {n: {"kind": "position", "kp": k} for n, k in zip(robot.dof_names, gains, strict=True)}, []
-    if model.suffix.lower() == ".xml":
+    if model.suffix.lower() in (".xml", *USD):
         return {}, ["the drives are the model's actuators"]
     raise Undecided(
         "kp",

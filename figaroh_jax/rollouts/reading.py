@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, nearest
+from ..formats.files import model_format
 from ..formats.mjcf import actuator_of, compile_mjcf, compiled_robot, disabled, engine, joint_names
 from ..formats.robotfile import read_robot, urdf_dynamics
+from ..formats.usd import UsdJoint, usd_joints
 from ..formats.xmlfile import find_in_packages
 from ..rigid.manifold import neutral
 from ..rigid.model import RobotModel
@@ -33,11 +35,12 @@ def load_loop(
     law: str | None = None,
     integrator: Integrator | None = None,
 ) -> tuple[Loop, tuple[str, ...]]:
-    """The loop of a `.urdf` or `.xml` (MJCF) file, and what of the file it does not contain.
+    """The loop of a `.urdf`, `.xml` (MJCF) or `.usd` file, and what of the file it does not contain.
 
     An MJCF's joints, actuators, time step and integrator are taken as MuJoCo compiles them; `drives` replaces its
-    actuators, and states those of a URDF: `{joint: {kind: position, kp: 17.8, kd: 0.6, force: 3.35}}`. `law` is "soft"
-    for an MJCF (its `frictionloss`) and "hard" otherwise, unless given. Raises `InputError` for actuators that this
+    actuators (of a stage: the drives of its joints), and states those of a URDF: `{joint: {kind: position, kp: 17.8,
+    kd: 0.6, force: 3.35}}`. `law` is "soft" for an MJCF (its `frictionloss`) and "hard" otherwise, unless given.
+    Raises `InputError` for actuators that this
     version does not simulate, with the actuator's name.
 
     >>> import figaroh_jax as fj
@@ -45,10 +48,12 @@ def load_loop(
     >>> loop.drives.names
     ('elbow',)
     """
-    if str(path).lower().endswith(".urdf"):
+    form = model_format(path)
+    if form != "mjcf":
         robot = read_robot(path, joints, posture, gravity, root)
-        own, notes = _urdf_joints(robot, path), ()
-        actuators, start = joint_drives(robot, drives or {}, path), neutral(robot)
+        own, notes = (_usd_joints if form == "usd" else _urdf_joints)(robot, path), ()
+        stated = _usd_drives(robot, path) if form == "usd" and not drives else drives or {}
+        actuators, start = joint_drives(robot, stated, path), neutral(robot)
         default = (0.002, "implicitfast", "hard", bool(np.isfinite(own.limit).any()))
     else:
         file = find_in_packages(path, ())
@@ -110,6 +115,26 @@ def _urdf_joints(robot: RobotModel, path: str | Path) -> Joints:
             if joint.name == name and not joint.follows and joint.kind in ("revolute", "prismatic"):
                 own.damping[joint.coordinate], own.friction[joint.coordinate] = damping, friction
     return own
+
+
+def _usd_joints(robot: RobotModel, path: str | Path) -> Joints:
+    own = plain_joints(robot)
+    for joint, acting in _driven(robot, path):
+        k = joint.coordinate
+        own.armature[k], own.damping[k], own.friction[k] = acting.armature, acting.damping, acting.friction
+        own.stiffness[k], own.rest[k] = acting.stiffness, acting.rest
+    return own
+
+
+def _usd_drives(robot: RobotModel, path: str | Path) -> dict[str, dict[str, Any]]:
+    return {joint.name: acting.drive for joint, acting in _driven(robot, path) if acting.drive is not None}
+
+
+def _driven(robot: RobotModel, path: str | Path) -> list[tuple[Any, UsdJoint]]:
+    """Independent joints of one axis with what a stage says acts there."""
+    stated, _ = usd_joints(path)
+    single = [joint for joint in robot.joints if not joint.follows and joint.kind in ("revolute", "prismatic")]
+    return [(joint, stated[joint.name]) for joint in single if joint.name in stated]
 
 
 def joint_drives(

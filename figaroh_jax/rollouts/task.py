@@ -16,6 +16,7 @@ from ..effects.extended import ExtendedModel, extend
 from ..effects.plausibility import implausible
 from ..errors import InputError
 from ..formats.config import robot_options
+from ..formats.files import USD
 from ..recordings.dataset import Recording, read_recordings
 from ..results import Cause, Diagnosis, Estimate, Experiment, Gain, Name, Rest, Trace
 from .alone import separable
@@ -84,7 +85,8 @@ def diagnose_rollout_task(
 def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
     """The loop of a task and its recordings."""
     options = robot_options(task.robot)
-    options["root"] = None if task.robot.root == "fixed" and task.robot.model.suffix == ".xml" else options["root"]
+    if task.robot.root == "fixed" and task.robot.model.suffix.lower() in (".xml", *USD):
+        options["root"] = None
     drives = {name: drive.model_dump() for name, drive in task.actuator.drives.items()}
     loop, left_out = load_loop(task.robot.model, drives, **options)
     if not loop.drives.names:

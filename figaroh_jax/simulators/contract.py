@@ -18,6 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from ..errors import InputError, NotSupported, check_real, nearest
+from ..formats.files import model_format
 from ..rigid.derivatives import TorqueDerivatives
 from ..rigid.manifold import difference, integrate, random_configuration
 from ..rigid.model import RobotModel
@@ -63,7 +64,7 @@ FUNCTIONS = (
 class Capabilities:
     """What a backend can do, known without calling it."""
 
-    formats: tuple[str, ...] = ("urdf", "mjcf", "model")  # of models that it takes
+    formats: tuple[str, ...] = ("urdf", "mjcf", "usd", "model")  # of models that it takes
     differentiable: bool = False  # its functions can be differentiated by jax, in their arguments and its leaves
     batch: Literal["vectorised", "threads", "loop"] = "loop"  # how many samples are computed
     gpu: bool = False
@@ -122,7 +123,7 @@ class Backend(Protocol):
 
     @property
     def model_format(self) -> str:
-        """Format of the file that the robot was read from, `urdf` or `mjcf`; `model` where there was none."""
+        """Format of the file that the robot was read from, `urdf`, `mjcf` or `usd`; `model` where there was none."""
         ...
 
     @property
@@ -388,10 +389,8 @@ def host_samples(backend: Backend, **arrays: ArrayLike) -> Samples:
 
 
 def file_format(source: Path | None) -> str:
-    """Format of a model file by its name: `urdf`, `mjcf`, or `model` where there is none."""
-    if source is None:
-        return "model"
-    return "urdf" if source.suffix.lower() == ".urdf" else "mjcf"
+    """Format of a model file by its name: `urdf`, `mjcf`, `usd`, or `model` where there is none."""
+    return "model" if source is None else model_format(source)
 
 
 def as_reference(reference: str) -> Reference:

@@ -1,0 +1,693 @@
+"""Robots from OpenUSD, as Isaac Sim, Newton and the converters of URDF and MJCF write them, without any mesh.
+
+What UsdPhysics says of rigid bodies and joints is read, with what Newton's, MuJoCo's and PhysX's schemas add to it:
+symmetric inertias, armature, damping, dry friction, springs, mimic joints, limits of velocity and effort. Stages may
+be in any unit and with any axis up; the model is in metres and kilograms, in the axes of the stage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import InputError
+from ..rigid import inertia
+from ..rigid.model import Kind, RobotModel
+from .assembly import ROOT_JOINT, FramePart, JointPart, LinkPart, Posture, Root, assemble, displacement, refuse_many
+from .files import plain_file
+from .xmlfile import find_in_packages
+
+__all__ = ["UsdJoint", "load_usd", "usd_joints"]
+
+_LARGEST = 200_000_000  # bytes of the root layer; meshes may stand in it
+_ROTATIONS, _TRANSLATIONS = ("rotX", "rotY", "rotZ"), ("transX", "transY", "transZ")
+_WATER = 1000.0  # kg/m^3, the density that UsdPhysics gives a collider that states none
+_DEGREE = np.pi / 180
+
+
+class UsdJoint(NamedTuple):
+    """What a stage says of a joint beside its motion, in SI units (rad, m, N m, N)."""
+
+    armature: float = 0.0
+    damping: float = 0.0
+    friction: float = 0.0
+    stiffness: float = 0.0
+    rest: float = 0.0
+    drive: dict[str, Any] | None = None  # kind, kp, kd and force, as a task's `actuator` states a drive
+
+
+class _Body(NamedTuple):
+    name: str
+    prim: Any
+    pose: Float[np.ndarray, "4 4"]  # in the stage, m
+    scale: Float[np.ndarray, "3"]  # of its axes: local points are in these units, times the stage's
+
+
+class _Edge(NamedTuple):
+    """A joint between two bodies ("" for the world); the frames are in the bodies, in m."""
+
+    name: str
+    prim: Any
+    kind: Kind | str
+    axis: Float[np.ndarray, "3"]  # in the joint's frames, which agree at zero
+    ends: tuple[str, str]
+    frames: tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]]
+
+
+def load_usd(
+    path: str | Path,
+    joints: Sequence[str] | None = None,
+    posture: Posture | None = None,
+    gravity: Sequence[float] | None = None,
+    root: Root | None = None,
+    packages: Sequence[str | Path] = (),
+) -> RobotModel:
+    """Model of the robot in an OpenUSD stage (`.usd`, `.usda`, `.usdc`, `.usdz`); needs `usd-core`.
+
+    `joints`, `posture` and `packages` as in `load_urdf`. `gravity` (m/s^2) is that of the stage's physics scene where
+    it is None, and 9.81 against the up axis where there is no scene. `root` None takes the base as the stage has it: a
+    tree without a joint to the world moves freely. `fixed` holds it where it stands, `free_flyer` frees a base that a
+    fixed joint holds.
+
+    A rigid body is a link; a revolute, prismatic, spherical or fixed joint is one of the model, and so is a generic
+    joint whose limits leave one axis, three rotations or all six free. The zero of a joint is where its two frames
+    agree (less `mjc:ref`). Bodies, joints, sites and Xforms without shapes are frames. Where a body states no inertia,
+    that of its colliders counts, if these are cubes, spheres, cylinders or capsules. A drive's gains are its
+    controller's and no part of the robot; its greatest force is the effort limit.
+
+    Raises `InputError` for a stage that does not open, and, with the names of the joints or bodies, for what is no
+    tree: loops, two robots in one stage, joints that do not hold their axes.
+    """
+    file = find_in_packages(path, packages)
+    with _reading(file):
+        stage = _Stage(file)
+        links, parts, frames, free = _parts(stage, root)
+        own = stage.gravity() if gravity is None else gravity
+    if free and joints is not None and free not in joints:
+        joints = [free, *joints]
+    return assemble(str(file), stage.name, (links, parts), joints, posture, own, "fixed", frames)
+
+
+def usd_joints(path: str | Path, packages: Sequence[str | Path] = ()) -> tuple[dict[str, UsdJoint], tuple[str, ...]]:
+    """What acts at the joints of a stage, by name, and what of the stage acts and is not read."""
+    file = find_in_packages(path, packages)
+    with _reading(file):
+        stage = _Stage(file)
+        notes = [f"tendon '{_name(prim)}'" for prim in stage.prims if prim.GetTypeName() == "MjcTendon"]
+        held = [body.name for body in stage.bodies.values() if value(body.prim, "mjc:body:gravcomp", 0.0)]
+        notes += [f"gravcomp of the bodies {', '.join(held)}"] if held else []
+        return {edge.name: _acting(stage, edge) for edge in stage.edges}, tuple(notes)
+
+
+class _reading:
+    """Errors of the reader and of `pxr` as one message that names the file."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        if isinstance(error, InputError):
+            raise InputError(f"{self.file}: {str(error).removeprefix(f'{self.file}: ')}") from None
+        if isinstance(error, Exception) and type(error).__module__.startswith(("pxr", "Boost")):
+            raise InputError(f"{self.file}: OpenUSD does not read it: {' '.join(str(error).split())}") from None
+
+
+def _pxr() -> Any:
+    try:
+        import pxr.Gf
+        import pxr.Tf
+        import pxr.Usd
+        import pxr.UsdGeom
+        import pxr.UsdPhysics  # noqa: F401
+    except ImportError:
+        raise InputError("USD is read by usd-core; install it: pip install 'figaroh-jax[usd]'") from None
+    return pxr
+
+
+class _Stage:
+    """An open stage: its units, bodies and joints."""
+
+    def __init__(self, file: Path) -> None:
+        self.pxr = _pxr()
+        usd, geom, physics = self.pxr.Usd, self.pxr.UsdGeom, self.pxr.UsdPhysics
+        plain_file(file, str(file), "a robot model", _LARGEST, (".usd", ".usda", ".usdc", ".usdz"))
+        self.stage = usd.Stage.Open(str(file))
+        missing = self.stage.GetCompositionErrors() if hasattr(self.stage, "GetCompositionErrors") else []
+        if missing:
+            raise InputError(f"a layer that it names cannot be read: {missing[0]}")
+        self.metre = geom.GetStageMetersPerUnit(self.stage)
+        self.kilogram = physics.GetStageKilogramsPerUnit(self.stage)
+        self.up = np.eye(3)["XYZ".index(geom.GetStageUpAxis(self.stage))]
+        self._cache = geom.XformCache(usd.TimeCode.Default())
+        self.prims = list(usd.PrimRange.Stage(self.stage, usd.TraverseInstanceProxies()))
+        refuse_many("", "prims with a rigid body", sum(p.HasAPI(physics.RigidBodyAPI) for p in self.prims))
+        self.scene = next((p for p in self.prims if p.IsA(physics.Scene)), None)
+        default = self.stage.GetDefaultPrim()
+        self.name = _name(default) if default else file.stem
+        self.bodies = self._bodies()
+        self.edges = [edge for prim in self.prims if prim.IsA(physics.Joint) and (edge := self._edge(prim)) is not None]
+
+    def gravity(self) -> list[float]:
+        """Of the physics scene in m/s^2, or 9.81 against the up axis."""
+        physics, way, size = self.pxr.UsdPhysics, np.zeros(3), -np.inf
+        if self.scene is not None:
+            scene = physics.Scene(self.scene)
+            way = np.array(scene.GetGravityDirectionAttr().Get(), float)
+            size = float(scene.GetGravityMagnitudeAttr().Get())
+            if not value(self.scene, "newton:gravityEnabled", True):
+                return [0.0, 0.0, 0.0]
+        way = way / np.linalg.norm(way) if way.any() else -self.up
+        return (way * (9.81 if size < 0 else size * self.metre)).tolist()
+
+    def degrees(self) -> bool:
+        """Whether MuJoCo's own attributes of hinges are in degrees."""
+        return self.scene is None or value(self.scene, "mjc:compiler:angle", "degree") == "degree"
+
+    def pose(self, prim: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Pose of a prim in the stage (m) and the scale of its axes; `InputError` where they are skewed."""
+        matrix = np.array(self._cache.GetLocalToWorldTransform(prim), float).T
+        scale = np.linalg.norm(matrix[:3, :3], axis=0)
+        turn = matrix[:3, :3] / np.where(scale > 0, scale, 1.0)
+        if not np.allclose(turn.T @ turn, np.eye(3), rtol=0, atol=1e-5):
+            raise InputError(f"prim {prim.GetPath()}: its axes are skewed or of no length; a rigid body is not sheared")
+        u, _, v = np.linalg.svd(turn)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = u @ v, matrix[:3, 3] * self.metre
+        if np.linalg.det(u @ v) < 0:
+            raise InputError(f"prim {prim.GetPath()}: its axes are mirrored (a negative scale)")
+        return pose, scale
+
+    def carrier(self, prim: Any) -> str:
+        """Path of the rigid body that a prim belongs to, "" for none."""
+        while prim and str(prim.GetPath()) not in self.bodies:
+            prim = prim.GetParent()
+        return str(prim.GetPath()) if prim else ""
+
+    def in_body(self, prim: Any) -> tuple[str, np.ndarray, np.ndarray]:
+        """Body of a prim, the prim's pose in it (in the stage for none) and the scale of its axes."""
+        body = self.carrier(prim)
+        pose, scale = self.pose(prim)
+        return body, (np.linalg.inv(self.bodies[body].pose) @ pose if body else pose), scale
+
+    def _bodies(self) -> dict[str, _Body]:
+        api, found = self.pxr.UsdPhysics.RigidBodyAPI, {}
+        for prim in self.prims:
+            if prim.HasAPI(api) and api(prim).GetRigidBodyEnabledAttr().Get() is not False:
+                found[str(prim.GetPath())] = _Body(_name(prim), prim, *self.pose(prim))
+        if not found:
+            raise InputError("no prim is a rigid body (PhysicsRigidBodyAPI); a robot's links are")
+        return found
+
+    def _edge(self, prim: Any) -> _Edge | None:
+        joint, path = self.pxr.UsdPhysics.Joint(prim), prim.GetPath()
+        if joint.GetJointEnabledAttr().Get() is False:
+            return None
+        ends, frames = [], []
+        for side in "01":
+            targets = getattr(joint, f"GetBody{side}Rel")().GetTargets()
+            if len(targets) > 1:
+                raise InputError(f"joint {path}: body{side} has {len(targets)} targets; one is expected")
+            target = self.stage.GetPrimAtPath(targets[0]) if targets else None
+            if targets and not target:
+                raise InputError(f"joint {path}: body{side}, {targets[0]}, does not exist")
+            body, pose, scale = self.in_body(target) if target else ("", np.eye(4), np.ones(3))
+            local = _pose(
+                np.array(getattr(joint, f"GetLocalPos{side}Attr")().Get(), float) * scale * self.metre,
+                getattr(joint, f"GetLocalRot{side}Attr")().Get(),
+            )
+            ends.append(body)
+            frames.append(pose @ local)
+        if ends[0] == ends[1]:
+            raise InputError(f"joint {path}: joins {ends[0] or 'the world'} to itself")
+        if joint.GetExcludeFromArticulationAttr().Get():
+            raise InputError(
+                f"joint {path} closes a kinematic loop (excludeFromArticulation) between {ends[0] or 'the world'} and "
+                f"{ends[1] or 'the world'}; a robot is a tree: disable the joint or take it out"
+            )
+        return _Edge(_name(prim), prim, *self._motion(prim), (ends[0], ends[1]), (frames[0], frames[1]))
+
+    def _motion(self, prim: Any) -> tuple[str, np.ndarray]:
+        """Kind and axis of a joint."""
+        physics = self.pxr.UsdPhysics
+        for schema, kind in ((physics.RevoluteJoint, "revolute"), (physics.PrismaticJoint, "prismatic")):
+            if prim.IsA(schema):
+                return kind, np.eye(3)["XYZ".index(schema(prim).GetAxisAttr().Get())]
+        if prim.IsA(physics.FixedJoint):
+            return "fixed", np.zeros(3)
+        if prim.IsA(physics.SphericalJoint):
+            return "spherical", np.zeros(3)
+        if prim.GetTypeName() == "PhysicsJoint":
+            return _generic(prim, physics)
+        raise InputError(
+            f"joint {prim.GetPath()}: a {prim.GetTypeName()} does not hold its bodies to fixed axes; fixed, revolute, "
+            "prismatic, spherical and generic joints are read"
+        )
+
+
+def value(prim: Any, name: str, default: Any = None) -> Any:
+    """An attribute that the file gives, in whatever schema; `default` where it gives none."""
+    attribute = prim.GetAttribute(name)
+    found = attribute.Get() if attribute and attribute.HasAuthoredValue() else None
+    return default if found is None else found
+
+
+def _name(prim: Any) -> str:
+    """What the robot's own file called it, where the name is no identifier of USD."""
+    return prim.GetDisplayName() or prim.GetName()
+
+
+def _pose(position: Float[np.ndarray, "3"], quaternion: Any) -> Float[np.ndarray, "4 4"]:
+    numbers = np.array([*quaternion.GetImaginary(), quaternion.GetReal()], float)
+    if not np.linalg.norm(numbers) > 0.5:  # a zero quaternion is USD's "none given"
+        numbers = np.array([0.0, 0.0, 0.0, 1.0])
+    return displacement("free", np.zeros(3), np.concatenate([position, numbers]))
+
+
+def _generic(prim: Any, physics: Any) -> tuple[str, np.ndarray]:
+    """Kind and axis of a generic (D6) joint by the axes that its limits leave free."""
+    free = []
+    for token in (*_TRANSLATIONS, *_ROTATIONS):
+        limit = physics.LimitAPI(prim, token)
+        low, high = limit.GetLowAttr().Get(), limit.GetHighAttr().Get()
+        if not (prim.HasAPI(physics.LimitAPI, token) and low is not None and high is not None and low > high):
+            free.append(token)
+    turning, sliding = [t for t in free if t in _ROTATIONS], [t for t in free if t in _TRANSLATIONS]
+    kinds = {(0, 0): "fixed", (1, 0): "revolute", (0, 1): "prismatic", (3, 0): "spherical", (3, 3): "free"}
+    kind, axis = kinds.get((len(turning), len(sliding))), np.zeros(3)
+    if len(free) == 1 or (len(turning), len(sliding)) == (1, 2) and turning[0][-1] not in {t[-1] for t in sliding}:
+        axis["XYZ".index((turning or sliding)[0][-1])] = 1.0
+        kind = kind or "planar"
+    if kind is None:
+        raise InputError(f"joint {prim.GetPath()}: its limits leave {', '.join(free)} free; no kind of joint does")
+    return kind, axis
+
+
+def _parts(stage: _Stage, root: Root | None) -> tuple[list[LinkPart], list[JointPart], list[FramePart], str]:
+    """Links, joints and frames of the one robot of a stage, and the name of its free joint ("" for none)."""
+    base, edges, beside = _tree(stage)
+    if beside and root == "free_flyer":
+        raise InputError(
+            f"root: free_flyer, but the bodies {', '.join(beside)} are welded to the world beside the base"
+        )
+    inside = [path for path in stage.bodies if path == base or any(path in edge.ends for edge in edges)]
+    offset = {"": np.eye(4)} | {path: np.eye(4) for path in inside}
+    for edge in edges:
+        if edge.ends[0] or edge.kind != "fixed":  # the frame of a link is that of its last joint, in the body's axes
+            offset[edge.ends[1]] = _shift(-edge.frames[1][:3, 3])
+    names = {path: stage.bodies[path].name for path in inside}
+    names[""] = "world" if "world" not in names.values() else "world_of_the_stage"
+    start, edges = _start(stage, base, edges, root, names)
+    links = [LinkPart(names[path], inertia.transform(_inertia(stage, path), offset[path])) for path in inside]
+    parts, inner = _joints(stage, edges, names, offset)
+    frames = [
+        FramePart(names[path], names[path], offset[path])
+        for path in inside if not np.array_equal(offset[path], np.eye(4))
+    ]  # fmt: skip
+    if any(part.parent == names[""] for part in (*start, *parts)):
+        links.insert(0, LinkPart(names[""], np.zeros(10)))
+    else:
+        names[""] = names[base]
+    for path in beside:  # they neither move nor work
+        names[path], offset[path] = names[""], stage.bodies[path].pose
+        frames.append(FramePart(stage.bodies[path].name, names[""], offset[path]))
+    frames += _frames(stage, names, offset)
+    return [*links, *inner], [*start, *parts], frames, start[0].name if start and start[0].kind == "free" else ""
+
+
+def _start(
+    stage: _Stage, base: str, edges: list[_Edge], root: Root | None, names: dict[str, str]
+) -> tuple[list[JointPart], list[_Edge]]:
+    """What holds the base or lets it fly, and the other joints."""
+    held = [edge for edge in edges if edge.ends[0] == ""]
+    if held and held[0].kind != "fixed":
+        if root == "free_flyer":
+            raise InputError(f"root: free_flyer, but joint '{held[0].name}' joins the base to the world")
+        return [], edges
+    place = held[0].frames[0] @ np.linalg.inv(held[0].frames[1]) if held else stage.bodies[base].pose
+    edges = [edge for edge in edges if edge not in held]
+    if root == "free_flyer" or (root is None and not held):
+        free = JointPart(ROOT_JOINT, "free", names[""], names[base], np.eye(4), np.zeros(3), neutral=_numbers(place))
+        return [free], edges
+    if np.allclose(place, np.eye(4), rtol=0, atol=1e-9):
+        return [], edges
+    return [
+        JointPart(held[0].name if held else "world_joint", "fixed", names[""], names[base], place, np.zeros(3))
+    ], edges
+
+
+def _numbers(pose: Float[np.ndarray, "4 4"]) -> tuple[float, ...]:
+    """The pose as the numbers of a free joint."""
+    from scipy.spatial.transform import Rotation
+
+    return tuple(map(float, (*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat())))
+
+
+def _tree(stage: _Stage) -> tuple[str, list[_Edge], list[str]]:
+    """Base of the robot, its joints from the base outwards, each from parent to child, and bodies welded beside it."""
+    groups = list[set[str]]()
+    for edge in stage.edges:
+        ends = {end for end in edge.ends if end}
+        touching = [group for group in groups if group & ends]
+        groups = [group for group in groups if group not in touching] + [ends.union(*touching)]
+    moving = [g for g in groups if any(e.kind != "fixed" and g & set(e.ends) for e in stage.edges)]
+    if not moving:
+        raise InputError("no joint that moves joins its rigid bodies; a robot is a tree of them")
+    if len(moving) > 1:
+        heads = ", ".join(f"'{next(path for path in stage.bodies if path in group)}'" for group in moving)
+        raise InputError(
+            f"{len(moving)} separate robots begin at the bodies {heads}; a file has one: join or remove them"
+        )
+    for path, body in stage.bodies.items():
+        above = stage.carrier(body.prim.GetParent())
+        if above in moving[0] and not any(path in group for group in groups):
+            raise InputError(f"no joint carries the body '{body.name}' below '{stage.bodies[above].name}'; join them")
+    own = [edge for edge in stage.edges if moving[0] & set(edge.ends)]
+    base = _base(stage, moving[0], own)
+    beside = [path for group in groups if group is not moving[0] for path in sorted(group)]
+    return base, _outwards(base, own), beside
+
+
+def _outwards(base: str, edges: Sequence[_Edge]) -> list[_Edge]:
+    """The joints turned from parent to child, those of the world first; `InputError` for one that closes a loop."""
+    queue, known, found, left = [base], {base, ""}, list[_Edge](), list(edges)
+    world = [edge if edge.ends[0] == "" else _reversed(edge) for edge in left if "" in edge.ends]
+    left = [edge for edge in left if "" not in edge.ends]
+    for edge in world:
+        if edge.ends[1] != base or (edge is not world[0] and not (_stacks(edge) and _stacks(world[0]))):
+            _refuse_loop(edge, world[:1])
+    while queue:
+        at = queue.pop(0)
+        own = [edge for edge in left if at in edge.ends]
+        left = [edge for edge in left if at not in edge.ends]
+        for edge in own:
+            edge = edge if edge.ends[0] == at else _reversed(edge)
+            before = [other for other in found if other.ends[1] == edge.ends[1]]
+            beside = all(other.ends == edge.ends and _stacks(other) for other in (edge, *before))
+            if edge.ends[1] in known and not (before and beside):
+                _refuse_loop(edge, before)
+            queue += [edge.ends[1]] if edge.ends[1] not in known else []
+            known.add(edge.ends[1])
+            found.append(edge)
+    order = {edge.prim.GetPath(): k for k, edge in enumerate(edges)}
+    return world + sorted(found, key=lambda edge: order[edge.prim.GetPath()])
+
+
+def _refuse_loop(edge: _Edge, others: Sequence[_Edge]) -> None:
+    by = ", ".join(f"'{other.name}'" for other in others) or "the world"
+    raise InputError(
+        f"joint '{edge.name}' closes a kinematic loop: the body '{edge.ends[1]}' is carried by {by} already; a robot "
+        "is a tree: lock the joints of the loop or take this one out"
+    )
+
+
+def _base(stage: _Stage, group: set[str], edges: Sequence[_Edge]) -> str:
+    """The body held to the world, else the one marked as an articulation's root, else the one that nothing carries."""
+    ends = [edge.ends for edge in edges]
+    held = [max(pair) for pair in ends if "" in pair]
+    marked = [
+        path for path in stage.bodies
+        if path in group and stage.bodies[path].prim.HasAPI(stage.pxr.UsdPhysics.ArticulationRootAPI)
+    ]  # fmt: skip
+    first = [path for path in stage.bodies if path in group and path not in {pair[1] for pair in ends}]
+    return (held or marked or first or [path for path in stage.bodies if path in group])[0]
+
+
+def _stacks(edge: _Edge) -> bool:
+    """Whether joints between the same two bodies add their motions: MuJoCo's do."""
+    return edge.kind in ("revolute", "prismatic") and "MjcJointAPI" in _schemas(edge.prim)
+
+
+def _schemas(prim: Any) -> list[str]:
+    return list(prim.GetPrimTypeInfo().GetAppliedAPISchemas())
+
+
+def _reversed(edge: _Edge) -> _Edge:
+    return edge._replace(axis=-edge.axis, ends=edge.ends[::-1], frames=edge.frames[::-1])
+
+
+def _chains(edges: Sequence[_Edge]) -> Iterator[list[_Edge]]:
+    """Joints between the same two bodies together."""
+    together: dict[tuple[str, str], list[_Edge]] = {}
+    for edge in edges:
+        together.setdefault(edge.ends, []).append(edge)
+    yield from together.values()
+
+
+def _joints(
+    stage: _Stage, edges: Sequence[_Edge], names: dict[str, str], offset: dict[str, np.ndarray]
+) -> tuple[list[JointPart], list[LinkPart]]:
+    """Joints of the model, those between the same two bodies one after another with massless links between."""
+    parts, inner = [], []
+    leaders = {str(edge.prim.GetPath()): edge for edge in edges}
+    for chain in _chains(edges):
+        parent, child = chain[0].ends
+        carrier, pose = names[parent], offset[parent] @ chain[0].frames[0] @ np.linalg.inv(chain[0].frames[1])
+        for edge in chain:
+            link = names[child] if edge is chain[-1] else f"{edge.name}_link"
+            if edge is not chain[-1]:
+                inner.append(LinkPart(link, np.zeros(10)))
+            turn, shift, ref = edge.frames[1][:3, :3], edge.frames[1][:3, 3], _reference(stage, edge)
+            axis, placement = turn @ edge.axis, pose @ _shift(shift)
+            if ref:
+                placement = placement @ displacement(edge.kind, axis, np.array([-ref]))
+            limit, mimic, neutral = _limit(stage, edge), _mimic(stage, edge, leaders), (ref,) if ref else ()
+            parts.append(JointPart(edge.name, edge.kind, carrier, link, placement, axis, limit, mimic, neutral))  # pyright: ignore[reportArgumentType]
+            carrier, pose = link, _shift(-shift)
+    return parts, inner
+
+
+def _shift(way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    pose = np.eye(4)
+    pose[:3, 3] = way
+    return pose
+
+
+def _unit(stage: _Stage, edge: _Edge) -> float:
+    """Of UsdPhysics' positions of a joint in rad or m: degrees, lengths of the stage."""
+    return _DEGREE if edge.kind == "revolute" else stage.metre
+
+
+def _moment(stage: _Stage, edge: _Edge) -> float:
+    """Of a stage's forces (prismatic) or torques in N or N m."""
+    return stage.kilogram * stage.metre ** (2 if edge.kind == "revolute" else 1)
+
+
+def _reference(stage: _Stage, edge: _Edge) -> float:
+    """MuJoCo's `ref` in rad or m: the position of the joint where its frames agree; 0 for other joints."""
+    if edge.kind not in ("revolute", "prismatic"):
+        return 0.0
+    angle = edge.kind == "revolute" and stage.degrees()
+    return float(value(edge.prim, "mjc:ref", 0.0)) * (_DEGREE if angle else 1.0)
+
+
+def _limit(stage: _Stage, edge: _Edge) -> tuple[float, float, float, float]:
+    """Lower, upper, velocity and effort limit; infinite where the stage gives none."""
+    lower, upper, fast, strong = -np.inf, np.inf, np.inf, np.inf
+    if edge.kind not in ("revolute", "prismatic"):
+        return lower, upper, fast, strong
+    prim, unit = edge.prim, _unit(stage, edge)
+    physics = stage.pxr.UsdPhysics
+    if prim.GetTypeName() == "PhysicsJoint":
+        token = (_ROTATIONS if edge.kind == "revolute" else _TRANSLATIONS)[int(np.abs(edge.axis).argmax())]
+        own = physics.LimitAPI(prim, token)
+        bounds = (own.GetLowAttr().Get(), own.GetHighAttr().Get()) if prim.HasAPI(physics.LimitAPI, token) else ()
+    else:
+        token = "angular" if edge.kind == "revolute" else "linear"
+        bounds = (prim.GetAttribute("physics:lowerLimit").Get(), prim.GetAttribute("physics:upperLimit").Get())
+    if bounds:
+        lower, upper = (float(bound) * unit for bound in bounds)
+    if lower > upper:
+        raise InputError(f"joint '{edge.name}': its lower limit {lower:g} is above the upper one {upper:g}")
+    for name in ("newton:velocityLimit", "physxJoint:maxJointVelocity"):
+        fast = min(fast, float(value(prim, name, np.inf)) * unit)
+    strong = float(value(prim, f"drive:{token}:physics:maxForce", np.inf)) * _moment(stage, edge)
+    strong = min(strong, float(value(prim, "urdf:limit:effort", np.inf)), _mujoco_effort(stage, edge))
+    return lower, upper, fast, strong
+
+
+def _mujoco_effort(stage: _Stage, edge: _Edge) -> float:
+    """Largest torque that MuJoCo's attributes let the drives of a joint give; infinite without a limit."""
+    total = _range(edge.prim, "mjc:actuatorfrc", "mjc:actuatorfrcrange")
+    sums = []
+    for prim in stage.prims:
+        if prim.GetTypeName() != "MjcActuator" or prim.GetPath() == edge.prim.GetPath():
+            continue
+        targets = prim.GetRelationship("mjc:target")
+        if targets and edge.prim.GetPath() in targets.GetTargets():
+            gain, bias = value(prim, "mjc:gainPrm", [1.0]), [*value(prim, "mjc:biasPrm", []), 0.0, 0.0, 0.0]
+            plain = value(prim, "mjc:gainType", "fixed") == "fixed" and not any(bias[1:3])
+            force = _range(prim, "mjc:force", "mjc:forceRange")
+            control = _range(prim, "mjc:ctrl", "mjc:ctrlRange") * abs(gain[0]) if plain else np.inf
+            sums.append(min(force, control) * abs(value(prim, "mjc:gear", [1.0])[0]))
+    return float(min(total, sum(sums) if sums else np.inf))
+
+
+def _range(prim: Any, limited: str, name: str) -> float:
+    """Larger bound of one of MuJoCo's ranges; infinite where it is not in force."""
+    low, high = float(value(prim, f"{name}:min", 0.0)), float(value(prim, f"{name}:max", 0.0))
+    stated = value(prim, f"{limited}limited" if limited.endswith("frc") else f"{limited}Limited", "auto")
+    in_force = stated == "true" or (stated == "auto" and low != high)
+    return max(abs(low), abs(high)) if in_force else np.inf
+
+
+def _mimic(stage: _Stage, edge: _Edge, leaders: dict[str, _Edge]) -> tuple[str, float, float] | None:
+    """Joint that it follows, ratio and offset, by Newton's schema (and MuJoCo's, which builds on it) or PhysX's."""
+    prim = edge.prim
+    relation, found = prim.GetRelationship("newton:mimicJoint"), None
+    if relation and relation.GetTargets() and value(prim, "newton:mimicEnabled", True):
+        if any(value(prim, f"mjc:coef{k}", 0.0) for k in (2, 3, 4)):
+            raise InputError(
+                f"joint '{edge.name}' follows another by a curve (mjc:coef2 and above); a line is expected"
+            )
+        ratio, offset = value(prim, "newton:mimicCoef1", 1.0), value(prim, "newton:mimicCoef0", 0.0)
+        found = str(relation.GetTargets()[0]), float(ratio), float(offset) * _unit(stage, edge)
+    for schema in _schemas(prim):
+        if schema.startswith("PhysxMimicJointAPI"):  # q + gearing * leader + offset = 0
+            own = f"physxMimicJoint:{schema.partition(':')[2]}"
+            targets = prim.GetRelationship(f"{own}:referenceJoint").GetTargets()
+            gearing, offset = float(value(prim, f"{own}:gearing", 1.0)), float(value(prim, f"{own}:offset", 0.0))
+            found = str(targets[0]) if targets else "", -gearing, -offset * _unit(stage, edge)
+    if found is None:
+        return None
+    path, ratio, offset = found
+    if path not in leaders:
+        raise InputError(f"joint '{edge.name}' mimics '{path}', which is no joint of the robot")
+    leader = leaders[path]
+    return leader.name, ratio, offset + _reference(stage, edge) - ratio * _reference(stage, leader)
+
+
+def _acting(stage: _Stage, edge: _Edge) -> UsdJoint:
+    """What acts at a joint, by Newton's, MuJoCo's or PhysX's attributes, whichever the stage gives."""
+    if edge.kind == "fixed":
+        return UsdJoint()
+    prim, angle, moment = edge.prim, edge.kind in ("revolute", "spherical"), _moment(stage, edge)
+    per = 1.0 / _DEGREE if angle else 1.0 / stage.metre  # of gains that count degrees
+    mass = stage.kilogram * (stage.metre**2 if angle else 1.0)
+    armature = value(prim, "newton:armature", value(prim, "mjc:armature", value(prim, "physxJoint:armature", 0.0)))
+    friction = value(prim, "newton:friction", value(prim, "mjc:frictionloss", 0.0))
+    damping = (
+        float(value(prim, "newton:damping", 0.0)) * per * moment or float(value(prim, "mjc:damping", 0.0)) * moment
+    )
+    rest = float(value(prim, "mjc:springref", 0.0)) * (_DEGREE if angle and stage.degrees() else 1.0)
+    stiffness, drive, token = float(value(prim, "mjc:stiffness", 0.0)), None, "angular" if angle else "linear"
+    if prim.HasAPI(stage.pxr.UsdPhysics.DriveAPI, token):
+        own = f"drive:{token}:physics"
+        if value(prim, f"{own}:type", "force") != "force":
+            raise InputError(f"joint '{edge.name}': its drive is of type acceleration; a drive of type force is read")
+        kp, kd = (float(value(prim, f"{own}:{gain}", 0.0)) * per * moment for gain in ("stiffness", "damping"))
+        force = float(value(prim, f"{own}:maxForce", np.inf)) * moment
+        kind = "position" if kp else "velocity"
+        drive = {"kind": kind, "kp": kp or None, "kd": kd, "force": force if np.isfinite(force) else None}
+    return UsdJoint(float(armature) * mass, damping, float(friction) * moment, stiffness, rest, drive)
+
+
+def _inertia(stage: _Stage, path: str) -> Float[np.ndarray, "10"]:
+    """Inertia of a body in its own frame: what its mass schema states, else what its colliders weigh."""
+    body, api = stage.bodies[path], stage.pxr.UsdPhysics.MassAPI(stage.bodies[path].prim)
+    mass = float(value(body.prim, "physics:mass", 0.0)) * stage.kilogram
+    com = np.array(value(body.prim, "physics:centerOfMass", [-np.inf] * 3), float) * body.scale * stage.metre
+    moments = _moments(stage, body.prim, api)
+    if mass < 0:
+        raise InputError(f"body '{body.name}': its mass is {mass:g} kg; it cannot be negative")
+    if mass > 0 and moments is not None and np.isfinite(com).all():
+        return inertia.from_com(mass, com, moments)
+    shapes = _colliders(stage, path)
+    if shapes is None:  # nothing has a shape: a mass without extent, or none
+        return inertia.from_com(
+            mass, np.where(np.isfinite(com), com, 0.0), np.zeros((3, 3)) if moments is None else moments
+        )
+    weight, centre, about = inertia.to_com(shapes)
+    if mass > 0 and weight > 0:
+        weight, about = mass, about * (mass / weight)
+    return inertia.from_com(
+        weight, com if np.isfinite(com).all() else centre, about if moments is None else moments
+    )  # fmt: skip
+
+
+def _moments(stage: _Stage, prim: Any, api: Any) -> Float[np.ndarray, "3 3"] | None:
+    """Moments about the centre of mass in the body's axes; None where the stage gives none."""
+    unit = stage.kilogram * stage.metre**2
+    full = np.array(value(prim, "newton:inertia", []), float)
+    if full.size == 6:
+        xx, yy, zz, xy, xz, yz = full * unit
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    diagonal = np.array(value(prim, "physics:diagonalInertia", np.zeros(3)), float) * unit
+    if not diagonal.any():
+        return None
+    turn = _pose(np.zeros(3), api.GetPrincipalAxesAttr().Get())[:3, :3]
+    return turn @ np.diag(diagonal) @ turn.T
+
+
+def _colliders(stage: _Stage, path: str) -> Float[np.ndarray, "10"] | None:
+    """What the colliders of a body weigh together, in the body's frame; None where it has none."""
+    physics, body = stage.pxr.UsdPhysics, stage.bodies[path]
+    solid = [p for p in stage.prims if p.HasAPI(physics.CollisionAPI) and value(p, "physics:collisionEnabled", True)]
+    found = [prim for prim in solid if stage.carrier(prim) == path]
+    if not found:
+        return None
+    total = np.zeros(10)
+    for prim in found:
+        volume, moments = _shape(stage, prim, body.name)
+        density = float(value(prim, "physics:density", 0.0)) or float(value(body.prim, "physics:density", 0.0))
+        density = density * stage.kilogram / stage.metre**3 or _WATER
+        mass = float(value(prim, "physics:mass", 0.0)) * stage.kilogram or density * volume
+        pose = stage.in_body(prim)[1]
+        total = total + inertia.transform(inertia.from_com(mass, np.zeros(3), mass * moments), pose)
+    return total
+
+
+def _shape(stage: _Stage, prim: Any, body: str) -> tuple[float, Float[np.ndarray, "3 3"]]:
+    """Volume (m^3) of a solid collider and its moments for a unit of mass, about its own origin."""
+    kind, scale = str(prim.GetTypeName()), stage.pose(prim)[1] * stage.metre
+    get = lambda name: float(prim.GetAttribute(name).Get())  # noqa: E731
+    if kind == "Cube":
+        x, y, z = get("size") * scale
+        return x * y * z, np.diag([y * y + z * z, x * x + z * z, x * x + y * y]) / 12
+    if kind == "Sphere":
+        radius = get("radius") * scale[0]
+        return 4 / 3 * np.pi * radius**3, 0.4 * radius**2 * np.eye(3)
+    if kind in ("Cylinder", "Capsule"):
+        along = "XYZ".index(prim.GetAttribute("axis").Get())
+        r, h = get("radius") * scale[along - 1], get("height") * scale[along]
+        middle, ends = np.pi * r * r * h, 4 / 3 * np.pi * r**3 if kind == "Capsule" else 0.0
+        axial = middle * r * r / 2 + ends * 0.4 * r * r
+        across = middle * (h * h / 12 + r * r / 4) + ends * (0.4 * r * r + 0.375 * r * h + h * h / 4)
+        moments = np.full(3, across)
+        moments[along] = axial
+        return middle + ends, np.diag(moments) / (middle + ends)
+    raise InputError(
+        f"body '{body}' states no inertia, and that of its collider {prim.GetPath()}, a {kind}, is not computed; "
+        "give the body physics:mass, physics:centerOfMass and physics:diagonalInertia"
+    )
+
+
+def _frames(stage: _Stage, names: dict[str, str], offset: dict[str, np.ndarray]) -> list[FramePart]:
+    """Xforms without shapes and sites, each once, at the link that carries them."""
+    shaped = set[str]()
+    for prim in stage.prims:
+        site = bool({"MjcSiteAPI", "NewtonSiteAPI"} & set(_schemas(prim)))
+        if prim.IsA(stage.pxr.UsdGeom.Gprim) and not site:
+            while prim and str(prim.GetPath()) not in shaped and str(prim.GetPath()) not in stage.bodies:
+                shaped.add(str(prim.GetPath()))
+                prim = prim.GetParent()
+    default, frames = stage.stage.GetDefaultPrim(), dict[str, FramePart]()
+    taken = {*names.values(), *(edge.name for edge in stage.edges)}
+    for prim in stage.prims:
+        path = str(prim.GetPath())
+        plain = (
+            prim.GetTypeName() == "Xform" and path not in shaped and not (prim.IsInstance() or prim.IsInstanceProxy())
+        )
+        site = bool({"MjcSiteAPI", "NewtonSiteAPI"} & set(_schemas(prim)))
+        if not (plain or site) or path in stage.bodies or prim == default or _name(prim) in taken:
+            continue
+        body, pose, _ = stage.in_body(prim)
+        if body in names:
+            frames.setdefault(_name(prim), FramePart(_name(prim), names[body], offset[body] @ pose))
+    return list(frames.values())
