@@ -12,10 +12,10 @@ from ..effects.extended import ExtendedModel, extend
 from ..recordings.stacked import filtered_rows
 from ..results import Estimate
 from ..rigid.model import RobotModel, prismatic
-from .design import batch_size, kind, local, sensor_response, shapes, units_and_slopes, with_shape
+from .design import kind, local, sensor_response, shapes, with_shape
 from .problem import Problem
 from .shifts import torque_change
-from .state import State
+from .state import State, unit_slopes
 
 __all__ = ["Fitted", "estimates", "fitted_model", "torque_slope", "torque_slopes", "with_amplitudes"]
 
@@ -125,11 +125,8 @@ def torque_slopes(
     if not names or kind(effect) != "columns":
         return [torque_slope(problem, state, effect, name, whitening) for name in names]
     response = state.response(problem.records.omega)[:, None] * whitening
-    batch = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], batch_size(effect), axis=0), effect)
-    values = np.stack([getattr(batch, n) for n in names], axis=1)
-    each = units_and_slopes(batch, values, _without(state, effect))[1][0]
     amplitudes, out = [float(getattr(effect, n)) for n, p in effect.parameters().items() if p.linear], []
-    for slope in each:
+    for slope in unit_slopes(problem, state, effect, _without(state, effect)):
         torque = np.zeros((slope.shape[-1], problem.model.nv))
         torque[:, np.asarray(effect.at) if local(effect) else slice(None)] = np.tensordot(amplitudes, slope, 1).T
         out.append(filtered_rows(problem.records, torque, response))

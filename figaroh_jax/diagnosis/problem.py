@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
-from typing import Any, NamedTuple
+from typing import Any, TypeVar
 from weakref import ref
 
 import equinox as eqx
@@ -22,15 +22,19 @@ from ..simulators.contract import Backend
 from .design import Units, candidates, flattened, kind, shapes, units
 from .shifts import links_torque, rigid_torque
 
+T = TypeVar("T")
+
 __all__ = ["Layout", "Part", "Problem", "family_of", "without_factor"]
 
 # cached, and the same for all weights of the rows
-_OF_THE_MOTION = ("torque", "gain", "motion", "families", "fixed", "plain")
+_OF_THE_MOTION = ("torque", "gain", "motion", "families", "fixed", "plain", "_terms")
 KEPT = 64 << 20  # bytes of filtered columns that are held
+MOST_TERMS = 48  # terms of models whose columns are held
 TURNED = 128  # samples that are turned at once: they stay in the processor's cache
 
 
-class Part(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Part:
     """Columns of a regressor at all samples, without the zeros: a tree leaves many joints of a column untouched."""
 
     series: Float[np.ndarray, "series nN"]  # by joint, then by column
@@ -38,6 +42,7 @@ class Part(NamedTuple):
     column: Int[np.ndarray, " series"]
     nv: int
     width: int  # columns
+    _last: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)  # coefficients and their torque
 
     @classmethod
     def of(cls, columns: Float[np.ndarray, "nv k nN"]) -> Part:
@@ -60,13 +65,18 @@ class Part(NamedTuple):
         """Samples of all recordings."""
         return self.series.shape[1]
 
-    def torque(self, theta: Float[np.ndarray, " k"], rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+    def torque(self, theta: Float[np.ndarray, " k"], rows: slice = slice(None)) -> Float[np.ndarray, "rows nv"]:
         """Torque (samples, nv) of the coefficients `theta`, N m or N; `rows` are samples."""
+        if rows == slice(None) and self._last and np.array_equal(self._last[0][0], theta):
+            return self._last[0][1]
         series = self.series[:, rows]
         out, ends = np.zeros((series.shape[1], self.nv)), np.searchsorted(self.joint, np.arange(self.nv + 1))
         for joint in range(self.nv):
             own = slice(ends[joint], ends[joint + 1])
             out[:, joint] = theta[self.column[own]] @ series[own]
+        if rows == slice(None):  # states that grow out of one another ask for the same
+            out.setflags(write=False)
+            self._last[:] = [(theta.copy(), out)]
         return out
 
     def dense(self, columns: range) -> Float[np.ndarray, "k nv nN"]:
@@ -230,6 +240,19 @@ class Problem:
     def following(self, effect: str, motion: Motion) -> Units:
         """Unit torques of one effect that follows the torque of the current model."""
         return units({effect: flattened(self.families["following"][effect])}, motion, self.records)[effect]
+
+    @cached_property
+    def _terms(self) -> OrderedDict[Any, tuple[Motion, Any]]:
+        return OrderedDict()
+
+    def kept(self, name: Any, motion: Motion, make: Callable[[], T]) -> T:
+        """What has been made under the name of the same motion, or is made now; the last few are held."""
+        known = self._terms.pop(name, None)
+        made = known[1] if known is not None and known[0] is motion else make()
+        self._terms[name] = motion, made
+        while len(self._terms) > MOST_TERMS:
+            self._terms.popitem(last=False)
+        return made
 
     def with_width(self, width: Float[np.ndarray, " nv"]) -> Problem:
         """The problem with another width of the friction's reversal, which no candidate's place and grid depends on."""

@@ -124,9 +124,9 @@ def _compliances(effects: Effect, motion: Motion, records: Records) -> list[_Com
     loads = np.repeat(load[None], len(effects.at), axis=0)
     unit = (_errors(effects, motion, loads + 1) - _errors(effects, motion, loads)).mean(1)
     joints = np.asarray(effects.at)[:, 0]
-    few = _Few.of(motion, records)
-    slopes = few.slopes(motion.model, joints, lambda q, v, a: links_torque(motion.model, q, v, a, records))
-    own = few.between(np.stack([slopes[k, :, :, j] for k, j in enumerate(joints)]))  # (sensors, 3, n, N)
+    few, (once, place) = _Few.of(motion, records), np.unique(joints, return_inverse=True)
+    slopes = few.slopes(motion.model, once, lambda q, v, a: links_torque(motion.model, q, v, a, records))
+    own = few.between(np.stack([slopes[k, :, :, j] for k, j in enumerate(once)]))[place]  # (sensors, 3, n, N)
     dt, out = float(records.dt), []
     for K, D, M in unit[:, None, None, None] * own:
         inertial = np.stack([M, -2 * M, M]) / dt**2

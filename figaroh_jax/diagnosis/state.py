@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -33,6 +34,7 @@ __all__ = [
     "on_motion",
     "plain_rows",
     "solved",
+    "unit_slopes",
     "unit_torques",
     "whitened",
     "with_term",
@@ -70,7 +72,8 @@ class State:
         """Torque of what each recording is known to carry, N m or N."""
         if self.carried is None:
             return np.zeros((self.rigid.samples, self.rigid.nv))
-        each = np.split(np.arange(self.rigid.samples), len(self.carried))
+        count = self.rigid.samples // len(self.carried)
+        each = [slice(k * count, (k + 1) * count) for k in range(len(self.carried))]
         torques = [self.rigid.torque(ten.reshape(-1), rows) for ten, rows in zip(self.carried, each, strict=True)]
         return np.concatenate(torques)
 
@@ -210,19 +213,48 @@ def _choices(effect: Effect) -> list[str]:
 
 
 def _shaped_units(term: Effect, motion: Motion) -> Units:
-    """By the program of the refits: filled up to its batch."""
-    count, torques, size = len(term.at), [], batch_size(term)
+    """By the program of the refits."""
+    torque, _ = shaped_units(term, motion)
+    everywhere = np.tile(np.arange(np.shape(motion.velocity)[1]), (len(torque), 1))
+    return Units(torque, np.asarray(term.at) if local(term) else everywhere)
+
+
+def shaped_units(
+    term: Effect, motion: Motion
+) -> tuple[Float[np.ndarray, "effects k rows nN"], Float[np.ndarray, "effects p k rows nN"]]:
+    """`units_and_slopes` at the effects' own shapes, filled up to the batch of the refits."""
+    count, found, size = len(term.at), [], batch_size(term)
     for start in range(0, count, size):
         some = np.resize(np.arange(start, min(start + size, count)), size)
         part = jax.tree.map(lambda x, i=some: np.asarray(x)[i], term)
         values = np.stack([getattr(part, name) for name in shapes(type(term))], axis=1)
-        torques.append(units_and_slopes(part, values, motion)[0])
-    everywhere = np.tile(np.arange(np.shape(motion.velocity)[1]), (count, 1))
-    joints = np.asarray(term.at) if local(term) else everywhere
-    return Units(np.concatenate(torques)[:count], joints)
+        found.append(units_and_slopes(part, values, motion))
+    torque, slope = (np.concatenate(x)[:count] for x in zip(*found, strict=True))
+    return torque, slope
+
+
+def unit_slopes(problem: Problem, state: State, effect: Effect, motion: Motion) -> Float[np.ndarray, "p k rows nN"]:
+    """Derivatives of the unit torques of one effect in its shapes, `motion` being what it follows."""
+    term = batched(effect)
+    if effect.follows_torque:
+        return shaped_units(term, motion)[1][0]
+    return problem.kept(
+        (unit_slopes, *_identity(term)), state.measured, lambda: shaped_units(term, motion)[1][0].copy()
+    )
+
+
+def _identity(term: Effect) -> tuple[Any, ...]:
+    """What tells the columns of a term from those of others, the motion being the same."""
+    return type(term), *((name, np.asarray(getattr(term, name)).tobytes()) for name in ("at", *_choices(term)))
 
 
 def _term_columns(problem: Problem, state: State, term: Effect) -> Part:
+    if family_of(type(term)) in ("fixed", "shaped"):
+        return problem.kept(_identity(term), state.measured, lambda: _columns(problem, state, term))
+    return _columns(problem, state, term)
+
+
+def _columns(problem: Problem, state: State, term: Effect) -> Part:
     given = unit_torques(problem, state, term)
     columns = np.zeros((problem.model.nv, *given.torque.shape[:2], given.torque.shape[3]))
     for one, joints in enumerate(given.joints):
