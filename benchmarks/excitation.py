@@ -9,11 +9,13 @@ wheel, so it does not run here.
 from __future__ import annotations
 
 import argparse
+import inspect
 import itertools
 import os
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -127,7 +129,7 @@ TOUCHING = {  # pairs that are nearer than 20 mm by their construction
 }
 
 
-def clearance() -> None:
+def clearance(seed: int | None = None) -> None:
     """All limits, 20 mm between all bodies and the floor, 10 s; one start, three seeds; meshes by coal afterwards."""
     from figaroh_jax.excitation.clearance import clearance_of
     from figaroh_jax.excitation.design import excite
@@ -148,10 +150,10 @@ def clearance() -> None:
         kept = clearance_of(model, shapes, margin=0.02, ignore=TOUCHING[name], floor=-0.05)
         learned, bounds = learn(model, trust=None), limits_of(model, acceleration=8.0, clearance=kept)
         for basis in (fourier(5, 0.1, 10.0), spline(9, 10.0)):
-            for seed in range(3):
+            for k in range(3) if seed is None else [seed]:
                 since = time.process_time()
-                found = excite(model, basis, bounds, learned, starts=1, seed=seed)
-                told(f"{name} {basis.kind} seed {seed}", found, spent(since))
+                found = excite(model, basis, bounds, learned, starts=1, seed=k)
+                told(f"{name} {basis.kind} seed {k}", found, spent(since))
                 q = np.asarray(found.stages[0].motion.at(np.arange(0, 10, 0.2))[0])
                 near = kept.exact_distances(q, kept.pairs)
                 if near is not None:
@@ -320,7 +322,7 @@ PAIRS = {
 }
 
 
-def separation() -> None:
+def separation(names: Sequence[str] = tuple(PAIRS), seed: int = 0, starts: int = 2) -> None:
     """Pairs of causes at the UR10e's elbow, 10 s: sigmas of random, D-optimal and designed motions, the worse way."""
     from figaroh_jax.excitation.design import excite, gram_of, random_motion
     from figaroh_jax.excitation.information import learn
@@ -344,7 +346,7 @@ def separation() -> None:
     )
     states = [problem.states(random_motion(problem, np.random.default_rng(k))) for k in range(11)]
     most = excite(model, basis, bounds, learned, starts=2).stages[0].motion.states(20.0)
-    for name, pair in PAIRS.items():
+    for name, pair in ((name, PAIRS[name]) for name in names):
         given = causes(learned, [pair], states[0])
 
         def worse(motion: Any, given: Any = given) -> float:
@@ -352,7 +354,7 @@ def separation() -> None:
             return min(one.sigmas for one in separated(given, G, np.asarray(learned.prior)))
 
         since = time.process_time()
-        found = excite(model, basis, bounds, learned, objective="separate", separate=[pair], starts=2)
+        found = excite(model, basis, bounds, learned, objective="separate", separate=[pair], starts=starts, seed=seed)
         cpu = spent(since)
         usual = np.median([worse(motion) for motion in states])
         one = min(found.separated, key=lambda one: one.sigmas)
@@ -362,7 +364,7 @@ def separation() -> None:
         )
 
 
-def chooser(draws: int = 100, names: tuple[str, ...] = tuple(PAIRS)) -> None:
+def chooser(draws: int = 100, names: Sequence[str] = tuple(PAIRS), seed: int = 0, starts: int = 3) -> None:
     """Four pairs of causes at the UR10e's elbow, 10 s, 20 harmonics: 100 simulated runs with either as the truth.
 
     Torques are Pinocchio's; each run has its own link errors (10 % of the inertias), noise of 1 % of the largest torque
@@ -378,7 +380,8 @@ def chooser(draws: int = 100, names: tuple[str, ...] = tuple(PAIRS)) -> None:
     learned, bounds, basis = learn(model), limits_of(model, acceleration=8.0), fourier(20, 0.1, 10.0)
     for name, pair in ((name, PAIRS[name]) for name in names):
         since = time.process_time()
-        found = excite(model, basis, bounds, learned, objective="separate", separate=[pair], starts=3, rate=50.0)
+        options = {"starts": starts, "rate": 50.0, "seed": seed}
+        found = excite(model, basis, bounds, learned, objective="separate", separate=[pair], **options)
         cpu = spent(since)
         runs = _Runs(model, learned, found.stages[0].motion, pair)
         said = []
@@ -527,7 +530,7 @@ def _best(fits: list[_Fit], y: np.ndarray, repeats: int) -> tuple[float, float]:
 POSTURE = [0.0, -1.2, 1.0, -0.5, 0.3, 0.0]
 
 
-def pays(draws: int = 60) -> None:
+def pays(draws: int = 60, seed: int = 0, starts: int = 8) -> None:
     """Simulated identifications on FIGAROH's problem with friction: error of the torque predicted on unseen motions.
 
     The truth is Pinocchio's, with Coulomb and viscous friction, 30 % more Coulomb friction at rest (Stribeck), torque
@@ -565,8 +568,12 @@ def pays(draws: int = 60) -> None:
         friction = np.concatenate([np.eye(6) * v[:, None], np.eye(6) * np.tanh(v / 0.03)[:, None]], axis=2)
         return np.concatenate([np.asarray(robot.joint_torque_regressor(q, v, a)), friction], axis=2)[:, :, kept]
 
-    def error(states: np.ndarray, stribeck: float, encoder: float) -> float:
-        squares = []
+    def error(states: np.ndarray, stribeck: float, encoder: float) -> tuple[float, float]:
+        """RMS error on the unseen motions, sigmas, and the share of 95 % intervals that hold the true parameter."""
+        squares, held = [], []
+        clean = (rows(states) / sigma[:, None]).reshape(-1, len(kept))
+        scale = np.linalg.norm(clean, axis=0)
+        true = np.linalg.lstsq(clean / scale, (torque(states, 0.0) / sigma).ravel(), rcond=None)[0]
         for k in range(draws):
             noise = np.random.default_rng([11, k])
             read = states + np.array([encoder, 0, 0])[:, None, None] * noise.standard_normal(states.shape)
@@ -574,13 +581,16 @@ def pays(draws: int = 60) -> None:
             A = (rows(read) / sigma[:, None]).reshape(-1, len(kept))
             size = np.linalg.norm(A, axis=0)
             fit = np.linalg.lstsq(A / size, (y / sigma).ravel(), rcond=None)[0] / size
+            left = (y / sigma).ravel() - A @ fit
+            spread = np.linalg.inv((A / scale).T @ (A / scale)) * (left @ left) / (len(left) - len(kept))
+            held.append(np.mean(np.abs(fit * scale - true) < 1.96 * np.sqrt(np.diag(spread))))
             for motion, (W, truth) in zip(unseen, tests[stribeck], strict=True):
                 squares.append((((W @ fit - truth) / sigma) ** 2).mean() if motion is not None else 0.0)
-        return float(np.sqrt(np.mean(squares)))
+        return float(np.sqrt(np.mean(squares))), float(np.mean(held))
 
     tests = {s: [(rows(motion), torque(motion, s)) for motion in unseen] for s in (0.0, 0.3)}
     seen = [tuple(motion) for motion in randoms]  # motions of the kind that matters, none of them judged on
-    same = {"start": POSTURE, "starts": 8}
+    same = {"start": POSTURE, "starts": starts, "seed": seed}
     designs = {
         "condition": excite(model, basis, bounds, plain, objective="condition", **same),
         "information": excite(model, basis, bounds, learned, **same),
@@ -588,12 +598,13 @@ def pays(draws: int = 60) -> None:
     }
     motions = {name: np.stack(found.stages[0].motion.states(20.0)) for name, found in designs.items()}
     kinds = {"noise": (0.0, 0.0), "+ Stribeck": (0.3, 0.0), "+ encoder": (0.0, 2e-3)}
-    table = {"random, median": [np.median([error(m, *k) for m in randoms[:7]]) for k in kinds.values()]}
+    table = {"random, median": [np.median([error(m, *k) for m in randoms[:7]], axis=0) for k in kinds.values()]}
     table |= {name: [error(m, *k) for k in kinds.values()] for name, m in motions.items()}
     print(f"condition number of the condition design in FIGAROH's columns: {designs['condition'].condition:.2f}")
     for name, values in table.items():
         cells = (
-            f"{key} {x:.3f} ({x / y - 1:+.0%})" for key, x, y in zip(kinds, values, table["condition"], strict=True)
+            f"{key} {x:.3f} ({x / y - 1:+.0%}), covered {held:.3f}"
+            for key, (x, held), (y, _) in zip(kinds, values, table["condition"], strict=True)
         )
         print(f"{name:16s} {'  '.join(cells)}")
 
@@ -773,6 +784,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("parts", nargs="*", choices=[[], *PARTS], help=f"default: all of {', '.join(PARTS)}")
     parser.add_argument("--cold", action="store_true", help="one start in a fresh process, programs compiled")
+    parser.add_argument("--seed", type=int, help="of the random starts, where a part takes one")
+    parser.add_argument("--starts", type=int, help="random starts, where a part takes them")
+    parser.add_argument("--names", nargs="+", choices=list(PAIRS), help="pairs of causes, where a part takes them")
     args = parser.parse_args()
     if args.cold:
         told("one start, cold", *on_peer_problem(1))
@@ -780,7 +794,8 @@ def main() -> None:
         return
     for part in args.parts or [name for name in PARTS if name != "gpu"]:
         print(f"== {part}")
-        PARTS[part]()
+        wanted = {name: getattr(args, name) for name in inspect.signature(PARTS[part]).parameters if name in args}
+        PARTS[part](**{name: value for name, value in wanted.items() if value is not None})
 
 
 if __name__ == "__main__":

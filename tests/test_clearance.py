@@ -11,6 +11,7 @@ import robots
 
 from figaroh_jax.cli import main
 from figaroh_jax.errors import InputError
+from figaroh_jax.excitation.certified import nearest_approaches
 from figaroh_jax.excitation.clearance import Box, Capsule, clearance_of, enclosing_capsule, link_poses
 from figaroh_jax.excitation.limits import checked, limits_of
 from figaroh_jax.excitation.motions import Trajectory, fourier
@@ -234,3 +235,21 @@ def test_the_view_draws_the_robot_and_the_capsules_that_were_kept_apart(arm: Rob
     t = np.clip((points - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
     away = np.linalg.norm(points - start - t[:, None] * (end - start), axis=1)
     np.testing.assert_allclose(away, BODIES[3].radius, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_distance_is_kept_between_samples_too_or_known_not_to_be(arm: RobotModel, seed: int):
+    """A motion at 30 rad/s whose least distance no sample of 100 Hz shows; the truth by samples of 10 kHz."""
+    basis, generator = fourier(5, 2.0, 0.5), np.random.default_rng(seed)
+    motion = Trajectory(0.3 * generator.normal(size=3), 0.5 * generator.normal(size=(3, basis.size)), basis)
+    every = clearance_of(arm, margin=0.01, bodies=BODIES, floor=-1.5, boxes=[BOX])
+    fine, coarse = (every.capsule_distances(np.asarray(motion.states(rate)[0])) for rate in (10000.0, 100.0))
+    names = [one.bodies for one in nearest_approaches(every, motion, 0.0)]
+    least, shown = dict(zip(every.rows.names, fine.min(0), strict=True)), coarse.min(0)
+    assert names == every.rows.names and (shown > fine.min(0) + 1e-6).any()
+    for share, kept in ((1 - 1e-3, True), (1 + 1e-3, False)):
+        for k, name in enumerate(names):
+            if least[name] > 0.01:
+                told = nearest_approaches(every, motion, share * least[name])[k]
+                assert told.kept == kept, (name, told, least[name])
+                assert told.distance >= least[name] - 1e-9

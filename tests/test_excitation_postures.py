@@ -17,6 +17,7 @@ from figaroh_jax.errors import InputError
 from figaroh_jax.excitation import postures
 from figaroh_jax.excitation.clearance import Capsule, clearance_of
 from figaroh_jax.excitation.postures import Instrument, View, excite_postures
+from figaroh_jax.excitation.touch import Touch
 from figaroh_jax.rigid.model import RobotModel
 
 LIMIT = '<limit lower="-2" upper="2" velocity="3" effort="40"/>'
@@ -27,6 +28,15 @@ WRIST = robots.robot(
     robots.joint("roll", "b", "c", axis="1 0 0", more=LIMIT),
 )
 DEVICE = Instrument("pose", "base", "c")
+LONG = robots.robot(
+    *robots.LINKS,
+    robots.link("e", 0.3),
+    robots.joint("j0", "base", "a", axis="0 0 1", more=LIMIT),
+    robots.joint("j1", "a", "b", axis="0 1 0", more=LIMIT),
+    robots.joint("j2", "b", "c", axis="0 1 0", more=LIMIT),
+    robots.joint("j3", "c", "d", axis="1 0 0", more=LIMIT),
+    robots.joint("j4", "d", "e", axis="0 0 1", more=LIMIT),
+)
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +119,7 @@ def test_designed_postures_are_seen_and_clear(arm: RobotModel, mount: Literal["h
     column = np.linspace(0, 0.2, 41)[:, None] * np.array([0, 0, 1.0])
     apart = np.linalg.norm(ends[:, :, None] - column, axis=3).min(axis=(1, 2)) - 0.15
     assert (apart >= 0.1 - 1e-6).all()
-    with pytest.raises(InputError, match="0 of .* random postures are seen by the device and clear"):
+    with pytest.raises(InputError, match="0 of .* random postures are seen by the device and are clear"):
         excite_postures(arm, Instrument("pose", "base", "c", view=View((9.0, 9.0, 9.0), far=1.0)), count=10)
 
 
@@ -139,7 +149,10 @@ def test_the_command_writes_postures_with_their_share_of_the_bound(tmp_path: Pat
     ("block", "message"),
     [
         ("{kind: postures}", "excite.measurement is missing"),
-        ("{kind: postures, measurement: {plane: n, tool_frame: c}}", "postures that touch a plane are where it is"),
+        (
+            "{kind: postures, measurement: {plane: n, tool_frame: c}}",
+            "postures that touch a plane need its place and axis",
+        ),
         ("{kind: postures, measurement: {pose: p, tool_frame: d}}", "has no frame 'd'"),
         ("{kind: postures, postures: 2, measurement: {pose: p, tool_frame: c}}", "2 postures cannot tell"),
         ("{kind: postures, measurement: {pose: p, base_frame: c, tool_frame: c}}", "no joint moves tool_frame"),
@@ -153,3 +166,61 @@ def test_what_cannot_be_chosen_is_one_message(tmp_path: Path, block: str, messag
     (tmp_path / "task.yaml").write_text(f"robot: {{model: robot.urdf}}\nexcite: {block}\n")
     with pytest.raises(InputError, match=message):
         excite_task(load_task(tmp_path / "task.yaml"))
+
+
+@pytest.mark.parametrize("kind", ["plane", "socket"])
+def test_designed_postures_touch_what_they_are_measured_with(tmp_path: Path, kind: Literal["plane", "socket"]):
+    """Points by Pinocchio's poses; the information is that of differences of what a touch measures."""
+    arm, point = robots.load(LONG, tmp_path), np.array([0.02, 0.0, 0.1])
+    ends = reference.forward_kinematics(arm, np.array([[0.3, 0.4, 0.2, 0.1, 0], [-0.8, 0.9, -0.5, 0.3, 0]]))[:, 4]
+    at = [tuple((end[:3, :3] @ point + end[:3, 3]).tolist()) for end in ends]
+    places = [Touch(at[0], (0, 0, 1), 0.4), Touch(at[1], (0, -1, 0.2), 0.4)] if kind == "plane" else [*map(Touch, at)]
+    device = Instrument(kind, "base", "e", ("tool_frame",), touched=tuple(places), point=tuple(point.tolist()))
+    found = excite_postures(arm, device, count=12, candidates=100, level="joint_offset")
+    assert found.logdet >= found.chosen_logdet - 1e-6 and found.random_logdet < found.chosen_logdet
+    pose = np.asarray(reference.forward_kinematics(arm, found.position))[:, 4]
+    at = pose[:, :3, :3] @ point + pose[:, :3, 3]
+    low, high = np.array(arm.position_limit).T
+    assert (found.position >= low - 1e-9).all() and (found.position <= high + 1e-9).all()
+    away = at[:, None] - np.array([one.place for one in places])
+    if kind == "plane":
+        normal = np.array([np.array(one.axis) / np.linalg.norm(np.array(one.axis)) for one in places])
+        off = np.abs((away * normal).sum(2))
+        assert (np.linalg.norm(away, axis=2)[np.arange(12), off.argmin(1)] <= 0.4 + 1e-6).all()
+    else:
+        off = np.abs(away).max(2)
+    assert (off.min(axis=1) < 1e-5).all()
+    assert set(off.argmin(axis=1).tolist()) == {0, 1}
+
+
+def test_postures_for_a_device_of_ones_own_are_those_of_its_function(arm: RobotModel):
+    """A wire from an eyelet: its slope by a joint's offset is that of Pinocchio's distances."""
+    import jax.numpy as jnp
+
+    from figaroh_jax.recordings.devices import own_device
+
+    eyelet = np.array([0.9, 0.4, 0.7])
+    unknowns = {f"eyelet {axis}": (float(x), "m", 0.01) for axis, x in zip("xyz", eyelet, strict=True)}
+    wire = own_device(lambda pose, at, length: jnp.linalg.norm(pose[:3, 3] - at)[None] - length, unknowns)
+
+    def lengths(poses: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(poses[:, :3, 3] - eyelet, axis=1)
+
+    device = Instrument("own", "base", "c", accuracy=(2e-4, 1e-3), device=wire, seen=lengths)
+    found = excite_postures(arm, device, count=10, candidates=60, level="joint_offset")
+    names = [one.name for one in found.parameters]
+    assert found.random_logdet < found.chosen_logdet <= found.bound + 1e-9 and "eyelet x" in names
+
+    def measured(q: np.ndarray) -> np.ndarray:
+        return lengths(np.asarray(reference.forward_kinematics(arm, q))[:, 2])
+
+    h, columns = 1e-6, []
+    for name in names:
+        if name.startswith("joint_offset"):
+            step = h * np.eye(3)[["turn", "bend", "roll"].index(name.split()[1])]
+            columns.append((measured(found.position + step) - measured(found.position - step)) / (2 * h))
+        else:
+            way = np.asarray(reference.forward_kinematics(arm, found.position))[:, 2, :3, 3] - eyelet
+            columns.append(-(way / np.linalg.norm(way, axis=1, keepdims=True))[:, "xyz".index(name[-1])])
+    J = np.stack(columns, 1) / 2e-4
+    assert np.linalg.slogdet(J.T @ J)[1] == pytest.approx(found.logdet, abs=1e-3)

@@ -15,6 +15,7 @@ __all__ = [
     "Ground",
     "Hypothesis",
     "Verdicts",
+    "coefficients",
     "fold_sums",
     "ground",
     "grown_sums",
@@ -97,6 +98,12 @@ def grown_sums(rows: Rows, known: FoldSums, X: Float[np.ndarray, "nv T P"]) -> F
         gram[fold, :, P:], gram[fold, P:, :P] = cross, cross[:P].T
         moment[fold, P:] = tall[:, P:].T @ rows.y[:, own].reshape(-1)
     return FoldSums(gram, moment, known.square)
+
+
+def coefficients(sums: FoldSums, prior: Prior) -> Float[np.ndarray, " P"]:
+    """The fit to all rows."""
+    gram, moment, square = (part.sum(0) for part in sums)
+    return _solve(gram, moment, square, prior)[0]
 
 
 def judge(rows: Rows, hypothesis: Hypothesis, known: FoldSums | None = None) -> Verdicts:

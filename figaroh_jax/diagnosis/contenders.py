@@ -14,7 +14,7 @@ from ..estimation.priors import physical_body
 from ..estimation.rows import Rows
 from ..results import Name
 from .comparison import Ground, Hypothesis, Verdicts, judge, judge_grown
-from .design import kind, shapes, with_shape
+from .design import BATCH, kind, shapes, with_shape
 from .estimates import torque_slope
 from .problem import Problem
 from .refit import Whitened, refit, refit_shift
@@ -26,7 +26,6 @@ from .thresholds import BEST_OF_A_PLACE, GAIN, SHARE_OF_BEST, SHIFTS, SHORTLIST
 __all__ = ["Contender", "acting", "contend", "for_refit", "shortlist"]
 
 TURNS, RESPONSE_TURNS = 3, 6  # of Gauss-Newton on a shift of the position; on a response of the torque
-STARTS = 4  # of a refit
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ def _exact_columns(
     """The effect with the shape that fits best, and its whitened columns."""
     if not shapes(type(group.effect)):
         return jax.tree.map(lambda x: x[order[0]], group.effect), group.columns.Z[order[0]]
-    starts = np.resize(order, STARTS)
+    starts = np.resize(order, BATCH)
     effects = jax.tree.map(lambda x: x[starts], group.effect)
     effect, Z = refit(effects, step.state.motion, problem.records, ready, group.effect)
     return effect, Z.reshape(*Z.shape[:2], -1)

@@ -20,11 +20,12 @@ from ..formats.collision import Shape, enclosed_points, rotation
 from ..rigid.kinematics import ancestors
 from ..rigid.model import RobotModel
 
-__all__ = ["Box", "Capsule", "Clearance", "clearance_of", "enclosing_capsule", "link_poses"]
+__all__ = ["Box", "Capsule", "Clearance", "clearance_of", "enclosing_capsule", "farthest", "link_poses"]
 
 LOOKED = 400  # random postures in which pairs are looked at
 SELDOM = 0.10  # share of them in which a pair must be clear
 OFTEN = 0.10  # share of random postures in which capsules are too near: it pays to know how much the meshes leave
+FITTED, SURE = 30, 0.98  # instants of a motion in which its shapes are looked at, and the share of the least gap there
 SEEN = 80  # postures in which these are looked at
 FEW = 2  # shapes of a link that get a capsule each; of more than these, one goes around all
 STILL = 1e-6  # m: a distance that changes less is none of a motion's
@@ -102,6 +103,29 @@ class Clearance:
         The slack of a pair is added, so its distance is an estimate, which the meshes have to confirm in the end.
         """
         return self.rows.near(link_poses(self.model, q))[0]
+
+    def capsule_distances(self, q: Float[np.ndarray, "samples nv"]) -> Float[np.ndarray, "samples rows"]:
+        """The same without slack: never above the distances of the shapes, m."""
+        distance = self.distances(q)
+        distance[:, : len(self.rows.slack)] -= self.rows.slack
+        return distance
+
+    def fitted(self, q: Float[np.ndarray, "samples nv"]) -> Clearance:
+        """With the slack of each pair that its shapes leave in a motion, where its capsules alone are too near."""
+        if self.mesh_distance is None or not self.pairs:
+            return self
+        slack, own = list(self.slack or [0.0] * len(self.pairs)), self.capsule_distances(q)
+        for k, pair in enumerate(self.pairs):
+            near = own[:, : len(self.rows.pair)][:, self.rows.pair == k].min(axis=1)
+            close = np.flatnonzero(near < self.margin)
+            if not len(close):
+                continue
+            some = np.unique(np.append(close[:: max(1, len(close) // FITTED)], near.argmin()))
+            exact = self.exact_distances(q[some], [pair])
+            assert exact is not None
+            counts = exact[:, 0] <= max(2 * self.margin, float(exact.min()))
+            slack[k] = SURE * max(0.0, float((exact[:, 0] - near[some])[counts].min()))
+        return replace(self, slack=tuple(slack))
 
     def with_gradient(
         self, q: Float[np.ndarray, "samples nv"]
@@ -417,6 +441,12 @@ def _capsules(shapes: Sequence[Shape]) -> list[tuple[np.ndarray, np.ndarray, flo
     whole = [(enclosed_points(shape), shape) for shape in shapes]
     round_ones = ("sphere", "capsule")
     return [(x[0], x[1], s.size[0]) if s.kind in round_ones else enclosing_capsule(x) for x, s in whole]
+
+
+def farthest(link: _Link) -> float:
+    """Distance of the farthest point of a link, of its capsules and of its shapes, from its frame's origin, m."""
+    ends = [np.linalg.norm(x, axis=1) + link.radius for x in (link.start, link.end)]
+    return max(float(x.max()) for x in [*ends, *(np.linalg.norm(_hull(shape), axis=1) for shape in link.shapes)])
 
 
 def _hull(shape: Shape) -> Float[np.ndarray, "n 3"]:

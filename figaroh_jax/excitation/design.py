@@ -14,6 +14,7 @@ from ..effects.base import Effect
 from ..effects.extended import ExtendedModel
 from ..errors import InputError
 from ..rigid.model import RobotModel
+from .clearance import Clearance
 from .information import Learned, learn
 from .limits import ALLOWED, Limits, Torque, Use, checked, limits_of, unmeetable
 from .motions import Basis, Trajectory
@@ -27,10 +28,11 @@ __all__ = ["Cause", "Design", "Stage", "best_motion", "excite", "random_motion"]
 TIGHTENED = 3  # times that a motion is designed again with a margin
 SCREENED = 8  # random motions, the best of which a start improves
 WAVE, OVER = 8, 4  # samples of a wave, rows of a column: enough to look for a motion, which all samples then improve
-TRIED = 400  # random postures in which a motion may begin
+TRIED, ROOMY = 400, 3  # random postures in which a motion may begin; one of so many that are clear does
 CHECKED = 8  # motions, the best first, until one is feasible at 1 kHz
 ROUNDING = 1e-6  # of a limit
 CLEAR_RATE = 40.0  # Hz at which a random motion touches nothing: what begins on the wrong side of a body stays there
+SMALLER = (1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05, 0.02)  # shares of a random motion that are tried for that
 STEP = 0.98  # by which a motion is made smaller until it meets its limits
 
 Objective = Literal["information", "prediction", "condition", "separate"]
@@ -47,6 +49,7 @@ class Stage:
     logdet: float  # of the information of this motion, all before it, and the prior
     starts: tuple[float, ...]  # objective that each start reached
     evaluations: int
+    clearance: Clearance | None = None  # the limits' own, its capsules fitted to the shapes in this motion
 
     @property
     def met(self) -> bool:
@@ -260,7 +263,7 @@ def _objectives(
     if objective == "prediction":
         assert wanted is not None
         own = prediction_objective(prior, wanted)
-        return (information_objective(prior), own), (own,)
+        return ((information_objective(prior), own),)  # what tells nothing has no slope that leads anywhere
     if objective == "separate":
         assert given is not None and seen is not None
         apart = separation_objective(given, np.asarray(given.prior))
@@ -283,17 +286,19 @@ def _leading(objective: GramObjective, size: int) -> GramObjective:
 
 
 def _free_start(limits: Limits, nv: int, generator: np.random.Generator) -> Float[np.ndarray, " nv"]:
-    """A random posture in the middle half of the range, clear of everything where that is asked for."""
+    """A random posture in the middle half of the range; where distances count, one of those that leave most room."""
     reach = np.where(np.isfinite(limits.reach), limits.reach, np.pi)
     clearance = limits.clearance
     if clearance is None or not _distances_count(limits):
         return limits.middle + 0.5 * reach * generator.uniform(-1, 1, nv)
     tried = limits.middle + 0.5 * reach * generator.uniform(-1, 1, (TRIED, nv))
     near = clearance.distances(tried)
-    clear = np.flatnonzero(near.min(axis=1) >= clearance.margin)
+    least = near.min(axis=1)
+    clear = np.flatnonzero(least >= clearance.margin)
     if len(clear):
-        return tried[clear[0]]
-    best = int(near.min(axis=1).argmax())
+        roomy = clear[np.argsort(-least[clear])][: max(1, len(clear) // ROOMY)]
+        return tried[generator.choice(roomy)]
+    best = int(least.argmax())
     raise InputError(
         f"limits.clearance: none of {TRIED} postures keeps {clearance.margin:g} m; in the best of them"
         f" {clearance.name(int(near[best].argmin()))} are {near[best].min():.3f} m apart. Lower the margin, or give a"
@@ -319,12 +324,14 @@ def random_motion(problem: Problem, generator: np.random.Generator, amplitude: f
             room = np.where(moved > 0, 1 - still[kind], 1 + still[kind]) / np.abs(moved)
         scale = np.minimum(scale, np.nanmin(np.where(np.abs(moved) > 0, room, np.inf), axis=0))
     scale = amplitude * np.where(np.isfinite(scale), scale, 1.0)
-    for smaller in (1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1) if _distances_count(limits) else ():
+    if not _distances_count(limits):
+        return problem.numbers(Trajectory(start, weights * scale[:, None], problem.basis))
+    assert limits.clearance is not None
+    for smaller in SMALLER:
         motion = Trajectory(start, weights * (smaller * scale)[:, None], problem.basis)
-        assert limits.clearance is not None
         if (limits.clearance.distances(np.asarray(motion.states(CLEAR_RATE)[0])) > 0).all():
-            return problem.numbers(motion)
-    return problem.numbers(Trajectory(start, weights * scale[:, None], problem.basis))
+            break
+    return problem.numbers(motion)
 
 
 def _distances_count(limits: Limits) -> bool:
@@ -361,17 +368,19 @@ def best_motion(
             x = solve(problem, x, penalty)
         found.append((problems[-1].value(x), x, penalty))
     reached = tuple(value for value, _, _ in found)
-    tried: list[tuple[bool, float, Trajectory, tuple[Use, ...]]] = []
+    tried: list[tuple[bool, float, Trajectory, tuple[Use, ...], Limits]] = []
     for _, x, penalty in sorted(found, key=lambda one: one[0])[:CHECKED]:
-        x = x if few is None else solve(final, x, penalty)
-        motion, uses = _feasible(torque, final, x, penalty)
+        own = _fitted(final, final.trajectory(x))
+        x = x if few is None else solve(own, x, penalty)
+        motion, uses, kept_limits = _feasible(torque, own, x, penalty)
         met = all(use.met for use in uses)
-        tried.append((not met, final.value(final.numbers(motion)), motion, uses))
+        tried.append((not met, final.value(final.numbers(motion)), motion, uses, kept_limits))
+        final.evaluations += own.evaluations
         if met:
             break
-    _, _, motion, uses = min(tried, key=lambda one: one[:2])
+    _, _, motion, uses, kept_limits = min(tried, key=lambda one: one[:2])
     evaluations = sum(problem.evaluations for way in (*made, [final]) for problem in way)
-    return Stage(motion, uses, np.nan, reached, evaluations)
+    return Stage(motion, uses, np.nan, reached, evaluations, kept_limits.clearance)
 
 
 def _few_samples(problem: Problem) -> int | None:
@@ -384,20 +393,27 @@ def _few_samples(problem: Problem) -> int | None:
 
 def _feasible(
     torque: Torque, problem: Problem, x: Float[np.ndarray, " n"], penalty: Penalty
-) -> tuple[Trajectory, tuple[Use, ...]]:
+) -> tuple[Trajectory, tuple[Use, ...], Limits]:
     """The motion of x, designed again with margins for what it exceeds at 1 kHz, at last made a little smaller."""
-    margin = penalty.margin
-    motion = problem.trajectory(x)
-    uses = checked(torque, problem.learned.robot, motion, problem.limits, meshes=False)
     for _ in range(TIGHTENED):
+        problem = _fitted(problem, problem.trajectory(x))
+        uses = checked(torque, problem.learned.robot, problem.trajectory(x), problem.limits, meshes=False)
         over = {use.kind: _excess(use) for use in uses if use.share > 1.0}
         if max(over.values(), default=0.0) < ALLOWED:
             break
-        margin = {kind: margin.get(kind, 0.0) + 1.2 * over.get(kind, 0.0) for kind in {*margin, *over}}
-        penalty.margin = margin
-        motion = problem.trajectory(solve(problem, problem.numbers(motion), penalty))
-        uses = checked(torque, problem.learned.robot, motion, problem.limits, meshes=False)
-    return _smaller(torque, problem, motion, uses)
+        margin = penalty.margin
+        penalty.margin = {kind: margin.get(kind, 0.0) + 1.2 * over.get(kind, 0.0) for kind in {*margin, *over}}
+        x = solve(problem, x, penalty)
+    return _smaller(torque, problem, problem.trajectory(x))
+
+
+def _fitted(problem: Problem, motion: Trajectory) -> Problem:
+    """The problem with distances of capsules as near to those of the shapes as this motion allows."""
+    limits = problem.limits
+    if limits.clearance is None or not _distances_count(limits):
+        return problem
+    q = np.asarray(motion.states(CLEAR_RATE)[0])
+    return replace(problem, limits=replace(limits, clearance=limits.clearance.fitted(q)))
 
 
 def _excess(use: Use) -> float:
@@ -405,17 +421,21 @@ def _excess(use: Use) -> float:
     return (use.limit - use.value) / NEAR if use.kind == "clearance" else use.share - 1.0
 
 
-def _smaller(
-    torque: Torque, problem: Problem, motion: Trajectory, uses: tuple[Use, ...]
-) -> tuple[Trajectory, tuple[Use, ...]]:
+def _smaller(torque: Torque, problem: Problem, motion: Trajectory) -> tuple[Trajectory, tuple[Use, ...], Limits]:
     """The motion shrunk towards its start until it meets its limits; as it was where standing still does not either."""
-    first, limits = (motion, uses), problem.limits
-    start = np.clip(motion.start, limits.position[:, 0], limits.position[:, 1])
+    robot, first = problem.learned.robot, None
+    start = np.clip(motion.start, problem.limits.position[:, 0], problem.limits.position[:, 1])
     for _ in range(100):
+        limits = _fitted(problem, motion).limits
+        uses = checked(torque, robot, motion, limits, meshes=False)
+        first = first or (motion, uses, limits)
         worst = max((use.share for use in uses), default=0.0)
+        if worst <= 1.0 + ROUNDING and limits.clearance is not None:
+            uses = checked(torque, robot, motion, limits)
+            worst = max((use.share for use in uses if not use.met), default=0.0)
         if worst <= 1.0 + ROUNDING:
-            return motion, checked(torque, problem.learned.robot, motion, limits)
+            return motion, uses, limits
         shrink = max(STEP, 1.0 / worst) if worst < 1.02 else STEP
         motion = Trajectory(start, np.asarray(motion.weights) * shrink, motion.basis)
-        uses = checked(torque, problem.learned.robot, motion, limits, meshes=False)
+    assert first is not None
     return first

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from ..errors import InputError, nearest
 from ..rigid.model import RobotModel
+from .certified import nearest_approaches
 from .clearance import Clearance
 from .motions import Trajectory
 
@@ -23,9 +24,8 @@ __all__ = ["ALLOWED", "CHECK_RATE", "KINDS", "Limits", "Torque", "Use", "checked
 KINDS = ("position", "velocity", "acceleration", "torque")
 CHECK_RATE = 1000.0  # Hz
 ALLOWED = 1e-3  # of a limit: what may be exceeded at 1 kHz
-_EXACT = 20  # samples of 1 kHz between two at which meshes are looked at
 _SKIPPED = 10  # samples of 1 kHz, between two that are always looked at
-_POSTURES = 512  # at which the torque of standing still is looked at
+_POSTURES, _FIRST = 512, 64  # at which the torque of standing still is looked at, and how many of them first
 
 # torques (samples, nv) of states (3, samples, nv)
 Torque = Callable[[Float[np.ndarray, "3 samples nv"]], Float[np.ndarray, "samples nv"]]
@@ -149,11 +149,12 @@ def unmeetable(torque: Torque, robot: RobotModel, limits: Limits, seed: int = 0)
     generator = np.random.default_rng(seed)
     low, high = (np.where(np.isfinite(x), x, end) for x, end in zip(limits.position.T, (-np.pi, np.pi), strict=True))
     q = generator.uniform(low, high, (_POSTURES, robot.nv))
-    held = np.abs(torque(np.stack([q, 0 * q, 0 * q]))) / limits.torque
-    best = int(held.max(axis=1).argmin())
+    for some in (q[:_FIRST], q):
+        held = np.abs(torque(np.stack([some, 0 * some, 0 * some]))) / limits.torque
+        best = int(held.max(axis=1).argmin())
+        if held[best].max() <= 1.0:
+            return None
     worst = int(held[best].argmax())
-    if held[best, worst] <= 1.0:
-        return None
     return (
         f"limits.torque: holding still takes {held[best, worst]:.2f} times the limit of '{robot.dof_names[worst]}'"
         f" ({limits.torque[worst]:g}) in the easiest of {_POSTURES} postures; no motion meets it"
@@ -166,7 +167,8 @@ def checked(
     """The largest use of each limit at 1 kHz; `torque` gives that of states (3, samples, nv), N m or N.
 
     Torques and distances are looked at 100 times a second, and at 1 kHz wherever what lies between two of these
-    instants could be larger than the largest of them. `meshes`: pairs of bodies that are left to their meshes too.
+    instants could be larger than the largest of them. `meshes`: distances by the shapes of the bodies where their
+    capsules are too near, and between samples too (`certified`).
     """
     time = motion.basis.instants(CHECK_RATE)
     states = np.stack([np.asarray(x) for x in motion.at(time)])
@@ -179,7 +181,7 @@ def checked(
         tau, at = _looked(lambda k: torque(states[:, k]), lambda x: np.abs(x) / limits.torque, len(time))
         uses.append(_largest("torque", robot, limits, np.abs(tau) / limits.torque, time[at], tau))
     if limits.clearance is not None:
-        uses += _distances(limits.clearance, states[0], time, meshes)
+        uses += _distances(limits.clearance, motion, states[0], time, meshes)
     return tuple(uses)
 
 
@@ -210,34 +212,23 @@ def _looked(
     return np.concatenate([first, values(fine)]), np.concatenate([coarse, fine])
 
 
-def _distances(clearance: Clearance, q: Float[np.ndarray, "samples nv"], time: np.ndarray, meshes: bool) -> list[Use]:
-    """The nearest two bodies: by their capsules, and by their meshes where these are counted on."""
+def _distances(clearance: Clearance, motion: Trajectory, q: np.ndarray, time: np.ndarray, shapes: bool) -> list[Use]:
+    """The nearest two bodies at 1 kHz, by their capsules; with their shapes, at every instant between too."""
     margin, rows, uses = clearance.margin, clearance.rows, []
-    if rows.names:
-        near, at = _looked(lambda k: clearance.distances(q[k]), lambda d: -d, len(time))
+    told = nearest_approaches(clearance, motion, (1.0 - ALLOWED) * margin) if shapes else []
+    exact = {row for one in told if one.exact for row in np.flatnonzero(rows.pair == one.row).tolist()}
+    own = np.array([row for row in range(len(rows.names)) if row not in exact], int)
+    if len(own):
+        distances = clearance.capsule_distances if shapes else clearance.distances
+        near, at = _looked(lambda k: distances(q[k])[:, own], lambda d: -d, len(time))
         s, row = (int(k) for k in np.unravel_index(int(np.argmin(near)), near.shape))
-        uses.append(_nearness(clearance.name(row), float(near[s, row]), float(time[at[s]]), margin))
-    if not meshes:
-        return uses
-    for pair, some in [*_unsure(clearance, q), *((p, np.arange(0, len(q), _EXACT)) for p in clearance.exact)]:
-        exact = clearance.exact_distances(q[some], [pair])
-        assert exact is not None, "meshes are counted on where they can be looked at alone"
-        s, name = int(np.argmin(exact)), " - ".join(clearance.links[k].name for k in pair)
-        uses.append(_nearness(f"{name} (meshes)", float(exact[s, 0]), float(time[some[s]]), margin))
+        uses.append(_nearness(clearance.name(own[row]), float(near[s, row]), float(time[at[s]]), margin))
+    for one in told:
+        if one.exact or not one.kept:
+            name = f"{one.bodies} (meshes)" if one.exact else one.bodies
+            distance = one.distance if one.kept else min(one.distance, (1.0 - 2 * ALLOWED) * margin)
+            uses.append(_nearness(name, distance, one.time, margin))
     return uses
-
-
-def _unsure(clearance: Clearance, q: Float[np.ndarray, "samples nv"]) -> list[tuple[tuple[int, int], np.ndarray]]:
-    """Pairs whose capsules alone do not keep the margin, and the samples at which they do not (100 a second)."""
-    rows, out = clearance.rows, []
-    if not len(rows.slack) or not rows.slack.any():
-        return out
-    some = np.arange(0, len(q), _SKIPPED)
-    own = clearance.distances(q[some])[:, : len(rows.slack)] - rows.slack
-    for k, pair in enumerate(clearance.pairs):
-        near = (own[:, rows.pair == k] < clearance.margin).any(axis=1)
-        out += [(pair, some[near])] if near.any() and rows.slack[rows.pair == k].any() else []
-    return out
 
 
 def _nearness(bodies: str, distance: float, time: float, margin: float) -> Use:

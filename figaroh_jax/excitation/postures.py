@@ -10,7 +10,7 @@ any weights $0 \le w_i \le 1$ that add up to n: f is concave, and that is its ta
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -25,10 +25,11 @@ from ..errors import InputError
 from ..estimation import posefit
 from ..estimation.posegroups import Measured, assemble, postures_of
 from ..recordings.arrays import postures as recorded
+from ..recordings.devices import POSITION, Device, Planes, Sockets
 from ..rigid.chain import chain_between
-from ..rigid.kinematics import forward_kinematics
 from ..rigid.model import RobotModel
 from .clearance import Clearance, link_poses
+from .touch import Touch, Touching
 
 __all__ = [
     "Instrument",
@@ -92,14 +93,22 @@ class View:
 
 @dataclass(frozen=True)
 class Instrument:
-    """What measures the postures: as in the `measurement` of a task."""
+    """What measures the postures: as in the `measurement` of a task.
 
-    kind: Literal["pose", "position"]
+    `touched`: the planes or sockets, and `point` the tool point that touches them. Kind "own": a `device` of your own
+    (`own_device`), and `seen`, which gives what it measures of poses (n, 4, 4) of the tool in the base frame.
+    """
+
+    kind: Literal["pose", "position", "plane", "socket", "own"]
     base_frame: str
     tool_frame: str
     unknown: tuple[str, ...] = ("base_frame", "tool_frame")
     accuracy: tuple[float, float] = ACCURACY  # one sigma, m and rad
     view: View | None = None  # None: everything is seen
+    touched: tuple[Touch, ...] = ()
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, in the tool frame
+    device: Device | None = None
+    seen: Callable[[Float[np.ndarray, "n 4 4"]], Any] | None = None
 
 
 class _Parameter(NamedTuple):
@@ -144,11 +153,42 @@ class PostureDesign:
         return float(np.exp((logdet - self.bound) / len(self.parameters)))
 
 
+def tool_poses(
+    model: RobotModel, instrument: Instrument, q: Float[np.ndarray, "postures nv"]
+) -> Float[np.ndarray, "postures 4 4"]:
+    """Poses of the tool frame in the base frame."""
+    poses = np.moveaxis(link_poses(model, q), 3, 0)
+    world = np.concatenate([np.broadcast_to(np.eye(4), (len(q), 1, 4, 4)), poses], axis=1)
+    base, tool = (
+        world[:, model.frames[k].parent + 1] @ np.asarray(model.frame_placement)[k]
+        for k in (model.frame_index(instrument.base_frame), model.frame_index(instrument.tool_frame))
+    )
+    return np.linalg.solve(base, tool)
+
+
+def touching_of(model: RobotModel, instrument: Instrument) -> Touching | None:
+    """What keeps postures at planes or sockets; None for a device that only looks."""
+    if instrument.kind not in ("plane", "socket"):
+        return None
+    plane = instrument.kind == "plane"
+    if not instrument.touched or (plane and any(one.axis is None for one in instrument.touched)):
+        need = "place and axis (the normal)" if plane else "place"
+        raise InputError(f"excite.touch: postures that touch a {instrument.kind} need its {need}, in the base frame")
+    return Touching(lambda q: tool_poses(model, instrument, q), instrument.point, instrument.touched, plane)
+
+
+def _axes(normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Axes (rows) whose third is the normal."""
+    x = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(normal, x), normal])
+
+
 class _Calibrated:
     """Rows of postures, weighted by the accuracy, in the parameters that postures can tell."""
 
     def __init__(self, model: RobotModel, instrument: Instrument, level: Level, position: np.ndarray) -> None:
-        self.model, self.instrument = model, instrument
+        self.model, self.instrument, self.touching = model, instrument, touching_of(model, instrument)
         chain = sorted(chain_between(model, instrument.base_frame, instrument.tool_frame).joints)
         every = geometry_columns(model, chain)
         columns = [c for c in every if level == "full" or (level == "joint_offset" and c.effect == "joint_offset")]
@@ -165,25 +205,36 @@ class _Calibrated:
         self.kept = np.array([k for k in range(len(names)) if k not in dependent])
 
     def _assembled(self, position: np.ndarray) -> Measured:
-        seen = self.seen(position)
-        given: dict[str, Any] = {self.instrument.kind: seen, "unknown": self.instrument.unknown}
+        given: dict[str, Any] = {"unknown": self.instrument.unknown}
+        kind, seen = self.instrument.kind, self.seen(position)
+        given |= {"device": self.instrument.device, "measured": seen} if kind == "own" else {kind: seen}
         base, tool = self.instrument.base_frame, self.instrument.tool_frame
-        recording = recorded(q=position, base_frame=base, tool_frame=tool, **given)
-        several = (recording,)
-        return assemble(self.model, several, postures_of(self.model, several), self.columns, [1.0] * len(self.columns))
+        several = (recorded(q=position, base_frame=base, tool_frame=tool, **given),)
+        postures, sizes = postures_of(self.model, several), [1.0] * len(self.columns)
+        found = assemble(self.model, several, postures, self.columns, sizes)
+        if self.touching is None:
+            return found
+        (group,) = found.problem.groups
+        return found._replace(problem=replace(found.problem, groups=(replace(group, device=self._touched()),)))
+
+    def _touched(self) -> Device:
+        """The planes or sockets where they are."""
+        at, point, unknown = self.touching, np.array(self.instrument.point, float), self.instrument.unknown
+        assert at is not None
+        estimated = tuple(name for name in unknown if name == "tool_frame")
+        if not at.plane:
+            return Sockets(point, estimated, at.place)
+        return Planes(point, estimated, np.array([_axes(axis) for axis in at.axis]), at.place)
 
     def seen(self, position: np.ndarray) -> np.ndarray:
-        """What the device sees of the nominal robot: poses, or points of a marker."""
-        model, poses = self.model, np.asarray(forward_kinematics(self.model, position))
-        world = np.concatenate([np.broadcast_to(np.eye(4), (len(position), 1, 4, 4)), poses], axis=1)
-        base, tool = (
-            world[:, model.frames[k].parent + 1] @ np.asarray(model.frame_placement)[k]
-            for k in (model.frame_index(self.instrument.base_frame), model.frame_index(self.instrument.tool_frame))
-        )
-        found = np.linalg.solve(base, tool)
-        if self.instrument.kind == "pose":
-            return found
-        return (found @ np.array([*MARKER, 1.0]))[:, None, :3]
+        """What the device sees of the nominal robot: poses, points of a marker, the number of what is touched."""
+        if self.touching is not None:
+            return self.touching.which(position)
+        found = tool_poses(self.model, self.instrument, position)
+        if self.instrument.kind == "own":
+            assert self.instrument.seen is not None
+            return np.asarray(self.instrument.seen(found))
+        return found if self.instrument.kind == "pose" else (found @ np.array([*MARKER, 1.0]))[:, None, :3]
 
     def rows(self, position: np.ndarray) -> Float[np.ndarray, "postures rows parameters"]:
         """Weighted Jacobian of each posture, by one program for any number of them."""
@@ -208,7 +259,8 @@ class _Calibrated:
         samples = np.shape(problem.groups[0].position)[1]
         J = (J / np.asarray(problem.scale))[: samples * np.shape(problem.groups[0].measured)[1]]
         J = J.reshape(-1, samples, J.shape[1]).swapaxes(0, 1)
-        sigma = np.where(np.arange(J.shape[1]) < 3, *self.instrument.accuracy)
+        channels = np.array(problem.groups[0].device.channels())
+        sigma = np.where(channels == POSITION, *self.instrument.accuracy)
         return J / sigma[:, None]
 
 
@@ -234,7 +286,7 @@ def excite_postures(
     limits = np.array(model.position_limit if position_limit is None else position_limit, float)
     limits = np.where(np.isfinite(limits), limits, [-np.pi, np.pi])
     generator = np.random.default_rng(seed)
-    allowed = _Allowed(model, instrument, clearance)
+    allowed = _Allowed(model, instrument, clearance, limits)
     q = allowed.candidates(limits, candidates, count, generator)
     candidates = len(q)
     progress("rows of the candidates", 0.05)
@@ -374,29 +426,44 @@ def _capped(w: Float[np.ndarray, " n"], count: int) -> Float[np.ndarray, " n"]:
 class _Allowed:
     """Which postures are seen and clear, and what is missing where they are not."""
 
-    def __init__(self, model: RobotModel, instrument: Instrument, clearance: Clearance | None) -> None:
+    def __init__(
+        self,
+        model: RobotModel,
+        instrument: Instrument,
+        clearance: Clearance | None,
+        limits: Float[np.ndarray, "nv 2"],
+    ) -> None:
         self.model, self.instrument, self.clearance = model, instrument, clearance
-        self.frames = [model.frame_index(name) for name in (instrument.base_frame, instrument.tool_frame)]
-        self.free = instrument.view is None and clearance is None
+        self.touching, self.limits = touching_of(model, instrument), limits
+        self.free = instrument.view is None and clearance is None and self.touching is None
+
+    def onto(self, q: Float[np.ndarray, "postures nv"]) -> Float[np.ndarray, "postures nv"]:
+        """The postures, touching what is to be touched."""
+        return q if self.touching is None else self.touching.onto(q, self.touching.which(q))
+
+    def drawn(self, q: Float[np.ndarray, "postures nv"], generator: np.random.Generator) -> np.ndarray:
+        """Random postures, each touching one of what is to be touched."""
+        if self.touching is None:
+            return q
+        q = self.touching.onto(q, generator.integers(len(self.touching.touched), size=len(q)))
+        return q[np.abs(self.touching.missing(q, self.touching.which(q))).max(axis=1) < 1e-7]
 
     def room(self, q: Float[np.ndarray, "postures nv"]) -> Float[np.ndarray, "postures k"]:
         """Below zero where a posture is not allowed: of the view (cosines, m), then of the clearance (0.1 m)."""
         parts = [np.ones((len(q), 1))]
         if self.instrument.view is not None:
-            poses = np.moveaxis(link_poses(self.model, q), 3, 0)
-            world = np.concatenate([np.broadcast_to(np.eye(4), (len(q), 1, 4, 4)), poses], axis=1)
-            frames = self.model.frames
-            base, tool = (
-                world[:, frames[k].parent + 1] @ np.asarray(self.model.frame_placement)[k] for k in self.frames
-            )
-            parts.append(self.instrument.view.room(np.linalg.solve(base, tool)))
+            parts.append(self.instrument.view.room(tool_poses(self.model, self.instrument, q)))
         if self.clearance is not None:
             parts.append((self.clearance.distances(q) - self.clearance.margin) / 0.1)
+        if self.touching is not None:
+            parts += [self.touching.room(q)[:, 1:], q - self.limits[:, 0], self.limits[:, 1] - q]
         return np.concatenate(parts, axis=1)
 
     def met(self, q: Float[np.ndarray, "postures nv"]) -> np.ndarray:
         """Which postures are seen and clear; by the meshes too where these are counted on."""
         good = np.asarray((self.room(q) >= 0).all(axis=1))
+        if self.touching is not None:
+            good &= self.touching.room(q)[:, 0] >= 0
         clearance = self.clearance
         if clearance is None or clearance.mesh_distance is None or not good.any():
             return good
@@ -413,22 +480,25 @@ class _Allowed:
         """Random postures; where few of them are allowed, others near those that are."""
         if self.free:
             return generator.uniform(limits[:, 0], limits[:, 1], (wanted, self.model.nv))
-        found, drawn, best = np.zeros((0, self.model.nv)), 0, -np.inf
-        while len(found) < wanted and drawn < _DRAWN:
-            some = generator.uniform(limits[:, 0], limits[:, 1], (_BATCH, self.model.nv))
-            if len(found) >= 10 and len(found) < wanted * drawn / _DRAWN * 4:  # too seldom: look beside those known
-                near = found[generator.integers(len(found), size=_BATCH)]
+        found, drawn = np.zeros((0, self.model.nv)), 0
+        batch, most = (_BATCH, _DRAWN) if self.touching is None else (_BATCH // 4, _DRAWN // 10)
+        while len(found) < wanted and drawn < most:
+            some = generator.uniform(limits[:, 0], limits[:, 1], (batch, self.model.nv))
+            if len(found) >= 10 and len(found) < wanted * drawn / most * 4:  # too seldom: look beside those known
+                near = found[generator.integers(len(found), size=batch)]
                 some = near + _NEARBY * np.diff(limits)[:, 0] * generator.standard_normal(near.shape)
                 some = np.clip(some, limits[:, 0], limits[:, 1])
-            room = self.room(some)
-            best = max(best, float(np.median(room.min(axis=1))))
-            found, drawn = np.concatenate([found, some[(room >= 0).all(axis=1)]]), drawn + _BATCH
+            some = self.drawn(some, generator)
+            found, drawn = np.concatenate([found, some[(self.room(some) >= 0).all(axis=1)]]), drawn + batch
         found = found[:wanted]
         found = found[self.met(found)]
         if len(found) < max(least, 2):
+            ways = "widen the view (cone, tilt, near, far), bring its place into reach, or lower limits.clearance"
+            if self.touching is not None:
+                ways = "bring what is touched into reach, widen its radius and tilt, or lower limits.clearance"
+            what = "are seen by the device" if self.touching is None else "touch"
             raise InputError(
-                f"excite: {len(found)} of {drawn} random postures are seen by the device and clear, {least} are needed;"
-                " widen the view (cone, tilt, near, far), bring its place into reach, or lower limits.clearance"
+                f"excite: {len(found)} of {drawn} random postures {what} and are clear, {least} are needed; {ways}"
             )
         return found
 
@@ -446,8 +516,11 @@ def _moved(
     count, nv = position.shape
     ways = np.concatenate([np.zeros((1, nv)), STEP * np.eye(nv)])
 
+    touching = allowed.touching
+
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-        around = (x.reshape(count, nv)[None] + ways[:, None]).reshape(-1, nv)
+        own = allowed.onto(x.reshape(count, nv))
+        around = (own[None] + ways[:, None]).reshape(-1, nv)
         J = calibrated.rows(around) / size
         J = J.reshape(len(ways), count, *J.shape[1:])
         information = _information(J[0])
@@ -458,6 +531,8 @@ def _moved(
             beyond = np.minimum(allowed.room(around).reshape(len(ways), count, -1) - _INSIDE, 0.0)
             walls = _WALL * (beyond**2).sum(axis=2)
             value, slope = value + float(walls[0].sum()), slope + (walls[1:] - walls[0]).T / STEP
+        if touching is not None:
+            slope = touching.along(own, touching.which(own), slope)
         return value, slope.ravel()
 
     box = np.tile(limits, (count, 1))
@@ -467,7 +542,7 @@ def _moved(
     if allowed.free:
         return moved
     for share in (1.0, 0.9, 0.7, 0.4, 0.0):  # back towards the candidate, which is allowed
-        tried = position + share * (moved - position)
+        tried = allowed.onto(position + share * (moved - position))
         good = allowed.met(tried) if share else np.ones(count, bool)
         position, moved = np.where(good[:, None], tried, position), np.where(good[:, None], tried, moved)
         if good.all():

@@ -1,13 +1,14 @@
-"""The rows of a motion and the gradient of any function of them, on the host, by programs that serve any motion.
+"""The rows of a motion and the gradient of any function of them, on the host.
 
-A motion goes through in chunks of fixed size, so that one program of a robot serves all lengths, bases, objectives and
-limits. All that a design asks for (information, prediction, torque) is a function of the rows: its gradient by them
-goes back through the closed form of `regressor_pullback`, and that of the effects' columns through JAX.
+All that a design asks for (information, prediction, torque) is a function of the rows: its gradient by them goes back
+through the closed form of `regressor_pullback`, and that of the effects' columns through JAX, but for the usual
+friction, whose columns and slopes are written out here. A motion goes in chunks of fixed size through the programs, so
+that one of a robot serves all lengths, bases, objectives and limits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -15,8 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..compiled.batching import program
+from ..compiled.batching import aligned, program
 from ..effects.base import Effect, Motion, columns
+from ..effects.friction import CoulombFriction, ViscousFriction
+from ..effects.sensors import TorqueOffset
+from ..effects.transmission import RotorInertia
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.model import RobotModel
 from ..rigid.regressor import dense_rows
@@ -25,6 +29,28 @@ from ..rigid.regressor_gradient import pullback_rows
 __all__ = ["CHUNK", "Sampler", "smooth_motion", "term_blocks"]
 
 CHUNK = 64  # samples: the temporaries of a chunk stay in the processor's cache
+_SHARP = 1e-9  # rad/s, so that a reversal without a width has a slope
+
+
+def _viscous(q: np.ndarray, v: np.ndarray, a: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, int, Any]:
+    return v, 1, 1.0
+
+
+def _coulomb(q: np.ndarray, v: np.ndarray, a: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, int, Any]:
+    sign = np.tanh(v / (width + _SHARP))
+    return sign, 1, (1.0 - sign**2) / (width + _SHARP)
+
+
+def _rotor(q: np.ndarray, v: np.ndarray, a: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, int, Any]:
+    return a, 2, 1.0
+
+
+def _offset(q: np.ndarray, v: np.ndarray, a: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, int, Any]:
+    return np.ones_like(v), 0, 0.0
+
+
+# column of an effect on a joint, by which of q, v, a it changes, and how fast
+_PLAIN = {ViscousFriction: _viscous, CoulombFriction: _coulomb, RotorInertia: _rotor, TorqueOffset: _offset}
 
 
 class _SmoothMotion(Motion):
@@ -32,12 +58,12 @@ class _SmoothMotion(Motion):
 
     @property
     def direction(self) -> Float[Array, "samples nv"]:
-        return jnp.tanh(self.velocity / (self.width + 1e-9))
+        return jnp.tanh(self.velocity / (self.width + _SHARP))
 
     def reversal(
         self, velocity: Float[Array, " samples"], acceleration: Float[Array, " samples"], width: Float[Array, ""]
     ) -> Float[Array, " samples"]:
-        return jnp.tanh(velocity / (width + 1e-9))
+        return jnp.tanh(velocity / (width + _SHARP))
 
 
 def smooth_motion(robot: RobotModel, width: Any, load: Any, q: Any, v: Any, a: Any) -> Motion:
@@ -73,17 +99,17 @@ def _in_all_rows(effect: Effect, motion: Any) -> Float[Array, "samples nv amplit
     return jnp.zeros((*motion.velocity.shape, torque.shape[-1])).at[:, effect.at].add(torque)
 
 
-def _beside(robot: RobotModel, terms: Any, width: Any, states: Float[Array, "3 nv n"]) -> Float[Array, "nv k n"]:
-    q, v, a = (x.T for x in states)
-    return jnp.moveaxis(jnp.concatenate(term_blocks(robot, terms, width, q, v, a), axis=2), 0, 2)
-
-
-def _rows(robot: RobotModel, states: Float[Array, "3 nv n"]) -> Float[Array, "nv columns n"]:
-    return dense_rows(robot, states[0], states[1], states[2])
+def _rows(robot: RobotModel, states: Float[Array, "3 nv n"]) -> Float[Array, "columns nv n"]:
+    return dense_rows(robot, states[0], states[1], states[2]).swapaxes(0, 1)
 
 
 def _back(robot: RobotModel, states: Float[Array, "3 nv n"], cotangent: Array) -> Float[Array, "3 nv n"]:
-    return pullback_rows(robot, states[0], states[1], states[2], cotangent)
+    return pullback_rows(robot, states[0], states[1], states[2], cotangent.swapaxes(0, 1))
+
+
+def _beside(robot: RobotModel, terms: Any, width: Any, states: Float[Array, "3 nv n"]) -> Float[Array, "k nv n"]:
+    q, v, a = (x.T for x in states)
+    return jnp.moveaxis(jnp.concatenate(term_blocks(robot, terms, width, q, v, a), axis=2), 0, 2).swapaxes(0, 1)
 
 
 def _beside_back(robot: RobotModel, terms: Any, width: Any, states: Array, cotangent: Array) -> Array:
@@ -98,20 +124,40 @@ class Sampler:
     """Rows of all columns (links, then effects) at states, and the gradient by the states."""
 
     def __init__(self, robot: RobotModel, terms: Sequence[Effect], width: Float[np.ndarray, " nv"]) -> None:
-        with jax.enable_x64(True):
-            self.robot, self.terms, self.width = jax.device_put((robot, tuple(terms), np.asarray(width, float)))
+        self.robot, self.width = robot, np.asarray(width, float)
         self.own = 10 * len(robot.joints)
+        self.plain: list[tuple[Any, int, int]] = []  # column of an effect on a joint, its place, the joint
+        others: list[Effect] = []
+        self.columns, other = self.own, []
+        for term in terms:
+            at = np.asarray(term.at)
+            count = len(at) * sum(p.linear for p in term.parameters().values())
+            where = range(self.columns, self.columns + count)
+            if type(term) in _PLAIN:
+                rows = zip(where, at[:, 0].tolist(), strict=True)
+                self.plain += [(_PLAIN[type(term)], place, joint) for place, joint in rows]
+            else:
+                others.append(term)
+                other += where
+            self.columns += count
+        self.other = np.array(other, int)
+        with jax.enable_x64(True):
+            self.on_device, self.others, self.widths = jax.device_put((robot, tuple(others), self.width))
 
     def rows(self, states: Float[np.ndarray, "3 samples nv"]) -> Float[np.ndarray, "nv columns samples"]:
         """The rows at q, v, a (rad or m, and their rates); N m or N for a unit of each parameter."""
-        parts = []
+        samples, nv = states.shape[1:]
+        out = np.zeros((self.columns, nv, samples))
         with jax.enable_x64(True):
-            for x in _cut(states):
-                part = [np.asarray(_rows_program(self.robot, x))]
-                if self.terms:
-                    part.append(np.asarray(_beside_program(self.robot, self.terms, self.width, x)))
-                parts.append(np.concatenate(part, axis=1))
-        return np.concatenate(parts, axis=2)[:, :, : states.shape[1]]
+            for piece, x in _cut(states):
+                count = len(range(samples)[piece])
+                out[: self.own, :, piece] = np.asarray(_rows_program(self.on_device, x))[:, :, :count]
+                if len(self.other):
+                    beside = _beside_program(self.on_device, self.others, self.widths, x)
+                    out[self.other, :, piece] = np.asarray(beside)[:, :, :count]
+        for column, place, joint in self.plain:
+            out[place, joint] = column(*states[:, :, joint], self.width[joint])[0]
+        return out.swapaxes(0, 1)
 
     def torque(
         self, states: Float[np.ndarray, "3 samples nv"], theta: Float[np.ndarray, " columns"]
@@ -126,22 +172,33 @@ class Sampler:
         self, states: Float[np.ndarray, "3 samples nv"], cotangent: Float[np.ndarray, "nv columns samples"]
     ) -> Float[np.ndarray, "3 samples nv"]:
         """Gradient by q, v and a of a function whose gradient by the rows is `cotangent`."""
-        samples = states.shape[1]
-        padded = np.pad(cotangent, ((0, 0), (0, 0), (0, -samples % CHUNK)))
-        out = np.empty((3, padded.shape[2], states.shape[2]))
+        by, samples = cotangent.swapaxes(0, 1), states.shape[1]
+        out = np.empty(states.shape)
         with jax.enable_x64(True):
-            for k, x in enumerate(_cut(states)):
-                where = slice(k * CHUNK, (k + 1) * CHUNK)
-                one = np.asarray(_back_program(self.robot, x, padded[:, : self.own, where]))
-                if self.terms:
-                    beside = padded[:, self.own :, where]
-                    one = one + np.asarray(_beside_back_program(self.robot, self.terms, self.width, x, beside))
-                out[:, where] = one.swapaxes(1, 2)
-        return out[:, :samples]
+            for piece, x in _cut(states):
+                count = len(range(samples)[piece])
+                one = np.asarray(_back_program(self.on_device, x, _filled(by[: self.own, :, piece])))
+                if len(self.other):
+                    beside = _filled(by[self.other, :, piece])
+                    one = one + np.asarray(_beside_back_program(self.on_device, self.others, self.widths, x, beside))
+                out[:, piece] = one[:, :, :count].swapaxes(1, 2)
+        for column, place, joint in self.plain:
+            _, which, slope = column(*states[:, :, joint], self.width[joint])
+            out[which, :, joint] += slope * by[place, joint]
+        return out
 
 
-def _cut(states: Float[np.ndarray, "3 samples nv"]) -> list[Float[np.ndarray, "3 nv chunk"]]:
+def _cut(states: Float[np.ndarray, "3 samples nv"]) -> Iterator[tuple[slice, Float[np.ndarray, "3 nv chunk"]]]:
     """Samples in chunks, last in each; the last one fills its chunk up."""
-    missing = -states.shape[1] % CHUNK
-    full = np.concatenate([states, np.repeat(states[:, -1:], missing, axis=1)], axis=1).swapaxes(1, 2)
-    return [np.ascontiguousarray(full[:, :, k : k + CHUNK]) for k in range(0, full.shape[2], CHUNK)]
+    for k in range(0, states.shape[1], CHUNK):
+        some = states[:, k : k + CHUNK].swapaxes(1, 2)
+        missing = CHUNK - some.shape[2]
+        full = np.concatenate([some, np.repeat(some[:, :, -1:], missing, axis=2)], axis=2) if missing else some
+        yield slice(k, k + CHUNK), np.ascontiguousarray(full)
+
+
+def _filled(x: Float[np.ndarray, "columns nv samples"]) -> Float[np.ndarray, "columns nv chunk"]:
+    """A chunk with zeros behind."""
+    out = aligned((*x.shape[:2], CHUNK), None if x.shape[2] == CHUNK else 0.0)
+    out[:, :, : x.shape[2]] = x
+    return out

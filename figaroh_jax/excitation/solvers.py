@@ -111,15 +111,14 @@ class Problem:
         return weights if self.start is not None else np.concatenate([by_states[0].sum(0), weights])
 
     def gram(self, rows: Float[np.ndarray, "nv columns samples"]) -> tuple[np.ndarray, np.ndarray]:
-        """Weighted rows of the columns that count (then late torques), and their Gram matrix."""
-        own = rows[:, self.columns, : self.count]
+        """Weighted rows (columns that count, then late torques; joints and samples), and their Gram matrix."""
+        own = rows.swapaxes(0, 1)[self.columns][:, :, : self.count]
         if self.shifts:
             torque = np.asarray(self.learned.theta) @ rows[:, : len(self.learned.theta)]
-            late = torque.reshape(self.nv, len(self.shifts), self.count)
-            own = np.concatenate([own, late], axis=1)
-        own = own * self.root[:, None, None]
-        flat = own.swapaxes(0, 1).reshape(own.shape[1], -1)
-        return own, flat @ flat.T
+            late = torque.reshape(self.nv, len(self.shifts), self.count).swapaxes(0, 1)
+            own = np.concatenate([own, late])
+        flat = (own * self.root[:, None]).reshape(len(own), -1)
+        return flat, flat @ flat.T
 
     def value(self, x: Float[np.ndarray, " n"]) -> float:
         """The objective."""
@@ -157,17 +156,18 @@ class Problem:
             self.lagrangian(x, penalty)
         seen = self._seen
         assert seen is not None
-        cotangent = np.zeros(seen.shape)
-        by_rows = 2.0 * self.root[:, None, None] * (seen.by_gram @ seen.own)
-        cotangent[:, self.columns, : self.count] = by_rows[:, : len(self.columns)]
+        nv, columns, samples = seen.shape
+        cotangent, theta = np.zeros((columns, nv, samples)), np.asarray(self.learned.theta)
+        by_rows = ((2.0 * seen.by_gram) @ seen.own).reshape(-1, nv, self.count) * self.root[:, None]
+        cotangent[self.columns, :, : self.count] = by_rows[: len(self.columns)]
+        by_torque = np.zeros((nv, samples))
         if self.shifts:
-            theta = np.asarray(self.learned.theta)
-            late = by_rows[:, len(self.columns) :].reshape(self.nv, 1, -1)
-            cotangent[:, : len(theta)] += late * theta[:, None]
+            by_torque += by_rows[len(self.columns) :].swapaxes(0, 1).reshape(nv, samples)
         if seen.by_torque is not None:
-            theta = np.asarray(self.learned.theta)
-            cotangent[:, : len(theta)] += (seen.by_torque / self.limits.torque).T[:, None] * theta[:, None]
-        by_states = self.sampler.back(seen.states, cotangent)
+            by_torque += (seen.by_torque / self.limits.torque).T
+        if by_torque.any():
+            cotangent[: len(theta)] += by_torque * theta[:, None, None]
+        by_states = self.sampler.back(seen.states, cotangent.swapaxes(0, 1))
         if seen.by_position is not None:
             by_states[0, : self.count] += seen.by_position
         return self.to_numbers(by_states) + seen.slope

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import equinox as eqx
 import jax
@@ -21,6 +21,7 @@ from .information import Learned, learn
 from .limits import limits_of
 from .motions import Basis, fourier, quintic, spline
 from .postures import ACCURACY, Instrument, PostureDesign, View, excite_postures
+from .touch import Touch
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Excite, Sight, SizedEffect, Task
@@ -130,25 +131,22 @@ def _postures(task: Task, asked: Excite, robot: RobotModel, progress: Callable[[
             f"{task.file}: excite.measurement is missing: postures are chosen for a device, as in"
             " measurement: {pose: pose, base_frame: base_link, tool_frame: tool0}"
         )
-    kinds = {"pose": "pose", "camera": "pose", "position": "position"}
-    if measurement.kind not in kinds:
-        raise InputError(
-            f"{task.file}: excite.measurement: postures that touch a {measurement.kind} are where it is; they are not"
-            " designed. Expected: pose, position or camera"
-        )
     if measurement.tool_frame is None:
         raise InputError(f"{task.file}: excite.measurement.tool_frame is missing: which frame is measured?")
     base = measurement.base_frame or next((f.name for f in robot.frames if f.parent < 0), robot.frames[0].name)
     for name in (base, measurement.tool_frame):
         robot.frame_index(name)
     place, turn = measurement.accuracy.position, measurement.accuracy.orientation
+    kind = "pose" if measurement.kind == "camera" else measurement.kind
     instrument = Instrument(
-        "pose" if kinds[measurement.kind] == "pose" else "position",
+        cast(Any, kind),
         base,
         measurement.tool_frame,
         tuple(measurement.unknown),
         (place or ACCURACY[0], turn or ACCURACY[1]),
         _view(asked.view, measurement.mount if measurement.kind == "camera" else "world"),
+        tuple(Touch(one.place, one.axis, one.radius, one.tilt) for one in asked.touch),
+        asked.point,
     )
     clearance, said = clearance_asked(task, asked, robot)
     limits = limits_of(robot, asked.limits.position)
@@ -161,7 +159,7 @@ def _postures(task: Task, asked: Excite, robot: RobotModel, progress: Callable[[
         clearance=clearance,
         progress=progress,
     )
-    if asked.view is None:
+    if asked.view is None and not asked.touch:
         said = (*said, "no view is given: what the device can see from its place is not looked at")
     if place is None:
         said = (*said, f"no accuracy is given: {1e3 * ACCURACY[0]:g} mm and {1e3 * ACCURACY[1]:g} mrad are taken")

@@ -448,6 +448,15 @@ class Sight(_Keys):
     far: Positive = 10.0
 
 
+class Touched(_Keys):
+    """A plane or a socket that postures are to touch, in the device's base frame."""
+
+    place: Vector  # m: the socket, or a point on the plane
+    axis: Vector | None = None  # of a plane: its normal, towards the robot; of a socket: the way out of it
+    radius: Positive = 0.3  # m around the place: how much of the plane is there
+    tilt: Annotated[Positive, Field(le=3.15)] = 3.15  # rad, between the tool's z axis and the way in
+
+
 class SizedEffect(_Keys):
     """A cause that is to be told from another, and how large it is taken to be."""
 
@@ -475,6 +484,8 @@ class Excite(_Keys):
     candidates: Annotated[int, Field(ge=10, le=20_000)] = 500  # random postures to choose from
     measurement: Measurement | None = None  # of postures: the device; None: that of the recordings
     view: Sight | None = None  # of postures: what the device sees; None: everything
+    touch: tuple[Touched, ...] = ()  # of postures measured with planes or sockets: where these are
+    point: Vector = (0.0, 0.0, 0.0)  # m, in the tool frame: what touches them
     floor: Number | None = None  # its height in the world, m
     boxes: tuple[Obstacle, ...] = ()
     bodies: tuple[Body, ...] = ()  # for links without collision shapes, or in the place of theirs

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..excitation.design import Design, Stage, torque_of
-from ..excitation.limits import CHECK_RATE, Limits, Use
+from ..excitation.limits import CHECK_RATE, Use
 from ..excitation.postures import PostureDesign
 from ..excitation.sampling import Sampler
 from ..rigid.model import prismatic
@@ -45,7 +45,7 @@ def answer(found: Design) -> dict[str, Any]:
         "met": found.met,
         "rate": found.rate,
         "noise": [_number(1 / math.sqrt(w)) for w in np.asarray(found.learned.weight)],
-        "trajectories": [_stage(k, stage, found.limits) for k, stage in enumerate(found.stages)],
+        "trajectories": [_stage(k, stage) for k, stage in enumerate(found.stages)],
         "parameters": [
             {"expression": name, "std_before": _number(before), "std": _number(after)}
             for name, before, after in zip(found.learned.expressions, found.std_before, found.std, strict=True)
@@ -87,9 +87,9 @@ def posture_answer(found: PostureDesign) -> dict[str, Any]:
     }
 
 
-def _stage(k: int, stage: Stage, limits: Limits) -> dict[str, Any]:
+def _stage(k: int, stage: Stage) -> dict[str, Any]:
     basis = stage.motion.basis
-    near = nearest_bodies(stage, limits)
+    near = nearest_bodies(stage)
     own = {} if near is None else {"clearance": {"rate": POINTS, "distance": np.round(near[1], 6).tolist()}}
     return own | {
         "file": f"trajectory_{k + 1}.csv",
@@ -107,9 +107,9 @@ def _stage(k: int, stage: Stage, limits: Limits) -> dict[str, Any]:
     }
 
 
-def nearest_bodies(stage: Stage, limits: Limits) -> tuple[np.ndarray, np.ndarray] | None:
+def nearest_bodies(stage: Stage) -> tuple[np.ndarray, np.ndarray] | None:
     """Times (s) and the least distance (m) of two bodies by what surrounds them; None where none are looked at."""
-    clearance = limits.clearance
+    clearance = stage.clearance
     if clearance is None or not clearance.rows.names:
         return None
     time = stage.motion.basis.instants(POINTS)
@@ -263,7 +263,7 @@ def _page(found: Design, drawn: list[tuple[np.ndarray, dict[str, np.ndarray]]], 
         failure=failure(found),
         parameters=list(zip(found.learned.expressions, found.std_before.tolist(), found.std.tolist(), strict=True)),
         curves=[_curves(found, time, arrays) for time, arrays in drawn],
-        near=[_near_curve(stage, found.limits) for stage in found.stages],
+        near=[_near_curve(stage) for stage in found.stages],
         css=Markup((page / "report.css").read_text("utf-8")),
     )
 
@@ -281,14 +281,13 @@ def _curves(found: Design, time: np.ndarray, arrays: dict[str, np.ndarray]) -> l
     return out
 
 
-def _near_curve(stage: Stage, limits: Limits) -> dict[str, Any] | None:
+def _near_curve(stage: Stage) -> dict[str, Any] | None:
     """The least distance between bodies against time, and the margin."""
-    near = nearest_bodies(stage, limits)
-    if near is None or limits.clearance is None:
+    near, clearance = nearest_bodies(stage), stage.clearance
+    if near is None or clearance is None:
         return None
-    return _curve(
-        "clearance", near[0], np.minimum(near[1], 10 * limits.clearance.margin), np.array([limits.clearance.margin])
-    )
+    margin = clearance.margin
+    return _curve("clearance", near[0], np.minimum(near[1], 10 * margin), np.array([margin]))
 
 
 def _curve(kind: str, time: np.ndarray, values: np.ndarray, ends: np.ndarray) -> dict[str, Any]:
