@@ -2,6 +2,7 @@
 
     python benchmarks/rollouts.py servo_miuzei      # a hobby servo with a weight: train, test and all other runs
     python benchmarks/rollouts.py dfki_double_pendulum --window 0.3
+    python benchmarks/rollouts.py so101_sage [--third K]        # a 6-joint servo arm; K: that third is left out
 
 Data under the folder that FIGAROH_JAX_DATA names. It prints the RMS of the position error, rad, after each cause, on
 runs that were fitted and on runs that were not, each simulated from its first measured state by its command alone.
@@ -19,8 +20,10 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 
+from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.data import Run, Stretch, windows
 from figaroh_jax.rollouts.fit import fit
+from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.parameters import Entry, put
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.search import Search, search, setting
@@ -126,6 +129,99 @@ def dfki_double_pendulum(window: float, every: int) -> None:
         print(f"{label:<10} train {rms[0]:7.2f} mrad, held out {rms[1]:7.2f} mrad   {values}", flush=True)
 
 
+SO101 = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+WHOLE = ((0.0, 999.0),)
+TRAIN = {
+    "friction_gravity": WHOLE, "prbs_excitation": WHOLE, "chirp_sweep": ((0.0, 108.0),), "multisine": WHOLE,
+    "backlash_detection": WHOLE, "single_joint_rotation": WHOLE, "single_joint_wrist_pitch": WHOLE,
+    "single_joint_wrist_roll": ((0.0, 41.0),),
+    "large_amplitude": ((0.0, 30.0), (36.0, 53.0), (60.0, 90.0), (112.0, 133.0)),
+}  # fmt: skip
+TEST = {
+    "step_response": WHOLE, "velocity_ramp": WHOLE, "slow_precision": WHOLE, "repetitive_motion": WHOLE,
+    "hold_under_gravity": ((0.0, 14.0), (49.0, 61.0)),
+}  # fmt: skip
+PERIOD = 0.02006  # s
+
+
+def so101_runs(which: dict[str, tuple[tuple[float, float], ...]]) -> list[Run]:
+    """Motions of the arm, cut as its README says: without the table, the chirp before its clock jumps."""
+    found = []
+    for name, cuts in which.items():
+        z = np.load(DATA / "so101_sage" / f"{name}.npz")
+        command, position = (np.array(z[k], float) for k in ("command", "q"))
+        for x in (command, position):  # the jaw is told as a share of its range
+            x[:, 5] = -0.174533 + 1523 * 2 * np.pi / 4096 * x[:, 5]
+        for k, (first, last) in enumerate(cuts):
+            inside = (z["t"] - z["t"][0] >= first) & (z["t"] - z["t"][0] <= last)
+            label = f"{name} {k + 1}" if len(cuts) > 1 else name
+            found.append(Run(label, PERIOD * np.arange(inside.sum()), command[inside], position[inside], None))
+    return found
+
+
+def so101_loop(**values: float) -> Loop:
+    """The arm with the servo of the BAM study at every joint, no dry friction, unless told otherwise."""
+    drive = {"kind": "position", "kp": values.get("kp", 17.8), "kd": values.get("kd", 0.6), "force": 3.35}
+    file = DATA / "so101_sage" / "so101.xml"
+    loop, _ = load_loop(file, dict.fromkeys(SO101, drive), law="hard", dt=PERIOD / 4)
+    full = np.ones(6)
+    where = lambda m: (m.joints.friction, m.joints.armature, m.joints.damping)  # noqa: E731
+    new = (values.get("friction", 0.0) * full, values.get("armature", 0.028) * full, values.get("damping", 0.0) * full)
+    return eqx.tree_at(where, loop, new)
+
+
+def so101_sage(third: int | None, most: float) -> None:
+    """Gains and viscous friction of every servo are fitted; what else the arm shows is sought."""
+    loop = so101_loop()
+    runs = [r for k, r in enumerate(so101_runs(TRAIN)) if third is None or k % 3 != third]
+    runs = [_shorter(r, most) for r in runs]
+    cut = [
+        Stretch(k, f, min(750, len(r.time) - f)) for k, r in enumerate(runs) for f in range(0, len(r.time) - 100, 750)
+    ]
+    here = setting(
+        loop, runs, baseline=("joint_damping",), more=[("actuator_gain", name) for name in SO101], gains_known=False,
+        stretches=cut,
+    )  # fmt: skip
+    start = time.process_time()
+    found = search_arm(here)
+    seconds = sum(len(r.time) for r in runs) * PERIOD
+    print(
+        f"verdict {found.verdict}, {time.process_time() - start:.0f} CPU s, {seconds:.0f} s of {len(runs)} recordings"
+    )
+    for n in found.named or found.proxy:
+        alike = f", alike {', '.join(str(a) for a in n.alike)}" if n.alike else ""
+        gain = f"{1e3 * n.before:.2f} -> {1e3 * n.after:.2f} mrad"
+        print(f"  {n.candidate.effect} ({n.candidate.at[0]}) t {n.t:.1f}, {gain}{alike}")
+    for label, level in found.table:
+        print(f"  chi2/N {level:10.2f} after {label}")
+    for entry in dict.fromkeys(found.last.free[found.last.free >= 0]):
+        one = found.structure.table[entry]
+        print(f"  {one.name:>14} {SO101[one.at[0]] if one.at[0] < 6 else 'spring':<14} {found.last.theta[entry]:.5g}")
+    models = {
+        "as stated": here.loop,
+        "gains and damping": put(here.loop, here.known.table, found.first.theta),
+        "with the causes": put(found.structure.loop, found.structure.table, found.last.theta),
+        "friction 1e-4, armature .15": so101_loop(friction=1e-4, armature=0.15),
+        "friction .35, kp 48, armature .05": so101_loop(friction=0.35, kp=48.0, armature=0.05),
+    }
+    for label, model in models.items():
+        show_motions(label, model, so101_runs(TEST))
+
+
+def show_motions(label: str, model: Loop, runs: list[Run]) -> None:
+    """RMS by motion and joint, mrad, each simulated from its first position and its command alone."""
+    rms = np.array(
+        [1e3 * np.sqrt(np.mean((simulated(model, r)[:, :5] - r.position[:, :5]) ** 2, axis=0)) for r in runs]
+    )
+    each = ", ".join(f"{r.name} {x.mean():.2f}" for r, x in zip(runs, rms, strict=True))
+    print(f"{label:<34} unseen {rms.mean():6.2f} mrad, by joint {np.round(rms.mean(0), 1)}; {each}", flush=True)
+
+
+def _shorter(run: Run, most: float) -> Run:
+    rows = slice(0, round(most / PERIOD))
+    return run._replace(time=run.time[rows], command=run.command[rows], position=run.position[rows])
+
+
 def total(pairs: list[tuple[Run, np.ndarray]]) -> float:
     """RMS over all samples, rad."""
     return float(np.sqrt(np.mean(np.concatenate([((run.position - read) ** 2).ravel() for run, read in pairs]))))
@@ -144,12 +240,16 @@ def show(found: Search, causes: list[str]) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", choices=["servo_miuzei", "dfki_double_pendulum"])
+    parser.add_argument("data", choices=["servo_miuzei", "dfki_double_pendulum", "so101_sage"])
     parser.add_argument("--window", type=float, default=0.3, help="s, of the double pendulum")
     parser.add_argument("--law", choices=["hard", "soft"], default="hard")
     parser.add_argument("--every", type=int, default=1, help="takes one window of so many")
+    parser.add_argument("--third", type=int, choices=[0, 1, 2], help="of the arm's recordings, left out of the fit")
+    parser.add_argument("--most", type=float, default=999.0, help="s of each of the arm's recordings that are fitted")
     args = parser.parse_args()
-    if args.data == "servo_miuzei":
+    if args.data == "so101_sage":
+        so101_sage(args.third, args.most)
+    elif args.data == "servo_miuzei":
         servo_miuzei(args.law)
     else:
         dfki_double_pendulum(args.window, args.every)

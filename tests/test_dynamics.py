@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -11,10 +12,12 @@ import pytest
 import reference
 import robots
 
+from figaroh_jax.compiled.batching import CPU_OPTIONS
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.rigid import dynamics, kinematics, regressor
 from figaroh_jax.rigid.model import RobotModel
+from figaroh_jax.rigid.scalar_programs import written
 
 
 class Independent:
@@ -159,3 +162,16 @@ def test_constants_inside_somebodys_program_are_worked_out(tmp_path: Path):
         + np.asarray(regressor.joint_torque_regressor(model, q, q, q))[..., 0]
     )
     np.testing.assert_allclose(inside(2.0), 2 * expected, rtol=0, atol=1e-12)
+
+
+def test_torques_of_many_samples_equal_pinocchios(data_dir: Path) -> None:
+    """Many samples go through a program that is written out for a short robot; a longer one keeps the plain one."""
+    model = load_urdf(data_dir / robots.REAL["tx40"])
+    assert written(load_urdf(data_dir / robots.REAL["talos"])) is None
+    assert written(model) is not None or not CPU_OPTIONS
+    model = dataclasses.replace(model, gravity=np.array([0.3, -0.2, -9.7]))
+    heavier = dataclasses.replace(model, inertia=1.1 * np.asarray(model.inertia))
+    q, v, a = robots.states(model, dynamics.MANY)
+    for robot in (model, heavier):  # the second by the program of the first
+        theirs = reference.inverse_dynamics(robot, q, v, a)
+        np.testing.assert_allclose(dynamics.inverse_dynamics(robot, q, v, a), theirs, rtol=0, atol=1e-10)

@@ -120,15 +120,20 @@ def test_torque_of_the_baseline_is_pinocchios_plus_the_friction(model: RobotMode
 
 
 def test_rows_of_a_state_that_has_grown_are_those_computed_from_scratch(model: RobotModel) -> None:
-    problem = problem_of(model, made_signals(6.0, repeat="A"), made_signals(6.0, repeat="A"))
+    signals = made_signals(6.0, repeat="A"), made_signals(6.0, repeat="A")
+    problem, fresh = problem_of(model, *signals), problem_of(model, *signals)
     weights = 1 / (1 + np.asarray(problem.records.omega)[:, None] * [0.01, 0.02])
     state = baseline(problem, ["viscous_friction"])
+    for other in (0.5 * weights, weights):  # what is kept of them must not serve other weights
+        whitened(problem, state, other)
     grown = extended_state(problem, state, find("joint_spring")(np.array([1])))
-    short = whitened(problem, grown, weights, whitened(problem, state, weights))
-    for one, other in zip(short, whitened(problem, grown, weights), strict=True):
+    short = whitened(problem, grown, weights)
+    for one, other in zip(short, whitened(fresh, grown, weights), strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
     assert short.X.shape[2] == 20 + 2 + 2
     np.testing.assert_allclose(short.Xi, short.X, rtol=0, atol=1e-9)  # equal repeats are each other's instruments
+    lighter = fresh.weighted(0.5 * np.asarray(fresh.records.weight))
+    np.testing.assert_allclose(whitened(lighter, grown, weights).X, 0.5 * short.X, rtol=0, atol=1e-12)
 
 
 def test_a_robot_near_its_nominal_values_is_fitted_without_rest(model: RobotModel) -> None:

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 
 from .executable_cache import Program
 from .kernels import Straight, straight_answers, usable
+from .machine_code import machine_code
 
 __all__ = [
     "BLOCK",
@@ -126,12 +127,12 @@ def over_samples(
 ) -> Array:
     """Answers of `kernel(parameters, *arrays)` for float64 arrays (*batch, k): (*batch, ...), or samples `last`.
 
-    `width` is about how many numbers an answer has for a sample; `straight` the same function for a GPU, where there is
-    one. To be called where 64-bit JAX is on.
+    `width` is about how many numbers an answer has for a sample; `straight` the same function written out in scalars,
+    for a GPU or a C compiler, where there is one. To be called where 64-bit JAX is on.
     """
     chunk, batch = chunk_size(width), np.shape(arrays[0])[:-1]
     if on_host(parameters, arrays):
-        answer = _assembled(kernel, chunk, last, parameters, *two_axes(*arrays, host=True))
+        answer = host_answer(kernel, chunk, last, straight, parameters, *two_axes(*arrays, host=True))
         return answer if last else answer.reshape(*batch, *answer.shape[1:])
     flat = two_axes(*arrays, host=False)
     if straight is not None and usable(*arrays):
@@ -219,6 +220,19 @@ def host_blocks(
         rows = [in_chunks(x[where], chunk, chunks) for x in arrays]
         room = _fill(kernel, _room(kernel, parameters, *rows) if room is None else room, parameters, *rows)
         yield where, np.moveaxis(np.asarray(room), 0, -2)
+
+
+def host_answer(
+    kernel: Callable[..., Any],
+    chunk: int,
+    last: bool,
+    straight: Straight | None,
+    parameters: Any,
+    *arrays: Float[np.ndarray, "samples _"],
+) -> Array:
+    """Answers for arrays of the host, by machine code of the `straight` form where there is some."""
+    code = None if straight is None else machine_code(straight, parameters, *arrays)
+    return _assembled(kernel, chunk, last, parameters, *arrays) if code is None else to_device(code(aligned, *arrays))
 
 
 def _assembled(kernel: Callable[..., Any], chunk: int, last: bool, parameters: Any, *arrays: np.ndarray) -> Array:

@@ -26,7 +26,7 @@ import numpy as np
 
 from .store import Store, cache_home
 
-__all__ = ["Program", "keep_programs"]
+__all__ = ["Program", "keep_programs", "surroundings"]
 
 _PACKAGE = Path(__file__).parents[1]
 _PLAIN = (tuple, list, dict, type(None))
@@ -108,7 +108,7 @@ class Program:
             known,
             *(f"{x.shape} {x.dtype}" for x in leaves),
             f"{self.options} {self.donate} {jax.dtypes.canonicalize_dtype(float)}",
-            _surroundings(),
+            surroundings(),
         ]
         name = hashlib.blake2b("\n".join(parts).encode(), digest_size=20).hexdigest()
         return _Entry(Store(Path(folder) / "programs"), name)
@@ -127,7 +127,7 @@ def _types(tree: Any) -> Iterable[Any]:
 
 
 @lru_cache(maxsize=1)
-def _surroundings() -> str:
+def surroundings() -> str:
     """What a program depends on beside its function and arguments."""
     source = hashlib.blake2b()
     for file in sorted(_PACKAGE.rglob("*.py")):

@@ -103,15 +103,20 @@ class Straight(NamedTuple):
     `last`: the samples stand last in the answer, which is then (*shape, samples), else (samples, *shape).
     """
 
+    name: str  # of all forms with the same programs and places
+    structure: Callable[[Any], Any]  # what the programs follow from, without `known`; its `repr` tells it from others
     plain: Callable[..., Array]  # answers of (parameters, *arrays), arrays (samples, k)
-    constants: Callable[[Any], Array]  # what the program takes from the parameters, in one row
+    constants: Callable[..., Any]  # what the program takes from the parameters, in one row (dtype, NumPy or JAX)
     known: Callable[[Any], bytes]  # which constants are known before; parameters in NumPy
+    known_lengths: Callable[[Any], bytes]  # the same of those that stay as they are when the rest is identified
     nothing_known: Callable[[Any], bytes]
     programs: Callable[[Any, bytes], Sequence[Program]]  # each writes a part of the answer
     shape: Callable[[Any], tuple[int, ...]]  # of what the programs write for a sample
     columns: Callable[[Any], Columns]
     last: bool = False
     finish: Callable[[Any, Array], Array] | None = None  # of what they wrote, the samples last
+    answer: Callable[[Any], tuple[int, ...]] = lambda parameters: ()  # shape of a sample's answer, finished
+    places: Callable[[Any, tuple[int, ...]], Sequence[int]] | None = None  # in it, flat, of what a program writes
 
 
 def usable(*arrays: Any) -> bool:

@@ -13,8 +13,8 @@ from ..effects.base import Effect
 from ..estimation.priors import physical_body
 from ..estimation.rows import Rows
 from ..results import Name
-from .comparison import Ground, Hypothesis, Verdicts, judge, judge_grown
-from .design import kind, shapes, with_shape
+from .comparison import Ground, Hypothesis, Verdicts, coefficients, grown_sums, judge, judge_grown, sums_of
+from .design import BATCH, kind, shapes, with_shape
 from .estimates import torque_slope
 from .problem import Problem
 from .refit import Whitened, refit, refit_shift
@@ -26,7 +26,6 @@ from .thresholds import BEST_OF_A_PLACE, GAIN, SHARE_OF_BEST, SHIFTS, SHORTLIST
 __all__ = ["Contender", "acting", "contend", "for_refit", "shortlist"]
 
 TURNS, RESPONSE_TURNS = 3, 6  # of Gauss-Newton on a shift of the position; on a response of the torque
-STARTS = 4  # of a refit
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ def _exact_columns(
     """The effect with the shape that fits best, and its whitened columns."""
     if not shapes(type(group.effect)):
         return jax.tree.map(lambda x: x[order[0]], group.effect), group.columns.Z[order[0]]
-    starts = np.resize(order, STARTS)
+    starts = np.resize(order, BATCH)
     effects = jax.tree.map(lambda x: x[starts], group.effect)
     effect, Z = refit(effects, step.state.motion, problem.records, ready, group.effect)
     return effect, Z.reshape(*Z.shape[:2], -1)
@@ -135,7 +134,9 @@ def _body_verdicts(
     rows, full = step.rows, np.moveaxis(Z, 0, 2)
     free = judge_grown(rows, base, range(len(rows.y)), Z)
     body = physical_body(free.theta[-10:], _information(rows, base, full))
-    verdicts = judge(rows, Hypothesis(rows.X, step.state.prior, full @ body))
+    fixed = full @ body
+    sums = sums_of(rows, step.folded, rows.y - fixed)
+    verdicts = judge(rows, Hypothesis(rows.X, step.state.prior, fixed), sums)
     return with_shape(effect, list(effect.parameters()), list(body)), verdicts
 
 
@@ -176,7 +177,7 @@ def _sensor_contender(
         here = stand(problem, extended_state(problem, base, effect), whitening)
         slope = torque_slope(problem, here.state, effect, name, whitening)
         X = np.concatenate([here.rows.X, slope[..., None]], axis=2)
-        theta = judge(here.rows, Hypothesis(X, here.state.prior.extended(1))).theta
+        theta = coefficients(grown_sums(here.rows, here.folded, X), here.state.prior.extended(1))
         value = float(np.clip(float(getattr(effect, name)) + theta[-1], parameter.lower, parameter.upper))
         done = abs(value - float(getattr(effect, name))) < 1e-7
         effect = with_shape(effect, [name], [np.float64(value)])

@@ -11,14 +11,16 @@ JAX evaluates the equations, many effects in one program; samples, shifts and fi
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
+from math import prod
 from typing import Literal, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
+from ..compiled.batching import CPU_OPTIONS
 from ..compiled.executable_cache import Program
 from ..effects.base import Effect, Motion, columns
 from ..recordings.stacked import Records, filter_rows
@@ -26,7 +28,9 @@ from ..rigid.model import RobotModel
 from .shifts import links_torque, shift_torques, torque_change
 
 __all__ = [
+    "BATCH",
     "Units",
+    "batch_size",
     "candidates",
     "flattened",
     "kind",
@@ -38,6 +42,9 @@ __all__ = [
     "units_and_slopes",
     "with_shape",
 ]
+
+
+BATCH = 4  # effects with a shape in one program, and starts of a refit
 
 
 class Units(NamedTuple):
@@ -64,9 +71,17 @@ def shapes(effect: type[Effect]) -> list[str]:
     return [name for name, p in effect.parameters().items() if not p.linear and not p.choice]
 
 
+def batch_size(effect: Effect | type[Effect]) -> int:
+    """Effects with a shape in one program: as many as a refit starts from."""
+    return min(BATCH, prod(len(p.grid) for p in effect.parameters().values() if not p.linear))
+
+
 def with_shape(effect: Effect, names: list[str], values: list) -> Effect:
     """The effect with the named parameters replaced."""
-    return eqx.tree_at(lambda e: [getattr(e, name) for name in names], effect, values)
+    other = object.__new__(type(effect))  # as `eqx.tree_at` makes it, which takes ten times as long
+    for name, value in (vars(effect) | dict(zip(names, values, strict=True))).items():
+        object.__setattr__(other, name, value)
+    return other
 
 
 def flattened(batch: Effect) -> Effect:
@@ -106,7 +121,7 @@ def unit_rows(given: Units, records: Records, whitening: Complex[np.ndarray, "F 
     response = whitening.T[given.joints][:, None]
     if given.response is not None:
         response = response * given.response[:, None, None]
-    rows = filter_rows(records, given.torque.reshape(*given.torque.shape[:3], n, samples), response)
+    rows = filter_rows(records, given.torque.reshape(*given.torque.shape[:3], n, samples), response, fitted=True)
     return rows * np.moveaxis(np.asarray(records.weight), 2, 0)[given.joints][:, None]
 
 
@@ -203,12 +218,12 @@ def _amplitudes(effect: Effect) -> list[str]:
     return [name for name, p in effect.parameters().items() if p.linear]
 
 
-@Program
+@partial(Program, options=CPU_OPTIONS)
 def _unit_torques(batches: dict[str, Effect], motion: Motion) -> dict[str, Float[Array, "effects k nN *rows"]]:
     return {name: jax.vmap(lambda e: columns(e, motion))(batch) for name, batch in batches.items()}
 
 
-@Program
+@partial(Program, options=CPU_OPTIONS)
 def _units_and_slopes(
     effects: Effect, values: Array, motion: Motion
 ) -> tuple[Float[Array, "effects k nN rows"], Float[Array, "effects k nN rows p"]]:
@@ -226,12 +241,12 @@ def _units_and_slopes(
     return jax.vmap(one)(effects, values)
 
 
-@Program
+@partial(Program, options=CPU_OPTIONS)
 def _responses(batches: dict[str, Effect], omega: Array) -> dict[str, Complex[Array, "effects F"]]:
     return {name: jax.vmap(lambda e: e.torque_response(omega))(batch) for name, batch in batches.items()}
 
 
-@Program
+@partial(Program, options=CPU_OPTIONS)
 def _changed(effects: Effect, model: RobotModel) -> list[Float[Array, "effects amplitudes *rest"]]:
     """Leaves of the robot with a unit of each amplitude of each effect."""
     names = _amplitudes(effects)

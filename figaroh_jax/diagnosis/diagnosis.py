@@ -23,7 +23,7 @@ from ..errors import InputError
 from ..estimation.noise import Spectrum
 from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
-from ..recordings.signals import Signals, prepare_all
+from ..recordings.signals import Resampled, Signals, prepare_all
 from ..recordings.stacked import stack
 from ..results import Cause, Diagnosis, Gain, Name, Nearest, Rest, Verdict
 from ..rigid.model import RobotModel, prismatic
@@ -144,11 +144,9 @@ def _signals(
     Each position is taken down to the band of its own motion only where the baseline then predicts left-out parts
     better, by their error in N m: coarse encoders need it, and it takes the abrupt parts of a fine one away.
     """
-    both = [
-        sorted(checked_repeats(prepare_all(recordings, preprocess, slowed=slowed)), key=lambda s: s.role == "holdout")
-        for slowed in (False, True)
-    ]
-    plain, slow = both
+    resampled: Resampled = {}
+    prepared = (prepare_all(recordings, preprocess, slowed=slowed, resampled=resampled) for slowed in (False, True))
+    plain, slow = both = [sorted(checked_repeats(each), key=lambda s: s.role == "holdout") for each in prepared]
     if all(np.array_equal(a.position, b.position) for a, b in zip(plain, slow, strict=True)):
         return plain, False
     errors = [_baseline_error(*_begun(backend, signals, known, trust)) for signals in both]

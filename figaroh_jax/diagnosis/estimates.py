@@ -12,12 +12,12 @@ from ..effects.extended import ExtendedModel, extend
 from ..recordings.stacked import filtered_rows
 from ..results import Estimate
 from ..rigid.model import RobotModel, prismatic
-from .design import kind, local, sensor_response, shapes, units_and_slopes, with_shape
+from .design import kind, local, sensor_response, shapes, with_shape
 from .problem import Problem
 from .shifts import torque_change
-from .state import BATCH, State
+from .state import State, unit_slopes
 
-__all__ = ["Fitted", "estimates", "fitted_model", "torque_slope", "with_amplitudes"]
+__all__ = ["Fitted", "estimates", "fitted_model", "torque_slope", "torque_slopes", "with_amplitudes"]
 
 STEP = 1e-5  # of central differences, relative: error 1e-10 of a third derivative's size
 
@@ -117,20 +117,27 @@ def _without(state: State, effect: Effect) -> Motion:
     return motion
 
 
+def torque_slopes(
+    problem: Problem, state: State, effect: Effect, whitening: Float[np.ndarray, "F nv"]
+) -> list[Float[np.ndarray, "nv T"]]:
+    """Derivatives of the whitened torque in the shapes of the effect, its amplitudes as they are."""
+    names = shapes(type(effect))
+    if not names or kind(effect) != "columns":
+        return [torque_slope(problem, state, effect, name, whitening) for name in names]
+    response = state.response(problem.records.omega)[:, None] * whitening
+    amplitudes, out = [float(getattr(effect, n)) for n, p in effect.parameters().items() if p.linear], []
+    for slope in unit_slopes(problem, state, effect, _without(state, effect)):
+        torque = np.zeros((slope.shape[-1], problem.model.nv))
+        torque[:, np.asarray(effect.at) if local(effect) else slice(None)] = np.tensordot(amplitudes, slope, 1).T
+        out.append(filtered_rows(problem.records, torque, response))
+    return out
+
+
 def torque_slope(
     problem: Problem, state: State, effect: Effect, name: str, whitening: Float[np.ndarray, "F nv"]
 ) -> Float[np.ndarray, "nv T"]:
-    """Derivative of the whitened torque in one shape of the effect, its amplitudes as they are."""
-    response = state.response(problem.records.omega)[:, None] * whitening
-    names, size = shapes(type(effect)), float(getattr(effect, name))
-    if kind(effect) == "columns":
-        batch = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], BATCH, axis=0), effect)
-        values = np.stack([getattr(batch, n) for n in names], axis=1)
-        slope = units_and_slopes(batch, values, _without(state, effect))[1][0, names.index(name)]
-        amplitudes = [float(getattr(effect, n)) for n, p in effect.parameters().items() if p.linear]
-        torque = np.zeros((slope.shape[-1], problem.model.nv))
-        torque[:, np.asarray(effect.at) if local(effect) else slice(None)] = np.tensordot(amplitudes, slope, 1).T
-        return filtered_rows(problem.records, torque, response)
+    """Derivative of the whitened torque in the one parameter of a sensor effect."""
+    response, size = state.response(problem.records.omega)[:, None] * whitening, float(getattr(effect, name))
     h = STEP * max(abs(size), STEP)
     sides = jax.tree.map(lambda *x: np.stack(x), *(with_shape(effect, [name], [size + s * h]) for s in (1, -1)))
     if kind(effect) == "response":

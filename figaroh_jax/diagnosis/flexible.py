@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -71,7 +69,7 @@ def friction_width(problem: Problem, state: State, whitening: Float[np.ndarray, 
         z = tried[best]
         G, b = _replaced(G, b, column, z @ rows.X[joint], z @ z, z @ rows.y[joint])[1:]
         rows.X[joint, :, column] = z
-    return replace(problem, width=width)
+    return problem.with_width(width)
 
 
 def _smooth_columns(

@@ -14,8 +14,8 @@ from ..effects.catalogue import CATALOGUE, find
 from ..estimation.rows import Rows
 from ..results import Name
 from .design import kind, shapes, with_shape
-from .estimates import Fitted, amplitude_places, torque_slope, with_amplitudes
-from .problem import Problem
+from .estimates import Fitted, amplitude_places, torque_slopes, with_amplitudes
+from .problem import Problem, family_of
 from .search import Found
 from .state import State, extended_state, solved
 from .step import Step, stand
@@ -41,13 +41,18 @@ def polished(problem: Problem, start: State, causes: list[Effect], whitening: Fl
     Sensor effects follow the load and the torque, so each turn begins with what the last one made of the baseline.
     """
     joint = _together(problem, start, causes, whitening)
-    for _ in range(POLISH):
+    for _ in range(0 if all(map(_settled, causes)) else POLISH):
         causes = [moved(e, joint.fitted, at) for e, at in zip(joint.causes, joint.fitted.places, strict=True)]
         base = solved(problem, start, joint.step.state.theta[: len(start.theta)])
         last, joint = joint.fitted, _together(problem, base, causes, whitening)
         if np.all(np.abs(joint.fitted.value - last.value) <= SETTLED * np.sqrt(np.diag(joint.fitted.covariance))):
             break
     return joint
+
+
+def _settled(effect: Effect) -> bool:
+    """Whether one turn is all: the columns are those of the measured motion, whatever is found of the others."""
+    return effect.inertial or family_of(type(effect)) == "fixed"
 
 
 def _together(problem: Problem, base: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> Joint:
@@ -70,7 +75,7 @@ def joint_fit(
 ) -> Fitted:
     """Gauss-Newton step of all coefficients and shapes at once, and a covariance from the scores of the blocks."""
     causes = with_amplitudes(state, causes, problem.model)
-    slopes = [torque_slope(problem, state, e, name, whitening) for e in causes for name in shapes(type(e))]
+    slopes = [slope for e in causes for slope in torque_slopes(problem, state, e, whitening)]
     J = np.concatenate([rows.X, *[s[..., None] for s in slopes]], axis=2)
     precision = np.append(state.prior.precision, np.zeros(len(slopes)))
     tall = J.reshape(-1, J.shape[2])

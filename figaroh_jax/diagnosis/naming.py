@@ -192,7 +192,7 @@ def _varied_joint(grown: _Grown, torque: np.ndarray, joints: tuple[int, ...]) ->
     for joint in joints:
         varying = [_unit(x) for x in (q[:, joint], np.abs(v[:, joint]), load[:, joint], np.asarray(motion.time))]
         columns = np.stack([torque[:, joint] * f for x in varying for f in (x, 2 * x**2 - 1)])
-        rows = filter_rows(records, columns.reshape(-1, n, samples), grown.response[:, joint][None])
+        rows = filter_rows(records, columns.reshape(-1, n, samples), grown.response[:, joint][None], fitted=True)
         out.append((rows * np.asarray(problem.records.weight)[:, :, joint]).reshape(len(columns), -1))
     return np.stack(out, axis=1)
 
@@ -243,7 +243,7 @@ def _with_smooth(grown: _Grown, step: Step, sized: bool) -> Hypothesis:
     response = whitening * step.state.response(problem.records.omega)[:, None]
     blocks = []
     for joint, functions in enumerate(smooth_functions(step.state.motion)):
-        own = filter_rows(problem.records, functions.reshape(-1, n, samples), response[:, joint][None])
+        own = filter_rows(problem.records, functions.reshape(-1, n, samples), response[:, joint][None], fitted=True)
         own = (own * np.asarray(problem.records.weight)[:, :, joint]).reshape(len(functions), -1)
         full = np.zeros((nv, own.shape[1], len(own)))
         full[joint] = own.T

@@ -2,24 +2,142 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from hashlib import blake2b
+from typing import Any, TypeVar
+from weakref import ref
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 
 from ..effects.base import Effect, Motion
 from ..effects.catalogue import CATALOGUE
-from ..recordings.stacked import Records, open_rows
+from ..recordings.stacked import Records, filter_rows, open_rows
 from ..rigid.model import RobotModel
 from ..simulators.contract import Backend
 from .design import Units, candidates, flattened, kind, shapes, units
 from .shifts import links_torque, rigid_torque
 
-__all__ = ["Layout", "Problem", "family_of"]
+T = TypeVar("T")
 
-_OF_THE_MOTION = ("torque", "gain", "motion", "families", "fixed")  # cached, and the same for all weights of the rows
+__all__ = ["Layout", "Part", "Problem", "family_of", "without_factor"]
+
+# cached, and the same for all weights of the rows
+_OF_THE_MOTION = ("torque", "gain", "motion", "families", "fixed", "plain", "_terms")
+KEPT = 64 << 20  # bytes of filtered columns that are held
+MOST_TERMS = 48  # terms of models whose columns are held
+TURNED = 128  # samples that are turned at once: they stay in the processor's cache
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Columns of a regressor at all samples, without the zeros: a tree leaves many joints of a column untouched."""
+
+    series: Float[np.ndarray, "series nN"]  # by joint, then by column
+    joint: Int[np.ndarray, " series"]
+    column: Int[np.ndarray, " series"]
+    nv: int
+    width: int  # columns
+    _last: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)  # coefficients and their torque
+
+    @classmethod
+    def of(cls, columns: Float[np.ndarray, "nv k nN"]) -> Part:
+        """The part of columns as they are."""
+        joint, column = np.nonzero(columns.any(2))
+        return cls(columns[joint, column], joint, column, *columns.shape[:2])
+
+    @classmethod
+    def of_samples(cls, columns: Float[np.ndarray, "nN nv k"]) -> Part:
+        """The part of columns that lie sample by sample."""
+        joint, column = np.nonzero(columns.any(0))
+        series = np.empty((len(joint), len(columns)))
+        for start in range(0, len(columns), TURNED):
+            few = slice(start, start + TURNED)
+            series[:, few] = columns[few][:, joint, column].T
+        return cls(series, joint, column, *columns.shape[1:])
+
+    @property
+    def samples(self) -> int:
+        """Samples of all recordings."""
+        return self.series.shape[1]
+
+    def torque(self, theta: Float[np.ndarray, " k"], rows: slice = slice(None)) -> Float[np.ndarray, "rows nv"]:
+        """Torque (samples, nv) of the coefficients `theta`, N m or N; `rows` are samples."""
+        if rows == slice(None) and self._last and np.array_equal(self._last[0][0], theta):
+            return self._last[0][1]
+        series = self.series[:, rows]
+        out, ends = np.zeros((series.shape[1], self.nv)), np.searchsorted(self.joint, np.arange(self.nv + 1))
+        for joint in range(self.nv):
+            own = slice(ends[joint], ends[joint + 1])
+            out[:, joint] = theta[self.column[own]] @ series[own]
+        if rows == slice(None):  # states that grow out of one another ask for the same
+            out.setflags(write=False)
+            self._last[:] = [(theta.copy(), out)]
+        return out
+
+    def dense(self, columns: range) -> Float[np.ndarray, "k nv nN"]:
+        """Some of the columns in the rows of all joints."""
+        out = np.zeros((len(columns), self.nv, self.samples))
+        own = np.flatnonzero((self.column >= columns.start) & (self.column < columns.stop))
+        out[self.column[own] - columns.start, self.joint[own]] = self.series[own]
+        return out
+
+
+class Filtered:
+    """Parts of regressors through the row filter and a response, kept while they are used: most stay the same."""
+
+    def __init__(self) -> None:
+        # filtered columns by the addresses of the series and of the filter, as long as these live, and by the response
+        self._kept: OrderedDict[tuple[int, int, bytes], tuple[ref[Any], ref[Any], np.ndarray]] = OrderedDict()
+
+    def rows(
+        self, records: Records, parts: Sequence[Part], response: Complex[np.ndarray, "F nv"] | Float[np.ndarray, "F nv"]
+    ) -> Float[np.ndarray, "nv T P"]:
+        """Masked rows of the parts side by side."""
+        response, factor = without_factor(response)
+        code = blake2b(np.ascontiguousarray(response).tobytes(), digest_size=16).digest()
+        blocks = [self._block(records, part, response, code) for part in parts]
+        weight = (np.moveaxis(np.asarray(records.weight), 2, 0) * factor[:, None, None]).reshape(len(factor), -1, 1)
+        X, first = np.empty((*blocks[0].shape[:2], sum(part.width for part in parts))), 0
+        for block in blocks:
+            np.multiply(block, weight, out=X[:, :, first : first + block.shape[2]])
+            first += block.shape[2]
+        return X
+
+    def _block(self, records: Records, part: Part, response: np.ndarray, code: bytes) -> Float[np.ndarray, "nv T k"]:
+        source = np.asarray(records.source)
+        used = np.asarray(records.weight).any((1, 2))
+        key = (id(part.series), id(source), code + used.tobytes())
+        known = self._kept.pop(key, None)
+        same = known is not None and known[0]() is part.series and known[1]() is source
+        block = known[2] if known is not None and same else _through(records, part, response)
+        self._kept[key] = ref(part.series), ref(source), block
+        for old in [k for k, (one, other, _) in self._kept.items() if one() is None or other() is None]:
+            del self._kept[old]
+        while len(self._kept) > 1 and sum(own.nbytes for _, _, own in self._kept.values()) > KEPT:
+            self._kept.popitem(last=False)
+        return block
+
+
+def without_factor(response: np.ndarray) -> tuple[np.ndarray, Float[np.ndarray, " nv"]]:
+    """The response and a factor of each joint's rows: a response that no frequency changes is all factor."""
+    if np.iscomplexobj(response) or not (response == response[:1]).all():
+        return response, np.ones(response.shape[1])
+    return np.ones_like(response), response[0]
+
+
+def _through(records: Records, part: Part, response: np.ndarray) -> Float[np.ndarray, "nv T k"]:
+    """A part through the row filter and the response, the zeros filled in."""
+    n, samples, count, nv = records.shape
+    series = part.series.reshape(len(part.series), n, samples)
+    rows = filter_rows(records, series, response.T[part.joint], fitted=True)
+    block = np.zeros((nv, n * count, part.width))
+    block[part.joint, :, part.column] = rows.reshape(len(rows), n * count)
+    return block
 
 
 class Layout(eqx.Module):
@@ -46,6 +164,7 @@ class Problem:
     trust: float
     width: Float[np.ndarray, " nv"]  # half width of the friction's reversal, rad/s or m/s
     held: Float[np.ndarray, "n M nv"]  # 1: a row of a holdout recording with torque
+    filtered: Filtered = field(default_factory=Filtered, compare=False, repr=False)
 
     @property
     def model(self) -> RobotModel:
@@ -98,9 +217,48 @@ class Problem:
         """Unit torques of the effects that depend on the measured motion alone."""
         return self.family("fixed", self.motion)
 
+    @cached_property
+    def plain(self) -> dict[str, tuple[Float[np.ndarray, "e k r n M"], Int[np.ndarray, "e r"]]]:
+        """Rows, neither whitened nor weighted, of the effects that depend on the measured motion alone, and joints."""
+        n, samples, _, _ = self.records.shape
+        given = self.fixed | self.family("shaped", self.motion)
+        return {
+            name: (filter_rows(self.records, own.torque.reshape(*own.torque.shape[:3], n, samples), fitted=True), at)
+            for name, own in given.items()
+            for at in [own.joints]
+        }
+
     def family(self, name: str, motion: Motion) -> dict[str, Units]:
-        """Unit torques of a family, on one axis of places and grid points."""
+        """Unit torques of a family, on one axis of places and grid points.
+
+        Of the effects that follow the torque each has a program of its own: it serves one of them as well.
+        """
+        if name == "following":
+            return {n: self.following(n, motion) for n in self.families[name]}
         return units({n: flattened(b) for n, b in self.families[name].items()}, motion, self.records)
+
+    def following(self, effect: str, motion: Motion) -> Units:
+        """Unit torques of one effect that follows the torque of the current model."""
+        return units({effect: flattened(self.families["following"][effect])}, motion, self.records)[effect]
+
+    @cached_property
+    def _terms(self) -> OrderedDict[Any, tuple[Motion, Any]]:
+        return OrderedDict()
+
+    def kept(self, name: Any, motion: Motion, make: Callable[[], T]) -> T:
+        """What has been made under the name of the same motion, or is made now; the last few are held."""
+        known = self._terms.pop(name, None)
+        made = known[1] if known is not None and known[0] is motion else make()
+        self._terms[name] = motion, made
+        while len(self._terms) > MOST_TERMS:
+            self._terms.popitem(last=False)
+        return made
+
+    def with_width(self, width: Float[np.ndarray, " nv"]) -> Problem:
+        """The problem with another width of the friction's reversal, which no candidate's place and grid depends on."""
+        other = replace(self, width=width)
+        other.__dict__.update({k: v for k, v in self.__dict__.items() if k in ("torque", "gain", "families")})
+        return other
 
 
 def family_of(effect: type[Effect]) -> str:

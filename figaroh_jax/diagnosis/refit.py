@@ -92,12 +92,19 @@ def refit(
     points = {n: p.grid if grid is None else np.unique(getattr(grid, n)) for n, p in effects.parameters().items()}
     box = np.stack([_box(effects.parameters()[n], x, points[n]) for n, x in zip(names, start.T, strict=True)], axis=-1)
     low, width = box[:, 0], box[:, 1] - box[:, 0]
-    device_effects, device_motion = jax.device_put((effects, motion))
+    # a start that stands there more than once (the grid is short) is followed once
+    fields = np.concatenate([np.reshape(x, (len(start), -1)) for x in jax.tree.leaves(effects)], axis=1)
+    _, once, copies = np.unique(fields, axis=0, return_index=True, return_inverse=True)
+    device_effects, device_motion = jax.device_put((jax.tree.map(lambda x: np.asarray(x)[once], effects), motion))
     scale, known = 1.0, {}
+
+    def profiles(values: Float[np.ndarray, "starts p"]) -> dict[str, Any]:
+        found = _profiles(device_effects, device_motion, values[once], records, whitened)
+        return {name: x[copies.reshape(-1)] for name, x in found.items() if name != "Z"} | {"Z": found["Z"]}
 
     def function(u: Float[np.ndarray, " startsp"]) -> tuple[float, Float[np.ndarray, " startsp"]]:
         values = low + u.reshape(low.shape) * width
-        known.update(_profiles(device_effects, device_motion, values, records, whitened), at=values)
+        known.update(profiles(values), at=values)
         return float(known["value"].sum()) / scale, (known["slope"] * width).reshape(-1) / scale
 
     first = ((start - low) / width).reshape(-1)
@@ -106,10 +113,10 @@ def refit(
         low + bounded_minimum(function, first, np.zeros_like(first), np.ones_like(first)).reshape(low.shape) * width
     )
     if not np.array_equal(known["at"], values):
-        known = _profiles(device_effects, device_motion, values, records, whitened)
+        known = profiles(values)
     best = int(np.argmin(np.where(np.isfinite(known["value"]), known["value"], np.inf)))
     one = jax.tree.map(lambda x: np.asarray(x)[best], effects)
-    return with_shape(one, names, list(values[best])), known["Z"][best]
+    return with_shape(one, names, list(values[best])), known["Z"][copies.reshape(-1)[best]]
 
 
 def shift_profile(change: Float[np.ndarray, "sizes nv T"], whitened: Whitened) -> Float[np.ndarray, " sizes"]:

@@ -190,7 +190,7 @@ def _rows_at(
 ) -> Float[np.ndarray, "k T"]:
     n, samples, _, _ = problem.records.shape
     response = (whitening[:, joint] * state.response(problem.records.omega))[None]
-    rows = filter_rows(problem.records, columns.reshape(-1, n, samples), response)
+    rows = filter_rows(problem.records, columns.reshape(-1, n, samples), response, fitted=True)
     return (rows * np.asarray(problem.records.weight)[:, :, joint]).reshape(len(columns), -1)
 
 

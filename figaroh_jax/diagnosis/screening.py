@@ -22,7 +22,7 @@ from ..rigid.model import RobotModel
 from .bank import Bank, Columns, bank
 from .design import flattened, unit_rows, units
 from .evidence import Score, block_scores, largest, other_scores, projection, pulled, scores
-from .problem import Problem
+from .problem import Problem, without_factor
 from .state import State
 
 __all__ = ["Group", "Null", "Screen", "catalogue", "family_p", "screen"]
@@ -95,19 +95,27 @@ def _fresh_columns(
     problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], wanted: Collection[str], everything: bool
 ) -> dict[str, list[Columns]]:
     """Whitened columns by place: of all wanted effects, or of those whose columns follow the torque of the state."""
-    given = problem.family("following", state.motion)
+    response = whitening * state.response(problem.records.omega)[:, None]
+    given, known, factor = problem.family("following", state.motion), {}, np.ones(0)
     if everything:
-        given |= problem.fixed | problem.family("shaped", state.motion)
+        coloured, factor = without_factor(response)
+        if (coloured == 1).all():
+            known = problem.plain
+        else:
+            given |= problem.fixed | problem.family("shaped", state.motion)
     sensors = {n: b for n, b in problem.families["sensor"].items() if n in wanted and (everything or b.follows_torque)}
     given |= units({n: flattened(b) for n, b in sensors.items()}, state.motion, problem.records)
-    response = whitening * state.response(problem.records.omega)[:, None]
     batches = {n: b for family in problem.families.values() for n, b in family.items()}
-    out = {}
-    for name in (n for n in given if n in wanted):
+    weight, out = np.moveaxis(np.asarray(problem.records.weight), 2, 0), {}
+    for name in (n for n in [*given, *known] if n in wanted):
         places, grid = batches[name].at.shape[:2]
-        rows = unit_rows(given[name], problem.records, response)
+        if name in given:
+            rows, at = unit_rows(given[name], problem.records, response), given[name].joints
+        else:
+            rows, at = known[name]
+            rows = rows * (weight * factor[:, None, None])[at][:, None]
         rows = rows.reshape(places, grid, *rows.shape[1:3], -1)
-        joints = given[name].joints[::grid].tolist()
+        joints = at[::grid].tolist()
         out[name] = [Columns(tuple(at), Z) for at, Z in zip(joints, rows, strict=True)]
     return out
 

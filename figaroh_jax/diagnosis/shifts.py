@@ -6,6 +6,7 @@ JAX evaluates inverse dynamics, many samples in one program; the equations of th
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..compiled.batching import CPU_OPTIONS
 from ..compiled.executable_cache import Program
 from ..effects.base import Effect, Motion
 from ..recordings.stacked import Records
@@ -122,9 +124,9 @@ def _compliances(effects: Effect, motion: Motion, records: Records) -> list[_Com
     loads = np.repeat(load[None], len(effects.at), axis=0)
     unit = (_errors(effects, motion, loads + 1) - _errors(effects, motion, loads)).mean(1)
     joints = np.asarray(effects.at)[:, 0]
-    few = _Few.of(motion, records)
-    slopes = few.slopes(motion.model, joints, lambda q, v, a: links_torque(motion.model, q, v, a, records))
-    own = few.between(np.stack([slopes[k, :, :, j] for k, j in enumerate(joints)]))  # (sensors, 3, n, N)
+    few, (once, place) = _Few.of(motion, records), np.unique(joints, return_inverse=True)
+    slopes = few.slopes(motion.model, once, lambda q, v, a: links_torque(motion.model, q, v, a, records))
+    own = few.between(np.stack([slopes[k, :, :, j] for k, j in enumerate(once)]))[place]  # (sensors, 3, n, N)
     dt, out = float(records.dt), []
     for K, D, M in unit[:, None, None, None] * own:
         inertial = np.stack([M, -2 * M, M]) / dt**2
@@ -260,7 +262,7 @@ def _load_slopes(motion: Motion, records: Records) -> Float[np.ndarray, "3 nv nv
     return _SLOPES[0][2]
 
 
-@Program
+@partial(Program, options=CPU_OPTIONS)
 def _unit_errors(effects: Effect, motion: Motion) -> Float[Array, "effects k nN"]:
     names = [name for name, p in effects.parameters().items() if p.linear]
 
@@ -270,6 +272,6 @@ def _unit_errors(effects: Effect, motion: Motion) -> Float[Array, "effects k nN"
     return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(effects, jnp.eye(len(names)))
 
 
-@Program
+@partial(Program, options=CPU_OPTIONS)
 def _error(effect: Effect, motion: Motion) -> Float[Array, " nN"]:
     return effect.position_error(motion)

@@ -65,7 +65,7 @@ def only_sticks(
 def _friction(state: State) -> Float[np.ndarray, " nv"]:
     """RMS of what all friction of the state takes of each joint, N m or N."""
     _, *shares = state.shares(state.theta)
-    friction = np.zeros(state.rigid.shape[:2])
+    friction = np.zeros((state.rigid.samples, state.rigid.nv))
     for share, term in zip(shares, state.terms, strict=True):
         friction = friction + share * term.dissipative
     return np.sqrt((friction**2).mean(0))

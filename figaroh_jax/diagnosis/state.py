@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,10 +19,10 @@ from ..effects.base import Effect, Motion
 from ..effects.catalogue import find
 from ..estimation.priors import body_precision, rigid_prior
 from ..estimation.rows import Prior, Rows, instruments
-from ..recordings.stacked import filter_rows, filtered_rows
+from ..recordings.stacked import filtered_rows
 from ..rigid.model import Leaf
-from .design import Units, flattened, kind, local, sensor_response, shapes, units, units_and_slopes
-from .problem import Layout, Problem, family_of
+from .design import Units, batch_size, flattened, kind, local, sensor_response, shapes, units, units_and_slopes
+from .problem import Layout, Part, Problem, family_of
 from .shifts import shifted
 
 __all__ = [
@@ -33,13 +34,13 @@ __all__ = [
     "on_motion",
     "plain_rows",
     "solved",
+    "unit_slopes",
     "unit_torques",
     "whitened",
     "with_term",
 ]
 
 FRICTION_PRECISION = 1e-6
-BATCH = 4  # effects with a shape in one program
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class State:
 
     terms: tuple[Effect, ...]  # each with a leading axis of places
     sensors: tuple[Effect, ...]
-    parts: tuple[Float[np.ndarray, "nN nv k"], ...]  # regressor: the rigid body's columns, then those of each term
+    parts: tuple[Part, ...]  # regressor: the rigid body's columns, then those of each term
     prior: Prior
     theta: Float[np.ndarray, " P"]
     measured: Motion  # as measured, with the nominal robot's load
@@ -58,11 +59,11 @@ class State:
     def motion(self) -> Motion:
         """The motion as measured, with load, total torque and inertia of `theta`."""
         load, *others = self.shares(self.theta)
-        new = (load, sum(others, load), self.theta[: self.rigid.shape[2]].reshape(-1, 10))
+        new = (load, sum(others, load), self.theta[: self.rigid.width].reshape(-1, 10))
         return eqx.tree_at(lambda m: (m.load, m.total, m.model.inertia), self.measured, new)
 
     @property
-    def rigid(self) -> Float[np.ndarray, "nN nv columns"]:
+    def rigid(self) -> Part:
         """Regressor of the rigid body."""
         return self.parts[0]
 
@@ -70,26 +71,21 @@ class State:
     def known(self) -> Float[np.ndarray, "nN nv"]:
         """Torque of what each recording is known to carry, N m or N."""
         if self.carried is None:
-            return np.zeros(self.rigid.shape[:2])
-        ten = self.carried.reshape(len(self.carried), -1, 1)
-        each = self.rigid.reshape(len(ten), -1, ten.shape[1]) @ ten
-        return each.reshape(self.rigid.shape[:2])
-
-    def columns(self, first: int = 0) -> Float[np.ndarray, "nN nv k"]:
-        """Columns of the regressor from one on."""
-        starts = np.cumsum([0, *(part.shape[2] for part in self.parts)])
-        kept = [part[:, :, max(first - start, 0) :] for part, start in zip(self.parts, starts, strict=False)]
-        return np.concatenate([part for part in kept if part.shape[2]] or [self.rigid[:, :, :0]], axis=2)
+            return np.zeros((self.rigid.samples, self.rigid.nv))
+        count = self.rigid.samples // len(self.carried)
+        each = [slice(k * count, (k + 1) * count) for k in range(len(self.carried))]
+        torques = [self.rigid.torque(ten.reshape(-1), rows) for ten, rows in zip(self.carried, each, strict=True)]
+        return np.concatenate(torques)
 
     def torque(self, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "nN nv"]:
         """Torque at the samples with the coefficients `theta`, N m or N."""
-        return sum(self.shares(theta), np.zeros(self.rigid.shape[:2]))
+        return sum(self.shares(theta), np.zeros((self.rigid.samples, self.rigid.nv)))
 
     def shares(self, theta: Float[np.ndarray, " P"]) -> Iterator[Float[np.ndarray, "nN nv"]]:
         """Torque of the rigid body with what it carries, then of each term."""
-        split = np.split(theta, np.cumsum([part.shape[2] for part in self.parts])[:-1])
+        split = np.split(theta, np.cumsum([part.width for part in self.parts])[:-1])
         for part, own, known in zip(self.parts, split, (self.known, *(0.0 for _ in self.terms)), strict=True):
-            yield (part.reshape(-1, part.shape[2]) @ own).reshape(self.rigid.shape[:2]) + known
+            yield part.torque(own) + known
 
     def response(self, omega: Float[Leaf, " F"]) -> Complex[np.ndarray, " F"] | Float[np.ndarray, " F"]:
         """Response of the torque sensor of all sensor effects together."""
@@ -122,7 +118,7 @@ def batched(effect: Effect) -> Effect:
 def with_term(problem: Problem, state: State, term: Effect) -> State:
     """The state with one more effect (leading axis of places) whose torque is linear in its amplitudes."""
     own = _term_columns(problem, state, term)
-    count = own.shape[-1]
+    count = own.width
     mean, precision = np.zeros(count), np.full(count, FRICTION_PRECISION)
     if term.body:
         mean = np.array([float(getattr(term, name)[0]) for name in term.parameters()])
@@ -146,13 +142,13 @@ def extended_state(problem: Problem, state: State, effect: Effect) -> State:
 def on_motion(problem: Problem, state: State) -> State:
     """The state, its coefficients as they are, along the motion of another problem."""
     rigid = _rigid(problem, problem.motion)
-    first = State((), state.sensors, (rigid,), state.prior, state.theta[: rigid.shape[2]], problem.motion)
+    first = State((), state.sensors, (rigid,), state.prior, state.theta[: rigid.width], problem.motion)
     here = replace(first, carried=problem.records.carried)
     if any(kind(effect) == "position" for effect in state.sensors):
         here = replace(here, parts=(_rigid(problem, link_motion(problem, here)),))
     for term in state.terms:
         own = _term_columns(problem, here, term)
-        theta = state.theta[: len(here.theta) + own.shape[2]]
+        theta = state.theta[: len(here.theta) + own.width]
         here = replace(here, terms=(*here.terms, term), parts=(*here.parts, own), theta=theta)
     return here
 
@@ -185,7 +181,7 @@ def unit_torques(problem: Problem, state: State, term: Effect) -> Units:
     """What a unit of each amplitude of a term (one leading axis) adds in the state, N m or N."""
     if term.inertial:
         links = np.asarray(term.at)[:, 0]
-        torque = np.stack([state.rigid[:, :, 10 * k : 10 * k + 10].transpose(2, 1, 0) for k in links])
+        torque = np.stack([state.rigid.dense(range(10 * k, 10 * k + 10)) for k in links])
         return Units(torque, np.tile(np.arange(problem.model.nv), (len(links), 1)))
     family = family_of(type(term))
     if family == "shaped":
@@ -193,8 +189,9 @@ def unit_torques(problem: Problem, state: State, term: Effect) -> Units:
     if family in ("fixed", "following"):
         place = _places_in(problem.families[family].get(term.name), term)
         if place is not None:
-            known = problem.fixed if family == "fixed" else problem.family(family, state.motion)
-            return Units(known[term.name].torque[place], known[term.name].joints[place])
+            fixed = family == "fixed"
+            known = problem.fixed[term.name] if fixed else problem.following(term.name, state.motion)
+            return Units(known.torque[place], known.joints[place])
     return units({term.name: term}, state.motion, problem.records)[term.name]
 
 
@@ -216,47 +213,70 @@ def _choices(effect: Effect) -> list[str]:
 
 
 def _shaped_units(term: Effect, motion: Motion) -> Units:
-    """By the program of the refits: filled up to its batch."""
-    count, torques = len(term.at), []
-    for start in range(0, count, BATCH):
-        some = np.resize(np.arange(start, min(start + BATCH, count)), BATCH)
+    """By the program of the refits."""
+    torque, _ = shaped_units(term, motion)
+    everywhere = np.tile(np.arange(np.shape(motion.velocity)[1]), (len(torque), 1))
+    return Units(torque, np.asarray(term.at) if local(term) else everywhere)
+
+
+def shaped_units(
+    term: Effect, motion: Motion
+) -> tuple[Float[np.ndarray, "effects k rows nN"], Float[np.ndarray, "effects p k rows nN"]]:
+    """`units_and_slopes` at the effects' own shapes, filled up to the batch of the refits."""
+    count, found, size = len(term.at), [], batch_size(term)
+    for start in range(0, count, size):
+        some = np.resize(np.arange(start, min(start + size, count)), size)
         part = jax.tree.map(lambda x, i=some: np.asarray(x)[i], term)
         values = np.stack([getattr(part, name) for name in shapes(type(term))], axis=1)
-        torques.append(units_and_slopes(part, values, motion)[0])
-    everywhere = np.tile(np.arange(np.shape(motion.velocity)[1]), (count, 1))
-    joints = np.asarray(term.at) if local(term) else everywhere
-    return Units(np.concatenate(torques)[:count], joints)
+        found.append(units_and_slopes(part, values, motion))
+    torque, slope = (np.concatenate(x)[:count] for x in zip(*found, strict=True))
+    return torque, slope
 
 
-def _term_columns(problem: Problem, state: State, term: Effect) -> Float[np.ndarray, "nN nv columns"]:
+def unit_slopes(problem: Problem, state: State, effect: Effect, motion: Motion) -> Float[np.ndarray, "p k rows nN"]:
+    """Derivatives of the unit torques of one effect in its shapes, `motion` being what it follows."""
+    term = batched(effect)
+    if effect.follows_torque:
+        return shaped_units(term, motion)[1][0]
+    return problem.kept(
+        (unit_slopes, *_identity(term)), state.measured, lambda: shaped_units(term, motion)[1][0].copy()
+    )
+
+
+def _identity(term: Effect) -> tuple[Any, ...]:
+    """What tells the columns of a term from those of others, the motion being the same."""
+    return type(term), *((name, np.asarray(getattr(term, name)).tobytes()) for name in ("at", *_choices(term)))
+
+
+def _term_columns(problem: Problem, state: State, term: Effect) -> Part:
+    if family_of(type(term)) in ("fixed", "shaped"):
+        return problem.kept(_identity(term), state.measured, lambda: _columns(problem, state, term))
+    return _columns(problem, state, term)
+
+
+def _columns(problem: Problem, state: State, term: Effect) -> Part:
     given = unit_torques(problem, state, term)
     columns = np.zeros((problem.model.nv, *given.torque.shape[:2], given.torque.shape[3]))
     for one, joints in enumerate(given.joints):
-        np.add.at(columns[:, one], joints, np.swapaxes(given.torque[one], 0, 1))
-    return np.ascontiguousarray(np.moveaxis(columns.reshape(problem.model.nv, -1, columns.shape[-1]), 2, 0))
+        np.add.at(columns[:, one], joints, given.torque[one].swapaxes(0, 1))
+    return Part.of(columns.reshape(problem.model.nv, -1, columns.shape[-1]))
 
 
-def _rigid(problem: Problem, motion: Motion) -> Float[np.ndarray, "nN nv P"]:
+def _rigid(problem: Problem, motion: Motion) -> Part:
     state = (np.asarray(x) for x in (motion.position, motion.velocity, motion.acceleration))
-    return np.asarray(problem.backend.joint_torque_regressor(*state))
+    return Part.of_samples(np.asarray(problem.backend.joint_torque_regressor(*state)))
 
 
-def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], before: Rows | None = None) -> Rows:
-    """Whitened rows of the measured torque and of the state's regressor, with their instruments.
-
-    `before` are the rows of the state that this one extends by columns alone: only the new columns are filtered.
-    """
+def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> Rows:
+    """Whitened rows of the measured torque and of the state's regressor, with their instruments."""
     layout = problem.layout
     response = whitening * state.response(problem.records.omega)[:, None]
-    y = _unexplained(problem, state, whitening, response) if before is None else before.y
-    first = 0 if before is None else before.X.shape[2]
-    X = _filtered_columns(problem, state.columns(first), response)
+    X = problem.filtered.rows(problem.records, state.parts, response)
     Xi = X
     if layout.repeats:
         Xi = np.stack([instruments(x.T, layout.partner, p).T for x, p in zip(X, layout.paired, strict=True)])
-    if before is not None:
-        X, Xi = np.concatenate([before.X, X], axis=2), np.concatenate([before.Xi, Xi], axis=2)
-    return Rows(y, np.ascontiguousarray(X), np.ascontiguousarray(Xi), *_row_layout(layout))
+    y = _unexplained(problem, state, whitening, response)
+    return Rows(y, X, np.ascontiguousarray(Xi), *_row_layout(layout))
 
 
 def plain_rows(problem: Problem, state: State) -> Rows:
@@ -270,20 +290,6 @@ def _unexplained(
     """Rows of the measured torque, less what the sensors read of a known load."""
     rows = filtered_rows(problem.records, problem.records.flat(problem.records.torque), whitening)
     return rows if state.carried is None else rows - filtered_rows(problem.records, state.known, response)
-
-
-def _filtered_columns(
-    problem: Problem, X: Float[np.ndarray, "nN nv k"], response: Complex[np.ndarray, "F nv"]
-) -> Float[np.ndarray, "nv T k"]:
-    """Masked rows of columns, of which a tree leaves many zero."""
-    n, samples, count, nv = problem.records.shape
-    torque = np.ascontiguousarray(np.moveaxis(X, 0, 2)).reshape(-1, n, samples)
-    joints = np.repeat(np.arange(nv), X.shape[2])
-    used = torque.any(axis=(1, 2))
-    rows = np.zeros((len(torque), n, count))
-    rows[used] = filter_rows(problem.records, torque[used], response.T[joints[used]])
-    rows = rows.reshape(nv, -1, n, count) * np.moveaxis(problem.records.weight, 2, 0)[:, None]
-    return np.ascontiguousarray(np.swapaxes(rows.reshape(nv, -1, n * count), 1, 2))
 
 
 def _row_layout(layout: Layout) -> tuple[np.ndarray, ...]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect
 from ..estimation.rows import Linear, Rows, fit
-from .comparison import FoldSums, Hypothesis, Verdicts, fold_sums, grown_sums, judge
+from .comparison import FoldSums, Hypothesis, Verdicts, coefficients, fold_sums, grown_sums, judge
 from .design import kind
 from .problem import Problem
 from .state import State, extended_state, solved, whitened
@@ -20,26 +21,34 @@ __all__ = ["Step", "stand", "with_cause", "with_causes"]
 
 @dataclass(frozen=True)
 class Step:
-    """Where a search stands: the state, its rows and fit."""
+    """Where a search stands: the state, its rows and the normal equations of their folds."""
 
     state: State
     rows: Rows
-    linear: Linear
-    verdicts: Verdicts
     folded: FoldSums
+
+    @cached_property
+    def linear(self) -> Linear:
+        """The instrumented fit."""
+        return fit(self.rows, self.state.prior, self.folded.gram.sum(0))
+
+    @cached_property
+    def verdicts(self) -> Verdicts:
+        """What the data say of the state, on rows that it was not fitted to."""
+        return judge(self.rows, Hypothesis(self.rows.X, self.state.prior), self.folded)
 
 
 def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], before: Step | None = None) -> Step:
-    """Rows, fit and held-out squares of a state; the state comes back with its coefficients.
+    """Rows and fit of a state, which comes back with its coefficients.
 
     `before` is where the search stood when this state has grown out of it.
     """
-    shared = before.rows if before is not None and len(before.state.sensors) == len(state.sensors) else None
-    rows = whitened(problem, state, whitening, shared)
-    folded = fold_sums(rows, rows.X) if before is None or shared is None else grown_sums(rows, before.folded, rows.X)
-    linear = fit(rows, state.prior, folded.gram.sum(0))
-    verdicts = judge(rows, Hypothesis(rows.X, state.prior), folded)
-    return Step(solved(problem, state, verdicts.theta), rows, linear, verdicts, folded)
+    rows = whitened(problem, state, whitening)
+    if before is not None and len(before.state.sensors) == len(state.sensors):
+        folded = grown_sums(rows, before.folded, rows.X)
+    else:
+        folded = fold_sums(rows, rows.X)
+    return Step(solved(problem, state, coefficients(folded, state.prior)), rows, folded)
 
 
 def with_cause(problem: Problem, step: Step, effect: Effect, whitening: Float[np.ndarray, "F nv"]) -> Step:

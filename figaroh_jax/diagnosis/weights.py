@@ -103,8 +103,8 @@ def _whitened_rows(
     records = problem.records
     n, samples, _, _ = records.shape
     response = (whitening[:, joint] * state.response(records.omega))[None]
-    rows = filter_rows(records, columns.reshape(-1, n, samples), response) * np.asarray(records.weight)[:, :, joint]
-    return rows.reshape(len(columns), -1).T
+    rows = filter_rows(records, columns.reshape(-1, n, samples), response, fitted=True)
+    return (rows * np.asarray(records.weight)[:, :, joint]).reshape(len(columns), -1).T
 
 
 def _left(rows: Rows, state: State, joint: int, smooth: Float[np.ndarray, "T k"]) -> Float[np.ndarray, " T"]:

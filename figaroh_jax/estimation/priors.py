@@ -41,13 +41,16 @@ def physical_body(free: Float[np.ndarray, "10"], information: Float[np.ndarray, 
     basis = np.zeros((10, 4, 4))
     basis[(np.arange(10), *lower)] = 1.0
 
+    # the ten parameters are quadratic in x
+    products = np.einsum("iab,jcb->ijac", basis, basis)
+    forms = np.moveaxis(_ten((products + np.swapaxes(products, 2, 3)) / 2), 2, 0).reshape(100, 10)
+    weighed, wanted = (root @ forms.reshape(10, 100)).reshape(100, 10), root @ free
+
     def misfit(x: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
-        L = np.tensordot(x, basis, 1)
-        return root @ (_ten(L @ L.T) - free)
+        return (weighed @ x).reshape(10, 10) @ x - wanted
 
     def slope(x: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10 10"]:
-        half = basis @ np.tensordot(x, basis, 1).T
-        return root @ _ten(half + np.swapaxes(half, 1, 2)).T
+        return 2 * (weighed @ x).reshape(10, 10)
 
     options = {"method": "lm", "ftol": 1e-10, "xtol": 1e-10}
     L = np.tensordot(least_squares(misfit, start, slope, **options).x, basis, 1)  # pyright: ignore[reportArgumentType]

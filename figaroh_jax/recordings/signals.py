@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Rates",
+    "Resampled",
     "RowFilter",
     "Signals",
     "align",
@@ -72,6 +73,10 @@ class Signals:
     notes: tuple[str, ...]
 
 
+# by recording and shift: rate and gaps of its even grid, then times and columns at the working rate
+Resampled = dict[tuple[int, float], tuple[float, Any, Any, Any]]
+
+
 class Rates(NamedTuple):
     """Rates that all recordings of a task share."""
 
@@ -86,23 +91,29 @@ class Rates(NamedTuple):
 
 
 def prepare_all(
-    recordings: Sequence[Recording], preprocess: Preprocess, *, slowed: bool = True, model: RobotModel | None = None
+    recordings: Sequence[Recording],
+    preprocess: Preprocess,
+    *,
+    slowed: bool = True,
+    model: RobotModel | None = None,
+    resampled: Resampled | None = None,
 ) -> tuple[Signals, ...]:
     """`prepare` every recording at the same rates, and repeats of one excitation on grids that meet.
 
     Row k of a repeat's first recording is then row k + `align(first, repeat)` of the repeat, to a fiftieth of a row.
-    `slowed` and `model` as for `prepare`.
+    `slowed`, `model` and `resampled` as for `prepare`.
     """
     rates = choose_rates(recordings, preprocess)
     prepared: list[Signals] = []
     leaders: dict[str, Signals] = {}
     for recording in recordings:
-        signals = prepare(recording, preprocess, rates, slowed=slowed, model=model)
+        signals = prepare(recording, preprocess, rates, slowed=slowed, model=model, resampled=resampled)
         leader = leaders.setdefault(recording.repeat, signals) if recording.repeat else signals
         late = _late_rows(leader, signals) if leader is not signals else 0.0
         off = (late - round(late)) * rates.row
         if abs(off) >= rates.row / 50:
-            signals = prepare(recording, preprocess, rates, shift=off, slowed=slowed, model=model)
+            more = {"slowed": slowed, "model": model, "resampled": resampled}
+            signals = prepare(recording, preprocess, rates, shift=off, **more)
         prepared.append(signals)
     return tuple(prepared)
 
@@ -115,25 +126,30 @@ def prepare(
     shift: float = 0.0,
     slowed: bool = True,
     model: RobotModel | None = None,
+    resampled: Resampled | None = None,
 ) -> Signals:
     """Even, low-passed, differentiated signals of one recording and the filter that makes its rows.
 
     `rates` are those of `choose_rates`, by default for this recording alone; `shift` (s, less than a row) moves the
     grid; `slowed` takes a position down to the band of its own motion where that is below the cutoff. A `model` with
-    quaternions in q takes the rates on its group (`groupmotion`). Raises `InputError` where the window, the cutoff or
+    quaternions in q takes the rates on its group (`groupmotion`). `resampled` holds what calls that differ in `slowed`
+    alone have in common: an empty dictionary at first. Raises `InputError` where the window, the cutoff or
     the rate do not fit the recording, or it is too short.
     """
-    rates = rates or choose_rates((recording,), preprocess)
+    rates, key = rates or choose_rates((recording,), preprocess), (id(recording), shift)
     recording, masked = without_untrusted(recording)
     time, position, torque = _window(recording, preprocess.window)
     grouped = model if model is not None and model.nq != model.nv else None
     if grouped is not None:
         position = continued(grouped, position, str(recording.file))
     _refuse_endless(recording, time, rates)
-    grid = even_grid(time, position, *([] if torque is None else [torque]))
-    at, columns = _resample(grid, rates, shift)
+    known = {} if resampled is None else resampled
+    if key not in known:
+        grid = even_grid(time, position, *([] if torque is None else [torque]))
+        known[key] = grid.rate, grid.gaps, *_resample(grid, rates, shift)
+    rate, gaps, at, columns = known[key]
     dt = 1 / rates.working
-    seconds = time[-1] - time[0] + 1 / grid.rate
+    seconds = time[-1] - time[0] + 1 / rate
     trim = 0.5 if seconds > 9.99 else 0.1
     nv = len(recording.joints)
     rows = row_filter(len(at), dt, rates.cutoff, step=rates.step, trim=trim, start=float(at[0]), nv=nv)
@@ -150,7 +166,7 @@ def prepare(
     else:
         position = normalised(grouped, low_pass(columns[0], dt, rates.cutoff))
         velocity, acceleration = group_rates(grouped, position, dt)
-    weight = _weight(recording, preprocess, rows, velocity, grid.gaps, rates.cutoff)
+    weight = _weight(recording, preprocess, rows, velocity, gaps, rates.cutoff)
     weight *= ~near(rows.row_times, masked, 0.5 / rates.cutoff)
     return Signals(
         name=recording.name,
@@ -166,7 +182,7 @@ def prepare(
         cutoff=rates.cutoff,
         rows=eqx.tree_at(lambda r: r.weight, rows, weight),
         load=recording.load,
-        notes=recording.notes + _gap_notes(recording, grid.gaps, rates.cutoff),
+        notes=recording.notes + _gap_notes(recording, gaps, rates.cutoff),
     )
 
 
@@ -245,7 +261,8 @@ def _resample(grid: Grid, rates: Rates, shift: float):
     slower = min(grid.rate, rates.working)
     passed = min(3 * rates.cutoff, 0.4 * slower)
     edges = {"start": grid.start, "rate": grid.rate, "passed": passed, "stopped": slower - passed}
-    return at, tuple(band_limited(x, at, **edges) for x in grid.columns)
+    widths = np.cumsum([x.shape[1] for x in grid.columns])[:-1]
+    return at, tuple(np.split(band_limited(np.concatenate(grid.columns, axis=1), at, **edges), widths, axis=1))
 
 
 def _weight(recording: Recording, preprocess: Preprocess, rows: RowFilter, velocity, gaps, cutoff: float):

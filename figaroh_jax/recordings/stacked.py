@@ -65,22 +65,27 @@ def filter_rows(
     records: Records,
     torque: Float[np.ndarray, "*series n N"],
     response: Shaped[np.ndarray, "... F"] | None = None,
+    fitted: bool = False,
 ) -> Float[np.ndarray, "*series n M"]:
     """Rows of torques or columns: low-passed without phase, times `response`, at the rows' samples.
 
     `response` (real or complex, over `records.omega`) may lack series, or hold one for all of an axis. On the host:
-    the filter is linear, so that derivatives of a column pass it as columns do.
+    the filter is linear, so that derivatives of a column pass it as columns do. `fitted`: rows of a recording of which
+    none has a weight are zero.
     """
     series = torque.shape[:-2]
     factor = np.asarray(records.low_pass) if response is None else np.asarray(records.low_pass) * response
-    flat, out = torque.reshape(-1, *torque.shape[-2:]), np.empty((int(np.prod(series)), *records.kept.shape))
+    count = int(np.prod(series))
+    flat, out = torque.reshape(count, *torque.shape[-2:]), np.empty((count, *records.kept.shape))
     shared = factor.ndim == 1 or factor.size == factor.shape[-1]
-    each = None if shared else np.broadcast_to(factor, (*series, factor.shape[-1])).reshape(len(flat), -1)
+    each = None if shared else np.broadcast_to(factor, (*series, factor.shape[-1])).reshape(count, factor.shape[-1])
+    used = np.asarray(records.weight).any((1, 2)) if fitted else np.ones(len(records.kept), bool)
+    out[:, ~used] = 0.0
     for start in range(0, len(flat), SERIES):
         part = slice(start, start + SERIES)
         own = factor.reshape(-1) if each is None else each[part]
-        for k, (source, kept) in enumerate(zip(records.source, records.kept, strict=True)):
-            out[part, k] = filtered(flat[part, k], source, kept, own)
+        for k in np.flatnonzero(used):
+            out[part, k] = filtered(flat[part, k], records.source[k], records.kept[k], own)
     return out.reshape(*series, *records.kept.shape)
 
 
@@ -97,7 +102,7 @@ def filtered_rows(
 ) -> Float[np.ndarray, "nv T"]:
     """Rows of a torque at all samples through the row filter and `response`, masked."""
     n, samples, _, nv = records.shape
-    rows = filter_rows(records, torque.T.reshape(nv, n, samples), response.T)
+    rows = filter_rows(records, torque.T.reshape(nv, n, samples), response.T, fitted=True)
     return (rows * np.moveaxis(records.weight, 2, 0)).reshape(nv, -1)
 
 

@@ -7,18 +7,21 @@ kernels the sample is the last axis; the public functions take any leading batch
 
 from __future__ import annotations
 
+from math import prod
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from ..compiled.batching import over_samples
+from ..compiled.batching import aligned, on_host, over_samples, to_device, two_axes
+from ..compiled.machine_code import machine_code
 from ..compiled.precision import in_float64
 from .inertia import pseudo_inertia
 from .kinematics import Motion, add_up, ancestors, axis_twists, check_shapes, gather, motion, movers, pose_columns, take
 from .model import RobotModel
-from .scalar_programs import MASSES, TORQUES, straight
+from .scalar_programs import MASSES, TORQUES, straight, written, written_torques
 from .spatial import cross, matmul, rotate
 
 __all__ = [
@@ -29,6 +32,8 @@ __all__ = [
     "joint_torques",
     "mass_matrix",
 ]
+
+MANY = 512  # samples from which a program is worth its compilation that is written out for the robot at hand
 
 
 @in_float64
@@ -53,6 +58,12 @@ def inverse_dynamics(
     (5, 4)
     """
     check_shapes(model, q=q, v=v, a=a)
+    if on_host(model, q, v, a) and prod(np.shape(q)[:-1]) >= MANY:
+        rows = two_axes(q, v, a, host=True)
+        if (code := machine_code(_TORQUES, model, *rows)) is not None:
+            return to_device(code(aligned, *rows).reshape(*np.shape(q)[:-1], model.nv))
+        if (robot := written(model)) is not None:
+            return over_samples(written_torques, robot, q, v, a)
     return over_samples(joint_torques, model, q, v, a, straight=_TORQUES)
 
 

@@ -6,7 +6,7 @@ number may not be squared. Both add up over pieces of the data: the answer for e
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -16,17 +16,19 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from ..compiled.batching import BLOCK, CPU_OPTIONS, chunk_size, in_chunks, on_host, traced, two_axes
+from ..compiled.batching import BLOCK, CPU_OPTIONS, aligned, chunk_size, in_chunks, on_host, traced, two_axes
 from ..compiled.kernels import usable
+from ..compiled.machine_code import machine_code
 from ..compiled.precision import in_float64
 from ..errors import InputError, check_real
 from .kinematics import check_shapes
 from .model import RobotModel
-from .regressor import block_codes, block_rows, coordinate_blocks, coordinate_rows, dense_rows
+from .regressor import BLOCK_FORM, block_codes, block_rows, coordinate_blocks, coordinate_rows, dense_rows
 
 __all__ = ["NormalMatrix", "normal_matrix", "triangular_factor"]
 
 SMALL = 160  # columns of a normal matrix
+AT_ONCE = 512  # samples of a product on a CPU, by machine code
 TOGETHER = 4096  # samples of a product on a GPU
 DEVICE_BYTES = 1e9  # of the blocks of a chunk on a GPU
 
@@ -67,9 +69,10 @@ def normal_matrix(
     columns = 10 * len(model.joints) + (0 if extra is None else np.shape(extra)[-1]) + 1
     groups = _groups(model, columns)
     start = tuple(jnp.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
+    parts = _by_machine_code(model, groups, rows) if on_host(model, rows) else None
     # a small matrix is added to from the innermost cache; a large one costs more to add to than its rows to make
     chunk = 32 if on_host() and columns <= SMALL else _rows_at_once(model) if usable() else chunk_size()
-    parts = _fold(_adder(block_codes(model)), chunk, start, model, rows)
+    parts = _fold(_adder(block_codes(model)), chunk, start, model, rows) if parts is None else parts
     index = np.concatenate([_flat(group, columns).ravel() for group in groups])
     whole = _scattered(columns, index, parts)
     new = NormalMatrix(whole[:-1, :-1], whole[:-1, -1], whole[-1, -1])
@@ -246,6 +249,41 @@ def _rows_at_once(model: RobotModel) -> int:
     """Samples to a chunk on a GPU, whose products are the quicker the more rows they sum."""
     blocks, _ = coordinate_blocks(model)
     return 1 << min(19, int(np.log2(DEVICE_BYTES / 80 / len(blocks))))
+
+
+def _by_machine_code(model: RobotModel, groups: Sequence[_Group], rows: _Rows) -> tuple[np.ndarray, ...] | None:
+    """The groups' products from blocks that machine code makes; None where there is none for these rows."""
+    code = machine_code(BLOCK_FORM, model, rows.q, rows.v, rows.a)
+    if code is None:
+        return None
+    samples, memory = len(rows.q), np.empty(0)
+
+    def room(shape: tuple[int, ...], fill: float | None) -> np.ndarray:
+        nonlocal memory
+        memory = memory if memory.shape == shape else aligned(shape, fill)
+        return memory
+
+    beside = [
+        np.moveaxis(np.asarray(x).reshape(samples, model.nv, -1), 0, -1)
+        for x in (rows.extra, rows.tau)
+        if x is not None
+    ]
+    side = np.concatenate(beside, axis=1)  # coordinates, columns, samples
+    totals = [np.zeros((len(g.coordinates), g.columns.shape[1], g.columns.shape[1])) for g in groups]
+    for start in range(0, samples, AT_ONCE):
+        piece = slice(max(0, min(start, samples - AT_ONCE)), min(start + AT_ONCE, samples))
+        blocks = code(room, *(x[piece] for x in (rows.q, rows.v, rows.a)))
+        root = np.array(rows.root[piece].T)
+        root[:, : start - piece.start] = 0.0  # what the piece before has had
+        for total, group in zip(totals, groups, strict=True):
+            both = np.empty((group.columns.shape[1], blocks.shape[2]))
+            for k, (coordinate, links) in enumerate(zip(group.coordinates, group.blocks, strict=True)):
+                own, first = blocks[links[0] : links[0] + len(links)], 4 * len(links)  # they stand side by side
+                np.multiply(own[:, :4], root[coordinate], out=both[:first].reshape(*own[:, :4].shape))
+                np.multiply(own[:, 4:], root[coordinate], out=both[first : 10 * len(links)].reshape(*own[:, 4:].shape))
+                np.multiply(side[coordinate, :, piece], root[coordinate], out=both[10 * len(links) :])
+                total[k] += both @ both.T
+    return tuple(totals)
 
 
 def _add_rows(model: RobotModel, total: Array, rows: _Rows) -> Array:

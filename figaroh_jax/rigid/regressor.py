@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from ..compiled.batching import aligned, chunk_size, host_blocks, on_host, over_samples, put, to_device, two_axes
 from ..compiled.kernels import known_codes, straight_answers, usable
+from ..compiled.machine_code import machine_code
 from ..compiled.precision import in_float64
 from ..errors import InputError
 from .kinematics import Motion, ancestors, check_shapes, motion, take
@@ -26,6 +27,7 @@ from .scalar_programs import BLOCKS, DENSE, PACKED, straight
 from .spatial import cross, rotate_back
 
 __all__ = [
+    "BLOCK_FORM",
     "block_codes",
     "block_rows",
     "coordinate_blocks",
@@ -81,8 +83,10 @@ def joint_torque_regressor(
     check_shapes(model, q=q, v=v, a=a)
     width = 10 * len(pairs(model))
     if on_host(model, q, v, a):
-        shape = (*np.shape(q)[:-1], model.nv, 10 * len(model.joints))
-        return to_device(_dense_on_host(model, chunk_size(width), *two_axes(q, v, a, host=True)).reshape(shape))
+        rows = two_axes(q, v, a, host=True)
+        code = machine_code(_DENSE, model, *rows)
+        whole = code(aligned, *rows) if code else _dense_on_host(model, chunk_size(width), *rows)
+        return to_device(whole.reshape(*np.shape(q)[:-1], model.nv, 10 * len(model.joints)))
     return over_samples(dense_rows, model, q, v, a, width=width, straight=_DENSE)
 
 
@@ -169,13 +173,13 @@ def block_rows(
 ) -> Float[Array, "blocks 10 samples"]:
     """Blocks of `coordinate_blocks`, in a program; on a GPU by a kernel of their own, with `codes` of `block_codes`."""
     if usable(q, v, a):
-        return straight_answers(_BLOCKS, model, q, v, a, codes=codes)
-    return _BLOCKS.plain(model, q, v, a)
+        return straight_answers(BLOCK_FORM, model, q, v, a, codes=codes)
+    return BLOCK_FORM.plain(model, q, v, a)
 
 
 def block_codes(model: RobotModel) -> bytes | None:
     """What `block_rows` of a program that takes the model as an argument may know of it."""
-    return known_codes(_BLOCKS, model) if usable() else None
+    return known_codes(BLOCK_FORM, model) if usable() else None
 
 
 def dense_rows(
@@ -214,7 +218,7 @@ def packed_rows(
     return sum(moments[1:], moments[0]), sum(inertias[1:], inertias[0])
 
 
-_BLOCKS = straight(BLOCKS, coordinate_rows, lambda model: 10 * len(coordinate_blocks(model)[0]))
+BLOCK_FORM = straight(BLOCKS, coordinate_rows, lambda model: 10 * len(coordinate_blocks(model)[0]))
 _DENSE = straight(DENSE, dense_rows, lambda model: 10 * len(pairs(model)))
 _PACKED = straight(PACKED, packed_rows, lambda model: 10 * len(pairs(model)))
 

@@ -11,25 +11,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
+from itertools import accumulate
 from math import factorial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from ..compiled.batching import in_one_program
+from ..compiled.batching import CPU_OPTIONS, in_one_program
 from ..compiled.kernels import Load, Number, Program, Read, Straight, Write
 from .kinematics import ancestors
-from .model import Joint, RobotModel, dofs
+from .model import Joint, Leaf, RobotModel, dofs
 
-__all__ = ["BLOCKS", "DENSE", "MASSES", "PACKED", "TORQUES", "straight"]
+__all__ = ["BLOCKS", "DENSE", "MASSES", "PACKED", "TORQUES", "Written", "straight", "written", "written_torques"]
 
 LOADED = 2  # code of a constant that is not known before; -1, 0 and 1 stand for themselves
 _SIZES = {"rotation": 9, "origin": 3, "across": 9, "twice": 9, "inertia": 10, "second": 6, "ratio": 1, "offset": 1}
 _PER_JOINT = sum(_SIZES.values())
+_PLACES = dict(zip(_SIZES, accumulate(_SIZES.values(), initial=0), strict=False))
 _PER_DOF = {"axis": 3, "along": 3}
+MOST_WRITTEN, _TURNED = 10, 3  # joints; numbers of a joint's rotation, on average, that may be other than 0, 1, -1
 
 
 ZERO, ONE = Number(0.0), Number(1.0)
@@ -77,8 +81,7 @@ def constants(model: RobotModel, dtype: Any = float, space: Any = jnp) -> Any:
     hinge = model.dofs.first + np.array([_HINGE.get(one.kind, 0) for one in model.joints], int)
     across = space.cross(rotation, axis[hinge][:, None])
     inertia = space.asarray(model.inertia, dtype)
-    half = 0.5 * (inertia[:, 4] + inertia[:, 6] + inertia[:, 9])
-    second = np.array([1, 0, 1, 0, 0, 1]) * half[:, None] - inertia[:, 4:]
+    second = _second_moments(inertia)
     n, nd = len(model.joints), len(joint)
     columns = [rotation.reshape(n, 9), placement[:, :3, 3], across.reshape(n, 9)]
     columns += [space.cross(across, axis[hinge][:, None]).reshape(n, 9), inertia, second]
@@ -89,6 +92,12 @@ def constants(model: RobotModel, dtype: Any = float, space: Any = jnp) -> Any:
     return space.concatenate([space.concatenate(columns, 1).reshape(n * _PER_JOINT), by_dof, gravity])
 
 
+def _second_moments(inertia: Any) -> Any:
+    """Second moments of mass (joints, 6) of inertial parameters (joints, 10)."""
+    half = 0.5 * (inertia[:, 4] + inertia[:, 6] + inertia[:, 9])
+    return np.array([1, 0, 1, 0, 0, 1]) * half[:, None] - inertia[:, 4:]
+
+
 _HINGE = {"planar": 2}  # the degree of freedom, counted in the joint, about which its angle turns
 
 
@@ -97,6 +106,17 @@ def known(model: RobotModel) -> bytes:
     values = constants(model, float, np)
     codes = np.where(np.isin(values, (-1.0, 0.0, 1.0)), values, LOADED).astype(np.int8)
     return codes.tobytes()
+
+
+def known_lengths(model: RobotModel) -> bytes:
+    """As `known`, but for inertial parameters: all that a robot is taken to weigh has one structure."""
+    return _codes_of_lengths(constants(model, float, np), len(model.joints)).tobytes()
+
+
+def _codes_of_lengths(table: Float[np.ndarray, " constants"], joints: int) -> np.ndarray:
+    codes = np.where(np.isin(table, (-1.0, 0.0, 1.0)), table, LOADED).astype(np.int8)
+    codes[: joints * _PER_JOINT].reshape(-1, _PER_JOINT)[:, _PLACES["inertia"] : _PLACES["ratio"]] = LOADED
+    return codes
 
 
 def nothing_known(joints: tuple[Joint, ...]) -> bytes:
@@ -110,8 +130,6 @@ class Robot:
     def __init__(self, joints: tuple[Joint, ...], codes: bytes, load: Load) -> None:
         self.joints, self.dofs, self.load = joints, dofs(joints), load
         self.codes = np.frombuffer(codes, np.int8)
-        places = np.cumsum([0, *_SIZES.values()])
-        self.place = dict(zip(_SIZES, places[:-1], strict=True))
 
     def _at(self, k: int) -> Number:
         code = self.codes[k]
@@ -119,7 +137,7 @@ class Robot:
 
     def of_joint(self, i: int, what: str) -> list[Number]:
         """Numbers of joint i by name."""
-        first = i * _PER_JOINT + self.place[what]
+        first = i * _PER_JOINT + _PLACES[what]
         return [self._at(first + k) for k in range(_SIZES[what])]
 
     def of_dof(self, k: int, what: str) -> Vector:
@@ -334,6 +352,65 @@ def torques(robot: Robot, q: Read, v: Read, a: Read, put: Callable[[int, Number]
     still = _rest(robot)
     for i in robot.children(-1):
         visit(i, still, _spin(still))
+
+
+class Written(eqx.Module):
+    """A robot whose program is written out in scalars: its numbers, and which of them the program knows before.
+
+    Inertial parameters and gravity are never known, so that one program serves all that a robot is taken to weigh, and
+    a tilted base.
+    """
+
+    table: Float[Leaf, " constants"]
+    joints: tuple[Joint, ...] = eqx.field(static=True)
+    codes: bytes = eqx.field(static=True)
+
+
+def written(model: RobotModel) -> Written | None:
+    """The robot for `written_torques` on a CPU; None where the program would take longer to compile than it spares.
+
+    The compiler must put all of it into one loop over the samples, which it does with the options of JAX before 0.11;
+    there a sample of six joints takes a ninth of the time of the plain kernel.
+    """
+    if not CPU_OPTIONS or len(model.joints) > MOST_WRITTEN:
+        return None
+    lengths = tuple(np.asarray(x) for x in (model.placement, model.axis, model.ratio, model.offset, model.gravity))
+    last = _LAST.get(model.joints)
+    if last is None or not all(x is y or np.array_equal(x, y) for x, y in zip(lengths, last[0], strict=True)):
+        last = _LAST[model.joints] = (lengths, *_structure(model))
+    _, table, codes = last
+    if codes is None:
+        return None
+    table, inertia = table.copy(), np.asarray(model.inertia, float)
+    of_joint = table[: len(model.joints) * _PER_JOINT].reshape(-1, _PER_JOINT)
+    of_joint[:, _PLACES["inertia"] : _PLACES["ratio"]] = np.concatenate([inertia, _second_moments(inertia)], 1)
+    return Written(table, model.joints, codes)
+
+
+_LAST: dict[tuple[Joint, ...], tuple[tuple[np.ndarray, ...], np.ndarray, bytes | None]] = {}  # of each structure
+
+
+def _structure(model: RobotModel) -> tuple[Float[np.ndarray, " constants"], bytes | None]:
+    """All numbers of a robot, and the codes of its program where it is to be written out."""
+    table = constants(model, float, np)
+    codes = np.where(np.isin(table, (-1.0, 0.0, 1.0)), table, LOADED).astype(np.int8)
+    by_joint = codes[: len(model.joints) * _PER_JOINT].reshape(-1, _PER_JOINT)
+    by_joint[:, _PLACES["inertia"] : _PLACES["ratio"]] = LOADED
+    codes[-3:] = LOADED
+    turned = by_joint[:, : _PLACES["origin"]] == LOADED
+    return table, None if turned.sum() > _TURNED * len(model.joints) else codes.tobytes()
+
+
+def written_torques(
+    robot: Written, q: Float[Array, "nq samples"], v: Float[Array, "nv samples"], a: Float[Array, "nv samples"]
+) -> Float[Array, "nv samples"]:
+    """Kernel of `inverse_dynamics` for a robot that is `written` out."""
+    out: dict[int, Array] = {}
+    whole = lambda x: jnp.broadcast_to(jnp.asarray(x, q.dtype), q.shape[1:])  # noqa: E731
+    of_lanes = Robot(robot.joints, robot.codes, lambda k: whole(robot.table[k]))
+    reads = [lambda k, x=x: Number(x[k]) for x in (q, v, a)]
+    torques(of_lanes, reads[0], reads[1], reads[2], lambda column, number: out.update({column: whole(number.x)}))
+    return jnp.stack([out[column] for column in sorted(out)])
 
 
 class Twist(NamedTuple):
@@ -578,8 +655,14 @@ def _empty(joints: tuple[Joint, ...]) -> np.ndarray:
 
 def _rows(model: RobotModel, coordinates: bool) -> np.ndarray:
     """Degree of freedom, or coordinate, and link of the blocks of the regressor that can differ from zero, sorted."""
-    row = model.dofs.column if coordinates else np.arange(model.nd)
-    dof, link = np.nonzero(ancestors(model.joints)[model.dofs.joint] > 0)
+    return _sorted_rows(model.joints, coordinates)
+
+
+@lru_cache(maxsize=64)
+def _sorted_rows(joints: tuple[Joint, ...], coordinates: bool) -> np.ndarray:
+    places = dofs(joints)
+    row = places.column if coordinates else np.arange(len(places.column))
+    dof, link = np.nonzero(ancestors(joints)[places.joint] > 0)
     return np.unique(np.stack([row[dof], link], 1), axis=0)
 
 
@@ -592,19 +675,49 @@ def _dense(model: RobotModel, blocks: Array) -> Array:
 
 
 class _Form(NamedTuple):
-    """Of an answer: its programs, the shape of what they write, what is made of it, whether the samples stand last."""
+    """Of an answer: its programs, the shape of what they write, what is made of it, whether the samples stand last.
 
+    Without `finish` the answer is what they write. `answer` and `places` are its shape and where in it a number goes.
+    """
+
+    name: str
     programs: Callable[[RobotModel, bytes], list[Program]]
     shape: Callable[[RobotModel], tuple[int, ...]]
     finish: Callable[[RobotModel, Array], Array] | None = None
     last: bool = False
+    answer: Callable[[RobotModel], tuple[int, ...]] | None = None
+    places: Callable[[RobotModel, tuple[int, ...]], list[int]] | None = None
 
 
-TORQUES = _Form(_torques, lambda model: (model.nv,))
-PACKED = _Form(partial(_blocks, False), lambda model: (len(_rows(model, False)), 10), last=True)
-BLOCKS = _Form(partial(_blocks, True), lambda model: (len(_rows(model, True)), 10), last=True)
-DENSE = _Form(partial(_blocks, True), lambda model: (len(_rows(model, True)), 10), _dense)
-MASSES = _Form(_masses, lambda model: (model.nv, model.nv), _whole_masses)
+def _dense_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
+    block, column = place
+    row, link = _sorted_rows(model.joints, True)[block]
+    return [10 * (row * len(model.joints) + link) + column]
+
+
+def _mass_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
+    row, column = place
+    return sorted({model.nv * row + column, model.nv * column + row})
+
+
+_ANSWERS = {"rows": lambda model: (len(_rows(model, False)), 10), "blocks": lambda model: (len(_rows(model, True)), 10)}
+
+TORQUES = _Form("torques", _torques, lambda model: (model.nv,))
+PACKED = _Form("packed", partial(_blocks, False), _ANSWERS["rows"], last=True)
+BLOCKS = _Form("blocks", partial(_blocks, True), _ANSWERS["blocks"], last=True)
+DENSE = _Form(
+    "dense",
+    partial(_blocks, True),
+    _ANSWERS["blocks"],
+    _dense,
+    answer=lambda model: (model.nv, 10 * len(model.joints)),
+    places=_dense_places,
+)
+MASSES = _Form("masses", _masses, lambda model: (model.nv, model.nv), _whole_masses, places=_mass_places)
+
+
+def _in_order(shape: Callable[[RobotModel], tuple[int, ...]], model: RobotModel, place: tuple[int, ...]) -> list[int]:
+    return [int(np.ravel_multi_index(place, shape(model)))]
 
 
 def straight(form: _Form, kernel: Callable[..., Any], width: Callable[[RobotModel], int] = lambda model: 1) -> Straight:
@@ -616,5 +729,19 @@ def straight(form: _Form, kernel: Callable[..., Any], width: Callable[[RobotMode
         return answer if form.last else jnp.moveaxis(answer, -1, 0)
 
     read = columns if form is not MASSES else lambda model: [[x for x in g if x[0] == 0] for g in columns(model)]
-    nothing = lambda model: nothing_known(model.joints)  # noqa: E731
-    return Straight(plain, constants, known, nothing, form.programs, form.shape, read, form.last, form.finish)
+    return Straight(
+        name=form.name,
+        structure=lambda model: model.joints,
+        plain=plain,
+        constants=constants,
+        known=known,
+        known_lengths=known_lengths,
+        nothing_known=lambda model: nothing_known(model.joints),
+        programs=form.programs,
+        shape=form.shape,
+        columns=read,
+        last=form.last,
+        finish=form.finish,
+        answer=form.answer or form.shape,
+        places=form.places or partial(_in_order, form.shape),
+    )

@@ -66,7 +66,7 @@ def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbi
         table += [Entry(number, (k,)) for number in _DRIVE_ENTRIES]
         name = names[int(np.argmax(np.abs(np.asarray(loop.drives.transmission)[k])))]
         candidates += [(*one, name) for one in _of_drive(k, float(forces[k]), gains_known)]
-    for i, joint in enumerate(robot.joints):
+    for i, joint in enumerate(robot.joints if loop.carried is None else ()):
         table.append(Entry("payload", (i,)))
         candidates.append(("payload", (("payload", i),), ((0.0,),), ("mass",), joint.link))
     index = {(e.name, e.at[0]): k for k, e in enumerate(table)}
@@ -178,6 +178,7 @@ def elastic_loop(loop: Loop, coordinate: int, stiffness: float, damping: float, 
         limited=loop.limited,
         measured=loop.measured,
         summed=summed,
+        carried=loop.carried,
     )
 
 

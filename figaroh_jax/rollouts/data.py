@@ -28,7 +28,8 @@ class Run(NamedTuple):
     position: np.ndarray  # (rows, ny)
     velocity: np.ndarray | None
     holdout: bool = False
-    trusted: np.ndarray | None = None  # (rows,) False: rows that count for nothing
+    trusted: np.ndarray | None = None  # (rows,) or (rows, ny), False: what counts for nothing
+    carried: np.ndarray | None = None  # (rows, 4 + 3 links) of one joint alone: `alone.carried_by`
 
 
 class Stretch(NamedTuple):
@@ -92,17 +93,19 @@ def windows(
     most = max(s.rows for s in stretches)
     rows = -(-most // rows_of_block) * rows_of_block
     lead = int(np.ceil(_LEAD / period))
-    command, reading, weight, start, precision = [], [], [], [], []
+    command, reading, weight, start, precision, carried = [], [], [], [], [], []
     for stretch in stretches:
         run = runs[stretch.run]
         at = np.clip(np.arange(stretch.first - lead, stretch.first + rows), 0, len(run.time) - 1)
         command.append(run.command[at])
+        if run.carried is not None:
+            carried.append(run.carried[at[lead:]])
         inside = np.arange(rows) < stretch.rows
         here = at[lead:]
-        counted = inside if run.trusted is None else inside & run.trusted[here]
+        counted = inside if run.trusted is None else (inside & run.trusted[here].T).T
         parts = [run.position] + ([run.velocity] if len(noise) > 1 and run.velocity is not None else [])
         reading.append(np.concatenate([p[here] for p in parts], 1))
-        weight.append(np.concatenate([counted[:, None] / s for s in noise], 1))
+        weight.append(np.concatenate([counted.reshape(rows, -1) / s for s in noise], 1))
         rows_of_state = _smooth_rows(run, stretch.first, noise[0]) if smooth else 5
         state, certainty = _state(loop, run, stretch.first, noise, period, rows_of_state)
         start.append(state)
@@ -113,6 +116,7 @@ def windows(
         weight=np.stack(weight, -1),
         start=np.stack(start, -1),
         precision=np.stack(precision, -1),
+        carried=np.stack(carried, -1) if carried else None,
         substeps=substeps,
         lead=lead,
         block=rows_of_block,

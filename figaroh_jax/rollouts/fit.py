@@ -20,6 +20,7 @@ from .sensitivity import Sums, Windows, linear_sums
 __all__ = ["Fit", "fit", "held_out", "standard_errors", "start_of"]
 
 _ITERATIONS = 40
+_PAIR = 2
 _CLOSE = 0.02  # predicted decrease of the sum of whitened squares at which a fit ends
 
 
@@ -80,11 +81,13 @@ class _Lanes:
         for k, one in enumerate(free):
             self.free[k, : len(one)] = one
         self.bounds = np.array([BOUNDS[entry.name] for entry in table])
+        self.rows = max(int((np.asarray(data.weight) > 0).sum()), 1)
 
     def sums(self, which: np.ndarray, theta: np.ndarray, start: np.ndarray) -> list[Sums]:
-        padded = np.resize(which, self.lanes)
+        lanes = _PAIR if len(which) <= _PAIR < self.lanes else self.lanes  # few are left of many: a smaller program
+        padded = np.resize(which, lanes)
         index = np.maximum(self.free[padded], 0)
-        at = np.resize(np.arange(len(which)), self.lanes)
+        at = np.resize(np.arange(len(which)), lanes)
         with jax.enable_x64(True):
             found = linear_sums(self.loop, self.table, theta[at], index, self.data, start[at])
             cost, gradient, matrix = (np.asarray(x) for x in found)
@@ -93,21 +96,21 @@ class _Lanes:
     def cost(self, sums: Sums, start: np.ndarray) -> float:
         prior = (start - np.asarray(self.data.start)) * np.asarray(self.data.precision)
         total = float(sums.cost.sum() + (prior**2).sum())
-        return total if np.isfinite(total) else np.inf
+        return total if np.isfinite(total) and np.isfinite(sums.matrix).all() else np.inf
 
     def run(self, iterations: int) -> list[Fit]:
         count = len(self.theta)
         everyone = np.arange(count)
         now = self.sums(everyone, self.theta, self.start)
         cost = [self.cost(s, x) for s, x in zip(now, self.start, strict=True)]
-        damping, done = np.full(count, 1e-3), np.zeros(count, bool)
+        damping, done = np.full(count, 1e-3), ~np.isfinite(cost)  # one that diverges has no derivative
         for _ in range(iterations):
             active = everyone[~done]
             if not len(active):
                 break
             steps = [self.step(now[k], k, damping[k]) for k in active]
             for k, step in zip(active, steps, strict=True):
-                done[k] |= step.gain < _CLOSE and damping[k] <= 1.0
+                done[k] |= step.gain < _CLOSE * max(1.0, cost[k] / self.rows) and damping[k] <= 1.0
             tried = [(k, step) for k, step in zip(active, steps, strict=True) if not done[k]]
             if not tried:
                 continue
@@ -186,6 +189,13 @@ class System:
         starts = inner[..., -1] - np.einsum("wip,p->wi", inner[..., :-1], change)
         return change, starts.T
 
+    def reduced(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
+        """Matrix and right side of the parameters, the windows' starts solved for."""
+        hss = self.hss + damping * np.einsum("wii,ij->wij", self.hss, np.eye(self.hss.shape[1]))
+        inner = np.linalg.solve(hss, np.concatenate([np.swapaxes(self.hps, 1, 2), self.gs[..., None]], 2))
+        schur = self.hpp - np.einsum("wpi,wiq->pq", self.hps, inner[..., :-1])
+        return schur, self.gp - np.einsum("wpi,wi->p", self.hps, inner[..., -1])
+
     def decrease(self, change: np.ndarray, starts: np.ndarray) -> float:
         """Of the sum of squares, as the quadratic model promises it for a step."""
         s = starts.T
@@ -195,7 +205,9 @@ class System:
 
     def covariance(self, fixed: np.ndarray) -> np.ndarray:
         """Of the parameters, the starts being unknown; infinite variance where nothing tells one."""
-        inner = np.linalg.solve(self.hss + 1e-12 * np.eye(self.hss.shape[1]), np.swapaxes(self.hps, 1, 2))
+        size = 1e-12 * np.maximum(np.einsum("wii->w", self.hss), 1.0)
+        least = size[:, None, None] * np.eye(self.hss.shape[1])
+        inner = np.linalg.solve(self.hss + least, np.swapaxes(self.hps, 1, 2))
         schur = self.hpp - np.einsum("wpi,wiq->pq", self.hps, inner)
         keep = ~fixed & (np.diag(schur) > 0)
         answer = np.diag(np.full(self.m, np.inf))

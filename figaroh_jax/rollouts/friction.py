@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-__all__ = ["Rows", "Solution", "corrected", "row_force", "solve_rows", "solved"]
+__all__ = ["Rows", "Solution", "corrected", "row_force", "solve_rows", "solved", "times"]
 
 _MOST = 60  # Newton steps; 1 to 4 are used
 _FAR = 1e300
@@ -62,10 +62,18 @@ def _slope(rows: Rows, slip: Array, low: Array, high: Array) -> Array:
     return jnp.where(slip == 0, 1 / rows.soft, 0.0) + low / rows.low_soft + high / rows.high_soft
 
 
+def times(matrix: Array, vector: Array) -> Array:
+    """Matrices (n, m, samples) times vectors (m, samples): as a sum, which XLA fuses with what stands around it."""
+    return jnp.sum(matrix * vector[None], 1)
+
+
 def solved(matrix: Array, right: Array) -> Array:
     """Solution of symmetric positive systems with the samples on the last axis: (n, n, samples), (n, samples)."""
     if matrix.shape[0] == 1:
         return right / matrix[0]
+    if matrix.shape[0] == 2:
+        (a, b), (_, c) = matrix
+        return jnp.stack([c * right[0] - b * right[1], a * right[1] - b * right[0]]) / (a * c - b * b)
     factor = jnp.linalg.cholesky(jnp.moveaxis(matrix, -1, 0))
     return jax.vmap(lambda f, b: jax.scipy.linalg.cho_solve((f, True), b))(factor, right.T).T
 
@@ -92,7 +100,7 @@ def solve_rows(masses: Array, right: Array, rows: Rows, warm: Array) -> Solution
     def newton(state: tuple[Solution, Array, Array]) -> tuple[Solution, Array, Array]:
         found, done, count = state
         slope = _slope(rows, found.slip, found.low, found.high)
-        gap = jnp.einsum("ijs,js->is", masses, found.a) - right - row_force(rows, found, found.a)
+        gap = times(masses, found.a) - right - row_force(rows, found, found.a)
         way = -solved(masses + jnp.eye(len(right))[..., None] * slope[:, None], gap)
         full = _acting(rows, found.a + way)
         same = jnp.stack([(x == y).all(0) for x, y in zip(full, found[1:], strict=True)]).all(0)
@@ -112,8 +120,8 @@ def _line_search(masses: Array, right: Array, rows: Rows, a: Array, way: Array) 
     at = jnp.concatenate([jnp.where(jnp.isfinite(x) & (way != 0), (x - a) / moving, 0.0) for x in edges])
     at = jnp.concatenate([jnp.clip(at, 0.0, None), jnp.zeros((1, at.shape[1]))])
     at = jnp.concatenate([at, at.max(0, keepdims=True) + 1.0])
-    start = jnp.sum(way * (jnp.einsum("ijs,js->is", masses, a) - right), 0)
-    curve = jnp.einsum("is,ijs,js->s", way, masses, way)
+    start = jnp.sum(way * (times(masses, a) - right), 0)
+    curve = jnp.sum(way * times(masses, way), 0)
 
     def slope(s: Array) -> Array:
         new = a + s * way

@@ -23,9 +23,21 @@ from ..rigid.dynamics import joint_masses, joint_torques
 from ..rigid.manifold import integrate
 from ..rigid.model import RobotModel
 from ..rigid.spatial import cross, quaternion_rotation, rotate, rotate_back
-from .friction import Rows, Solution, corrected, solve_rows, solved
+from .friction import Rows, Solution, corrected, solve_rows, solved, times
 
-__all__ = ["Activation", "Drives", "Integrator", "Joints", "Loop", "State", "Step", "advance", "integrated", "observe"]
+__all__ = [
+    "Activation",
+    "Carried",
+    "Drives",
+    "Integrator",
+    "Joints",
+    "Loop",
+    "State",
+    "Step",
+    "advance",
+    "integrated",
+    "observe",
+]
 
 Activation = Literal["none", "integrator", "filter", "filterexact"]
 Integrator = Literal["euler", "implicitfast", "rk4"]
@@ -83,6 +95,21 @@ class Joints(eqx.Module):
     reading: Any  # rad, what the encoder reads beside the position
 
 
+class Carried(eqx.Module):
+    """What the rest of a robot does to one joint while the other joints move as they were measured; arrays (samples,).
+
+    The torque of the rigid body at the joint is mass a + bias + slope (q - place). Every coordinate of the loop adds to
+    the joint's position: one, or the motor and the twist of a spring behind it.
+    """
+
+    mass: Any  # kg m2 (kg), armature not included
+    bias: Any  # N m (N): gravity, and all that the other joints' motion needs here
+    slope: Any  # N m/rad
+    place: Any  # rad (m)
+    share: Any  # 1 / mass as seen by soft constraints, over that of the joint alone: the others may give way
+    payload: Any  # (links,) kg, added to each link of the arm
+
+
 class Loop(eqx.Module):
     """A robot, its drives and what acts at its joints, in steps of `dt` seconds."""
 
@@ -96,6 +123,7 @@ class Loop(eqx.Module):
     limited: bool = eqx.field(static=True)  # whether any joint limit acts
     measured: tuple[int, ...] = eqx.field(static=True)  # coordinates that the encoders read
     summed: tuple[int, ...] = eqx.field(static=True)  # a second coordinate added to each (-1: none)
+    carried: Carried | None = None  # in place of the robot's rigid body
 
     @property
     def columns(self) -> np.ndarray:
@@ -124,9 +152,11 @@ class Step(NamedTuple):
 
 def mobility(loop: Loop) -> Array:
     """Diagonal of the inverse inertia at the start (MuJoCo's dof_invweight0), (nv, 1); mean over ball and free axes."""
-    matrix = joint_masses(loop.robot, jnp.asarray(loop.start, jnp.float64)[:, None])[..., 0]
-    matrix = matrix + jnp.diag(jnp.asarray(loop.joints.armature))
-    diagonal = jnp.diagonal(jnp.linalg.inv(matrix)) if loop.robot.nv > 1 else 1.0 / matrix[0]
+    matrix = _masses(loop, jnp.asarray(loop.start, jnp.float64)[:, None])[..., 0]
+    n = loop.robot.nv
+    diagonal = jnp.diagonal(solved(matrix[..., None] * jnp.ones(n), jnp.eye(n)) if n < 3 else jnp.linalg.inv(matrix))
+    if loop.carried is not None:
+        return (loop.carried.share * diagonal)[:, None]
     for joint in loop.robot.joints:
         at = slice(joint.coordinate, joint.coordinate + 3)
         parts = {"free": (at, slice(at.stop, at.stop + 3)), "spherical": (at,)}.get(joint.kind, ())
@@ -177,7 +207,7 @@ class _Drive(NamedTuple):
 def _drive(loop: Loop, angle: Array, v: Array, control: Array) -> _Drive:
     drives = loop.drives
     way = jnp.asarray(drives.transmission)
-    length, rate = way @ angle, way @ v
+    length, rate = times(way[..., None], angle), times(way[..., None], v)
     gain, bias = (jnp.asarray(x)[..., None] for x in (drives.gain, drives.bias))
     scale = jnp.asarray(drives.scale)[:, None]
     force = bias[:, 0] + scale * ((gain[:, 0] + gain[:, 1] * length) * control + bias[:, 1] * length)
@@ -188,7 +218,7 @@ def _drive(loop: Loop, angle: Array, v: Array, control: Array) -> _Drive:
     force = jnp.clip(force, -volt, volt) + slope * rate
     low, high = (jnp.asarray(drives.force_range)[:, k, None] for k in (0, 1))
     free = (force > low) & (force < high)
-    torque = way.T @ jnp.clip(force, low, high)
+    torque = times(way.T[..., None], jnp.clip(force, low, high))
     least, most = (jnp.asarray(loop.joints.torque_range)[:, k, None] for k in (0, 1))
     return _Drive(jnp.clip(torque, least, most), jnp.where(free, slope, 0.0))
 
@@ -222,11 +252,12 @@ def _smooth(loop: Loop, state: State, u: Array, weight: Array) -> _Smooth:
     angle = _angles(loop, q)
     control, rate = _control(loop, act, u)
     drive = _drive(loop, angle, v, control)
-    bias = joint_torques(loop.robot, q, v, jnp.zeros_like(v))
+    bias = _bias(loop, q, v)
     damping = jnp.eye(loop.robot.nv)[..., None] * jnp.asarray(loop.joints.damping)[:, None, None]
     if loop.integrator == "implicitfast":
         way = jnp.asarray(loop.drives.transmission)
-        damping = damping - jnp.einsum("ai,as,aj->ijs", way, drive.slope, way)
+        pairs = way[:, :, None, None] * way[:, None, :, None]
+        damping = damping - (pairs * drive.slope[:, None, None]).sum(0)
     torque = drive.torque + _passive(loop, angle, v)
     rows = _rows(loop, angle, v, drive.torque, bias, weight)
     return _Smooth(torque, bias, damping, _next_activation(loop, act, rate), rows, _shift(loop, v), rate)
@@ -283,9 +314,21 @@ def _shift(loop: Loop, v: Array) -> Array:
     return shift
 
 
+def _bias(loop: Loop, q: Array, v: Array) -> Array:
+    """Gravity and velocity torques of the rigid body."""
+    if loop.carried is None:
+        return joint_torques(loop.robot, q, v, jnp.zeros_like(v))
+    one = loop.carried
+    return jnp.broadcast_to(one.bias + one.slope * (q.sum(0) - one.place), q.shape)
+
+
 def _masses(loop: Loop, q: Array) -> Array:
-    armature = jnp.asarray(loop.joints.armature)[:, None, None]
-    return joint_masses(loop.robot, q) + jnp.eye(loop.robot.nv)[..., None] * armature
+    armature = jnp.eye(loop.robot.nv)[..., None] * jnp.asarray(loop.joints.armature)[:, None, None]
+    if loop.carried is None:
+        return joint_masses(loop.robot, q) + armature
+    return jnp.broadcast_to(loop.carried.mass, q.shape[1:]) + jnp.broadcast_to(
+        armature, (*armature.shape[:2], q.shape[1])
+    )
 
 
 def _accelerate(loop: Loop, state: State, u: Array, weight: Array, warm: Array) -> tuple[_Smooth, Array, Solution]:
@@ -302,7 +345,7 @@ def advance(loop: Loop, state: State, u: Array, weight: Array, warm: Array) -> t
     if loop.integrator == "rk4":
         return _runge_kutta(loop, state, u, weight, warm, None)
     smooth, masses, solution = _accelerate(loop, state, u, weight, warm)
-    force = jnp.einsum("ijs,js->is", masses, solution.a + smooth.shift)
+    force = times(masses, solution.a + smooth.shift)
     a = solved(masses + loop.dt * smooth.damping, force)
     return _moved(loop, state, a, smooth.activation), Step(solution, a)
 
@@ -320,17 +363,20 @@ def integrated(loop: Loop, state: State, u: Array, weight: Array, step: Step) ->
     implicit = masses + loop.dt * jax.lax.stop_gradient(smooth.damping)
     first, second = _inertial(loop, state, smooth.bias, found.a, whole - smooth.shift)
     a = corrected(masses, smooth.rows, found, first + smooth.bias - smooth.torque)
-    gap = second + loop.dt * jnp.einsum("ijs,js->is", smooth.damping, whole) - first
-    gap = gap - jnp.einsum("ijs,js->is", masses, a - found.a)
+    gap = second + loop.dt * times(smooth.damping, whole) - first
+    gap = gap - times(masses, a - found.a)
     return _moved(loop, state, whole - solved(implicit, gap), smooth.activation)
 
 
 def _inertial(loop: Loop, state: State, bias: Array, *accelerations: Array) -> list[Array]:
     """M a of the rigid body with armature for each of the accelerations, by one inverse dynamics of all of them."""
+    armature = jnp.asarray(loop.joints.armature)[:, None]
+    if loop.carried is not None:
+        return [loop.carried.mass * a.sum(0) + armature * a for a in accelerations]
     count = len(accelerations)
     a = jnp.concatenate(accelerations, 1)
     q, v = (jnp.concatenate([x] * count, 1) for x in (state.q, state.v))
-    torque = joint_torques(loop.robot, q, v, a) + jnp.asarray(loop.joints.armature)[:, None] * a
+    torque = joint_torques(loop.robot, q, v, a) + armature * a
     return [part - bias for part in jnp.split(torque, count, axis=1)]
 
 

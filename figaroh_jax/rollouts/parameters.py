@@ -9,13 +9,14 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from .loop import Loop
 
-__all__ = ["BOUNDS", "UNITS", "Entry", "Table", "current", "put", "values"]
+__all__ = ["BOUNDS", "UNITS", "Entry", "Table", "current", "put", "unit_payload", "values"]
 
 _OF_DRIVES = ("scale", "delay", "dead_band", "voltage", "time_constant")
 
@@ -41,7 +42,7 @@ _ANY = (-np.inf, np.inf)
 BOUNDS = {  # what such a number can be
     "armature": (1e-6, 1e3), "damping": (0.0, 1e4), "friction": (0.0, 1e4), "stribeck_force": (0.0, 1e4),
     "stribeck_speed": (0.005, 3.0), "load_ratio": (0.0, 0.95), "stiffness": (0.0, 1e7), "play": (0.0, 0.5),
-    "ripple_order": (0.5, 40.0), "scale": (0.02, 50.0), "delay": (0.0, 0.15), "dead_band": (0.0, 0.5),
+    "ripple_order": (0.5, 40.0), "scale": (1e-3, 1e3), "delay": (0.0, 0.15), "dead_band": (0.0, 0.5),
     "voltage": (1e-4, 1e6), "force_limit": (1e-4, 1e6), "time_constant": (1e-4, 2.0), "payload": (-50.0, 50.0),
     "kp": (1e-6, 1e6), "kd": (0.0, 1e5), "reading": (-0.5, 0.5), "offset": _ANY, "rest": _ANY, "ripple_sine": _ANY,
     "ripple_cosine": _ANY, "gravity_x": (-9.0, 9.0), "gravity_y": (-9.0, 9.0),
@@ -64,7 +65,7 @@ def _get(loop: Loop, name: str, xp: Any = np) -> Any:
         "kp": lambda: xp.asarray(drives.gain)[:, 0],
         "kd": lambda: -xp.asarray(drives.bias)[:, 2],
         "force_limit": lambda: xp.asarray(drives.force_range)[:, 1],
-        "payload": lambda: xp.zeros(len(loop.robot.joints)),
+        "payload": lambda: xp.zeros(len(loop.robot.joints) if loop.carried is None else len(loop.carried.payload)),
         "gravity_x": lambda: xp.asarray(loop.robot.gravity)[:1],
         "gravity_y": lambda: xp.asarray(loop.robot.gravity)[1:2],
     }
@@ -75,17 +76,21 @@ def _get(loop: Loop, name: str, xp: Any = np) -> Any:
 
 def put(loop: Loop, table: Table, theta: Array | np.ndarray) -> Loop:
     """The loop with the table's numbers; differentiable in `theta`."""
-    for name in dict.fromkeys(entry.name for entry in table):
-        pairs = [(place, k) for k, entry in enumerate(table) if entry.name == name for place in entry.at]
-        at, which = (np.array(x) for x in zip(*pairs, strict=True))
-        loop = _put(loop, name, at, theta[which])
+    with jax.enable_x64(True):
+        for name in dict.fromkeys(entry.name for entry in table):
+            pairs = [(place, k) for k, entry in enumerate(table) if entry.name == name for place in entry.at]
+            at, which = (np.array(x) for x in zip(*pairs, strict=True))
+            loop = _put(loop, name, at, theta[which])
     return loop
 
 
 def _put(loop: Loop, name: str, at: np.ndarray, new: Array | np.ndarray) -> Loop:
+    if name == "payload" and loop.carried is not None:
+        whole = jnp.asarray(loop.carried.payload).at[at].set(new)
+        return eqx.tree_at(lambda m: m.carried.payload, loop, whole)
     if name == "payload":
         own = jnp.asarray(loop.robot.inertia)
-        return eqx.tree_at(lambda m: m.robot.inertia, loop, own.at[at].add(new[:, None] * _point(loop, at)))
+        return eqx.tree_at(lambda m: m.robot.inertia, loop, own.at[at].add(new[:, None] * unit_payload(loop, at)))
     if name in ("gravity_x", "gravity_y"):
         k = 0 if name == "gravity_x" else 1
         return eqx.tree_at(lambda m: m.robot.gravity, loop, jnp.asarray(loop.robot.gravity).at[k].set(new[0]))
@@ -103,7 +108,7 @@ def _put(loop: Loop, name: str, at: np.ndarray, new: Array | np.ndarray) -> Loop
     return eqx.tree_at(lambda m: getattr(getattr(m, group), name), loop, old.at[at].set(new))
 
 
-def _point(loop: Loop, at: np.ndarray) -> Array:
+def unit_payload(loop: Loop, at: np.ndarray) -> Array:
     """Ten parameters of a unit mass at the centre of mass of each link."""
     own = jnp.asarray(loop.robot.inertia)[at]
     c = own[:, 1:4] / jnp.maximum(own[:, :1], 1e-9)

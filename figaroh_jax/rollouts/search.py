@@ -15,16 +15,34 @@ from .causes import BASELINE, CONTAINS, Candidate, Catalogue, catalogue, elastic
 from .data import Run, Stretch, noise_of, windows
 from .fit import Fit, System, fit, held_out, standard_errors
 from .loop import Loop
-from .parameters import Entry, Table, values
+from .parameters import BOUNDS, Entry, Table, values
 from .sensitivity import Windows, predicted
 
-__all__ = ["Named", "Search", "Setting", "begun", "largest_forces", "residuals", "search", "setting"]
+__all__ = [
+    "Model",
+    "Named",
+    "Search",
+    "Setting",
+    "begun",
+    "excess",
+    "free_entries",
+    "judged",
+    "level_of",
+    "largest_forces",
+    "residuals",
+    "search",
+    "setting",
+    "t_of",
+]
 
 _WORTH, _SURE, _ALIKE = 0.004, 1.64, 1.7  # held-out gain and t of a name; t below which two causes are alike
 _CLEAR = 3.0  # t of a name beside which more than noise is left
 _SHORT = 6  # candidates that are fitted where a linear screening can order them
+_SHORTER = 4  # of one joint of an arm
 _GROUP = 25  # rows whose mean shows a slow misfit
 _MOST = 6  # causes
+_USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
+_PAIR = 2  # starts of the baseline that are followed to the end
 _EARLY, _LATE = 4, 12  # iterations of a race among all starts, and of its leaders
 _LIMITS = ("actuator_saturation", "voltage_saturation")
 _SHAPED = ("stribeck_friction",)  # without an amplitude their shape shows nothing
@@ -45,6 +63,11 @@ class Setting:
     width: int
     stretches: tuple[Stretch, ...]
     block: float
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """(entries, 2): what the numbers can be."""
+        return np.array([BOUNDS[entry.name] for entry in self.known.table])
 
 
 class Structure(NamedTuple):
@@ -80,6 +103,8 @@ class Search:
     nearest: list[tuple[Name, float, str]] = field(default_factory=list)
     table: list[tuple[str, float]] = field(default_factory=list)  # chi2/N after each step
     held: list[float] = field(default_factory=list)  # held-out RMS of the baseline and after each cause, rad or m
+    fits: list[Fit] = field(default_factory=list)  # after each cause
+    origin: Structure | None = None  # of the baseline
 
 
 def setting(
@@ -154,7 +179,7 @@ def excess(error: np.ndarray, weight: np.ndarray) -> float:
     return float(max(power / 4, slow / 5))
 
 
-def _free(fitted: Sequence[int], extra: Sequence[int]) -> list[int]:
+def free_entries(fitted: Sequence[int], extra: Sequence[int]) -> list[int]:
     return list(dict.fromkeys([*fitted, *extra]))
 
 
@@ -166,7 +191,7 @@ def _start_values(theta: np.ndarray, candidate: Candidate, values: Sequence[floa
     return new
 
 
-class _State(NamedTuple):
+class Model(NamedTuple):
     """The model that stands, and the causes in it."""
 
     structure: Structure
@@ -176,15 +201,19 @@ class _State(NamedTuple):
 
 
 def search(
-    here: Setting, progress: Callable[[str, float], None] = lambda phase, share: None, *, forbid: Sequence[str] = ()
+    here: Setting,
+    progress: Callable[[str, float], None] = lambda phase, share: None,
+    *,
+    forbid: Sequence[str] = (),
+    begin: Fit | None = None,
 ) -> Search:
     """Baseline, then one cause after another while held-out data gain; what is left decides the verdict."""
     structure = Structure(here.loop, here.known.table, here.data)
     progress("fitting the baseline", 0.1)
-    first = begun(here)
+    first = begun(here) if begin is None else begin
     weight = np.asarray(here.data.weight)
-    now = _State(structure, first, here.baseline, excess(residuals(structure, first), weight))
-    begin, found, p_value, steps, nearest = now, [], 1.0, [("baseline", _level(first, weight))], []
+    now = Model(structure, first, here.baseline, excess(residuals(structure, first), weight))
+    stood, found, p_value, steps, nearest = [now], [], 1.0, [("baseline", level_of(first, weight))], []
     while len(found) < _MOST:
         progress(f"looking for cause {len(found) + 1}", min(0.2 + 0.15 * len(found), 0.9))
         tried = _tried(here, now, [n.candidate for n in found], forbid)
@@ -194,17 +223,26 @@ def search(
             break
         found.append(best[0])
         now = best[1]
-        steps.append((str(Name(best[0].candidate.effect, best[0].candidate.at)), _level(now.fit, weight)))
+        stood.append(now)
+        steps.append((str(Name(best[0].candidate.effect, best[0].candidate.at)), level_of(now.fit, weight)))
         if now.excess < 1.0:
             break
-    return _judged(here, begin, now, found, p_value, steps, nearest)
+    result = judged(here, stood[0], now, found, p_value, steps, nearest)
+    result.fits, result.origin = [one.fit for one in stood[1:]], stood[0].structure
+    return result
 
 
 def begun(here: Setting) -> Fit:
     """The baseline's fit."""
     begins: Any = _begins(here, values(here.loop, here.known.table))
     structure = Structure(here.loop, here.known.table, here.data)
-    fits = fit(*structure, begins, [here.baseline] * len(begins), width=here.width, lanes=here.lanes)
+    sizes: Any = {"width": here.width, "lanes": here.lanes}
+    if len(begins) == 1:
+        return fit(*structure, begins, [here.baseline], **sizes)[0]
+    early = fit(*structure, begins, [here.baseline] * len(begins), iterations=_EARLY, **sizes)
+    order = sorted(early, key=lambda f: f.cost)[:_PAIR]
+    states = np.stack([f.theta for f in order]), np.stack([f.start for f in order])
+    fits = fit(*structure, states[0], [here.baseline] * len(order), states[1], **sizes)
     return min(fits, key=lambda f: f.cost)
 
 
@@ -215,46 +253,47 @@ def _begins(here: Setting, theta: np.ndarray) -> np.ndarray:
         return theta[None]
     rotors = [k for k in here.baseline if here.known.table[k].name == "armature"]
     begins = []
-    for stiff, heavy in ((1.0, 1.0), (4.0, 1.0), (1.0, 8.0), (4.0, 8.0)):
+    for stiff, heavy in ((1.0, 1.0), (4.0, 1.0), (1.0, 8.0), (4.0, 8.0), (0.1, 1.0), (0.02, 1.0)):
         begins.append(theta.copy())
         begins[-1][gains] *= stiff
         begins[-1][rotors] = np.maximum(begins[-1][rotors], 1e-3) * heavy
     return np.array(begins)
 
 
-def _level(found: Fit, weight: np.ndarray) -> float:
+def level_of(found: Fit, weight: np.ndarray) -> float:
     return found.squares / max((weight > 0).sum(), 1)
 
 
 class _Tried(NamedTuple):
     candidate: Candidate
-    state: _State
+    state: Model
     sse: np.ndarray  # held out, by blocks and windows
 
 
-def _tried(here: Setting, now: _State, named: Sequence[Candidate], forbid: Sequence[str]) -> list[_Tried]:
+def _tried(here: Setting, now: Model, named: Sequence[Candidate], forbid: Sequence[str]) -> list[_Tried]:
     """Every candidate that may still come, fitted from the present optimum from each of its starts."""
     used = {(c.effect, c.at) for c in named}
     left = [c for c in here.known.candidates if (c.effect, c.at) not in used and not set(c.entries) <= set(now.free)]
-    if here.loop.robot.nv > 1:
-        left = _screened(here, now, left)
+    if here.loop.robot.nv > 1 or here.loop.carried is not None:
+        left = _screened(here, now, left) if left else []
     thetas, free, owner = [], [], []
     for c in left:
         for start in c.starts:
             thetas.append(_start_values(now.fit.theta, c, start))
-            free.append(_free(now.free, c.entries))
+            free.append(free_entries(now.free, c.entries))
             owner.append(c)
     found = []
     for k, best in _raced(here, now, np.array(thetas), free, [(c.effect, c.at) for c in owner]):
         found.append(_tried_one(here, now.structure, owner[k], best, free[k]))
     rigid = len(now.structure.table) == len(here.known.table)
-    if here.loop.robot.nv == 1 and rigid and all(one.state.excess >= 1.0 for one in found):
+    first = here.loop.carried is None or not named  # a spring competes with the first cause of a joint of an arm
+    if here.loop.robot.nv == 1 and rigid and first and all(one.state.excess >= 1.0 for one in found):
         found += _elastic(here, now, forbid)
     return found
 
 
 def _raced(
-    here: Setting, now: _State, thetas: np.ndarray, free: Sequence[Sequence[int]], owner: Sequence[tuple]
+    here: Setting, now: Model, thetas: np.ndarray, free: Sequence[Sequence[int]], owner: Sequence[tuple]
 ) -> list[tuple[int, Fit]]:
     """The fits that lead after a few steps, finished: one of each candidate, with its place among the starts."""
     if not len(thetas):
@@ -276,17 +315,17 @@ def _raced(
 
 def _tried_one(here: Setting, structure: Structure, c: Candidate, best: Fit, free: Sequence[int]) -> _Tried:
     weight = np.asarray(structure.data.weight)
-    state = _State(structure, best, tuple(free), excess(residuals(structure, best), weight))
+    state = Model(structure, best, tuple(free), excess(residuals(structure, best), weight))
     return _Tried(c, state, held_out(best, structure.data, here.folds))
 
 
-def _screened(here: Setting, now: _State, left: Sequence[Candidate]) -> list[Candidate]:
+def _screened(here: Setting, now: Model, left: Sequence[Candidate]) -> list[Candidate]:
     """The candidates that one linear step from the present model promises most, several to one linearisation.
 
     A limit of a drive changes the model before it can be differentiated: each is linearised at one start of its own.
     """
-    scores: dict[int, float] = {}
     room = here.width - len(now.free)
+    left = [c for c in left if len(c.entries) <= room]
     limits = [k for k, c in enumerate(left) if c.effect in _LIMITS]
     packs, filled = [], 0
     for k in [k for k in range(len(left)) if k not in limits]:
@@ -295,35 +334,40 @@ def _screened(here: Setting, now: _State, left: Sequence[Candidate]) -> list[Can
             filled = 0
         packs[-1].append(k)
         filled += len(left[k].entries)
+    lanes = []
     for pack in packs:
         for variant in range(max([1, *(len(left[k].starts) for k in pack if left[k].effect in _SHAPED)])):
             theta = now.fit.theta.copy()
             for k in pack:
                 if left[k].effect in _SHAPED:
                     theta[left[k].entries[1]] = left[k].starts[variant][1]
-            _score(here, now, theta, [(k, left[k]) for k in pack], scores)
+            lanes.append((theta, pack))
     for k in limits:
-        theta = _start_values(now.fit.theta, left[k], left[k].starts[len(left[k].starts) // 2])
-        _score(here, now, theta, [(k, left[k])], scores)
-    return [left[k] for k in sorted(scores, key=lambda k: scores[k])[:_SHORT]]
+        lanes += [(_start_values(now.fit.theta, left[k], start), [k]) for start in left[k].starts]
+    scores = _scores(here, now, left, lanes) if lanes else {}
+    most = _SHORT if here.loop.carried is None else _SHORTER
+    return [left[k] for k in sorted(scores, key=lambda k: scores[k])[:most]]
 
 
-def _score(
-    here: Setting, now: _State, theta: np.ndarray, pack: Sequence[tuple[int, Candidate]], scores: dict[int, float]
-) -> None:
-    """Cost after a linear step of each candidate of the pack beside what is free already."""
-    columns = _free(now.free, [entry for _, c in pack for entry in c.entries])
-    start = now.fit.start[None]
-    one = fit(*now.structure, theta[None], [columns], start, width=here.width, lanes=here.lanes, iterations=0)[0]
-    for k, c in pack:
-        mine = set(now.free) | set(c.entries)
-        fixed = np.array([entry < 0 or entry not in mine for entry in one.free])
-        system = System(one.sums, now.structure.data, one.start)
-        cost = one.cost - system.decrease(*system.solve(fixed, 1e-6))
-        scores[k] = min(scores.get(k, np.inf), cost)
+def _scores(
+    here: Setting, now: Model, left: Sequence[Candidate], lanes: Sequence[tuple[np.ndarray, list[int]]]
+) -> dict[int, float]:
+    """Cost after a linear step of each candidate of each lane's pack beside what is free already."""
+    columns = [free_entries(now.free, [entry for k in pack for entry in left[k].entries]) for _, pack in lanes]
+    thetas, start = np.array([theta for theta, _ in lanes]), np.repeat(now.fit.start[None], len(lanes), 0)
+    fits = fit(*now.structure, thetas, columns, start, width=here.width, lanes=here.lanes, iterations=0)
+    scores: dict[int, float] = {}
+    for one, (_, pack) in zip(fits, lanes, strict=True):
+        for k in pack if np.isfinite(one.cost) else ():
+            mine = set(now.free) | set(left[k].entries)
+            fixed = np.array([entry < 0 or entry not in mine for entry in one.free])
+            system = System(one.sums, now.structure.data, one.start)
+            cost = one.cost - system.decrease(*system.solve(fixed, 1e-6))
+            scores[k] = min(scores.get(k, np.inf), cost)
+    return scores
 
 
-def _elastic(here: Setting, now: _State, forbid: Sequence[str]) -> list[_Tried]:
+def _elastic(here: Setting, now: Model, forbid: Sequence[str]) -> list[_Tried]:
     """A spring, and a spring with play, between motor and link."""
     wanted = [name for name in ("joint_elasticity", "backlash") if name not in forbid]
     if not wanted:
@@ -347,19 +391,20 @@ def _elastic(here: Setting, now: _State, forbid: Sequence[str]) -> list[_Tried]:
             theta = base.copy()
             theta[k : k + 3] = stiffness, 0.002 * stiffness, 0.0 if name == "joint_elasticity" else 0.1 * share
             thetas.append(theta)
-            free.append(_free(now.free, entries))
+            free.append(free_entries(now.free, entries))
             owner.append(name)
     start = np.zeros((len(thetas), 2 * (n + 1), now.fit.start.shape[1]))
     start[:, :n], start[:, n + 1 : 2 * n + 1] = now.fit.start[:n], now.fit.start[n:]
-    fits = fit(*structure, np.array(thetas), free, start, width=here.width, lanes=6)
+    most = 40 if here.loop.carried is None else _LATE
+    fits = fit(*structure, np.array(thetas), free, start, width=here.width, lanes=6, iterations=most)
     found = []
     for name in wanted:
         best = min((f for f, o in zip(fits, owner, strict=True) if o == name), key=lambda f: f.cost)
-        found.append(_tried_one(here, structure, made[name], best, _free(now.free, made[name].entries)))
+        found.append(_tried_one(here, structure, made[name], best, free_entries(now.free, made[name].entries)))
     return found
 
 
-def _t(worse: np.ndarray, better: np.ndarray) -> float:
+def t_of(worse: np.ndarray, better: np.ndarray) -> float:
     """t of the blocks' gain in held-out squares."""
     gain = (worse - better).ravel()
     gain = gain[(worse.ravel() != 0) | (better.ravel() != 0)]
@@ -367,12 +412,12 @@ def _t(worse: np.ndarray, better: np.ndarray) -> float:
 
 
 def _best(
-    here: Setting, now: _State, tried: Sequence[_Tried], nearest: list[tuple[Name, float, str]]
-) -> tuple[tuple[Named, _State] | None, float]:
+    here: Setting, now: Model, tried: Sequence[_Tried], nearest: list[tuple[Name, float, str]]
+) -> tuple[tuple[Named, Model] | None, float]:
     """The cause to name next with the state it makes, and p of what is left before it being noise."""
     before = held_out(now.fit, now.structure.data, here.folds)
     gains = [(before.sum() - one.sse.sum()) / before.sum() for one in tried]
-    ts = [_t(before, one.sse) for one in tried]
+    ts = [t_of(before, one.sse) for one in tried]
     nearest.clear()
     if not tried:
         return None, 1.0
@@ -385,9 +430,12 @@ def _best(
     if not passing:
         return None, p
     k = min(passing, key=lambda k: tried[k].sse.sum())
+    if tried[k].state.excess >= 1.0:  # more is to come: what every joint has before what few have
+        usual = [j for j in passing if tried[j].candidate.effect in BASELINE and gains[j] > _USUAL * gains[k]]
+        k = min(usual, key=lambda j: tried[j].sse.sum(), default=k)
     for simple in passing:  # what it contains is preferred unless clearly worse
         if tried[simple].candidate.effect in CONTAINS.get(tried[k].candidate.effect, ()):
-            if _t(tried[simple].sse, tried[k].sse) < _ALIKE or tried[simple].sse.sum() <= 1.002 * tried[k].sse.sum():
+            if t_of(tried[simple].sse, tried[k].sse) < _ALIKE or tried[simple].sse.sum() <= 1.002 * tried[k].sse.sum():
                 k = simple
     best = tried[k]
     alike = []
@@ -398,7 +446,7 @@ def _best(
         )
         noise = tried[other].state.excess < 1.0 or best.state.excess >= 1.0
         near = tried[other].sse.sum() - best.sse.sum() < 0.1 * (before.sum() - best.sse.sum())
-        if other != k and not contained and noise and near and _t(tried[other].sse, best.sse) < _ALIKE:
+        if other != k and not contained and noise and near and t_of(tried[other].sse, best.sse) < _ALIKE:
             alike.append(Name(tried[other].candidate.effect, tried[other].candidate.at))
     named = Named(best.candidate, ts[k], float(gains[k]), tuple(alike), _rms(here, before), _rms(here, best.sse))
     return (named, best.state), p
@@ -427,8 +475,8 @@ def _sized(here: Setting, one: _Tried) -> bool:
     return bool(np.isfinite(error) and abs(value - neutral) > 3 * error)
 
 
-def _judged(
-    here: Setting, begin: _State, now: _State, found: list[Named], p_value: float, steps: list, nearest: list
+def judged(
+    here: Setting, begin: Model, now: Model, found: list[Named], p_value: float, steps: list, nearest: list
 ) -> Search:
     """`named` where the rest is noise; `named+rest` where the names hold without each of three recordings or more."""
     held = [_rms(here, held_out(begin.fit, begin.structure.data, here.folds)), *(n.after for n in found)]

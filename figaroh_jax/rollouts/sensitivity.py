@@ -35,6 +35,7 @@ class Windows(eqx.Module):
     weight: Any  # (rows, ny, windows): 1 / standard deviation, 0 where nothing counts
     start: Any  # (2 nv, windows): position and velocity at the first row, as measured
     precision: Any  # (2 nv, windows): 1 / standard deviation of that state
+    carried: Any  # (rows, 4 + 3 links, windows): what one joint carries (`alone.carried_by`), or None
     substeps: int = eqx.field(static=True)
     lead: int = eqx.field(static=True)
     block: int = eqx.field(static=True)  # rows that one sum covers; divides the rows
@@ -75,6 +76,24 @@ def _seen(loop: Loop, data: Windows, block: Array) -> Array:
     return delayed(fine, jnp.asarray(loop.drives.delay), loop.dt)[data.lead * data.substeps :]
 
 
+def _carried(data: Windows, block: Array) -> Array | None:
+    """What the joint carries at each step of a block of rows, (steps, 4 + 3 links, windows): held from row to row."""
+    if data.carried is None:
+        return None
+    rows = jax.lax.dynamic_slice_in_dim(jnp.asarray(data.carried), block * data.block, data.block)
+    return jnp.repeat(rows, data.substeps, axis=0)
+
+
+def _carrying(loop: Loop, carried: Array | None) -> Loop:
+    """The loop at instants at which its joint carries that, (4 + 3 links, samples)."""
+    if carried is None or loop.carried is None:
+        return loop
+    more = carried[4:].reshape(-1, 3, carried.shape[1])
+    mass, bias, slope = carried[:3] + jnp.sum(jnp.asarray(loop.carried.payload)[:, None, None] * more, 0)
+    where = lambda m: (m.carried.mass, m.carried.bias, m.carried.slope, m.carried.place)  # noqa: E731
+    return eqx.tree_at(where, loop, (mass, bias, slope, carried[3]))
+
+
 def read_of(loop: Loop, state: State, rates: bool) -> Array:
     """What the encoders read, then their rates."""
     read = observe(loop, state)
@@ -85,11 +104,11 @@ def read_of(loop: Loop, state: State, rates: bool) -> Array:
 
 
 def _rollout(loop: Loop, data: Windows, state: State, warm: Array, weight: Array, block: Array) -> Any:
-    def one(carry: tuple[State, Array], control: Array) -> Any:
-        after, step = advance(loop, carry[0], control, weight, carry[1])
+    def one(carry: tuple[State, Array], given: tuple[Array, Array | None]) -> Any:
+        after, step = advance(_carrying(loop, given[1]), carry[0], given[0], weight, carry[1])
         return (after, step.a), (carry[0], step)
 
-    return jax.lax.scan(one, (state, warm), _seen(loop, data, block))
+    return jax.lax.scan(one, (state, warm), (_seen(loop, data, block), _carried(data, block)))
 
 
 def _predicted(loop: Loop, table: Table, theta: Array, data: Windows, start: Array) -> Array:
@@ -149,7 +168,7 @@ def _lane(loop: Loop, table: Table, theta: Array, free: Array, data: Windows, st
         truth, precise = (jax.lax.dynamic_slice_in_dim(x, first, data.block) for x in (data.reading, data.weight))
         at_rows = jax.tree.map(lambda x: x[:: data.substeps], states)
         read = jax.vmap(lambda q, v, act: read_of(here, State(q, v, act), rates))(*at_rows)
-        slope = jnp.einsum("yx,txpw->typw", look, rows)
+        slope = jnp.sum(look[None, :, :, None, None] * rows[:, None], 2)
         slope = slope.at[:, :, : len(free)].add(direct[None, :, :, None]) * precise[:, :, None]
         error = (truth - read) * precise
         cost, gradient = jnp.sum(error**2, 0).T, jnp.einsum("typw,tyw->wp", slope, error)
@@ -198,10 +217,13 @@ def _linearised(
     else:
         fixed = jax.tree.map(flat, steps)
     here = State(*(flat(x) for x in states))
+    carried = _carried(data, block)
+    carried = None if carried is None else flat(carried)
 
     def move(q: Array, v: Array, act: Array, theta: Array) -> Array:
         at = put(loop, table, theta)
-        after = integrated(at, State(q, v, act), flat(_seen(at, data, block)), mobility(at), fixed)
+        seen, weight = flat(_seen(at, data, block)), mobility(at)
+        after = integrated(_carrying(at, carried), State(q, v, act), seen, weight, fixed)
         return jnp.concatenate([after.q, after.v, after.act] if active else [after.q, after.v])
 
     _, pushed = jax.linearize(move, *here, theta)
@@ -224,7 +246,7 @@ def _spread(a: Array, b: Array, spread: Array, substeps: int) -> tuple[Array, Ar
     columns = b.shape[2]
 
     def one(spread: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
-        after = jnp.einsum("xyw,ypw->xpw", step[0], spread)
+        after = jnp.sum(step[0][:, :, None] * spread[None], 1)
         return after.at[:, :columns].add(step[1]), spread
 
     last, rows = jax.lax.scan(one, spread, (a, b))

@@ -19,6 +19,8 @@ from ..formats.config import robot_options
 from ..formats.files import USD
 from ..recordings.dataset import Recording, read_recordings
 from ..results import Cause, Diagnosis, Estimate, Experiment, Gain, Name, Rest, Trace
+from .alone import separable
+from .arm import search_arm
 from .causes import BASELINE
 from .data import Run, Stretch, noise_of, regular, windows
 from .fit import standard_errors
@@ -49,6 +51,7 @@ EFFECTS = {  # parameters of effects and the fields of `Joints` that hold them
     "load_dependent_friction": {"ratio": "load_ratio"},
     "joint_spring": {"stiffness": "stiffness", "offset": "offset"},
 }
+_WINDOW = 15.0  # s
 _TURN = 12.0  # a command that many times beyond what the joint did is in other units
 
 
@@ -68,7 +71,8 @@ def diagnose_rollout_task(
     loop, runs, notes = read_rollouts(task)
     here = diagnosis_setting(task, loop, runs)
     with jax.enable_x64(True):
-        found = search(here, progress, forbid=task.diagnose.forbid)
+        seek = search_arm if separable(loop) else search
+        found = seek(here, progress, forbid=task.diagnose.forbid)
         if not np.isfinite(found.first.cost):
             raise InputError(
                 f"{task.robot.model}: the simulation diverges with the model's own gains: they contradict its inertia "
@@ -132,8 +136,25 @@ def diagnosis_setting(task: Task, loop: Loop, runs: Sequence[Run]) -> Setting:
     names = [n for n, on in zip(BASELINE, (rotor, known.viscous, known.coulomb), strict=True) if on]
     more = [(entry.effect, entry.at[0]) for entry in known.effects if entry.at]
     return setting(
-        loop, runs, baseline=names, more=more, gains_known=task.actuator.gains == "known", forbid=task.diagnose.forbid
-    )
+        loop, runs, baseline=names, more=more, gains_known=task.actuator.gains == "known", forbid=task.diagnose.forbid,
+        stretches=_cut(task, loop, runs),
+    )  # fmt: skip
+
+
+def _cut(task: Task, loop: Loop, runs: Sequence[Run]) -> tuple[Stretch, ...]:
+    """Windows of the task's length; `auto`: whole recordings of one joint, else 15 s, which run side by side."""
+    wanted = task.rollout.window
+    if wanted == "whole" or (wanted == "auto" and not separable(loop)):
+        return ()
+    length = _WINDOW if wanted == "auto" else float(wanted)
+    found = []
+    for k, run in enumerate(r for r in runs if not r.holdout):
+        rows = max(2, round(length / regular(run.name, run.time)))
+        found += [Stretch(k, first, rows) for first in range(0, len(run.time) - rows + 1, rows)]
+        rest = len(run.time) % rows
+        if rest > 0.2 * rows or len(run.time) < rows:
+            found.append(Stretch(k, len(run.time) - rest, rest))
+    return tuple(found)
 
 
 def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes: tuple[str, ...]) -> RolloutDiagnosis:
@@ -269,10 +290,11 @@ def _traces(
             np.asarray(predicted(s.loop, s.table, f.theta[None], s.data, f.start[None])[0])
             for s, f in ((first, found.first), last)
         ]
-    for w, stretch in enumerate(here.stretches):
-        run, rows = fitted[stretch.run], slice(stretch.first, stretch.first + stretch.rows)
+    for k, run in enumerate(fitted):
+        mine = [(w, stretch) for w, stretch in enumerate(here.stretches) if stretch.run == k]
+        rows = np.concatenate([np.arange(one.first, one.first + one.rows) for _, one in mine])
         ny = run.position.shape[1]
-        before, after = (x[: stretch.rows, :ny, w] for x in both)
+        before, after = (np.concatenate([x[: one.rows, :ny, w] for w, one in mine]) for x in both)
         traces.append(_trace(run, "fit", rows, before, after))
     for run in runs:
         if run.holdout:
@@ -280,7 +302,7 @@ def _traces(
     return tuple(traces)
 
 
-def _trace(run: Run, role: Any, rows: slice, before: np.ndarray, after: np.ndarray) -> Trace:
+def _trace(run: Run, role: Any, rows: slice | np.ndarray, before: np.ndarray, after: np.ndarray) -> Trace:
     time, position = run.time[rows], run.position[rows]
     velocity = np.gradient(position, time, axis=0) if run.velocity is None else run.velocity[rows]
     return Trace(run.name, role, time, position, velocity, position, before, after)

@@ -1,0 +1,104 @@
+"""One or two hidden effects in an arm of six servos: verdicts from command and position alone.
+
+    python benchmarks/arm_cases.py --seeds 1 2 [--effects payload none] [--sizes 0 1 2] [--noise white|coloured|counts]
+    python benchmarks/arm_cases.py --seeds 1 --pairs
+
+Each arm is made by MuJoCo C (`tests/generators/servo_arm6.py`, no code shared with the library) and diagnosed with a
+model whose armature, damping and frictionloss are 1.6 times too large, on two recordings of 12 s. The joint follows
+from the seed. One line a run; `wrong` is a name that is neither hidden nor told to be alike.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from generators import servo_arm6  # noqa: E402
+
+from figaroh_jax.rollouts.arm import search_arm  # noqa: E402
+from figaroh_jax.rollouts.data import Run, Stretch  # noqa: E402
+from figaroh_jax.rollouts.reading import load_loop  # noqa: E402
+from figaroh_jax.rollouts.search import search, setting  # noqa: E402
+
+LINKS = 5  # the last link carries the payload
+
+
+def run(
+    hidden: list[tuple[str, int, float]], seed: int, noise: str, *, whole: bool, known: bool
+) -> tuple[str, str, float]:
+    """Verdict with its names, what was found, CPU seconds."""
+    with tempfile.NamedTemporaryFile("w", suffix=".xml") as file:
+        file.write(servo_arm6.model_text(1.6))
+        file.flush()
+        loop, _ = load_loop(file.name)
+    runs = []
+    for number in range(2):
+        r = servo_arm6.record(hidden, seed, number, noise)
+        runs.append(Run(f"run {number}", r["t"], r["u"], r["q"], None))
+    cut = [Stretch(k, f, 600) for k in range(2) for f in range(0, 1200, 600)]
+    start = time.process_time()
+    here = setting(loop, runs, gains_known=known, stretches=cut)
+    found = (search if whole else search_arm)(here)
+    names = {(n.candidate.effect, *n.candidate.at) for n in found.named}
+    alike = {(a.effect, *a.at) for n in found.named for a in n.alike}
+    truth = {(effect, "payload" if effect == "payload" else servo_arm6.NAMES[j]) for effect, j, _ in hidden}
+    told = {(e, "payload" if e == "payload" else place) for e, place in names}
+    also = {(e, "payload" if e == "payload" else place) for e, place in alike}
+    if not hidden:
+        word = "right" if found.verdict == "nothing" else "wrong" if names else "unknown"
+    elif told == truth or (truth <= told | also and told <= truth | also):
+        word = "right"
+    elif not told:
+        word = "missed" if found.verdict == "nothing" else "unknown"
+    else:
+        word = "part" if told < truth else "wrong"
+    names_text = "+".join(f"{e}({p})" for e, p in sorted(names)) or "-"
+    proxy = "+".join(f"{n.candidate.effect}({n.candidate.at[0]})" for n in found.proxy) or "-"
+    levels = " -> ".join(f"{x:.3f}" for _, x in found.table)
+    return word, f"{found.verdict} {names_text}, chi2/N {levels}, proxy {proxy}", time.process_time() - start
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
+    parser.add_argument(
+        "--effects", nargs="+", choices=["none", *servo_arm6.EFFECTS], default=["none", *servo_arm6.EFFECTS]
+    )
+    parser.add_argument("--sizes", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--noise", choices=["white", "coloured", "counts"], default="white")
+    parser.add_argument("--pairs", action="store_true", help="two effects at a time, of the middle size")
+    parser.add_argument("--whole", action="store_true", help="search with the whole arm in place of joint by joint")
+    args = parser.parse_args()
+    count: dict[str, int] = {}
+    for seed in args.seeds:
+        for hidden in _cases(args, np.random.default_rng([seed, 3])):
+            word, text, seconds = run(hidden, seed, args.noise, whole=args.whole, known=True)
+            count[word] = count.get(word, 0) + 1
+            label = "+".join(f"{e}@{servo_arm6.NAMES[j]}:{size:g}" for e, j, size in hidden) or "none"
+            print(f"seed {seed} {args.noise} {label}: {word}; {text}, {seconds:.0f} CPU s", flush=True)
+    print(", ".join(f"{word} {n}" for word, n in sorted(count.items())))
+
+
+def _cases(args: argparse.Namespace, rng: np.random.Generator) -> list[list[tuple[str, int, float]]]:
+    def one(effect: str, size: int) -> tuple[str, int, float]:
+        joint = 5 if effect == "payload" else int(rng.integers(0, 5))
+        return effect, joint, servo_arm6.EFFECTS[effect][size]
+
+    effects = list(servo_arm6.EFFECTS)
+    if args.pairs:
+        pairs = [rng.choice(len(effects), 2, replace=False) for _ in range(3)]
+        return [[one(effects[a], 1), one(effects[b], 1)] for a, b in pairs if {a, b} != {2, 3}]
+    cases: list[list[tuple[str, int, float]]] = []
+    for effect in args.effects:
+        cases += [[]] if effect == "none" else [[one(effect, size)] for size in args.sizes]
+    return cases
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,370 @@
+"""Straight programs as code of the processor at hand: eight samples (AVX-512) to a vector, from joint angles to answer.
+
+XLA makes of such a program on a CPU a chain of small products that it computes over and over. Where the machine has a C
+compiler (`cc`, or what `$CC` names), the program is written out in C instead, compiled once for a robot's structure and
+kept beside JAX's own cache, where that is on. Everything else (no compiler, few samples, an angle beyond 1e5 rad,
+transformations of JAX, other devices, `FIGAROH_JAX_MACHINE_CODE=0`) takes the plain form, whose answers it gives to
+rounding.
+
+Code that is read from disk is run only where `store` vouches that this user's own processes wrote it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache, partial
+from math import prod
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from .executable_cache import surroundings
+from .kernels import Number, Program, Straight
+from .store import Store
+
+__all__ = ["machine_code"]
+
+FROM = 512  # samples; below, handing them over costs as much as it saves
+TO_COMPILE = 2048  # samples from which a program that is nowhere yet is compiled
+SMALL = 700  # constants of a robot (12 joints) up to which this holds; a larger one takes longer to compile than XLA's
+PIECE = 4096  # samples of one call, on one core
+FARTHEST = 1e5  # rad, to which `sine_cosine` is exact
+PATIENCE = 300.0  # s that a compiler may take
+FLAGS = ("-O1", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared", "-w", "-x", "c", "-")
+
+_HEAD = """
+#include <stddef.h>
+#include <string.h>
+#if defined(__AVX512F__)
+#define W 8
+#elif defined(__AVX__)
+#define W 4
+#else
+#define W 2
+#endif
+typedef double V __attribute__((vector_size(8 * W)));
+typedef double U __attribute__((vector_size(8 * W), aligned(8)));
+typedef long long I __attribute__((vector_size(8 * W)));
+static const double whole = 6755399441055744.0; /* 1.5 * 2^52: sums with it are whole numbers, in their low bits */
+static inline V lanes(const double *x, size_t stride) {
+  V r;
+  for (int l = 0; l < W; l++) r[l] = x[l * stride];
+  return r;
+}
+static inline V choose(I no, V yes, V other) { return (V)(((I)yes & ~no) | ((I)other & no)); }
+static inline V down(V x) { V r = (x + whole) - whole; return choose((I)(r > x), r, r - 1.0); }
+static inline I bits(V x) { return (I)(x + whole); }
+int lanes_of_a_block(void) { return W; }
+"""
+TOGETHER = 128  # samples whose answers are collected in the cache, for they go to as many places of memory as numbers
+
+
+Room = Callable[[tuple[int, ...], float | None], np.ndarray]  # (shape, fill) -> memory for answers
+
+
+def machine_code(
+    straight: Straight, parameters: Any, *arrays: Float[np.ndarray, "samples _"]
+) -> Callable[..., np.ndarray] | None:
+    """`run(room, *arrays)`: answers for these arrays of the host or pieces of them, at least a vector of samples.
+
+    They are (samples, *shape), or the samples last, in memory from `room`. None where the plain form has to serve.
+    """
+    samples = len(arrays[0])
+    if samples < FROM or straight.places is None or _compiler() is None or not _near(arrays[0]):
+        return None
+    wanted = _Wanted(straight, parameters, straight.known_lengths(parameters), tuple(x.shape[1] for x in arrays))
+    code = _code(wanted, samples >= TO_COMPILE * max(1.0, len(wanted.codes) / SMALL))
+    if code is None:
+        return None
+    constants = np.ascontiguousarray(straight.constants(parameters, float, np), float)
+    return partial(_run, code, straight.last, constants)
+
+
+def _run(code: _Code, last: bool, constants: np.ndarray, room: Room, *arrays: np.ndarray) -> np.ndarray:
+    samples, fill = len(arrays[0]), None if code.complete else 0.0
+    answer = room((*code.shape, samples) if last else (samples, *code.shape), fill)
+    rows = [np.ascontiguousarray(x, float) for x in arrays]
+    _in_pieces(partial(code.run, constants, rows, answer, last), samples, code.lanes)
+    return answer
+
+
+def _near(angle: np.ndarray) -> bool:
+    return not angle.size or bool(max(angle.max(), -angle.min()) < FARTHEST)  # false where one is not a number
+
+
+def _in_pieces(run: Callable[[int, int], None], samples: int, lanes: int) -> None:
+    """`run(first, last)` over all samples, in whole vectors: the last one reaches back where samples are too few."""
+    starts = range(0, samples, PIECE)
+    pieces = [(max(0, min(k, samples - lanes)), min(k + PIECE, samples)) for k in starts]
+    cores = min(_cores(), len(pieces))
+    if cores == 1:
+        for piece in pieces:
+            run(*piece)
+        return
+    with ThreadPoolExecutor(cores) as pool:
+        list(pool.map(lambda piece: run(*piece), pieces))
+
+
+def _cores() -> int:
+    """Cores to use: as many as there are, unless OPENBLAS_NUM_THREADS or OMP_NUM_THREADS says how many."""
+    told = os.environ.get("OPENBLAS_NUM_THREADS") or os.environ.get("OMP_NUM_THREADS") or ""
+    if told.isdigit() and int(told):
+        return int(told)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class _Code(NamedTuple):
+    """Functions of one form of one structure of a robot, in memory."""
+
+    functions: tuple[Any, ...]
+    shape: tuple[int, ...]
+    lanes: int
+    complete: bool  # whether every number of the answer is written
+
+    def run(
+        self, constants: np.ndarray, arrays: Sequence[np.ndarray], answer: np.ndarray, last: bool, first: int, end: int
+    ) -> None:
+        """Samples from `first` up to `end`, at least a vector of them."""
+        size, total = prod(self.shape), answer.shape[-1] if last else len(answer)
+        inside = [x.ctypes.data + 8 * first * x.shape[1] for x in arrays]
+        out = answer.ctypes.data + 8 * first * (1 if last else size)
+        for function in self.functions:
+            function(constants.ctypes.data, *inside, out, end - first, total)
+
+
+class _Wanted(NamedTuple):
+    """A form for the structure of some parameters, with what is known of their constants and the arrays' columns."""
+
+    straight: Straight
+    parameters: Any
+    codes: bytes
+    widths: tuple[int, ...]
+
+
+_ready: dict[Any, _Code | None] = {}
+
+
+def _code(wanted: _Wanted, compile_it: bool) -> _Code | None:
+    """From memory, from disk, or made now where `compile_it`; None where there is none."""
+    key = (wanted.straight.name, wanted.straight.structure(wanted.parameters), wanted.codes, wanted.widths)
+    if key in _ready:
+        return _ready[key]
+    store = _store()
+    name = hashlib.blake2b(repr((key, surroundings(), FLAGS, _version())).encode(), digest_size=20).hexdigest()
+    library = store.get(f"{name}.so") if store else None
+    kept = library is not None
+    if library is None:
+        if not compile_it:
+            return None
+        library = _compiled(wanted)
+        if library is not None and store is not None:
+            store.put(f"{name}.so", library)
+    code = None if library is None else _loaded(wanted, library)
+    if code is None and kept:  # of another machine, although it has the same name: made anew
+        library = _compiled(wanted)
+        code = None if library is None else _loaded(wanted, library)
+    _ready[key] = code
+    return code
+
+
+def _store() -> Store | None:
+    folder = jax.config.values.get("jax_compilation_cache_dir")
+    on = folder and jax.config.values.get("jax_enable_compilation_cache")
+    return Store(Path(str(folder)) / "programs") if on else None
+
+
+@lru_cache(maxsize=1)
+def _compiler() -> str | None:
+    if os.environ.get("FIGAROH_JAX_MACHINE_CODE", "") == "0" or os.name == "nt":
+        return None
+    return shutil.which(str(os.environ.get("CC") or "cc"))
+
+
+@lru_cache(maxsize=1)
+def _version() -> str:
+    """What the compiler calls itself, and whatever decides about the code that it makes for this machine."""
+    compiler = _compiler()
+    if compiler is None:
+        return ""
+    info = os.stat(compiler)
+    return f"{os.path.realpath(compiler)} {info.st_size} {info.st_mtime_ns}"
+
+
+def _compiled(wanted: _Wanted) -> bytes | None:
+    """A shared library; None where the compiler fails."""
+    compiler = _compiler()
+    if compiler is None:
+        return None
+    with tempfile.TemporaryDirectory(prefix="figaroh_jax_") as folder:
+        out = Path(folder) / "code.so"
+        try:
+            subprocess.run(  # noqa: S603  (the user's own compiler, with source that is made here)
+                [compiler, *FLAGS, "-o", str(out)],
+                input=_source(wanted).encode(),
+                check=True,
+                capture_output=True,
+                timeout=PATIENCE,
+            )
+            return out.read_bytes()
+        except (OSError, subprocess.SubprocessError):
+            return None
+
+
+def _loaded(wanted: _Wanted, library: bytes) -> _Code | None:
+    try:
+        handle = _opened(library)
+        functions = tuple(handle[f"straight_{k}"] for k in range(int(handle["programs"]())))
+        lanes = int(handle["lanes_of_a_block"]())
+        complete = bool(handle["complete"]())
+    except (OSError, AttributeError):
+        return None
+    for function in functions:
+        function.restype = None
+        function.argtypes = [ctypes.c_void_p] * (len(wanted.widths) + 2) + [ctypes.c_size_t] * 2
+    return _Code(functions, wanted.straight.answer(wanted.parameters), lanes, complete)
+
+
+def _opened(library: bytes) -> ctypes.CDLL:
+    """The library loaded from memory that only this process writes; a file stands for it where the system needs one."""
+    if hasattr(os, "memfd_create"):
+        handle = os.memfd_create("figaroh_jax")  # stays open: to the loader a name that it has seen is the same file
+        with open(handle, "wb", closefd=False) as file:
+            file.write(library)
+        return ctypes.CDLL(f"/proc/self/fd/{handle}")
+    with tempfile.TemporaryDirectory(prefix="figaroh_jax_") as folder:
+        path = Path(folder) / "code.so"
+        path.write_bytes(library)
+        return ctypes.CDLL(str(path))
+
+
+def _source(wanted: _Wanted) -> str:
+    """C for all programs of a form: constants, arrays, answer, samples to do, samples of the whole answer."""
+    straight, parameters, codes, widths = wanted
+    parts, written = [_HEAD], set[int]()
+    programs = straight.programs(parameters, codes)
+    heads = "".join(f", const double *x{n}" for n in range(len(widths)))
+    for k, program in enumerate(programs):
+        written_out = _Writer(wanted, program)
+        written |= set(written_out.places)
+        parts.append(
+            f"void straight_{k}(const double *restrict c{heads}, double *restrict out, size_t count, size_t total) {{\n"
+            f"{written_out.text()}}}\n"
+        )
+    complete = len(written) == prod(straight.answer(parameters))
+    parts += [f"int programs(void) {{ return {len(programs)}; }}\n"]
+    parts += [f"int complete(void) {{ return {int(complete)}; }}\n"]
+    return "".join(parts)
+
+
+def _traced(wanted: _Wanted, program: Program) -> tuple[Any, list[tuple[int, int]], list[tuple[int, ...]]]:
+    """The program as JAX's operations on single numbers: constants, then columns of the arrays; and what it writes."""
+    arrays = sorted({one for group in wanted.straight.columns(wanted.parameters) for one in group})
+    index, constants = {one: k for k, one in enumerate(arrays)}, len(wanted.codes)
+    places: list[tuple[int, ...]] = []
+
+    def numbers(*given: Any) -> list[Any]:
+        table, read, out = given[:constants], given[constants:], []
+
+        def write(entries: Iterable[tuple[tuple[int, ...], Number]]) -> None:
+            for place, number in entries:
+                places.append(place)
+                out.append(jnp.full((), number.x, float) if number.known else number.x)
+
+        reads = [lambda column, n=n: Number(read[index[n, column]]) for n in range(len(wanted.widths))]
+        program(lambda k: table[k], reads, write)
+        return out
+
+    with jax.enable_x64(True):
+        scalar = jax.ShapeDtypeStruct((), jnp.float64)
+        return jax.make_jaxpr(numbers)(*[scalar] * (constants + len(arrays))).jaxpr, arrays, places
+
+
+class _Writer:
+    """One program as C, statement by statement; an answer is put aside as soon as it is known."""
+
+    def __init__(self, wanted: _Wanted, program: Program) -> None:
+        straight, parameters, codes, self.widths = wanted
+        self.size, self.last = prod(straight.answer(parameters)), straight.last
+        jaxpr, arrays, written = _traced(wanted, program)
+        self.names = {v: f"c[{k}]" for k, v in enumerate(jaxpr.invars[: len(codes)])}
+        self.loads = dict(zip(jaxpr.invars[len(codes) :], arrays, strict=True))
+        self.places: list[int] = []  # in a sample's answer, of each number as it becomes known
+        self.lines: list[str] = []
+        assert straight.places is not None
+        later: dict[Any, list[int]] = {}
+        for variable, place in zip(jaxpr.outvars, written, strict=True):
+            targets = list(straight.places(parameters, place))
+            if hasattr(variable, "val") or variable in self.names or variable in self.loads:
+                self._put(f"(V){{}} + {self._operand(variable)}", targets)
+            else:
+                later.setdefault(variable, []).extend(targets)
+        for equation in jaxpr.eqns:
+            (result,) = equation.outvars
+            operation = self._operation(equation.primitive.name, [self._operand(x) for x in equation.invars])
+            name = self.names[result] = f"t{len(self.names)}"
+            self.lines.append(f"{'V' if result.aval.dtype == jnp.float64 else 'I'} {name} = {operation};\n")
+            self._put(name, later.get(result, []))
+
+    def _operand(self, x: Any) -> str:
+        if hasattr(x, "val"):
+            return f"{int(x.val)}LL" if np.asarray(x.val).dtype.kind in "ib" else f"({float(x.val)!r})"
+        if x not in self.names:
+            array, column = self.loads[x]
+            width = self.widths[array]
+            name = self.names[x] = f"x{array}_{column}"
+            self.lines.append(f"V {name} = lanes(x{array} + s * {width} + {column}, {width});\n")
+        return self.names[x]
+
+    def _put(self, value: str, targets: Sequence[int]) -> None:
+        first = len(self.places)
+        self.places += targets
+        self.lines += [f"*(U *)(side + {first + k} * R + s - r) = {value};\n" for k in range(len(targets))]
+
+    def _operation(self, kind: str, x: list[str]) -> str:
+        if kind in _SIGNS:
+            return f"(V){{}} + {x[0]} {_SIGNS[kind]} {x[1]}" if _plain(x) else f"{x[0]} {_SIGNS[kind]} {x[1]}"
+        return _CALLS[kind].format(*x)
+
+    def text(self) -> str:
+        """The body of the function: rounds of R samples, a vector after the other, whose numbers then go out."""
+        count, places = len(self.places), ", ".join(map(str, self.places))
+        out = f"for (k = 0; k < {count}; k++) memcpy(out + place[k] * total + r, side + k * R, 8 * n);"
+        if not self.last:
+            to = f"out[(r + l) * {self.size} + place[k]] = side[k * R + l]"
+            out = f"for (l = 0; l < n; l++) for (k = 0; k < {count}; k++) {to};"
+        return (
+            f"enum {{ R = {TOGETHER if self.last else 'W'} }};\nstatic const size_t place[] = {{{places}}};\n"
+            f"double side[{count} * R] __attribute__((aligned(64)));\nsize_t r, s, k, l;\n"
+            "for (r = 0; r < count; r += R) {\n"
+            "if (r + R > count) r = count > R ? count - R : 0;\nconst size_t n = count < R ? count : R;\n"
+            "for (s = r; s < r + n; s += W) {\nif (s + W > r + n) s = r + n - W;\n"
+            f"{''.join(self.lines)}}}\n{out}\n}}\n"
+        )
+
+
+_SIGNS = {"mul": "*", "add": "+", "sub": "-", "div": "/"}
+_CALLS = {
+    "select_n": "choose({0}, {1}, {2})",
+    "neg": "-({0} + (V){{}})",
+    "floor": "down({0} + (V){{}})",
+    "convert_element_type": "bits({0} + (V){{}})",
+    "and": "{0} & {1}",
+    "ne": "({0} != {1})",
+    "broadcast_in_dim": "(V){{}} + {0}",
+}
+
+
+def _plain(operands: Sequence[str]) -> bool:
+    """Whether no operand is a vector: then C would compute one number."""
+    return all(x[0] in "c(" for x in operands)

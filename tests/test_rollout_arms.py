@@ -1,0 +1,66 @@
+"""Arms of several servos, made by MuJoCo C: each joint alone among the measured others, and causes in one of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from generators import servo_arm6
+
+from figaroh_jax.rollouts.alone import alone, carried_by, separable
+from figaroh_jax.rollouts.arm import search_arm
+from figaroh_jax.rollouts.data import Run, Stretch, windows
+from figaroh_jax.rollouts.parameters import Entry
+from figaroh_jax.rollouts.reading import load_loop
+from figaroh_jax.rollouts.search import setting
+from figaroh_jax.rollouts.sensitivity import predicted
+
+ROWS = 400
+
+
+def recorded(hidden: list[tuple[str, int, float]], number: int = 0) -> Run:
+    r = servo_arm6.record(hidden, 4, number)
+    return Run(f"run {number}", r["t"], r["u"], r["q"], None)
+
+
+def test_a_joint_alone_moves_as_in_the_arm_with_a_payload_beyond_it(tmp_path: Path):
+    """The lift and the elbow, the motion of the others taken from their noisy encoders, once the start is forgotten."""
+    (tmp_path / "arm.xml").write_text(servo_arm6.model_text())
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    assert separable(loop)
+    run = recorded([("payload", 5, 0.3)])
+    carried = carried_by(loop, [run])
+    for joint in (1, 2):
+        small, (mine,) = alone(loop, [run], carried, joint)
+        data = windows(small, [mine], [Stretch(0, 0, ROWS)], [np.array([2e-4])], 0.3, smooth=True)
+        read = {}
+        for mass in (0.0, 0.3):
+            with jax.enable_x64(True):
+                theta = np.array([[mass]])
+                found = predicted(small, (Entry("payload", (5,)),), theta, data, np.asarray(data.start)[None])
+            read[mass] = np.sqrt(np.mean((np.asarray(found)[0, 100:ROWS, 0, 0] - mine.position[100:ROWS, 0]) ** 2))
+        assert read[0.3] < 10 * servo_arm6.NOISE < 30 * servo_arm6.NOISE < read[0.0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("hidden", "name"),
+    [
+        ([], None),
+        ([("payload", 5, 0.3)], ("payload", "payload")),
+        ([("stribeck_friction", 2, 0.3)], ("stribeck_friction", "elbow")),
+    ],
+)
+def test_what_is_hidden_in_an_arm_is_named_there_and_nothing_else(tmp_path: Path, hidden: list, name: tuple | None):
+    (tmp_path / "arm.xml").write_text(servo_arm6.model_text(1.6))
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    runs = [recorded(hidden, k) for k in range(2)]
+    found = search_arm(setting(loop, runs, stretches=[Stretch(k, f, 600) for k in range(2) for f in (0, 600)]))
+    told = [(n.candidate.effect, n.candidate.at[0]) for n in found.named]
+    if name is None:
+        assert (found.verdict, told) == ("nothing", [])
+    else:
+        assert found.verdict == "named"
+        assert told[0][0] == name[0] and (name[0] == "payload" or told == [name])
