@@ -388,7 +388,9 @@ def chooser(draws: int = 100, names: Sequence[str] = tuple(PAIRS), seed: int = 0
         for way, told in zip((0, 1), found.separated, strict=True):
             right, measured, both = runs.tried(way, told.size, 1, draws)
             text = f"{told.sigmas:.2f} sigmas predicted, {measured:.2f} measured, right {right:.2f} (sure {both:.2f})"
-            if told.repeats > 1:
+            if told.repeats is None:
+                text += ", no repeats suffice"
+            elif told.repeats > 1:
                 right, _, both = runs.tried(way, told.size, told.repeats, draws)
                 text += f", after {told.repeats} repeats {right:.2f} (sure {both:.2f})"
             said.append(f"{told.truth.split()[0]}: {text}")
