@@ -49,7 +49,7 @@ def main() -> None:
         start = time.perf_counter()
         line = study(np.random.default_rng(options.seed + k), options.seconds, options.trials)
         force, moment = ("".join(f"{x:8.2f}" for x in line[key]) for key in ("force", "moment"))
-        rest = f"{line['mass']:8.2f}{line['com']:8.2f}{line['scale']:8.2f}{line['covered']:7.2f}"
+        rest = f"{line['mass']:8.2f}{line['com']:8.2f}{line['size']:8.2f}{line['covered']:7.2f}"
         print(f"{options.seed + k:6}{'':4}{force}{moment}{rest}{time.perf_counter() - start:6.0f}", flush=True)
 
 
@@ -108,7 +108,7 @@ def captured(robot, own, fitted, trial):
 def judged(person, robot, found, table, capture, unscaled, data, unseen) -> dict:
     truth = capture.wrench  # what the plates measured, at the pelvis
     models = (found.model, capture), (table, capture), (robot, unscaled)
-    errors = [np.asarray(people._rows(m, c)) @ np.ravel(m.inertia) - c.wrench for m, c in models]
+    errors = [people.predicted(m, c) - c.wrench for m, c in models]
     bw = 9.81 * sum(i.mass for i in person.model.inertias)
     moment = np.sqrt((truth[:, 3:] ** 2).mean())
     true = np.array(
@@ -116,7 +116,7 @@ def judged(person, robot, found, table, capture, unscaled, data, unseen) -> dict
     )
     index = [robot.link_names.index(name) for name in found.links]
     off = (found.parameters - true[index]) / found.std
-    import pinocchio as pin
+    import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
     q = unseen.q[len(unseen.q) // 2]
     fitted_q = capture.position[len(capture.position) // 2]
@@ -127,7 +127,7 @@ def judged(person, robot, found, table, capture, unscaled, data, unseen) -> dict
         "moment": [100 * np.sqrt((e[:, 3:] ** 2).mean()) / moment for e in errors],
         "mass": 100 * abs(found.mass()[0] * 9.81 / bw - 1),
         "com": 1e3 * float(np.linalg.norm(found.centre(fitted_q)[0] - centre)),
-        "scale": 100 * float(np.abs(np.asarray(data.scale) / scales - 1).mean()),
+        "size": 100 * float(np.abs(np.asarray(data.scale) / scales - 1).mean()),
         "covered": float((np.abs(off) < 1.96).mean()),
         "off": off,
     }

@@ -63,12 +63,16 @@ class GenesisBackend(Backend):
         """The robot."""
         return self._robot
 
-    @cached_property
+    @property
     def simulator(self) -> Any:
         """The built `genesis.Scene` of the file, or of the robot's arrays where there is no URDF or MJCF.
 
         Raises `InputError` where Genesis does not read the file, a mesh that is not there among the reasons.
         """
+        return self._own_simulator
+
+    @cached_property
+    def _own_simulator(self) -> Any:
         form = file_format(self._source)
         if form not in ("urdf", "mjcf"):
             return self._scene[0]
@@ -173,7 +177,9 @@ class GenesisBackend(Backend):
         """The torques of a robot of one link at a time, with one inertial parameter at a time: see `unit_regressor`."""
         samples = host_samples(self, q=q, v=v, a=a)
         try:
-            columns = unit_regressor(lambda only: self._torques(*samples, only=only), len(self._robot.joints))
+            columns = unit_regressor(
+                lambda only: self._torques(samples[0], samples[1], samples[2], only), len(self._robot.joints)
+            )
         finally:
             self._weigh(np.asarray(self._robot.inertia, float))
         return samples.restore(columns)

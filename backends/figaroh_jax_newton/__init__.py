@@ -92,12 +92,16 @@ class NewtonBackend(Backend):
         """The robot."""
         return self._robot
 
-    @cached_property
+    @property
     def simulator(self) -> Any:
         """The `newton.Model` of the file, by Newton's importer; of the robot's arrays where there is no file.
 
         Raises `InputError` where the importer fails, a mesh that is not there among the reasons.
         """
+        return self._own_simulator
+
+    @cached_property
+    def _own_simulator(self) -> Any:
         form = file_format(self._source)
         if form == "model":
             return self._of(1).model
@@ -202,7 +206,11 @@ class NewtonBackend(Backend):
     ) -> Float[np.ndarray, "*batch nv columns"]:
         """Newton's torques of one link at a time with one inertial parameter at a time: see `unit_regressor`."""
         samples = host_samples(self, q=q, v=v, a=a)
-        return samples.restore(unit_regressor(lambda only: self._torques(*samples, only=only), len(self._robot.joints)))
+        return samples.restore(
+            unit_regressor(
+                lambda only: self._torques(samples[0], samples[1], samples[2], only), len(self._robot.joints)
+            )
+        )
 
     def step(
         self,

@@ -151,7 +151,7 @@ def marker_data(
         raise InputError(f"markers: shapes {sorted(frames)}; each is (frames, 3), all with the same frames")
     labels = tuple(label for label in markers if label in seen)
     places = np.stack([np.asarray(seen[label], float) for label in labels], axis=1)
-    present = np.isfinite(places).all(axis=2)
+    present = np.asarray(np.isfinite(places).all(axis=2))
     if (present.sum(axis=1) < 2).any():
         raise InputError(f"markers: frame {int(np.argmax(present.sum(axis=1) < 2))} shows fewer than two of them")
     index = [robot.link_names.index(markers[label][0]) for label in labels]
@@ -238,7 +238,7 @@ def _upright(
     for row, seen in zip(start, places, strict=True):
         there = np.isfinite(seen).all(1)
         middle, centre = model[there].mean(0), seen[there].mean(0)
-        turn, _ = Rotation.align_vectors(seen[there] - centre, model[there] - middle)
+        turn = Rotation.align_vectors(seen[there] - centre, model[there] - middle)[0]
         row[:3], row[3:7] = centre - turn.apply(middle), turn.as_quat()
     return start
 

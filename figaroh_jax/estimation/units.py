@@ -70,7 +70,7 @@ def spreads(
     ]
     p_units, p_days = (_holm(np.array([row[index] for row in rows])) for index in (4, 5))
     return tuple(
-        Spread(name, *row[:4], float(u), float(d), row[6], widened)
+        Spread(name, row[0], row[1], row[2], row[3], float(u), float(d), row[6], widened)
         for name, row, u, d in zip(names, rows, p_units, p_days, strict=True)
     )
 

@@ -29,7 +29,16 @@ from ..rigid.manifold import difference
 from ..rigid.model import RobotModel
 from .wrenches import wrench_regressor
 
-__all__ = ["Capture", "Payload", "Segments", "anthropometric", "capture", "identify_segments", "name_payload"]
+__all__ = [
+    "Capture",
+    "Payload",
+    "Segments",
+    "anthropometric",
+    "capture",
+    "identify_segments",
+    "name_payload",
+    "predicted",
+]
 
 Sex = Literal["female", "male"]
 
@@ -280,7 +289,13 @@ def name_payload(
         costs[place] = float(b @ b - b @ A @ x)
         results[place] = float(x[0]), float(np.sqrt(np.linalg.inv(normal)[0, 0]))
     best = min(results, key=lambda place: costs[place])
-    return Payload(best, *results[best], costs)
+    mass, std = results[best]
+    return Payload(best, mass, std, costs)
+
+
+def predicted(model: RobotModel, one: Capture) -> Float[np.ndarray, "samples 6"]:
+    """Wrench of the plates at and in the root's frame, N and N m, that the model needs for the motion of a capture."""
+    return _rows(model, one) @ np.ravel(np.asarray(model.inertia))
 
 
 def _kind(link: str) -> str:

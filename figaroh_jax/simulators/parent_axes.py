@@ -71,6 +71,7 @@ def rates(
             share[:, first : first + 2, column : column + 2] = turn
             x, y, w = v[:, column : column + 3].T
             drift[:, first : first + 2] = (turn @ np.stack([-w * y, w * x], -1)[..., None])[..., 0]
+        turn = np.eye(3)
         if joint.kind in ("free", "spherical"):
             turn = _rotation(q[:, at.stop - 4 : at.stop])
             width = 6 if joint.kind == "free" else 3
@@ -79,7 +80,7 @@ def rates(
         if joint.kind == "free":
             mass = float(robot.inertia[i][0])
             centre = np.asarray(robot.inertia[i][1:4], float) / mass if centres and mass else np.zeros(3)
-            share[:, first : first + 3, column : column + 3] = turn  # pyright: ignore[reportPossiblyUnboundVariable]
+            share[:, first : first + 3, column : column + 3] = turn
             share[:, first : first + 3, column + 3 : column + 6] = -turn @ _cross(centre)
             linear, spin = v[:, column : column + 3], v[:, column + 3 : column + 6]
             moved = np.cross(spin, linear + np.cross(spin, centre))
