@@ -13,6 +13,7 @@ from scipy.special import ndtr
 from ..results import Name, Verdict
 from .causes import BASELINE, CONTAINS, Candidate, Catalogue, catalogue, elastic_loop
 from .data import Run, Stretch, noise_of, windows
+from .faults import Fault
 from .fit import Fit, System, fit, held_out, standard_errors
 from .loop import Loop
 from .parameters import BOUNDS, Entry, Table, values
@@ -105,6 +106,8 @@ class Search:
     held: list[float] = field(default_factory=list)  # held-out RMS of the baseline and after each cause, rad or m
     fits: list[Fit] = field(default_factory=list)  # after each cause
     origin: Structure | None = None  # of the baseline
+    setting: Setting | None = None  # where rows were left out: without them
+    faults: list[Fault] = field(default_factory=list)  # why they were
 
 
 def setting(
