@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -9,15 +10,14 @@ import numpy as np
 import figaroh_jax as fj
 
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "so101_sage"
-PERIOD, ROWS, STEPS = 0.02006, 1500, 4  # s, rows of each motion, steps of the simulation to a row
+PERIOD, ROWS, STEPS = 0.02006, 1500, 4  # s, rows of each motion, steps to a row
 ARM = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
-
-# N m/rad, N m s/rad (gain and joint together), N m, kg m2 of pan, lift, elbow, wrist flex, wrist roll and jaw
+# N m/rad, N m s/rad (gain and joint together), N m, kg m2
 MODELS = {
     "as MuJoCo Menagerie says": (998.2, 3.33, 0.052, 0.028),
     "no friction, heavy rotors (Playground)": (17.8, 0.6, 1e-4, 0.15),
     "friction .35, light rotors (Isaac Lab)": (48.0, 0.6, 0.35, 0.05),
-    "friction by load (this library)": (
+    "friction by joint (this library)": (
         (12.5, 11.0, 11.4, 10.4, 21.4, 21.7),
         (1.27, 0.82, 0.78, 0.85, 1.99, 1.99),
         (0.10, 0.36, 0.46, 0.15, 0.10, 0.10),
@@ -26,10 +26,10 @@ MODELS = {
 }
 
 
-def arm(gain: object, damping: object, friction: object, armature: object) -> fj.Loop:
+def arm(gain: Any, damping: Any, friction: Any, armature: Any) -> Any:
     """The arm with these numbers at its servos; friction is the torque that stops a joint within a step."""
-    gains = np.broadcast_to(np.asarray(gain, float), 6)
-    drives = {n: {"kind": "position", "kp": k, "kd": 0.0, "force": 3.35} for n, k in zip(ARM, gains, strict=True)}
+    each = zip(ARM, np.broadcast_to(gain, 6), strict=True)
+    drives = {name: {"kind": "position", "kp": float(kp), "kd": 0.0, "force": 3.35} for name, kp in each}
     loop, _ = fj.load_loop(DATA / "so101.xml", drives, law="hard", dt=PERIOD / STEPS)
     new = [np.broadcast_to(np.asarray(x, float), 6) for x in (damping, friction, armature)]
     return eqx.tree_at(lambda m: (m.joints.damping, m.joints.friction, m.joints.armature), loop, new)
@@ -47,11 +47,10 @@ def motion(name: str) -> tuple[np.ndarray, np.ndarray]:
 def main() -> None:
     """Error of each model on motions that no fit has seen, from the command alone."""
     if not DATA.is_dir():
-        return print(f"skipped: no recordings in {DATA}; FIGAROH_JAX_DATA names the folder above")
+        return print(f"skipped: no {DATA}; FIGAROH_JAX_DATA names the folder above")
     for label, numbers in MODELS.items():
         loop, errors = arm(*numbers), []
-        for name in ("step_response", "velocity_ramp", "slow_precision"):
-            command, position = motion(name)
+        for command, position in map(motion, ("step_response", "velocity_ramp", "slow_precision")):
             read = np.asarray(fj.rollout(loop, np.repeat(command, STEPS, axis=0), position[0]).reading)[::STEPS]
             errors.append(1e3 * np.sqrt(np.mean((read - position)[:, :5] ** 2, axis=0)))
         print(f"{label:<40} {np.mean(errors):5.1f} mrad; by joint {np.round(np.mean(errors, axis=0), 1)}")
