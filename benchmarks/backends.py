@@ -1,16 +1,23 @@
-"""Samples a second of inverse dynamics and regressor by every installed backend, in one interleaved run.
+"""Agreement, speed, first call and memory of every installed backend on five robots.
 
     python benchmarks/backends.py [--robots NAME ...] [--backends NAME ...] [--samples N] [--rounds N]
 
-Robots are found by FIGAROH_JAX_DATA. MuJoCo C uses all cores, the others what JAX is allowed to. A round asks every
-backend in turn; the median over the rounds is told, with the ratio to Pinocchio's loop within the rounds. The first
-call, with its compilation, is told apart.
+Agreement is the largest difference to Pinocchio on 50 random states, relative to the largest number of the answer, over
+frames, mass matrix, inverse dynamics and regressor. Speed is samples a second of inverse dynamics and regressor, the
+median of the rounds; the first call, with its compilation, is told apart. Each backend has a process of its own, whose
+memory is the peak after each robot. Robots are found by FIGAROH_JAX_DATA. MuJoCo C uses all cores, the others what
+their library is allowed to.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import resource
+import subprocess
+import sys
+import tempfile
 import time
 from pathlib import Path
 from statistics import median
@@ -19,12 +26,23 @@ from typing import Any
 import jax
 import numpy as np
 
-import figaroh_jax as fj
+from figaroh_jax.errors import InputError
+from figaroh_jax.formats.robotfile import read_robot
+from figaroh_jax.rigid.model import RobotModel
 from figaroh_jax.simulators import registry
 
-DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
-ROBOTS = {"UR10e": "ur10e_innopolis/ur10e.urdf", "TALOS": "talos_contact/talos_full_v2.urdf"}
-FUNCTIONS = ("inverse_dynamics", "joint_torque_regressor")
+ROOT = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get("FIGAROH_JAX_DATA", ROOT.parent / "shared" / "data"))
+ROBOTS = {
+    "UR10e": ("ur10e_innopolis/ur10e.urdf", None),
+    "Panda": ("panda_gaz2019/panda.urdf", None),
+    "TALOS": ("talos_contact/talos_full_v2.urdf", None),
+    "quadruped": ("", None),  # that of the tests
+    "human": ("human_model/human.urdf", "free_flyer"),
+}
+FUNCTIONS = {"inverse_dynamics": "q v a", "joint_torque_regressor": "q v a"}
+COMPARED = {"frame_placements": "q", "mass_matrix": "q"} | FUNCTIONS
+STATES = 50
 
 
 def main() -> None:
@@ -32,32 +50,78 @@ def main() -> None:
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS))
     parser.add_argument("--backends", nargs="+", default=list(registry.names()), metavar="NAME")
     parser.add_argument("--samples", type=int, default=2000)
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)  # one backend, in this process
     options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    print(f"{'robot':7}{'function':24}{'backend':11}{'first call s':>13}{'samples/s':>12}{'times Pinocchio':>17}")
-    for robot in options.robots:
-        for function in FUNCTIONS:
-            _table(robot, function, options)
+    if options.here:
+        jax.config.update("jax_enable_x64", True)
+        for robot in options.robots:
+            print(json.dumps(_cell(robot, options.backends[0], options.samples, options.rounds)), flush=True)
+        return
+    heads = ("differs by", "first ID s", "ID /s", "first W s", "W /s", "MB")
+    print(f"{'backend':11}{'robot':11}" + "".join(f"{head:>12}" for head in heads))
+    more = ["--samples", str(options.samples), "--rounds", str(options.rounds), "--robots", *options.robots]
+    for name in options.backends:
+        command = [sys.executable, __file__, "--here", "--backends", name, *more]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, stderr=subprocess.DEVNULL) as made:
+            for line in made.stdout or ():
+                if line.startswith("{"):
+                    _print(name, json.loads(line))
 
 
-def _table(robot: str, function: str, options: argparse.Namespace) -> None:
-    samples, rounds = options.samples, options.rounds
-    model = fj.load_urdf(DATA / ROBOTS[robot])
-    backends = {name: registry.backend(name, model) for name in options.backends}
-    state = [np.random.default_rng(k).uniform(-1.5, 1.5, (samples, model.nv)) for k in range(3)]
-    first = {name: _seconds(backend, function, state) for name, backend in backends.items()}
-    times = [{name: _seconds(backend, function, state) for name, backend in backends.items()} for _ in range(rounds)]
-    for name in backends:
-        rate = samples / median(row[name] for row in times)
-        ratio = median(row["pinocchio"] / row[name] for row in times) if "pinocchio" in backends else float("nan")
-        print(f"{robot:7}{function:24}{name:11}{first[name]:13.2f}{rate:12.0f}{ratio:17.2f}", flush=True)
+def model(robot: str) -> RobotModel:
+    """A robot of the table."""
+    path, root = ROBOTS[robot]
+    if path:
+        return read_robot(DATA / path, root=root)  # pyright: ignore[reportArgumentType]
+    sys.path.insert(0, str(ROOT / "tests"))
+    import robots
+
+    file = Path(tempfile.mkdtemp()) / "quadruped.xml"
+    file.write_text(robots.MJCF["quadruped"])
+    return read_robot(file)
+
+
+def _cell(robot: str, name: str, samples: int, rounds: int) -> dict[str, Any]:
+    try:
+        whole = model(robot)
+        backend, reference = registry.backend(name, whole), registry.backend("pinocchio", whole)
+    except InputError as error:
+        return {"robot": robot, "error": str(error)}
+    state = _state(backend, samples)
+    answer: dict[str, Any] = {"robot": robot, "differs": 0.0}
+    for function, words in FUNCTIONS.items():
+        given = [state[word] for word in words.split()]
+        first = _seconds(backend, function, given)
+        times = [_seconds(backend, function, given) for _ in range(rounds)]
+        answer[function] = first, samples / median(times)
+    state = {key: x[:STATES] for key, x in state.items()}
+    for function, words in COMPARED.items():
+        given = [state[word] for word in words.split()]
+        got, want = (np.asarray(getattr(b, function)(*given), float) for b in (backend, reference))
+        answer["differs"] = max(answer["differs"], float(np.abs(got - want).max() / np.abs(want).max()))
+    return answer | {"MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
+
+
+def _state(backend: Any, samples: int) -> dict[str, np.ndarray]:
+    q = np.asarray(backend.random_configuration(0, (samples,)))
+    v, a = np.random.default_rng(1).uniform(-1.5, 1.5, (2, samples, backend.nv))
+    return {"q": q, "v": v, "a": a}
 
 
 def _seconds(backend: Any, function: str, state: list[np.ndarray]) -> float:
     start = time.perf_counter()
     jax.block_until_ready(getattr(backend, function)(*state))
     return time.perf_counter() - start
+
+
+def _print(name: str, cell: dict[str, Any]) -> None:
+    if "error" in cell:
+        print(f"{name:11}{cell['robot']:11} {cell['error']}", flush=True)
+        return
+    (first, rate), (first_w, rate_w) = (cell[function] for function in FUNCTIONS)
+    line = f"{cell['differs']:12.1e}{first:12.2f}{rate:12.0f}{first_w:12.2f}{rate_w:12.0f}{cell['MB']:12.0f}"
+    print(f"{name:11}{cell['robot']:11}{line}", flush=True)
 
 
 if __name__ == "__main__":

@@ -156,9 +156,12 @@ _SPACES = {
     "devices": "recordings.devices",
     "instruments": "identification.instruments",
     "least_squares": "estimation.least_squares",
+    "markers": "estimation.markers",
     "payloads": "identification.payloads",
+    "people": "identification.people",
     "regression": "estimation.regression",
     "states": "estimation.states",
+    "units": "estimation.units",
     "wrenches": "identification.wrenches",
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}

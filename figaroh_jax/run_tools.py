@@ -117,7 +117,7 @@ def compare(args: argparse.Namespace) -> int:
 
     if len(args.runs) < 2:
         raise InputError("compare: one run directory is given; expected two or more, the first is the reference")
-    sections = compare_runs(args.runs)
+    sections = compare_runs(args.runs, args.units.split(",") if args.units else None)
     if args.out:
         write_file(args.out, comparison_page(args.runs, sections), "--out", PAGE)
     _print(sections, args.json, comparison_text(sections))

@@ -248,7 +248,7 @@ def test_an_unknown_backend_is_refused_with_those_installed_and_how_to_install_m
     with pytest.raises(InputError, match="no backend 'bullet' is installed; installed: native.*pip install") as told:
         registry.backend("bullet", source("arm")[0])
     assert all(name in str(told.value) for name in registry.names())
-    assert "'figaroh-jax[mujoco,mjx,pinocchio]'" in str(told.value)
+    assert "'figaroh-jax[mujoco,mjx,pinocchio,newton,genesis]'" in str(told.value)
 
 
 @pytest.mark.parametrize("name", CLASSES)

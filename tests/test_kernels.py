@@ -13,6 +13,7 @@ import pytest
 import robots
 from test_general_dynamics import random_tree
 
+from figaroh_jax.compiled.batching import DRAFT_OPTIONS
 from figaroh_jax.compiled.kernels import Number, Straight, launch, straight_answers
 from figaroh_jax.rigid import dynamics, regressor, scalar_programs
 from figaroh_jax.rigid.model import RobotModel
@@ -55,6 +56,16 @@ def states(model: RobotModel, samples: int, seed: int = 0) -> list[np.ndarray]:
     return [q, v, a]
 
 
+def quick(function: Any) -> Any:
+    """The function as one program that is compiled fast and runs slowly."""
+    return jax.jit(function, compiler_options=DRAFT_OPTIONS if jax.default_backend() == "cpu" else None)
+
+
+def plainly(straight: Straight, model: RobotModel, *arrays: Any) -> Any:
+    """The plain form, as one program: operation by operation most of the time goes into compiling each."""
+    return quick(straight.plain)(model, *map(jnp.asarray, arrays))
+
+
 def agree(found: Any, expected: Any, limit: float = 1e-13) -> None:
     expected = np.asarray(expected)
     assert np.shape(found) == expected.shape
@@ -88,9 +99,7 @@ def test_programs_of_a_tree_with_mimic_joints_are_the_plain_kernels(tmp_path: Pa
     model = robots.load(robots.TREE, tmp_path)
     for form, straight in FORMS.items():
         arrays = states(model, 4)[: 1 if form == "masses" else 3]
-        agree(
-            by_hand(straight, straight.known(model), model, *arrays), straight.plain(model, *map(jnp.asarray, arrays))
-        )
+        agree(by_hand(straight, straight.known(model), model, *arrays), plainly(straight, model, *arrays))
 
 
 def test_kernels_without_a_gpu(tmp_path: Path):
@@ -101,7 +110,7 @@ def test_kernels_without_a_gpu(tmp_path: Path):
     (program,) = torques.programs(model, torques.known(model))
     shape, columns = torques.shape(model), torques.columns(model)
     found = launch(program, torques.constants(model), arrays, shape, columns, torques.last, interpret=True)
-    agree(found, torques.plain(model, *arrays))
+    agree(found, plainly(torques, model, *arrays))
 
 
 def test_pieces_of_a_tree_are_written_into_one_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -109,7 +118,7 @@ def test_pieces_of_a_tree_are_written_into_one_answer(tmp_path: Path, monkeypatc
     model, packed = robots.load(robots.TREE, tmp_path), FORMS["packed"]
     arrays = states(model, 3)
     assert len(packed.programs(model, packed.known(model))) == 3
-    agree(by_hand(packed, packed.known(model), model, *arrays), packed.plain(model, *map(jnp.asarray, arrays)))
+    agree(by_hand(packed, packed.known(model), model, *arrays), plainly(packed, model, *arrays))
 
 
 def test_transformations(tmp_path: Path):
@@ -121,16 +130,16 @@ def test_transformations(tmp_path: Path):
     def total(model: RobotModel, q: Any) -> Any:
         return jnp.sum(straight_answers(torques, model, q, *rest) ** 2)
 
-    plain = jax.grad(lambda q: jnp.sum(torques.plain(model, q, *rest) ** 2))
-    agree(jax.jit(jax.grad(total, argnums=1))(model, q[:3]), plain(jnp.asarray(q[:3])))
+    plain = quick(jax.grad(lambda q: jnp.sum(torques.plain(model, q, *rest) ** 2)))
+    agree(quick(jax.grad(total, argnums=1))(model, q[:3]), plain(jnp.asarray(q[:3])))
     batches = [jnp.asarray(x).reshape(2, 3, -1) for x in (q, v, a)]
     for form in ("torques", "packed"):
-        both = jax.vmap(lambda *x: straight_answers(FORMS[form], model, *x))(*batches)  # noqa: B023
+        both = quick(jax.vmap(lambda *x: straight_answers(FORMS[form], model, *x)))(*batches)  # noqa: B023
         for k in range(2):
-            agree(both[k], FORMS[form].plain(model, *(x[k] for x in batches)))
+            agree(both[k], plainly(FORMS[form], model, *(x[k] for x in batches)))
     many = jax.tree.map(lambda x: jnp.stack([x, 1.1 * x]), model)
-    answers = jax.vmap(lambda m: straight_answers(torques, m, q, v, a))(many)
-    agree(answers[0], torques.plain(model, q, v, a))
+    answers = quick(jax.vmap(lambda m: straight_answers(torques, m, q, v, a)))(many)
+    agree(answers[0], plainly(torques, model, q, v, a))
 
 
 @pytest.mark.skipif(jax.default_backend() != "gpu", reason="needs an NVIDIA GPU")

@@ -37,6 +37,7 @@ __all__ = ["machine_code"]
 
 FROM = 512  # samples; below, handing them over costs as much as it saves
 TO_COMPILE = 2048  # samples from which a program that is nowhere yet is compiled
+SMALL = 700  # constants of a robot (12 joints) up to which this holds; a larger one takes longer to compile than XLA's
 PIECE = 4096  # samples of one call, on one core
 FARTHEST = 1e5  # rad, to which `sine_cosine` is exact
 PATIENCE = 300.0  # s that a compiler may take
@@ -82,8 +83,8 @@ def machine_code(
     samples = len(arrays[0])
     if samples < FROM or straight.places is None or _compiler() is None or not _near(arrays[0]):
         return None
-    wanted = _Wanted(straight, parameters, straight.known(parameters), tuple(x.shape[1] for x in arrays))
-    code = _code(wanted, samples >= TO_COMPILE)
+    wanted = _Wanted(straight, parameters, straight.known_lengths(parameters), tuple(x.shape[1] for x in arrays))
+    code = _code(wanted, samples >= TO_COMPILE * max(1.0, len(wanted.codes) / SMALL))
     if code is None:
         return None
     constants = np.ascontiguousarray(straight.constants(parameters, float, np), float)

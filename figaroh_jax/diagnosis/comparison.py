@@ -16,6 +16,7 @@ __all__ = [
     "Hypothesis",
     "Verdicts",
     "coefficients",
+    "fewer_sums",
     "fold_sums",
     "ground",
     "grown_sums",
@@ -23,6 +24,7 @@ __all__ = [
     "judge_grown",
     "overlap",
     "shares_of_wins",
+    "sums_of",
     "t_value",
 ]
 
@@ -98,6 +100,22 @@ def grown_sums(rows: Rows, known: FoldSums, X: Float[np.ndarray, "nv T P"]) -> F
         gram[fold, :, P:], gram[fold, P:, :P] = cross, cross[:P].T
         moment[fold, P:] = tall[:, P:].T @ rows.y[:, own].reshape(-1)
     return FoldSums(gram, moment, known.square)
+
+
+def fewer_sums(known: FoldSums, without: Sequence[int]) -> FoldSums:
+    """The sums of the columns that are left without some."""
+    gram = np.delete(np.delete(known.gram, without, axis=1), without, axis=2)
+    return FoldSums(gram, np.delete(known.moment, without, axis=1), known.square)
+
+
+def sums_of(rows: Rows, known: FoldSums, y: Float[np.ndarray, "nv T"]) -> FoldSums:
+    """The sums of the same columns with another torque `y`."""
+    moment, square = np.zeros_like(known.moment), np.zeros_like(known.square)
+    for fold in range(len(known.gram)):
+        own = y * (rows.fold == fold)
+        moment[fold] = np.tensordot(own, rows.X, 2)
+        square[fold] = (own**2).sum()
+    return FoldSums(known.gram, moment, square)
 
 
 def coefficients(sums: FoldSums, prior: Prior) -> Float[np.ndarray, " P"]:

@@ -13,7 +13,7 @@ from ..effects.base import Effect
 from ..estimation.priors import physical_body
 from ..estimation.rows import Rows
 from ..results import Name
-from .comparison import Ground, Hypothesis, Verdicts, judge, judge_grown
+from .comparison import Ground, Hypothesis, Verdicts, coefficients, grown_sums, judge, judge_grown, sums_of
 from .design import BATCH, kind, shapes, with_shape
 from .estimates import torque_slope
 from .problem import Problem
@@ -134,7 +134,9 @@ def _body_verdicts(
     rows, full = step.rows, np.moveaxis(Z, 0, 2)
     free = judge_grown(rows, base, range(len(rows.y)), Z)
     body = physical_body(free.theta[-10:], _information(rows, base, full))
-    verdicts = judge(rows, Hypothesis(rows.X, step.state.prior, full @ body))
+    fixed = full @ body
+    sums = sums_of(rows, step.folded, rows.y - fixed)
+    verdicts = judge(rows, Hypothesis(rows.X, step.state.prior, fixed), sums)
     return with_shape(effect, list(effect.parameters()), list(body)), verdicts
 
 
@@ -175,7 +177,7 @@ def _sensor_contender(
         here = stand(problem, extended_state(problem, base, effect), whitening)
         slope = torque_slope(problem, here.state, effect, name, whitening)
         X = np.concatenate([here.rows.X, slope[..., None]], axis=2)
-        theta = judge(here.rows, Hypothesis(X, here.state.prior.extended(1))).theta
+        theta = coefficients(grown_sums(here.rows, here.folded, X), here.state.prior.extended(1))
         value = float(np.clip(float(getattr(effect, name)) + theta[-1], parameter.lower, parameter.upper))
         done = abs(value - float(getattr(effect, name))) < 1e-7
         effect = with_shape(effect, [name], [np.float64(value)])

@@ -38,9 +38,9 @@ __all__ = ["KINDS", "Free", "Open", "Part", "apply", "chosen_of"]
 
 KINDS = (
     *("inertia", "friction", "effects", "joint_offset", "link_geometry", "frames", "tool_frame", "base", "gravity"),
-    *("start", "drives"),
+    *("start", "drives", "segments", "markers"),
 )
-OPEN = ("frames", "start", "drives")  # left open by the data, not by the model
+OPEN = ("frames", "start", "drives", "segments", "markers")  # left open by the data, not by the model
 TEN = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 TEN_UNITS = ("kg", *("kg m",) * 3, *("kg m2",) * 6)
 TWIST = ("x", "y", "z", "rx", "ry", "rz")

@@ -403,7 +403,7 @@ def _feasible(
             break
         margin = penalty.margin
         penalty.margin = {kind: margin.get(kind, 0.0) + 1.2 * over.get(kind, 0.0) for kind in {*margin, *over}}
-        x = solve(problem, x, penalty)
+        x = solve(problem, x, penalty, polish=False)
     return _smaller(torque, problem, problem.trajectory(x))
 
 

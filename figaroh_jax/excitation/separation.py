@@ -5,7 +5,8 @@ of its rival at the point g of the rival's shapes, what no fit of the rival make
 $$T_g = \min_{\theta, b} |z - X \theta - Z_g b|^2 + \theta' M_0 \theta = u' (G + M_0) u, \quad u = (-\theta, -b, 1)$$
 in the Gram matrix G of all these columns, so its gradient by G is $u u'$. A design makes the smallest T of all pairs,
 both ways (but for a link as the true cause, of which only a guess could be told), large;
-$t = \sqrt T$ is the separation in standard deviations, and n repeats give $\sqrt n \, t$.
+$t = \sqrt T$ is the separation in standard deviations. Of n repeats it is that of n G: $\sqrt n \, t$ where the rows
+decide, and bounded where it is the prior that keeps the fit from following.
 
 A cause that changes the torque in time (a delay, a lag: a response $H(\omega)$) is written as torques of some moments
 before, $\sum_k w_k \tau(t - s_k) \approx H \tau$, by least squares of $\sum w_k e^{-i \omega s_k} - H(\omega)$ over
@@ -32,6 +33,7 @@ from .solvers import GramObjective
 __all__ = ["ENOUGH", "Causes", "Pair", "Separated", "causes", "check_told", "separated", "separation_objective"]
 
 ENOUGH = 4.0  # standard deviations at which a name is sure
+MOST = 50  # repeats that are thought of
 LOUD = 2.0  # times the noise: RMS torque of a cause whose size is not given
 LINK = 0.2  # share by which a link's inertia is taken to be wrong
 LOOSE = 5.0  # times the stated trust, of a link that is a cause itself
@@ -59,7 +61,7 @@ class Separated:
     rival: str
     size: dict[str, float]  # of the true cause, in its own units
     sigmas: float  # of one run
-    repeats: int  # of the motion until the name is sure
+    repeats: int | None  # of the motion until the name is sure; None: no number of them does it
 
 
 @dataclass(frozen=True)
@@ -283,10 +285,18 @@ def separation_objective(given: Causes, prior: Float[np.ndarray, "p p"]) -> Gram
 
 def separated(given: Causes, G: Float[np.ndarray, "n n"], prior: Float[np.ndarray, "p p"]) -> tuple[Separated, ...]:
     """How far the rows of a Gram matrix tell each pair apart, each way; the nearest shape of the rival counts."""
-    T, _ = _fits(G, given, prior)
     pair_of = np.array([case.pair for case in given.cases])
+
+    def least(times: int) -> Float[np.ndarray, " pairs"]:
+        T = _fits(times * G, given, prior)[0]
+        return np.sqrt([T[pair_of == k].min() for k in range(len(given.pairs))])
+
     found = []
     for k, (pair, size) in enumerate(zip(given.pairs, given.sizes, strict=True)):
-        sigmas = float(np.sqrt(T[pair_of == k].min()))
-        found.append(Separated(pair.truth, pair.rival, size, sigmas, max(1, int(np.ceil((ENOUGH / sigmas) ** 2)))))
+        sigmas = float(least(1)[k])
+        enough = None
+        if least(MOST)[k] >= ENOUGH:  # rows that only add up would take the first number of these
+            first = max(1, min(MOST, int(np.ceil((ENOUGH / sigmas) ** 2))))
+            enough = next(n for n in range(first, MOST + 1) if least(n)[k] >= ENOUGH)
+        found.append(Separated(pair.truth, pair.rival, size, sigmas, enough))
     return tuple(found)

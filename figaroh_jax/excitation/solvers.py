@@ -1,9 +1,10 @@
 r"""Maximising a function of a motion's rows within limits.
 
 Few linear rows: sequential quadratic programming (SLSQP). Rows of torque, or thousands of linear ones: the augmented
-Lagrangian $f + \sum \max(0, \lambda + \mu c)^2 / 2\mu$ (Nocedal and Wright 2006, section 17.4) by L-BFGS-B. Objective
-and torques come from one pass over the rows. Limits are kept at the samples of the design, tightened by what the motion
-exceeds them between, and at last the motion is made smaller until it meets them at 1 kHz.
+Lagrangian $f + \sum \max(0, \lambda + \mu c)^2 / 2\mu$ (Nocedal and Wright 2006, section 17.4) by L-BFGS-B, which finds
+the rows that matter, and then sequential quadratic programming with these alone, others joining as they are violated.
+Objective and torques come from one pass over the rows. Limits are kept at the samples of the design, tightened by what
+the motion exceeds them between, and at last the motion is made smaller until it meets them at 1 kHz.
 """
 
 from __future__ import annotations
@@ -30,6 +31,11 @@ AGAIN = 4  # outer steps from multipliers that are nearly right
 PENALTY, GROWTH = 10.0, 3.0
 NEAR = 0.05  # m: a distance that misses its margin by this violates it as much as a whole limit
 CLOSE = 2e-3  # of a limit, at the samples of the design
+ROUNDS, POLISHED = 8, 30  # times that rows join a sequential programme, and its steps
+REACH = 1.5  # rad (or at 2 rad/s, 8 rad/s^2) that such a programme changes a number
+ENDED = 1e-5  # of the objective, below which nothing more is gained
+WITHIN = 0.15  # of a limit: rows nearer to it than this are in
+MANY = 900  # rows that are too many for it
 
 
 @dataclass
@@ -41,6 +47,7 @@ class _Seen:
     shape: tuple[int, ...]
     own: np.ndarray
     by_gram: np.ndarray
+    rows: np.ndarray
     by_torque: np.ndarray | None = None
     by_position: np.ndarray | None = None  # of the distances
     slope: np.ndarray | float = 0.0
@@ -135,7 +142,7 @@ class Problem:
         rows = self.sampler.rows(states)
         own, gram = self.gram(rows)
         value, by_gram = self.objective(gram)
-        self._seen = _Seen(x.copy(), states, rows.shape, own, by_gram)
+        self._seen = _Seen(x.copy(), states, rows.shape, own, by_gram, rows)
         if penalty is not None:
             if self.limits.clearance is not None:
                 distance, back = self.limits.clearance.with_gradient(states[0, : self.count])
@@ -175,6 +182,56 @@ class Problem:
     def forget(self) -> None:
         """The multipliers have changed, and with them the value at every point."""
         self._seen = None
+
+    def torque_shares(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "samples nv"]:
+        """Torques as shares of their limits."""
+        if self._seen is None or not np.array_equal(self._seen.x, x):
+            self.lagrangian(x, None)
+        assert self._seen is not None
+        theta = np.asarray(self.learned.theta)
+        return (theta @ self._seen.rows[:, : len(theta)]).T / self.limits.torque
+
+    def torque_slopes(
+        self, x: Float[np.ndarray, " n"], samples: np.ndarray, joints: np.ndarray
+    ) -> Float[np.ndarray, "rows n"]:
+        """Gradient of some of `torque_shares`."""
+        states, theta = self.states(x), np.asarray(self.learned.theta)
+        out = np.zeros((len(samples), len(x)))
+        for j in np.unique(joints):
+            cotangent = np.zeros((self.sampler.columns, self.nv, states.shape[1]))
+            cotangent[: len(theta), j] = theta[:, None] / self.limits.torque[j]
+            some = np.flatnonzero(joints == j)
+            by = self.sampler.back(states, cotangent.swapaxes(0, 1))[:, samples[some]]
+            out[some] = self._numbers_of_each(by, samples[some])
+        return out
+
+    def distances(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "samples rows"]:
+        """What the distances leave of the margin, in units of `NEAR`."""
+        clearance = self.limits.clearance
+        if clearance is None or not clearance.rows.names:
+            return np.zeros((self.count, 0))
+        return (clearance.distances(self.states(x)[0, : self.count]) - clearance.margin) / NEAR
+
+    def distance_slopes(
+        self, x: Float[np.ndarray, " n"], samples: np.ndarray, pairs: np.ndarray
+    ) -> Float[np.ndarray, "rows n"]:
+        """Gradient of some of `distances`."""
+        out = np.zeros((len(samples), len(x)))
+        if not len(samples):
+            return out
+        clearance, states = self.limits.clearance, self.states(x)[0]
+        assert clearance is not None
+        near, back = clearance.with_gradient(states[samples])  # a posture for each row
+        chosen = np.zeros_like(near)
+        chosen[np.arange(len(samples)), pairs] = 1.0 / NEAR
+        by = np.zeros((3, len(samples), self.nv))
+        by[0] = back(chosen)
+        return self._numbers_of_each(by, samples)
+
+    def _numbers_of_each(self, by: Float[np.ndarray, "3 rows nv"], samples: np.ndarray) -> Float[np.ndarray, "rows n"]:
+        """Gradients by the numbers of rows that each depend on one sample."""
+        weights = np.einsum("krb,krj->rjb", self.matrix[:, samples], by).reshape(len(samples), -1)
+        return weights if self.start is not None else np.concatenate([by[0], weights], axis=1)
 
     def shares(self, x: Float[np.ndarray, " n"]) -> dict[str, Float[np.ndarray, "rows nv"]]:
         """Position (from the middle), velocity and acceleration as shares of their limits."""
@@ -258,12 +315,17 @@ class Penalty:
 
 
 def solve(
-    problem: Problem, x: Float[np.ndarray, " n"], penalty: Penalty | None = None, *, iterations: int = 200
+    problem: Problem,
+    x: Float[np.ndarray, " n"],
+    penalty: Penalty | None = None,
+    *,
+    iterations: int = 200,
+    polish: bool = True,
 ) -> Float[np.ndarray, " n"]:
     """The numbers of the best motion found from x, within the limits at the samples of the design.
 
     `penalty` holds the margins to be kept; one that has served already (for fewer samples or smaller margins) is where
-    the multipliers begin, and is changed.
+    the multipliers begin, and is changed. `polish`: not only near the best, which takes as long again.
     """
     penalty = Penalty() if penalty is None else penalty
     A, b = problem.linear_matrix(penalty.margin)
@@ -272,7 +334,80 @@ def solve(
         if _meets_the_rest(problem, found, penalty.margin):
             return found
         x = found
-    return _augmented(problem, x, penalty)
+    found = _augmented(problem, x, penalty)
+    clearance = problem.limits.clearance  # its rows are dear, and gain little
+    if not polish or (clearance is not None and clearance.rows.names):
+        return found
+    return _polished(problem, found, penalty, A, b)
+
+
+def _polished(problem: Problem, x: np.ndarray, penalty: Penalty, A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """A motion near its limits, improved with the rows that are near them; as it was where these do not settle."""
+    from scipy.optimize import minimize  # slow to import
+
+    rows, best, reach = _Near(problem, penalty.margin, A, b), x, REACH
+    for _ in range(ROUNDS):
+        if rows.joined(x) > MANY:
+            return best
+        kept = {"type": "ineq", "fun": rows.room, "jac": rows.slopes}
+        options = {"maxiter": POLISHED, "ftol": 1e-6}
+        box = np.stack([best - reach, best + reach], axis=1)  # rows that are not in know nothing of what lies beyond
+        begin = np.clip(x, *box.T)
+        tried = minimize(
+            problem.value, begin, jac=problem.slope, method="SLSQP", bounds=box, constraints=[kept], options=options
+        ).x
+        worst, before = rows.worst(tried), problem.value(best)
+        if not np.isfinite(worst) or worst > WITHIN:
+            reach /= 3
+        elif worst >= CLOSE:
+            x = tried
+        elif problem.value(tried) < before - ENDED or rows.worst(best) >= CLOSE:
+            x = best = tried
+        else:
+            break
+    return best
+
+
+class _Near:
+    """Rows that are near their limits, or have been: their room and its slopes."""
+
+    def __init__(self, problem: Problem, margin: dict[str, float], A: np.ndarray, b: np.ndarray) -> None:
+        self.problem, self.margin, self.A, self.b = problem, margin, A, b
+        self.linear = np.zeros(len(b), bool)
+        self.torque = np.zeros((problem.count, problem.nv), bool)
+        self.distance = np.zeros(np.shape(problem.distances(np.zeros(A.shape[1]))), bool)
+
+    def _rooms(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        torque = np.full(self.torque.shape, np.inf)
+        if self.problem.torque:
+            torque = 1.0 - self.margin.get("torque", 0.0) - np.abs(self.problem.torque_shares(x)[: len(torque)])
+        distance = self.problem.distances(x) - self.margin.get("clearance", 0.0)
+        return self.b - self.A @ x, torque, distance
+
+    def joined(self, x: np.ndarray) -> int:
+        """Take in what is near its limit at x; how many rows there are."""
+        linear, torque, distance = self._rooms(x)
+        self.linear |= linear < WITHIN
+        self.torque |= torque < WITHIN
+        self.distance |= distance < 2 * WITHIN
+        return int(self.linear.sum() + self.torque.sum() + self.distance.sum())
+
+    def worst(self, x: np.ndarray) -> float:
+        """The largest violation of any row at x."""
+        return max((-float(room.min()) for room in self._rooms(x) if room.size), default=0.0)
+
+    def room(self, x: np.ndarray) -> np.ndarray:
+        linear, torque, distance = self._rooms(x)
+        return np.concatenate([linear[self.linear], torque[self.torque], distance[self.distance]])
+
+    def slopes(self, x: np.ndarray) -> np.ndarray:
+        parts = [-self.A[self.linear]]
+        if self.torque.any():
+            at = np.nonzero(self.torque)
+            sign = np.sign(self.problem.torque_shares(x)[at])
+            parts.append(-sign[:, None] * self.problem.torque_slopes(x, *at))
+        parts.append(self.problem.distance_slopes(x, *np.nonzero(self.distance)))
+        return np.concatenate(parts)
 
 
 def _meets_the_rest(problem: Problem, x: np.ndarray, margin: dict[str, float]) -> bool:

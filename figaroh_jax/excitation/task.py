@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 __all__ = ["excite_task"]
 
 DEFAULT_NOISE = 0.01  # of the largest torque
+ONLY_NOISE = (
+    "the noise is that of the recordings; what they tell of the links is not counted, since either cause changes it"
+)
 
 
 def excite_task(
@@ -67,7 +70,11 @@ def excite_task(
     said = [*notes, *around]
     if task.data:
         progress("what the recordings tell", 0.0)
-        learned, texts = with_recordings(task, model.robot, known, learned, asked.noise is None)
+        after, texts = with_recordings(task, model.robot, known, learned, asked.noise is None)
+        if separate or asked.objective == "separate":  # the causes were at work in the recordings too
+            learned, texts = with_noise(learned, 1 / np.sqrt(np.asarray(after.weight))), (*texts[:-1], ONLY_NOISE)
+        else:
+            learned = after
         said += texts
     elif asked.noise is None:
         said.append(f"neither recordings nor noise are given: one sigma is {DEFAULT_NOISE:.0%} of the largest torque")

@@ -15,6 +15,7 @@ from ..excitation.design import Design, Stage, torque_of
 from ..excitation.limits import CHECK_RATE, Use
 from ..excitation.postures import PostureDesign
 from ..excitation.sampling import Sampler
+from ..excitation.separation import MOST
 from ..rigid.model import prismatic
 from .report import page_template
 
@@ -52,7 +53,7 @@ def answer(found: Design) -> dict[str, Any]:
         ],
         "separated": [
             {"cause": s.truth, "rival": s.rival, "size": s.size, "sigmas": _number(s.sigmas), "repeats": s.repeats}
-            | {"seconds": s.repeats * sum(stage.motion.duration for stage in found.stages)}
+            | {"seconds": None if s.repeats is None else s.repeats * sum(one.motion.duration for one in found.stages)}
             for s in found.separated
         ],
         "notes": list(found.notes),
@@ -197,9 +198,14 @@ def summary_lines(found: Design | PostureDesign) -> list[str]:
         )
         lines.append(f"trajectory {k + 1}: largest use at 1 kHz: {used or 'no limits'}")
     for s in found.separated:
-        times = "one run" if s.repeats == 1 else f"{s.repeats} repeats"
-        lines.append(f"{s.truth} is told from {s.rival} by {s.sigmas:.2g} standard deviations; {times} for a sure name")
+        lines.append(f"{s.truth} is told from {s.rival} by {s.sigmas:.2g} standard deviations; {_times(s.repeats)}")
     return [*lines, *(f"Note: {note}" for note in found.notes)]
+
+
+def _times(repeats: int | None) -> str:
+    if repeats is None:
+        return f"{MOST} repeats do not make the name sure: the links would have to be known better (`trust`)"
+    return f"{'one run' if repeats == 1 else f'{repeats} repeats'} for a sure name"
 
 
 def _apart(use: Use) -> str:

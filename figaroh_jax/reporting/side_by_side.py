@@ -32,12 +32,18 @@ class Section(NamedTuple):
     rows: tuple[tuple[str, ...], ...]
 
 
-def compare_runs(folders: Sequence[Path]) -> tuple[Section, ...]:
-    """The tables of a comparison; raises `InputError` where a folder is no run."""
+def compare_runs(folders: Sequence[Path], units: Sequence[str] | None = None) -> tuple[Section, ...]:
+    """The tables of a comparison; raises `InputError` where a folder is no run.
+
+    `units`: the robot of each run, by any label; runs of one label are days of one robot. From three runs on, what
+    differs between robots and between days is a table of its own.
+    """
+    if units is not None and len(units) != len(folders):
+        raise InputError(f"--units: {len(units)} labels for {len(folders)} runs; one for each is expected")
     runs = [read_run(folder) for folder in folders]
     names = _names(folders)
     with as_written(" or ".join(map(str, folders))):
-        return _sections(folders, runs, names)
+        return (*_sections(folders, runs, names), *_spread(runs, units))
 
 
 _PARAMETERS = "Parameters (± one standard deviation; * differs by more than 3)"
@@ -57,6 +63,26 @@ def _sections(folders: Sequence[Path], runs: Sequence[dict[str, Any]], names: tu
         Section("Made by", ("made by", *names), tuple(_made(folders))),
     )
     return tuple(section for section in sections if section.rows)
+
+
+def _spread(runs: Sequence[dict[str, Any]], units: Sequence[str] | None) -> tuple[Section, ...]:
+    """Parameters that three runs or more tell: mean, spreads, and whether they differ (`estimation.units`)."""
+    from ..estimation.units import spreads
+
+    tables = [_parameters(run) for run in runs]
+    names = [n for n in dict.fromkeys(n for t in tables for n in t) if sum(t.get(n, (0, 0))[1] > 0 for t in tables) > 1]
+    if len(runs) < 3 or not names:
+        return ()
+    missing = (float("nan"), float("nan"), "")
+    whole = [[t[n] if t.get(n, missing)[1] > 0 else missing for n in names] for t in tables]
+    values, std = (np.array([[cell[k] for cell in row] for row in whole], float) for k in (0, 1))
+    rows = []
+    for found in spreads(names, values, std, units):
+        unit = next(t[found.name][2] for t in tables if found.name in t)
+        mean = f"{found.mean:.4g} ± {found.std:.2g} {unit}".rstrip()
+        rows.append((found.name, mean, f"{found.units:.2g}", f"{found.days:.2g}", found.differs() or "-"))
+    title = "Spread between robots and between days (random effects; differs: p < 0.05 over all parameters)"
+    return (Section(title, ("parameter", "mean", "between robots", "between days", "differs between"), tuple(rows)),)
 
 
 def list_runs(folder: Path) -> Section:

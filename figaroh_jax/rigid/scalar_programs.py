@@ -108,6 +108,17 @@ def known(model: RobotModel) -> bytes:
     return codes.tobytes()
 
 
+def known_lengths(model: RobotModel) -> bytes:
+    """As `known`, but for inertial parameters: all that a robot is taken to weigh has one structure."""
+    return _codes_of_lengths(constants(model, float, np), len(model.joints)).tobytes()
+
+
+def _codes_of_lengths(table: Float[np.ndarray, " constants"], joints: int) -> np.ndarray:
+    codes = np.where(np.isin(table, (-1.0, 0.0, 1.0)), table, LOADED).astype(np.int8)
+    codes[: joints * _PER_JOINT].reshape(-1, _PER_JOINT)[:, _PLACES["inertia"] : _PLACES["ratio"]] = LOADED
+    return codes
+
+
 def nothing_known(joints: tuple[Joint, ...]) -> bytes:
     """In place of `known`, for a model whose arrays are being traced."""
     return np.full(len(joints) * _PER_JOINT + 6 * len(dofs(joints).joint) + 3, LOADED, np.int8).tobytes()
@@ -724,6 +735,7 @@ def straight(form: _Form, kernel: Callable[..., Any], width: Callable[[RobotMode
         plain=plain,
         constants=constants,
         known=known,
+        known_lengths=known_lengths,
         nothing_known=lambda model: nothing_known(model.joints),
         programs=form.programs,
         shape=form.shape,

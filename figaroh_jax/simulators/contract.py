@@ -69,6 +69,7 @@ class Capabilities:
     batch: Literal["vectorised", "threads", "loop"] = "loop"  # how many samples are computed
     gpu: bool = False
     contact: bool = False  # the simulator behind it simulates contact (the functions here are the free rigid body's)
+    precision: Literal["float64", "float32"] = "float64"  # of what it computes in; arrays are float64 in any case
     lacking: frozenset[str] = frozenset()  # functions that raise `NotSupported`
 
     @property
@@ -251,8 +252,8 @@ def announced(name: str) -> Any:  # type[Backend]: a protocol, which no run-time
     if not found:
         raise InputError(
             f"no backend '{name}' is installed; installed: {', '.join(names())}. Those of this library are installed "
-            f"with: pip install 'figaroh-jax[mujoco,mjx,pinocchio]'; another one is a package with an entry point "
-            f"'{name}' in the group '{GROUP}'"
+            f"with: pip install 'figaroh-jax[mujoco,mjx,pinocchio,newton,genesis]'; another one is a package with an "
+            f"entry point '{name}' in the group '{GROUP}'"
         )
     try:
         return found[0].load()
@@ -325,7 +326,7 @@ def tried(backend: Backend) -> Backend:
     return backend
 
 
-_OWN = ("figaroh_jax", "figaroh_jax_mujoco", "figaroh_jax_mjx", "figaroh_jax_pinocchio")
+_OWN = ("figaroh_jax", *(f"figaroh_jax_{name}" for name in ("mujoco", "mjx", "pinocchio", "newton", "genesis")))
 
 
 def _answer(backend: Backend, function: str, arguments: tuple[Any, ...], shape: tuple[int, ...]) -> np.ndarray:

@@ -1,0 +1,137 @@
+"""Simulated people: sizes from markers, segments from two force plates, judged on motion that was not fitted.
+
+    python benchmarks/people.py [--people N] [--seconds S] [--seed K]
+
+Each person is 5-20 % off the model in every segment's length and inertial parameters; markers slide by 5 mm with the
+skin and are seen to 2 mm; plates have noise and a zero. A line is a person: RMS error of the root's force (% of body
+weight) and moment (% of its RMS) on an unseen trial with the identified person, the scaled one with the table alone and
+the unscaled model; error of mass (%) and centre of mass (mm); share of the parameters within their 95 % intervals.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from generators import people as simulated  # noqa: E402
+
+import figaroh_jax as fj  # noqa: E402
+from figaroh_jax.estimation import markers  # noqa: E402
+from figaroh_jax.identification import people  # noqa: E402
+from figaroh_jax.rigid.inertia import to_com  # noqa: E402
+
+DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+URDF = DATA / "human_model" / "human.urdf"
+CUTOFF = 2.5  # Hz: the motions have nothing above 0.9 Hz
+FRAMES = 40  # of the trial by which sizes are found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--people", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--trials", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    print(
+        f"{'person':>6}{'':4}{'force % BW':>24}{'moment %':>24}{'mass %':>8}{'com mm':>8}{'size %':>8}{'95 %':>7}   s"
+    )
+    print(f"{'':10}{'  found   table unscaled':>24}{'  found   table unscaled':>24}")
+    for k in range(options.people):
+        start = time.perf_counter()
+        line = study(np.random.default_rng(options.seed + k), options.seconds, options.trials)
+        force, moment = ("".join(f"{x:8.2f}" for x in line[key]) for key in ("force", "moment"))
+        rest = f"{line['mass']:8.2f}{line['com']:8.2f}{line['size']:8.2f}{line['covered']:7.2f}"
+        print(f"{options.seed + k:6}{'':4}{force}{moment}{rest}{time.perf_counter() - start:6.0f}", flush=True)
+
+
+def places(robot: fj.RobotModel) -> dict[str, tuple[str, np.ndarray]]:
+    """Four markers on each segment, around its centre of mass and its far end, at places that the model states."""
+    found = {}
+    mass, com, about = (np.asarray(x) for x in to_com(np.asarray(robot.inertia)))
+    for i, joint in enumerate(robot.joints):
+        below = [np.asarray(robot.placement[k])[:3, 3] for k, o in enumerate(robot.joints) if o.parent == i]
+        if mass[i] <= 0 and len(below) < 2:
+            continue
+        ends = [way for way in below if np.linalg.norm(way) > 0.05]
+        end = ends[0] if ends else 1.6 * com[i]
+        size = max(0.04, 0.25 * float(np.linalg.norm(end)))
+        for k, way in enumerate(([0.0, 0, 0.6], [0.5, 0, -0.6], [-0.6, 0, 0.2], [0.3, 0.4, 0.3])):
+            found[f"{joint.link}_{k}"] = joint.link, (0.1 + 0.3 * k) * end + size * np.array(way)
+    return found
+
+
+def study(rng: np.random.Generator, seconds: float, trials: int) -> dict:
+    """One person from end to end."""
+    robot = fj.load_urdf(URDF, root="free_flyer")
+    person = simulated.make_person(str(URDF), rng)
+    own = places(robot)
+    joint_of = {joint.link: joint.name for joint in robot.joints}
+    simulated.put_markers(person, {label: (joint_of[link], at) for label, (link, at) in own.items()}, rng)
+    fitted = [simulated.record(person, rng, seconds) for _ in range(trials)]
+    unseen = simulated.record(person, rng, seconds)
+    data = size(robot, own, fitted[0])
+    captures = [captured(robot, own, data, trial) for trial in [*fitted, unseen]]
+    weight = float(np.mean([np.linalg.norm(c.wrench[:, :3], axis=1).mean() for c in captures[:-1]]))
+    table = people.anthropometric(robot, weight / 9.81, "male", np.asarray(data.scale))
+    found = people.identify_segments(captures[:-1], table)
+    unscaled = captured(robot, own, None, unseen)
+    return judged(person, robot, found, table, captures[-1], unscaled, data, unseen)
+
+
+def size(robot, own, trial):
+    """Segments' sizes by `fit` on a few frames."""
+    pick = np.linspace(0, len(trial.time) - 1, FRAMES).astype(int)
+    seen = {label: at[pick] for label, at in trial.markers.items()}
+    return markers.segment_sizes(robot, markers.marker_data(robot, own, seen)).data
+
+
+def captured(robot, own, fitted, trial):
+    """Positions by inverse kinematics with the sizes found (None: the model's), and the capture."""
+    import equinox as eqx
+
+    data = markers.marker_data(robot, own, trial.markers)
+    if fitted is not None:
+        data = eqx.tree_at(lambda d: (d.scale, d.shift), data, (fitted.scale, fitted.shift))
+    q = markers.joint_positions(robot, data).position
+    return people.capture(data.robot(robot), trial.time, q, trial.plates, CUTOFF)
+
+
+def judged(person, robot, found, table, capture, unscaled, data, unseen) -> dict:
+    truth = capture.wrench  # what the plates measured, at the pelvis
+    models = (found.model, capture), (table, capture), (robot, unscaled)
+    errors = [people.predicted(m, c) - c.wrench for m, c in models]
+    bw = 9.81 * sum(i.mass for i in person.model.inertias)
+    moment = np.sqrt((truth[:, 3:] ** 2).mean())
+    true = np.array(
+        [person.model.inertias[person.model.getJointId(j.name)].toDynamicParameters() for j in robot.joints]
+    )
+    index = [robot.link_names.index(name) for name in found.links]
+    off = (found.parameters - true[index]) / found.std
+    import pinocchio as pin  # pyright: ignore[reportMissingImports]
+
+    q = unseen.q[len(unseen.q) // 2]
+    fitted_q = capture.position[len(capture.position) // 2]
+    centre = pin.centerOfMass(person.model, person.model.createData(), q)
+    scales = np.array([person.scale[next(j.name for j in robot.joints if j.link == n)] for n in data.names])
+    return {
+        "force": [100 * np.sqrt((e[:, :3] ** 2).sum(1).mean()) / bw for e in errors],
+        "moment": [100 * np.sqrt((e[:, 3:] ** 2).mean()) / moment for e in errors],
+        "mass": 100 * abs(found.mass()[0] * 9.81 / bw - 1),
+        "com": 1e3 * float(np.linalg.norm(found.centre(fitted_q)[0] - centre)),
+        "size": 100 * float(np.abs(np.asarray(data.scale) / scales - 1).mean()),
+        "covered": float((np.abs(off) < 1.96).mean()),
+        "off": off,
+    }
+
+
+if __name__ == "__main__":
+    main()
