@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
 import robots
+from jaxtyping import Array, Float
 from test_excitation import ARM, a_motion
 
+from figaroh_jax.effects.base import JointEffect, Motion, Scalar, amplitude
+from figaroh_jax.effects.catalogue import CATALOGUE, register
 from figaroh_jax.errors import InputError
 from figaroh_jax.estimation.priors import rigid_prior
 from figaroh_jax.excitation import information as info
 from figaroh_jax.excitation.design import excite, gram_of
 from figaroh_jax.excitation.limits import limits_of
 from figaroh_jax.excitation.motions import fourier
-from figaroh_jax.excitation.separation import LINK, LOOSE, causes, separated, separation_objective
+from figaroh_jax.excitation.separation import LINK, LOOSE, MOST, causes, separated, separation_objective
 from figaroh_jax.rigid.model import RobotModel
 
 ROTOR = ("rotor_inertia", ("turn",), {"inertia": 0.3})
@@ -69,6 +73,55 @@ def test_separation_is_what_least_squares_leaves_of_the_cause_and_its_gradient_t
     change, h = rows @ rows.T, 1e-5
     slope = (objective(G + h * change)[0] - objective(G - h * change)[0]) / (2 * h)
     assert np.sum(objective(G)[1] * change) == pytest.approx(slope, rel=1e-4)
+
+
+def test_an_effect_of_ones_own_takes_part_and_its_repeats_are_those_of_rows_repeated(arm: RobotModel):
+    """A magnet on 'bend' against its rotor; n repeats are the rows times the root of n, beside the same prior."""
+
+    @register
+    class Detent(JointEffect):
+        """A magnet."""
+
+        name, title, equation, separated_by = "detent", "detent", "strength sin(3 q)", "slow sweeps of {at}"
+        strength: Scalar = amplitude("N m")
+
+        def torque(self, motion: Motion) -> Float[Array, " samples"]:
+            return self.strength * jnp.sin(3.0 * self.here(motion.position))
+
+    try:
+        learned = info.learn(arm, noise=0.02)
+        states = np.stack([np.asarray(x) for x in a_motion(arm).states(20.0)])
+        pair = (("detent", ("bend",), {"strength": 0.25}), ("rotor_inertia", ("bend",), {"inertia": 0.02}))
+        given = causes(learned, [pair], states, 0.1)
+        forth, back = separated(given, gram_of(learned, given.sampler, states, given.columns), learned.prior)
+    finally:
+        CATALOGUE.pop("detent")
+    q, v, a = states
+    friction = np.zeros((len(q), 2, 4))
+    for joint in range(2):
+        friction[:, joint, joint] = v[:, joint]
+        friction[:, joint, 2 + joint] = np.tanh(v[:, joint] / (info.SMOOTH + 1e-9))
+    root = np.sqrt(np.asarray(learned.weight))[:, None]
+    W = np.concatenate([reference.regressor(arm, q, v, a), friction], axis=2) * root
+    X = W.reshape(2 * len(q), -1)[:, list(learned.independent)]
+    prior = np.linalg.cholesky(learned.prior).T
+
+    def left(z: np.ndarray, rival: np.ndarray, times: int) -> float:
+        z, rival = ((np.stack([0 * x, x], 1) * root[:, 0]).reshape(-1) for x in (z, rival))
+        A = np.sqrt(times) * np.column_stack([X, rival])
+        A = np.concatenate([A, np.column_stack([prior, np.zeros(len(prior))])])
+        y, size = np.concatenate([np.sqrt(times) * z, np.zeros(len(prior))]), np.linalg.norm(A, axis=0)
+        return float(np.linalg.norm(y - A @ (np.linalg.lstsq(A / size, y, rcond=None)[0] / size)))
+
+    magnet, rotor = 0.25 * np.sin(3 * q[:, 1]), 0.02 * a[:, 1]
+    for told, z, rival in ((forth, magnet, rotor), (back, rotor, magnet)):
+        assert told.sigmas == pytest.approx(left(z, rival, 1), rel=1e-4)
+        if told.repeats is None:
+            assert left(z, rival, MOST) < 4
+        else:
+            assert left(z, rival, told.repeats) >= 4 * (1 - 1e-4)
+            assert told.repeats == 1 or left(z, rival, told.repeats - 1) < 4
+    assert {type(told.repeats) for told in (forth, back)} == {int, type(None)}
 
 
 @pytest.mark.slow

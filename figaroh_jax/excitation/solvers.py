@@ -336,7 +336,7 @@ def solve(
         x = found
     found = _augmented(problem, x, penalty)
     clearance = problem.limits.clearance  # its rows are dear, and gain little
-    if not polish or (clearance is not None and clearance.rows.names and problem.samples is None):
+    if not polish or (clearance is not None and clearance.rows.names):
         return found
     return _polished(problem, found, penalty, A, b)
 
