@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,6 +15,7 @@ import robots
 from jaxtyping import Array
 from synthetic import made_signals
 
+from figaroh_jax.compiled.batching import DRAFT_OPTIONS
 from figaroh_jax.diagnosis.design import Units, candidates, flattened, shapes, unit_rows, units_and_slopes, with_shape
 from figaroh_jax.diagnosis.refit import Whitened, bounded_minimum, profile, refit, refit_shift, shift_profile
 from figaroh_jax.diagnosis.shifts import shifted, torque_change
@@ -222,7 +224,7 @@ def test_the_native_minimiser_works_inside_vmap_and_agrees() -> None:
     made = [quadratic(seed) for seed in range(4)]
     A, b = (jnp.asarray(np.stack(part)) for part in zip(*made, strict=True))
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=DRAFT_OPTIONS)  # most of the time goes into compiling the minimiser
     @jax.vmap
     def found(A: Array, b: Array) -> Array:
         def function(x: Array) -> tuple[Array, Array]:

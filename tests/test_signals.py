@@ -183,14 +183,15 @@ def test_the_row_filter_is_jitted_mapped_and_differentiated():
     plain = filter_rows(rows, x)
     assert plain.shape == (rows.kept, 2, 3)
     np.testing.assert_allclose(jax.jit(filter_rows)(rows, x), plain, rtol=0, atol=1e-12)
-    mapped = jax.vmap(lambda c: filter_rows(rows, c), in_axes=2, out_axes=2)(x)
+    mapped = jax.jit(jax.vmap(lambda c: filter_rows(rows, c), in_axes=2, out_axes=2))(x)
     np.testing.assert_allclose(mapped, plain, rtol=0, atol=1e-12)
 
+    @jax.jit
     def power(delay):
         return jnp.sum(filter_rows(rows, x[:, 0, 0], jnp.exp(-1j * frequencies(rows) * delay)) ** 3)
 
     slope = (power(0.01 + 1e-6) - power(0.01 - 1e-6)) / 2e-6
-    assert jax.grad(power)(0.01) == pytest.approx(float(slope), rel=1e-3)
+    assert jax.jit(jax.grad(power))(0.01) == pytest.approx(float(slope), rel=1e-3)
 
 
 @pytest.mark.parametrize("late", [0.0, 0.1, -0.0731, 1.3333, -0.3333])

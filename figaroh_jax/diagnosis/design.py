@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from ..compiled.batching import CPU_OPTIONS
+from ..compiled.batching import CPU_OPTIONS, DRAFT_OPTIONS
 from ..compiled.executable_cache import Program
 from ..effects.base import Effect, Motion, columns
 from ..recordings.stacked import Records, filter_rows
@@ -44,6 +44,7 @@ __all__ = [
 ]
 
 
+SHORT = 4096  # samples up to which programs of the whole catalogue take longer to optimise than that spares
 BATCH = 4  # effects with a shape in one program, and starts of a refit
 
 
@@ -92,7 +93,8 @@ def flattened(batch: Effect) -> Effect:
 def units(batches: Mapping[str, Effect], motion: Motion, records: Records) -> dict[str, Units]:
     """What a unit of each amplitude adds, for batches (one leading axis) of effects of any kind."""
     plain = {name: batch for name, batch in batches.items() if _way(batch) == "torque"}
-    torques = _unit_torques(plain, motion) if plain else {}
+    program = _unit_torques if len(motion.time) > SHORT else _quick_unit_torques
+    torques = program(plain, motion) if plain else {}
     responses = {name: batch for name, batch in batches.items() if kind(batch) == "response"}
     factors = sensor_response(responses, np.asarray(records.omega))
     everywhere, out = np.arange(np.shape(motion.velocity)[1]), {}
@@ -218,9 +220,11 @@ def _amplitudes(effect: Effect) -> list[str]:
     return [name for name, p in effect.parameters().items() if p.linear]
 
 
-@partial(Program, options=CPU_OPTIONS)
-def _unit_torques(batches: dict[str, Effect], motion: Motion) -> dict[str, Float[Array, "effects k nN *rows"]]:
+def _all_unit_torques(batches: dict[str, Effect], motion: Motion) -> dict[str, Float[Array, "effects k nN *rows"]]:
     return {name: jax.vmap(lambda e: columns(e, motion))(batch) for name, batch in batches.items()}
+
+
+_unit_torques, _quick_unit_torques = (Program(_all_unit_torques, options=o) for o in (CPU_OPTIONS, DRAFT_OPTIONS))
 
 
 @partial(Program, options=CPU_OPTIONS)

@@ -58,22 +58,33 @@ def links_torque(
     return torque.reshape(np.shape(q))
 
 
-def shifted(effects: Effect, motion: Motion, records: Records, turns: int = TURNS) -> Motion:
+def shifted(
+    effects: Effect,
+    motion: Motion,
+    records: Records,
+    turns: int = TURNS,
+    as_read: Float[np.ndarray, "nN nv"] | None = None,
+) -> Motion:
     """The true motion of the links for each of a batch of position sensors that have read `motion`.
 
     A sensor whose error follows the load feels that of the true motion, so q + error(load(q)) = q_measured is solved:
     Newton's steps, with the joint's inertia and stiffness along the motion. Without `turns` the load is that of
-    `motion`, right to first order.
+    `motion`, right to first order. `as_read` is the links' torque along `motion`, where that is known.
 
     Position, velocity and acceleration of the answer have a leading axis of effects.
     """
     shift = _errors(effects, motion)
     if not turns:
         return _moved(effects, motion, shift, records)
-    compliances, shift = _compliances(effects, motion, records), np.zeros_like(shift)
-    for _ in range(turns):
-        true = _moved(effects, motion, shift, records)
-        loads = links_torque(motion.model, true.position, true.velocity, true.acceleration, records)
+    if as_read is None:
+        as_read = links_torque(motion.model, motion.position, motion.velocity, motion.acceleration, records)
+    compliances, shift = _compliances(effects, motion, records, as_read), np.zeros_like(shift)
+    for turn in range(turns):
+        if turn:
+            true = _moved(effects, motion, shift, records)
+            loads = links_torque(motion.model, true.position, true.velocity, true.acceleration, records)
+        else:  # the motion as it was read
+            loads = np.broadcast_to(as_read, (len(shift), *as_read.shape))
         missing = (_errors(effects, motion, loads) - shift).reshape(-1, *records.position.shape[:2])
         change = [own.solve(one) for own, one in zip(compliances, missing, strict=True)]
         shift = shift + np.reshape(change, shift.shape)
@@ -118,9 +129,10 @@ def _square(diagonals: Float[np.ndarray, "3 n N"]) -> Float[np.ndarray, "3 n N"]
     return square
 
 
-def _compliances(effects: Effect, motion: Motion, records: Records) -> list[_Compliance]:
+def _compliances(
+    effects: Effect, motion: Motion, records: Records, load: Float[np.ndarray, "nN nv"]
+) -> list[_Compliance]:
     """What a small change of its joint's motion changes of each sensor's reading."""
-    load = links_torque(motion.model, motion.position, motion.velocity, motion.acceleration, records)
     loads = np.repeat(load[None], len(effects.at), axis=0)
     unit = (_errors(effects, motion, loads + 1) - _errors(effects, motion, loads)).mean(1)
     joints = np.asarray(effects.at)[:, 0]
@@ -220,7 +232,7 @@ def torque_change(
     """
     if as_read is None:
         as_read = links_torque(motion.model, motion.position, motion.velocity, motion.acceleration, records)
-    true = shifted(effects, motion, records, turns)
+    true = shifted(effects, motion, records, turns, as_read)
     return links_torque(motion.model, true.position, true.velocity, true.acceleration, records) - as_read
 
 
