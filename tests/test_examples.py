@@ -23,6 +23,7 @@ SLOW = {
     "payload_and_gains",
     "real_calibrations",
     "real_identifications",
+    "so101",
 }
 SAYS = {
     "dynamics_and_gradients": "by the mass of each link",
@@ -40,6 +41,7 @@ SAYS = {
     "payload_and_gains": "payload 1.700 kg",
     "real_calibrations": "TALOS: 16 parameters, 1.430 mm",
     "real_identifications": "TX40",
+    "so101": "friction by joint",
 }
 NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
 

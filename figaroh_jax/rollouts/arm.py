@@ -8,6 +8,7 @@ The verdict is that of the arm's simulation from the command alone.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,6 +18,7 @@ import numpy as np
 from .alone import alone, carried_by
 from .causes import Candidate, Catalogue, elastic_loop
 from .data import windows
+from .faults import Fault, faults, without
 from .fit import Fit, System, fit, held_out
 from .parameters import Entry, put, values
 from .search import (
@@ -58,6 +60,10 @@ def search_arm(
     """Causes of an arm whose drives act at one joint each and whose joints are all measured."""
     joints = _begun(here, values(here.loop, here.known.table), progress, 0.1)
     first = _together(here, joints, [one.fit for one in joints])
+    here, wrong = _sound(here, first)
+    if wrong:
+        joints = _begun(here, first.theta, progress, 0.15)
+        first = _together(here, joints, [one.fit for one in joints])
     shared: list[Named] = []
     theta = values(here.loop, here.known.table)
     found: list[Search] = []
@@ -71,7 +77,26 @@ def search_arm(
         joints = _begun(here, theta, progress, 0.3, [e for one in shared for e in one.candidate.entries])
     joints, found = _rest_again(here, joints, found, theta, shared, progress, forbid)
     progress("simulating the arm", 0.85)
-    return _judged(here, joints, first, found, shared, theta)
+    result = _judged(here, joints, first, found, shared, theta)
+    result.setting, result.faults = here, wrong
+    return result
+
+
+def _sound(here: Setting, first: Fit) -> tuple[Setting, list[Fault]]:
+    """The setting without the rows that no loop explains, and what is wrong with these."""
+    structure = Structure(here.loop, here.known.table, here.data)
+    model = _simulated(here, structure, first.theta, first.start)
+    if model is None:
+        return here, []
+    n, places = here.loop.robot.nv, np.array(here.loop.measured)
+    loop = put(here.loop, here.known.table, first.theta)
+    read = [x[:, :n][:, places] + np.asarray(loop.joints.reading)[places] for x in model]
+    found = faults(loop, here.runs, read)
+    if not found:
+        return here, []
+    runs = without(here.runs, found)
+    data = windows(here.loop, runs, here.stretches, here.noise, here.block)
+    return replace(here, runs=runs, data=data), found
 
 
 def _begun(

@@ -17,7 +17,9 @@ from .loop import Loop
 __all__ = ["Fault", "faults", "without"]
 
 _SLOW, _LONG, _REACH = 0.02, 0.6, 2.0  # rad/s of a joint that stands, s, multiples of what friction holds
-_BLOCK, _JUMP, _ALIKE = 4.0, 1.5, 0.5  # s of one lag, periods of a jump, share by which joints may differ
+_BLOCK, _JUMP, _ALIKE = 2.0, 2.0, 0.5  # s of one lag, periods of a jump, share by which joints may differ
+_MOST_LATE, _SHIFTED, _FEW = 0.3, 0.15, 3  # s, share of the power that a shift leaves, blocks on either side of a jump
+_WRONG, _HOLDS = 6.0, 1.2  # multiples of the usual error and of the friction, of a joint that stands
 _MOVING = 0.1  # rad/s
 
 
@@ -43,7 +45,7 @@ class Fault(NamedTuple):
 def faults(loop: Loop, runs: Sequence[Run], simulated: Sequence[np.ndarray]) -> list[Fault]:
     """The faults of the recordings; `simulated` (rows, joints) is what a fitted loop does with their commands."""
     found = []
-    for k, (run, read, held) in enumerate(zip(runs, simulated, _held(loop, runs), strict=True)):
+    for k, (run, read, held) in enumerate(zip(runs, simulated, _held(loop, runs, simulated), strict=True)):
         jump = _jump(run, read)
         if jump is not None:
             time, late = jump
@@ -69,7 +71,7 @@ def without(runs: Sequence[Run], found: Sequence[Fault], margin: float = 0.5) ->
     return tuple(kept)
 
 
-def _held(loop: Loop, runs: Sequence[Run]) -> list[np.ndarray]:
+def _held(loop: Loop, runs: Sequence[Run], simulated: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Torque (rows, joints) by which standing joints exceed what friction holds, 0 elsewhere."""
     nets, rates = [], []
     drives, places = loop.drives, np.array(loop.measured)
@@ -92,10 +94,15 @@ def _held(loop: Loop, runs: Sequence[Run]) -> list[np.ndarray]:
         rates.append(np.stack([np.convolve(np.abs(x), kernel, mode="same") for x in v.T], 1))
     moving = [np.where(r > _MOVING, np.abs(n), np.nan) for n, r in zip(nets, rates, strict=True)]
     usual = np.array([_level(np.concatenate([m[:, j] for m in moving])) for j in range(loop.robot.nv)])
-    return [
-        np.where((r < _SLOW) & (np.abs(n) > _REACH * usual), np.abs(n) - usual, 0.0)
-        for n, r in zip(nets, rates, strict=True)
-    ]
+    errors = [np.abs(run.position - read) for run, read in zip(runs, simulated, strict=True)]
+    typical = np.median(np.concatenate(errors), axis=0)
+    found = []
+    for net, rate, error in zip(nets, rates, errors, strict=True):
+        far = np.zeros_like(net)
+        far[:, places] = error / np.maximum(typical, 1e-12)
+        beyond = (np.abs(net) > _REACH * usual) | ((np.abs(net) > _HOLDS * usual) & (far > _WRONG))
+        found.append(np.where((rate < _SLOW) & beyond, np.abs(net) - usual, 0.0))
+    return found
 
 
 def _level(values: np.ndarray) -> float:
@@ -116,29 +123,44 @@ def _stretches(mask: np.ndarray) -> list[tuple[int, int]]:
 def _jump(run: Run, read: np.ndarray) -> tuple[float, float] | None:
     """When all joints begin to follow later than before, and by how much (s)."""
     period = regular(run.name, run.time)
-    rate = np.gradient(read, period, axis=0)
     rows = max(8, round(_BLOCK / period))
-    blocks = len(read) // rows
-    if blocks < 6:
+    lag = _lags(run.position, read, rows, max(2, round(_MOST_LATE / period)), _MOVING * period)
+    told = np.isfinite(lag).sum(1) >= 2
+    place, middle = np.flatnonzero(told), np.nanmedian(np.where(told[:, None], lag, 0.0), axis=1)
+    best: tuple[float, int, float] | None = None
+    for k in range(_FEW, len(place) - _FEW + 1):
+        before, after = np.median(middle[place[:k]]), np.median(middle[place[k:]])
+        left = np.abs(middle[place[:k]] - before).sum() + np.abs(middle[place[k:]] - after).sum()
+        if best is None or left < best[0]:
+            best = float(left), k, float(after - before)
+    if best is None or abs(best[2]) < _JUMP:
         return None
-    shape = (blocks, rows, read.shape[1])
-    error = (run.position - read)[: blocks * rows].reshape(shape)
-    speed = rate[: blocks * rows].reshape(shape)
-    speed = speed - speed.mean(1, keepdims=True)
-    power = (speed**2).sum(1)
-    lag = -((error - error.mean(1, keepdims=True)) * speed).sum(1) / np.maximum(power, 1e-12)
-    told = power / rows > _MOVING**2 / 4
-    best: tuple[float, float, float] | None = None
-    for cut in range(3, blocks - 1):
-        steps = []
-        for j in range(read.shape[1]):
-            before, after = lag[:cut, j][told[:cut, j]][-4:], lag[cut:, j][told[cut:, j]][:4]
-            if len(before) >= 2 and len(after) >= 1:
-                steps.append(np.median(after) - np.median(before))
-        if len(steps) >= 2:
-            middle = float(np.median(steps))
-            spread = float(np.max(np.abs(np.array(steps) - middle)))
-            if abs(middle) > _JUMP * period and spread < _ALIKE * abs(middle):
-                if best is None or abs(middle) - spread > best[2]:
-                    best = float(run.time[cut * rows]), middle, abs(middle) - spread
-    return None if best is None else best[:2]
+    _, k, step = best
+    each = [_step(lag[place[:k], j], lag[place[k:], j]) for j in range(lag.shape[1])]
+    each = np.array([x for x in each if np.isfinite(x)])
+    if len(each) < 2 or np.mean(np.abs(each - step) <= _ALIKE * abs(step)) < 0.75:
+        return None
+    return float(run.time[place[k] * rows]), step * period
+
+
+def _step(before: np.ndarray, after: np.ndarray) -> float:
+    before, after = (x[np.isfinite(x)] for x in (before, after))
+    return float(np.median(after) - np.median(before)) if len(before) > 1 and len(after) > 1 else float("nan")
+
+
+def _lags(truth: np.ndarray, read: np.ndarray, rows: int, most: int, slow: float) -> np.ndarray:
+    """Rows (blocks, joints) by which what was measured is later than the model, NaN where a shift explains little."""
+    blocks = len(truth) // rows
+    found = np.full((blocks, truth.shape[1]), np.nan)
+    for b in range(1, blocks):
+        here = np.arange(b * rows, (b + 1) * rows)
+        y = truth[here] - truth[here].mean(0)
+        costs = []
+        for shift in range(-most // 2, most + 1):
+            s = read[np.clip(here - shift, 0, len(read) - 1)]
+            costs.append(((y - (s - s.mean(0))) ** 2).sum(0))
+        power, best = (y**2).sum(0), np.min(costs, axis=0)
+        moving = np.sqrt(np.mean(np.diff(truth[here], axis=0) ** 2, axis=0)) > slow
+        told = moving & (best < _SHIFTED * power)
+        found[b] = np.where(told, np.argmin(costs, axis=0) - most // 2, np.nan)
+    return found

@@ -13,6 +13,7 @@ from scipy.special import ndtr
 from ..results import Name, Verdict
 from .causes import BASELINE, CONTAINS, Candidate, Catalogue, catalogue, elastic_loop
 from .data import Run, Stretch, noise_of, windows
+from .faults import Fault
 from .fit import Fit, System, fit, held_out, standard_errors
 from .loop import Loop
 from .parameters import BOUNDS, Entry, Table, values
@@ -45,6 +46,7 @@ _USUAL = 0.5  # share of the best gain from which friction, damping and rotor co
 _PAIR = 2  # starts of the baseline that are followed to the end
 _EARLY, _LATE = 4, 12  # iterations of a race among all starts, and of its leaders
 _LIMITS = ("actuator_saturation", "voltage_saturation")
+_STILL = ("encoder_offset", "torque_offset", "joint_spring")  # of one joint: each makes up for the others
 _SHAPED = ("stribeck_friction",)  # without an amplitude their shape shows nothing
 
 
@@ -105,6 +107,8 @@ class Search:
     held: list[float] = field(default_factory=list)  # held-out RMS of the baseline and after each cause, rad or m
     fits: list[Fit] = field(default_factory=list)  # after each cause
     origin: Structure | None = None  # of the baseline
+    setting: Setting | None = None  # where rows were left out: without them
+    faults: list[Fault] = field(default_factory=list)  # why they were
 
 
 def setting(
@@ -274,6 +278,8 @@ def _tried(here: Setting, now: Model, named: Sequence[Candidate], forbid: Sequen
     """Every candidate that may still come, fitted from the present optimum from each of its starts."""
     used = {(c.effect, c.at) for c in named}
     left = [c for c in here.known.candidates if (c.effect, c.at) not in used and not set(c.entries) <= set(now.free)]
+    placed = {c.at for c in named if c.effect in _STILL}
+    left = [c for c in left if not (c.effect in _STILL and c.at in placed)]
     if here.loop.robot.nv > 1 or here.loop.carried is not None:
         left = _screened(here, now, left) if left else []
     thetas, free, owner = [], [], []
@@ -423,7 +429,9 @@ def _best(
         return None, 1.0
     p = float(max(ndtr(-4 * now.excess), 1e-12))
     sure = _SURE if now.excess >= 1.0 else 2.5
-    passing = [k for k in range(len(tried)) if gains[k] > _WORTH and ts[k] > sure and _sized(here, tried[k])]
+    several = here.loop.carried is not None and _by_recording(here)
+    needs = [_CLEAR if several and one.state.excess >= 1.0 else sure for one in tried]  # beside a rest: more
+    passing = [k for k in range(len(tried)) if gains[k] > _WORTH and ts[k] > needs[k] and _sized(here, tried[k])]
     for k in np.argsort(gains)[::-1][:3]:
         why = "no better than another" if k in passing else "gains too little on data that it was not fitted to"
         nearest.append((Name(tried[k].candidate.effect, tried[k].candidate.at), float(max(gains[k], 0.0)), why))
@@ -475,6 +483,11 @@ def _sized(here: Setting, one: _Tried) -> bool:
     return bool(np.isfinite(error) and abs(value - neutral) > 3 * error)
 
 
+def _by_recording(here: Setting) -> bool:
+    """Whether the folds are recordings, three or more."""
+    return len(np.unique(here.folds)) == len({s.run for s in here.stretches}) >= 3
+
+
 def judged(
     here: Setting, begin: Model, now: Model, found: list[Named], p_value: float, steps: list, nearest: list
 ) -> Search:
@@ -484,8 +497,7 @@ def judged(
     if now.excess < 1.0:
         result.verdict = "named" if found else "nothing"
         return result
-    several = len(np.unique(here.folds)) == len({s.run for s in here.stretches}) >= 3
-    if found and several and all(n.t > _CLEAR for n in found[:1]):
+    if found and _by_recording(here) and all(n.t > _CLEAR for n in found[:1]):
         result.verdict = "named+rest"
         return result
     result.verdict, result.proxy, result.named = "unknown", found, []

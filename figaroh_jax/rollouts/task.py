@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..formats.config import robot_options
 from ..formats.files import USD
 from ..recordings.dataset import Recording, read_recordings
-from ..results import Cause, Diagnosis, Estimate, Experiment, Gain, Name, Rest, Trace
+from ..results import Cause, Diagnosis, Estimate, Experiment, Gain, Name, Rest, Trace, Verdict
 from .alone import separable
 from .arm import search_arm
 from .causes import BASELINE
@@ -79,6 +79,8 @@ def diagnose_rollout_task(
                 "and time step; check kp, kd (their units and signs) and armature"
             )
         progress("measuring the gain", 0.9)
+        here = found.setting or here
+        notes = (*notes, *(one.text(loop, here.runs) for one in found.faults))
         return _answer(task, here, runs, found, notes)
 
 
@@ -173,8 +175,8 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
     gain = _gain(held, runs, found)
     model = extended_of(final if n == final.robot.nv else start)
     diagnosis = Diagnosis(
-        verdict=found.verdict,
-        causes=tuple(_cause(one, found, here) for one in found.named) if named else (),
+        verdict=_verdict(found),
+        causes=(*_faulty(found, here), *(_cause(one, found, here) for one in (found.named if named else ()))),
         p_value=found.p_value,
         joints=tuple(loop.robot.dof_names[k] for k in loop.measured),
         before=before,
@@ -194,6 +196,30 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
     )
     predictions = {run.name: (run.time, held[run.name][1]) for run in runs if run.holdout}
     return RolloutDiagnosis(diagnosis, final, predictions)
+
+
+def _verdict(found: Search) -> Verdict:
+    """With rows named that no loop explains; what is left beside them stays a rest."""
+    if not found.faults:
+        return found.verdict
+    with_faults: dict[Verdict, Verdict] = {"nothing": "named", "unknown": "named+rest"}
+    return with_faults.get(found.verdict, found.verdict)
+
+
+def _faulty(found: Search, here: Setting) -> list[Cause]:
+    """Rows that were left out of every fit, as causes with their place and time."""
+    causes, names = [], here.loop.robot.dof_names
+    for one in found.faults:
+        at = () if one.kind == "clock_error" else tuple(names[j] for j in one.joints)
+        size = ("delay", "s") if one.kind == "clock_error" else ("torque", "N m")
+        parameters = {
+            "first": Estimate(one.first, 0.5, "s"),
+            "last": Estimate(one.last, 0.5, "s"),
+            size[0]: Estimate(one.size, float("inf"), size[1]),
+        }
+        gain = Gain(found.held[0], found.held[0], "rad")
+        causes.append(Cause(Name(one.kind, at), parameters, 0.9, gain, note=one.text(here.loop, here.runs)))
+    return causes
 
 
 def simulated(loop: Loop, run: Run) -> np.ndarray:
