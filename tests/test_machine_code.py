@@ -86,11 +86,21 @@ def test_a_normal_matrix_of_machine_code_is_the_sum_of_the_rows(
     tau, extra = random.normal(size=(samples, model.nv)), random.normal(size=(samples, model.nv, 2))
     weight = random.uniform(0.5, 2.0, (samples, model.nv))
     found = fj.normal_matrix(model, q, v, a, tau, weight=weight, extra=extra)
+    factor = np.asarray(fj.triangular_factor(model, q, v, a, tau, weight=weight, extra=extra))
+    halves = fj.triangular_factor(model, q[:70], v[:70], a[:70], tau[:70], weight=weight[:70], extra=extra[:70])
+    rest = fj.triangular_factor(model, q[70:], v[70:], a[70:], tau[70:], weight[70:], extra[70:], total=halves)
+    bare = np.asarray(fj.triangular_factor(model, q, v, a))
     monkeypatch.setattr(code, "FROM", samples + 1)  # now by the plain form
     rows = np.concatenate([np.asarray(fj.joint_torque_regressor(model, q, v, a)), extra], axis=2)
     agree(found.matrix, np.einsum("sij,si,sik->jk", rows, weight, rows), 1e-12)
     agree(found.moment, np.einsum("sij,si,si->j", rows, weight, tau), 1e-12)
     agree(found.square, (weight * tau**2).sum(), 1e-12)
+    whole = np.concatenate([rows, tau[..., None]], axis=2)
+    products = np.einsum("sij,si,sik->jk", whole, weight, whole)
+    for one in (factor, np.asarray(rest)):
+        assert np.array_equal(one, np.triu(one)) and (np.diagonal(one) >= 0).all()
+        agree(one.T @ one, products, 1e-12)
+    agree(bare.T @ bare, np.einsum("sij,sik->jk", rows[..., :-2], rows[..., :-2]), 1e-12)
 
 
 @pytest.mark.parametrize("angle", [2e5, np.nan])

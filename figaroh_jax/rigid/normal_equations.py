@@ -6,7 +6,7 @@ number may not be squared. Both add up over pieces of the data: the answer for e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from .regressor import BLOCK_FORM, block_codes, block_rows, coordinate_blocks, c
 __all__ = ["NormalMatrix", "normal_matrix", "triangular_factor"]
 
 SMALL = 160  # columns of a normal matrix
+PANEL = 16  # columns that a QR factorisation takes together
 AT_ONCE = 512  # samples of a product on a CPU, by machine code
 TOGETHER = 4096  # samples of a product on a GPU
 DEVICE_BYTES = 1e9  # of the blocks of a chunk on a GPU
@@ -105,6 +106,9 @@ def triangular_factor(
     rows = _rows(model, q, v, a, tau, weight, extra)
     columns = 10 * len(model.joints) + sum(np.shape(x)[-1] for x in (extra,) if x is not None) + (tau is not None)
     start = jnp.zeros((columns, columns)) if total is None else jnp.asarray(total, jnp.float64)
+    if on_host(model, rows, start) and (own := _factor_by_machine_code(model, columns, rows)) is not None:
+        whole = np.concatenate([np.asarray(start), own])
+        return _upright(jnp.asarray(np.linalg.qr(whole, mode="r")))
     return _upright(_fold(_add_rows, 2 * chunk_size(), start, model, rows))
 
 
@@ -256,6 +260,41 @@ def _by_machine_code(model: RobotModel, groups: Sequence[_Group], rows: _Rows) -
     code = machine_code(BLOCK_FORM, model, rows.q, rows.v, rows.a)
     if code is None:
         return None
+    totals = [np.zeros((len(g.coordinates), g.columns.shape[1], g.columns.shape[1])) for g in groups]
+    for group, k, both in _coded_rows(code, model, groups, rows):
+        totals[group][k] += both @ both.T
+    return tuple(totals)
+
+
+def _factor_by_machine_code(model: RobotModel, columns: int, rows: _Rows) -> Float[np.ndarray, "rows columns"] | None:
+    """Rows with the same products as those of the regressor, from a triangular factor of each coordinate's own columns.
+
+    A piece goes onto a factor by a QR factorisation that knows of its zeros (LAPACK's tpqrt).
+    """
+    code = machine_code(BLOCK_FORM, model, rows.q, rows.v, rows.a)
+    if code is None:
+        return None
+    from scipy.linalg.lapack import dtpqrt  # pyright: ignore[reportAttributeAccessIssue]  (scipy is slow to import)
+
+    groups = _groups(model, columns)
+    factors = [[np.zeros((g.columns.shape[1],) * 2, order="F") for _ in g.coordinates] for g in groups]
+    for group, k, both in _coded_rows(code, model, groups, rows):
+        factors[group][k] = dtpqrt(0, min(PANEL, len(both)), factors[group][k], both.T, overwrite_a=1, overwrite_b=1)[0]
+    parts = []
+    for group, own in zip(groups, factors, strict=True):
+        for place, factor in zip(group.columns, own, strict=True):
+            parts.append(np.zeros((len(factor), columns)))
+            parts[-1][:, place] = factor
+    return np.concatenate(parts)
+
+
+def _coded_rows(
+    code: Callable[..., np.ndarray], model: RobotModel, groups: Sequence[_Group], rows: _Rows
+) -> Iterator[tuple[int, int, Float[np.ndarray, "columns samples"]]]:
+    """Weighted rows of each coordinate, a piece of the samples at a time: group, place in it, and columns by samples.
+
+    The next one may overwrite them.
+    """
     samples, memory = len(rows.q), np.empty(0)
 
     def room(shape: tuple[int, ...], fill: float | None) -> np.ndarray:
@@ -263,27 +302,25 @@ def _by_machine_code(model: RobotModel, groups: Sequence[_Group], rows: _Rows) -
         memory = memory if memory.shape == shape else aligned(shape, fill)
         return memory
 
-    beside = [
-        np.moveaxis(np.asarray(x).reshape(samples, model.nv, -1), 0, -1)
-        for x in (rows.extra, rows.tau)
-        if x is not None
-    ]
-    side = np.concatenate(beside, axis=1)  # coordinates, columns, samples
-    totals = [np.zeros((len(g.coordinates), g.columns.shape[1], g.columns.shape[1])) for g in groups]
+    given = [x for x in (rows.extra, rows.tau) if x is not None]
+    side = np.concatenate([np.zeros((model.nv, 0, samples)), *(_by_coordinate(x, model.nv) for x in given)], axis=1)
     for start in range(0, samples, AT_ONCE):
         piece = slice(max(0, min(start, samples - AT_ONCE)), min(start + AT_ONCE, samples))
         blocks = code(room, *(x[piece] for x in (rows.q, rows.v, rows.a)))
         root = np.array(rows.root[piece].T)
         root[:, : start - piece.start] = 0.0  # what the piece before has had
-        for total, group in zip(totals, groups, strict=True):
+        for number, group in enumerate(groups):
             both = np.empty((group.columns.shape[1], blocks.shape[2]))
             for k, (coordinate, links) in enumerate(zip(group.coordinates, group.blocks, strict=True)):
                 own, first = blocks[links[0] : links[0] + len(links)], 4 * len(links)  # they stand side by side
                 np.multiply(own[:, :4], root[coordinate], out=both[:first].reshape(*own[:, :4].shape))
                 np.multiply(own[:, 4:], root[coordinate], out=both[first : 10 * len(links)].reshape(*own[:, 4:].shape))
                 np.multiply(side[coordinate, :, piece], root[coordinate], out=both[10 * len(links) :])
-                total[k] += both @ both.T
-    return tuple(totals)
+                yield number, k, both
+
+
+def _by_coordinate(x: np.ndarray, coordinates: int) -> Float[np.ndarray, "nv k samples"]:
+    return np.moveaxis(np.asarray(x).reshape(len(x), coordinates, -1), 0, -1)
 
 
 def _add_rows(model: RobotModel, total: Array, rows: _Rows) -> Array:
