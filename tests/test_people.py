@@ -40,7 +40,7 @@ def stick(folder: Path) -> fj.RobotModel:
 def motion(robot: fj.RobotModel, samples: int, rate: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Time and positions: sums of slow sines, of the root too."""
     rng, t = np.random.default_rng(seed), np.arange(samples) / rate
-    wave = sum(
+    wave: np.ndarray = sum(  # pyright: ignore[reportAssignmentType]
         np.sin(2 * np.pi * np.outer(t, rng.uniform(0.2, 0.8, robot.nv)) + rng.uniform(0, 6, robot.nv)) for _ in "ab"
     )
     q = np.zeros((samples, robot.nq))

@@ -127,7 +127,7 @@ class GenesisBackend(Backend):
     ) -> Float[np.ndarray, "*batch nv"]:
         """`M a + bias` by the terms of Genesis's forward dynamics."""
         samples = host_samples(self, q=q, v=v, a=a)
-        return samples.restore(self._torques(*samples))
+        return samples.restore(self._torques(samples[0], samples[1], samples[2]))
 
     def forward_dynamics(
         self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], tau: Float[ArrayLike, "*batch nv"]

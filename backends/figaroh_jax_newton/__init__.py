@@ -36,7 +36,9 @@ from figaroh_jax.simulators.parent_axes import numbers, rates, refuse_inner_free
 
 __all__ = ["NewtonBackend"]
 
-wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # it prints its devices and each kernel's module
+_LEVEL, wp.config.log_level = wp.config.log_level, wp.LOG_ERROR
+wp.init()  # without the list of devices, and without a warning where there is no GPU
+wp.config.log_level = max(_LEVEL, wp.LOG_WARNING)  # it prints each kernel's module too
 _MOST = int(os.environ.get("FIGAROH_JAX_NEWTON_WORLDS", "1024"))  # replicated robots: larger batches go in turns
 
 
@@ -154,7 +156,7 @@ class NewtonBackend(Backend):
     ) -> Float[np.ndarray, "*batch nv"]:
         """`newton.eval_inverse_dynamics_force`."""
         samples = host_samples(self, q=q, v=v, a=a)
-        return samples.restore(self._torques(*samples))
+        return samples.restore(self._torques(samples[0], samples[1], samples[2]))
 
     def forward_dynamics(
         self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], tau: Float[ArrayLike, "*batch nv"]
