@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 import robots
 from test_general_dynamics import random_tree
 
+from figaroh_jax.compiled import kernels
 from figaroh_jax.compiled.batching import DRAFT_OPTIONS
 from figaroh_jax.compiled.kernels import Number, Straight, launch, straight_answers
 from figaroh_jax.rigid import dynamics, regressor, scalar_programs
@@ -142,6 +144,29 @@ def test_transformations(tmp_path: Path):
     agree(answers[0], plainly(torques, model, q, v, a))
 
 
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated")
+def test_a_jax_without_triton_takes_the_plain_form_on_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    model = robots.load(robots.ARM, tmp_path)
+    q, v, a = states(model, 7)
+
+    def lowered() -> str:
+        kernels._triton.cache_clear()
+        kernels._batched.cache_clear()
+        program = jax.jit(lambda *x: straight_answers(FORMS["torques"], model, *x)).trace(q, v, a)
+        return program.lower(lowering_platforms=("cuda",)).as_text()
+
+    assert "triton" in lowered()
+    monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
+    monkeypatch.delattr("jax.experimental.pallas.triton", raising=False)
+    try:
+        assert "triton" not in lowered()
+    finally:
+        monkeypatch.undo()
+        kernels._triton.cache_clear()
+        kernels._batched.cache_clear()
+
+
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated")
 @pytest.mark.skipif(jax.default_backend() != "gpu", reason="needs an NVIDIA GPU")
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("robot", ["ARM", "TREE", "GENERAL"])

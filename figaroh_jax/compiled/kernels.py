@@ -121,9 +121,19 @@ class Straight(NamedTuple):
 
 def usable(*arrays: Any) -> bool:
     """Whether there is a GPU that the kernels are for, and none of the arrays is spread over several devices."""
-    if jax.default_backend() != "gpu":
+    if jax.default_backend() != "gpu" or not _triton():
         return False
     return all(len(getattr(x, "devices", lambda: ())()) <= 1 for x in arrays if not isinstance(x, Tracer))
+
+
+@lru_cache(maxsize=1)
+def _triton() -> bool:
+    """Whether this JAX makes kernels by Triton: 0.11 says that a later one will not."""
+    try:
+        from jax.experimental.pallas import triton
+    except ImportError:
+        return False
+    return hasattr(triton, "CompilerParams")
 
 
 def known_codes(straight: Straight, parameters: Any) -> bytes:
@@ -175,6 +185,8 @@ def _batched(straight: Straight, codes: bytes) -> Callable[..., Array]:
 
     @jax.custom_batching.custom_vmap
     def call(parameters: Any, *arrays: Array) -> Array:
+        if not _triton():
+            return straight.plain(parameters, *arrays)
         kernel = partial(_kernel, straight, codes)
         return lax.platform_dependent(parameters, *arrays, cuda=kernel, default=straight.plain)
 
