@@ -70,7 +70,7 @@ def test_a_clock_that_jumps_and_a_joint_that_is_held_are_told_with_time_and_plac
 @pytest.mark.slow
 @pytest.mark.parametrize("hidden", [[], [("stribeck_friction", 2, 0.3)]])
 def test_an_arm_gets_no_wrong_name(tmp_path: Path, hidden: list):
-    """What is named is hidden there; `unknown` is allowed: the rest must be noise in the simulation of the whole arm."""
+    """What is named is hidden there; `unknown` is allowed: the rest must be noise in the whole arm's simulation."""
     (tmp_path / "arm.xml").write_text(servo_arm6.model_text(1.6))
     loop, _ = load_loop(tmp_path / "arm.xml")
     runs = [recorded(hidden, k) for k in range(2)]
