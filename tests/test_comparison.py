@@ -9,6 +9,8 @@ from synthetic import made_rows
 
 from figaroh_jax.diagnosis.comparison import (
     Hypothesis,
+    coefficients,
+    fewer_sums,
     fold_sums,
     ground,
     grown_sums,
@@ -16,6 +18,7 @@ from figaroh_jax.diagnosis.comparison import (
     judge_grown,
     overlap,
     shares_of_wins,
+    sums_of,
     t_value,
 )
 from figaroh_jax.estimation.rows import Prior, Rows
@@ -70,6 +73,19 @@ def test_sums_grown_by_columns_are_the_sums_of_all_columns(rows: Rows) -> None:
     grown, whole = grown_sums(rows, fold_sums(rows, rows.X), both), fold_sums(rows, both)
     for one, other in zip(grown, whole, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
+
+
+def test_sums_of_fewer_columns_and_of_another_torque_are_those_computed_from_scratch(rows: Rows) -> None:
+    torque, known = np.random.default_rng(4).normal(size=rows.y.shape), fold_sums(rows, rows.X)
+    pairs = (
+        (fewer_sums(known, [1]), fold_sums(rows, rows.X[:, :, [0, 2]])),
+        (sums_of(rows, known, torque), fold_sums(rows, rows.X, torque)),
+    )
+    for short, whole in pairs:
+        for one, other in zip(short, whole, strict=True):
+            np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
+    theta = coefficients(known, PRIOR)
+    np.testing.assert_allclose(theta, refit(rows, rows.y, rows.X, PRIOR, -2)[0], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("joints", [(1,), (0, 1)])
