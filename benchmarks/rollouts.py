@@ -25,6 +25,7 @@ import numpy as np
 from figaroh_jax.rollouts.alone import alone, carried_by
 from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.data import Run, Stretch, windows
+from figaroh_jax.rollouts.faults import faults
 from figaroh_jax.rollouts.fit import fit, start_of
 from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.parameters import Entry, put, values
@@ -212,6 +213,18 @@ def so101_sage(motions: list[str], third: int | None, most: float, unseen: float
         show_motions(label, model, [_shorter(r, unseen) for r in so101_runs(TEST)])
 
 
+def so101_faults() -> None:
+    """What is told of whole recordings, three with known faults among them, with a roughly fitted arm."""
+    loop = so101_loop(kp=12.0)
+    friction, damping = np.array([0.1, 0.3, 0.4, 0.14, 0.1, 0.1]), np.array([0.6, 0.3, 0.3, 0.3, 0.6, 0.6])
+    loop = eqx.tree_at(lambda m: (m.joints.friction, m.joints.damping), loop, (friction, damping))
+    whole = ("hold_under_gravity", "large_amplitude", "chirp_sweep", "single_joint_wrist_roll")
+    first = {"multisine": ((0.0, 60.0),), "step_response": ((0.0, 60.0),)}
+    runs = so101_runs(dict.fromkeys(whole, WHOLE) | first)
+    for one in faults(loop, runs, [simulated(loop, run) for run in runs]):
+        print(one.text(loop, runs))
+
+
 def so101_speed() -> None:
     """CPU seconds of the squares and sensitivities of 60 s, warm: the whole arm at once, and its joints one by one."""
     loop, run = so101_loop(), _shorter(so101_runs({"multisine": WHOLE})[0], 60.0)
@@ -273,7 +286,9 @@ def show(found: Search, causes: list[str]) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", choices=["servo_miuzei", "dfki_double_pendulum", "so101_sage", "so101_speed"])
+    parser.add_argument(
+        "data", choices=["servo_miuzei", "dfki_double_pendulum", "so101_sage", "so101_speed", "so101_faults"]
+    )
     parser.add_argument("--window", type=float, default=0.3, help="s, of the double pendulum")
     parser.add_argument("--law", choices=["hard", "soft"], default="hard")
     parser.add_argument("--every", type=int, default=1, help="takes one window of so many")
@@ -285,6 +300,8 @@ if __name__ == "__main__":
     args = parser.parse_args()
     if args.data == "so101_speed":
         so101_speed()
+    elif args.data == "so101_faults":
+        so101_faults()
     elif args.data == "so101_sage":
         so101_sage(args.motions, args.third, args.most, args.unseen, args.forbid)
     elif args.data == "servo_miuzei":
