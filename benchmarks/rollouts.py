@@ -3,6 +3,7 @@
     python benchmarks/rollouts.py servo_miuzei      # a hobby servo with a weight: train, test and all other runs
     python benchmarks/rollouts.py dfki_double_pendulum --window 0.3
     python benchmarks/rollouts.py so101_sage [--third K]        # a 6-joint servo arm; K: that third is left out
+    python benchmarks/rollouts.py so101_speed                   # CPU seconds of sensitivities: arm and joints
 
 Data under the folder that FIGAROH_JAX_DATA names. It prints the RMS of the position error, rad, after each cause, on
 runs that were fitted and on runs that were not, each simulated from its first measured state by its command alone.
@@ -18,15 +19,19 @@ import time
 from pathlib import Path
 
 import equinox as eqx
+import jax
 import numpy as np
 
+from figaroh_jax.rollouts.alone import alone, carried_by
 from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.data import Run, Stretch, windows
-from figaroh_jax.rollouts.fit import fit
+from figaroh_jax.rollouts.faults import faults
+from figaroh_jax.rollouts.fit import fit, start_of
 from figaroh_jax.rollouts.loop import Loop
-from figaroh_jax.rollouts.parameters import Entry, put
+from figaroh_jax.rollouts.parameters import Entry, put, values
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import Search, search, setting
+from figaroh_jax.rollouts.search import Search, Setting, search, setting
+from figaroh_jax.rollouts.sensitivity import linear_sums
 from figaroh_jax.rollouts.task import simulated
 
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", "/data"))
@@ -170,20 +175,20 @@ def so101_loop(**values: float) -> Loop:
     return eqx.tree_at(where, loop, new)
 
 
-def so101_sage(third: int | None, most: float) -> None:
+def so101_sage(motions: list[str], third: int | None, most: float, unseen: float, forbid: list[str]) -> None:
     """Gains and viscous friction of every servo are fitted; what else the arm shows is sought."""
     loop = so101_loop()
-    runs = [r for k, r in enumerate(so101_runs(TRAIN)) if third is None or k % 3 != third]
+    runs = [r for k, r in enumerate(so101_runs({k: TRAIN[k] for k in motions})) if third is None or k % 3 != third]
     runs = [_shorter(r, most) for r in runs]
     cut = [
         Stretch(k, f, min(750, len(r.time) - f)) for k, r in enumerate(runs) for f in range(0, len(r.time) - 100, 750)
     ]
     here = setting(
         loop, runs, baseline=("joint_damping",), more=[("actuator_gain", name) for name in SO101], gains_known=False,
-        stretches=cut,
+        stretches=cut, forbid=forbid,
     )  # fmt: skip
     start = time.process_time()
-    found = search_arm(here)
+    found = search_arm(here, forbid=forbid)
     seconds = sum(len(r.time) for r in runs) * PERIOD
     print(
         f"verdict {found.verdict}, {time.process_time() - start:.0f} CPU s, {seconds:.0f} s of {len(runs)} recordings"
@@ -205,7 +210,48 @@ def so101_sage(third: int | None, most: float) -> None:
         "friction .35, kp 48, armature .05": so101_loop(friction=0.35, kp=48.0, armature=0.05),
     }
     for label, model in models.items():
-        show_motions(label, model, so101_runs(TEST))
+        show_motions(label, model, [_shorter(r, unseen) for r in so101_runs(TEST)])
+
+
+def so101_faults() -> None:
+    """What is told of whole recordings, three with known faults among them, with a roughly fitted arm."""
+    loop = so101_loop(kp=12.0)
+    friction, damping = np.array([0.1, 0.3, 0.4, 0.14, 0.1, 0.1]), np.array([0.6, 0.3, 0.3, 0.3, 0.6, 0.6])
+    loop = eqx.tree_at(lambda m: (m.joints.friction, m.joints.damping), loop, (friction, damping))
+    whole = ("hold_under_gravity", "large_amplitude", "chirp_sweep", "single_joint_wrist_roll")
+    first = {"multisine": ((0.0, 60.0),), "step_response": ((0.0, 60.0),)}
+    runs = so101_runs(dict.fromkeys(whole, WHOLE) | first)
+    for one in faults(loop, runs, [simulated(loop, run) for run in runs]):
+        print(one.text(loop, runs))
+
+
+def so101_speed() -> None:
+    """CPU seconds of the squares and sensitivities of 60 s, warm: the whole arm at once, and its joints one by one."""
+    loop, run = so101_loop(), _shorter(so101_runs({"multisine": WHOLE})[0], 60.0)
+    cut = [Stretch(0, f, 500) for f in range(0, len(run.time) - 500, 500)]
+    here = setting(loop, [run], stretches=cut)
+    theta = values(loop, here.known.table)
+    whole = _sums_seconds(loop, here, theta, np.array(here.baseline))
+    carried, total = carried_by(loop, [run]), 0.0
+    for j in range(6):
+        one, mine = alone(loop, [run], carried, j)
+        small = setting(one, mine, stretches=cut)
+        total += _sums_seconds(one, small, values(one, small.known.table), np.array(small.baseline))
+    print(
+        f"squares and sensitivities of {len(run.time) * PERIOD:.0f} s: arm {whole:.2f} CPU s, joints {total:.2f} CPU s"
+    )
+
+
+def _sums_seconds(loop: Loop, here: Setting, theta: np.ndarray, free: np.ndarray) -> float:
+    """The least of three, after one that compiles."""
+    found = []
+    for _ in range(4):
+        start = time.process_time()
+        with jax.enable_x64(True):
+            sums = linear_sums(loop, here.known.table, theta[None], free[None], here.data, start_of(here.data))
+            jax.block_until_ready(sums)
+        found.append(time.process_time() - start)
+    return min(found[1:])
 
 
 def show_motions(label: str, model: Loop, runs: list[Run]) -> None:
@@ -240,15 +286,24 @@ def show(found: Search, causes: list[str]) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", choices=["servo_miuzei", "dfki_double_pendulum", "so101_sage"])
+    parser.add_argument(
+        "data", choices=["servo_miuzei", "dfki_double_pendulum", "so101_sage", "so101_speed", "so101_faults"]
+    )
     parser.add_argument("--window", type=float, default=0.3, help="s, of the double pendulum")
     parser.add_argument("--law", choices=["hard", "soft"], default="hard")
     parser.add_argument("--every", type=int, default=1, help="takes one window of so many")
     parser.add_argument("--third", type=int, choices=[0, 1, 2], help="of the arm's recordings, left out of the fit")
     parser.add_argument("--most", type=float, default=999.0, help="s of each of the arm's recordings that are fitted")
+    parser.add_argument("--motions", nargs="+", choices=list(TRAIN), default=list(TRAIN), help="of the arm, fitted")
+    parser.add_argument("--unseen", type=float, default=999.0, help="s of each of the arm's motions that are predicted")
+    parser.add_argument("--forbid", nargs="*", default=[], help="effects that the arm's search leaves out")
     args = parser.parse_args()
-    if args.data == "so101_sage":
-        so101_sage(args.third, args.most)
+    if args.data == "so101_speed":
+        so101_speed()
+    elif args.data == "so101_faults":
+        so101_faults()
+    elif args.data == "so101_sage":
+        so101_sage(args.motions, args.third, args.most, args.unseen, args.forbid)
     elif args.data == "servo_miuzei":
         servo_miuzei(args.law)
     else:

@@ -18,7 +18,7 @@ def model_format(path: str | Path) -> str:
     suffix = Path(path).suffix.lower()
     known = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf"} | dict.fromkeys(USD, "usd")
     if suffix not in known:
-        raise InputError(f"{path}: a robot model is a .urdf, an .xml (MJCF) or a .usd, .usda, .usdc or .usdz file")
+        raise InputError(f"{path}: a robot model is a .urdf or an .xml (MJCF) file, or USD (.usd, .usda, .usdc, .usdz)")
     return known[suffix]
 
 

@@ -135,6 +135,15 @@ KEYS: dict[str, tuple[str, str, str]] = {
     "excite.view.tilt": ("rad", "0.8", "the target may be turned away by 1 rad"),
     "excite.view.near": ("m", "0.3", "from a distance of 0.1 m"),
     "excite.view.far": ("m", "3.0", "to a distance of 10 m"),
+    "excite.touch[].place": (
+        "m",
+        "[0.5, 0, 0.1]",
+        "no plane or socket is touched; the socket, or a point on the plane",
+    ),
+    "excite.touch[].axis": ("", "[0, 0, 1]", "a socket is open to every side; a plane needs its normal"),
+    "excite.touch[].radius": ("m", "0.2", "a plane is there within 0.3 m of its place"),
+    "excite.touch[].tilt": ("rad", "0.8", "the tool may come from any side"),
+    "excite.point": ("m", "[0, 0, 0.1]", "the origin of the tool frame touches planes and sockets"),
     "excite.ignore": ("", "[[hand, forearm]]", "every pair of bodies that no joint joins keeps clear"),
     "excite.measurement": ("", "{position: p, tool_frame: tool0}", "the device of the recordings"),
 }

@@ -69,7 +69,7 @@ def search_arm(
     found: list[Search] = []
     for number in range(_ROUNDS + 1):
         found = _each(here, joints, [True] * len(joints), [], progress, forbid)
-        best = _shared(here, joints, found, shared) if number < _ROUNDS else None
+        best = _shared(here, joints, found, shared, theta) if number < _ROUNDS else None
         if best is None:
             break
         shared.append(best[0])
@@ -104,13 +104,19 @@ def _begun(
 ) -> list[_Joint]:
     """The joints with their baselines fitted: among the measured others, then among the simulated ones corrected."""
     joints = _joints(here, theta, progress, share, known)
-    new = theta.copy()
+    new = theta
     for joint in joints:
-        own = [e.name != "payload" for e in joint.setting.known.table]
-        new[joint.entries[own]] = joint.fit.theta[own]
+        new = _with_own(new, joint, joint.fit.theta)
     structure = Structure(here.loop, here.known.table, here.data)
     model = _simulated(here, structure, new, np.concatenate(_halves([one.fit.start for one in joints])))
     return _joints(here, new, progress, share, known, model)
+
+
+def _with_own(theta: np.ndarray, joint: _Joint, own: np.ndarray) -> np.ndarray:
+    """The arm's numbers with a joint's own in them; payloads are the arm's."""
+    new, mine = theta.copy(), [e.name != "payload" for e in joint.setting.known.table]
+    new[joint.entries[mine]] = own[: len(mine)][mine]
+    return new
 
 
 def _halves(starts: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -251,7 +257,7 @@ def _place(entry: Entry, drives: dict[int, int]) -> tuple[int, ...]:
 
 
 def _shared(
-    here: Setting, joints: Sequence[_Joint], found: Sequence[Search], named: Sequence[Named]
+    here: Setting, joints: Sequence[_Joint], found: Sequence[Search], named: Sequence[Named], base: np.ndarray
 ) -> tuple[Named, np.ndarray] | None:
     """The cause of several joints that explains more than any cause of one, with the arm's numbers where it stands."""
     before = [held_out(one.fit, one.setting.data, here.folds) for one in joints]
@@ -263,7 +269,7 @@ def _shared(
     links = [c for c in here.known.candidates if c.effect == "payload" and c not in [n.candidate for n in named]]
     rest = max(level_of(one.fit, np.asarray(one.setting.data.weight)) for one in joints)
     if links and rest > 1.05:
-        candidate, thetas, fits = _payload(here, joints, links)
+        candidate, thetas, fits = _payload(here, joints, links, base)
         after = [held_out(f, one.setting.data, here.folds) for f, one in zip(fits, joints, strict=True)]
         gain = sum(float((b - a).sum()) for b, a in zip(before, after, strict=True))
         t = t_of(np.concatenate([b.ravel() for b in before]), np.concatenate([a.ravel() for a in after]))
@@ -273,10 +279,10 @@ def _shared(
     j = int(np.argmax(gains))
     if most > 0 and firsts[j] and firsts[j][0].candidate.effect == _SPREADS and len([g for g in gains if g > 0]) > 1:
         one, fitted = firsts[j][0], found[j].fits[0]
-        theta = values(here.loop, here.known.table)
+        theta = base
         for joint in joints:
-            theta[joint.entries] = joint.fit.theta
-        theta[joints[j].entries] = fitted.theta[: len(joints[j].entries)]
+            theta = _with_own(theta, joint, joint.fit.theta)
+        theta = _with_own(theta, joints[j], fitted.theta)
         mine = one.candidate._replace(entries=tuple(int(joints[j].entries[e]) for e in one.candidate.entries))
         best = one._replace(candidate=mine), theta
     return best
@@ -288,7 +294,7 @@ def _rms(here: Setting, squares: np.ndarray) -> float:
 
 
 def _payload(
-    here: Setting, joints: Sequence[_Joint], links: Sequence[Candidate]
+    here: Setting, joints: Sequence[_Joint], links: Sequence[Candidate], base: np.ndarray
 ) -> tuple[Candidate, np.ndarray, list[Fit]]:
     """The link whose payload lowers the squares of all joints most, fitted with every joint's own numbers."""
     entries = [c.entries[0] for c in links]
@@ -309,9 +315,10 @@ def _payload(
             fits, systems, cost, damping = new, other, sum(f.cost for f in new), damping / 5
         else:
             damping *= 10
-    theta = values(here.loop, here.known.table)
+    theta = base
     for joint, one in zip(joints, fits, strict=True):
-        theta[joint.entries] = one.theta
+        theta = _with_own(theta, joint, one.theta)
+    theta[entries[best]] += fits[0].theta[int(np.flatnonzero(joints[0].entries == entries[best])[0])]
     return links[best], theta, [_without(f, joint, entries[best]) for f, joint in zip(fits, joints, strict=True)]
 
 

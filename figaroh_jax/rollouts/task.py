@@ -51,7 +51,7 @@ EFFECTS = {  # parameters of effects and the fields of `Joints` that hold them
     "load_dependent_friction": {"ratio": "load_ratio"},
     "joint_spring": {"stiffness": "stiffness", "offset": "offset"},
 }
-_WINDOW = 15.0  # s
+_WINDOW, _OPEN = 15.0, 1.0  # s
 _TURN = 12.0  # a command that many times beyond what the joint did is in other units
 
 
@@ -144,11 +144,16 @@ def diagnosis_setting(task: Task, loop: Loop, runs: Sequence[Run]) -> Setting:
 
 
 def _cut(task: Task, loop: Loop, runs: Sequence[Run]) -> tuple[Stretch, ...]:
-    """Windows of the task's length; `auto`: whole recordings of one joint, else 15 s, which run side by side."""
+    """Windows of the task's length; `auto`: whole recordings of one joint, else 15 s, which run side by side.
+
+    An arm with a joint that no drive brings back to its command may leave any motion: its windows are of 1 s.
+    """
     wanted = task.rollout.window
     if wanted == "whole" or (wanted == "auto" and not separable(loop)):
         return ()
-    length = _WINDOW if wanted == "auto" else float(wanted)
+    back = (np.asarray(loop.drives.transmission) != 0) & (np.asarray(loop.drives.bias)[:, [1]] < 0)
+    auto = _WINDOW if back.any(0).all() else _OPEN
+    length = auto if wanted == "auto" else float(wanted)
     found = []
     for k, run in enumerate(r for r in runs if not r.holdout):
         rows = max(2, round(length / regular(run.name, run.time)))
