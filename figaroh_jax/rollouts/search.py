@@ -38,6 +38,7 @@ __all__ = [
 
 _WORTH, _SURE, _ALIKE = 0.004, 1.64, 1.7  # held-out gain and t of a name; t below which two causes are alike
 _CLEAR = 3.0  # t of a name beside which more than noise is left
+_MUCH = 0.25  # held-out gain of such a name, unless it is one that every joint has: less may stand in for the rest
 _SHORT = 6  # candidates that are fitted where a linear screening can order them
 _SHORTER = 4  # of one joint of an arm
 _GROUP = 25  # rows whose mean shows a slow misfit
@@ -430,8 +431,10 @@ def _best(
     p = float(max(ndtr(-4 * now.excess), 1e-12))
     sure = _SURE if now.excess >= 1.0 else 2.5
     several = here.loop.carried is not None and _by_recording(here)
-    needs = [_CLEAR if several and one.state.excess >= 1.0 else sure for one in tried]  # beside a rest: more
-    passing = [k for k in range(len(tried)) if gains[k] > _WORTH and ts[k] > needs[k] and _sized(here, tried[k])]
+    beside = [several and one.state.excess >= 1.0 for one in tried]  # a rest, of an arm: more is asked
+    needs = [_CLEAR if rest else sure for rest in beside]
+    worth = [_MUCH if r and t.candidate.effect not in BASELINE else _WORTH for r, t in zip(beside, tried, strict=True)]
+    passing = [k for k in range(len(tried)) if gains[k] > worth[k] and ts[k] > needs[k] and _sized(here, tried[k])]
     for k in np.argsort(gains)[::-1][:3]:
         why = "no better than another" if k in passing else "gains too little on data that it was not fitted to"
         nearest.append((Name(tried[k].candidate.effect, tried[k].candidate.at), float(max(gains[k], 0.0)), why))
