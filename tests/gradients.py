@@ -103,8 +103,8 @@ OTHERS = frozenset(
     "Baseline BlockLevenbergMarquardt CATALOGUE Cause Device Diagnosis Effect ExtendedModel Fit Frame InputError Joint"
     " LinearFit Motion PoseData Preprocess Recording RobotModel TorqueData amplitude backend calibrate calibrate_task"
     " diagnose diagnose_task extend identify identify_task linear_basis linear_limits load_extended load_mjcf"
-    " load_model load_robot load_task load_urdf own_device place pose_data postures read_recordings recording register"
-    " shape torque_data write_model write_report"
+    " load_model load_robot load_task load_urdf load_usd own_device place pose_data postures read_recordings recording"
+    " register shape torque_data write_model write_report"
     " Design Instrument Learned PostureDesign Trajectory excite excite_postures excite_task fourier learn limits_of"
     " quintic spline"
     " JointEffect Load PoseRecording RolloutData Selection load_loop rollout_data select".split()

@@ -111,7 +111,7 @@ def test_most_hidden_effects_are_named_at_their_place():
 
 
 @needs_robots
-@pytest.mark.parametrize("chosen", [range(2), pytest.param(range(len(HIDDEN)), marks=pytest.mark.slow)], ids=len)
+@pytest.mark.parametrize("chosen", [range(1), pytest.param(range(len(HIDDEN)), marks=pytest.mark.slow)], ids=len)
 def test_no_hidden_effect_gets_a_confident_wrong_name(chosen: range):
     scores = [score_of_hidden_effect(k) for k in chosen]
     assert sum(s.grade == "right" for s in scores) >= 0.8 * len(scores), table(scores)
@@ -125,7 +125,7 @@ def test_nothing_is_named_in_clean_recordings():
 
 
 @needs_robots
-@pytest.mark.parametrize("effect", [*LEFT_OUT[:2], *(slow(effect) for effect in LEFT_OUT[2:])])
+@pytest.mark.parametrize("effect", [*LEFT_OUT[:1], *(slow(effect) for effect in LEFT_OUT[1:])])
 def test_an_effect_left_out_of_the_catalogue_is_unknown(effect: str):
     case = make_case([(effect, 0.08)], robot=ROBOTS[0], seed=300 + LEFT_OUT.index(effect))
     answer = diagnosis_of(case, forbid=(effect,))
