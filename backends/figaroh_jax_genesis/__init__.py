@@ -29,10 +29,10 @@ from genesis.utils.misc import qd_to_torch
 
 from figaroh_jax.errors import InputError, NotSupported
 from figaroh_jax.formats.mujoco_model import frame_poses
-from figaroh_jax.rigid.derivatives import coriolis_from_bias
 from figaroh_jax.rigid.inertia import from_com, to_com
 from figaroh_jax.rigid.model import RobotModel
-from figaroh_jax.simulators.contract import Backend, Capabilities, Reference, as_reference, file_format, host_samples
+from figaroh_jax.simulators.contract import Capabilities, Reference, as_reference, file_format, host_samples
+from figaroh_jax.simulators.from_torques import FromTorques
 from figaroh_jax.simulators.parent_axes import numbers, rates, refuse_inner_free_joints, unit_inertias, unit_regressor
 
 __all__ = ["GenesisBackend"]
@@ -41,8 +41,12 @@ _ENVIRONMENTS = int(os.environ.get("FIGAROH_JAX_GENESIS_ENVIRONMENTS", "64"))  #
 _LEAST = 1e-12  # kg, kg m^2: Genesis takes no link without a mass
 
 
-class GenesisBackend(Backend):
-    """A robot of Genesis; `simulator` is its `genesis.Scene`."""
+class GenesisBackend(FromTorques):
+    """A robot of Genesis; `simulator` is its `genesis.Scene`.
+
+    Mass matrix by `get_mass_mat`, torques `M a + bias` by the terms of its forward
+    dynamics.
+    """
 
     name: ClassVar[str] = "genesis"
     capabilities: ClassVar[Capabilities] = Capabilities(
@@ -97,46 +101,6 @@ class GenesisBackend(Backend):
         read = (entity.get_links_mass, entity.get_links_COM, entity.get_links_inertia)
         parts = [np.asarray(one().cpu(), float)[links] for one in read]
         return np.stack([from_com(*link) for link in zip(*parts, strict=True)])
-
-    def mass_matrix(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch nv nv"]:
-        """`get_mass_mat`."""
-        samples = host_samples(self, q=q)
-        return samples.restore(self._masses(samples[0]))
-
-    def coriolis_matrix(
-        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"]
-    ) -> Float[np.ndarray, "*batch nv nv"]:
-        """From differences of the quadratic bias torques, see `coriolis_from_bias`."""
-        samples = host_samples(self, q=q, v=v)
-        q, v = samples
-
-        def bias(around: Any) -> np.ndarray:
-            x = np.asarray(around).reshape(-1, self.nv)
-            return self._torques(np.repeat(q, self.nv, 0), x, np.zeros_like(x)).reshape(around.shape)
-
-        return samples.restore(np.asarray(coriolis_from_bias(self._robot, bias, self._masses(q), v)))
-
-    def gravity_vector(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch nv"]:
-        """Bias forces at rest."""
-        samples = host_samples(self, q=q)
-        rest = np.zeros((len(samples[0]), self.nv))
-        return samples.restore(self._torques(samples[0], rest, rest))
-
-    def inverse_dynamics(
-        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
-    ) -> Float[np.ndarray, "*batch nv"]:
-        """`M a + bias` by the terms of Genesis's forward dynamics."""
-        samples = host_samples(self, q=q, v=v, a=a)
-        return samples.restore(self._torques(samples[0], samples[1], samples[2]))
-
-    def forward_dynamics(
-        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], tau: Float[ArrayLike, "*batch nv"]
-    ) -> Float[np.ndarray, "*batch nv"]:
-        """Solve with Genesis's mass matrix for the torques less its bias forces."""
-        samples = host_samples(self, q=q, v=v, tau=tau)
-        q, v, tau = samples
-        bias = self._torques(q, v, np.zeros_like(v))
-        return samples.restore(np.linalg.solve(self._masses(q), (tau - bias)[..., None])[..., 0])
 
     def frame_placements(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch frames 4 4"]:
         """`get_links_pos` and `get_links_quat`."""

@@ -21,7 +21,6 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from figaroh_jax.errors import InputError
 from figaroh_jax.formats.mujoco_model import (
     compiled,
     drift,
@@ -32,9 +31,9 @@ from figaroh_jax.formats.mujoco_model import (
     rates,
     spatial_inertias,
 )
-from figaroh_jax.rigid.derivatives import coriolis_from_bias
 from figaroh_jax.rigid.model import RobotModel
-from figaroh_jax.simulators.contract import Backend, Capabilities, Reference, as_reference, file_format, host_samples
+from figaroh_jax.simulators.contract import Capabilities, Reference, as_reference, file_format, host_samples
+from figaroh_jax.simulators.from_torques import FromTorques
 
 __all__ = ["MujocoBackend"]
 
@@ -44,8 +43,11 @@ _CHUNK = 64  # samples of a task: what they need stays in the cache
 _MANY_BODIES = 16
 
 
-class MujocoBackend(Backend):
-    """A `mujoco.MjModel`: `simulator` is the user's own, with contacts and all, where an MJCF file was given."""
+class MujocoBackend(FromTorques):
+    """A `mujoco.MjModel`: `simulator` is the user's own, with contacts and all, where an MJCF file was given.
+
+    Mass matrix by `mj_crb`, torques by `mj_rne`.
+    """
 
     name: ClassVar[str] = "mujoco"
     capabilities: ClassVar[Capabilities] = Capabilities(
@@ -86,55 +88,6 @@ class MujocoBackend(Backend):
     def inertias(self) -> Float[np.ndarray, "links 10"]:
         """Inertial parameters of the links in MuJoCo's model."""
         return link_inertias(self._translation, self._simulator)
-
-    def mass_matrix(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch nv nv"]:
-        """Composite bodies (`mj_crb`)."""
-        samples = host_samples(self, q=q)
-        return samples.restore(self._masses(samples[0]))
-
-    def coriolis_matrix(
-        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"]
-    ) -> Float[np.ndarray, "*batch nv nv"]:
-        """From differences of MuJoCo's quadratic bias torques: exact, see `coriolis_from_bias`."""
-        samples = host_samples(self, q=q, v=v)
-        q, v = samples
-
-        def bias(around: Any) -> np.ndarray:
-            x = np.asarray(around).reshape(-1, self.nv)
-            return self._torques(np.repeat(q, self.nv, 0), x, np.zeros_like(x)).reshape(around.shape)
-
-        return samples.restore(np.asarray(coriolis_from_bias(self._robot, bias, self._masses(q), v)))
-
-    def gravity_vector(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch nv"]:
-        """`mj_rne` at rest."""
-        samples = host_samples(self, q=q)
-        rest = np.zeros((len(samples[0]), self.nv))
-        return samples.restore(self._torques(samples[0], rest, rest))
-
-    def inverse_dynamics(
-        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
-    ) -> Float[np.ndarray, "*batch nv"]:
-        """`mj_rne`."""
-        samples = host_samples(self, q=q, v=v, a=a)
-        return samples.restore(self._torques(*samples))
-
-    def forward_dynamics(
-        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], tau: Float[ArrayLike, "*batch nv"]
-    ) -> Float[np.ndarray, "*batch nv"]:
-        """Solve with the mass matrix of `mj_crb` for the torques less those of `mj_rne` without acceleration.
-
-        Raises `InputError` where a joint moves no mass.
-        """
-        samples = host_samples(self, q=q, v=v, tau=tau)
-        q, v, tau = samples
-        bias = self._torques(q, v, np.zeros_like(v))
-        try:
-            return samples.restore(np.linalg.solve(self._masses(q), (tau - bias)[..., None])[..., 0])
-        except np.linalg.LinAlgError:
-            raise InputError(
-                f"robot '{self._robot.name}': a joint moves no mass, so no torque tells its acceleration; "
-                "give its link an inertia"
-            ) from None
 
     def frame_placements(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch frames 4 4"]:
         """`mj_kinematics`."""

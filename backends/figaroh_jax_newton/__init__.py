@@ -28,10 +28,10 @@ from jaxtyping import Float
 
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.mujoco_model import frame_poses
-from figaroh_jax.rigid.derivatives import coriolis_from_bias
 from figaroh_jax.rigid.inertia import from_com, to_com
 from figaroh_jax.rigid.model import RobotModel
-from figaroh_jax.simulators.contract import Backend, Capabilities, Reference, as_reference, file_format, host_samples
+from figaroh_jax.simulators.contract import Capabilities, Reference, as_reference, file_format, host_samples
+from figaroh_jax.simulators.from_torques import FromTorques
 from figaroh_jax.simulators.parent_axes import numbers, rates, refuse_inner_free_joints, unit_inertias, unit_regressor
 
 __all__ = ["NewtonBackend"]
@@ -71,8 +71,12 @@ class _Worlds:
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
 
-class NewtonBackend(Backend):
-    """A robot of Newton; `simulator` is its `newton.Model`."""
+class NewtonBackend(FromTorques):
+    """A robot of Newton; `simulator` is its `newton.Model`.
+
+    Mass matrix by `newton.eval_inverse_dynamics_passive`, torques by
+    `newton.eval_inverse_dynamics_force`.
+    """
 
     name: ClassVar[str] = "newton"
     capabilities: ClassVar[Capabilities] = Capabilities(
@@ -110,7 +114,6 @@ class NewtonBackend(Backend):
         builder = newton.ModelBuilder()
         try:
             getattr(builder, f"add_{form}")(str(self._source))
-            builder.request_contact_attributes("force")
             return builder.finalize()
         except Exception as error:
             raise InputError(f"{self._source}: Newton's importer does not read it: {error}") from error
@@ -126,52 +129,6 @@ class NewtonBackend(Backend):
         model = self._of(1).model
         mass, com, about = (x.numpy().astype(float) for x in (model.body_mass, model.body_com, model.body_inertia))
         return np.stack([from_com(*link) for link in zip(mass, com, about, strict=True)])
-
-    def mass_matrix(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch nv nv"]:
-        """`newton.eval_inverse_dynamics_passive`."""
-        samples = host_samples(self, q=q)
-        return samples.restore(self._masses(samples[0]))
-
-    def coriolis_matrix(
-        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"]
-    ) -> Float[np.ndarray, "*batch nv nv"]:
-        """From differences of Newton's quadratic bias torques, see `coriolis_from_bias`."""
-        samples = host_samples(self, q=q, v=v)
-        q, v = samples
-
-        def bias(around: Any) -> np.ndarray:
-            x = np.asarray(around).reshape(-1, self.nv)
-            return self._torques(np.repeat(q, self.nv, 0), x, np.zeros_like(x)).reshape(around.shape)
-
-        return samples.restore(np.asarray(coriolis_from_bias(self._robot, bias, self._masses(q), v)))
-
-    def gravity_vector(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch nv"]:
-        """`newton.eval_inverse_dynamics_passive` at rest."""
-        samples = host_samples(self, q=q)
-        rest = np.zeros((len(samples[0]), self.nv))
-        return samples.restore(self._torques(samples[0], rest, rest))
-
-    def inverse_dynamics(
-        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
-    ) -> Float[np.ndarray, "*batch nv"]:
-        """`newton.eval_inverse_dynamics_force`."""
-        samples = host_samples(self, q=q, v=v, a=a)
-        return samples.restore(self._torques(samples[0], samples[1], samples[2]))
-
-    def forward_dynamics(
-        self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], tau: Float[ArrayLike, "*batch nv"]
-    ) -> Float[np.ndarray, "*batch nv"]:
-        """Solve, in float64, with Newton's mass matrix for the torques less its torques without acceleration."""
-        samples = host_samples(self, q=q, v=v, tau=tau)
-        q, v, tau = samples
-        bias = self._torques(q, v, np.zeros_like(v))
-        try:
-            return samples.restore(np.linalg.solve(self._masses(q), (tau - bias)[..., None])[..., 0])
-        except np.linalg.LinAlgError:
-            raise InputError(
-                f"robot '{self._robot.name}': a joint moves no mass, so no torque tells its acceleration; "
-                "give its link an inertia"
-            ) from None
 
     def frame_placements(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch frames 4 4"]:
         """`newton.eval_fk`."""
