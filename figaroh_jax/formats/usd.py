@@ -81,6 +81,14 @@ def load_usd(
 
     Raises `InputError` for a stage that does not open, and, with the names of the joints or bodies, for what is no
     tree: loops, two robots in one stage, joints that do not hold their axes.
+
+    >>> import pathlib, tempfile, figaroh_jax as fj
+    >>> has = '["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI"]'
+    >>> text = f'def Cube "box" (prepend apiSchemas = {has}) {{ float physics:mass = 2 }}'
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = pathlib.Path(folder, "box.usda").write_text(f"#usda 1.0\\n{text}")
+    ...     fj.load_usd(f"{folder}/box.usda").joint_names
+    ('root_joint',)
     """
     file = find_in_packages(path, packages)
     with _reading(file):
