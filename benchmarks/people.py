@@ -16,6 +16,7 @@ import sys
 import time
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -39,6 +40,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--trials", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--tissue", type=float, default=0.005, help="m, how far skin slides")
+    parser.add_argument("--noise", type=float, default=0.002, help="m, of a marker")
+    parser.add_argument(
+        "--exact", choices=["sizes", "all"], help="true sizes, or true sizes and positions: what is left"
+    )
+    parser.add_argument("--save", type=Path, help="folder for a file of errors and intervals for each person")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     print(
@@ -47,10 +54,13 @@ def main() -> None:
     print(f"{'':10}{'  found   table unscaled':>24}{'  found   table unscaled':>24}")
     for k in range(options.people):
         start = time.perf_counter()
-        line = study(np.random.default_rng(options.seed + k), options.seconds, options.trials)
+        line = study(np.random.default_rng(options.seed + k), options)
         force, moment = ("".join(f"{x:8.2f}" for x in line[key]) for key in ("force", "moment"))
         rest = f"{line['mass']:8.2f}{line['com']:8.2f}{line['size']:8.2f}{line['covered']:7.2f}"
         print(f"{options.seed + k:6}{'':4}{force}{moment}{rest}{time.perf_counter() - start:6.0f}", flush=True)
+        if options.save is not None:
+            options.save.mkdir(parents=True, exist_ok=True)
+            np.savez(options.save / f"{options.exact}_{options.tissue}_{options.seed + k}.npz", **line)
 
 
 def places(robot: fj.RobotModel) -> dict[str, tuple[str, np.ndarray]]:
@@ -69,17 +79,20 @@ def places(robot: fj.RobotModel) -> dict[str, tuple[str, np.ndarray]]:
     return found
 
 
-def study(rng: np.random.Generator, seconds: float, trials: int) -> dict:
+def study(rng: np.random.Generator, options: argparse.Namespace) -> dict:
     """One person from end to end."""
+    seconds, trials = options.seconds, options.trials
+    skin = {"tissue": options.tissue, "noise": options.noise}
     robot = fj.load_urdf(URDF, root="free_flyer")
     person = simulated.make_person(str(URDF), rng)
     own = places(robot)
     joint_of = {joint.link: joint.name for joint in robot.joints}
     simulated.put_markers(person, {label: (joint_of[link], at) for label, (link, at) in own.items()}, rng)
-    fitted = [simulated.record(person, rng, seconds) for _ in range(trials)]
-    unseen = simulated.record(person, rng, seconds)
-    data = size(robot, own, fitted[0])
-    captures = [captured(robot, own, data, trial) for trial in [*fitted, unseen]]
+    fitted = [simulated.record(person, rng, seconds, **skin) for _ in range(trials)]
+    unseen = simulated.record(person, rng, seconds, **skin)
+    data = size(robot, own, fitted[0]) if options.exact is None else true_size(robot, own, person, fitted[0])
+    known = person if options.exact == "all" else None
+    captures = [captured(robot, own, data, trial, known) for trial in [*fitted, unseen]]
     weight = float(np.mean([np.linalg.norm(c.wrench[:, :3], axis=1).mean() for c in captures[:-1]]))
     table = people.anthropometric(robot, weight / 9.81, "male", np.asarray(data.scale))
     found = people.identify_segments(captures[:-1], table)
@@ -94,10 +107,27 @@ def size(robot, own, trial):
     return markers.segment_sizes(robot, markers.marker_data(robot, own, seen)).data
 
 
-def captured(robot, own, fitted, trial):
-    """Positions by inverse kinematics with the sizes found (None: the model's), and the capture."""
-    import equinox as eqx
+def true_size(robot, own, person, trial):
+    """The sizes and the markers' places as they are."""
+    data = markers.marker_data(robot, own, {label: at[:2] for label, at in trial.markers.items()})
+    joint = {j.link: j.name for j in robot.joints}
+    scale = np.array([person.scale[joint[name]] for name in data.names])
+    true = [person.markers[label][1] for label in data.labels]
+    shift = np.array(true) - np.append(scale, 1.0)[np.array(data.segment)[list(data.link)], None] * data.place
+    return eqx.tree_at(lambda d: (d.scale, d.shift), data, (scale, shift))
 
+
+def captured(robot, own, fitted, trial, known=None):
+    """Positions by inverse kinematics with the sizes found (None: the model's), and the capture.
+
+    `known`: the person whose true positions are taken instead.
+    """
+    if known is not None:
+        q = np.empty((len(trial.time), robot.nq))
+        for joint, at in zip(robot.joints, robot.dofs.positions, strict=True):
+            there = known.model.joints[known.model.getJointId(joint.name if joint.parent >= 0 else "root_joint")]
+            q[:, at] = trial.q[:, there.idx_q : there.idx_q + there.nq]
+        return people.capture(fitted.robot(robot), trial.time, q, trial.plates, CUTOFF)
     data = markers.marker_data(robot, own, trial.markers)
     if fitted is not None:
         data = eqx.tree_at(lambda d: (d.scale, d.shift), data, (fitted.scale, fitted.shift))
@@ -130,6 +160,11 @@ def judged(person, robot, found, table, capture, unscaled, data, unseen) -> dict
         "size": 100 * float(np.abs(np.asarray(data.scale) / scales - 1).mean()),
         "covered": float((np.abs(off) < 1.96).mean()),
         "off": off,
+        "seen": found.seen,
+        "noise": found.noise,
+        "samples": found.samples,
+        "links": np.array(found.links),
+        "scale": np.asarray(data.scale) / scales - 1,
     }
 
 
