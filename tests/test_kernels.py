@@ -42,7 +42,8 @@ def by_hand(straight: Straight, codes: bytes, model: RobotModel, *arrays: np.nda
         for place, number in entries:
             answer[place] = number.x
 
-    reads = [lambda k, x=x: Number(jnp.asarray(x[:, k])) for x in arrays]
+    reads: list[Any] = [lambda k, x=x: Number(jnp.asarray(x[:, k])) for x in arrays]
+    reads.append(lambda places: [Number(jnp.asarray(answer[place])) for place in places])
     for program in straight.programs(model, codes):
         program(lambda k: jnp.asarray(constants[k]), reads, write)
     whole = answer if straight.finish is None else np.asarray(straight.finish(model, jnp.asarray(answer)))
@@ -123,6 +124,28 @@ def test_pieces_of_a_tree_are_written_into_one_answer(tmp_path: Path, monkeypatc
     arrays = states(model, 3)
     assert len(packed.programs(model, packed.known(model))) == 3
     agree(by_hand(packed, packed.known(model), model, *arrays), plainly(packed, model, *arrays))
+
+
+def test_torques_limb_by_limb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """An arm and a tree cut into pieces: what a limb hands over; a coordinate that two pieces share is not cut."""
+    monkeypatch.setattr(scalar_programs, "LIMB", 1)
+    scalar_programs._limbs.cache_clear()
+    try:
+        limbs = dynamics._LIMBS
+        arm, tree = robots.load(robots.ARM, tmp_path), random_tree(8, ("revolute", "prismatic") * 2).model
+        assert len(limbs.programs(arm, limbs.known(arm))) == 2 and len(limbs.programs(tree, limbs.known(tree))) > 2
+        for model in (arm, tree):
+            arrays = states(model, 3)
+            agree(by_hand(limbs, limbs.known(model), model, *arrays), plainly(limbs, model, *arrays))
+        arrays, answer = [jnp.asarray(x) for x in states(arm, 3)], None
+        shape, columns, constants = limbs.shape(arm), limbs.columns(arm), limbs.constants(arm)
+        for program in limbs.programs(arm, limbs.known(arm)):
+            answer = launch(program, constants, arrays, shape, columns, True, answer, interpret=True)
+        assert answer is not None
+        agree(answer[: arm.nv].T, plainly(limbs, arm, *arrays))
+        assert not scalar_programs.in_limbs(robots.load(robots.TREE, tmp_path))
+    finally:
+        scalar_programs._limbs.cache_clear()
 
 
 def test_transformations(tmp_path: Path):

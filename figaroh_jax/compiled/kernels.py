@@ -95,6 +95,7 @@ Read = Callable[[int], Number]  # column of an array -> its number
 Write = Callable[[Iterable[tuple[tuple[int, ...], Number]]], None]  # takes (place in the answer of a sample, number)
 Columns = Sequence[Sequence[tuple[int, int]]]  # (array, column) that are read together
 Program = Callable[..., None]  # program(load, reads, write); the arguments give and take numbers
+Back = Callable[[Sequence[tuple[int, ...]]], list[Number]]  # places in the answer -> what programs before wrote there
 
 
 class Straight(NamedTuple):
@@ -117,6 +118,7 @@ class Straight(NamedTuple):
     finish: Callable[[Any, Array], Array] | None = None  # of what they wrote, the samples last
     answer: Callable[[Any], tuple[int, ...]] = lambda parameters: ()  # shape of a sample's answer, finished
     places: Callable[[Any, tuple[int, ...]], Sequence[int]] | None = None  # in it, flat, of what a program writes
+    apart: Callable[[Any], Straight | None] = lambda parameters: None  # the same in smaller kernels, where one is large
 
 
 def usable(*arrays: Any) -> bool:
@@ -205,6 +207,7 @@ def _batched(straight: Straight, codes: bytes) -> Callable[..., Array]:
 
 
 def _kernel(straight: Straight, codes: bytes, parameters: Any, *arrays: Array) -> Array:
+    straight = straight.apart(parameters) or straight
     shape, columns = straight.shape(parameters), straight.columns(parameters)
     constants = straight.constants(parameters).astype(arrays[0].dtype)
     last = straight.last or prod(shape) > DIRECT or straight.finish is not None
@@ -229,8 +232,8 @@ def launch(
 ) -> Array:
     """Answers of a program for arrays (samples, k): (samples, *shape), or samples `last`.
 
-    `interpret` computes them without a GPU, slowly. What the program does not write is as in the answer `into`, which
-    is given away, or anything.
+    The program's `reads` are those of the arrays and, last, a `Back`. `interpret` computes them without a GPU, slowly.
+    What the program does not write is as in the answer `into`, which is given away, or anything.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
@@ -246,7 +249,7 @@ def launch(
         lanes = _Lanes(triton, given, out, samples, last, once[0] if pieces else None, columns)
         program(
             lambda k: table[k],
-            [partial(lanes.read, k) for k in range(len(arrays))],
+            [*(partial(lanes.read, k) for k in range(len(arrays))), lanes.back],
             lanes.write,
         )
 
@@ -292,13 +295,25 @@ class _Lanes:
             self.seen.update({one: Number(x) for one, x in zip(group, loaded, strict=True)})
         return self.seen[array, column]
 
+    def back(self, places: Sequence[tuple[int, ...]]) -> list[Number]:
+        """What programs before this one wrote."""
+
+        def read(index: Array, _: list[Array]) -> list[Array]:
+            mask = self._mask(index)
+            other = None if mask is None else 0.0
+            return [self.triton.load(self._at(place, index), mask=mask, other=other) for place in places]
+
+        return [Number(x) for x in self._apart(read, [jnp.zeros(LANES, self.out.dtype)] * len(places))]
+
+    def _at(self, place: tuple[int, ...], index: Array) -> Any:
+        return self.out.at[(*place, index) if self.last else (index, *place)]
+
     def write(self, entries: Iterable[tuple[tuple[int, ...], Number]]) -> None:
         places, numbers = zip(*entries, strict=True)
 
         def put(index: Array, values: list[Array]) -> list[Array]:
             for place, value in zip(places, values, strict=True):
-                at = self.out.at[(*place, index) if self.last else (index, *place)]
-                self.triton.store(at, value, mask=self._mask(index))
+                self.triton.store(self._at(place, index), value, mask=self._mask(index))
             return [*values[1:], -values[0]]  # changed, or the loop would be seen through
 
         self._apart(put, [_in_lanes(number, self.out.dtype) for number in numbers])
