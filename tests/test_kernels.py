@@ -17,7 +17,7 @@ from test_general_dynamics import random_tree
 from figaroh_jax.compiled import kernels
 from figaroh_jax.compiled.batching import DRAFT_OPTIONS
 from figaroh_jax.compiled.kernels import Number, Straight, launch, straight_answers
-from figaroh_jax.rigid import dynamics, regressor, scalar_programs
+from figaroh_jax.rigid import dynamics, normal_equations, regressor, scalar_programs
 from figaroh_jax.rigid.model import RobotModel
 
 FORMS = {
@@ -33,19 +33,23 @@ TREES = {
 }
 
 
-def by_hand(straight: Straight, codes: bytes, model: RobotModel, *arrays: np.ndarray) -> np.ndarray:
+def by_hand(straight: Straight, codes: bytes, model: RobotModel, *arrays: np.ndarray) -> Any:
     """Answers of the programs with an operation at a time."""
-    constants = np.asarray(straight.constants(model))
-    answer = np.full((*straight.shape(model), len(arrays[0])), np.nan)
+    constants, shape = np.asarray(straight.constants(model)), straight.shape(model)
+    many = isinstance(shape, list)
+    answers = [np.full((*one, len(arrays[0])), np.nan) for one in (shape if isinstance(shape, list) else [shape])]
+    answer = answers[0]
 
     def write(entries: Any) -> None:
         for place, number in entries:
-            answer[place] = number.x
+            (answers[place[0]] if many else answer)[place[1:] if many else place] = number.x
 
     reads: list[Any] = [lambda k, x=x: Number(jnp.asarray(x[:, k])) for x in arrays]
     reads.append(lambda places: [Number(jnp.asarray(answer[place])) for place in places])
     for program in straight.programs(model, codes):
         program(lambda k: jnp.asarray(constants[k]), reads, write)
+    if many:
+        return answers
     whole = answer if straight.finish is None else np.asarray(straight.finish(model, jnp.asarray(answer)))
     return whole if straight.last else np.moveaxis(whole, -1, 0)
 
@@ -146,6 +150,30 @@ def test_torques_limb_by_limb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         assert not scalar_programs.in_limbs(robots.load(robots.TREE, tmp_path))
     finally:
         scalar_programs._limbs.cache_clear()
+
+
+def test_rows_of_a_normal_matrix_are_written_by_coordinate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The programs against the plain rows, one kernel interpreted, and the sums that a GPU would make of them."""
+    model, arm = robots.load(robots.TREE, tmp_path), robots.load(robots.ARM, tmp_path)
+    random, count = np.random.default_rng(1), 3
+    q, v, a, tau, weight = random.standard_normal((5, 9, model.nv))
+    extra = random.standard_normal((9, model.nv, 2))
+    form = normal_equations._row_form(count)
+    arrays = [q, v, a, np.abs(weight), random.standard_normal((9, model.nv * count))]
+    written = by_hand(form, form.known(model), model, *arrays)
+    for found, expected in zip(written, plainly(form, model, *arrays), strict=True):
+        agree(found, expected)
+    small = [jnp.asarray(x[:, : arm.nv * (count if k == 4 else 1)]) for k, x in enumerate(arrays)]
+    (program,) = form.programs(arm, form.known(arm))
+    shape, columns, constants = form.shape(arm), form.columns(arm), form.constants(arm)
+    found = launch(program, constants, small, shape, columns, True, interpret=True)
+    for one, expected in zip(found, plainly(form, arm, *small), strict=True):
+        agree(one, expected)
+    expected = normal_equations.normal_matrix(model, q, v, a, tau, weight**2, extra)
+    monkeypatch.setattr(normal_equations, "usable", lambda *x: True)
+    monkeypatch.setattr(normal_equations, "on_host", lambda *x: False)
+    for one, other in zip(normal_equations.normal_matrix(model, q, v, a, tau, weight**2, extra), expected, strict=True):
+        agree(one, other)
 
 
 def test_transformations(tmp_path: Path):

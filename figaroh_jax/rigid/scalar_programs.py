@@ -37,6 +37,7 @@ __all__ = [
     "Written",
     "in_limbs",
     "straight",
+    "weighted_rows",
     "written",
     "written_torques",
 ]
@@ -744,6 +745,50 @@ def _blocks(coordinates: bool, model: RobotModel, codes: bytes) -> list[Program]
     return [of_links(links) for links in _pieces(model)]
 
 
+def _weighted_rows(side: int, model: RobotModel, codes: bytes) -> list[Program]:
+    """Of each coordinate all of a normal matrix's columns: those of the links, then `side` given ones; weighed."""
+    blocks = _rows(model, True)
+    first = {int(row): int(np.flatnonzero(blocks[:, 0] == row)[0]) for row in blocks[:, 0]}
+    place = {tuple(block): 10 * (k - first[block[0]]) for k, block in enumerate(blocks.tolist())}
+    pieces = _pieces(model)
+
+    def of_links(links: list[int]) -> Program:
+        def weighted_rows(load: Load, reads: list[Read], write: Write) -> None:
+            q, v, a, root, given = reads[:5]
+
+            def put(row: int, link: int, ten: list[Number]) -> None:
+                write([((row, place[row, link] + k), number * root(row)) for k, number in enumerate(ten)])
+
+            if links is pieces[0]:
+                for row, (count,) in enumerate(_row_lengths(side, model)):
+                    own = range(row * side, (row + 1) * side)
+                    write([((row, count - side + n), given(k) * root(row)) for n, k in enumerate(own)])
+            regressor_blocks(Robot(model.joints, codes, load), q, v, a, put, links, True)
+
+        return weighted_rows
+
+    return [of_links(links) for links in pieces]
+
+
+def _row_lengths(side: int, model: RobotModel) -> list[tuple[int]]:
+    counts = np.bincount(_rows(model, True)[:, 0], minlength=model.nv)
+    return [(10 * int(count) + side,) for count in counts]
+
+
+def weighted_rows(side: int, plain: Callable[..., list[Array]]) -> Straight:
+    """Rows (columns, samples) of each coordinate: of the links that it moves, then its `side` given ones.
+
+    The arrays are q, v, a, the roots of the weights (samples, nv) and the given columns (samples, nv * side).
+    """
+    form = _Form(f"rows beside {side}", partial(_weighted_rows, side), partial(_row_lengths, side), last=True)
+
+    def read(model: RobotModel) -> list[list[tuple[int, int]]]:
+        given = ([(4, row * side + n) for n in range(side)] for row in range(model.nv))
+        return [*columns(model), *([(3, row)] for row in range(model.nv)), *(one for one in given if one)]
+
+    return straight(form, plain)._replace(plain=plain, columns=read)
+
+
 def _pieces(model: RobotModel) -> list[list[int]]:
     """Links by depth first, cut where their blocks would be more than a kernel takes."""
     depth = ancestors(model.joints)[model.dofs.joint].sum(0)
@@ -822,7 +867,7 @@ class _Form(NamedTuple):
 
     name: str
     programs: Callable[[RobotModel, bytes], list[Program]]
-    shape: Callable[[RobotModel], tuple[int, ...]]
+    shape: Callable[[RobotModel], Any]
     finish: Callable[[RobotModel, Array], Array] | None = None
     last: bool = False
     answer: Callable[[RobotModel], tuple[int, ...]] | None = None
