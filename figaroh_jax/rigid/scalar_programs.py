@@ -26,7 +26,18 @@ from ..compiled.kernels import Load, Number, Program, Read, Straight, Write
 from .kinematics import ancestors
 from .model import Joint, Leaf, RobotModel, dofs
 
-__all__ = ["BLOCKS", "DENSE", "MASSES", "PACKED", "TORQUES", "Written", "straight", "written", "written_torques"]
+__all__ = [
+    "ACCELERATIONS",
+    "BLOCKS",
+    "DENSE",
+    "MASSES",
+    "PACKED",
+    "TORQUES",
+    "Written",
+    "straight",
+    "written",
+    "written_torques",
+]
 
 LOADED = 2  # code of a constant that is not known before; -1, 0 and 1 stand for themselves
 _SIZES = {"rotation": 9, "origin": 3, "across": 9, "twice": 9, "inertia": 10, "second": 6, "ratio": 1, "offset": 1}
@@ -555,6 +566,40 @@ def mass_entries(robot: Robot, q: Read, put: Callable[[int, int, Number], None])
         put(row, col, value)
 
 
+def accelerations(robot: Robot, q: Read, v: Read, tau: Read, put: Callable[[int, Number], None]) -> None:
+    """`put` receives the acceleration of every coordinate: a = M^-1 (tau - bias), M = L'DL (Featherstone 2008, 8.5).
+
+    From the last coordinate to the first that leaves the zeros of a tree where they are.
+    """
+    rest: dict[int, Number] = {}
+    M: dict[tuple[int, int], Number] = {}
+    torques(robot, q, v, lambda k: ZERO, lambda row, bias: rest.update({row: bias}))
+    rest = {row: tau(row) - bias for row, bias in rest.items()}
+    mass_entries(robot, q, lambda row, column, number: M.update({(row, column): number}))
+    order = sorted(rest)
+    above = {k: [i for i in order[:n] if (k, i) in M] for n, k in enumerate(order)}
+    inverse: dict[int, Number] = {}
+    for k in reversed(order):
+        inverse[k] = _inverse(M[k, k])
+        for i in reversed(above[k]):
+            share = M[k, i] * inverse[k]
+            for j in above[k]:
+                if j <= i:
+                    M[i, j] = M.get((i, j), ZERO) - share * M[k, j]
+                    above[i] = sorted({*above[i], *([j] if j < i else [])})
+            M[k, i] = share
+            rest[i] = rest[i] - share * rest[k]
+    for k in order:
+        rest[k] = rest[k] * inverse[k]
+        for i in above[k]:
+            rest[k] = rest[k] - M[k, i] * rest[i]
+        put(k, rest[k])
+
+
+def _inverse(x: Number) -> Number:
+    return Number(float("nan")) if x.known else Number(lax.div(lax.full_like(x.x, 1.0), x.x))
+
+
 def _joined(one: Body, two: Body) -> Body:
     rows = tuple(_add(x, y) for x, y in zip(one.inertia, two.inertia, strict=True))
     return Body(one.m + two.m, _add(one.h, two.h), rows)
@@ -637,6 +682,14 @@ def _masses(model: RobotModel, codes: bytes) -> list[Program]:
     return [mass_matrix]
 
 
+def _accelerations(model: RobotModel, codes: bytes) -> list[Program]:
+    def forward_dynamics(load: Load, reads: list[Read], write: Write) -> None:
+        q, v, tau = reads
+        accelerations(Robot(model.joints, codes, load), q, v, tau, lambda row, number: write([((row,), number)]))
+
+    return [forward_dynamics]
+
+
 def _whole_masses(model: RobotModel, upper: Array) -> Array:
     """From the entries on and above the diagonal that are not zero for every posture."""
     place = np.arange(model.nv)
@@ -702,6 +755,7 @@ def _mass_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
 
 _ANSWERS = {"rows": lambda model: (len(_rows(model, False)), 10), "blocks": lambda model: (len(_rows(model, True)), 10)}
 
+ACCELERATIONS = _Form("accelerations", _accelerations, lambda model: (model.nv,))
 TORQUES = _Form("torques", _torques, lambda model: (model.nv,))
 PACKED = _Form("packed", partial(_blocks, False), _ANSWERS["rows"], last=True)
 BLOCKS = _Form("blocks", partial(_blocks, True), _ANSWERS["blocks"], last=True)
