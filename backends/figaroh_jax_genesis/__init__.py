@@ -290,8 +290,8 @@ def _set_up() -> None:
 
 
 def _with_limits(path: Path) -> str:
-    """The URDF file, or its text with what Genesis does not do without: a limit, infinite, of every joint that moves."""
-    root, missing = read_xml(path, "robot"), False
+    """The URDF file, or its text with an infinite limit where a joint has none, which Genesis refuses."""
+    missing, root = False, read_xml(path, "robot")
     for joint in root.iter("joint"):
         if joint.get("type") in ("revolute", "prismatic") and joint.find("limit") is None:
             missing = True
