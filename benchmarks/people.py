@@ -3,9 +3,10 @@
     python benchmarks/people.py [--people N] [--seconds S] [--seed K]
 
 Each person is 5-20 % off the model in every segment's length and inertial parameters; markers slide by 5 mm with the
-skin and are seen to 2 mm; plates have noise and a zero. A line is a person: RMS error of the root's force (% of body
-weight) and moment (% of its RMS) on an unseen trial with the identified person, the scaled one with the table alone and
-the unscaled model; error of mass (%) and centre of mass (mm); share of the parameters within their 95 % intervals.
+skin and are seen to 2 mm; plates have noise and a zero of their own in every trial. A line is a person: RMS error of
+the root's force (% of body weight) and moment (% of its RMS) on an unseen trial, against plates without errors, with
+the identified person, the scaled one with the table alone and the unscaled model; error of mass (%) and centre of mass
+(mm); share of the parameters within their 95 % intervals.
 """
 
 from __future__ import annotations
@@ -92,12 +93,13 @@ def study(rng: np.random.Generator, options: argparse.Namespace) -> dict:
     unseen = simulated.record(person, rng, seconds, **skin)
     data = size(robot, own, fitted[0]) if options.exact is None else true_size(robot, own, person, fitted[0])
     known = person if options.exact == "all" else None
-    captures = [captured(robot, own, data, trial, known) for trial in [*fitted, unseen]]
-    weight = float(np.mean([np.linalg.norm(c.wrench[:, :3], axis=1).mean() for c in captures[:-1]]))
+    captures = [captured(robot, own, data, trial, known) for trial in fitted]
+    judge = captured(robot, own, data, unseen, known, exact=True)
+    weight = float(np.mean([np.linalg.norm(c.wrench[:, :3], axis=1).mean() for c in captures]))
     table = people.anthropometric(robot, weight / 9.81, "male", np.asarray(data.scale))
-    found = people.identify_segments(captures[:-1], table)
-    unscaled = captured(robot, own, None, unseen)
-    return judged(person, robot, found, table, captures[-1], unscaled, data, unseen)
+    found = people.identify_segments(captures, table)
+    unscaled = captured(robot, own, None, unseen, exact=True)
+    return judged(person, robot, found, table, judge, unscaled, data, unseen)
 
 
 def size(robot, own, trial):
@@ -117,28 +119,32 @@ def true_size(robot, own, person, trial):
     return eqx.tree_at(lambda d: (d.scale, d.shift), data, (scale, shift))
 
 
-def captured(robot, own, fitted, trial, known=None):
+def captured(robot, own, fitted, trial, known=None, exact=False):
     """Positions by inverse kinematics with the sizes found (None: the model's), and the capture.
 
-    `known`: the person whose true positions are taken instead.
+    `known`: the person whose true positions are taken instead; `exact`: with a second capture, of what plates without
+    noise and zeros would say.
     """
     if known is not None:
-        q = np.empty((len(trial.time), robot.nq))
+        q, model = np.empty((len(trial.time), robot.nq)), fitted.robot(robot)
         for joint, at in zip(robot.joints, robot.dofs.positions, strict=True):
             there = known.model.joints[known.model.getJointId(joint.name if joint.parent >= 0 else "root_joint")]
             q[:, at] = trial.q[:, there.idx_q : there.idx_q + there.nq]
-        return people.capture(fitted.robot(robot), trial.time, q, trial.plates, CUTOFF)
-    data = markers.marker_data(robot, own, trial.markers)
-    if fitted is not None:
-        data = eqx.tree_at(lambda d: (d.scale, d.shift), data, (fitted.scale, fitted.shift))
-    q = markers.joint_positions(robot, data).position
-    return people.capture(data.robot(robot), trial.time, q, trial.plates, CUTOFF)
+    else:
+        data = markers.marker_data(robot, own, trial.markers)
+        if fitted is not None:
+            data = eqx.tree_at(lambda d: (d.scale, d.shift), data, (fitted.scale, fitted.shift))
+        q, model = markers.joint_positions(robot, data).position, data.robot(robot)
+    plates = [trial.plates, trial.exact] if exact else [trial.plates]
+    both = [people.capture(model, trial.time, q, some, CUTOFF) for some in plates]
+    return both if exact else both[0]
 
 
-def judged(person, robot, found, table, capture, unscaled, data, unseen) -> dict:
-    truth = capture.wrench  # what the plates measured, at the pelvis
-    models = (found.model, capture), (table, capture), (robot, unscaled)
+def judged(person, robot, found, table, both, unscaled, data, unseen) -> dict:
+    capture, truth = both[0], both[1].wrench  # what plates without errors measure, at the pelvis
+    models = (found.model, both[1]), (table, both[1]), (robot, unscaled[1])
     errors = [people.predicted(m, c) - c.wrench for m, c in models]
+    read = people.predicted(found.model, capture) - capture.wrench
     bw = 9.81 * sum(i.mass for i in person.model.inertias)
     moment = np.sqrt((truth[:, 3:] ** 2).mean())
     true = np.array(
@@ -155,6 +161,7 @@ def judged(person, robot, found, table, capture, unscaled, data, unseen) -> dict
     return {
         "force": [100 * np.sqrt((e[:, :3] ** 2).sum(1).mean()) / bw for e in errors],
         "moment": [100 * np.sqrt((e[:, 3:] ** 2).mean()) / moment for e in errors],
+        "read": [np.sqrt((read[:, :3] ** 2).sum(1).mean()), np.sqrt((read[:, 3:] ** 2).mean())],  # with plates' errors
         "mass": 100 * abs(found.mass()[0] * 9.81 / bw - 1),
         "com": 1e3 * float(np.linalg.norm(found.centre(fitted_q)[0] - centre)),
         "size": 100 * float(np.abs(np.asarray(data.scale) / scales - 1).mean()),
