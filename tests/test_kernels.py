@@ -14,7 +14,7 @@ import pytest
 import robots
 from test_general_dynamics import random_tree
 
-from figaroh_jax.compiled import kernels
+from figaroh_jax.compiled import executable_cache, kernels
 from figaroh_jax.compiled.batching import DRAFT_OPTIONS
 from figaroh_jax.compiled.kernels import Number, Straight, launch, straight_answers
 from figaroh_jax.rigid import dynamics, normal_equations, regressor, scalar_programs
@@ -174,6 +174,18 @@ def test_rows_of_a_normal_matrix_are_written_by_coordinate(tmp_path: Path, monke
     monkeypatch.setattr(normal_equations, "on_host", lambda *x: False)
     for one, other in zip(normal_equations.normal_matrix(model, q, v, a, tau, weight**2, extra), expected, strict=True):
         agree(one, other)
+
+
+def test_a_kernel_is_kept_between_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    model = robots.load(robots.ARM, tmp_path)
+    arrays = [jnp.asarray(x) for x in states(model, 5)]
+    monkeypatch.setattr(executable_cache, "keeping", lambda: tmp_path / "kept")
+    kernels._kept.cache_clear()
+    found = straight_answers(FORMS["masses"], model, arrays[0])
+    kernels._kept.cache_clear()  # as in a new process
+    monkeypatch.setattr(executable_cache.Program, "_made", None)
+    np.testing.assert_array_equal(straight_answers(FORMS["masses"], model, arrays[0]), found)
+    kernels._kept.cache_clear()
 
 
 def test_transformations(tmp_path: Path):

@@ -20,6 +20,8 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from . import executable_cache
+
 __all__ = [
     "Load",
     "Number",
@@ -27,6 +29,7 @@ __all__ = [
     "Read",
     "Straight",
     "Write",
+    "kept_here",
     "known_codes",
     "launch",
     "rounded",
@@ -162,8 +165,25 @@ def straight_answers(
     samples = len(arrays[0])
     missing = rounded(samples) - samples
     padded = [jnp.pad(x, ((0, missing), (0, 0)), mode="edge") for x in arrays] if missing and samples else arrays
-    answer = _program(straight, codes, parameters, *padded)
+    program = _kept(straight, codes) if kept_here(*padded) else partial(_program, straight, codes)
+    answer = program(parameters, *padded)
     return (answer[..., :samples] if straight.last else answer[:samples]) if missing else answer
+
+
+@lru_cache(maxsize=64)
+def _kept(straight: Straight, codes: bytes) -> executable_cache.Program:
+    def straight_program(parameters: Any, *arrays: Array) -> Any:
+        return _answers(straight, codes, parameters, *arrays)
+
+    return executable_cache.Program(straight_program, key=f"{straight.name} {codes.hex()}")
+
+
+def kept_here(*arrays: Any) -> bool:
+    """Whether programs of these arrays, none of them traced, are kept between processes: on the first device alone."""
+    if executable_cache.keeping() is None or jax.config.values.get("jax_default_device") is not None:
+        return False
+    first = {jax.devices()[0]}
+    return all(x.devices() == first for x in arrays if isinstance(x, jax.Array))
 
 
 def rounded(samples: int) -> int:

@@ -17,7 +17,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..compiled.batching import BLOCK, CPU_OPTIONS, aligned, chunk_size, in_chunks, on_host, traced, two_axes
-from ..compiled.kernels import Straight, known_codes, rounded, straight_answers, usable
+from ..compiled.executable_cache import Program
+from ..compiled.kernels import Straight, kept_here, known_codes, rounded, straight_answers, usable
 from ..compiled.machine_code import machine_code
 from ..compiled.precision import in_float64
 from ..errors import InputError, check_real
@@ -249,11 +250,21 @@ def _by_kernels(model: RobotModel, start: tuple[Array, ...], rows: _Rows) -> tup
     if whole > samples:
         modes = ("edge", "edge", "edge", "constant", "edge")
         arrays = [jnp.pad(x, ((0, whole - samples), (0, 0)), mode=m) for x, m in zip(arrays, modes, strict=True)]
-    return _kernel_program(known_codes(_row_form(0), model), min(whole, _rows_at_once(model)), model, start, *arrays)
+    told = known_codes(_row_form(0), model), min(whole, _rows_at_once(model))
+    if traced(model, start, arrays):
+        return _sums_of_rows(*told, model, start, *arrays)
+    return (_kept_sums(*told) if kept_here(*arrays) else partial(_program_of_sums, *told))(model, start, *arrays)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _kernel_program(
+@lru_cache(maxsize=64)
+def _kept_sums(codes: bytes, chunk: int) -> Program:
+    def sums_of_rows(model: RobotModel, start: tuple[Array, ...], *arrays: Array) -> tuple[Array, ...]:
+        return _sums_of_rows(codes, chunk, model, start, *arrays)
+
+    return Program(sums_of_rows, key=f"{chunk} {codes.hex()}")
+
+
+def _sums_of_rows(
     codes: bytes, chunk: int, model: RobotModel, start: tuple[Array, ...], *arrays: Float[Array, "samples _"]
 ) -> tuple[Array, ...]:
     form = _row_form(arrays[4].shape[1] // model.nv)
@@ -264,6 +275,9 @@ def _kernel_program(
         return tuple(x + row_products(one[None]) for x, one in zip(total, rows, strict=True)), None
 
     return jax.lax.scan(step, start, chunks)[0] if len(arrays[0]) else start
+
+
+_program_of_sums = jax.jit(_sums_of_rows, static_argnums=(0, 1))
 
 
 @lru_cache(maxsize=16)
