@@ -84,7 +84,7 @@ def load_usd(
 
     >>> import pathlib, tempfile, figaroh_jax as fj
     >>> has = '["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI"]'
-    >>> text = f'def Cube "box" (prepend apiSchemas = {has}) {{ float physics:mass = 2 }}'
+    >>> text = f'def Cube "box" (prepend apiSchemas = {has}) {{\\n float physics:mass = 2\\n}}'
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     _ = pathlib.Path(folder, "box.usda").write_text(f"#usda 1.0\\n{text}")
     ...     fj.load_usd(f"{folder}/box.usda").joint_names

@@ -83,8 +83,8 @@ def write_report(diagnosis: Diagnosis, path: Path, title: str) -> None:
     >>> import pathlib, tempfile, figaroh_jax as fj
     >>> found = fj.diagnose_task(fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml")))
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     fj.write_report(found, pathlib.Path(folder, "report.html"), "the demo's arm")
-    ...     "the demo's arm" in pathlib.Path(folder, "report.html").read_text()
+    ...     fj.write_report(found, pathlib.Path(folder, "report.html"), "bench arm")
+    ...     "bench arm" in pathlib.Path(folder, "report.html").read_text()
     True
     """
     path.write_text(_page(diagnosis, title, path.parent), encoding="utf-8")
