@@ -83,12 +83,14 @@ def load_usd(
     tree: loops, two robots in one stage, joints that do not hold their axes.
 
     >>> import pathlib, tempfile, figaroh_jax as fj
-    >>> has = '["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI"]'
-    >>> text = f'def Cube "box" (prepend apiSchemas = {has}) {{\\n float physics:mass = 2\\n}}'
+    >>> has = 'prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI"]'
+    >>> bodies = [f'def Cube "{name}" ({has})\\n{{\\n float physics:mass = 2\\n}}\\n' for name in ("base", "arm")]
+    >>> ends = "rel physics:body0 = </base>\\n rel physics:body1 = </arm>"
+    >>> joint = f'def PhysicsRevoluteJoint "hinge"\\n{{\\n {ends}\\n}}\\n'
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = pathlib.Path(folder, "box.usda").write_text(f"#usda 1.0\\n{text}")
-    ...     fj.load_usd(f"{folder}/box.usda").joint_names
-    ('root_joint',)
+    ...     _ = pathlib.Path(folder, "arm.usda").write_text("#usda 1.0\\n" + "".join(bodies) + joint)
+    ...     fj.load_usd(f"{folder}/arm.usda", root="fixed").joint_names
+    ('hinge',)
     """
     file = find_in_packages(path, packages)
     with _reading(file):
