@@ -13,6 +13,7 @@ how far numbers are from those of the native one.
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import os
 import resource
@@ -129,8 +130,8 @@ def model(robot: str) -> RobotModel:
 def _cell(robot: str, name: str, samples: int, rounds: int) -> dict[str, Any]:
     try:
         whole = model(robot)
-        backend, reference = registry.backend(name, whole), registry.backend("pinocchio", whole)
-    except InputError as error:
+        backend, reference = _built(name, whole), _built("pinocchio", whole)
+    except (InputError, ImportError) as error:
         return {"robot": robot, "error": str(error)}
     state = _state(backend, samples)
     answer: dict[str, Any] = {"robot": robot, "differs": 0.0}
@@ -145,6 +146,14 @@ def _cell(robot: str, name: str, samples: int, rounds: int) -> dict[str, Any]:
         got, want = (np.asarray(getattr(b, function)(*given), float) for b in (backend, reference))
         answer["differs"] = max(answer["differs"], float(np.abs(got - want).max() / np.abs(want).max()))
     return answer | {"MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
+
+
+def _built(name: str, robot: RobotModel) -> Any:
+    """The backend of a robot; one that is not installed from the folder `backends`."""
+    if name in registry.names():
+        return registry.backend(name, robot)
+    sys.path.append(str(ROOT / "backends"))
+    return getattr(importlib.import_module(f"figaroh_jax_{name}"), f"{name.capitalize()}Backend").build(robot)
 
 
 def _state(backend: Any, samples: int) -> dict[str, np.ndarray]:
