@@ -122,6 +122,14 @@ def arms() -> dict[str, Any]:
     return {"UR10e": load_urdf(ur10), "Panda": load_urdf(panda, joints=joints)}
 
 
+def torso_and_arm() -> Any:
+    """TALOS' torso and left arm, nine joints."""
+    from figaroh_jax.formats.urdf import load_urdf
+
+    names = ["torso_1_joint", "torso_2_joint", *(f"arm_left_{k}_joint" for k in range(1, 8))]
+    return load_urdf(DATA / "talos_contact" / "talos_full_v2.urdf", joints=names)
+
+
 MESHES = os.environ.get("FIGAROH_JAX_MESHES")  # `robots` of the package example-robot-data, whose URDF have meshes
 TOUCHING = {  # pairs that are nearer than 20 mm by their construction
     "UR10": [("upper_arm_link", "base_link"), ("wrist_1_link", "wrist_3_link"), ("wrist_2_link", "forearm_link")],
@@ -264,8 +272,12 @@ def postures() -> None:
     """30 postures of 500 candidates, moved; the bound is that of 5000 others."""
     from figaroh_jax.excitation.postures import Instrument, _Calibrated, certified_bound, excite_postures
 
-    cases = {"UR10e": ("base", "wrist_3_link"), "Panda": ("panda_link0", "panda_link7")}
-    for name, model in arms().items():
+    cases = {
+        "UR10e": ("base", "wrist_3_link"),
+        "Panda": ("panda_link0", "panda_link7"),
+        "TALOS": ("base_link", "arm_left_7_link"),
+    }
+    for name, model in {**arms(), "TALOS": torso_and_arm()}.items():
         device = Instrument("pose", *cases[name])
         excite_postures(model, device)
         since = time.process_time()
@@ -343,13 +355,10 @@ def views() -> None:
     The camera looks at a board on the table at 0.2 to 1 m, within 0.35 rad of its axis and 0.9 rad of the normal.
     """
     from figaroh_jax.excitation.postures import Instrument, View, excite_postures
-    from figaroh_jax.formats.urdf import load_urdf
 
-    names = ["torso_1_joint", "torso_2_joint", *(f"arm_left_{k}_joint" for k in range(1, 8))]
-    talos = load_urdf(DATA / "talos_contact" / "talos_full_v2.urdf", joints=names)
     board = View((0.5, 0.0, 0.0), (0.0, 0.0, 1.0), "hand", cone=0.35, tilt=0.9, near=0.2, far=1.0)
     cases = {
-        "TALOS": (talos, Instrument("pose", "base_link", "arm_left_7_link")),
+        "TALOS": (torso_and_arm(), Instrument("pose", "base_link", "arm_left_7_link")),
         "Panda, camera": (arms()["Panda"], Instrument("pose", "panda_link0", "panda_link7", view=board)),
     }
     for name, (model, device) in cases.items():
@@ -586,8 +595,11 @@ def _best(fits: list[_Fit], y: np.ndarray, repeats: int) -> tuple[float, float]:
 POSTURE = [0.0, -1.2, 1.0, -0.5, 0.3, 0.0]
 
 
-def pays(draws: int = 60, seed: int = 0, starts: int = 8) -> None:
+def pays(draws: int = 60, seed: int = 0, starts: int = 8, peer: str | None = None) -> None:
     """Simulated identifications on FIGAROH's problem with friction: error of the torque predicted on unseen motions.
+
+    All is told against FIGAROH's own motion where `peer` names its file (`peer_motion.py` makes it), else against ours
+    of the smallest condition number.
 
     The truth is Pinocchio's, with Coulomb and viscous friction, 30 % more Coulomb friction at rest (Stribeck), torque
     noise of 1 % of the largest torque and an encoder error of 2 mrad; the fit is plain weighted least squares in NumPy.
@@ -653,6 +665,10 @@ def pays(draws: int = 60, seed: int = 0, starts: int = 8) -> None:
         "prediction": excite(model, basis, bounds, learned, objective="prediction", predict=seen, **same),
     }
     motions = {name: np.stack(found.stages[0].motion.states(20.0)) for name, found in designs.items()}
+    against = "condition"
+    if peer is not None:
+        file, against = np.load(peer), "FIGAROH"
+        motions = {against: np.stack([file[key] for key in "qva"]), **motions}
     kinds = {"noise": (0.0, 0.0), "+ Stribeck": (0.3, 0.0), "+ encoder": (0.0, 2e-3)}
     table = {"random, median": [np.median([error(m, *k) for m in randoms[:7]], axis=0) for k in kinds.values()]}
     table |= {name: [error(m, *k) for k in kinds.values()] for name, m in motions.items()}
@@ -660,9 +676,9 @@ def pays(draws: int = 60, seed: int = 0, starts: int = 8) -> None:
     for name, values in table.items():
         cells = (
             f"{key} {x:.3f} ({x / y - 1:+.0%}), covered {held:.3f}"
-            for key, (x, held), (y, _) in zip(kinds, values, table["condition"], strict=True)
+            for key, (x, held), (y, _) in zip(kinds, values, table[against], strict=True)
         )
-        print(f"{name:16s} {'  '.join(cells)}")
+        print(f"{name:16s} {'  '.join(cells)}", flush=True)
 
 
 def ranking(triples: int = 200) -> None:
@@ -810,11 +826,18 @@ def gpu(starts: int = 256, outer: int = 5, inner: int = 100, compared: int = 4) 
     )
 
 
-def peer() -> None:
+def peer(seeds: int = 20) -> None:
     """FIGAROH's problem: information and condition number, warm."""
     on_peer_problem(1)
-    for seed in range(3):
-        told(f"one start, seed {seed}", *on_peer_problem(1, seed=seed))
+    many = [on_peer_problem(1, seed=seed) for seed in range(seeds)]
+    for seed, one in enumerate(many[:3]):
+        told(f"one start, seed {seed}", *one)
+    quartiles = [np.percentile([one(x) for x in many], (25, 50, 75)) for one in (lambda x: x[0].logdet, lambda x: x[1])]
+    print(
+        "{} seeds, quartiles: logdet {:.2f} {:.2f} {:.2f}, CPU s {:.3f} {:.3f} {:.3f}".format(
+            seeds, *np.ravel(quartiles)
+        )
+    )
     told("best of 32", *on_peer_problem(32))
     told("condition, best of 8", *on_peer_problem(8, "condition"))
     print(f"peer, quoted: {PEER}")
@@ -843,6 +866,8 @@ def main() -> None:
     parser.add_argument("--cold", action="store_true", help="one start in a fresh process, programs compiled")
     parser.add_argument("--seed", type=int, help="of the random starts, where a part takes one")
     parser.add_argument("--starts", type=int, help="random starts, where a part takes them")
+    parser.add_argument("--draws", type=int, help="simulations, where a part takes them")
+    parser.add_argument("--peer", help="FIGAROH's motion, of `peer_motion.py`, that `pays` compares with")
     parser.add_argument("--names", nargs="+", choices=list(PAIRS), help="pairs of causes, where a part takes them")
     args = parser.parse_args()
     if args.cold:

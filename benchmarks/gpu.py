@@ -1,13 +1,17 @@
 """Throughput on an accelerator, and that it gives the numbers of the CPU.
 
-    PYTHONPATH=.:backends python benchmarks/gpu.py ROBOT.urdf ... [--samples N ...] [--json FILE]
+    PYTHONPATH=. python benchmarks/gpu.py ROBOT.urdf ... [--only WORD ...] [--gpus 0 1] [--at-once N] [--out FILE]
 
-Inverse dynamics, mass matrix and regressor (dense, packed, streaming normal matrix) of the core, in float64 and the
-kernels of inverse dynamics and packed regressor in float32 too, the robot known when they are compiled and, where told,
-an argument of the program; inverse dynamics and regressor of MJX where its package is there. Every function is one
-compiled program of arrays that lie on the device already; each is called until half a second has passed, the best call
-counts. The first call is told apart. Before that, 1000 samples are computed in a process that sees the CPU alone, and
-compared.
+Inverse and forward dynamics, mass matrix and regressor (dense, packed, normal matrix with torque) in float64, and the
+kernels in float32 too. Each function of each robot is a process of its own, begun in the order of the goals of this
+library; several are compiled at once, one at a time runs on a GPU. Every figure is printed, and added to FILE as a line
+of JSON, as soon as it is taken, so that what is cut off has told what it knew.
+
+A process puts the states on the device, traces and compiles (told apart), compares the first 1000 answers with those of
+a process that sees the CPU alone, and calls until half a second has passed: the best call counts ("in a program"). Two
+more call the public function as it is ("called"), for the time of the first call without kept programs and with those
+that the one before kept. The robot is known when the function is compiled; "argument" says where it is an argument of
+the program.
 """
 
 from __future__ import annotations
@@ -19,129 +23,251 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
-import figaroh_jax as fj
-from figaroh_jax.compiled.kernels import straight_answers
-from figaroh_jax.rigid import dynamics, regressor
-
 CHECKED = 1000  # samples that are compared with the CPU's
-DENSE_LIMIT = 16e9  # bytes that a dense regressor may take
-MJX_LIMIT = 1 << 16  # samples that MJX is asked for at the most: its regressor holds ten torques a link
+LONGEST = 170.0  # seconds that a process of a function may take with all its compilation
+# function: samples for a robot of up to ten joints and for a larger one; in the order of what is to be known first
+CASES = {
+    "normal matrix": (1 << 22, 1 << 19),
+    "inverse dynamics": (1 << 22, 1 << 20),
+    "packed regressor": (1 << 20, 1 << 17),
+    "forward dynamics": (1 << 21, 1 << 17),
+    "mass matrix": (1 << 21, 1 << 18),
+    "dense regressor": (1 << 20, 1 << 15),
+    "inverse dynamics float32": (1 << 22, 1 << 20),
+    "packed regressor float32": (1 << 21, 1 << 18),
+    "mass matrix float32": (1 << 21, 1 << 18),
+    "forward dynamics float32": (1 << 21, 1 << 17),
+    "inverse dynamics argument": (1 << 22, 1 << 20),
+}
+
+
+_PUBLIC = (
+    "inverse dynamics",
+    "forward dynamics",
+    "mass matrix",
+    "packed regressor",
+    "dense regressor",
+    "normal matrix",
+)
+STAGES = {"in a program": tuple(CASES), "called, none kept": _PUBLIC, "called, kept": _PUBLIC}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("robots", type=Path, nargs="+", metavar="ROBOT.urdf")
-    parser.add_argument("--samples", type=int, nargs="+", default=[1 << 14, 1 << 17, 1 << 20])
-    parser.add_argument("--json", type=Path, help="file for all figures")
-    parser.add_argument("--reference", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--only", nargs="+", default=[""], help="functions whose names hold one of these words")
+    parser.add_argument("--gpus", nargs="+", default=["0"], help="as CUDA_VISIBLE_DEVICES tells them")
+    parser.add_argument("--at-once", type=int, default=8, help="processes that compile beside each other")
+    parser.add_argument("--samples", type=int, help="in place of each function's own number")
+    parser.add_argument("--out", type=Path, help="file to which each figure is added as a line of JSON")
+    parser.add_argument("--child", nargs=3, metavar=("FUNCTION", "FOLDER", "STAGE"), help=argparse.SUPPRESS)
     options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    if options.reference:
-        np.savez(options.reference, allow_pickle=False, **_answers(options.robots[0]))
+    if options.child:
+        name, own, stage = options.child
+        _child(options.robots[0], name, own, stage, options.samples)
         return
-    print(f"jax {jax.__version__}, {jax.devices()[0].device_kind}, float64 where nothing else is said")
-    found = [row for robot in options.robots for row in _robot(robot, options.samples)]
-    memory = jax.devices()[0].memory_stats() or {}
-    print(f"peak of the device's memory: {memory.get('peak_bytes_in_use', 0) / 1e9:.2f} GB")
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=1), encoding="utf-8")
+    gpus = cycle(options.gpus)
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(options.at_once) as pool:
+        jobs = [
+            (robot, name, next(gpus))
+            for name in CASES
+            for robot in options.robots
+            if any(word in name for word in options.only)
+        ]
+        list(pool.map(lambda job: _case(*job, folder=Path(folder), options=options), jobs))
 
 
-def _robot(file: Path, sizes: list[int]) -> list[dict[str, Any]]:
-    rows = []
-    errors = _compare(file)
-    model = fj.load_urdf(file)
-    functions = _functions(model)
-    for name, function in functions.items():
-        print(f"{model.name:12} {name:26} largest difference from the CPU, relative: {errors[name]:.1e}", flush=True)
-        for samples in sizes:
-            if name.startswith("mjx") and samples > MJX_LIMIT:
-                continue
-            if name.startswith("dense") and 80 * samples * model.nv * len(model.joints) > DENSE_LIMIT:
-                continue
-            first, best = _time(function, _states(model, samples))
-            rate = samples / best / 1e6
-            rows.append({"robot": model.name, "function": name, "samples": samples, "first": first, "best": best})
-            print(f"{'':12} {name:26} {samples:9d} samples  {first:6.2f} s at first  {rate:9.3f} M/s", flush=True)
-    return rows
+def _case(robot: Path, name: str, gpu: str, folder: Path, options: argparse.Namespace) -> None:
+    """Processes of one function: the CPU's answers beside its compilation, then again with what it kept."""
+    own = folder / f"{robot.stem} {name} {gpu}"
+    own.mkdir()
+    command = [sys.executable, __file__, str(robot), "--samples", str(options.samples or 0), "--child", name, str(own)]
+    here = os.environ | {"XDG_CACHE_HOME": str(own), "CUDA_VISIBLE_DEVICES": gpu}
+    here["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
+    cpu = subprocess.Popen([*command, "cpu"], env=here | {"JAX_PLATFORMS": "cpu"})
+    for stage in STAGES if name in STAGES["called, kept"] else list(STAGES)[:1]:
+        try:
+            done = subprocess.run([*command, stage], env=here, timeout=LONGEST, capture_output=True, text=True)
+            found = done.stdout.splitlines()[-1] if done.returncode == 0 else json.dumps({"failed": done.stderr[-600:]})
+        except subprocess.TimeoutExpired:
+            found = json.dumps({"failed": f"not done in {LONGEST:.0f} s"})
+        _tell({"robot": robot.stem, "function": name, "programs": stage, "gpu": gpu, **json.loads(found)}, options.out)
+        if "failed" in found:
+            break
+    cpu.wait()
 
 
-def _functions(model: fj.RobotModel) -> Mapping[str, Callable[..., Any]]:
-    """Name -> function of (q, v, a), compiled, the robot an argument of the program."""
-    own = {
+def _tell(row: dict[str, Any], out: Path | None) -> None:
+    print(
+        f"{row['robot']:14} {row['function']:26} {row['programs']:17}",
+        row.get("failed")
+        or f"{row['samples']:8d} samples {row['rate']:10.2f} M/s; first call {row['first']:6.2f} s"
+        f" (traced {row['traced']:.2f}, compiled {row['compiled']:.2f}); {row['difference']:.1e} from the CPU;"
+        f" peak {row['peak'] / 1e9:.2f} GB",
+        flush=True,
+    )
+    if out is not None:
+        with out.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+
+
+def _child(robot: Path, name: str, folder: str, stage: str, samples: int) -> None:
+    import jax
+
+    import figaroh_jax as fj
+    from figaroh_jax.compiled.executable_cache import keep_programs
+
+    jax.config.update("jax_enable_x64", True)
+    model = fj.load_urdf(robot)
+    reference = Path(folder) / "cpu.npz"
+    if stage == "cpu":
+        found = _answer(jax.jit(_function(model, name))(*_states(model, name, CHECKED)))
+        np.save(reference.with_suffix(".tmp.npy"), found)
+        reference.with_suffix(".tmp.npy").replace(reference)
+        return
+    if stage.startswith("called"):
+        keep_programs()
+    samples = samples or CASES[name][model.nv > 10]
+    jax.block_until_ready(jax.device_put(np.zeros(8)) + 1.0)  # the device is there and has run something
+    if stage.startswith("called"):
+        print(json.dumps(_called(model, name, samples)))
+        return
+    types = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in _states(model, name, samples, lengths_alone=True)]
+    begin = time.perf_counter()
+    lowered = jax.jit(_function(model, name)).lower(*types)
+    traced = time.perf_counter() - begin
+    function = lowered.compile()
+    compiled = time.perf_counter() - begin - traced
+    state = _states(model, name, samples)
+    with _alone():
+        state = [jax.block_until_ready(jax.device_put(x)) for x in state]
+        begin = time.perf_counter()
+        found = jax.block_until_ready(function(*state))
+        first = time.perf_counter() - begin + traced + compiled
+        row = {"samples": samples, "first": first, "traced": traced, "compiled": compiled}
+        sample = _first_samples(found, model, name)
+        del found
+        best = _best(function, state)
+        peak = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", 0)
+    row |= {"rate": samples / best / 1e6, "peak": peak, "device": jax.devices()[0].device_kind, "jax": jax.__version__}
+    if name == "normal matrix":  # a sum: of the same samples, on the GPU too
+        small = [x[:CHECKED] for x in state]
+        sample = _answer(jax.jit(_function(model, name))(*small))
+    print(json.dumps(row | {"difference": _difference(sample, reference)}))
+
+
+def _called(model: Any, name: str, samples: int) -> dict[str, Any]:
+    """The public function called as it is, first and then."""
+    import jax
+
+    function, state = _function(model, name), _states(model, name, samples)
+    with _alone():
+        state = [jax.block_until_ready(jax.device_put(x)) for x in state]
+        begin = time.perf_counter()
+        jax.block_until_ready(function(*state))
+        first = time.perf_counter() - begin
+        rate = samples / _best(function, state) / 1e6
+        peak = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", 0)
+    nothing = dict.fromkeys(("traced", "compiled", "difference"), -1.0)
+    return {"samples": samples, "first": first, "rate": rate, "peak": peak, **nothing}
+
+
+def _difference(found: Any, reference: Path) -> float:
+    """Largest difference from the CPU's answers, over the largest number."""
+    while not reference.exists():
+        time.sleep(0.2)
+    cpu = np.load(reference)
+    return float(np.abs(found - cpu).max() / np.abs(cpu).max())
+
+
+def _function(model: Any, name: str) -> Callable[..., Any]:
+    """The function of (q, v, a) or, for accelerations, (q, v, tau)."""
+    import figaroh_jax as fj
+    from figaroh_jax.compiled.kernels import straight_answers
+    from figaroh_jax.rigid import dynamics, regressor
+
+    known = {
         "inverse dynamics": fj.inverse_dynamics,
+        "forward dynamics": fj.forward_dynamics,
         "mass matrix": lambda model, q, v, a: fj.mass_matrix(model, q),
         "packed regressor": fj.packed_regressor,
         "dense regressor": fj.joint_torque_regressor,
         "normal matrix": lambda model, q, v, a: fj.normal_matrix(model, q, v, a, tau=a),
-        "inverse dynamics float32": partial(_single, dynamics._TORQUES),
-        "packed regressor float32": partial(_single, regressor._PACKED),
     }
-    compiled = {name: jax.jit(partial(function, model)) for name, function in own.items()}
-    argument = {name: own[name] for name in ("inverse dynamics", "packed regressor")}
-    compiled |= {f"{name}, argument": _bound(jax.jit(function), model) for name, function in argument.items()}
-    try:
-        from figaroh_jax_mjx import MjxBackend
-    except ImportError:
-        return compiled
-    robot = MjxBackend.build(model)
-    theirs = {
-        "mjx inverse dynamics": lambda robot, q, v, a: robot.inverse_dynamics(q, v, a),
-        "mjx regressor": lambda robot, q, v, a: robot.joint_torque_regressor(q, v, a),
+    kernels = {
+        "inverse dynamics float32": lambda *x: straight_answers(dynamics._TORQUES, model, *x),
+        "packed regressor float32": lambda *x: straight_answers(regressor._PACKED, model, *x),
+        "mass matrix float32": lambda q, v, a: straight_answers(dynamics._MASSES, model, q),
+        "forward dynamics float32": lambda *x: _accelerations(model, *x),
     }
-    return compiled | {name: _bound(jax.jit(function), robot) for name, function in theirs.items()}
+    if name in kernels:
+        return kernels[name]
+    if name == "inverse dynamics argument":
+        nothing = dynamics._TORQUES.nothing_known(model)
+        return lambda *x: straight_answers(dynamics._TORQUES, model, *x, codes=nothing)
+    return partial(known[name], model)
 
 
-def _single(straight: Any, model: fj.RobotModel, *state: Any) -> Any:
-    return straight_answers(straight, model, *(x.astype(np.float32) for x in state))
+def _accelerations(model: Any, q: Any, v: Any, tau: Any) -> Any:
+    from figaroh_jax.rigid import dynamics
+
+    return dynamics.joint_accelerations(model, q.T, v.T, tau.T).T
 
 
-def _bound(function: Callable[..., Any], model: Any) -> Callable[..., Any]:
-    model = jax.tree.map(jax.device_put, model)
-    return lambda *state: function(model, *state)
-
-
-def _states(model: fj.RobotModel, samples: int) -> list[Any]:
+def _states(model: Any, name: str, samples: int, lengths_alone: bool = False) -> list[np.ndarray]:
+    """q, v, a of which the first thousand are the same for all numbers of samples; in the function's precision."""
+    dtype = np.float32 if "float32" in name else np.float64
+    if lengths_alone:
+        return [np.broadcast_to(dtype(0), (samples, model.nv))] * 3
     random = np.random.default_rng(0)
-    return [jax.device_put(random.uniform(-1.5, 1.5, (samples, model.nv))) for _ in range(3)]
+    checked = [random.uniform(-1.5, 1.5, (CHECKED, model.nv)) for _ in range(3)]
+    rest = [random.random((max(0, samples - CHECKED), model.nv), np.float32) * 3.0 - 1.5 for _ in range(3)]
+    return [np.concatenate([x, y]).astype(dtype)[:samples] for x, y in zip(checked, rest, strict=True)]
 
 
-def _time(function: Callable[..., Any], state: list[Any]) -> tuple[float, float]:
-    """Seconds of the first call and of the fastest later one."""
+def _first_samples(found: Any, model: Any, name: str) -> np.ndarray | None:
+    if name == "normal matrix":
+        return None
+    return _answer(found[..., :CHECKED] if name.startswith("packed") else found[:CHECKED])
+
+
+def _answer(found: Any) -> np.ndarray:
+    import jax
+
+    return np.concatenate([np.ravel(np.asarray(x, np.float64)) for x in jax.tree.leaves(found)])
+
+
+def _best(function: Callable[..., Any], state: list[Any]) -> float:
+    """Seconds of the fastest call."""
+    import jax
+
     seconds, begin = [], time.perf_counter()
-    while len(seconds) < 3 or time.perf_counter() - begin < 0.5 + seconds[0]:
+    while len(seconds) < 3 or time.perf_counter() - begin < 0.5:
         start = time.perf_counter()
         jax.block_until_ready(function(*state))
         seconds.append(time.perf_counter() - start)
-    return seconds[0], min(seconds[1:])
+    return min(seconds)
 
 
-def _answers(file: Path) -> dict[str, np.ndarray]:
-    model = fj.load_urdf(file)
-    state = _states(model, CHECKED)
-    return {
-        name: np.concatenate([np.ravel(x) for x in jax.tree.leaves(function(*state))])
-        for name, function in _functions(model).items()
-    }
+@contextmanager
+def _alone() -> Iterator[None]:
+    """Alone on this GPU among the processes of this benchmark."""
+    import fcntl
 
-
-def _compare(file: Path) -> dict[str, float]:
-    """Largest difference of each function from the same on the CPU, over the largest number."""
-    with tempfile.TemporaryDirectory() as folder:
-        reference = Path(folder) / "cpu.npz"
-        command = [sys.executable, __file__, str(file), "--reference", str(reference)]
-        subprocess.run(command, check=True, env=os.environ | {"JAX_PLATFORMS": "cpu"})
-        with np.load(reference) as cpu:
-            here = _answers(file)
-            return {name: float(np.abs(here[name] - cpu[name]).max() / np.abs(cpu[name]).max()) for name in here}
+    name = f"figaroh_jax_gpu_{os.environ.get('CUDA_VISIBLE_DEVICES', '')}.lock"
+    with (Path(tempfile.gettempdir()) / name).open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 if __name__ == "__main__":

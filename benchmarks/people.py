@@ -3,9 +3,10 @@
     python benchmarks/people.py [--people N] [--seconds S] [--seed K]
 
 Each person is 5-20 % off the model in every segment's length and inertial parameters; markers slide by 5 mm with the
-skin and are seen to 2 mm; plates have noise and a zero. A line is a person: RMS error of the root's force (% of body
-weight) and moment (% of its RMS) on an unseen trial with the identified person, the scaled one with the table alone and
-the unscaled model; error of mass (%) and centre of mass (mm); share of the parameters within their 95 % intervals.
+skin and are seen to 2 mm; plates have noise and a zero of their own in every trial. A line is a person: RMS error of
+the root's force (% of body weight) and moment (% of its RMS) on an unseen trial, against plates without errors, with
+the identified person, the scaled one with the table alone and the unscaled model; error of mass (%) and centre of mass
+(mm); share of the parameters within their 95 % intervals.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import sys
 import time
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -39,6 +41,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--trials", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--tissue", type=float, default=0.005, help="m, how far skin slides")
+    parser.add_argument("--noise", type=float, default=0.002, help="m, of a marker")
+    parser.add_argument(
+        "--exact", choices=["sizes", "all"], help="true sizes, or true sizes and positions: what is left"
+    )
+    parser.add_argument("--save", type=Path, help="folder for a file of errors and intervals for each person")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     print(
@@ -47,10 +55,13 @@ def main() -> None:
     print(f"{'':10}{'  found   table unscaled':>24}{'  found   table unscaled':>24}")
     for k in range(options.people):
         start = time.perf_counter()
-        line = study(np.random.default_rng(options.seed + k), options.seconds, options.trials)
+        line = study(np.random.default_rng(options.seed + k), options)
         force, moment = ("".join(f"{x:8.2f}" for x in line[key]) for key in ("force", "moment"))
         rest = f"{line['mass']:8.2f}{line['com']:8.2f}{line['size']:8.2f}{line['covered']:7.2f}"
         print(f"{options.seed + k:6}{'':4}{force}{moment}{rest}{time.perf_counter() - start:6.0f}", flush=True)
+        if options.save is not None:
+            options.save.mkdir(parents=True, exist_ok=True)
+            np.savez(options.save / f"{options.exact}_{options.tissue}_{options.seed + k}.npz", **line)
 
 
 def places(robot: fj.RobotModel) -> dict[str, tuple[str, np.ndarray]]:
@@ -69,22 +80,26 @@ def places(robot: fj.RobotModel) -> dict[str, tuple[str, np.ndarray]]:
     return found
 
 
-def study(rng: np.random.Generator, seconds: float, trials: int) -> dict:
+def study(rng: np.random.Generator, options: argparse.Namespace) -> dict:
     """One person from end to end."""
+    seconds, trials = options.seconds, options.trials
+    skin = {"tissue": options.tissue, "noise": options.noise}
     robot = fj.load_urdf(URDF, root="free_flyer")
     person = simulated.make_person(str(URDF), rng)
     own = places(robot)
     joint_of = {joint.link: joint.name for joint in robot.joints}
     simulated.put_markers(person, {label: (joint_of[link], at) for label, (link, at) in own.items()}, rng)
-    fitted = [simulated.record(person, rng, seconds) for _ in range(trials)]
-    unseen = simulated.record(person, rng, seconds)
-    data = size(robot, own, fitted[0])
-    captures = [captured(robot, own, data, trial) for trial in [*fitted, unseen]]
-    weight = float(np.mean([np.linalg.norm(c.wrench[:, :3], axis=1).mean() for c in captures[:-1]]))
+    fitted = [simulated.record(person, rng, seconds, **skin) for _ in range(trials)]
+    unseen = simulated.record(person, rng, seconds, **skin)
+    data = size(robot, own, fitted[0]) if options.exact is None else true_size(robot, own, person, fitted[0])
+    known = person if options.exact == "all" else None
+    captures = [captured(robot, own, data, trial, known) for trial in fitted]
+    judge = captured(robot, own, data, unseen, known, exact=True)
+    weight = float(np.mean([np.linalg.norm(c.wrench[:, :3], axis=1).mean() for c in captures]))
     table = people.anthropometric(robot, weight / 9.81, "male", np.asarray(data.scale))
-    found = people.identify_segments(captures[:-1], table)
-    unscaled = captured(robot, own, None, unseen)
-    return judged(person, robot, found, table, captures[-1], unscaled, data, unseen)
+    found = people.identify_segments(captures, table)
+    unscaled = captured(robot, own, None, unseen, exact=True)
+    return judged(person, robot, found, table, judge, unscaled, data, unseen)
 
 
 def size(robot, own, trial):
@@ -94,21 +109,42 @@ def size(robot, own, trial):
     return markers.segment_sizes(robot, markers.marker_data(robot, own, seen)).data
 
 
-def captured(robot, own, fitted, trial):
-    """Positions by inverse kinematics with the sizes found (None: the model's), and the capture."""
-    import equinox as eqx
+def true_size(robot, own, person, trial):
+    """The sizes and the markers' places as they are."""
+    data = markers.marker_data(robot, own, {label: at[:2] for label, at in trial.markers.items()})
+    joint = {j.link: j.name for j in robot.joints}
+    scale = np.array([person.scale[joint[name]] for name in data.names])
+    true = [person.markers[label][1] for label in data.labels]
+    shift = np.array(true) - np.append(scale, 1.0)[np.array(data.segment)[list(data.link)], None] * data.place
+    return eqx.tree_at(lambda d: (d.scale, d.shift), data, (scale, shift))
 
-    data = markers.marker_data(robot, own, trial.markers)
-    if fitted is not None:
-        data = eqx.tree_at(lambda d: (d.scale, d.shift), data, (fitted.scale, fitted.shift))
-    q = markers.joint_positions(robot, data).position
-    return people.capture(data.robot(robot), trial.time, q, trial.plates, CUTOFF)
+
+def captured(robot, own, fitted, trial, known=None, exact=False):
+    """Positions by inverse kinematics with the sizes found (None: the model's), and the capture.
+
+    `known`: the person whose true positions are taken instead; `exact`: with a second capture, of what plates without
+    noise and zeros would say.
+    """
+    if known is not None:
+        q, model = np.empty((len(trial.time), robot.nq)), fitted.robot(robot)
+        for joint, at in zip(robot.joints, robot.dofs.positions, strict=True):
+            there = known.model.joints[known.model.getJointId(joint.name if joint.parent >= 0 else "root_joint")]
+            q[:, at] = trial.q[:, there.idx_q : there.idx_q + there.nq]
+    else:
+        data = markers.marker_data(robot, own, trial.markers)
+        if fitted is not None:
+            data = eqx.tree_at(lambda d: (d.scale, d.shift), data, (fitted.scale, fitted.shift))
+        q, model = markers.joint_positions(robot, data).position, data.robot(robot)
+    plates = [trial.plates, trial.exact] if exact else [trial.plates]
+    both = [people.capture(model, trial.time, q, some, CUTOFF) for some in plates]
+    return both if exact else both[0]
 
 
-def judged(person, robot, found, table, capture, unscaled, data, unseen) -> dict:
-    truth = capture.wrench  # what the plates measured, at the pelvis
-    models = (found.model, capture), (table, capture), (robot, unscaled)
+def judged(person, robot, found, table, both, unscaled, data, unseen) -> dict:
+    capture, truth = both[0], both[1].wrench  # what plates without errors measure, at the pelvis
+    models = (found.model, both[1]), (table, both[1]), (robot, unscaled[1])
     errors = [people.predicted(m, c) - c.wrench for m, c in models]
+    read = people.predicted(found.model, capture) - capture.wrench
     bw = 9.81 * sum(i.mass for i in person.model.inertias)
     moment = np.sqrt((truth[:, 3:] ** 2).mean())
     true = np.array(
@@ -125,11 +161,17 @@ def judged(person, robot, found, table, capture, unscaled, data, unseen) -> dict
     return {
         "force": [100 * np.sqrt((e[:, :3] ** 2).sum(1).mean()) / bw for e in errors],
         "moment": [100 * np.sqrt((e[:, 3:] ** 2).mean()) / moment for e in errors],
+        "read": [np.sqrt((read[:, :3] ** 2).sum(1).mean()), np.sqrt((read[:, 3:] ** 2).mean())],  # with plates' errors
         "mass": 100 * abs(found.mass()[0] * 9.81 / bw - 1),
         "com": 1e3 * float(np.linalg.norm(found.centre(fitted_q)[0] - centre)),
         "size": 100 * float(np.abs(np.asarray(data.scale) / scales - 1).mean()),
         "covered": float((np.abs(off) < 1.96).mean()),
         "off": off,
+        "seen": found.seen,
+        "noise": found.noise,
+        "samples": found.samples,
+        "links": np.array(found.links),
+        "scale": np.asarray(data.scale) / scales - 1,
     }
 
 

@@ -46,11 +46,12 @@ def test_code_of_trees_with_all_joints_gives_pinocchios_numbers(name: str, alway
     twin = random_tree(*TREES[name])
     model, data = twin.model, twin.robot.createData()
     q, v, a = states(model, 157)
-    found = {form: answers(FORMS[form], model, q, v, a) for form in ("torques", "dense")}
+    found = {form: answers(FORMS[form], model, q, v, a) for form in ("torques", "dense", "accelerations")}
     found["masses"] = answers(FORMS["masses"], model, q)
     for k in (0, 1, 127, 128, 155, 156):
         theirs = twin.theirs(q[k])
         agree(found["torques"][k], pin.rnea(twin.robot, data, theirs, v[k], a[k]), 1e-12)
+        agree(found["accelerations"][k], pin.aba(twin.robot, data, theirs, v[k], a[k]), 1e-12)
         upper = np.triu(pin.crba(twin.robot, data, theirs))
         agree(found["masses"][k], upper + np.triu(upper, 1).T, 1e-12)
         agree(found["dense"][k], pin.computeJointTorqueRegressor(twin.robot, data, theirs, v[k], a[k]), 1e-12)

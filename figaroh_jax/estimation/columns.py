@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..compiled.batching import CPU_OPTIONS, DRAFT_OPTIONS, FEW, program
 from ..effects.base import Effect, Motion, columns, place, smooth_sign
@@ -35,6 +35,8 @@ __all__ = [
     "state_columns",
     "structural_columns",
     "term_columns",
+    "term_places",
+    "term_rows",
 ]
 
 STATES = 129  # more than a chunk of `batching`, so that the program of the recordings serves random states too
@@ -160,6 +162,35 @@ def term_columns(
     return _term_columns(terms, motion_at(model, jnp.zeros(jnp.shape(v)[0]), q, v, a, 0.0, width))
 
 
+def term_rows(
+    model: RobotModel,
+    terms: tuple[Effect, ...],
+    width: Float[Array, " nv"],
+    q: Float[Array, "samples nq"],
+    v: Float[Array, "samples nv"],
+    a: Float[Array, "samples nv"],
+) -> Float[Array, "rows samples"]:
+    """What of `term_columns` can differ from zero, in the order of `term_places`; to be traced."""
+    motion, out = motion_at(model, jnp.zeros(jnp.shape(v)[0]), q, v, a, 0.0, width), [jnp.zeros((0, jnp.shape(v)[0]))]
+    for term in terms:
+        torque = jax.vmap(lambda effect: _own_torque(effect, motion))(term)  # (places, samples, joints, amplitudes)
+        out.append(jnp.moveaxis(torque, 1, 3).reshape(-1, torque.shape[1]))
+    return jnp.concatenate(out)
+
+
+def term_places(model: RobotModel, terms: tuple[Effect, ...]) -> Int[np.ndarray, "rows 2"]:
+    """Coordinate and column (behind those of the links) of each of `term_rows`."""
+    places, first = [np.zeros((0, 2), int)], 0
+    for term in terms:
+        amplitudes = sum(parameter.linear for parameter in term.parameters().values())
+        for at in np.asarray(term.at):
+            rows = np.arange(model.nv) if term.acts_on in ("link", "robot") else np.asarray(at)
+            grid = np.meshgrid(rows, first + np.arange(amplitudes), indexing="ij")
+            places.append(np.stack([x.ravel() for x in grid], 1))
+            first += amplitudes
+    return np.concatenate(places)
+
+
 def _term_columns(terms: tuple[Effect, ...], motion: Motion) -> list[Float[Array, "samples nv columns"]]:
     blocks = []
     for term in terms:
@@ -170,8 +201,13 @@ def _term_columns(terms: tuple[Effect, ...], motion: Motion) -> list[Float[Array
 
 def _joint_columns(effect: Effect, motion: Motion) -> Float[Array, "samples nv amplitudes"]:
     """Torque of a unit of each amplitude in the rows of all joints."""
-    torque = jnp.moveaxis(columns(effect, motion), 0, -1)
+    torque = _own_torque(effect, motion)
     if effect.acts_on in ("link", "robot"):
         return torque
-    torque = torque.reshape(torque.shape[0], -1, torque.shape[-1])
     return jnp.zeros((*motion.velocity.shape, torque.shape[-1])).at[:, effect.at].add(torque)
+
+
+def _own_torque(effect: Effect, motion: Motion) -> Float[Array, "samples rows amplitudes"]:
+    """Torque of a unit of each amplitude in the rows of the effect's own joints, or of all where it acts on links."""
+    torque = jnp.moveaxis(columns(effect, motion), 0, -1)
+    return torque if effect.acts_on in ("link", "robot") else torque.reshape(torque.shape[0], -1, torque.shape[-1])

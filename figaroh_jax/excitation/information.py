@@ -52,6 +52,7 @@ class Learned(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)  # of all columns
     independent: tuple[int, ...] = eqx.field(static=True)  # the columns that are kept
     expressions: tuple[str, ...] = eqx.field(static=True)  # base parameters in names
+    held: tuple[int, ...] = eqx.field(static=True, default=())  # coordinates that stand still
 
     @property
     def rank(self) -> int:
@@ -72,14 +73,18 @@ def learn(
     trust: float | None = 0.10,
     order: Sequence[int] | None = None,
     width: float = SMOOTH,
+    measured: Mapping[str, float] | None = None,
+    hold: Sequence[str] = (),
 ) -> Learned:
     """Base parameters of the robot and of its friction, weighted by the noise of the torques.
 
     `known` says which friction there is (default: viscous and Coulomb); `noise` is one sigma of a sample, as a share of
     each joint's largest torque (`effort_limit` of the model, or what typical motions take where it has none), `sigma`
     the same in N m or N; `trust` how far the nominal inertials are believed (relative one sigma), None for not at all;
-    `order` prefers columns in the choice of base parameters. Raises `InputError` for a robot with joints of several
-    degrees of freedom and for joints that are not there.
+    `order` prefers columns in the choice of base parameters. `measured`: the only joints whose torque is measured, with
+    one sigma each (N m or N), as the plate under a person (`people.standing`), and links without a mass have none to be
+    learned; `hold`: joints that stand still. Raises
+    `InputError` for a robot with joints of several degrees of freedom and for joints that are not there.
     """
     from ..formats.config import Baseline
 
@@ -89,12 +94,23 @@ def learn(
     names = column_names(robot, terms)
     sampler = Sampler(robot, terms, np.full(robot.nv, width))
     samples = max(64, 4 * len(names) // robot.nv)
-    structure = sampler.rows(np.stack(random_states(robot, samples)))  # what any motion at all could show
+    held = np.array([_column(robot, "hold", name) for name in hold], int)
+    rows = [_column(robot, "measured", name) for name in measured] if measured else list(range(robot.nv))
+    states = np.stack(random_states(robot, samples * (robot.nv // len(rows))))
+    states[:, :, held] = 0.0
+    structure = sampler.rows(states)[rows]  # what any motion at all could show
+    if measured:  # a link that has no mass, between two axes of a joint, is none
+        structure[:, np.repeat(np.asarray(robot.inertia)[:, 0] <= 0, 10).nonzero()[0]] = 0.0
     base = base_parameters(structure.swapaxes(1, 2).reshape(-1, len(names)), names, order)
     own = 10 * len(robot.joints)
     scale = _sigmas(robot, noise) if sigma is None else np.asarray(sigma, float)
     if scale.shape != (robot.nv,) or not (scale > 0).all():
         raise InputError(f"noise: {robot.nv} standard deviations above zero are needed, one for each joint")
+    if measured:
+        scale = np.full(robot.nv, np.inf)
+        scale[rows] = list(measured.values())
+        if not (scale[rows] > 0).all():
+            raise InputError("measured: one sigma of each joint is above zero")
     prior = np.zeros((base.rank, base.rank))
     if trust is not None:
         precision = np.append(rigid_prior(robot, trust)[1], np.full(len(names) - own, UNKNOWN_DRIVE))
@@ -109,7 +125,14 @@ def learn(
         names=names,
         independent=tuple(base.independent.tolist()),
         expressions=base.expressions,
+        held=tuple(held.tolist()),
     )
+
+
+def _column(robot: RobotModel, key: str, name: str) -> int:
+    if name not in robot.dof_names:
+        raise InputError(f"{key}: no moving joint '{name}'{nearest(name, robot.dof_names)}")
+    return robot.dof_names.index(name)
 
 
 def _sigmas(robot: RobotModel, noise: float | Mapping[str, float]) -> Float[np.ndarray, " nv"]:
