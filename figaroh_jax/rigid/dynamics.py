@@ -21,7 +21,7 @@ from ..compiled.precision import in_float64
 from .inertia import pseudo_inertia
 from .kinematics import Motion, add_up, ancestors, axis_twists, check_shapes, gather, motion, movers, pose_columns, take
 from .model import RobotModel
-from .scalar_programs import ACCELERATIONS, MASSES, TORQUES, straight, written, written_torques
+from .scalar_programs import ACCELERATIONS, LIMB_TORQUES, MASSES, TORQUES, in_limbs, straight, written, written_torques
 from .spatial import cross, matmul, rotate
 
 __all__ = [
@@ -127,7 +127,8 @@ def joint_masses(model: RobotModel, q: Float[Array, "nq samples"]) -> Float[Arra
     return gather(model, jnp.swapaxes(gather(model, full), 0, 1))
 
 
-_TORQUES = straight(TORQUES, joint_torques)
+_LIMBS = straight(LIMB_TORQUES, joint_torques)
+_TORQUES = straight(TORQUES, joint_torques, apart=lambda model: _LIMBS if in_limbs(model) else None)
 _MASSES = straight(MASSES, joint_masses, lambda model: model.nv**2)
 
 

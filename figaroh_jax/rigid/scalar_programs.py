@@ -30,11 +30,14 @@ __all__ = [
     "ACCELERATIONS",
     "BLOCKS",
     "DENSE",
+    "LIMB_TORQUES",
     "MASSES",
     "PACKED",
     "TORQUES",
     "Written",
+    "in_limbs",
     "straight",
+    "weighted_rows",
     "written",
     "written_torques",
 ]
@@ -174,6 +177,14 @@ class Robot:
     def children(self, i: int) -> list[int]:
         """Joints that hang on joint i."""
         return [k for k, joint in enumerate(self.joints) if joint.parent == i]
+
+    def above(self, i: int) -> list[int]:
+        """Joints that move joint i's frame, from the world on."""
+        out: list[int] = []
+        while i >= 0 and self.joints[i].parent >= 0:
+            i = self.joints[i].parent
+            out.insert(0, i)
+        return out
 
 
 class Pose(NamedTuple):
@@ -334,8 +345,23 @@ def _carried(robot: Robot, i: int, motion: Motion, spin: Matrix) -> tuple[Vector
     return force, _add(_cross(h, motion.ac), about)
 
 
-def torques(robot: Robot, q: Read, v: Read, a: Read, put: Callable[[int, Number], None]) -> None:
-    """Newton and Euler's recursion (Luh, Walker and Paul, 1980): `put` receives the torque of every coordinate."""
+def torques(
+    robot: Robot,
+    q: Read,
+    v: Read,
+    a: Read,
+    put: Callable[[int, Number], None],
+    limbs: Sequence[int] = (),
+    limb: int = -1,
+    hand: Callable[[list[Number]], None] = lambda six: None,
+    taken: Callable[[int], list[Number]] = lambda child: [],
+) -> None:
+    """Newton and Euler's recursion (Luh, Walker and Paul, 1980): `put` receives the torque of every coordinate.
+
+    Where `limbs` are told, by their first joints, only those of `limb` are put. Its motion comes from the world anew;
+    `taken` gives the force and the torque of a limb that hangs on it, as that limb had them for `hand`: about the
+    origin of the link that carries it, in its axes.
+    """
     total: dict[int, Number] = {}
     left = np.bincount(robot.dofs.column)
 
@@ -345,7 +371,11 @@ def torques(robot: Robot, q: Read, v: Read, a: Read, put: Callable[[int, Number]
         own = _spin(motion)
         force, torque = _carried(robot, i, motion, own)
         for child in robot.children(i):
-            there, about = visit(child, motion, own)
+            if child in limbs:
+                six = taken(child)
+                there, about = tuple(six[:3]), tuple(six[3:])
+            else:
+                there, about = visit(child, motion, own)
             force, torque = _add(force, there), _add(torque, about)
         ratio = robot.of_joint(i, "ratio")[0]
         for k in robot.own(i):
@@ -360,9 +390,15 @@ def torques(robot: Robot, q: Read, v: Read, a: Read, put: Callable[[int, Number]
         up = pose.turn(force)
         return up, _add(pose.turn(torque), _cross(pose.origin, up))
 
-    still = _rest(robot)
-    for i in robot.children(-1):
-        visit(i, still, _spin(still))
+    motion = _rest(robot)
+    spin = _spin(motion)
+    for i in robot.above(limb):
+        motion = _moved(robot, i, _pose(robot, i, q), motion, spin, v, a)
+        spin = _spin(motion)
+    for i in [limb] if limb >= 0 else robot.children(-1):
+        up, about = visit(i, motion, spin)
+        if limb >= 0 and robot.joints[i].parent >= 0:
+            hand([*up, *about])
 
 
 class Written(eqx.Module):
@@ -634,10 +670,62 @@ def columns(model: RobotModel) -> list[list[tuple[int, int]]]:
 
 def _torques(model: RobotModel, codes: bytes) -> list[Program]:
     def inverse_dynamics(load: Load, reads: list[Read], write: Write) -> None:
-        q, v, a = reads
+        q, v, a = reads[:3]
         torques(Robot(model.joints, codes, load), q, v, a, lambda row, number: write([((row,), number)]))
 
     return [inverse_dynamics]
+
+
+LIMB = 10  # joints of which one kernel holds the torques: the numbers of more are not held by a lane's registers
+
+
+@lru_cache(maxsize=64)
+def _limbs(joints: tuple[Joint, ...]) -> tuple[int, ...]:
+    """First joints of parts of the tree, so many joints at the most in each, those further out before others.
+
+    None at all where the tree is one part, or where two parts share a coordinate.
+    """
+    size, cut = [1] * len(joints), list[int]()
+    for i in reversed(range(len(joints))):
+        hanging = sorted((k for k, joint in enumerate(joints) if joint.parent == i), key=lambda k: size[k])
+        size[i] += sum(size[k] for k in hanging)
+        while size[i] > LIMB and hanging:
+            cut.append(hanging.pop())
+            size[i] -= size[cut[-1]]
+    cut += [i for i, joint in enumerate(joints) if joint.parent < 0]
+    part = list[int]()
+    for i, joint in enumerate(joints):
+        part.append(i if i in cut else part[joint.parent])
+    places = dofs(joints)
+    shared = any(len({part[j] for j in places.joint[places.column == k]}) > 1 for k in set(places.column.tolist()))
+    return () if len(cut) == 1 or shared or len(joints) <= LIMB else tuple(sorted(cut, reverse=True))
+
+
+def _handed(model: RobotModel) -> dict[int, list[int]]:
+    """Where the six numbers of each limb that hangs on another stand, behind the torques."""
+    hanging = [i for i in _limbs(model.joints) if model.joints[i].parent >= 0]
+    return {i: list(range(model.nv + 6 * n, model.nv + 6 * n + 6)) for n, i in enumerate(hanging)}
+
+
+def _limb_torques(model: RobotModel, codes: bytes) -> list[Program]:
+    limbs, handed = _limbs(model.joints), _handed(model)
+
+    def of_limb(limb: int) -> Program:
+        def inverse_dynamics(load: Load, reads: list[Any], write: Write) -> None:
+            q, v, a, back = reads
+            torques(
+                Robot(model.joints, codes, load),
+                *(q, v, a),
+                put=lambda row, number: write([((row,), number)]),
+                limbs=limbs,
+                limb=limb,
+                hand=lambda six: write([((k,), number) for k, number in zip(handed[limb], six, strict=True)]),
+                taken=lambda child: back([(k,) for k in handed[child]]),
+            )
+
+        return inverse_dynamics
+
+    return [of_limb(limb) for limb in limbs]
 
 
 def _blocks(coordinates: bool, model: RobotModel, codes: bytes) -> list[Program]:
@@ -649,12 +737,56 @@ def _blocks(coordinates: bool, model: RobotModel, codes: bytes) -> list[Program]
             def put(row: int, link: int, ten: list[Number]) -> None:
                 write([((place[row, link], k), number) for k, number in enumerate(ten)])
 
-            q, v, a = reads
+            q, v, a = reads[:3]
             regressor_blocks(Robot(model.joints, codes, load), q, v, a, put, links, coordinates)
 
         return regressor
 
     return [of_links(links) for links in _pieces(model)]
+
+
+def _weighted_rows(side: int, model: RobotModel, codes: bytes) -> list[Program]:
+    """Of each coordinate all of a normal matrix's columns: those of the links, then `side` given ones; weighed."""
+    blocks = _rows(model, True)
+    first = {int(row): int(np.flatnonzero(blocks[:, 0] == row)[0]) for row in blocks[:, 0]}
+    place = {tuple(block): 10 * (k - first[block[0]]) for k, block in enumerate(blocks.tolist())}
+    pieces = _pieces(model)
+
+    def of_links(links: list[int]) -> Program:
+        def weighted_rows(load: Load, reads: list[Read], write: Write) -> None:
+            q, v, a, root, given = reads[:5]
+
+            def put(row: int, link: int, ten: list[Number]) -> None:
+                write([((row, place[row, link] + k), number * root(row)) for k, number in enumerate(ten)])
+
+            if links is pieces[0]:
+                for row, (count,) in enumerate(_row_lengths(side, model)):
+                    own = range(row * side, (row + 1) * side)
+                    write([((row, count - side + n), given(k) * root(row)) for n, k in enumerate(own)])
+            regressor_blocks(Robot(model.joints, codes, load), q, v, a, put, links, True)
+
+        return weighted_rows
+
+    return [of_links(links) for links in pieces]
+
+
+def _row_lengths(side: int, model: RobotModel) -> list[tuple[int]]:
+    counts = np.bincount(_rows(model, True)[:, 0], minlength=model.nv)
+    return [(10 * int(count) + side,) for count in counts]
+
+
+def weighted_rows(side: int, plain: Callable[..., list[Array]]) -> Straight:
+    """Rows (columns, samples) of each coordinate: of the links that it moves, then its `side` given ones.
+
+    The arrays are q, v, a, the roots of the weights (samples, nv) and the given columns (samples, nv * side).
+    """
+    form = _Form(f"rows beside {side}", partial(_weighted_rows, side), partial(_row_lengths, side), last=True)
+
+    def read(model: RobotModel) -> list[list[tuple[int, int]]]:
+        given = ([(4, row * side + n) for n in range(side)] for row in range(model.nv))
+        return [*columns(model), *([(3, row)] for row in range(model.nv)), *(one for one in given if one)]
+
+    return straight(form, plain)._replace(plain=plain, columns=read)
 
 
 def _pieces(model: RobotModel) -> list[list[int]]:
@@ -684,7 +816,7 @@ def _masses(model: RobotModel, codes: bytes) -> list[Program]:
 
 def _accelerations(model: RobotModel, codes: bytes) -> list[Program]:
     def forward_dynamics(load: Load, reads: list[Read], write: Write) -> None:
-        q, v, tau = reads
+        q, v, tau = reads[:3]
         accelerations(Robot(model.joints, codes, load), q, v, tau, lambda row, number: write([((row,), number)]))
 
     return [forward_dynamics]
@@ -735,7 +867,7 @@ class _Form(NamedTuple):
 
     name: str
     programs: Callable[[RobotModel, bytes], list[Program]]
-    shape: Callable[[RobotModel], tuple[int, ...]]
+    shape: Callable[[RobotModel], Any]
     finish: Callable[[RobotModel, Array], Array] | None = None
     last: bool = False
     answer: Callable[[RobotModel], tuple[int, ...]] | None = None
@@ -757,6 +889,13 @@ _ANSWERS = {"rows": lambda model: (len(_rows(model, False)), 10), "blocks": lamb
 
 ACCELERATIONS = _Form("accelerations", _accelerations, lambda model: (model.nv,))
 TORQUES = _Form("torques", _torques, lambda model: (model.nv,))
+LIMB_TORQUES = _Form(
+    "torques of limbs",
+    _limb_torques,
+    lambda model: (model.nv + 6 * len(_handed(model)),),
+    lambda model, whole: whole[: model.nv],
+    answer=lambda model: (model.nv,),
+)
 PACKED = _Form("packed", partial(_blocks, False), _ANSWERS["rows"], last=True)
 BLOCKS = _Form("blocks", partial(_blocks, True), _ANSWERS["blocks"], last=True)
 DENSE = _Form(
@@ -774,8 +913,13 @@ def _in_order(shape: Callable[[RobotModel], tuple[int, ...]], model: RobotModel,
     return [int(np.ravel_multi_index(place, shape(model)))]
 
 
-def straight(form: _Form, kernel: Callable[..., Any], width: Callable[[RobotModel], int] = lambda model: 1) -> Straight:
-    """A form beside the plain kernel with the same answers; `width` as `over_samples` takes it."""
+def straight(
+    form: _Form,
+    kernel: Callable[..., Any],
+    width: Callable[[RobotModel], int] = lambda model: 1,
+    apart: Callable[[RobotModel], Straight | None] = lambda model: None,
+) -> Straight:
+    """A form beside the plain kernel with the same answers; `width` as `over_samples` takes it, `apart` as Straight."""
 
     def plain(model: RobotModel, *arrays: Any) -> Any:
         arrays = tuple(jnp.asarray(x) for x in arrays)
@@ -798,4 +942,10 @@ def straight(form: _Form, kernel: Callable[..., Any], width: Callable[[RobotMode
         finish=form.finish,
         answer=form.answer or form.shape,
         places=form.places or partial(_in_order, form.shape),
+        apart=apart,
     )
+
+
+def in_limbs(model: RobotModel) -> bool:
+    """Whether the tree is too large for one kernel, and falls into limbs."""
+    return bool(_limbs(model.joints))
