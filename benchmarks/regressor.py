@@ -235,9 +235,7 @@ def main() -> None:
         worker.close()
     print(f"{told}; {rounds} rounds on core {options.core}; float64; medians [min, max] over the rounds\n")
     cases, compile_time = {}, {}
-    print(
-        "CPU s of the first call (trace, compile, run 1000 samples) in a fresh process without cache, and with kept programs"
-    )
+    print("CPU s of the first call, 1000 samples, in a fresh process: without cache, and with kept programs")
     for name in options.robots:
         path = str(DATA / ROBOTS[name])
         joints = [j for j in load_urdf(path).joint_names if j not in LOCKED]
