@@ -150,7 +150,8 @@ def surroundings() -> str:
     lines = info.read_text().splitlines() if info.exists() else []
     processor = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
     versions = (jax.__version__, version("jaxlib"), platform.machine(), platform.processor())
-    return repr((source.hexdigest(), versions, processor, os.environ.get("XLA_FLAGS")))
+    quick = jax.config.values.get("jax_disable_most_optimizations")
+    return repr((source.hexdigest(), versions, processor, os.environ.get("XLA_FLAGS"), quick))
 
 
 class _Entry(NamedTuple):
