@@ -99,12 +99,12 @@ def study(
     unseen = simulated.record(person, rng, seconds, **skin)
     data = size(robot, own, fitted) if exact is None else true_size(robot, own, person, fitted[0])
     known = person if exact == "all" else None
-    captures = [captured(robot, own, data, trial, known) for trial in fitted]
-    judge = captured(robot, own, data, unseen, known, exact=True)
+    captures = [captured(robot, own, data, trial, known)[0] for trial in fitted]
+    judge = captured(robot, own, data, unseen, known)
     weight = float(np.mean([np.linalg.norm(c.wrench[:, :3], axis=1).mean() for c in captures]))
     table = people.anthropometric(robot, weight / 9.81, "male", np.asarray(data.scale))
     found = people.identify_segments(captures, table)
-    unscaled = captured(robot, own, None, unseen, exact=True)
+    unscaled = captured(robot, own, None, unseen)
     return judged(person, robot, found, table, judge, unscaled, data, unseen)
 
 
@@ -125,11 +125,11 @@ def true_size(robot, own, person, trial):
     return eqx.tree_at(lambda d: (d.scale, d.shift), data, (scale, shift))
 
 
-def captured(robot, own, fitted, trial, known=None, exact=False):
-    """Positions by inverse kinematics with the sizes found (None: the model's), and the capture.
+def captured(robot, own, fitted, trial, known=None) -> tuple[people.Capture, people.Capture]:
+    """Positions by inverse kinematics with the sizes found (None: the model's), and two captures.
 
-    `known`: the person whose true positions are taken instead; `exact`: with a second capture, of what plates without
-    noise and zeros would say.
+    The first is of the plates, the second of what plates without noise and zeros would say. `known`: the person whose
+    true positions are taken instead.
     """
     if known is not None:
         q, model = np.empty((len(trial.time), robot.nq)), fitted.robot(robot)
@@ -141,9 +141,8 @@ def captured(robot, own, fitted, trial, known=None, exact=False):
         if fitted is not None:
             data = eqx.tree_at(lambda d: (d.scale, d.shift), data, (fitted.scale, fitted.shift))
         q, model = markers.joint_positions(robot, data).position, data.robot(robot)
-    plates = [trial.plates, trial.exact] if exact else [trial.plates]
-    both = [people.capture(model, trial.time, q, some, CUTOFF) for some in plates]
-    return both if exact else both[0]
+    read, exact = (people.capture(model, trial.time, q, some, CUTOFF) for some in (trial.plates, trial.exact))
+    return read, exact
 
 
 def judged(person, robot, found, table, both, unscaled, data, unseen) -> dict:
