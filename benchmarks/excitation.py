@@ -727,10 +727,13 @@ def ranking(triples: int = 200) -> None:
         return theta
 
     def error(some: Any) -> float:
-        theta = fit(some, weight)
+        """RMS on the other runs, in that of the fit to all runs there: some runs are harder than others."""
         others = [data[k] for k in range(count) if k not in some]
-        squares = np.sum([one.squares(theta) for one in others], axis=0) * weight
-        return float(np.sqrt(squares.sum() / np.sum([one.rows for one in others])))
+        squares = [
+            (np.sum([one.squares(theta) for one in others], axis=0) * weight).sum()
+            for theta in (fit(some, weight), fit(range(count), weight))
+        ]
+        return float(np.sqrt(squares[0] / squares[1]))
 
     weight = np.ones(6)
     for _ in range(5):
@@ -739,20 +742,33 @@ def ranking(triples: int = 200) -> None:
     grams = [one.factor(weight)[:, kept] for one in data]
     grams = [A.T @ A for A in grams]
 
+    every_gram, rows = sum(grams), float(np.sum([one.rows for one in data]))
+
     def told_by(some: Any) -> float:
         return float(np.linalg.slogdet(np.asarray(learned.prior) + sum(grams[k] for k in some))[1])
 
+    def foreseen(some: Any) -> float:
+        """Less the mean square of the error on all runs that the noise of these makes, sigmas."""
+        G = np.asarray(learned.prior) + sum(grams[k] for k in some)
+        size = np.sqrt(np.diag(G))
+        return -float(np.trace(np.linalg.solve(G / np.outer(size, size), every_gram / np.outer(size, size)))) / rows
+
     every = list(itertools.combinations(range(count), 3))
-    best, worst = max(every, key=told_by), min(every, key=told_by)
     some = [every[k] for k in np.random.default_rng(0).permutation(len(every))[:triples]]
-    errors, scores = [error(t) for t in some], [told_by(t) for t in some]
-    ends = f"best 3 {error(best):.3f}, worst 3 {error(worst):.3f}"
-    print(f"{count} runs; error on the others in sigmas of a fit to all: {ends}")
+    errors = np.array([error(t) for t in some])
+    print(f"{count} runs; errors on the others beside those of a fit to all")
     print(f"{triples} random triples: median {np.median(errors):.3f}, best {min(errors):.3f}, worst {max(errors):.3f}")
-    print(f"rank correlation of log determinant and error: {spearmanr(scores, errors)[0]:.2f}")
     alone = [error((k,)) for k in range(count)]
-    told = [told_by((k,)) for k in range(count)]
-    print(f"single runs: rank correlation {spearmanr(told, alone)[0]:.2f}")
+    for name, score in (("information", told_by), ("prediction", foreseen)):
+        best, worst = max(every, key=score), min(every, key=score)
+        scores = np.array([score(t) for t in some])
+        halves = [np.median(errors[scores >= np.median(scores)]), np.median(errors[scores < np.median(scores)])]
+        print(
+            f"{name}: best 3 {error(best):.3f}, worst 3 {error(worst):.3f}; medians of the better and the worse half"
+            f" {halves[0]:.3f} {halves[1]:.3f}; rank correlation {spearmanr(scores, errors)[0]:.2f}, of single runs"
+            f" {spearmanr([score((k,)) for k in range(count)], alone)[0]:.2f}",
+            flush=True,
+        )
 
 
 def gpu(starts: int = 256, outer: int = 5, inner: int = 100, compared: int = 4) -> None:
@@ -832,12 +848,11 @@ def peer(seeds: int = 20) -> None:
     many = [on_peer_problem(1, seed=seed) for seed in range(seeds)]
     for seed, one in enumerate(many[:3]):
         told(f"one start, seed {seed}", *one)
-    quartiles = [np.percentile([one(x) for x in many], (25, 50, 75)) for one in (lambda x: x[0].logdet, lambda x: x[1])]
-    print(
-        "{} seeds, quartiles: logdet {:.2f} {:.2f} {:.2f}, CPU s {:.3f} {:.3f} {:.3f}".format(
-            seeds, *np.ravel(quartiles)
-        )
-    )
+    for starts in (1, 2, 3):
+        if starts > 1:
+            many = [on_peer_problem(starts, seed=seed) for seed in range(seeds)]
+        logdet, cpu = (np.percentile(x, (25, 50, 75)) for x in zip(*((a.logdet, b) for a, b in many), strict=True))
+        print(f"{seeds} seeds, {starts} starts, quartiles: logdet {np.round(logdet, 2)}, CPU s {np.round(cpu, 3)}")
     told("best of 32", *on_peer_problem(32))
     told("condition, best of 8", *on_peer_problem(8, "condition"))
     print(f"peer, quoted: {PEER}")

@@ -8,9 +8,10 @@ library; several are compiled at once, one at a time runs on a GPU. Every figure
 of JSON, as soon as it is taken, so that what is cut off has told what it knew.
 
 A process puts the states on the device, traces and compiles (told apart), compares the first 1000 answers with those of
-a process that sees the CPU alone, and calls until half a second has passed: the best call counts. Then a fresh process
-does the same with the programs that the first one kept, for the time of its first call. The robot is known when the
-function is compiled; "argument" says where it is an argument of the program.
+a process that sees the CPU alone, and calls until half a second has passed: the best call counts ("in a program"). Two
+more call the public function as it is ("called"), for the time of the first call without kept programs and with those
+that the one before kept. The robot is known when the function is compiled; "argument" says where it is an argument of
+the program.
 """
 
 from __future__ import annotations
@@ -50,6 +51,17 @@ CASES = {
 }
 
 
+_PUBLIC = (
+    "inverse dynamics",
+    "forward dynamics",
+    "mass matrix",
+    "packed regressor",
+    "dense regressor",
+    "normal matrix",
+)
+STAGES = {"in a program": tuple(CASES), "called, none kept": _PUBLIC, "called, kept": _PUBLIC}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("robots", type=Path, nargs="+", metavar="ROBOT.urdf")
@@ -83,7 +95,7 @@ def _case(robot: Path, name: str, gpu: str, folder: Path, options: argparse.Name
     here = os.environ | {"XDG_CACHE_HOME": str(own), "CUDA_VISIBLE_DEVICES": gpu}
     here["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     cpu = subprocess.Popen([*command, "cpu"], env=here | {"JAX_PLATFORMS": "cpu"})
-    for stage in ("none kept", "kept"):
+    for stage in STAGES if name in STAGES["called, kept"] else list(STAGES)[:1]:
         try:
             done = subprocess.run([*command, stage], env=here, timeout=LONGEST, capture_output=True, text=True)
             found = done.stdout.splitlines()[-1] if done.returncode == 0 else json.dumps({"failed": done.stderr[-600:]})
@@ -97,7 +109,7 @@ def _case(robot: Path, name: str, gpu: str, folder: Path, options: argparse.Name
 
 def _tell(row: dict[str, Any], out: Path | None) -> None:
     print(
-        f"{row['robot']:14} {row['function']:26} {row['programs']:9}",
+        f"{row['robot']:14} {row['function']:26} {row['programs']:17}",
         row.get("failed")
         or f"{row['samples']:8d} samples {row['rate']:10.2f} M/s; first call {row['first']:6.2f} s"
         f" (traced {row['traced']:.2f}, compiled {row['compiled']:.2f}); {row['difference']:.1e} from the CPU;"
@@ -123,9 +135,13 @@ def _child(robot: Path, name: str, folder: str, stage: str, samples: int) -> Non
         np.save(reference.with_suffix(".tmp.npy"), found)
         reference.with_suffix(".tmp.npy").replace(reference)
         return
-    keep_programs()
+    if stage.startswith("called"):
+        keep_programs()
     samples = samples or CASES[name][model.nv > 10]
     jax.block_until_ready(jax.device_put(np.zeros(8)) + 1.0)  # the device is there and has run something
+    if stage.startswith("called"):
+        print(json.dumps(_called(model, name, samples)))
+        return
     types = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in _states(model, name, samples, lengths_alone=True)]
     begin = time.perf_counter()
     lowered = jax.jit(_function(model, name)).lower(*types)
@@ -146,14 +162,28 @@ def _child(robot: Path, name: str, folder: str, stage: str, samples: int) -> Non
     row |= {"rate": samples / best / 1e6, "peak": peak, "device": jax.devices()[0].device_kind, "jax": jax.__version__}
     if name == "normal matrix":  # a sum: of the same samples, on the GPU too
         small = [x[:CHECKED] for x in state]
-        sample = _answer(jax.jit(_function(model, name))(*small)) if stage == "none kept" else None
+        sample = _answer(jax.jit(_function(model, name))(*small))
     print(json.dumps(row | {"difference": _difference(sample, reference)}))
 
 
+def _called(model: Any, name: str, samples: int) -> dict[str, Any]:
+    """The public function called as it is, first and then."""
+    import jax
+
+    function, state = _function(model, name), _states(model, name, samples)
+    with _alone():
+        state = [jax.block_until_ready(jax.device_put(x)) for x in state]
+        begin = time.perf_counter()
+        jax.block_until_ready(function(*state))
+        first = time.perf_counter() - begin
+        rate = samples / _best(function, state) / 1e6
+        peak = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", 0)
+    nothing = dict.fromkeys(("traced", "compiled", "difference"), -1.0)
+    return {"samples": samples, "first": first, "rate": rate, "peak": peak, **nothing}
+
+
 def _difference(found: Any, reference: Path) -> float:
-    """Largest difference from the CPU's answers, over the largest number; -1 where nothing was compared."""
-    if found is None:
-        return -1.0
+    """Largest difference from the CPU's answers, over the largest number."""
     while not reference.exists():
         time.sleep(0.2)
     cpu = np.load(reference)

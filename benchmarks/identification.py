@@ -1,10 +1,10 @@
 """Base parameters and their least squares fit against FIGAROH: CPU seconds and peak memory, in one run.
 
 Random states of a robot with viscous, Coulomb, rotor and offset columns; torque of known parameters and noise. Ours
-streams the states through triangular factors (`States`, `condense`); FIGAROH 1.0.2 builds the tall regressor and
-factors it twice. Each case is a process of its own on one thread; compilation is told apart. `--stream N` reads N
-samples from files on disk, through `condense_on_devices`. The environment of FIGAROH is the one that `regressor.py`
-makes.
+streams the states through well-conditioned products (`States`, `condense_on_devices`) or, with `--factors`, triangular
+factors (`condense`); FIGAROH 1.0.2 builds the tall regressor and factors it twice. Each case is a process of its own on
+one thread; compilation is told apart. `--stream N` reads N samples from files on disk. The environment of FIGAROH is
+the one that `regressor.py` makes.
 """
 
 from __future__ import annotations
@@ -63,16 +63,16 @@ def ours(request: dict[str, Any]) -> dict[str, Any]:
     def fit(samples: int) -> tuple[int, float]:
         if request["files"]:
             rows = States(model, lambda: islice(read_pieces(request["files"], PIECE), -(-samples // PIECE)), terms)
-            condensed = condense_on_devices(rows, folds=1)
         else:
             pieces = range(0, samples, PIECE)
             rows = States(model, lambda: (tuple(data[:, k : min(k + PIECE, samples)]) for k in pieces), terms)
-            condensed = condense(rows, rows.used, folds=1)
+        factors = request["factors"] and not request["files"]
+        condensed = condense(rows, rows.used, folds=1) if factors else condense_on_devices(rows, folds=1)
         base = base_parameters(condensed.factor()[:, :-1], rows.names)
         return base.rank, float(solve(condensed, kept=base.independent).rms.max())
 
     before, start = peak_mb(), time.process_time()
-    fit(PIECE if request["files"] else 100)
+    fit(100 if request["factors"] else PIECE)
     compiled = time.process_time() - start
     start, wall = time.process_time(), time.perf_counter()
     count = request["samples"]
@@ -120,6 +120,8 @@ def main() -> None:
     parser.add_argument("--no-peer", action="store_true", help="ours alone")
     parser.add_argument("--limit-mb", type=float, default=12_000, help="memory that FIGAROH may take")
     parser.add_argument("--cases", nargs="*", default=[f"{name}:{n}" for name, n in CASES], metavar="ROBOT:SAMPLES")
+    parser.add_argument("--factors", action="store_true", help="by QR factorisations (`condense`), not by products")
+    parser.add_argument("--figaroh", default=str(PEER), metavar="PYTHON", help="of an environment that has figaroh")
     parser.add_argument("--stream", type=int, default=0, metavar="N", help="samples of the UR10e from a file on disk")
     options = parser.parse_args()
     if options.work:
@@ -128,18 +130,21 @@ def main() -> None:
     for case in options.cases:
         robot, samples = case.split(":")
         request = {"path": str(DATA / ROBOTS[robot]), "joints": joints_of(robot), "samples": int(samples), "files": []}
+        request["factors"] = options.factors
         mine = ask([sys.executable, __file__, "--work"], request)
         print(f"{case} ours   {_line(mine)}; the first fit, with compilation: {mine.get('first', 0):.1f} s", flush=True)
         if options.no_peer:
             continue
         peer = ask(
-            [str(PEER), str(ROOT / "benchmarks" / "peer_identification.py")], request | {"limit_mb": options.limit_mb}
+            [options.figaroh, str(ROOT / "benchmarks" / "peer_identification.py")],
+            request | {"limit_mb": options.limit_mb},
         )
         print(f"{case} figaroh {_line(peer)}", flush=True)
         if "cpu" in peer and "cpu" in mine:
             print(f"{case} figaroh / ours: {peer['cpu'] / mine['cpu']:.1f}", flush=True)
     if options.stream:
         request = {"path": str(DATA / ROBOTS["UR10e"]), "joints": joints_of("UR10e"), "samples": options.stream}
+        request["factors"] = False
         with tempfile.TemporaryDirectory(dir=ROOT / ".cache") as folder:
             files = write_states(folder, request, options.stream)
             found = ask([sys.executable, __file__, "--work"], request | {"files": files})

@@ -14,7 +14,9 @@ import pytest
 from robots import ARM, TREE, load, states
 
 import figaroh_jax as fj
+from figaroh_jax.compiled import machine_code
 from figaroh_jax.errors import InputError
+from figaroh_jax.estimation import accelerators
 from figaroh_jax.estimation.accelerators import condense_on_devices, coordinates, fit_states
 from figaroh_jax.estimation.base_parameters import base_parameters
 from figaroh_jax.estimation.columns import friction_terms
@@ -54,6 +56,23 @@ def test_sums_on_a_device_are_the_factors_of_the_host(tmp_path: Path):
     fits = [solve(x, WeightedByJoint(), kept=expected.independent).parameters for x in (device, host)]
     np.testing.assert_allclose(*fits, rtol=0, atol=1e-9)
     assert len(device.factors) == 5 and (device.count.sum(1) > 0).all()
+
+
+def test_sums_of_machine_code_are_those_of_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Pieces that are no whole number of chunks, rows of terms computed a chunk at a time; the same folds."""
+    if machine_code._compiler() is None:
+        pytest.skip("no C compiler")
+    for name, value in {"FROM": 16, "TO_COMPILE": 16, "_ready": {}, "_store": lambda: None}.items():
+        monkeypatch.setattr(machine_code, name, value)
+    monkeypatch.setattr(accelerators, "CODE_CHUNK", 64)
+    monkeypatch.setattr(accelerators, "TERMS_CHUNK", 128)
+    rows = tree_states(tmp_path)
+    code, program = condense_on_devices(rows), condense_on_devices(rows, chunk=64)
+    for weight in [None, *np.eye(rows.model.nv)]:
+        expected = normal(program, weight)
+        np.testing.assert_allclose(normal(code, weight), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_array_equal(code.count, program.count)
+    np.testing.assert_allclose(code.torque, program.torque, rtol=0, atol=1e-9)
 
 
 def test_a_motion_that_shows_less_has_a_lower_rank_on_a_device_too(tmp_path: Path):
@@ -131,6 +150,7 @@ PEAK = """
 import sys
 from pathlib import Path
 import numpy as np
+from figaroh_jax.estimation import accelerators
 from figaroh_jax.estimation.accelerators import condense_on_devices
 from figaroh_jax.estimation.states import States, read_pieces
 from figaroh_jax.formats.urdf import load_urdf

@@ -189,7 +189,7 @@ def test_scores_of_the_residual_drawn_again_are_the_scores() -> None:
     np.testing.assert_allclose(again[0], own_scores(rows, linear, columns), rtol=0, atol=1e-9)
     np.testing.assert_array_equal(again[1], 0.0)
     found = evidence.scores(linear, stock, H)
-    np.testing.assert_allclose(evidence.largest(stock, found, again)[0], found[0].z.max(), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(evidence.largest(stock.span, found, again)[0], found[0].z.max(), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("k", "error"), [(1, 0.2), (2, 0.12), (3, 0.09), (10, 0.04)])

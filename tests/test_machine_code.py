@@ -46,11 +46,12 @@ def test_code_of_trees_with_all_joints_gives_pinocchios_numbers(name: str, alway
     twin = random_tree(*TREES[name])
     model, data = twin.model, twin.robot.createData()
     q, v, a = states(model, 157)
-    found = {form: answers(FORMS[form], model, q, v, a) for form in ("torques", "dense")}
+    found = {form: answers(FORMS[form], model, q, v, a) for form in ("torques", "dense", "accelerations")}
     found["masses"] = answers(FORMS["masses"], model, q)
     for k in (0, 1, 127, 128, 155, 156):
         theirs = twin.theirs(q[k])
         agree(found["torques"][k], pin.rnea(twin.robot, data, theirs, v[k], a[k]), 1e-12)
+        agree(found["accelerations"][k], pin.aba(twin.robot, data, theirs, v[k], a[k]), 1e-12)
         upper = np.triu(pin.crba(twin.robot, data, theirs))
         agree(found["masses"][k], upper + np.triu(upper, 1).T, 1e-12)
         agree(found["dense"][k], pin.computeJointTorqueRegressor(twin.robot, data, theirs, v[k], a[k]), 1e-12)
@@ -115,11 +116,22 @@ def test_without_a_compiler_the_plain_form_answers(always: None, tmp_path: Path,
     model = robots.load(robots.ARM, tmp_path)
     arrays = states(model, 30)
     with_code = fj.inverse_dynamics(model, *arrays)
-    for broken in (None, shutil.which("false")):
+    for broken in (None, [str(shutil.which("false"))]):
         monkeypatch.setattr(code, "_ready", {})
         monkeypatch.setattr(code, "_compiler", lambda: broken)  # noqa: B023
         agree(fj.inverse_dynamics(model, *arrays), with_code)
         assert code.machine_code(FORMS["torques"], model, *arrays) is None
+
+
+@pytest.mark.parametrize(("told", "after"), [("cc -g0", ["-g0"]), ("my cc", []), ("no-such -g0", None), ("'", None)])
+def test_the_compiler_is_what_make_takes_it_for(
+    told: str, after: list[str] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "my cc").symlink_to(str(shutil.which("cc")))
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setenv("CC", told)
+    found = code._compiler.__wrapped__()
+    assert found is None if after is None else found is not None and found[1:] == after
 
 
 CHILD = """

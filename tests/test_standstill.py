@@ -14,7 +14,9 @@ from figaroh_jax.diagnosis.layout import held_rows, layout
 from figaroh_jax.diagnosis.problem import Problem
 from figaroh_jax.diagnosis.rest import relative_rest
 from figaroh_jax.diagnosis.standstill import only_sticks, resting
-from figaroh_jax.diagnosis.state import State, baseline, solved
+from figaroh_jax.diagnosis.state import State, assembled, baseline, solved
+from figaroh_jax.effects.sensors import TorqueSaturation
+from figaroh_jax.effects.transmission import RotorInertia
 from figaroh_jax.recordings.stacked import stack
 from figaroh_jax.rigid.model import RobotModel
 from figaroh_jax.simulators.native import NativeBackend
@@ -88,3 +90,20 @@ def test_rows_at_rest_are_those_of_low_speed_and_their_neighbours(model: RobotMo
     slow = speed < 0.08 * speed.max(0)
     assert still[slow].all()
     assert slow.mean() < still.mean() < 0.6
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_drive_at_its_limit_sees_the_torque_of_all_causes(model: RobotModel, first: bool) -> None:
+    """Its torque is what is cut off of all the others', whichever of them a search has found first."""
+    problem, state = recorded(model, lambda v, top, rng: np.zeros_like(v))
+    motion, joint = problem.motion, 1
+    rotor = RotorInertia((joint,), inertia=np.float64(2.0))
+    total = np.asarray(state.motion.total)[:, joint] + 2.0 * np.asarray(motion.acceleration)[:, joint]
+    limit = 0.6 * np.abs(total).max()
+    drive = TorqueSaturation((joint,), share=np.float64(1.0), limit=np.float64(limit))
+    causes = [drive, rotor] if first else [rotor, drive]
+    found = assembled(problem, state, causes)
+    assert [t.name for t in found.terms[-2:]] == [c.name for c in causes]
+    cut = found.parts[-2 if first else -1].torque(np.ones(1))
+    np.testing.assert_allclose(cut[:, joint], np.clip(total, -limit, limit) - total, rtol=0, atol=1e-9 * limit)
+    np.testing.assert_allclose(found.theta[-2:], [1.0, 2.0] if first else [2.0, 1.0], rtol=0, atol=0)

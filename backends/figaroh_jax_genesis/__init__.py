@@ -29,6 +29,7 @@ from genesis.utils.misc import qd_to_torch
 
 from figaroh_jax.errors import InputError, NotSupported
 from figaroh_jax.formats.mujoco_model import frame_poses
+from figaroh_jax.formats.xmlfile import read_xml
 from figaroh_jax.rigid.inertia import from_com, to_com
 from figaroh_jax.rigid.model import RobotModel
 from figaroh_jax.simulators.contract import Capabilities, Reference, as_reference, file_format, host_samples
@@ -83,7 +84,8 @@ class GenesisBackend(FromTorques):
         _set_up()
         try:
             scene = gs.Scene(show_viewer=False)
-            scene.add_entity(getattr(gs.morphs, form.upper())(file=str(Path(str(self._source)).resolve())))
+            path = Path(str(self._source)).resolve()
+            scene.add_entity(getattr(gs.morphs, form.upper())(file=_with_limits(path) if form == "urdf" else str(path)))
             scene.build()
             return scene
         except Exception as error:
@@ -285,6 +287,24 @@ class GenesisBackend(FromTorques):
 def _set_up() -> None:
     if not gs._initialized:
         gs.init(backend=gs.cpu, precision="64", logging_level="error")
+
+
+def _with_limits(path: Path) -> str:
+    """The URDF file, or its text with an infinite limit where a joint has none, which Genesis refuses."""
+    missing, root = False, read_xml(path, "robot")
+    for joint in root.iter("joint"):
+        if joint.get("type") in ("revolute", "prismatic") and joint.find("limit") is None:
+            missing = True
+            joint.append(joint.makeelement("limit", {"effort": "inf", "velocity": "inf"}))
+    if not missing:
+        return str(path)
+    for mesh in root.iter("mesh"):  # a text has no folder
+        name = mesh.get("filename", "")
+        if name and "://" not in name:
+            mesh.set("filename", str(path.parent / name))
+    from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+
+    return etree.tostring(root, encoding="unicode")
 
 
 def _numpy(tensor: Any) -> np.ndarray:

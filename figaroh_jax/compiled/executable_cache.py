@@ -1,4 +1,4 @@
-"""Programs for a CPU that are kept on disk whole: a later process only reads them.
+"""Programs that are kept on disk whole: a later process only reads them.
 
 JAX's persistent cache spares the compilation alone, and only after a function has been traced and lowered, which takes
 five times as long as reading a program. Where that cache is on (the command line turns it on), a `Program` stands in
@@ -26,7 +26,7 @@ import numpy as np
 
 from .store import Store, cache_home
 
-__all__ = ["Program", "keep_programs", "surroundings"]
+__all__ = ["Program", "keep_programs", "keeping", "surroundings"]
 
 _PACKAGE = Path(__file__).parents[1]
 _PLAIN = (tuple, list, dict, type(None))
@@ -36,8 +36,9 @@ class Program:
     """A function of trees of arrays, compiled once for each type of its arguments; to be called outside of any trace.
 
     The first `static` arguments are functions; the arrays of argument `donate` are given away; `options` are those of
-    a CPU's compiler. Where trees other than tuples, lists and dicts come out, or types of another package go in, the
-    program lives as long as the process.
+    a CPU's compiler. For a CPU they are kept; for other devices where a `key` says all that the function depends on
+    beside its name, and then they are for arrays of the first device. Where trees other than tuples, lists and dicts
+    come out, or types of another package go in, the program lives as long as the process.
     """
 
     def __init__(
@@ -46,8 +47,9 @@ class Program:
         static: int = 0,
         donate: int | None = None,
         options: dict[str, Any] | None = None,
+        key: str = "",
     ) -> None:
-        self.function, self.static, self.donate, self.options = function, static, donate, options
+        self.function, self.static, self.donate, self.options, self.key = function, static, donate, options, key
         self._ready: dict[Any, tuple[Any, Any]] = {}
 
     def __call__(self, *args: Any) -> Any:
@@ -95,8 +97,7 @@ class Program:
 
     def _entry(self, static: tuple[Any, ...], leaves: list[Any], tree: Any) -> _Entry | None:
         """Where the program is kept; None where it is not."""
-        folder = jax.config.values.get("jax_compilation_cache_dir")
-        on = jax.config.values.get("jax_enable_compilation_cache") and jax.default_backend() == "cpu"
+        folder, on = keeping(), bool(self.key) or jax.default_backend() == "cpu"
         functions = (self.function, *static)
         if not (folder and on and all(map(_ours, functions)) and all(x is None or _ours(x) for x in _types(tree))):
             return None
@@ -107,11 +108,24 @@ class Program:
             *(f"{f.__module__}.{f.__qualname__}" for f in functions),
             known,
             *(f"{x.shape} {x.dtype}" for x in leaves),
-            f"{self.options} {self.donate} {jax.dtypes.canonicalize_dtype(float)}",
+            f"{self.options} {self.donate} {self.key} {jax.dtypes.canonicalize_dtype(float)}",
+            _device(),
             surroundings(),
         ]
         name = hashlib.blake2b("\n".join(parts).encode(), digest_size=20).hexdigest()
-        return _Entry(Store(Path(folder) / "programs"), name)
+        return _Entry(Store(folder / "programs"), name)
+
+
+def keeping() -> Path | None:
+    """The folder in which programs are kept between processes; None where they are not."""
+    folder = jax.config.values.get("jax_compilation_cache_dir")
+    return Path(str(folder)) if folder and jax.config.values.get("jax_enable_compilation_cache") else None
+
+
+def _device() -> str:
+    """What a program is made for, where that is no CPU."""
+    first = jax.devices()[0]
+    return "" if first.platform == "cpu" else f"{first.device_kind} {first.client.platform_version}"
 
 
 def _ours(thing: Any) -> bool:
@@ -136,7 +150,8 @@ def surroundings() -> str:
     lines = info.read_text().splitlines() if info.exists() else []
     processor = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
     versions = (jax.__version__, version("jaxlib"), platform.machine(), platform.processor())
-    return repr((source.hexdigest(), versions, processor, os.environ.get("XLA_FLAGS")))
+    quick = jax.config.values.get("jax_disable_most_optimizations")
+    return repr((source.hexdigest(), versions, processor, os.environ.get("XLA_FLAGS"), quick))
 
 
 class _Entry(NamedTuple):

@@ -20,6 +20,8 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from . import executable_cache
+
 __all__ = [
     "Load",
     "Number",
@@ -27,8 +29,10 @@ __all__ = [
     "Read",
     "Straight",
     "Write",
+    "kept_here",
     "known_codes",
     "launch",
+    "rounded",
     "straight_answers",
     "usable",
 ]
@@ -95,6 +99,10 @@ Read = Callable[[int], Number]  # column of an array -> its number
 Write = Callable[[Iterable[tuple[tuple[int, ...], Number]]], None]  # takes (place in the answer of a sample, number)
 Columns = Sequence[Sequence[tuple[int, int]]]  # (array, column) that are read together
 Program = Callable[..., None]  # program(load, reads, write); the arguments give and take numbers
+Back = Callable[[Sequence[tuple[int, ...]]], list[Number]]  # places in the answer -> what programs before wrote there
+
+
+Shape = tuple[int, ...] | list[tuple[int, ...]]  # of a list: of several arrays, the first number of a place says which
 
 
 class Straight(NamedTuple):
@@ -111,12 +119,13 @@ class Straight(NamedTuple):
     known_lengths: Callable[[Any], bytes]  # the same of those that stay as they are when the rest is identified
     nothing_known: Callable[[Any], bytes]
     programs: Callable[[Any, bytes], Sequence[Program]]  # each writes a part of the answer
-    shape: Callable[[Any], tuple[int, ...]]  # of what the programs write for a sample
+    shape: Callable[[Any], Shape]  # of what the programs write for a sample
     columns: Callable[[Any], Columns]
     last: bool = False
     finish: Callable[[Any, Array], Array] | None = None  # of what they wrote, the samples last
     answer: Callable[[Any], tuple[int, ...]] = lambda parameters: ()  # shape of a sample's answer, finished
     places: Callable[[Any, tuple[int, ...]], Sequence[int]] | None = None  # in it, flat, of what a program writes
+    apart: Callable[[Any], Straight | None] = lambda parameters: None  # the same in smaller kernels, where one is large
 
 
 def usable(*arrays: Any) -> bool:
@@ -154,13 +163,30 @@ def straight_answers(
     if any(isinstance(x, Tracer) for x in [*leaves, *arrays]):
         return _answers(straight, codes, parameters, *arrays)
     samples = len(arrays[0])
-    missing = _rounded(samples) - samples
+    missing = rounded(samples) - samples
     padded = [jnp.pad(x, ((0, missing), (0, 0)), mode="edge") for x in arrays] if missing and samples else arrays
-    answer = _program(straight, codes, parameters, *padded)
+    program = _kept(straight, codes) if kept_here(*padded) else partial(_program, straight, codes)
+    answer = program(parameters, *padded)
     return (answer[..., :samples] if straight.last else answer[:samples]) if missing else answer
 
 
-def _rounded(samples: int) -> int:
+@lru_cache(maxsize=64)
+def _kept(straight: Straight, codes: bytes) -> executable_cache.Program:
+    def straight_program(parameters: Any, *arrays: Array) -> Any:
+        return _answers(straight, codes, parameters, *arrays)
+
+    return executable_cache.Program(straight_program, key=f"{straight.name} {codes.hex()}")
+
+
+def kept_here(*arrays: Any) -> bool:
+    """Whether programs of these arrays, none of them traced, are kept between processes: on the first device alone."""
+    if executable_cache.keeping() is None or jax.config.values.get("jax_default_device") is not None:
+        return False
+    first = {jax.devices()[0]}
+    return all(x.devices() == first for x in arrays if isinstance(x, jax.Array))
+
+
+def rounded(samples: int) -> int:
     """So many or more: 2^k or 1.5 times that, so that few programs serve all recordings."""
     whole = 1 << max(10, (samples - 1).bit_length()) if samples else 0
     return whole * 3 // 4 if whole > 1024 and samples <= whole * 3 // 4 else whole
@@ -191,24 +217,27 @@ def _batched(straight: Straight, codes: bytes) -> Callable[..., Array]:
         return lax.platform_dependent(parameters, *arrays, cuda=kernel, default=straight.plain)
 
     @call.def_vmap
-    def _(size: int, batched: Any, parameters: Any, *arrays: Array) -> tuple[Array, bool]:
+    def _(size: int, batched: Any, parameters: Any, *arrays: Array) -> tuple[Any, Any]:
         if any(jax.tree.leaves(batched[0])):
             axes = jax.tree.map(lambda b: 0 if b else None, batched)
-            return jax.vmap(straight.plain, in_axes=tuple(axes))(parameters, *arrays), True
+            found = jax.vmap(straight.plain, in_axes=tuple(axes))(parameters, *arrays)
+            return found, jax.tree.map(lambda _: True, found)
         whole = [x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(arrays, batched[1:], strict=True)]
         answer = call(parameters, *(x.reshape(-1, x.shape[-1]) for x in whole))
         if straight.last:
-            return jnp.moveaxis(answer.reshape(*answer.shape[:-1], size, -1), -2, 0), True
+            apart = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], size, -1), -2, 0), answer)
+            return apart, jax.tree.map(lambda _: True, apart)
         return answer.reshape(size, -1, *answer.shape[1:]), True
 
     return call
 
 
 def _kernel(straight: Straight, codes: bytes, parameters: Any, *arrays: Array) -> Array:
+    straight = straight.apart(parameters) or straight
     shape, columns = straight.shape(parameters), straight.columns(parameters)
     constants = straight.constants(parameters).astype(arrays[0].dtype)
-    last = straight.last or prod(shape) > DIRECT or straight.finish is not None
-    answer = None
+    last = straight.last or _numbers(shape) > DIRECT or straight.finish is not None
+    answer: Any = None
     for program in straight.programs(parameters, codes):
         answer = launch(program, constants, arrays, shape, columns, last, answer)
     assert answer is not None
@@ -217,51 +246,60 @@ def _kernel(straight: Straight, codes: bytes, parameters: Any, *arrays: Array) -
     return answer if last == straight.last else jnp.moveaxis(answer, -1, 0)
 
 
+def _numbers(shape: Shape) -> int:
+    return sum(map(prod, shape if isinstance(shape, list) else [shape]))
+
+
 def launch(
     program: Program,
     constants: Float[Array, " constants"],
     arrays: Sequence[Float[Array, "samples _"]],
-    shape: tuple[int, ...],
+    shape: Shape,
     columns: Columns,
     last: bool,
-    into: Array | None = None,
+    into: Any = None,
     interpret: bool = False,
-) -> Array:
+) -> Any:
     """Answers of a program for arrays (samples, k): (samples, *shape), or samples `last`.
 
-    `interpret` computes them without a GPU, slowly. What the program does not write is as in the answer `into`, which
-    is given away, or anything.
+    The program's `reads` are those of the arrays and, last, a `Back`. `interpret` computes them without a GPU, slowly.
+    What the program does not write is as in the answer `into`, which is given away, or anything.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    samples = len(arrays[0])
-    answer = jax.ShapeDtypeStruct((*shape, samples) if last else (samples, *shape), arrays[0].dtype)
+    samples, many = len(arrays[0]), isinstance(shape, list)
+    shapes = [(*one, samples) if last else (samples, *one) for one in (shape if isinstance(shape, list) else [shape])]
+    answers = [jax.ShapeDtypeStruct(one, arrays[0].dtype) for one in shapes]
     if not samples:
-        return jnp.zeros(answer.shape, answer.dtype)
-    pieces = len([x for group in columns for x in group]) + prod(shape) > FEW
+        empty = [jnp.zeros(one.shape, one.dtype) for one in answers]
+        return empty if many else empty[0]
+    pieces = len([x for group in columns for x in group]) + _numbers(shape) > FEW
 
     def kernel(*refs: Any) -> None:
-        (table, once, *given), out = refs[: 2 + len(arrays)], refs[-1]
-        lanes = _Lanes(triton, given, out, samples, last, once[0] if pieces else None, columns)
+        (table, once, *given), outs = refs[: 2 + len(arrays)], refs[-len(answers) :]
+        lanes = _Lanes(
+            triton, given, list(outs) if many else outs[0], samples, last, once[0] if pieces else None, columns
+        )
         program(
             lambda k: table[k],
-            [partial(lanes.read, k) for k in range(len(arrays))],
+            [*(partial(lanes.read, k) for k in range(len(arrays))), lanes.back],
             lanes.write,
         )
 
-    anywhere, before = pl.BlockSpec(memory_space=pl.ANY), () if into is None else (into,)
-    return pl.pallas_call(
+    anywhere, before = pl.BlockSpec(memory_space=pl.ANY), jax.tree.leaves(into)
+    found = pl.pallas_call(
         kernel,
-        out_shape=answer,
+        out_shape=answers,
         grid=(ceil(samples / LANES),),
         in_specs=[anywhere] * (2 + len(arrays) + len(before)),
-        out_specs=anywhere,
-        input_output_aliases={2 + len(arrays): 0} if before else {},
+        out_specs=[anywhere] * len(answers),
+        input_output_aliases={2 + len(arrays) + k: k for k in range(len(before))},
         compiler_params=None if interpret else triton.CompilerParams(num_warps=1, num_stages=1),
         interpret=interpret,
         name=program.__name__,
     )(constants, jnp.ones(1, jnp.int32), *arrays, *before)
+    return list(found) if many else found[0]
 
 
 class _Lanes:
@@ -278,6 +316,7 @@ class _Lanes:
         from jax.experimental import pallas as pl
 
         self.triton, self.given, self.out, self.samples, self.last = triton, given, out, samples, last
+        self.dtype = (out[0] if isinstance(out, list) else out).dtype
         self.once, self.columns = once, columns
         self.index = pl.program_id(0) * LANES + lax.iota(jnp.int32, LANES)
         self.seen: dict[tuple[int, int], Number] = {}
@@ -287,21 +326,34 @@ class _Lanes:
             group = [(array, column)]
             if self.once is not None:
                 group = next(g for g in self.columns if (array, column) in g)
-            start = [jnp.zeros(LANES, self.out.dtype)] * len(group)
+            start = [jnp.zeros(LANES, self.dtype)] * len(group)
             loaded = self._apart(lambda index, _: [self._fetched(index, *one) for one in group], start)
             self.seen.update({one: Number(x) for one, x in zip(group, loaded, strict=True)})
         return self.seen[array, column]
+
+    def back(self, places: Sequence[tuple[int, ...]]) -> list[Number]:
+        """What programs before this one wrote."""
+
+        def read(index: Array, _: list[Array]) -> list[Array]:
+            mask = self._mask(index)
+            other = None if mask is None else 0.0
+            return [self.triton.load(self._at(place, index), mask=mask, other=other) for place in places]
+
+        return [Number(x) for x in self._apart(read, [jnp.zeros(LANES, self.dtype)] * len(places))]
+
+    def _at(self, place: tuple[int, ...], index: Array) -> Any:
+        out, place = (self.out[place[0]], place[1:]) if isinstance(self.out, list) else (self.out, place)
+        return out.at[(*place, index) if self.last else (index, *place)]
 
     def write(self, entries: Iterable[tuple[tuple[int, ...], Number]]) -> None:
         places, numbers = zip(*entries, strict=True)
 
         def put(index: Array, values: list[Array]) -> list[Array]:
             for place, value in zip(places, values, strict=True):
-                at = self.out.at[(*place, index) if self.last else (index, *place)]
-                self.triton.store(at, value, mask=self._mask(index))
+                self.triton.store(self._at(place, index), value, mask=self._mask(index))
             return [*values[1:], -values[0]]  # changed, or the loop would be seen through
 
-        self._apart(put, [_in_lanes(number, self.out.dtype) for number in numbers])
+        self._apart(put, [_in_lanes(number, self.dtype) for number in numbers])
 
     def _fetched(self, index: Array, array: int, column: int) -> Array:
         mask = self._mask(index)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -185,10 +186,17 @@ def _store() -> Store | None:
 
 
 @lru_cache(maxsize=1)
-def _compiler() -> str | None:
+def _compiler() -> list[str] | None:
+    """The compiler and what its user adds to it, as make takes `$CC`: "ccache gcc", or one path that holds a space."""
     if os.environ.get("FIGAROH_JAX_MACHINE_CODE", "") == "0" or os.name == "nt":
         return None
-    return shutil.which(str(os.environ.get("CC") or "cc"))
+    told = os.environ.get("CC") or "cc"
+    try:
+        words = [told] if shutil.which(told) else shlex.split(told)
+    except ValueError:  # a quote that is not closed
+        return None
+    found = shutil.which(words[0]) if words else None
+    return None if found is None else [found, *words[1:]]
 
 
 @lru_cache(maxsize=1)
@@ -197,8 +205,8 @@ def _version() -> str:
     compiler = _compiler()
     if compiler is None:
         return ""
-    info = os.stat(compiler)
-    return f"{os.path.realpath(compiler)} {info.st_size} {info.st_mtime_ns}"
+    info = os.stat(compiler[0])
+    return f"{os.path.realpath(compiler[0])} {compiler[1:]} {info.st_size} {info.st_mtime_ns}"
 
 
 def _compiled(wanted: _Wanted) -> bytes | None:
@@ -210,7 +218,7 @@ def _compiled(wanted: _Wanted) -> bytes | None:
         out = Path(folder) / "code.so"
         try:
             subprocess.run(  # noqa: S603  (the user's own compiler, with source that is made here)
-                [compiler, *FLAGS, "-o", str(out)],
+                [*compiler, *FLAGS, "-o", str(out)],
                 input=_source(wanted).encode(),
                 check=True,
                 capture_output=True,

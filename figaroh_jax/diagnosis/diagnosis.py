@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -35,7 +36,7 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .holdout import fold_error, held_squares, part_error, residual_rms, traces
+from .holdout import fold_error, held_squares, part_error, residual_rms, step_squares, traces
 from .joint import Joint, polished, sized
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import reason_against, standings
@@ -249,7 +250,7 @@ def _judged(searched: _Searched, names: Sequence[str], tolerance: float) -> _Jud
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
     here, joint = _as_predicts_best([here] if same else [here, before], named)
-    gaining = _without_losses(here, named, joint)
+    gaining = _without_losses(here, named, joint, partial(_falls_beside_all, searched))
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= dict.fromkeys(gaining.worse, "the error on the data held out does not fall with it")
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
@@ -292,12 +293,15 @@ class _Gaining(NamedTuple):
     worse: list[Name]  # those that did not
 
 
-def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> _Gaining:
+def _without_losses(
+    here: _Setting, named: list[Found], joint: Joint, falls_beside_all: Callable[[Found], bool]
+) -> _Gaining:
     """The causes without those that do not lower the error on the data held out.
 
     Each must lower the error of the joints where it acts, for a joint of large torque hides what happens at the
-    others; and that of the robot, as it comes in: by what it gains alone, or else after all the others, for some
-    show only beside another.
+    others: beside the named causes, or beside all that were found, for what is left out moves the fit of the rest. And
+    it must lower that of the robot, as it comes in: by what it gains alone, or else after all the others, for some show
+    only beside another.
     """
     worse: list[Name] = []
     later: list[Name] = []  # come in behind the others
@@ -306,6 +310,7 @@ def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> _Gainin
         falls, places = [a - b for a, b in pairwise(squares)], [list(named[k].joints) for k in order]
         own = [f[at].sum() / a[at].sum() for at, f, a in zip(places, falls, squares, strict=False)]
         whole = [f.sum() for f in falls]
+        own = [1.0 if g <= 0 and falls_beside_all(named[k]) else g for k, g in zip(order, own, strict=True)]
         if not named or (min(own) > 0 and min(whole) > 0):
             gains = [float(np.sqrt(s.sum() / power.sum())) for s in squares]
             return _Gaining(named, joint, order, gains, worse)
@@ -316,6 +321,15 @@ def _without_losses(here: _Setting, named: list[Found], joint: Joint) -> _Gainin
         worse.append(named[least].name)
         named = [f for k, f in enumerate(named) if k != least]
         joint = polished(here.problem, here.start, [f.effect for f in named], here.whitening)
+
+
+def _falls_beside_all(searched: _Searched, one: Found) -> bool:
+    """Whether a cause lowers the error of its joints on the data held out with all others in that were found."""
+    problem, start, whitening = searched.here.problem, searched.here.start, searched.here.whitening
+    pairs = zip(searched.found, searched.joint.causes, strict=True)
+    others = with_causes(problem, start, [effect for f, effect in pairs if f.name != one.name], whitening)
+    before, after = (step_squares(problem, s)[list(one.joints)].sum() for s in (others, searched.joint.step))
+    return bool(after < before)
 
 
 def _by_gain(

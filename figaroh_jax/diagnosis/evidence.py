@@ -61,10 +61,12 @@ def scores(linear: Linear, stock: Bank, H: Float[np.ndarray, "P columns"]) -> li
     return [score for score in out if score is not None]
 
 
-def largest(stock: Bank, found: list[Score], drawn: Float[np.ndarray, "draws columns"]) -> Float[np.ndarray, " draws"]:
-    """Largest z of all candidates that other scores of the same columns would have."""
+def largest(
+    span: list[tuple[int, int, int]], found: list[Score], drawn: Float[np.ndarray, "draws columns"]
+) -> Float[np.ndarray, " draws"]:
+    """Largest z that other scores of the same columns would have, of the candidates that own the columns `span`."""
     highest, by_column = np.full(len(drawn), -np.inf), np.ascontiguousarray(drawn.T)
-    for members, columns in _by_width(stock.span):
+    for members, columns in _by_width(span):
         root = np.concatenate([found[i].root for i in members])
         rank = np.concatenate([found[i].rank for i in members])
         Q = _whitened_squares(by_column[columns.T], root)  # z grows with Q: the largest Q of a rank will do

@@ -20,7 +20,7 @@ from .shifts import torque_change
 from .state import State, batched, extended_state
 from .step import Step, stand
 
-__all__ = ["fold_error", "held_squares", "part_error", "predicted", "residual_rms", "traces"]
+__all__ = ["fold_error", "held_squares", "part_error", "predicted", "residual_rms", "step_squares", "traces"]
 
 
 def held_squares(
@@ -32,18 +32,27 @@ def held_squares(
     each predicted by a fit to the rest.
     """
     out, step = [], None
-    mask = problem.held if problem.held.any() else np.asarray(problem.records.judged)
     for effect in [None, *causes]:
         grown = start if step is None or effect is None else extended_state(problem, step.state, effect)
         step = stand(problem, grown, whitening, step)
-        state, part = step.state, problem.layout.part
-        if problem.held.any():
-            error = problem.torque - predicted(problem, state)
-        else:
-            parts = judge(step.rows._replace(fold=part), Hypothesis(step.rows.X, state.prior)).folds
-            error = _left_out(problem, state, parts, part)
-        out.append(((error * mask) ** 2).sum((0, 1)))
-    return out, ((problem.torque * mask) ** 2).sum((0, 1))
+        out.append(step_squares(problem, step))
+    return out, ((problem.torque * _kept_out(problem)) ** 2).sum((0, 1))
+
+
+def step_squares(problem: Problem, step: Step) -> Float[np.ndarray, " nv"]:
+    """Squares of each joint's error on data not fitted (N m or N, squared), as `held_squares` has them, of one fit."""
+    state, part = step.state, problem.layout.part
+    if problem.held.any():
+        error = problem.torque - predicted(problem, state)
+    else:
+        parts = judge(step.rows._replace(fold=part), Hypothesis(step.rows.X, state.prior)).folds
+        error = _left_out(problem, state, parts, part)
+    return ((error * _kept_out(problem)) ** 2).sum((0, 1))
+
+
+def _kept_out(problem: Problem) -> np.ndarray:
+    """The rows whose errors count: those of holdout recordings; without any, all that are judged."""
+    return problem.held if problem.held.any() else np.asarray(problem.records.judged)
 
 
 def predicted(problem: Problem, state: State) -> Float[np.ndarray, "n M nv"]:

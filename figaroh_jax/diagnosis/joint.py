@@ -17,7 +17,7 @@ from .design import kind, shapes, with_shape
 from .estimates import Fitted, amplitude_places, torque_slopes, with_amplitudes
 from .problem import Problem, family_of
 from .search import Found
-from .state import State, extended_state, solved
+from .state import State, assembled, solved
 from .step import Step, stand
 
 __all__ = ["Joint", "has_size", "joint_fit", "moved", "polished", "sized"]
@@ -56,18 +56,9 @@ def _settled(effect: Effect) -> bool:
 
 
 def _together(problem: Problem, base: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> Joint:
-    state = base
-    for effect in causes:
-        state = solved(problem, extended_state(problem, state, effect), _grown(state, effect))
-    step = stand(problem, state, whitening)
+    step = stand(problem, assembled(problem, base, causes), whitening)
     causes = with_amplitudes(step.state, causes, problem.model)
     return Joint(step, causes, joint_fit(problem, step.state, step.rows, causes, whitening))
-
-
-def _grown(state: State, effect: Effect) -> Float[np.ndarray, " P"]:
-    if kind(effect) != "columns":
-        return state.theta
-    return np.append(state.theta, [float(getattr(effect, n)) for n, p in effect.parameters().items() if p.linear])
 
 
 def joint_fit(

@@ -16,12 +16,12 @@ from ..results import Name
 from .comparison import Hypothesis, Verdicts, fewer_sums, ground, judge, overlap, shares_of_wins, t_value
 from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
-from .estimates import amplitude_places
+from .estimates import amplitude_places, with_amplitudes
 from .flexible import friction_width
 from .gates import ambiguous, exists, gains, passes, physical_sign, rivals, simpler
 from .problem import Problem
-from .screening import DRAWS, Null, Screen, catalogue, family_p, screen
-from .state import State, with_width
+from .screening import DRAWS, Null, Screen, catalogue, family_p, place_p, screen
+from .state import State, solved, with_width
 from .step import Step, stand, with_cause, with_causes
 from .thresholds import AGAIN, CONFIDENT, GAIN, MOST_CAUSES, MUCH, OTHER, SMALLEST
 
@@ -56,7 +56,7 @@ class Search(NamedTuple):
     """How a search ended: the problem and the baseline as it sees them, its last step, the causes in order."""
 
     problem: Problem
-    start: State
+    start: State  # with the coefficients that it has beside all causes
     step: Step
     found: list[Found]
     p_value: float  # of the whole catalogue before anything was found
@@ -108,10 +108,21 @@ def find_causes(
         for best in chosen[: MOST_CAUSES - len(found)]:
             found.append(_found(before, contenders, best, screened, p_values[-1], generator))
             step = with_cause(problem, step, best.effect, whitening)
+        if len(found) > 1 and any(type(f.effect).follows_total for f in found):
+            step, screened = _refreshed(problem, state, step, found, whitening), None
         if any(kind(best.effect) != "columns" for best in chosen):
             problem = friction_width(problem, step.state, whitening)
             step, groups, screened = stand(problem, with_width(problem, step.state), whitening), None, None
-    return Search(problem, with_width(problem, state), step, found, p_values[0], p_values[-1], screens[0])
+    begun = solved(problem, with_width(problem, state), step.state.theta[: len(state.theta)])
+    return Search(problem, begun, step, found, p_values[0], p_values[-1], screens[0])
+
+
+def _refreshed(
+    problem: Problem, start: State, step: Step, found: list[Found], whitening: Float[np.ndarray, "F nv"]
+) -> Step:
+    """The step with what follows all torque together evaluated at that of all causes so far."""
+    begun = solved(problem, with_width(problem, start), step.state.theta[: len(start.theta)])
+    return with_causes(problem, begun, with_amplitudes(step.state, [f.effect for f in found], problem.model), whitening)
 
 
 def _chance(
@@ -122,13 +133,18 @@ def _chance(
     generator: np.random.Generator,
     first: bool,
 ) -> float:
-    """p-value of the whole catalogue, with more draws where few leave it open on which side of `alpha` it lies."""
+    """p-value of the whole catalogue, with more draws where few leave it open on which side of `alpha` it lies.
+
+    Once causes are in, each place is asked for itself too: what one joint leaves must not hide another's.
+    """
 
     def drawn(draws: int) -> float:
         return family_p(step.rows, step.linear, screened, null, generator, draws)
 
     p = drawn(DRAWS if first else LATER)
-    return drawn(CLOSER) if alpha < p < NEAR * alpha else p
+    if alpha < p < NEAR * alpha:
+        p = drawn(CLOSER)
+    return p if first or p <= alpha else min(p, place_p(step.rows, step.linear, screened, generator))
 
 
 def _contenders(

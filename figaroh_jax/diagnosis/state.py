@@ -5,12 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Complex, Float, Int
@@ -27,6 +26,7 @@ from .shifts import shifted
 
 __all__ = [
     "State",
+    "assembled",
     "baseline",
     "batched",
     "extended_state",
@@ -59,8 +59,8 @@ class State:
     def motion(self) -> Motion:
         """The motion as measured, with load, total torque and inertia of `theta`."""
         load, *others = self.shares(self.theta)
-        new = (load, sum(others, load), self.theta[: self.rigid.width].reshape(-1, 10))
-        return eqx.tree_at(lambda m: (m.load, m.total, m.model.inertia), self.measured, new)
+        model = replace(self.measured.model, inertia=self.theta[: self.rigid.width].reshape(-1, 10))
+        return replace(self.measured, load=load, total=sum(others, load), model=model)
 
     @property
     def rigid(self) -> Part:
@@ -139,6 +139,43 @@ def extended_state(problem: Problem, state: State, effect: Effect) -> State:
     return replace(grown, parts=(moved, *state.parts[1:]))
 
 
+def assembled(
+    problem: Problem,
+    start: State,
+    causes: Sequence[Effect],
+    before: Callable[[State, Effect], State] = lambda state, effect: state,
+) -> State:
+    """The state with all causes at their sizes, in their order; `before` is asked for the state that one comes into.
+
+    A cause that follows all torque together is evaluated behind the others, whatever its place among them.
+    """
+    order = sorted(range(len(causes)), key=lambda k: type(causes[k]).follows_total)
+    state = start
+    for effect in (causes[k] for k in order):
+        state = before(state, effect)
+        grown = extended_state(problem, state, effect)
+        linear = [n for n, p in effect.parameters().items() if p.linear and kind(effect) == "columns"]
+        state = solved(problem, grown, np.append(state.theta, [float(getattr(effect, n)) for n in linear]))
+    return _rearranged(state, [k for k in order if kind(causes[k]) == "columns"])
+
+
+def _rearranged(state: State, order: list[int]) -> State:
+    """The state with its last terms, which stand in `order`, sorted."""
+    if order == sorted(order):
+        return state
+    first, sorting = len(state.terms) - len(order), np.argsort(order)
+    places = np.split(np.arange(len(state.theta)), np.cumsum([part.width for part in state.parts])[:-1])
+    moved = [*range(first), *(first + sorting)]
+    at = np.concatenate([places[0], *(places[1 + k] for k in moved)])
+    return replace(
+        state,
+        terms=tuple(state.terms[k] for k in moved),
+        parts=(state.rigid, *(state.parts[1 + k] for k in moved)),
+        prior=Prior(state.prior.mean[at], state.prior.precision[at]),
+        theta=state.theta[at],
+    )
+
+
 def on_motion(problem: Problem, state: State) -> State:
     """The state, its coefficients as they are, along the motion of another problem."""
     rigid = _rigid(problem, problem.motion)
@@ -167,8 +204,8 @@ def link_motion(problem: Problem, state: State) -> Motion:
     for effect in state.sensors:
         if kind(effect) == "position":
             moved = shifted(batched(effect), motion, problem.records)
-            first = (moved.position[0], moved.velocity[0], moved.acceleration[0])
-            motion = eqx.tree_at(lambda m: (m.position, m.velocity, m.acceleration), moved, first)
+            position, velocity, acceleration = moved.position[0], moved.velocity[0], moved.acceleration[0]
+            motion = replace(moved, position=position, velocity=velocity, acceleration=acceleration)
     return motion
 
 

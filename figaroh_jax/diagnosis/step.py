@@ -14,7 +14,7 @@ from ..estimation.rows import Linear, Rows, fit
 from .comparison import FoldSums, Hypothesis, Verdicts, coefficients, fold_sums, grown_sums, judge
 from .design import kind
 from .problem import Problem
-from .state import State, extended_state, solved, whitened
+from .state import State, assembled, extended_state, solved, whitened
 
 __all__ = ["Step", "stand", "with_cause", "with_causes"]
 
@@ -61,10 +61,13 @@ def with_cause(problem: Problem, step: Step, effect: Effect, whitening: Float[np
 
 
 def with_causes(problem: Problem, start: State, causes: Sequence[Effect], whitening: Float[np.ndarray, "F nv"]) -> Step:
-    """All causes in at once (sensor effects see the torque of the baseline and of the causes before them)."""
-    state = start
-    for effect in causes:
-        if kind(effect) != "columns":
-            state = stand(problem, state, whitening).state
-        state = extended_state(problem, state, effect)
-    return stand(problem, state, whitening)
+    """All causes in at once, each at its size where it comes in.
+
+    What follows the torque (a late sensor, friction by load) sees that of the coefficients of `start` and of the causes
+    before it; what follows all torque together (a drive at its limit), that of all causes.
+    """
+
+    def solved_first(state: State, effect: Effect) -> State:
+        return state if kind(effect) == "columns" else stand(problem, state, whitening).state
+
+    return stand(problem, assembled(problem, start, causes, solved_first), whitening)

@@ -47,7 +47,7 @@ class TorqueGain(JointEffect):
     """A wrong torque constant or gear ratio: the reading is off by a factor."""
 
     name, title = "torque_gain", "wrong torque gain"
-    follows_torque = True
+    follows_torque = follows_total = True
     equation = "gain tau_hat"
     separated_by = "the same motion of {at} with and without a payload of known mass"
     gain: Scalar = amplitude("")
@@ -90,7 +90,7 @@ class TorqueSaturation(JointEffect):
     """A drive or a sensor that gives no more than its limit."""
 
     name, title = "torque_saturation", "saturation of the torque"
-    follows_torque = True
+    follows_torque = follows_total = True
     equation = "clip(tau_hat, -limit, limit) - tau_hat"
     separated_by = "motion of {at} at two larger accelerations: the largest torque stays"
     share: Scalar = amplitude("", lower=0.5, upper=2.0)  # of what lies above the limit; 1 where nothing passes
@@ -122,7 +122,7 @@ class ClockError(Effect):
     """A clock of the torque that runs faster or slower than that of the position."""
 
     name, title, acts_on = "clock_error", "clocks of position and torque that drift apart", "robot"
-    follows_torque = True
+    follows_torque = follows_total = True
     equation = "rate t p tau_hat"
     separated_by = "a longer recording: the lag at its end against the lag at its start"
     rate: Scalar = amplitude("s/s", lower=-0.02, upper=0.02)

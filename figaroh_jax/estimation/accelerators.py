@@ -1,38 +1,43 @@
 """States condensed on devices: one program for one accelerator or several, and for batches of robots or trajectories.
 
 A QR factorisation of every chunk, which `regression.condense` makes on the host, is slow on an accelerator; products
-are not, but they square the condition number. So the rows are first brought to coordinates in which they are well
-conditioned, Z = X_b R^-1 with the columns X_b of the structural base parameters and R their triangular factor at random
-states: the products of Z lose next to nothing (as the second pass of CholeskyQR2; Yamamoto and others, 2015), and
-X = Z R B with the matrix B of the base parameters.
+are not, but they square the condition number. So the rows of each joint are first brought to coordinates in which they
+are well conditioned, Z = X R^-1 with those of the joint's columns X that are independent in its own rows and R their
+triangular factor at random states: the products of Z lose next to nothing (as the second pass of CholeskyQR2; Yamamoto
+and others, 2015), and all columns of the joint are Z R B with the matrix B of its rows' base parameters.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from ..compiled.batching import CPU_OPTIONS
+from ..compiled.batching import CPU_OPTIONS, aligned, program
+from ..compiled.machine_code import machine_code
 from ..effects.base import Effect
 from ..errors import InputError
 from ..rigid.model import RobotModel
-from ..rigid.regressor import dense_rows
+from ..rigid.normal_equations import row_products
+from ..rigid.regressor import BLOCK_FORM, block_codes, block_rows, coordinate_blocks, dense_rows
 from .base_parameters import BaseParameters
-from .columns import term_columns
+from .columns import term_columns, term_places, term_rows
 from .regression import FOLDS, Condensed
-from .states import States, check_piece
+from .states import OwnFrame, States, check_piece
 
 __all__ = ["BatchFit", "Coordinates", "condense_on_devices", "coordinates", "fit_states"]
 
 HOST_CHUNK = 128  # samples whose rows stay in the processor's cache
+CODE_CHUNK = 512  # the same where machine code makes them
+TERMS_CHUNK = 4096  # samples of which the columns of friction and the like are computed at once beside machine code
 DEVICE_BYTES = 2e9  # of the rows of a chunk on an accelerator
+BESIDE = 32  # columns to a multiple of which a joint's rows are filled up on a device, so that few products serve all
 CLIPPED = 1e-13  # share of a joint's products that is rounding: what they say of smaller ones is left out
 _SAMPLES = PartitionSpec("samples")
 
@@ -44,10 +49,18 @@ class Coordinates(NamedTuple):
     back: Float[np.ndarray, "rank columns"]
 
 
-class _Sums(NamedTuple):
-    """What is added up over the samples, for each fold and joint: products of [Z tau], rows and torque."""
+class _Group(NamedTuple):
+    """Joints whose rows are filled up to equally many: where these stand among all rows, and their coordinates."""
 
-    products: Any
+    joints: Int[np.ndarray, " joints"]
+    places: Int[np.ndarray, "joints k"]
+    into: Float[np.ndarray, "joints k k"]
+
+
+class _Sums(NamedTuple):
+    """What is added up over the samples, for each fold and joint: products of [Z tau], by group; rows and torque."""
+
+    products: tuple[Any, ...]
     rows: Any
     torque: Any
 
@@ -61,7 +74,16 @@ class BatchFit(NamedTuple):
 
 
 def coordinates(structure: Float[np.ndarray, "samples nv columns"], base: BaseParameters) -> Coordinates:
-    """Coordinates in which the columns at the random states `structure` are orthonormal."""
+    """Coordinates in which the columns at the random states `structure` are orthonormal.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> from figaroh_jax.estimation.base_parameters import base_parameters
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> W, names = fj.columns.structural_columns(robot, ()), fj.columns.column_names(robot, ())
+    >>> base = base_parameters(W.reshape(-1, len(names)), names)
+    >>> fj.accelerators.coordinates(W, base).into.shape == (len(names), base.rank)
+    True
+    """
     kept = structure[:, :, base.independent].reshape(-1, base.rank)
     R = np.linalg.qr(kept, mode="r")
     into = np.zeros((structure.shape[2], base.rank))
@@ -75,34 +97,22 @@ def condense_on_devices(
     """`condense(states, states.used)`, the samples of every piece spread over `devices` (default: all that JAX has).
 
     Each device forms the rows of its own samples, `chunk` at a time, and sums their products; the sums of the devices
-    are added. Pieces of one length share a program; the source is read while the devices work. A direction in which the
-    rows are less than 3e-7 of the strongest one's is taken as not shown. Folds are whole chunks in turn. Raises
-    `InputError` where a piece has a wrong shape or holds a number that is not finite.
+    are added. Pieces of one length share a program; the source is read while the devices work. A single CPU takes
+    machine code for the rows of long pieces, where there is some. A direction in which the rows are less than 3e-7 of
+    the strongest one's is taken as not shown. Folds are whole chunks in turn. Raises `InputError` where a piece has a
+    wrong shape or holds a number that is not finite.
     """
     mesh = Mesh(np.array(list(devices or jax.devices())), ("samples",))
-    frame = coordinates(states.structure, states.structural)
-    nv, size = states.model.nv, frame.into.shape[1] + 1
+    frames = states.frames
+    on_one_cpu = mesh.size == 1 and mesh.devices.flat[0].platform == "cpu" and jax.default_backend() == "cpu"
     with jax.enable_x64(True):
-        total = _Sums(jnp.zeros((folds, nv, size, size)), jnp.zeros((folds, nv)), jnp.zeros((folds, nv)))
-        everywhere = NamedSharding(mesh, PartitionSpec())
-        width = np.broadcast_to(np.asarray(states.width, float), (nv,))
-        fixed = jax.device_put((states.model, states.terms, width, frame.into), everywhere)
-        total, before = jax.device_put(total, everywhere), None
-        chunk = chunk or _chunk(mesh, nv, sum(frame.into.shape) + 1)
-        program = _program(mesh, chunk, folds)
-        chunks = 0
-        for number, part in enumerate(states.source()):
-            check_piece(states.model, part, number, values=False)
-            total = program(total, fixed, _spread(part, chunk, mesh), chunks)
-            chunks += -(-len(part[0]) // chunk)
-            jax.block_until_ready(before)  # one piece ahead: no more wait in memory
-            before = total.rows
-        sums = jax.device_get(total)
-    if not all(np.isfinite(x).all() for x in sums):
+        sums = _summed_by_code(states, frames, folds) if on_one_cpu and chunk is None else None
+        sums = sums or _summed(states, frames, mesh, folds, chunk)
+    if not all(np.isfinite(x).all() for x in jax.tree.leaves(sums)):
         for number, part in enumerate(states.source()):
             check_piece(states.model, part, number)
         raise InputError("the rows of the states are not finite: numbers too large, or a model that moves no mass")
-    return _condensed(states, frame, sums)
+    return _condensed(states, frames, sums)
 
 
 def fit_states(
@@ -132,10 +142,67 @@ def fit_states(
     return BatchFit(into @ theta, jnp.sqrt(variance), rms)
 
 
-def _chunk(mesh: Mesh, nv: int, width: int) -> int:
+def _places(model: RobotModel, terms: tuple[Effect, ...]) -> tuple[Int[np.ndarray, "nv columns"], int]:
+    """Where the rows of each coordinate and column stand among all that can differ from zero, -1 elsewhere; how many.
+
+    Those of the links are first, block by block, then those of `term_rows`.
+    """
+    blocks, beside = coordinate_blocks(model)[0], term_places(model, terms)
+    links = 10 * len(model.joints)
+    out = np.full((model.nv, links + max(beside[:, 1], default=-1) + 1), -1)
+    for k in range(10):
+        out[blocks[:, 0], 10 * blocks[:, 1] + k] = 10 * np.arange(len(blocks)) + k
+    out[beside[:, 0], links + beside[:, 1]] = 10 * len(blocks) + np.arange(len(beside))
+    return out, 10 * len(blocks) + len(beside)
+
+
+def _grouped(model: RobotModel, terms: tuple[Effect, ...], frames: Sequence[OwnFrame]) -> list[_Group]:
+    """Joints by the number of their rows, filled up to a multiple; behind all rows stand the torques and one zero."""
+    places, count = _places(model, terms)
+    widths = [-(-(len(frame.kept) + 1) // BESIDE) * BESIDE for frame in frames]
+    groups = []
+    for width in sorted(set(widths)):
+        joints = np.array([j for j, w in enumerate(widths) if w == width], int)
+        index, into = np.full((len(joints), width), count + model.nv), np.zeros((len(joints), width, width))
+        for n, j in enumerate(joints):
+            rank = len(frames[j].kept)
+            index[n, : rank + 1] = [*places[j, frames[j].kept], count + j]
+            into[n, :rank, :rank], into[n, rank, rank] = frames[j].into, 1.0
+        groups.append(_Group(joints, index, into))
+    return groups
+
+
+def _summed(states: States, frames: Sequence[OwnFrame], mesh: Mesh, folds: int, chunk: int | None) -> _Sums:
+    """Sums of all pieces by programs of JAX."""
+    model, terms, nv = states.model, states.terms, states.model.nv
+    groups = _grouped(model, terms, frames)
+    everywhere = NamedSharding(mesh, PartitionSpec())
+    width = np.broadcast_to(np.asarray(states.width, float), (nv,))
+    fixed = jax.device_put((model, terms, width, [group[1:] for group in groups]), everywhere)
+    zero = (np.zeros((folds, len(g.joints), *2 * g.places.shape[1:])) for g in groups)
+    total = jax.device_put(_Sums(tuple(zero), *np.zeros((2, folds, nv))), everywhere)
+    chunk = chunk or _chunk(mesh, _places(model, terms)[1] + sum(2 * g.places.size for g in groups))
+    program = _program(mesh, chunk, folds, block_codes(model) if mesh.devices.flat[0].platform == "gpu" else None)
+    chunks, before = 0, None
+    for number, part in enumerate(states.source()):
+        check_piece(model, part, number, values=False)
+        total = program(total, fixed, _spread(part, chunk, mesh), chunks)
+        chunks += -(-len(part[0]) // chunk)
+        jax.block_until_ready(before)  # one piece ahead: no more wait in memory
+        before = total.rows
+    sums = jax.device_get(total)
+    products: list[Any] = [None] * nv
+    for group, found in zip(groups, sums.products, strict=True):
+        for n, j in enumerate(group.joints):
+            size = len(frames[j].kept) + 1
+            products[j] = found[:, n, :size, :size]
+    return _Sums(tuple(products), sums.rows, sums.torque)
+
+
+def _chunk(mesh: Mesh, rows: int) -> int:
     if mesh.devices.flat[0].platform == "cpu":
         return HOST_CHUNK
-    return 1 << max(8, int(np.log2(DEVICE_BYTES / 8 / nv / width)))
+    return 1 << max(8, int(np.log2(DEVICE_BYTES / 8 / rows)))
 
 
 def _spread(part: Sequence[Any], chunk: int, mesh: Mesh) -> tuple[Any, ...]:
@@ -151,17 +218,17 @@ def _spread(part: Sequence[Any], chunk: int, mesh: Mesh) -> tuple[Any, ...]:
 
 
 @lru_cache(maxsize=16)
-def _program(mesh: Mesh, chunk: int, folds: int) -> Callable[..., _Sums]:
+def _program(mesh: Mesh, chunk: int, folds: int, codes: bytes | None) -> Callable[..., _Sums]:
     def local(fixed: Any, part: tuple[Array, ...], before: Array) -> _Sums:
         """Sums over this device's share of a piece, which begins after so many chunks."""
         chunks = [x.reshape(-1, chunk, *x.shape[1:]) for x in part]
         first = before + jax.lax.axis_index("samples") * len(chunks[0])
 
         def step(total: _Sums, k: Array) -> tuple[_Sums, None]:
-            new, fold = _sums(fixed, *(x[k] for x in chunks)), (first + k) % folds
-            return _Sums(*(x.at[fold].add(y) for x, y in zip(total, new, strict=True))), None
+            new, fold = _sums(codes, fixed, *(x[k] for x in chunks)), (first + k) % folds
+            return jax.tree.map(lambda x, y: x.at[fold].add(y), total, new), None
 
-        shapes = jax.eval_shape(lambda *x: _sums(fixed, *x), *(x[0] for x in chunks))
+        shapes = jax.eval_shape(partial(_sums, codes, fixed), *(x[0] for x in chunks))
         zero = jax.tree.map(lambda x: jnp.zeros((folds, *x.shape), x.dtype), shapes)
         return jax.lax.psum(jax.lax.scan(step, zero, jnp.arange(len(chunks[0])))[0], "samples")
 
@@ -175,12 +242,70 @@ def _program(mesh: Mesh, chunk: int, folds: int) -> Callable[..., _Sums]:
     return jax.jit(program, compiler_options=options)
 
 
-def _sums(fixed: Any, q: Array, v: Array, a: Array, tau: Array, there: Array) -> _Sums:
-    model, terms, width, into = fixed
-    Z, y = _rows(model, terms, width, into, q, v, a, tau)
-    both = jnp.concatenate([Z, y[:, None]], axis=1) * there
-    products = jnp.einsum("jks,jls->jkl", both, both, precision=jax.lax.Precision.HIGHEST)
-    return _Sums(products, jnp.broadcast_to(there.sum(), y.shape[:1]), y @ there)
+def _sums(codes: bytes | None, fixed: Any, q: Array, v: Array, a: Array, tau: Array, there: Array) -> _Sums:
+    model, terms, width, groups = fixed
+    rows = block_rows(model, q, v, a, codes)
+    parts = [rows.reshape(-1, rows.shape[-1]), term_rows(model, terms, width, q, v, a), tau.T]
+    whole = jnp.concatenate([*parts, jnp.zeros_like(parts[0][:1])])
+    products = []
+    for index, into in groups:
+        Z = jnp.einsum("jkr,jks->jrs", into, whole[index] * there, precision=jax.lax.Precision.HIGHEST)
+        products.append(row_products(Z))
+    return _Sums(tuple(products), jnp.broadcast_to(there.sum(), tau.shape[1:]), tau.T @ there)
+
+
+_own_term_rows = program(term_rows, CPU_OPTIONS, kept=True)
+
+
+def _summed_by_code(states: States, frames: Sequence[OwnFrame], folds: int) -> _Sums | None:
+    """Sums of all pieces on one CPU, the rows by machine code; None where there is none for one of the pieces."""
+    nv, (places, _) = states.model.nv, _places(states.model, states.terms)
+    first = 10 * len(coordinate_blocks(states.model)[0])
+    index = [places[j, frame.kept] for j, frame in enumerate(frames)]
+    parts = [(k[k < first], k[k >= first] - first) for k in index]
+    products = tuple(np.zeros((folds, len(k) + 1, len(k) + 1)) for k in index)
+    rows, torque = np.zeros((2, folds, nv))
+    chunks = 0
+    for number, part in enumerate(states.source()):
+        check_piece(states.model, part, number, values=False)
+        state = [np.asarray(x, float) for x in part]
+        code = machine_code(BLOCK_FORM, states.model, *state[:3])
+        if code is None:
+            return None
+        for blocks, side, tau in _coded(states, code, *state):
+            fold = chunks % folds
+            for j, (links, terms) in enumerate(parts):
+                Z = np.empty((len(index[j]) + 1, tau.shape[1]))
+                np.matmul(frames[j].into.T, np.concatenate([blocks[links], side[terms]]), out=Z[:-1])
+                Z[-1] = tau[j]
+                products[j][fold] += Z @ Z.T
+            rows[fold] += tau.shape[1]
+            torque[fold] += tau.sum(1)
+            chunks += 1
+    return _Sums(products, rows, torque)
+
+
+def _coded(
+    states: States, code: Callable[..., np.ndarray], q: np.ndarray, v: np.ndarray, a: np.ndarray, tau: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Rows of the links and of the terms, and torques, samples last, a chunk at a time; the next overwrites them."""
+    memory, width = np.empty(0), np.broadcast_to(np.asarray(states.width, float), (states.model.nv,))
+
+    def room(shape: tuple[int, ...], fill: float | None) -> np.ndarray:
+        nonlocal memory
+        memory = memory if memory.shape == shape else aligned(shape, fill)
+        return memory
+
+    side, samples = np.empty((0, 0)), len(q)
+    for start in range(0, samples, CODE_CHUNK):
+        if start % TERMS_CHUNK == 0:
+            filled = np.minimum(start + np.arange(TERMS_CHUNK), samples - 1)
+            side = np.asarray(_own_term_rows(states.model, states.terms, width, q[filled], v[filled], a[filled]))
+        end = min(start + CODE_CHUNK, samples)
+        piece = slice(max(0, end - CODE_CHUNK), end)  # the last one reaches back, for whole vectors
+        blocks = code(room, q[piece], v[piece], a[piece])
+        own = slice(start % TERMS_CHUNK, start % TERMS_CHUNK + end - start)
+        yield blocks.reshape(-1, blocks.shape[-1])[:, start - piece.start :], side[:, own], tau[start:end].T
 
 
 def _rows(
@@ -193,14 +318,16 @@ def _rows(
     return jnp.einsum("kr,jks->jrs", into, columns, precision=jax.lax.Precision.HIGHEST), jnp.asarray(tau).T
 
 
-def _condensed(states: States, frame: Coordinates, sums: _Sums) -> Condensed:
-    back = np.zeros((len(frame.back) + 1, len(states.names) + 1))
-    back[:-1, :-1], back[-1, -1] = frame.back, 1.0
-    own = tuple(np.flatnonzero(row) for row in states.used)
-    factors = tuple(
-        tuple(_root(G) @ back[:, [*mine, -1]] for G, mine in zip(fold, own, strict=True)) for fold in sums.products
-    )
-    return Condensed(states.names, own, factors, sums.rows, sums.torque)
+def _condensed(states: States, frames: Sequence[OwnFrame], sums: _Sums) -> Condensed:
+    factors = []
+    for fold in range(len(sums.rows)):
+        own = []
+        for frame, products in zip(frames, sums.products, strict=True):
+            back = np.zeros((len(frame.back) + 1, len(frame.columns) + 1))
+            back[:-1, :-1], back[-1, -1] = frame.back, 1.0
+            own.append(_root(products[fold]) @ back)
+        factors.append(tuple(own))
+    return Condensed(states.names, tuple(f.columns for f in frames), tuple(factors), sums.rows, sums.torque)
 
 
 def _root(products: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:

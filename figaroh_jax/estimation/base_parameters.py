@@ -161,16 +161,16 @@ def inertial_names(model: RobotModel) -> tuple[str, ...]:
 
 
 def _independent(columns: Float[np.ndarray, "n k"], order: Sequence[int], tolerance: float) -> list[int]:
-    basis = np.zeros((len(columns), 0))
-    kept = []
+    whole = np.empty((len(columns), min(columns.shape)), order="F")
+    kept: list[int] = []
     for k in order:
-        rest = columns[:, k]
+        rest, basis = columns[:, k], whole[:, : len(kept)]
         for _ in range(2):  # twice is enough (Kahan, Parlett)
             rest = rest - basis @ (basis.T @ rest)
         size = np.linalg.norm(rest)
-        if size > tolerance:
+        if size > tolerance and len(kept) < whole.shape[1]:
+            whole[:, len(kept)] = rest / size
             kept.append(k)
-            basis = np.column_stack([basis, rest / size])
     return kept
 
 

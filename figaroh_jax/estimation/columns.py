@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..compiled.batching import CPU_OPTIONS, DRAFT_OPTIONS, FEW, program
 from ..effects.base import Effect, Motion, columns, place, smooth_sign
@@ -35,6 +35,8 @@ __all__ = [
     "state_columns",
     "structural_columns",
     "term_columns",
+    "term_places",
+    "term_rows",
 ]
 
 STATES = 129  # more than a chunk of `batching`, so that the program of the recordings serves random states too
@@ -45,6 +47,12 @@ def friction_terms(model: RobotModel, known: Baseline) -> tuple[Effect, ...]:
     """The effects that a task's baseline asks for, those of every joint as one object with a leading axis.
 
     A free joint has no drive, so the six rows of a free flyer's root have no friction.
+
+    >>> import figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> terms = fj.columns.friction_terms(robot, fj.Baseline(offset=True))
+    >>> [term.name for term in terms]
+    ['viscous_friction', 'coulomb_friction', 'torque_offset']
     """
     switches = {
         "viscous_friction": known.viscous,
@@ -73,7 +81,14 @@ def _joints(model: RobotModel) -> list[Joint]:
 
 
 def column_names(model: RobotModel, terms: Sequence[Effect]) -> tuple[str, ...]:
-    """`m1` to `Izz1` and on for the links in tree order, then `fv1`, `fc1` ... of the joints, then other effects."""
+    """`m1` to `Izz1` and on for the links in tree order, then `fv1`, `fc1` ... of the joints, then other effects.
+
+    >>> import figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> terms = fj.columns.friction_terms(robot, fj.Baseline(offset=True))
+    >>> fj.columns.column_names(robot, terms)[:4], len(fj.columns.column_names(robot, terms))
+    (('m1', 'mx1', 'my1', 'mz1'), 52)
+    """
     names = list(inertial_names(model))
     for term in terms:
         amplitudes = [name for name, parameter in term.parameters().items() if parameter.linear]
@@ -87,7 +102,15 @@ def column_names(model: RobotModel, terms: Sequence[Effect]) -> tuple[str, ...]:
 def structural_columns(
     model: RobotModel, terms: tuple[Effect, ...], samples: int | None = None, seed: int = 0
 ) -> Float[np.ndarray, "samples nv columns"]:
-    """Columns at independent random states: what any motion at all could show."""
+    """Columns at independent random states: what any motion at all could show.
+
+    >>> import figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> terms = fj.columns.friction_terms(robot, fj.Baseline(offset=True))
+    >>> W = fj.columns.structural_columns(robot, terms)
+    >>> W.shape[1:] == (robot.nv, len(fj.columns.column_names(robot, terms)))
+    True
+    """
     samples = samples or max(STATES, 4 * len(column_names(model, terms)) // max(model.nv, 1))
     q, v, a = random_states(model, samples, seed)
     with jax.enable_x64(True):
@@ -98,7 +121,13 @@ def structural_columns(
 def random_states(
     model: RobotModel, samples: int, seed: int = 0
 ) -> tuple[Float[np.ndarray, "samples nq"], Float[np.ndarray, "samples nv"], Float[np.ndarray, "samples nv"]]:
-    """Independent random positions (quaternions of length one), velocities and accelerations."""
+    """Independent random positions (quaternions of length one), velocities and accelerations.
+
+    >>> import figaroh_jax as fj
+    >>> q, v, a = fj.columns.random_states(fj.load_urdf(fj.DEMO), 100)
+    >>> q.shape
+    (100, 4)
+    """
     generator = np.random.default_rng(seed)
     q, v, a = (generator.normal(scale=2.0, size=(samples, n)) for n in (model.nq, model.nv, model.nv))
     for joint, where in zip(model.joints, model.dofs.positions, strict=True):
@@ -160,6 +189,35 @@ def term_columns(
     return _term_columns(terms, motion_at(model, jnp.zeros(jnp.shape(v)[0]), q, v, a, 0.0, width))
 
 
+def term_rows(
+    model: RobotModel,
+    terms: tuple[Effect, ...],
+    width: Float[Array, " nv"],
+    q: Float[Array, "samples nq"],
+    v: Float[Array, "samples nv"],
+    a: Float[Array, "samples nv"],
+) -> Float[Array, "rows samples"]:
+    """What of `term_columns` can differ from zero, in the order of `term_places`; to be traced."""
+    motion, out = motion_at(model, jnp.zeros(jnp.shape(v)[0]), q, v, a, 0.0, width), [jnp.zeros((0, jnp.shape(v)[0]))]
+    for term in terms:
+        torque = jax.vmap(lambda effect: _own_torque(effect, motion))(term)  # (places, samples, joints, amplitudes)
+        out.append(jnp.moveaxis(torque, 1, 3).reshape(-1, torque.shape[1]))
+    return jnp.concatenate(out)
+
+
+def term_places(model: RobotModel, terms: tuple[Effect, ...]) -> Int[np.ndarray, "rows 2"]:
+    """Coordinate and column (behind those of the links) of each of `term_rows`."""
+    places, first = [np.zeros((0, 2), int)], 0
+    for term in terms:
+        amplitudes = sum(parameter.linear for parameter in term.parameters().values())
+        for at in np.asarray(term.at):
+            rows = np.arange(model.nv) if term.acts_on in ("link", "robot") else np.asarray(at)
+            grid = np.meshgrid(rows, first + np.arange(amplitudes), indexing="ij")
+            places.append(np.stack([x.ravel() for x in grid], 1))
+            first += amplitudes
+    return np.concatenate(places)
+
+
 def _term_columns(terms: tuple[Effect, ...], motion: Motion) -> list[Float[Array, "samples nv columns"]]:
     blocks = []
     for term in terms:
@@ -170,8 +228,13 @@ def _term_columns(terms: tuple[Effect, ...], motion: Motion) -> list[Float[Array
 
 def _joint_columns(effect: Effect, motion: Motion) -> Float[Array, "samples nv amplitudes"]:
     """Torque of a unit of each amplitude in the rows of all joints."""
-    torque = jnp.moveaxis(columns(effect, motion), 0, -1)
+    torque = _own_torque(effect, motion)
     if effect.acts_on in ("link", "robot"):
         return torque
-    torque = torque.reshape(torque.shape[0], -1, torque.shape[-1])
     return jnp.zeros((*motion.velocity.shape, torque.shape[-1])).at[:, effect.at].add(torque)
+
+
+def _own_torque(effect: Effect, motion: Motion) -> Float[Array, "samples rows amplitudes"]:
+    """Torque of a unit of each amplitude in the rows of the effect's own joints, or of all where it acts on links."""
+    torque = jnp.moveaxis(columns(effect, motion), 0, -1)
+    return torque if effect.acts_on in ("link", "robot") else torque.reshape(torque.shape[0], -1, torque.shape[-1])

@@ -217,10 +217,10 @@ def _placed(columns: int, kept: np.ndarray, values: np.ndarray) -> Float[np.ndar
 
 
 def _by_joint(data: Condensed, kept: np.ndarray, method: WeightedByJoint):
-    weight, theta = np.ones(len(data.columns)), np.zeros(len(data.names))
+    weight, theta, own = np.ones(len(data.columns)), np.zeros(len(data.names)), data.merged(kept.tolist())
     for turn in range(1, method.iterations + 1):
-        theta = _placed(len(data.names), kept, _least(data.factor(weight)[:, [*kept, -1]]))
-        new = joint_weights(data, theta)
+        values = _least(own.factor(weight))
+        theta, new = _placed(len(data.names), kept, values), joint_weights(own, values)
         done = bool(np.allclose(new, weight, rtol=method.tolerance, atol=0))
         weight = new
         if done:

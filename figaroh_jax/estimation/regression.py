@@ -85,17 +85,17 @@ class Condensed:
         self, weight: Float[np.ndarray, " nv"] | None = None, folds: Sequence[int] | None = None
     ) -> Float[np.ndarray, "n n"]:
         """Triangular factor of `sqrt(weight) [X y]` of all joints, or of the rows in `folds`."""
-        size = len(self.names) + 1
-        total = np.zeros((size, size))
+        size, chosen = len(self.names) + 1, range(len(self.factors)) if folds is None else folds
         root = np.ones(len(self.columns)) if weight is None else np.sqrt(weight)
-        for fold in range(len(self.factors)) if folds is None else folds:
-            blocks = []
-            for own, factor, w in zip(self.columns, self.factors[fold], root, strict=True):
-                block = np.zeros((len(factor), size))
-                block[:, [*own, size - 1]] = w * factor
-                blocks.append(block)
-            total = np.asarray(np.linalg.qr(np.concatenate([total, *blocks]), mode="r"))
-        return total
+        total = [np.zeros((0, size))]
+        for j, (own, w) in enumerate(zip(self.columns, root, strict=True)):
+            whole = np.concatenate([np.zeros((0, len(own) + 1)), *(self.factors[fold][j] for fold in chosen)])
+            if len(whole) > len(own) + 1:
+                whole = np.asarray(np.linalg.qr(whole, mode="r"))
+            total.append(np.zeros((len(whole), size)))
+            total[-1][:, [*own, size - 1]] = w * whole
+        R = np.asarray(np.linalg.qr(np.concatenate(total), mode="r"))
+        return np.concatenate([R, np.zeros((size - len(R), size))])
 
     def squares(
         self, theta: Float[np.ndarray, " columns"], folds: Sequence[int] | None = None
@@ -113,19 +113,29 @@ class Condensed:
 
     def restricted(self, kept: Sequence[int]) -> Condensed:
         """The regression on the columns `kept` alone."""
+        return self._restricted(kept, self.factors, self.count, self.torque)
+
+    def merged(self, kept: Sequence[int]) -> Condensed:
+        """The same without folds: one factor for each joint."""
+        joined = (tuple(np.concatenate([fold[j] for fold in self.factors]) for j in range(len(self.columns))),)
+        return self._restricted(kept, joined, self.count.sum(0, keepdims=True), self.torque.sum(0, keepdims=True))
+
+    def _restricted(
+        self, kept: Sequence[int], factors: tuple[tuple[np.ndarray, ...], ...], count: np.ndarray, torque: np.ndarray
+    ) -> Condensed:
         place_of = {int(k): i for i, k in enumerate(kept)}
         inside = [[i for i, k in enumerate(own) if int(k) in place_of] for own in self.columns]
         columns = tuple(
             np.array([place_of[int(own[i])] for i in ins], int) for own, ins in zip(self.columns, inside, strict=True)
         )
-        factors = tuple(
+        own = tuple(
             tuple(
                 np.asarray(np.linalg.qr(R[:, [*ins, R.shape[1] - 1]], mode="r"))
                 for R, ins in zip(fold, inside, strict=True)
             )
-            for fold in self.factors
+            for fold in factors
         )
-        return Condensed(tuple(self.names[k] for k in kept), columns, factors, self.count, self.torque)
+        return Condensed(tuple(self.names[k] for k in kept), columns, own, count, torque)
 
 
 @dataclass(frozen=True)

@@ -10,21 +10,34 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ..effects.base import Effect
 from ..errors import InputError
 from ..rigid.model import RobotModel
 from .base_parameters import BaseParameters, base_parameters
-from .columns import column_names, state_columns, structural_columns
+from .columns import STATES, column_names, state_columns, structural_columns
 from .regression import Piece
 
-__all__ = ["States", "check_piece", "read_pieces"]
+__all__ = ["OwnFrame", "States", "check_piece", "read_pieces"]
+
+
+class OwnFrame(NamedTuple):
+    """Of one joint's rows: columns that can differ from zero, and coordinates in which they are well conditioned.
+
+    The rows of the `kept` ones, which are independent, are `kept @ into` there, and `z @ back` are those of all.
+    """
+
+    columns: Int[np.ndarray, " own"]
+    kept: Int[np.ndarray, " rank"]
+    into: Float[np.ndarray, "rank rank"]
+    back: Float[np.ndarray, "rank own"]
+
 
 CHUNK_BYTES = 8e6  # of a chunk's columns: they stay in the processor's cache
 FEWEST = 256  # samples of a chunk, however wide
@@ -62,7 +75,19 @@ class States:
     @cached_property
     def structural(self) -> BaseParameters:
         """Base parameters that some motion could show."""
-        return base_parameters(self.structure.reshape(-1, len(self.names)), self.names)
+        rows = self.structure.reshape(-1, len(self.names))
+        return base_parameters(np.linalg.qr(rows, mode="r") / np.sqrt(len(rows)), self.names)
+
+    @cached_property
+    def frames(self) -> tuple[OwnFrame, ...]:
+        """Coordinates of each joint's rows, from random states, so many that the widest have twice their columns."""
+        own = [np.flatnonzero(row) for row in self.used]
+        factors, samples = [np.zeros((0, len(mine))) for mine in own], 0
+        for seed in range(max(1, -(-2 * max(map(len, own)) // STATES))):
+            X = structural_columns(self.model, self.terms, STATES, seed)
+            both = [np.concatenate([R, X[:, j, mine]]) for j, (R, mine) in enumerate(zip(factors, own, strict=True))]
+            factors, samples = [np.asarray(np.linalg.qr(rows, mode="r")) for rows in both], samples + len(X)
+        return tuple(_frame(mine, R / np.sqrt(samples)) for mine, R in zip(own, factors, strict=True))
 
     def pieces(self, widths: Sequence[float] = (), fitted: bool = True) -> Iterator[Piece]:
         """Chunks of rows, all of one size but the last of each piece, which is filled up with rows of no weight."""
@@ -84,11 +109,25 @@ class States:
                 count += n
 
 
+def _frame(own: Int[np.ndarray, " own"], factor: Float[np.ndarray, "k own"]) -> OwnFrame:
+    base = base_parameters(factor, [str(k) for k in own])
+    R = np.linalg.qr(factor[:, base.independent], mode="r")
+    return OwnFrame(own, own[base.independent], np.linalg.inv(R), R @ base.matrix)
+
+
 def read_pieces(files: Sequence[str | Path], samples: int = 20_000) -> Iterator[tuple[np.ndarray, ...]]:
     """Pieces of `samples` rows of the .npy files of q, v, a and tau, read one after another.
 
     Unlike arrays mapped by `numpy.load(mmap_mode="r")`, what was read does not stay in memory. Raises `InputError`
     where a file is no .npy file of numbers in rows, or has another number of rows than the first.
+
+    >>> import tempfile, numpy as np, figaroh_jax as fj
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = [f"{folder}/{name}.npy" for name in ("q", "v", "a", "tau")]
+    ...     for file in files:
+    ...         np.save(file, np.zeros((50000, 4)))
+    ...     [len(q) for q, v, a, tau in fj.states.read_pieces(files)]
+    [20000, 20000, 10000]
     """
     arrays = [_mapped(Path(file)) for file in files]
     for file, array in zip(files, arrays, strict=True):

@@ -108,7 +108,7 @@ def excite(
     separate: Sequence[tuple[Cause, Cause]] = (),
     trust: float = 0.10,
     trajectories: int = 1,
-    start: Sequence[float] | None = None,
+    start: Sequence[float] | np.ndarray | None = None,
     starts: int = 4,
     rate: float = 20.0,
     seed: int = 0,
@@ -123,14 +123,23 @@ def excite(
     `start` is the posture at the beginning (rad or m; None: chosen), `starts` how many random motions are improved,
     `rate` (Hz) the samples of a design, whose noise is independent. Raises `InputError` where no motion meets the
     limits, the start is outside of them, or `predict` is needed and empty.
+
+    >>> import figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> limits = fj.limits_of(robot, acceleration=10.0)
+    >>> found = fj.excite(robot, fj.spline(3, duration=2.0), limits, starts=1)
+    >>> max(use.share for use in found.stages[0].uses) <= 1.0  # of the limits
+    True
+    >>> q, v, a = found.stages[0].motion.states(rate=1000.0)  # what the robot is to run
     """
     robot = model.robot if isinstance(model, ExtendedModel) else model
     limits = limits_of(robot) if limits is None else limits
     learned = learn(model) if learned is None else learned
     begin = None if start is None else _inside(robot, np.asarray(start, float), limits)
+    limits = _without(limits, robot, learned.held, begin)
     sampler = Sampler(robot, learned.terms, np.asarray(learned.width))
     torque = torque_of(model, learned, sampler)
-    problem = unmeetable(torque, robot, limits)
+    problem = unmeetable(torque, robot, limits, begin)
     if problem is not None:
         raise InputError(problem)
     with jax.enable_x64(True):
@@ -239,6 +248,23 @@ def _inside(robot: RobotModel, start: np.ndarray, limits: Limits) -> np.ndarray:
     return start
 
 
+def _without(limits: Limits, robot: RobotModel, held: Sequence[int], start: Float[np.ndarray, " nv"] | None) -> Limits:
+    """The limits, without those of motion of the joints that stand still: where the start is, or at zero."""
+    if not held:
+        return limits
+    at, position = list(held), np.array(limits.position)
+    for j in at if start is None else []:
+        if not position[j, 0] <= 0 <= position[j, 1]:
+            raise InputError(
+                f"hold: '{robot.dof_names[j]}' cannot stand at zero, its range is {position[j, 0]:g} to"
+                f" {position[j, 1]:g}; give a start"
+            )
+    position[at] = -np.inf, np.inf
+    velocity, acceleration = np.array(limits.velocity), np.array(limits.acceleration)
+    velocity[at] = acceleration[at] = np.inf
+    return replace(limits, position=position, velocity=velocity, acceleration=acceleration)
+
+
 def _wanted(
     learned: Learned, sampler: Sampler, predict: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
 ) -> np.ndarray:
@@ -311,8 +337,8 @@ def random_motion(problem: Problem, generator: np.random.Generator, amplitude: f
     limits, nv = problem.limits, problem.nv
     start = problem.start
     if start is None:
-        start = _free_start(limits, nv, generator)
-    weights = generator.standard_normal((nv, problem.basis.size))
+        start = _free_start(limits, nv, generator) * problem.moved
+    weights = generator.standard_normal((nv, problem.basis.size)) * problem.moved[:, None]
     motion = Trajectory(start, weights, problem.basis)
     x = problem.numbers(motion)
     still = problem.shares(problem.numbers(Trajectory(start, 0 * weights, problem.basis)))

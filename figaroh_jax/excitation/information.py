@@ -52,6 +52,7 @@ class Learned(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)  # of all columns
     independent: tuple[int, ...] = eqx.field(static=True)  # the columns that are kept
     expressions: tuple[str, ...] = eqx.field(static=True)  # base parameters in names
+    held: tuple[int, ...] = eqx.field(static=True, default=())  # coordinates that stand still
 
     @property
     def rank(self) -> int:
@@ -72,14 +73,23 @@ def learn(
     trust: float | None = 0.10,
     order: Sequence[int] | None = None,
     width: float = SMOOTH,
+    measured: Mapping[str, float] | None = None,
+    hold: Sequence[str] = (),
 ) -> Learned:
     """Base parameters of the robot and of its friction, weighted by the noise of the torques.
 
     `known` says which friction there is (default: viscous and Coulomb); `noise` is one sigma of a sample, as a share of
     each joint's largest torque (`effort_limit` of the model, or what typical motions take where it has none), `sigma`
     the same in N m or N; `trust` how far the nominal inertials are believed (relative one sigma), None for not at all;
-    `order` prefers columns in the choice of base parameters. Raises `InputError` for a robot with joints of several
-    degrees of freedom and for joints that are not there.
+    `order` prefers columns in the choice of base parameters. `measured`: the only joints whose torque is measured, with
+    one sigma each (N m or N), as the plate under a person (`people.standing`), and links without a mass have none to be
+    learned; `hold`: joints that stand still. Raises
+    `InputError` for a robot with joints of several degrees of freedom and for joints that are not there.
+
+    >>> import figaroh_jax as fj
+    >>> learned = fj.learn(fj.load_urdf(fj.DEMO), noise={"waist": 1.0, "shoulder": 1.0, "elbow": 0.5, "wrist": 0.2})
+    >>> learned.rank == len(learned.expressions) <= len(learned.names)  # base parameters, columns
+    True
     """
     from ..formats.config import Baseline
 
@@ -89,12 +99,23 @@ def learn(
     names = column_names(robot, terms)
     sampler = Sampler(robot, terms, np.full(robot.nv, width))
     samples = max(64, 4 * len(names) // robot.nv)
-    structure = sampler.rows(np.stack(random_states(robot, samples)))  # what any motion at all could show
+    held = np.array([_column(robot, "hold", name) for name in hold], int)
+    rows = [_column(robot, "measured", name) for name in measured] if measured else list(range(robot.nv))
+    states = np.stack(random_states(robot, samples * (robot.nv // len(rows))))
+    states[:, :, held] = 0.0
+    structure = sampler.rows(states)[rows]  # what any motion at all could show
+    if measured:  # a link that has no mass, between two axes of a joint, is none
+        structure[:, np.repeat(np.asarray(robot.inertia)[:, 0] <= 0, 10).nonzero()[0]] = 0.0
     base = base_parameters(structure.swapaxes(1, 2).reshape(-1, len(names)), names, order)
     own = 10 * len(robot.joints)
     scale = _sigmas(robot, noise) if sigma is None else np.asarray(sigma, float)
     if scale.shape != (robot.nv,) or not (scale > 0).all():
         raise InputError(f"noise: {robot.nv} standard deviations above zero are needed, one for each joint")
+    if measured:
+        scale = np.full(robot.nv, np.inf)
+        scale[rows] = list(measured.values())
+        if not (scale[rows] > 0).all():
+            raise InputError("measured: one sigma of each joint is above zero")
     prior = np.zeros((base.rank, base.rank))
     if trust is not None:
         precision = np.append(rigid_prior(robot, trust)[1], np.full(len(names) - own, UNKNOWN_DRIVE))
@@ -109,7 +130,14 @@ def learn(
         names=names,
         independent=tuple(base.independent.tolist()),
         expressions=base.expressions,
+        held=tuple(held.tolist()),
     )
+
+
+def _column(robot: RobotModel, key: str, name: str) -> int:
+    if name not in robot.dof_names:
+        raise InputError(f"{key}: no moving joint '{name}'{nearest(name, robot.dof_names)}")
+    return robot.dof_names.index(name)
 
 
 def _sigmas(robot: RobotModel, noise: float | Mapping[str, float]) -> Float[np.ndarray, " nv"]:
@@ -176,6 +204,13 @@ def information(
     A pure function of the parameters of the motion. An increase by 1 makes the geometric mean of the standard
     deviations smaller by the factor exp(-1 / (2 rank)). `learned` None: as `learn(model)` has it, which needs a model
     that is not being traced.
+
+    >>> import jax, numpy as np, figaroh_jax as fj
+    >>> robot, basis = fj.load_urdf(fj.DEMO), fj.spline(4, duration=3.0)
+    >>> learned = fj.learn(robot)
+    >>> of = lambda size: fj.information(robot, fj.Trajectory(np.zeros(4), size * np.ones((4, 4)), basis), learned)
+    >>> bool(of(0.3) > of(0.1)), bool(jax.grad(of)(0.1) > 0)  # larger motions tell more
+    (True, True)
     """
     matrix = information_matrix(learn(model) if learned is None else learned, motion, rate)
     return 2.0 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(matrix))))
@@ -193,5 +228,13 @@ def condition(learned: Learned, motion: Trajectory | States, rate: float = 20.0)
 
 @in_float64
 def expected_std(learned: Learned, motion: Trajectory | States, rate: float = 20.0) -> Float[Array, " rank"]:
-    """Standard deviation of each base parameter (its unit) after a fit to the motion and to what was known before."""
+    """Standard deviation of each base parameter (its unit) after a fit to the motion and to what was known before.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> learned, motion = fj.learn(robot), fj.Trajectory(np.zeros(4), 0.3 * np.ones((4, 4)), fj.spline(4, duration=3.0))
+    >>> once, twice = (fj.expected_std(learned, motion, rate=rate) for rate in (20.0, 40.0))
+    >>> bool((twice < once).all())
+    True
+    """
     return jnp.sqrt(jnp.diagonal(jnp.linalg.inv(information_matrix(learned, motion, rate))))

@@ -45,8 +45,8 @@ class Limits:
     @property
     def middle(self) -> Float[np.ndarray, " nv"]:
         """Of the range of positions; zero where there is none."""
-        both = self.position.sum(axis=1) / 2
-        return np.where(np.isfinite(both), both, 0.0)
+        free = np.isinf(self.position).any(axis=1)
+        return np.where(free, 0.0, np.where(free[:, None], 0.0, self.position).sum(axis=1) / 2)
 
     @property
     def reach(self) -> Float[np.ndarray, " nv"]:
@@ -91,6 +91,12 @@ def limits_of(
     `clearance`: distances between bodies, as `clearance_of` has them.
 
     Raises `InputError` where a joint is not there, or a limit leaves no room.
+
+    >>> import figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> limits = fj.limits_of(robot, velocity={"elbow": 1.0}, acceleration=10.0, scale=0.9)
+    >>> float(limits.velocity[robot.joint_names.index("elbow")])
+    0.9
     """
     given = {
         "velocity": _by_joint(robot, "velocity", velocity, np.asarray(robot.velocity_limit, float)),
@@ -105,8 +111,8 @@ def limits_of(
     for name, (low, high) in zip(robot.dof_names, span, strict=True):
         if not low < high:
             raise InputError(f"limits.position: '{name}' may move from {low:g} to {high:g}: that leaves no room")
-    middle, half = span.sum(axis=1, keepdims=True) / 2, np.diff(span) / 2
     with np.errstate(invalid="ignore"):
+        middle, half = span.sum(axis=1, keepdims=True) / 2, np.diff(span) / 2
         scaled = np.where(np.isfinite(span), middle + np.array([-1.0, 1.0]) * half * scale, span)
     return Limits(scaled, **{kind: given[kind] * scale for kind in KINDS[1:]}, clearance=clearance)
 
@@ -142,13 +148,24 @@ def _dof(robot: RobotModel, kind: str, name: str) -> int:
     return robot.dof_names.index(name)
 
 
-def unmeetable(torque: Torque, robot: RobotModel, limits: Limits, seed: int = 0) -> str | None:
-    """Why no motion meets the limits, where the torque of standing still says so: which joint, by how much."""
+def unmeetable(
+    torque: Torque,
+    robot: RobotModel,
+    limits: Limits,
+    start: Float[np.ndarray, " nv"] | None = None,
+    seed: int = 0,
+) -> str | None:
+    """Why no motion meets the limits, where the torque of standing still says so: which joint, by how much.
+
+    `start`: where every motion begins; None: anywhere.
+    """
     if not np.isfinite(limits.torque).any():
         return None
     generator = np.random.default_rng(seed)
     low, high = (np.where(np.isfinite(x), x, end) for x, end in zip(limits.position.T, (-np.pi, np.pi), strict=True))
     q = generator.uniform(low, high, (_POSTURES, robot.nv))
+    if start is not None:
+        q[0] = start  # with others: the message tells of the easiest
     for some in (q[:_FIRST], q):
         held = np.abs(torque(np.stack([some, 0 * some, 0 * some]))) / limits.torque
         best = int(held.max(axis=1).argmin())

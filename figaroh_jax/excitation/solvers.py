@@ -81,7 +81,11 @@ class Problem:
         late = [np.maximum(times - shift, 0.0) for shift in self.shifts if shift > 0]
         self.matrix = self.basis.at(np.concatenate([times, *late]))
         self.nv = self.learned.robot.nv
-        self.root = np.sqrt(np.asarray(self.learned.weight) * len(every) / count)
+        weight = np.asarray(self.learned.weight)
+        self.measured = np.flatnonzero(weight > 0)  # coordinates whose rows count
+        self.root = np.sqrt(weight[self.measured] * len(every) / count)
+        self.moved = np.ones(self.nv)
+        self.moved[list(self.learned.held)] = 0.0
         first, *others = self.basis.peaks(self.rate)
         peaks = (first if self.start is not None else np.append(0.0, first), *others)
         self.rows = [
@@ -114,16 +118,17 @@ class Problem:
 
     def to_numbers(self, by_states: Float[np.ndarray, "3 samples nv"]) -> Float[np.ndarray, " n"]:
         """Gradient by the numbers, of one by the states."""
+        by_states = by_states * self.moved
         weights = np.einsum("ksb,ksj->jb", self.matrix, by_states).ravel()
         return weights if self.start is not None else np.concatenate([by_states[0].sum(0), weights])
 
     def gram(self, rows: Float[np.ndarray, "nv columns samples"]) -> tuple[np.ndarray, np.ndarray]:
         """Weighted rows (columns that count, then late torques; joints and samples), and their Gram matrix."""
-        own = rows.swapaxes(0, 1)[self.columns][:, :, : self.count]
+        own = rows.swapaxes(0, 1)[self.columns][:, self.measured, : self.count]
         if self.shifts:
             torque = np.asarray(self.learned.theta) @ rows[:, : len(self.learned.theta)]
             late = torque.reshape(self.nv, len(self.shifts), self.count).swapaxes(0, 1)
-            own = np.concatenate([own, late])
+            own = np.concatenate([own, late[:, self.measured]])
         flat = (own * self.root[:, None]).reshape(len(own), -1)
         return flat, flat @ flat.T
 
@@ -165,7 +170,9 @@ class Problem:
         assert seen is not None
         nv, columns, samples = seen.shape
         cotangent, theta = np.zeros((columns, nv, samples)), np.asarray(self.learned.theta)
-        by_rows = ((2.0 * seen.by_gram) @ seen.own).reshape(-1, nv, self.count) * self.root[:, None]
+        by_own = ((2.0 * seen.by_gram) @ seen.own).reshape(-1, len(self.measured), self.count) * self.root[:, None]
+        by_rows = np.zeros((len(by_own), nv, self.count))
+        by_rows[:, self.measured] = by_own
         cotangent[self.columns, :, : self.count] = by_rows[: len(self.columns)]
         by_torque = np.zeros((nv, samples))
         if self.shifts:
@@ -230,6 +237,7 @@ class Problem:
 
     def _numbers_of_each(self, by: Float[np.ndarray, "3 rows nv"], samples: np.ndarray) -> Float[np.ndarray, "rows n"]:
         """Gradients by the numbers of rows that each depend on one sample."""
+        by = by * self.moved
         weights = np.einsum("krb,krj->rjb", self.matrix[:, samples], by).reshape(len(samples), -1)
         return weights if self.start is not None else np.concatenate([by[0], weights], axis=1)
 

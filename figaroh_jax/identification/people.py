@@ -18,18 +18,19 @@ from typing import Any, Literal, NamedTuple
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
 from ..errors import InputError
 from ..estimation.consistency import bodies, physical_fit
 from ..estimation.markers import scaled, segments_of
-from ..estimation.priors import rigid_prior
-from ..rigid.inertia import from_com, to_com
+from ..rigid.inertia import from_com, to_com, transform
 from ..rigid.kinematics import forward_kinematics
 from ..rigid.manifold import difference
-from ..rigid.model import RobotModel
+from ..rigid.model import Frame, Joint, RobotModel
 from .wrenches import wrench_regressor
 
 __all__ = [
+    "PLATE",
     "Capture",
     "Payload",
     "Segments",
@@ -38,9 +39,18 @@ __all__ = [
     "identify_segments",
     "name_payload",
     "predicted",
+    "standing",
 ]
 
 Sex = Literal["female", "male"]
+PLATE: tuple[str, ...] = (
+    "plate_Fx",
+    "plate_Fy",
+    "plate_Fz",
+    "plate_Tx",
+    "plate_Ty",
+    "plate_Tz",
+)  # joints of `standing`
 
 
 class _Segment(NamedTuple):
@@ -82,6 +92,7 @@ _WORDS = {  # of links' names
     "foot": ("foot",),
 }
 _OFFSET = np.array([2.0, 2.0, 2.0, 0.5, 0.5, 0.5])  # N, N m: one sigma of a plate's zero
+_SIX = (np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2]))  # of a moment: xx xy yy xz yz zz
 _EDGE = 0.5  # s at either end of a recording, which a filter of few hertz bends
 
 
@@ -224,8 +235,9 @@ def identify_segments(
     """Inertial parameters of a person's segments by the wrench of the plates, with the table as the prior.
 
     `table` is the scaled person with the table's inertias (`anthropometric`); `trust` how far these are believed
-    (relative, one sigma of `rigid_prior`). The least squares of the six rows, each by its own noise, and of the prior
-    over segments that are bodies (a semidefinite programme). The residual is correlated in time, for markers slide
+    (relative, one sigma of each segment's mass, centre and moments about it). The least squares of the six rows, each
+    by its own noise, of the plates' zeros in each recording, and of the prior over segments that are bodies (a
+    semidefinite programme). The residual is correlated in time, for markers slide
     with the skin and filters smooth: rows count as the number of independent ones that its correlation leaves
     (`effective` overrides it). Raises `InputError` where nothing was captured.
     """
@@ -233,25 +245,26 @@ def identify_segments(
         raise InputError("identify_segments: no recording; give one `capture` or more")
     index = [i for i, ten in enumerate(np.asarray(table.inertia)) if ten[0] > 0]
     columns = np.concatenate([10 * i + np.arange(10) for i in index])
-    mean, precision = rigid_prior(table, trust)
-    mean, precision = mean[columns], precision[columns]
+    mean, root = _believed(table, index, trust)
     W = np.concatenate([_rows(table, one)[:, :, columns] for one in captures])
-    y, Z = np.concatenate([one.wrench for one in captures]), np.concatenate([one.zero for one in captures])
+    y, Z = np.concatenate([one.wrench for one in captures]), _zeros(captures)
     X = np.concatenate([W, Z], axis=2)
-    wide, about = np.concatenate([precision, 1 / _OFFSET**2]), np.concatenate([mean, np.zeros(6)])
+    zeros = np.diag(np.tile(1 / _OFFSET, len(captures)))
+    prior = np.asarray(block_diag(root, zeros)), np.concatenate([mean, np.zeros(len(zeros))])
     sigma, count = np.array([10.0, 10.0, 10.0, 3.0, 3.0, 3.0]), float(len(X)) / 20
     for _ in range(4):  # the noise from the residual, and back
-        factor = _factor(X, y, sigma, count / len(X), wide, about)
+        factor = _factor(X, y, sigma, count / len(X), *prior)
         x = np.linalg.lstsq(factor[:, :-1], factor[:, -1], rcond=None)[0]
         gone = y - X @ x
         sigma = np.maximum(gone.std(axis=0), [0.1] * 3 + [0.02] * 3)
         count = effective or _independent(gone, [len(one.wrench) for one in captures])
-    factor = _factor(X, y, sigma, count / len(X), wide, about)
+    factor = _factor(X, y, sigma, count / len(X), *prior)
     whole = eqx.tree_at(lambda m: m.inertia, table, np.asarray(table.inertia))
     links = [body for k, body in enumerate(bodies(whole)) if k in index]
     shifted = [replace(body, columns=tuple(range(10 * k, 10 * k + 10))) for k, body in enumerate(links)]
     best = physical_fit(factor, shifted)
     covariance = np.linalg.inv(factor[:, :-1].T @ factor[:, :-1])[: len(columns), : len(columns)]
+    before = (np.linalg.inv(root) ** 2).sum(axis=1)
     inertia = np.array(table.inertia, float)
     inertia[index] = best[: len(columns)].reshape(-1, 10)
     return Segments(
@@ -260,10 +273,41 @@ def identify_segments(
         links=tuple(table.link_names[i] for i in index),
         parameters=inertia[index],
         covariance=covariance,
-        seen=(1 - np.diag(covariance) * precision).reshape(-1, 10),
+        seen=(1 - np.diag(covariance) / before).reshape(-1, 10),
         noise=sigma,
         samples=count,
     )
+
+
+def _believed(
+    table: RobotModel, index: Sequence[int], trust: float
+) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, "P P"]]:
+    """The table's parameters and the root of their precision.
+
+    Mass, centre and moments about it are believed each for itself: what a segment weighs more, or farther out, turns
+    harder about its joint too. One sigma is `trust` times the mass, the distance of the centre (5 cm at the least) and
+    the moments, which grow with the mass beside.
+    """
+    mass, com, about = (np.asarray(part)[index] for part in to_com(np.asarray(table.inertia, float)))
+    roots = []
+    for m, c, moments in zip(mass, com, about, strict=True):
+        scale = np.sqrt(np.diag(moments))
+        wide = [m, *[max(0.05, float(np.linalg.norm(c)))] * 3, *np.outer(scale, scale)[_SIX]]
+        slope = np.zeros((10, 10))
+        slope[:, 0] = from_com(m, c, moments) / m  # as dense everywhere
+        for k, e in enumerate(np.eye(3)):  # quadratic in the centre: exact
+            slope[:, 1 + k] = (from_com(m, c + e, moments) - from_com(m, c - e, moments)) / 2
+        slope[4:, 4:] = np.eye(6)
+        roots.append(np.linalg.inv(slope * (trust * np.array(wide))))
+    return np.asarray(table.inertia, float)[index].ravel(), np.asarray(block_diag(*roots))
+
+
+def _zeros(captures: Sequence[Capture]) -> Float[np.ndarray, "samples 6 offsets"]:
+    """What the plates' offsets do: six for each recording, before which plates are set to zero."""
+    every = [np.zeros((len(one.wrench), 6, 6 * len(captures))) for one in captures]
+    for k, (own, one) in enumerate(zip(every, captures, strict=True)):
+        own[:, :, 6 * k : 6 * k + 6] = one.zero
+    return np.concatenate(every)
 
 
 def name_payload(
@@ -274,19 +318,22 @@ def name_payload(
     At each place a load of ten parameters, believed to be up to `heaviest` kg within 0.3 m of the joint, is fitted to
     the residual; the place that explains most is named. `places`: names of links (default: all segments).
     """
-    model, results, costs = person.model, {}, {"": 0.0}
+    model, results, costs = person.model, {}, {}
     size = np.array([heaviest / 2, *[heaviest * 0.15] * 3, *[heaviest * 0.05] * 6])
     rows = [_rows(model, one) for one in loaded]
     gone = np.concatenate([c.wrench - W @ np.ravel(model.inertia) for c, W in zip(loaded, rows, strict=True)])
     weight = np.sqrt(person.samples / max(1, len(gone))) / person.noise
-    costs[""] = float(np.sum((gone * weight) ** 2))
-    for place in places or person.links:
-        i = model.link_index(place)
-        X = np.concatenate([W[:, :, 10 * i : 10 * i + 10] for W in rows]) * weight[:, None]
-        A, b = X.reshape(-1, 10), (gone * weight).reshape(-1)
-        normal = A.T @ A + np.diag(1 / size**2)
+    zeros, b = _zeros(loaded), (gone * weight).reshape(-1)
+    wide = np.tile(_OFFSET, len(loaded))
+    for place in ("", *(places or person.links)):
+        own = np.concatenate([W[:, :, 10 * model.link_index(place) :][:, :, :10] for W in rows]) if place else zeros
+        X = np.concatenate([own, zeros] if place else [zeros], axis=2) * weight[:, None]
+        A = X.reshape(len(b), -1)
+        normal = A.T @ A + np.diag(1 / (np.concatenate([size, wide]) if place else wide) ** 2)
         x = np.linalg.solve(normal, A.T @ b)
         costs[place] = float(b @ b - b @ A @ x)
+        if not place:
+            continue
         results[place] = float(x[0]), float(np.sqrt(np.linalg.inv(normal)[0, 0]))
     best = min(results, key=lambda place: costs[place])
     mass, std = results[best]
@@ -296,6 +343,118 @@ def name_payload(
 def predicted(model: RobotModel, one: Capture) -> Float[np.ndarray, "samples 6"]:
     """Wrench of the plates at and in the root's frame, N and N m, that the model needs for the motion of a capture."""
     return _rows(model, one) @ np.ravel(np.asarray(model.inertia))
+
+
+def standing(
+    robot: RobotModel,
+    link: str,
+    posture: Float[np.ndarray, " nq"],
+    support: tuple[float, float] = (0.08, 0.04),
+    plate: Float[np.ndarray, "4 4"] | None = None,
+) -> RobotModel:
+    """The person who stands with one link (a foot) on a plate, which does not move: for motions by `excite`.
+
+    The tree begins at the plate with six joints without a mass, `PLATE`, that stand still; their forces (N) and torques
+    (N m) are the plate's wrench at and in `plate` (its pose in the world; default: the link's place in `posture`, axes
+    of the world). The other joints keep names, limits and their place in v; `posture` is one of the free `robot`, in
+    the world. `support` is how far the sole reaches before and behind, and to either side of, the plate's frame (m):
+    the centre of pressure of the body's weight stays in it where torques keep the model's limits. Hold both legs'
+    joints and make the support larger for a person on two feet. Raises `InputError` for a robot that is not free, an
+    unknown link, and joints of several axes.
+    """
+    if robot.joints[0].kind != "free" or any(j.kind not in ("revolute", "prismatic") for j in robot.joints[1:]):
+        raise InputError("standing: one free root and joints of one axis; load the model with root='free_flyer'")
+    q = np.asarray(posture, float)
+    if q.shape != (robot.nq,) or not np.isfinite(q).all():
+        raise InputError(f"standing: posture has shape {q.shape}; ({robot.nq},) finite numbers are expected")
+    first = robot.link_index(link)
+    pose = np.asarray(forward_kinematics(robot, q))[first]
+    if plate is None:
+        plate = np.eye(4)
+        plate[:3, 3] = pose[:3, 3]
+    inside = np.linalg.inv(np.asarray(plate, float)) @ pose
+    tree = _rerooted(robot, first, inside)
+    weight = float(np.asarray(robot.inertia)[:, 0].sum() * np.linalg.norm(np.asarray(robot.gravity)))
+    effort = np.array(robot.effort_limit, float)
+    effort[:6] = [np.inf, np.inf, np.inf, weight * support[1], weight * support[0], np.inf]
+    placement = np.array([plate, *[np.eye(4)] * 5, *tree.placement])
+    eye = np.eye(3)
+    joints = [Joint(PLATE[k], "revolute" if k > 2 else "prismatic", k - 1, k, f"{PLATE[k]}_link") for k in range(6)]
+    joints[5] = joints[5]._replace(link=link)
+    frames = [Frame(PLATE[5], 5), *tree.frames]
+    return eqx.tree_at(
+        lambda m: (m.placement, m.axis, m.inertia, m.ratio, m.offset, m.frame_placement, m.effort_limit),
+        replace(robot, joints=(*joints, *tree.joints), frames=tuple(frames), name=f"{robot.name} on {link}"),
+        (
+            placement,
+            np.concatenate([eye, eye, tree.axis]),
+            np.concatenate([np.zeros((5, 10)), tree.inertia]),
+            np.concatenate([np.ones(6), tree.ratio]),
+            np.concatenate([np.zeros(6), tree.offset]),
+            np.concatenate([np.eye(4)[None], tree.frame_placement]),
+            effort,
+        ),
+    )
+
+
+class _Tree(NamedTuple):
+    """A tree that begins with the link behind joint 5; its first inertia is that link's."""
+
+    joints: list[Joint]
+    frames: list[Frame]
+    placement: list[np.ndarray]
+    axis: np.ndarray
+    inertia: np.ndarray
+    ratio: np.ndarray
+    offset: np.ndarray
+    frame_placement: np.ndarray
+
+
+def _rerooted(robot: RobotModel, first: int, inside: Float[np.ndarray, "4 4"]) -> _Tree:
+    """The tree of a free robot from another link on, whose frame stands at `inside` in the one that joint 5 moves.
+
+    A joint on the way to the old root carries the link that carried it, by the opposite axis; that link's frame is then
+    the joint's, so that what stands on it moves into that frame.
+    """
+    old = np.asarray(robot.placement, float)
+    frame = {i: np.eye(4) for i in range(len(robot.joints))} | {first: inside}  # old frame of a link in its new one
+    turned, link = [], first
+    while link:  # joint `link` will carry its old parent
+        turned.append(link)
+        frame[robot.joints[link].parent] = np.linalg.inv(old[link])
+        link = robot.joints[link].parent
+    carries = {link: robot.joints[link].parent for link in turned}  # of each joint of the old tree
+    below = {i: [k for k, j in enumerate(robot.joints) if j.parent == i and k not in carries] for i in frame}
+    for link in turned:
+        below[link].insert(0, link)  # the joint itself, towards the old root
+    order, number, open_ = [], {first: 5}, [(joint, first) for joint in reversed(below[first])]
+    while open_:  # depth first
+        joint, parent = open_.pop()
+        link = carries.get(joint, joint)
+        number[link] = 6 + len(order)
+        order.append((joint, link, parent))
+        more = [k for k in below[link] if k != joint]
+        open_ += [(k, link) for k in reversed(more)]
+    pick = np.array([joint for joint, _, _ in order], int)
+    axes = np.asarray(robot.axis, float)[robot.dofs.first[pick]]
+    axes[[k for k, (joint, _, _) in enumerate(order) if joint in carries]] *= -1.0
+    links = [first, *(link for _, link, _ in order)]
+    inertia = [transform(np.asarray(robot.inertia[link], float), frame[link]) for link in links]
+    places = [frame[parent] @ (np.eye(4) if joint in carries else old[joint]) for joint, _, parent in order]
+    own = [frame[f.parent] if f.parent >= 0 else np.eye(4) for f in robot.frames]
+    return _Tree(
+        [
+            robot.joints[joint]._replace(parent=number[parent], link=robot.joints[link].link)
+            for joint, link, parent in order
+        ],
+        [f._replace(parent=number[f.parent] if f.parent >= 0 else -1) for f in robot.frames],
+        places,
+        axes,
+        np.array(inertia),
+        np.asarray(robot.ratio, float)[pick],
+        np.asarray(robot.offset, float)[pick],
+        np.stack([a @ b for a, b in zip(own, np.asarray(robot.frame_placement, float), strict=True)]),
+    )
 
 
 def _kind(link: str) -> str:
@@ -369,14 +528,13 @@ def _rows(model: RobotModel, one: Capture) -> Float[np.ndarray, "samples 6 colum
 
 
 def _factor(
-    X: np.ndarray, y: np.ndarray, sigma: np.ndarray, share: float, precision: np.ndarray, mean: np.ndarray
+    X: np.ndarray, y: np.ndarray, sigma: np.ndarray, share: float, root: np.ndarray, mean: np.ndarray
 ) -> Float[np.ndarray, "n k"]:
     """Rows of the data, thinned to their independent ones, above those of the prior; the last column is the right."""
     weight = np.sqrt(share) / sigma
     rows = np.concatenate([X, y[..., None]], axis=2) * weight[:, None]
     rows = np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode="r")
-    root = np.sqrt(precision)
-    return np.concatenate([rows, np.column_stack([np.diag(root), root * mean])])
+    return np.concatenate([rows, np.column_stack([root, root @ mean])])
 
 
 def _independent(gone: Float[np.ndarray, "samples 6"], lengths: Sequence[int]) -> float:

@@ -113,10 +113,15 @@ def _filtered_on_host(signal: np.ndarray, source: np.ndarray, place: np.ndarray,
     common = int(np.gcd.reduce(place - place[:1], initial=length))
     step = common & -common
     first = int(place[0]) % step if len(place) else 0
-    spectrum = np.fft.rfft(signal[..., np.roll(source, -first)], axis=-1) * response
+    spectrum = np.fft.rfft(np.take(signal, np.roll(source, -first), axis=-1), axis=-1)
+    shape = np.broadcast_shapes(spectrum.shape, response.shape)  # memory that is new takes longer than the product
+    spectrum = np.multiply(spectrum, response, out=spectrum if shape == spectrum.shape else None)
     for size in (length >> k for k in range(step.bit_length() - 1)):
         lower = slice(size // 4 + 1)
-        spectrum = 0.5 * (spectrum[..., lower] + spectrum[..., ::-1][..., lower].conj())
+        folded = np.conjugate(spectrum[..., ::-1][..., lower])
+        folded += spectrum[..., lower]
+        folded *= 0.5
+        spectrum = folded
     return np.fft.irfft(spectrum, length // step, axis=-1)[..., place // step]
 
 

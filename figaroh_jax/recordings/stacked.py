@@ -19,7 +19,7 @@ from .signals import Signals
 
 __all__ = ["Records", "filter_rows", "filtered_rows", "open_rows", "stack"]
 
-SERIES = 32  # filtered at once: their spectra stay in the processor's cache
+SERIES = 16  # filtered at once: their spectra stay in the processor's cache
 
 
 class Records(eqx.Module):

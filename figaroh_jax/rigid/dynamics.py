@@ -21,7 +21,7 @@ from ..compiled.precision import in_float64
 from .inertia import pseudo_inertia
 from .kinematics import Motion, add_up, ancestors, axis_twists, check_shapes, gather, motion, movers, pose_columns, take
 from .model import RobotModel
-from .scalar_programs import MASSES, TORQUES, straight, written, written_torques
+from .scalar_programs import ACCELERATIONS, LIMB_TORQUES, MASSES, TORQUES, in_limbs, straight, written, written_torques
 from .spatial import cross, matmul, rotate
 
 __all__ = [
@@ -33,6 +33,7 @@ __all__ = [
     "mass_matrix",
 ]
 
+MOST_JOINTS = 12  # of a robot whose mass matrix is factorised in registers
 MANY = 512  # samples from which a program is worth its compilation that is written out for the robot at hand
 
 
@@ -126,7 +127,8 @@ def joint_masses(model: RobotModel, q: Float[Array, "nq samples"]) -> Float[Arra
     return gather(model, jnp.swapaxes(gather(model, full), 0, 1))
 
 
-_TORQUES = straight(TORQUES, joint_torques)
+_LIMBS = straight(LIMB_TORQUES, joint_torques)
+_TORQUES = straight(TORQUES, joint_torques, apart=lambda model: _LIMBS if in_limbs(model) else None)
 _MASSES = straight(MASSES, joint_masses, lambda model: model.nv**2)
 
 
@@ -150,7 +152,8 @@ def forward_dynamics(
     True
     """
     check_shapes(model, q=q, v=v, tau=tau)
-    return over_samples(joint_accelerations, model, q, v, tau, width=model.nv**2)
+    form = _ACCELERATIONS if len(model.joints) <= MOST_JOINTS else None
+    return over_samples(joint_accelerations, model, q, v, tau, width=model.nv**2, straight=form)
 
 
 def joint_accelerations(
@@ -160,3 +163,6 @@ def joint_accelerations(
     bias = joint_torques(model, q, v, jnp.zeros_like(v))
     factor = jnp.linalg.cholesky(jnp.moveaxis(joint_masses(model, q), -1, 0))
     return jax.scipy.linalg.cho_solve((factor, True), (tau - bias).T[..., None])[..., 0].T
+
+
+_ACCELERATIONS = straight(ACCELERATIONS, joint_accelerations, lambda model: model.nv**2)

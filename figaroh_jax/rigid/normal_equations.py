@@ -17,21 +17,23 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..compiled.batching import BLOCK, CPU_OPTIONS, aligned, chunk_size, in_chunks, on_host, traced, two_axes
-from ..compiled.kernels import usable
+from ..compiled.executable_cache import Program
+from ..compiled.kernels import Straight, kept_here, known_codes, rounded, straight_answers, usable
 from ..compiled.machine_code import machine_code
 from ..compiled.precision import in_float64
 from ..errors import InputError, check_real
 from .kinematics import check_shapes
 from .model import RobotModel
-from .regressor import BLOCK_FORM, block_codes, block_rows, coordinate_blocks, coordinate_rows, dense_rows
+from .regressor import BLOCK_FORM, coordinate_blocks, coordinate_rows, dense_rows
+from .scalar_programs import weighted_rows
 
 __all__ = ["NormalMatrix", "normal_matrix", "triangular_factor"]
 
 SMALL = 160  # columns of a normal matrix
 PANEL = 16  # columns that a QR factorisation takes together
 AT_ONCE = 512  # samples of a product on a CPU, by machine code
-TOGETHER = 4096  # samples of a product on a GPU
-DEVICE_BYTES = 1e9  # of the blocks of a chunk on a GPU
+TOGETHER = 1024  # samples of a product on a GPU
+DEVICE_BYTES = 2e9  # of the blocks of a chunk on a GPU
 
 
 class NormalMatrix(NamedTuple):
@@ -68,15 +70,18 @@ def normal_matrix(
     """
     rows = _rows(model, q, v, a, tau, weight, extra)
     columns = 10 * len(model.joints) + (0 if extra is None else np.shape(extra)[-1]) + 1
-    groups = _groups(model, columns)
-    start = tuple(jnp.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
+    on_gpu = usable(*rows)
+    groups = _groups(model, columns, apart=on_gpu)
+    library: Any = np if on_host(model, rows) else jnp
+    start = tuple(library.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
     parts = _by_machine_code(model, groups, rows) if on_host(model, rows) else None
+    if on_gpu:
+        parts = _by_kernels(model, start, rows)
     # a small matrix is added to from the innermost cache; a large one costs more to add to than its rows to make
-    chunk = 32 if on_host() and columns <= SMALL else _rows_at_once(model) if usable() else chunk_size()
-    parts = _fold(_adder(block_codes(model)), chunk, start, model, rows) if parts is None else parts
+    chunk = 32 if on_host() and columns <= SMALL else chunk_size()
+    parts = _fold(_add_products, chunk, start, model, rows) if parts is None else parts
     index = np.concatenate([_flat(group, columns).ravel() for group in groups])
-    whole = _scattered(columns, index, parts)
-    new = NormalMatrix(whole[:-1, :-1], whole[:-1, -1], whole[-1, -1])
+    new = _scattered(columns, index, parts)
     return new if total is None else NormalMatrix(*(x + y for x, y in zip(total, new, strict=True)))
 
 
@@ -181,7 +186,7 @@ def _fold_chunks(step: Callable[..., Any], total: Any, model: RobotModel, rows: 
 
 
 _device_program = jax.jit(_fold_chunks, static_argnums=0)
-_host_program = jax.jit(_fold_chunks, static_argnums=0, compiler_options=CPU_OPTIONS)
+_host_program = Program(_fold_chunks, static=1, options=CPU_OPTIONS)
 
 
 class _Group(NamedTuple):
@@ -192,16 +197,18 @@ class _Group(NamedTuple):
     columns: np.ndarray
 
 
-def _groups(model: RobotModel, columns: int) -> list[_Group]:
+def _groups(model: RobotModel, columns: int, apart: bool = False) -> list[_Group]:
+    """`apart`: each coordinate by itself, with its columns in the order of the regressor."""
     blocks, _ = coordinate_blocks(model)
     members = [np.flatnonzero(blocks[:, 0] == coordinate) for coordinate in range(model.nv)]
-    groups = []
-    for size in sorted({len(m) for m in members}):
-        which = np.array([k for k, m in enumerate(members) if len(m) == size], int)
+    groups, order = [], ((0, 10),) if apart else ((0, 4), (4, 10))
+    alike = [[k for k, m in enumerate(members) if len(m) == size] for size in sorted({len(m) for m in members})]
+    for which in ([k] for k in range(model.nv)) if apart else alike:
+        which = np.array(which, int)
         index = np.stack([members[k] for k in which])
         # the columns of mass and first moments of all links before those of their inertia, as the kernel gives them
         first = 10 * blocks[index, 1][..., None]
-        own = np.concatenate([(first + np.arange(*ends)).reshape(len(which), -1) for ends in ((0, 4), (4, 10))], axis=1)
+        own = np.concatenate([(first + np.arange(*ends)).reshape(len(which), -1) for ends in order], axis=1)
         shared = np.broadcast_to(
             np.arange(10 * len(model.joints), columns), (len(which), columns - 10 * len(model.joints))
         )
@@ -215,23 +222,15 @@ def _flat(group: _Group, columns: int) -> np.ndarray:
 
 
 @partial(jax.jit, static_argnums=0)
-def _scattered(columns: int, index: Array, parts: tuple[Array, ...]) -> Float[Array, "columns columns"]:
+def _scattered(columns: int, index: Array, parts: tuple[Array, ...]) -> NormalMatrix:
     values = jnp.concatenate([part.reshape(-1) for part in parts])
-    return jnp.zeros(columns * columns).at[index].add(values).reshape(columns, columns)
+    whole = jnp.zeros(columns * columns).at[index].add(values).reshape(columns, columns)
+    return NormalMatrix(whole[:-1, :-1], whole[:-1, -1], whole[-1, -1])
 
 
-@lru_cache(maxsize=64)
-def _adder(codes: bytes | None) -> Callable[..., Any]:
-    return partial(_add_products, codes)
-
-
-def _add_products(codes: bytes | None, model: RobotModel, totals: tuple[Array, ...], rows: _Rows) -> tuple[Array, ...]:
+def _add_products(model: RobotModel, totals: tuple[Array, ...], rows: _Rows) -> tuple[Array, ...]:
     samples = rows.q.shape[-1]
-    if usable():
-        blocks = block_rows(model, rows.q.T, rows.v.T, rows.a.T, codes)
-        pieces = blocks[:, :4], blocks[:, 4:]
-    else:
-        pieces = coordinate_rows(model, rows.q, rows.v, rows.a)
+    pieces = coordinate_rows(model, rows.q, rows.v, rows.a)
     side = _beside(model, rows)
     columns = 10 * len(model.joints) + side.shape[1]
     new = []
@@ -240,6 +239,59 @@ def _add_products(codes: bytes | None, model: RobotModel, totals: tuple[Array, .
         both = jnp.concatenate([*own, side[group.coordinates]], axis=1) * rows.root[group.coordinates, None]
         new.append(total + row_products(both))
     return tuple(new)
+
+
+def _by_kernels(model: RobotModel, start: tuple[Array, ...], rows: _Rows) -> tuple[Array, ...]:
+    """The products of each coordinate on a GPU, from rows that a kernel writes as they are multiplied."""
+    samples, nv = len(rows.q), model.nv
+    given = [x.reshape(samples, nv, -1) for x in (rows.extra, rows.tau) if x is not None]
+    side = jnp.concatenate([jnp.zeros((samples, nv, 0)), *map(jnp.asarray, given)], axis=2).reshape(samples, -1)
+    whole = rounded(samples)
+    arrays = [jnp.asarray(x) for x in (rows.q, rows.v, rows.a, rows.root, side)]
+    if whole > samples:
+        modes = ("edge", "edge", "edge", "constant", "edge")
+        arrays = [jnp.pad(x, ((0, whole - samples), (0, 0)), mode=m) for x, m in zip(arrays, modes, strict=True)]
+    told = known_codes(_row_form(0), model), min(whole, _rows_at_once(model))
+    if traced(model, start, arrays):
+        return _sums_of_rows(*told, model, start, *arrays)
+    return (_kept_sums(*told) if kept_here(*arrays) else partial(_program_of_sums, *told))(model, start, *arrays)
+
+
+@lru_cache(maxsize=64)
+def _kept_sums(codes: bytes, chunk: int) -> Program:
+    def sums_of_rows(model: RobotModel, start: tuple[Array, ...], *arrays: Array) -> tuple[Array, ...]:
+        return _sums_of_rows(codes, chunk, model, start, *arrays)
+
+    return Program(sums_of_rows, key=f"{chunk} {codes.hex()}")
+
+
+def _sums_of_rows(
+    codes: bytes, chunk: int, model: RobotModel, start: tuple[Array, ...], *arrays: Float[Array, "samples _"]
+) -> tuple[Array, ...]:
+    form = _row_form(arrays[4].shape[1] // model.nv)
+    chunks = [x.reshape(-1, chunk, x.shape[1]) for x in arrays]
+
+    def step(total: tuple[Array, ...], arrays: list[Array]) -> tuple[tuple[Array, ...], None]:
+        rows = straight_answers(form, model, *arrays, codes=codes)
+        return tuple(x + row_products(one[None]) for x, one in zip(total, rows, strict=True)), None
+
+    return jax.lax.scan(step, start, chunks)[0] if len(arrays[0]) else start
+
+
+_program_of_sums = jax.jit(_sums_of_rows, static_argnums=(0, 1))
+
+
+@lru_cache(maxsize=16)
+def _row_form(side: int) -> Straight:
+    return weighted_rows(side, partial(_plain_rows, side))
+
+
+def _plain_rows(side: int, model: RobotModel, q: Any, v: Any, a: Any, root: Any, given: Any) -> list[Array]:
+    blocks, samples = jnp.concatenate(coordinate_rows(model, q.T, v.T, a.T), axis=1), len(q)
+    own = [np.flatnonzero(coordinate_blocks(model)[0][:, 0] == row) for row in range(model.nv)]
+    beside = given.T.reshape(model.nv, side, samples)
+    parts = [jnp.concatenate([blocks[k].reshape(-1, samples), beside[row]]) for row, k in enumerate(own)]
+    return [x * root[:, row] for row, x in enumerate(parts)]
 
 
 def row_products(rows: Float[Array, "c k samples"]) -> Float[Array, "c k k"]:
@@ -252,7 +304,7 @@ def row_products(rows: Float[Array, "c k samples"]) -> Float[Array, "c k k"]:
 def _rows_at_once(model: RobotModel) -> int:
     """Samples to a chunk on a GPU, whose products are the quicker the more rows they sum."""
     blocks, _ = coordinate_blocks(model)
-    return 1 << min(19, int(np.log2(DEVICE_BYTES / 80 / len(blocks))))
+    return 1 << min(20, int(np.log2(DEVICE_BYTES / 80 / len(blocks))))
 
 
 def _by_machine_code(model: RobotModel, groups: Sequence[_Group], rows: _Rows) -> tuple[np.ndarray, ...] | None:

@@ -26,7 +26,21 @@ from ..compiled.kernels import Load, Number, Program, Read, Straight, Write
 from .kinematics import ancestors
 from .model import Joint, Leaf, RobotModel, dofs
 
-__all__ = ["BLOCKS", "DENSE", "MASSES", "PACKED", "TORQUES", "Written", "straight", "written", "written_torques"]
+__all__ = [
+    "ACCELERATIONS",
+    "BLOCKS",
+    "DENSE",
+    "LIMB_TORQUES",
+    "MASSES",
+    "PACKED",
+    "TORQUES",
+    "Written",
+    "in_limbs",
+    "straight",
+    "weighted_rows",
+    "written",
+    "written_torques",
+]
 
 LOADED = 2  # code of a constant that is not known before; -1, 0 and 1 stand for themselves
 _SIZES = {"rotation": 9, "origin": 3, "across": 9, "twice": 9, "inertia": 10, "second": 6, "ratio": 1, "offset": 1}
@@ -163,6 +177,14 @@ class Robot:
     def children(self, i: int) -> list[int]:
         """Joints that hang on joint i."""
         return [k for k, joint in enumerate(self.joints) if joint.parent == i]
+
+    def above(self, i: int) -> list[int]:
+        """Joints that move joint i's frame, from the world on."""
+        out: list[int] = []
+        while i >= 0 and self.joints[i].parent >= 0:
+            i = self.joints[i].parent
+            out.insert(0, i)
+        return out
 
 
 class Pose(NamedTuple):
@@ -323,8 +345,23 @@ def _carried(robot: Robot, i: int, motion: Motion, spin: Matrix) -> tuple[Vector
     return force, _add(_cross(h, motion.ac), about)
 
 
-def torques(robot: Robot, q: Read, v: Read, a: Read, put: Callable[[int, Number], None]) -> None:
-    """Newton and Euler's recursion (Luh, Walker and Paul, 1980): `put` receives the torque of every coordinate."""
+def torques(
+    robot: Robot,
+    q: Read,
+    v: Read,
+    a: Read,
+    put: Callable[[int, Number], None],
+    limbs: Sequence[int] = (),
+    limb: int = -1,
+    hand: Callable[[list[Number]], None] = lambda six: None,
+    taken: Callable[[int], list[Number]] = lambda child: [],
+) -> None:
+    """Newton and Euler's recursion (Luh, Walker and Paul, 1980): `put` receives the torque of every coordinate.
+
+    Where `limbs` are told, by their first joints, only those of `limb` are put. Its motion comes from the world anew;
+    `taken` gives the force and the torque of a limb that hangs on it, as that limb had them for `hand`: about the
+    origin of the link that carries it, in its axes.
+    """
     total: dict[int, Number] = {}
     left = np.bincount(robot.dofs.column)
 
@@ -334,7 +371,11 @@ def torques(robot: Robot, q: Read, v: Read, a: Read, put: Callable[[int, Number]
         own = _spin(motion)
         force, torque = _carried(robot, i, motion, own)
         for child in robot.children(i):
-            there, about = visit(child, motion, own)
+            if child in limbs:
+                six = taken(child)
+                there, about = tuple(six[:3]), tuple(six[3:])
+            else:
+                there, about = visit(child, motion, own)
             force, torque = _add(force, there), _add(torque, about)
         ratio = robot.of_joint(i, "ratio")[0]
         for k in robot.own(i):
@@ -349,9 +390,15 @@ def torques(robot: Robot, q: Read, v: Read, a: Read, put: Callable[[int, Number]
         up = pose.turn(force)
         return up, _add(pose.turn(torque), _cross(pose.origin, up))
 
-    still = _rest(robot)
-    for i in robot.children(-1):
-        visit(i, still, _spin(still))
+    motion = _rest(robot)
+    spin = _spin(motion)
+    for i in robot.above(limb):
+        motion = _moved(robot, i, _pose(robot, i, q), motion, spin, v, a)
+        spin = _spin(motion)
+    for i in [limb] if limb >= 0 else robot.children(-1):
+        up, about = visit(i, motion, spin)
+        if limb >= 0 and robot.joints[i].parent >= 0:
+            hand([*up, *about])
 
 
 class Written(eqx.Module):
@@ -555,6 +602,40 @@ def mass_entries(robot: Robot, q: Read, put: Callable[[int, int, Number], None])
         put(row, col, value)
 
 
+def accelerations(robot: Robot, q: Read, v: Read, tau: Read, put: Callable[[int, Number], None]) -> None:
+    """`put` receives the acceleration of every coordinate: a = M^-1 (tau - bias), M = L'DL (Featherstone 2008, 8.5).
+
+    From the last coordinate to the first that leaves the zeros of a tree where they are.
+    """
+    rest: dict[int, Number] = {}
+    M: dict[tuple[int, int], Number] = {}
+    torques(robot, q, v, lambda k: ZERO, lambda row, bias: rest.update({row: bias}))
+    rest = {row: tau(row) - bias for row, bias in rest.items()}
+    mass_entries(robot, q, lambda row, column, number: M.update({(row, column): number}))
+    order = sorted(rest)
+    above = {k: [i for i in order[:n] if (k, i) in M] for n, k in enumerate(order)}
+    inverse: dict[int, Number] = {}
+    for k in reversed(order):
+        inverse[k] = _inverse(M[k, k])
+        for i in reversed(above[k]):
+            share = M[k, i] * inverse[k]
+            for j in above[k]:
+                if j <= i:
+                    M[i, j] = M.get((i, j), ZERO) - share * M[k, j]
+                    above[i] = sorted({*above[i], *([j] if j < i else [])})
+            M[k, i] = share
+            rest[i] = rest[i] - share * rest[k]
+    for k in order:
+        rest[k] = rest[k] * inverse[k]
+        for i in above[k]:
+            rest[k] = rest[k] - M[k, i] * rest[i]
+        put(k, rest[k])
+
+
+def _inverse(x: Number) -> Number:
+    return Number(float("nan")) if x.known else Number(lax.div(lax.full_like(x.x, 1.0), x.x))
+
+
 def _joined(one: Body, two: Body) -> Body:
     rows = tuple(_add(x, y) for x, y in zip(one.inertia, two.inertia, strict=True))
     return Body(one.m + two.m, _add(one.h, two.h), rows)
@@ -589,10 +670,62 @@ def columns(model: RobotModel) -> list[list[tuple[int, int]]]:
 
 def _torques(model: RobotModel, codes: bytes) -> list[Program]:
     def inverse_dynamics(load: Load, reads: list[Read], write: Write) -> None:
-        q, v, a = reads
+        q, v, a = reads[:3]
         torques(Robot(model.joints, codes, load), q, v, a, lambda row, number: write([((row,), number)]))
 
     return [inverse_dynamics]
+
+
+LIMB = 10  # joints of which one kernel holds the torques: the numbers of more are not held by a lane's registers
+
+
+@lru_cache(maxsize=64)
+def _limbs(joints: tuple[Joint, ...]) -> tuple[int, ...]:
+    """First joints of parts of the tree, so many joints at the most in each, those further out before others.
+
+    None at all where the tree is one part, or where two parts share a coordinate.
+    """
+    size, cut = [1] * len(joints), list[int]()
+    for i in reversed(range(len(joints))):
+        hanging = sorted((k for k, joint in enumerate(joints) if joint.parent == i), key=lambda k: size[k])
+        size[i] += sum(size[k] for k in hanging)
+        while size[i] > LIMB and hanging:
+            cut.append(hanging.pop())
+            size[i] -= size[cut[-1]]
+    cut += [i for i, joint in enumerate(joints) if joint.parent < 0]
+    part = list[int]()
+    for i, joint in enumerate(joints):
+        part.append(i if i in cut else part[joint.parent])
+    places = dofs(joints)
+    shared = any(len({part[j] for j in places.joint[places.column == k]}) > 1 for k in set(places.column.tolist()))
+    return () if len(cut) == 1 or shared or len(joints) <= LIMB else tuple(sorted(cut, reverse=True))
+
+
+def _handed(model: RobotModel) -> dict[int, list[int]]:
+    """Where the six numbers of each limb that hangs on another stand, behind the torques."""
+    hanging = [i for i in _limbs(model.joints) if model.joints[i].parent >= 0]
+    return {i: list(range(model.nv + 6 * n, model.nv + 6 * n + 6)) for n, i in enumerate(hanging)}
+
+
+def _limb_torques(model: RobotModel, codes: bytes) -> list[Program]:
+    limbs, handed = _limbs(model.joints), _handed(model)
+
+    def of_limb(limb: int) -> Program:
+        def inverse_dynamics(load: Load, reads: list[Any], write: Write) -> None:
+            q, v, a, back = reads
+            torques(
+                Robot(model.joints, codes, load),
+                *(q, v, a),
+                put=lambda row, number: write([((row,), number)]),
+                limbs=limbs,
+                limb=limb,
+                hand=lambda six: write([((k,), number) for k, number in zip(handed[limb], six, strict=True)]),
+                taken=lambda child: back([(k,) for k in handed[child]]),
+            )
+
+        return inverse_dynamics
+
+    return [of_limb(limb) for limb in limbs]
 
 
 def _blocks(coordinates: bool, model: RobotModel, codes: bytes) -> list[Program]:
@@ -604,12 +737,56 @@ def _blocks(coordinates: bool, model: RobotModel, codes: bytes) -> list[Program]
             def put(row: int, link: int, ten: list[Number]) -> None:
                 write([((place[row, link], k), number) for k, number in enumerate(ten)])
 
-            q, v, a = reads
+            q, v, a = reads[:3]
             regressor_blocks(Robot(model.joints, codes, load), q, v, a, put, links, coordinates)
 
         return regressor
 
     return [of_links(links) for links in _pieces(model)]
+
+
+def _weighted_rows(side: int, model: RobotModel, codes: bytes) -> list[Program]:
+    """Of each coordinate all of a normal matrix's columns: those of the links, then `side` given ones; weighed."""
+    blocks = _rows(model, True)
+    first = {int(row): int(np.flatnonzero(blocks[:, 0] == row)[0]) for row in blocks[:, 0]}
+    place = {tuple(block): 10 * (k - first[block[0]]) for k, block in enumerate(blocks.tolist())}
+    pieces = _pieces(model)
+
+    def of_links(links: list[int]) -> Program:
+        def weighted_rows(load: Load, reads: list[Read], write: Write) -> None:
+            q, v, a, root, given = reads[:5]
+
+            def put(row: int, link: int, ten: list[Number]) -> None:
+                write([((row, place[row, link] + k), number * root(row)) for k, number in enumerate(ten)])
+
+            if links is pieces[0]:
+                for row, (count,) in enumerate(_row_lengths(side, model)):
+                    own = range(row * side, (row + 1) * side)
+                    write([((row, count - side + n), given(k) * root(row)) for n, k in enumerate(own)])
+            regressor_blocks(Robot(model.joints, codes, load), q, v, a, put, links, True)
+
+        return weighted_rows
+
+    return [of_links(links) for links in pieces]
+
+
+def _row_lengths(side: int, model: RobotModel) -> list[tuple[int]]:
+    counts = np.bincount(_rows(model, True)[:, 0], minlength=model.nv)
+    return [(10 * int(count) + side,) for count in counts]
+
+
+def weighted_rows(side: int, plain: Callable[..., list[Array]]) -> Straight:
+    """Rows (columns, samples) of each coordinate: of the links that it moves, then its `side` given ones.
+
+    The arrays are q, v, a, the roots of the weights (samples, nv) and the given columns (samples, nv * side).
+    """
+    form = _Form(f"rows beside {side}", partial(_weighted_rows, side), partial(_row_lengths, side), last=True)
+
+    def read(model: RobotModel) -> list[list[tuple[int, int]]]:
+        given = ([(4, row * side + n) for n in range(side)] for row in range(model.nv))
+        return [*columns(model), *([(3, row)] for row in range(model.nv)), *(one for one in given if one)]
+
+    return straight(form, plain)._replace(plain=plain, columns=read)
 
 
 def _pieces(model: RobotModel) -> list[list[int]]:
@@ -635,6 +812,14 @@ def _masses(model: RobotModel, codes: bytes) -> list[Program]:
         mass_entries(Robot(model.joints, codes, load), reads[0], put)
 
     return [mass_matrix]
+
+
+def _accelerations(model: RobotModel, codes: bytes) -> list[Program]:
+    def forward_dynamics(load: Load, reads: list[Read], write: Write) -> None:
+        q, v, tau = reads[:3]
+        accelerations(Robot(model.joints, codes, load), q, v, tau, lambda row, number: write([((row,), number)]))
+
+    return [forward_dynamics]
 
 
 def _whole_masses(model: RobotModel, upper: Array) -> Array:
@@ -682,7 +867,7 @@ class _Form(NamedTuple):
 
     name: str
     programs: Callable[[RobotModel, bytes], list[Program]]
-    shape: Callable[[RobotModel], tuple[int, ...]]
+    shape: Callable[[RobotModel], Any]
     finish: Callable[[RobotModel, Array], Array] | None = None
     last: bool = False
     answer: Callable[[RobotModel], tuple[int, ...]] | None = None
@@ -702,7 +887,15 @@ def _mass_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
 
 _ANSWERS = {"rows": lambda model: (len(_rows(model, False)), 10), "blocks": lambda model: (len(_rows(model, True)), 10)}
 
+ACCELERATIONS = _Form("accelerations", _accelerations, lambda model: (model.nv,))
 TORQUES = _Form("torques", _torques, lambda model: (model.nv,))
+LIMB_TORQUES = _Form(
+    "torques of limbs",
+    _limb_torques,
+    lambda model: (model.nv + 6 * len(_handed(model)),),
+    lambda model, whole: whole[: model.nv],
+    answer=lambda model: (model.nv,),
+)
 PACKED = _Form("packed", partial(_blocks, False), _ANSWERS["rows"], last=True)
 BLOCKS = _Form("blocks", partial(_blocks, True), _ANSWERS["blocks"], last=True)
 DENSE = _Form(
@@ -720,8 +913,13 @@ def _in_order(shape: Callable[[RobotModel], tuple[int, ...]], model: RobotModel,
     return [int(np.ravel_multi_index(place, shape(model)))]
 
 
-def straight(form: _Form, kernel: Callable[..., Any], width: Callable[[RobotModel], int] = lambda model: 1) -> Straight:
-    """A form beside the plain kernel with the same answers; `width` as `over_samples` takes it."""
+def straight(
+    form: _Form,
+    kernel: Callable[..., Any],
+    width: Callable[[RobotModel], int] = lambda model: 1,
+    apart: Callable[[RobotModel], Straight | None] = lambda model: None,
+) -> Straight:
+    """A form beside the plain kernel with the same answers; `width` as `over_samples` takes it, `apart` as Straight."""
 
     def plain(model: RobotModel, *arrays: Any) -> Any:
         arrays = tuple(jnp.asarray(x) for x in arrays)
@@ -744,4 +942,10 @@ def straight(form: _Form, kernel: Callable[..., Any], width: Callable[[RobotMode
         finish=form.finish,
         answer=form.answer or form.shape,
         places=form.places or partial(_in_order, form.shape),
+        apart=apart,
     )
+
+
+def in_limbs(model: RobotModel) -> bool:
+    """Whether the tree is too large for one kernel, and falls into limbs."""
+    return bool(_limbs(model.joints))

@@ -7,7 +7,9 @@ entry point of the group `figaroh_jax.backends`, `name = "module:Class"`.
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NoReturn, Protocol, runtime_checkable
@@ -82,8 +84,28 @@ class Capabilities:
 GROUP = "figaroh_jax.backends"  # entry points by which packages announce their backends
 
 
+class _ByName(type(Protocol)):  # pyright: ignore[reportGeneralTypeIssues, reportUntypedBaseClass]
+    """Members are looked for, not evaluated: Python 3.11 asks an instance for each, a property that fails too."""
+
+    def __instancecheck__(cls, instance: Any) -> bool:
+        if cls.__dict__.get("_is_protocol"):
+            return all(_has(instance, name) for name in _members(cls))
+        return super().__instancecheck__(instance)
+
+
+def _has(instance: Any, name: str) -> bool:
+    nothing = object()
+    return inspect.getattr_static(instance, name, nothing) is not nothing
+
+
+@cache
+def _members(protocol: type) -> tuple[str, ...]:
+    own = {*vars(protocol), *protocol.__annotations__}
+    return tuple(sorted(name for name in own if not name.startswith("_")))
+
+
 @runtime_checkable
-class Backend(Protocol):
+class Backend(Protocol, metaclass=_ByName):
     r"""Dynamics, kinematics and regressor of one robot, by one simulator.
 
     Conventions, the same for every backend; an adapter translates them once.

@@ -34,6 +34,7 @@ class Trial:
     plates: list[tuple[np.ndarray, np.ndarray]]  # pose, wrench on the person at and in the plate (frames, 6)
     q: np.ndarray  # true
     wrench: np.ndarray  # true, of both plates on the person, at and in the pelvis
+    exact: list[tuple[np.ndarray, np.ndarray]]  # the plates without noise and zeros
 
 
 def make_person(path: str, rng: np.random.Generator, spread: float = 0.12) -> Person:
@@ -101,8 +102,8 @@ def record(
         for label, (joint, place) in person.markers.items():
             pose = data.oMi[model.getJointId(joint)]
             seen[label][k] = pose.act(place + skin[label][k]) + rng.normal(0, noise, 3)
-    plates = _plates(np.array(root), pelvis, t, rng)
-    return Trial(t, seen, plates, q, np.array(root))
+    plates, exact = _plates(np.array(root), pelvis, t, rng)
+    return Trial(t, seen, plates, q, np.array(root), exact)
 
 
 def _skin(t: np.ndarray, rng: np.random.Generator, size: float) -> np.ndarray:
@@ -112,16 +113,17 @@ def _skin(t: np.ndarray, rng: np.random.Generator, size: float) -> np.ndarray:
     return size / np.sqrt(3) * total / total.std(0)
 
 
-def _plates(root: np.ndarray, pelvis: list, t: np.ndarray, rng: np.random.Generator) -> list:
-    """Two plates under the feet that share the wrench, each with noise (1.5 N, 0.4 N m) and a small zero."""
+def _plates(root: np.ndarray, pelvis: list, t: np.ndarray, rng: np.random.Generator) -> tuple[list, list]:
+    """Two plates under the feet that share the wrench, with noise (1.5 N, 0.4 N m) and a small zero; and without."""
     poses = [np.eye(4), np.eye(4)]
     poses[0][:3, 3], poses[1][:3, 3] = [0.0, 0.0, 0.0], [0.0, 0.4, 0.0]
     poses[1][:3, :3] = pin.exp3(np.array([0, 0, np.pi / 2]))
     share = 0.5 + 0.2 * np.sin(2 * np.pi * 0.23 * t)
-    out = []
+    out, exact = [], []
     for pose, part in zip(poses, (share, 1 - share), strict=True):
         back = pin.SE3(pose).inverse()
         wrench = [(back * m).act(pin.Force(w * f)).vector for m, w, f in zip(pelvis, root, part, strict=True)]
         error = rng.normal(0, [1.5] * 3 + [0.4] * 3, (len(t), 6)) + rng.normal(0, [1.0] * 3 + [0.2] * 3)
         out.append((pose, np.array(wrench) + error))
-    return out
+        exact.append((pose, np.array(wrench)))
+    return out, exact
