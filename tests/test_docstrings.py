@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import inspect
+from operator import attrgetter
 
 import pytest
 
@@ -14,7 +15,14 @@ LONG = {"calibrate", "diagnose", "diagnose_task", "identify", "identify_task", "
 LONG |= {"excite", "excite_postures", "excite_task", "write_report"}
 LONG |= {"rollout", "rollout_data", "select", "simulate", "triangular_factor"}
 FUNCTIONS = [n for n in fj.__all__ if callable(getattr(fj, n)) and not inspect.isclass(getattr(fj, n))]
-SHOWN = [*sorted(set(FUNCTIONS)), "BlockLevenbergMarquardt", "Trajectory"]
+SPACES = [
+    f"{space}.{name}"
+    for space in fj._SPACES
+    for name in getattr(fj, space).__all__
+    if inspect.isfunction(getattr(fj, space).__dict__[name])
+    and ">>>" in (getattr(fj, space).__dict__[name].__doc__ or "")
+]
+SHOWN = [*sorted(set(FUNCTIONS)), "BlockLevenbergMarquardt", "Trajectory", *SPACES]
 
 
 def test_every_public_function_and_class_says_what_it_is():
@@ -25,7 +33,7 @@ def test_every_public_function_and_class_says_what_it_is():
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in LONG)) for n in SHOWN])
 def test_the_example_in_a_docstring_runs_and_is_short(name: str):
     before = [dict(known) for known in (registry.CATALOGUE, registry.POSES)]
-    found = getattr(fj, name)
+    found = attrgetter(name)(fj)
     found = inspect.unwrap(found) if inspect.isfunction(found) else found
     (test,) = doctest.DocTestFinder(recurse=False).find(found, name, globs={})
     assert 0 < len(test.examples) <= 10
