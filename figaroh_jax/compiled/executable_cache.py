@@ -180,7 +180,12 @@ def _loaded(data: bytes, leaves: int) -> tuple[Any, Any]:
 @lru_cache(maxsize=1)
 def _find_lapack() -> None:
     """Have JAX look up LAPACK's functions, as it does when it lowers one: a program from disk jumps to them unasked."""
-    jax.jit(jax.numpy.linalg.cholesky).lower(np.eye(1))
+    try:
+        from jaxlib.lapack import prepare_lapack_call
+
+        prepare_lapack_call("potrf_ffi", np.dtype(float))
+    except (ImportError, TypeError, NotImplementedError):  # of a JAX that has it elsewhere
+        jax.jit(jax.numpy.linalg.cholesky).lower(np.eye(1))
 
 
 def _write(entry: _Entry, leaves: list[Any], compiled: Any, out: Any) -> None:
