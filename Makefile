@@ -19,7 +19,7 @@ test: .venv/developed ## the tests, without the slow ones
 	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile $(ARGS)
 
 test-slow: .venv/developed ## the slow tests: many hidden effects, many clean recordings
-	$(BIN)/python -m pytest -m slow -n $(WORKERS) --dist loadfile $(ARGS)
+	JAX_DISABLE_MOST_OPTIMIZATIONS=0 $(BIN)/python -m pytest -m slow -n $(WORKERS) --dist loadfile $(ARGS)
 
 lint: .venv/developed
 	$(BIN)/ruff check .

@@ -46,6 +46,8 @@ def main() -> None:
     state = jax.block_until_ready(_recordings(fleet, jnp.asarray(drives), options.samples))
     print(f"jax {jax.__version__}, {jax.devices()[0].device_kind}, float64; {options.robots} recordings of"
           f" {options.samples} samples made in {time.perf_counter() - start:.1f} s", flush=True)  # fmt: skip
+    memory = jax.devices()[0].memory_stats() or {}
+    print(f"peak of the device's memory until here: {memory.get('peak_bytes_in_use', 0) / 1e9:.2f} GB", flush=True)
     bytes_each = 8 * options.samples * rows.model.nv * (sum(into.shape) + 1)
     at_once = options.at_once or max(1, int(AT_ONCE / bytes_each))
     axes = _axes(rows.model)

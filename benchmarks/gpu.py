@@ -98,7 +98,11 @@ def _case(robot: Path, name: str, gpu: str, folder: Path, options: argparse.Name
     for stage in STAGES if name in STAGES["called, kept"] else list(STAGES)[:1]:
         try:
             done = subprocess.run([*command, stage], env=here, timeout=LONGEST, capture_output=True, text=True)
-            found = done.stdout.splitlines()[-1] if done.returncode == 0 else json.dumps({"failed": done.stderr[-600:]})
+            found = (
+                done.stdout.splitlines()[-1]
+                if done.returncode == 0
+                else json.dumps({"failed": f"status {done.returncode} {done.stderr[-600:]}"})
+            )
         except subprocess.TimeoutExpired:
             found = json.dumps({"failed": f"not done in {LONGEST:.0f} s"})
         _tell({"robot": robot.stem, "function": name, "programs": stage, "gpu": gpu, **json.loads(found)}, options.out)
@@ -110,8 +114,9 @@ def _case(robot: Path, name: str, gpu: str, folder: Path, options: argparse.Name
 def _tell(row: dict[str, Any], out: Path | None) -> None:
     print(
         f"{row['robot']:14} {row['function']:26} {row['programs']:17}",
-        row.get("failed")
-        or f"{row['samples']:8d} samples {row['rate']:10.2f} M/s; first call {row['first']:6.2f} s"
+        f"failed: {row['failed']}"
+        if "failed" in row
+        else f"{row['samples']:8d} samples {row['rate']:10.2f} M/s; first call {row['first']:6.2f} s"
         f" (traced {row['traced']:.2f}, compiled {row['compiled']:.2f}); {row['difference']:.1e} from the CPU;"
         f" peak {row['peak'] / 1e9:.2f} GB",
         flush=True,

@@ -32,7 +32,7 @@ from figaroh_jax.rigid.inertia import to_com  # noqa: E402
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 URDF = DATA / "human_model" / "human.urdf"
 CUTOFF = 2.5  # Hz: the motions have nothing above 0.9 Hz
-FRAMES = 40  # of the trial by which sizes are found
+FRAMES = 24  # of each trial, by which sizes are found: skin slides slowly, and one trial is little
 
 
 def main() -> None:
@@ -55,7 +55,8 @@ def main() -> None:
     print(f"{'':10}{'  found   table unscaled':>24}{'  found   table unscaled':>24}")
     for k in range(options.people):
         start = time.perf_counter()
-        line = study(np.random.default_rng(options.seed + k), options)
+        skin = {"tissue": options.tissue, "noise": options.noise}
+        line = study(np.random.default_rng(options.seed + k), options.seconds, options.trials, skin, options.exact)
         force, moment = ("".join(f"{x:8.2f}" for x in line[key]) for key in ("force", "moment"))
         rest = f"{line['mass']:8.2f}{line['com']:8.2f}{line['size']:8.2f}{line['covered']:7.2f}"
         print(f"{options.seed + k:6}{'':4}{force}{moment}{rest}{time.perf_counter() - start:6.0f}", flush=True)
@@ -80,10 +81,15 @@ def places(robot: fj.RobotModel) -> dict[str, tuple[str, np.ndarray]]:
     return found
 
 
-def study(rng: np.random.Generator, options: argparse.Namespace) -> dict:
+def study(
+    rng: np.random.Generator,
+    seconds: float,
+    trials: int,
+    skin: dict[str, float] | None = None,
+    exact: str | None = None,
+) -> dict:
     """One person from end to end."""
-    seconds, trials = options.seconds, options.trials
-    skin = {"tissue": options.tissue, "noise": options.noise}
+    skin = skin or {}
     robot = fj.load_urdf(URDF, root="free_flyer")
     person = simulated.make_person(str(URDF), rng)
     own = places(robot)
@@ -91,21 +97,21 @@ def study(rng: np.random.Generator, options: argparse.Namespace) -> dict:
     simulated.put_markers(person, {label: (joint_of[link], at) for label, (link, at) in own.items()}, rng)
     fitted = [simulated.record(person, rng, seconds, **skin) for _ in range(trials)]
     unseen = simulated.record(person, rng, seconds, **skin)
-    data = size(robot, own, fitted[0]) if options.exact is None else true_size(robot, own, person, fitted[0])
-    known = person if options.exact == "all" else None
-    captures = [captured(robot, own, data, trial, known) for trial in fitted]
-    judge = captured(robot, own, data, unseen, known, exact=True)
+    data = size(robot, own, fitted) if exact is None else true_size(robot, own, person, fitted[0])
+    known = person if exact == "all" else None
+    captures = [captured(robot, own, data, trial, known)[0] for trial in fitted]
+    judge = captured(robot, own, data, unseen, known)
     weight = float(np.mean([np.linalg.norm(c.wrench[:, :3], axis=1).mean() for c in captures]))
     table = people.anthropometric(robot, weight / 9.81, "male", np.asarray(data.scale))
     found = people.identify_segments(captures, table)
-    unscaled = captured(robot, own, None, unseen, exact=True)
+    unscaled = captured(robot, own, None, unseen)
     return judged(person, robot, found, table, judge, unscaled, data, unseen)
 
 
-def size(robot, own, trial):
-    """Segments' sizes by `fit` on a few frames."""
-    pick = np.linspace(0, len(trial.time) - 1, FRAMES).astype(int)
-    seen = {label: at[pick] for label, at in trial.markers.items()}
+def size(robot, own, trials):
+    """Segments' sizes by a few frames of each trial."""
+    pick = np.linspace(0, len(trials[0].time) - 1, FRAMES).astype(int)
+    seen = {label: np.concatenate([trial.markers[label][pick] for trial in trials]) for label in trials[0].markers}
     return markers.segment_sizes(robot, markers.marker_data(robot, own, seen)).data
 
 
@@ -119,11 +125,11 @@ def true_size(robot, own, person, trial):
     return eqx.tree_at(lambda d: (d.scale, d.shift), data, (scale, shift))
 
 
-def captured(robot, own, fitted, trial, known=None, exact=False):
-    """Positions by inverse kinematics with the sizes found (None: the model's), and the capture.
+def captured(robot, own, fitted, trial, known=None) -> tuple[people.Capture, people.Capture]:
+    """Positions by inverse kinematics with the sizes found (None: the model's), and two captures.
 
-    `known`: the person whose true positions are taken instead; `exact`: with a second capture, of what plates without
-    noise and zeros would say.
+    The first is of the plates, the second of what plates without noise and zeros would say. `known`: the person whose
+    true positions are taken instead.
     """
     if known is not None:
         q, model = np.empty((len(trial.time), robot.nq)), fitted.robot(robot)
@@ -135,9 +141,8 @@ def captured(robot, own, fitted, trial, known=None, exact=False):
         if fitted is not None:
             data = eqx.tree_at(lambda d: (d.scale, d.shift), data, (fitted.scale, fitted.shift))
         q, model = markers.joint_positions(robot, data).position, data.robot(robot)
-    plates = [trial.plates, trial.exact] if exact else [trial.plates]
-    both = [people.capture(model, trial.time, q, some, CUTOFF) for some in plates]
-    return both if exact else both[0]
+    read, exact = (people.capture(model, trial.time, q, some, CUTOFF) for some in (trial.plates, trial.exact))
+    return read, exact
 
 
 def judged(person, robot, found, table, both, unscaled, data, unseen) -> dict:

@@ -14,6 +14,7 @@ import os
 import platform
 import subprocess
 import sys
+import tempfile
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -46,10 +47,13 @@ def work() -> None:
     import jax
     import numpy as np
 
+    from figaroh_jax.compiled.executable_cache import keep_programs
     from figaroh_jax.formats.urdf import load_urdf
     from figaroh_jax.rigid.normal_equations import normal_matrix
     from figaroh_jax.rigid.regressor import joint_torque_regressor, packed_regressor
 
+    if "XDG_CACHE_HOME" in os.environ:
+        keep_programs()
     methods: dict[str, Any] = {
         "dense": joint_torque_regressor,
         "packed": packed_regressor,
@@ -89,10 +93,12 @@ def squared_norm(method: str, answer: Any) -> float:
 class Worker:
     """A process on one core that answers requests."""
 
-    def __init__(self, command: list[str], core: int) -> None:
+    def __init__(self, command: list[str], core: int, kept: str | None = None) -> None:
+        environment = {k: v for k, v in os.environ.items() if k != "XDG_CACHE_HOME"} | ONE_THREAD
+        environment |= {"XDG_CACHE_HOME": kept} if kept else {}
         pinned = ["taskset", "-c", str(core), *command]
         self.process = subprocess.Popen(
-            pinned, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ | ONE_THREAD
+            pinned, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
         )
         self.versions = self.read()
 
@@ -146,9 +152,9 @@ class Bench:
         self.command = {m: peers for m in PEERS} | {m: [sys.executable, __file__, "--worker"] for m in OURS}
         self.core = core
 
-    def fresh(self, method: str, *request: Any) -> dict[str, float]:
-        """Answer of a process that has done nothing before."""
-        worker = Worker(self.command[method], self.core)
+    def fresh(self, method: str, *request: Any, kept: str | None = None) -> dict[str, float]:
+        """Answer of a process that has done nothing before, with the programs that others kept in a folder."""
+        worker = Worker(self.command[method], self.core, kept)
         answer = worker.ask(method, *request)
         worker.close()
         return answer
@@ -229,15 +235,18 @@ def main() -> None:
         worker.close()
     print(f"{told}; {rounds} rounds on core {options.core}; float64; medians [min, max] over the rounds\n")
     cases, compile_time = {}, {}
-    print("CPU s of the first call (trace, compile, run 1000 samples) in a fresh process without cache")
+    print("CPU s of the first call, 1000 samples, in a fresh process: without cache, and with kept programs")
     for name in options.robots:
         path = str(DATA / ROBOTS[name])
         joints = [j for j in load_urdf(path).joint_names if j not in LOCKED]
         compile_time[name] = {
             m: spread([bench.fresh(m, path, joints, 1000)["cpu"] for _ in range(min(3, rounds))]) for m in OURS
         }
-        told_times = (f"{m} {x['median']:.2f} [{x['min']:.2f}, {x['max']:.2f}]" for m, x in compile_time[name].items())
-        print(f"{name:6}", "  ".join(told_times))
+        with tempfile.TemporaryDirectory() as folder:
+            kept = {m: [bench.fresh(m, path, joints, 1000, kept=folder)["cpu"] for _ in range(4)][1:] for m in OURS}
+        for what, times in {"": compile_time[name], "kept": {m: spread(x) for m, x in kept.items()}}.items():
+            told_times = (f"{m} {x['median']:.2f} [{x['min']:.2f}, {x['max']:.2f}]" for m, x in times.items())
+            print(f"{name:6} {what:5}", "  ".join(told_times), flush=True)
     print(f"\n{'robot  samples method         us a sample, CPU':58} peak MB ", *(f"times faster: {p:9}" for p in PEERS))
     for name in options.robots:
         path = str(DATA / ROBOTS[name])
@@ -248,6 +257,7 @@ def main() -> None:
         for samples in options.samples or ([1_000] if options.quick else [1_000, 10_000, 100_000]):
             cases[name].append(bench.case(path, joints, sizes, samples, rounds))
             tell(name, cases[name][-1])
+            sys.stdout.flush()
     if options.json:
         answer = {"machine": told, "rounds": rounds, "first_call_cpu_s": compile_time, "cases": cases}
         options.json.write_text(json.dumps(answer, indent=1) + "\n")

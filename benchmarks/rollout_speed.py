@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import mujoco
+import mujoco as engine
 import numpy as np
 
 from figaroh_jax.rollouts.data import Run, Stretch, windows
@@ -32,6 +32,7 @@ from figaroh_jax.rollouts.parameters import Entry, Table
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.sensitivity import linear_sums
 
+mujoco: Any = engine
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", "/data"))
 KP, KV = (600.0, 600.0, 500.0, 400.0, 150.0, 120.0, 60.0), (30.0, 30.0, 25.0, 20.0, 7.0, 6.0, 3.0)
 TRUTH = {
@@ -44,7 +45,7 @@ HOME = np.array([0.0, -0.4, 0.0, -2.0, 0.0, 1.7, 0.5])
 DT, ROWS, NOISE = 0.002, 2499, (2e-4, 2e-3)
 
 
-def arm(scale: float = 1.0) -> mujoco.MjSpec:
+def arm(scale: float = 1.0) -> Any:
     """The Panda without its hand's fingers and meshes; its 21 numbers times `scale`."""
     text = (DATA / "panda_gaz2019" / "panda.urdf").read_text()
     text = re.sub(r"<(visual|collision)\b.*?</\1>", "", text, flags=re.DOTALL)
@@ -83,7 +84,7 @@ def command(seed: int, rows: int) -> np.ndarray:
     return HOME + (waves + steps) * np.clip(t / 0.5, 0, 1)
 
 
-def record(model: mujoco.MjModel, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def record(model: Any, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions and rates at the instants at which the rows of the command are written, (rows, 7) each."""
     data = mujoco.MjData(model)
     data.qpos[:] = u[0]
@@ -94,7 +95,7 @@ def record(model: mujoco.MjModel, u: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return q, v
 
 
-def loop_of(spec: mujoco.MjSpec, folder: Path) -> Loop:
+def loop_of(spec: Any, folder: Path) -> Loop:
     file = folder / "panda.xml"
     spec.compile()
     file.write_text(spec.to_xml())
@@ -204,7 +205,7 @@ def gpu(count: int, rows: int, folder: Path) -> None:
     )
 
 
-def _core_seconds(model: mujoco.MjModel, rows: int) -> float:
+def _core_seconds(model: Any, rows: int) -> float:
     """Seconds of one rollout of MuJoCo C in one thread, no Python between its steps."""
     from mujoco import rollout
 
@@ -218,9 +219,10 @@ def _core_seconds(model: mujoco.MjModel, rows: int) -> float:
     return (time.perf_counter() - start) / 20
 
 
-def _noisy(seen: tuple[np.ndarray, np.ndarray], seed: int) -> list[np.ndarray]:
+def _noisy(seen: tuple[np.ndarray, np.ndarray], seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    return [x + s * rng.normal(size=x.shape) for x, s in zip(seen, NOISE, strict=True)]
+    q, v = (x + s * rng.normal(size=x.shape) for x, s in zip(seen, NOISE, strict=True))
+    return q, v
 
 
 def _timed(call: Callable[[], Any]) -> tuple[Any, float, float]:

@@ -16,6 +16,7 @@ import dataclasses
 import json
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import equinox as eqx
@@ -52,7 +53,7 @@ def miuzei_runs() -> list[Run]:
 def servo_miuzei(law: str = "hard") -> None:
     """Every fourth run is fitted, every fourth from the second is the test."""
     file = DATA / "servo_miuzei" / "servo_meshfree.xml"
-    loop, _ = load_loop(file, {"servo": {"kind": "position", "kp": 25.0, "kd": 5.0}}, law=law)
+    loop, _ = load_loop(file, {"servo": {"kind": "position", "kp": 25.0, "kd": 5.0}}, law=law, dt=0.005)
     runs = miuzei_runs()
     train, test = runs[::4], runs[1::4]
     other = [r for k, r in enumerate(runs) if k % 4 > 1]
@@ -62,7 +63,7 @@ def servo_miuzei(law: str = "hard") -> None:
         forbid=("payload", "encoder_offset", "torque_offset", "joint_elasticity", "backlash"),
     )  # fmt: skip
     start = time.process_time()
-    found = search(here)
+    found = search(here, _told(start))
     print(f"verdict {found.verdict}, {time.process_time() - start:.0f} CPU s, {len(train)} runs fitted")
     show(found, [n.candidate.effect for n in (found.named or found.proxy)])
     loop0 = here.loop
@@ -76,6 +77,11 @@ def servo_miuzei(law: str = "hard") -> None:
             f"{name:>6}: "
             + ", ".join(f"{k} {total([(r, simulated(m, r)) for r in group]):.4f}" for k, m in models.items())
         )
+
+
+def _told(start: float) -> Callable[[str, float | None], None]:
+    """Prints what a search does, with the CPU seconds spent."""
+    return lambda phase, share: print(f"  [{time.process_time() - start:.0f} CPU s] {phase}", flush=True)
 
 
 def pendulum_runs() -> list[Run]:
@@ -103,29 +109,29 @@ def dfki_double_pendulum(window: float, every: int) -> None:
     data = {}
     for name, group in (("train", train), ("test", test)):
         cut = [Stretch(k, f, rows) for k in group for f in range(0, len(runs[k].time) - rows, every * rows)]
-        data[name] = windows(loop, runs, cut, noise, window)
+        data[name] = windows(loop, runs, cut, noise, window, smooth=True)
     table = (
-        *(Entry("payload", (i,)) for i in range(2)),
+        *(Entry(name, (i,)) for name in ("mass_z", "inertia_xx") for i in range(2)),
         *(Entry(name, (i,)) for name in ("damping", "friction", "armature") for i in range(2)),
         Entry("delay", (0, 1)),
     )
-    theta, free = np.array([0.0, 0.0, 0.001, 0.001, 0.0, 0.0, 1e-6, 1e-6, 0.0]), list[int]()
+    theta, free = np.array([0.0] * 4 + [0.001, 0.001, 0.0, 0.0, 1e-6, 1e-6, 0.0]), list[int]()
     steps = (
         ("nominal", ()),
-        ("+ masses", (0, 1)),
-        ("+ viscous", (2, 3)),
-        ("+ Coulomb", (4, 5)),
-        ("+ rotor", (6, 7)),
-        ("+ delay", (8,)),
+        ("+ rigid", (0, 1, 2, 3)),  # all that gravity and inertia of two links in a plane show
+        ("+ viscous", (4, 5)),
+        ("+ Coulomb", (6, 7)),
+        ("+ rotor", (8, 9)),
+        ("+ delay", (10,)),
     )
     start = None
     for label, more in steps:
         free += more
         for entry in more:
             theta[entry] = {"friction": 0.05, "armature": 1e-3, "delay": 0.001}.get(table[entry].name, theta[entry])
-        one = fit(loop, table, data["train"], theta[None], [free], start, width=9, lanes=1)[0]
+        one = fit(loop, table, data["train"], theta[None], [free], start, width=11, lanes=1)[0]
         theta, start = one.theta, one.start[None]
-        held = fit(loop, table, data["test"], theta[None], [[]], width=9, lanes=1)[0]
+        held = fit(loop, table, data["test"], theta[None], [[]], width=11, lanes=1)[0]
         rms = [
             1e3 * np.sqrt(f.squares / (d.weight > 0).sum()) * 2e-3
             for f, d in ((one, data["train"]), (held, data["test"]))
@@ -188,7 +194,7 @@ def so101_sage(motions: list[str], third: int | None, most: float, unseen: float
         stretches=cut, forbid=forbid,
     )  # fmt: skip
     start = time.process_time()
-    found = search_arm(here, forbid=forbid)
+    found = search_arm(here, _told(start), forbid=forbid)
     seconds = sum(len(r.time) for r in runs) * PERIOD
     print(
         f"verdict {found.verdict}, {time.process_time() - start:.0f} CPU s, {seconds:.0f} s of {len(runs)} recordings"

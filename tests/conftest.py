@@ -5,10 +5,19 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import jax
-import pytest
+# Most of the seconds are the compiler's: here and in the commands that the tests start it does not optimise (a third
+# less time in all). `make test-slow` and the benchmarks run what users run.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
+QUICK = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+
+_FLAGS = os.environ.get("XLA_FLAGS", "")
+if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "1" and jax.__version_info__ < (0, 11) and QUICK not in _FLAGS:
+    os.environ["XLA_FLAGS"] = f"{_FLAGS} {QUICK}"  # later compilers lack the first flag
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", str(ROOT / ".cache" / "jax"))

@@ -72,14 +72,14 @@ def panda_task(folder: Path, data: Path) -> Path:
     )
 
 
-def ur10e_task(folder: Path, data: Path) -> Path:
-    """Four runs fitted, two held out; currents through the published gains."""
+def ur10e_task(folder: Path, data: Path, every: bool = False) -> Path:
+    """Four runs fitted, or every one of 16, and two held out; currents through the published gains."""
     runs = data / "ur10e_innopolis" / "id"
     names = sorted(path.name for path in runs.glob("*.npz"))
-    fitted = [n for n in names if any(part in n for part in FITTED)]
+    fitted = [n for n in names if any(part in n for part in (("",) if every else FITTED))]
     held = [n for n in names if any(part in n for part in HELD)]
     entry = {"time": "t", "position": "q", "torque": "i", "units": {"torque": "A"}}
-    data_list = [{"file": str(runs / n), **entry} for n in fitted]
+    data_list = [{"file": str(runs / n), **entry} for n in fitted if n not in held]
     data_list += [{"file": str(runs / n), **entry, "role": "holdout"} for n in held]
     return write(
         folder,

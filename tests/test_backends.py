@@ -282,6 +282,23 @@ def test_a_backend_whose_library_is_missing_says_what_to_install(monkeypatch: py
         registry.backend("bullet", source("arm")[0])
 
 
+class _Unreadable(NativeBackend):
+    """Its simulator does not read the file."""
+
+    @property
+    def simulator(self) -> Any:
+        raise InputError("this file is read by others alone")
+
+
+def test_a_backend_is_one_where_its_simulator_cannot_be_had() -> None:
+    """A property that raises is not asked for: Python 3.11 would evaluate it."""
+    model = made("native", "pendulum").robot
+    assert isinstance(_Unreadable(model), Backend)
+    assert not isinstance(model, Backend)
+    with pytest.raises(InputError):
+        _ = _Unreadable(model).simulator
+
+
 def test_a_third_party_adds_a_backend_by_an_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     info = tmp_path / "toy_backend-1.0.dist-info"
     info.mkdir()

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import doctest
 import inspect
+from operator import attrgetter
 
 import pytest
 
 import figaroh_jax as fj
 from figaroh_jax.effects import registry
 
-# what takes files that are not here (an MJCF, a task of postures, a finished diagnosis)
-FILES = {"calibrate_task", "load_mjcf", "load_usd", "write_report"}
-DESIGN = {"excite", "excite_postures", "excite_task", "expected_std", "fourier", "information", "learn", "limits_of"}
-DESIGN |= {"quintic", "spline"}  # `examples/design_a_motion.py` shows them together
 LONG = {"calibrate", "diagnose", "diagnose_task", "identify", "identify_task", "linear_basis", "linear_limits"}
+LONG |= {"excite", "excite_postures", "excite_task", "write_report"}
 LONG |= {"rollout", "rollout_data", "select", "simulate", "triangular_factor"}
 FUNCTIONS = [n for n in fj.__all__ if callable(getattr(fj, n)) and not inspect.isclass(getattr(fj, n))]
-SHOWN = [*sorted(set(FUNCTIONS) - FILES - DESIGN), "BlockLevenbergMarquardt"]
+SPACES = [
+    f"{space}.{name}"
+    for space in fj._SPACES
+    for name in getattr(fj, space).__all__
+    if inspect.isfunction(getattr(fj, space).__dict__[name])
+    and ">>>" in (getattr(fj, space).__dict__[name].__doc__ or "")
+]
+SHOWN = [*sorted(set(FUNCTIONS)), "BlockLevenbergMarquardt", "Trajectory", *SPACES]
 
 
 def test_every_public_function_and_class_says_what_it_is():
@@ -28,7 +33,7 @@ def test_every_public_function_and_class_says_what_it_is():
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in LONG)) for n in SHOWN])
 def test_the_example_in_a_docstring_runs_and_is_short(name: str):
     before = [dict(known) for known in (registry.CATALOGUE, registry.POSES)]
-    found = getattr(fj, name)
+    found = attrgetter(name)(fj)
     found = inspect.unwrap(found) if inspect.isfunction(found) else found
     (test,) = doctest.DocTestFinder(recurse=False).find(found, name, globs={})
     assert 0 < len(test.examples) <= 10

@@ -116,11 +116,22 @@ def test_without_a_compiler_the_plain_form_answers(always: None, tmp_path: Path,
     model = robots.load(robots.ARM, tmp_path)
     arrays = states(model, 30)
     with_code = fj.inverse_dynamics(model, *arrays)
-    for broken in (None, shutil.which("false")):
+    for broken in (None, [str(shutil.which("false"))]):
         monkeypatch.setattr(code, "_ready", {})
         monkeypatch.setattr(code, "_compiler", lambda: broken)  # noqa: B023
         agree(fj.inverse_dynamics(model, *arrays), with_code)
         assert code.machine_code(FORMS["torques"], model, *arrays) is None
+
+
+@pytest.mark.parametrize(("told", "after"), [("cc -g0", ["-g0"]), ("my cc", []), ("no-such -g0", None), ("'", None)])
+def test_the_compiler_is_what_make_takes_it_for(
+    told: str, after: list[str] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "my cc").symlink_to(str(shutil.which("cc")))
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setenv("CC", told)
+    found = code._compiler.__wrapped__()
+    assert found is None if after is None else found is not None and found[1:] == after
 
 
 CHILD = """

@@ -86,7 +86,7 @@ def test_every_backend_gives_the_same_verdict_causes_and_parameters(
 ):
     if backend in ("newton", "genesis"):
         pytest.importorskip(backend, reason=f"{backend} is not installed (the extra `{backend}`)")
-    near = 2e-3 if backend == "newton" else 1e-6  # Newton computes in float32
+    near = 5e-4 if backend == "newton" else 1e-6  # Newton computes in float32: 3.4e-4 at most was measured
     other = diagnosis_of(data_dir, tmp_path, backend)
     assert (other.verdict, [cause.name for cause in other.causes]) == (answer.verdict, [c.name for c in answer.causes])
     for one, same in zip(answer.causes, other.causes, strict=True):

@@ -14,6 +14,7 @@ import robots
 from robots import joint, link, robot
 
 from figaroh_jax.errors import InputError
+from figaroh_jax.formats.robotfile import load_extended
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.rigid.kinematics import frame_placement
 
@@ -104,6 +105,16 @@ def test_limits_are_read_and_infinite_where_there_are_none(tmp_path: Path) -> No
     np.testing.assert_array_equal(model.position_limit, [[-1, 2], [-np.inf, np.inf], [-np.inf, np.inf]])
     np.testing.assert_array_equal(model.velocity_limit, [3, 3, np.inf])
     np.testing.assert_array_equal(model.effort_limit, [4, 4, np.inf])
+
+
+def test_what_a_joint_says_twice_counts_once_and_is_told(tmp_path: Path) -> None:
+    """The first counts, as it does for Pinocchio (urdfdom); published files have such joints."""
+    text = robot(*robots.LINKS[:2], joint("turn", "base", "a", "continuous", more='<origin xyz="9 9 9"/>'))
+    model = robots.load(text, tmp_path)
+    np.testing.assert_array_equal(model.placement[0, :3, 3], [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(pin.buildModelFromXML(text).jointPlacements[1].translation, [0.1, 0.2, 0.3], rtol=0)
+    (file,) = tmp_path.glob("*.urdf")
+    assert load_extended(file).notes == ("the second <origin> of joint 'turn' (line 1): the first counts",)
 
 
 def test_meshes_are_never_looked_for(tmp_path: Path) -> None:

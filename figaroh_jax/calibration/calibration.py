@@ -47,7 +47,20 @@ def calibrate_task(
     level: str | None = None,
     priors: bool = True,
 ) -> Calibration:
-    """Calibrate the robot of a task from its recordings with a `measurement`; `level`, `priors`: see `calibrate`."""
+    """Calibrate the robot of a task from its recordings with a `measurement`; `level`, `priors`: see `calibrate`.
+
+    >>> import pathlib, tempfile, numpy as np, figaroh_jax as fj
+    >>> robot, q = fj.load_urdf(fj.DEMO), np.random.default_rng(0).uniform(-1.4, 1.4, (30, 4))
+    >>> seen = np.asarray(fj.frame_placement(robot, q + [0.0, 0.02, 0.0, 0.0], "hand"))[:, :3] @ [0.05, 0.02, 0.03, 1.0]
+    >>> keys = "{position: seen, base_frame: base, tool_frame: hand, unknown: [base_frame, tool_frame]}"
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     np.savez(f"{folder}/run.npz", q=q, seen=seen)
+    ...     data = f"data: [{{file: run.npz, position: q, measurement: {keys}}}]"
+    ...     _ = pathlib.Path(folder, "task.yaml").write_text(f"robot: {{model: {fj.DEMO}}}\\n{data}")
+    ...     found = fj.calibrate_task(fj.load_task(f"{folder}/task.yaml"), level="joint_offset")
+    >>> round(found.solution.parameters["joint_offset shoulder"].value, 4)
+    0.02
+    """
     from ..formats.robotfile import load_robot
 
     model = load_robot(task)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -83,11 +84,12 @@ def machine_code(
     samples = len(arrays[0])
     if samples < FROM or straight.places is None or _compiler() is None or not _near(arrays[0]):
         return None
-    wanted = _Wanted(straight, parameters, straight.known_lengths(parameters), tuple(x.shape[1] for x in arrays))
+    constants = np.ascontiguousarray(straight.constants(parameters, float, np), float)
+    codes = straight.known_lengths(parameters, constants)
+    wanted = _Wanted(straight, parameters, codes, tuple(x.shape[1] for x in arrays))
     code = _code(wanted, samples >= TO_COMPILE * max(1.0, len(wanted.codes) / SMALL))
     if code is None:
         return None
-    constants = np.ascontiguousarray(straight.constants(parameters, float, np), float)
     return partial(_run, code, straight.last, constants)
 
 
@@ -185,10 +187,17 @@ def _store() -> Store | None:
 
 
 @lru_cache(maxsize=1)
-def _compiler() -> str | None:
+def _compiler() -> list[str] | None:
+    """The compiler and what its user adds to it, as make takes `$CC`: "ccache gcc", or one path that holds a space."""
     if os.environ.get("FIGAROH_JAX_MACHINE_CODE", "") == "0" or os.name == "nt":
         return None
-    return shutil.which(str(os.environ.get("CC") or "cc"))
+    told = os.environ.get("CC") or "cc"
+    try:
+        words = [told] if shutil.which(told) else shlex.split(told)
+    except ValueError:  # a quote that is not closed
+        return None
+    found = shutil.which(words[0]) if words else None
+    return None if found is None else [found, *words[1:]]
 
 
 @lru_cache(maxsize=1)
@@ -197,8 +206,8 @@ def _version() -> str:
     compiler = _compiler()
     if compiler is None:
         return ""
-    info = os.stat(compiler)
-    return f"{os.path.realpath(compiler)} {info.st_size} {info.st_mtime_ns}"
+    info = os.stat(compiler[0])
+    return f"{os.path.realpath(compiler[0])} {compiler[1:]} {info.st_size} {info.st_mtime_ns}"
 
 
 def _compiled(wanted: _Wanted) -> bytes | None:
@@ -210,7 +219,7 @@ def _compiled(wanted: _Wanted) -> bytes | None:
         out = Path(folder) / "code.so"
         try:
             subprocess.run(  # noqa: S603  (the user's own compiler, with source that is made here)
-                [compiler, *FLAGS, "-o", str(out)],
+                [*compiler, *FLAGS, "-o", str(out)],
                 input=_source(wanted).encode(),
                 check=True,
                 capture_output=True,

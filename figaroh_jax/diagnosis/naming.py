@@ -220,23 +220,23 @@ def _beside_smooth(
     step = grown.step
     if kind(effect) == "position":
         return 1.0
-    full = _with_smooth(grown, step, sized=bare is not None)
+    full = _with_smooth(grown, step)
     within = judge(step.rows, full)
     if bare is None:
         X, prior = full.X, full.prior
         fewer = prior._replace(mean=np.delete(prior.mean, place), precision=np.delete(prior.precision, place))
         without = judge(step.rows, Hypothesis(np.delete(X, place, axis=2), fewer))
     else:
-        without = judge(bare.rows, _with_smooth(grown, bare, sized=True))
+        without = judge(bare.rows, _with_smooth(grown, bare))
     return 1 - float(within.own(step.rows, joints).sum() / max(without.own(step.rows, joints).sum(), 1e-300))
 
 
-def _with_smooth(grown: _Grown, step: Step, sized: bool) -> Hypothesis:
+def _with_smooth(grown: _Grown, step: Step) -> Hypothesis:
     """The columns of a fit and smooth functions of each joint's own motion, as its sensors read them.
 
-    `sized`: each function is expected to be no larger than what the model leaves without any cause. Many free functions
-    of few rows predict the rows left out so badly that two fits of other columns could not be compared beside them;
-    where one column more is asked about, free ones are the harder rival.
+    Each function is expected to be no larger than what the model leaves without any cause. Many free functions of few
+    rows predict the rows left out so badly that two fits could not be compared beside them, and what they predict says
+    nothing of a cause of two numbers that acts on all joints.
     """
     problem, whitening, rows = grown.problem, grown.whitening, step.rows
     n, samples, _, nv = problem.records.shape
@@ -250,9 +250,7 @@ def _with_smooth(grown: _Grown, step: Step, sized: bool) -> Hypothesis:
         blocks.append(full)
     prior = step.state.prior
     size = np.concatenate([np.full(b.shape[2], s) for b, s in zip(blocks, grown.size, strict=True)])
-    more = prior.extended(len(size))
-    if sized:
-        more = Prior(more.mean, np.append(prior.precision, size**-2.0))
+    more = Prior(prior.extended(len(size)).mean, np.append(prior.precision, size**-2.0))
     return Hypothesis(np.concatenate([rows.X, *blocks], axis=2), more)
 
 

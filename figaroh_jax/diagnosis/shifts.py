@@ -6,6 +6,7 @@ JAX evaluates inverse dynamics, many samples in one program; the equations of th
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -191,7 +192,7 @@ def _errors(
     """What each sensor reads beside the truth, under the motion's load or each under its own."""
     out = []
     for one in range(len(effects.at)):
-        here = motion if loads is None else eqx.tree_at(lambda m: m.load, motion, loads[one])
+        here = motion if loads is None else replace(motion, load=loads[one])
         out.append(np.asarray(_error(jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects), here)))
     return np.stack(out)
 
@@ -207,7 +208,8 @@ def _moved(effects: Effect, motion: Motion, errors: Float[np.ndarray, "effects n
         moved = np.repeat(np.asarray(signal)[None], len(errors), axis=0)
         moved[one, :, joint] -= delta.reshape(len(errors), -1)
         true.append(moved)
-    return eqx.tree_at(lambda m: (m.position, m.velocity, m.acceleration), motion, tuple(true))
+    position, velocity, acceleration = true
+    return replace(motion, position=position, velocity=velocity, acceleration=acceleration)
 
 
 def difference(signal: Float[np.ndarray, "*n N"], dt: float) -> Float[np.ndarray, "*n N"]:

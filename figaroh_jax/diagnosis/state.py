@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Complex, Float, Int
@@ -60,8 +59,8 @@ class State:
     def motion(self) -> Motion:
         """The motion as measured, with load, total torque and inertia of `theta`."""
         load, *others = self.shares(self.theta)
-        new = (load, sum(others, load), self.theta[: self.rigid.width].reshape(-1, 10))
-        return eqx.tree_at(lambda m: (m.load, m.total, m.model.inertia), self.measured, new)
+        model = replace(self.measured.model, inertia=self.theta[: self.rigid.width].reshape(-1, 10))
+        return replace(self.measured, load=load, total=sum(others, load), model=model)
 
     @property
     def rigid(self) -> Part:
@@ -205,8 +204,8 @@ def link_motion(problem: Problem, state: State) -> Motion:
     for effect in state.sensors:
         if kind(effect) == "position":
             moved = shifted(batched(effect), motion, problem.records)
-            first = (moved.position[0], moved.velocity[0], moved.acceleration[0])
-            motion = eqx.tree_at(lambda m: (m.position, m.velocity, m.acceleration), moved, first)
+            position, velocity, acceleration = moved.position[0], moved.velocity[0], moved.acceleration[0]
+            motion = replace(moved, position=position, velocity=velocity, acceleration=acceleration)
     return motion
 
 

@@ -74,7 +74,16 @@ class BatchFit(NamedTuple):
 
 
 def coordinates(structure: Float[np.ndarray, "samples nv columns"], base: BaseParameters) -> Coordinates:
-    """Coordinates in which the columns at the random states `structure` are orthonormal."""
+    """Coordinates in which the columns at the random states `structure` are orthonormal.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> from figaroh_jax.estimation.base_parameters import base_parameters
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> W, names = fj.columns.structural_columns(robot, ()), fj.columns.column_names(robot, ())
+    >>> base = base_parameters(W.reshape(-1, len(names)), names)
+    >>> fj.accelerators.coordinates(W, base).into.shape == (len(names), base.rank)
+    True
+    """
     kept = structure[:, :, base.independent].reshape(-1, base.rank)
     R = np.linalg.qr(kept, mode="r")
     into = np.zeros((structure.shape[2], base.rank))

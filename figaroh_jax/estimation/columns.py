@@ -47,6 +47,12 @@ def friction_terms(model: RobotModel, known: Baseline) -> tuple[Effect, ...]:
     """The effects that a task's baseline asks for, those of every joint as one object with a leading axis.
 
     A free joint has no drive, so the six rows of a free flyer's root have no friction.
+
+    >>> import figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> terms = fj.columns.friction_terms(robot, fj.Baseline(offset=True))
+    >>> [term.name for term in terms]
+    ['viscous_friction', 'coulomb_friction', 'torque_offset']
     """
     switches = {
         "viscous_friction": known.viscous,
@@ -75,7 +81,14 @@ def _joints(model: RobotModel) -> list[Joint]:
 
 
 def column_names(model: RobotModel, terms: Sequence[Effect]) -> tuple[str, ...]:
-    """`m1` to `Izz1` and on for the links in tree order, then `fv1`, `fc1` ... of the joints, then other effects."""
+    """`m1` to `Izz1` and on for the links in tree order, then `fv1`, `fc1` ... of the joints, then other effects.
+
+    >>> import figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> terms = fj.columns.friction_terms(robot, fj.Baseline(offset=True))
+    >>> fj.columns.column_names(robot, terms)[:4], len(fj.columns.column_names(robot, terms))
+    (('m1', 'mx1', 'my1', 'mz1'), 52)
+    """
     names = list(inertial_names(model))
     for term in terms:
         amplitudes = [name for name, parameter in term.parameters().items() if parameter.linear]
@@ -89,7 +102,15 @@ def column_names(model: RobotModel, terms: Sequence[Effect]) -> tuple[str, ...]:
 def structural_columns(
     model: RobotModel, terms: tuple[Effect, ...], samples: int | None = None, seed: int = 0
 ) -> Float[np.ndarray, "samples nv columns"]:
-    """Columns at independent random states: what any motion at all could show."""
+    """Columns at independent random states: what any motion at all could show.
+
+    >>> import figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> terms = fj.columns.friction_terms(robot, fj.Baseline(offset=True))
+    >>> W = fj.columns.structural_columns(robot, terms)
+    >>> W.shape[1:] == (robot.nv, len(fj.columns.column_names(robot, terms)))
+    True
+    """
     samples = samples or max(STATES, 4 * len(column_names(model, terms)) // max(model.nv, 1))
     q, v, a = random_states(model, samples, seed)
     with jax.enable_x64(True):
@@ -100,7 +121,13 @@ def structural_columns(
 def random_states(
     model: RobotModel, samples: int, seed: int = 0
 ) -> tuple[Float[np.ndarray, "samples nq"], Float[np.ndarray, "samples nv"], Float[np.ndarray, "samples nv"]]:
-    """Independent random positions (quaternions of length one), velocities and accelerations."""
+    """Independent random positions (quaternions of length one), velocities and accelerations.
+
+    >>> import figaroh_jax as fj
+    >>> q, v, a = fj.columns.random_states(fj.load_urdf(fj.DEMO), 100)
+    >>> q.shape
+    (100, 4)
+    """
     generator = np.random.default_rng(seed)
     q, v, a = (generator.normal(scale=2.0, size=(samples, n)) for n in (model.nq, model.nv, model.nv))
     for joint, where in zip(model.joints, model.dofs.positions, strict=True):

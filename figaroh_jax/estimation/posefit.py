@@ -207,13 +207,13 @@ def _tied(device: Device, own: Array) -> tuple[Array, Array]:
 
 
 def linearise(
-    problem: Problem, unknowns: Float[Any, " unknowns"]
+    problem: Problem, unknowns: Float[Any, " unknowns"], parts: tuple[Part, ...] | None = None
 ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows unknowns"]]:
-    """Residual in m and rad at the scaled unknowns, and its exact Jacobian."""
+    """Residual in m and rad at the scaled unknowns, and its exact Jacobian; `parts` are those of the problem."""
     scale = np.asarray(problem.scale)
     values, first = np.asarray(unknowns) * scale, problem.columns
     residuals, jacobians = [], []
-    for group, part in zip(problem.groups, parts_of(problem), strict=True):
+    for group, part in zip(problem.groups, parts or parts_of(problem), strict=True):
         own = slice(first, first + len(group.device.unknowns()))
         residual, response, by_own = _flat_rows(group, part, values[: problem.columns], values[own])
         columns = np.zeros((len(values), residual.size))  # the Jacobian's columns, each in one piece

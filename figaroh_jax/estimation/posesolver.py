@@ -85,7 +85,8 @@ def solve(
     start = np.asarray(start, float) * free
     few = max(np.shape(group.position)[1] for group in problem.groups) <= DRAFT
     if few and jax.default_backend() == "cpu":  # on the host, by the program that `linearise` has compiled anyway
-        normal_at, found = partial(_normal_on_host, problem, weights, precision, free), beginning(start)
+        given = problem, parts_of(problem), weights, precision, free
+        normal_at, found = partial(_normal_on_host, *given), beginning(start)
         while _going(found, max_steps):
             found = attempt(normal_at, found)
     else:
@@ -153,9 +154,14 @@ def _square(rows: Float[Array, "columns samples"]) -> Float[Array, "columns colu
 
 
 def _normal_on_host(
-    problem: Problem, weights: np.ndarray, precision: np.ndarray, free: np.ndarray, at: np.ndarray
+    problem: Problem,
+    parts: tuple[Part, ...],
+    weights: np.ndarray,
+    precision: np.ndarray,
+    free: np.ndarray,
+    at: np.ndarray,
 ) -> NormalEquations:
-    residual, jacobian = linearise(problem, at)
+    residual, jacobian = linearise(problem, at, parts)
     rows, columns = weights * residual, weights[:, None] * jacobian * free
     matrix = columns.T @ columns + np.diag(free * precision + 1.0 - free)
     return NormalEquations(

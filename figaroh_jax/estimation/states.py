@@ -120,6 +120,14 @@ def read_pieces(files: Sequence[str | Path], samples: int = 20_000) -> Iterator[
 
     Unlike arrays mapped by `numpy.load(mmap_mode="r")`, what was read does not stay in memory. Raises `InputError`
     where a file is no .npy file of numbers in rows, or has another number of rows than the first.
+
+    >>> import tempfile, numpy as np, figaroh_jax as fj
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     files = [f"{folder}/{name}.npy" for name in ("q", "v", "a", "tau")]
+    ...     for file in files:
+    ...         np.save(file, np.zeros((50000, 4)))
+    ...     [len(q) for q, v, a, tau in fj.states.read_pieces(files)]
+    [20000, 20000, 10000]
     """
     arrays = [_mapped(Path(file)) for file in files]
     for file, array in zip(files, arrays, strict=True):

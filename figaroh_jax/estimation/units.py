@@ -50,8 +50,8 @@ def spreads(
     Runs with one label are days of one unit. NaN where a run does not tell a parameter. Raises `InputError` for fewer
     than two runs, wrong shapes, and standard deviations that are not above zero.
 
-    >>> import numpy as np
-    >>> found = spreads(["a"], np.array([[1.0], [1.2], [3.0]]), np.full((3, 1), 0.1))
+    >>> import numpy as np, figaroh_jax as fj
+    >>> found = fj.units.spreads(["a"], np.array([[1.0], [1.2], [3.0]]), np.full((3, 1), 0.1))
     >>> found[0].differs()
     'units'
     """

@@ -123,6 +123,14 @@ def excite(
     `start` is the posture at the beginning (rad or m; None: chosen), `starts` how many random motions are improved,
     `rate` (Hz) the samples of a design, whose noise is independent. Raises `InputError` where no motion meets the
     limits, the start is outside of them, or `predict` is needed and empty.
+
+    >>> import figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> limits = fj.limits_of(robot, acceleration=10.0)
+    >>> found = fj.excite(robot, fj.spline(3, duration=2.0), limits, starts=1)
+    >>> max(use.share for use in found.stages[0].uses) <= 1.0  # of the limits
+    True
+    >>> q, v, a = found.stages[0].motion.states(rate=1000.0)  # what the robot is to run
     """
     robot = model.robot if isinstance(model, ExtendedModel) else model
     limits = limits_of(robot) if limits is None else limits

@@ -85,6 +85,11 @@ def learn(
     one sigma each (N m or N), as the plate under a person (`people.standing`), and links without a mass have none to be
     learned; `hold`: joints that stand still. Raises
     `InputError` for a robot with joints of several degrees of freedom and for joints that are not there.
+
+    >>> import figaroh_jax as fj
+    >>> learned = fj.learn(fj.load_urdf(fj.DEMO), noise={"waist": 1.0, "shoulder": 1.0, "elbow": 0.5, "wrist": 0.2})
+    >>> learned.rank == len(learned.expressions) <= len(learned.names)  # base parameters, columns
+    True
     """
     from ..formats.config import Baseline
 
@@ -199,6 +204,13 @@ def information(
     A pure function of the parameters of the motion. An increase by 1 makes the geometric mean of the standard
     deviations smaller by the factor exp(-1 / (2 rank)). `learned` None: as `learn(model)` has it, which needs a model
     that is not being traced.
+
+    >>> import jax, numpy as np, figaroh_jax as fj
+    >>> robot, basis = fj.load_urdf(fj.DEMO), fj.spline(4, duration=3.0)
+    >>> learned = fj.learn(robot)
+    >>> of = lambda size: fj.information(robot, fj.Trajectory(np.zeros(4), size * np.ones((4, 4)), basis), learned)
+    >>> bool(of(0.3) > of(0.1)), bool(jax.grad(of)(0.1) > 0)  # larger motions tell more
+    (True, True)
     """
     matrix = information_matrix(learn(model) if learned is None else learned, motion, rate)
     return 2.0 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(matrix))))
@@ -216,5 +228,13 @@ def condition(learned: Learned, motion: Trajectory | States, rate: float = 20.0)
 
 @in_float64
 def expected_std(learned: Learned, motion: Trajectory | States, rate: float = 20.0) -> Float[Array, " rank"]:
-    """Standard deviation of each base parameter (its unit) after a fit to the motion and to what was known before."""
+    """Standard deviation of each base parameter (its unit) after a fit to the motion and to what was known before.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> learned, motion = fj.learn(robot), fj.Trajectory(np.zeros(4), 0.3 * np.ones((4, 4)), fj.spline(4, duration=3.0))
+    >>> once, twice = (fj.expected_std(learned, motion, rate=rate) for rate in (20.0, 40.0))
+    >>> bool((twice < once).all())
+    True
+    """
     return jnp.sqrt(jnp.diagonal(jnp.linalg.inv(information_matrix(learned, motion, rate))))

@@ -91,6 +91,12 @@ def limits_of(
     `clearance`: distances between bodies, as `clearance_of` has them.
 
     Raises `InputError` where a joint is not there, or a limit leaves no room.
+
+    >>> import figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> limits = fj.limits_of(robot, velocity={"elbow": 1.0}, acceleration=10.0, scale=0.9)
+    >>> float(limits.velocity[robot.joint_names.index("elbow")])
+    0.9
     """
     given = {
         "velocity": _by_joint(robot, "velocity", velocity, np.asarray(robot.velocity_limit, float)),

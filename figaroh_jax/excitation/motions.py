@@ -74,6 +74,10 @@ def fourier(harmonics: int, base: float, duration: float) -> Basis:
     """Sums of sines and cosines of `base` (Hz) and its multiples, at rest at the beginning and the end (periodic).
 
     Raises `InputError` where the duration holds no whole number of periods, or there are fewer than two harmonics.
+
+    >>> import figaroh_jax as fj
+    >>> fj.fourier(5, base=0.1, duration=10.0).size  # numbers a joint
+    8
     """
     if harmonics < 2 or not base > 0:
         raise InputError(
@@ -92,6 +96,11 @@ def spline(points: int, duration: float) -> Basis:
     """B-splines of degree 5, clamped at rest at both ends, with so many free control points; the last is the end.
 
     Raises `InputError` for fewer than two.
+
+    >>> import figaroh_jax as fj
+    >>> basis = fj.spline(4, duration=3.0)
+    >>> basis.at([0.0, 3.0]).shape  # position, velocity and acceleration of four functions, at both ends
+    (3, 2, 4)
     """
     if points < 2:
         raise InputError(f"a spline with {points} free control points: at least 2 are needed")
@@ -102,6 +111,10 @@ def quintic(waypoints: int, duration: float) -> Basis:
     """Quintic polynomials from rest to rest between waypoints, the first of which is the start; equal times between.
 
     Raises `InputError` for fewer than two.
+
+    >>> import figaroh_jax as fj
+    >>> fj.quintic(5, duration=8.0).size  # numbers a joint: the first waypoint is the start
+    4
     """
     if waypoints < 2:
         raise InputError(f"a quintic with {waypoints} waypoints: at least 2 are needed, the start among them")
@@ -109,7 +122,14 @@ def quintic(waypoints: int, duration: float) -> Basis:
 
 
 class Trajectory(eqx.Module):
-    """A motion of all joints: a pytree whose two arrays are its parameters, to differentiate and to map over."""
+    """A motion of all joints: a pytree whose two arrays are its parameters, to differentiate and to map over.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> motion = fj.Trajectory(np.zeros(4), 0.2 * np.ones((4, 6)), fj.spline(6, duration=5.0))
+    >>> q, v, a = motion.states(rate=100.0)
+    >>> q.shape, float(abs(v[-1]).max())  # at rest at the end
+    ((501, 4), 0.0)
+    """
 
     start: Float[Leaf, "*batch nv"]  # posture at the beginning, rad or m
     weights: Float[Leaf, "*batch nv size"]  # of the basis' functions

@@ -282,6 +282,13 @@ def excite_postures(
     Candidates are random within the joint limits (`position_limit`, default the model's; a turn where it has none),
     seen by the device (`instrument.view`) and clear of all that `clearance` keeps apart.
     Raises `InputError` where frames are not there, and where so few postures cannot tell all that can be told.
+
+    >>> import figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> tracker = fj.Instrument("position", base_frame="base", tool_frame="hand", accuracy=(5e-5, 1e-3))
+    >>> found = fj.excite_postures(robot, tracker, count=12, candidates=100, level="joint_offset", polish=False)
+    >>> found.position.shape, found.logdet > found.random_logdet
+    ((12, 4), True)
     """
     limits = np.array(model.position_limit if position_limit is None else position_limit, float)
     limits = np.where(np.isfinite(limits), limits, [-np.pi, np.pi])

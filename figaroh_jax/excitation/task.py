@@ -44,6 +44,16 @@ def excite_task(
 
     `separate`: pairs of causes (effect, place, sizes) that are to be told apart, in place of the block's objective.
     Recordings of the task are what is known already: their information is the prior, their residuals are the noise.
+
+    >>> import pathlib, tempfile, figaroh_jax as fj
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = pathlib.Path(folder, "task.yaml")
+    ...     limits = "{acceleration: 10.0}"
+    ...     text = f"robot: {{model: {fj.DEMO}}}\\nexcite: {{duration: 2.0, limits: {limits}}}"
+    ...     _ = file.write_text(text)
+    ...     found = fj.excite_task(fj.load_task(file))
+    >>> len(found.stages)
+    1
     """
     from ..formats.config import robot_options
     from ..formats.robotfile import load_extended, load_robot, stated_baseline

@@ -72,6 +72,12 @@ def load_mjcf(
 
     Raises `InputError` for a file that MuJoCo does not compile, for a loop that an equality closes, and for couplings
     that are not linear.
+
+    >>> import tempfile, figaroh_jax as fj
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     fj.write_model(fj.extend(fj.load_urdf(fj.DEMO)), folder)
+    ...     fj.load_mjcf(f"{folder}/robot.xml").joint_names
+    ('waist', 'shoulder', 'elbow', 'wrist')
     """
     path = find_in_packages(path, packages)
     return compiled_robot(str(path), compile_mjcf(path), joints, posture, gravity, root)

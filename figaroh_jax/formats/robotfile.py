@@ -23,7 +23,7 @@ from .compensation import GravityCompensation
 from .files import model_format
 from .mjcf import actuator_of, body_name, compile_mjcf, compiled_robot, disabled, engine, joint_names, load_mjcf
 from .native import place_names
-from .urdf import load_urdf, urdf_dynamics
+from .urdf import load_urdf, said_twice, urdf_dynamics
 from .usd import load_usd, usd_joints
 from .xmlfile import find_in_packages
 
@@ -95,10 +95,11 @@ def load_extended(
     if form == "urdf":
         robot = read_robot(path, joints, posture, gravity, root, packages)
         found = _Joints(robot)
-        for name, (damping, friction) in urdf_dynamics(find_in_packages(path, packages)).items():
+        file = find_in_packages(path, packages)
+        for name, (damping, friction) in urdf_dynamics(file).items():
             for dof in range(found.width(name)):
                 found.add(name, dof, damping=(damping,), friction=friction)
-        return Loaded(extend(robot, *found.effects()), ())
+        return Loaded(extend(robot, *found.effects()), said_twice(file))
     file = find_in_packages(path, packages)
     mj = compile_mjcf(file)
     robot = compiled_robot(str(file), mj, joints, posture, gravity, root)

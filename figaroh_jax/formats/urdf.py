@@ -18,7 +18,7 @@ from ..rigid.model import Kind, RobotModel
 from .assembly import JointPart, LinkPart, Posture, Root, assemble, refuse_many
 from .xmlfile import find_in_packages, read_xml
 
-__all__ = ["load_urdf", "urdf_dynamics"]
+__all__ = ["load_urdf", "said_twice", "urdf_dynamics"]
 
 _KINDS: dict[str, Kind | Literal["fixed"]] = {
     "revolute": "revolute",
@@ -48,6 +48,7 @@ _NUMBERS = {  # element: attributes, how many numbers each holds, which must be 
 _REQUIRED = ("mass", "inertia")  # elements of which no attribute may be left out
 _MAY_BE_INFINITE = ("limit",)
 _ONCE = {"link": ("inertial",), "inertial": ("origin", "mass", "inertia")}  # a second one contradicts the first
+_OF_A_JOINT = ("origin", "parent", "child", "axis", "limit", "mimic", "dynamics")  # the first counts, as in urdfdom
 _ROUNDED = 1e-6  # kg m^2; the inertias of small parts are often rounded to nonsense below this
 
 
@@ -106,6 +107,18 @@ def urdf_dynamics(path: str | Path) -> dict[str, tuple[float, float]]:
                     )
             found[joint.get("name")] = (float(element.get("damping", 0)), float(element.get("friction", 0)))
     return found
+
+
+def said_twice(path: str | Path) -> tuple[str, ...]:
+    """What the file says of a joint more than once; the first counts, as it does for other readers of URDF."""
+    joints = read_xml(path, "robot").iterchildren("joint")
+    counts = ((joint, tag, len(joint.findall(tag))) for joint in joints for tag in _OF_A_JOINT)
+    return tuple(
+        f"{'the second' if count == 2 else f'{count - 1} more'} <{tag}> of joint '{joint.get('name')}' (line"
+        f" {joint.findall(tag)[1].sourceline}): the first counts"
+        for joint, tag, count in counts
+        if count > 1
+    )
 
 
 def _read(path: str | Path) -> Any:

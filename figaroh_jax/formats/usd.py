@@ -81,6 +81,16 @@ def load_usd(
 
     Raises `InputError` for a stage that does not open, and, with the names of the joints or bodies, for what is no
     tree: loops, two robots in one stage, joints that do not hold their axes.
+
+    >>> import pathlib, tempfile, figaroh_jax as fj
+    >>> has = 'prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI"]'
+    >>> bodies = [f'def Cube "{name}" ({has})\\n{{\\n float physics:mass = 2\\n}}\\n' for name in ("base", "arm")]
+    >>> ends = "rel physics:body0 = </base>\\n rel physics:body1 = </arm>"
+    >>> joint = f'def PhysicsRevoluteJoint "hinge"\\n{{\\n {ends}\\n}}\\n'
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = pathlib.Path(folder, "arm.usda").write_text("#usda 1.0\\n" + "".join(bodies) + joint)
+    ...     fj.load_usd(f"{folder}/arm.usda", root="fixed").joint_names
+    ('hinge',)
     """
     file = find_in_packages(path, packages)
     with _reading(file):

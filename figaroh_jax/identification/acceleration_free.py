@@ -104,6 +104,14 @@ def momentum_columns(
     r"""Columns P and H with $\tau = \dot P \theta + H \theta$: momentum (N m s), and $g + f - \partial_q T$ (N m).
 
     To be called where 64-bit JAX is on; an effect may depend on the acceleration linearly, as a rotor does.
+
+    >>> import jax, numpy as np, figaroh_jax as fj
+    >>> robot, (q, v) = fj.load_urdf(fj.DEMO), np.random.default_rng(0).normal(size=(2, 10, 4))
+    >>> with jax.enable_x64(True):
+    ...     P, H = map(np.asarray, fj.acceleration_free.momentum_columns(robot, (), q, v))
+    >>> momentum = np.einsum("sij,sj->si", fj.mass_matrix(robot, q), v)
+    >>> bool(np.allclose(P @ np.asarray(robot.inertia).ravel(), momentum, rtol=0, atol=1e-9))
+    True
     """
     q, v = jnp.asarray(q), jnp.asarray(v)
     still = jnp.zeros_like(v)
@@ -120,7 +128,16 @@ def momentum_columns(
 def energy_columns(
     model: RobotModel, terms: tuple[Effect, ...], q: Float[ArrayLike, "samples nv"], v: Float[ArrayLike, "samples nv"]
 ) -> tuple[Float[Array, "samples 1 columns"], Float[Array, "samples 1 columns"]]:
-    r"""Columns E and D with $v' \tau = \dot E \theta + D \theta$: energy (J) and the power of friction (W)."""
+    r"""Columns E and D with $v' \tau = \dot E \theta + D \theta$: energy (J) and the power of friction (W).
+
+    >>> import jax, numpy as np, figaroh_jax as fj
+    >>> robot, (q, v) = fj.load_urdf(fj.DEMO), np.random.default_rng(0).normal(size=(2, 10, 4))
+    >>> with jax.enable_x64(True):
+    ...     E, still = (np.asarray(fj.acceleration_free.energy_columns(robot, (), q, x)[0]) for x in (v, 0 * v))
+    >>> kinetic = 0.5 * np.einsum("si,sij,sj->s", v, fj.mass_matrix(robot, q), v)
+    >>> bool(np.allclose((E - still)[:, 0] @ np.asarray(robot.inertia).ravel(), kinetic, rtol=0, atol=1e-9))
+    True
+    """
     q, v = jnp.asarray(q), jnp.asarray(v)
     still = jnp.zeros_like(v)
     resting, moving = (term_columns(model, terms, jnp.zeros(model.nv), q, v, a) for a in (still, v))

@@ -43,6 +43,13 @@ def generalized_force(
     `wrenches`: by name of the frame the force (N) and torque about its origin (N m) that the environment exerts on the
     robot there, in the axes of the frame. Added to the motors' torques (zero for a free root) it is what
     `inverse_dynamics` and friction have to give. Raises `InputError` for an unknown frame or a wrong shape.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot, q = fj.load_urdf(fj.DEMO), np.zeros((10, 4))
+    >>> push = np.tile([0.0, 0.0, 5.0, 0.0, 0.0, 0.0], (10, 1))  # 5 N along z of the hand
+    >>> J = np.asarray(fj.frame_jacobian(robot, q, "hand", "local"))
+    >>> bool(np.allclose(fj.wrenches.generalized_force(robot, q, {"hand": push}), 5.0 * J[:, 2], rtol=0, atol=1e-12))
+    True
     """
     total = np.zeros((len(np.asarray(q)), model.nv))
     for name, wrench in wrenches.items():
@@ -64,6 +71,13 @@ def wrench_regressor(
     Force (N) and torque about the frame's origin (N m) in its axes; 10 columns a link, in tree order, gravity included.
     What a sensor feels is the sum over the links that it carries: all of them on a force plate. Raises `InputError`
     where there is no such frame or the arrays do not fit the model.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot, zero = fj.load_urdf(fj.DEMO), np.zeros((1, 4))
+    >>> W = np.asarray(fj.wrenches.wrench_regressor(robot, zero, zero, zero, "base"))[0]
+    >>> weight = 9.81 * np.asarray(robot.inertia)[:, 0].sum()  # of all links, N
+    >>> bool(abs((W @ np.asarray(robot.inertia).ravel())[2] - weight) < 1e-9)
+    True
     """
     index = model.frame_index(frame)
     with jax.enable_x64(True):

@@ -23,6 +23,14 @@ def median_filter(recording: Recording, samples: int = 5) -> Recording:
     """Position and torque replaced by the median of `samples` (odd) neighbours: single wild samples vanish.
 
     The recording's ends see the nearest sample repeated. Raises `InputError` for an even or too large number.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> t = np.arange(500)[:, None] / 250.0
+    >>> tau = np.cos(t + np.arange(4))
+    >>> tau[100, 2] = 50.0  # a wild sample
+    >>> run = fj.recording(q=np.sin(t + np.arange(4)), tau=tau, rate=250)
+    >>> float(fj.cleaning.median_filter(run).torque.max()) < 1.01
+    True
     """
     from scipy.ndimage import median_filter as running_median
 
@@ -39,6 +47,16 @@ def savitzky_golay(recording: Recording, samples: int, order: int = 3) -> Record
 
     It keeps the peaks of a slowly sampled motion better than a low pass does (Savitzky and Golay, 1964). The samples
     must be evenly spaced. Raises `InputError` where the numbers do not fit.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> t = np.arange(500)[:, None] / 250.0
+    >>> tau = np.cos(t + np.arange(4))
+    >>> tau += 0.1 * np.random.default_rng(0).normal(size=tau.shape)
+    >>> run = fj.recording(q=np.sin(t + np.arange(4)), tau=tau, rate=250)
+    >>> smooth = fj.cleaning.savitzky_golay(run, samples=31)
+    >>> error = [float(np.abs(one.torque - np.cos(t + np.arange(4))).mean()) for one in (run, smooth)]
+    >>> error[1] < 0.5 * error[0]
+    True
     """
     from scipy.signal import savgol_filter
 
@@ -57,6 +75,15 @@ def without_spikes(
 
     The running median is over `samples` (odd) neighbours; the deviation is 1.48 times the median distance of those that
     lie off it. `joints` limits it to some of them. Nothing is replaced: `trusted` holds the flags, a note their number.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> t = np.arange(500)[:, None] / 250.0
+    >>> tau = np.cos(t + np.arange(4))
+    >>> tau[100, 2] = 50.0  # a wild sample
+    >>> run = fj.recording(q=np.sin(t + np.arange(4)), tau=tau, rate=250)
+    >>> found = fj.cleaning.without_spikes(run)
+    >>> np.argwhere(~found.trusted).tolist()  # sample, joint
+    [[100, 2]]
     """
     torque = recording.torque
     if torque is None:

@@ -6,6 +6,7 @@ therefore without phase. Signals are (samples, columns), times in seconds, rates
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ __all__ = ["Grid", "band_limited", "differentiate", "even_grid", "sampling_rate"
 
 EVEN = 0.02  # stamps within this share of a step of a straight line count as even
 GAP_STEPS = 5
+_SAME = 9  # decimals, in samples: instants that lie so close between samples have one kernel
 _AT_ONCE = 1 << 22  # weights of an interpolation that are held at once
 STOP_BAND = 100.0  # dB
 BETA = 0.1102 * (STOP_BAND - 8.7)  # Kaiser 1974
@@ -77,14 +79,19 @@ def band_limited(
     half = min(int(np.ceil(length / 2 * rate)), len(x) - 1)
     extended = np.concatenate([2 * x[:1] - x[half:0:-1], x, 2 * x[-1:] - x[-2 : -half - 2 : -1]])
     where = (np.asarray(at) - start) * rate
+    nearest = np.clip(np.rint(where).astype(int), 0, len(x) - 1)
+    # what instants between samples have in common (few, where one rate divides another) is computed once
+    between, which = np.unique(np.round(where - nearest, _SAME), return_inverse=True)
+    taps = np.arange(-half, half + 1)
     out = np.empty((len(where), x.shape[1]))
-    block = max(1, _AT_ONCE // (2 * half + 1))
+    block = max(1, _AT_ONCE // len(taps))
+    kernel = partial(_kernel, cutoff=(passed + stopped) / 2, length=length)
+    known = kernel((taps - between[:, None]) / rate) if len(between) <= block else None
     for first in range(0, len(where), block):
-        some = where[first : first + block]
-        taps = np.clip(np.rint(some).astype(int), 0, len(x) - 1)[:, None] + np.arange(-half, half + 1)
-        weights = _kernel((taps - some[:, None]) / rate, (passed + stopped) / 2, length)
+        some = slice(first, first + block)
+        weights = kernel((taps - between[which[some], None]) / rate) if known is None else known[which[some]]
         for j in range(x.shape[1]):
-            out[first : first + block, j] = np.einsum("tk,tk->t", extended[taps + half, j], weights)
+            out[some, j] = np.einsum("tk,tk->t", extended[nearest[some, None] + half + taps, j], weights)
     return out
 
 

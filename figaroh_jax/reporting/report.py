@@ -78,7 +78,15 @@ class _Left(NamedTuple):
 
 
 def write_report(diagnosis: Diagnosis, path: Path, title: str) -> None:
-    """Write the page of a diagnosis to `path`; `title` is the robot's name, as the verdict's sentence says it."""
+    """Write the page of a diagnosis to `path`; `title` is the robot's name, as the verdict's sentence says it.
+
+    >>> import pathlib, tempfile, figaroh_jax as fj
+    >>> found = fj.diagnose_task(fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml")))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     fj.write_report(found, pathlib.Path(folder, "report.html"), "bench arm")
+    ...     "bench arm" in pathlib.Path(folder, "report.html").read_text()
+    True
+    """
     path.write_text(_page(diagnosis, title, path.parent), encoding="utf-8")
 
 

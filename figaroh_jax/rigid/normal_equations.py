@@ -72,7 +72,8 @@ def normal_matrix(
     columns = 10 * len(model.joints) + (0 if extra is None else np.shape(extra)[-1]) + 1
     on_gpu = usable(*rows)
     groups = _groups(model, columns, apart=on_gpu)
-    start = tuple(jnp.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
+    library: Any = np if on_host(model, rows) else jnp
+    start = tuple(library.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
     parts = _by_machine_code(model, groups, rows) if on_host(model, rows) else None
     if on_gpu:
         parts = _by_kernels(model, start, rows)
@@ -80,8 +81,7 @@ def normal_matrix(
     chunk = 32 if on_host() and columns <= SMALL else chunk_size()
     parts = _fold(_add_products, chunk, start, model, rows) if parts is None else parts
     index = np.concatenate([_flat(group, columns).ravel() for group in groups])
-    whole = _scattered(columns, index, parts)
-    new = NormalMatrix(whole[:-1, :-1], whole[:-1, -1], whole[-1, -1])
+    new = _scattered(columns, index, parts)
     return new if total is None else NormalMatrix(*(x + y for x, y in zip(total, new, strict=True)))
 
 
@@ -186,7 +186,7 @@ def _fold_chunks(step: Callable[..., Any], total: Any, model: RobotModel, rows: 
 
 
 _device_program = jax.jit(_fold_chunks, static_argnums=0)
-_host_program = jax.jit(_fold_chunks, static_argnums=0, compiler_options=CPU_OPTIONS)
+_host_program = Program(_fold_chunks, static=1, options=CPU_OPTIONS)
 
 
 class _Group(NamedTuple):
@@ -222,9 +222,10 @@ def _flat(group: _Group, columns: int) -> np.ndarray:
 
 
 @partial(jax.jit, static_argnums=0)
-def _scattered(columns: int, index: Array, parts: tuple[Array, ...]) -> Float[Array, "columns columns"]:
+def _scattered(columns: int, index: Array, parts: tuple[Array, ...]) -> NormalMatrix:
     values = jnp.concatenate([part.reshape(-1) for part in parts])
-    return jnp.zeros(columns * columns).at[index].add(values).reshape(columns, columns)
+    whole = jnp.zeros(columns * columns).at[index].add(values).reshape(columns, columns)
+    return NormalMatrix(whole[:-1, :-1], whole[:-1, -1], whole[-1, -1])
 
 
 def _add_products(model: RobotModel, totals: tuple[Array, ...], rows: _Rows) -> tuple[Array, ...]:

@@ -43,6 +43,7 @@ _WEAK = 0.3  # share of the largest gain below which a joint is looked at again
 _ROUNDS = 3  # times that a cause of several joints may be named and the joints searched again
 _ROOM = 8  # numbers of causes beside the baseline, at one joint
 _SHARED = 6  # steps of a payload's fit
+_WHOLE = 3  # steps of the arm's own fit
 _SPREADS = "encoder_offset"  # of a joint: what the others carry is wrong by it, too
 
 
@@ -384,6 +385,7 @@ def _judged(
     lists = [list(one.named or one.proxy) for one in found]
     payloads = [one.candidate.entries[0] for one in shared if one.candidate.effect == "payload"]
     structure, last, named = _assembled(here, joints, found, lists, base, payloads)
+    last = _refitted(here, structure, last)
     weight = np.asarray(here.data.weight)
     left = excess(residuals(structure, last), np.asarray(structure.data.weight))
     begin = Model(Structure(here.loop, here.known.table, here.data), first, here.baseline, 0.0)
@@ -393,6 +395,15 @@ def _judged(
     nearest = [x for one in found for x in one.nearest]
     p = min([one.p_value for one in found] + ([1e-12] if shared else []))
     return judged(here, begin, now, named, p, steps, nearest)
+
+
+def _refitted(here: Setting, structure: Structure, last: Fit) -> Fit:
+    """The arm's own fit of everything that is free, by its exact sensitivities, from where its joints' fits ended."""
+    width = max(here.width, len(last.free))
+    begin = fit(
+        *structure, last.theta[None], [list(last.free)], last.start[None], width=width, lanes=1, iterations=_WHOLE
+    )
+    return begin[0] if np.isfinite(begin[0].cost) and begin[0].cost <= last.cost else last
 
 
 def _assembled(

@@ -17,10 +17,13 @@ from .loop import Loop
 from .parameters import BOUNDS, Table
 from .sensitivity import Sums, Windows, linear_sums
 
-__all__ = ["Fit", "fit", "held_out", "standard_errors", "start_of"]
+__all__ = ["Fit", "fit", "held_out", "refitted_without", "standard_errors", "start_of"]
 
 _ITERATIONS = 40
 _PAIR = 2
+_FEW = 12  # windows up to which starts and numbers always move together
+_MOSTLY = 0.5  # share of a step's gain from which the starts move alone, every other time
+_GROUPS, _REFITS = 6, 3  # of recordings that are left out, steps of each fit without one
 _CLOSE = 0.02  # predicted decrease of the sum of whitened squares at which a fit ends
 
 
@@ -74,13 +77,15 @@ def fit(
 class _Lanes:
     """Levenberg-Marquardt of a few lanes that share one compiled program."""
 
-    def __init__(self, loop, table, data, theta, free, start, width, lanes):  # noqa: ANN001
+    def __init__(self, loop, table, data, theta, free, start, width, lanes, left=None):  # noqa: ANN001
+        self.left = left or []  # (blocks, windows) of each lane, True: left out of its fit
         self.loop, self.table, self.data, self.lanes = loop, table, data, lanes
         self.theta, self.start = np.array(theta, float), np.array(start, float)
         self.free = np.full((len(theta), width), -1)
         for k, one in enumerate(free):
             self.free[k, : len(one)] = one
         self.bounds = np.array([BOUNDS[entry.name] for entry in table])
+        self.inner = np.full((len(self.theta), self.start.shape[2]), 1e-8)  # damping of each window's start
         self.rows = max(int((np.asarray(data.weight) > 0).sum()), 1)
 
     def sums(self, which: np.ndarray, theta: np.ndarray, start: np.ndarray) -> list[Sums]:
@@ -93,6 +98,33 @@ class _Lanes:
             cost, gradient, matrix = (np.asarray(x) for x in found)
         return [Sums(cost[k], gradient[k], matrix[k]) for k in range(len(which))]
 
+    def several(self, now: list[Sums], steps: int) -> list[Sums]:
+        """The sums of every lane after some damped steps of what it keeps; starts of what it leaves out stay."""
+        count = len(self.theta)
+        cost = np.array([self.cost(self.kept(now[k], k), self.start[k]) for k in range(count)])
+        damping = np.full(count, 1e-3)
+        for _ in range(steps):
+            made = [self.step(self.kept(now[k], k), k, damping[k]) for k in range(count)]
+            stay = [self.left[k].all(0) for k in range(count)]
+            starts = np.stack([np.where(stay[k], self.start[k], made[k].start) for k in range(count)])
+            trial: list[Sums] = []
+            for lot in range(0, count, self.lanes):
+                which = np.arange(lot, min(lot + self.lanes, count))
+                trial += self.sums(which, np.stack([made[k].theta for k in which]), starts[which])
+            for k, new in enumerate(trial):
+                after = self.cost(self.kept(new, k), starts[k])
+                if after <= cost[k]:
+                    self.theta[k], self.start[k], now[k], cost[k] = made[k].theta, starts[k], new, after
+                    damping[k] /= 5
+                else:
+                    damping[k] *= 30
+        return now
+
+    def kept(self, sums: Sums, lane: int) -> Sums:
+        """Without what a lane leaves out."""
+        keep = ~self.left[lane]
+        return Sums(*(np.where(keep.reshape(keep.shape + (1,) * (x.ndim - 2)), x, 0.0) for x in sums))  # pyright: ignore[reportArgumentType]
+
     def cost(self, sums: Sums, start: np.ndarray) -> float:
         prior = (start - np.asarray(self.data.start)) * np.asarray(self.data.precision)
         total = float(sums.cost.sum() + (prior**2).sum())
@@ -104,6 +136,7 @@ class _Lanes:
         now = self.sums(everyone, self.theta, self.start)
         cost = [self.cost(s, x) for s, x in zip(now, self.start, strict=True)]
         damping, done = np.full(count, 1e-3), ~np.isfinite(cost)  # one that diverges has no derivative
+        alone = np.zeros(count, bool)
         for _ in range(iterations):
             active = everyone[~done]
             if not len(active):
@@ -114,9 +147,19 @@ class _Lanes:
             tried = [(k, step) for k, step in zip(active, steps, strict=True) if not done[k]]
             if not tried:
                 continue
+            for place, (k, step) in enumerate(tried):
+                own = self.starts(now[k], k)
+                many = self.start.shape[2] > _FEW
+                alone[k] = many and own.gain > _MOSTLY * step.gain and (not alone[k] or (self.free[k] < 0).all())
+                tried[place] = (k, own) if alone[k] else (k, step)
             which = np.array([k for k, _ in tried])
             trial = self.sums(which, np.stack([s.theta for _, s in tried]), np.stack([s.start for _, s in tried]))
             for (k, step), sums in zip(tried, trial, strict=True):
+                if alone[k]:
+                    before, now[k] = cost[k], self.better(now[k], sums, step.start, k)
+                    cost[k] = self.cost(now[k], self.start[k])
+                    done[k] = before - cost[k] < 1e-7 * before and self.inner[k].max() > 1e3
+                    continue
                 new = self.cost(sums, step.start)
                 if new < cost[k]:
                     self.theta[k], self.start[k], now[k], damping[k] = step.theta, step.start, sums, damping[k] / 5
@@ -127,13 +170,34 @@ class _Lanes:
                     done[k] = damping[k] > 1e8
         return [Fit(self.theta[k], self.free[k], self.start[k], cost[k], now[k], bool(done[k])) for k in everyone]
 
+    def starts(self, sums: Sums, lane: int) -> _Step:
+        """A step of the states at the starts alone, each window with a damping of its own."""
+        system = System(sums, self.data, self.start[lane])
+        size = self.inner[lane][:, None] * np.einsum("wii->wi", system.hss) + 1e-12
+        change = np.linalg.solve(system.hss + size[:, None] * np.eye(size.shape[1]), system.gs[..., None])[..., 0]
+        gain = system.decrease(np.zeros(system.m), change.T)
+        return _Step(self.theta[lane], self.start[lane] + change.T, gain)
+
+    def better(self, old: Sums, new: Sums, start: np.ndarray, lane: int) -> Sums:
+        """The better sums of each window, whose start moves where they are the new ones."""
+        precise, truth = np.asarray(self.data.precision), np.asarray(self.data.start)
+        costs = [
+            sums.cost.sum((0, 2)) + ((x - truth) ** 2 * precise**2).sum(0)
+            for sums, x in ((old, self.start[lane]), (new, start))
+        ]
+        good = np.isfinite(new.matrix).all((0, 2, 3)) & (costs[1] < costs[0])
+        self.start[lane] = np.where(good, start, self.start[lane])
+        self.inner[lane] = np.where(good, self.inner[lane] / 5, np.clip(self.inner[lane] * 6, 1e-3, 1e8))
+        wide = lambda x: good.reshape(1, -1, *(1,) * (x.ndim - 2))  # noqa: E731
+        return Sums(*(np.where(wide(x), x, y) for x, y in zip(new, old, strict=True)))  # pyright: ignore[reportArgumentType]
+
     def step(self, sums: Sums, lane: int, damping: Any) -> _Step:
         """The damped step within the bounds; entries that would leave them stay where they are."""
         system = System(sums, self.data, self.start[lane])
         free = self.free[lane]
         at, (low, high) = np.maximum(free, 0), self.bounds[np.maximum(free, 0)].T
         fixed = free < 0
-        change, starts = system.solve(fixed, damping)
+        change, starts = system.solve(fixed, damping, self.inner[lane])
         for _ in range(2):
             wanted = self.theta[lane][at] + change
             out = ~fixed & (
@@ -142,7 +206,7 @@ class _Lanes:
             if not out.any():
                 break
             fixed = fixed | out
-            change, starts = system.solve(fixed, damping)
+            change, starts = system.solve(fixed, damping, self.inner[lane])
         theta = self.theta[lane].copy()
         mine = free >= 0
         theta[at[mine]] = np.clip(theta[at[mine]] + change[mine], low[mine], high[mine])
@@ -169,12 +233,14 @@ class System:
         self.hss = matrix[:, m:, m:] + np.einsum("wi,ij->wij", precision, np.eye(states))
         self.gs = gradient[:, m:] - precision * (start - np.asarray(data.start)).T
 
-    def solve(self, fixed: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
-        """Damped step of the parameters (those `fixed` stay) and of the windows' starts (states, windows)."""
+    def solve(self, fixed: np.ndarray, damping: float, each: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Damped step of the parameters (those `fixed` stay) and of the windows' starts (states, windows).
+
+        `each` (windows,) damps the starts of single windows more.
+        """
         scale = np.einsum("wii->wi", self.hss)
-        hss = (
-            self.hss + damping * np.einsum("wi,ij->wij", scale, np.eye(scale.shape[1])) + 1e-12 * np.eye(scale.shape[1])
-        )
+        scale = scale * np.maximum(damping, np.broadcast_to(each, len(scale)))[:, None] + 1e-12
+        hss = self.hss + scale[:, None] * np.eye(scale.shape[1])
         inner = np.linalg.solve(hss, np.concatenate([np.swapaxes(self.hps, 1, 2), self.gs[..., None]], 2))
         schur = self.hpp - np.einsum("wpi,wiq->pq", self.hps, inner[..., :-1])
         right = self.gp - np.einsum("wpi,wi->p", self.hps, inner[..., -1])
@@ -220,6 +286,27 @@ def standard_errors(found: Fit, data: Windows, level: float = 1.0) -> np.ndarray
     with np.errstate(invalid="ignore"):
         spread = np.diag(System(found.sums, data, found.start).covariance(found.free < 0))
         return np.sqrt(np.maximum(spread, 0.0) * level)
+
+
+def refitted_without(
+    loop: Loop, table: Table, data: Windows, found: Sequence[Fit], folds: np.ndarray, *, lanes: int
+) -> np.ndarray:
+    """Squares of each block and window by fits of all others, (fits, blocks, windows): `held_out` to every order.
+
+    Recordings that hold much of what tells a number leave a direction open that one linear step follows out of sight.
+    A few damped steps do not. `folds` are recordings, left out in groups, six at the most.
+    """
+    groups = np.searchsorted(np.unique(folds), folds) % _GROUPS
+    left = [groups == k for k in range(groups.max() + 1)]
+    many, width = len(left), max(len(one.free) for one in found)
+    theta, start = (np.repeat(np.stack([getattr(one, name) for one in found]), many, 0) for name in ("theta", "start"))
+    free = [one.free for one in found for _ in left]
+    fits = _Lanes(loop, table, data, theta, free, start, width, lanes, left * len(found))
+    sums = fits.several([one.sums for one in found for _ in left], _REFITS)
+    answers = np.zeros((len(found), *folds.shape))
+    for k, one in enumerate(sums):
+        answers[k // many] = np.where(left[k % many], one.cost.sum(-1), answers[k // many])
+    return answers
 
 
 def held_out(found: Fit, data: Windows, folds: np.ndarray) -> np.ndarray:

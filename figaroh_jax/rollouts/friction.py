@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-__all__ = ["Rows", "Solution", "corrected", "row_force", "solve_rows", "solved", "times"]
+__all__ = ["Rows", "Solution", "corrected", "inverse", "row_force", "solve_rows", "solved", "times"]
 
 _MOST = 60  # Newton steps; 1 to 4 are used
 _FAR = 1e300
@@ -78,6 +78,24 @@ def solved(matrix: Array, right: Array) -> Array:
     return jax.vmap(lambda f, b: jax.scipy.linalg.cho_solve((f, True), b))(factor, right.T).T
 
 
+def inverse(matrix: Array) -> Array:
+    """Inverses of symmetric positive matrices with the samples on the last axis, (n, n, samples).
+
+    For derivatives: many directions then share what is done once, and each is a sum. Sweeps (Gauss and Jordan's
+    elimination in place) need no pivots here and run over all samples at once.
+    """
+    places = jnp.arange(len(matrix))
+
+    def sweep(k: Array, a: Array) -> Array:
+        mine = places == k
+        row = a[k] / a[k, k]
+        after = a - a[:, k][:, None] * row[None]
+        after = jnp.where(mine[:, None, None], row[None], jnp.where(mine[None, :, None], row[:, None], after))
+        return jnp.where(mine[:, None, None] & mine[None, :, None], -1 / a[k, k], after)
+
+    return -jax.lax.fori_loop(0, len(matrix), sweep, matrix)
+
+
 def corrected(masses: Array, rows: Rows, found: Solution, gap: Array) -> Array:
     """The solution's acceleration after one Newton step: its value is the same, its derivatives are exact.
 
@@ -85,7 +103,7 @@ def corrected(masses: Array, rows: Rows, found: Solution, gap: Array) -> Array:
     """
     slope = jax.lax.stop_gradient(_slope(rows, found.slip, found.low, found.high))
     matrix = masses + jnp.eye(len(found.a))[..., None] * slope[:, None]
-    return found.a - solved(matrix, gap - row_force(rows, found, found.a))
+    return found.a - times(jax.lax.stop_gradient(inverse(matrix)), gap - row_force(rows, found, found.a))
 
 
 def solve_rows(masses: Array, right: Array, rows: Rows, warm: Array) -> Solution:

@@ -23,7 +23,7 @@ from ..rigid.dynamics import joint_masses, joint_torques
 from ..rigid.manifold import integrate
 from ..rigid.model import RobotModel
 from ..rigid.spatial import cross, quaternion_rotation, rotate, rotate_back
-from .friction import Rows, Solution, corrected, solve_rows, solved, times
+from .friction import Rows, Solution, corrected, inverse, solve_rows, solved, times
 
 __all__ = [
     "Activation",
@@ -31,6 +31,7 @@ __all__ = [
     "Drives",
     "Integrator",
     "Joints",
+    "Linear",
     "Loop",
     "State",
     "Step",
@@ -110,6 +111,27 @@ class Carried(eqx.Module):
     payload: Any  # (links,) kg, added to each link of the arm
 
 
+class Linear(eqx.Module):
+    """The rigid body's torques to first order about known samples, at three accelerations: 0 and two of a step.
+
+    What a parameter of the rigid body adds stands in `more`, whose value is 0: so the many directions of a derivative
+    share one differentiation of the rigid body.
+    """
+
+    q: Any  # (nv, samples)
+    v: Any
+    a: Any  # (3, nv, samples)
+    torque: Any  # (3, nv, samples), armature not included
+    by_q: Any  # (3, nv, nv, samples)
+    by_v: Any  # (nv, nv, samples), at every acceleration the same
+    mass: Any  # (nv, nv, samples)
+    more: Any  # (3, nv, samples)
+
+    def at(self, k: int, q: Array, v: Array) -> Array:
+        """Torque (nv, samples) at the acceleration `k`."""
+        return self.torque[k] + times(self.by_q[k], q - self.q) + times(self.by_v, v - self.v) + self.more[k]
+
+
 class Loop(eqx.Module):
     """A robot, its drives and what acts at its joints, in steps of `dt` seconds."""
 
@@ -124,6 +146,7 @@ class Loop(eqx.Module):
     measured: tuple[int, ...] = eqx.field(static=True)  # coordinates that the encoders read
     summed: tuple[int, ...] = eqx.field(static=True)  # a second coordinate added to each (-1: none)
     carried: Carried | None = None  # in place of the robot's rigid body
+    linear: Linear | None = None  # in place of the robot's rigid body, for derivatives
 
     @property
     def columns(self) -> np.ndarray:
@@ -316,6 +339,8 @@ def _shift(loop: Loop, v: Array) -> Array:
 
 def _bias(loop: Loop, q: Array, v: Array) -> Array:
     """Gravity and velocity torques of the rigid body."""
+    if loop.linear is not None:
+        return loop.linear.at(0, q, v)
     if loop.carried is None:
         return joint_torques(loop.robot, q, v, jnp.zeros_like(v))
     one = loop.carried
@@ -324,6 +349,8 @@ def _bias(loop: Loop, q: Array, v: Array) -> Array:
 
 def _masses(loop: Loop, q: Array) -> Array:
     armature = jnp.eye(loop.robot.nv)[..., None] * jnp.asarray(loop.joints.armature)[:, None, None]
+    if loop.linear is not None:
+        return loop.linear.mass + armature
     if loop.carried is None:
         return joint_masses(loop.robot, q) + armature
     return jnp.broadcast_to(loop.carried.mass, q.shape[1:]) + jnp.broadcast_to(
@@ -365,12 +392,15 @@ def integrated(loop: Loop, state: State, u: Array, weight: Array, step: Step) ->
     a = corrected(masses, smooth.rows, found, first + smooth.bias - smooth.torque)
     gap = second + loop.dt * times(smooth.damping, whole) - first
     gap = gap - times(masses, a - found.a)
-    return _moved(loop, state, whole - solved(implicit, gap), smooth.activation)
+    return _moved(loop, state, whole - times(inverse(implicit), gap), smooth.activation)
 
 
 def _inertial(loop: Loop, state: State, bias: Array, *accelerations: Array) -> list[Array]:
     """M a of the rigid body with armature for each of the accelerations, by one inverse dynamics of all of them."""
     armature = jnp.asarray(loop.joints.armature)[:, None]
+    if (one := loop.linear) is not None:
+        torques = [one.at(k, state.q, state.v) + times(one.mass, a - one.a[k]) for k, a in enumerate(accelerations, 1)]
+        return [torque + armature * a - bias for torque, a in zip(torques, accelerations, strict=True)]
     if loop.carried is not None:
         return [loop.carried.mass * a.sum(0) + armature * a for a in accelerations]
     count = len(accelerations)

@@ -16,26 +16,30 @@ from jaxtyping import Array
 
 from .loop import Loop
 
-__all__ = ["BOUNDS", "UNITS", "Entry", "Table", "current", "put", "unit_payload", "values"]
+__all__ = ["BOUNDS", "TEN", "UNITS", "Entry", "Table", "current", "put", "unit_payload", "values"]
 
 _OF_DRIVES = ("scale", "delay", "dead_band", "voltage", "time_constant")
 
 
 class Entry(NamedTuple):
-    """One number: `name` is a field of `Joints` or `Drives`, or kp, kd, force_limit, payload."""
+    """One number: `name` is a field of `Joints` or `Drives`, or kp, kd, force_limit, payload, or one of `TEN`."""
 
     name: str
-    at: tuple[int, ...]  # coordinates, drives (names of `Drives`, kp, kd, force_limit) or links (payload)
+    at: tuple[int, ...]  # coordinates, drives (names of `Drives`, kp, kd, force_limit) or links (payload, `TEN`)
 
 
 Table = tuple[Entry, ...]
+
+TEN = ("mass", "mass_x", "mass_y", "mass_z",
+       "inertia_xx", "inertia_xy", "inertia_yy", "inertia_xz", "inertia_yz", "inertia_zz")  # fmt: skip
 
 UNITS = {
     "armature": "kg m2", "damping": "N m s/rad", "friction": "N m", "stribeck_force": "N m", "stribeck_speed": "rad/s",
     "load_ratio": "", "stiffness": "N m/rad", "rest": "rad", "play": "rad", "offset": "N m", "ripple_sine": "N m",
     "ripple_cosine": "N m", "ripple_order": "1/rad", "reading": "rad", "scale": "", "delay": "s", "dead_band": "rad",
     "voltage": "N m", "force_limit": "N m", "time_constant": "s", "payload": "kg", "kp": "N m/rad", "kd": "N m s/rad",
-    "gravity_x": "m/s2", "gravity_y": "m/s2",
+    "gravity_x": "m/s2", "gravity_y": "m/s2", "mass": "kg", **dict.fromkeys(TEN[1:4], "kg m"),
+    **dict.fromkeys(TEN[4:], "kg m2"),
 }  # fmt: skip
 
 _ANY = (-np.inf, np.inf)
@@ -46,11 +50,12 @@ BOUNDS = {  # what such a number can be
     "voltage": (1e-4, 1e6), "force_limit": (1e-4, 1e6), "time_constant": (1e-4, 2.0), "payload": (-50.0, 50.0),
     "kp": (1e-6, 1e6), "kd": (0.0, 1e5), "reading": (-0.5, 0.5), "offset": _ANY, "rest": _ANY, "ripple_sine": _ANY,
     "ripple_cosine": _ANY, "gravity_x": (-9.0, 9.0), "gravity_y": (-9.0, 9.0),
+    **dict.fromkeys(TEN, _ANY),
 }  # fmt: skip
 
 
 def values(loop: Loop, table: Table) -> np.ndarray:
-    """The numbers of the table in a loop (a payload is 0: it is what is added)."""
+    """The numbers of the table in a loop (a payload is 0, as are those of `TEN`: they are what is added)."""
     return np.array([float(_get(loop, entry.name)[entry.at[0]]) for entry in table])
 
 
@@ -66,6 +71,7 @@ def _get(loop: Loop, name: str, xp: Any = np) -> Any:
         "kd": lambda: -xp.asarray(drives.bias)[:, 2],
         "force_limit": lambda: xp.asarray(drives.force_range)[:, 1],
         "payload": lambda: xp.zeros(len(loop.robot.joints) if loop.carried is None else len(loop.carried.payload)),
+        **dict.fromkeys(TEN, lambda: xp.zeros(len(loop.robot.joints))),
         "gravity_x": lambda: xp.asarray(loop.robot.gravity)[:1],
         "gravity_y": lambda: xp.asarray(loop.robot.gravity)[1:2],
     }
@@ -91,6 +97,10 @@ def _put(loop: Loop, name: str, at: np.ndarray, new: Array | np.ndarray) -> Loop
     if name == "payload":
         own = jnp.asarray(loop.robot.inertia)
         return eqx.tree_at(lambda m: m.robot.inertia, loop, own.at[at].add(new[:, None] * unit_payload(loop, at)))
+    if name in TEN:
+        return eqx.tree_at(
+            lambda m: m.robot.inertia, loop, jnp.asarray(loop.robot.inertia).at[at, TEN.index(name)].add(new)
+        )
     if name in ("gravity_x", "gravity_y"):
         k = 0 if name == "gravity_x" else 1
         return eqx.tree_at(lambda m: m.robot.gravity, loop, jnp.asarray(loop.robot.gravity).at[k].set(new[0]))

@@ -14,7 +14,7 @@ from ..results import Name, Verdict
 from .causes import BASELINE, CONTAINS, Candidate, Catalogue, catalogue, elastic_loop
 from .data import Run, Stretch, noise_of, windows
 from .faults import Fault
-from .fit import Fit, System, fit, held_out, standard_errors
+from .fit import Fit, System, fit, held_out, refitted_without, standard_errors
 from .loop import Loop
 from .parameters import BOUNDS, Entry, Table, values
 from .sensitivity import Windows, predicted
@@ -40,9 +40,10 @@ _WORTH, _SURE, _ALIKE = 0.004, 1.64, 1.7  # held-out gain and t of a name; t bel
 _CLEAR = 3.0  # t of a name beside which more than noise is left
 _MUCH = 0.25  # held-out gain of such a name, unless it is one that every joint has: less may stand in for the rest
 _SHORT = 6  # candidates that are fitted where a linear screening can order them
+_CHECKED = 3  # candidates whose held-out squares are those of fits without some recordings
 _SHORTER = 4  # of one joint of an arm
 _GROUP = 25  # rows whose mean shows a slow misfit
-_MOST = 6  # causes
+_MOST, _MOST_ONE = 6, 4  # causes, and where only a rest that is noise gives them a name
 _USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
 _PAIR = 2  # starts of the baseline that are followed to the end
 _EARLY, _LATE = 4, 12  # iterations of a race among all starts, and of its leaders
@@ -219,7 +220,8 @@ def search(
     weight = np.asarray(here.data.weight)
     now = Model(structure, first, here.baseline, excess(residuals(structure, first), weight))
     stood, found, p_value, steps, nearest = [now], [], 1.0, [("baseline", level_of(first, weight))], []
-    while len(found) < _MOST:
+    most = _MOST if _by_recording(here) else _MOST_ONE
+    while len(found) < most:
         progress(f"looking for cause {len(found) + 1}", min(0.2 + 0.15 * len(found), 0.9))
         tried = _tried(here, now, [n.candidate for n in found], forbid)
         best, p = _best(here, now, tried, nearest)
@@ -281,6 +283,7 @@ def _tried(here: Setting, now: Model, named: Sequence[Candidate], forbid: Sequen
     left = [c for c in here.known.candidates if (c.effect, c.at) not in used and not set(c.entries) <= set(now.free)]
     placed = {c.at for c in named if c.effect in _STILL}
     left = [c for c in left if not (c.effect in _STILL and c.at in placed)]
+    left = [c for c in left if len(now.free) + len(c.entries) <= here.width]
     if here.loop.robot.nv > 1 or here.loop.carried is not None:
         left = _screened(here, now, left) if left else []
     thetas, free, owner = [], [], []
@@ -377,7 +380,7 @@ def _scores(
 def _elastic(here: Setting, now: Model, forbid: Sequence[str]) -> list[_Tried]:
     """A spring, and a spring with play, between motor and link."""
     wanted = [name for name in ("joint_elasticity", "backlash") if name not in forbid]
-    if not wanted:
+    if not wanted or len(now.free) + 3 > here.width:
         return []
     n = here.loop.robot.nv
     torque = float(largest_forces(here.loop, here.runs).max())
@@ -422,8 +425,10 @@ def _best(
     here: Setting, now: Model, tried: Sequence[_Tried], nearest: list[tuple[Name, float, str]]
 ) -> tuple[tuple[Named, Model] | None, float]:
     """The cause to name next with the state it makes, and p of what is left before it being noise."""
-    before = held_out(now.fit, now.structure.data, here.folds)
+    tried, before = _held_out(here, now, tried)
     gains = [(before.sum() - one.sse.sum()) / before.sum() for one in tried]
+    if _by_recording(here):  # no more than on the data themselves: the rest is luck of a fit without a recording
+        gains = [min(g, 1 - one.state.fit.squares / now.fit.squares) for g, one in zip(gains, tried, strict=True)]
     ts = [t_of(before, one.sse) for one in tried]
     nearest.clear()
     if not tried:
@@ -432,7 +437,8 @@ def _best(
     sure = _SURE if now.excess >= 1.0 else 2.5
     several = here.loop.carried is not None and _by_recording(here)
     beside = [several and one.state.excess >= 1.0 for one in tried]  # a rest, of an arm: more is asked
-    needs = [_CLEAR if rest else sure for rest in beside]
+    common = [t.candidate.effect in BASELINE and g > _MUCH for t, g in zip(tried, gains, strict=True)]
+    needs = [_CLEAR if rest and not usual else sure for rest, usual in zip(beside, common, strict=True)]
     worth = [_MUCH if r and t.candidate.effect not in BASELINE else _WORTH for r, t in zip(beside, tried, strict=True)]
     passing = [k for k in range(len(tried)) if gains[k] > worth[k] and ts[k] > needs[k] and _sized(here, tried[k])]
     for k in np.argsort(gains)[::-1][:3]:
@@ -440,10 +446,10 @@ def _best(
         nearest.append((Name(tried[k].candidate.effect, tried[k].candidate.at), float(max(gains[k], 0.0)), why))
     if not passing:
         return None, p
-    k = min(passing, key=lambda k: tried[k].sse.sum())
+    k = max(passing, key=lambda k: gains[k])
     if tried[k].state.excess >= 1.0:  # more is to come: what every joint has before what few have
         usual = [j for j in passing if tried[j].candidate.effect in BASELINE and gains[j] > _USUAL * gains[k]]
-        k = min(usual, key=lambda j: tried[j].sse.sum(), default=k)
+        k = max(usual, key=lambda j: gains[j], default=k)
     for simple in passing:  # what it contains is preferred unless clearly worse
         if tried[simple].candidate.effect in CONTAINS.get(tried[k].candidate.effect, ()):
             if t_of(tried[simple].sse, tried[k].sse) < _ALIKE or tried[simple].sse.sum() <= 1.002 * tried[k].sse.sum():
@@ -463,6 +469,24 @@ def _best(
     return (named, best.state), p
 
 
+def _held_out(here: Setting, now: Model, tried: Sequence[_Tried]) -> tuple[list[_Tried], np.ndarray]:
+    """The candidates that fit best, and the squares of the present model, held out by fits without some recordings."""
+    tried = list(tried)
+    if not _by_recording(here) or here.loop.robot.nv > 1:
+        return tried, held_out(now.fit, now.structure.data, here.folds)
+    order = sorted(range(len(tried)), key=lambda k: tried[k].state.fit.cost)[:_CHECKED]
+    same = [k for k in order if tried[k].state.structure is now.structure]
+    fits = [now.fit, *(tried[k].state.fit for k in same)]
+    before, *found = refitted_without(*now.structure, fits, here.folds, lanes=here.lanes)
+    found = dict(zip(same, found, strict=True))
+    for k in order:
+        one = tried[k].state
+        if k not in found:
+            found[k] = refitted_without(*one.structure, [one.fit], here.folds, lanes=6)[0]
+        tried[k] = tried[k]._replace(sse=found[k])
+    return tried, before
+
+
 def _rms(here: Setting, squares: np.ndarray) -> float:
     """Whitened squares as an RMS of position: rad, or m."""
     count = (np.asarray(here.data.weight) > 0).sum()
@@ -480,6 +504,9 @@ def _sized(here: Setting, one: _Tried) -> bool:
         spread = standard_errors(found, one.state.structure.data)[int(np.flatnonzero(found.free == width)[0])]
         if not found.theta[width] > 3 * spread:
             return False
+    bounds = here.bounds[list(one.candidate.entries)] if not one.candidate.elastic else np.zeros((0, 2))
+    if any(found.theta[e] >= high for e, (_, high) in zip(one.candidate.entries, bounds, strict=False)):
+        return False
     neutral = 1.0 if one.candidate.effect == "actuator_gain" else 0.0
     if one.candidate.effect in (*BASELINE, "actuator_saturation", "voltage_saturation", "joint_elasticity", "backlash"):
         return bool(np.isfinite(error) and error < 0.5 * abs(value) + 1e-12)

@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Array
 
 from ..compiled.batching import program
-from .loop import Loop, State, advance, integrated, mobility, observe
-from .parameters import Table, put
+from ..rigid.dynamics import joint_masses, joint_torques
+from .loop import Linear, Loop, State, advance, integrated, mobility, observe
+from .parameters import TEN, Table, put, unit_payload
 from .simulation import delayed
 
 __all__ = ["Sums", "Windows", "began", "linear_sums", "predicted", "read_of", "state_size"]
@@ -137,6 +138,8 @@ def _linear_sums(loop: Loop, table: Table, theta: Array, free: Array, data: Wind
     `theta` (lanes, entries) are all numbers of the table, `free` (lanes, columns) which of them each lane
     differentiates, `start` (lanes, 2 nv, windows) the states at the windows' starts.
     """
+    if len(theta) == 1:  # branches that are not taken are then not computed
+        return Sums(*(x[None] for x in _lane(loop, table, theta[0], free[0], data, start[0])))
     return Sums(*jax.vmap(lambda t, f, s: _lane(loop, table, t, f, data, s))(theta, free, start))
 
 
@@ -219,10 +222,12 @@ def _linearised(
     here = State(*(flat(x) for x in states))
     carried = _carried(data, block)
     carried = None if carried is None else flat(carried)
+    rigid = _RigidBody(loop, table, theta, free, here, fixed) if _one_body(loop) else None
 
     def move(q: Array, v: Array, act: Array, theta: Array) -> Array:
         at = put(loop, table, theta)
         seen, weight = flat(_seen(at, data, block)), mobility(at)
+        at = at if rigid is None else rigid.put(at, theta)
         after = integrated(_carrying(at, carried), State(q, v, act), seen, weight, fixed)
         return jnp.concatenate([after.q, after.v, after.act] if active else [after.q, after.v])
 
@@ -239,6 +244,73 @@ def _linearised(
     both = jax.vmap(one)(tangents, entries)  # (size + columns, size, steps windows)
     both = jnp.moveaxis(both.reshape(*both.shape[:2], count, windows), (0, 1, 2), (2, 1, 0))
     return both[:, :, :size], both[:, :, size:]
+
+
+def _one_body(loop: Loop) -> bool:
+    """Whether the rigid body can be linearised by itself."""
+    return loop.carried is None and loop.integrator != "rk4" and loop.robot.nq == loop.robot.nv
+
+
+class _RigidBody:
+    """The rigid body of a loop at the samples of a block, differentiated once by positions and rates.
+
+    Most parameters do not touch it: a direction of theirs costs a few sums, no inverse dynamics.
+    """
+
+    def __init__(self, loop: Loop, table: Table, theta: Array, free: Array, state: State, step: Any):
+        q, v = state.q, state.v
+        now, samples = put(loop, table, theta), q.shape[1]
+        robot, n = now.robot, loop.robot.nv
+        a = jnp.stack([jnp.zeros_like(v), step.solution.a, step.a])
+        three = lambda x: jnp.concatenate([x] * 3, 1)  # noqa: E731
+        wide = jnp.concatenate(list(a), 1)
+        torque, by_q = jax.linearize(lambda q: joint_torques(robot, q, three(v), wide), three(q))
+        _, by_v = jax.linearize(lambda v: joint_torques(robot, q, v, jnp.zeros_like(v)), v)
+        each = jnp.eye(n)[:, :, None]
+        columns = jax.vmap(by_q)(jnp.broadcast_to(each, (n, n, 3 * samples)))  # (direction, torque, samples)
+        self.table, self.theta = table, theta
+        self.linear = Linear(
+            q=q, v=v, a=a,
+            torque=jnp.stack(jnp.split(torque, 3, axis=1)),
+            by_q=jnp.stack(jnp.split(columns.swapaxes(0, 1), 3, axis=2)),
+            by_v=jax.vmap(by_v)(jnp.broadcast_to(each, (n, n, samples))).swapaxes(0, 1),
+            mass=joint_masses(robot, q),
+            more=jnp.zeros_like(a),
+        )  # fmt: skip
+        self.which = [k for k, entry in enumerate(table) if entry.name in _OF_BODY]
+        if self.which:
+            mine = jnp.any(jnp.isin(free, jnp.array(self.which)))
+            empty = jnp.zeros((len(self.which), *a.shape))
+            self.columns = jax.lax.cond(mine, lambda: self._columns(loop, a), lambda: empty)
+
+    def _columns(self, loop: Loop, a: Array) -> Array:
+        """What a unit of each number of the rigid body adds to the torques, (numbers, 3, nv, samples)."""
+        q, v, zero = self.linear.q, self.linear.v, jnp.zeros_like(self.linear.v)
+        robot, found = loop.robot, []
+        still = jnp.zeros(3)
+        for entry in (self.table[k] for k in self.which):
+            if entry.name not in _PULLS:
+                at, ten = np.array(entry.at), jnp.zeros_like(jnp.asarray(robot.inertia))
+                unit = unit_payload(loop, at) if entry.name == "payload" else np.eye(10)[TEN.index(entry.name)]
+                ten = ten.at[at].set(unit)
+                body = eqx.tree_at(lambda r: r.inertia, robot, ten)
+                found.append(jnp.stack([joint_torques(body, q, v, one) for one in a]))
+            else:
+                pulled = eqx.tree_at(lambda r: r.gravity, robot, still.at["xy".index(entry.name[-1])].set(1.0))
+                found.append(jnp.broadcast_to(joint_torques(pulled, q, zero, zero), a.shape))
+        return jnp.stack(found)
+
+    def put(self, loop: Loop, theta: Array) -> Loop:
+        """The loop with its rigid body to first order about the samples and about the present numbers."""
+        linear = self.linear
+        if self.which:
+            change = (theta - self.theta)[np.array(self.which)]
+            linear = eqx.tree_at(lambda x: x.more, linear, jnp.einsum("k,kans->ans", change, self.columns))
+        return eqx.tree_at(lambda m: m.linear, loop, linear, is_leaf=lambda x: x is None)
+
+
+_PULLS = ("gravity_x", "gravity_y")
+_OF_BODY = ("payload", *TEN, *_PULLS)
 
 
 def _spread(a: Array, b: Array, spread: Array, substeps: int) -> tuple[Array, Array]:
