@@ -54,7 +54,7 @@ class Standing:
     share: float  # RMS torque over that of the joint, where it is largest
     modulation: float = 0.0  # squares that an amplitude which varies gains, over those of the cause
     modulation_held_out: float = 0.0
-    beside_smooth: float = 1.0  # gain of a cause of the whole robot beside smooth functions at every joint
+    beside_smooth: float = 1.0  # gain of a cause of the whole robot beside smooth functions, or in their place
     inertia_alone: bool = False  # a coupling of inertia, without friction of its own
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
 
@@ -216,7 +216,11 @@ def _varied_robot(grown: _Grown, effect: Effect, torque: np.ndarray) -> Float[np
 def _beside_smooth(
     grown: _Grown, bare: Step | None, effect: Effect, place: list[int], joints: tuple[int, ...]
 ) -> float:
-    """Gain of the cause beside smooth functions of each joint's own motion; `bare` is the fit without a late sensor."""
+    """Gain of the cause beside smooth functions of each joint's own motion, or in their place, whichever is larger.
+
+    Few joints that move along one path leave little that many functions could not follow, but a law of few numbers then
+    predicts better than they do. `bare` is the fit without a late sensor.
+    """
     step = grown.step
     if kind(effect) == "position":
         return 1.0
@@ -228,7 +232,8 @@ def _beside_smooth(
         without = judge(step.rows, Hypothesis(np.delete(X, place, axis=2), fewer))
     else:
         without = judge(bare.rows, _with_smooth(grown, bare))
-    return 1 - float(within.own(step.rows, joints).sum() / max(without.own(step.rows, joints).sum(), 1e-300))
+    alone, both, smooth = (v.own(step.rows, joints).sum() for v in (step.verdicts, within, without))
+    return 1 - float(min(alone, both) / max(smooth, 1e-300))
 
 
 def _with_smooth(grown: _Grown, step: Step) -> Hypothesis:
