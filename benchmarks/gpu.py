@@ -98,7 +98,11 @@ def _case(robot: Path, name: str, gpu: str, folder: Path, options: argparse.Name
     for stage in STAGES if name in STAGES["called, kept"] else list(STAGES)[:1]:
         try:
             done = subprocess.run([*command, stage], env=here, timeout=LONGEST, capture_output=True, text=True)
-            found = done.stdout.splitlines()[-1] if done.returncode == 0 else json.dumps({"failed": done.stderr[-600:]})
+            found = (
+                done.stdout.splitlines()[-1]
+                if done.returncode == 0
+                else json.dumps({"failed": f"status {done.returncode} {done.stderr[-600:]}"})
+            )
         except subprocess.TimeoutExpired:
             found = json.dumps({"failed": f"not done in {LONGEST:.0f} s"})
         _tell({"robot": robot.stem, "function": name, "programs": stage, "gpu": gpu, **json.loads(found)}, options.out)
@@ -110,8 +114,9 @@ def _case(robot: Path, name: str, gpu: str, folder: Path, options: argparse.Name
 def _tell(row: dict[str, Any], out: Path | None) -> None:
     print(
         f"{row['robot']:14} {row['function']:26} {row['programs']:17}",
-        row.get("failed")
-        or f"{row['samples']:8d} samples {row['rate']:10.2f} M/s; first call {row['first']:6.2f} s"
+        f"failed: {row['failed']}"
+        if "failed" in row
+        else f"{row['samples']:8d} samples {row['rate']:10.2f} M/s; first call {row['first']:6.2f} s"
         f" (traced {row['traced']:.2f}, compiled {row['compiled']:.2f}); {row['difference']:.1e} from the CPU;"
         f" peak {row['peak'] / 1e9:.2f} GB",
         flush=True,
@@ -208,7 +213,7 @@ def _function(model: Any, name: str) -> Callable[..., Any]:
         "inverse dynamics float32": lambda *x: straight_answers(dynamics._TORQUES, model, *x),
         "packed regressor float32": lambda *x: straight_answers(regressor._PACKED, model, *x),
         "mass matrix float32": lambda q, v, a: straight_answers(dynamics._MASSES, model, q),
-        "forward dynamics float32": lambda *x: _accelerations(model, *x),
+        "forward dynamics float32": lambda *x: straight_answers(dynamics._ACCELERATIONS, model, *x),
     }
     if name in kernels:
         return kernels[name]
@@ -216,12 +221,6 @@ def _function(model: Any, name: str) -> Callable[..., Any]:
         nothing = dynamics._TORQUES.nothing_known(model)
         return lambda *x: straight_answers(dynamics._TORQUES, model, *x, codes=nothing)
     return partial(known[name], model)
-
-
-def _accelerations(model: Any, q: Any, v: Any, tau: Any) -> Any:
-    from figaroh_jax.rigid import dynamics
-
-    return dynamics.joint_accelerations(model, q.T, v.T, tau.T).T
 
 
 def _states(model: Any, name: str, samples: int, lengths_alone: bool = False) -> list[np.ndarray]:

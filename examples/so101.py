@@ -12,27 +12,29 @@ import figaroh_jax as fj
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "so101_sage"
 PERIOD, ROWS, STEPS = 0.02006, 1500, 4  # s, rows of each motion, steps to a row
 ARM = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
-# N m/rad, N m s/rad (gain and joint together), N m, kg m2
+# N m/rad, N m s/rad (gain and joint together), N m, kg m2, s
 MODELS = {
-    "as MuJoCo Menagerie says": (998.2, 3.33, 0.052, 0.028),
-    "no friction, heavy rotors (Playground)": (17.8, 0.6, 1e-4, 0.15),
-    "friction .35, light rotors (Isaac Lab)": (48.0, 0.6, 0.35, 0.05),
-    "friction by joint (this library)": (
-        (12.5, 11.0, 11.4, 10.4, 21.4, 21.7),
-        (1.27, 0.82, 0.78, 0.85, 1.99, 1.99),
-        (0.10, 0.36, 0.46, 0.15, 0.10, 0.10),
-        (0.028, 0.028, 0.028, 0.017, 0.028, 0.028),
+    "as MuJoCo Menagerie says": (998.2, 3.33, 0.052, 0.028, 0.0),
+    "no friction, heavy rotors (Playground)": (17.8, 0.6, 1e-4, 0.15, 0.0),
+    "friction .35, light rotors (Isaac Lab)": (48.0, 0.6, 0.35, 0.05, 0.0),
+    "causes named by this library": (
+        (28.3, 13.4, 11.8, 10.4, 27.9, 20.9),
+        (2.02, 0.91, 0.80, 0.84, 1.96, 1.96),
+        (0.291, 0.429, 0.468, 0.147, 0.310, 0.0),
+        (0.028, 0.028, 0.028, 0.0177, 0.028, 0.028),
+        (0.0134, 0.0, 0.0, 0.0, 0.0, 0.0),
     ),
 }
 
 
-def arm(gain: Any, damping: Any, friction: Any, armature: Any) -> Any:
+def arm(gain: Any, damping: Any, friction: Any, armature: Any, delay: Any) -> Any:
     """The arm with these numbers at its servos; friction is the torque that stops a joint within a step."""
     each = zip(ARM, np.broadcast_to(gain, 6), strict=True)
     drives = {name: {"kind": "position", "kp": float(kp), "kd": 0.0, "force": 3.35} for name, kp in each}
     loop, _ = fj.load_loop(DATA / "so101.xml", drives, law="hard", dt=PERIOD / STEPS)
-    new = [np.broadcast_to(np.asarray(x, float), 6) for x in (damping, friction, armature)]
-    return eqx.tree_at(lambda m: (m.joints.damping, m.joints.friction, m.joints.armature), loop, new)
+    new = [np.broadcast_to(np.asarray(x, float), 6) for x in (damping, friction, armature, delay)]
+    where = lambda m: (m.joints.damping, m.joints.friction, m.joints.armature, m.drives.delay)  # noqa: E731
+    return eqx.tree_at(where, loop, new)
 
 
 def motion(name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.reporting.rollout_report import show_rollouts, write_rollouts
 from figaroh_jax.results import Trace
 from figaroh_jax.rollouts.identification import RolloutIdentification
+from figaroh_jax.rollouts.rest import parts_of, relative_rest
 
 
 def trace(name: str, role: Any, rng: np.random.Generator) -> Trace:
@@ -86,3 +87,23 @@ def test_the_page_is_accessible_draws_positions_and_fits_its_screen(
     assert wrong == [] and tab.problems == []
     rows = tab.value("[...document.getElementById('parameters').rows].map((r) => r.cells[0].dataset.value)")
     assert rows[1:3] == ["armature waist", "armature shoulder"]
+
+
+def test_what_is_left_goes_with_the_motion_or_a_line():
+    """Errors that follow the speed at one joint, a line of 7 Hz at the other, are told as such."""
+    rng, traces = np.random.default_rng(0), []
+    for k in range(2):
+        t = 0.01 * np.arange(2000)
+        q = np.stack([np.sin(t + k), np.sin(2 * t)], 1)
+        v = np.gradient(q, t, axis=0)
+        left = 0.01 * np.stack([np.tanh(8 * v[:, 0]), np.sin(14 * np.pi * t)], 1) + 1e-3 * rng.normal(size=q.shape)
+        traces.append(Trace(f"run {k}", "fit", t, q, v, q, q - left, q - left))
+    noise = np.full(2, 1e-3)
+    size = relative_rest(np.full(2, 0.01), noise, traces)
+    np.testing.assert_allclose(size, 0.01 * np.sqrt(2), rtol=0.02, atol=0)
+    parts = parts_of(traces, ("a", "b"), noise, size)
+    first = {part.at[0]: part for part in parts[::-1]}
+    assert (first["a"].kind, first["b"].kind) == ("velocity", "frequency")
+    assert first["a"].share > 0.9
+    assert first["b"].band is not None
+    assert first["b"].band[0] < 7 < first["b"].band[1]

@@ -170,16 +170,29 @@ def _read(entry: _Entry, leaves: int) -> tuple[Any, Any] | None:
 def _loaded(data: bytes, leaves: int) -> tuple[Any, Any]:
     from jax.experimental.serialize_executable import deserialize_and_load
 
-    program, out = pickle.loads(data)  # noqa: S301  the store has checked that this user's process wrote it
+    program, out, solves = pickle.loads(data)  # noqa: S301  the store has checked that this user's process wrote it
+    if solves:
+        _find_lapack()
     arguments = jax.tree.structure(((0,) * leaves, {}))
     return deserialize_and_load(program, arguments, jax.tree.structure([0] * out.num_leaves)), out
+
+
+@lru_cache(maxsize=1)
+def _find_lapack() -> None:
+    """Have JAX look up LAPACK's functions, as it does when it lowers one: a program from disk jumps to them unasked."""
+    try:
+        from jaxlib.lapack import prepare_lapack_call
+
+        prepare_lapack_call("potrf_ffi", np.dtype(float))
+    except (ImportError, TypeError, NotImplementedError):  # of a JAX that has it elsewhere
+        jax.jit(jax.numpy.linalg.cholesky).lower(np.eye(1))
 
 
 def _write(entry: _Entry, leaves: list[Any], compiled: Any, out: Any) -> None:
     from jax.experimental.serialize_executable import serialize
 
     try:
-        data = pickle.dumps((serialize(compiled)[0], out))
+        data = pickle.dumps((serialize(compiled)[0], out, "lapack" in compiled.as_text()))
         _loaded(data, len(leaves))[0](*(np.zeros(x.shape, x.dtype) for x in leaves))  # it must run to be worth keeping
     except Exception:  # a program that cannot be kept: only time is lost
         return

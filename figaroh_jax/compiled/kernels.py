@@ -116,7 +116,7 @@ class Straight(NamedTuple):
     plain: Callable[..., Array]  # answers of (parameters, *arrays), arrays (samples, k)
     constants: Callable[..., Any]  # what the program takes from the parameters, in one row (dtype, NumPy or JAX)
     known: Callable[[Any], bytes]  # which constants are known before; parameters in NumPy
-    known_lengths: Callable[[Any], bytes]  # the same of those that stay as they are when the rest is identified
+    known_lengths: Callable[[Any, Any], bytes]  # of constants at hand, those that stay when the rest is identified
     nothing_known: Callable[[Any], bytes]
     programs: Callable[[Any, bytes], Sequence[Program]]  # each writes a part of the answer
     shape: Callable[[Any], Shape]  # of what the programs write for a sample

@@ -84,11 +84,12 @@ def machine_code(
     samples = len(arrays[0])
     if samples < FROM or straight.places is None or _compiler() is None or not _near(arrays[0]):
         return None
-    wanted = _Wanted(straight, parameters, straight.known_lengths(parameters), tuple(x.shape[1] for x in arrays))
+    constants = np.ascontiguousarray(straight.constants(parameters, float, np), float)
+    codes = straight.known_lengths(parameters, constants)
+    wanted = _Wanted(straight, parameters, codes, tuple(x.shape[1] for x in arrays))
     code = _code(wanted, samples >= TO_COMPILE * max(1.0, len(wanted.codes) / SMALL))
     if code is None:
         return None
-    constants = np.ascontiguousarray(straight.constants(parameters, float, np), float)
     return partial(_run, code, straight.last, constants)
 
 

@@ -7,6 +7,7 @@ bilinear-transformed filter, so it equals `scipy.signal.sosfiltfilt` away from t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -26,6 +27,7 @@ __all__ = [
     "frequencies",
     "gain",
     "low_pass",
+    "on_host",
     "reach",
     "row_filter",
 ]
@@ -104,25 +106,35 @@ def filtered(
     if traced(signal, source, response):
         spectrum = jnp.fft.rfft(signal[..., source], axis=-1) * response
         return jnp.fft.irfft(spectrum, source.shape[-1], axis=-1)[..., place]
-    return _filtered_on_host(np.asarray(signal), np.asarray(source), np.asarray(place), np.asarray(response))
+    return on_host(np.asarray(source), np.asarray(place))(np.asarray(signal), np.asarray(response))
 
 
-def _filtered_on_host(signal: np.ndarray, source: np.ndarray, place: np.ndarray, response: np.ndarray) -> np.ndarray:
-    """As `filtered`; where only every second, fourth, ... number is asked for, the spectrum is folded before it."""
+def on_host(
+    source: Int[np.ndarray, " length"], place: Int[np.ndarray, " rows"]
+) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """`filtered` of a signal and a response in NumPy: what depends on the record alone is made once.
+
+    Where only every second, fourth, ... number is asked for, the spectrum is folded before it is transformed back.
+    """
     length = len(source)
     common = int(np.gcd.reduce(place - place[:1], initial=length))
     step = common & -common
     first = int(place[0]) % step if len(place) else 0
-    spectrum = np.fft.rfft(np.take(signal, np.roll(source, -first), axis=-1), axis=-1)
-    shape = np.broadcast_shapes(spectrum.shape, response.shape)  # memory that is new takes longer than the product
-    spectrum = np.multiply(spectrum, response, out=spectrum if shape == spectrum.shape else None)
-    for size in (length >> k for k in range(step.bit_length() - 1)):
-        lower = slice(size // 4 + 1)
-        folded = np.conjugate(spectrum[..., ::-1][..., lower])
-        folded += spectrum[..., lower]
-        folded *= 0.5
-        spectrum = folded
-    return np.fft.irfft(spectrum, length // step, axis=-1)[..., place // step]
+    turned, at = np.roll(source, -first), place // step
+
+    def run(signal: np.ndarray, response: np.ndarray) -> np.ndarray:
+        spectrum = np.fft.rfft(np.take(signal, turned, axis=-1), axis=-1)
+        shape = np.broadcast_shapes(spectrum.shape, response.shape)  # memory that is new takes longer than the product
+        spectrum = np.multiply(spectrum, response, out=spectrum if shape == spectrum.shape else None)
+        for size in (length >> k for k in range(step.bit_length() - 1)):
+            lower = slice(size // 4 + 1)
+            folded = np.conjugate(spectrum[..., ::-1][..., lower])
+            folded += spectrum[..., lower]
+            folded *= 0.5
+            spectrum = folded
+        return np.take(np.fft.irfft(spectrum, length // step, axis=-1), at, axis=-1)
+
+    return run
 
 
 def frequencies(rows: RowFilter) -> Float[np.ndarray, " freqs"]:

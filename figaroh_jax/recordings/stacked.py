@@ -14,12 +14,12 @@ from jaxtyping import Float, Inexact, Int, Shaped
 
 from ..rigid.model import Leaf, RobotModel
 from .dataset import carried_body
-from .rowfilter import extension, fast_length, filtered, gain, reach
+from .rowfilter import extension, fast_length, gain, on_host, reach
 from .signals import Signals
 
 __all__ = ["Records", "filter_rows", "filtered_rows", "open_rows", "stack"]
 
-SERIES = 16  # filtered at once: their spectra stay in the processor's cache
+AT_ONCE = 100_000  # numbers of series that are filtered at once: their spectra stay in the processor's cache
 
 
 class Records(eqx.Module):
@@ -81,11 +81,12 @@ def filter_rows(
     each = None if shared else np.broadcast_to(factor, (*series, factor.shape[-1])).reshape(count, factor.shape[-1])
     used = np.asarray(records.weight).any((1, 2)) if fitted else np.ones(len(records.kept), bool)
     out[:, ~used] = 0.0
-    for start in range(0, len(flat), SERIES):
-        part = slice(start, start + SERIES)
-        own = factor.reshape(-1) if each is None else each[part]
-        for k in np.flatnonzero(used):
-            out[part, k] = filtered(flat[part, k], records.source[k], records.kept[k], own)
+    few = max(1, AT_ONCE // records.source.shape[1])
+    parts = [slice(start, start + few) for start in range(0, count, few)]
+    for k in np.flatnonzero(used):
+        run = on_host(np.asarray(records.source[k]), np.asarray(records.kept[k]))
+        for part in parts:
+            out[part, k] = run(flat[part, k], factor.reshape(-1) if each is None else each[part])
     return out.reshape(*series, *records.kept.shape)
 
 

@@ -62,7 +62,8 @@ def rest(diagnosis: Diagnosis) -> list[str]:
     left, out = diagnosis.rest, []
     if len(left.relative) and max(left.relative) > 0:
         worst = max(range(len(left.relative)), key=lambda k: left.relative[k])
-        size = f"Unexplained residual: {error(float(left.relative[worst]), 'relative RMS')} of the torque of"
+        what = "motion" if diagnosis.of_positions else "torque"
+        size = f"Unexplained residual: {error(float(left.relative[worst]), 'relative RMS')} of the {what} of"
         out.append(f"{size} {diagnosis.joints[worst]}{f'; {left.text}' if left.text else ''}.")
     for joint in dict.fromkeys(part.at for part in left.parts):
         own = [part for part in left.parts if part.at == joint]

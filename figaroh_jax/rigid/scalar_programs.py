@@ -122,9 +122,9 @@ def known(model: RobotModel) -> bytes:
     return codes.tobytes()
 
 
-def known_lengths(model: RobotModel) -> bytes:
-    """As `known`, but for inertial parameters: all that a robot is taken to weigh has one structure."""
-    return _codes_of_lengths(constants(model, float, np), len(model.joints)).tobytes()
+def known_lengths(model: RobotModel, table: Float[np.ndarray, " constants"]) -> bytes:
+    """As `known`, of the model's constants, but for inertial parameters: what a robot is taken to weigh is loaded."""
+    return _codes_of_lengths(table, len(model.joints)).tobytes()
 
 
 def _codes_of_lengths(table: Float[np.ndarray, " constants"], joints: int) -> np.ndarray:

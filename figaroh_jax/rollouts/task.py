@@ -27,6 +27,7 @@ from .fit import standard_errors
 from .loop import Loop
 from .parameters import UNITS, put
 from .reading import load_loop
+from .rest import nearest_of, parts_of, relative_rest
 from .search import Named, Search, Setting, Structure, residuals, search, setting
 from .sensitivity import predicted
 
@@ -179,6 +180,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
     held = {run.name: (simulated(start, run), simulated(final, run)) for run in runs if run.holdout}
     gain = _gain(held, runs, found)
     model = extended_of(final if n == final.robot.nv else start)
+    traces = _traces(here, runs, first, found, last, held)
     diagnosis = Diagnosis(
         verdict=_verdict(found),
         causes=(*_faulty(found, here), *(_cause(one, found, here) for one in (found.named if named else ()))),
@@ -191,10 +193,10 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
         holdout_scheme="recordings kept out of the fit" if held else "quarters of the recording left out in turn",
         experiment=_experiment(found),
         candidates=(),
-        traces=_traces(here, runs, first, found, last, held),
+        traces=traces,
         baseline=extended_of(start),
         model=model,
-        rest=_rest(found, before if not named else after, scale, loop),
+        rest=_rest(found, before if not named else after, scale, loop, traces),
         notes=(*notes, *implausible(loop.robot, model, task.robot.trust)),
         prismatic=tuple(j.kind == "prismatic" for j in loop.robot.joints if not j.follows),
         of_positions=True,
@@ -301,15 +303,16 @@ def _experiment(found: Search) -> Experiment | None:
     return None
 
 
-def _rest(found: Search, left: np.ndarray, noise: np.ndarray, loop: Loop) -> Rest:
+def _rest(found: Search, left: np.ndarray, noise: np.ndarray, loop: Loop, traces: Sequence[Trace]) -> Rest:
     if found.verdict in ("nothing", "named"):
         return Rest(np.zeros(0))
-    ratio = left / noise
-    k = int(ratio.argmax())
-    joint = loop.robot.dof_names[loop.measured[k]]
-    text = f"Unexplained residual, mostly at {joint}: {1e3 * left[k]:.3g} mrad against {1e3 * noise[k]:.3g} of noise"
+    names = tuple(loop.robot.dof_names[k] for k in loop.measured)
+    k = int((left / noise).argmax())
+    text = f"{1e3 * left[k]:.3g} mrad at {names[k]} against {1e3 * noise[k]:.3g} of noise"
     proxy = ", ".join(str(Name(n.candidate.effect, n.candidate.at)) for n in found.proxy)
-    return Rest(np.zeros(0), text=f"{text}; best proxy, not a cause: {proxy}" if proxy else text)
+    text = f"{text}; best proxy, not a cause: {proxy}" if proxy else text
+    size = relative_rest(left, noise, traces)
+    return Rest(size, parts_of(traces, names, noise, size), nearest_of(found), text)
 
 
 def _traces(
