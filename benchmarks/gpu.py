@@ -213,7 +213,7 @@ def _function(model: Any, name: str) -> Callable[..., Any]:
         "inverse dynamics float32": lambda *x: straight_answers(dynamics._TORQUES, model, *x),
         "packed regressor float32": lambda *x: straight_answers(regressor._PACKED, model, *x),
         "mass matrix float32": lambda q, v, a: straight_answers(dynamics._MASSES, model, q),
-        "forward dynamics float32": lambda *x: _accelerations(model, *x),
+        "forward dynamics float32": lambda *x: straight_answers(dynamics._ACCELERATIONS, model, *x),
     }
     if name in kernels:
         return kernels[name]
@@ -221,12 +221,6 @@ def _function(model: Any, name: str) -> Callable[..., Any]:
         nothing = dynamics._TORQUES.nothing_known(model)
         return lambda *x: straight_answers(dynamics._TORQUES, model, *x, codes=nothing)
     return partial(known[name], model)
-
-
-def _accelerations(model: Any, q: Any, v: Any, tau: Any) -> Any:
-    from figaroh_jax.rigid import dynamics
-
-    return dynamics.joint_accelerations(model, q.T, v.T, tau.T).T
 
 
 def _states(model: Any, name: str, samples: int, lengths_alone: bool = False) -> list[np.ndarray]:

@@ -79,8 +79,12 @@ def ur10e_task(folder: Path, data: Path, every: bool = False) -> Path:
     fitted = [n for n in names if any(part in n for part in (("",) if every else FITTED))]
     held = [n for n in names if any(part in n for part in HELD)]
     entry = {"time": "t", "position": "q", "torque": "i", "units": {"torque": "A"}}
-    data_list = [{"file": str(runs / n), **entry} for n in fitted if n not in held]
-    data_list += [{"file": str(runs / n), **entry, "role": "holdout"} for n in held]
+    files = {n: str(runs / n) for n in names}
+    with np.load(runs / CORRUPT) as arrays:  # its first rows are wild
+        files[CORRUPT] = str(folder / CORRUPT)
+        np.savez(folder / CORRUPT, **{key: arrays[key][12:] for key in ("t", "q", "i")})  # pyright: ignore[reportArgumentType]
+    data_list = [{"file": files[n], **entry} for n in fitted if n not in held]
+    data_list += [{"file": files[n], **entry, "role": "holdout"} for n in held]
     return write(
         folder,
         "ur10e",
@@ -94,5 +98,6 @@ def ur10e_task(folder: Path, data: Path, every: bool = False) -> Path:
     )
 
 
+CORRUPT = "19_09_27_11_32_02.npz"
 FITTED = ("20_02_06_20sec_10harm", "20_02_10_30sec", "20_02_12_40sec", "20_02_12_50sec")
 HELD = ("20_02_10_20sec_7harm", "20_02_05_20sec_8harm")

@@ -9,6 +9,7 @@ in blocks of fixed size; under a transformation (jit, grad, vmap) the whole is o
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import wraps
 from math import prod
 from typing import Any
@@ -33,6 +34,7 @@ __all__ = [
     "in_one_program",
     "in_chunks",
     "on_host",
+    "on_the_host",
     "over_samples",
     "program",
     "sized_program",
@@ -100,6 +102,16 @@ def traced(*trees: Any) -> bool:
 def on_host(*trees: Any) -> bool:
     """Whether the work is done on this machine's CPU, outside of JAX's transformations."""
     return jax.default_backend() == "cpu" and not traced(*trees)
+
+
+def on_the_host() -> AbstractContextManager[Any]:
+    """What is computed within is computed on this machine's CPU, where JAX has it beside another device."""
+    if jax.default_backend() == "cpu":
+        return nullcontext()
+    try:
+        return jax.default_device(jax.local_devices(backend="cpu")[0])
+    except RuntimeError:
+        return nullcontext()
 
 
 def aligned(shape: Sequence[int], fill: float | None = None) -> np.ndarray:

@@ -8,11 +8,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..estimation.rows import Rows
 
 __all__ = ["Bank", "Columns", "bank"]
+
+FEW = 8_000_000  # numbers of all columns that are put side by side joint by joint: one product is quicker than many
 
 
 class Columns(NamedTuple):
@@ -22,17 +24,24 @@ class Columns(NamedTuple):
     Z: Float[np.ndarray, "grid k rows T"]
 
 
+class Block(NamedTuple):
+    """Columns at one joint, of all candidates that touch it, or of one where they are large."""
+
+    joint: int
+    columns: Int[np.ndarray, " columns"]
+    Zi: Float[np.ndarray, "columns T"]
+
+
 class Bank(NamedTuple):
     """Instruments of many candidates, joint by joint (one product serves all of them), and their products.
 
-    Candidate i owns the columns `span[i]`, grid point by grid point; `joint[j]` are the columns that touch joint j.
+    Candidate i owns the columns `span[i]`, grid point by grid point.
     """
 
     candidates: list[Columns]
     span: list[tuple[int, int, int]]  # first column, grid points, columns a point
     parts: list[list[Float[np.ndarray, "columns T"]]]  # instruments of each candidate at each of its joints
-    joint: list[Int[np.ndarray, " columns"]]
-    Zi: list[Float[np.ndarray, "columns T"]]
+    blocks: list[Block]
     own: list[Float[np.ndarray, "grid k k"]]  # Zi'Zi of each candidate
     ZX: Float[np.ndarray, "columns P"]  # Zi'X
     ZXi: Float[np.ndarray, "columns P"]  # Zi'Xi
@@ -44,7 +53,7 @@ class Bank(NamedTuple):
 
     def product(self, rows: list[Float[np.ndarray, "T m"]]) -> Float[np.ndarray, "columns m"]:
         """Every column times one matrix of rows a joint, summed over the joints."""
-        return _product(self.width, self.joint, self.Zi, rows)
+        return _product(self.width, self.blocks, rows)
 
 
 def bank(rows: Rows, candidates: list[Columns], before: Bank | None = None) -> Bank:
@@ -63,27 +72,33 @@ def bank(rows: Rows, candidates: list[Columns], before: Bank | None = None) -> B
     sizes = np.array([c.Z.shape[0] * c.Z.shape[1] for c in candidates], int)
     firsts = np.cumsum(sizes) - sizes
     span = [(int(first), *c.Z.shape[:2]) for first, c in zip(firsts, candidates, strict=True)]
-    joint, Zi = _by_joint(rows, candidates, parts, firsts)
+    blocks = _blocks(candidates, parts, firsts)
     kept = np.full(int(sizes.sum()), -1)  # column of `before`
     for i, first, size in zip(place, firsts, sizes, strict=True):
         if before and i >= 0:
             kept[first : first + size] = before.span[i][0] + np.arange(size)
-    ZX = _grown_product(rows.X, joint, Zi, kept, before.ZX if before else None)
-    ZXi = _grown_product(rows.Xi, joint, Zi, kept, before.ZXi if before else None) if len(rows.partner) else ZX
-    return Bank(candidates, span, parts, joint, Zi, own, ZX, ZXi)
+    ZX = _grown_product(rows.X, blocks, kept, before.ZX if before else None)
+    ZXi = _grown_product(rows.Xi, blocks, kept, before.ZXi if before else None) if len(rows.partner) else ZX
+    return Bank(candidates, span, parts, blocks, own, ZX, ZXi)
 
 
-def _by_joint(
-    rows: Rows, candidates: list[Columns], parts: list[list[np.ndarray]], firsts: Int[np.ndarray, " candidates"]
-) -> tuple[list[Int[np.ndarray, " columns"]], list[Float[np.ndarray, "columns T"]]]:
-    """Columns that touch each joint, and their instruments there."""
-    stored: list[list[np.ndarray]] = [[np.zeros((0, rows.y.shape[1]))] for _ in rows.y]
-    touching: list[list[np.ndarray]] = [[np.zeros(0, int)] for _ in rows.y]
-    for one, part, first in zip(candidates, parts, firsts, strict=True):
-        for joint, columns in zip(one.joints, part, strict=True):
-            stored[joint].append(columns)
-            touching[joint].append(np.arange(first, first + len(columns)))
-    return [np.concatenate(t) for t in touching], [np.concatenate(z) for z in stored]
+def _blocks(
+    candidates: list[Columns], parts: list[list[np.ndarray]], firsts: Int[np.ndarray, " candidates"]
+) -> list[Block]:
+    """The instruments at each joint, with the columns that they are of."""
+    out = [
+        Block(joint, np.arange(first, first + len(columns)), columns)
+        for one, part, first in zip(candidates, parts, firsts, strict=True)
+        for joint, columns in zip(one.joints, part, strict=True)
+    ]
+    if sum(block.Zi.size for block in out) > FEW:
+        return out
+    joints = sorted({block.joint for block in out})
+    beside = [[block for block in out if block.joint == joint] for joint in joints]
+    return [
+        Block(joint, np.concatenate([x.columns for x in own]), np.concatenate([x.Zi for x in own]))
+        for joint, own in zip(joints, beside, strict=True)
+    ]
 
 
 def _own_product(one: Columns, part: list[Float[np.ndarray, "columns T"]]) -> Float[np.ndarray, "grid k k"]:
@@ -98,32 +113,27 @@ def _parts(rows: Rows, one: Columns) -> list[Float[np.ndarray, "columns T"]]:
 
 def _grown_product(
     X: Float[np.ndarray, "nv T P"],
-    joint: list[Int[np.ndarray, " columns"]],
-    Zi: list[Float[np.ndarray, "columns T"]],
+    blocks: list[Block],
     kept: Int[np.ndarray, " width"],
     known: Float[np.ndarray, "before P0"] | None,
 ) -> Float[np.ndarray, "width P"]:
     """Zi'X, of which the first columns are `known` where `kept` names a row of them."""
     if known is None:
-        return _product(len(kept), joint, Zi, list(X))
+        return _product(len(kept), blocks, list(X))
     P, same = known.shape[1], kept >= 0
     out = np.zeros((len(kept), X.shape[2]))
-    out[:, P:] = _product(len(kept), joint, Zi, [x[:, P:] for x in X])
-    fresh = [~same[columns] for columns in joint]
-    left = [columns[new] for columns, new in zip(joint, fresh, strict=True)]
-    some = [z[new] for z, new in zip(Zi, fresh, strict=True)]
-    out[:, :P] = _product(len(kept), left, some, [x[:, :P] for x in X])
+    out[:, P:] = _product(len(kept), blocks, [x[:, P:] for x in X])
+    out[:, :P] = _product(len(kept), [_fresh(block, ~same[block.columns]) for block in blocks], [x[:, :P] for x in X])
     out[same, :P] = known[kept[same]]
     return out
 
 
-def _product(
-    width: int,
-    joint: list[Int[np.ndarray, " columns"]],
-    Zi: list[Float[np.ndarray, "columns T"]],
-    rows: list[Float[np.ndarray, "T m"]],
-) -> Float[np.ndarray, "columns m"]:
+def _fresh(block: Block, new: Bool[np.ndarray, " columns"]) -> Block:
+    return block if new.all() else Block(block.joint, block.columns[new], block.Zi[new])
+
+
+def _product(width: int, blocks: list[Block], rows: list[Float[np.ndarray, "T m"]]) -> Float[np.ndarray, "columns m"]:
     out = np.zeros((width, rows[0].shape[1]))
-    for columns, own, right in zip(joint, Zi, rows, strict=True):
-        out[columns] += own @ right
+    for joint, columns, own in blocks:
+        out[columns] += own @ rows[joint]
     return out

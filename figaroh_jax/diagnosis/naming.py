@@ -54,7 +54,7 @@ class Standing:
     share: float  # RMS torque over that of the joint, where it is largest
     modulation: float = 0.0  # squares that an amplitude which varies gains, over those of the cause
     modulation_held_out: float = 0.0
-    beside_smooth: float = 1.0  # gain of a cause of the whole robot beside smooth functions at every joint
+    beside_smooth: float = 1.0  # gain of a cause of the whole robot beside smooth functions, or in their place
     inertia_alone: bool = False  # a coupling of inertia, without friction of its own
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
 
@@ -216,27 +216,32 @@ def _varied_robot(grown: _Grown, effect: Effect, torque: np.ndarray) -> Float[np
 def _beside_smooth(
     grown: _Grown, bare: Step | None, effect: Effect, place: list[int], joints: tuple[int, ...]
 ) -> float:
-    """Gain of the cause beside smooth functions of each joint's own motion; `bare` is the fit without a late sensor."""
+    """Gain of the cause beside smooth functions of each joint's own motion, or in their place, whichever is larger.
+
+    Few joints that move along one path leave little that many functions could not follow, but a law of few numbers then
+    predicts better than they do. `bare` is the fit without a late sensor.
+    """
     step = grown.step
     if kind(effect) == "position":
         return 1.0
-    full = _with_smooth(grown, step, sized=bare is not None)
+    full = _with_smooth(grown, step)
     within = judge(step.rows, full)
     if bare is None:
         X, prior = full.X, full.prior
         fewer = prior._replace(mean=np.delete(prior.mean, place), precision=np.delete(prior.precision, place))
         without = judge(step.rows, Hypothesis(np.delete(X, place, axis=2), fewer))
     else:
-        without = judge(bare.rows, _with_smooth(grown, bare, sized=True))
-    return 1 - float(within.own(step.rows, joints).sum() / max(without.own(step.rows, joints).sum(), 1e-300))
+        without = judge(bare.rows, _with_smooth(grown, bare))
+    alone, both, smooth = (v.own(step.rows, joints).sum() for v in (step.verdicts, within, without))
+    return 1 - float(min(alone, both) / max(smooth, 1e-300))
 
 
-def _with_smooth(grown: _Grown, step: Step, sized: bool) -> Hypothesis:
+def _with_smooth(grown: _Grown, step: Step) -> Hypothesis:
     """The columns of a fit and smooth functions of each joint's own motion, as its sensors read them.
 
-    `sized`: each function is expected to be no larger than what the model leaves without any cause. Many free functions
-    of few rows predict the rows left out so badly that two fits of other columns could not be compared beside them;
-    where one column more is asked about, free ones are the harder rival.
+    Each function is expected to be no larger than what the model leaves without any cause. Many free functions of few
+    rows predict the rows left out so badly that two fits could not be compared beside them, and what they predict says
+    nothing of a cause of two numbers that acts on all joints.
     """
     problem, whitening, rows = grown.problem, grown.whitening, step.rows
     n, samples, _, nv = problem.records.shape
@@ -250,9 +255,7 @@ def _with_smooth(grown: _Grown, step: Step, sized: bool) -> Hypothesis:
         blocks.append(full)
     prior = step.state.prior
     size = np.concatenate([np.full(b.shape[2], s) for b, s in zip(blocks, grown.size, strict=True)])
-    more = prior.extended(len(size))
-    if sized:
-        more = Prior(more.mean, np.append(prior.precision, size**-2.0))
+    more = Prior(prior.extended(len(size)).mean, np.append(prior.precision, size**-2.0))
     return Hypothesis(np.concatenate([rows.X, *blocks], axis=2), more)
 
 

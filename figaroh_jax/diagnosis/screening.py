@@ -5,7 +5,7 @@ Naming starts here and never ends here: columns that are right to first order fi
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from ..estimation.rows import Linear, Rows
 from ..results import Name
 from ..rigid.model import RobotModel
 from .bank import Bank, Columns, bank
-from .design import flattened, unit_rows, units
+from .design import Units, flattened, unit_rows, units
 from .evidence import Score, block_scores, largest, other_scores, projection, pulled, scores
 from .problem import Problem, without_factor
 from .state import State
@@ -97,28 +97,35 @@ def _fresh_columns(
 ) -> dict[str, list[Columns]]:
     """Whitened columns by place: of all wanted effects, or of those whose columns follow the torque of the state."""
     response = whitening * state.response(problem.records.omega)[:, None]
-    given, known, factor = problem.family("following", state.motion), {}, np.ones(0)
-    if everything:
-        coloured, factor = without_factor(response)
-        if (coloured == 1).all():
-            known = problem.plain
-        else:
-            given |= problem.fixed | problem.family("shaped", state.motion)
-    sensors = {n: b for n, b in problem.families["sensor"].items() if n in wanted and (everything or b.follows_torque)}
-    given |= units({n: flattened(b) for n, b in sensors.items()}, state.motion, problem.records)
     batches = {n: b for family in problem.families.values() for n, b in family.items()}
     weight, out = np.moveaxis(np.asarray(problem.records.weight), 2, 0), {}
-    for name in (n for n in [*given, *known] if n in wanted):
+
+    def placed(name: str, rows: np.ndarray, at: np.ndarray) -> None:
         places, grid = batches[name].at.shape[:2]
-        if name in given:
-            rows, at = unit_rows(given[name], problem.records, response), given[name].joints
-        else:
-            rows, at = known[name]
-            rows = rows * (weight * factor[:, None, None])[at][:, None]
         rows = rows.reshape(places, grid, *rows.shape[1:3], -1)
-        joints = at[::grid].tolist()
-        out[name] = [Columns(tuple(at), Z) for at, Z in zip(joints, rows, strict=True)]
+        out[name] = [Columns(tuple(joints), Z) for joints, Z in zip(at[::grid].tolist(), rows, strict=True)]
+
+    coloured, factor = without_factor(response)
+    plain = everything and bool((coloured == 1).all())
+    for name, (rows, at) in (problem.plain if plain else {}).items():
+        if name in wanted:
+            placed(name, rows * (weight * factor[:, None, None])[at][:, None], at)
+    for family in _fresh_families(problem, state, wanted, everything, plain):  # samples of one family at a time
+        for name in (n for n in family if n in wanted):
+            placed(name, unit_rows(family[name], problem.records, response), family[name].joints)
     return out
+
+
+def _fresh_families(
+    problem: Problem, state: State, wanted: Collection[str], everything: bool, plain: bool
+) -> Iterator[Mapping[str, Units]]:
+    """Unit torques at all samples, a family after another; those of the measured motion alone not where `plain`."""
+    yield problem.family("following", state.motion)
+    if everything and not plain:
+        yield problem.fixed
+        yield problem.family("shaped", state.motion)
+    sensors = {n: b for n, b in problem.families["sensor"].items() if n in wanted and (everything or b.follows_torque)}
+    yield units({n: flattened(b) for n, b in sensors.items()}, state.motion, problem.records)
 
 
 def place_names(model: RobotModel, effect: Effect | type[Effect], at: tuple[int, ...]) -> tuple[str, ...]:

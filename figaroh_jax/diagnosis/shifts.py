@@ -25,6 +25,7 @@ from ..rigid.model import Leaf, RobotModel
 
 __all__ = ["difference", "links_torque", "rigid_torque", "shift_torques", "shifted", "torque_change"]
 
+AT_ONCE = 2_000_000  # numbers of a torque of all samples, for several effects: more are moved one after another
 TURNS = 3  # of Newton's method for the true motion
 ENDS, TINY = 6, 1e-6  # samples whose derivatives are held; what makes them zero
 EVERY = 4  # samples between which derivatives of the torque are straight
@@ -234,8 +235,12 @@ def torque_change(
     """
     if as_read is None:
         as_read = links_torque(motion.model, motion.position, motion.velocity, motion.acceleration, records)
-    true = shifted(effects, motion, records, turns, as_read)
-    return links_torque(motion.model, true.position, true.velocity, true.acceleration, records) - as_read
+    out, few = np.empty((len(effects.at), *as_read.shape)), max(1, AT_ONCE // as_read.size)
+    for part in (slice(start, start + few) for start in range(0, len(out), few)):
+        some = jax.tree.map(lambda x, part=part: np.asarray(x)[part], effects)
+        true = shifted(some, motion, records, turns, as_read)
+        out[part] = links_torque(motion.model, true.position, true.velocity, true.acceleration, records) - as_read
+    return out
 
 
 def shift_torques(effects: Effect, motion: Motion, records: Records) -> Float[np.ndarray, "effects k nv nN"]:

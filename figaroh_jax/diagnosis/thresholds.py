@@ -46,7 +46,7 @@ GAIN_NAMED = 0.25  # gain there with all other causes in
 GAIN_NAMED_ROBOT = 0.04  # the same of a cause that acts on the whole robot
 MODULATION, MODULATION_HELD_OUT = 0.3, 0.25  # squares that an amplitude which varies gains, over those of the cause
 SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
-BESIDE_SMOOTH = 0.01  # gain of a cause of the whole robot beside smooth functions at every joint
+BESIDE_SMOOTH = 0.05  # gain of a cause of the whole robot beside smooth functions at every joint, or in their place
 
 # The rest (`rest`)
 REST_P = 0.01  # p-value of a rest

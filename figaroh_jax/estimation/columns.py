@@ -14,7 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from ..compiled.batching import CPU_OPTIONS, DRAFT_OPTIONS, FEW, program
+from ..compiled.batching import CPU_OPTIONS, DRAFT_OPTIONS, FEW, on_the_host, program
 from ..effects.base import Effect, Motion, columns, place, smooth_sign
 from ..effects.catalogue import find
 from ..errors import InputError
@@ -113,7 +113,7 @@ def structural_columns(
     """
     samples = samples or max(STATES, 4 * len(column_names(model, terms)) // max(model.nv, 1))
     q, v, a = random_states(model, samples, seed)
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), on_the_host():  # few states: not worth a kernel of a GPU
         motion = motion_at(model, np.arange(samples) * 1.0, q, v, a, 0.0, jnp.zeros(model.nv))
         return columns_of(NativeBackend(model), terms, motion)
 

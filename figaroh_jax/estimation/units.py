@@ -4,8 +4,9 @@ Random effects: the estimate of run j of unit i, with standard deviation $s_{ij}
 $x_{ij} = \mu + u_i + d_{ij} + e_{ij}$ with spreads $\tau_u$ between units and $\tau_d$ between the days of one unit.
 Spreads are by Paule and Mandel (1982): the weighted squares about the weighted mean are their degrees of freedom. That
 a spread is there at all is tested by those squares with the spread zero (Cochran 1954), the p values over all
-parameters by Holm's method. Standard deviations that are too small everywhere would make everything differ: they are
-widened by what the median parameter shows (an empirical null, Efron 2004), for most parameters are alike.
+parameters, of units and of days together, by Holm's method. Standard deviations that are too small everywhere would
+make everything differ: they are widened by what the median parameter shows (an empirical null, Efron 2004), for most
+parameters are alike.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class Spread(NamedTuple):
     std: float  # of the mean
     units: float  # spread between units, one sigma
     days: float  # spread between the days of a unit, one sigma
-    p_units: float  # of no spread between units, over all parameters together (Holm); 1 where there is one unit
+    p_units: float  # of no spread between units, over all parameters and days too (Holm); 1 where there is one unit
     p_days: float  # of no spread between days; 1 where no unit has two
     shrunk: dict[str, float]  # each unit's value, drawn towards the mean by what its own data leave open
     widened: float  # factor of the given standard deviations
@@ -68,7 +69,7 @@ def spreads(
     rows = [
         _one(values[t, k], widened * std[t, k], [labels[i] for i in np.flatnonzero(t)]) for k, t in enumerate(told.T)
     ]
-    p_units, p_days = (_holm(np.array([row[index] for row in rows])) for index in (4, 5))
+    p_units, p_days = _holm(np.array([[row[index] for row in rows] for index in (4, 5)]))
     return tuple(
         Spread(name, row[0], row[1], row[2], row[3], float(u), float(d), row[6], widened)
         for name, row, u, d in zip(names, rows, p_units, p_days, strict=True)
@@ -119,7 +120,10 @@ def _paule_mandel(x: np.ndarray, s: np.ndarray, groups: Int[np.ndarray, " n"], f
 
 
 def _widening(values: np.ndarray, std: np.ndarray, told: np.ndarray, labels: list[str]) -> float:
-    """Factor of the standard deviations by which the median parameter does not differ; at least one."""
+    """Factor of the standard deviations by which the median parameter does not differ; at least one.
+
+    Above one it takes one standard error of that median with it: too small a factor names what does not differ.
+    """
     from scipy.stats import chi2
 
     ratios = []
@@ -133,7 +137,11 @@ def _widening(values: np.ndarray, std: np.ndarray, told: np.ndarray, labels: lis
             groups, freedom = np.zeros(len(own), int), len(own) - 1
         if freedom > 0:
             ratios.append(_within(x[t], s[t], groups, 0.0) / chi2.median(freedom))
-    return max(1.0, float(np.sqrt(np.median(ratios)))) if len(ratios) >= 8 else 1.0
+    if len(ratios) < 8:
+        return 1.0
+    low, middle, high = np.percentile(ratios, (25, 50, 75))
+    error = 1.2533 * (high - low) / 1.349 / np.sqrt(len(ratios))  # of the median of normal numbers
+    return float(np.sqrt(middle + error)) if middle > 1.0 else 1.0
 
 
 def _numbered(labels: Sequence[str]) -> Int[np.ndarray, " n"]:
@@ -141,10 +149,11 @@ def _numbered(labels: Sequence[str]) -> Int[np.ndarray, " n"]:
     return np.array([known.index(label) for label in labels], int)
 
 
-def _holm(p: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Holm's adjusted p values."""
-    order = np.argsort(p)
-    adjusted = np.minimum(1.0, np.maximum.accumulate((len(p) - np.arange(len(p))) * p[order]))
+def _holm(p: Float[np.ndarray, "kinds n"]) -> Float[np.ndarray, "kinds n"]:
+    """Holm's adjusted p values, of units and days together; what was not tested (p = 1) does not count."""
+    flat = p.ravel()
+    order, count = np.argsort(flat), int((flat < 1.0).sum())
+    adjusted = np.minimum(1.0, np.maximum.accumulate(np.maximum(1, count - np.arange(len(flat))) * flat[order]))
     out = np.empty_like(adjusted)
     out[order] = adjusted
-    return out
+    return out.reshape(p.shape)

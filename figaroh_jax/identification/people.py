@@ -93,6 +93,7 @@ _WORDS = {  # of links' names
 }
 _OFFSET = np.array([2.0, 2.0, 2.0, 0.5, 0.5, 0.5])  # N, N m: one sigma of a plate's zero
 _SIX = (np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2]))  # of a moment: xx xy yy xz yz zz
+_SEGMENT = 1e-5  # of the body's mass: what has less stands in the model for its joints alone
 _EDGE = 0.5  # s at either end of a recording, which a filter of few hertz bends
 
 
@@ -243,7 +244,8 @@ def identify_segments(
     """
     if not captures:
         raise InputError("identify_segments: no recording; give one `capture` or more")
-    index = [i for i, ten in enumerate(np.asarray(table.inertia)) if ten[0] > 0]
+    masses = np.asarray(table.inertia)[:, 0]
+    index = [i for i, mass in enumerate(masses) if mass > _SEGMENT * masses.sum()]
     columns = np.concatenate([10 * i + np.arange(10) for i in index])
     mean, root = _believed(table, index, trust)
     W = np.concatenate([_rows(table, one)[:, :, columns] for one in captures])

@@ -152,7 +152,7 @@ def _rows(
         raise InputError(f"extra has shape {np.shape(extra)}; expected {(*shape, 'columns')}, a row for each torque")
     if weight is not None and np.shape(weight) not in ((), shape[-1:], shape):
         raise InputError(f"weight has shape {np.shape(weight)}; expected {shape[-1:]} or {shape}")
-    host = not traced(model, q, v, a, tau, weight, extra)
+    host = on_host(model, q, v, a, tau, weight, extra)
     library: Any = np if host else jnp
     root = library.broadcast_to(library.sqrt(library.asarray(1.0 if weight is None else weight, float)), shape)
     if extra is not None:

@@ -56,8 +56,12 @@ def make_person(path: str, rng: np.random.Generator, spread: float = 0.12) -> Pe
         if inertia.mass > 0:
             mass = inertia.mass * s * (1 + one())
             lever = inertia.lever * s * (1 + one()) + rng.normal(0, 0.004, 3)
-            turn = np.diag(1 + np.array([one(), one(), one()]) / 2)
-            model.inertias[j] = pin.Inertia(mass, lever, turn @ (inertia.inertia * mass / inertia.mass * s * s) @ turn)
+            wider = np.diag(1 + np.array([one(), one(), one()]) / 2)  # along each axis: it stays a body that can exist
+            values, axes = np.linalg.eigh(np.trace(inertia.inertia) / 2 * np.eye(3) - inertia.inertia)
+            spread_out = (axes * np.maximum(values, 1e-3 * values.max())) @ axes.T  # the model's clavicles are none
+            spread_out = wider @ spread_out @ wider * (mass / inertia.mass * s * s)
+            about = np.trace(spread_out) * np.eye(3) - spread_out
+            model.inertias[j] = pin.Inertia(mass, lever, about)
     return Person(model, nominal, size, {})
 
 
