@@ -1,6 +1,6 @@
 """What random effects find among 60 parameters of 20 simulated robots on two days, three of which truly differ.
 
-    python benchmarks/units.py [--studies N]
+    python benchmarks/units.py [--studies N] [--seed K]
 
 By how far the three differ between robots (in standard deviations of one estimate): how many of them are named, how
 many studies name a false one; with honest standard deviations, and with ones stated half as large as they are.
@@ -20,11 +20,12 @@ PARAMETERS, UNITS, DAYS, DIFFERENT = 60, 20, 2, (7, 23, 41)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--studies", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0, help="of the first study")
     options = parser.parse_args()
     print(f"{'spread':>7}{'stated std':>12}{'found of three':>16}{'studies with a false one':>26}")
     for size in (1.0, 1.5, 2.0, 3.0):
         for stated in (1.0, 0.5):
-            told = [_study(np.random.default_rng(seed), size, stated) for seed in range(options.studies)]
+            told = [_study(np.random.default_rng(options.seed + k), size, stated) for k in range(options.studies)]
             found = np.mean([len(names & set(DIFFERENT)) for names in told])
             false = np.mean([bool(names - set(DIFFERENT)) for names in told])
             print(f"{size:7.1f}{stated:12.1f}{found:16.2f}{100 * false:24.1f} %", flush=True)

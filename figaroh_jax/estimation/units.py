@@ -120,7 +120,10 @@ def _paule_mandel(x: np.ndarray, s: np.ndarray, groups: Int[np.ndarray, " n"], f
 
 
 def _widening(values: np.ndarray, std: np.ndarray, told: np.ndarray, labels: list[str]) -> float:
-    """Factor of the standard deviations by which the median parameter does not differ; at least one."""
+    """Factor of the standard deviations by which the median parameter does not differ; at least one.
+
+    Above one it takes one standard error of that median with it: too small a factor names what does not differ.
+    """
     from scipy.stats import chi2
 
     ratios = []
@@ -134,7 +137,11 @@ def _widening(values: np.ndarray, std: np.ndarray, told: np.ndarray, labels: lis
             groups, freedom = np.zeros(len(own), int), len(own) - 1
         if freedom > 0:
             ratios.append(_within(x[t], s[t], groups, 0.0) / chi2.median(freedom))
-    return max(1.0, float(np.sqrt(np.median(ratios)))) if len(ratios) >= 8 else 1.0
+    if len(ratios) < 8:
+        return 1.0
+    low, middle, high = np.percentile(ratios, (25, 50, 75))
+    error = 1.2533 * (high - low) / 1.349 / np.sqrt(len(ratios))  # of the median of normal numbers
+    return float(np.sqrt(middle + error)) if middle > 1.0 else 1.0
 
 
 def _numbered(labels: Sequence[str]) -> Int[np.ndarray, " n"]:

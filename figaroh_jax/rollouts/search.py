@@ -507,10 +507,25 @@ def _sized(here: Setting, one: _Tried) -> bool:
     bounds = here.bounds[list(one.candidate.entries)] if not one.candidate.elastic else np.zeros((0, 2))
     if any(found.theta[e] >= high for e, (_, high) in zip(one.candidate.entries, bounds, strict=False)):
         return False
+    if one.candidate.effect == "stribeck_friction":  # falling off beyond every speed it is plain friction
+        coordinate = one.state.structure.table[one.candidate.entries[1]].at[0]
+        if found.theta[one.candidate.entries[1]] > _top_speed(here, coordinate):
+            return False
     neutral = 1.0 if one.candidate.effect == "actuator_gain" else 0.0
     if one.candidate.effect in (*BASELINE, "actuator_saturation", "voltage_saturation", "joint_elasticity", "backlash"):
         return bool(np.isfinite(error) and error < 0.5 * abs(value) + 1e-12)
     return bool(np.isfinite(error) and abs(value - neutral) > 3 * error)
+
+
+def _top_speed(here: Setting, coordinate: int) -> float:
+    """The fastest that a joint moved, over five rows (rad/s or m/s)."""
+    column = here.loop.measured.index(coordinate)
+    return max(
+        float(
+            np.abs(run.position[4:, column] - run.position[:-4, column]).max(initial=0.0) / (run.time[4] - run.time[0])
+        )
+        for run in here.runs
+    )
 
 
 def _by_recording(here: Setting) -> bool:

@@ -18,6 +18,7 @@ from jaxtyping import Array
 
 from ..compiled.batching import program
 from ..rigid.dynamics import joint_masses, joint_torques
+from ..rigid.model import RobotModel
 from .loop import Linear, Loop, State, advance, integrated, mobility, observe
 from .parameters import TEN, Table, put, unit_payload
 from .simulation import delayed
@@ -281,13 +282,12 @@ class _RigidBody:
         if self.which:
             mine = jnp.any(jnp.isin(free, jnp.array(self.which)))
             empty = jnp.zeros((len(self.which), *a.shape))
-            self.columns = jax.lax.cond(mine, lambda: self._columns(loop, a), lambda: empty)
+            self.columns = jax.lax.cond(mine, lambda: self._columns(loop, robot, a), lambda: empty)
 
-    def _columns(self, loop: Loop, a: Array) -> Array:
+    def _columns(self, loop: Loop, robot: RobotModel, a: Array) -> Array:
         """What a unit of each number of the rigid body adds to the torques, (numbers, 3, nv, samples)."""
         q, v, zero = self.linear.q, self.linear.v, jnp.zeros_like(self.linear.v)
-        robot, found = loop.robot, []
-        still = jnp.zeros(3)
+        found, still = [], jnp.zeros(3)
         for entry in (self.table[k] for k in self.which):
             if entry.name not in _PULLS:
                 at, ten = np.array(entry.at), jnp.zeros_like(jnp.asarray(robot.inertia))
