@@ -24,7 +24,8 @@ from figaroh_jax.reporting.rollout_effects import NOT_LOOKED_FOR, ROLLOUT_EFFECT
 from figaroh_jax.rollouts.parameters import Entry, put, values  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
-SIZES = {"mass": 0.5, "com_x": 0.05, "com_y": 0.02, "com_z": 0.05, "height": 0.35, "x": 0.1, "rate": 1e-3, "speed": 0.4}
+SIZES = {"mass": 0.5, "com_x": 0.05, "com_y": 0.02, "com_z": 0.05, "height": 0.35, "x": 0.1}
+SIZES |= {"rate": 1e-3, "speed": 0.4, "limit": 3.0}
 
 
 def page(path: str, text: str) -> None:
