@@ -74,6 +74,41 @@ def test_sums_are_those_of_finite_differences(tmp_path: Path):
     assert np.asarray(found.cost).sum() == pytest.approx(squares(theta, start), rel=1e-10)
 
 
+TWO = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/><worldbody>
+<body pos="0 0 1"><joint name="j1" axis="0 1 0" damping="0.4" armature="0.05" frictionloss="0.15"/>
+<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="1"/>
+<body pos="0.3 0 0"><joint name="j2" axis="0 1 0" damping="0.3" armature="0.04" frictionloss="0.1"/>
+<geom type="capsule" fromto="0 0 0 0.25 0 0" size="0.02" mass="0.6"/></body></body></worldbody>
+<actuator><position joint="j1" kp="60" kv="2"/><position joint="j2" kp="40" kv="1"/></actuator></mujoco>"""
+
+
+def test_sums_of_two_joints_are_those_of_finite_differences(tmp_path: Path):
+    """Numbers of joints, drives, sensors and of the rigid body itself, all free at once."""
+    (tmp_path / "arm.xml").write_text(TWO)
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    t = 0.002 * np.arange(300)
+    u = 0.3 * np.sin(t[:, None] * [4.0, 7.0] + [0.0, 1.0])
+    run = Run("two", t, u, 0.9 * u, np.gradient(0.9 * u, t, axis=0))
+    data = windows(loop, [run], [Stretch(0, 0, 300)], [np.full(2, 2e-4), np.full(2, 5e-3)], 0.2)
+    at = {"armature": 0, "delay": 1, "friction": 0, "payload": 1, "mass_x": 0, "inertia_yy": 1, "gravity_x": 0}
+    table = tuple(Entry(name, (place,)) for name, place in at.items())
+    theta = np.array([0.06, 0.0051, 0.2, 0.1, 0.02, 0.004, 0.3])
+    start = np.array([[0.03], [0.1], [0.4], [-0.2]])
+
+    def squares(theta: np.ndarray) -> float:
+        with jax.enable_x64(True):
+            read = np.asarray(predicted(loop, table, theta[None], data, start[None]))[0]
+        return float((((data.reading - read) * data.weight) ** 2).sum())
+
+    with jax.enable_x64(True):
+        found = linear_sums(loop, table, theta[None], np.arange(len(at))[None], data, start[None])
+    assert np.asarray(found.cost).sum() == pytest.approx(squares(theta), rel=1e-10)
+    exact = -2 * np.asarray(found.gradient)[0].sum((0, 1))[: len(at)]
+    moves = 1e-6 * np.eye(len(at))
+    numeric = [(squares(theta + move) - squares(theta - move)) / 2e-6 for move in moves]
+    np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=0)
+
+
 def test_a_joint_of_two_bodies_is_mujocos(tmp_path: Path):
     """The elastic structure built from the plain arm against MuJoCo's own two bodies."""
     (tmp_path / "arm.xml").write_text(servo_arm.model_text())

@@ -96,7 +96,8 @@ def _put(loop: Loop, name: str, at: np.ndarray, new: Array | np.ndarray) -> Loop
         return eqx.tree_at(lambda m: m.carried.payload, loop, whole)
     if name == "payload":
         own = jnp.asarray(loop.robot.inertia)
-        return eqx.tree_at(lambda m: m.robot.inertia, loop, own.at[at].add(new[:, None] * unit_payload(loop, at)))
+        chosen = np.eye(len(own))[at]  # no scatter: XLA mixes up one that adds to the array it is computed from
+        return eqx.tree_at(lambda m: m.robot.inertia, loop, own + chosen.T @ (new[:, None] * unit_payload(loop, at)))
     if name in TEN:
         return eqx.tree_at(
             lambda m: m.robot.inertia, loop, jnp.asarray(loop.robot.inertia).at[at, TEN.index(name)].add(new)
