@@ -10,13 +10,12 @@ import reference
 import robots
 from synthetic import made_signals, swing
 
+import figaroh_jax as fj
 from figaroh_jax.diagnosis.layout import held_rows, layout
 from figaroh_jax.diagnosis.problem import Problem
 from figaroh_jax.diagnosis.rest import relative_rest
 from figaroh_jax.diagnosis.standstill import only_sticks, resting
 from figaroh_jax.diagnosis.state import State, assembled, baseline, solved
-from figaroh_jax.effects.sensors import TorqueSaturation
-from figaroh_jax.effects.transmission import RotorInertia
 from figaroh_jax.recordings.stacked import stack
 from figaroh_jax.rigid.model import RobotModel
 from figaroh_jax.simulators.native import NativeBackend
@@ -97,10 +96,11 @@ def test_a_drive_at_its_limit_sees_the_torque_of_all_causes(model: RobotModel, f
     """Its torque is what is cut off of all the others', whichever of them a search has found first."""
     problem, state = recorded(model, lambda v, top, rng: np.zeros_like(v))
     motion, joint = problem.motion, 1
-    rotor = RotorInertia((joint,), inertia=np.float64(2.0))
+    at = [model.joint_names[joint]]
+    rotor = fj.place(fj.CATALOGUE["rotor_inertia"], model, at, inertia=2.0)
     total = np.asarray(state.motion.total)[:, joint] + 2.0 * np.asarray(motion.acceleration)[:, joint]
     limit = 0.6 * np.abs(total).max()
-    drive = TorqueSaturation((joint,), share=np.float64(1.0), limit=np.float64(limit))
+    drive = fj.place(fj.CATALOGUE["torque_saturation"], model, at, share=1.0, limit=float(limit))
     causes = [drive, rotor] if first else [rotor, drive]
     found = assembled(problem, state, causes)
     assert [t.name for t in found.terms[-2:]] == [c.name for c in causes]

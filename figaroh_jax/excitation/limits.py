@@ -45,8 +45,9 @@ class Limits:
     @property
     def middle(self) -> Float[np.ndarray, " nv"]:
         """Of the range of positions; zero where there is none."""
-        free = np.isinf(self.position).any(axis=1)
-        return np.where(free, 0.0, np.where(free[:, None], 0.0, self.position).sum(axis=1) / 2)
+        low, high = self.position.T
+        bounded = np.isfinite(low) & np.isfinite(high)
+        return (np.where(bounded, low, 0.0) + np.where(bounded, high, 0.0)) / 2
 
     @property
     def reach(self) -> Float[np.ndarray, " nv"]:
