@@ -21,8 +21,7 @@ MODELS = {
         (28.3, 13.4, 11.8, 10.4, 27.9, 20.9),
         (2.02, 0.91, 0.80, 0.84, 1.96, 1.96),
         (0.291, 0.429, 0.468, 0.147, 0.310, 0.0),
-        (0.028, 0.028, 0.028, 0.0177, 0.028, 0.028),
-        (0.0134, 0.0, 0.0, 0.0, 0.0, 0.0),
+        *((0.028, 0.028, 0.028, 0.0177, 0.028, 0.028), (0.0134, 0.0, 0.0, 0.0, 0.0, 0.0)),
     ),
 }
 
@@ -40,10 +39,9 @@ def arm(gain: Any, damping: Any, friction: Any, armature: Any, delay: Any) -> An
 def motion(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Command and position (rows, 6), rad; the jaw is told as a share of its range."""
     z = np.load(DATA / f"{name}.npz")
-    command, position = (np.array(z[k][:ROWS], float) for k in ("command", "q"))
-    for x in (command, position):
-        x[:, 5] = -0.174533 + 1523 * 2 * np.pi / 4096 * x[:, 5]
-    return command, position
+    both = np.array([z["command"][:ROWS], z["q"][:ROWS]], float)
+    both[..., 5] = -0.174533 + 1523 * 2 * np.pi / 4096 * both[..., 5]
+    return both[0], both[1]
 
 
 def main() -> None:
