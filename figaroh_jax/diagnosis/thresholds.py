@@ -44,7 +44,7 @@ CERTAIN = 0.2  # of alpha: what a name needs, for p is not uniform under coloure
 T_NAMED = 2.3  # t of the held-out squares of the cause's joints
 GAIN_NAMED = 0.25  # gain there with all other causes in
 GAIN_NAMED_ROBOT = 0.04  # the same of a cause that acts on the whole robot
-MODULATION, MODULATION_HELD_OUT = 0.3, 0.25  # squares that an amplitude which varies gains, over those of the cause
+MODULATION, MODULATION_HELD_OUT = 0.3, 0.2  # squares that an amplitude which varies gains, over those of the cause
 SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
 BESIDE_SMOOTH = 0.05  # gain of a cause of the whole robot beside smooth functions at every joint, or in their place
 
