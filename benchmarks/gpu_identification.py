@@ -4,7 +4,7 @@
 
 Robots are built here (no file): an arm of 6 and a tree of 32 revolute joints, with viscous, Coulomb, rotor and offset
 columns; torques are Pinocchio's. The source gives the same pieces of random states again and again, from the host's
-memory ("host": they travel to the devices) or from the devices' own ("device"). A fit is all of it: rows, products, rank
+memory ("host": they travel to the devices) or the devices' own ("device"). A fit is all of it: rows, products, rank
 and base parameters weighed by joint; the seconds of the host's algebra (rank and fit), which do not grow with the
 samples, are told beside. The first fit, of one piece, compiles and is told apart. Meanwhile a process that sees the CPU
 alone fits 4000 samples by `condense`, with QR factorisations in NumPy; the devices' fit of them is compared with it.
