@@ -181,32 +181,28 @@ class _ByHand:
 
     dtype = np.dtype(float)
 
-    def __init__(self, out: np.ndarray, rounds: int) -> None:
-        self.out, self.round = out, rounds
+    def __init__(self, outs: list[np.ndarray]) -> None:
+        self.outs = outs
 
     def full(self, x: Any) -> Any:
-        return jnp.full(self.out.shape[1], x)
+        return jnp.full(self.outs[0].shape[1], x)
 
     def read(self, ref: np.ndarray, first: Any, k: int) -> Number:
         return Number(jnp.asarray(ref[:, int(first) + k]))
 
-    def at(self, ref: np.ndarray, row: Any) -> Any:
-        return jnp.asarray(ref[int(row)])
+    def at(self, ref: np.ndarray, row: Any, wanted: Any = True) -> Any:
+        return jnp.where(wanted, jnp.asarray(ref[int(row)]), np.nan)
 
-    def back(self, row: Any, wanted: Any) -> Any:
-        return self.at(self.out, row)
-
-    def put(self, row: Any, numbers: Any) -> None:
-        for k, x in enumerate(numbers):
-            self.out[int(row) + k] = x
+    def put(self, ref: np.ndarray, row: Any, numbers: Any, wanted: Any = True) -> None:
+        for k, x in enumerate(numbers if np.all(wanted) else ()):
+            ref[int(row) + k] = x
 
 
-def launch_by_hand(kernel: Any, arrays: Any, shape: tuple[int, int], rounds: int = 1, interpret: bool = False) -> Any:
-    out = np.full(shape, np.nan)
+def launch_by_hand(kernel: Any, arrays: Any, shapes: list[tuple[int, int]], interpret: bool = False) -> Any:
+    outs = [np.full(shape, np.nan) for shape in shapes]
     with jax.disable_jit():
-        for n in range(rounds):
-            kernel(_ByHand(out, n), *map(np.asarray, arrays))
-    return jnp.asarray(out)
+        kernel(_ByHand(outs), *map(np.asarray, arrays))
+    return [jnp.asarray(out) for out in outs]
 
 
 @pytest.mark.parametrize("name", [*TREES, "TREE"])
@@ -214,7 +210,7 @@ def test_looped_kernels_write_what_the_plain_ones_do(name: str, tmp_path: Path, 
     """Weighted rows with columns beside; where joints share a coordinate, rows of each degree of freedom alone."""
     monkeypatch.setattr(scalar_forms, "MOST", 1)
     monkeypatch.setattr(looped_kernels, "launch_over", launch_by_hand)
-    monkeypatch.setattr(looped_kernels, "lanes_of", lambda x, lanes: jnp.broadcast_to(x.x, lanes.out.shape[1]))
+    monkeypatch.setattr(looped_kernels, "lanes_of", lambda x, lanes: jnp.broadcast_to(x.x, lanes.outs[0].shape[1]))
     model = random_tree(*TREES[name]).model if name in TREES else robots.load(getattr(robots, name), tmp_path)
     arrays, random = states(model, 3), np.random.default_rng(2)
     shared = len(model.dofs.column) > model.nv

@@ -387,14 +387,14 @@ def _in_lanes(number: Number, dtype: Any) -> Array:
 class Lanes:
     """The samples of one block in a kernel that loops: numbers of arrays (k, samples) and (samples, k) by their place.
 
-    `round` counts what is done for the same samples.
+    `outs` are the arrays that it writes.
     """
 
-    def __init__(self, triton: Any, out: Any, samples: int) -> None:
+    def __init__(self, triton: Any, outs: Sequence[Any], samples: int) -> None:
         from jax.experimental import pallas as pl
 
-        self.triton, self.out, self.dtype, self.round = triton, out, out.dtype, pl.program_id(0)
-        self.index = pl.program_id(1) * LANES + lax.iota(jnp.int32, LANES)
+        self.triton, self.outs, self.dtype = triton, outs, outs[0].dtype
+        self.index = pl.program_id(0) * LANES + lax.iota(jnp.int32, LANES)
         self.mask = self.index < samples if samples % LANES else None
 
     def full(self, x: Any) -> Array:
@@ -405,18 +405,17 @@ class Lanes:
         """Column first + k of an array (samples, _)."""
         return Number(self._load(ref.at[self.index, first + k], self.mask))
 
-    def at(self, ref: Any, row: Any) -> Array:
-        """A row of an array (_, samples)."""
-        return self._load(ref.at[row, self.index], self.mask)
+    def at(self, ref: Any, row: Any, wanted: Array | None = None) -> Array:
+        """A row of an array (_, samples), where it is wanted."""
+        return self._load(ref.at[row, self.index], self._both(wanted))
 
-    def back(self, row: Any, wanted: Array) -> Array:
-        """A row of the answer that this lane wrote before, where it is wanted."""
-        return self._load(self.out.at[row, self.index], wanted if self.mask is None else wanted & self.mask)
-
-    def put(self, row: Any, numbers: Sequence[Array]) -> None:
-        """Write rows of the answer, from `row` on."""
+    def put(self, ref: Any, row: Any, numbers: Sequence[Array], wanted: Array | None = None) -> None:
+        """Write rows of an array (_, samples) from `row` on, where they are wanted."""
         for k, x in enumerate(numbers):
-            self.triton.store(self.out.at[row + k, self.index], x, mask=self.mask)
+            self.triton.store(ref.at[row + k, self.index], x, mask=self._both(wanted))
+
+    def _both(self, wanted: Array | None) -> Array | None:
+        return self.mask if wanted is None else wanted if self.mask is None else wanted & self.mask
 
     def _load(self, at: Any, mask: Array | None) -> Array:
         return self.triton.load(at, mask=mask, other=None if mask is None else 0.0)
@@ -428,27 +427,23 @@ def lanes_of(number: Number, lanes: Lanes) -> Array:
 
 
 def launch_over(
-    kernel: Callable[..., None],
-    arrays: Sequence[Array],
-    shape: tuple[int, int],
-    rounds: int = 1,
-    interpret: bool = False,
-) -> Float[Array, "rows samples"]:
-    """What `kernel(lanes, *refs)` writes, called so many rounds for each block of samples."""
+    kernel: Callable[..., None], arrays: Sequence[Array], shapes: Sequence[tuple[int, int]], interpret: bool = False
+) -> list[Float[Array, "rows samples"]]:
+    """What `kernel(lanes, *refs)` writes into arrays of these shapes, called once for each block of samples."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    dtype = next(x.dtype for x in arrays if jnp.issubdtype(x.dtype, jnp.floating))
-    if 0 in shape:
-        return jnp.zeros(shape, dtype)
+    samples, dtype = shapes[0][1], next(x.dtype for x in arrays if jnp.issubdtype(x.dtype, jnp.floating))
+    if not samples:
+        return [jnp.zeros(shape, dtype) for shape in shapes]
     anywhere = pl.BlockSpec(memory_space=pl.ANY)
     return pl.pallas_call(
-        lambda *refs: kernel(Lanes(triton, refs[-1], shape[1]), *refs[:-1]),
-        out_shape=jax.ShapeDtypeStruct(shape, dtype),
-        grid=(rounds, ceil(shape[1] / LANES)),
+        lambda *refs: kernel(Lanes(triton, refs[len(arrays) :], samples), *refs[: len(arrays)]),
+        out_shape=[jax.ShapeDtypeStruct(shape, dtype) for shape in shapes],
+        grid=(ceil(samples / LANES),),
         in_specs=[anywhere] * len(arrays),
-        out_specs=anywhere,
+        out_specs=[anywhere] * len(shapes),
         compiler_params=None if interpret else triton.CompilerParams(num_warps=1, num_stages=1),
         interpret=interpret,
-        name=getattr(kernel, "func", kernel).__name__.strip("_"),
+        name="looped_rows",
     )(*arrays)

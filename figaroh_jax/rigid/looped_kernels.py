@@ -1,16 +1,15 @@
-"""Rows of the regressor of large trees on a GPU, by two small kernels that loop over joints and links.
+"""Rows of the regressor of large trees on a GPU, by one small kernel that loops over joints and links.
 
 A large tree written out in scalars fills several kernels of thousands of operations, which take minutes to trace and
-compile. Here a first kernel goes from joint to joint, one sample a lane, and leaves the pose and motion of every link
-in memory; a second one takes them from there and writes the columns of all links that a degree of freedom moves. Which
-joint comes next are numbers in a table, so that neither grows with the tree; what one of them does with a joint are the
-scalars of `scalars.py`. Joints are numbered depth first: the links that one moves stand side by side.
+compile. Here one kernel goes from joint to joint, one sample a lane, and at each link over the dofs that
+move it. Which joint comes next are numbers in a table, so that the kernel does not grow with the tree; what it does
+with a joint are the scalars of `scalars.py`. Axes, and links where limbs begin, are remembered in memory.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -47,14 +46,15 @@ from .scalars import (
 __all__ = ["Rows", "looped_rows"]
 
 LINK, DOF = 21, 6  # numbers of a link: rotation, origin, w, al, ac; of a degree of freedom: axis, origin of its joint
+JOINT, PAIR, SIDE = 9, 4, 2  # numbers in the tables
 
 
 class Rows(NamedTuple):
-    """Rows to be written one after another: of which degree of freedom, where each begins, and how many there are."""
+    """Arrays to be written: how long they are, and of each degree of freedom in which one its row begins, and where."""
 
-    dof: Int[np.ndarray, " rows"]
-    start: Int[np.ndarray, " rows"]
-    length: int
+    lengths: tuple[int, ...]
+    array: Int[np.ndarray, " nd"]
+    start: Int[np.ndarray, " nd"]
 
 
 class _Link(NamedTuple):
@@ -75,99 +75,145 @@ def _link(x: Sequence[Number]) -> _Link:
 
 
 class _Tree(NamedTuple):
+    """Of each joint: place of what carries it, or -1 for the joint before; its own place, or -1; first of q, of v, of
+    the dofs, behind those; kind; first of its pairs, behind those. Of each pair: dof, whether it turns, array, row."""
+
     kinds: tuple[Kind, ...]
-    joints: Int[np.ndarray, "nj 6"]  # carried by (0: world), first of q, of v, of the dofs, behind those, which kind
-    dofs: Int[np.ndarray, "nd 4"]  # joint, whether it turns, links moved, column of v
+    places: int
+    joints: Int[np.ndarray, "nj joint"]
+    pairs: Int[np.ndarray, "pairs pair"]
 
 
-@lru_cache(maxsize=64)
-def _tree(joints: tuple[Joint, ...]) -> _Tree:
-    places = dofs(joints)
-    kinds = tuple(sorted({joint.kind for joint in joints}))
-    first = [*places.first.tolist(), len(places.joint)]
-    table = [
-        [joint.parent + 1, places.positions[i].start, joint.coordinate, first[i], first[i + 1], kinds.index(joint.kind)]
-        for i, joint in enumerate(joints)
-    ]
-    moved = ancestors(joints)[places.joint].sum(1)
-    beside = np.stack([places.joint, places.turns, moved, places.column], 1)
-    return _Tree(kinds, np.array(table, np.int32), beside.astype(np.int32))
+def _tree(joints: tuple[Joint, ...], rows: Rows) -> _Tree:
+    dof, kinds = dofs(joints), tuple(sorted({joint.kind for joint in joints}))
+    over = ancestors(joints)[dof.joint] > 0
+    branching = sorted({-1, *(joint.parent for i, joint in enumerate(joints) if joint.parent != i - 1)})
+    place = {link: k for k, link in enumerate(branching)}
+    first = [*dof.first.tolist(), len(dof.joint)]
+    table, pairs = [], []
+    filled = np.array(rows.start)
+    for i, joint in enumerate(joints):
+        before = len(pairs)
+        for k in np.flatnonzero(over[:, i]):
+            pairs.append([k, dof.turns[k], rows.array[k], filled[k]])
+            filled[k] += 10
+        carried = -1 if joint.parent == i - 1 and i else place[joint.parent]
+        own = [dof.positions[i].start, joint.coordinate, first[i], first[i + 1], kinds.index(joint.kind)]
+        table.append([carried, place.get(i, -1), *own, before, len(pairs)])
+    return _Tree(kinds, len(place), np.array(table, np.int32), np.array(pairs, np.int32))
 
 
 def looped_rows(
     model: RobotModel,
     arrays: Sequence[Float[Array, "samples _"]],
-    rows: Sequence[Rows],
+    rows: Rows,
     by_ratio: bool = False,
     side: int = 0,
     interpret: bool = False,
 ) -> list[Float[Array, "length samples"]]:
-    """The columns of the links that each row's degree of freedom moves, ten a link; for each of `rows` an array.
+    """The columns of the links that each degree of freedom moves, ten a link, the links in the order of the tree.
 
-    With `by_ratio` rows of mimic joints are times their ratio. The arrays are q, v, a and, for weighted rows,
-    the roots of the weights and `side` columns a coordinate that follow those of the links, as
-    `scalar_forms.weighted_rows` takes them.
+    With `by_ratio` rows of mimic joints are times their ratio. The arrays are q, v, a and, for weighted rows, the roots
+    of the weights and `side` columns a coordinate that follow those of the links, as `scalar_forms.weighted_rows`
+    takes them.
     """
-    tree, dtype = _tree(model.joints), arrays[0].dtype
-    state = _states(model, tree, arrays, interpret)
-    ratio = jnp.asarray(model.ratio, dtype)[model.dofs.joint] if by_ratio else jnp.ones(len(tree.dofs), dtype)
-    out = []
-    for one in rows:
-        table = np.concatenate([tree.dofs[one.dof], one.dof[:, None], one.start[:, None]], axis=1).astype(np.int32)
-        kernel = partial(_write_rows, len(model.joints), side)
-        found = launch_over(
-            kernel,
-            [jnp.asarray(table.reshape(-1)), ratio[one.dof], state, *arrays[3:]],
-            (one.length, len(arrays[0])),
-            rounds=len(one.dof),
-            interpret=interpret,
-        )
-        out.append(found)
-    return out
-
-
-def _states(
-    model: RobotModel, tree: _Tree, arrays: Sequence[Array], interpret: bool
-) -> Float[Array, "numbers samples"]:
-    """Of the world and every link, then of every degree of freedom."""
-    nj, nd = tree.joints.shape[0], len(tree.dofs)
-    return launch_over(
-        partial(_write_states, nj, nd, tree.kinds),
-        [constants(model).astype(arrays[0].dtype), jnp.asarray(tree.joints.reshape(-1)), *arrays[:3]],
-        ((nj + 1) * LINK + nd * DOF, len(arrays[0])),
+    tree, dtype, places = _tree(model.joints, rows), arrays[0].dtype, model.dofs
+    ratio = jnp.asarray(model.ratio, dtype)[places.joint] if by_ratio else jnp.ones(len(places.joint), dtype)
+    behind = rows.start + 10 * ancestors(model.joints)[places.joint].sum(1).astype(int)
+    beside = np.stack([rows.array, behind], 1)[np.argsort(places.column)] if side else np.zeros((0, SIDE))
+    tables = [tree.joints, tree.pairs, beside, places.column[:, None]]
+    kernel = _Kernel(len(model.joints), len(places.joint), tree, side, [x.size for x in tables])
+    integers = np.concatenate([x.reshape(-1) for x in tables]).astype(np.int32)
+    remembered = len(places.joint) * DOF + tree.places * LINK
+    found = launch_over(
+        kernel,
+        [constants(model).astype(dtype), jnp.asarray(integers), ratio, *arrays],
+        [(length, len(arrays[0])) for length in (*rows.lengths, remembered)],
         interpret=interpret,
     )
+    return found[:-1]
 
 
-def _write_states(nj: int, nd: int, kinds: Sequence[Kind], lanes: Lanes, table: Any, tree: Any, *reads: Any) -> None:
-    def of_joint(i: Any, above: list[Array]) -> list[Array]:
-        parent, q, v, first, last, kind = (tree[6 * i + k] for k in range(6))
-        fresh = lanes.full(parent != i)  # else it is carried by the joint before, whose numbers are at hand
-        there = [lanes.back(parent * LINK + k, fresh) for k in range(LINK)]
-        above = [jnp.where(fresh, x, y) for x, y in zip(there, above, strict=True)]
-        load = partial(_load_of_one, table, nj, i, first)
-        starts = (q, v, v)
-        branches = [partial(_advance, one, lanes, load, starts, reads) for one in kinds]
-        new = branches[0](above) if len(kinds) == 1 else lax.switch(kind, branches, above)
-        lanes.put((i + 1) * LINK, new)
-        link = _link([Number(x) for x in new])
+class _Kernel:
+    """What is done for a block of samples."""
 
-        def of_dof(k: Any, count: Any) -> Any:
-            axis = tuple(Number(table[nj * PER_JOINT + 6 * k + n]) for n in range(3))
-            both = [*turned(link.rotation, axis), *link.origin]
-            lanes.put((nj + 1) * LINK + k * DOF, [lanes_of(x, lanes) for x in both])
-            return count + 1
+    def __init__(self, joints: int, dofs: int, tree: _Tree, side: int, sizes: Sequence[int]) -> None:
+        self.joints, self.dofs, self.tree, self.side = joints, dofs, tree, side
+        self.pairs_at, self.side_at, self.column_at = np.cumsum(sizes)[:3].tolist()
+        self.coordinates = sizes[2] // SIDE
 
-        lax.fori_loop(first, last, of_dof, jnp.int32(0))
-        return new
+    def __call__(self, lanes: Lanes, table: Any, integers: Any, ratio: Any, *arrays: Any) -> None:
+        """Write the rows."""
+        rest = tuple(-Number(table[self.joints * PER_JOINT + 6 * self.dofs + k]) for k in range(3))
+        world = [lanes_of(x, lanes) for x in _Link(_UNTURNED, NONE, Motion(NONE, NONE, rest)).numbers()]
+        memory = lanes.outs[-1]
+        lanes.put(memory, self.dofs * DOF, world)
 
-    gravity = [Number(table[nj * PER_JOINT + 6 * nd + k]) for k in range(3)]
-    rest = _Link(
-        ((ONE, ZERO, ZERO), (ZERO, ONE, ZERO), (ZERO, ZERO, ONE)), NONE, Motion(NONE, NONE, tuple(-x for x in gravity))
-    )
-    world = [lanes_of(x, lanes) for x in rest.numbers()]
-    lanes.put(0, world)
-    lax.fori_loop(0, nj, of_joint, world)
+        def of_joint(i: Any, above: list[Array]) -> list[Array]:
+            carried, own, q, v, first, last, kind, begin, end = (integers[JOINT * i + k] for k in range(JOINT))
+            elsewhere = lanes.full(carried >= 0)
+            there = [lanes.at(memory, self.dofs * DOF + carried * LINK + k, elsewhere) for k in range(LINK)]
+            above = [jnp.where(elsewhere, x, y) for x, y in zip(there, above, strict=True)]
+            load = partial(_load_of_one, table, self.joints, i, first)
+            branches = [partial(_advance, one, lanes, load, (q, v, v), arrays[:3]) for one in self.tree.kinds]
+            new = branches[0](above) if len(branches) == 1 else lax.switch(kind, branches, above)
+            lanes.put(memory, self.dofs * DOF + own * LINK, new, lanes.full(own >= 0))
+            link = _link([Number(x) for x in new])
+            lax.fori_loop(first, last, partial(self._axis, lanes, table, integers, ratio, arrays[3:4], link), first)
+            lax.fori_loop(begin, end, partial(self._columns, lanes, integers, link), begin)
+            return new
+
+        lax.fori_loop(0, self.joints, of_joint, world)
+        if self.side:
+            lax.fori_loop(0, self.coordinates, partial(self._beside, lanes, integers, *arrays[3:]), jnp.int32(0))
+
+    def _axis(
+        self, lanes: Lanes, table: Any, integers: Any, ratio: Any, root: Sequence[Any], link: _Link, k: Any, count: Any
+    ) -> Any:
+        """Remember the axis of degree of freedom k in the world, times the weight of its row, and its origin."""
+        axis = tuple(Number(table[self.joints * PER_JOINT + 6 * k + n]) for n in range(3))
+        weight = Number(ratio[k])
+        for one in root:
+            weight = weight * lanes.read(one, integers[self.column_at + k], 0)
+        numbers = [*scaled(turned(link.rotation, axis), weight), *link.origin]
+        lanes.put(lanes.outs[-1], k * DOF, [lanes_of(x, lanes) for x in numbers])
+        return count + 1
+
+    def _columns(self, lanes: Lanes, integers: Any, link: _Link, k: Any, count: Any) -> Any:
+        """Write the ten columns of the link in the row of a degree of freedom."""
+        dof, turns, array, row = (integers[self.pairs_at + PAIR * k + n] for n in range(PAIR))
+        six = [Number(lanes.at(lanes.outs[-1], dof * DOF + n)) for n in range(DOF)]
+        turning, axis, origin = Number(turns.astype(lanes.dtype)), tuple(six[:3]), tuple(six[3:])
+        about, along = scaled(axis, turning), scaled(axis, ONE - turning)
+        arm = tuple(x - y for x, y in zip(link.origin, origin, strict=True))
+        linear = turned_back(link.rotation, add(cross(about, arm), along))
+        twist = Twist(0, linear, turned_back(link.rotation, about))
+        ten = [lanes_of(x, lanes) for x in ten_columns(twist, link.motion, spin_of(link.motion))]
+        self._put(lanes, array, row, ten)
+        return count + 1
+
+    def _beside(self, lanes: Lanes, integers: Any, root: Any, given: Any, k: Any, count: Any) -> Any:
+        """Write the weighed columns of coordinate k that follow those of the links."""
+        array, row = (integers[self.side_at + SIDE * k + n] for n in range(SIDE))
+        weight = lanes.read(root, k, 0)
+        own = [lanes_of(lanes.read(given, k * self.side, n) * weight, lanes) for n in range(self.side)]
+        self._put(lanes, array, row, own)
+        return count + 1
+
+    def _put(self, lanes: Lanes, array: Any, row: Any, numbers: list[Array]) -> None:
+        outs = lanes.outs[:-1]
+        if len(outs) == 1:
+            lanes.put(outs[0], row, numbers)
+            return
+
+        def write(out: Any, row: Any, *numbers: Array) -> Any:
+            lanes.put(out, row, numbers)
+            return row
+
+        lax.switch(array, [partial(write, out) for out in outs], row, *numbers)
+
+
+_UNTURNED: Matrix = ((ONE, ZERO, ZERO), (ZERO, ONE, ZERO), (ZERO, ZERO, ONE))
 
 
 def _load_of_one(table: Any, nj: int, joint: Any, dof: Any, k: int) -> Any:
@@ -191,29 +237,3 @@ def _advance(
     motion = moved_by(robot, 0, pose, before.motion, spin_of(before.motion), v, a)
     origin = add(before.origin, turned(before.rotation, pose.origin))
     return [lanes_of(x, lanes) for x in _Link(product(before.rotation, pose.matrix()), origin, motion).numbers()]
-
-
-def _write_rows(nj: int, side: int, lanes: Lanes, table: Any, ratio: Any, state: Any, *given: Any) -> None:
-    joint, turns, links, column, dof, start = (table[6 * lanes.round + k] for k in range(6))
-    weight = Number(ratio[lanes.round])
-    if given:
-        weight = weight * lanes.read(given[0], column, 0)
-    first = (nj + 1) * LINK + dof * DOF
-    six = [Number(lanes.at(state, first + k)) for k in range(DOF)]
-    turning = Number(turns.astype(lanes.dtype))
-    axis, origin = scaled(tuple(six[:3]), weight), tuple(six[3:])
-    about, along = scaled(axis, turning), scaled(axis, ONE - turning)
-
-    def of_link(k: Any, row: Any) -> Any:
-        link = _link([Number(lanes.at(state, (joint + 1 + k) * LINK + n)) for n in range(LINK)])
-        arm = tuple(x - y for x, y in zip(link.origin, origin, strict=True))
-        linear = turned_back(link.rotation, add(cross(about, arm), along))
-        twist = Twist(0, linear, turned_back(link.rotation, about))
-        ten = ten_columns(twist, link.motion, spin_of(link.motion))
-        lanes.put(row, [lanes_of(x, lanes) for x in ten])
-        return row + 10
-
-    row = lax.fori_loop(0, links, of_link, start)
-    if side:
-        root = lanes.read(given[0], column, 0)
-        lanes.put(row, [lanes_of(lanes.read(given[1], column * side, k) * root, lanes) for k in range(side)])

@@ -70,7 +70,7 @@ def normal_matrix(
     """
     rows = _rows(model, q, v, a, tau, weight, extra)
     columns = 10 * len(model.joints) + (0 if extra is None else np.shape(extra)[-1]) + 1
-    on_gpu = usable(*rows)
+    on_gpu = usable(*rows) and len(rows.q) > 0
     groups = _groups(model, columns, whole=on_gpu)
     library: Any = np if on_host(model, rows) else jnp
     start = tuple(library.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)

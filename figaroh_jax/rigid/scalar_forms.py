@@ -190,23 +190,23 @@ def looped(model: RobotModel, coordinates: bool) -> bool:
 def _looped_blocks(coordinates: bool, model: RobotModel, *arrays: Array) -> Array | None:
     if not looped(model, coordinates):
         return None
-    dof, first, count = np.unique(_rows(model, False)[:, 0], return_index=True, return_counts=True)
-    if coordinates:  # in the order of the coordinates
-        dof, count = np.argsort(model.dofs.column), count[np.argsort(model.dofs.column)]
-        first = np.cumsum(count) - count
-    rows = Rows(dof, 10 * first, 10 * int(count.sum()))
-    (found,) = looped_rows(model, arrays, [rows], by_ratio=coordinates)
+    order = np.argsort(model.dofs.column) if coordinates else np.arange(len(model.dofs.column))
+    moved = ancestors(model.joints)[model.dofs.joint].sum(1).astype(int)
+    start = np.empty_like(moved)
+    start[order] = 10 * (np.cumsum(moved[order]) - moved[order])
+    rows = Rows((10 * int(moved.sum()),), np.zeros_like(moved), start)
+    (found,) = looped_rows(model, arrays, rows, by_ratio=coordinates)
     return found.reshape(-1, 10, found.shape[-1])
 
 
 def _looped_weighted_rows(side: int, model: RobotModel, *arrays: Array) -> list[Array] | None:
     if not looped(model, True):
         return None
-    of_coordinate, lengths = np.argsort(model.dofs.column), _row_lengths(side, model)
-    rows = [
-        Rows(of_coordinate[group], length * np.arange(len(group)), len(group) * length)
-        for group, (_, length) in zip(row_groups(model), lengths, strict=True)
-    ]
+    lengths, (group, start) = _row_lengths(side, model), np.zeros((2, model.nv), int)
+    for k, members in enumerate(row_groups(model)):
+        group[members], start[members] = k, lengths[k][1] * np.arange(len(members))
+    column = model.dofs.column
+    rows = Rows(tuple(n * length for n, length in lengths), group[column], start[column])
     found = looped_rows(model, arrays, rows, by_ratio=True, side=side)
     return [x.reshape(*shape, -1) for x, shape in zip(found, lengths, strict=True)]
 
