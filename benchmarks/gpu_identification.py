@@ -24,7 +24,7 @@ from typing import Any
 
 import jax
 import numpy as np
-import pinocchio as pin
+import pinocchio as pin  # pyright: ignore[reportMissingImports]
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from figaroh_jax.compiled.executable_cache import keep_programs

@@ -84,8 +84,12 @@ class _Tree(NamedTuple):
     pairs: Int[np.ndarray, "pairs pair"]
 
 
+def _kinds(joints: tuple[Joint, ...]) -> tuple[Kind, ...]:
+    return tuple(sorted({joint.kind for joint in joints}))
+
+
 def _tree(joints: tuple[Joint, ...], rows: Rows) -> _Tree:
-    dof, kinds = dofs(joints), tuple(sorted({joint.kind for joint in joints}))
+    dof, kinds = dofs(joints), _kinds(joints)
     over = ancestors(joints)[dof.joint] > 0
     branching = sorted({-1, *(joint.parent for i, joint in enumerate(joints) if joint.parent != i - 1)})
     place = {link: k for k, link in enumerate(branching)}
