@@ -6,7 +6,10 @@ as a prior of stated width, and every interval says which of the two it comes fr
 
 The table is de Leva's (Adjustments to Zatsiorsky-Seluyanov's segment inertia parameters, Journal of Biomechanics 29(9),
 1223-1230, 1996, table 4): shares of the body mass, distance of the centre of mass from the proximal joint and radii of
-gyration (about the antero-posterior, the lateral and the long axis) in shares of the segment's length.
+gyration (about the antero-posterior, the lateral and the long axis) in shares of the segment's length. Lengths are
+those between joint centres (the table's rows SJC-EJC, EJC-WJC, HJC-KJC and KJC-AJC), for a model has joints there; the
+rows from the knee to a malleolus are another length. The numbers were compared with two public copies of the table, of
+BMClab (all agree) and of biobuddy (all but a rounding of the head's mass and its shank, which ends at the malleolus).
 """
 
 from __future__ import annotations
@@ -76,8 +79,8 @@ _TABLE: dict[str, dict[Sex, _Segment]] = {
         "male": _Segment(0.1416, 0.4095, (0.329, 0.329, 0.149)),
     },
     "shank": {
-        "female": _Segment(0.0481, 0.4416, (0.271, 0.267, 0.093)),
-        "male": _Segment(0.0433, 0.4459, (0.255, 0.249, 0.103)),
+        "female": _Segment(0.0481, 0.4352, (0.267, 0.263, 0.092)),
+        "male": _Segment(0.0433, 0.4395, (0.251, 0.246, 0.102)),
     },
     "foot": {"female": _Segment(0.0129, 0, (0, 0, 0)), "male": _Segment(0.0137, 0, (0, 0, 0))},
 }
