@@ -154,7 +154,7 @@ def test_segments_are_found_by_the_roots_wrench_alone(tmp_path: Path) -> None:
         [trial(robot, truth, 11, pin.Inertia(3.0, np.array([0.05, -0.3, 0.1]), 0.003 * np.eye(3)))], found
     )
     assert carried.link == "shank"
-    assert abs(carried.mass - 3.0) < 0.45
+    assert abs(carried.mass - 3.0) < min(0.45, 3 * carried.std)
 
 
 def plate_wrench(path: str, robot: fj.RobotModel, q0: np.ndarray, x: np.ndarray, link: str) -> np.ndarray:

@@ -321,7 +321,8 @@ def name_payload(
     """The segment at which a person carries a load, by recordings with it and the `Segments` found without.
 
     At each place a load of ten parameters, believed to be up to `heaviest` kg within 0.3 m of the joint, is fitted to
-    the residual; the place that explains most is named. `places`: names of links (default: all segments).
+    the residual; the place that explains most is named. `places`: names of links (default: all segments). The standard
+    deviation of the mass holds the noise of these recordings and what the person's own parameters may be off.
     """
     model, results, costs = person.model, {}, {}
     size = np.array([heaviest / 2, *[heaviest * 0.15] * 3, *[heaviest * 0.05] * 6])
@@ -330,6 +331,10 @@ def name_payload(
     weight = np.sqrt(person.samples / max(1, len(gone))) / person.noise
     zeros, b = _zeros(loaded), (gone * weight).reshape(-1)
     wide = np.tile(_OFFSET, len(loaded))
+    index = [model.link_index(link) for link in person.links]
+    columns = np.concatenate([10 * i + np.arange(10) for i in index])
+    person_rows = np.concatenate([W[:, :, columns] for W in rows]) * weight[:, None]
+    unsure = person_rows.reshape(len(b), -1) @ np.linalg.cholesky(person.covariance)
     for place in ("", *(places or person.links)):
         own = np.concatenate([W[:, :, 10 * model.link_index(place) :][:, :, :10] for W in rows]) if place else zeros
         X = np.concatenate([own, zeros] if place else [zeros], axis=2) * weight[:, None]
@@ -339,7 +344,9 @@ def name_payload(
         costs[place] = float(b @ b - b @ A @ x)
         if not place:
             continue
-        results[place] = float(x[0]), float(np.sqrt(np.linalg.inv(normal)[0, 0]))
+        inverse = np.linalg.inv(normal)
+        of_person = inverse[0] @ (A.T @ unsure)  # what the person's own parameters may be off
+        results[place] = float(x[0]), float(np.sqrt(inverse[0, 0] + of_person @ of_person))
     best = min(results, key=lambda place: costs[place])
     mass, std = results[best]
     return Payload(best, mass, std, costs)
