@@ -6,7 +6,8 @@ Each person is 5-20 % off the model in every segment's length and inertial param
 skin and are seen to 2 mm; plates have noise and a zero of their own in every trial. A line is a person: RMS error of
 the root's force (% of body weight) and moment (% of its RMS) on an unseen trial, against plates without errors, with
 the identified person, the scaled one with the table alone and the unscaled model; error of mass (%) and centre of mass
-(mm); share of the parameters within their 95 % intervals.
+(mm); share of the parameters within their 95 % intervals. `--load`: one more trial, with 3 to 8 kg at a hand, the head
+or the thorax, for `name_payload`: the link that it names of all segments, and the mass.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -46,6 +48,7 @@ def main() -> None:
     parser.add_argument(
         "--exact", choices=["sizes", "all"], help="true sizes, or true sizes and positions: what is left"
     )
+    parser.add_argument("--load", action="store_true", help="a load that the person carries is to be named")
     parser.add_argument("--save", type=Path, help="folder for a file of errors and intervals for each person")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -56,10 +59,13 @@ def main() -> None:
     for k in range(options.people):
         start = time.perf_counter()
         skin = {"tissue": options.tissue, "noise": options.noise}
-        line = study(np.random.default_rng(options.seed + k), options.seconds, options.trials, skin, options.exact)
+        rng = np.random.default_rng(options.seed + k)
+        line = study(rng, options.seconds, options.trials, skin, options.exact, options.load)
         force, moment = ("".join(f"{x:8.2f}" for x in line[key]) for key in ("force", "moment"))
         rest = f"{line['mass']:8.2f}{line['com']:8.2f}{line['size']:8.2f}{line['covered']:7.2f}"
         print(f"{options.seed + k:6}{'':4}{force}{moment}{rest}{time.perf_counter() - start:6.0f}", flush=True)
+        if options.load:
+            print("{:6}  load {:.1f} kg at {}: named {:.1f} +- {:.1f} kg at {}".format(options.seed + k, *line["load"]))
         if options.save is not None:
             options.save.mkdir(parents=True, exist_ok=True)
             np.savez(options.save / f"{options.exact}_{options.tissue}_{options.seed + k}.npz", **line)
@@ -87,6 +93,7 @@ def study(
     trials: int,
     skin: dict[str, float] | None = None,
     exact: str | None = None,
+    load: bool = False,
 ) -> dict:
     """One person from end to end."""
     skin = skin or {}
@@ -105,7 +112,28 @@ def study(
     table = people.anthropometric(robot, weight / 9.81, "male", np.asarray(data.scale))
     found = people.identify_segments(captures, table)
     unscaled = captured(robot, own, None, unseen)
-    return judged(person, robot, found, table, judge, unscaled, data, unseen)
+    line = judged(person, robot, found, table, judge, unscaled, data, unseen)
+    if load:
+        link, what = carried(rng)
+        joint = joint_of[link]
+        trial = simulated.record(person, rng, seconds, **skin, load=(joint, what))
+        named = people.name_payload([captured(robot, own, data, trial, known)[0]], found)
+        line["load"] = what.mass, link, named.mass, named.std, named.link
+    return line
+
+
+def carried(rng: np.random.Generator) -> tuple[str, Any]:
+    """A load and the link that carries it: a dumbbell, a rucksack or a helmet, about the link's frame."""
+    import pinocchio as pin  # pyright: ignore[reportMissingImports]
+
+    link, at, size = (
+        ("left_hand", [0.0, -0.08, 0.0], 0.1),
+        ("right_hand", [0.0, -0.08, 0.0], 0.1),
+        ("middle_thorax", [-0.18, 0.15, 0.0], 0.25),
+        ("middle_head", [0.0, 0.15, 0.0], 0.15),
+    )[rng.integers(4)]
+    mass = float(rng.uniform(3.0, 8.0))
+    return link, pin.Inertia(mass, np.array(at) + rng.normal(0, 0.02, 3), mass * size**2 / 6 * np.eye(3))
 
 
 def size(robot, own, trials):

@@ -6,7 +6,10 @@ as a prior of stated width, and every interval says which of the two it comes fr
 
 The table is de Leva's (Adjustments to Zatsiorsky-Seluyanov's segment inertia parameters, Journal of Biomechanics 29(9),
 1223-1230, 1996, table 4): shares of the body mass, distance of the centre of mass from the proximal joint and radii of
-gyration (about the antero-posterior, the lateral and the long axis) in shares of the segment's length.
+gyration (about the antero-posterior, the lateral and the long axis) in shares of the segment's length. Lengths are
+those between joint centres (the table's rows SJC-EJC, EJC-WJC, HJC-KJC and KJC-AJC), for a model has joints there; the
+rows from the knee to a malleolus are another length. The numbers were compared with two public copies of the table, of
+BMClab (all agree) and of biobuddy (all but a rounding of the head's mass and its shank, which ends at the malleolus).
 """
 
 from __future__ import annotations
@@ -76,8 +79,8 @@ _TABLE: dict[str, dict[Sex, _Segment]] = {
         "male": _Segment(0.1416, 0.4095, (0.329, 0.329, 0.149)),
     },
     "shank": {
-        "female": _Segment(0.0481, 0.4416, (0.271, 0.267, 0.093)),
-        "male": _Segment(0.0433, 0.4459, (0.255, 0.249, 0.103)),
+        "female": _Segment(0.0481, 0.4352, (0.267, 0.263, 0.092)),
+        "male": _Segment(0.0433, 0.4395, (0.251, 0.246, 0.102)),
     },
     "foot": {"female": _Segment(0.0129, 0, (0, 0, 0)), "male": _Segment(0.0137, 0, (0, 0, 0))},
 }
@@ -318,7 +321,8 @@ def name_payload(
     """The segment at which a person carries a load, by recordings with it and the `Segments` found without.
 
     At each place a load of ten parameters, believed to be up to `heaviest` kg within 0.3 m of the joint, is fitted to
-    the residual; the place that explains most is named. `places`: names of links (default: all segments).
+    the residual; the place that explains most is named. `places`: names of links (default: all segments). The standard
+    deviation of the mass holds the noise of these recordings and what the person's own parameters may be off.
     """
     model, results, costs = person.model, {}, {}
     size = np.array([heaviest / 2, *[heaviest * 0.15] * 3, *[heaviest * 0.05] * 6])
@@ -327,6 +331,10 @@ def name_payload(
     weight = np.sqrt(person.samples / max(1, len(gone))) / person.noise
     zeros, b = _zeros(loaded), (gone * weight).reshape(-1)
     wide = np.tile(_OFFSET, len(loaded))
+    index = [model.link_index(link) for link in person.links]
+    columns = np.concatenate([10 * i + np.arange(10) for i in index])
+    person_rows = np.concatenate([W[:, :, columns] for W in rows]) * weight[:, None]
+    unsure = person_rows.reshape(len(b), -1) @ np.linalg.cholesky(person.covariance)
     for place in ("", *(places or person.links)):
         own = np.concatenate([W[:, :, 10 * model.link_index(place) :][:, :, :10] for W in rows]) if place else zeros
         X = np.concatenate([own, zeros] if place else [zeros], axis=2) * weight[:, None]
@@ -336,7 +344,9 @@ def name_payload(
         costs[place] = float(b @ b - b @ A @ x)
         if not place:
             continue
-        results[place] = float(x[0]), float(np.sqrt(np.linalg.inv(normal)[0, 0]))
+        inverse = np.linalg.inv(normal)
+        of_person = inverse[0] @ (A.T @ unsure)  # what the person's own parameters may be off
+        results[place] = float(x[0]), float(np.sqrt(inverse[0, 0] + of_person @ of_person))
     best = min(results, key=lambda place: costs[place])
     mass, std = results[best]
     return Payload(best, mass, std, costs)
