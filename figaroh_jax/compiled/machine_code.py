@@ -237,7 +237,7 @@ def _built(source: str, *flags: str) -> bytes | None:
 
 
 def library(source: str, *flags: str) -> ctypes.CDLL | None:
-    """A file of C as a library in memory, compiled once and kept as robots' programs are; None where none can be made."""
+    """A file of C as a library in memory, compiled once and kept as robots' programs are; None where none is made."""
     flags = (*LIBRARY_FLAGS, *flags, "-x", "c", "-", "-lm")
     store = _store() if _compiler() is not None else None
     name = hashlib.blake2b(repr((source, surroundings(), flags, _version())).encode(), digest_size=20).hexdigest()
