@@ -7,7 +7,9 @@ skin and are seen to 2 mm; plates have noise and a zero of their own in every tr
 the root's force (% of body weight) and moment (% of its RMS) on an unseen trial, against plates without errors, with
 the identified person, the scaled one with the table alone and the unscaled model; error of mass (%) and centre of mass
 (mm); share of the parameters within their 95 % intervals. `--load`: one more trial, with 3 to 8 kg at a hand, the head
-or the thorax, for `name_payload`: the link that it names of all segments, and the mass.
+or the thorax, for `name_payload`: the link that it names of all segments, and the mass. `--motion BASIS`: in place of
+all this the motion of the whole person (39 joints) on the left foot that tells most of the segments by the plate below,
+within the limits of the joints and in balance: seconds, the largest share of each limit at 1 kHz, what it tells.
 """
 
 from __future__ import annotations
@@ -34,6 +36,13 @@ from figaroh_jax.rigid.inertia import to_com  # noqa: E402
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 URDF = DATA / "human_model" / "human.urdf"
 CUTOFF = 2.5  # Hz: the motions have nothing above 0.9 Hz
+BASES = {
+    "fourier": fj.fourier(3, 0.2, 5.0),
+    "slow": fj.fourier(3, 0.1, 10.0),
+    "long": fj.fourier(5, 0.1, 10.0),
+    "spline": fj.spline(6, 6.0),
+    "quintic": fj.quintic(6, 10.0),
+}
 FRAMES = 24  # of each trial, by which sizes are found: skin slides slowly, and one trial is little
 
 
@@ -49,9 +58,14 @@ def main() -> None:
         "--exact", choices=["sizes", "all"], help="true sizes, or true sizes and positions: what is left"
     )
     parser.add_argument("--load", action="store_true", help="a load that the person carries is to be named")
+    parser.add_argument("--motion", choices=BASES, help="design a motion of all joints")
+    parser.add_argument("--starts", type=int, default=1, help="of the design of a motion")
     parser.add_argument("--save", type=Path, help="folder for a file of errors and intervals for each person")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    if options.motion:
+        motion(options.motion, options.starts, options.seed)
+        return
     print(
         f"{'person':>6}{'':4}{'force % BW':>24}{'moment %':>24}{'mass %':>8}{'com mm':>8}{'size %':>8}{'95 %':>7}   s"
     )
@@ -69,6 +83,36 @@ def main() -> None:
         if options.save is not None:
             options.save.mkdir(parents=True, exist_ok=True)
             np.savez(options.save / f"{options.exact}_{options.tissue}_{options.seed + k}.npz", **line)
+
+
+def motion(basis: str, starts: int, seed: int) -> None:
+    """A motion of all joints on one foot, as a user asks for it."""
+    clock = [time.perf_counter()]
+    robot = fj.load_urdf(URDF, root="free_flyer")
+    upright = np.zeros(robot.nq)
+    upright[:7] = [0.0, 0.0, 0.95, np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]  # the model's y is up
+    person = people.standing(robot, "left_foot", upright, support=(0.1, 0.05))
+    start = people.balanced(person)
+    clock.append(time.perf_counter())
+    sigma = dict(zip(people.PLATE, [3.0, 3.0, 3.0, 1.0, 1.0, 1.0], strict=True))  # N, N m
+    still = fj.Baseline(viscous=False, coulomb=False)
+    learned = fj.learn(person, still, measured=sigma, hold=people.PLATE, trust=0.25)
+    limits = fj.limits_of(person, velocity=3.0, acceleration=10.0, scale=0.95)
+    clock.append(time.perf_counter())
+    found = fj.excite(person, BASES[basis], limits, learned, start=start, starts=starts, seed=seed)
+    clock.append(time.perf_counter())
+    stage, told = found.stages[0], found.std / found.std_before
+    print(
+        f"{basis}, {person.nv - 6} joints, {starts} starts, seed {seed}: limits {'met' if stage.met else 'NOT met'};"
+        " {:.0f} s to balance, {:.0f} s to learn, {:.0f} s to design,".format(*np.diff(clock)),
+        f"{stage.evaluations} evaluations, {time.process_time():.0f} CPU s in all",
+    )
+    print("  " + ", ".join(f"{use.kind} {use.joint} {100 * use.share:.1f} %" for use in stage.uses))
+    print(
+        f"  log determinant {stage.logdet:.1f}; of {learned.rank} base parameters {(told < 0.5).sum()} are told better"
+        f" than by the table by half, {(told < 0.8).sum()} by a fifth",
+        flush=True,
+    )
 
 
 def places(robot: fj.RobotModel) -> dict[str, tuple[str, np.ndarray]]:
@@ -96,14 +140,14 @@ def study(
     load: bool = False,
 ) -> dict:
     """One person from end to end."""
-    skin = skin or {}
+    slide, seen = (skin or {}).get("tissue", 0.005), (skin or {}).get("noise", 0.002)
     robot = fj.load_urdf(URDF, root="free_flyer")
     person = simulated.make_person(str(URDF), rng)
     own = places(robot)
     joint_of = {joint.link: joint.name for joint in robot.joints}
     simulated.put_markers(person, {label: (joint_of[link], at) for label, (link, at) in own.items()}, rng)
-    fitted = [simulated.record(person, rng, seconds, **skin) for _ in range(trials)]
-    unseen = simulated.record(person, rng, seconds, **skin)
+    fitted = [simulated.record(person, rng, seconds, slide, seen) for _ in range(trials)]
+    unseen = simulated.record(person, rng, seconds, slide, seen)
     data = size(robot, own, fitted) if exact is None else true_size(robot, own, person, fitted[0])
     known = person if exact == "all" else None
     captures = [captured(robot, own, data, trial, known)[0] for trial in fitted]
@@ -116,7 +160,7 @@ def study(
     if load:
         link, what = carried(rng)
         joint = joint_of[link]
-        trial = simulated.record(person, rng, seconds, **skin, load=(joint, what))
+        trial = simulated.record(person, rng, seconds, slide, seen, (joint, what))
         named = people.name_payload([captured(robot, own, data, trial, known)[0]], found)
         line["load"] = what.mass, link, named.mass, named.std, named.link
     return line

@@ -23,9 +23,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from ..errors import InputError
+from ..errors import InputError, nearest
 from ..estimation.consistency import bodies, physical_fit
 from ..estimation.markers import scaled, segments_of
+from ..rigid.dynamics import inverse_dynamics
 from ..rigid.inertia import from_com, to_com, transform
 from ..rigid.kinematics import forward_kinematics
 from ..rigid.manifold import difference
@@ -38,6 +39,7 @@ __all__ = [
     "Payload",
     "Segments",
     "anthropometric",
+    "balanced",
     "capture",
     "identify_segments",
     "name_payload",
@@ -97,6 +99,7 @@ _WORDS = {  # of links' names
 _OFFSET = np.array([2.0, 2.0, 2.0, 0.5, 0.5, 0.5])  # N, N m: one sigma of a plate's zero
 _SIX = (np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2]))  # of a moment: xx xy yy xz yz zz
 _SEGMENT = 1e-5  # of the body's mass: what has less stands in the model for its joints alone
+_PRESSED = 3e-3  # m of the centre of pressure that weigh as much as a joint's half range
 _EDGE = 0.5  # s at either end of a recording, which a filter of few hertz bends
 
 
@@ -407,6 +410,61 @@ def standing(
             effort,
         ),
     )
+
+
+def balanced(
+    person: RobotModel,
+    near: Float[np.ndarray, " nv"] | None = None,
+    hold: Sequence[str] = (),
+    room: float = 0.1,
+) -> Float[np.ndarray, " nv"]:
+    """The posture of a `standing` person nearest to `near` whose weight presses on the middle of the support.
+
+    A motion begins at rest, so this is where one may begin (`excite(start=...)`). `near` (rad; default: all zero) is
+    measured in shares of the joints' ranges; `hold` names joints that stay as they are there, `room` is the share of
+    each range that is left free at either end. Raises `InputError` for a model that is not of `standing`, and where no
+    posture within the limits is in balance.
+    """
+    from scipy.optimize import least_squares
+
+    if person.dof_names[:6] != PLATE:
+        raise InputError(f"balanced: '{person.name}' stands on no plate; `standing` makes the model of one who does")
+    given = np.zeros(person.nv) if near is None else np.asarray(near, float)
+    if given.shape != (person.nv,) or not np.isfinite(given).all():
+        raise InputError(f"balanced: near has shape {given.shape}; ({person.nv},) finite numbers are expected")
+    unknown = sorted({*hold} - {*person.dof_names})
+    if unknown:
+        raise InputError(f"balanced: hold: no moving joint '{unknown[0]}'{nearest(unknown[0], person.dof_names)}")
+    moved = np.array([k for k, name in enumerate(person.dof_names) if k > 5 and name not in hold], int)
+    low, high = np.clip(np.asarray(person.position_limit, float)[moved].T, -np.pi, np.pi)
+    half = (high - low) / 2
+    low, high = low + 2 * room * half, high - 2 * room * half
+    first = np.clip(given[moved], low + 1e-6 * half, high - 1e-6 * half)
+    weight = float(np.asarray(person.inertia)[:, 0].sum() * np.linalg.norm(np.asarray(person.gravity)))
+    step, count = 1e-5, len(moved)
+
+    def off(x: np.ndarray) -> np.ndarray:  # of the centre of pressure, m
+        q = np.tile(given, (len(x), 1))
+        q[:, moved] = x
+        return np.asarray(inverse_dynamics(person, q, 0 * q, 0 * q))[:, 3:5] / weight
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([off(x[None])[0] / _PRESSED, (x - first) / half])
+
+    def slope(x: np.ndarray) -> np.ndarray:
+        both = off(np.concatenate([x + step * np.eye(count), x - step * np.eye(count)]))
+        return np.concatenate([(both[:count] - both[count:]).T / (2 * step * _PRESSED), np.diag(1 / half)])
+
+    found = least_squares(residual, first, slope, bounds=(low, high), ftol=1e-5)  # pyright: ignore[reportArgumentType]
+    left = float(np.abs(off(found.x[None])).max())
+    if left > 3 * _PRESSED:
+        raise InputError(
+            f"balanced: the centre of pressure stays {1e3 * left:.0f} mm off in the best posture within the limits;"
+            " free more joints, or let the plate stand elsewhere"
+        )
+    given = given.copy()
+    given[moved] = found.x
+    return given
 
 
 class _Tree(NamedTuple):
