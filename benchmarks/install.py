@@ -5,20 +5,23 @@
 The library is installed from this checkout without extras into a new environment; then each extra into a copy of that,
 by pip with what it keeps of earlier downloads (`pip cache purge` first for a bare machine). MB are what an extra adds
 on disk, without compiled Python (`--no-compile`). The first use is a process of its own: it imports the library, makes
-the smallest thing that needs the extra and calls it, with an empty store of compiled programs. `genesis` needs torch,
-for which pip takes the build for CUDA unless a CPU build is installed before it or found by `PIP_FIND_LINKS`.
+the smallest thing that needs the extra and calls it, with an empty store of compiled programs. CPU seconds stand beside
+those of the wall, which count what else the machine does. `genesis` needs torch, for which pip takes the build for CUDA
+unless a CPU build is installed before it or found by `PIP_FIND_LINKS`.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import resource
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 BACKEND = """
@@ -69,29 +72,39 @@ def main() -> None:
     folder = Path(tempfile.mkdtemp(dir=options.folder, prefix="install_"))
     try:
         base = folder / "base"
-        start = time.perf_counter()
         subprocess.run([sys.executable, "-m", "venv", str(base)], check=True)
-        seconds, size = _installed(base, "", time.perf_counter() - start), _megabytes(base)
-        print(f"{'extra':12}{'install s':>10}{'MB more':>9}{'first use s':>13}", flush=True)
-        print(f"{'(none)':12}{seconds:10.0f}{size:9.0f}{_used(base, '', folder):13.1f}", flush=True)
+        print(f"{'extra':12}{'install s':>10}{'CPU s':>7}{'MB more':>9}{'first use s':>13}{'CPU s':>7}", flush=True)
+        _line("(none)", _installed(base, ""), size := _megabytes(base), _used(base, "", folder))
         for name in options.extras:
             own = folder / name
             shutil.copytree(base, own, symlinks=True)
-            seconds = _installed(own, f"[{name}]")
-            print(f"{name:12}{seconds:10.0f}{_megabytes(own) - size:9.0f}{_used(own, name, folder):13.1f}", flush=True)
+            _line(name, _installed(own, f"[{name}]"), _megabytes(own) - size, _used(own, name, folder))
             shutil.rmtree(own)
     finally:
         shutil.rmtree(folder)
 
 
-def _installed(environment: Path, extra: str, before: float = 0.0) -> float:
+def _line(name: str, installed: tuple[float, float], size: float, used: tuple[float, float]) -> None:
+    (wall, cpu), (first, busy) = installed, used
+    print(f"{name:12}{wall:10.0f}{cpu:7.0f}{size:9.0f}{first:13.1f}{busy:7.1f}", flush=True)
+
+
+def _timed(command: list[str], **options: Any) -> tuple[subprocess.CompletedProcess[str], tuple[float, float]]:
+    """A finished process, and its seconds: of the wall and of CPU."""
+    start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run(command, capture_output=True, text=True, **options)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return done, (time.perf_counter() - start, busy)
+
+
+def _installed(environment: Path, extra: str) -> tuple[float, float]:
     """Seconds of `pip install '.[extra]'`."""
-    start = time.perf_counter()
-    command = [str(environment / "bin" / "python"), "-m", "pip", "install", "--no-compile", "--quiet", f"{ROOT}{extra}"]
-    done = subprocess.run(command, capture_output=True, text=True)
+    pip = [str(environment / "bin" / "python"), "-m", "pip", "install", "--no-compile", "--quiet", f"{ROOT}{extra}"]
+    done, seconds = _timed(pip)
     if done.returncode:
         raise SystemExit(f"pip install '.{extra}' failed:\n{done.stderr[-2000:]}")
-    return before + time.perf_counter() - start
+    return seconds
 
 
 def _megabytes(environment: Path) -> float:
@@ -99,19 +112,17 @@ def _megabytes(environment: Path) -> float:
     return sum(file.lstat().st_size for file in files) / 1e6
 
 
-def _used(environment: Path, extra: str, folder: Path) -> float:
+def _used(environment: Path, extra: str, folder: Path) -> tuple[float, float]:
     """Seconds of the first process that uses it."""
     home = folder / f"home_{extra}"
     home.mkdir()
     bare = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "JAX_COMPILATION_CACHE_DIR")}
     variables = bare | {"HOME": str(home), "XDG_CACHE_HOME": str(home), "JAX_PLATFORMS": "cpu"}
-    start = time.perf_counter()
-    command = [str(environment / "bin" / "python"), "-c", USES[extra]]
-    done = subprocess.run(command, capture_output=True, text=True, env=variables, cwd=home)
+    done, seconds = _timed([str(environment / "bin" / "python"), "-c", USES[extra]], env=variables, cwd=home)
     if done.returncode:
         print(f"{extra or '(none)'}: its first use failed:\n{done.stderr[-1500:]}", file=sys.stderr, flush=True)
-        return float("nan")
-    return time.perf_counter() - start
+        return float("nan"), float("nan")
+    return seconds
 
 
 if __name__ == "__main__":
