@@ -14,6 +14,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import platform
 import shlex
 import shutil
 import subprocess
@@ -44,6 +45,8 @@ FARTHEST = 1e5  # rad, to which `sine_cosine` is exact
 PATIENCE = 300.0  # s that a compiler may take
 FLAGS = ("-O1", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared", "-w", "-x", "c", "-")
 LIBRARY_FLAGS = ("-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared", "-w")
+if platform.machine() in ("x86_64", "AMD64"):
+    LIBRARY_FLAGS += ("-mprefer-vector-width=512",)
 
 _HEAD = """
 #include <stddef.h>

@@ -203,10 +203,11 @@ def _searched(
     progress: Callable[[str, float], None],
     generator: np.random.Generator,
 ) -> _Searched:
-    """The causes that the data show; where a rest stays, without the effects that any rest looks like.
+    """The causes that the data show; where a rest stays, without the laws of one joint that any rest looks like.
 
     Beside a rest those (`Effect.beside_rest`) are not named, and take the place of causes that could be: the search is
-    taken up again from where the first of them came in.
+    taken up again from where the first of them came in. Such an effect of the whole robot stays: what it stands for
+    would go into several others, each of which would look sure.
     """
 
     def ended(before: _Setting, search: Search) -> _Searched:
@@ -218,13 +219,13 @@ def _searched(
         return _Searched(before, here, search, found, joint, left, line, strict)
 
     first = ended(here, find_causes(*here[:4], forbid, alpha, progress, generator))
-    taken = next((k for k, f in enumerate(first.search.found) if not f.effect.beside_rest), None)
+    like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
+    taken = next((k for k, f in enumerate(first.search.found) if f.effect.name in like_a_rest), None)
     if taken is None or not first.strict:
         return first
     kept = first.search.found[:taken]
     step = with_causes(here.problem, here.start, [f.effect for f in kept], here.whitening)
     begun = first.search._replace(problem=here.problem, start=here.start, step=step, found=kept)
-    like_a_rest = [name for name, effect in CATALOGUE.items() if not effect.beside_rest]
     return ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun))
 
 

@@ -14,6 +14,7 @@
 #define ROWS 64 /* numbers that are read at an instant: positions and rates */
 #define TURNS 60 /* Newton steps of the constraints; 1 to 4 are used */
 #define INLINE static inline __attribute__((always_inline))
+#define WIDE static __attribute__((noinline, optimize("O3"))) /* loops over columns, in vectors */
 #if SIZE
 #define ALIKE INLINE
 #else
@@ -197,7 +198,7 @@ APART void summed_up(const Given *g, Work *w, const int n, const int all) {
 }
 
 /* inverse of a symmetric positive matrix, in place */
-APART void swept(double *A, const int n) {
+WIDE void swept(double *A, const int n) {
   for (int k = 0; k < n; k++) {
     const double d = 1 / A[k * n + k];
     double row[MOST];
@@ -809,10 +810,10 @@ INLINE double seen(const Given *g, const Work *w, const int n, const long y) {
 }
 
 /* sums of a row: squares, gradient, normal matrix (its upper half) */
-APART void collected(const Given *g, const Work *w, const int n, const long window, const long row, const long width,
+WIDE void collected(const Given *g, const Work *w, const int n, const long window, const long row, const long width,
                       const double *S, double *cost, double *gradient, double *matrix) {
   const long wide = g->ny * (g->rates ? 2 : 1), total = g->columns + 2 * n;
-  double slope[512];
+  double slope[512] __attribute__((aligned(64)));
   for (long y = 0; y < wide; y++) {
     const double sure = g->weight[(row * wide + y) * g->windows + window];
     if (sure == 0) continue;
@@ -820,9 +821,9 @@ APART void collected(const Given *g, const Work *w, const int n, const long wind
     cost[y] += error * error;
     const long half = y < g->ny ? 0 : n, j = g->measured[y % g->ny], k = g->summed[y % g->ny];
     const double *own = S + (half + j) * width, *twin = k < 0 ? 0 : S + (half + k) * width;
-    for (long c = 0; c < total; c++) slope[c] = own[c] * sure;
+    for (long c = 0; c < width; c++) slope[c] = own[c] * sure;
     if (twin)
-      for (long c = 0; c < total; c++) slope[c] += twin[c] * sure;
+      for (long c = 0; c < width; c++) slope[c] += twin[c] * sure;
     if (!half)
       for (long p = 0; p < g->many; p++)
         if (g->kind[p] == READING && g->place[p] == j) slope[g->column[p]] += sure;
@@ -830,30 +831,29 @@ APART void collected(const Given *g, const Work *w, const int n, const long wind
       const double f = slope[c];
       if (f == 0) continue;
       gradient[c] += f * error;
-      for (long r = c; r < total; r++) matrix[c * width + r] += f * slope[r];
+      double *restrict line = matrix + c * width + (c & ~7L);
+      const double *restrict from = slope + (c & ~7L);
+      for (long r = 0; r < width - (c & ~7L); r++) line[r] += f * from[r];
     }
   }
 }
 
-INLINE void carried_on(const Given *g, const int n, const long width, const double *by, double *S, double *old) {
-  const long total = g->columns + 2 * n;
+WIDE void carried_on(const Given *g, const int n, const long width, const double *by, double *S, double *old) {
   const double dt = g->dt;
   memcpy(old, S, sizeof(double) * 2 * n * width);
   for (int j = 0; j < n; j++) {
-    double *v = S + (n + j) * width, *q = S + j * width;
+    double *restrict v = S + (n + j) * width, *restrict q = S + j * width;
     for (int k = 0; k < 2 * n; k++) {
       const double f = dt * BY(k);
-      if (f == 0) continue;
-      const double *from = old + k * width;
-      for (long c = 0; c < total; c++) v[c] += f * from[c];
+      const double *restrict from = old + k * width;
+      for (long c = 0; c < width; c++) v[c] += f * from[c];
     }
     for (long c = 0; c < g->columns; c++) v[c] += dt * BY(2 * n + c);
-    for (long c = 0; c < total; c++) q[c] += dt * v[c];
+    for (long c = 0; c < width; c++) q[c] += dt * v[c];
   }
 }
 
 INLINE void window_of(const Given *g, const int n, const int carried, const int want, const long window, const double *mobile, Work *w) {
-  enum { WIDE = 512 };
   const long wide = g->ny * (g->rates ? 2 : 1), total = g->columns + 2 * n, width = (total + 7) / 8 * 8;
   const long blocks = g->rows / g->block;
   double S[want ? 2 * n * width : 1] __attribute__((aligned(64))), old[want ? 2 * n * width : 1] __attribute__((aligned(64)));
@@ -880,7 +880,6 @@ INLINE void window_of(const Given *g, const int n, const int carried, const int 
         stepped(g, w, n, carried, want);
         if (want) linearised(g, w, n, carried, mobile, by), carried_on(g, n, width, by, S, old);
         for (int j = 0; j < n; j++) w->v[j] += g->dt * w->moved[j], w->q[j] += g->dt * w->v[j];
-        if (n > 1) memcpy(w->a, w->moved, sizeof(double) * n);
       }
     }
     if (!want) continue;
