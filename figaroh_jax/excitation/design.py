@@ -29,7 +29,6 @@ TIGHTENED = 3  # times that a motion is designed again with a margin
 SCREENED = 8  # random motions, the best of which a start improves
 WAVE, OVER = 8, 4  # samples of a wave, rows of a column: enough to look for a motion, which all samples then improve
 TRIED, ROOMY = 400, 3  # random postures in which a motion may begin; one of so many that are clear does
-DEAR = 120  # numbers of a motion, from which on it is polished at all its samples alone
 CHECKED = 8  # motions, the best first, until one is feasible at 1 kHz
 ROUNDING = 1e-6  # of a limit
 CLEAR_RATE = 40.0  # Hz at which a random motion touches nothing: what begins on the wrong side of a body stays there
@@ -419,7 +418,7 @@ def best_motion(
         x = min((random_motion(final, generator) for _ in range(SCREENED)), key=problems[0].value)
         for problem in problems:
             penalty = Penalty()
-            x = solve(problem, x, penalty, polish=few is None or len(x) < DEAR)
+            x = solve(problem, x, penalty)
         found.append((problems[-1].value(x), x, penalty))
     reached = tuple(value for value, _, _ in found)
     tried: list[tuple[bool, float, Trajectory, tuple[Use, ...], Limits]] = []
