@@ -37,7 +37,7 @@ from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
 from .holdout import fold_error, held_squares, part_error, residual_rms, step_squares, traces
-from .joint import Joint, polished, sized
+from .joint import Joint, opened, polished, sized
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import reason_against, standings
 from .problem import Problem
@@ -99,7 +99,7 @@ def diagnose(
         here = _setting(backend, signals, known, trust, forbid, progress)
         generator = np.random.default_rng(seed)
         searched = _searched(here, forbid, CERTAIN * alpha, tolerance, progress, generator)
-        judged = _judged(searched, [s.name for s in signals], tolerance)
+        judged = _judged(searched, [s.name for s in signals], forbid, tolerance)
         progress("measuring the gain", 0.9)
         return replace(_answer(searched.here, signals, searched.search, judged), slowed=slowed)
 
@@ -239,7 +239,7 @@ def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) 
     return kept, joint
 
 
-def _judged(searched: _Searched, names: Sequence[str], tolerance: float) -> _Judged:
+def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], tolerance: float) -> _Judged:
     """The verdict by what is left beside all causes; of these, the ones that stand beside it are named.
 
     What is not named is no part of the answer's model: the others are fitted anew without it.
@@ -252,6 +252,7 @@ def _judged(searched: _Searched, names: Sequence[str], tolerance: float) -> _Jud
     same = before.problem is here.problem
     here, joint = _as_predicts_best([here] if same else [here, before], named)
     gaining = _without_losses(here, named, joint, partial(_falls_beside_all, searched))
+    gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= dict.fromkeys(gaining.worse, "the error on the data held out does not fall with it")
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
