@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -108,6 +109,41 @@ def test_three_devices_give_the_sums_of_one(tmp_path: Path):
     command = [sys.executable, "-c", SHARDED, str(tmp_path), str(TESTS.parent / ".cache" / "jax")]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+HOSTS = """
+import sys
+from pathlib import Path
+import jax, numpy as np
+from test_devices import States, condense_on_devices, tree_states
+jax.config.update("jax_compilation_cache_dir", sys.argv[4])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+jax.distributed.initialize(sys.argv[2], num_processes=2, process_id=int(sys.argv[3]))
+rows = tree_states(Path(sys.argv[1]))
+pieces = list(rows.source())
+own = States(rows.model, lambda: pieces[:1] if sys.argv[3] == "0" else pieces[1:], rows.terms)
+np.save(Path(sys.argv[1]) / f"factor{sys.argv[3]}.npy", condense_on_devices(own).factor())
+"""
+
+
+def test_two_processes_with_pieces_of_their_own_give_the_sums_of_one(tmp_path: Path):
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
+    paths = os.pathsep.join([str(TESTS), str(TESTS.parent)])
+    environment = os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"}
+    rows = tree_states(tmp_path)
+    command, cache = [sys.executable, "-c", HOSTS, str(tmp_path), address], str(TESTS.parent / ".cache" / "jax")
+    running = [
+        subprocess.Popen([*command, str(k), cache], env=environment, stderr=subprocess.PIPE, text=True)
+        for k in range(2)
+    ]
+    said = [one.communicate(timeout=300)[1] for one in running]
+    assert [one.returncode for one in running] == [0, 0], said
+    first, second = (np.load(tmp_path / f"factor{k}.npy") for k in range(2))
+    np.testing.assert_array_equal(first, second)
+    expected = normal(condense(rows, rows.used))
+    np.testing.assert_allclose(first.T @ first, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
 def test_vmap_over_robots_and_their_trajectories_is_one_fit_after_another(tmp_path: Path):
