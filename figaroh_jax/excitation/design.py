@@ -140,7 +140,8 @@ def excite(
     limits = _without(limits, robot, learned.held, begin)
     sampler = Sampler(robot, learned.terms, np.asarray(learned.width))
     torque = torque_of(model, learned, sampler)
-    _stands(torque, robot, limits, begin)
+    if learned.held:
+        _stands(torque, robot, limits, begin)
     problem = unmeetable(torque, robot, limits, begin)
     if problem is not None:
         raise InputError(problem)
@@ -251,7 +252,7 @@ def _inside(robot: RobotModel, start: np.ndarray, limits: Limits) -> np.ndarray:
 
 
 def _stands(torque: Torque, robot: RobotModel, limits: Limits, start: np.ndarray | None) -> None:
-    """`InputError` where standing still in the posture in which a motion begins takes more than a torque limit."""
+    """`InputError` where who stands on joints that are held falls over in the posture in which a motion begins."""
     if start is None or not np.isfinite(limits.torque).any():
         return
     share = np.abs(torque(np.stack([start, 0 * start, 0 * start])[:, None]))[0] / limits.torque
