@@ -29,6 +29,7 @@ from .model import Joint, Leaf, RobotModel, dofs
 __all__ = [
     "ACCELERATIONS",
     "BLOCKS",
+    "COLUMNS",
     "DENSE",
     "LIMB_TORQUES",
     "MASSES",
@@ -880,6 +881,12 @@ def _dense_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
     return [10 * (row * len(model.joints) + link) + column]
 
 
+def _column_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
+    block, column = place
+    row, link = _sorted_rows(model.joints, True)[block]
+    return [int((10 * link + column) * model.nv + row)]
+
+
 def _mass_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
     row, column = place
     return sorted({model.nv * row + column, model.nv * column + row})
@@ -905,6 +912,14 @@ DENSE = _Form(
     _dense,
     answer=lambda model: (model.nv, 10 * len(model.joints)),
     places=_dense_places,
+)
+COLUMNS = _Form(
+    "columns",
+    partial(_blocks, True),
+    _ANSWERS["blocks"],
+    last=True,
+    answer=lambda model: (10 * len(model.joints), model.nv),
+    places=_column_places,
 )
 MASSES = _Form("masses", _masses, lambda model: (model.nv, model.nv), _whole_masses, places=_mass_places)
 
