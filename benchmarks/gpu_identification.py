@@ -2,24 +2,29 @@
 
     PYTHONPATH=. python benchmarks/gpu_identification.py [--devices 1 2 4] [--samples N] [--robots arm humanoid]
 
-Robots are built here (no file, no simulator): an arm of 6 and a tree of 32 revolute joints, with viscous, Coulomb,
-rotor and offset columns. The source gives the same pieces of random states again and again, from the host's memory
-("host": they travel to the devices) or from the devices' own ("device"). A fit is all of it: rows, products, rank and
-base parameters weighed by joint; the seconds of the host's algebra (rank and fit), which do not grow with the samples,
-are told beside. The first fit, of one piece, compiles and is told apart. Before that, 4000 samples are fitted by
-`condense` on the host, with QR factorisations in NumPy, and compared.
+Robots are built here (no file): an arm of 6 and a tree of 32 revolute joints, with viscous, Coulomb, rotor and offset
+columns; torques are Pinocchio's. The source gives the same pieces of random states again and again, from the host's
+memory ("host": they travel to the devices) or the devices' own ("device"). A fit is all of it: rows, products, rank
+and base parameters weighed by joint; the seconds of the host's algebra (rank and fit), which do not grow with the
+samples, are told beside. The first fit, of one piece, compiles and is told apart. Meanwhile a process that sees the CPU
+alone fits 4000 samples by `condense`, with QR factorisations in NumPy; the devices' fit of them is compared with it.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import subprocess
+import sys
 import time
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
 import numpy as np
+import pinocchio as pin  # pyright: ignore[reportMissingImports]
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from figaroh_jax.compiled.executable_cache import keep_programs
@@ -29,15 +34,15 @@ from figaroh_jax.estimation.base_parameters import base_parameters
 from figaroh_jax.estimation.least_squares import WeightedByJoint, solve
 from figaroh_jax.estimation.regression import condense
 from figaroh_jax.estimation.states import States
-from figaroh_jax.rigid.dynamics import inverse_dynamics
 from figaroh_jax.rigid.model import Joint, RobotModel
 
 CHECKED = 4000  # samples
-AT_ONCE = 4096  # samples whose torques are made by one program, compiled once
+DIFFERENT = 1 << 16  # samples of a piece
+FROM_HOST = 16  # so many times fewer samples where they travel
 NOISE = 0.05  # N m
 DRIVES = ("viscous_friction", "coulomb_friction", "rotor_inertia", "torque_offset")
 DRIVE = 0.7  # hidden value of every drive parameter
-SIZES = {"arm": (1 << 18, 1 << 25), "humanoid": (1 << 15, 1 << 25)}  # samples of a piece, and in all
+SIZES = {"arm": (1 << 21, 1 << 29), "humanoid": (1 << 18, 1 << 27)}  # samples of a piece, and in all
 
 
 def main() -> None:
@@ -48,17 +53,26 @@ def main() -> None:
     parser.add_argument("--piece", type=int, help="samples of a piece and device, likewise")
     parser.add_argument("--chunk", type=int, help="samples whose rows exist at once on a device")
     parser.add_argument("--json", type=Path, help="file for all figures")
+    parser.add_argument("--by-host", type=Path, help="fit the first robot on the CPU, into this file, and no more")
     options = parser.parse_args()
+    if options.by_host:
+        _fit_on_host(options.robots[0], options.by_host)
+        return
     keep_programs()  # a second run of the benchmark compiles nothing
     devices = jax.devices()
     print(f"jax {jax.__version__}, {len(devices)} x {devices[0].device_kind}, float64")
     found = []
     for robot in options.robots:
         piece, samples = options.piece or SIZES[robot][0], options.samples or SIZES[robot][1]
-        rows = _Source(MODELS[robot]())
-        _compare(robot, rows, options.chunk)
-        for count in (n for n in options.devices if n <= len(devices)):
-            found += _measure(robot, rows, devices[:count], piece, samples, options.chunk)
+        with TemporaryDirectory() as folder, _host(robot, Path(folder)) as host:
+            start = time.perf_counter()
+            rows = _Source(MODELS[robot]())
+            joints = len(rows.states.frames)
+            print(f"{robot:9} columns of {joints} joints in {time.perf_counter() - start:.1f} s", flush=True)
+            for count in (n for n in options.devices if n <= len(devices)):
+                found += _measure(robot, rows, devices[:count], piece, samples, options.chunk)
+            host.wait()
+            _compare(robot, rows, np.load(Path(folder) / "fit.npy"), options.chunk)
     if options.json:
         options.json.write_text(json.dumps(found, indent=1), encoding="utf-8")
 
@@ -77,7 +91,7 @@ def _measure(
         start = time.perf_counter()
         _fit(rows, part, 1, devices, chunk)
         first = time.perf_counter() - start
-        pieces = max(1, samples // length)
+        pieces = max(1, samples // length // (FROM_HOST if source == "host" else 1))
         start = time.perf_counter()
         _, error, algebra = _fit(rows, part, pieces, devices, chunk)
         seconds = time.perf_counter() - start
@@ -116,26 +130,46 @@ class _Source:
 
 
 def _piece(model: RobotModel, samples: int) -> list[np.ndarray]:
+    """Random states, some again and again: their torques are made one by one."""
     random = np.random.default_rng(0)
-    q, v, a = (random.uniform(-2.0, 2.0, (samples, model.nv)) for _ in range(3))
-    pieces = [(x[k : k + AT_ONCE] for x in (q, v, a)) for k in range(0, samples, AT_ONCE)]
-    rigid = np.concatenate([np.asarray(inverse_dynamics(model, *piece)) for piece in pieces])
-    tau = rigid + DRIVE * (v + np.sign(v) + a + 1)
-    return [q, v, a, tau + NOISE * random.standard_normal(tau.shape)]
+    q, v, a = (random.uniform(-2.0, 2.0, (min(samples, DIFFERENT), model.nv)) for _ in range(3))
+    tau = _torques(model, q, v, a) + DRIVE * (v + np.sign(v) + a + 1)
+    tau += NOISE * random.standard_normal(tau.shape)
+    return [np.resize(x, (samples, model.nv)) for x in (q, v, a, tau)]
 
 
-def _compare(robot: str, rows: _Source, chunk: int | None) -> None:
-    """The fit on the devices against the fit by QR factorisations on the host."""
-    part = _piece(rows.states.model, CHECKED)
-    rows.given = [part]
-    with jax.default_device(jax.local_devices(backend="cpu")[0]):
-        host = condense(rows.states, rows.states.used)
+def _torques(model: RobotModel, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Pinocchio's, of the robots of this file: revolute joints."""
+    robot = pin.Model()
+    for i, joint in enumerate(model.joints):
+        at = pin.SE3(model.placement[i, :3, :3], model.placement[i, :3, 3])
+        robot.addJoint(joint.parent + 1, pin.JointModelRevoluteUnaligned(model.axis[i]), at, joint.name)
+        robot.inertias[i + 1] = pin.Inertia.FromDynamicParameters(np.asarray(model.inertia[i]))
+    robot.gravity.linear = np.asarray(model.gravity)
+    data = robot.createData()
+    return np.array([pin.rnea(robot, data, *state) for state in zip(q, v, a, strict=True)])
+
+
+def _host(robot: str, folder: Path) -> subprocess.Popen[bytes]:
+    """The fit on the CPU, by a process of its own."""
+    command = [sys.executable, __file__, "--robots", robot, "--by-host", str(folder / "fit.npy")]
+    return subprocess.Popen(command, env=os.environ | {"JAX_PLATFORMS": "cpu"})
+
+
+def _fit_on_host(robot: str, file: Path) -> None:
+    rows = _Source(MODELS[robot]())
+    rows.given = [_piece(rows.states.model, CHECKED)]
+    host = condense(rows.states, rows.states.used)
     base = base_parameters(host.factor()[:, :-1], rows.states.names)
-    expected = solve(host, WeightedByJoint(), kept=base.independent).parameters[base.independent]
-    found, error, _ = _fit(rows, part, 1, jax.devices()[:1], chunk)
+    np.save(file, solve(host, WeightedByJoint(), kept=base.independent).parameters[base.independent])
+
+
+def _compare(robot: str, rows: _Source, expected: np.ndarray, chunk: int | None) -> None:
+    """The fit on a device against the fit by QR factorisations on the host."""
+    found, error, _ = _fit(rows, _piece(rows.states.model, CHECKED), 1, jax.devices()[:1], chunk)
     different = np.abs(found - expected).max() / np.abs(expected).max()
     print(
-        f"{robot:9} rank {base.rank}, largest difference from the host's fit, relative: {different:.1e};"
+        f"{robot:9} rank {len(found)}, largest difference from the host's fit, relative: {different:.1e};"
         f" residual {error:.4f} N m for noise of {NOISE} N m",
         flush=True,
     )

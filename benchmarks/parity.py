@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import resource
 import shutil
@@ -22,7 +23,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -106,23 +107,28 @@ def _identifications(folder: Path) -> Iterator[dict[str, Any]]:
 def _hidden(folder: Path, seeds: list[int]) -> Iterator[dict[str, Any]]:
     import hidden_effects
 
-    for robot, seed in zip(("tx40", "panda"), seeds, strict=True):
-        args = argparse.Namespace(closed_loop=False, clean=0, foreign=False, robots=[robot])
-        args.layouts, args.seeds, args.size, args.noise, args.left_out = (
-            list(hidden_effects.LAYOUTS),
-            [seed],
-            0.05,
-            1.0,
-            0,
-        )
-        args.effects = list(hidden_effects.EFFECTS[:16])  # those that the first version knew
-        for label, case, _ in hidden_effects._cases(args):
-            name = label.replace(" ", "_").replace("(", "").replace(")", "").replace(",", "")
-            case.write(folder / name)
-            _smaller(folder / name)
-            _smaller(folder / name)
-            truth = [{"effect": one.effect, "at": list(one.at)} for one in case.truth]
-            yield {"name": label, "task": f"{name}/task.yaml", "command": "diagnose", "truth": truth}
+    effects = list(hidden_effects.EFFECTS[:16])  # those that the first version knew
+    wishes = [(r, s, effect) for r, s in zip(("tx40", "panda"), seeds, strict=True) for effect in effects]
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
+        for made in pool.map(_one_hidden, [folder] * len(wishes), *zip(*wishes, strict=True)):
+            yield from made
+
+
+def _one_hidden(folder: Path, robot: str, seed: int, effect: str) -> list[dict[str, Any]]:
+    """The cases of one effect in one robot, with and without repeats."""
+    sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(ROOT / "tests")]
+    import hidden_effects
+
+    args = argparse.Namespace(closed_loop=False, clean=0, foreign=False, left_out=0, size=0.05, noise=1.0)
+    args.robots, args.seeds, args.effects, args.layouts = [robot], [seed], [effect], list(hidden_effects.LAYOUTS)
+    made = []
+    for label, case, _ in hidden_effects._cases(args):
+        name = label.replace(" ", "_").replace("(", "").replace(")", "").replace(",", "")
+        case.write(folder / name)
+        _smaller(folder / name)
+        truth = [{"effect": one.effect, "at": list(one.at)} for one in case.truth]
+        made.append({"name": label, "task": f"{name}/task.yaml", "command": "diagnose", "truth": truth})
+    return made
 
 
 def _smaller(folder: Path) -> None:

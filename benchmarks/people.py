@@ -6,7 +6,10 @@ Each person is 5-20 % off the model in every segment's length and inertial param
 skin and are seen to 2 mm; plates have noise and a zero of their own in every trial. A line is a person: RMS error of
 the root's force (% of body weight) and moment (% of its RMS) on an unseen trial, against plates without errors, with
 the identified person, the scaled one with the table alone and the unscaled model; error of mass (%) and centre of mass
-(mm); share of the parameters within their 95 % intervals.
+(mm); share of the parameters within their 95 % intervals. `--load`: one more trial, with 3 to 8 kg at a hand, the head
+or the thorax, for `name_payload`: the link that it names of all segments, and the mass. `--motion BASIS`: in place of
+all this the motion of the whole person (39 joints) on the left foot that tells most of the segments by the plate below,
+within the limits of the joints and in balance: seconds, the largest share of each limit at 1 kHz, what it tells.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -32,6 +36,13 @@ from figaroh_jax.rigid.inertia import to_com  # noqa: E402
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 URDF = DATA / "human_model" / "human.urdf"
 CUTOFF = 2.5  # Hz: the motions have nothing above 0.9 Hz
+BASES = {
+    "fourier": fj.fourier(3, 0.2, 5.0),
+    "slow": fj.fourier(3, 0.1, 10.0),
+    "long": fj.fourier(5, 0.1, 10.0),
+    "spline": fj.spline(6, 6.0),
+    "quintic": fj.quintic(6, 10.0),
+}
 FRAMES = 24  # of each trial, by which sizes are found: skin slides slowly, and one trial is little
 
 
@@ -46,9 +57,15 @@ def main() -> None:
     parser.add_argument(
         "--exact", choices=["sizes", "all"], help="true sizes, or true sizes and positions: what is left"
     )
+    parser.add_argument("--load", action="store_true", help="a load that the person carries is to be named")
+    parser.add_argument("--motion", choices=BASES, help="design a motion of all joints")
+    parser.add_argument("--starts", type=int, default=1, help="of the design of a motion")
     parser.add_argument("--save", type=Path, help="folder for a file of errors and intervals for each person")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    if options.motion:
+        motion(options.motion, options.starts, options.seed)
+        return
     print(
         f"{'person':>6}{'':4}{'force % BW':>24}{'moment %':>24}{'mass %':>8}{'com mm':>8}{'size %':>8}{'95 %':>7}   s"
     )
@@ -56,13 +73,46 @@ def main() -> None:
     for k in range(options.people):
         start = time.perf_counter()
         skin = {"tissue": options.tissue, "noise": options.noise}
-        line = study(np.random.default_rng(options.seed + k), options.seconds, options.trials, skin, options.exact)
+        rng = np.random.default_rng(options.seed + k)
+        line = study(rng, options.seconds, options.trials, skin, options.exact, options.load)
         force, moment = ("".join(f"{x:8.2f}" for x in line[key]) for key in ("force", "moment"))
         rest = f"{line['mass']:8.2f}{line['com']:8.2f}{line['size']:8.2f}{line['covered']:7.2f}"
         print(f"{options.seed + k:6}{'':4}{force}{moment}{rest}{time.perf_counter() - start:6.0f}", flush=True)
+        if options.load:
+            print("{:6}  load {:.1f} kg at {}: named {:.1f} +- {:.1f} kg at {}".format(options.seed + k, *line["load"]))
         if options.save is not None:
             options.save.mkdir(parents=True, exist_ok=True)
             np.savez(options.save / f"{options.exact}_{options.tissue}_{options.seed + k}.npz", **line)
+
+
+def motion(basis: str, starts: int, seed: int) -> None:
+    """A motion of all joints on one foot, as a user asks for it."""
+    clock = [time.perf_counter()]
+    robot = fj.load_urdf(URDF, root="free_flyer")
+    upright = np.zeros(robot.nq)
+    upright[:7] = [0.0, 0.0, 0.95, np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]  # the model's y is up
+    person = people.standing(robot, "left_foot", upright, support=(0.1, 0.05))
+    start = people.balanced(person)
+    clock.append(time.perf_counter())
+    sigma = dict(zip(people.PLATE, [3.0, 3.0, 3.0, 1.0, 1.0, 1.0], strict=True))  # N, N m
+    still = fj.Baseline(viscous=False, coulomb=False)
+    learned = fj.learn(person, still, measured=sigma, hold=people.PLATE, trust=0.25)
+    limits = fj.limits_of(person, velocity=3.0, acceleration=10.0, scale=0.95)
+    clock.append(time.perf_counter())
+    found = fj.excite(person, BASES[basis], limits, learned, start=start, starts=starts, seed=seed)
+    clock.append(time.perf_counter())
+    stage, told = found.stages[0], found.std / found.std_before
+    print(
+        f"{basis}, {person.nv - 6} joints, {starts} starts, seed {seed}: limits {'met' if stage.met else 'NOT met'};"
+        " {:.0f} s to balance, {:.0f} s to learn, {:.0f} s to design,".format(*np.diff(clock)),
+        f"{stage.evaluations} evaluations, {time.process_time():.0f} CPU s in all",
+    )
+    print("  " + ", ".join(f"{use.kind} {use.joint} {100 * use.share:.1f} %" for use in stage.uses))
+    print(
+        f"  log determinant {stage.logdet:.1f}; of {learned.rank} base parameters {(told < 0.5).sum()} are told better"
+        f" than by the table by half, {(told < 0.8).sum()} by a fifth",
+        flush=True,
+    )
 
 
 def places(robot: fj.RobotModel) -> dict[str, tuple[str, np.ndarray]]:
@@ -87,16 +137,17 @@ def study(
     trials: int,
     skin: dict[str, float] | None = None,
     exact: str | None = None,
+    load: bool = False,
 ) -> dict:
     """One person from end to end."""
-    skin = skin or {}
+    slide, seen = (skin or {}).get("tissue", 0.005), (skin or {}).get("noise", 0.002)
     robot = fj.load_urdf(URDF, root="free_flyer")
     person = simulated.make_person(str(URDF), rng)
     own = places(robot)
     joint_of = {joint.link: joint.name for joint in robot.joints}
     simulated.put_markers(person, {label: (joint_of[link], at) for label, (link, at) in own.items()}, rng)
-    fitted = [simulated.record(person, rng, seconds, **skin) for _ in range(trials)]
-    unseen = simulated.record(person, rng, seconds, **skin)
+    fitted = [simulated.record(person, rng, seconds, slide, seen) for _ in range(trials)]
+    unseen = simulated.record(person, rng, seconds, slide, seen)
     data = size(robot, own, fitted) if exact is None else true_size(robot, own, person, fitted[0])
     known = person if exact == "all" else None
     captures = [captured(robot, own, data, trial, known)[0] for trial in fitted]
@@ -105,7 +156,28 @@ def study(
     table = people.anthropometric(robot, weight / 9.81, "male", np.asarray(data.scale))
     found = people.identify_segments(captures, table)
     unscaled = captured(robot, own, None, unseen)
-    return judged(person, robot, found, table, judge, unscaled, data, unseen)
+    line = judged(person, robot, found, table, judge, unscaled, data, unseen)
+    if load:
+        link, what = carried(rng)
+        joint = joint_of[link]
+        trial = simulated.record(person, rng, seconds, slide, seen, (joint, what))
+        named = people.name_payload([captured(robot, own, data, trial, known)[0]], found)
+        line["load"] = what.mass, link, named.mass, named.std, named.link
+    return line
+
+
+def carried(rng: np.random.Generator) -> tuple[str, Any]:
+    """A load and the link that carries it: a dumbbell, a rucksack or a helmet, about the link's frame."""
+    import pinocchio as pin  # pyright: ignore[reportMissingImports]
+
+    link, at, size = (
+        ("left_hand", [0.0, -0.08, 0.0], 0.1),
+        ("right_hand", [0.0, -0.08, 0.0], 0.1),
+        ("middle_thorax", [-0.18, 0.15, 0.0], 0.25),
+        ("middle_head", [0.0, 0.15, 0.0], 0.15),
+    )[rng.integers(4)]
+    mass = float(rng.uniform(3.0, 8.0))
+    return link, pin.Inertia(mass, np.array(at) + rng.normal(0, 0.02, 3), mass * size**2 / 6 * np.eye(3))
 
 
 def size(robot, own, trials):

@@ -24,9 +24,7 @@ def main() -> None:
     still = fj.Baseline(viscous=False, coulomb=False)
     learned = fj.learn(person, still, measured=sigma, hold=fj.people.PLATE, trust=0.25)
     limits = fj.limits_of(person, velocity=3.0, acceleration=10.0, scale=0.95)
-    start = np.zeros(person.nv)
-    for name, angle in (("left_elbow_Z", 0.6), ("right_elbow_Z", 0.6), ("middle_lumbar_Z", -0.2)):
-        start[person.dof_names.index(name)] = angle
+    start = fj.people.balanced(person)
     found = fj.excite(person, fj.fourier(3, 0.2, 5.0), limits, learned, start=start, starts=1)
 
     for use in found.stages[0].uses:

@@ -17,7 +17,7 @@ from test_general_dynamics import random_tree
 from figaroh_jax.compiled import executable_cache, kernels
 from figaroh_jax.compiled.batching import DRAFT_OPTIONS
 from figaroh_jax.compiled.kernels import Number, Straight, launch, straight_answers
-from figaroh_jax.rigid import dynamics, normal_equations, regressor, scalar_programs
+from figaroh_jax.rigid import dynamics, looped_kernels, normal_equations, regressor, scalar_forms
 from figaroh_jax.rigid.model import RobotModel
 
 FORMS = {
@@ -123,7 +123,7 @@ def test_kernels_without_a_gpu(tmp_path: Path):
 
 
 def test_pieces_of_a_tree_are_written_into_one_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(scalar_programs, "MOST", 4)
+    monkeypatch.setattr(scalar_forms, "MOST", 4)
     model, packed = robots.load(robots.TREE, tmp_path), FORMS["packed"]
     arrays = states(model, 3)
     assert len(packed.programs(model, packed.known(model))) == 3
@@ -132,8 +132,8 @@ def test_pieces_of_a_tree_are_written_into_one_answer(tmp_path: Path, monkeypatc
 
 def test_torques_limb_by_limb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """An arm and a tree cut into pieces: what a limb hands over; a coordinate that two pieces share is not cut."""
-    monkeypatch.setattr(scalar_programs, "LIMB", 1)
-    scalar_programs._limbs.cache_clear()
+    monkeypatch.setattr(scalar_forms, "LIMB", 1)
+    scalar_forms._limbs.cache_clear()
     try:
         limbs = dynamics._LIMBS
         arm, tree = robots.load(robots.ARM, tmp_path), random_tree(8, ("revolute", "prismatic") * 2).model
@@ -147,9 +147,9 @@ def test_torques_limb_by_limb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             answer = launch(program, constants, arrays, shape, columns, True, answer, interpret=True)
         assert answer is not None
         agree(answer[: arm.nv].T, plainly(limbs, arm, *arrays))
-        assert not scalar_programs.in_limbs(robots.load(robots.TREE, tmp_path))
+        assert not scalar_forms.in_limbs(robots.load(robots.TREE, tmp_path))
     finally:
-        scalar_programs._limbs.cache_clear()
+        scalar_forms._limbs.cache_clear()
 
 
 def test_rows_of_a_normal_matrix_are_written_by_coordinate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -174,6 +174,55 @@ def test_rows_of_a_normal_matrix_are_written_by_coordinate(tmp_path: Path, monke
     monkeypatch.setattr(normal_equations, "on_host", lambda *x: False)
     for one, other in zip(normal_equations.normal_matrix(model, q, v, a, tau, weight**2, extra), expected, strict=True):
         agree(one, other)
+
+
+class _ByHand:
+    """In place of `kernels.Lanes`: arrays of NumPy, a kernel's loops run in Python."""
+
+    dtype = np.dtype(float)
+
+    def __init__(self, outs: list[np.ndarray]) -> None:
+        self.outs = outs
+
+    def full(self, x: Any) -> Any:
+        return jnp.full(self.outs[0].shape[1], x)
+
+    def read(self, ref: np.ndarray, first: Any, k: int) -> Number:
+        return Number(jnp.asarray(ref[:, int(first) + k]))
+
+    def at(self, ref: np.ndarray, row: Any, wanted: Any = True) -> Any:
+        return jnp.where(wanted, jnp.asarray(ref[int(row)]), np.nan)
+
+    def put(self, ref: np.ndarray, row: Any, numbers: Any, wanted: Any = True) -> None:
+        for k, x in enumerate(numbers if np.all(wanted) else ()):
+            ref[int(row) + k] = x
+
+
+def launch_by_hand(kernel: Any, arrays: Any, shapes: list[tuple[int, int]], interpret: bool = False) -> Any:
+    outs = [np.full(shape, np.nan) for shape in shapes]
+    with jax.disable_jit():
+        kernel(_ByHand(outs), *map(np.asarray, arrays))
+    return [jnp.asarray(out) for out in outs]
+
+
+@pytest.mark.parametrize("name", [*TREES, "TREE"])
+def test_looped_kernels_write_what_the_plain_ones_do(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Weighted rows with columns beside; where joints share a coordinate, rows of each degree of freedom alone."""
+    monkeypatch.setattr(scalar_forms, "MOST", 1)
+    monkeypatch.setattr(looped_kernels, "launch_over", launch_by_hand)
+    monkeypatch.setattr(looped_kernels, "lanes_of", lambda x, lanes: jnp.broadcast_to(x.x, lanes.outs[0].shape[1]))
+    model = random_tree(*TREES[name]).model if name in TREES else robots.load(getattr(robots, name), tmp_path)
+    arrays, random = states(model, 3), np.random.default_rng(2)
+    shared = len(model.dofs.column) > model.nv
+    beside, packed = normal_equations._row_form(2), FORMS["packed"]
+    weighted = [*arrays, np.abs(random.standard_normal((3, model.nv))), random.standard_normal((3, 2 * model.nv))]
+    assert packed.looped and beside.looped
+    if shared:
+        assert beside.looped(model, *weighted) is None
+        agree(packed.looped(model, *arrays), plainly(packed, model, *arrays))
+    else:
+        for one, expected in zip(beside.looped(model, *weighted), plainly(beside, model, *weighted), strict=True):
+            agree(one, expected)
 
 
 def test_a_kernel_is_kept_between_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

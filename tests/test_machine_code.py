@@ -23,7 +23,7 @@ from figaroh_jax.rigid import normal_equations
 from figaroh_jax.rigid.model import RobotModel
 from figaroh_jax.rigid.regressor import dense_rows
 from figaroh_jax.rigid.regressor_gradient import regressor_pullback
-from figaroh_jax.rigid.scalar_programs import COLUMNS, straight
+from figaroh_jax.rigid.scalar_forms import COLUMNS, straight
 
 pytestmark = pytest.mark.skipif(code._compiler() is None, reason="needs a C compiler")
 

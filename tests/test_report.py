@@ -71,6 +71,7 @@ def test_sentence_names_nothing_where_nothing_or_no_name_was_found():
         (Estimate(3.2e7, 1e6, "N m/rad"), "(3.20 ± 0.20) × 10⁷ N m/rad"),
         (Estimate(1.5, 1e-9, "rad"), "1.500000 ± 2e−09 rad"),
         (Estimate(1.5e-6, 1e-14, "s"), "(1.500000 ± 2e−08) × 10⁻⁶ s"),
+        (Estimate(0.24, 1.5e4, "rad"), "not determined by this data"),
     ],
 )
 def test_interval_shows_the_digits_that_count(estimate: Estimate, text: str):

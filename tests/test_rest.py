@@ -9,7 +9,7 @@ import pytest
 
 from figaroh_jax.diagnosis.estimates import Fitted
 from figaroh_jax.diagnosis.joint import has_size
-from figaroh_jax.diagnosis.naming import Standing, reason_against
+from figaroh_jax.diagnosis.naming import Standing, _turns_against_itself, reason_against
 from figaroh_jax.diagnosis.rest import significance, verdict, wrong_law
 from figaroh_jax.effects.catalogue import find
 from figaroh_jax.results import Name
@@ -102,3 +102,16 @@ def test_a_rest_without_repeats_counts_where_smooth_functions_predict_it() -> No
     assert not there(predicted=False)
     assert there(p_repeat=1e-4, predicted=False)  # power that repeats is no noise
     assert not there(p_repeat=1e-4, tolerable=True)
+
+
+def test_a_coupling_turned_by_parts_of_opposite_signs_is_none() -> None:
+    covariance = np.diag([0.1, 0.1, 0.1]) ** 2
+
+    def against(inertia: float, damping: float, friction: float) -> bool:
+        effect = find("coupled_transmission")(np.array([0, 1]), inertia=inertia, damping=damping, friction=friction)
+        return _turns_against_itself(effect, Fitted(np.zeros(3), covariance, ((0, 1, 2),)), (0, 1, 2))
+
+    assert not against(1.0, 1.0, 1.0)
+    assert not against(1.0, 1.0, -0.25)  # may be zero
+    assert against(1.0, 1.0, -0.35)
+    assert against(-1.0, 1.0, 1.0)

@@ -81,13 +81,15 @@ def test_wrong_input_is_refused() -> None:
 
 def run(folder: Path, name: str, values: dict[str, float]) -> Path:
     rows = [{"expression": k, "value": v, "std": 0.1, "status": "identified"} for k, v in values.items()]
+    damping = {"value": values["fv1"], "std": 0.1, "unit": "N m s/rad"}
+    effect = {"effect": "viscous_friction", "at": ["waist"], "parameters": {"damping": damping}}
     fit = {"rms": [1.0], "relative": [0.1], "r2": [0.9]}
     content = {
         "rank": 2,
         "condition": 3.0,
         "base_parameters": rows,
         "links": [],
-        "effects": [],
+        "effects": [effect],
         "fit": fit,
         "holdout": {},
     }
@@ -99,13 +101,21 @@ def run(folder: Path, name: str, values: dict[str, float]) -> Path:
 def test_compare_tells_what_differs_between_robots_and_days(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     runs = [
-        run(tmp_path, f"r{k}", {"Izz1": 1 + 0.1 * rng.normal(), "m2": 5 + 3 * (k // 2) + 0.1 * rng.normal()})
+        run(
+            tmp_path, f"r{k}", {"Izz1": 1 + 0.1 * rng.normal(), "m2": 5 + 3 * (k // 2) + 0.1 * rng.normal(), "fv1": 1.0}
+        )
         for k in range(6)
     ]
     sections = compare_runs(runs, ["a", "a", "b", "b", "c", "c"])
     table = next(section for section in sections if section.title.startswith("Spread between robots"))
-    assert {row[0]: row[-1] for row in table.rows} == {"Izz1": "-", "m2": "units"}
+    assert {row[0]: row[-1] for row in table.rows} == {
+        "viscous_friction (waist) damping": "-",  # fv1 is the same number
+        "Izz1": "-",
+        "m2": "units",
+    }
     assert "between days" in comparison_text(sections)
     assert not any("Spread" in section.title for section in compare_runs(runs[:2]))
+    with pytest.raises(InputError, match="from three runs on"):
+        compare_runs(runs[:2], ["a", "b"])
     with pytest.raises(InputError, match="--units: 2 labels for 6 runs"):
         compare_runs(runs, ["a", "b"])

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 from . import executable_cache
 
 __all__ = [
+    "Lanes",
     "Load",
     "Number",
     "Program",
@@ -31,7 +32,9 @@ __all__ = [
     "Write",
     "kept_here",
     "known_codes",
+    "lanes_of",
     "launch",
+    "launch_over",
     "rounded",
     "straight_answers",
     "usable",
@@ -126,6 +129,7 @@ class Straight(NamedTuple):
     answer: Callable[[Any], tuple[int, ...]] = lambda parameters: ()  # shape of a sample's answer, finished
     places: Callable[[Any, tuple[int, ...]], Sequence[int]] | None = None  # in it, flat, of what a program writes
     apart: Callable[[Any], Straight | None] = lambda parameters: None  # the same in smaller kernels, where one is large
+    looped: Callable[..., Any] | None = None  # of (parameters, *arrays): what programs write, the samples last, or None
 
 
 def usable(*arrays: Any) -> bool:
@@ -237,9 +241,10 @@ def _kernel(straight: Straight, codes: bytes, parameters: Any, *arrays: Array) -
     shape, columns = straight.shape(parameters), straight.columns(parameters)
     constants = straight.constants(parameters).astype(arrays[0].dtype)
     last = straight.last or _numbers(shape) > DIRECT or straight.finish is not None
-    answer: Any = None
-    for program in straight.programs(parameters, codes):
-        answer = launch(program, constants, arrays, shape, columns, last, answer)
+    answer: Any = straight.looped(parameters, *arrays) if straight.looped else None
+    if answer is None:
+        for program in straight.programs(parameters, codes):
+            answer = launch(program, constants, arrays, shape, columns, last, answer)
     assert answer is not None
     if straight.finish is not None:
         answer = straight.finish(parameters, answer)
@@ -377,3 +382,68 @@ class _Lanes:
 def _in_lanes(number: Number, dtype: Any) -> Array:
     x = number.x
     return jnp.full(LANES, x, dtype) if number.known or not jnp.shape(x) else x
+
+
+class Lanes:
+    """The samples of one block in a kernel that loops: numbers of arrays (k, samples) and (samples, k) by their place.
+
+    `outs` are the arrays that it writes.
+    """
+
+    def __init__(self, triton: Any, outs: Sequence[Any], samples: int) -> None:
+        from jax.experimental import pallas as pl
+
+        self.triton, self.outs, self.dtype = triton, outs, outs[0].dtype
+        self.index = pl.program_id(0) * LANES + lax.iota(jnp.int32, LANES)
+        self.mask = self.index < samples if samples % LANES else None
+
+    def full(self, x: Any) -> Array:
+        """The same in all lanes."""
+        return jnp.full(LANES, x)
+
+    def read(self, ref: Any, first: Any, k: int) -> Number:
+        """Column first + k of an array (samples, _)."""
+        return Number(self._load(ref.at[self.index, first + k], self.mask))
+
+    def at(self, ref: Any, row: Any, wanted: Array | None = None) -> Array:
+        """A row of an array (_, samples), where it is wanted."""
+        return self._load(ref.at[row, self.index], self._both(wanted))
+
+    def put(self, ref: Any, row: Any, numbers: Sequence[Array], wanted: Array | None = None) -> None:
+        """Write rows of an array (_, samples) from `row` on, where they are wanted."""
+        for k, x in enumerate(numbers):
+            self.triton.store(ref.at[row + k, self.index], x, mask=self._both(wanted))
+
+    def _both(self, wanted: Array | None) -> Array | None:
+        return self.mask if wanted is None else wanted if self.mask is None else wanted & self.mask
+
+    def _load(self, at: Any, mask: Array | None) -> Array:
+        return self.triton.load(at, mask=mask, other=None if mask is None else 0.0)
+
+
+def lanes_of(number: Number, lanes: Lanes) -> Array:
+    """The number in every lane."""
+    return _in_lanes(number, lanes.dtype)
+
+
+def launch_over(
+    kernel: Callable[..., None], arrays: Sequence[Array], shapes: Sequence[tuple[int, int]], interpret: bool = False
+) -> list[Float[Array, "rows samples"]]:
+    """What `kernel(lanes, *refs)` writes into arrays of these shapes, called once for each block of samples."""
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton
+
+    samples, dtype = shapes[0][1], next(x.dtype for x in arrays if jnp.issubdtype(x.dtype, jnp.floating))
+    if not samples:
+        return [jnp.zeros(shape, dtype) for shape in shapes]
+    anywhere = pl.BlockSpec(memory_space=pl.ANY)
+    return pl.pallas_call(
+        lambda *refs: kernel(Lanes(triton, refs[len(arrays) :], samples), *refs[: len(arrays)]),
+        out_shape=[jax.ShapeDtypeStruct(shape, dtype) for shape in shapes],
+        grid=(ceil(samples / LANES),),
+        in_specs=[anywhere] * len(arrays),
+        out_specs=[anywhere] * len(shapes),
+        compiler_params=None if interpret else triton.CompilerParams(num_warps=1, num_stages=1),
+        interpret=interpret,
+        name="looped_rows",
+    )(*arrays)

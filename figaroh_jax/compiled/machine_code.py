@@ -14,6 +14,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import platform
 import shlex
 import shutil
 import subprocess
@@ -34,7 +35,7 @@ from .executable_cache import surroundings
 from .kernels import Number, Program, Straight
 from .store import Store
 
-__all__ = ["FARTHEST", "FEWEST", "code_of_few", "machine_code"]
+__all__ = ["FARTHEST", "FEWEST", "code_of_few", "library", "machine_code"]
 
 FEWEST = 8  # samples: no vector is longer
 FROM = 512  # samples; below, handing them over costs as much as it saves
@@ -45,6 +46,9 @@ FARTHEST = 1e5  # rad, to which `sine_cosine` is exact
 PATIENCE = 300.0  # s that a compiler may take
 LEVEL = {False: "-O1", True: "-Og"}  # of the reverse: as fast, compiled in half the time
 FLAGS = ("-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared", "-w", "-x", "c", "-")
+LIBRARY_FLAGS = ("-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared", "-w")
+if platform.machine() in ("x86_64", "AMD64"):
+    LIBRARY_FLAGS += ("-mprefer-vector-width=512",)
 
 _HEAD = """
 #include <stddef.h>
@@ -275,6 +279,11 @@ def _version() -> str:
 
 def _compiled(wanted: _Wanted) -> bytes | None:
     """A shared library; None where the compiler fails."""
+    return _built(_source(wanted), LEVEL[wanted.back], *FLAGS)
+
+
+def _built(source: str, *flags: str) -> bytes | None:
+    """C of standard input as a shared library; None where there is no compiler or it fails."""
     compiler = _compiler()
     if compiler is None:
         return None
@@ -282,8 +291,8 @@ def _compiled(wanted: _Wanted) -> bytes | None:
         out = Path(folder) / "code.so"
         try:
             subprocess.run(  # noqa: S603  (the user's own compiler, with source that is made here)
-                [*compiler, LEVEL[wanted.back], *FLAGS, "-o", str(out)],
-                input=_source(wanted).encode(),
+                [*compiler, "-o", str(out), *flags],
+                input=source.encode(),
                 check=True,
                 capture_output=True,
                 timeout=PATIENCE,
@@ -291,6 +300,22 @@ def _compiled(wanted: _Wanted) -> bytes | None:
             return out.read_bytes()
         except (OSError, subprocess.SubprocessError):
             return None
+
+
+def library(source: str, *flags: str) -> ctypes.CDLL | None:
+    """A file of C as a library in memory, compiled once and kept as robots' programs are; None where none is made."""
+    flags = (*LIBRARY_FLAGS, *flags, "-x", "c", "-", "-lm")
+    store = _store() if _compiler() is not None else None
+    name = hashlib.blake2b(repr((source, surroundings(), flags, _version())).encode(), digest_size=20).hexdigest()
+    code = store.get(f"{name}.so") if store else None
+    if code is None:
+        code = _built(source, *flags)
+        if code is not None and store is not None:
+            store.put(f"{name}.so", code)
+    try:
+        return None if code is None else _opened(code)
+    except OSError:
+        return None
 
 
 def _loaded(wanted: _Wanted, library: bytes) -> _Code | None:

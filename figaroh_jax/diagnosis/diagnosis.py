@@ -37,7 +37,7 @@ from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
 from .holdout import fold_error, held_squares, part_error, residual_rms, step_squares, traces
-from .joint import Joint, polished, sized
+from .joint import Joint, opened, polished, sized
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import reason_against, standings
 from .problem import Problem
@@ -99,7 +99,7 @@ def diagnose(
         here = _setting(backend, signals, known, trust, forbid, progress)
         generator = np.random.default_rng(seed)
         searched = _searched(here, forbid, CERTAIN * alpha, tolerance, progress, generator)
-        judged = _judged(searched, [s.name for s in signals], tolerance)
+        judged = _judged(searched, [s.name for s in signals], forbid, tolerance)
         progress("measuring the gain", 0.9)
         return replace(_answer(searched.here, signals, searched.search, judged), slowed=slowed)
 
@@ -203,10 +203,11 @@ def _searched(
     progress: Callable[[str, float], None],
     generator: np.random.Generator,
 ) -> _Searched:
-    """The causes that the data show; where a rest stays, without the effects that any rest looks like.
+    """The causes that the data show; where a rest stays, without the laws of one joint that any rest looks like.
 
     Beside a rest those (`Effect.beside_rest`) are not named, and take the place of causes that could be: the search is
-    taken up again from where the first of them came in.
+    taken up again from where the first of them came in. Such an effect of the whole robot stays: what it stands for
+    would go into several others, each of which would look sure.
     """
 
     def ended(before: _Setting, search: Search) -> _Searched:
@@ -218,13 +219,13 @@ def _searched(
         return _Searched(before, here, search, found, joint, left, line, strict)
 
     first = ended(here, find_causes(*here[:4], forbid, alpha, progress, generator))
-    taken = next((k for k, f in enumerate(first.search.found) if not f.effect.beside_rest), None)
+    like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
+    taken = next((k for k, f in enumerate(first.search.found) if f.effect.name in like_a_rest), None)
     if taken is None or not first.strict:
         return first
     kept = first.search.found[:taken]
     step = with_causes(here.problem, here.start, [f.effect for f in kept], here.whitening)
     begun = first.search._replace(problem=here.problem, start=here.start, step=step, found=kept)
-    like_a_rest = [name for name, effect in CATALOGUE.items() if not effect.beside_rest]
     return ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun))
 
 
@@ -238,7 +239,7 @@ def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) 
     return kept, joint
 
 
-def _judged(searched: _Searched, names: Sequence[str], tolerance: float) -> _Judged:
+def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], tolerance: float) -> _Judged:
     """The verdict by what is left beside all causes; of these, the ones that stand beside it are named.
 
     What is not named is no part of the answer's model: the others are fitted anew without it.
@@ -251,6 +252,7 @@ def _judged(searched: _Searched, names: Sequence[str], tolerance: float) -> _Jud
     same = before.problem is here.problem
     here, joint = _as_predicts_best([here] if same else [here, before], named)
     gaining = _without_losses(here, named, joint, partial(_falls_beside_all, searched))
+    gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= dict.fromkeys(gaining.worse, "the error on the data held out does not fall with it")
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])

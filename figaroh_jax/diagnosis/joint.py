@@ -20,7 +20,7 @@ from .search import Found
 from .state import State, assembled, solved
 from .step import Step, stand
 
-__all__ = ["Joint", "has_size", "joint_fit", "moved", "polished", "sized"]
+__all__ = ["Joint", "has_size", "joint_fit", "moved", "opened", "polished", "sized"]
 
 KEPT = 1e-12
 SURE = 0.95  # of the region of a cause's amplitudes that must not hold zero
@@ -140,12 +140,27 @@ def sized(found: list[Found], joint: Joint, forbid: Sequence[str]) -> list[Found
     for one, effect, at in zip(found, joint.causes, joint.fitted.places, strict=True):
         if has_size(effect, joint.fitted, at):
             out.append(one)
-            continue
-        laws = [n for n, e in CATALOGUE.items() if effect.speed_law and e.speed_law and n not in (effect.name, *forbid)]
-        more = dict.fromkeys([*one.ambiguous, *one.alike, *(Name(n, one.name.at) for n in laws)])
-        if more and not type(effect).contains:
-            out.append(replace(one, ambiguous=tuple(more)))
+        elif (more := _open(one, effect, forbid)) and not type(effect).contains:
+            out.append(replace(one, ambiguous=more))
     return out
+
+
+def opened(found: list[Found], joint: Joint, forbid: Sequence[str]) -> list[Found]:
+    """The causes, each whose size this fit leaves open with all that it may be.
+
+    The fit that predicts best weighs rows otherwise than the one that found the causes.
+    """
+    each = zip(found, joint.causes, joint.fitted.places, strict=True)
+    return [
+        one if has_size(effect, joint.fitted, at) else replace(one, ambiguous=_open(one, effect, forbid))
+        for one, effect, at in each
+    ]
+
+
+def _open(one: Found, effect: Effect, forbid: Sequence[str]) -> tuple[Name, ...]:
+    """What a cause without a sure size may be: what was told apart poorly, or any law of the speed for such a law."""
+    laws = [n for n, e in CATALOGUE.items() if effect.speed_law and e.speed_law and n not in (effect.name, *forbid)]
+    return tuple(dict.fromkeys([*one.ambiguous, *one.alike, *(Name(n, one.name.at) for n in laws)]))
 
 
 def has_size(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:

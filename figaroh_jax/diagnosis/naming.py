@@ -101,7 +101,7 @@ def standings(
     grown = _Grown(problem, full, whitening, ground(full.rows, full.verdicts, full.state.prior, full.folded), size)
     out = []
     for one, effect, place, at in zip(found, joint.causes, places, joint.fitted.places, strict=True):
-        late = kind(effect) == "response"
+        late, coupled = kind(effect) == "response", effect.name == "coupled_transmission"
         bare = stood_without(problem, start, found, one, whitening) if late else None
         without = bare.verdicts if bare else judged_without(problem, start, full, found, one, whitening)
         worse, better = (v.own(full.rows, one.joints) for v in (without, full.verdicts))
@@ -112,7 +112,7 @@ def standings(
             Standing(
                 name=one.name,
                 whole=whole,
-                physical=physical_sign(effect),
+                physical=physical_sign(effect) and not (coupled and _turns_against_itself(effect, joint.fitted, at)),
                 beside_rest=effect.beside_rest,
                 gain=1 - float(better.sum() / max(worse.sum(), 1e-300)),
                 t=t_value(worse, better),
@@ -120,7 +120,7 @@ def standings(
                 modulation=modulation[0],
                 modulation_held_out=modulation[1],
                 beside_smooth=_beside_smooth(grown, bare, effect, place, one.joints) if whole else 1.0,
-                inertia_alone=effect.name == "coupled_transmission" and _inertia_alone(effect, joint.fitted, at),
+                inertia_alone=coupled and _inertia_alone(effect, joint.fitted, at),
             )
         )
     return out
@@ -261,9 +261,23 @@ def _with_smooth(grown: _Grown, step: Step) -> Hypothesis:
 
 def _inertia_alone(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
     """Whether neither friction of a coupling is surely there (two standard deviations)."""
+    deviations = _deviations(effect, fitted, place)
+    return all(abs(deviations[n]) < 2 for n in ("damping", "friction"))
+
+
+def _turns_against_itself(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
+    """Whether a part of a coupling is surely negative (three standard deviations).
+
+    One rotor that turns the sum, or the difference, of two joints has inertia, damping and friction of that sign.
+    """
+    return min(_deviations(effect, fitted, place)[n] for n in ("inertia", "damping", "friction")) < -3
+
+
+def _deviations(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> dict[str, float]:
+    """Each parameter in its standard deviations."""
     names = [n for n, p in effect.parameters().items() if p.linear] + shapes(type(effect))
-    std = dict(zip(names, np.sqrt(np.diag(fitted.covariance)[list(place)]), strict=True))
-    return all(abs(float(getattr(effect, n))) < 2 * std[n] for n in ("damping", "friction"))
+    std = np.sqrt(np.maximum(np.diag(fitted.covariance)[list(place)], 1e-300))
+    return {name: float(getattr(effect, name)) / float(s) for name, s in zip(names, std, strict=True)}
 
 
 def _unit(x: np.ndarray) -> np.ndarray:

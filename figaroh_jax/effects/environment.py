@@ -64,6 +64,7 @@ class ExternalWrench(PointEffect):
     equation = "-J(q)' (force_x, force_y, force_z) at the point (x, y, z) of the link"
     separated_by = "the same motion with {at} free, or with the base turned"
     resembles = ("gravity_tilt", "payload")  # six numbers that follow any constant load of a few postures
+    beside_rest = False  # for the same reason: a rest that goes with the posture looks like it
     force_x: Scalar = amplitude("N")
     force_y: Scalar = amplitude("N")
     force_z: Scalar = amplitude("N")

@@ -123,6 +123,7 @@ class ClockError(Effect):
 
     name, title, acts_on = "clock_error", "clocks of position and torque that drift apart", "robot"
     follows_torque = follows_total = True
+    beside_rest = False  # whatever is late in one part of a recording and not in another looks like it
     equation = "rate t p tau_hat"
     separated_by = "a longer recording: the lag at its end against the lag at its start"
     rate: Scalar = amplitude("s/s", lower=-0.02, upper=0.02)

@@ -36,7 +36,7 @@ __all__ = ["BatchFit", "Coordinates", "condense_on_devices", "coordinates", "fit
 HOST_CHUNK = 128  # samples whose rows stay in the processor's cache
 CODE_CHUNK = 512  # the same where machine code makes them
 TERMS_CHUNK = 4096  # samples of which the columns of friction and the like are computed at once beside machine code
-DEVICE_BYTES = 2e9  # of the rows of a chunk on an accelerator
+DEVICE_BYTES = 8e9  # of the rows of a chunk on an accelerator, at the most
 BESIDE = 32  # columns to a multiple of which a joint's rows are filled up on a device, so that few products serve all
 CLIPPED = 1e-13  # share of a joint's products that is rounding: what they say of smaller ones is left out
 _SAMPLES = PartitionSpec("samples")
@@ -100,7 +100,7 @@ def condense_on_devices(
     are added. Pieces of one length share a program; the source is read while the devices work. A single CPU takes
     machine code for the rows of long pieces, where there is some. A direction in which the rows are less than 3e-7 of
     the strongest one's is taken as not shown. Folds are whole chunks in turn. Raises `InputError` where a piece has a
-    wrong shape or holds a number that is not finite.
+    wrong shape or holds a number that is not finite. An accelerator is busy with pieces of 1e5 samples and more.
     """
     mesh = Mesh(np.array(list(devices or jax.devices())), ("samples",))
     frames = states.frames
@@ -181,11 +181,13 @@ def _summed(states: States, frames: Sequence[OwnFrame], mesh: Mesh, folds: int, 
     fixed = jax.device_put((model, terms, width, [group[1:] for group in groups]), everywhere)
     zero = (np.zeros((folds, len(g.joints), *2 * g.places.shape[1:])) for g in groups)
     total = jax.device_put(_Sums(tuple(zero), *np.zeros((2, folds, nv))), everywhere)
-    chunk = chunk or _chunk(mesh, _places(model, terms)[1] + sum(2 * g.places.size for g in groups))
-    program = _program(mesh, chunk, folds, block_codes(model) if mesh.devices.flat[0].platform == "gpu" else None)
+    numbers = _places(model, terms)[1] + sum(2 * g.places.size for g in groups)
+    codes = block_codes(model) if mesh.devices.flat[0].platform == "gpu" else None
     chunks, before = 0, None
     for number, part in enumerate(states.source()):
         check_piece(model, part, number, values=False)
+        chunk = chunk or _chunk(mesh, numbers, len(part[0]) // folds)
+        program = _program(mesh, chunk, folds, codes)
         total = program(total, fixed, _spread(part, chunk, mesh), chunks)
         chunks += -(-len(part[0]) // chunk)
         jax.block_until_ready(before)  # one piece ahead: no more wait in memory
@@ -199,10 +201,13 @@ def _summed(states: States, frames: Sequence[OwnFrame], mesh: Mesh, folds: int, 
     return _Sums(tuple(products), sums.rows, sums.torque)
 
 
-def _chunk(mesh: Mesh, rows: int) -> int:
-    if mesh.devices.flat[0].platform == "cpu":
+def _chunk(mesh: Mesh, rows: int, most: int) -> int:
+    """Samples whose rows exist at once: on an accelerator many, but so few that a piece has chunks for all folds."""
+    device = mesh.devices.flat[0]
+    if device.platform == "cpu":
         return HOST_CHUNK
-    return 1 << max(8, int(np.log2(DEVICE_BYTES / 8 / rows)))
+    memory = min(DEVICE_BYTES, (device.memory_stats() or {}).get("bytes_limit", DEVICE_BYTES) / 10)
+    return 1 << max(8, min(int(np.log2(memory / 8 / rows)), int(np.ceil(np.log2(max(1, most / mesh.size))))))
 
 
 def _spread(part: Sequence[Any], chunk: int, mesh: Mesh) -> tuple[Any, ...]:

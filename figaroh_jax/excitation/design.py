@@ -34,6 +34,7 @@ CHECKED = 8  # motions, the best first, until none promises more than one that i
 ROUNDING = 1e-6  # of a limit
 CLEAR_RATE = 40.0  # Hz at which a random motion touches nothing: what begins on the wrong side of a body stays there
 SMALLER = (1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05, 0.02)  # shares of a random motion that are tried for that
+FAR, SHRUNK = 2.0, 12  # of a torque limit, where a random motion may begin; times that it is made smaller for it
 STEP = 0.98  # by which a motion is made smaller until it meets its limits
 
 Objective = Literal["information", "prediction", "condition", "separate"]
@@ -140,6 +141,7 @@ def excite(
     limits = _without(limits, robot, learned.held, begin)
     sampler = Sampler(robot, learned.terms, np.asarray(learned.width))
     torque = torque_of(model, learned, sampler)
+    _stands(torque, robot, limits, begin)
     problem = unmeetable(torque, robot, limits, begin)
     if problem is not None:
         raise InputError(problem)
@@ -249,6 +251,20 @@ def _inside(robot: RobotModel, start: np.ndarray, limits: Limits) -> np.ndarray:
     return start
 
 
+def _stands(torque: Torque, robot: RobotModel, limits: Limits, start: np.ndarray | None) -> None:
+    """`InputError` where standing still in the posture in which a motion begins takes more than a torque limit."""
+    if start is None or not np.isfinite(limits.torque).any():
+        return
+    share = np.abs(torque(np.stack([start, 0 * start, 0 * start])[:, None]))[0] / limits.torque
+    worst = int(share.argmax())
+    if share[worst] > 1.0:
+        raise InputError(
+            f"start: holding still there takes {share[worst]:.2f} times the torque limit of '{robot.dof_names[worst]}'"
+            f" ({limits.torque[worst]:g}), and a motion begins at rest: begin elsewhere (a person on a plate: where"
+            " `people.balanced` says)"
+        )
+
+
 def _without(limits: Limits, robot: RobotModel, held: Sequence[int], start: Float[np.ndarray, " nv"] | None) -> Limits:
     """The limits, without those of motion of the joints that stand still: where the start is, or at zero."""
     if not held:
@@ -352,13 +368,24 @@ def random_motion(problem: Problem, generator: np.random.Generator, amplitude: f
         scale = np.minimum(scale, np.nanmin(np.where(np.abs(moved) > 0, room, np.inf), axis=0))
     scale = amplitude * np.where(np.isfinite(scale), scale, 1.0)
     if not _distances_count(limits):
-        return problem.numbers(Trajectory(start, weights * scale[:, None], problem.basis))
+        return _within_torque(problem, problem.numbers(Trajectory(start, weights * scale[:, None], problem.basis)))
     assert limits.clearance is not None
     for smaller in SMALLER:
         motion = Trajectory(start, weights * (smaller * scale)[:, None], problem.basis)
         if (limits.clearance.distances(np.asarray(motion.states(CLEAR_RATE)[0])) > 0).all():
             break
     return problem.numbers(motion)
+
+
+def _within_torque(problem: Problem, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """The motion made smaller where it takes many times a torque limit, as of one who stands: no solver leads back."""
+    for _ in range(SHRUNK if problem.torque else 0):
+        worst = float(np.abs(problem.torque_shares(x)).max())
+        if worst <= FAR:
+            break
+        motion = problem.trajectory(x)
+        x = problem.numbers(replace(motion, weights=np.asarray(motion.weights) * max(0.5, FAR / worst)))
+    return x
 
 
 def _distances_count(limits: Limits) -> bool:

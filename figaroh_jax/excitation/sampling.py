@@ -26,7 +26,7 @@ from ..rigid.dynamics import inverse_dynamics
 from ..rigid.model import RobotModel
 from ..rigid.regressor import dense_rows
 from ..rigid.regressor_gradient import pullback_rows
-from ..rigid.scalar_programs import COLUMNS, straight
+from ..rigid.scalar_forms import COLUMNS, straight
 
 __all__ = ["CHUNK", "Sampler", "smooth_motion", "term_blocks"]
 

@@ -16,17 +16,12 @@ from jaxtyping import Float
 
 from ..errors import InputError
 from ..rigid import inertia
-from ..rigid.model import Kind, RobotModel
-from .assembly import ROOT_JOINT, FramePart, JointPart, LinkPart, Posture, Root, assemble, displacement, refuse_many
-from .files import plain_file
+from ..rigid.model import RobotModel
+from .assembly import ROOT_JOINT, FramePart, JointPart, LinkPart, Posture, Root, assemble, displacement
+from .usd_stage import DEGREE, ROTATIONS, TRANSLATIONS, Edge, Stage, body_inertia, name_of, reading, schemas, value
 from .xmlfile import find_in_packages
 
 __all__ = ["UsdJoint", "load_usd", "usd_joints"]
-
-_LARGEST = 200_000_000  # bytes of the root layer; meshes may stand in it
-_ROTATIONS, _TRANSLATIONS = ("rotX", "rotY", "rotZ"), ("transX", "transY", "transZ")
-_WATER = 1000.0  # kg/m^3, the density that UsdPhysics gives a collider that states none
-_DEGREE = np.pi / 180
 
 
 class UsdJoint(NamedTuple):
@@ -38,24 +33,6 @@ class UsdJoint(NamedTuple):
     stiffness: float = 0.0
     rest: float = 0.0
     drive: dict[str, Any] | None = None  # kind, kp, kd and force, as a task's `actuator` states a drive
-
-
-class _Body(NamedTuple):
-    name: str
-    prim: Any
-    pose: Float[np.ndarray, "4 4"]  # in the stage, m
-    scale: Float[np.ndarray, "3"]  # of its axes: local points are in these units, times the stage's
-
-
-class _Edge(NamedTuple):
-    """A joint between two bodies ("" for the world); the frames are in the bodies, in m."""
-
-    name: str
-    prim: Any
-    kind: Kind | str
-    axis: Float[np.ndarray, "3"]  # in the joint's frames, which agree at zero
-    ends: tuple[str, str]
-    frames: tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]]
 
 
 def load_usd(
@@ -93,8 +70,8 @@ def load_usd(
     ('hinge',)
     """
     file = find_in_packages(path, packages)
-    with _reading(file):
-        stage = _Stage(file)
+    with reading(file):
+        stage = Stage(file)
         links, parts, frames, free = _parts(stage, root)
         own = stage.gravity() if gravity is None else gravity
     if free and joints is not None and free not in joints:
@@ -105,201 +82,15 @@ def load_usd(
 def usd_joints(path: str | Path, packages: Sequence[str | Path] = ()) -> tuple[dict[str, UsdJoint], tuple[str, ...]]:
     """What acts at the joints of a stage, by name, and what of the stage acts and is not read."""
     file = find_in_packages(path, packages)
-    with _reading(file):
-        stage = _Stage(file)
-        notes = [f"tendon '{_name(prim)}'" for prim in stage.prims if prim.GetTypeName() == "MjcTendon"]
+    with reading(file):
+        stage = Stage(file)
+        notes = [f"tendon '{name_of(prim)}'" for prim in stage.prims if prim.GetTypeName() == "MjcTendon"]
         held = [body.name for body in stage.bodies.values() if value(body.prim, "mjc:body:gravcomp", 0.0)]
         notes += [f"gravcomp of the bodies {', '.join(held)}"] if held else []
         return {edge.name: _acting(stage, edge) for edge in stage.edges}, tuple(notes)
 
 
-class _reading:
-    """Errors of the reader and of `pxr` as one message that names the file."""
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if isinstance(error, InputError):
-            raise InputError(f"{self.file}: {str(error).removeprefix(f'{self.file}: ')}") from None
-        if isinstance(error, Exception) and type(error).__module__.startswith(("pxr", "Boost")):
-            raise InputError(f"{self.file}: OpenUSD does not read it: {' '.join(str(error).split())}") from None
-
-
-def _pxr() -> Any:
-    try:
-        import pxr.Gf
-        import pxr.Tf
-        import pxr.Usd
-        import pxr.UsdGeom
-        import pxr.UsdPhysics  # noqa: F401
-    except ImportError:
-        raise InputError("USD is read by usd-core; install it: pip install 'figaroh-jax[usd]'") from None
-    return pxr
-
-
-class _Stage:
-    """An open stage: its units, bodies and joints."""
-
-    def __init__(self, file: Path) -> None:
-        self.pxr = _pxr()
-        usd, geom, physics = self.pxr.Usd, self.pxr.UsdGeom, self.pxr.UsdPhysics
-        plain_file(file, str(file), "a robot model", _LARGEST, (".usd", ".usda", ".usdc", ".usdz"))
-        self.stage = usd.Stage.Open(str(file))
-        missing = self.stage.GetCompositionErrors() if hasattr(self.stage, "GetCompositionErrors") else []
-        if missing:
-            raise InputError(f"a layer that it names cannot be read: {missing[0]}")
-        self.metre = geom.GetStageMetersPerUnit(self.stage)
-        self.kilogram = physics.GetStageKilogramsPerUnit(self.stage)
-        self.up = np.eye(3)["XYZ".index(geom.GetStageUpAxis(self.stage))]
-        self._cache = geom.XformCache(usd.TimeCode.Default())
-        self.prims = list(usd.PrimRange.Stage(self.stage, usd.TraverseInstanceProxies()))
-        refuse_many("", "prims with a rigid body", sum(p.HasAPI(physics.RigidBodyAPI) for p in self.prims))
-        self.scene = next((p for p in self.prims if p.IsA(physics.Scene)), None)
-        default = self.stage.GetDefaultPrim()
-        self.name = _name(default) if default else file.stem
-        self.bodies = self._bodies()
-        self.edges = [edge for prim in self.prims if prim.IsA(physics.Joint) and (edge := self._edge(prim)) is not None]
-
-    def gravity(self) -> list[float]:
-        """Of the physics scene in m/s^2, or 9.81 against the up axis."""
-        physics, way, size = self.pxr.UsdPhysics, np.zeros(3), -np.inf
-        if self.scene is not None:
-            scene = physics.Scene(self.scene)
-            way = np.array(scene.GetGravityDirectionAttr().Get(), float)
-            size = float(scene.GetGravityMagnitudeAttr().Get())
-            if not value(self.scene, "newton:gravityEnabled", True):
-                return [0.0, 0.0, 0.0]
-        way = way / np.linalg.norm(way) if way.any() else -self.up
-        return (way * (9.81 if size < 0 else size * self.metre)).tolist()
-
-    def degrees(self) -> bool:
-        """Whether MuJoCo's own attributes of hinges are in degrees."""
-        return self.scene is None or value(self.scene, "mjc:compiler:angle", "degree") == "degree"
-
-    def pose(self, prim: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Pose of a prim in the stage (m) and the scale of its axes; `InputError` where they are skewed."""
-        matrix = np.array(self._cache.GetLocalToWorldTransform(prim), float).T
-        scale = np.linalg.norm(matrix[:3, :3], axis=0)
-        turn = matrix[:3, :3] / np.where(scale > 0, scale, 1.0)
-        if not np.allclose(turn.T @ turn, np.eye(3), rtol=0, atol=1e-5):
-            raise InputError(f"prim {prim.GetPath()}: its axes are skewed or of no length; a rigid body is not sheared")
-        u, _, v = np.linalg.svd(turn)
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = u @ v, matrix[:3, 3] * self.metre
-        if np.linalg.det(u @ v) < 0:
-            raise InputError(f"prim {prim.GetPath()}: its axes are mirrored (a negative scale)")
-        return pose, scale
-
-    def carrier(self, prim: Any) -> str:
-        """Path of the rigid body that a prim belongs to, "" for none."""
-        while prim and str(prim.GetPath()) not in self.bodies:
-            prim = prim.GetParent()
-        return str(prim.GetPath()) if prim else ""
-
-    def in_body(self, prim: Any) -> tuple[str, np.ndarray, np.ndarray]:
-        """Body of a prim, the prim's pose in it (in the stage for none) and the scale of its axes."""
-        body = self.carrier(prim)
-        pose, scale = self.pose(prim)
-        return body, (np.linalg.inv(self.bodies[body].pose) @ pose if body else pose), scale
-
-    def _bodies(self) -> dict[str, _Body]:
-        api, found = self.pxr.UsdPhysics.RigidBodyAPI, {}
-        for prim in self.prims:
-            if prim.HasAPI(api) and api(prim).GetRigidBodyEnabledAttr().Get() is not False:
-                found[str(prim.GetPath())] = _Body(_name(prim), prim, *self.pose(prim))
-        if not found:
-            raise InputError("no prim is a rigid body (PhysicsRigidBodyAPI); a robot's links are")
-        return found
-
-    def _edge(self, prim: Any) -> _Edge | None:
-        joint, path = self.pxr.UsdPhysics.Joint(prim), prim.GetPath()
-        if joint.GetJointEnabledAttr().Get() is False:
-            return None
-        ends, frames = [], []
-        for side in "01":
-            targets = getattr(joint, f"GetBody{side}Rel")().GetTargets()
-            if len(targets) > 1:
-                raise InputError(f"joint {path}: body{side} has {len(targets)} targets; one is expected")
-            target = self.stage.GetPrimAtPath(targets[0]) if targets else None
-            if targets and not target:
-                raise InputError(f"joint {path}: body{side}, {targets[0]}, does not exist")
-            body, pose, scale = self.in_body(target) if target else ("", np.eye(4), np.ones(3))
-            local = _pose(
-                np.array(getattr(joint, f"GetLocalPos{side}Attr")().Get(), float) * scale * self.metre,
-                getattr(joint, f"GetLocalRot{side}Attr")().Get(),
-            )
-            ends.append(body)
-            frames.append(pose @ local)
-        if ends[0] == ends[1]:
-            raise InputError(f"joint {path}: joins {ends[0] or 'the world'} to itself")
-        if joint.GetExcludeFromArticulationAttr().Get():
-            raise InputError(
-                f"joint {path} closes a kinematic loop (excludeFromArticulation) between {ends[0] or 'the world'} and "
-                f"{ends[1] or 'the world'}; a robot is a tree: disable the joint or take it out"
-            )
-        return _Edge(_name(prim), prim, *self._motion(prim), (ends[0], ends[1]), (frames[0], frames[1]))
-
-    def _motion(self, prim: Any) -> tuple[str, np.ndarray]:
-        """Kind and axis of a joint."""
-        physics = self.pxr.UsdPhysics
-        for schema, kind in ((physics.RevoluteJoint, "revolute"), (physics.PrismaticJoint, "prismatic")):
-            if prim.IsA(schema):
-                return kind, np.eye(3)["XYZ".index(schema(prim).GetAxisAttr().Get())]
-        if prim.IsA(physics.FixedJoint):
-            return "fixed", np.zeros(3)
-        if prim.IsA(physics.SphericalJoint):
-            return "spherical", np.zeros(3)
-        if prim.GetTypeName() == "PhysicsJoint":
-            return _generic(prim, physics)
-        raise InputError(
-            f"joint {prim.GetPath()}: a {prim.GetTypeName()} does not hold its bodies to fixed axes; fixed, revolute, "
-            "prismatic, spherical and generic joints are read"
-        )
-
-
-def value(prim: Any, name: str, default: Any = None) -> Any:
-    """An attribute that the file gives, in whatever schema; `default` where it gives none."""
-    attribute = prim.GetAttribute(name)
-    found = attribute.Get() if attribute and attribute.HasAuthoredValue() else None
-    return default if found is None else found
-
-
-def _name(prim: Any) -> str:
-    """What the robot's own file called it, where the name is no identifier of USD."""
-    return prim.GetDisplayName() or prim.GetName()
-
-
-def _pose(position: Float[np.ndarray, "3"], quaternion: Any) -> Float[np.ndarray, "4 4"]:
-    numbers = np.array([*quaternion.GetImaginary(), quaternion.GetReal()], float)
-    if not np.linalg.norm(numbers) > 0.5:  # a zero quaternion is USD's "none given"
-        numbers = np.array([0.0, 0.0, 0.0, 1.0])
-    return displacement("free", np.zeros(3), np.concatenate([position, numbers]))
-
-
-def _generic(prim: Any, physics: Any) -> tuple[str, np.ndarray]:
-    """Kind and axis of a generic (D6) joint by the axes that its limits leave free."""
-    free = []
-    for token in (*_TRANSLATIONS, *_ROTATIONS):
-        limit = physics.LimitAPI(prim, token)
-        low, high = limit.GetLowAttr().Get(), limit.GetHighAttr().Get()
-        if not (prim.HasAPI(physics.LimitAPI, token) and low is not None and high is not None and low > high):
-            free.append(token)
-    turning, sliding = [t for t in free if t in _ROTATIONS], [t for t in free if t in _TRANSLATIONS]
-    kinds = {(0, 0): "fixed", (1, 0): "revolute", (0, 1): "prismatic", (3, 0): "spherical", (3, 3): "free"}
-    kind, axis = kinds.get((len(turning), len(sliding))), np.zeros(3)
-    if len(free) == 1 or (len(turning), len(sliding)) == (1, 2) and turning[0][-1] not in {t[-1] for t in sliding}:
-        axis["XYZ".index((turning or sliding)[0][-1])] = 1.0
-        kind = kind or "planar"
-    if kind is None:
-        raise InputError(f"joint {prim.GetPath()}: its limits leave {', '.join(free)} free; no kind of joint does")
-    return kind, axis
-
-
-def _parts(stage: _Stage, root: Root | None) -> tuple[list[LinkPart], list[JointPart], list[FramePart], str]:
+def _parts(stage: Stage, root: Root | None) -> tuple[list[LinkPart], list[JointPart], list[FramePart], str]:
     """Links, joints and frames of the one robot of a stage, and the name of its free joint ("" for none)."""
     base, edges, beside = _tree(stage)
     if beside and root == "free_flyer":
@@ -314,7 +105,7 @@ def _parts(stage: _Stage, root: Root | None) -> tuple[list[LinkPart], list[Joint
     names = {path: stage.bodies[path].name for path in inside}
     names[""] = "world" if "world" not in names.values() else "world_of_the_stage"
     start, edges = _start(stage, base, edges, root, names)
-    links = [LinkPart(names[path], inertia.transform(_inertia(stage, path), offset[path])) for path in inside]
+    links = [LinkPart(names[path], inertia.transform(body_inertia(stage, path), offset[path])) for path in inside]
     parts, inner = _joints(stage, edges, names, offset)
     frames = [
         FramePart(names[path], names[path], offset[path])
@@ -332,8 +123,8 @@ def _parts(stage: _Stage, root: Root | None) -> tuple[list[LinkPart], list[Joint
 
 
 def _start(
-    stage: _Stage, base: str, edges: list[_Edge], root: Root | None, names: dict[str, str]
-) -> tuple[list[JointPart], list[_Edge]]:
+    stage: Stage, base: str, edges: list[Edge], root: Root | None, names: dict[str, str]
+) -> tuple[list[JointPart], list[Edge]]:
     """What holds the base or lets it fly, and the other joints."""
     held = [edge for edge in edges if edge.ends[0] == ""]
     if held and held[0].kind != "fixed":
@@ -359,7 +150,7 @@ def _numbers(pose: Float[np.ndarray, "4 4"]) -> tuple[float, ...]:
     return tuple(map(float, (*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat())))
 
 
-def _tree(stage: _Stage) -> tuple[str, list[_Edge], list[str]]:
+def _tree(stage: Stage) -> tuple[str, list[Edge], list[str]]:
     """Base of the robot, its joints from the base outwards, each from parent to child, and bodies welded beside it."""
     groups = list[set[str]]()
     for edge in stage.edges:
@@ -384,9 +175,9 @@ def _tree(stage: _Stage) -> tuple[str, list[_Edge], list[str]]:
     return base, _outwards(base, own), beside
 
 
-def _outwards(base: str, edges: Sequence[_Edge]) -> list[_Edge]:
+def _outwards(base: str, edges: Sequence[Edge]) -> list[Edge]:
     """The joints turned from parent to child, those of the world first; `InputError` for one that closes a loop."""
-    queue, known, found, left = [base], {base, ""}, list[_Edge](), list(edges)
+    queue, known, found, left = [base], {base, ""}, list[Edge](), list(edges)
     world = [edge if edge.ends[0] == "" else _reversed(edge) for edge in left if "" in edge.ends]
     left = [edge for edge in left if "" not in edge.ends]
     for edge in world:
@@ -409,7 +200,7 @@ def _outwards(base: str, edges: Sequence[_Edge]) -> list[_Edge]:
     return world + sorted(found, key=lambda edge: order[edge.prim.GetPath()])
 
 
-def _refuse_loop(edge: _Edge, others: Sequence[_Edge]) -> None:
+def _refuse_loop(edge: Edge, others: Sequence[Edge]) -> None:
     by = ", ".join(f"'{other.name}'" for other in others) or "the world"
     raise InputError(
         f"joint '{edge.name}' closes a kinematic loop: the body '{edge.ends[1]}' is carried by {by} already; a robot "
@@ -417,7 +208,7 @@ def _refuse_loop(edge: _Edge, others: Sequence[_Edge]) -> None:
     )
 
 
-def _base(stage: _Stage, group: set[str], edges: Sequence[_Edge]) -> str:
+def _base(stage: Stage, group: set[str], edges: Sequence[Edge]) -> str:
     """The body held to the world, else the one marked as an articulation's root, else the one that nothing carries."""
     ends = [edge.ends for edge in edges]
     held = [max(pair) for pair in ends if "" in pair]
@@ -429,29 +220,25 @@ def _base(stage: _Stage, group: set[str], edges: Sequence[_Edge]) -> str:
     return (held or marked or first or [path for path in stage.bodies if path in group])[0]
 
 
-def _stacks(edge: _Edge) -> bool:
+def _stacks(edge: Edge) -> bool:
     """Whether joints between the same two bodies add their motions: MuJoCo's do."""
-    return edge.kind in ("revolute", "prismatic") and "MjcJointAPI" in _schemas(edge.prim)
+    return edge.kind in ("revolute", "prismatic") and "MjcJointAPI" in schemas(edge.prim)
 
 
-def _schemas(prim: Any) -> list[str]:
-    return list(prim.GetPrimTypeInfo().GetAppliedAPISchemas())
-
-
-def _reversed(edge: _Edge) -> _Edge:
+def _reversed(edge: Edge) -> Edge:
     return edge._replace(axis=-edge.axis, ends=edge.ends[::-1], frames=edge.frames[::-1])
 
 
-def _chains(edges: Sequence[_Edge]) -> Iterator[list[_Edge]]:
+def _chains(edges: Sequence[Edge]) -> Iterator[list[Edge]]:
     """Joints between the same two bodies together."""
-    together: dict[tuple[str, str], list[_Edge]] = {}
+    together: dict[tuple[str, str], list[Edge]] = {}
     for edge in edges:
         together.setdefault(edge.ends, []).append(edge)
     yield from together.values()
 
 
 def _joints(
-    stage: _Stage, edges: Sequence[_Edge], names: dict[str, str], offset: dict[str, np.ndarray]
+    stage: Stage, edges: Sequence[Edge], names: dict[str, str], offset: dict[str, np.ndarray]
 ) -> tuple[list[JointPart], list[LinkPart]]:
     """Joints of the model, those between the same two bodies one after another with massless links between."""
     parts, inner = [], []
@@ -479,25 +266,25 @@ def _shift(way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     return pose
 
 
-def _unit(stage: _Stage, edge: _Edge) -> float:
+def _unit(stage: Stage, edge: Edge) -> float:
     """Of UsdPhysics' positions of a joint in rad or m: degrees, lengths of the stage."""
-    return _DEGREE if edge.kind == "revolute" else stage.metre
+    return DEGREE if edge.kind == "revolute" else stage.metre
 
 
-def _moment(stage: _Stage, edge: _Edge) -> float:
+def _moment(stage: Stage, edge: Edge) -> float:
     """Of a stage's forces (prismatic) or torques in N or N m."""
     return stage.kilogram * stage.metre ** (2 if edge.kind == "revolute" else 1)
 
 
-def _reference(stage: _Stage, edge: _Edge) -> float:
+def _reference(stage: Stage, edge: Edge) -> float:
     """MuJoCo's `ref` in rad or m: the position of the joint where its frames agree; 0 for other joints."""
     if edge.kind not in ("revolute", "prismatic"):
         return 0.0
     angle = edge.kind == "revolute" and stage.degrees()
-    return float(value(edge.prim, "mjc:ref", 0.0)) * (_DEGREE if angle else 1.0)
+    return float(value(edge.prim, "mjc:ref", 0.0)) * (DEGREE if angle else 1.0)
 
 
-def _limit(stage: _Stage, edge: _Edge) -> tuple[float, float, float, float]:
+def _limit(stage: Stage, edge: Edge) -> tuple[float, float, float, float]:
     """Lower, upper, velocity and effort limit; infinite where the stage gives none."""
     lower, upper, fast, strong = -np.inf, np.inf, np.inf, np.inf
     if edge.kind not in ("revolute", "prismatic"):
@@ -505,7 +292,7 @@ def _limit(stage: _Stage, edge: _Edge) -> tuple[float, float, float, float]:
     prim, unit = edge.prim, _unit(stage, edge)
     physics = stage.pxr.UsdPhysics
     if prim.GetTypeName() == "PhysicsJoint":
-        token = (_ROTATIONS if edge.kind == "revolute" else _TRANSLATIONS)[int(np.abs(edge.axis).argmax())]
+        token = (ROTATIONS if edge.kind == "revolute" else TRANSLATIONS)[int(np.abs(edge.axis).argmax())]
         own = physics.LimitAPI(prim, token)
         bounds = (own.GetLowAttr().Get(), own.GetHighAttr().Get()) if prim.HasAPI(physics.LimitAPI, token) else ()
     else:
@@ -522,7 +309,7 @@ def _limit(stage: _Stage, edge: _Edge) -> tuple[float, float, float, float]:
     return lower, upper, fast, strong
 
 
-def _mujoco_effort(stage: _Stage, edge: _Edge) -> float:
+def _mujoco_effort(stage: Stage, edge: Edge) -> float:
     """Largest torque that MuJoCo's attributes let the drives of a joint give; infinite without a limit."""
     total = _range(edge.prim, "mjc:actuatorfrc", "mjc:actuatorfrcrange")
     sums = []
@@ -547,7 +334,7 @@ def _range(prim: Any, limited: str, name: str) -> float:
     return max(abs(low), abs(high)) if in_force else np.inf
 
 
-def _mimic(stage: _Stage, edge: _Edge, leaders: dict[str, _Edge]) -> tuple[str, float, float] | None:
+def _mimic(stage: Stage, edge: Edge, leaders: dict[str, Edge]) -> tuple[str, float, float] | None:
     """Joint that it follows, ratio and offset, by Newton's schema (and MuJoCo's, which builds on it) or PhysX's."""
     prim = edge.prim
     relation, found = prim.GetRelationship("newton:mimicJoint"), None
@@ -558,7 +345,7 @@ def _mimic(stage: _Stage, edge: _Edge, leaders: dict[str, _Edge]) -> tuple[str, 
             )
         ratio, offset = value(prim, "newton:mimicCoef1", 1.0), value(prim, "newton:mimicCoef0", 0.0)
         found = str(relation.GetTargets()[0]), float(ratio), float(offset) * _unit(stage, edge)
-    for schema in _schemas(prim):
+    for schema in schemas(prim):
         if schema.startswith("PhysxMimicJointAPI"):  # q + gearing * leader + offset = 0
             own = f"physxMimicJoint:{schema.partition(':')[2]}"
             targets = prim.GetRelationship(f"{own}:referenceJoint").GetTargets()
@@ -573,19 +360,19 @@ def _mimic(stage: _Stage, edge: _Edge, leaders: dict[str, _Edge]) -> tuple[str, 
     return leader.name, ratio, offset + _reference(stage, edge) - ratio * _reference(stage, leader)
 
 
-def _acting(stage: _Stage, edge: _Edge) -> UsdJoint:
+def _acting(stage: Stage, edge: Edge) -> UsdJoint:
     """What acts at a joint, by Newton's, MuJoCo's or PhysX's attributes, whichever the stage gives."""
     if edge.kind == "fixed":
         return UsdJoint()
     prim, angle, moment = edge.prim, edge.kind in ("revolute", "spherical"), _moment(stage, edge)
-    per = 1.0 / _DEGREE if angle else 1.0 / stage.metre  # of gains that count degrees
+    per = 1.0 / DEGREE if angle else 1.0 / stage.metre  # of gains that count degrees
     mass = stage.kilogram * (stage.metre**2 if angle else 1.0)
     armature = value(prim, "newton:armature", value(prim, "mjc:armature", value(prim, "physxJoint:armature", 0.0)))
     friction = value(prim, "newton:friction", value(prim, "mjc:frictionloss", 0.0))
     damping = (
         float(value(prim, "newton:damping", 0.0)) * per * moment or float(value(prim, "mjc:damping", 0.0)) * moment
     )
-    rest = float(value(prim, "mjc:springref", 0.0)) * (_DEGREE if angle and stage.degrees() else 1.0)
+    rest = float(value(prim, "mjc:springref", 0.0)) * (DEGREE if angle and stage.degrees() else 1.0)
     stiffness, drive, token = float(value(prim, "mjc:stiffness", 0.0)), None, "angular" if angle else "linear"
     if prim.HasAPI(stage.pxr.UsdPhysics.DriveAPI, token):
         own = f"drive:{token}:physics"
@@ -598,91 +385,11 @@ def _acting(stage: _Stage, edge: _Edge) -> UsdJoint:
     return UsdJoint(float(armature) * mass, damping, float(friction) * moment, stiffness, rest, drive)
 
 
-def _inertia(stage: _Stage, path: str) -> Float[np.ndarray, "10"]:
-    """Inertia of a body in its own frame: what its mass schema states, else what its colliders weigh."""
-    body, api = stage.bodies[path], stage.pxr.UsdPhysics.MassAPI(stage.bodies[path].prim)
-    mass = float(value(body.prim, "physics:mass", 0.0)) * stage.kilogram
-    com = np.array(value(body.prim, "physics:centerOfMass", [-np.inf] * 3), float) * body.scale * stage.metre
-    moments = _moments(stage, body.prim, api)
-    if mass < 0:
-        raise InputError(f"body '{body.name}': its mass is {mass:g} kg; it cannot be negative")
-    if mass > 0 and moments is not None and np.isfinite(com).all():
-        return inertia.from_com(mass, com, moments)
-    shapes = _colliders(stage, path)
-    if shapes is None:  # nothing has a shape: a mass without extent, or none
-        return inertia.from_com(
-            mass, np.where(np.isfinite(com), com, 0.0), np.zeros((3, 3)) if moments is None else moments
-        )
-    weight, centre, about = inertia.to_com(shapes)
-    if mass > 0 and weight > 0:
-        weight, about = mass, about * (mass / weight)
-    return inertia.from_com(
-        weight, com if np.isfinite(com).all() else centre, about if moments is None else moments
-    )  # fmt: skip
-
-
-def _moments(stage: _Stage, prim: Any, api: Any) -> Float[np.ndarray, "3 3"] | None:
-    """Moments about the centre of mass in the body's axes; None where the stage gives none."""
-    unit = stage.kilogram * stage.metre**2
-    full = np.array(value(prim, "newton:inertia", []), float)
-    if full.size == 6:
-        xx, yy, zz, xy, xz, yz = full * unit
-        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    diagonal = np.array(value(prim, "physics:diagonalInertia", np.zeros(3)), float) * unit
-    if not diagonal.any():
-        return None
-    turn = _pose(np.zeros(3), api.GetPrincipalAxesAttr().Get())[:3, :3]
-    return turn @ np.diag(diagonal) @ turn.T
-
-
-def _colliders(stage: _Stage, path: str) -> Float[np.ndarray, "10"] | None:
-    """What the colliders of a body weigh together, in the body's frame; None where it has none."""
-    physics, body = stage.pxr.UsdPhysics, stage.bodies[path]
-    solid = [p for p in stage.prims if p.HasAPI(physics.CollisionAPI) and value(p, "physics:collisionEnabled", True)]
-    found = [prim for prim in solid if stage.carrier(prim) == path]
-    if not found:
-        return None
-    total = np.zeros(10)
-    for prim in found:
-        volume, moments = _shape(stage, prim, body.name)
-        density = float(value(prim, "physics:density", 0.0)) or float(value(body.prim, "physics:density", 0.0))
-        density = density * stage.kilogram / stage.metre**3 or _WATER
-        mass = float(value(prim, "physics:mass", 0.0)) * stage.kilogram or density * volume
-        pose = stage.in_body(prim)[1]
-        total = total + inertia.transform(inertia.from_com(mass, np.zeros(3), mass * moments), pose)
-    return total
-
-
-def _shape(stage: _Stage, prim: Any, body: str) -> tuple[float, Float[np.ndarray, "3 3"]]:
-    """Volume (m^3) of a solid collider and its moments for a unit of mass, about its own origin."""
-    kind, scale = str(prim.GetTypeName()), stage.pose(prim)[1] * stage.metre
-    get = lambda name: float(prim.GetAttribute(name).Get())  # noqa: E731
-    if kind == "Cube":
-        x, y, z = get("size") * scale
-        return x * y * z, np.diag([y * y + z * z, x * x + z * z, x * x + y * y]) / 12
-    if kind == "Sphere":
-        radius = get("radius") * scale[0]
-        return 4 / 3 * np.pi * radius**3, 0.4 * radius**2 * np.eye(3)
-    if kind in ("Cylinder", "Capsule"):
-        along = "XYZ".index(prim.GetAttribute("axis").Get())
-        r, h = get("radius") * scale[along - 1], get("height") * scale[along]
-        middle, ends = np.pi * r * r * h, 4 / 3 * np.pi * r**3 if kind == "Capsule" else 0.0
-        axial = middle * r * r / 2 + ends * 0.4 * r * r
-        across = middle * (h * h / 12 + r * r / 4) + ends * (0.4 * r * r + 0.375 * r * h + h * h / 4)
-        moments = np.full(3, across)
-        moments[along] = axial
-        return middle + ends, np.diag(moments) / (middle + ends)
-    raise InputError(
-        f"body '{body}' states no inertia, and that of its collider {prim.GetPath()}, a {kind}, is not computed; "
-        "give the body physics:mass, physics:centerOfMass and physics:diagonalInertia"
-    )
-
-
-def _frames(stage: _Stage, names: dict[str, str], offset: dict[str, np.ndarray]) -> list[FramePart]:
+def _frames(stage: Stage, names: dict[str, str], offset: dict[str, np.ndarray]) -> list[FramePart]:
     """Xforms without shapes and sites, each once, at the link that carries them."""
     shaped = set[str]()
     for prim in stage.prims:
-        site = bool({"MjcSiteAPI", "NewtonSiteAPI"} & set(_schemas(prim)))
+        site = bool({"MjcSiteAPI", "NewtonSiteAPI"} & set(schemas(prim)))
         if prim.IsA(stage.pxr.UsdGeom.Gprim) and not site:
             while prim and str(prim.GetPath()) not in shaped and str(prim.GetPath()) not in stage.bodies:
                 shaped.add(str(prim.GetPath()))
@@ -694,10 +401,10 @@ def _frames(stage: _Stage, names: dict[str, str], offset: dict[str, np.ndarray])
         plain = (
             prim.GetTypeName() == "Xform" and path not in shaped and not (prim.IsInstance() or prim.IsInstanceProxy())
         )
-        site = bool({"MjcSiteAPI", "NewtonSiteAPI"} & set(_schemas(prim)))
-        if not (plain or site) or path in stage.bodies or prim == default or _name(prim) in taken:
+        site = bool({"MjcSiteAPI", "NewtonSiteAPI"} & set(schemas(prim)))
+        if not (plain or site) or path in stage.bodies or prim == default or name_of(prim) in taken:
             continue
         body, pose, _ = stage.in_body(prim)
         if body in names:
-            frames.setdefault(_name(prim), FramePart(_name(prim), names[body], offset[body] @ pose))
+            frames.setdefault(name_of(prim), FramePart(name_of(prim), names[body], offset[body] @ pose))
     return list(frames.values())

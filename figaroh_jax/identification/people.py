@@ -6,7 +6,10 @@ as a prior of stated width, and every interval says which of the two it comes fr
 
 The table is de Leva's (Adjustments to Zatsiorsky-Seluyanov's segment inertia parameters, Journal of Biomechanics 29(9),
 1223-1230, 1996, table 4): shares of the body mass, distance of the centre of mass from the proximal joint and radii of
-gyration (about the antero-posterior, the lateral and the long axis) in shares of the segment's length.
+gyration (about the antero-posterior, the lateral and the long axis) in shares of the segment's length. Lengths are
+those between joint centres (the table's rows SJC-EJC, EJC-WJC, HJC-KJC and KJC-AJC), for a model has joints there; the
+rows from the knee to a malleolus are another length. The numbers were compared with two public copies of the table, of
+BMClab (all agree) and of biobuddy (all but a rounding of the head's mass and its shank, which ends at the malleolus).
 """
 
 from __future__ import annotations
@@ -20,9 +23,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from ..errors import InputError
+from ..errors import InputError, nearest
 from ..estimation.consistency import bodies, physical_fit
 from ..estimation.markers import scaled, segments_of
+from ..rigid.dynamics import inverse_dynamics
 from ..rigid.inertia import from_com, to_com, transform
 from ..rigid.kinematics import forward_kinematics
 from ..rigid.manifold import difference
@@ -35,6 +39,7 @@ __all__ = [
     "Payload",
     "Segments",
     "anthropometric",
+    "balanced",
     "capture",
     "identify_segments",
     "name_payload",
@@ -76,8 +81,8 @@ _TABLE: dict[str, dict[Sex, _Segment]] = {
         "male": _Segment(0.1416, 0.4095, (0.329, 0.329, 0.149)),
     },
     "shank": {
-        "female": _Segment(0.0481, 0.4416, (0.271, 0.267, 0.093)),
-        "male": _Segment(0.0433, 0.4459, (0.255, 0.249, 0.103)),
+        "female": _Segment(0.0481, 0.4352, (0.267, 0.263, 0.092)),
+        "male": _Segment(0.0433, 0.4395, (0.251, 0.246, 0.102)),
     },
     "foot": {"female": _Segment(0.0129, 0, (0, 0, 0)), "male": _Segment(0.0137, 0, (0, 0, 0))},
 }
@@ -94,6 +99,7 @@ _WORDS = {  # of links' names
 _OFFSET = np.array([2.0, 2.0, 2.0, 0.5, 0.5, 0.5])  # N, N m: one sigma of a plate's zero
 _SIX = (np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2]))  # of a moment: xx xy yy xz yz zz
 _SEGMENT = 1e-5  # of the body's mass: what has less stands in the model for its joints alone
+_PRESSED = 3e-3  # m of the centre of pressure that weigh as much as a joint's half range
 _EDGE = 0.5  # s at either end of a recording, which a filter of few hertz bends
 
 
@@ -318,7 +324,8 @@ def name_payload(
     """The segment at which a person carries a load, by recordings with it and the `Segments` found without.
 
     At each place a load of ten parameters, believed to be up to `heaviest` kg within 0.3 m of the joint, is fitted to
-    the residual; the place that explains most is named. `places`: names of links (default: all segments).
+    the residual; the place that explains most is named. `places`: names of links (default: all segments). The standard
+    deviation of the mass holds the noise of these recordings and what the person's own parameters may be off.
     """
     model, results, costs = person.model, {}, {}
     size = np.array([heaviest / 2, *[heaviest * 0.15] * 3, *[heaviest * 0.05] * 6])
@@ -327,6 +334,10 @@ def name_payload(
     weight = np.sqrt(person.samples / max(1, len(gone))) / person.noise
     zeros, b = _zeros(loaded), (gone * weight).reshape(-1)
     wide = np.tile(_OFFSET, len(loaded))
+    index = [model.link_index(link) for link in person.links]
+    columns = np.concatenate([10 * i + np.arange(10) for i in index])
+    person_rows = np.concatenate([W[:, :, columns] for W in rows]) * weight[:, None]
+    unsure = person_rows.reshape(len(b), -1) @ np.linalg.cholesky(person.covariance)
     for place in ("", *(places or person.links)):
         own = np.concatenate([W[:, :, 10 * model.link_index(place) :][:, :, :10] for W in rows]) if place else zeros
         X = np.concatenate([own, zeros] if place else [zeros], axis=2) * weight[:, None]
@@ -336,7 +347,9 @@ def name_payload(
         costs[place] = float(b @ b - b @ A @ x)
         if not place:
             continue
-        results[place] = float(x[0]), float(np.sqrt(np.linalg.inv(normal)[0, 0]))
+        inverse = np.linalg.inv(normal)
+        of_person = inverse[0] @ (A.T @ unsure)  # what the person's own parameters may be off
+        results[place] = float(x[0]), float(np.sqrt(inverse[0, 0] + of_person @ of_person))
     best = min(results, key=lambda place: costs[place])
     mass, std = results[best]
     return Payload(best, mass, std, costs)
@@ -397,6 +410,61 @@ def standing(
             effort,
         ),
     )
+
+
+def balanced(
+    person: RobotModel,
+    near: Float[np.ndarray, " nv"] | None = None,
+    hold: Sequence[str] = (),
+    room: float = 0.1,
+) -> Float[np.ndarray, " nv"]:
+    """The posture of a `standing` person nearest to `near` whose weight presses on the middle of the support.
+
+    A motion begins at rest, so this is where one may begin (`excite(start=...)`). `near` (rad; default: all zero) is
+    measured in shares of the joints' ranges; `hold` names joints that stay as they are there, `room` is the share of
+    each range that is left free at either end. Raises `InputError` for a model that is not of `standing`, and where no
+    posture within the limits is in balance.
+    """
+    from scipy.optimize import least_squares
+
+    if person.dof_names[:6] != PLATE:
+        raise InputError(f"balanced: '{person.name}' stands on no plate; `standing` makes the model of one who does")
+    given = np.zeros(person.nv) if near is None else np.asarray(near, float)
+    if given.shape != (person.nv,) or not np.isfinite(given).all():
+        raise InputError(f"balanced: near has shape {given.shape}; ({person.nv},) finite numbers are expected")
+    unknown = sorted({*hold} - {*person.dof_names})
+    if unknown:
+        raise InputError(f"balanced: hold: no moving joint '{unknown[0]}'{nearest(unknown[0], person.dof_names)}")
+    moved = np.array([k for k, name in enumerate(person.dof_names) if k > 5 and name not in hold], int)
+    low, high = np.clip(np.asarray(person.position_limit, float)[moved].T, -np.pi, np.pi)
+    half = (high - low) / 2
+    low, high = low + 2 * room * half, high - 2 * room * half
+    first = np.clip(given[moved], low + 1e-6 * half, high - 1e-6 * half)
+    weight = float(np.asarray(person.inertia)[:, 0].sum() * np.linalg.norm(np.asarray(person.gravity)))
+    step, count = 1e-5, len(moved)
+
+    def off(x: np.ndarray) -> np.ndarray:  # of the centre of pressure, m
+        q = np.tile(given, (len(x), 1))
+        q[:, moved] = x
+        return np.asarray(inverse_dynamics(person, q, 0 * q, 0 * q))[:, 3:5] / weight
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([off(x[None])[0] / _PRESSED, (x - first) / half])
+
+    def slope(x: np.ndarray) -> np.ndarray:
+        both = off(np.concatenate([x + step * np.eye(count), x - step * np.eye(count)]))
+        return np.concatenate([(both[:count] - both[count:]).T / (2 * step * _PRESSED), np.diag(1 / half)])
+
+    found = least_squares(residual, first, slope, bounds=(low, high), ftol=1e-5)  # pyright: ignore[reportArgumentType]
+    left = float(np.abs(off(found.x[None])).max())
+    if left > 3 * _PRESSED:
+        raise InputError(
+            f"balanced: the centre of pressure stays {1e3 * left:.0f} mm off in the best posture within the limits;"
+            " free more joints, or let the plate stand elsewhere"
+        )
+    given = given.copy()
+    given[moved] = found.x
+    return given
 
 
 class _Tree(NamedTuple):

@@ -40,6 +40,8 @@ def compare_runs(folders: Sequence[Path], units: Sequence[str] | None = None) ->
     """
     if units is not None and len(units) != len(folders):
         raise InputError(f"--units: {len(units)} labels for {len(folders)} runs; one for each is expected")
+    if units is not None and len(folders) < 3:
+        raise InputError("--units: what differs between robots and days is told from three runs on")
     runs = [read_run(folder) for folder in folders]
     names = _names(folders)
     with as_written(" or ".join(map(str, folders))):
@@ -160,11 +162,15 @@ def _parameters(run: dict[str, Any]) -> dict[str, tuple[float, float, str]]:
             if value["value"] is not None:
                 name = f"{effect['effect']} ({', '.join(effect['at'])}) {key}"
                 found[name] = value["value"], value["std"] or 0.0, value["unit"]
+    stated = [estimate[:2] for estimate in found.values()]
     result = run["result"] or {}
     for one in (*result.get("base_parameters", []), *(result.get("parameters", []) if "level" in result else [])):
         if one["value"] is not None:
-            name = one.get("expression", one.get("name", ""))
-            found[name] = one["value"], one["std"] or 0.0, one.get("unit", "")
+            name, estimate = one.get("expression", one.get("name", "")), (one["value"], one["std"] or 0.0)
+            if " " in name or not any(
+                np.allclose(estimate, other, rtol=1e-9, atol=1e-6 * other[1]) for other in stated
+            ):
+                found[name] = *estimate, one.get("unit", "")  # a drive's own column is an effect already
     return found
 
 

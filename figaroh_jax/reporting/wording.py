@@ -178,8 +178,13 @@ def effect_equation(effect: str) -> str:
 
 
 def interval(estimate: Estimate) -> str:
-    """Value with its 95 % interval and unit: "0.0113 ± 0.0004 kg m²"; without an interval where there is none."""
+    """Value with its 95 % interval and unit: "0.0113 ± 0.0004 kg m²"; without an interval where there is none.
+
+    An angle that may lie anywhere on the turn has no value: where a spring rests, beside a free torque offset.
+    """
     half = _NORMAL_95 * estimate.std
+    if estimate.unit == "rad" and half > 2 * math.pi:
+        return "not determined by this data"
     if not (math.isfinite(half) and half > 0.0):
         return _with_unit(number(estimate.value), estimate.unit)
     power = math.floor(math.log10(half))

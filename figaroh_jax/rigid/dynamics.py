@@ -21,7 +21,8 @@ from ..compiled.precision import in_float64
 from .inertia import pseudo_inertia
 from .kinematics import Motion, add_up, ancestors, axis_twists, check_shapes, gather, motion, movers, pose_columns, take
 from .model import RobotModel
-from .scalar_programs import ACCELERATIONS, LIMB_TORQUES, MASSES, TORQUES, in_limbs, straight, written, written_torques
+from .scalar_forms import ACCELERATIONS, LIMB_TORQUES, MASSES, TORQUES, in_limbs, straight
+from .scalar_programs import written, written_torques
 from .spatial import cross, matmul, rotate
 
 __all__ = [

@@ -25,7 +25,7 @@ from ..errors import InputError, check_real
 from .kinematics import check_shapes
 from .model import RobotModel
 from .regressor import BLOCK_FORM, coordinate_blocks, coordinate_rows, dense_rows
-from .scalar_programs import weighted_rows
+from .scalar_forms import row_groups, weighted_rows
 
 __all__ = ["NormalMatrix", "normal_matrix", "triangular_factor"]
 
@@ -70,8 +70,8 @@ def normal_matrix(
     """
     rows = _rows(model, q, v, a, tau, weight, extra)
     columns = 10 * len(model.joints) + (0 if extra is None else np.shape(extra)[-1]) + 1
-    on_gpu = usable(*rows)
-    groups = _groups(model, columns, apart=on_gpu)
+    on_gpu = usable(*rows) and len(rows.q) > 0
+    groups = _groups(model, columns, whole=on_gpu)
     library: Any = np if on_host(model, rows) else jnp
     start = tuple(library.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
     parts = _by_machine_code(model, groups, rows) if on_host(model, rows) else None
@@ -197,14 +197,12 @@ class _Group(NamedTuple):
     columns: np.ndarray
 
 
-def _groups(model: RobotModel, columns: int, apart: bool = False) -> list[_Group]:
-    """`apart`: each coordinate by itself, with its columns in the order of the regressor."""
+def _groups(model: RobotModel, columns: int, whole: bool = False) -> list[_Group]:
+    """`whole`: the columns in the order of the regressor, as kernels of a GPU write them."""
     blocks, _ = coordinate_blocks(model)
     members = [np.flatnonzero(blocks[:, 0] == coordinate) for coordinate in range(model.nv)]
-    groups, order = [], ((0, 10),) if apart else ((0, 4), (4, 10))
-    alike = [[k for k, m in enumerate(members) if len(m) == size] for size in sorted({len(m) for m in members})]
-    for which in ([k] for k in range(model.nv)) if apart else alike:
-        which = np.array(which, int)
+    groups, order = [], ((0, 10),) if whole else ((0, 4), (4, 10))
+    for which in row_groups(model):
         index = np.stack([members[k] for k in which])
         # the columns of mass and first moments of all links before those of their inertia, as the kernel gives them
         first = 10 * blocks[index, 1][..., None]
@@ -273,7 +271,7 @@ def _sums_of_rows(
 
     def step(total: tuple[Array, ...], arrays: list[Array]) -> tuple[tuple[Array, ...], None]:
         rows = straight_answers(form, model, *arrays, codes=codes)
-        return tuple(x + row_products(one[None]) for x, one in zip(total, rows, strict=True)), None
+        return tuple(x + row_products(one) for x, one in zip(total, rows, strict=True)), None
 
     return jax.lax.scan(step, start, chunks)[0] if len(arrays[0]) else start
 
@@ -291,7 +289,7 @@ def _plain_rows(side: int, model: RobotModel, q: Any, v: Any, a: Any, root: Any,
     own = [np.flatnonzero(coordinate_blocks(model)[0][:, 0] == row) for row in range(model.nv)]
     beside = given.T.reshape(model.nv, side, samples)
     parts = [jnp.concatenate([blocks[k].reshape(-1, samples), beside[row]]) for row, k in enumerate(own)]
-    return [x * root[:, row] for row, x in enumerate(parts)]
+    return [jnp.stack([parts[row] * root[:, row] for row in group]) for group in row_groups(model)]
 
 
 def row_products(rows: Float[Array, "c k samples"]) -> Float[Array, "c k k"]:

@@ -23,7 +23,7 @@ from ..compiled.precision import in_float64
 from ..errors import InputError
 from .kinematics import Motion, ancestors, check_shapes, motion, take
 from .model import Joint, RobotModel, dofs
-from .scalar_programs import BLOCKS, DENSE, PACKED, straight
+from .scalar_forms import BLOCKS, DENSE, PACKED, straight
 from .spatial import cross, rotate_back
 
 __all__ = [

@@ -109,7 +109,7 @@ def _one_joint(robot: RobotModel, joint: int) -> RobotModel:
 
 def _masses_at(loop: Loop) -> np.ndarray:
     with jax.enable_x64(True):
-        return np.asarray(joint_masses(loop.robot, jnp.asarray(loop.start, jnp.float64)[:, None]))[..., 0]
+        return np.asarray(_masses(loop.robot, np.asarray(loop.start, float)[:, None]))[..., 0]
 
 
 def carried_by(loop: Loop, runs: Sequence[Run], simulated: Sequence[np.ndarray] | None = None) -> list[np.ndarray]:
@@ -173,4 +173,4 @@ def _load_rows(robot: RobotModel, q: jax.Array, v: jax.Array, a: jax.Array) -> j
     return jnp.stack([own, torque[:, :count] - own * a, slope], 1)
 
 
-_loads = program(_load_rows)
+_loads, _masses = program(_load_rows), program(joint_masses)

@@ -43,7 +43,9 @@ _WEAK = 0.3  # share of the largest gain below which a joint is looked at again
 _ROUNDS = 3  # times that a cause of several joints may be named and the joints searched again
 _ROOM = 8  # numbers of causes beside the baseline, at one joint
 _SHARED = 6  # steps of a payload's fit
-_WHOLE = 3  # steps of the arm's own fit
+_WHOLE = 5  # steps of the arm's own fit
+_LEAST, _CERTAIN = 0.002, 2.5  # held-out gain and t of a cause in the arm's own simulation, below which it goes
+_PLAIN = 0.2  # of the squares: a cause that explains so much stays without another fit
 _SPREADS = "encoder_offset"  # of a joint: what the others carry is wrong by it, too
 
 
@@ -384,8 +386,7 @@ def _judged(
     """All causes in the arm's own structure, the arm simulated, and what is left of it."""
     lists = [list(one.named or one.proxy) for one in found]
     payloads = [one.candidate.entries[0] for one in shared if one.candidate.effect == "payload"]
-    structure, last, named = _assembled(here, joints, found, lists, base, payloads)
-    last = _refitted(here, structure, last)
+    structure, last, named = _needed(here, joints, found, lists, base, payloads)
     weight = np.asarray(here.data.weight)
     left = excess(residuals(structure, last), np.asarray(structure.data.weight))
     begin = Model(Structure(here.loop, here.known.table, here.data), first, here.baseline, 0.0)
@@ -395,6 +396,98 @@ def _judged(
     nearest = [x for one in found for x in one.nearest]
     p = min([one.p_value for one in found] + ([1e-12] if shared else []))
     return judged(here, begin, now, named, p, steps, nearest)
+
+
+def _needed(
+    here: Setting,
+    joints: Sequence[_Joint],
+    found: Sequence[Search],
+    lists: list[list[Named]],
+    base: np.ndarray,
+    payloads: Sequence[int],
+) -> tuple[Structure, Fit, list[Named]]:
+    """The arm's own fit with the causes that its simulation needs: a joint alone also shows what others' noise makes.
+
+    The cause that explains least goes first; it stays where held-out squares of the arm are clearly fewer with it.
+    """
+    structure, last, named = _assembled(here, joints, found, lists, base, payloads)
+    last, gone = _refitted(here, structure, last), set[tuple]()
+    for one in reversed(named[1:] if len(named) > 1 and not payloads else list(named)):
+        if one.candidate.elastic:
+            j = here.loop.robot.dof_names.index(one.candidate.at[0])
+            fewer = [[n for n in own if not n.candidate.elastic] if k == j else own for k, own in enumerate(lists)]
+            rigid = [_rigid(joints[k], f) if k == j else f for k, f in enumerate(found)]
+            other, without, names = _assembled(here, joints, rigid, fewer, base, payloads)
+            for past in [n for n in names if (n.candidate.effect, n.candidate.at) in gone]:
+                without = _fitted_without(here, other, without, past)
+            without = _refitted(here, other, without)
+            if not _worse(here, other, without, structure, last):
+                structure, last, found, lists = other, without, rigid, fewer
+                gone.add((one.candidate.effect, one.candidate.at))
+                named = [n for n in names if (n.candidate.effect, n.candidate.at) not in gone]
+            continue
+        if _promised(structure, last, one) > _PLAIN * last.squares:
+            continue
+        without = _fitted_without(here, structure, last, one)
+        if not _worse(here, structure, without, structure, last):
+            last = without
+            gone.add((one.candidate.effect, one.candidate.at))
+            named = [n for n in named if (n.candidate.effect, n.candidate.at) not in gone]
+    return structure, last, named
+
+
+def _neutral(structure: Structure, one: Named) -> np.ndarray:
+    """The numbers of a cause where it does nothing: those of the model as stated."""
+    stated = values(structure.loop, structure.table)
+    return stated[list(one.candidate.entries)]
+
+
+def _promised(structure: Structure, last: Fit, one: Named) -> float:
+    """Squares that come back without a cause, to second order, everything else following."""
+    free, entries = last.free.tolist(), list(one.candidate.entries)
+    if any(entry not in free for entry in entries):
+        return 0.0
+    matrix, _ = System(last.sums, structure.data, last.start).reduced(1e-9)
+    mine = np.array([free.index(entry) for entry in entries])
+    rest = np.array([k for k, entry in enumerate(free) if entry >= 0 and entry not in entries])
+    step = last.theta[entries] - _neutral(structure, one)
+    if not np.isfinite(step).all():  # a limit that is far away
+        return 0.0
+    inner = np.linalg.lstsq(matrix[np.ix_(rest, rest)], matrix[np.ix_(rest, mine)], rcond=1e-12)[0]
+    return float(step @ (matrix[np.ix_(mine, mine)] - matrix[np.ix_(mine, rest)] @ inner) @ step)
+
+
+def _fitted_without(here: Setting, structure: Structure, last: Fit, one: Named) -> Fit:
+    theta, entries = last.theta.copy(), list(one.candidate.entries)
+    theta[entries] = _neutral(structure, one)
+    free = [k for k in last.free.tolist() if k >= 0 and (k not in entries or k in here.baseline)]
+    return fit(
+        *structure, theta[None], [free], last.start[None], width=max(here.width, len(free)), lanes=1, iterations=_WHOLE
+    )[0]
+
+
+def _worse(here: Setting, structure: Structure, without: Fit, full: Structure, last: Fit) -> bool:
+    """Whether held-out squares of the arm are clearly more without a cause than with it."""
+    if not np.isfinite(without.cost):
+        return True
+    before, after = held_out(without, structure.data, here.folds), held_out(last, full.data, here.folds)
+    gain = (before.sum() - after.sum()) / before.sum()
+    return bool(gain > _LEAST and t_of(before, after) > _CERTAIN)
+
+
+def _rigid(joint: _Joint, one: Search) -> Search:
+    """What was found at a joint, its spring left out."""
+    known, n = len(joint.setting.known.table), joint.setting.loop.robot.nv
+    keep = [n2 for n2 in (one.named or one.proxy) if not n2.candidate.elastic]
+    s, last = joint.setting, one.last
+    free = [int(k) for k in last.free if 0 <= k < known]
+    start = last.start[[0, len(last.start) // 2]] if len(last.start) > 2 * n else last.start
+    plain = Structure(s.loop, s.known.table, s.data)
+    again = fit(
+        *plain, last.theta[None, :known], [free], start[None],
+        width=max(s.width, len(free)), lanes=s.lanes, iterations=_SHARED,
+    )[0]  # fmt: skip
+    return Search(one.verdict, keep, plain, one.first, again, one.p_value, [], one.nearest)
 
 
 def _refitted(here: Setting, structure: Structure, last: Fit) -> Fit:

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from .loop import Loop
+from .native import native
 from .parameters import BOUNDS, Table
 from .sensitivity import Sums, Windows, linear_sums
 
@@ -86,9 +87,13 @@ class _Lanes:
             self.free[k, : len(one)] = one
         self.bounds = np.array([BOUNDS[entry.name] for entry in table])
         self.inner = np.full((len(self.theta), self.start.shape[2]), 1e-8)  # damping of each window's start
+        self.code = native(loop, table, data)
         self.rows = max(int((np.asarray(data.weight) > 0).sum()), 1)
 
     def sums(self, which: np.ndarray, theta: np.ndarray, start: np.ndarray) -> list[Sums]:
+        if self.code.usable:
+            lanes = zip(which, theta, start, strict=True)
+            return [Sums(*self.code.sums(one, self.free[k], x)) for k, one, x in lanes]  # pyright: ignore[reportArgumentType]
         lanes = _PAIR if len(which) <= _PAIR < self.lanes else self.lanes  # few are left of many: a smaller program
         padded = np.resize(which, lanes)
         index = np.maximum(self.free[padded], 0)

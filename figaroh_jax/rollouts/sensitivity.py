@@ -16,10 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..compiled.batching import program
+from ..compiled.batching import program, traced
 from ..rigid.dynamics import joint_masses, joint_torques
 from ..rigid.model import RobotModel
 from .loop import Linear, Loop, State, advance, integrated, mobility, observe
+from .native import native
 from .parameters import TEN, Table, put, unit_payload
 from .simulation import delayed
 
@@ -144,8 +145,32 @@ def _linear_sums(loop: Loop, table: Table, theta: Array, free: Array, data: Wind
     return Sums(*jax.vmap(lambda t, f, s: _lane(loop, table, t, f, data, s))(theta, free, start))
 
 
-predicted = program(_predicted, static_argnums=1)
-linear_sums = program(_linear_sums, static_argnums=1)
+_predicted_program = program(_predicted, static_argnums=1)
+_sums_program = program(_linear_sums, static_argnums=1)
+
+
+def predicted(loop: Loop, table: Table, theta: Any, data: Windows, start: Any) -> Any:
+    """Readings (lanes, rows, ny, windows) of the parameters (lanes, entries) and starts (lanes, 2 nv, windows)."""
+    code = None if traced(loop, theta, data, start) else native(loop, table, data)
+    if code is None or not code.usable:
+        return _predicted_program(loop, table, theta, data, start)
+    return np.stack([code.read(np.asarray(one), np.asarray(x)) for one, x in zip(theta, start, strict=True)])
+
+
+def linear_sums(loop: Loop, table: Table, theta: Any, free: Any, data: Windows, start: Any) -> Sums:
+    """Sums of squares, gradients and normal matrices of each lane, by machine code where it can be.
+
+    `theta` (lanes, entries) are all numbers of the table, `free` (lanes, columns) which of them each lane
+    differentiates (-1: none, a column that means nothing), `start` (lanes, 2 nv, windows) the states at the windows'
+    starts.
+    """
+    code = None if traced(loop, theta, free, data, start) else native(loop, table, data)
+    if code is None or not code.usable:
+        at = np.maximum(free, 0) if isinstance(free, np.ndarray) else free
+        return _sums_program(loop, table, theta, at, data, start)
+    lanes = zip(theta, free, start, strict=True)
+    found = [code.sums(np.asarray(one), np.asarray(f), np.asarray(x)) for one, f, x in lanes]
+    return Sums(*(np.stack(parts) for parts in zip(*found, strict=True)))  # pyright: ignore[reportArgumentType]
 
 
 def _lane(loop: Loop, table: Table, theta: Array, free: Array, data: Windows, start: Array) -> tuple[Array, ...]:

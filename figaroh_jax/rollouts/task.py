@@ -88,8 +88,8 @@ def diagnose_rollout_task(
 def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
     """The loop of a task and its recordings."""
     options = robot_options(task.robot)
-    if task.robot.root == "fixed" and task.robot.model.suffix.lower() in (".xml", *USD):
-        options["root"] = None
+    if "root" not in task.robot.model_fields_set and task.robot.model.suffix.lower() in (".xml", *USD):
+        options["root"] = None  # as the file has it
     drives = {name: drive.model_dump() for name, drive in task.actuator.drives.items()}
     loop, left_out = load_loop(task.robot.model, drives, **options)
     if not loop.drives.names:

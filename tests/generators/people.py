@@ -72,10 +72,21 @@ def put_markers(person: Person, places: dict[str, tuple[str, np.ndarray]], rng: 
 
 
 def record(
-    person: Person, rng: np.random.Generator, seconds: float = 20.0, tissue: float = 0.005, noise: float = 0.002
+    person: Person,
+    rng: np.random.Generator,
+    seconds: float = 20.0,
+    tissue: float = 0.005,
+    noise: float = 0.002,
+    load: tuple[str, pin.Inertia] | None = None,
 ) -> Trial:
-    """A trial: skin slides by `tissue` (m, with the motion and slowly), markers are seen to `noise` (m)."""
+    """A trial: skin slides by `tissue` (m, with the motion and slowly), markers are seen to `noise` (m).
+
+    `load`: a joint, and what the person carries on its link, about the joint's frame.
+    """
     model, t = person.model, np.arange(int(seconds * RATE)) / RATE
+    if load is not None:
+        model = model.copy()
+        model.inertias[model.getJointId(load[0])] += load[1]
     data, nv = model.createData(), model.nv
     lower, upper = model.lowerPositionLimit[7:], model.upperPositionLimit[7:]
     reach = np.minimum(0.45 * (upper - lower), 0.5)

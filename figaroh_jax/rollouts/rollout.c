@@ -1,0 +1,914 @@
+/* Rollouts of a loop and their exact derivatives, one window of time after the other: `loop.py` and `sensitivity.py`
+   as machine code, for trees of turning and sliding joints and for one joint that is carried by a measured arm.
+
+   A step is solved (rigid body, drives, dry friction and limits as soft constraints), then linearised where it stands,
+   and the sensitivities are carried on: x' = A x + B. Spatial vectors stand in the world's axes at the world's origin,
+   angular part first. Derivatives of the rigid body: S. Singh, R. P. Russell, P. M. Wensing, "Efficient analytical
+   derivatives of rigid-body dynamics using spatial vector algebra", IEEE RA-L 7 (2022). */
+
+#include <math.h>
+#include <stddef.h>
+#include <string.h>
+
+#define MOST 32 /* coordinates, drives */
+#define ROWS 64 /* numbers that are read at an instant: positions and rates */
+#define TURNS 60 /* Newton steps of the constraints; 1 to 4 are used */
+#define INLINE static inline __attribute__((always_inline))
+#define WIDE static __attribute__((noinline, optimize("O3"))) /* loops over columns, in vectors */
+#if SIZE
+#define ALIKE INLINE
+#else
+#define ALIKE APART
+#endif
+#define APART static __attribute__((noinline))
+
+enum joint_number {
+  ARMATURE, DAMPING, FRICTION, PEAK, SPEED, RATIO, STIFFNESS, REST, PLAY, OFFSET, SINE, COSINE, ORDER, READING,
+  RATE, SHARE, LEAST, LARGEST, LOWER, UPPER, MARGIN, TIME, DAMPED, LOWEST, HIGHEST, WIDTH, MIDDLE, POWER
+};
+enum drive_number { SCALE, DELAY, DEAD, VOLTAGE, GAIN0, GAIN1, GAIN2, BIAS0, BIAS1, BIAS2, FROM, TO, WEAKEST, STRONGEST };
+enum unknown { OF_DRIVE = 100, LIMIT = 110, KP, KD, BODY = 200, PULL, CARRIED_BODY };
+
+typedef struct {
+  long n, nu, links, ny, rates, carried, hard, limited, implicit, windows, rows, lead, substeps, block, many, columns;
+  double dt;
+  const long *measured, *summed;             /* (ny) */
+  const long *parent, *coordinate, *slides;  /* (n) of each tree joint */
+  const double *placement, *axis, *inertia;  /* (n, 16), (n, 3), (n, 10) */
+  const double *gravity, *start;             /* (3), (n) */
+  const double *joint, *drive, *way;         /* (28, n), (14, nu), (nu, n) */
+  const double *payload, *resting;           /* (links), (2): mass and share of a carried joint */
+  const long *kind, *place, *column;         /* (many) of the unknowns */
+  const double *ten;                         /* (many, 10), of unknowns of the rigid body */
+  const double *command, *reading, *weight, *load, *begin; /* (lead + rows, nu, windows) ... (2 n, windows) */
+  double *cost, *gradient, *matrix, *read;   /* sums, or what is read alone where `cost` is none */
+} Given;
+
+typedef struct {
+  double R[9], p[3], S[6], V[6], A[6], T[6]; /* T: V of the parent x S */
+  double m, h[3], J[6];                      /* of the link, then of all that it carries: xx xy yy xz yz zz */
+  double own[10];                            /* of the link: m, h, J */
+  double F[6], P[6], B[9];                   /* force, momentum, the upper left part of 2 B */
+} Body;
+
+typedef struct { /* a joint limit: force (pull - a) / soft where it acts, with derivatives by distance and rate */
+  double pull, soft, by, by_rate, log_soft;
+  int on;
+} Side;
+
+typedef struct {
+  double q[MOST], v[MOST], a[MOST], moved[MOST], force[MOST]; /* a: of the constraints; moved: of the integrator */
+  double M[MOST * MOST], K[MOST * MOST], L[MOST * MOST];      /* with armature; inverses of the constraints', of the step's */
+  double D[MOST * MOST], bias[MOST], torque[MOST], motor[MOST];
+  double level[MOST], peak[MOST], pull[MOST], soft[MOST], weight[MOST];
+  Side side[2][MOST];
+  int slip[MOST], within[MOST];
+  double u[MOST], faster[MOST], by_length[MOST], by_rate[MOST], by_u[MOST], slope[MOST], length[MOST], rate[MOST];
+  double part[MOST], often; /* of a delay in steps */
+  int whole[MOST];
+  double by_scale[MOST], by_gain[MOST], by_band[MOST];
+  int volt[MOST], limit[MOST], inside[MOST];
+  double mass, base, steep, at;                               /* of a carried joint */
+  const double *more;
+  Body body[MOST];
+} Work;
+
+INLINE void cross(const double *a, const double *b, double *c) {
+  c[0] = a[1] * b[2] - a[2] * b[1];
+  c[1] = a[2] * b[0] - a[0] * b[2];
+  c[2] = a[0] * b[1] - a[1] * b[0];
+}
+INLINE double dot3(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+INLINE double dot6(const double *a, const double *b) { return dot3(a, b) + dot3(a + 3, b + 3); }
+INLINE void turned(const double *R, const double *x, double *y) {
+  for (int i = 0; i < 3; i++) y[i] = R[3 * i] * x[0] + R[3 * i + 1] * x[1] + R[3 * i + 2] * x[2];
+}
+/* motion x motion, motion x force */
+INLINE void crossed(const double *V, const double *S, double *out) {
+  double x[3], y[3];
+  cross(V, S, out);
+  cross(V, S + 3, x);
+  cross(V + 3, S, y);
+  for (int k = 0; k < 3; k++) out[3 + k] = x[k] + y[k];
+}
+INLINE void crossed_force(const double *V, const double *F, double *out) {
+  double x[3], y[3];
+  cross(V, F, x);
+  cross(V + 3, F + 3, y);
+  cross(V, F + 3, out + 3);
+  for (int k = 0; k < 3; k++) out[k] = x[k] + y[k];
+}
+INLINE void inertial(double m, const double *h, const double *J, const double *V, double *F) {
+  double x[3], y[3];
+  cross(h, V + 3, x);
+  cross(h, V, y);
+  F[0] = J[0] * V[0] + J[1] * V[1] + J[3] * V[2] + x[0];
+  F[1] = J[1] * V[0] + J[2] * V[1] + J[4] * V[2] + x[1];
+  F[2] = J[3] * V[0] + J[4] * V[1] + J[5] * V[2] + x[2];
+  for (int k = 0; k < 3; k++) F[3 + k] = m * V[3 + k] - y[k];
+}
+
+/* ten numbers of a link in its own axes at its own origin -> at the world's */
+APART void placed(const double *ten, const double *R, const double *p, double *m, double *h, double *J) {
+  const double I[9] = {ten[4], ten[5], ten[7], ten[5], ten[6], ten[8], ten[7], ten[8], ten[9]};
+  double RI[9], W[9], s[3];
+  *m = ten[0];
+  turned(R, ten + 1, s);
+  for (int i = 0; i < 3; i++)
+    for (int j = 0; j < 3; j++) RI[3 * i + j] = R[3 * i] * I[j] + R[3 * i + 1] * I[3 + j] + R[3 * i + 2] * I[6 + j];
+  for (int i = 0; i < 3; i++)
+    for (int j = 0; j <= i; j++) {
+      double x = RI[3 * i] * R[3 * j] + RI[3 * i + 1] * R[3 * j + 1] + RI[3 * i + 2] * R[3 * j + 2];
+      x -= p[i] * s[j] + s[i] * p[j] + *m * p[i] * p[j];
+      if (i == j) x += 2 * dot3(p, s) + *m * dot3(p, p);
+      W[3 * i + j] = x;
+    }
+  J[0] = W[0], J[1] = W[3], J[2] = W[4], J[3] = W[6], J[4] = W[7], J[5] = W[8];
+  for (int k = 0; k < 3; k++) h[k] = s[k] + *m * p[k];
+}
+
+/* poses, velocities, accelerations without those of the joints, masses and bias */
+APART void posed(const Given *g, Work *w, const int n, const double *q, const double *v) {
+  static const double one[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1}, zero[6] = {0};
+  double ground[6] = {0, 0, 0, -g->gravity[0], -g->gravity[1], -g->gravity[2]};
+  for (int i = 0; i < n; i++) {
+    Body *b = w->body + i;
+    const long up = g->parent[i], c = g->coordinate[i];
+    const double *R0 = up < 0 ? one : w->body[up].R, *p0 = up < 0 ? zero : w->body[up].p;
+    const double *V0 = up < 0 ? zero : w->body[up].V, *A0 = up < 0 ? ground : w->body[up].A;
+    const double *H = g->placement + 16 * i, *e = g->axis + 3 * i;
+    double C[9], x[3];
+    for (int r = 0; r < 3; r++) {
+      for (int k = 0; k < 3; k++) C[3 * r + k] = R0[3 * r] * H[k] + R0[3 * r + 1] * H[4 + k] + R0[3 * r + 2] * H[8 + k];
+      b->p[r] = p0[r] + R0[3 * r] * H[3] + R0[3 * r + 1] * H[7] + R0[3 * r + 2] * H[11];
+    }
+    turned(C, e, x);
+    if (g->slides[i]) {
+      memcpy(b->R, C, sizeof C);
+      for (int k = 0; k < 3; k++) b->p[k] += x[k] * q[c], b->S[k] = 0, b->S[3 + k] = x[k];
+    } else {
+      const double s = sin(q[c]), k = cos(q[c]), r = 1 - k;
+      const double E[9] = {k + r * e[0] * e[0], r * e[0] * e[1] - s * e[2], r * e[0] * e[2] + s * e[1],
+                           r * e[1] * e[0] + s * e[2], k + r * e[1] * e[1], r * e[1] * e[2] - s * e[0],
+                           r * e[2] * e[0] - s * e[1], r * e[2] * e[1] + s * e[0], k + r * e[2] * e[2]};
+      for (int i2 = 0; i2 < 3; i2++)
+        for (int j = 0; j < 3; j++) b->R[3 * i2 + j] = C[3 * i2] * E[j] + C[3 * i2 + 1] * E[3 + j] + C[3 * i2 + 2] * E[6 + j];
+      memcpy(b->S, x, sizeof x);
+      cross(b->p, x, b->S + 3);
+    }
+    crossed(V0, b->S, b->T);
+    for (int k = 0; k < 6; k++) b->V[k] = V0[k] + b->S[k] * v[c], b->A[k] = A0[k] + b->T[k] * v[c];
+    placed(g->inertia + 10 * i, b->R, b->p, &b->m, b->h, b->J);
+    b->own[0] = b->m, memcpy(b->own + 1, b->h, sizeof b->h), memcpy(b->own + 4, b->J, sizeof b->J);
+    inertial(b->m, b->h, b->J, b->V, b->P);
+    double f[6];
+    inertial(b->m, b->h, b->J, b->A, b->F);
+    crossed_force(b->V, b->P, f);
+    for (int k = 0; k < 6; k++) b->F[k] += f[k];
+  }
+}
+
+APART void momentum_slope(Body *b) { /* the upper left part of 2 B = V x* I - I V x + (I V) x* */
+  const double *w = b->V, *v = b->V + 3, *h = b->h, *J = b->J, *n = b->P;
+  const double W[9] = {0, -w[2], w[1], w[2], 0, -w[0], -w[1], w[0], 0};
+  const double I[9] = {J[0], J[1], J[3], J[1], J[2], J[4], J[3], J[4], J[5]};
+  const double N[9] = {0, -n[2], n[1], n[2], 0, -n[0], -n[1], n[0], 0};
+  for (int i = 0; i < 3; i++)
+    for (int j = 0; j < 3; j++) {
+      double x = -N[3 * i + j] - (v[j] * h[i] + h[j] * v[i]);
+      for (int k = 0; k < 3; k++) x += W[3 * i + k] * I[3 * k + j] - I[3 * i + k] * W[3 * k + j];
+      if (i == j) x += 2 * dot3(v, h);
+      b->B[3 * i + j] = x;
+    }
+}
+
+APART void summed_up(const Given *g, Work *w, const int n, const int all) {
+  for (int i = n - 1; i >= 0; i--) {
+    Body *b = w->body + i;
+    if (g->parent[i] < 0) continue;
+    Body *u = w->body + g->parent[i];
+    for (int k = 0; k < 6; k++) u->F[k] += b->F[k];
+    if (all) {
+      u->m += b->m;
+      for (int k = 0; k < 3; k++) u->h[k] += b->h[k];
+      for (int k = 0; k < 6; k++) u->J[k] += b->J[k], u->P[k] += b->P[k];
+      for (int k = 0; k < 9; k++) u->B[k] += b->B[k];
+    }
+  }
+}
+
+/* inverse of a symmetric positive matrix, in place */
+WIDE void swept(double *A, const int n) {
+  for (int k = 0; k < n; k++) {
+    const double d = 1 / A[k * n + k];
+    double row[MOST];
+    for (int j = 0; j < n; j++) row[j] = A[k * n + j] * d;
+    for (int i = 0; i < n; i++) {
+      if (i == k) continue;
+      const double f = A[i * n + k];
+      for (int j = 0; j < n; j++) A[i * n + j] -= f * row[j];
+      A[i * n + k] = f * d;
+    }
+    for (int j = 0; j < n; j++) A[k * n + j] = row[j];
+    A[k * n + k] = -d;
+  }
+  for (int k = 0; k < n * n; k++) A[k] = -A[k];
+}
+INLINE void inverted(double *A, const int n) {
+  if (n == 1) {
+    A[0] = 1 / A[0];
+    return;
+  }
+  if (n > 2) {
+    swept(A, n);
+    return;
+  }
+  const double one = 1 / (A[0] * A[3] - A[1] * A[2]), a = A[0];
+  A[0] = A[3] * one, A[1] *= -one, A[2] *= -one, A[3] = a * one;
+}
+
+APART void masses(const Given *g, Work *w, const int n, double *M) {
+  memset(M, 0, sizeof(double) * n * n);
+  for (int i = 0; i < n; i++) {
+    Body *b = w->body + i;
+    double z[6];
+    inertial(b->m, b->h, b->J, b->S, z);
+    for (long j = i; j >= 0; j = g->parent[j]) {
+      const long a = g->coordinate[i], c = g->coordinate[j];
+      M[a * n + c] = M[c * n + a] = dot6(w->body[j].S, z);
+    }
+  }
+}
+
+/* torques of a unit of the rigid body's unknown `k` at accelerations A of the bodies; `rigid`: without velocities */
+APART void unit_torques(const Given *g, const Work *w, const int n, const long k, double A[][6], int rigid, double *out) {
+  memset(out, 0, sizeof(double) * n);
+  if (g->kind[k] == PULL) {
+    if (rigid) return;
+    double F[MOST][6];
+    for (int i = n - 1; i >= 0; i--) {
+      double a[6] = {0};
+      a[3 + g->place[k]] = -1;
+      inertial(w->body[i].m, w->body[i].h, w->body[i].J, a, F[i]); /* of all that it carries */
+      out[g->coordinate[i]] = dot6(w->body[i].S, F[i]);
+    }
+    return;
+  }
+  const long i = g->place[k];
+  double m, h[3], J[6], F[6], P[6], f[6];
+  placed(g->ten + 10 * k, w->body[i].R, w->body[i].p, &m, h, J);
+  inertial(m, h, J, A[i], F);
+  if (!rigid) {
+    inertial(m, h, J, w->body[i].V, P);
+    crossed_force(w->body[i].V, P, f);
+    for (int c = 0; c < 6; c++) F[c] += f[c];
+  }
+  for (long j = i; j >= 0; j = g->parent[j]) out[g->coordinate[j]] = dot6(w->body[j].S, F);
+}
+
+#define JN(name) (g->joint[(name) * n + j])
+#define DN(name) (g->drive[(name) * g->nu + d])
+
+/* softness of the constraints, and the logarithm's derivative by each unknown */
+APART void mobility(const Given *g, Work *w, const int n, double *by) {
+  double M[MOST * MOST], zero[MOST] = {0};
+  if (g->carried) {
+    for (int k = 0; k < n * n; k++) M[k] = g->resting[0];
+  } else {
+    posed(g, w, n, g->start, zero);
+    for (int i = 0; i < n; i++) memset(w->body[i].B, 0, sizeof w->body[i].B);
+    summed_up(g, w, n, 1);
+    masses(g, w, n, M);
+  }
+  for (int j = 0; j < n; j++) M[j * n + j] += JN(ARMATURE);
+  inverted(M, n);
+  for (int j = 0; j < n; j++) w->weight[j] = M[j * n + j] * (g->carried ? g->resting[1] : 1);
+  memset(by, 0, sizeof(double) * n * g->many);
+  for (long k = 0; k < g->many; k++) {
+    if (g->kind[k] == ARMATURE)
+      for (int j = 0; j < n; j++) by[k * n + j] = -M[j * n + g->place[k]] * M[j * n + g->place[k]] / M[j * n + j];
+    if (g->kind[k] != BODY) continue;
+    double dM[MOST * MOST];
+    for (int c = 0; c < n; c++) {
+      double A[MOST][6];
+      for (int i = 0; i < n; i++) {
+        for (int r = 0; r < 6; r++) {
+          A[i][r] = g->parent[i] < 0 ? 0 : A[g->parent[i]][r];
+          if (g->coordinate[i] == c) A[i][r] += w->body[i].S[r];
+        }
+      }
+      unit_torques(g, w, n, k, A, 1, dM + c * n);
+    }
+    for (int j = 0; j < n; j++) {
+      double x = 0;
+      for (int c = 0; c < n; c++)
+        for (int r = 0; r < n; r++) x -= M[j * n + c] * dM[c * n + r] * M[r * n + j];
+      by[k * n + j] = x / M[j * n + j];
+    }
+  }
+}
+
+INLINE void driven(const Given *g, Work *w, const int n, const int want) {
+  for (int j = 0; j < n; j++) w->motor[j] = 0;
+  for (long d = 0; d < g->nu; d++) {
+    const double *way = g->way + d * n;
+    double length = 0, rate = 0;
+    for (int j = 0; j < n; j++) length += way[j] * w->q[j], rate += way[j] * w->v[j];
+    double u = w->u[d], uu = 1;
+    if (u < DN(FROM)) u = DN(FROM), uu = 0;
+    if (u > DN(TO)) u = DN(TO), uu = 0;
+    const double scale = DN(SCALE), gain = DN(GAIN0) + DN(GAIN1) * length;
+    const double drawn = gain * u + DN(BIAS1) * length;
+    double force = DN(BIAS0) + scale * drawn, open = 1, band = 0;
+    const double idle = fabs(DN(GAIN0)) * scale * DN(DEAD);
+    if (idle > 0 && fabs(force) < idle) force = 0, open = 0;
+    else if (DN(DEAD) > 0 || want) band = force > 0 ? -1 : force < 0 ? 1 : 0, force += band * idle;
+    const double slope = DN(BIAS2) + DN(GAIN2) * u;
+    int volt = 0, limit = 0;
+    if (force > DN(VOLTAGE)) force = DN(VOLTAGE), volt = 1;
+    if (force < -DN(VOLTAGE)) force = -DN(VOLTAGE), volt = -1;
+    force += slope * rate;
+    if (force >= DN(STRONGEST)) force = DN(STRONGEST), limit = 1;
+    if (force <= DN(WEAKEST)) force = DN(WEAKEST), limit = -1;
+    for (int j = 0; j < n; j++) w->motor[j] += way[j] * force;
+    w->inside[d] = !limit;
+    w->slope[d] = limit ? 0 : slope;
+    if (!want) continue;
+    const double through = limit || volt ? 0 : open;
+    w->volt[d] = limit ? 0 : volt;
+    w->limit[d] = limit;
+    w->length[d] = length;
+    w->rate[d] = rate;
+    w->by_length[d] = through * scale * (DN(GAIN1) * u + DN(BIAS1));
+    w->by_rate[d] = limit ? 0 : slope;
+    w->by_u[d] = uu * (through * scale * gain + (limit ? 0 : DN(GAIN2) * rate));
+    w->by_scale[d] = through * (drawn + band * fabs(DN(GAIN0)) * DN(DEAD));
+    w->by_gain[d] = through * scale * (u - length + band * DN(DEAD));
+    w->by_band[d] = through * band * fabs(DN(GAIN0)) * scale;
+    w->faster[d] *= uu;
+  }
+}
+
+INLINE void limited(const Given *g, const int n, const int j, double distance, double rate, double weight, Side *one) {
+  one->pull = -INFINITY, one->soft = 1, one->by = 0, one->by_rate = 0, one->log_soft = 0;
+  if (!(distance < JN(MARGIN))) return;
+  const double depth = distance - JN(MARGIN), middle = JN(MIDDLE), power = JN(POWER), high = JN(HIGHEST);
+  double x = fabs(depth) / JN(WIDTH), curve, steep, inner = 1;
+  if (x >= 1) x = 1, inner = 0;
+  if (power == 1) curve = x, steep = 1;
+  else if (x <= middle) curve = pow(x, power) / pow(middle, power - 1), steep = power * pow(x / middle, power - 1);
+  else curve = 1 - pow(1 - x, power) / pow(1 - middle, power - 1), steep = power * pow((1 - x) / (1 - middle), power - 1);
+  const double impedance = JN(LOWEST) + curve * (high - JN(LOWEST));
+  const double rise = inner * steep * (high - JN(LOWEST)) * (depth < 0 ? -1 : 1) / JN(WIDTH);
+  const double time = JN(TIME), safe = time > 2 * g->dt ? time : 2 * g->dt;
+  double stiff, damp;
+  if (time <= 0) stiff = -time / (high * high), damp = -JN(DAMPED) / high;
+  else stiff = 1 / (high * safe * JN(DAMPED) * high * safe * JN(DAMPED)), damp = 2 / (high * safe);
+  one->pull = -damp * rate - stiff * impedance * depth;
+  one->soft = (1 - impedance) / impedance * weight;
+  one->by = -stiff * (impedance + rise * depth);
+  one->by_rate = -damp;
+  one->log_soft = -rise / (impedance * (1 - impedance));
+}
+
+ALIKE void resisted(const Given *g, Work *w, const int n) {
+  for (int j = 0; j < n; j++) {
+    const double v = w->v[j], q = w->q[j], motor = w->motor[j];
+    double total = motor;
+    w->within[j] = 1;
+    if (motor < JN(LEAST)) total = JN(LEAST), w->within[j] = 0;
+    if (motor > JN(LARGEST)) total = JN(LARGEST), w->within[j] = 0;
+    w->motor[j] = total;
+    double stretch = q - JN(REST), half = JN(PLAY) / 2;
+    stretch = stretch > half ? stretch - half : stretch < -half ? stretch + half : 0;
+    double passive = JN(DAMPING) * v + JN(STIFFNESS) * stretch + JN(OFFSET);
+    if (JN(SINE) != 0 || JN(COSINE) != 0) passive += JN(SINE) * sin(JN(ORDER) * q) + JN(COSINE) * cos(JN(ORDER) * q);
+    w->torque[j] = total - passive;
+    double level = JN(FRICTION);
+    w->peak[j] = 0;
+    if (JN(PEAK) != 0) w->peak[j] = exp(-(v / JN(SPEED)) * (v / JN(SPEED))), level += JN(PEAK) * w->peak[j];
+    if (JN(RATIO) != 0) level += JN(RATIO) * fabs(total - w->bias[j]);
+    w->level[j] = level > 0 ? level : 0;
+    w->pull[j] = g->hard ? -v / g->dt : -JN(RATE) * v;
+    w->soft[j] = w->weight[j] * (g->hard ? 1e-9 : JN(SHARE));
+    if (!g->limited) continue;
+    limited(g, n, j, q - JN(LOWER), v, w->weight[j], &w->side[0][j]);
+    limited(g, n, j, JN(UPPER) - q, -v, w->weight[j], &w->side[1][j]);
+  }
+}
+
+INLINE void acting(const Given *g, Work *w, const int n, const double *a) {
+  for (int j = 0; j < n; j++) {
+    const double raw = (w->pull[j] - a[j]) / w->soft[j];
+    w->slip[j] = raw >= w->level[j] ? 1 : raw <= -w->level[j] ? -1 : 0;
+    w->side[0][j].on = g->limited && a[j] < w->side[0][j].pull;
+    w->side[1][j].on = g->limited && -a[j] < w->side[1][j].pull;
+  }
+}
+INLINE double force_at(const Work *w, const int j, double a) {
+  double f = w->slip[j] ? w->slip[j] * w->level[j] : (w->pull[j] - a) / w->soft[j];
+  if (w->side[0][j].on) f += (w->side[0][j].pull - a) / w->side[0][j].soft;
+  if (w->side[1][j].on) f -= (w->side[1][j].pull + a) / w->side[1][j].soft;
+  return f;
+}
+INLINE double stiffness(const Work *w, const int j) {
+  double s = w->slip[j] ? 0 : 1 / w->soft[j];
+  for (int k = 0; k < 2; k++)
+    if (w->side[k][j].on) s += 1 / w->side[k][j].soft;
+  return s;
+}
+
+/* slope of the cost along a way; sets the forces that act there */
+APART double along(const Given *g, Work *w, const int n, const double *a, const double *way, double s, double start, double curve) {
+  double at[MOST], x = start + s * curve;
+  for (int j = 0; j < n; j++) at[j] = a[j] + s * way[j];
+  acting(g, w, n, at);
+  for (int j = 0; j < n; j++) x -= way[j] * force_at(w, j, at[j]);
+  return x;
+}
+APART double step_length(const Given *g, Work *w, const int n, const double *r, const double *way) {
+  double at[4 * MOST + 2], start = 0, curve = 0, far = 0, low = 0, high = INFINITY;
+  int many = 0;
+  for (int j = 0; j < n; j++) {
+    double x = 0, y = 0;
+    for (int k = 0; k < n; k++) x += w->M[j * n + k] * w->a[k], y += w->M[j * n + k] * way[k];
+    start += way[j] * (x - r[j]), curve += way[j] * y;
+    if (way[j] == 0) continue;
+    const double reach = w->soft[j] * w->level[j];
+    const double edge[4] = {w->pull[j] - reach, w->pull[j] + reach, w->side[0][j].pull, -w->side[1][j].pull};
+    for (int k = 0; k < (g->limited ? 4 : 2); k++) {
+      const double s = (edge[k] - w->a[j]) / way[j];
+      if (isfinite(s) && s > 0) at[many++] = s, far = s > far ? s : far;
+    }
+  }
+  at[many++] = far + 1;
+  for (int k = 0; k < many; k++) {
+    if (at[k] <= low || at[k] >= high) continue;
+    if (along(g, w, n, w->a, way, at[k], start, curve) <= 0) low = at[k];
+    else high = at[k];
+  }
+  if (!isfinite(high)) high = low + 1;
+  const double a = along(g, w, n, w->a, way, low, start, curve), b = along(g, w, n, w->a, way, high, start, curve);
+  return b > a ? low - a * (high - low) / (b - a) : low;
+}
+
+INLINE void with_stiffness(const Work *w, const int n, double *K) {
+  memcpy(K, w->M, sizeof(double) * n * n);
+  for (int j = 0; j < n; j++) K[j * n + j] += stiffness(w, j);
+  inverted(K, n);
+}
+
+/* accelerations of the constrained joints, the forces that act, and the inverse of masses and their stiffness */
+INLINE void settled(const Given *g, Work *w, const int n) {
+  double r[MOST];
+  for (int j = 0; j < n; j++) r[j] = w->torque[j] - w->bias[j];
+  if (n == 1) {
+    double best = 0;
+    int slip = 0, set = 0;
+    for (int k = 0; k < (g->limited ? 3 : 1); k++) {
+      double mass = w->M[0], right = r[0];
+      const Side *one = k ? &w->side[k - 1][0] : 0;
+      if (k && one->pull == -INFINITY) continue;
+      if (k) mass += 1 / one->soft, right += (k == 1 ? one->pull : -one->pull) / one->soft;
+      double raw = (w->pull[0] - right / mass) / (w->soft[0] + 1 / mass);
+      const int now = raw >= w->level[0] ? 1 : raw <= -w->level[0] ? -1 : 0;
+      const double a = (right + (now ? now * w->level[0] : raw)) / mass;
+      if (k && !((a < w->side[0][0].pull) == (k == 1) && (-a < w->side[1][0].pull) == (k == 2))) continue;
+      best = a, slip = now, set = k;
+    }
+    w->a[0] = best, w->slip[0] = slip, w->side[0][0].on = set == 1, w->side[1][0].on = set == 2;
+    w->K[0] = 1 / (w->M[0] + stiffness(w, 0));
+    return;
+  }
+  acting(g, w, n, w->a);
+  for (int turn = 0; turn < TURNS; turn++) {
+    double way[MOST], gap[MOST], full[MOST];
+    int slip[MOST], low[MOST], high[MOST], same = 1;
+    with_stiffness(w, n, w->K);
+    for (int j = 0; j < n; j++) {
+      gap[j] = -r[j] - force_at(w, j, w->a[j]);
+      for (int k = 0; k < n; k++) gap[j] += w->M[j * n + k] * w->a[k];
+      slip[j] = w->slip[j], low[j] = w->side[0][j].on, high[j] = w->side[1][j].on;
+    }
+    for (int j = 0; j < n; j++) {
+      way[j] = 0;
+      for (int k = 0; k < n; k++) way[j] -= w->K[j * n + k] * gap[k];
+      full[j] = w->a[j] + way[j];
+    }
+    acting(g, w, n, full);
+    for (int j = 0; j < n; j++) same &= slip[j] == w->slip[j] && low[j] == w->side[0][j].on && high[j] == w->side[1][j].on;
+    if (same) {
+      memcpy(w->a, full, sizeof(double) * n);
+      return;
+    }
+    const double s = step_length(g, w, n, r, way);
+    if (!isfinite(s)) {
+      for (int j = 0; j < n; j++) w->a[j] = NAN;
+      return;
+    }
+    for (int j = 0; j < n; j++) w->a[j] += s * way[j];
+    acting(g, w, n, w->a);
+  }
+}
+
+/* one step from q, v: `want` keeps what the derivatives need */
+INLINE void stepped(const Given *g, Work *w, const int n, const int carried, const int want) {
+  if (carried) {
+    double q = 0;
+    for (int j = 0; j < n; j++) q += w->q[j];
+    for (int j = 0; j < n; j++) w->bias[j] = w->base + w->steep * (q - w->at);
+    for (int k = 0; k < n * n; k++) w->M[k] = w->mass;
+  } else {
+    posed(g, w, n, w->q, w->v);
+    if (want)
+      for (int i = 0; i < n; i++) momentum_slope(w->body + i);
+    summed_up(g, w, n, 1);
+    for (int i = 0; i < n; i++) w->bias[g->coordinate[i]] = dot6(w->body[i].S, w->body[i].F);
+    masses(g, w, n, w->M);
+  }
+  for (int j = 0; j < n; j++) w->M[j * n + j] += JN(ARMATURE);
+  driven(g, w, n, want);
+  resisted(g, w, n);
+  settled(g, w, n);
+  int damped = 0;
+  memset(w->D, 0, sizeof(double) * n * n);
+  for (int j = 0; j < n; j++) w->D[j * n + j] = JN(DAMPING), damped |= JN(DAMPING) != 0;
+  for (long d = 0; g->implicit && d < g->nu; d++) {
+    const double *way = g->way + d * n;
+    if (w->slope[d] == 0) continue;
+    damped = 1;
+    for (int j = 0; j < n; j++)
+      for (int k = 0; k < n; k++) w->D[j * n + k] -= way[j] * way[k] * w->slope[d];
+  }
+  if (!damped && !want) {
+    memcpy(w->moved, w->a, sizeof(double) * n);
+    return;
+  }
+  double force[MOST];
+  for (int k = 0; k < n * n; k++) w->L[k] = w->M[k] + g->dt * w->D[k];
+  inverted(w->L, n);
+  for (int j = 0; j < n; j++) {
+    force[j] = 0;
+    for (int k = 0; k < n; k++) force[j] += w->M[j * n + k] * w->a[k];
+  }
+  for (int j = 0; j < n; j++) {
+    w->moved[j] = 0;
+    for (int k = 0; k < n; k++) w->moved[j] += w->L[j * n + k] * force[k];
+  }
+}
+
+/* derivatives of the rigid body's torques by q and v at accelerations A (those of the base included where `moving`) */
+APART void slopes(const Given *g, const Work *w, const int n, double A[][6], double F[][6], int moving, double *by_q, double *by_v) {
+  const double ground[6] = {0, 0, 0, -g->gravity[0], -g->gravity[1], -g->gravity[2]}, zero[6] = {0};
+  double U[MOST][6];
+  memset(by_q, 0, sizeof(double) * n * n);
+  if (by_v) memset(by_v, 0, sizeof(double) * n * n);
+  for (int i = 0; i < n; i++) {
+    const long up = g->parent[i];
+    crossed(up < 0 ? (moving ? ground : zero) : A[up], w->body[i].S, U[i]);
+    if (!moving) continue;
+    double x[6];
+    crossed(up < 0 ? zero : w->body[up].V, w->body[i].T, x);
+    for (int k = 0; k < 6; k++) U[i][k] += x[k];
+  }
+  for (int i = 0; i < n; i++) {
+    const Body *b = w->body + i;
+    const double *f = b->P + 3;
+    double z[6], y[6], x[6], t[3], y2[6];
+    inertial(b->m, b->h, b->J, b->S, z);
+    inertial(b->m, b->h, b->J, U[i], y);
+    crossed_force(b->S, F[i], x);
+    for (int k = 0; k < 6; k++) y[k] += x[k];
+    if (moving) {
+      turned(b->B, b->T, x);
+      cross(f, b->T, x + 3);
+      for (int k = 0; k < 3; k++) y[k] += x[k], y[3 + k] -= 2 * x[3 + k];
+      cross(f, b->S + 3, t);
+      for (int k = 0; k < 3; k++) t[k] = 2 * t[k] + b->B[k] * b->S[0] + b->B[3 + k] * b->S[1] + b->B[6 + k] * b->S[2];
+      if (by_v) {
+        inertial(b->m, b->h, b->J, b->T, y2);
+        turned(b->B, b->S, x);
+        cross(f, b->S, x + 3);
+        for (int k = 0; k < 3; k++) y2[k] = 2 * y2[k] + x[k], y2[3 + k] = 2 * (y2[3 + k] - x[3 + k]);
+      }
+    }
+    const long r = g->coordinate[i];
+    for (long j = i; j >= 0; j = g->parent[j]) {
+      const long c = g->coordinate[j];
+      const Body *o = w->body + j;
+      by_q[r * n + c] = dot6(z, U[j]) + (moving ? dot3(t, o->T) : 0);
+      if (j != i) by_q[c * n + r] = dot6(o->S, y);
+      if (!by_v) continue;
+      by_v[r * n + c] = 2 * dot6(z, o->T) + dot3(t, o->S);
+      if (j != i) by_v[c * n + r] = dot6(o->S, y2);
+    }
+  }
+}
+
+/* accelerations of the bodies from those of the joints, and the forces that they take, with all that is carried */
+APART void spread(const Given *g, const Work *w, const int n, const double *a, double A[][6], double F[][6]) {
+  for (int i = 0; i < n; i++) {
+    const Body *b = w->body + i;
+    for (int k = 0; k < 6; k++) A[i][k] = (g->parent[i] < 0 ? 0 : A[g->parent[i]][k]) + b->S[k] * a[g->coordinate[i]];
+    inertial(b->own[0], b->own + 1, b->own + 4, A[i], F[i]);
+  }
+  for (int i = n - 1; i >= 0; i--)
+    if (g->parent[i] >= 0)
+      for (int k = 0; k < 6; k++) F[g->parent[i]][k] += F[i][k];
+}
+
+#define BY(c) by[(c) * n + j] /* columns first */
+
+/* derivatives of the step's acceleration by q, v and the unknowns: (2 n + many, n) */
+INLINE void linearised(const Given *g, Work *w, const int n, const int carried, const double *mobile, double *by) {
+  const int two = 2 * n, total = two + (int)g->many;
+  double first[MOST * MOST * 2], second[MOST * MOST], own[MOST * MOST], W[MOST * MOST], x[MOST], load[MOST], sign[MOST];
+  double A[MOST][6], F[MOST][6], X[MOST][6], G[MOST][6], idle[MOST][6];
+  int loaded = 0;
+  for (int j = 0; j < n; j++) {
+    x[j] = w->moved[j] - w->a[j];
+    sign[j] = 0;
+    if (w->slip[j] && JN(RATIO) != 0 && w->level[j] > 0) sign[j] = w->slip[j] * JN(RATIO) * (w->motor[j] > w->bias[j] ? 1 : -1);
+    loaded |= sign[j] != 0;
+    load[j] = 1 + sign[j]; /* a torque of the drive also raises the friction */
+  }
+  double *by_q = first, *by_v = first + n * n;
+  if (carried) {
+    for (int k = 0; k < n * n; k++) by_q[k] = w->steep, by_v[k] = 0, second[k] = 0;
+    for (int j = 0; j < n; j++)
+      for (int k = 0; k < n; k++) by_q[j * n + k] += sign[j] * w->steep;
+  } else {
+    spread(g, w, n, w->a, A, F);
+    for (int i = 0; i < n; i++)
+      for (int k = 0; k < 6; k++) idle[i][k] = w->body[i].A[k], A[i][k] += w->body[i].A[k], F[i][k] += w->body[i].F[k];
+    slopes(g, w, n, A, F, 1, by_q, by_v);
+    spread(g, w, n, x, X, G);
+    slopes(g, w, n, X, G, 0, second, 0);
+    if (loaded) {
+      double rest[MOST][6], bias_v[MOST * MOST];
+      for (int i = 0; i < n; i++) memcpy(rest[i], w->body[i].F, sizeof rest[i]);
+      slopes(g, w, n, idle, rest, 1, own, bias_v);
+      for (int j = 0; j < n; j++)
+        for (int k = 0; k < n; k++) by_q[j * n + k] += sign[j] * own[j * n + k], by_v[j * n + k] += sign[j] * bias_v[j * n + k];
+    }
+  }
+  for (long d = 0; d < g->nu; d++) {
+    const double *way = g->way + d * n;
+    for (int j = 0; j < n; j++) {
+      const double f = way[j] * load[j] * w->within[j];
+      if (f == 0) continue;
+      for (int k = 0; k < n; k++) by_q[j * n + k] -= f * way[k] * w->by_length[d], by_v[j * n + k] -= f * way[k] * w->by_rate[d];
+    }
+  }
+  for (int j = 0; j < n; j++) {
+    const double q = w->q[j], v = w->v[j], half = JN(PLAY) / 2, out = q - JN(REST);
+    double dq = out > half || out < -half || half == 0 ? JN(STIFFNESS) : 0, dv = JN(DAMPING);
+    if (JN(SINE) != 0 || JN(COSINE) != 0)
+      dq += JN(ORDER) * (JN(SINE) * cos(JN(ORDER) * q) - JN(COSINE) * sin(JN(ORDER) * q));
+    if (w->slip[j] == 0) dv += (g->hard ? 1 / g->dt : JN(RATE)) / w->soft[j];
+    else if (w->level[j] > 0) dv += w->slip[j] * JN(PEAK) * w->peak[j] * 2 * v / (JN(SPEED) * JN(SPEED));
+    for (int k = 0; k < 2; k++) {
+      const Side *one = &w->side[k][j];
+      if (!one->on) continue;
+      const double f = (one->pull + (k ? w->a[j] : -w->a[j])) / one->soft;
+      dq -= one->by / one->soft - f * one->log_soft;
+      dv -= one->by_rate / one->soft;
+    }
+    by_q[j * n + j] += dq, by_v[j * n + j] += dv;
+  }
+  for (int i = 0; i < n; i++) /* W = L^-1 M K^-1 */
+    for (int j = 0; j < n; j++) {
+      own[i * n + j] = 0;
+      for (int k = 0; k < n; k++) own[i * n + j] += w->L[i * n + k] * w->M[k * n + j];
+    }
+  for (int i = 0; i < n; i++)
+    for (int j = 0; j < n; j++) {
+      W[i * n + j] = 0;
+      for (int k = 0; k < n; k++) W[i * n + j] += own[i * n + k] * w->K[k * n + j];
+    }
+  memset(by, 0, sizeof(double) * total * n);
+  for (int j = 0; j < n; j++)
+    for (int k = 0; k < n; k++)
+      for (int c = 0; c < n; c++) {
+        BY(c) -= W[j * n + k] * by_q[k * n + c] + w->L[j * n + k] * second[k * n + c];
+        BY(n + c) -= W[j * n + k] * by_v[k * n + c];
+      }
+  for (long p = 0; p < g->many; p++) {
+    const long c = two + g->column[p], at = g->place[p], kind = g->kind[p];
+    double one[MOST], more[MOST];
+    int all = 0;
+    if (kind == ARMATURE || kind >= BODY) {
+      memset(one, 0, sizeof(double) * n), memset(more, 0, sizeof(double) * n);
+      all = 1;
+    }
+    if (kind == ARMATURE) one[at] = w->a[at], more[at] = x[at];
+    if (kind == CARRIED_BODY) {
+      double q = -w->at, a = 0, s = 0;
+      for (int k = 0; k < n; k++) q += w->q[k], a += w->a[k], s += x[k];
+      const double bias = w->more[(3 * at + 1) * g->windows] + w->more[(3 * at + 2) * g->windows] * q;
+      const double mass = w->more[3 * at * g->windows];
+      for (int j = 0; j < n; j++) one[j] = mass * a + bias * (1 + sign[j]), more[j] = mass * s;
+    } else if (kind >= BODY) {
+      unit_torques(g, w, n, p, A, 0, one);
+      if (loaded) {
+        unit_torques(g, w, n, p, idle, 0, more);
+        for (int j = 0; j < n; j++) one[j] += sign[j] * more[j];
+      }
+      unit_torques(g, w, n, p, X, 1, more);
+    }
+    if (all) {
+      for (int j = 0; j < n; j++) { /* the constraints' softness follows the masses */
+        if (mobile[p * n + j] == 0) continue;
+        double f = w->slip[j] ? 0 : (w->pull[j] - w->a[j]) / w->soft[j];
+        if (w->side[0][j].on) f += (w->side[0][j].pull - w->a[j]) / w->side[0][j].soft;
+        if (w->side[1][j].on) f -= (w->side[1][j].pull + w->a[j]) / w->side[1][j].soft;
+        one[j] += f * mobile[p * n + j];
+      }
+      for (int j = 0; j < n; j++)
+        for (int k = 0; k < n; k++) BY(c) -= W[j * n + k] * one[k] + w->L[j * n + k] * more[k];
+      continue;
+    }
+    if (kind >= OF_DRIVE) {
+      const long d = at;
+      const double *way = g->way + d * n;
+      double f = 0, bend = 0;
+      if (kind == OF_DRIVE + SCALE) f = w->by_scale[d];
+      if (kind == OF_DRIVE + DELAY) f = w->by_u[d] * w->faster[d], bend = w->inside[d] * DN(GAIN2) * w->faster[d];
+      if (kind == OF_DRIVE + DEAD) f = w->by_band[d];
+      if (kind == OF_DRIVE + VOLTAGE) f = w->volt[d];
+      if (kind == LIMIT) f = w->limit[d];
+      if (kind == KP) f = w->by_gain[d];
+      if (kind == KD) f = w->inside[d] ? -w->rate[d] : 0, bend = w->inside[d] ? -1 : 0;
+      double turn = 0;
+      for (int k = 0; k < n; k++) turn += way[k] * w->moved[k];
+      for (int k = 0; k < n; k++) {
+        if (way[k] == 0) continue;
+        const double t1 = -way[k] * f * load[k] * w->within[k], t2 = g->implicit ? -g->dt * way[k] * turn * bend : 0;
+        for (int j = 0; j < n; j++) BY(c) -= W[j * n + k] * t1 + w->L[j * n + k] * t2;
+      }
+      continue;
+    }
+    double t1 = 0, t2 = 0;
+    {
+      const int j = (int)at;
+      const double q = w->q[j], v = w->v[j], half = JN(PLAY) / 2, out = q - JN(REST);
+      const int far = out > half ? 1 : out < -half ? -1 : 0;
+      const double slip = w->level[j] > 0 || JN(FRICTION) + JN(PEAK) >= 0 ? w->slip[j] : 0;
+      switch (kind) {
+        case DAMPING: t1 = v, t2 = g->dt * w->moved[j]; break;
+        case FRICTION: t1 = -slip; break;
+        case PEAK: t1 = -slip * exp(-(v / JN(SPEED)) * (v / JN(SPEED))); break;
+        case SPEED: t1 = -slip * JN(PEAK) * w->peak[j] * 2 * v * v / (JN(SPEED) * JN(SPEED) * JN(SPEED)); break;
+        case RATIO: t1 = -slip * fabs(w->motor[j] - w->bias[j]); break;
+        case STIFFNESS: t1 = out - far * half - (far ? 0 : out); break;
+        case REST: t1 = far || half == 0 ? -JN(STIFFNESS) : 0; break;
+        case PLAY: t1 = -far * JN(STIFFNESS) / 2; break;
+        case OFFSET: t1 = 1; break;
+        case SINE: t1 = sin(JN(ORDER) * q); break;
+        case COSINE: t1 = cos(JN(ORDER) * q); break;
+        case ORDER: t1 = q * (JN(SINE) * cos(JN(ORDER) * q) - JN(COSINE) * sin(JN(ORDER) * q)); break;
+        default: break;
+      }
+    }
+    for (int j = 0; j < n; j++) BY(c) -= W[j * n + at] * t1 + w->L[j * n + at] * t2;
+  }
+}
+
+/* what the drives see at a step, and its derivative by the delay: `least` is the first step whose command is known */
+INLINE void commanded(const Given *g, Work *w, const long window, const long step, const long least) {
+  for (long d = 0; d < g->nu; d++) {
+    int now = (int)step - w->whole[d], before = now - 1;
+    if (now < least) now = (int)least;
+    if (before < least) before = (int)least;
+    const unsigned each = (unsigned)g->substeps;
+    const double a = g->command[((unsigned)now / each * g->nu + d) * g->windows + window];
+    const double b = g->command[((unsigned)before / each * g->nu + d) * g->windows + window];
+    w->u[d] = a + w->part[d] * (b - a);
+    w->faster[d] = (b - a) * w->often;
+  }
+}
+
+INLINE void carrying(const Given *g, Work *w, const long window, const long row) {
+  const long wide = 4 + 3 * g->links;
+  const double *one = g->load + row * wide * g->windows + window;
+  w->mass = one[0], w->base = one[g->windows], w->steep = one[2 * g->windows], w->at = one[3 * g->windows];
+  w->more = one + 4 * g->windows;
+  for (long k = 0; k < g->links; k++) {
+    if (g->payload[k] == 0) continue;
+    w->mass += g->payload[k] * w->more[3 * k * g->windows];
+    w->base += g->payload[k] * w->more[(3 * k + 1) * g->windows];
+    w->steep += g->payload[k] * w->more[(3 * k + 2) * g->windows];
+  }
+}
+
+/* what is read: positions, then rates */
+INLINE double seen(const Given *g, const Work *w, const int n, const long y) {
+  const int j = (int)g->measured[y % g->ny];
+  const long k = g->summed[y % g->ny];
+  const double *x = y < g->ny ? w->q : w->v;
+  return x[j] + (k < 0 ? 0 : x[k]) + (y < g->ny ? JN(READING) : 0);
+}
+
+/* sums of a row: squares, gradient, normal matrix (its upper half) */
+WIDE void collected(const Given *g, const Work *w, const int n, const long window, const long row, const long width,
+                      const double *S, double *cost, double *gradient, double *matrix) {
+  const long wide = g->ny * (g->rates ? 2 : 1), total = g->columns + 2 * n;
+  double slope[512] __attribute__((aligned(64)));
+  for (long y = 0; y < wide; y++) {
+    const double sure = g->weight[(row * wide + y) * g->windows + window];
+    if (sure == 0) continue;
+    const double error = (g->reading[(row * wide + y) * g->windows + window] - seen(g, w, n, y)) * sure;
+    cost[y] += error * error;
+    const long half = y < g->ny ? 0 : n, j = g->measured[y % g->ny], k = g->summed[y % g->ny];
+    const double *own = S + (half + j) * width, *twin = k < 0 ? 0 : S + (half + k) * width;
+    for (long c = 0; c < width; c++) slope[c] = own[c] * sure;
+    if (twin)
+      for (long c = 0; c < width; c++) slope[c] += twin[c] * sure;
+    if (!half)
+      for (long p = 0; p < g->many; p++)
+        if (g->kind[p] == READING && g->place[p] == j) slope[g->column[p]] += sure;
+    for (long c = 0; c < total; c++) {
+      const double f = slope[c];
+      if (f == 0) continue;
+      gradient[c] += f * error;
+      double *restrict line = matrix + c * width + (c & ~7L);
+      const double *restrict from = slope + (c & ~7L);
+      for (long r = 0; r < width - (c & ~7L); r++) line[r] += f * from[r];
+    }
+  }
+}
+
+WIDE void carried_on(const Given *g, const int n, const long width, const double *by, double *S, double *old) {
+  const double dt = g->dt;
+  memcpy(old, S, sizeof(double) * 2 * n * width);
+  for (int j = 0; j < n; j++) {
+    double *restrict v = S + (n + j) * width, *restrict q = S + j * width;
+    for (int k = 0; k < 2 * n; k++) {
+      const double f = dt * BY(k);
+      const double *restrict from = old + k * width;
+      for (long c = 0; c < width; c++) v[c] += f * from[c];
+    }
+    for (long c = 0; c < g->columns; c++) v[c] += dt * BY(2 * n + c);
+    for (long c = 0; c < width; c++) q[c] += dt * v[c];
+  }
+}
+
+INLINE void window_of(const Given *g, const int n, const int carried, const int want, const long window, const double *mobile, Work *w) {
+  const long wide = g->ny * (g->rates ? 2 : 1), total = g->columns + 2 * n, width = (total + 7) / 8 * 8;
+  const long blocks = g->rows / g->block;
+  double S[want ? 2 * n * width : 1] __attribute__((aligned(64))), old[want ? 2 * n * width : 1] __attribute__((aligned(64)));
+  double gradient[want ? width : 1], matrix[want ? total * width : 1] __attribute__((aligned(64))), cost[ROWS];
+  double by[want ? (2 * n + g->many) * n : 1];
+  for (int j = 0; j < n; j++) w->q[j] = g->begin[j * g->windows + window], w->v[j] = g->begin[(n + j) * g->windows + window], w->a[j] = 0;
+  if (want) {
+    memset(S, 0, sizeof S);
+    for (int k = 0; k < 2 * n; k++) S[k * width + g->columns + k] = 1;
+  }
+  int lost = 0;
+  for (long b = 0; b < blocks; b++) {
+    memset(cost, 0, sizeof cost);
+    if (want) memset(gradient, 0, sizeof gradient), memset(matrix, 0, sizeof matrix);
+    for (long row = b * g->block; row < (b + 1) * g->block; row++) {
+      for (int j = 0; j < n; j++) lost |= !(fabs(w->v[j]) < 1e12);
+      if (want && !lost) collected(g, w, n, window, row, width, S, cost, gradient, matrix);
+      if (!want)
+        for (long y = 0; y < wide; y++) g->read[(row * wide + y) * g->windows + window] = lost ? NAN : seen(g, w, n, y);
+      if (lost) continue;
+      if (carried) carrying(g, w, window, row);
+      for (long k = 0; k < g->substeps; k++) {
+        commanded(g, w, window, (row + g->lead) * g->substeps + k, b * g->block * g->substeps);
+        stepped(g, w, n, carried, want);
+        if (want) linearised(g, w, n, carried, mobile, by), carried_on(g, n, width, by, S, old);
+        for (int j = 0; j < n; j++) w->v[j] += g->dt * w->moved[j], w->q[j] += g->dt * w->v[j];
+      }
+    }
+    if (!want) continue;
+    for (long y = 0; y < wide; y++) g->cost[(b * g->windows + window) * wide + y] = lost ? NAN : cost[y];
+    double *one = g->gradient + (b * g->windows + window) * total, *two = g->matrix + (b * g->windows + window) * total * total;
+    for (long c = 0; c < total; c++) {
+      one[c] = lost ? NAN : gradient[c];
+      for (long r = c; r < total; r++) two[c * total + r] = two[r * total + c] = lost ? NAN : matrix[c * width + r];
+    }
+  }
+}
+
+INLINE void all_windows(const Given *g, const int n, const int carried, const int want) {
+  static __thread Work w;
+  double mobile[n * g->many + 1];
+  mobility(g, &w, n, mobile);
+  w.often = 1 / g->dt;
+  for (long d = 0; d < g->nu; d++) {
+    const double late = (DN(DELAY) > 0 ? DN(DELAY) : 0) / g->dt;
+    w.whole[d] = late < 1e9 ? (int)late : 1000000000, w.part[d] = late - floor(late);
+  }
+  for (long k = 0; k < g->windows; k++) window_of(g, n, carried, want, k, mobile, &w);
+}
+
+long most_coordinates(void) { return MOST; }
+
+/* SIZE: coordinates where they are one or two, else 0; ONE: a joint carried by a measured arm */
+void rolled(const Given *g) {
+  const int n = SIZE ? SIZE : (int)g->n;
+  if (g->cost) all_windows(g, n, ONE, 1);
+  else all_windows(g, n, ONE, 0);
+}
