@@ -896,7 +896,9 @@ def main() -> None:
     args = parser.parse_args()
     if args.cold:
         told("one start, cold", *on_peer_problem(1))
-        print(f"whole process {time.process_time():.2f} CPU s")
+        spent_by = os.times()
+        compiler = spent_by.children_user + spent_by.children_system
+        print(f"whole process {time.process_time():.2f} CPU s, C compiler {compiler:.2f}")
         return
     for part in args.parts or [name for name in PARTS if name != "gpu"]:
         print(f"== {part}")
