@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from .estimation import (
         accelerators as accelerators,
         columns as columns,
+        fleets as fleets,
         least_squares as least_squares,
         regression as regression,
         states as states,
@@ -154,6 +155,7 @@ _SPACES = {
     "cleaning": "recordings.cleaning",
     "columns": "estimation.columns",
     "devices": "recordings.devices",
+    "fleets": "estimation.fleets",
     "instruments": "identification.instruments",
     "least_squares": "estimation.least_squares",
     "markers": "estimation.markers",

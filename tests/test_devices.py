@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -110,6 +111,39 @@ def test_three_devices_give_the_sums_of_one(tmp_path: Path):
     assert done.returncode == 0, done.stderr
 
 
+HOSTS = """
+import sys
+from pathlib import Path
+import jax, numpy as np
+from test_devices import States, condense_on_devices, tree_states
+jax.config.update("jax_compilation_cache_dir", sys.argv[4])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+jax.distributed.initialize(sys.argv[2], num_processes=2, process_id=int(sys.argv[3]))
+rows = tree_states(Path(sys.argv[1]))
+pieces = list(rows.source())
+own = States(rows.model, lambda: pieces[:1] if sys.argv[3] == "0" else pieces[1:], rows.terms)
+np.save(Path(sys.argv[1]) / f"factor{sys.argv[3]}.npy", condense_on_devices(own).factor())
+"""
+
+
+def test_two_processes_with_pieces_of_their_own_give_the_sums_of_one(tmp_path: Path):
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
+    paths = os.pathsep.join([str(TESTS), str(TESTS.parent)])
+    environment = os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"}
+    rows = tree_states(tmp_path)
+    command, cache = [sys.executable, "-c", HOSTS, str(tmp_path), address], str(TESTS.parent / ".cache" / "jax")
+    starts = {"env": environment, "stderr": subprocess.PIPE, "text": True}
+    running = [subprocess.Popen([*command, str(k), cache], **starts) for k in range(2)]
+    said = [one.communicate(timeout=300)[1] for one in running]
+    assert [one.returncode for one in running] == [0, 0], said
+    first, second = (np.load(tmp_path / f"factor{k}.npy") for k in range(2))
+    np.testing.assert_array_equal(first, second)
+    expected = normal(condense(rows, rows.used))
+    np.testing.assert_allclose(first.T @ first, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+
+
 def test_vmap_over_robots_and_their_trajectories_is_one_fit_after_another(tmp_path: Path):
     rows = tree_states(tmp_path)
     base, count = rows.structural, 3
@@ -177,3 +211,25 @@ def test_memory_is_the_same_for_twenty_times_the_samples_from_disk(tmp_path: Pat
     (small, few), (large, many) = (map(int, line.split()) for line in done.stdout.splitlines())
     assert (few, many) == (20_000, 400_000)
     assert large - small < 20
+
+
+def test_a_fleet_is_one_robot_after_another_and_who_differs_stands_out(tmp_path: Path):
+    """Twelve robots; spread of friction beside noise; one with three times the friction at its second joint."""
+    rows, random = tree_states(tmp_path), np.random.default_rng(5)
+    q, v, a = np.stack([states(rows.model, 200, seed=k) for k in range(12)], axis=1)
+    friction = 2.0 + 0.2 * random.standard_normal((12, 1, rows.model.nv))
+    friction[7, 0, 1] = 6.0
+    rigid = np.stack([fj.inverse_dynamics(rows.model, *state) for state in zip(q, v, a, strict=True)])
+    tau = rigid + friction * v + 0.01 * random.standard_normal(v.shape)
+    fleet = fj.fleets.identify_fleet([rows.model] * 12, rows.terms, q, v, a, tau)
+    base = rows.structural
+    own = States(rows.model, lambda: [(q[3], v[3], a[3], tau[3])], rows.terms)
+    alone = solve(condense(own, own.used), WeightedByJoint(), kept=base.independent).parameters[base.independent]
+    np.testing.assert_allclose(fleet.parameters[3], alone, rtol=0, atol=1e-3 * np.abs(alone).max())
+    viscous = [k for k, name in enumerate(fleet.names) if name.startswith("fv")]
+    found = fleet.unusual()
+    assert found[:, viscous].sum() == 1 and found[7].sum() >= 1
+    ordinary = np.delete(fleet.spread[viscous], np.argmax(fleet.spread[viscous]))
+    np.testing.assert_allclose(ordinary, 0.2, rtol=0.6)
+    with pytest.raises(InputError, match="tau has shape"):
+        fj.fleets.identify_fleet([rows.model] * 12, rows.terms, q, v, a, tau[:, :, :2])

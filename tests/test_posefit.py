@@ -12,6 +12,7 @@ import poses
 import pytest
 
 from figaroh_jax.estimation import posefit, starts
+from figaroh_jax.estimation.posehost import written_out
 from figaroh_jax.estimation.posesolver import solve
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.recordings.devices import Camera, Device, Distance, Planes, Points, Poses, Sockets, own_device
@@ -93,6 +94,10 @@ def test_jacobian_of_every_device_is_the_derivative_of_its_rows(name: str, model
     np.testing.assert_allclose(residual, posefit.predict(whole, y), rtol=0, atol=1e-14)
     assert len(posefit.rows_of(whole).group) == len(residual)
     assert_derivative(whole, y, jacobian)
+    if written_out(device):
+        compiled = posefit.linearise(whole, y, posefit.parts_of(whole))
+        np.testing.assert_allclose(residual, compiled[0], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(jacobian, compiled[1], rtol=0, atol=1e-12)
     if isinstance(device, Poses) and not isinstance(device, Camera):
         for angle in (0.0, np.pi - 1e-3):
             turned = at_angle(angle, datum, residual[N * 3 :].reshape(3, N).T)

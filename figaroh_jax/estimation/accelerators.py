@@ -94,20 +94,24 @@ def coordinates(structure: Float[np.ndarray, "samples nv columns"], base: BasePa
 def condense_on_devices(
     states: States, devices: Sequence[Any] | None = None, folds: int = FOLDS, chunk: int | None = None
 ) -> Condensed:
-    """`condense(states, states.used)`, the samples of every piece spread over `devices` (default: all that JAX has).
+    """`condense(states, states.used)`, the samples of every piece spread over `devices` (default: all of this host).
 
     Each device forms the rows of its own samples, `chunk` at a time, and sums their products; the sums of the devices
     are added. Pieces of one length share a program; the source is read while the devices work. A single CPU takes
     machine code for the rows of long pieces, where there is some. A direction in which the rows are less than 3e-7 of
     the strongest one's is taken as not shown. Folds are whole chunks in turn. Raises `InputError` where a piece has a
     wrong shape or holds a number that is not finite. An accelerator is busy with pieces of 1e5 samples and more.
+
+    Where `jax.distributed` runs, each process takes the pieces that its own source gives, however many, on the devices
+    of its host; the sums of all are added once at the end, and every process gets the same answer.
     """
-    mesh = Mesh(np.array(list(devices or jax.devices())), ("samples",))
+    mesh = Mesh(np.array(list(devices or jax.local_devices())), ("samples",))
     frames = states.frames
     on_one_cpu = mesh.size == 1 and mesh.devices.flat[0].platform == "cpu" and jax.default_backend() == "cpu"
     with jax.enable_x64(True):
         sums = _summed_by_code(states, frames, folds) if on_one_cpu and chunk is None else None
         sums = sums or _summed(states, frames, mesh, folds, chunk)
+        sums = _of_all_processes(sums) if jax.process_count() > 1 else sums
     if not all(np.isfinite(x).all() for x in jax.tree.leaves(sums)):
         for number, part in enumerate(states.source()):
             check_piece(states.model, part, number)
@@ -199,6 +203,12 @@ def _summed(states: States, frames: Sequence[OwnFrame], mesh: Mesh, folds: int, 
             size = len(frames[j].kept) + 1
             products[j] = found[:, n, :size, :size]
     return _Sums(tuple(products), sums.rows, sums.torque)
+
+
+def _of_all_processes(sums: _Sums) -> _Sums:
+    from jax.experimental.multihost_utils import process_allgather  # slow to import
+
+    return jax.tree.map(lambda x: np.asarray(process_allgather(np.asarray(x))).sum(0), sums)
 
 
 def _chunk(mesh: Mesh, rows: int, most: int) -> int:

@@ -22,11 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..compiled.batching import DRAFT_OPTIONS, chunk_size, program
+from ..compiled.batching import DRAFT_OPTIONS, chunk_size, program, traced
 from ..recordings.devices import Device
 from ..rigid import lie
 from ..rigid.chain import Chain, chain_pose, joint_response
 from ..rigid.model import Leaf
+from .posehost import HostRows, written_out
 
 __all__ = [
     "DRAFT",
@@ -37,6 +38,7 @@ __all__ = [
     "Rows",
     "block_rows",
     "group_of",
+    "host_parts",
     "linearise",
     "parts_of",
     "predict",
@@ -206,15 +208,31 @@ def _tied(device: Device, own: Array) -> tuple[Array, Array]:
     return device.constraint(own), jax.jacfwd(device.constraint)(own)
 
 
+def host_parts(problem: Problem) -> tuple[Part | HostRows, ...]:
+    """For `linearise`: groups of few postures, measured by a device that has one, in a form that compiles nothing."""
+    by_hand = [_by_hand(group) for group in problem.groups]
+    parts = (None,) * len(by_hand) if all(by_hand) else parts_of(problem)
+    return tuple(
+        HostRows(g.chain, g.device, np.asarray(g.position), g.datum) if part is None or own else part
+        for g, own, part in zip(problem.groups, by_hand, parts, strict=True)
+    )
+
+
+def _by_hand(group: Group) -> bool:
+    few = np.shape(group.position)[1] <= DRAFT and jax.default_backend() == "cpu"
+    return few and written_out(group.device) and not traced(group)
+
+
 def linearise(
-    problem: Problem, unknowns: Float[Any, " unknowns"], parts: tuple[Part, ...] | None = None
+    problem: Problem, unknowns: Float[Any, " unknowns"], parts: tuple[Part | HostRows, ...] | None = None
 ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows unknowns"]]:
     """Residual in m and rad at the scaled unknowns, and its exact Jacobian; `parts` are those of the problem."""
     scale = np.asarray(problem.scale)
     values, first = np.asarray(unknowns) * scale, problem.columns
     residuals, jacobians = [], []
-    for group, part in zip(problem.groups, parts or parts_of(problem), strict=True):
-        own = slice(first, first + len(group.device.unknowns()))
+    for group, part in zip(problem.groups, parts or host_parts(problem), strict=True):
+        by_hand = isinstance(part, HostRows)
+        own = slice(first, first + (part.unknowns if by_hand else len(group.device.unknowns())))
         residual, response, by_own = _flat_rows(group, part, values[: problem.columns], values[own])
         columns = np.zeros((len(values), residual.size))  # the Jacobian's columns, each in one piece
         columns[: problem.columns] = np.reshape(group.steady, (len(response), -1)).T @ response.reshape(
@@ -225,7 +243,7 @@ def linearise(
         columns[own] = by_own.reshape(-1, residual.size)
         residuals.append(residual.reshape(-1))
         jacobians.append(columns.T)
-        if ties(group.device):
+        if not by_hand and ties(group.device):
             tied, by_own = _tied(group.device, values[own])
             residuals.append(np.asarray(tied))
             jacobians.append(np.zeros((len(tied), len(values))))
@@ -235,12 +253,17 @@ def linearise(
 
 
 def _flat_rows(
-    group: Group, part: Part, coefficients: np.ndarray, own: np.ndarray
+    group: Group, part: Part | HostRows, coefficients: np.ndarray, own: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows (rows, samples) of a group and their derivatives by joint twists and by the device's unknowns."""
-    samples, block = np.shape(group.position)[1], part.position.shape[2]
-    twists = np.repeat((np.asarray(group.steady) @ coefficients)[..., None], samples, axis=2)
+    samples, twists = np.shape(group.position)[1], (np.asarray(group.steady) @ coefficients)[..., None]
+    if isinstance(part, HostRows) and not len(group.at):
+        return part.rows(twists, own)
+    twists = np.repeat(twists, samples, axis=2)
     np.add.at(twists, np.asarray(group.at), coefficients[np.asarray(group.column)][:, None, None] * group.fields)
+    if isinstance(part, HostRows):
+        return part.rows(twists, own)
+    block = part.position.shape[2]
     cut = np.moveaxis(_cut(np.moveaxis(twists, -1, 0), block), 1, -1)
     rows = _rows_quick if samples <= DRAFT else _rows_fast
     found = rows(part.chain, part.device, own, cut, part.position, part.datum)

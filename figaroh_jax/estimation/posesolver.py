@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from ..compiled.batching import program
-from .posefit import DRAFT, Part, Problem, block_rows, linearise, parts_of, ties
+from .posefit import DRAFT, Part, Problem, block_rows, host_parts, linearise, parts_of, ties
 
 __all__ = [
     "NormalEquations",
@@ -84,8 +84,8 @@ def solve(
     weights, precision, free = (np.asarray(x, float) for x in (row_weights, precision, free))
     start = np.asarray(start, float) * free
     few = max(np.shape(group.position)[1] for group in problem.groups) <= DRAFT
-    if few and jax.default_backend() == "cpu":  # on the host, by the program that `linearise` has compiled anyway
-        given = problem, parts_of(problem), weights, precision, free
+    if few and jax.default_backend() == "cpu":  # on the host, by the rows that `linearise` takes too
+        given = problem, host_parts(problem), weights, precision, free
         normal_at, found = partial(_normal_on_host, *given), beginning(start)
         while _going(found, max_steps):
             found = attempt(normal_at, found)
@@ -155,14 +155,15 @@ def _square(rows: Float[Array, "columns samples"]) -> Float[Array, "columns colu
 
 def _normal_on_host(
     problem: Problem,
-    parts: tuple[Part, ...],
+    parts: Any,
     weights: np.ndarray,
     precision: np.ndarray,
     free: np.ndarray,
     at: np.ndarray,
 ) -> NormalEquations:
     residual, jacobian = linearise(problem, at, parts)
-    rows, columns = weights * residual, weights[:, None] * jacobian * free
+    rows, columns = weights * residual, jacobian * free
+    columns *= weights[:, None]
     matrix = columns.T @ columns + np.diag(free * precision + 1.0 - free)
     return NormalEquations(
         matrix, columns.T @ rows + free * precision * at, 0.5 * (rows @ rows + np.sum(precision * at**2))
@@ -180,7 +181,10 @@ def attempt(normal_at: Callable[[Any], NormalEquations], state: State) -> State:
     normal = normal_at(at)
     gained = (state.normal.cost - normal.cost) / state.decrease
     better = gained > 0.0  # from the infinite cost at the beginning to the first one too
-    at, normal = jax.tree.map(partial(lib.where, better), (at, normal), (state.at, state.normal))
+    if lib is np:
+        at, normal = (at, normal) if better else (state.at, state.normal)
+    else:
+        at, normal = jax.tree.map(partial(jnp.where, better), (at, normal), (state.at, state.normal))
     shrink = lib.clip(1.0 - (2.0 * gained - 1.0) ** 3, 1.0 / 3.0, 1.0)
     damping = lib.where(state.steps == 0, state.damping, state.damping * lib.where(better, shrink, state.growth))
     step, decrease = _damped(normal, damping)

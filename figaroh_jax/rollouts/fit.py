@@ -24,7 +24,7 @@ _ITERATIONS = 40
 _PAIR = 2
 _FEW = 12  # windows up to which starts and numbers always move together
 _MOSTLY = 0.5  # share of a step's gain from which the starts move alone, every other time
-_GROUPS, _REFITS = 6, 3  # of recordings that are left out, steps of each fit without one
+_GROUPS, _REFITS = 6, 10  # of recordings that are left out, steps of each fit without one
 _CLOSE = 0.02  # predicted decrease of the sum of whitened squares at which a fit ends
 
 

@@ -809,11 +809,26 @@ INLINE double seen(const Given *g, const Work *w, const int n, const long y) {
   return x[j] + (k < 0 ? 0 : x[k]) + (y < g->ny ? JN(READING) : 0);
 }
 
-/* sums of a row: squares, gradient, normal matrix (its upper half) */
+/* rows of weighed sensitivities that wait to be multiplied with themselves */
+enum { KEPT = 64 };
+typedef double V __attribute__((vector_size(64), aligned(8)));
+WIDE void multiplied(const long width, const long many, const double *restrict kept, double *restrict matrix) {
+  for (long c = 0; c < width; c += 4) /* four rows of the matrix, its upper half */
+    for (long r = c / 8 * 8; r < width; r += 8) {
+      V sum[4] = {{0}};
+      for (long k = 0; k < many; k++) {
+        const double *row = kept + k * width;
+        const V x = *(const V *)(row + r);
+        for (int i = 0; i < 4; i++) sum[i] += row[c + i] * x;
+      }
+      for (int i = 0; i < 4; i++) *(V *)(matrix + (c + i) * width + r) += sum[i];
+    }
+}
+
+/* sums of a row: squares, gradient, and what the normal matrix will be made of */
 WIDE void collected(const Given *g, const Work *w, const int n, const long window, const long row, const long width,
-                      const double *S, double *cost, double *gradient, double *matrix) {
-  const long wide = g->ny * (g->rates ? 2 : 1), total = g->columns + 2 * n;
-  double slope[512] __attribute__((aligned(64)));
+                    const double *S, double *cost, double *gradient, double *matrix, double *kept, long *many) {
+  const long wide = g->ny * (g->rates ? 2 : 1);
   for (long y = 0; y < wide; y++) {
     const double sure = g->weight[(row * wide + y) * g->windows + window];
     if (sure == 0) continue;
@@ -821,20 +836,15 @@ WIDE void collected(const Given *g, const Work *w, const int n, const long windo
     cost[y] += error * error;
     const long half = y < g->ny ? 0 : n, j = g->measured[y % g->ny], k = g->summed[y % g->ny];
     const double *own = S + (half + j) * width, *twin = k < 0 ? 0 : S + (half + k) * width;
+    double *restrict slope = kept + *many * width;
     for (long c = 0; c < width; c++) slope[c] = own[c] * sure;
     if (twin)
       for (long c = 0; c < width; c++) slope[c] += twin[c] * sure;
     if (!half)
       for (long p = 0; p < g->many; p++)
         if (g->kind[p] == READING && g->place[p] == j) slope[g->column[p]] += sure;
-    for (long c = 0; c < total; c++) {
-      const double f = slope[c];
-      if (f == 0) continue;
-      gradient[c] += f * error;
-      double *restrict line = matrix + c * width + (c & ~7L);
-      const double *restrict from = slope + (c & ~7L);
-      for (long r = 0; r < width - (c & ~7L); r++) line[r] += f * from[r];
-    }
+    for (long c = 0; c < width; c++) gradient[c] += slope[c] * error;
+    if (++*many == KEPT) multiplied(width, *many, kept, matrix), *many = 0;
   }
 }
 
@@ -857,7 +867,9 @@ INLINE void window_of(const Given *g, const int n, const int carried, const int 
   const long wide = g->ny * (g->rates ? 2 : 1), total = g->columns + 2 * n, width = (total + 7) / 8 * 8;
   const long blocks = g->rows / g->block;
   double S[want ? 2 * n * width : 1] __attribute__((aligned(64))), old[want ? 2 * n * width : 1] __attribute__((aligned(64)));
-  double gradient[want ? width : 1], matrix[want ? total * width : 1] __attribute__((aligned(64))), cost[ROWS];
+  double gradient[want ? width : 1], matrix[want ? width * width : 1] __attribute__((aligned(64))), cost[ROWS];
+  double kept[want ? KEPT * width : 1] __attribute__((aligned(64)));
+  long waiting = 0;
   double by[want ? (2 * n + g->many) * n : 1];
   for (int j = 0; j < n; j++) w->q[j] = g->begin[j * g->windows + window], w->v[j] = g->begin[(n + j) * g->windows + window], w->a[j] = 0;
   if (want) {
@@ -870,7 +882,7 @@ INLINE void window_of(const Given *g, const int n, const int carried, const int 
     if (want) memset(gradient, 0, sizeof gradient), memset(matrix, 0, sizeof matrix);
     for (long row = b * g->block; row < (b + 1) * g->block; row++) {
       for (int j = 0; j < n; j++) lost |= !(fabs(w->v[j]) < 1e12);
-      if (want && !lost) collected(g, w, n, window, row, width, S, cost, gradient, matrix);
+      if (want && !lost) collected(g, w, n, window, row, width, S, cost, gradient, matrix, kept, &waiting);
       if (!want)
         for (long y = 0; y < wide; y++) g->read[(row * wide + y) * g->windows + window] = lost ? NAN : seen(g, w, n, y);
       if (lost) continue;
@@ -883,6 +895,7 @@ INLINE void window_of(const Given *g, const int n, const int carried, const int 
       }
     }
     if (!want) continue;
+    multiplied(width, waiting, kept, matrix), waiting = 0;
     for (long y = 0; y < wide; y++) g->cost[(b * g->windows + window) * wide + y] = lost ? NAN : cost[y];
     double *one = g->gradient + (b * g->windows + window) * total, *two = g->matrix + (b * g->windows + window) * total * total;
     for (long c = 0; c < total; c++) {

@@ -46,7 +46,7 @@ _GROUP = 25  # rows whose mean shows a slow misfit
 _MOST, _MOST_ONE = 6, 4  # causes, and where only a rest that is noise gives them a name
 _USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
 _PAIR = 2  # starts of the baseline that are followed to the end
-_EARLY, _LATE = 4, 12  # iterations of a race among all starts, and of its leaders
+_EARLY, _LATE = 4, 30  # iterations of a race among all starts, and of its leaders
 _LIMITS = ("actuator_saturation", "voltage_saturation")
 _STILL = ("encoder_offset", "torque_offset", "joint_spring")  # of one joint: each makes up for the others
 _SHAPED = ("stribeck_friction",)  # without an amplitude their shape shows nothing
@@ -449,6 +449,8 @@ def _best(
     k = max(passing, key=lambda k: gains[k])
     if tried[k].state.excess >= 1.0:  # more is to come: what every joint has before what few have
         usual = [j for j in passing if tried[j].candidate.effect in BASELINE and gains[j] > _USUAL * gains[k]]
+        if tried[k].candidate.effect == "stribeck_friction":  # more friction at rest: beside friction, not without it
+            usual += [j for j in passing if tried[j].candidate[:2] == ("friction_loss", tried[k].candidate.at)]
         k = max(usual, key=lambda j: gains[j], default=k)
     for simple in passing:  # what it contains is preferred unless clearly worse
         if tried[simple].candidate.effect in CONTAINS.get(tried[k].candidate.effect, ()):

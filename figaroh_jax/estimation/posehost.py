@@ -1,0 +1,221 @@
+"""The rows of `posefit` for few postures, in NumPy: nothing to compile, and less time than a program's call takes.
+
+For devices that measure points or poses (`recordings.devices.Points`, `Poses`), whose derivatives are written out here;
+others, and many postures, take the compiled rows. Samples stand first inside. Formulas: `rigid.chain`, and for the
+derivative of exponentials the left Jacobians of SO(3) and SE(3) (Barfoot, State Estimation for Robotics, 2017, 7.1).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..recordings.devices import Points, Poses
+from ..rigid.chain import Chain
+
+__all__ = ["HostRows", "written_out"]
+
+_SMALL = 1e-4  # rad^2; below it the series is exact to rounding, and the quotients lose digits
+_EYE = np.eye(3)
+
+
+def written_out(device: Any) -> bool:
+    """Whether rows of the device have a form in NumPy."""
+    return type(device) is Points or (type(device) is Poses and device.axes != "twist")
+
+
+class HostRows:
+    """Rows of one group; what depends on the joint positions and on the measurement alone is computed once."""
+
+    def __init__(self, chain: Chain, device: Any, position: Float[np.ndarray, "nv samples"], datum: Any) -> None:
+        self.samples, self.unknowns = position.shape[1], len(device.unknowns())
+        self.placement = np.asarray(chain.placement, float)
+        self.first, self.last = np.asarray(chain.first, float), np.asarray(chain.last, float)
+        axis, turns = np.asarray(chain.axis, float), np.asarray(chain.turns, float)[:, None] > 0.0
+        q = np.asarray(chain.ratio)[:, None] * position[np.asarray(chain.column)] + np.asarray(chain.offset)[:, None]
+        angle, across = np.where(turns, q, 0.0)[..., None, None], _skew(axis)[:, None]
+        self.turn = _EYE + np.sin(angle) * across + (2.0 * np.sin(angle / 2.0) ** 2) * (across @ across)
+        self.slide = None if turns.all() else np.where(turns, 0.0, q)[..., None] * axis[:, None]
+        self.base, self.centre = np.asarray(device.base, float), np.asarray(device.centre, float)
+        self.poses = type(device) is Poses
+        self.free_base, self.free_tool = (name in device.estimated for name in ("base_frame", "tool_frame"))
+        datum = np.asarray(datum, float)
+        if self.poses:
+            self.tool, self.body = np.asarray(device.tool, float), device.axes == "body"
+            self.back, self.seen = np.swapaxes(datum[:, :3, :3], 1, 2), datum[:, :3, 3]
+        else:
+            self.markers = np.asarray(device.markers, float)
+            self.seen = datum.reshape(self.samples, len(self.markers), 3)
+
+    def rows(
+        self, twists: Float[np.ndarray, "n 6 #samples"], own: Float[np.ndarray, " k"]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows (rows, samples), their derivatives by twists of joints (6n, rows, samples) and by `own` (k, ...)."""
+        twists = np.moveaxis(twists, -1, 1)
+        placed = own[: 6 * (self.free_base + (self.free_tool and self.poses))].reshape(-1, 6)
+        turns = np.concatenate([twists[..., 3:].reshape(-1, 3), placed[:, 3:]])
+        exponent, bend, more = _exponentials(turns)
+        split, shape = len(turns) - len(placed), (*twists.shape[:2], 3, 3)
+        R, p, before, turned, origin = self._poses(
+            twists[..., :3], exponent[:split].reshape(shape), bend[:split].reshape(shape)
+        )
+        moved = _moved(placed, exponent[split:], bend[split:], [x[split:] for x in more])
+        residual, by_motion, by_own = self._pose_rows(R, p, moved) if self.poses else self._points(R, p, own, moved)
+        linear, angular = by_motion[..., :3], by_motion[..., 3:]
+        of_turn = (angular - linear @ _skew(p - origin)) @ turned
+        response = np.concatenate([linear @ before, of_turn], axis=-1)  # joint sample row twist
+        response = response.transpose(0, 3, 2, 1).reshape(-1, residual.shape[1], self.samples)
+        return residual.T, response, by_own.transpose(2, 1, 0)
+
+    def _poses(self, shift: np.ndarray, exponent: np.ndarray, bend: np.ndarray) -> tuple[np.ndarray, ...]:
+        samples, n = self.samples, len(self.turn)
+        R, p = np.broadcast_to(self.first[:3, :3], (samples, 3, 3)), np.broadcast_to(self.first[:3, 3], (samples, 3))
+        before, turned, origin = np.empty((n, samples, 3, 3)), np.empty((n, samples, 3, 3)), np.empty((n, samples, 3))
+        for j, placement in enumerate(self.placement):
+            np.matmul(R, placement[:3, :3], out=before[j])
+            p = p + R @ placement[:3, 3] + _times(before[j], shift[j])
+            origin[j] = p
+            np.matmul(before[j], bend[j], out=turned[j])
+            R = before[j] @ exponent[j]
+            if self.slide is not None:
+                p = p + _times(R, self.slide[j])
+            R = R @ self.turn[j]
+        return R @ self.last[:3, :3], p + R @ self.last[:3, 3], before, turned, origin
+
+    def _placed(self, moved: _Moved) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rotation and origin of the base in the device, and the left Jacobian of its unknowns, if it has any."""
+        if not self.free_base:
+            return self.base[:3, :3], self.base[:3, 3], np.zeros((6, 0))
+        turn, shift, jacobian = (x[0] for x in moved)
+        return turn @ self.base[:3, :3], self.centre + shift + turn @ (self.base[:3, 3] - self.centre), jacobian
+
+    def _points(
+        self, R: np.ndarray, p: np.ndarray, own: np.ndarray, moved: _Moved
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        turn, place, jacobian = self._placed(moved)
+        base, markers = jacobian.shape[1], self.markers
+        if self.free_tool:
+            markers = markers + own[base:].reshape(-1, 3)
+        arms = markers @ np.swapaxes(R, 1, 2)  # of the markers from the tool's origin, in base axes
+        points = (arms + p[:, None]) @ turn.T + place
+        by_turn = -turn @ _skew(arms)
+        by_motion = np.concatenate([np.broadcast_to(turn, by_turn.shape), by_turn], axis=-1)
+        by_own = np.zeros((*by_turn.shape[:3], self.unknowns))
+        by_own[..., :base] = jacobian[:3] - _skew(points - self.centre) @ jacobian[3:]
+        for k in range(len(markers) if self.free_tool else 0):
+            by_own[:, k, :, base + 3 * k : base + 3 * k + 3] = turn @ R
+        flat = self.samples, 3 * len(markers)
+        return (points - self.seen).reshape(flat), by_motion.reshape(*flat, 6), by_own.reshape(*flat, -1)
+
+    def _pose_rows(self, R: np.ndarray, p: np.ndarray, moved: _Moved) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        turn, place, jacobian = self._placed(moved)
+        tool_turn, arm = self.tool[:3, :3], self.tool[:3, 3]
+        whole, base = turn @ R, jacobian.shape[1]  # of the tool in the device
+        axes, by_tool = whole @ tool_turn, np.zeros((6, 0))
+        if self.free_tool:
+            motion, shift, by_tool = (x[-1] for x in moved)
+            tool_turn, arm = tool_turn @ motion, arm + tool_turn @ shift
+            by_tool = np.concatenate([by_tool[:3] - _skew(shift) @ by_tool[3:], by_tool[3:]])
+        lever = R @ arm
+        at = (p + lever) @ turn.T + place
+        angle = _logarithm(self.back @ whole @ tool_turn)
+        twist = _inverse_left_jacobian(angle) @ self.back  # a turning in the device's axes as a rate of the angle
+        away, samples = at - self.seen, self.samples
+        by_motion, by_own = np.zeros((samples, 6, 6)), np.empty((samples, 6, self.unknowns))
+        by_motion[:, :3, :3], by_motion[:, :3, 3:], by_motion[:, 3:, 3:] = turn, -turn @ _skew(lever), twist @ turn
+        by_own[:, :3, :base] = jacobian[:3] - _skew(at - self.centre) @ jacobian[3:]
+        by_own[:, 3:, :base] = twist @ jacobian[3:]
+        by_own[:, :3, base:] = axes @ by_tool[:3]
+        by_own[:, 3:, base:] = twist @ axes @ by_tool[3:]
+        if self.body:
+            away = _times(self.back, away)
+            by_motion[:, :3], by_own[:, :3] = self.back @ by_motion[:, :3], self.back @ by_own[:, :3]
+        return np.concatenate([away, angle], axis=1), by_motion, by_own
+
+
+class _Moved(NamedTuple):
+    """Exponentials of twists: rotations, translations and left Jacobians."""
+
+    turn: Float[np.ndarray, "m 3 3"]
+    shift: Float[np.ndarray, "m 3"]
+    jacobian: Float[np.ndarray, "m 6 6"]
+
+
+def _times(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    return (matrix @ vector[..., None])[..., 0]
+
+
+def _skew(w: np.ndarray) -> np.ndarray:
+    out = np.zeros((*w.shape, 3))
+    x, y, z = w[..., 0], w[..., 1], w[..., 2]
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -z, y, -x
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = z, -y, x
+    return out
+
+
+def _series(square: np.ndarray) -> tuple[np.ndarray, ...]:
+    """sin t / t, (1 - cos t) / t^2, (t - sin t) / t^3 and the two further ones of SE(3), of the squared angle."""
+    small = square < _SMALL
+    safe = np.where(small, 1.0, square)
+    t = np.sqrt(safe)
+    sine, cosine, versine = np.sin(t), np.cos(t), 2.0 * np.sin(t / 2.0) ** 2
+    exact = (sine / t, versine / safe, (t - sine) / (safe * t))
+    exact += ((0.5 * safe - versine) / safe**2, (2.0 * t - 3.0 * sine + t * cosine) / (2.0 * safe**2 * t))
+    near = ((1.0, 6.0, 120.0), (0.5, 24.0, 720.0), (1 / 6.0, 120.0, 5040.0), (1 / 24.0, 720.0, 40320.0))
+    terms = [a - square / b + square**2 / c for a, b, c in near] + [1 / 120.0 - square / 2520.0 + square**2 / 120960.0]
+    return tuple(np.where(small, x, y) for x, y in zip(terms, exact, strict=True))
+
+
+def _exponentials(w: Float[np.ndarray, "m 3"]) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Rotations and left Jacobians of rotation vectors (rad), and what `_moved` takes beside them."""
+    a, b, *more = (x[:, None, None] for x in _series(np.sum(w * w, axis=-1)))
+    K = _skew(w)
+    square = K @ K
+    return _EYE + a * K + b * square, _EYE + b * K + more[0] * square, more
+
+
+def _moved(twist: Float[np.ndarray, "m 6"], turn: np.ndarray, bend: np.ndarray, more: list[np.ndarray]) -> _Moved:
+    c, d, e = more
+    r, w = _skew(twist[:, :3]), _skew(twist[:, 3:])
+    wr, rw = w @ r, r @ w
+    wrw = wr @ w
+    jacobian = np.zeros((len(twist), 6, 6))
+    jacobian[:, :3, :3] = jacobian[:, 3:, 3:] = bend
+    mixed = 0.5 * r + c * (wr + rw + wrw) + d * (w @ wr + rw @ w - 3.0 * wrw) + e * (wrw @ w + w @ wrw)
+    jacobian[:, :3, 3:] = mixed
+    return _Moved(turn, _times(bend, twist[:, :3]), jacobian)
+
+
+def _logarithm(R: Float[np.ndarray, "samples 3 3"]) -> Float[np.ndarray, "samples 3"]:
+    """Rotation vectors (rad) of the shorter way round, from the largest entry of the unit quaternion."""
+    x, y, z = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
+    a, b, c = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
+    d, e, f = R[:, 0, 1] + R[:, 1, 0], R[:, 0, 2] + R[:, 2, 0], R[:, 1, 2] + R[:, 2, 1]
+    if np.all(x + y + z > 0.0):  # less than a third of a turn: the scalar part is the largest
+        row = np.stack([a, b, c, 1.0 + x + y + z], axis=1)
+        return _angles(row / np.linalg.norm(row, axis=1, keepdims=True))
+    each = [1 + x - y - z, d, e, a, d, 1 - x + y - z, f, b, e, f, 1 - x - y + z, c, a, b, c, 1 + x + y + z]
+    rows = np.stack(each, axis=1).reshape(-1, 4, 4)
+    row = rows[np.arange(len(R)), np.argmax(np.einsum("kii->ki", rows), axis=1)]
+    return _angles(row / np.linalg.norm(row, axis=1, keepdims=True) * np.where(row[:, 3:] < 0.0, -1.0, 1.0))
+
+
+def _angles(row: Float[np.ndarray, "samples 4"]) -> Float[np.ndarray, "samples 3"]:
+    v, w = row[:, :3], row[:, 3]
+    square = np.sum(v * v, axis=1)
+    small = square < _SMALL
+    norm, safe = np.sqrt(np.where(small, 1.0, square)), np.where(small, w, 1.0)
+    series = 2.0 / safe * (1.0 - square / (3.0 * safe**2) + square**2 / (5.0 * safe**4))
+    return v * np.where(small, series, 2.0 * np.arctan2(norm, np.where(small, 1.0, w)) / norm)[:, None]
+
+
+def _inverse_left_jacobian(w: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, "samples 3 3"]:
+    square = np.sum(w * w, axis=1)
+    small = square < _SMALL
+    half = 0.5 * np.sqrt(np.where(small, 1.0, square))
+    exact = (1.0 - half * np.cos(half) / np.sin(half)) / (4.0 * half**2)
+    d = np.where(small, 1.0 / 12.0 + square / 720.0 + square**2 / 30240.0, exact)[:, None, None]
+    K = _skew(w)
+    return _EYE - 0.5 * K + d * (K @ K)
