@@ -118,10 +118,11 @@ def _ours(robot: Path, dtype: str) -> Functions:
 
 
 def _mjx(robot: Path, dtype: str) -> Functions:
-    import mujoco  # pyright: ignore[reportMissingImports]
+    import mujoco as engine  # pyright: ignore[reportMissingImports]
     from mujoco import mjx  # pyright: ignore[reportMissingImports]
 
     text = robot.read_text(encoding="utf-8")
+    mujoco: Any = engine
     plain = mujoco.MjModel.from_xml_string(_without_meshes(text))
     plain.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
     model = jax.tree.map(

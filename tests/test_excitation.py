@@ -21,8 +21,9 @@ from figaroh_jax.excitation.objectives import (
     prediction_objective,
     smooth_condition_objective,
 )
+from figaroh_jax.excitation.programming import Rows, quadratic_step
 from figaroh_jax.excitation.sampling import Sampler
-from figaroh_jax.excitation.solvers import Penalty, Problem
+from figaroh_jax.excitation.solvers import Problem, solve
 from figaroh_jax.formats.config import Baseline
 from figaroh_jax.rigid.model import RobotModel
 from figaroh_jax.rigid.regressor_gradient import regressor_pullback
@@ -137,13 +138,67 @@ def test_gradient_is_that_of_finite_differences_and_of_the_solvers_own_programs(
         own = np.concatenate([np.asarray(y).ravel() for y in jax.tree.leaves(slope)])
         np.testing.assert_allclose(problem.slope(x), -own / learned.rank, rtol=1e-6, atol=1e-9)
         assert problem.value(x) == pytest.approx(-float(info.information(arm, motion, learned)) / learned.rank)
-        penalty = Penalty({})
-        penalty.mu = 1.0
-        for name in ("position", "velocity", "torque"):
-            assert np.isfinite(limits_of(arm).of(name)).all()
-        step = generator.normal(size=x.shape)
-        ends = [problem.lagrangian(x + s * h * step, penalty) for s in (-1, 1)]
-        assert problem.gradient(x, penalty) @ step == pytest.approx((ends[1] - ends[0]) / (2 * h), rel=1e-5)
+        rows, step = Rows(problem, {}), generator.normal(size=x.shape)
+        room = rows.all(x)
+        some = np.flatnonzero(np.isfinite(room))[:: max(1, len(room) // 200)]
+        assert (some >= rows.curved).any() and (some < rows.curved).any()
+        ends = [rows.all(x + s * h * step)[some] for s in (-1, 1)]
+        np.testing.assert_allclose(-rows.slopes(x, some) @ step, (ends[1] - ends[0]) / (2 * h), rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_quadratic_step_is_that_of_a_conic_solver(seed: int):
+    """Rows side by side are nearly alike, as those of a motion's samples are; also from rows that held before."""
+    import clarabel
+    from scipy import sparse
+
+    generator = np.random.default_rng(seed)
+    n, m = 12, 60
+    L = np.tril(generator.normal(size=(n, n))) + 3 * np.eye(n)
+    slope, way = 5 * generator.normal(size=n), generator.normal(size=(m // 3, n))
+    A = np.repeat(way, 3, axis=0) + 1e-4 * generator.normal(size=(m, n))
+    room = np.repeat(generator.uniform(0, 0.5, m // 3), 3)
+    found = quadratic_step(L, slope, A, room)
+    assert found is not None
+    d, held = found
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
+    cones = [clarabel.NonnegativeConeT(m)]
+    P = sparse.csc_matrix(np.triu(L @ L.T))
+    theirs = clarabel.DefaultSolver(P, slope, sparse.csc_matrix(A), room, cones, settings).solve()
+    np.testing.assert_allclose(d, theirs.x, atol=1e-6, rtol=0)
+    assert (A @ d <= room + 1e-9).all() and (held >= 0).all()
+    np.testing.assert_allclose(L @ L.T @ d + slope + A.T @ held, 0, atol=1e-8)
+    warm = quadratic_step(L, slope, A, room, np.append(np.flatnonzero(held), 5))
+    assert warm is not None
+    np.testing.assert_allclose(warm[0], d, atol=1e-8, rtol=0)
+    assert quadratic_step(L, slope, np.stack([A[0], -A[0]]), np.array([-1.0, -1.0])) is None
+
+
+def test_a_descent_within_torques_ends_where_slsqp_with_all_rows_does(arm: RobotModel):
+    from scipy.optimize import minimize
+
+    with jax.enable_x64(True):
+        learned = info.learn(arm, Baseline(viscous=True, coulomb=False))
+        basis, kept = spline(4, 2.0), np.array(learned.independent)
+        limits = limits_of(arm, acceleration=9.0, torque={"turn": 9.0, "bend": 3.0})
+        sampler = Sampler(arm, learned.terms, np.asarray(learned.width))
+        problem = Problem(
+            learned, sampler, information_objective(np.asarray(learned.prior)), kept, basis, limits, np.zeros(2)
+        )
+        rows = Rows(problem, {})
+        x = random_motion(problem, np.random.default_rng(1))
+        every = np.arange(rows.curved + rows.torques)
+        found = solve(problem, x)
+        assert rows.all(found).min() > -1e-4
+        assert rows.of_curved(found).min() < 1e-3  # a torque is at its limit
+        kept_rows = {"type": "ineq", "fun": rows.all, "jac": lambda x: -rows.slopes(x, every)}
+        options = {"maxiter": 300, "ftol": 1e-10}
+        theirs = minimize(
+            problem.value, found, jac=problem.slope, method="SLSQP", constraints=[kept_rows], options=options
+        ).x
+        assert problem.value(found) < problem.value(theirs) + 1e-3
 
 
 def test_gradients_by_the_gram_matrix_are_those_of_finite_differences():

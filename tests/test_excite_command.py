@@ -116,7 +116,7 @@ def test_what_cannot_be_designed_ends_in_one_message_and_nothing_is_written(
 def test_a_limit_that_is_not_met_at_1_khz_ends_with_status_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(solvers, "OUTER", 1)  # it cannot be met; a short search for it will do
+    monkeypatch.setattr(solvers, "STEPS", 5)  # it cannot be met; a short search for it will do
     # standing still at this start takes more torque than is allowed, so no motion from there meets the limit
     model = load_urdf(task_of(tmp_path, "duration: 2").with_name("robot.urdf"))
     start = np.array([1.0, 0.5])

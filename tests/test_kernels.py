@@ -296,3 +296,21 @@ def test_kernels_on_a_gpu(robot: str, dtype: Any, tmp_path: Path):
         off = limit if form != "accelerations" else 1000 * limit  # a solve with the mass matrix
         agree(straight_answers(straight, model, *given), expected, off)
         agree(jax.jit(lambda m, *x: straight_answers(straight, m, *x))(model, *given), expected, off)  # noqa: B023
+
+
+@pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated")
+@pytest.mark.skipif(jax.default_backend() != "gpu", reason="needs an NVIDIA GPU")
+@pytest.mark.parametrize("name", [*TREES, "TREE"])
+def test_looped_kernels_on_a_gpu(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(scalar_forms, "MOST", 1)
+    model = random_tree(*TREES[name]).model if name in TREES else robots.load(getattr(robots, name), tmp_path)
+    arrays, random = states(model, 1000), np.random.default_rng(2)
+    weighted = [*arrays, np.abs(random.standard_normal((1000, model.nv))), random.standard_normal((1000, 2 * model.nv))]
+    for form, given in ((FORMS["packed"], arrays), (normal_equations._row_form(2), weighted)):
+        if not scalar_forms.looped(model, form is not FORMS["packed"]):
+            continue
+        with jax.default_device(jax.devices("cpu")[0]):
+            expected = jax.tree.leaves(form.plain(model, *map(jnp.asarray, given)))
+        found = jax.jit(lambda *x: form.looped(model, *x))(*map(jnp.asarray, given))  # noqa: B023  # pyright: ignore
+        for one, other in zip(jax.tree.leaves(found), expected, strict=True):
+            agree(one, other)

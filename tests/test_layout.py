@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
+import jax
 import numpy as np
 import pytest
+import robots
 from synthetic import DT, STEP, made_signals, swing
 
+from figaroh_jax.diagnosis import shifts
 from figaroh_jax.diagnosis.layout import describe_folds, excitations, held_rows, layout
+from figaroh_jax.effects.base import Motion
+from figaroh_jax.effects.sensors import EncoderScale
 from figaroh_jax.recordings.signals import Signals
-from figaroh_jax.recordings.stacked import stack
+from figaroh_jax.recordings.stacked import Records, open_rows, stack
 
 ROW = STEP * DT
 
@@ -149,3 +157,43 @@ def test_held_rows_are_those_of_holdout_recordings_with_torque() -> None:
     expected = np.zeros_like(held)
     expected[1, 5 : signals[1].rows.kept] = 1.0
     np.testing.assert_array_equal(held, expected)
+
+
+def test_short_recordings_stand_in_one_slot_and_every_row_is_as_it_was(tmp_path: Path) -> None:
+    """Their rows, partners, blocks, folds and shifted motions are those of recordings with a slot each."""
+    rng, model = np.random.default_rng(5), robots.load(robots.ARM, tmp_path)
+    seconds, labels = [13.0, 4.0, 12.0, 5.0, 3.0, 4.0], [None, "A", None, "A", None, None]
+    signals = []
+    for k, (length, label) in enumerate(zip(seconds, labels, strict=True)):
+        torque = rng.standard_normal((round(length / DT), 2)).cumsum(0)
+        begin, role = 0.0 if label else 50.0 * k, "holdout" if k == 5 else "fit"
+        signals.append(made_signals(length, swing, torque, begin=begin, repeat=label, role=role))
+
+    def told(joined: bool) -> tuple[Records, dict[str, np.ndarray]]:
+        records = stack(signals, joined=joined)
+        n, _, count, nv = records.shape
+        found, flat = layout(signals, records), records.flat(np.asarray(records.torque))
+        own = np.concatenate([at.slot * count + at.row + np.arange(at.rows) for at in records.spans])
+        number = np.full(n * count, -1)  # of each row, whatever the slots
+        number[own] = np.arange(len(own))
+        rows = {name: getattr(found, name)[own] for name in ("block", "fold", "part")}
+        partner = found.partner[:, own]
+        rows["partner"] = np.where(partner >= 0, number[partner], -1)
+        rows["paired"] = found.paired[:, own]
+        rows["held"] = held_rows(signals, records).reshape(-1, nv)[own]
+        rows["torque"] = open_rows(records, flat, np.ones(len(records.omega))).reshape(-1, nv)[own]
+        kind: Any = EncoderScale
+        effect = kind(np.array([[0], [1]]), scale=np.ones(2))
+        q, v, a = (records.flat(np.asarray(x)) for x in (records.position, records.velocity, records.acceleration))
+        read = Motion(model, records.flat(records.time), q, v, a, np.zeros_like(v), np.zeros_like(v), DT, np.ones(2))
+        for one in shifts.shifted(effect, read, records, turns=0).acceleration:
+            rows[f"moved {len(rows)}"] = open_rows(records, one, np.ones(len(records.omega))).reshape(-1, nv)[own]
+        return records, rows
+
+    with jax.enable_x64(True):
+        (apart, before), (joined, after) = told(False), told(True)
+    assert (len(apart.kept), len(joined.kept)) == (6, 5)
+    assert len({at.slot for at, one in zip(joined.spans, signals, strict=True) if one.role == "holdout"}) == 1
+    assert all(joined.spans[5].slot != at.slot for at in joined.spans[:5])
+    for name, rows in before.items():
+        np.testing.assert_allclose(after[name], rows, rtol=0, atol=1e-9 * max(1.0, np.abs(rows).max()), err_msg=name)

@@ -21,6 +21,9 @@ from figaroh_jax.compiled import machine_code as code
 from figaroh_jax.compiled.kernels import Straight
 from figaroh_jax.rigid import normal_equations
 from figaroh_jax.rigid.model import RobotModel
+from figaroh_jax.rigid.regressor import dense_rows
+from figaroh_jax.rigid.regressor_gradient import regressor_pullback
+from figaroh_jax.rigid.scalar_forms import COLUMNS, straight
 
 pytestmark = pytest.mark.skipif(code._compiler() is None, reason="needs a C compiler")
 
@@ -63,6 +66,21 @@ def test_code_of_a_tree_with_mimic_joints_is_the_plain_kernels(always: None, tmp
     few = [x[:15] for x in arrays]  # so few samples go by the plain form
     agree(answers(FORMS["packed"], model, *arrays)[..., :15], fj.packed_regressor(model, *few))
     agree(answers(FORMS["dense"], model, *arrays)[:15], fj.joint_torque_regressor(model, *few))
+
+
+def test_the_reverse_of_a_program_is_the_closed_gradient_of_its_rows(always: None, tmp_path: Path):
+    """A tree with mimic joints; samples that are no whole number of vectors, and as few as a vector."""
+    model, form = robots.load(robots.TREE, tmp_path), straight(COLUMNS, dense_rows)
+    arrays = [x[:61] for x in states(model, 200)]
+    forth, back = (code.code_of_few(form, model, (model.nv,) * 3, back=way) for way in (False, True))
+    assert forth is not None and back is not None
+    rows = forth(lambda shape, fill: np.full(shape, np.nan if fill is None else fill), *arrays)
+    agree(np.moveaxis(rows, -1, 0).swapaxes(1, 2), fj.joint_torque_regressor(model, *arrays))
+    cotangent = np.random.default_rng(0).normal(size=rows.shape)
+    closed = regressor_pullback(model, *(x.T for x in arrays), cotangent.swapaxes(0, 1))
+    agree(back(cotangent, *arrays).reshape(closed.shape), closed)
+    few = back(np.ascontiguousarray(cotangent[..., : code.FEWEST]), *(x[: code.FEWEST] for x in arrays))
+    agree(few.reshape(3, model.nv, -1), closed[..., : code.FEWEST])
 
 
 def test_pieces_on_several_cores_are_those_of_one(always: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

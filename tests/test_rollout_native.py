@@ -5,13 +5,16 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 from generators import servo_arm6
 from test_rollouts import chain, mujoco_c, waves, written
 
+from figaroh_jax.rollouts import sensitivity
 from figaroh_jax.rollouts.alone import alone, carried_by
 from figaroh_jax.rollouts.causes import elastic_loop
 from figaroh_jax.rollouts.data import Run, Stretch, windows
@@ -19,7 +22,7 @@ from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.native import native
 from figaroh_jax.rollouts.parameters import Entry, Table
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.sensitivity import Windows
+from figaroh_jax.rollouts.sensitivity import Windows, linear_sums
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
@@ -63,9 +66,8 @@ def checked(loop: Loop, table: Table, theta: np.ndarray, data: Windows, start: n
     wrong = np.abs(own - rows @ rows.T) / np.maximum(np.outer(scale, scale), least)
     k = int(np.diag(wrong).argmax())
     assert wrong.max() < 2e-5, f"{names[k]}: {wrong[k, k]}"
-    np.testing.assert_allclose(
-        found.gradient.sum((0, 1)) / scale, rows @ error.ravel() / scale, rtol=0, atol=2e-5 * np.linalg.norm(error)
-    )
+    gradient, size = found.gradient.sum((0, 1)) / scale, float(np.linalg.norm(error))
+    np.testing.assert_allclose(gradient, np.asarray(rows @ error.ravel()) / scale, rtol=0, atol=2e-5 * size)
 
 
 def arm(folder: Path) -> tuple[Loop, Run]:
@@ -126,3 +128,19 @@ def test_what_the_code_does_not_know_is_left_to_the_plain_form(tmp_path: Path):
     data = windows(loop, [run], [Stretch(0, 0, 30)], [np.ones(1)], 0.02)
     assert not native(loop, (), data).usable
     assert native(dataclasses.replace(loop, integrator="euler"), (), data).usable
+
+
+@pytest.mark.slow
+def test_the_plain_form_gives_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Sums of a carried joint by JAX's program, which machines without a compiler run."""
+    loop, run = arm(tmp_path)
+    small, (mine,) = alone(loop, [run], carried_by(loop, [run]), 2)
+    table = tuple(Entry(name, (0,)) for name in ("armature", "friction", "load_ratio", "scale", "delay"))
+    data = windows(small, [mine], [Stretch(0, 100, 60)], [np.array([2e-4])], 0.3)
+    given = np.array([[0.05, 0.2, 0.1, 1.1, 0.0043]]), np.arange(5)[None], data, np.asarray(data.start)[None]
+    own = linear_sums(small, table, *given)
+    monkeypatch.setattr(sensitivity, "native", lambda *_: SimpleNamespace(usable=False))
+    with jax.enable_x64(True):
+        plain = linear_sums(small, table, *given)
+    for one, other in zip(own, plain, strict=True):
+        np.testing.assert_allclose(one, np.asarray(other), rtol=0, atol=1e-12 * np.abs(one).max())

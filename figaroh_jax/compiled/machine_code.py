@@ -35,15 +35,17 @@ from .executable_cache import surroundings
 from .kernels import Number, Program, Straight
 from .store import Store
 
-__all__ = ["library", "machine_code"]
+__all__ = ["FARTHEST", "FEWEST", "code_of_few", "library", "machine_code"]
 
+FEWEST = 8  # samples: no vector is longer
 FROM = 512  # samples; below, handing them over costs as much as it saves
 TO_COMPILE = 2048  # samples from which a program that is nowhere yet is compiled
 SMALL = 700  # constants of a robot (12 joints) up to which this holds; a larger one takes longer to compile than XLA's
 PIECE = 4096  # samples of one call, on one core
 FARTHEST = 1e5  # rad, to which `sine_cosine` is exact
 PATIENCE = 300.0  # s that a compiler may take
-FLAGS = ("-O1", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared", "-w", "-x", "c", "-")
+LEVEL = {False: "-O1", True: "-Og"}  # of the reverse: as fast, compiled in half the time
+FLAGS = ("-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared", "-w", "-x", "c", "-")
 LIBRARY_FLAGS = ("-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared", "-w")
 if platform.machine() in ("x86_64", "AMD64"):
     LIBRARY_FLAGS += ("-mprefer-vector-width=512",)
@@ -88,13 +90,35 @@ def machine_code(
     samples = len(arrays[0])
     if samples < FROM or straight.places is None or _compiler() is None or not _near(arrays[0]):
         return None
-    constants = np.ascontiguousarray(straight.constants(parameters, float, np), float)
-    codes = straight.known_lengths(parameters, constants)
-    wanted = _Wanted(straight, parameters, codes, tuple(x.shape[1] for x in arrays))
+    wanted, constants = _wanted(straight, parameters, tuple(x.shape[1] for x in arrays))
     code = _code(wanted, samples >= TO_COMPILE * max(1.0, len(wanted.codes) / SMALL))
     if code is None:
         return None
     return partial(_run, code, straight.last, constants)
+
+
+def code_of_few(
+    straight: Straight, parameters: Any, widths: tuple[int, ...], *, back: bool = False
+) -> Callable[..., np.ndarray] | None:
+    """As `machine_code`, for calls of few samples over and over, of arrays with so many columns.
+
+    `back`: `run(cotangent, *arrays)`, the gradient by each column (columns, samples) of the sum of the cotangent
+    (*shape, samples) times the answers, which stand samples last. It is the reverse of the program, statement by
+    statement. Angles are below `FARTHEST`, samples at least `FEWEST`. None for a large robot whose code is nowhere
+    yet, and without a compiler.
+    """
+    if straight.places is None or not straight.last or _compiler() is None:
+        return None
+    wanted, constants = _wanted(straight, parameters, widths)
+    code = _code(wanted._replace(back=back), len(wanted.codes) <= SMALL)
+    if code is None:
+        return None
+    return partial(_run_back, code, constants) if back else partial(_run, code, True, constants)
+
+
+def _wanted(straight: Straight, parameters: Any, widths: tuple[int, ...]) -> tuple[_Wanted, np.ndarray]:
+    constants = np.ascontiguousarray(straight.constants(parameters, float, np), float)
+    return _Wanted(straight, parameters, straight.known_lengths(parameters, constants), widths), constants
 
 
 def _run(code: _Code, last: bool, constants: np.ndarray, room: Room, *arrays: np.ndarray) -> np.ndarray:
@@ -103,6 +127,15 @@ def _run(code: _Code, last: bool, constants: np.ndarray, room: Room, *arrays: np
     rows = [np.ascontiguousarray(x, float) for x in arrays]
     _in_pieces(partial(code.run, constants, rows, answer, last), samples, code.lanes)
     return answer
+
+
+def _run_back(code: _Code, constants: np.ndarray, cotangent: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
+    samples, columns = len(arrays[0]), sum(x.shape[1] for x in arrays)
+    parts = np.empty((len(code.functions), columns, samples))
+    rows = [np.ascontiguousarray(x, float) for x in arrays]
+    given = np.ascontiguousarray(cotangent, float)
+    _in_pieces(partial(code.run_back, constants, rows, given, parts), samples, code.lanes)
+    return parts[0] if len(parts) == 1 else parts.sum(axis=0)
 
 
 def _near(angle: np.ndarray) -> bool:
@@ -148,6 +181,22 @@ class _Code(NamedTuple):
         for function in self.functions:
             function(constants.ctypes.data, *inside, out, end - first, total)
 
+    def run_back(
+        self,
+        constants: np.ndarray,
+        arrays: Sequence[np.ndarray],
+        given: np.ndarray,
+        parts: np.ndarray,
+        first: int,
+        end: int,
+    ) -> None:
+        """As `run`: what each function makes of the cotangent goes into a part of its own."""
+        total = parts.shape[-1]
+        inside = [x.ctypes.data + 8 * first * x.shape[1] for x in arrays]
+        for function, part in zip(self.functions, parts, strict=True):
+            places = given.ctypes.data + 8 * first, part.ctypes.data + 8 * first
+            function(constants.ctypes.data, *inside, *places, end - first, total)
+
 
 class _Wanted(NamedTuple):
     """A form for the structure of some parameters, with what is known of their constants and the arrays' columns."""
@@ -156,6 +205,12 @@ class _Wanted(NamedTuple):
     parameters: Any
     codes: bytes
     widths: tuple[int, ...]
+    back: bool = False  # the gradient by the arrays
+
+    @property
+    def pointers(self) -> int:
+        """Arguments of its functions: constants, arrays, the cotangent, the answer."""
+        return len(self.widths) + 2 + self.back
 
 
 _ready: dict[Any, _Code | None] = {}
@@ -163,11 +218,19 @@ _ready: dict[Any, _Code | None] = {}
 
 def _code(wanted: _Wanted, compile_it: bool) -> _Code | None:
     """From memory, from disk, or made now where `compile_it`; None where there is none."""
-    key = (wanted.straight.name, wanted.straight.structure(wanted.parameters), wanted.codes, wanted.widths)
+    key = (
+        wanted.straight.name,
+        wanted.straight.structure(wanted.parameters),
+        wanted.codes,
+        wanted.widths,
+        *(["back"] if wanted.back else []),
+    )
     if key in _ready:
         return _ready[key]
     store = _store()
-    name = hashlib.blake2b(repr((key, surroundings(), FLAGS, _version())).encode(), digest_size=20).hexdigest()
+    name = hashlib.blake2b(
+        repr((key, surroundings(), LEVEL[wanted.back], FLAGS, _version())).encode(), digest_size=20
+    ).hexdigest()
     library = store.get(f"{name}.so") if store else None
     kept = library is not None
     if library is None:
@@ -216,7 +279,7 @@ def _version() -> str:
 
 def _compiled(wanted: _Wanted) -> bytes | None:
     """A shared library; None where the compiler fails."""
-    return _built(_source(wanted), *FLAGS)
+    return _built(_source(wanted), LEVEL[wanted.back], *FLAGS)
 
 
 def _built(source: str, *flags: str) -> bytes | None:
@@ -265,7 +328,7 @@ def _loaded(wanted: _Wanted, library: bytes) -> _Code | None:
         return None
     for function in functions:
         function.restype = None
-        function.argtypes = [ctypes.c_void_p] * (len(wanted.widths) + 2) + [ctypes.c_size_t] * 2
+        function.argtypes = [ctypes.c_void_p] * wanted.pointers + [ctypes.c_size_t] * 2
     return _Code(functions, wanted.straight.answer(wanted.parameters), lanes, complete)
 
 
@@ -284,12 +347,12 @@ def _opened(library: bytes) -> ctypes.CDLL:
 
 def _source(wanted: _Wanted) -> str:
     """C for all programs of a form: constants, arrays, answer, samples to do, samples of the whole answer."""
-    straight, parameters, codes, widths = wanted
+    straight, parameters, codes, widths, back = wanted
     parts, written = [_HEAD], set[int]()
     programs = straight.programs(parameters, codes)
-    heads = "".join(f", const double *x{n}" for n in range(len(widths)))
+    heads = "".join(f", const double *x{n}" for n in range(len(widths))) + back * ", const double *restrict given"
     for k, program in enumerate(programs):
-        written_out = _Writer(wanted, program)
+        written_out = _Backwards(wanted, program) if back else _Writer(wanted, program)
         written |= set(written_out.places)
         parts.append(
             f"void straight_{k}(const double *restrict c{heads}, double *restrict out, size_t count, size_t total) {{\n"
@@ -328,17 +391,20 @@ class _Writer:
     """One program as C, statement by statement; an answer is put aside as soon as it is known."""
 
     def __init__(self, wanted: _Wanted, program: Program) -> None:
-        straight, parameters, codes, self.widths = wanted
+        straight, parameters, codes, self.widths = wanted[:4]
         self.size, self.last = prod(straight.answer(parameters)), straight.last
-        jaxpr, arrays, written = _traced(wanted, program)
+        self.jaxpr, self.arrays, written = _traced(wanted, program)
+        jaxpr = self.jaxpr
         self.names = {v: f"c[{k}]" for k, v in enumerate(jaxpr.invars[: len(codes)])}
-        self.loads = dict(zip(jaxpr.invars[len(codes) :], arrays, strict=True))
+        self.loads = dict(zip(jaxpr.invars[len(codes) :], self.arrays, strict=True))
+        self.targets: list[tuple[Any, list[int]]] = []  # of each number that is asked for, its places in the answer
         self.places: list[int] = []  # in a sample's answer, of each number as it becomes known
         self.lines: list[str] = []
         assert straight.places is not None
         later: dict[Any, list[int]] = {}
         for variable, place in zip(jaxpr.outvars, written, strict=True):
             targets = list(straight.places(parameters, place))
+            self.targets.append((variable, targets))
             if hasattr(variable, "val") or variable in self.names or variable in self.loads:
                 self._put(f"(V){{}} + {self._operand(variable)}", targets)
             else:
@@ -387,6 +453,72 @@ class _Writer:
         )
 
 
+class _Backwards(_Writer):
+    """The reverse of a program as C: behind its own statements, from the last one to the first, what each is worth.
+
+    A number's worth is the derivative of the sum of the cotangent times the answers. It is followed through the numbers
+    that depend on the arrays; wholes and choices between numbers have no derivative of their own.
+    """
+
+    def __init__(self, wanted: _Wanted, program: Program) -> None:
+        super().__init__(wanted, program)
+        self.worth: dict[Any, str] = {}
+        moved = set(self.loads)
+        for equation in self.jaxpr.eqns:
+            of_arrays = any(not hasattr(x, "val") and x in moved for x in equation.invars)
+            if of_arrays and equation.primitive.name not in _STILL:
+                moved.update(equation.outvars)
+        self.moved = moved
+        for variable, targets in self.targets:
+            for target in targets:
+                self._add(variable, f"*(const U *)(given + {target} * total + s)")
+        for equation in reversed(self.jaxpr.eqns):
+            worth = self.worth.get(equation.outvars[0])
+            if worth is not None:
+                self._pull(equation, worth)
+        for k, load in enumerate(self.loads):
+            self.lines.append(f"*(U *)(out + {k} * total + s) = (V){{}} + {self.worth.get(load, '0.0')};\n")
+
+    def _put(self, value: str, targets: Sequence[int]) -> None:
+        """The answers themselves are not asked for."""
+
+    def _add(self, variable: Any, part: str) -> None:
+        if hasattr(variable, "val") or variable not in self.moved:
+            return
+        name = self.worth.get(variable)
+        if name is None:
+            name = self.worth[variable] = f"w{len(self.worth)}"
+            self.lines.append(f"V {name} = {part};\n")
+        else:
+            self.lines.append(f"{name} += {part};\n")
+
+    def _pull(self, equation: Any, worth: str) -> None:
+        x, kind = equation.invars, equation.primitive.name
+        if kind in ("add", "sub"):
+            self._add(x[0], worth)
+            self._add(x[1], worth if kind == "add" else f"-{worth}")
+        elif kind == "mul":
+            self._add(x[0], f"{worth} * {self._operand(x[1])}")
+            self._add(x[1], f"{worth} * {self._operand(x[0])}")
+        elif kind == "div":
+            self._add(x[0], f"{worth} / {self._operand(x[1])}")
+            self._add(x[1], f"-{worth} * {self.names[equation.outvars[0]]} / {self._operand(x[1])}")
+        elif kind == "select_n":
+            no = self._operand(x[0])
+            self._add(x[1], f"choose({no}, {worth}, (V){{}})")
+            self._add(x[2], f"choose({no}, (V){{}}, {worth})")
+        else:
+            self._add(x[0], {"neg": f"-{worth}", "broadcast_in_dim": worth}[kind])
+
+    def text(self) -> str:
+        """The body of the function: a vector after the other."""
+        return (
+            "size_t s;\nfor (s = 0; s < count; s += W) {\nif (s + W > count) s = count - W;\n"
+            f"{''.join(self.lines)}}}\n"
+        )
+
+
+_STILL = ("floor", "convert_element_type", "and", "ne")  # whole numbers: no derivative
 _SIGNS = {"mul": "*", "add": "+", "sub": "-", "div": "/"}
 _CALLS = {
     "select_n": "choose({0}, {1}, {2})",

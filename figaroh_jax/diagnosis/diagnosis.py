@@ -165,7 +165,7 @@ def _baseline_error(problem: Problem, start: State) -> float:
 
 def _begun(backend: Backend, signals: Sequence[Signals], known: Baseline | None, trust: float) -> tuple[Problem, State]:
     """The recordings on one clock, and the baseline."""
-    records = without_reversals(stack(signals, backend.robot))
+    records = without_reversals(stack(signals, backend.robot, joined=True))
     held = held_rows(signals, records)
     problem = Problem(backend, records, layout(signals, records), trust, np.zeros(backend.robot.nv), held)
     return problem, baseline(problem, *_baseline_effects(backend.robot, known))

@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from ..effects.base import Effect
 from ..effects.catalogue import find
+from ..recordings.stacked import Records, Span
 from ..results import Experiment, Name
 from ..rigid.inertia import from_com
 from .design import candidates, kind, shapes, unit_rows, with_shape
@@ -111,7 +112,7 @@ def _predicted(
 
 def _menu(problem: Problem, effect: Effect) -> Iterator[_Idea]:
     """The recorded motion again, faster, slower, with a known load; sweeps of the joints of the effect."""
-    records, longest = problem.records, int(np.argmax(np.asarray(problem.records.weight).sum((1, 2))))
+    records, longest = problem.records, _longest(problem.records)
     q, v, a = (np.asarray(x)[longest] for x in (records.position, records.velocity, records.acceleration))
     yield _Idea(AGAIN, q, v, a)
     tip = len(problem.model.joints) - 1
@@ -173,7 +174,7 @@ def _imagined(problem: Problem, ideas: Sequence[_Idea]) -> Problem:
     """The problem with the motions of experiments in place of the recordings (as many, so that programs fit)."""
     records = problem.records
     n, _, count, _ = records.shape
-    longest, some = int(np.argmax(np.asarray(records.weight).sum((1, 2)))), [ideas[k % len(ideas)] for k in range(n)]
+    longest, some = _longest(records), [ideas[k % len(ideas)] for k in range(n)]
     weight = np.zeros_like(np.asarray(records.weight))
     for own, idea in zip(weight, some, strict=True):
         used = np.asarray(records.weight)[longest].any(1) & (np.arange(count) < idea.until * count)
@@ -189,10 +190,18 @@ def _imagined(problem: Problem, ideas: Sequence[_Idea]) -> Problem:
         kept=np.repeat(records.kept[longest : longest + 1], n, axis=0),
         weight=weight,
         carried=np.stack(ten) if np.any(ten) else None,
+        spans=tuple(Span(k, 0, records.shape[1], 0, count) for k in range(n)),
     )
-    rows = np.zeros(n * count, int)
-    alone = Layout(np.zeros((0, n * count), int), np.ones((weight.shape[2], n * count)), rows, rows, rows, False)
+    same = np.zeros(n * count, int)
+    alone = Layout(np.zeros((0, n * count), int), np.ones((weight.shape[2], n * count)), same, same, same, False)
     return replace(problem, records=changed, layout=alone, held=np.zeros_like(weight))
+
+
+def _longest(records: Records) -> int:
+    """The slot of one recording that says most."""
+    rows = np.asarray(records.weight).sum((1, 2))
+    rows[[slot for slot, _ in records.joins]] = -1.0
+    return int(np.argmax(rows))
 
 
 def _products(

@@ -140,15 +140,16 @@ def _fit(problem: Problem, rows: Float[np.ndarray, "nv T"], taken: np.ndarray | 
     frequency = np.fft.rfftfreq(count, 1 / rate)[1:]
     power, share = np.zeros((len(frequency), nv)), np.zeros((len(frequency), nv))
     weights = 0
-    for k in range(n):
-        series = rows.reshape(nv, n, count)[:, k].T
+    for at in records.spans:
+        here = slice(at.row, at.row + at.rows)
+        series = rows.reshape(nv, n, count)[:, at.slot, here].T
         used = np.flatnonzero(np.abs(series).max(1) > 0)
         if len(used) < 20:
             continue
         own, p = noise.periodogram(series[used[0] : used[-1] + 1], rate)
         power += len(used) * _onto(frequency, own, p)
         if taken is not None:
-            basis = taken[k][used[0] : used[-1] + 1]
+            basis = taken[at.slot][here][used[0] : used[-1] + 1]
             share += len(used) * _onto(frequency, own, noise.leverage(basis))
         weights += len(used)
     power, share = power / weights, share / weights

@@ -80,8 +80,8 @@ def traces(
     places = amplitude_places(last, causes, problem.model)
     shares = [_share(problem, last, e, at) for e, at in zip(causes, places, strict=True)]
     out = []
-    for k, one in enumerate(signals):
-        rows, count = one.rows.index, one.rows.kept
+    for one, at in zip(signals, problem.records.spans, strict=True):
+        rows, here = one.rows.index, (at.slot, slice(at.row, at.row + at.rows))
         out.append(
             Trace(
                 name=one.name,
@@ -89,10 +89,10 @@ def traces(
                 time=one.time[rows],
                 position=one.position[rows],
                 velocity=one.velocity[rows],
-                measured=None if one.torque is None else problem.torque[k, :count],
-                before=before[k, :count],
-                after=after[k, :count],
-                shares={str(f.name): share[k, :count] for f, share in zip(found, shares, strict=True)},
+                measured=None if one.torque is None else problem.torque[here],
+                before=before[here],
+                after=after[here],
+                shares={str(f.name): share[here] for f, share in zip(found, shares, strict=True)},
             )
         )
     return tuple(out)

@@ -78,9 +78,9 @@ def _compared(first: Signals, second: Signals) -> tuple[float, str]:
 def held_rows(signals: Sequence[Signals], records: Records) -> Float[np.ndarray, "n M nv"]:
     """1 for the rows of recordings that are kept out of the fit and have torque."""
     held = np.zeros_like(np.asarray(records.weight))
-    for k, one in enumerate(signals):
+    for one, at in zip(signals, records.spans, strict=True):
         if one.role == "holdout" and one.torque is not None:
-            held[k, : one.rows.kept] = one.rows.weight
+            held[at.slot, at.row : at.row + at.rows] = one.rows.weight
     return held
 
 
@@ -103,26 +103,28 @@ def _partners(signals: Sequence[Signals], records: Records) -> Int[np.ndarray, "
     n, _, count, _ = records.shape
     labels = excitations([s for s in signals if s.role == "fit"])
     most = max(labels.count(label) for label in labels) - 1
-    partner = np.full((max(most, 1), n, count), -1)
+    partner = np.full((max(most, 1), n * count), -1)
+    first = [at.slot * count + at.row for at in records.spans]
     for one in range(len(labels)):
+        own = np.arange(signals[one].rows.kept)
         others = [k for k in range(len(labels)) if k != one and labels[k] == labels[one]]
         for slot, other in enumerate(others):
-            row = np.arange(count) + align(signals[one], signals[other])
-            inside = (row >= 0) & (row < signals[other].rows.kept) & (np.arange(count) < signals[one].rows.kept)
-            partner[slot, one] = np.where(inside, other * count + row, -1)
-    return partner.reshape(len(partner), -1)
+            row = own + align(signals[one], signals[other])
+            inside = (row >= 0) & (row < signals[other].rows.kept)
+            partner[slot, first[one] + own] = np.where(inside, first[other] + row, -1)
+    return partner
 
 
 def _blocks(signals: Sequence[Signals], records: Records) -> Int[np.ndarray, " T"]:
     n, _, count, _ = records.shape
-    seconds = np.arange(count) / float(records.rate)
     block, start = np.full((n, count), -1), 0
-    for k, one in enumerate(s for s in signals if s.role == "fit"):
+    for one, at in zip((s for s in signals if s.role == "fit"), records.spans, strict=False):
+        seconds = np.arange(at.rows) / float(records.rate)
         length = one.time[-1] - one.time[0]
         width = BLOCK if length > SHORT else SHORT_BLOCK
-        number = np.minimum(seconds / width, max(1, round(seconds[one.rows.kept - 1] / width)) - 1).astype(int)
-        block[k, : one.rows.kept] = start + number[: one.rows.kept]
-        start = block[k].max() + 1
+        number = np.minimum(seconds / width, max(1, round(seconds[-1] / width)) - 1).astype(int)
+        block[at.slot, at.row : at.row + at.rows] = start + number
+        start += number[-1] + 1
     return block.reshape(-1)
 
 
@@ -137,12 +139,11 @@ def _folds(signals: Sequence[Signals], records: Records, sliced: bool) -> Int[np
     labels = excitations(fitted)
     enough = max(labels) + 1 >= FEWEST_EXCITATIONS
     fold, first = np.full((n, count), -1), {}
-    for k, one in enumerate(fitted):
+    for k, (one, at) in enumerate(zip(fitted, records.spans, strict=False)):
         late = align(fitted[first.setdefault(labels[k], k)], one) if one.repeat else 0
-        row = np.maximum(np.arange(count) - late, 0)  # repeats share their slices
+        row = np.maximum(np.arange(at.rows) - late, 0)  # repeats share their slices
         slices = row / float(records.rate) // SLICE % FOLDS
         quarter = labels[k] * QUARTERS + np.minimum(row * QUARTERS // max(one.rows.kept, 1), QUARTERS - 1)
-        fold[k] = labels[k] if enough else slices if sliced else quarter
-        fold[k, one.rows.kept :] = -1
+        fold[at.slot, at.row : at.row + at.rows] = labels[k] if enough else slices if sliced else quarter
     used = np.unique(fold[fold >= 0])
     return np.where(fold < 0, -1, np.searchsorted(used, fold)).reshape(-1)

@@ -175,13 +175,16 @@ def parts_of(
 
 def _dependences(problem: Problem, state: State, joint: int) -> list[tuple[Dependence, Float[np.ndarray, "k nN"]]]:
     """Smooth functions of the joint's position, velocity, load and time, and a constant for each recording."""
-    n, samples, _, _ = problem.records.shape
+    records = problem.records
     kinds: list[tuple[Dependence, np.ndarray]] = [
         (kind, np.stack(columns)) for kind, columns in dependences(state.motion, joint).items()
     ]
-    fitted = np.flatnonzero(problem.records.fitted.any((1, 2)))
+    fitted = [at for at in records.spans if records.fitted[at.slot, at.row : at.row + at.rows].any()]
     if len(fitted) > 1:
-        kinds.append(("recording", np.repeat(np.eye(n)[fitted], samples, axis=1)))
+        constants = np.zeros((len(fitted), *records.shape[:2]))
+        for own, at in zip(constants, fitted, strict=True):
+            own[at.slot, at.sample : at.sample + at.samples] = 1.0
+        kinds.append(("recording", constants.reshape(len(fitted), -1)))
     return kinds
 
 
@@ -196,8 +199,9 @@ def _rows_at(
 
 def _recording_of(drop: Float[np.ndarray, " blocks"], step: Step, problem: Problem, names: Sequence[str]) -> str:
     """The recording whose blocks a constant of its own helps most."""
-    block = step.rows.block.reshape(problem.records.shape[0], -1)
-    each = [drop[np.unique(own[own >= 0])].sum() if (own >= 0).any() else -np.inf for own in block]
+    block, spans = step.rows.block.reshape(problem.records.shape[0], -1), problem.records.spans
+    rows = (block[at.slot, at.row : at.row + at.rows] for at in spans)
+    each = [drop[np.unique(own[own >= 0])].sum() if (own >= 0).any() else -np.inf for own in rows]
     return names[int(np.argmax(each))]
 
 

@@ -147,6 +147,8 @@ def _compliances(
         whole = inertial + np.stack([-D / (2 * dt), 1 + K, D / (2 * dt)])
         for part, count in ((inertial, 1), (whole, ENDS)):
             part[:, :, :count] = part[:, :, -count:] = 0.0
+            for slot, first in records.joins:
+                part[:, slot, first - count : first + count] = 0.0
         out.append(_Compliance(whole, inertial))
     return out
 
@@ -214,7 +216,10 @@ def _moved(effects: Effect, motion: Motion, errors: Float[np.ndarray, "effects n
 
 
 def difference(signal: Float[np.ndarray, "*n N"], dt: float) -> Float[np.ndarray, "*n N"]:
-    """Derivative by five-point central differences; the two ends hold their neighbours' (rows there are trimmed)."""
+    """Derivative by five-point central differences; the two ends hold their neighbours'.
+
+    No row uses the ends of a recording (`rowfilter.extension`), so that another one may stand behind it.
+    """
     out = np.empty_like(signal)
     inner = 8 * (signal[..., 3:-1] - signal[..., 1:-3]) - (signal[..., 4:] - signal[..., :-4])
     out[..., 2:-2] = inner / (12 * dt)

@@ -21,15 +21,16 @@ from .motions import Basis, Trajectory
 from .objectives import condition_objective, information_objective, prediction_objective, smooth_condition_objective
 from .sampling import CHUNK, Sampler
 from .separation import Causes, Separated, causes, check_told, separated, separation_objective
-from .solvers import NEAR, GramObjective, Penalty, Problem, solve
+from .solvers import FEW_ROWS, NEAR, ROUGH, GramObjective, Problem, solve
 
 __all__ = ["Cause", "Design", "Stage", "best_motion", "excite", "random_motion"]
 
-TIGHTENED = 3  # times that a motion is designed again with a margin
-SCREENED = 8  # random motions, the best of which a start improves
+TIGHTENED, TIGHTENING = 3, 40  # times that a motion is designed again with a margin, in how many steps
+TRIED_SHORTLY = 8  # random motions that a start improves a little, the best of them then as far as it goes
 WAVE, OVER = 8, 4  # samples of a wave, rows of a column: enough to look for a motion, which all samples then improve
 TRIED, ROOMY = 400, 3  # random postures in which a motion may begin; one of so many that are clear does
-CHECKED = 8  # motions, the best first, until one is feasible at 1 kHz
+FINALISTS = 3  # of these that are improved as far as it goes, where thousands of rows make many optima
+CHECKED = 8  # motions, the best first, until none promises more than one that is feasible at 1 kHz
 ROUNDING = 1e-6  # of a limit
 CLEAR_RATE = 40.0  # Hz at which a random motion touches nothing: what begins on the wrong side of a body stays there
 SMALLER = (1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05, 0.02)  # shares of a random motion that are tried for that
@@ -412,27 +413,31 @@ def best_motion(
     final = Problem(learned, sampler, ways[0][-1], *kept, shifts=shifts)
     few = _few_samples(final)
     made = [[Problem(learned, sampler, one, *kept, shifts=shifts, samples=few) for one in way] for way in ways]
-    found: list[tuple[float, np.ndarray, Penalty]] = []
+    found: list[tuple[float, np.ndarray]] = []
     for k in range(starts):
-        progress(k / starts)
-        problems, penalty = made[k % len(made)], Penalty()
-        x = min((random_motion(final, generator) for _ in range(SCREENED)), key=problems[0].value)
-        for problem in problems:
-            penalty = Penalty()
-            x = solve(problem, x, penalty)
-        found.append((problems[-1].value(x), x, penalty))
-    reached = tuple(value for value, _, _ in found)
-    tried: list[tuple[bool, float, Trajectory, tuple[Use, ...], Limits]] = []
-    for _, x, penalty in sorted(found, key=lambda one: one[0])[:CHECKED]:
+        problems = made[k % len(made)]
+        tried: list[tuple[float, np.ndarray]] = []
+        for n in range(TRIED_SHORTLY):
+            progress((k + n / (2 * TRIED_SHORTLY)) / starts)
+            x = solve(problems[0], random_motion(final, generator), steps=ROUGH)
+            tried.append((problems[0].value(x), x))
+        for _, x in sorted(tried, key=lambda one: one[0])[: 1 if final.linear_rows <= FEW_ROWS else FINALISTS]:
+            for problem in problems:
+                x = solve(problem, x)
+            found.append((problems[-1].value(x), x))
+    each = len(found) // starts
+    reached = tuple(min(value for value, _ in found[k : k + each]) for k in range(0, len(found), each))
+    ends: list[tuple[bool, float, Trajectory, tuple[Use, ...], Limits]] = []
+    for value, x in sorted(found, key=lambda one: one[0])[:CHECKED]:
+        if ends and min(ends, key=lambda one: one[:2])[:2] <= (False, value):
+            break  # no motion that is left promises more
         own = _fitted(final, final.trajectory(x))
-        x = x if few is None else solve(own, x, penalty)
-        motion, uses, kept_limits = _feasible(torque, own, x, penalty)
+        x = x if few is None else solve(own, x)
+        motion, uses, kept_limits = _feasible(torque, own, x)
         met = all(use.met for use in uses)
-        tried.append((not met, final.value(final.numbers(motion)), motion, uses, kept_limits))
+        ends.append((not met, final.value(final.numbers(motion)), motion, uses, kept_limits))
         final.evaluations += own.evaluations
-        if met:
-            break
-    _, _, motion, uses, kept_limits = min(tried, key=lambda one: one[:2])
+    _, _, motion, uses, kept_limits = min(ends, key=lambda one: one[:2])
     evaluations = sum(problem.evaluations for way in (*made, [final]) for problem in way)
     return Stage(motion, uses, np.nan, reached, evaluations, kept_limits.clearance)
 
@@ -446,18 +451,18 @@ def _few_samples(problem: Problem) -> int | None:
 
 
 def _feasible(
-    torque: Torque, problem: Problem, x: Float[np.ndarray, " n"], penalty: Penalty
+    torque: Torque, problem: Problem, x: Float[np.ndarray, " n"]
 ) -> tuple[Trajectory, tuple[Use, ...], Limits]:
     """The motion of x, designed again with margins for what it exceeds at 1 kHz, at last made a little smaller."""
+    margin: dict[str, float] = {}
     for _ in range(TIGHTENED):
         problem = _fitted(problem, problem.trajectory(x))
         uses = checked(torque, problem.learned.robot, problem.trajectory(x), problem.limits, meshes=False)
         over = {use.kind: _excess(use) for use in uses if use.share > 1.0}
         if max(over.values(), default=0.0) < ALLOWED:
             break
-        margin = penalty.margin
-        penalty.margin = {kind: margin.get(kind, 0.0) + 1.2 * over.get(kind, 0.0) for kind in {*margin, *over}}
-        x = solve(problem, x, penalty, polish=False)
+        margin = {kind: margin.get(kind, 0.0) + 1.2 * over.get(kind, 0.0) for kind in {*margin, *over}}
+        x = solve(problem, x, margin, steps=TIGHTENING)
     return _smaller(torque, problem, problem.trajectory(x))
 
 

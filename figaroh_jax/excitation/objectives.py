@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from .programming import lapack
 from .solvers import GramObjective
 
 __all__ = ["condition_objective", "information_objective", "prediction_objective", "smooth_condition_objective"]
@@ -22,11 +23,16 @@ SHARPNESS = 4.0  # of the soft extremes of the eigenvalues
 
 def _inverse(G: Float[np.ndarray, "n n"]) -> tuple[np.ndarray, float]:
     """Inverse and log determinant, the columns scaled first."""
-    size = np.sqrt(np.maximum(np.diag(G), np.finfo(float).tiny))
-    scaled = G / np.outer(size, size)
-    L = np.linalg.cholesky(scaled + _RIDGE * np.eye(len(G)))
-    half = np.linalg.inv(L) / size
-    return half.T @ half, float(2 * np.log(np.diag(L)).sum() + 2 * np.log(size).sum())
+    size = np.sqrt(np.maximum(G.diagonal(), np.finfo(float).tiny))
+    scaled = G / (size[:, None] * size)
+    scaled.flat[:: len(G) + 1] += _RIDGE
+    L, failed = lapack("potrf")(scaled, lower=1)
+    if failed:
+        raise np.linalg.LinAlgError("the rows of a motion are not finite")
+    half, _ = lapack("potri")(L, lower=1)  # its lower triangle
+    inverse = np.tril(half) + np.tril(half, -1).T
+    inverse /= size[:, None] * size
+    return inverse, float(2 * np.log(L.diagonal() * size).sum())
 
 
 def information_objective(prior: Float[np.ndarray, "n n"]) -> GramObjective:

@@ -1,9 +1,9 @@
 """The rows of a motion and the gradient of any function of them, on the host.
 
 All that a design asks for (information, prediction, torque) is a function of the rows: its gradient by them goes back
-through the closed form of `regressor_pullback`, and that of the effects' columns through JAX, but for the usual
-friction, whose columns and slopes are written out here. A motion goes in chunks of fixed size through the programs, so
-that one of a robot serves all lengths, bases, objectives and limits.
+through the reverse of their machine code, or without a C compiler through the closed form of `regressor_pullback` in
+chunks of fixed size, so that one program of a robot serves all lengths, bases, objectives and limits; that of the
+effects' columns goes through JAX, but for the usual friction, whose columns and slopes are written out here.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..compiled.batching import aligned, program
+from ..compiled.machine_code import FARTHEST, FEWEST, code_of_few
 from ..effects.base import Effect, Motion, columns
 from ..effects.friction import CoulombFriction, ViscousFriction
 from ..effects.sensors import TorqueOffset
@@ -25,6 +26,7 @@ from ..rigid.dynamics import inverse_dynamics
 from ..rigid.model import RobotModel
 from ..rigid.regressor import dense_rows
 from ..rigid.regressor_gradient import pullback_rows
+from ..rigid.scalar_forms import COLUMNS, straight
 
 __all__ = ["CHUNK", "Sampler", "smooth_motion", "term_blocks"]
 
@@ -116,6 +118,7 @@ def _beside_back(robot: RobotModel, terms: Any, width: Any, states: Array, cotan
     return jax.vjp(lambda x: _beside(robot, terms, width, x), states)[1](cotangent)[0]
 
 
+_COLUMNS = straight(COLUMNS, lambda robot, q, v, a: _rows(robot, jnp.stack([q, v, a])))
 _rows_program, _back_program = program(_rows), program(_back)
 _beside_program, _beside_back_program = program(_beside), program(_beside_back)
 
@@ -124,7 +127,7 @@ class Sampler:
     """Rows of all columns (links, then effects) at states, and the gradient by the states."""
 
     def __init__(self, robot: RobotModel, terms: Sequence[Effect], width: Float[np.ndarray, " nv"]) -> None:
-        self.robot, self.width = robot, np.asarray(width, float)
+        self.robot, self.terms, self.width = robot, tuple(terms), np.asarray(width, float)
         self.own = 10 * len(robot.joints)
         self.plain: list[tuple[Any, int, int]] = []  # column of an effect on a joint, its place, the joint
         others: list[Effect] = []
@@ -141,17 +144,38 @@ class Sampler:
                 other += where
             self.columns += count
         self.other = np.array(other, int)
+        self.codes: dict[bool, Any] = {}  # machine code of the links' rows and of their gradient
         with jax.enable_x64(True):
             self.on_device, self.others, self.widths = jax.device_put((robot, tuple(others), self.width))
+
+    def wider(self, times: float) -> Sampler | None:
+        """The same with a reversal of dry friction so many times as wide; None where nothing reverses."""
+        if not self.others and all(column is not _coulomb for column, _, _ in self.plain):
+            return None
+        other = Sampler(self.robot, self.terms, times * self.width)
+        other.codes = self.codes
+        return other
+
+    def _code(self, states: Float[np.ndarray, "3 samples nv"], back: bool) -> Any:
+        """Machine code of the links' rows, or of their gradient; None where JAX has to serve."""
+        if states.shape[1] < FEWEST or not np.abs(states[0]).max() < FARTHEST:
+            return None
+        if back not in self.codes:
+            self.codes[back] = code_of_few(_COLUMNS, self.robot, (self.robot.nv,) * 3, back=back)
+        return self.codes[back]
 
     def rows(self, states: Float[np.ndarray, "3 samples nv"]) -> Float[np.ndarray, "nv columns samples"]:
         """The rows at q, v, a (rad or m, and their rates); N m or N for a unit of each parameter."""
         samples, nv = states.shape[1:]
         out = np.zeros((self.columns, nv, samples))
+        code = self._code(states, False)
+        if code is not None:
+            code(lambda shape, fill: out[: self.own], *states)
         with jax.enable_x64(True):
-            for piece, x in _cut(states):
+            for piece, x in () if code is not None and not len(self.other) else _cut(states):
                 count = len(range(samples)[piece])
-                out[: self.own, :, piece] = np.asarray(_rows_program(self.on_device, x))[:, :, :count]
+                if code is None:
+                    out[: self.own, :, piece] = np.asarray(_rows_program(self.on_device, x))[:, :, :count]
                 if len(self.other):
                     beside = _beside_program(self.on_device, self.others, self.widths, x)
                     out[self.other, :, piece] = np.asarray(beside)[:, :, :count]
@@ -173,15 +197,20 @@ class Sampler:
     ) -> Float[np.ndarray, "3 samples nv"]:
         """Gradient by q, v and a of a function whose gradient by the rows is `cotangent`."""
         by, samples = cotangent.swapaxes(0, 1), states.shape[1]
-        out = np.empty(states.shape)
+        out = np.zeros(states.shape)
+        code = self._code(states, True)
+        if code is not None:
+            out += code(by[: self.own], *states).reshape(3, -1, samples).swapaxes(1, 2)
         with jax.enable_x64(True):
-            for piece, x in _cut(states):
+            for piece, x in () if code is not None and not len(self.other) else _cut(states):
                 count = len(range(samples)[piece])
-                one = np.asarray(_back_program(self.on_device, x, _filled(by[: self.own, :, piece])))
+                if code is None:
+                    one = np.asarray(_back_program(self.on_device, x, _filled(by[: self.own, :, piece])))
+                    out[:, piece] += one[:, :, :count].swapaxes(1, 2)
                 if len(self.other):
                     beside = _filled(by[self.other, :, piece])
-                    one = one + np.asarray(_beside_back_program(self.on_device, self.others, self.widths, x, beside))
-                out[:, piece] = one[:, :, :count].swapaxes(1, 2)
+                    one = np.asarray(_beside_back_program(self.on_device, self.others, self.widths, x, beside))
+                    out[:, piece] += one[:, :, :count].swapaxes(1, 2)
         for column, place, joint in self.plain:
             _, which, slope = column(*states[:, :, joint], self.width[joint])
             out[which, :, joint] += slope * by[place, joint]

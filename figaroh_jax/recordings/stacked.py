@@ -7,6 +7,8 @@ Everything that is compared with the measured torque (the torque itself, each re
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -22,8 +24,21 @@ __all__ = ["Records", "filter_rows", "filtered_rows", "open_rows", "stack"]
 AT_ONCE = 100_000  # numbers of series that are filtered at once: their spectra stay in the processor's cache
 
 
+class Span(NamedTuple):
+    """Where a recording stands: its slot, and there its first sample and row, and how many there are."""
+
+    slot: int
+    sample: int
+    samples: int
+    row: int
+    rows: int
+
+
 class Records(eqx.Module):
-    """`n` recordings of at most `N` samples at one period, and of at most `M` rows; short ones are padded."""
+    """`n` slots of at most `N` samples at one period, and of at most `M` rows; short ones are padded.
+
+    A slot holds one recording, or several short ones behind each other (`stack`); `spans` says where each stands.
+    """
 
     time: Float[Leaf, "n N"]  # s
     position: Float[Leaf, "n N nq"]  # rad or m, low-passed
@@ -40,6 +55,12 @@ class Records(eqx.Module):
     rate: Float[Leaf, ""] | float  # Hz, of the rows
     cutoff: Float[Leaf, ""] | float  # Hz
     carried: Float[Leaf, "n links 10"] | None = None  # known bodies on the links, at and in their joint frames
+    spans: tuple[Span, ...] = eqx.field(static=True, default=())  # of the recordings in their order
+
+    @property
+    def joins(self) -> tuple[tuple[int, int], ...]:
+        """Slot and sample of every recording that stands behind another one."""
+        return tuple((s.slot, s.sample) for s in self.spans if s.sample)
 
     @property
     def fitted(self) -> Float[np.ndarray, "n M nv"]:
@@ -107,24 +128,46 @@ def filtered_rows(
     return (rows * np.moveaxis(records.weight, 2, 0)).reshape(nv, -1)
 
 
-def stack(signals: Sequence[Signals], model: RobotModel | None = None) -> Records:
+def stack(signals: Sequence[Signals], model: RobotModel | None = None, joined: bool = False) -> Records:
     """The recordings as one; they must share period, row rate and cutoff (`signals.prepare_all` sees to that).
 
-    With a `model`, the known loads stand in `carried`; `InputError` where one is fixed to what does not move.
+    With a `model`, the known loads stand in `carried`; `InputError` where one is fixed to what does not move. `joined`
+    puts short recordings of one role behind each other where none carries a load: what is padded is computed too.
     """
     first = signals[0]
     pad, samples = reach(first.dt, first.cutoff), max(s.time.size for s in signals)
-    count = max(s.rows.kept for s in signals)
-    length = fast_length(samples + 2 * pad)
-    weight = _padded([s.rows.weight * (s.role == "fit") for s in signals], count, hold=False)
+    count, length = max(s.rows.kept for s in signals), fast_length(samples + 2 * pad)
+    carried = None if model is None else _carried(model, signals)
+    slots = (
+        _slots(signals, samples, length - 2 * pad) if joined and carried is None else [[k] for k in range(len(signals))]
+    )
+    spans, kept, source = [_NOWHERE] * len(signals), [], []
+    for slot, members in enumerate(slots):
+        sample = row = place = 0
+        rows, index = [], []
+        for k in members:
+            one = signals[k]
+            spans[k] = Span(slot, sample, one.time.size, row, one.rows.kept)
+            room = length - place if k == members[-1] else one.time.size + 2 * pad
+            index.append(_extended(one, pad, room) + sample)
+            rows.append(one.rows.index + pad + place)
+            sample, row, place = sample + one.time.size, row + one.rows.kept, place + room
+        kept.append(np.concatenate(rows))
+        source.append(np.concatenate(index))
+
+    def behind(each: Sequence[Leaf]) -> list[np.ndarray]:
+        return [np.concatenate([np.asarray(each[k]) for k in members]) for members in slots]
+
+    weight = _padded(behind([s.rows.weight * (s.role == "fit") for s in signals]), count, hold=False)
+    torque = [np.zeros_like(s.velocity) if s.torque is None else s.torque for s in signals]
     return Records(
-        time=_padded([s.time for s in signals], samples),
-        position=_padded([s.position for s in signals], samples),
-        velocity=_padded([s.velocity for s in signals], samples, hold=False),
-        acceleration=_padded([s.acceleration for s in signals], samples, hold=False),
-        torque=_padded([np.zeros_like(s.velocity) if s.torque is None else s.torque for s in signals], samples),
-        source=np.stack([_extended(s, pad, length) for s in signals]),
-        kept=_padded([s.rows.index + pad for s in signals], count),
+        time=_padded(behind([s.time for s in signals]), samples),
+        position=_padded(behind([s.position for s in signals]), samples),
+        velocity=_padded(behind([s.velocity for s in signals]), samples, hold=False),
+        acceleration=_padded(behind([s.acceleration for s in signals]), samples, hold=False),
+        torque=_padded(behind(torque), samples),
+        source=np.stack(source),
+        kept=_padded(kept, count),
         weight=weight,
         judged=weight,
         low_pass=gain(length, first.dt, first.cutoff),
@@ -132,8 +175,38 @@ def stack(signals: Sequence[Signals], model: RobotModel | None = None) -> Record
         dt=first.dt,
         rate=1 / (first.dt * first.rows.step),
         cutoff=first.cutoff,
-        carried=None if model is None else _carried(model, signals),
+        carried=carried,
+        spans=tuple(spans),
     )
+
+
+_NOWHERE = Span(0, 0, 0, 0, 0)
+
+
+def _slots(signals: Sequence[Signals], samples: int, room: int) -> list[list[int]]:
+    """The recordings of each slot: long ones first, each into the first slot of its role that has room for it.
+
+    A slot has `samples`, of which each further recording needs twice what the filter reaches more; `room` is what all
+    have together. Slots stand in the order of their first recordings.
+    """
+    pad = reach(signals[0].dt, signals[0].cutoff)
+    slots: list[list[int]] = []
+    for k in sorted(range(len(signals)), key=lambda k: -signals[k].time.size):
+        for members in slots:
+            taken = sum(signals[m].time.size for m in members) + signals[k].time.size
+            alike = signals[members[0]].role == signals[k].role
+            if alike and taken <= min(samples, room - 2 * pad * len(members)) and _apart(signals, [*members, k]):
+                members.append(k)
+                break
+        else:
+            slots.append([k])
+    return sorted(map(sorted, slots))
+
+
+def _apart(signals: Sequence[Signals], members: list[int]) -> bool:
+    """Whether time jumps from each recording to the next: by that alone an effect knows where one begins."""
+    ordered = [signals[k] for k in sorted(members)]
+    return all(abs(b.time[0] - a.time[-1] - a.dt) > a.dt for a, b in pairwise(ordered))
 
 
 def _carried(model: RobotModel, signals: Sequence[Signals]) -> Float[np.ndarray, "n links 10"] | None:

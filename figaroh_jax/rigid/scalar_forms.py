@@ -21,6 +21,7 @@ from .scalars import Robot, constants, known, known_lengths, nothing_known
 __all__ = [
     "ACCELERATIONS",
     "BLOCKS",
+    "COLUMNS",
     "DENSE",
     "LIMB_TORQUES",
     "MASSES",
@@ -303,6 +304,12 @@ def _dense_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
     return [10 * (row * len(model.joints) + link) + column]
 
 
+def _column_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
+    block, column = place
+    row, link = sorted_rows(model.joints, True)[block]
+    return [int((10 * link + column) * model.nv + row)]
+
+
 def _mass_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
     row, column = place
     return sorted({model.nv * row + column, model.nv * column + row})
@@ -329,6 +336,14 @@ DENSE = _Form(
     answer=lambda model: (model.nv, 10 * len(model.joints)),
     places=_dense_places,
     looped=partial(_looped_blocks, True),
+)
+COLUMNS = _Form(
+    "columns",
+    partial(_blocks, True),
+    _ANSWERS["blocks"],
+    last=True,
+    answer=lambda model: (10 * len(model.joints), model.nv),
+    places=_column_places,
 )
 MASSES = _Form("masses", _masses, lambda model: (model.nv, model.nv), _whole_masses, places=_mass_places)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from functools import lru_cache
-from importlib.resources import files
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -236,7 +236,7 @@ def _fixed(loop: Loop, data: Windows) -> dict[str, np.ndarray]:
 @lru_cache
 def _code(size: int, one: bool) -> Any:
     """The compiled function, or None."""
-    source = files(__package__).joinpath("rollout.c").read_text()
+    source = (Path(__file__).parent / "rollout.c").read_text()
     found = library(source, f"-DSIZE={size}", f"-DONE={int(one)}")
     if found is None:
         return None
