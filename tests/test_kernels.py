@@ -207,19 +207,18 @@ def launch_by_hand(kernel: Any, arrays: Any, shapes: list[tuple[int, int]], inte
 
 @pytest.mark.parametrize("name", [*TREES, "TREE"])
 def test_looped_kernels_write_what_the_plain_ones_do(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Weighted rows with columns beside; where joints share a coordinate, rows of each degree of freedom alone."""
+    """Weighted rows with columns beside; none where joints share a coordinate."""
     monkeypatch.setattr(scalar_forms, "MOST", 1)
     monkeypatch.setattr(looped_kernels, "launch_over", launch_by_hand)
     monkeypatch.setattr(looped_kernels, "lanes_of", lambda x, lanes: jnp.broadcast_to(x.x, lanes.outs[0].shape[1]))
     model = random_tree(*TREES[name]).model if name in TREES else robots.load(getattr(robots, name), tmp_path)
     arrays, random = states(model, 3), np.random.default_rng(2)
     shared = len(model.dofs.column) > model.nv
-    beside, packed = normal_equations._row_form(2), FORMS["packed"]
+    beside = normal_equations._row_form(2)
     weighted = [*arrays, np.abs(random.standard_normal((3, model.nv))), random.standard_normal((3, 2 * model.nv))]
-    assert packed.looped and beside.looped
+    assert beside.looped
     if shared:
         assert beside.looped(model, *weighted) is None
-        agree(packed.looped(model, *arrays), plainly(packed, model, *arrays))
     else:
         for one, expected in zip(beside.looped(model, *weighted), plainly(beside, model, *weighted), strict=True):
             agree(one, expected)
@@ -306,11 +305,11 @@ def test_looped_kernels_on_a_gpu(name: str, tmp_path: Path, monkeypatch: pytest.
     model = random_tree(*TREES[name]).model if name in TREES else robots.load(getattr(robots, name), tmp_path)
     arrays, random = states(model, 1000), np.random.default_rng(2)
     weighted = [*arrays, np.abs(random.standard_normal((1000, model.nv))), random.standard_normal((1000, 2 * model.nv))]
-    for form, given in ((FORMS["packed"], arrays), (normal_equations._row_form(2), weighted)):
-        if not scalar_forms.looped(model, form is not FORMS["packed"]):
-            continue
-        with jax.default_device(jax.devices("cpu")[0]):
-            expected = jax.tree.leaves(form.plain(model, *map(jnp.asarray, given)))
-        found = jax.jit(lambda *x: form.looped(model, *x))(*map(jnp.asarray, given))  # noqa: B023  # pyright: ignore
-        for one, other in zip(jax.tree.leaves(found), expected, strict=True):
-            agree(one, other)
+    form = normal_equations._row_form(2)
+    if not scalar_forms.looped(model):
+        return
+    with jax.default_device(jax.devices("cpu")[0]):
+        expected = jax.tree.leaves(form.plain(model, *map(jnp.asarray, weighted)))
+    found = jax.jit(lambda *x: form.looped(model, *x))(*map(jnp.asarray, weighted))  # pyright: ignore
+    for one, other in zip(jax.tree.leaves(found), expected, strict=True):
+        agree(one, other)

@@ -180,28 +180,18 @@ def weighted_rows(side: int, plain: Callable[..., list[Array]]) -> Straight:
     return straight(form, plain)._replace(plain=plain, columns=read, looped=partial(_looped_weighted_rows, side))
 
 
-def looped(model: RobotModel, coordinates: bool) -> bool:
-    """Whether rows are written by kernels that loop: of trees that are more than one kernel, written out.
+def looped(model: RobotModel) -> bool:
+    """Whether weighted rows are written by one kernel that loops: of trees that are more than one kernel, written out.
 
-    Rows of joints that share a coordinate add up, which those do not.
+    It is there in seconds where those take most of a minute. Rows without weights stay written out, which are quicker
+    once they are there (TALOS on an H100: 121 for 85 million samples a second). Rows of joints that share a coordinate
+    add up, which a loop does not.
     """
-    return len(_pieces(model)) > 1 and not (coordinates and len(model.dofs.column) > model.nv)
-
-
-def _looped_blocks(coordinates: bool, model: RobotModel, *arrays: Array) -> Array | None:
-    if not looped(model, coordinates):
-        return None
-    order = np.argsort(model.dofs.column) if coordinates else np.arange(len(model.dofs.column))
-    moved = ancestors(model.joints)[model.dofs.joint].sum(1).astype(int)
-    start = np.empty_like(moved)
-    start[order] = 10 * (np.cumsum(moved[order]) - moved[order])
-    rows = Rows((10 * int(moved.sum()),), np.zeros_like(moved), start)
-    (found,) = looped_rows(model, arrays, rows, by_ratio=coordinates)
-    return found.reshape(-1, 10, found.shape[-1])
+    return len(_pieces(model)) > 1 and len(model.dofs.column) == model.nv
 
 
 def _looped_weighted_rows(side: int, model: RobotModel, *arrays: Array) -> list[Array] | None:
-    if not looped(model, True):
+    if not looped(model):
         return None
     lengths, (group, start) = _row_lengths(side, model), np.zeros((2, model.nv), int)
     for k, members in enumerate(row_groups(model)):
@@ -295,7 +285,6 @@ class _Form(NamedTuple):
     last: bool = False
     answer: Callable[[RobotModel], tuple[int, ...]] | None = None
     places: Callable[[RobotModel, tuple[int, ...]], list[int]] | None = None
-    looped: Callable[..., Any] | None = None
 
 
 def _dense_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
@@ -326,8 +315,8 @@ LIMB_TORQUES = _Form(
     lambda model, whole: whole[: model.nv],
     answer=lambda model: (model.nv,),
 )
-PACKED = _Form("packed", partial(_blocks, False), _ANSWERS["rows"], last=True, looped=partial(_looped_blocks, False))
-BLOCKS = _Form("blocks", partial(_blocks, True), _ANSWERS["blocks"], last=True, looped=partial(_looped_blocks, True))
+PACKED = _Form("packed", partial(_blocks, False), _ANSWERS["rows"], last=True)
+BLOCKS = _Form("blocks", partial(_blocks, True), _ANSWERS["blocks"], last=True)
 DENSE = _Form(
     "dense",
     partial(_blocks, True),
@@ -335,7 +324,6 @@ DENSE = _Form(
     _dense,
     answer=lambda model: (model.nv, 10 * len(model.joints)),
     places=_dense_places,
-    looped=partial(_looped_blocks, True),
 )
 COLUMNS = _Form(
     "columns",
@@ -382,7 +370,6 @@ def straight(
         answer=form.answer or form.shape,
         places=form.places or partial(_in_order, form.shape),
         apart=apart,
-        looped=form.looped,
     )
 
 
