@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -108,7 +109,8 @@ def test_a_coupling_turned_by_parts_of_opposite_signs_is_none() -> None:
     covariance = np.diag([0.1, 0.1, 0.1]) ** 2
 
     def against(inertia: float, damping: float, friction: float) -> bool:
-        effect = find("coupled_transmission")(np.array([0, 1]), inertia=inertia, damping=damping, friction=friction)
+        kind: Any = find("coupled_transmission")
+        effect = kind(np.array([0, 1]), inertia=inertia, damping=damping, friction=friction)
         return _turns_against_itself(effect, Fitted(np.zeros(3), covariance, ((0, 1, 2),)), (0, 1, 2))
 
     assert not against(1.0, 1.0, 1.0)

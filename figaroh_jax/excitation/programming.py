@@ -237,7 +237,8 @@ def _within(
 
 def _shortened(problem: Problem, rows: Rows, here: _Point, step: _Step, dear: float) -> _Point | None:
     """The point after as much of the step as the other linear rows allow and the merit is smaller for."""
-    fall = here.linear - rows.of_linear(here.x + step.d)
+    there = rows.of_linear(here.x + step.d)
+    fall = np.subtract(here.linear, there, out=np.zeros_like(there), where=np.isfinite(there))  # others have no limit
     with np.errstate(divide="ignore", invalid="ignore"):
         most = np.where(fall > 1e-14, np.maximum(here.linear, 0.0) / fall, np.inf)
     kept = step.rows[step.rows < rows.curved]
