@@ -98,9 +98,9 @@ class Problem:
         return None if sampler is None else replace(self, sampler=sampler, evaluations=0, _seen=None)
 
     def trajectory(self, x: Float[np.ndarray, " n"]) -> Trajectory:
-        """The motion of the numbers x."""
+        """The motion of the numbers x; joints that are held stand still, whatever rounding a solve has left them."""
         start, weights = self._split(x)
-        return Trajectory(start, weights, self.basis)
+        return Trajectory(start, weights * self.moved[:, None], self.basis)
 
     def numbers(self, motion: Trajectory) -> Float[np.ndarray, " n"]:
         """The numbers of a motion."""
