@@ -1,7 +1,7 @@
 """Answers of two versions of the package side by side: verdicts, causes, parameters, held-out errors.
 
-    python benchmarks/parity.py make --cases DIR [--seeds 31 32]                    # needs Pinocchio and the recordings
-    python benchmarks/parity.py pack --cases DIR --out FILE.tar.xz                  # small enough to travel; unpack: back
+    python benchmarks/parity.py make --cases DIR [--seeds 31 32]               # needs Pinocchio and the recordings
+    python benchmarks/parity.py pack --cases DIR --out FILE.tar.xz             # to travel; unpack: back
     python benchmarks/parity.py run --cases DIR --out OUT --jobs 60 before=/path/a now=/path/b
     python benchmarks/parity.py table --cases DIR --out OUT
 
