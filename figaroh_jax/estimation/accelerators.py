@@ -97,10 +97,11 @@ def condense_on_devices(
     """`condense(states, states.used)`, the samples of every piece spread over `devices` (default: all of this host).
 
     Each device forms the rows of its own samples, `chunk` at a time, and sums their products; the sums of the devices
-    are added at the end, on the host. Pieces of one length share a program; the source is read while the devices work. A single CPU takes
-    machine code for the rows of long pieces, where there is some. A direction in which the rows are less than 3e-7 of
-    the strongest one's is taken as not shown. Folds are whole chunks in turn. Raises `InputError` where a piece has a
-    wrong shape or holds a number that is not finite. An accelerator is busy with pieces of 1e5 samples and more.
+    are added at the end, on the host. Pieces of one length share a program; the source is read while the devices work.
+    A single CPU takes machine code for the rows of long pieces, where there is some. A direction in which the rows are
+    less than 3e-7 of the strongest one's is taken as not shown. Folds are whole chunks in turn. Raises `InputError`
+    where a piece has a wrong shape or holds a number that is not finite. An accelerator is busy with pieces of 1e5
+    samples and more.
 
     Where `jax.distributed` runs, each process takes the pieces that its own source gives, however many, on the devices
     of its host; the sums of all are added once at the end, and every process gets the same answer.
