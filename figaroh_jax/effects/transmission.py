@@ -160,7 +160,7 @@ class Backlash(JointEffect):
     width: Scalar = amplitude("rad", lower=0.0, upper=0.05)
 
     def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
-        """Half of the play on the side of the load, rad; changing sides takes as long as the motor takes to cross it."""
+        """Half of the play on the side of the load, rad; a change of side lasts as long as the motor needs."""
         load = self.here(motion.load)
         if isinstance(motion.dt, float) and motion.dt == 0.0:  # instants that are no record: the play has been crossed
             return self.width / 2 * (np if isinstance(load, np.ndarray) else jnp).sign(load)
