@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -173,8 +173,7 @@ def identify(
     with jax.enable_x64(True):
         progress("preparing signals", 0.05)
         regression, left_out = _regression(backend, recordings, preprocess or Preprocess(), known or Baseline(), joints)
-        notes, terms, signals = [*warned, *left_out], regression.terms, regression.signals
-        structure = structural_columns(model, terms)
+        structure = structural_columns(model, regression.terms)
         used = np.asarray(np.abs(structure).max(axis=0) > 0)
         structural = base_parameters(structure.reshape(-1, structure.shape[2]), regression.names)
         progress("condensing the recordings", 0.15)
@@ -183,52 +182,66 @@ def identify(
         covariance = coloured_covariance(regression, start.parameters, base.independent, start.weight)
         problem = _problem(regression, data, base, start, covariance, trust, fit, bounds)
         progress("fitting", 0.6)
-        chosen, validated = _validated(problem)
-        last = _fitted(problem, None, chosen)
-        theta = last.theta
+        last = _best(problem)
         progress("judging", 0.85)
-        if chosen > 1:
-            notes.append(
-                f"the nominal links are believed within {chosen * trust:.0%} where the torque shows them, not"
-                f" {trust:.0%} as stated: that predicts data left out of the fit better; elsewhere as stated"
-            )
-        own = 10 * len(model.joints)
-        posterior = posterior_covariance(problem.base, covariance, problem.spread_at(chosen))
-        judged = Judged(data, base, theta, posterior, covariance, prior_sigma(data, own, model, trust), problem.bounded)
-        ten = theta[:own].reshape(-1, 10)
-        given = _given_links(problem)
-        traces, holdout, outlying = predicted(regression, theta, given)
-        if last.failure:
-            notes.append(f"{last.failure}: do not trust these values")
-        rows = [np.asarray(t.after) - t.measured for t in traces if t.role == "fit" and t.measured is not None]
-        weighted = np.concatenate([(row * np.sqrt(problem.weight)).reshape(-1) for row in rows])
-        solution = solution_of(regression, last, posterior, base.rank, weighted)
-        kept = essential(data.factor(start.weight)[:, [*base.independent, -1]])
-        return Identification(
-            solution=solution,
-            joints=model.dof_names,
-            structural_rank=structural.rank,
-            condition=base.condition,
-            scaled_condition=base.scaled_condition,
-            base=judged.base_parameters(),
-            parameters=judged.parameters(),
-            null_directions=base.null_directions,
-            links=described_links(ten, model.link_names),
-            effects=described_effects(model, terms, theta[own:], np.sqrt(np.maximum(np.diag(posterior)[own:], 0.0))),
-            fit=quality(data, data.squares(theta)),
-            unconstrained=quality(data, data.squares(start.parameters)),
-            nominal=quality(data, data.squares(given)),
-            validated=validated,
-            holdout=holdout,
-            trust=chosen * trust,
-            width=regression.width,
-            method=fit,
-            essential=tuple(base.expressions[k] for k in kept),
-            traces=traces,
-            correlations=correlations(base, covariance),
-            notes=(*notes, *dropped(signals, model), *outlying, *(note for one in signals for note in one.notes)),
-            prismatic=prismatic(model),
-        )
+        found = _judged(problem, regression, start.parameters, covariance, last, trust, structural.rank)
+    notes = [*warned, *left_out, *found.notes, *dropped(regression.signals, model)]
+    return replace(found, notes=(*notes, *(note for one in regression.signals for note in one.notes)))
+
+
+_LOOSENED = (
+    "the nominal links are believed within {:.0%} where the torque shows them, not {:.0%} as stated: that predicts data"
+    " left out of the fit better; elsewhere as stated"
+)
+
+
+def _judged(
+    problem: _Problem,
+    regression: Regression,
+    free: Float[np.ndarray, " columns"],
+    covariance: Float[np.ndarray, "rank rank"],
+    last: _Best,
+    trust: float,
+    structural_rank: int,
+) -> Identification:
+    """What a fit is worth; `free` are the parameters without prior and bounds."""
+    model, data, base, theta = regression.model, problem.data, problem.base, last.fit.theta
+    own = 10 * len(model.joints)
+    posterior = posterior_covariance(base, covariance, problem.spread_at(last.slack))
+    judged = Judged(data, base, theta, posterior, covariance, prior_sigma(data, own, model, trust), problem.bounded)
+    given = _given_links(problem)
+    traces, holdout, outlying = predicted(regression, theta, given)
+    notes = [_LOOSENED.format(last.slack * trust, trust)] if last.slack > 1 else []
+    notes += [f"{last.fit.failure}: do not trust these values"] if last.fit.failure else []
+    rows = [np.asarray(t.after) - t.measured for t in traces if t.role == "fit" and t.measured is not None]
+    weighted = np.concatenate([(row * np.sqrt(problem.weight)).reshape(-1) for row in rows])
+    kept = essential(data.factor(problem.weight)[:, [*base.independent, -1]])
+    sigma = np.sqrt(np.maximum(np.diag(posterior)[own:], 0.0))
+    return Identification(
+        solution=solution_of(regression, last.fit, posterior, base.rank, weighted),
+        joints=model.dof_names,
+        structural_rank=structural_rank,
+        condition=base.condition,
+        scaled_condition=base.scaled_condition,
+        base=judged.base_parameters(),
+        parameters=judged.parameters(),
+        null_directions=base.null_directions,
+        links=described_links(theta[:own].reshape(-1, 10), model.link_names),
+        effects=described_effects(model, regression.terms, theta[own:], sigma),
+        fit=quality(data, data.squares(theta)),
+        unconstrained=quality(data, data.squares(free)),
+        nominal=quality(data, data.squares(given)),
+        validated=last.validated,
+        holdout=holdout,
+        trust=last.slack * trust,
+        width=regression.width,
+        method=problem.fit,
+        essential=tuple(base.expressions[k] for k in kept),
+        traces=traces,
+        correlations=correlations(base, covariance),
+        notes=(*notes, *outlying),
+        prismatic=prismatic(model),
+    )
 
 
 def _regression(
@@ -375,8 +388,15 @@ def _given_links(problem: _Problem) -> Float[np.ndarray, " columns"]:
     return np.append(problem.mean[:own], drives)
 
 
-def _validated(problem: _Problem) -> tuple[float, Quality]:
-    """How much less than stated the nominal is to be believed, and the quality on blocks that were left out."""
+class _Best(NamedTuple):
+    """The fit to all rows with the trust that predicts best, and its quality on blocks that were left out."""
+
+    slack: float  # how much less than stated the nominal is believed
+    validated: Quality
+    fit: Solved
+
+
+def _best(problem: _Problem) -> _Best:
     folds = [k for k in range(len(problem.data.factors)) if problem.data.count[k].any()]
     best: tuple[float, float, np.ndarray] | None = None
     for slack in TRUSTS:
@@ -389,4 +409,4 @@ def _validated(problem: _Problem) -> tuple[float, Quality]:
         if best is None or cost < best[0] * (1 - 1e-3):
             best = cost, slack, squares
     assert best is not None
-    return best[1], quality(problem.data, best[2])
+    return _Best(best[1], quality(problem.data, best[2]), _fitted(problem, None, best[1]))
