@@ -60,6 +60,7 @@ Fit = Literal["physical", "log_cholesky", "unconstrained"]
 MOVED = 2.0
 SHOWN = 0.01  # information of the data in a direction below which it stays as stated; 1 is the prior's own (a root)
 TRUSTS = (1.0, 3.0, 10.0, 100.0)  # multiples of the stated trust that cross-validation chooses from
+CLEARLY = 0.05  # of the squares left out: what letting go of all that no torque shows must gain
 DRIVE_PRECISION = 1e-6
 DEAD = 0.5  # share of samples at one single value: such a torque is not measured
 
@@ -91,20 +92,27 @@ class _Problem:
         room = np.maximum(1.0 - MOVED * self.told, 1e-12)
         return np.sqrt(np.clip(MOVED / (self.told * room), 1.0, slack**2))
 
-    def root_at(self, slack: float) -> Float[np.ndarray, "columns columns"]:
+    def root_at(self, slack: float, everywhere: bool = False) -> Float[np.ndarray, "columns columns"]:
         """R with R'R the precision of the prior, the nominal links believed up to `slack` times less (`loosened`).
 
         A direction that no torque shows stays as near to the nominal as was stated, however little that is believed
-        elsewhere: nothing would hold it.
+        elsewhere: nothing would hold it. `everywhere` lets it go too: a link that carries much more than it weighs is
+        no body unless the moments that no torque shows grow with those that one does.
         """
         root, own = np.diag(np.sqrt(self.precision)), self.nominal.size
+        if everywhere:
+            root[:own, :own] /= slack
+            return root
         tighter = self.shown * (1 - 1 / self.loosened(slack))
         root[:own, :own] -= (tighter @ self.shown.T) * np.sqrt(self.precision[:own])
         return root
 
-    def spread_at(self, slack: float) -> Float[np.ndarray, "columns columns"]:
+    def spread_at(self, slack: float, everywhere: bool = False) -> Float[np.ndarray, "columns columns"]:
         """S with SS' the covariance of that prior: the inverse of `root_at`."""
         spread, own = np.diag(1 / np.sqrt(self.precision)), self.nominal.size
+        if everywhere:
+            spread[:own, :own] *= slack
+            return spread
         wider = self.shown * (self.loosened(slack) - 1)
         spread[:own, :own] += (wider @ self.shown.T) / np.sqrt(self.precision[:own, None])
         return spread
@@ -193,6 +201,10 @@ _LOOSENED = (
     "the nominal links are believed within {:.0%} where the torque shows them, not {:.0%} as stated: that predicts data"
     " left out of the fit better; elsewhere as stated"
 )
+_LOOSENED_EVERYWHERE = (
+    "the nominal links are believed within {:.0%}, not {:.0%} as stated: that predicts data left out of the fit clearly"
+    " better; what no torque shows of them may be far off"
+)
 
 
 def _judged(
@@ -207,11 +219,12 @@ def _judged(
     """What a fit is worth; `free` are the parameters without prior and bounds."""
     model, data, base, theta = regression.model, problem.data, problem.base, last.fit.theta
     own = 10 * len(model.joints)
-    posterior = posterior_covariance(base, covariance, problem.spread_at(last.slack))
+    posterior = posterior_covariance(base, covariance, problem.spread_at(last.slack, last.everywhere))
     judged = Judged(data, base, theta, posterior, covariance, prior_sigma(data, own, model, trust), problem.bounded)
     given = _given_links(problem)
     traces, holdout, outlying = predicted(regression, theta, given)
-    notes = [_LOOSENED.format(last.slack * trust, trust)] if last.slack > 1 else []
+    loosened = _LOOSENED_EVERYWHERE if last.everywhere else _LOOSENED
+    notes = [loosened.format(last.slack * trust, trust)] if last.slack > 1 else []
     notes += [f"{last.fit.failure}: do not trust these values"] if last.fit.failure else []
     rows = [np.asarray(t.after) - t.measured for t in traces if t.role == "fit" and t.measured is not None]
     weighted = np.concatenate([(row * np.sqrt(problem.weight)).reshape(-1) for row in rows])
@@ -358,9 +371,9 @@ def _least(terms: Sequence[Effect]) -> Float[np.ndarray, " drives"]:
     return np.array(out)
 
 
-def _fitted(problem: _Problem, folds: Sequence[int] | None, slack: float) -> Solved:
-    """All columns fitted to the rows of `folds` (None: all), the nominal believed `slack` times less."""
-    root = np.sqrt(problem.inflation) * problem.root_at(slack)
+def _fitted(problem: _Problem, folds: Sequence[int] | None, slack: float, everywhere: bool = False) -> Solved:
+    """All columns fitted to the rows of `folds` (None: all), the nominal believed `slack` times less (`root_at`)."""
+    root = np.sqrt(problem.inflation) * problem.root_at(slack, everywhere)
     rows = np.column_stack([root, root @ problem.mean])
     own = problem.data.factor(problem.weight, folds)
     factor = np.asarray(np.linalg.qr(np.concatenate([own, rows]), mode="r"))
@@ -392,21 +405,35 @@ class _Best(NamedTuple):
     """The fit to all rows with the trust that predicts best, and its quality on blocks that were left out."""
 
     slack: float  # how much less than stated the nominal is believed
+    everywhere: bool  # also where no torque shows it
     validated: Quality
     fit: Solved
 
 
 def _best(problem: _Problem) -> _Best:
+    """What cross-validation chooses; what no torque shows is let go only where that predicts clearly better."""
+    tried = {slack: _left_out(problem, slack) for slack in TRUSTS}
+    cost = {slack: float(squares @ problem.weight) for slack, squares in tried.items()}
+    slack = TRUSTS[0]
+    for other in TRUSTS[1:]:
+        slack = other if cost[other] < cost[slack] * (1 - 1e-3) else slack
+    squares, everywhere = tried[slack], False
+    if slack > 1:
+        for other in TRUSTS[2:]:
+            free = _left_out(problem, other, everywhere=True)
+            if float(free @ problem.weight) > (1 - CLEARLY) * float(squares @ problem.weight):
+                break
+            slack, squares, everywhere = other, free, True
+    fit = _fitted(problem, None, slack, everywhere)
+    return _Best(slack, everywhere, quality(problem.data, squares), fit)
+
+
+def _left_out(problem: _Problem, slack: float, everywhere: bool = False) -> Float[np.ndarray, " nv"]:
+    """Squares of each joint in blocks that were left out of the fit in turn."""
     folds = [k for k in range(len(problem.data.factors)) if problem.data.count[k].any()]
-    best: tuple[float, float, np.ndarray] | None = None
-    for slack in TRUSTS:
-        squares = np.zeros(len(problem.weight))
-        for fold in folds:
-            others = [k for k in folds if k != fold]
-            theta = _fitted(problem, others, slack).theta if others else problem.mean
-            squares += problem.data.squares(theta, [fold])
-        cost = float(squares @ problem.weight)
-        if best is None or cost < best[0] * (1 - 1e-3):
-            best = cost, slack, squares
-    assert best is not None
-    return _Best(best[1], quality(problem.data, best[2]), _fitted(problem, None, best[1]))
+    squares = np.zeros(len(problem.weight))
+    for fold in folds:
+        others = [k for k in folds if k != fold]
+        theta = _fitted(problem, others, slack, everywhere).theta if others else problem.mean
+        squares += problem.data.squares(theta, [fold])
+    return squares
