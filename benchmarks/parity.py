@@ -211,7 +211,8 @@ def unpack(file: Path, folder: Path) -> None:
             kept = dict(arrays)
         if any(kept[key].dtype == np.uint8 for key in GRID if key in kept):
             for key, differences in DIFFERENCES.items():
-                folded = sum(one.astype(np.int64) << shift for one, shift in zip(kept[key], BYTES, strict=True)).T
+                planes = [one.astype(np.int64) << shift for one, shift in zip(kept[key], BYTES, strict=True)]
+                folded = np.sum(planes, axis=0).T
                 whole = np.where(folded % 2, -(folded + 1) // 2, folded // 2)
                 for _ in range(differences):
                     whole = np.cumsum(whole, axis=0)
