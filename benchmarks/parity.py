@@ -1,6 +1,7 @@
 """Answers of two versions of the package side by side: verdicts, causes, parameters, held-out errors.
 
-    python benchmarks/parity.py make --cases DIR [--seeds 31 32]                    # needs Pinocchio and the recordings
+    python benchmarks/parity.py make --cases DIR [--seeds 31 32]               # needs Pinocchio and the recordings
+    python benchmarks/parity.py pack --cases DIR --out FILE.tar.xz             # to travel; unpack: back
     python benchmarks/parity.py run --cases DIR --out OUT --jobs 60 before=/path/a now=/path/b
     python benchmarks/parity.py table --cases DIR --out OUT
 
@@ -13,6 +14,7 @@ stopped. `table` prints what differs, and of what is hidden who finds it.
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import multiprocessing
 import os
@@ -20,6 +22,7 @@ import resource
 import shutil
 import subprocess
 import sys
+import tarfile
 import tempfile
 import time
 from collections.abc import Iterator
@@ -33,6 +36,9 @@ ROOT = Path(__file__).resolve().parents[1]
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 ONE_THREAD |= {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"}
 CLOSE = 1e-6  # relative, of parameters that are the same
+GRID = {"q": 2.0**19, "tau": 2.0**9}  # steps to a radian and to a N m, a tenth of the made sensors' noise
+BYTES = (0, 8, 16, 24)
+DIFFERENCES = {"q": 3, "tau": 1}  # that leave the smallest numbers
 
 
 def make(folder: Path, seeds: list[int]) -> None:
@@ -132,11 +138,63 @@ def _one_hidden(folder: Path, robot: str, seed: int, effect: str) -> list[dict[s
 
 
 def _smaller(folder: Path) -> None:
-    """Recordings in single precision, for both versions alike."""
+    """Recordings rounded to a tenth of their noise and in single precision, for both versions alike."""
     for file in folder.glob("*.npz"):
         with np.load(file) as arrays:
-            kept = {key: x if key == "t" else x.astype(np.float32) for key, x in arrays.items()}
+            kept = {key: x if key == "t" else _rounded(key, x) / GRID[key] for key, x in arrays.items()}
+        kept = {key: x if key == "t" else x.astype(np.float32) for key, x in kept.items()}
         np.savez_compressed(file, **kept)  # pyright: ignore[reportArgumentType]
+
+
+def _rounded(key: str, values: np.ndarray) -> np.ndarray:
+    return np.round(values.astype(float) * GRID[key]).astype(np.int64)
+
+
+def pack(folder: Path, file: Path) -> None:
+    """All cases in one archive: what is hidden as differences of whole numbers, a byte of each after the other."""
+    hidden = {Path(c["task"]).parent for c in json.loads((folder / "cases.json").read_text()) if "truth" in c}
+    with tarfile.open(file, "w:xz", preset=9) as archive:
+        for one in sorted(x for x in folder.rglob("*") if x.is_file()):
+            name = one.relative_to(folder)
+            content = _packed(one) if one.suffix == ".npz" and name.parent in hidden else one.read_bytes()
+            entry = tarfile.TarInfo(str(name))
+            entry.size = len(content)
+            archive.addfile(entry, io.BytesIO(content))
+    print(f"{file.stat().st_size / 1e6:.1f} MB")
+
+
+def _packed(file: Path) -> bytes:
+    kept = {}
+    with np.load(file) as arrays:
+        for key, x in arrays.items():
+            if key in GRID:
+                whole = _rounded(key, x)
+                for _ in range(DIFFERENCES[key]):
+                    whole = np.diff(whole, axis=0, prepend=0)
+                folded = np.abs(2 * whole) - (whole < 0)  # signs in the last bit
+                kept[key] = np.stack([(folded.T >> shift) & 255 for shift in BYTES]).astype(np.uint8)
+            else:
+                kept[key] = x
+    out = io.BytesIO()
+    np.savez(out, **kept)
+    return out.getvalue()
+
+
+def unpack(file: Path, folder: Path) -> None:
+    """The cases of such an archive, as `make` wrote them."""
+    with tarfile.open(file, "r:xz") as archive:
+        archive.extractall(folder, filter="data")
+    for one in folder.rglob("*.npz"):
+        with np.load(one) as arrays:
+            kept = dict(arrays)
+        if any(kept[key].dtype == np.uint8 for key in GRID if key in kept):
+            for key, differences in DIFFERENCES.items():
+                folded = sum(one.astype(np.int64) << shift for one, shift in zip(kept[key], BYTES, strict=True)).T
+                whole = np.where(folded % 2, -(folded + 1) // 2, folded // 2)
+                for _ in range(differences):
+                    whole = np.cumsum(whole, axis=0)
+                kept[key] = (whole / GRID[key]).astype(np.float32)
+            np.savez_compressed(one, **kept)
 
 
 def run(folder: Path, out: Path, sides: dict[str, Path], jobs: int, only: list[str]) -> None:
@@ -269,7 +327,7 @@ def _sizes(answer: dict[str, Any]) -> dict[str, tuple[float, float]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("step", choices=["make", "run", "table"])
+    parser.add_argument("step", choices=["make", "pack", "unpack", "run", "table"])
     parser.add_argument("sides", nargs="*", metavar="NAME=FOLDER")
     parser.add_argument("--cases", type=Path, required=True)
     parser.add_argument("--out", type=Path)
@@ -279,6 +337,8 @@ def main() -> None:
     args = parser.parse_intermixed_args()  # versions may stand behind options
     if args.step == "make":
         make(args.cases, args.seeds)
+    elif args.step in ("pack", "unpack"):
+        pack(args.cases, args.out) if args.step == "pack" else unpack(args.out, args.cases)
     elif args.step == "run":
         sides = {name: Path(folder).resolve() for name, folder in (one.split("=", 1) for one in args.sides)}
         run(args.cases, args.out.resolve(), sides, args.jobs, args.only)

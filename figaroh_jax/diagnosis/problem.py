@@ -262,6 +262,7 @@ class Problem:
 
 
 def family_of(effect: type[Effect]) -> str:
+    """How an effect is screened: `link`, `sensor`, `following` (the torque), `shaped` (a grid) or `fixed` columns."""
     if effect.inertial:
         return "link"
     if kind(effect) != "columns" or not (effect.has("torque") or effect.has("torque_error")):

@@ -45,9 +45,11 @@ class ViscousFriction(JointEffect):
     damping: Scalar = amplitude("N m s/rad")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """damping v, N m or N, positive where the joint moves forwards."""
         return self.damping * self.here(motion.velocity)
 
     def native(self) -> tuple[Native, ...]:
+        """`damping` of the joint, in MJCF and URDF."""
         return (Native("joint", "damping", float(self.damping)),)
 
 
@@ -62,9 +64,11 @@ class CoulombFriction(JointEffect):
     force: Scalar = amplitude("N m")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """force s(v), N m or N; s is the smooth sign of `Motion.direction`."""
         return self.force * self.here(motion.direction)
 
     def native(self) -> tuple[Native, ...]:
+        """`frictionloss` of the joint in MJCF, `friction` in URDF."""
         return (Native("joint", "frictionloss", float(self.force)),)
 
 
@@ -79,6 +83,7 @@ class AsymmetricCoulombFriction(JointEffect):
     difference: Scalar = amplitude("N m")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """difference |s(v)|, N m or N: half the difference of the two levels, added in both directions."""
         return self.difference * jnp.abs(self.here(motion.direction))
 
 
@@ -92,6 +97,7 @@ class AsymmetricViscousFriction(JointEffect):
     difference: Scalar = amplitude("N m s/rad")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """difference |v|, N m or N: half the difference of the two slopes, added in both directions."""
         return self.difference * jnp.abs(self.here(motion.velocity))
 
 
@@ -107,6 +113,7 @@ class StribeckFriction(JointEffect):
     speed: Scalar = shape("rad/s", (0.03, 0.06, 0.1, 0.15, 0.25, 0.4), (0.012, 0.64))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """force exp(-(v / speed)^2) s(v), N m or N: what breakaway adds to the Coulomb level."""
         weight = jnp.exp(-((self.here(motion.velocity) / self.speed) ** 2))
         return self.force * weight * self.here(motion.direction)
 
@@ -123,10 +130,12 @@ class PowerLawFriction(JointEffect):
     exponent: Scalar = shape("", (0.4, 0.6, 1.5, 2.0, 2.5, 3.0), (0.24, 4.0), hole=(0.85, 1.15))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """strength |v|^exponent s(v), N m or N; |v| is kept above 1e-6 rad/s so that gradients at rest stay finite."""
         speed = jnp.sqrt(self.here(motion.velocity) ** 2 + 1e-12)
         return self.strength * speed**self.exponent * self.here(motion.direction)
 
     def native(self) -> tuple[Native, ...]:
+        """`damping2` or `damping3` of the joint where the exponent is 2 or 3; other exponents have no element."""
         attribute = {2.0: "damping2", 3.0: "damping3"}.get(float(self.exponent))
         return (Native("joint", attribute, float(self.strength)),) if attribute else ()
 
@@ -142,6 +151,7 @@ class LoadDependentFriction(JointEffect):
     ratio: Scalar = amplitude("")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """ratio |tau_load| s(v), N m or N; tau_load is the torque of the rigid body at this joint."""
         return self.ratio * jnp.abs(self.here(motion.load)) * self.here(motion.direction)
 
 
@@ -156,6 +166,7 @@ class PositionDependentFriction(JointEffect):
     sine: Scalar = amplitude("N m")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """s(v) (cosine cos q + sine sin q), N m or N; q in rad."""
         q = self.here(motion.angle)
         return self.here(motion.direction) * (self.cosine * jnp.cos(q) + self.sine * jnp.sin(q))
 
@@ -173,6 +184,7 @@ class FrictionDrift(JointEffect):
     time: Scalar = shape("s", (3.0, 8.0, 20.0, 60.0), (1.0, 600.0))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """(force s(v) + damping v) exp(-t / time), N m or N; t counts from the beginning of the record, s."""
         level = self.force * self.here(motion.direction) + self.damping * self.here(motion.velocity)
         return level * jnp.exp(-motion.elapsed / self.time)
 
@@ -185,6 +197,7 @@ class Bristle(JointEffect):
     memory: Any = eqx.field(default=None, kw_only=True)  # the state, where it is known (`step`)
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """force (z - s(v)), N m or N: the bristle's friction beyond the Coulomb friction that it comes with."""
         return self.force * (self.bent(motion) - self.here(motion.direction))
 
     def level(self, velocity: Float[Array, "*samples"]) -> Float[Array, "*samples"]:
@@ -206,6 +219,7 @@ class Bristle(JointEffect):
         return jax.lax.scan(follow, jnp.zeros_like(end[0]), (end, stays), unroll=8)[1]
 
     def step(self, velocity: Float[Array, " nv"], dt: Float[Array, ""]) -> Bristle:
+        """The bristle `dt` seconds later at the velocity (nv,), by the exact solution for its deflection z."""
         end, stays = self._turn(velocity[self.at[0]], dt)
         return dataclasses.replace(self, memory=end + (self.memory - end) * stays)
 
@@ -225,11 +239,13 @@ class Presliding(Bristle):
     separated_by = "reversals of {at} at several accelerations: presliding is late in position, a delay in time"
 
     def physical(self) -> dict[str, Scalar]:
+        """Level (N m), distance of the build-up (rad) and their ratio, the stiffness at a reversal (N m/rad)."""
         force, distance = self.force, self.distance
         return {"force": force, "distance": distance, "stiffness": force / distance}
 
     @classmethod
     def units(cls) -> dict[str, str]:
+        """Those of `physical`."""
         return {"force": "N m", "distance": "rad", "stiffness": "N m/rad"}
 
 
@@ -245,6 +261,7 @@ class LuGreFriction(Bristle):
     speed: Scalar = shape("rad/s", (0.05, 0.2), (0.012, 0.64))
 
     def level(self, velocity: Float[Array, "*samples"]) -> Float[Array, "*samples"]:
+        """g(v) = 1 + rise exp(-(v / speed)^2), in units of the level at high speed."""
         return 1 + self.rise * jnp.exp(-((velocity / self.speed) ** 2))
 
 
@@ -262,6 +279,7 @@ class DirectionalLoadFriction(JointEffect):
     driven: Scalar = amplitude("")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """|tau_load| s(v) times `driving` where the drive lifts its load (tau_load v > 0), else `driven`, N m or N."""
         load, way = self.here(motion.load), self.here(motion.direction)
         lifts = (1 + jnp.sign(load) * way) / 2
         return jnp.abs(load) * way * (self.driving * lifts + self.driven * (1 - lifts))
@@ -280,5 +298,6 @@ class LoadDependentStribeckFriction(JointEffect):
     speed: Scalar = shape("rad/s", (0.03, 0.06, 0.1, 0.15, 0.25, 0.4), (0.012, 0.64))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """ratio |tau_load| exp(-(v / speed)^2) s(v), N m or N."""
         weight = jnp.exp(-((self.here(motion.velocity) / self.speed) ** 2))
         return self.ratio * jnp.abs(self.here(motion.load)) * weight * self.here(motion.direction)

@@ -234,6 +234,7 @@ class JointOffset(JointEffect):
     offset: Scalar = amplitude("rad")
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        """The offset at every posture, rad: reading minus truth."""
         return self.offset * np.ones(len(motion.time))
 
 
@@ -259,6 +260,7 @@ class GearTransmissionError(JointEffect):
     order: Scalar = shape("", _ORDERS)
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        """sine sin(N q) + cosine cos(N q), rad: reading minus truth."""
         angle = self.order * self.here(motion.angle)
         return self.sine * _library(angle).sin(angle) + self.cosine * _library(angle).cos(angle)
 
@@ -273,6 +275,7 @@ class JointCompliance(JointEffect):
     compliance: Scalar = amplitude("rad/(N m)")
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        """compliance times the torque of gravity at the joint (N m), rad: reading minus truth."""
         return self.compliance * self.here(motion.load)
 
 
@@ -312,6 +315,7 @@ class PayloadDeflection(JointEffect):
     compliance: Scalar = amplitude("rad/(N m)")
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        """compliance times the torque of the load that is carried (N m), rad: reading minus truth."""
         return self.compliance * self.here(motion.payload)
 
 
@@ -326,6 +330,7 @@ class Settling(Effect):
     amount: Scalar = amplitude("")
 
     def position_error(self, motion: Any) -> Float[Leaf, "samples nj"]:
+        """A share of the way from the posture before, in all joints (samples, joints), rad: reading minus truth."""
         return self.amount * motion.way
 
 
@@ -340,6 +345,7 @@ class ReversalHysteresis(JointEffect):
     width: Scalar = amplitude("rad")
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        """-width times the side from which the joint came, rad: reading minus truth; zero where it did not move."""
         way = self.here(motion.way)
         return -self.width * _library(way).sign(way)
 
@@ -354,6 +360,7 @@ class JointCoupling(Effect):
     ratio: Scalar = amplitude("")
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        """ratio times the angle of the first joint of the pair, read at the second, rad."""
         return self.ratio * self.here(motion.angle)
 
 

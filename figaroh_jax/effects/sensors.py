@@ -36,9 +36,11 @@ class TorqueOffset(JointEffect):
     offset: Scalar = amplitude("N m")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """The offset at every sample, N m or N."""
         return self.offset * jnp.ones_like(motion.time)
 
     def native(self) -> tuple[Native, ...]:
+        """`bias` of the joint's actuator."""
         return (Native("actuator", "bias", float(self.offset)),)
 
 
@@ -53,6 +55,7 @@ class TorqueGain(JointEffect):
     gain: Scalar = amplitude("")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """gain times the torque of the whole model, N m or N: what the sensor reads too much."""
         return self.gain * self.here(motion.total)
 
 
@@ -68,6 +71,7 @@ class TorqueDelay(Effect):
     delay: Scalar = shape("s", (0.001, 0.003, 0.006, 0.012, 0.025), (0.0, 0.06))
 
     def torque_response(self, omega: Float[Array, " freqs"]) -> Complex[Array, " freqs"]:
+        """exp(-i omega delay): the torque sensor reads what was true `delay` seconds before."""
         return jnp.exp(-1j * omega * self.delay)
 
 
@@ -82,6 +86,7 @@ class TorqueLag(Effect):
     time: Scalar = shape("s", (0.001, 0.003, 0.006, 0.012, 0.025), (0.0002, 0.06))
 
     def torque_response(self, omega: Float[Array, " freqs"]) -> Complex[Array, " freqs"]:
+        """1 / (1 + i omega time): a low pass of first order."""
         return 1 / (1 + 1j * omega * self.time)
 
 
@@ -97,22 +102,27 @@ class TorqueSaturation(JointEffect):
     limit: Scalar = shape("N m", (1.0, 3.0, 10.0, 30.0, 100.0, 300.0), (0.0, 1e5))
 
     def torque_error(self, motion: Motion) -> Float[Array, " samples"]:
+        """share (clip(tau, -limit, limit) - tau), N m or N, of the torque of the whole model."""
         total = self.here(motion.total)
         return self.share * (jnp.clip(total, -self.limit, self.limit) - total)
 
     def delivered(self, torque: Float[Array, " nv"]) -> Float[Array, " nv"]:
+        """The torques (nv,) with this joint's cut at its limit, N m or N."""
         own = torque[self.at[0]]
         return torque.at[self.at[0]].add(self.share * (jnp.clip(own, -self.limit, self.limit) - own))
 
     def physical(self) -> dict[str, Scalar]:
+        """The limit alone: the share is 1 where a drive is saturated."""
         return {"limit": self.limit}
 
     @classmethod
     def units(cls) -> dict[str, str]:
+        """N m; N of a prismatic joint."""
         return {"limit": "N m"}
 
     @classmethod
     def starts(cls, motion: Motion, place: int) -> dict[str, tuple[float, ...]]:
+        """Limits at which the search begins: high quantiles of the torque as measured, N m or N."""
         size = np.abs(np.asarray(motion.total)[:, place])
         return {"limit": tuple(np.unique(np.quantile(size, (0.7, 0.8, 0.88, 0.94, 0.97, 0.99))).tolist())}
 
@@ -129,6 +139,7 @@ class ClockError(Effect):
     rate: Scalar = amplitude("s/s", lower=-0.02, upper=0.02)
 
     def torque_error(self, motion: Motion) -> Float[Array, "samples nv"]:
+        """rate t d(tau)/dt (samples, nv), N m or N: a lag that grows with the time t since the record began."""
         return self.rate * motion.elapsed[:, None] * motion.rate(motion.total)
 
 
@@ -143,6 +154,7 @@ class EncoderOffset(JointEffect):
     offset: Scalar = amplitude("rad", lower=-0.2, upper=0.2)
 
     def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
+        """The offset at every sample, rad or m."""
         return self.offset * jnp.ones_like(motion.time)
 
 
@@ -158,6 +170,7 @@ class EncoderScale(JointEffect):
     scale: Scalar = amplitude("", lower=-0.2, upper=0.2)
 
     def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
+        """scale q, rad or m."""
         return self.scale * self.here(motion.angle)
 
 
@@ -174,6 +187,7 @@ class EncoderEccentricity(JointEffect):
     cosine: Scalar = amplitude("rad", lower=-0.05, upper=0.05)
 
     def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
+        """sine sin q + cosine cos q, rad."""
         q = self.here(motion.angle)
         space = np if isinstance(q, np.ndarray) else jnp
         return self.sine * space.sin(q) + self.cosine * space.cos(q)

@@ -10,7 +10,7 @@ and others, 2015), and all columns of the joint are Z R B with the matrix B of i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -97,10 +97,11 @@ def condense_on_devices(
     """`condense(states, states.used)`, the samples of every piece spread over `devices` (default: all of this host).
 
     Each device forms the rows of its own samples, `chunk` at a time, and sums their products; the sums of the devices
-    are added. Pieces of one length share a program; the source is read while the devices work. A single CPU takes
-    machine code for the rows of long pieces, where there is some. A direction in which the rows are less than 3e-7 of
-    the strongest one's is taken as not shown. Folds are whole chunks in turn. Raises `InputError` where a piece has a
-    wrong shape or holds a number that is not finite. An accelerator is busy with pieces of 1e5 samples and more.
+    are added at the end, on the host. Pieces of one length share a program; the source is read while the devices work.
+    A single CPU takes machine code for the rows of long pieces, where there is some. A direction in which the rows are
+    less than 3e-7 of the strongest one's is taken as not shown. Folds are whole chunks in turn. Raises `InputError`
+    where a piece has a wrong shape or holds a number that is not finite. An accelerator is busy with pieces of 1e5
+    samples and more.
 
     Where `jax.distributed` runs, each process takes the pieces that its own source gives, however many, on the devices
     of its host; the sums of all are added once at the end, and every process gets the same answer.
@@ -183,8 +184,9 @@ def _summed(states: States, frames: Sequence[OwnFrame], mesh: Mesh, folds: int, 
     everywhere = NamedSharding(mesh, PartitionSpec())
     width = np.broadcast_to(np.asarray(states.width, float), (nv,))
     fixed = jax.device_put((model, terms, width, [group[1:] for group in groups]), everywhere)
-    zero = (np.zeros((folds, len(g.joints), *2 * g.places.shape[1:])) for g in groups)
-    total = jax.device_put(_Sums(tuple(zero), *np.zeros((2, folds, nv))), everywhere)
+    zero = (np.zeros((mesh.size, folds, len(g.joints), *2 * g.places.shape[1:])) for g in groups)
+    total = _Sums(tuple(zero), *np.zeros((2, mesh.size, folds, nv)))
+    total = jax.device_put(total, NamedSharding(mesh, _SAMPLES))
     numbers = _places(model, terms)[1] + sum(2 * g.places.size for g in groups)
     codes = block_codes(model) if mesh.devices.flat[0].platform == "gpu" else None
     chunks, before = 0, None
@@ -196,7 +198,7 @@ def _summed(states: States, frames: Sequence[OwnFrame], mesh: Mesh, folds: int, 
         chunks += -(-len(part[0]) // chunk)
         jax.block_until_ready(before)  # one piece ahead: no more wait in memory
         before = total.rows
-    sums = jax.device_get(total)
+    sums = jax.tree.map(lambda x: x.sum(0), jax.device_get(total))
     products: list[Any] = [None] * nv
     for group, found in zip(groups, sums.products, strict=True):
         for n, j in enumerate(group.joints):
@@ -234,27 +236,22 @@ def _spread(part: Sequence[Any], chunk: int, mesh: Mesh) -> tuple[Any, ...]:
 
 @lru_cache(maxsize=16)
 def _program(mesh: Mesh, chunk: int, folds: int, codes: bytes | None) -> Callable[..., _Sums]:
-    def local(fixed: Any, part: tuple[Array, ...], before: Array) -> _Sums:
+    """Adds the rows of a piece to the sums, of which each device has its own: they need not speak to each other."""
+
+    def local(total: _Sums, fixed: Any, part: tuple[Array, ...], before: Array) -> _Sums:
         """Sums over this device's share of a piece, which begins after so many chunks."""
         chunks = [x.reshape(-1, chunk, *x.shape[1:]) for x in part]
         first = before + jax.lax.axis_index("samples") * len(chunks[0])
 
         def step(total: _Sums, k: Array) -> tuple[_Sums, None]:
             new, fold = _sums(codes, fixed, *(x[k] for x in chunks)), (first + k) % folds
-            return jax.tree.map(lambda x, y: x.at[fold].add(y), total, new), None
+            return jax.tree.map(lambda x, y: x.at[0, fold].add(y), total, new), None
 
-        shapes = jax.eval_shape(partial(_sums, codes, fixed), *(x[0] for x in chunks))
-        zero = jax.tree.map(lambda x: jnp.zeros((folds, *x.shape), x.dtype), shapes)
-        return jax.lax.psum(jax.lax.scan(step, zero, jnp.arange(len(chunks[0])))[0], "samples")
+        return jax.lax.scan(step, total, jnp.arange(len(chunks[0])))[0]
 
-    specs = {"in_specs": (PartitionSpec(), _SAMPLES, PartitionSpec()), "out_specs": PartitionSpec()}
-    spread = jax.shard_map(local, mesh=mesh, check_vma=False, **specs)
+    specs = {"in_specs": (_SAMPLES, PartitionSpec(), _SAMPLES, PartitionSpec()), "out_specs": _SAMPLES}
     options = CPU_OPTIONS if mesh.devices.flat[0].platform == "cpu" else None
-
-    def program(total: _Sums, fixed: Any, part: tuple[Array, ...], before: Any) -> _Sums:
-        return jax.tree.map(jnp.add, total, spread(fixed, part, before))
-
-    return jax.jit(program, compiler_options=options)
+    return jax.jit(jax.shard_map(local, mesh=mesh, check_vma=False, **specs), compiler_options=options)
 
 
 def _sums(codes: bytes | None, fixed: Any, q: Array, v: Array, a: Array, tau: Array, there: Array) -> _Sums:

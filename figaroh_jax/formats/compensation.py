@@ -24,10 +24,12 @@ class GravityCompensation(Effect):
     fraction: Scalar = amplitude("")
 
     def torque(self, motion: Motion) -> Float[Array, "samples nv"]:
+        """-fraction times the torque of the link's weight (samples, nv), N m or N: what the drives need not give."""
         model, still = motion.model, jnp.zeros_like(motion.velocity)
         own = jnp.zeros_like(jnp.asarray(model.inertia)).at[self.at[0]].set(jnp.asarray(model.inertia)[self.at[0]])
         alone = eqx.tree_at(lambda m: m.inertia, model, own)
         return -self.fraction * inverse_dynamics(alone, motion.position, still, still)
 
     def native(self) -> tuple[Native, ...]:
+        """`gravcomp` of the body."""
         return (Native("body", "gravcomp", float(self.fraction)),)

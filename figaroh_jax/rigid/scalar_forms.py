@@ -258,6 +258,7 @@ def _rows(model: RobotModel, coordinates: bool) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def sorted_rows(joints: tuple[Joint, ...], coordinates: bool) -> np.ndarray:
+    """As `_rows`, of a tree; kept, since kernels ask for it at every call."""
     places = dofs(joints)
     row = places.column if coordinates else np.arange(len(places.column))
     dof, link = np.nonzero(ancestors(joints)[places.joint] > 0)

@@ -257,6 +257,10 @@ def _merged(robot: Robot, i: int, twists: list[Twist], coordinates: bool) -> lis
 
 
 def ten_columns(twist: Twist, motion: Motion, spin: Matrix) -> list[Number]:
+    """Row (10,) of the regressor: power of the ten parameters along a twist, for a body with spin matrix `spin`.
+
+    All in the body's axes; the parameters in Pinocchio's order.
+    """
     lin, ang, (w, al, ac) = twist.linear, twist.angular, motion
     first = add(turned_back(spin, lin), cross(ac, ang))
     g = cross(ang, w)
