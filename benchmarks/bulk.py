@@ -175,7 +175,7 @@ class Pool:
     def called(self, study: Study, case: dict[str, Any], job: blackbox.Job) -> str:
         """One call of the tool."""
         runs, limit = self.args.out / study.name / "runs", self.left()
-        told = blackbox.call(self.folder(study), runs, case, job, blackbox.default_command(), limit)
+        told = blackbox.call_tool(self.folder(study), runs, case, job, blackbox.default_command(), limit)
         if limit < LIMIT and blackbox.read(runs / job.folder) is None:  # the end of the machine is none of the tool's
             (runs / job.folder / "run.json").unlink()
         return told
