@@ -24,7 +24,14 @@ HIDDEN = 1e-6  # share of a number in directions that nothing determines, above 
 
 
 class Fit(eqx.Module):
-    """What a fit found; one of `fit` is a pytree, differentiable through the solution, and a batch under `jax.vmap`."""
+    """What a fit found; one of `fit` is a pytree, differentiable through the solution, and a batch under `jax.vmap`.
+
+    `model` is the model with the fitted numbers in it, `parameters` each of them by name with value, sigma, unit and
+    status; `values` (numbers,) are their changes from the model that was given, `covariance` (numbers, numbers) and
+    `std` what the rows tell of them, `rank` how many directions data and prior determine. `cost` is half of the squares
+    of all rows, `rows` the weighted residual. `result` is `optimistix.RESULTS.successful` or why not, `reason` the
+    same in words.
+    """
 
     model: ExtendedModel  # with the numbers in it
     data: tuple[Data, ...]  # with the devices' frames put in
