@@ -23,7 +23,7 @@ from ..compiled.precision import in_float64
 from ..errors import InputError
 from .kinematics import Motion, ancestors, check_shapes, motion, take
 from .model import Joint, RobotModel, dofs
-from .scalar_forms import BLOCKS, DENSE, PACKED, straight
+from .scalar_forms import BLOCKS, DENSE, PACKED, looped_blocks, straight
 from .spatial import cross, rotate_back
 
 __all__ = [
@@ -219,6 +219,7 @@ def packed_rows(
 
 
 BLOCK_FORM = straight(BLOCKS, coordinate_rows, lambda model: 10 * len(coordinate_blocks(model)[0]))
+BLOCK_FORM = BLOCK_FORM._replace(looped=looped_blocks)
 _DENSE = straight(DENSE, dense_rows, lambda model: 10 * len(pairs(model)))
 _PACKED = straight(PACKED, packed_rows, lambda model: 10 * len(pairs(model)))
 
