@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from ..compiled.batching import aligned, chunk_size, host_blocks, on_host, over_samples, put, to_device, two_axes
 from ..compiled.kernels import known_codes, straight_answers, usable
-from ..compiled.machine_code import machine_code
+from ..compiled.machine_code import machine_code, own_room
 from ..compiled.precision import in_float64
 from ..errors import InputError
 from .kinematics import Motion, ancestors, check_shapes, motion, take
@@ -85,7 +85,7 @@ def joint_torque_regressor(
     if on_host(model, q, v, a):
         rows = two_axes(q, v, a, host=True)
         code = machine_code(_DENSE, model, *rows)
-        whole = code(aligned, *rows) if code else _dense_on_host(model, chunk_size(width), *rows)
+        whole = code(own_room, *rows) if code else _dense_on_host(model, chunk_size(width), *rows)
         return to_device(whole.reshape(*np.shape(q)[:-1], model.nv, 10 * len(model.joints)))
     return over_samples(dense_rows, model, q, v, a, width=width, straight=_DENSE)
 
