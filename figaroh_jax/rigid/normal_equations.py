@@ -220,13 +220,13 @@ def _groups(model: RobotModel, columns: int) -> list[_Group]:
 def _kept_groups(model: RobotModel, kept: Kept | None, beside: int) -> list[_Group]:
     """As kernels of a GPU write them: the kept columns in the order of the regressor, then those beside."""
     blocks, _ = coordinate_blocks(model)
-    ends = np.cumsum([0, *([10] * len(model.joints) if kept is None else map(len, kept))])
+    ends = np.cumsum([0, *([10] * len(model.joints) if kept is None else map(len, kept))]).tolist()
     groups = []
     for which in row_groups(model, kept):
         index = np.stack([np.flatnonzero(blocks[:, 0] == k) for k in which])
         own = [
             np.concatenate([*(np.arange(ends[link], ends[link + 1]) for link in links), ends[-1] + np.arange(beside)])
-            for links in blocks[index, 1]
+            for links in blocks[index, 1].tolist()
         ]
         groups.append(_Group(which, index, np.stack(own)))
     return groups
