@@ -93,6 +93,7 @@ class Contact(PointEffect):
     name, title = "contact", "contact with a horizontal plane"
     equation = "-J_z(q)' stiffness max(0, height - z(q)) at the point (x, y, z) of the link"
     separated_by = "the same motion of {at} farther away from the plane"
+    beside_rest = False  # any rest that is larger in one part of the space looks like a plane somewhere
     stiffness: Scalar = amplitude("N/m", lower=0.0)
     height: Scalar = shape("m", (0.0, 0.2, 0.5, 1.0), (-10.0, 10.0))
     x: Scalar = shape("m", (0.0,), (-0.6, 0.6))
