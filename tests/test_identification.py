@@ -80,6 +80,7 @@ def test_an_identification_is_a_view_of_its_fit(truth: Truth, found: Identificat
     start[: 10 * len(found.links)] = np.asarray(truth.nominal.inertia).reshape(-1)
     np.testing.assert_allclose(fit.values + start, [value for value, _ in each], rtol=0, atol=1e-12)
     np.testing.assert_allclose(fit.std, [std for _, std in each], rtol=1e-12, atol=0)
+    assert [one.value for one in fit.parameters.values()] == pytest.approx([value for value, _ in each], abs=1e-12)
     assert fit.parameters["viscous_friction elbow damping"].unit == "N m s/rad" and not fit.reason
     weighted = fit.rows.reshape(-1, len(found.joints))
     assert np.sqrt(np.mean(weighted**2)) == pytest.approx(1.0, abs=0.2)
