@@ -36,6 +36,21 @@ def test_beside_a_rest_a_fall_that_chance_makes_is_none():
     assert not one.gains(strict=True)
 
 
+def test_a_fall_in_every_block_is_sure_however_unlike_they_are():
+    """Most of it in one block: mean over deviation is 1, and yet it is a chance of 2^-12."""
+    before = squares(np.random.default_rng(1), 4.0)
+    before[0] *= 50
+    one = fall(before, 0.5 * before, [0])
+    assert one.chance == pytest.approx(2.0**-BLOCKS)
+    assert one.gains(strict=True)
+
+
+def test_no_difference_is_sure_as_often_as_the_level_says():
+    rng = np.random.default_rng(4)
+    chances = [fall(*(rng.standard_normal((2, 30, 1)) ** 2 + 1), [0]).chance for _ in range(300)]
+    assert 0.02 < np.mean(np.array(chances) < 0.05) < 0.08
+
+
 def test_a_small_joint_gains_though_chance_moves_a_large_one_by_more():
     rng = np.random.default_rng(2)
     before = squares(rng, 1000.0, 1.0)

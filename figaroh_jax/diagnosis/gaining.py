@@ -11,15 +11,16 @@ from jaxtyping import Float
 
 from ..effects.base import Effect
 from ..results import Gain, Name
-from .comparison import t_value
 from .holdout import held_squares
 from .joint import Joint, polished
 from .problem import Problem
 from .search import Found
 from .state import State
-from .thresholds import CONFIDENT
+from .thresholds import BY_CHANCE
 
 __all__ = ["Fall", "Gaining", "fall", "without_losses"]
+
+EXACT, DRAWS = 12, 4000  # blocks up to which every choice of signs is made; choices beyond
 
 
 class Gaining(NamedTuple):
@@ -37,10 +38,10 @@ class Fall(NamedTuple):
     """What a cause does to the error on data kept out as it comes in."""
 
     own: float  # share of the squares of the joints where it acts that goes
-    sure: float  # Student t of the blocks of these
+    chance: float  # p-value of that: of the blocks' differences with signs at random
     each: float  # sum over the joints of that share
     whole: float  # squares of all joints that go, N m or N, squared
-    t: float  # Student t of the blocks of these
+    worse: float  # p-value of their rise
 
     def gains(self, strict: bool) -> bool:
         """Whether the cause predicts better where it acts, and the robot is not predicted worse for it.
@@ -50,19 +51,34 @@ class Fall(NamedTuple):
         """
         if not strict:
             return self.own > 0 and self.whole > 0
-        return self.own > 0 and self.sure > CONFIDENT and self.each > 0 and self.t > -CONFIDENT
+        return self.own > 0 and self.chance < BY_CHANCE and self.each > 0 and self.worse > BY_CHANCE
 
 
 def fall(before: Float[np.ndarray, "blocks nv"], after: Float[np.ndarray, "blocks nv"], joints: Sequence[int]) -> Fall:
     """What becomes of the squares of each block and joint for a cause that acts at the `joints`."""
-    places, drop, had = list(joints), (before - after).sum(0), np.maximum(before.sum(0), 1e-300)
+    places, less, had = list(joints), before - after, np.maximum(before.sum(0), 1e-300)
+    drop = less.sum(0)
     return Fall(
         own=float(drop[places].sum() / had[places].sum()),
-        sure=t_value(before[:, places].sum(1), after[:, places].sum(1)),
+        chance=_by_chance(less[:, places].sum(1)),
         each=float((drop / had).sum()),
         whole=float(drop.sum()),
-        t=t_value(before.sum(1), after.sum(1)),
+        worse=_by_chance(-less.sum(1)),
     )
+
+
+def _by_chance(gain: Float[np.ndarray, " blocks"]) -> float:
+    """How often the blocks' differences with signs at random sum to as much: exact for few blocks.
+
+    What a cause takes is most where it acts most: a few blocks have nearly all of it, and their mean and deviation say
+    little of whether every block has some.
+    """
+    if len(gain) <= EXACT:
+        signs = 1.0 - 2.0 * ((np.arange(2 ** len(gain))[:, None] >> np.arange(len(gain))) & 1)
+    else:
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (DRAWS, len(gain)))
+        signs[0] = 1.0
+    return float(np.mean(signs @ gain >= gain.sum() - 1e-12 * np.abs(gain).sum()))
 
 
 def without_losses(
@@ -82,7 +98,7 @@ def without_losses(
     while True:
         order, squares, power = _by_gain(problem, start, whitening, joint.causes, [f.name in later for f in named])
         falls = [fall(a, b, named[k].joints) for k, (a, b) in zip(order, pairwise(squares), strict=True)]
-        failing = [(one.sure, k) for k, one in zip(order, falls, strict=True) if not one.gains(strict)]
+        failing = [(one.own, k) for k, one in zip(order, falls, strict=True) if not one.gains(strict)]
         if not failing:
             gains = [_told(a, b, power, named[k], problem) for k, (a, b) in zip(order, pairwise(squares), strict=True)]
             return Gaining(named, joint, order, gains, _relative(squares[0], squares[-1], power), worse)
