@@ -221,7 +221,7 @@ def test_command_writes_a_whole_run(run: Path, capsys: pytest.CaptureFixture[str
     assert answer["base_parameters"][0]["expression"] in page and "cross-validated" in page
     assert "essential" in page and "free links" in page and "<code>predictions.npz</code>" in page
     told = [e for e in answer["effects"] if e["effect"] == "viscous_friction"]
-    assert all(f'<th scope="row">{e["at"][0]}</th>' in page for e in told) and "rows a joint at" in page
+    assert all(f'<th scope="row">{e["at"][0]}</th>' in page for e in told) and "rows per joint at" in page
 
 
 def test_predictions_stand_on_the_recordings_own_stamps(run: Path):
@@ -259,7 +259,7 @@ def test_what_was_dropped_is_said(truth: Truth):
     torque = one.torque.copy()
     torque[2000:2040, 0] += 500.0
     found = identify(truth.nominal, [replace(one, torque=torque)], Preprocess(cutoff=10, gate={"elbow": 0.05}))
-    assert any("rows a joint at" in note and "elbow" in note for note in found.notes)
+    assert any("rows per joint at" in note and "elbow" in note for note in found.notes)
     spike = next(note for note in found.notes if "robust standard deviations" in note and "shoulder" in note)
     assert float(spike.split()[-2]) == pytest.approx(one.time[2020], abs=0.3)
 

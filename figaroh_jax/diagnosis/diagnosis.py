@@ -253,7 +253,7 @@ def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], to
     gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict)
     gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
-    against |= dict.fromkeys(gaining.worse, "the error on the data held out does not fall with it")
+    against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
@@ -379,8 +379,8 @@ def _baseline_effects(model: RobotModel, known: Baseline | None) -> tuple[list[s
 
 
 _AT_REST = (
-    "at rest the torque differs from the model, as dry friction lets it: there it takes any value up to its limit, and"
-    " no law of the velocity predicts which; where the joints move, nothing is left beyond the tolerance"
+    "at rest the torque differs from the model, as dry friction allows: there it can take any value up to its limit,"
+    " which no law of velocity predicts; where the joints move, the residual is within the tolerance"
 )
 
 
@@ -393,10 +393,13 @@ def _scheme(signals: Sequence[Signals]) -> str:
 def _notes(signals: Sequence[Signals], here: _Setting) -> tuple[str, ...]:
     notes = [note for s in signals for note in s.notes]
     if not here.problem.layout.repeats:
-        notes.append("no recording repeats another: the noise is what a rich model leaves, less sure than repeats")
+        notes.append(
+            "no recording repeats another: the noise is estimated from the residual of a flexible model, which is less"
+            " certain than from repeats"
+        )
     if here.white:
         notes.append(
-            "the model errs by more than the noise: rows are weighted by what it leaves of each joint, which predicts"
-            " data that was not fitted better than weights by the spectrum of the noise"
+            "the model's error exceeds the noise: rows are weighted by each joint's residual, which predicts held-out"
+            " data better than weights from the noise spectrum"
         )
     return tuple(notes)
