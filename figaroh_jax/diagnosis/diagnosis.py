@@ -258,12 +258,25 @@ def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], to
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
     shown = left.there or (bool(nearest) and float(relative.max()) > tolerance)
-    sticks = shown and only_sticks(problem, joint.step.state, noise, relative, tolerance)
+    sticks = shown and _sticks([here, searched.here], [f.effect for f in named], joint, tolerance)
     rest = shown and not sticks
     text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
     parts = parts_of(problem, joint.step, whitening, line, names)
     nearest = tuple(sorted(nearest, key=lambda one: -one.share))
     return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text), sticks, here)
+
+
+def _sticks(settings: Sequence[_Setting], causes: list[Effect], joint: Joint, tolerance: float) -> bool:
+    """Whether what is left beside the named causes is that of joints at rest (the answer's fit, or by speed).
+
+    A fit that is also asked for slow rows gives part of their sticks to the friction of the joints that move.
+    """
+    for k, here in enumerate(settings):
+        fitted = polished(here.problem, here.start, causes, here.whitening) if k else joint
+        state, noise = fitted.step.state, noise_rms(here.problem, here.spectrum)
+        if only_sticks(here.problem, state, noise, relative_rest(here.problem, state, noise), tolerance):
+            return True
+    return False
 
 
 def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple[_Setting, Joint]:
