@@ -19,7 +19,7 @@ __all__ = ["Contact", "ExternalWrench", "GravityTilt", "PointEffect"]
 class GravityTilt(Effect):
     """A base that is not level: gravity in the base frame has a horizontal part."""
 
-    name, title, acts_on = "gravity_tilt", "tilt of the base", "robot"
+    name, title, acts_on = "gravity_tilt", "base tilt", "robot"
     equation = "tau(gravity + (x, y, 0)) - tau(gravity)"
     separated_by = "a full turn of the first joint with the arm stretched, or a level on the base"
     x: Scalar = amplitude("m/s2")
@@ -64,7 +64,7 @@ class PointEffect(Effect):
 class ExternalWrench(PointEffect):
     """A constant force on the last link: a cable, a hose, somebody who pulls."""
 
-    name, title = "external_wrench", "a constant force from outside"
+    name, title = "external_wrench", "constant external force"
     equation = "-J(q)' (force_x, force_y, force_z) at the point (x, y, z) of the link"
     separated_by = "the same motion with {at} free, or with the base turned"
     resembles = ("gravity_tilt", "payload")  # six numbers that follow any constant load of a few postures
@@ -93,6 +93,7 @@ class Contact(PointEffect):
     name, title = "contact", "contact with a horizontal plane"
     equation = "-J_z(q)' stiffness max(0, height - z(q)) at the point (x, y, z) of the link"
     separated_by = "the same motion of {at} farther away from the plane"
+    beside_rest = False  # any rest that is larger in one part of the space looks like a plane somewhere
     stiffness: Scalar = amplitude("N/m", lower=0.0)
     height: Scalar = shape("m", (0.0, 0.2, 0.5, 1.0), (-10.0, 10.0))
     x: Scalar = shape("m", (0.0,), (-0.6, 0.6))

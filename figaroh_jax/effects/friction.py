@@ -76,7 +76,7 @@ class CoulombFriction(JointEffect):
 class AsymmetricCoulombFriction(JointEffect):
     """Dry friction of another level in each direction; the part that differs."""
 
-    name, title = "asymmetric_coulomb_friction", "Coulomb friction that differs by direction"
+    name, title = "asymmetric_coulomb_friction", "direction-dependent Coulomb friction"
     indistinguishable_from = ("torque_offset",)
     equation = "difference |s(v)|"
     separated_by = "a dwell of {at} with the brake on, beside motion in both directions"
@@ -91,7 +91,7 @@ class AsymmetricCoulombFriction(JointEffect):
 class AsymmetricViscousFriction(JointEffect):
     """Viscous friction of another slope in each direction; the part that differs."""
 
-    name, title = "asymmetric_viscous_friction", "viscous friction that differs by direction"
+    name, title = "asymmetric_viscous_friction", "direction-dependent viscous friction"
     equation = "difference |v|"
     separated_by = "sweeps of {at} in both directions over its whole range of speed"
     difference: Scalar = amplitude("N m s/rad")
@@ -122,7 +122,7 @@ class StribeckFriction(JointEffect):
 class PowerLawFriction(JointEffect):
     """Friction that grows with a power of the speed (lubricant, temperature)."""
 
-    name, title = "power_law_friction", "friction with a power of the speed"
+    name, title = "power_law_friction", "power-law friction"
     speed_law = True
     equation = "strength |v|^exponent s(v)"
     separated_by = "constant-speed sweeps of {at} from 0.05 rad/s to its maximum speed"
@@ -144,7 +144,7 @@ class PowerLawFriction(JointEffect):
 class LoadDependentFriction(JointEffect):
     """Friction of the gears that grows with the torque they transmit."""
 
-    name, title = "load_dependent_friction", "friction that grows with the load"
+    name, title = "load_dependent_friction", "load-dependent friction"
     follows_torque = dissipative = True
     equation = "ratio |tau_load| s(v)"
     separated_by = "the same motion of {at} with and without a payload"
@@ -159,7 +159,7 @@ class LoadDependentFriction(JointEffect):
 class PositionDependentFriction(JointEffect):
     """Dry friction that changes over a turn (a bent shaft, a seal, a worn gear)."""
 
-    name, title = "position_dependent_friction", "friction that changes with the position"
+    name, title = "position_dependent_friction", "position-dependent friction"
     equation = "s(v) (cosine cos q + sine sin q)"
     separated_by = "the same motion of {at} in other postures of the other joints"
     cosine: Scalar = amplitude("N m")
@@ -175,7 +175,7 @@ class PositionDependentFriction(JointEffect):
 class FrictionDrift(JointEffect):
     """Friction above its later level that falls off as the joint warms up."""
 
-    name, title = "friction_drift", "friction that drifts with the warmth"
+    name, title = "friction_drift", "friction that falls as the joint warms up"
     beside_rest = False  # a rest that changes in the course of a recording looks like it
     equation = "(force s(v) + damping v) exp(-t/time)"
     separated_by = "the same motion of {at} at the start and again after the robot has warmed up"
@@ -233,7 +233,7 @@ class Bristle(JointEffect):
 class Presliding(Bristle):
     """Dry friction that builds up over a small distance after each reversal (Dahl 1968, exponent 1)."""
 
-    name, title = "presliding", "presliding: friction that lags behind the reversal"
+    name, title = "presliding", "presliding friction"
     beside_rest = False  # most of any rest stands at reversals, where it acts
     equation = "force (z - s(v)), z' = v/distance (1 - z s(v))"
     separated_by = "reversals of {at} at several accelerations: presliding is late in position, a delay in time"
@@ -253,7 +253,7 @@ class Presliding(Bristle):
 class LuGreFriction(Bristle):
     """Dry friction of a bristle whose level falls with the speed (Canudas de Wit et al. 1995), without its damping."""
 
-    name, title = "lugre_friction", "friction of a bristle (LuGre)"
+    name, title = "lugre_friction", "LuGre bristle friction"
     equation = "force (z - s(v)), z' = v/distance (1 - z s(v)/g), g = 1 + rise exp(-(v/speed)^2)"
     separated_by = "slow reversals of {at}, and constant speeds below 0.3 rad/s"
     searched = False  # presliding and Stribeck friction together, which a diagnosis finds one after the other
@@ -269,7 +269,7 @@ class LuGreFriction(Bristle):
 class DirectionalLoadFriction(JointEffect):
     """Friction in proportion to the load, of another share where the drive lifts it and where it is driven by it."""
 
-    name, title = "directional_load_friction", "friction that grows with the load, by the direction of the power"
+    name, title = "directional_load_friction", "load-dependent friction, driving and driven"
     follows_torque = dissipative = True
     contains = ("load_dependent_friction",)
     equation = "|tau_load| s(v) (driving where tau_load v > 0, driven elsewhere)"
@@ -289,7 +289,7 @@ class DirectionalLoadFriction(JointEffect):
 class LoadDependentStribeckFriction(JointEffect):
     """Friction in proportion to the load that falls as the speed rises."""
 
-    name, title = "load_dependent_stribeck_friction", "Stribeck friction that grows with the load"
+    name, title = "load_dependent_stribeck_friction", "load-dependent Stribeck friction"
     follows_torque = dissipative = True
     equation = "ratio |tau_load| exp(-(|v|/speed)^2) s(v)"
     separated_by = "slow sweeps of {at} below 0.3 rad/s with and without a payload"

@@ -42,7 +42,7 @@ class LinkEffect(Effect):
 class LinkInertia(LinkEffect):
     """A link whose inertia is not what the model says, further than it is trusted."""
 
-    name, title = "link_inertia", "inertia of a link"
+    name, title = "link_inertia", "link inertia"
     contains = ("payload",)
     indistinguishable_from = ("payload",)
     needs_trust = 0.05  # ten free parameters of a link make up for many a misfit
@@ -54,7 +54,7 @@ class LinkInertia(LinkEffect):
 class Payload(LinkEffect):
     """A body fixed to a link: ten parameters that a physical body can have."""
 
-    name, title = "payload", "a payload"
+    name, title = "payload", "payload"
     body = True
     equation = "W_k dpi_k, dpi_k a physical body: pseudo-inertia >= 0, mass > 0"
     separated_by = "the same motion with and without what is fixed to {at}"

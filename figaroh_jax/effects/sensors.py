@@ -48,7 +48,7 @@ class TorqueOffset(JointEffect):
 class TorqueGain(JointEffect):
     """A wrong torque constant or gear ratio: the reading is off by a factor."""
 
-    name, title = "torque_gain", "wrong torque gain"
+    name, title = "torque_gain", "torque gain error"
     follows_torque = follows_total = True
     equation = "gain tau_hat"
     separated_by = "the same motion of {at} with and without a payload of known mass"
@@ -63,7 +63,7 @@ class TorqueGain(JointEffect):
 class TorqueDelay(Effect):
     """Torque that is stamped late against the position."""
 
-    name, title, acts_on = "torque_delay", "delay of the torque", "robot"
+    name, title, acts_on = "torque_delay", "torque delay", "robot"
     follows_torque = True
     excludes = ("torque_lag",)
     equation = "tau_hat(t - delay) - tau_hat(t)"
@@ -79,7 +79,7 @@ class TorqueDelay(Effect):
 class TorqueLag(Effect):
     """Torque seen through a first-order low pass."""
 
-    name, title, acts_on = "torque_lag", "lag of the torque", "robot"
+    name, title, acts_on = "torque_lag", "torque lag", "robot"
     follows_torque = True
     equation = "(1/(1 + time p) - 1) tau_hat"
     separated_by = "faster motion: a lag weakens high frequencies, a delay does not"
@@ -94,7 +94,7 @@ class TorqueLag(Effect):
 class TorqueSaturation(JointEffect):
     """A drive or a sensor that gives no more than its limit."""
 
-    name, title = "torque_saturation", "saturation of the torque"
+    name, title = "torque_saturation", "torque saturation"
     follows_torque = follows_total = True
     equation = "clip(tau_hat, -limit, limit) - tau_hat"
     separated_by = "motion of {at} at two larger accelerations: the largest torque stays"
@@ -131,7 +131,7 @@ class TorqueSaturation(JointEffect):
 class ClockError(Effect):
     """A clock of the torque that runs faster or slower than that of the position."""
 
-    name, title, acts_on = "clock_error", "clocks of position and torque that drift apart", "robot"
+    name, title, acts_on = "clock_error", "drift between the clocks of position and torque", "robot"
     follows_torque = follows_total = True
     beside_rest = False  # whatever is late in one part of a recording and not in another looks like it
     equation = "rate t p tau_hat"
@@ -147,7 +147,7 @@ class ClockError(Effect):
 class EncoderOffset(JointEffect):
     """A zero of the encoder that is not the model's."""
 
-    name, title = "encoder_offset", "zero offset of the encoder"
+    name, title = "encoder_offset", "encoder zero offset"
     levels = ("torque",)  # to a calibration it is a `joint_offset`
     equation = "q_measured = q + offset"
     separated_by = "kinematic calibration, or a reference mark of {at}: torque hardly tells it from inertia"
@@ -162,7 +162,7 @@ class EncoderOffset(JointEffect):
 class EncoderScale(JointEffect):
     """An encoder that counts too much or too little a turn, or a gear ratio that is not the model's."""
 
-    name, title = "encoder_scale", "scale of the encoder"
+    name, title = "encoder_scale", "encoder scale error"
     correction = -1.0
     equation = "q_measured = q + scale q"
     separated_by = "motion of {at} over more than half a turn, or kinematic calibration"
@@ -178,7 +178,7 @@ class EncoderScale(JointEffect):
 class EncoderEccentricity(JointEffect):
     """An encoder's disc that is not centred: an error that comes back with every turn."""
 
-    name, title = "encoder_eccentricity", "eccentricity of the encoder"
+    name, title = "encoder_eccentricity", "encoder eccentricity"
     correction = -1.0
     equation = "q_measured = q + sine sin q + cosine cos q"
     separated_by = "a whole turn of {at}, or kinematic calibration with two payloads"

@@ -49,7 +49,7 @@ class RotorInertia(JointEffect):
 class CoupledTransmission(Effect):
     """A motor that turns the sum or the difference of two joints: its rotor and its friction act on both."""
 
-    name, title, acts_on = "coupled_transmission", "coupling of the transmission", "pair"
+    name, title, acts_on = "coupled_transmission", "transmission coupling", "pair"
     equation = "row i: inertia a_j + damping v_j + friction s(v_i + sign v_j); row j: i and j swapped, friction by sign"
     separated_by = "{at} alone, together and against each other"
     inertia: Scalar = amplitude("kg m2")
@@ -108,7 +108,7 @@ class TorqueRipple(JointEffect):
 class JointSpring(JointEffect):
     """A spring across the joint: a balancer, a cable, a hose."""
 
-    name, title = "joint_spring", "spring at the joint"
+    name, title = "joint_spring", "joint spring"
     contains = ("torque_offset",)
     equation = "stiffness (q - rest)"
     separated_by = "motion of {at} over a larger range, or with the base turned"
@@ -138,7 +138,7 @@ class JointSpring(JointEffect):
 class JointElasticity(JointEffect):
     """A gear that winds up under load: the sensor on the motor reads more than the link has turned."""
 
-    name, title = "joint_elasticity", "elasticity of the joint"
+    name, title = "joint_elasticity", "joint elasticity"
     equation = "q_measured = q + compliance tau_load"
     separated_by = "a chirp of {at} above a third of its resonance, or a sensor on the link side"
     compliance: Scalar = shape("rad/(N m)", (2e-5, 1e-4, 4e-4, 1.5e-3, 5e-3), (1e-7, 1e-2))

@@ -17,7 +17,7 @@ __all__ = ["GravityCompensation"]
 class GravityCompensation(Effect):
     """A force at a link's centre of mass, against its weight; read from files, not searched by the diagnosis."""
 
-    name, title, acts_on = "gravity_compensation", "compensated gravity", "link"
+    name, title, acts_on = "gravity_compensation", "gravity compensation", "link"
     equation = "-fraction tau_gravity of the link"
     separated_by = "postures of the joints below {at} with another load on it"
     searched = False
