@@ -61,7 +61,9 @@ class Part:
         return cls(series, joint, column, *columns.shape[1:])
 
     @classmethod
-    def of_blocks(cls, blocks: Float[np.ndarray, "pairs 10 nN"], where: Int[np.ndarray, "pairs 2"], model: RobotModel) -> Part:
+    def of_blocks(
+        cls, blocks: Float[np.ndarray, "pairs 10 nN"], where: Int[np.ndarray, "pairs 2"], model: RobotModel
+    ) -> Part:
         """The part of ten columns for each joint and link that are not zero by the tree alone, in order of the joints."""
         flat = blocks.reshape(-1, blocks.shape[2])
         used = flat[:, :TURNED].any(1)
