@@ -64,7 +64,7 @@ class Part:
     def of_blocks(
         cls, blocks: Float[np.ndarray, "pairs 10 nN"], where: Int[np.ndarray, "pairs 2"], model: RobotModel
     ) -> Part:
-        """The part of ten columns for each joint and link that are not zero by the tree alone, in order of the joints."""
+        """The part of ten columns for each joint and link that the tree does not make zero, in order of the joints."""
         flat = blocks.reshape(-1, blocks.shape[2])
         used = flat[:, :TURNED].any(1)
         used[~used] = flat[~used].any(1)
