@@ -191,7 +191,7 @@ def _summed(states: States, frames: Sequence[OwnFrame], mesh: Mesh, folds: int, 
         check_piece(model, part, number, values=False)
         chunk = chunk or _chunk(mesh, numbers, len(part[0]) // folds)
         add, own = _program(chunk, folds, codes, devices[0].platform == "cpu"), -(-len(part[0]) // (chunk * mesh.size))
-        firsts = np.int32(chunks + own * np.arange(mesh.size))
+        firsts = [np.int32(chunks + own * k) for k in range(mesh.size)]
         totals = tuple(map(add, totals, fixed, _shares(part, chunk, mesh), firsts))
         chunks += -(-len(part[0]) // chunk)
         jax.block_until_ready(before)  # one piece ahead: no more wait in memory
