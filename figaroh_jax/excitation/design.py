@@ -141,9 +141,9 @@ def excite(
     limits = _without(limits, robot, learned.held, begin)
     sampler = Sampler(robot, learned.terms, np.asarray(learned.width))
     torque = torque_of(model, learned, sampler)
-    if learned.held:
-        _stands(torque, robot, limits, begin)
-    problem = unmeetable(torque, robot, limits, begin)
+    if begin is not None:
+        check_start(torque, robot, limits, begin)
+    problem = unmeetable(torque, robot, limits) if begin is None else None
     if problem is not None:
         raise InputError(problem)
     with jax.enable_x64(True):
@@ -252,17 +252,15 @@ def _inside(robot: RobotModel, start: np.ndarray, limits: Limits) -> np.ndarray:
     return start
 
 
-def _stands(torque: Torque, robot: RobotModel, limits: Limits, start: np.ndarray | None) -> None:
-    """`InputError` where who stands on joints that are held falls over in the posture in which a motion begins."""
-    if start is None or not np.isfinite(limits.torque).any():
-        return
+def check_start(torque: Torque, robot: RobotModel, limits: Limits, start: Float[np.ndarray, " nv"]) -> None:
+    """`InputError` where the posture in which a motion begins takes more torque than there is, as of who falls over."""
     share = np.abs(torque(np.stack([start, 0 * start, 0 * start])[:, None]))[0] / limits.torque
     worst = int(share.argmax())
     if share[worst] > 1.0:
         raise InputError(
             f"start: holding still there takes {share[worst]:.2f} times the torque limit of '{robot.dof_names[worst]}'"
             f" ({limits.torque[worst]:g}), and a motion begins at rest: begin elsewhere (a person on a plate: where"
-            " `people.balanced` says)"
+            " `people.balanced` says), or leave the start open"
         )
 
 
