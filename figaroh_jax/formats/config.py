@@ -137,7 +137,7 @@ class Robot(_Keys):
 
 
 class Load(_Keys):
-    """A known payload carried during a recording."""
+    """A known payload carried during a recording: `mass` in kg, `com` in m in the axes of the model's `frame`."""
 
     frame: str
     mass: Positive  # kg
@@ -280,7 +280,16 @@ class Transmission(_Keys):
 
 
 class Preprocess(_Keys):
-    """What happens to every recording before anything is fitted; None leaves the choice to `signals`."""
+    """What happens to every recording before anything is fitted; what is not given is chosen from the recordings.
+
+    `window` (begin, end) in s is the part that is kept; `cutoff` in Hz that of one zero-phase low pass for position,
+    torque and every column of the regressor; `rate` in Hz that of the rows after it; `gate` drops the rows of a joint
+    that moves more slowly, `{"elbow": 0.05}` in rad/s (m/s).
+
+    >>> import figaroh_jax as fj
+    >>> fj.Preprocess(cutoff=15, rate=50).cutoff
+    15.0
+    """
 
     window: tuple[Number, Number] | None = None  # s, kept
     cutoff: Positive | None = None  # Hz
@@ -303,7 +312,15 @@ class BaselineEffect(_Keys):
 
 
 class Baseline(_Keys):
-    """What is fitted before anything is named."""
+    """What is fitted beside the rigid body before anything is named, and what `identify` fits.
+
+    At every joint `viscous` friction (N m s/rad), `coulomb` friction (N m), the inertia of the `rotor` (kg m2) and a
+    torque `offset` (N m); `effects` names more, each with its place: `{"effect": "joint_spring", "at": ["elbow"]}`.
+
+    >>> import figaroh_jax as fj
+    >>> fj.Baseline(rotor=True, effects=[{"effect": "joint_spring", "at": ["elbow"]}]).effects[0].at
+    ('elbow',)
+    """
 
     viscous: bool = True
     coulomb: bool = True
