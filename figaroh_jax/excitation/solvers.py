@@ -9,15 +9,15 @@ smaller until it meets them at 1 kHz.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from .information import Learned
+from .interior import BEGUN, from_within
 from .limits import KINDS, Limits
 from .motions import Basis, Trajectory
-from .interior import BEGUN, from_within
 from .programming import Rows, at_rest, descend, drawn_in
 from .sampling import Sampler
 
