@@ -399,8 +399,10 @@ def smooth_sign(
     return (velocity / (wider + 1e-9)).clip(-1.0, 1.0)
 
 
-def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **parameters: float) -> Effect:
+def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **parameters: Scalar) -> Effect:
     """The effect at the joints, pair or link named in `at`, with parameters by name (the others at their default).
+
+    A parameter is a number, also one that `jax.grad`, `jax.vmap` or `jax.jit` traces.
 
     >>> import figaroh_jax as fj
     >>> robot = fj.load_urdf(fj.DEMO)
@@ -421,7 +423,9 @@ def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **par
     return effect(indices, **{name: _number(effect, name, value) for name, value in parameters.items()})
 
 
-def _number(effect: type[Effect], name: str, value: Any) -> np.float64:
+def _number(effect: type[Effect], name: str, value: Any) -> Any:
+    if isinstance(value, Tracer) and value.ndim == 0:
+        return value
     try:
         number = np.float64(value)
     except (TypeError, ValueError):
