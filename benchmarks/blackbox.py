@@ -88,12 +88,12 @@ def run(
     print(f"{len(todo)} calls to make", flush=True)
     started = time.monotonic()
     with ThreadPoolExecutor(jobs) as pool:
-        calls = [pool.submit(_call, folder, out, cases[job.case], job, command, limit) for job in todo]
+        calls = [pool.submit(call_tool, folder, out, cases[job.case], job, command, limit) for job in todo]
         for count, call in enumerate(calls, 1):
             print(f"[{count}/{len(todo)} {time.monotonic() - started:.0f} s] {call.result()}", flush=True)
 
 
-def _call(folder: Path, out: Path, case: Case, job: Job, command: str, limit: float) -> str:
+def call_tool(folder: Path, out: Path, case: Case, job: Job, command: str, limit: float) -> str:
     with tempfile.TemporaryDirectory() as scratch:
         task = write_task(folder, Path(scratch), case, job.forbid)
         answer = Path(scratch) / "out"

@@ -1,10 +1,11 @@
 """Calibration on real sets, and the solver's speed against FIGAROH and against SciPy with finite differences.
 
-    python benchmarks/calibration.py [sets] [speed] [figaroh]
+    python benchmarks/calibration.py [sets] [speed] [figaroh] [POSTURES ...]
 
 `sets` calibrates the recordings of $FIGAROH_JAX_DATA with everything chosen inside five folds (MUKCa: on tool positions
 that were not fitted) and prints error and names. `speed` solves one problem, UR10e poses with its identifiable
-parameters, with both (Pinocchio in a Python loop for SciPy), in interleaved rounds. `figaroh` does the same with
+parameters, with both (Pinocchio in a Python loop for SciPy), in interleaved rounds, for 50 to 10 000 POSTURES or those
+told. `figaroh` does the same with
 FIGAROH 1.0.2 on its own sets, in the environment that `regressor.py` makes. CPU seconds; cold is that of a fresh
 process from its first line to the answer, without any cache, which tells peak memory too.
 """
@@ -17,8 +18,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -155,7 +157,7 @@ class Peer:
         return least_squares(residual, np.zeros(12 + len(picked)), method="lm").cost
 
 
-def run_speed() -> None:
+def run_speed(postures: Sequence[int] = (50, 500, 4000, 10000)) -> None:
     from figaroh_jax.calibration.candidates import geometry_columns
     from figaroh_jax.estimation.posegroups import postures_of
 
@@ -164,7 +166,7 @@ def run_speed() -> None:
     (zero,) = postures_of(model, [recording(np.zeros((1, 6)), "pose", np.eye(4)[None], *frames)])
     twists = np.array([column.pieces[0][1](zero)[:, 0] for column in columns])
     peer = Peer(path, frames[1], np.array([column.pieces[0][0] for column in columns]), twists)
-    for N in (50, 500, 4000, 10000):
+    for N in postures:
         _compare(N, model, frames, columns, peer)
 
 
@@ -310,5 +312,7 @@ if __name__ == "__main__":
     elif sys.argv[1:2] == ["level"]:
         calibrate_child(*sys.argv[2:])
     else:
-        for part in sys.argv[1:] or ["sets", "speed", "figaroh"]:
-            {"sets": run_sets, "speed": run_speed, "figaroh": run_figaroh}[part]()
+        told = [int(word) for word in sys.argv[1:] if word.isdigit()]
+        speed = partial(run_speed, told) if told else run_speed
+        for part in [word for word in sys.argv[1:] if not word.isdigit()] or ["sets", "speed", "figaroh"]:
+            {"sets": run_sets, "speed": speed, "figaroh": run_figaroh}[part]()

@@ -186,15 +186,15 @@ class Bench:
         """Two finished runs, with the files that the commands on runs read."""
         from test_run_tools import ANSWER, CALIBRATION, RESULT, run
 
+        from figaroh_jax.jobs.rollouts import write_loop
         from figaroh_jax.rollouts.reading import load_loop
-        from figaroh_jax.runs import _write_loop
 
         for name in ("first", "second"):
             run(self.folder / "runs" / name, self.folder / "task.yaml", answer=ANSWER, result=RESULT)
         loop_folder = self.folder / "loop"
         loop_folder.mkdir()
         shutil.copy(self.folder / "arm.xml", loop_folder / "robot.xml")
-        _write_loop(loop_folder, load_loop(self.folder / "arm.xml")[0])
+        write_loop(loop_folder, load_loop(self.folder / "arm.xml")[0])
         first = self.folder / "runs" / "first"
         self.run_files: dict[str, Any] = {
             "answer.json": json.dumps(ANSWER, indent=1),
@@ -536,16 +536,18 @@ def run_command(bench: Bench, file: Path) -> None:
 
 def command_line(bench: Bench, words: list[str]) -> None:
     """One command line, in the bench's folder; what it changes there is mended."""
-    from figaroh_jax import cli, runs
+    from figaroh_jax import cli
+    from figaroh_jax.errors import InputError
+    from figaroh_jax.jobs import commands, run
 
     def job(task_file: Path, out: Path, progress: Any, backend: str, **options: Any) -> None:
-        runs._task_for(task_file, out)
+        run.task_for(task_file, out)
         read_task(bench, task_file)
-        raise runs.InputError("stop")
+        raise InputError("stop")
 
-    before = {name: entry._replace(run=job) for name, entry in runs.JOBS.items()}
-    original = dict(runs.JOBS)
-    runs.JOBS.update(before)
+    before = {name: entry._replace(run=job) for name, entry in commands.COMMANDS.items()}
+    original = dict(commands.COMMANDS)
+    commands.COMMANDS.update(before)
     out, error = io.StringIO(), io.StringIO()
     here = os.getcwd()
     os.chdir(bench.folder)
@@ -554,7 +556,7 @@ def command_line(bench: Bench, words: list[str]) -> None:
             status = cli.main(words)
     finally:
         os.chdir(here)
-        runs.JOBS.update(original)
+        commands.COMMANDS.update(original)
         changed = [path.name for path, data in bench.kept.items() if _differs(path, data) and path.name not in OURS]
         bench.mend()
     assert not changed, f"files of the user's were changed: {changed}"

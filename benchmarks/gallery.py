@@ -257,7 +257,7 @@ def _left(answer: dict[str, Any]) -> list[str]:
     parts = sorted(rest.get("parts", []), key=lambda part: -part["share"])[:3]
     if parts:
         said = "; ".join(f"{part['kind']} at {', '.join(part['at'])} ({100 * part['share']:.0f} %)" for part in parts)
-        lines.append(f"It goes with {said}.")
+        lines.append(f"It varies with {said}.")
     return lines
 
 

@@ -119,12 +119,12 @@ def prepare(folder: Path) -> None:
     (folder.parent / "found.pickle").write_bytes(pickle.dumps(found))
     from generators import servo_arm
 
+    from figaroh_jax.jobs.rollouts import write_loop
     from figaroh_jax.rollouts.reading import load_loop
-    from figaroh_jax.runs import _write_loop
 
     (folder / "loop").mkdir()
     (folder / "loop" / "robot.xml").write_text(servo_arm.model_text())
-    _write_loop(folder / "loop", load_loop(folder / "loop" / "robot.xml")[0])
+    write_loop(folder / "loop", load_loop(folder / "loop" / "robot.xml")[0])
     _right_recording(folder / "run1.npz", found["diagnose"].model)
     (folder / "runs").mkdir()
     os.chdir(folder)
@@ -156,16 +156,13 @@ def made_before(folder: Path, name: str) -> None:
 def command(folder: Path, name: str, out: str = "runs/out") -> int:
     """One command in the user's folder; what it would compute is there."""
     from figaroh_jax import cli
-    from figaroh_jax.calibration import calibration
-    from figaroh_jax.diagnosis import diagnosis
-    from figaroh_jax.excitation import task as excitation
-    from figaroh_jax.identification import identification
+    from figaroh_jax.jobs import diagnosis, excitation, identification, postures
 
     found = pickle.loads((folder.parent / "found.pickle").read_bytes())
     diagnosis.diagnose_task = lambda *args, **more: found["demo" if name == "demo" else "diagnose"]
     identification.identify_task = lambda *args, **more: found["identify"]
     excitation.excite_task = lambda *args, **more: found["excite"]
-    calibration.calibrate_task = lambda *args, **more: found["calibrate"]
+    postures.calibrate_task = lambda *args, **more: found["calibrate"]
     os.chdir(folder)
     if name in LINES:
         return cli.main([name, *LINES[name]])

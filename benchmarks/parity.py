@@ -1,18 +1,21 @@
 """Answers of two versions of the package side by side: verdicts, causes, parameters, held-out errors.
 
-    python benchmarks/parity.py make --cases DIR [--seeds 31 32]                    # needs Pinocchio and the recordings
+    python benchmarks/parity.py make --cases DIR [--seeds 31 32]               # needs Pinocchio and the recordings
+    python benchmarks/parity.py pack --cases DIR --out FILE.tar.xz             # to travel; unpack: back
     python benchmarks/parity.py run --cases DIR --out OUT --jobs 60 before=/path/a now=/path/b
     python benchmarks/parity.py table --cases DIR --out OUT
 
 `make` writes folders that hold everything: twelve public sets ($FIGAROH_JAX_DATA: seven of torque, five of postures),
-four identifications, and 64 hidden effects (`hidden_effects.py`: sixteen effects, TX40 with the first seed and Panda
-with the second, with and without repeats). `run` starts a process for each case and version and goes on where it was
-stopped. `table` prints what differs, and of what is hidden who finds it.
+four identifications, 64 hidden effects (`hidden_effects.py`: sixteen effects, TX40 with the first seed and Panda with
+the second, with and without repeats), and 18 made identifications that are judged on recordings kept out. `run` starts
+a process for each case and version and goes on where it was stopped. `table` prints what differs, and of what is hidden
+who finds it.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import multiprocessing
 import os
@@ -20,6 +23,7 @@ import resource
 import shutil
 import subprocess
 import sys
+import tarfile
 import tempfile
 import time
 from collections.abc import Iterator
@@ -32,7 +36,11 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 ONE_THREAD |= {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"}
+FRESH = 9  # made recordings of each robot that are identified
 CLOSE = 1e-6  # relative, of parameters that are the same
+GRID = {"q": 2.0**19, "tau": 2.0**9}  # steps to a radian and to a N m, a tenth of the made sensors' noise
+BYTES = (0, 8, 16, 24)
+DIFFERENCES = {"q": 3, "tau": 1}  # that leave the smallest numbers
 
 
 def make(folder: Path, seeds: list[int]) -> None:
@@ -40,6 +48,7 @@ def make(folder: Path, seeds: list[int]) -> None:
     sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(ROOT / "tests")]
     folder.mkdir(parents=True, exist_ok=True)
     cases = [*_torques(folder), *_postures(folder), *_identifications(folder), *_hidden(folder, seeds)]
+    cases += _fresh(folder, seeds)
     (folder / "cases.json").write_text(json.dumps(cases, indent=1))
     print(f"{len(cases)} cases, {sum(f.stat().st_size for f in folder.rglob('*') if f.is_file()) / 1e6:.0f} MB")
 
@@ -131,12 +140,84 @@ def _one_hidden(folder: Path, robot: str, seed: int, effect: str) -> list[dict[s
     return made
 
 
+def _fresh(folder: Path, seeds: list[int]) -> Iterator[dict[str, Any]]:
+    """Made recordings to identify, two of six kept out; in turns nothing, a link or a payload is wrong."""
+    from generators import make_case
+
+    for robot, seed in zip(("tx40", "panda"), seeds, strict=True):
+        for k in range(FRESH):
+            effects = [[], [("link_inertia", 0.05)], [("payload", 0.1)]][k % 3]
+            case = make_case(effects, robot=robot, repeats=1, trajectories=6, seed=seed + 1000 * (k + 1))
+            name = f"fresh_{robot}_{k}"
+            case.write(folder / name)
+            _smaller(folder / name)
+            task = json.loads((folder / name / "task.yaml").read_text())
+            task["data"][-2:] = [one | {"role": "holdout"} for one in task["data"][-2:]]
+            (folder / name / "task.yaml").write_text(json.dumps(task))
+            title = f"fresh {robot} {k}{' '.join(name for name, _ in effects)} identify"
+            yield {"name": title, "task": f"{name}/task.yaml", "command": "identify"}
+
+
 def _smaller(folder: Path) -> None:
-    """Recordings in single precision, for both versions alike."""
+    """Recordings rounded to a tenth of their noise and in single precision, for both versions alike."""
     for file in folder.glob("*.npz"):
         with np.load(file) as arrays:
-            kept = {key: x if key == "t" else x.astype(np.float32) for key, x in arrays.items()}
+            kept = {key: x if key == "t" else _rounded(key, x) / GRID[key] for key, x in arrays.items()}
+        kept = {key: x if key == "t" else x.astype(np.float32) for key, x in kept.items()}
         np.savez_compressed(file, **kept)  # pyright: ignore[reportArgumentType]
+
+
+def _rounded(key: str, values: np.ndarray) -> np.ndarray:
+    return np.round(values.astype(float) * GRID[key]).astype(np.int64)
+
+
+def pack(folder: Path, file: Path) -> None:
+    """All cases in one archive: what is hidden as differences of whole numbers, a byte of each after the other."""
+    cases = json.loads((folder / "cases.json").read_text())
+    hidden = {Path(c["task"]).parent for c in cases if "truth" in c or c["name"].startswith("fresh")}
+    with tarfile.open(file, "w:xz", preset=9) as archive:
+        for one in sorted(x for x in folder.rglob("*") if x.is_file()):
+            name = one.relative_to(folder)
+            content = _packed(one) if one.suffix == ".npz" and name.parent in hidden else one.read_bytes()
+            entry = tarfile.TarInfo(str(name))
+            entry.size = len(content)
+            archive.addfile(entry, io.BytesIO(content))
+    print(f"{file.stat().st_size / 1e6:.1f} MB")
+
+
+def _packed(file: Path) -> bytes:
+    kept = {}
+    with np.load(file) as arrays:
+        for key, x in arrays.items():
+            if key in GRID:
+                whole = _rounded(key, x)
+                for _ in range(DIFFERENCES[key]):
+                    whole = np.diff(whole, axis=0, prepend=0)
+                folded = np.abs(2 * whole) - (whole < 0)  # signs in the last bit
+                kept[key] = np.stack([(folded.T >> shift) & 255 for shift in BYTES]).astype(np.uint8)
+            else:
+                kept[key] = x
+    out = io.BytesIO()
+    np.savez(out, **kept)
+    return out.getvalue()
+
+
+def unpack(file: Path, folder: Path) -> None:
+    """The cases of such an archive, as `make` wrote them."""
+    with tarfile.open(file, "r:xz") as archive:
+        archive.extractall(folder, filter="data")
+    for one in folder.rglob("*.npz"):
+        with np.load(one) as arrays:
+            kept = dict(arrays)
+        if any(kept[key].dtype == np.uint8 for key in GRID if key in kept):
+            for key, differences in DIFFERENCES.items():
+                planes = [one.astype(np.int64) << shift for one, shift in zip(kept[key], BYTES, strict=True)]
+                folded = np.sum(planes, axis=0).T
+                whole = np.where(folded % 2, -(folded + 1) // 2, folded // 2)
+                for _ in range(differences):
+                    whole = np.cumsum(whole, axis=0)
+                kept[key] = (whole / GRID[key]).astype(np.float32)
+            np.savez_compressed(one, **kept)
 
 
 def run(folder: Path, out: Path, sides: dict[str, Path], jobs: int, only: list[str]) -> None:
@@ -247,6 +328,8 @@ def _compared(before: dict[str, Any], now: dict[str, Any]) -> str:
 def _held(answer: dict[str, Any]) -> float | None:
     if answer.get("position"):
         return answer["position"]["validated_after"]
+    if answer.get("holdout"):
+        return float(np.mean([x for one in answer["holdout"].values() for x in one["relative"]]))
     if answer.get("cross_validation"):
         return float(np.sqrt(np.mean([x**2 for x in answer["cross_validation"]["rms"] if x is not None])))
     causes = answer.get("causes") or []
@@ -269,7 +352,7 @@ def _sizes(answer: dict[str, Any]) -> dict[str, tuple[float, float]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("step", choices=["make", "run", "table"])
+    parser.add_argument("step", choices=["make", "pack", "unpack", "run", "table"])
     parser.add_argument("sides", nargs="*", metavar="NAME=FOLDER")
     parser.add_argument("--cases", type=Path, required=True)
     parser.add_argument("--out", type=Path)
@@ -279,6 +362,8 @@ def main() -> None:
     args = parser.parse_intermixed_args()  # versions may stand behind options
     if args.step == "make":
         make(args.cases, args.seeds)
+    elif args.step in ("pack", "unpack"):
+        pack(args.cases, args.out) if args.step == "pack" else unpack(args.out, args.cases)
     elif args.step == "run":
         sides = {name: Path(folder).resolve() for name, folder in (one.split("=", 1) for one in args.sides)}
         run(args.cases, args.out.resolve(), sides, args.jobs, args.only)

@@ -35,12 +35,12 @@ def identified(name: str, folder: Path) -> tuple[Any, Any]:
     options = {"gated": False} if name == "tx40_ungated" else {}
     file = getattr(real_tasks, f"{name.removesuffix('_ungated')}_task")(folder, DATA, **options)
     kept: list[Any] = []
-    validate = identification._validated
-    identification._validated = lambda problem: kept.append(problem) or validate(problem)
+    validate = identification._best
+    identification._best = lambda problem: kept.append(problem) or validate(problem)
     try:
         return identification.identify_task(fj.load_task(file)), kept[0]
     finally:
-        identification._validated = validate
+        identification._best = validate
 
 
 def best_robots(problem: Any) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Identify a robot from arrays in memory: base parameters, links that can exist, friction. No files."""
+"""Identify a robot from arrays in memory: base parameters, physically consistent links, friction. No files."""
 
 import numpy as np
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .calibration.calibration import calibrate as calibrate, calibrate_task as calibrate_task
+    from .diagnosis.fleet import screen_fleet as screen_fleet
     from .effects.base import (
         Effect as Effect,
         JointEffect as JointEffect,
@@ -124,6 +125,7 @@ _MODULES = {
     "effects.catalogue": ("CATALOGUE", "register"),
     "errors": ("InputError",),
     "formats.export": ("load_model", "write_model"),
+    "diagnosis.fleet": ("screen_fleet",),
     "effects.extended": ("ExtendedModel", "extend", "predict"),
     "excitation.design": ("Design", "excite"),
     "excitation.information": ("Learned", "expected_std", "information", "learn"),

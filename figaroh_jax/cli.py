@@ -35,6 +35,7 @@ _TASKS = {  # commands that take a task file
     "calibrate": "fit the kinematics from measured poses or points",
     "excite": "design the motion that tells most, within limits",
 }
+_TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # of glibc's mallopt
 _READING = 0.03  # of a command's work, for the progress bar
 _OTHERS = ("verify", "compare", "list", "new", "migrate", "view")  # commands before and after a run
 _DESCRIPTION = "Name what a robot's simulation gets wrong, extend the model with it and measure the gain."
@@ -90,6 +91,21 @@ def _ended_by_signals() -> Iterator[None]:
             signal.signal(number, before)
 
 
+def _keep_freed_memory() -> None:
+    """Have the C library keep the memory of arrays that are gone for those that follow.
+
+    glibc gives each large array back to the system, which clears every page of the next one: with ten minutes of data
+    that was a fifth of the CPU seconds. Other C libraries do as they do.
+    """
+    if sys.platform.startswith("linux"):
+        import ctypes
+
+        with suppress(OSError, AttributeError):
+            set_option = ctypes.CDLL(None).mallopt
+            set_option(_MMAP_MAX, 0)
+            set_option(_TRIM_THRESHOLD, 2**31 - 1)
+
+
 def _drop_standard_output() -> None:
     """What Python would still write at exit goes nowhere."""
     with suppress(OSError, ValueError, AttributeError):
@@ -99,12 +115,13 @@ def _drop_standard_output() -> None:
 def _run(args: argparse.Namespace) -> int:
     for name, value in _THREADS.items():
         os.environ.setdefault(name, value)
+    _keep_freed_memory()
     if args.command in _OTHERS:
-        from . import run_tools
+        from .jobs import tools
 
         shown = io.StringIO()  # first the verdict, then the text: a reader that has gone changes no exit status
         with redirect_stdout(shown):
-            status = getattr(run_tools, args.command)(args)
+            status = getattr(tools, args.command)(args)
         _write_out(shown.getvalue())
         return status
     if args.command == "rerun":
@@ -115,32 +132,40 @@ def _run(args: argparse.Namespace) -> int:
 
         read_task(task)  # a file that is missing or no YAML is told before two seconds of imports
     _set_up_jax(cache=not args.no_cache)
-    from .recordings.progress import listener
-    from .reporting import terminal, wording
-    from .runs import JOBS, REPORT, export_loop
-
     if args.command == "export":
+        from .jobs.export import export_loop
+
         _write_out(export_loop(args.task, args.simulator, args.out))
         return 0
+    return _run_job(args)
+
+
+def _run_job(args: argparse.Namespace) -> int:
+    """A command that writes a run directory: the work, then what is said about it."""
+    from .jobs.commands import COMMANDS
+    from .jobs.run import REPORT
+    from .recordings.progress import listener
+    from .reporting import terminal, wording
+
     if args.command == "excite" and args.task is None:
         args.task = _task_of_run(args.of_run)
-    job = JOBS["diagnose" if args.command == "demo" else args.command]
+    command = COMMANDS["diagnose" if args.command == "demo" else args.command]
     with resources.as_file(resources.files("figaroh_jax") / "demo") as demo:
         task_file = args.task or demo / "task.yaml"
-        out = args.out or Path(f"{args.task.stem if args.task else 'demo'}_{job.noun}")
+        out = args.out or Path(f"{args.task.stem if args.task else 'demo'}_{command.noun}")
         with terminal.Progress(quiet=args.quiet) as progress:
             listener.set(lambda phase, share: progress(phase, _READING * share))
-            found = job.run(task_file, out, progress, args.backend, **_own_options(args))
+            done = command.run(task_file, out, progress, args.backend, **_own_options(args))
     with _standard_output():
         if args.json:
-            sys.stdout.write(job.to_json(found))
+            sys.stdout.write(done.to_json())
         else:
-            job.show(found, args.verbose)
+            done.show(args.verbose)
             print(wording.fitted(f"Report: {out / REPORT}"))
-    failed = job.failure(found)
-    if failed is not None:
-        print(f"figaroh-jax: limit not met: {_one_line(failed)}", file=sys.stderr)
-    return 0 if failed is None else 1
+    if done.failure is None:
+        return 0
+    print(f"figaroh-jax: limit not met: {_one_line(done.failure)}", file=sys.stderr)
+    return 1
 
 
 def _write_out(text: str) -> None:
@@ -169,7 +194,7 @@ def _standard_output() -> Iterator[None]:
 
 def _again(args: argparse.Namespace) -> argparse.Namespace:
     """The arguments of the command that made a run, for another directory."""
-    from .run_tools import command_of
+    from .jobs.tools import command_of
 
     command = command_of(args.run)
     out = args.out or args.run.with_name(f"{args.run.resolve().name}_again")
@@ -179,7 +204,7 @@ def _again(args: argparse.Namespace) -> argparse.Namespace:
 
 def _task_of_run(run: Path | None) -> Path:
     """The task file of a finished run."""
-    from .run_tools import command_of
+    from .jobs.tools import command_of
 
     if run is None:
         raise InputError("excite needs a TASK.yaml, or --from with the run directory of a diagnosis")

@@ -61,7 +61,9 @@ def left(text: str) -> Rest:
         Part("frequency", ("joint_2",), 0.1, band=(3.0, 3.4)),
         Part("recording", ("joint_4",), 0.2, file="exciting run"),
     )
-    near = Nearest(Name("torque_ripple", ("joint_2",)), 0.18, "its gain on held-out data is not sure: t = 1.9 of 2.3")
+    near = Nearest(
+        Name("torque_ripple", ("joint_2",)), 0.18, "its gain on held-out data is not significant: t = 1.9, 2.3 needed"
+    )
     return Rest(np.array([0.0, 0.024, 0.0, 0.011, 0.0, 0.0]), parts, (near,), text)
 
 

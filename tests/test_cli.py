@@ -19,11 +19,10 @@ import pytest
 from toy_backend import ToyBackend
 
 from figaroh_jax import cli
-from figaroh_jax.diagnosis import diagnosis
 from figaroh_jax.effects.extended import extend
 from figaroh_jax.errors import InputError
-from figaroh_jax.formats import export
 from figaroh_jax.formats.urdf import load_urdf
+from figaroh_jax.jobs import diagnosis
 from figaroh_jax.reporting.run_directory import MARKER, whole_directory
 from figaroh_jax.results import Diagnosis
 from figaroh_jax.simulators import registry
@@ -129,7 +128,7 @@ def test_a_failure_while_writing_leaves_the_earlier_run(made_up: Diagnosis, tmp_
     def fail(*_):
         raise RuntimeError("the disk caught fire")
 
-    monkeypatch.setattr(export, "write_model", fail)
+    monkeypatch.setattr(diagnosis, "write_model", fail)
     assert _diagnose("--out", "out") == 70
     assert "internal error: RuntimeError: the disk caught fire" in capsys.readouterr().err
     assert (tmp_path / "out" / "answer.json").stat().st_ino == before

@@ -22,7 +22,8 @@ SPACES = [
     if inspect.isfunction(getattr(fj, space).__dict__[name])
     and ">>>" in (getattr(fj, space).__dict__[name].__doc__ or "")
 ]
-SHOWN = [*sorted(set(FUNCTIONS)), "BlockLevenbergMarquardt", "Trajectory", *SPACES]
+CLASSES = [n for n in fj.__all__ if inspect.isclass(getattr(fj, n)) and ">>>" in (getattr(fj, n).__doc__ or "")]
+SHOWN = [*sorted(set(FUNCTIONS)), *CLASSES, *SPACES]
 
 
 def test_every_public_function_and_class_says_what_it_is():

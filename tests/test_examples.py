@@ -43,6 +43,7 @@ SAYS = {
     "person_on_a_plate": "of 44 base parameters",
     "real_calibrations": "TALOS: 16 parameters, 1.430 mm",
     "real_identifications": "TX40",
+    "fleet": "robot 5: load_dependent_friction",
     "so101": "friction by joint",
 }
 NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))

@@ -253,7 +253,7 @@ def test_a_designed_motion_tells_more_than_random_ones_and_meets_its_limits_by_p
 
 def test_what_no_motion_meets_is_refused_with_the_joint_and_by_how_much(arm: RobotModel):
     with pytest.raises(InputError, match=r"limits.torque: holding still takes .* times the limit of '(turn|bend)'"):
-        excite(arm, BASES[0], limits_of(arm, torque=0.01))
+        excite(arm, BASES[0], limits_of(arm, {"turn": (0.5, 1.0), "bend": (0.2, 0.5)}, torque=0.01))
     with pytest.raises(InputError, match="start: 'turn' at 3 is outside of its limits -2 to 2"):
         excite(arm, BASES[0], start=[3.0, 0.0])
     with pytest.raises(InputError, match="limits.velocity: 0 for 'bend'"):

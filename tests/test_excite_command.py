@@ -14,7 +14,7 @@ from test_excitation import ARM
 
 from figaroh_jax.cli import main
 from figaroh_jax.errors import InputError
-from figaroh_jax.excitation import solvers
+from figaroh_jax.excitation import design, solvers
 from figaroh_jax.excitation.task import excite_task, read_motion
 from figaroh_jax.formats.config import load_task
 from figaroh_jax.formats.urdf import load_urdf
@@ -70,6 +70,9 @@ def test_the_run_holds_the_motion_at_1_khz_with_its_torques_and_a_joint_trajecto
         ("objective: separate", "needs `separate`"),
         ("trajectories: 0", "excite.trajectories is 0, expected at least 1"),
         ("noise: -1", "more than 0"),
+        ("limits: {velocity: 0.0}", "excite.limits.velocity is 0.0, expected 'model', more than 0 or keys and values"),
+        ("limits: {position: {turn: [1, a]}}", "excite.limits.position.turn[1] is 'a', expected a number"),
+        ("limits: {torque: true}", "excite.limits.torque is True, expected 'model', a number or keys and values"),
     ],
 )
 def test_a_mistake_in_the_block_is_named_with_its_key(tmp_path: Path, keys: str, message: str):
@@ -91,8 +94,9 @@ def test_a_task_without_recordings_is_for_excite_alone(tmp_path: Path, capsys: p
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ("limits: {torque: 0.05}", "holding still takes"),
+        ("limits: {torque: 0.05, position: {turn: [0.5, 1.0], bend: [0.2, 0.5]}}", "holding still takes"),
         ("start: [0.0, 3.0]", "start: 'bend' at 3 is outside of its limits"),
+        ("start: [1.0, 0.5], limits: {torque: {turn: 3.0}}", "start: holding still there takes"),
         ("start: [0.0]", "start: 1 numbers for the 2 joints turn, bend"),
         ("limits: {velocity: {bent: 1.0}}", "no moving joint 'bent'; did you mean 'bend'?"),
         ("basis: {fourier: 3, base: 0.3}, duration: 4", "a base of 0.25 Hz fits"),
@@ -100,6 +104,11 @@ def test_a_task_without_recordings_is_for_excite_alone(tmp_path: Path, capsys: p
             "objective: separate,"
             " separate: [[{effect: joint_elasticity, at: [turn]}, {effect: rotor_inertia, at: [bend]}]]",
             "'joint_elasticity' has no torque of an instant",
+        ),
+        (
+            "objective: separate, separate:"
+            " [[{effect: viscous_friction, at: [turn]}, {effect: coulomb_friction, at: [turn]}]]",
+            "no motion tells viscous_friction at turn from coulomb_friction at turn: what is fitted anyway",
         ),
         ("objective: prediction, predict: [no.npz]", "no.npz (excite.predict) does not exist"),
     ],
@@ -117,6 +126,7 @@ def test_a_limit_that_is_not_met_at_1_khz_ends_with_status_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(solvers, "STEPS", 5)  # it cannot be met; a short search for it will do
+    monkeypatch.setattr(design, "check_start", lambda *given: None)  # which would refuse it before any search
     # standing still at this start takes more torque than is allowed, so no motion from there meets the limit
     model = load_urdf(task_of(tmp_path, "duration: 2").with_name("robot.urdf"))
     start = np.array([1.0, 0.5])

@@ -132,4 +132,10 @@ def test_everything_can_be_free_at_once(robot: fj.RobotModel, tracked: tuple[fj.
     assert float(moved.robot.inertia[2, 1]) == pytest.approx(
         float(robot.inertia[2, 1]) + y[at[f"inertia {robot.link_names[2]} mx"]], abs=1e-15
     )
+    told = dict(zip(chosen.names, chosen.held(moved, y), strict=True))  # what `Fit.parameters` says
+    assert told["stribeck_friction elbow force"] == float(moved.effects[0].force)
+    assert told[f"inertia {robot.link_names[2]} mx"] == float(moved.robot.inertia[2, 1])
+    assert (
+        told["gravity z"] == float(moved.robot.gravity[2]) and told["joint_offset elbow"] == y[at["joint_offset elbow"]]
+    )
     assert np.abs(fj.residual(moved, devices)).max() > 0

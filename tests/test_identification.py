@@ -80,6 +80,7 @@ def test_an_identification_is_a_view_of_its_fit(truth: Truth, found: Identificat
     start[: 10 * len(found.links)] = np.asarray(truth.nominal.inertia).reshape(-1)
     np.testing.assert_allclose(fit.values + start, [value for value, _ in each], rtol=0, atol=1e-12)
     np.testing.assert_allclose(fit.std, [std for _, std in each], rtol=1e-12, atol=0)
+    assert [one.value for one in fit.parameters.values()] == pytest.approx([value for value, _ in each], abs=1e-12)
     assert fit.parameters["viscous_friction elbow damping"].unit == "N m s/rad" and not fit.reason
     weighted = fit.rows.reshape(-1, len(found.joints))
     assert np.sqrt(np.mean(weighted**2)) == pytest.approx(1.0, abs=0.2)
@@ -149,6 +150,16 @@ def test_a_known_payload_is_no_part_of_the_robot(truth: Truth):
     np.testing.assert_allclose(values[0], values[1], rtol=1e-3, atol=5e-3)
 
 
+def test_a_payload_that_nobody_told_of_is_found_however_well_the_links_are_believed(truth: Truth):
+    """Its moments that no torque shows have to grow with the others, or the link would be no body."""
+    load = 3.0, np.array([0.2, 0.1, 0.3])
+    held = recording(truth, 10.0, seed=7, role="holdout", name="other", payload=load)
+    found = identify(truth.nominal, [recording(truth, seed=1, payload=load), held], SETTINGS, trust=0.02)
+    passed = np.sqrt(2 * 10.0 / simulated_arm.RATE)
+    assert (found.holdout["other.npz"].rms < 1.5 * passed * simulated_arm.TORQUE_NOISE).all()
+    assert any("clearly better" in note for note in found.notes)
+
+
 def test_bounds_of_cad_hold(truth: Truth):
     found = identify(truth.nominal, [recording(truth, seed=1)], SETTINGS, bounds={"fore": {"mass": (2.5, 2.6)}})
     assert 2.5 - 1e-6 <= found.links[1].parameters[0] <= 2.6 + 1e-6
@@ -210,7 +221,7 @@ def test_command_writes_a_whole_run(run: Path, capsys: pytest.CaptureFixture[str
     assert answer["base_parameters"][0]["expression"] in page and "cross-validated" in page
     assert "essential" in page and "free links" in page and "<code>predictions.npz</code>" in page
     told = [e for e in answer["effects"] if e["effect"] == "viscous_friction"]
-    assert all(f'<th scope="row">{e["at"][0]}</th>' in page for e in told) and "rows a joint at" in page
+    assert all(f'<th scope="row">{e["at"][0]}</th>' in page for e in told) and "rows per joint at" in page
 
 
 def test_predictions_stand_on_the_recordings_own_stamps(run: Path):
@@ -248,7 +259,7 @@ def test_what_was_dropped_is_said(truth: Truth):
     torque = one.torque.copy()
     torque[2000:2040, 0] += 500.0
     found = identify(truth.nominal, [replace(one, torque=torque)], Preprocess(cutoff=10, gate={"elbow": 0.05}))
-    assert any("rows a joint at" in note and "elbow" in note for note in found.notes)
+    assert any("rows per joint at" in note and "elbow" in note for note in found.notes)
     spike = next(note for note in found.notes if "robust standard deviations" in note and "shoulder" in note)
     assert float(spike.split()[-2]) == pytest.approx(one.time[2020], abs=0.3)
 

@@ -17,8 +17,9 @@ from test_general_dynamics import random_tree
 from figaroh_jax.compiled import executable_cache, kernels
 from figaroh_jax.compiled.batching import DRAFT_OPTIONS
 from figaroh_jax.compiled.kernels import Number, Straight, launch, straight_answers
-from figaroh_jax.rigid import dynamics, looped_kernels, normal_equations, regressor, scalar_forms
+from figaroh_jax.rigid import dynamics, looped_kernels, normal_equations, regressor, regrouped, scalar_forms
 from figaroh_jax.rigid.model import RobotModel
+from figaroh_jax.rigid.scalars import known
 
 FORMS = {
     "torques": dynamics._TORQUES,
@@ -152,16 +153,43 @@ def test_torques_limb_by_limb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         scalar_forms._limbs.cache_clear()
 
 
+@pytest.mark.parametrize("name", TREES)
+def test_columns_that_are_left_out_follow_from_those_that_are_kept(name: str):
+    """Pinocchio's regressor of trees with every joint, along and beside the axes of the links."""
+    kinds = (*TREES[name][1], "prismatic", "revolute")
+    twin = random_tree(TREES[name][0], kinds)
+    model, data = twin.model, twin.robot.createData()
+    kept = regrouped.kept_columns(model.joints, known(model))
+    assert [10 - len(own) for own, kind in zip(kept, kinds, strict=True) if kind != "revolute"] == [
+        {"prismatic": 6, "spherical": 1}.get(kind, 0) for kind in kinds if kind != "revolute"
+    ]
+    assert regrouped.regrouping(model, tuple(regrouped.ALL for _ in kept)).tolist() == np.eye(10 * len(kept)).tolist()
+    of_columns, left = regrouped.regrouping(model, kept), sum(10 - len(own) for own in kept)
+    assert of_columns.shape == (10 * len(kept) - left, 10 * len(kept))
+    index = [10 * i + k for i, own in enumerate(kept) for k in own]
+    q, v, a = states(model, 3)
+    for k in range(3):
+        whole = pin.computeJointTorqueRegressor(twin.robot, data, twin.theirs(q[k]), v[k], a[k])
+        agree(whole[:, index] @ of_columns, whole, 1e-12)
+
+
 def test_rows_of_a_normal_matrix_are_written_by_coordinate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The programs against the plain rows, one kernel interpreted, and the sums that a GPU would make of them."""
     model, arm = robots.load(robots.TREE, tmp_path), robots.load(robots.ARM, tmp_path)
     random, count = np.random.default_rng(1), 3
     q, v, a, tau, weight = random.standard_normal((5, 9, model.nv))
     extra = random.standard_normal((9, model.nv, 2))
-    form = normal_equations._row_form(count)
+    form = normal_equations._row_form(count, None)
     arrays = [q, v, a, np.abs(weight), random.standard_normal((9, model.nv * count))]
     written = by_hand(form, form.known(model), model, *arrays)
     for found, expected in zip(written, plainly(form, model, *arrays), strict=True):
+        agree(found, expected)
+    some = regrouped.kept_columns(model.joints, form.known(model))
+    assert sum(map(len, some)) < 10 * len(some)
+    few = normal_equations._row_form(count, some)
+    for found, expected in zip(
+        by_hand(few, few.known(model), model, *arrays), plainly(few, model, *arrays), strict=True
+    ):
         agree(found, expected)
     small = [jnp.asarray(x[:, : arm.nv * (count if k == 4 else 1)]) for k, x in enumerate(arrays)]
     (program,) = form.programs(arm, form.known(arm))
@@ -214,12 +242,15 @@ def test_looped_kernels_write_what_the_plain_ones_do(name: str, tmp_path: Path, 
     model = random_tree(*TREES[name]).model if name in TREES else robots.load(getattr(robots, name), tmp_path)
     arrays, random = states(model, 3), np.random.default_rng(2)
     shared = len(model.dofs.column) > model.nv
-    beside = normal_equations._row_form(2)
+    beside = normal_equations._row_form(2, None)
     weighted = [*arrays, np.abs(random.standard_normal((3, model.nv))), random.standard_normal((3, 2 * model.nv))]
     assert beside.looped
+    blocks = regressor.BLOCK_FORM
+    assert blocks.looped
     if shared:
-        assert beside.looped(model, *weighted) is None
+        assert beside.looped(model, *weighted) is None and blocks.looped(model, *arrays) is None
     else:
+        agree(blocks.looped(model, *arrays), plainly(blocks, model, *arrays))
         for one, expected in zip(beside.looped(model, *weighted), plainly(beside, model, *weighted), strict=True):
             agree(one, expected)
 
@@ -305,7 +336,7 @@ def test_looped_kernels_on_a_gpu(name: str, tmp_path: Path, monkeypatch: pytest.
     model = random_tree(*TREES[name]).model if name in TREES else robots.load(getattr(robots, name), tmp_path)
     arrays, random = states(model, 1000), np.random.default_rng(2)
     weighted = [*arrays, np.abs(random.standard_normal((1000, model.nv))), random.standard_normal((1000, 2 * model.nv))]
-    form = normal_equations._row_form(2)
+    form = normal_equations._row_form(2, None)
     if not scalar_forms.looped(model):
         return
     with jax.default_device(jax.devices("cpu")[0]):

@@ -17,7 +17,7 @@ from test_general_dynamics import random_tree
 from test_kernels import FORMS, TREES, agree, states
 
 import figaroh_jax as fj
-from figaroh_jax.compiled import machine_code as code
+from figaroh_jax.compiled import machine_code as code, memory
 from figaroh_jax.compiled.kernels import Straight
 from figaroh_jax.rigid import normal_equations
 from figaroh_jax.rigid.model import RobotModel
@@ -66,6 +66,39 @@ def test_code_of_a_tree_with_mimic_joints_is_the_plain_kernels(always: None, tmp
     few = [x[:15] for x in arrays]  # so few samples go by the plain form
     agree(answers(FORMS["packed"], model, *arrays)[..., :15], fj.packed_regressor(model, *few))
     agree(answers(FORMS["dense"], model, *arrays)[:15], fj.joint_torque_regressor(model, *few))
+
+
+def test_memory_is_used_again_when_nobody_holds_the_answer(
+    always: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """A view of an answer holds it; what is used again has its zeros where the program writes none."""
+    if memory._FREE is None:
+        pytest.skip("a system without MADV_FREE")
+    monkeypatch.setattr(memory, "LEAST", 1 << 10)
+    memory._shelf.clear()
+    model = robots.load(robots.TREE, tmp_path)
+    one, two, three = ([x[k : k + 64] for x in states(model, 200)] for k in (0, 64, 128))
+    run, plain = code.machine_code(FORMS["dense"], model, *one), FORMS["dense"].plain
+    assert run is not None
+    first = run(code.own_room, *one)
+    place, part = first.ctypes.data, first[5, 1:, 3]
+    expected = part.copy()
+    del first
+    second = run(code.own_room, *two)
+    assert second.ctypes.data != place
+    np.testing.assert_array_equal(part, expected)
+    del part
+    third = run(code.own_room, *three)
+    assert third.ctypes.data == place
+    agree(third, plain(model, *three))
+    agree(second, plain(model, *two))
+    held = [np.asarray(fj.joint_torque_regressor(model, *x))[3] for x in (one, two, three)]
+    for found, x in zip(held, (one, two, three), strict=True):
+        agree(found, np.asarray(plain(model, *x))[3])
+    del second, third, held
+    for _ in range(4):
+        run(code.own_room, *one)
+    assert len(memory._shelf) <= memory.LATEST
 
 
 def test_the_reverse_of_a_program_is_the_closed_gradient_of_its_rows(always: None, tmp_path: Path):
@@ -156,6 +189,7 @@ def test_the_compiler_is_what_make_takes_it_for(
 CHILD = """
 import numpy as np, figaroh_jax as fj
 from figaroh_jax.compiled import machine_code as code
+from figaroh_jax.compiled import memory
 from figaroh_jax.compiled.executable_cache import keep_programs
 made = []
 before = code._compiled

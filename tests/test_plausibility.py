@@ -48,7 +48,7 @@ def test_a_mass_within_what_was_trusted_or_nearly_the_same_is_not(robot: RobotMo
     [
         ("coulomb_friction", {"friction": 60.0}, "coulomb_friction of elbow: friction 60 N m is above"),
         ("coulomb_friction", {"friction": 6.0}, None),
-        ("viscous_friction", {"damping": 11.0}, "damping 11 at the speed limit, 55 N m"),
+        ("viscous_friction", {"damping": 11.0}, "damping 11 gives 55 N m at the speed limit"),
         ("viscous_friction", {"damping": 2.0}, None),
         ("torque_offset", {"offset": -70.0}, "70 N m is above the model's effort limit of 50"),
     ],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 
 import figaroh_jax as fj
+from figaroh_jax.compiled.precision import Float32Boundary
 from figaroh_jax.recordings.devices import Planes, Sockets
 
 T = np.arange(500)[:, None] / 250.0
@@ -175,3 +178,24 @@ def test_links_that_bend_or_grow_move_the_residual_of_postures(tmp_path):
     by = jax.jacfwd(lambda model: fj.residual(model, data))(fj.extend(robot, soft, warm))
     np.testing.assert_allclose(by.effects[0].first.reshape(3, 3)[:, 2], -9.81 * 0.4 * np.cos(roll), rtol=1e-9)
     np.testing.assert_allclose(by.effects[1].growth.reshape(3, 3), grown / 2e-3, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("wide", [True, False])
+def test_an_effect_takes_a_number_that_is_traced(robot: fj.RobotModel, wide: bool):
+    """A user maps and differentiates by a parameter where the effect is placed, with JAX's 64-bit mode on and off."""
+    t = np.arange(400)[:, None] / 250.0
+    q = 0.5 * np.sin(t * np.array([3.0, 4.4, 5.6, 6.9]))
+    data = fj.torque_data(robot, fj.recording(q=q, tau=np.cos(q), rate=250), fj.Preprocess(cutoff=20))
+
+    def cost(damping):
+        friction = fj.place(fj.CATALOGUE["viscous_friction"], robot, ["elbow"], damping=damping)
+        return (fj.residual(fj.extend(robot, friction), data) ** 2).mean()
+
+    sizes = np.array([0.0, 0.5, 1.0], np.float32)
+    with jax.enable_x64(wide), warnings.catch_warnings():
+        warnings.simplefilter("ignore", Float32Boundary)
+        many = np.asarray(jax.vmap(cost)(sizes))
+        slope = float(jax.grad(cost)(0.5))
+    single = [float(cost(float(size))) for size in sizes]
+    np.testing.assert_allclose(many, single, rtol=1e-12 if wide else 1e-6, atol=0)
+    assert slope == pytest.approx(single[2] - single[0], rel=1e-5)  # of a parabola

@@ -52,7 +52,7 @@ def test_a_fit_finds_what_mujoco_hid_and_its_derivative_is_that_of_differences(c
     model, data = case
     found = fj.fit(model, data, {"effects": ["damping", "inertia"], "start": True})
     assert not found.reason
-    for name, truth in (("viscous_friction j damping", 0.31 - 0.15), ("rotor_inertia j inertia", 0.012 - 0.024)):
+    for name, truth in (("viscous_friction j damping", 0.31), ("rotor_inertia j inertia", 0.012)):
         assert abs(found.parameters[name].value - truth) < 4 * found.parameters[name].std < 0.01
     rows = np.asarray(found.rows)
     assert np.sqrt(np.mean(rows[:STEPS] ** 2)) == pytest.approx(1.0, abs=0.15)

@@ -246,18 +246,18 @@ def test_compare_and_verify_replace_no_file_of_the_user_s(tmp_path: Path, capsys
 
 
 def test_rerun_uses_the_command_and_the_task_of_the_run(tmp_path: Path, monkeypatch):
-    from figaroh_jax import run_tools
+    from figaroh_jax.jobs import tools
 
     task = tmp_path / "task.yaml"
     task.write_text("robot: {}")
     folder = run(tmp_path / "run", task, answer=ANSWER)
-    assert run_tools.command_of(folder) == ("diagnose", str(task))
+    assert tools.command_of(folder) == ("diagnose", str(task))
     made = json.loads((folder / "provenance.json").read_text())
     assert made["inputs"][0]["bytes"] == 9 and len(made["inputs"][0]["sha256"]) == 64 and "jax" in made["versions"]
     assert cli.main(["rerun", str(folder)]) == 2  # the task is none
     task.unlink()
     with pytest.raises(ValueError, match="not there any more"):
-        run_tools.command_of(folder)
+        tools.command_of(folder)
 
 
 WORKFLOW = Path(__file__).resolve().parents[1] / "examples" / "github_actions.yml"

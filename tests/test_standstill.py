@@ -11,10 +11,11 @@ import robots
 from synthetic import made_signals, swing
 
 import figaroh_jax as fj
+from figaroh_jax.diagnosis.holdout import predicted
 from figaroh_jax.diagnosis.layout import held_rows, layout
 from figaroh_jax.diagnosis.problem import Problem
 from figaroh_jax.diagnosis.rest import relative_rest
-from figaroh_jax.diagnosis.standstill import only_sticks, resting
+from figaroh_jax.diagnosis.standstill import beyond_sliding, only_sticks, resting
 from figaroh_jax.diagnosis.state import State, assembled, baseline, solved
 from figaroh_jax.recordings.stacked import stack
 from figaroh_jax.rigid.model import RobotModel
@@ -48,16 +49,18 @@ def spring(v: np.ndarray, top: np.ndarray, rng: np.random.Generator) -> np.ndarr
     return 0.3 * SLIDING * np.sin(np.arange(len(v)) / 97.0)[:, None]
 
 
-def recorded(model: RobotModel, more: Law) -> tuple[Problem, State]:
-    """Torque of Pinocchio with sliding friction and something more, and the model without that."""
+def recorded(model: RobotModel, more: Law, width: float = 0.0) -> tuple[Problem, State]:
+    """Torque of Pinocchio with sliding friction and something more, and the model without that; its friction reverses
+    over twice the `width`, in top speeds."""
     plain = made_signals(30.0, swing)
     v, rng = plain.velocity, np.random.default_rng(5)
     rigid = reference.inverse_dynamics(model, plain.position, v, plain.acceleration)
     torque = rigid + SLIDING * np.sign(v) + more(v, np.abs(v).max(0), rng)
     signals = made_signals(30.0, swing, torque + NOISE * rng.standard_normal(torque.shape))
     records = stack([signals], model)
+    turned = width * np.abs(v).max(0)
     problem = Problem(
-        NativeBackend(model), records, layout([signals], records), 0.1, np.zeros(2), held_rows([signals], records)
+        NativeBackend(model), records, layout([signals], records), 0.1, turned, held_rows([signals], records)
     )
     state = baseline(problem, ["coulomb_friction"])
     return problem, solved(problem, state, np.append(state.theta[: -len(SLIDING)], SLIDING))
@@ -75,6 +78,15 @@ def test_only_a_stick_is_no_error_of_the_model(model: RobotModel, more: Law, sti
     relative = relative_rest(problem, state, noise)
     assert relative.max() > TOLERANCE  # something is left, in all three
     assert only_sticks(problem, state, noise, relative, TOLERANCE) == sticks
+
+
+def test_friction_up_to_its_limit_is_no_law_where_the_model_has_less(model: RobotModel) -> None:
+    """What a joint that creeps holds goes with its velocity, and stays within what it takes to slide."""
+    problem, state = recorded(model, lambda v, top, rng: 0.0 * v, width=0.06)
+    noise, left = np.full(2, NOISE), problem.torque - predicted(problem, state)
+    assert np.abs(left).max() > 0.2 * SLIDING.max()
+    assert beyond_sliding(problem, state, left).max() < 0.01 * SLIDING.max()
+    assert only_sticks(problem, state, noise, relative_rest(problem, state, noise), TOLERANCE)
 
 
 def test_what_is_tolerable_everywhere_is_no_stick(model: RobotModel) -> None:

@@ -19,6 +19,8 @@ def test_what_no_torque_shows_stays_as_near_to_the_nominal_as_was_stated(slack: 
     problem: Any = SimpleNamespace(precision=rng.uniform(1, 100, 12), nominal=np.zeros((1, 10)), shown=shown, told=told)
     loose = _Problem.loosened(problem, slack)
     problem.loosened = lambda slack: loose
+    everywhere = [f(problem, slack, everywhere=True) for f in (_Problem.root_at, _Problem.spread_at)]
+    np.testing.assert_allclose(everywhere[0] @ everywhere[1], np.eye(12), rtol=0, atol=1e-12)
     root, spread = _Problem.root_at(problem, slack), _Problem.spread_at(problem, slack)
     np.testing.assert_allclose(root @ spread, np.eye(12), rtol=0, atol=1e-12)
     covariance = spread @ spread.T

@@ -63,6 +63,7 @@ def test_no_cause_loses_what_the_others_gain(answer: Diagnosis):
     gains = [cause.gain for cause in answer.causes]
     assert all(one.after == after.before for one, after in zip(gains[:-1], gains[1:], strict=True))
     assert gains[0].before == answer.holdout.before and gains[-1].after == answer.holdout.after
+    assert all(gain.after < gain.before for gain in gains)
     assert answer.holdout.after < answer.holdout.before
     assert sorted(cause.found for cause in answer.causes) == list(range(1, len(gains) + 1))
 

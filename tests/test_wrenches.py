@@ -19,8 +19,8 @@ from figaroh_jax.estimation.states import States
 from figaroh_jax.formats.config import Baseline, load_task
 from figaroh_jax.identification.result import Identification
 from figaroh_jax.identification.wrenches import SensorStates, generalized_force, wrench_regressor
+from figaroh_jax.jobs.predictions import predictions
 from figaroh_jax.recordings.groupmotion import group_rates
-from figaroh_jax.runs import predictions
 
 # a trunk that flies, an arm of two joints on it; {k} scales what the model is told of the masses
 FLYER = """<mujoco model="flyer"><compiler angle="radian"/><option timestep="1e-3" integrator="Euler"/><worldbody>

@@ -34,10 +34,10 @@ def _rows(name: str, case: Case, out: Path, modes: Iterable[str]) -> list[dict[s
     found = []
     for mode in modes:
         forbid = tuple(case["forbid"]) if mode == "forbidden" else ()
-        job = Job(name, forbid)
-        if not (out / job.folder / "run.json").is_file():
+        job, twin_job = Job(name, forbid), Job(case["twin"], forbid)
+        if not all((out / each.folder / "run.json").is_file() for each in (job, twin_job)):
             continue
-        answer, twin = read(out / job.folder), read(out / Job(case["twin"], forbid).folder)
+        answer, twin = read(out / job.folder), read(out / twin_job.folder)
         graded = grade(case if mode == "named" else case | {"truth": []}, answer, twin)
         ran = json.loads((out / job.folder / "run.json").read_text())
         found.append(

@@ -267,7 +267,7 @@ class Run:
             scheme = "recordings with role: holdout"
         else:
             validated = list(zip(table["frames"], table["chosen"], strict=True))
-            scheme = f"{levels.FOLDS} folds, every fifth posture; level and effects selected within each"
+            scheme = f"{levels.FOLDS} folds of every fifth posture; level and effects are selected within each fold"
         both: list[Error | None] = [None, None]
         for c, (unit, scale) in enumerate((("mm", 1e3), ("deg", 180.0 / np.pi))):
             if len(fitted[0][c]):

@@ -29,27 +29,31 @@ def find_outliers(
     while len(found) < max(1, int(_MOST * postures)):
         rows = used & ~np.isin(linear.posture, list(found))
         posterior = marginal.fit(linear, rows, free, robust=True)
-        sizes = _sizes(linear, posterior, rows)
-        worst = max(sizes, key=lambda k: sizes[k])
-        if sizes[worst] < _limit(np.log(list(sizes.values()))):
+        numbers, sizes, counts = _sizes(linear, posterior, rows)
+        worst = int(np.argmax(sizes))
+        if sizes[worst] < _limit(np.log(sizes), int(counts[worst])):
             break
-        found[worst] = sizes[worst]
+        found[int(numbers[worst])] = float(sizes[worst])
     return found
 
 
-def _limit(logarithms: np.ndarray) -> float:
-    """Size from which a posture is an outlier, from median and median deviation of the logarithms of all sizes."""
+def _limit(logarithms: np.ndarray, count: int) -> float:
+    """Size from which a posture of `count` numbers is an outlier, by median and median deviation of all logarithms.
+
+    That deviation is known from few postures: it is no less than that of normal noise, 1/sqrt(2 n) for n numbers.
+    """
     if len(logarithms) < _ENOUGH:
         return _FAR
     middle = np.median(logarithms)
-    spread = 1.4826 * np.median(np.abs(logarithms - middle))
+    spread = max(1.4826 * float(np.median(np.abs(logarithms - middle))), (2 * count) ** -0.5)
     return min(_FAR, float(np.exp(middle + _ALONE * spread)))
 
 
-def _sizes(linear: Linear, posterior: Posterior, used: np.ndarray) -> dict[int, float]:
+def _sizes(linear: Linear, posterior: Posterior, used: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Postures, the size of each one's error, and of how many numbers it is."""
     residual, predicted = marginal.left_out(linear, posterior, used)
     rows = np.flatnonzero(used & (linear.posture >= 0))
     postures, which = np.unique(linear.posture[rows], return_inverse=True)
     square = residual[rows] * predicted[rows] / posterior.noise[linear.channel[rows]] ** 2
-    mean = np.bincount(which, square) / np.bincount(which)
-    return dict(zip(postures.tolist(), np.sqrt(np.maximum(mean, 1e-24)).tolist(), strict=True))
+    counts = np.bincount(which)
+    return postures, np.sqrt(np.maximum(np.bincount(which, square) / counts, 1e-24)), counts

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from .executable_cache import Program
 from .kernels import Straight, straight_answers, usable
-from .machine_code import machine_code
+from .machine_code import machine_code, own_room
 
 __all__ = [
     "BLOCK",
@@ -45,7 +45,6 @@ __all__ = [
 ]
 
 BLOCK, MOST = 1024, 16  # samples to a block, if these are not more chunks
-_ALIGNMENT = 64  # bytes; XLA takes such memory over without a copy
 
 # XLA's older code generator for loops takes half as long to compile our kernels, and the newer one computes gathers
 # inside of sums number by number. JAX 0.11 has the newer one alone.
@@ -116,10 +115,7 @@ def on_the_host() -> AbstractContextManager[Any]:
 
 def aligned(shape: Sequence[int], fill: float | None = None) -> np.ndarray:
     """A new array of float64, empty or zero, in memory that JAX takes over without a copy."""
-    size, spare = int(np.prod(shape)), _ALIGNMENT // 8
-    flat = np.empty(size + spare) if fill is None else np.zeros(size + spare)
-    start = -(flat.ctypes.data // 8) % spare
-    return flat[start : start + size].reshape(shape)
+    return own_room(tuple(shape), fill)
 
 
 def in_chunks(x: Float[Any, "samples k"], chunk: int, chunks: int = 0) -> Float[Any, "chunks k chunk"]:
@@ -244,7 +240,7 @@ def host_answer(
 ) -> Array:
     """Answers for arrays of the host, by machine code of the `straight` form where there is some."""
     code = None if straight is None else machine_code(straight, parameters, *arrays)
-    return _assembled(kernel, chunk, last, parameters, *arrays) if code is None else to_device(code(aligned, *arrays))
+    return _assembled(kernel, chunk, last, parameters, *arrays) if code is None else to_device(code(own_room, *arrays))
 
 
 def _assembled(kernel: Callable[..., Any], chunk: int, last: bool, parameters: Any, *arrays: np.ndarray) -> Array:

@@ -33,15 +33,17 @@ from jaxtyping import Float
 
 from .executable_cache import surroundings
 from .kernels import Number, Program, Straight
+from .memory import recycled
 from .store import Store
 
-__all__ = ["FARTHEST", "FEWEST", "code_of_few", "library", "machine_code"]
+__all__ = ["FARTHEST", "FEWEST", "code_of_few", "library", "machine_code", "own_room"]
 
 FEWEST = 8  # samples: no vector is longer
 FROM = 512  # samples; below, handing them over costs as much as it saves
 TO_COMPILE = 2048  # samples from which a program that is nowhere yet is compiled
 SMALL = 700  # constants of a robot (12 joints) up to which this holds; a larger one takes longer to compile than XLA's
 PIECE = 4096  # samples of one call, on one core
+ALIGNMENT = 64  # bytes; XLA takes such memory over without a copy
 FARTHEST = 1e5  # rad, to which `sine_cosine` is exact
 PATIENCE = 300.0  # s that a compiler may take
 LEVEL = {False: "-O1", True: "-Og"}  # of the reverse: as fast, compiled in half the time
@@ -85,7 +87,8 @@ def machine_code(
 ) -> Callable[..., np.ndarray] | None:
     """`run(room, *arrays)`: answers for these arrays of the host or pieces of them, at least a vector of samples.
 
-    They are (samples, *shape), or the samples last, in memory from `room`. None where the plain form has to serve.
+    They are (samples, *shape), or the samples last, in memory from `room`; from `own_room`, memory of answers that were
+    given up is used again. None where the plain form has to serve.
     """
     samples = len(arrays[0])
     if samples < FROM or straight.places is None or _compiler() is None or not _near(arrays[0]):
@@ -123,10 +126,20 @@ def _wanted(straight: Straight, parameters: Any, widths: tuple[int, ...]) -> tup
 
 def _run(code: _Code, last: bool, constants: np.ndarray, room: Room, *arrays: np.ndarray) -> np.ndarray:
     samples, fill = len(arrays[0]), None if code.complete else 0.0
-    answer = room((*code.shape, samples) if last else (samples, *code.shape), fill)
+    shape = (*code.shape, samples) if last else (samples, *code.shape)
+    answer = recycled(code.functions, shape) if room is own_room else None
+    answer = room(shape, fill) if answer is None else answer
     rows = [np.ascontiguousarray(x, float) for x in arrays]
     _in_pieces(partial(code.run, constants, rows, answer, last), samples, code.lanes)
     return answer
+
+
+def own_room(shape: tuple[int, ...], fill: float | None) -> np.ndarray:
+    """New memory that JAX takes over without a copy, empty or zero."""
+    size, spare = prod(shape), ALIGNMENT // 8
+    flat = np.empty(size + spare) if fill is None else np.zeros(size + spare)
+    start = -(flat.ctypes.data // 8) % spare
+    return flat[start : start + size].reshape(shape)
 
 
 def _run_back(code: _Code, constants: np.ndarray, cotangent: np.ndarray, *arrays: np.ndarray) -> np.ndarray:

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
-from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -26,7 +24,7 @@ from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Resampled, Signals, prepare_all
 from ..recordings.stacked import stack
-from ..results import Cause, Diagnosis, Gain, Name, Nearest, Rest, Verdict
+from ..results import Cause, Diagnosis, Nearest, Rest, Verdict
 from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
 from ..simulators.native import as_backend
@@ -36,7 +34,8 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .holdout import fold_error, held_squares, part_error, residual_rms, step_squares, traces
+from .gaining import Gaining, without_losses
+from .holdout import fold_error, part_error, residual_rms, traces
 from .joint import Joint, opened, polished, sized
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import reason_against, standings
@@ -131,7 +130,7 @@ class _Judged(NamedTuple):
     """What the diagnosis stands by."""
 
     word: Verdict
-    causes: _Gaining
+    causes: Gaining
     rest: Rest
     sticks: bool  # whether what is left is that of joints at rest
     here: _Setting  # with the weights of the answer's fit
@@ -251,20 +250,33 @@ def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], to
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
     here, joint = _as_predicts_best([here] if same else [here, before], named)
-    gaining = _without_losses(here, named, joint, partial(_falls_beside_all, searched))
+    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict)
     gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
-    against |= dict.fromkeys(gaining.worse, "the error on the data held out does not fall with it")
+    against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
     shown = left.there or (bool(nearest) and float(relative.max()) > tolerance)
-    sticks = shown and only_sticks(problem, joint.step.state, noise, relative, tolerance)
+    sticks = shown and _sticks([here, searched.here], [f.effect for f in named], joint, tolerance)
     rest = shown and not sticks
     text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
     parts = parts_of(problem, joint.step, whitening, line, names)
     nearest = tuple(sorted(nearest, key=lambda one: -one.share))
     return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text), sticks, here)
+
+
+def _sticks(settings: Sequence[_Setting], causes: list[Effect], joint: Joint, tolerance: float) -> bool:
+    """Whether what is left beside the named causes is that of joints at rest (the answer's fit, or by speed).
+
+    A fit that is also asked for slow rows gives part of their sticks to the friction of the joints that move.
+    """
+    for k, here in enumerate(settings):
+        fitted = polished(here.problem, here.start, causes, here.whitening) if k else joint
+        state, noise = fitted.step.state, noise_rms(here.problem, here.spectrum)
+        if only_sticks(here.problem, state, noise, relative_rest(here.problem, state, noise), tolerance):
+            return True
+    return False
 
 
 def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple[_Setting, Joint]:
@@ -283,71 +295,6 @@ def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple
             best = (error, one, joint) if best is None or error < best[0] else best
     assert best is not None
     return best[1:]
-
-
-class _Gaining(NamedTuple):
-    """Causes that all lower the error on the data held out, with that error."""
-
-    named: list[Found]
-    joint: Joint
-    order: list[int]  # of the named, by what each gains as it comes in
-    gains: list[float]  # relative RMS error before the first of that order, and after each
-    worse: list[Name]  # those that did not
-
-
-def _without_losses(
-    here: _Setting, named: list[Found], joint: Joint, falls_beside_all: Callable[[Found], bool]
-) -> _Gaining:
-    """The causes without those that do not lower the error on the data held out.
-
-    Each must lower the error of the joints where it acts, for a joint of large torque hides what happens at the
-    others: beside the named causes, or beside all that were found, for what is left out moves the fit of the rest. And
-    it must lower that of the robot, as it comes in: by what it gains alone, or else after all the others, for some show
-    only beside another.
-    """
-    worse: list[Name] = []
-    later: list[Name] = []  # come in behind the others
-    while True:
-        order, squares, power = _by_gain(here, joint.causes, [f.name in later for f in named])
-        falls, places = [a - b for a, b in pairwise(squares)], [list(named[k].joints) for k in order]
-        own = [f[at].sum() / a[at].sum() for at, f, a in zip(places, falls, squares, strict=False)]
-        whole = [f.sum() for f in falls]
-        own = [1.0 if g <= 0 and falls_beside_all(named[k]) else g for k, g in zip(order, own, strict=True)]
-        if not named or (min(own) > 0 and min(whole) > 0):
-            gains = [float(np.sqrt(s.sum() / power.sum())) for s in squares]
-            return _Gaining(named, joint, order, gains, worse)
-        least = order[int(np.argmin(own if min(own) <= 0 else whole))]
-        if named[least].name not in later and len(named) > 1:
-            later.append(named[least].name)
-            continue
-        worse.append(named[least].name)
-        named = [f for k, f in enumerate(named) if k != least]
-        joint = polished(here.problem, here.start, [f.effect for f in named], here.whitening)
-
-
-def _falls_beside_all(searched: _Searched, one: Found) -> bool:
-    """Whether a cause lowers the error of its joints on the data held out with all others in that were found."""
-    problem, start, whitening = searched.here.problem, searched.here.start, searched.here.whitening
-    pairs = zip(searched.found, searched.joint.causes, strict=True)
-    others = with_causes(problem, start, [effect for f, effect in pairs if f.name != one.name], whitening)
-    before, after = (step_squares(problem, s)[list(one.joints)].sum() for s in (others, searched.joint.step))
-    return bool(after < before)
-
-
-def _by_gain(
-    here: _Setting, causes: Sequence[Effect], later: Sequence[bool]
-) -> tuple[list[int], list[Float[np.ndarray, " nv"]], Float[np.ndarray, " nv"]]:
-    """The order of what each cause gains on held-out data as it comes in, those that come `later` behind the others.
-
-    With the squares of the error in that order, and of the torque.
-    """
-    order = list(range(len(causes)))
-    squares, power = held_squares(here.problem, here.start, list(causes), here.whitening)
-    drops = [float((before - after).sum()) for before, after in pairwise(squares)]
-    ranked = sorted(order, key=lambda k: (later[k], -drops[k]))
-    if ranked != order:
-        squares, power = held_squares(here.problem, here.start, [causes[k] for k in ranked], here.whitening)
-    return ranked, squares, power
 
 
 def _left(
@@ -375,7 +322,7 @@ def _left(
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:
     here, seen = judged.here, stand(searched.problem, searched.start, searched.whitening)
-    named, joint, order, gains, _ = judged.causes
+    named, joint, order, gains, holdout, _ = judged.causes
     problem, model, last = here.problem, here.problem.model, joint.step
     first = stand(problem, here.start, here.whitening)
     found = [named[k] for k in order]
@@ -388,18 +335,18 @@ def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judg
                 one.name,
                 estimates(effect, joint.fitted, joint.fitted.places[k], model),
                 one.confidence,
-                Gain(*gain),
+                gain,
                 one.ambiguous,
                 k + 1,
             )
-            for k, one, effect, gain in zip(order, found, causes, pairwise(gains), strict=True)
+            for k, one, effect, gain in zip(order, found, causes, gains, strict=True)
         ),
         p_value=search.p_value,
         joints=model.joint_names,
         before=residual_rms(problem, first.state),
         after=residual_rms(problem, last.state),
         noise=noise,
-        holdout=Gain(gains[0], gains[-1]),
+        holdout=holdout,
         holdout_scheme=_scheme(signals),
         experiment=next_experiment(judged.word, found, problem, here.start, causes, here.whitening),
         candidates=explain(seen.rows, seen.linear, search.screened, noise),
@@ -432,8 +379,8 @@ def _baseline_effects(model: RobotModel, known: Baseline | None) -> tuple[list[s
 
 
 _AT_REST = (
-    "at rest the torque differs from the model, as dry friction lets it: there it takes any value up to its limit, and"
-    " no law of the velocity predicts which; where the joints move, nothing is left beyond the tolerance"
+    "at rest the torque differs from the model, as dry friction allows: there it can take any value up to its limit,"
+    " which no law of velocity predicts; where the joints move, the residual is within the tolerance"
 )
 
 
@@ -446,10 +393,13 @@ def _scheme(signals: Sequence[Signals]) -> str:
 def _notes(signals: Sequence[Signals], here: _Setting) -> tuple[str, ...]:
     notes = [note for s in signals for note in s.notes]
     if not here.problem.layout.repeats:
-        notes.append("no recording repeats another: the noise is what a rich model leaves, less sure than repeats")
+        notes.append(
+            "no recording repeats another: the noise is estimated from the residual of a flexible model, which is less"
+            " certain than from repeats"
+        )
     if here.white:
         notes.append(
-            "the model errs by more than the noise: rows are weighted by what it leaves of each joint, which predicts"
-            " data that was not fitted better than weights by the spectrum of the noise"
+            "the model's error exceeds the noise: rows are weighted by each joint's residual, which predicts held-out"
+            " data better than weights from the noise spectrum"
         )
     return tuple(notes)

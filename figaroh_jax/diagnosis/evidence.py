@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..estimation.rows import Linear, Rows, tall
+from ..estimation.rows import Linear, Rows, block_sums, tall
 from .bank import Bank, Columns
 
 __all__ = [
@@ -113,10 +113,12 @@ def block_scores(
     rows: Rows, linear: Linear, stock: Bank, H: Float[np.ndarray, "P columns"]
 ) -> Float[np.ndarray, "blocks columns"]:
     """The scores' share of each block, then of each prior row; they sum to the scores."""
-    member = (rows.block[:, None] == np.arange(rows.block.max() + 1)).astype(float)
     own = linear.residual * rows.paired
-    model = sum(member.T @ (x * r[:, None]) for x, r in zip(rows.Xi, own, strict=True))
-    total = stock.product([member * r[:, None] for r in linear.residual]).T - model @ H
+    model = sum(block_sums(rows, r, x.T) for x, r in zip(rows.Xi, own, strict=True))
+    total = np.zeros((stock.width, rows.block.max() + 1))
+    for joint, columns, Zi in stock.blocks:
+        total[columns] += block_sums(rows, linear.residual[joint], Zi)
+    total = total.T - model.T @ H
     return np.concatenate([total, linear.pull[:, None] * H])
 
 

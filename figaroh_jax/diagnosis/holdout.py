@@ -19,35 +19,66 @@ from .search import Found
 from .shifts import torque_change
 from .state import State, batched, extended_state
 from .step import Step, stand
+from .thresholds import LEAST_MOVING, STANDS
 
-__all__ = ["fold_error", "held_squares", "part_error", "predicted", "residual_rms", "step_squares", "traces"]
+__all__ = ["fold_error", "held_squares", "part_error", "predicted", "residual_rms", "traces"]
+
+BLOCK, FEWEST = 1.0, 8  # s; blocks of a recording
 
 
 def held_squares(
     problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]
-) -> tuple[list[Float[np.ndarray, " nv"]], Float[np.ndarray, " nv"]]:
-    """Squares of each joint's error on data not fitted, of the baseline, then after each cause; and of its torque.
+) -> tuple[list[Float[np.ndarray, "2 blocks nv"]], Float[np.ndarray, "2 nv"]]:
+    """Squares of each joint's error on data not fitted, block by block, of the baseline, then after each cause; and of
+    its torque. First of all rows, then of those in which the joint moves.
 
     Of the filtered torque (N m or N), over the holdout recordings with torque; without any, over parts of the others,
     each predicted by a fit to the rest.
     """
-    out, step = [], None
+    out, step, block, kept = [], None, _blocks(problem), _kept_out(problem)
+    rows = np.stack([np.ones(kept.shape), _moves(problem)])
     for effect in [None, *causes]:
         grown = start if step is None or effect is None else extended_state(problem, step.state, effect)
         step = stand(problem, grown, whitening, step)
-        out.append(step_squares(problem, step))
-    return out, ((problem.torque * _kept_out(problem)) ** 2).sum((0, 1))
+        squares = np.moveaxis(_error(problem, step) ** 2 * rows, 3, 1)[..., block >= 0]
+        out.append(np.stack([[np.bincount(block[block >= 0], x) for x in some] for some in squares]).swapaxes(1, 2))
+    return out, ((problem.torque * kept) ** 2 * rows).sum((1, 2))
 
 
-def step_squares(problem: Problem, step: Step) -> Float[np.ndarray, " nv"]:
-    """Squares of each joint's error on data not fitted (N m or N, squared), as `held_squares` has them, of one fit."""
+def _moves(problem: Problem) -> Float[np.ndarray, "n M nv"]:
+    """1 in the rows in which a joint moves: where it stands, dry friction holds any torque up to its limit, and what a
+    model of the motion says of it is chance. 1 everywhere for a joint that hardly moves in the data not fitted."""
+    speed, kept = np.abs(np.asarray(problem.records.velocity)), _kept_out(problem) > 0
+    rows = np.take_along_axis(speed, problem.records.row_samples()[..., None], axis=1)
+    moves = rows >= STANDS * speed.max((0, 1))
+    seldom = (moves & kept).sum((0, 1)) < LEAST_MOVING * kept.sum((0, 1))
+    return np.where(seldom, 1.0, moves)
+
+
+def _error(problem: Problem, step: Step) -> Float[np.ndarray, "n M nv"]:
+    """Each joint's error (N m or N) on data not fitted, zero in other rows."""
     state, part = step.state, problem.layout.part
     if problem.held.any():
         error = problem.torque - predicted(problem, state)
     else:
         parts = judge(step.rows._replace(fold=part), Hypothesis(step.rows.X, state.prior)).folds
         error = _left_out(problem, state, parts, part)
-    return ((error * _kept_out(problem)) ** 2).sum((0, 1))
+    return error * _kept_out(problem)
+
+
+def _blocks(problem: Problem) -> Int[np.ndarray, "n M"]:
+    """Which block of the data not fitted a row belongs to, -1 for others: of about a second, at least `FEWEST` in a
+    recording."""
+    kept = np.any(_kept_out(problem) > 0, axis=2)
+    block, first, rate = np.full(kept.shape, -1), 0, float(problem.records.rate)
+    for at in problem.records.spans:
+        here = (at.slot, slice(at.row, at.row + at.rows))
+        if kept[here].any():
+            width = max(1.0, min(BLOCK * rate, at.rows / FEWEST))
+            number = (np.arange(at.rows) // width).astype(int)
+            block[here] = np.where(kept[here], first + number, -1)
+            first += int(number[-1]) + 1
+    return block
 
 
 def _kept_out(problem: Problem) -> np.ndarray:

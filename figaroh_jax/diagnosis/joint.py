@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..effects.base import Effect
 from ..effects.catalogue import CATALOGUE, find
-from ..estimation.rows import Rows
+from ..estimation.rows import Rows, block_sums
 from ..results import Name
 from .design import kind, shapes, with_shape
 from .estimates import Fitted, amplitude_places, torque_slopes, with_amplitudes
@@ -101,9 +101,8 @@ def _widened(
 def _scatter(rows: Rows, J: Float[np.ndarray, "nv T P"], residual: Float[np.ndarray, "nv T"]) -> np.ndarray:
     """sum_b g_b g_b' of the blocks' scores g_b = J_b' r_b: right for coloured residuals too."""
     blocks = rows.block.max() + 1
-    member = (rows.block[:, None] == np.arange(blocks)).astype(float)
-    scores = np.sum([member.T @ (x * r[:, None]) for x, r in zip(J, residual, strict=True)], axis=0)
-    return scores.T @ scores * blocks / max(blocks - 1, 1)
+    scores = np.sum([block_sums(rows, r, x.T) for x, r in zip(J, residual, strict=True)], axis=0)
+    return scores @ scores.T * blocks / max(blocks - 1, 1)
 
 
 def _places(problem: Problem, state: State, causes: list[Effect]) -> tuple[tuple[int, ...], ...]:

@@ -66,8 +66,8 @@ def reason_against(one: Standing, rest: bool, tolerance: float) -> str:
     """
     least = GAIN_NAMED_ROBOT if one.whole else GAIN_NAMED
     checks = [
-        (one.physical, "its sign is one that physics forbids"),
-        (one.gain > 0, f"it predicts held-out data no better (gain {one.gain:.2g})"),
+        (one.physical, "its fitted sign is physically impossible"),
+        (one.gain > 0, f"it does not improve the prediction of held-out data (gain {one.gain:.2g})"),
         (
             one.share >= tolerance,
             f"its torque is {one.share:.2%} of the joint's, below the tolerance of {tolerance:.2%}",
@@ -75,17 +75,23 @@ def reason_against(one: Standing, rest: bool, tolerance: float) -> str:
     ]
     if rest or not one.beside_rest:  # what any rest looks like is never taken on less
         checks += [
-            (one.t >= T_NAMED, f"its gain on held-out data is not sure: t = {one.t:.1f} of {T_NAMED:g}"),
-            (one.gain >= least, f"it takes {one.gain:.0%} of the held-out error where it acts, {least:.0%} are needed"),
+            (one.t >= T_NAMED, f"its gain on held-out data is not significant: t = {one.t:.1f}, {T_NAMED:g} needed"),
+            (one.gain >= least, f"it removes {one.gain:.0%} of the held-out error where it acts, {least:.0%} needed"),
             (
                 one.modulation <= MODULATION and one.modulation_held_out <= MODULATION_HELD_OUT,
-                "its amplitude would rather vary with position, speed, load or time"
-                f" ({max(one.modulation, one.modulation_held_out):.2f} of its gain more)",
+                "its amplitude varies with position, speed, load or time"
+                f" (that would add {max(one.modulation, one.modulation_held_out):.2f} of its gain)",
             ),
-            (one.share >= SHARE_NAMED, f"its torque is {one.share:.1%} of the joint's, {SHARE_NAMED:.0%} are needed"),
-            (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion do as well"),
-            (one.beside_rest or not rest, "a rest that stays may look like it: it is named only where none does"),
-            (not one.inertia_alone, "a coupling without friction of its own may be a rotor's or a link's inertia"),
+            (one.share >= SHARE_NAMED, f"its torque is {one.share:.1%} of the joint's, {SHARE_NAMED:.0%} needed"),
+            (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion explain as much"),
+            (
+                one.beside_rest or not rest,
+                "the unexplained residual may imitate it: it is named only where nothing else is left",
+            ),
+            (
+                not one.inertia_alone,
+                "a coupling without friction of its own cannot be distinguished from rotor or link inertia",
+            ),
         ]
     return next((reason for passed, reason in checks if not passed), "")
 

@@ -60,6 +60,19 @@ class Part:
             series[:, few] = columns[few][:, joint, column].T
         return cls(series, joint, column, *columns.shape[1:])
 
+    @classmethod
+    def of_blocks(
+        cls, blocks: Float[np.ndarray, "pairs 10 nN"], where: Int[np.ndarray, "pairs 2"], model: RobotModel
+    ) -> Part:
+        """The part of ten columns for each joint and link that the tree does not make zero, in order of the joints."""
+        flat = blocks.reshape(-1, blocks.shape[2])
+        used = flat[:, :TURNED].any(1)
+        used[~used] = flat[~used].any(1)
+        joint, first = np.repeat(where, 10, axis=0).T
+        column = 10 * first + np.tile(np.arange(10), len(where))
+        series = flat if used.all() else flat[used]
+        return cls(series, joint[used], column[used], model.nv, 10 * len(model.joints))
+
     @property
     def samples(self) -> int:
         """Samples of all recordings."""
@@ -262,6 +275,7 @@ class Problem:
 
 
 def family_of(effect: type[Effect]) -> str:
+    """How an effect is screened: `link`, `sensor`, `following` (the torque), `shaped` (a grid) or `fixed` columns."""
     if effect.inertial:
         return "link"
     if kind(effect) != "columns" or not (effect.has("torque") or effect.has("torque_error")):

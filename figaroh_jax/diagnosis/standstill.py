@@ -1,8 +1,9 @@
 """Dry friction at rest: set-valued, so that what is left of a joint's torque there need be no error of the model.
 
 During a stick the friction takes any value up to its limit, whichever way the joint moved before, and the row filter
-carries that to the rows around. A law of the velocity that the model lacks (Stribeck's) shows at the same speeds, but
-there the velocity predicts the torque; during a stick it does not.
+carries that to the rows around. A drive that pushes a joint which creeps makes that value go with the velocity, too. A
+law of the velocity that the model lacks (Stribeck's) shows at the same speeds, but there the friction goes beyond what
+the joint needs to slide; during a stick it stays within.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from .state import State
 from .thresholds import CARRIED, LAW_AT_REST, LAW_WIDTHS, LEAST_MOVING, STANDSTILL
 from .weights import relative_speed
 
-__all__ = ["only_sticks", "resting"]
+__all__ = ["beyond_sliding", "only_sticks", "resting"]
+
+TURNED = 0.1  # of the way to its limit: below, what friction a joint needs to slide is taken from the samples around
 
 
 def resting(problem: Problem) -> Bool[np.ndarray, "n M nv"]:
@@ -44,7 +47,7 @@ def only_sticks(
     tolerance: float,
 ) -> bool:
     """Whether what the state leaves beyond the `noise` (N m or N) is no larger than tolerable where the joints move,
-    and at rest no law of the velocity.
+    and at rest within what dry friction can hold, or no law of the velocity.
 
     `relative` is what it leaves of all rows over each joint's torque: a joint below the tolerance is not looked at.
     """
@@ -56,19 +59,42 @@ def only_sticks(
     if not len(looked_at) or np.any(moving[looked_at] > tolerance * torque[looked_at]):
         return False
     seen = (judged & ~still).sum((0, 1)) >= LEAST_MOVING * judged.sum((0, 1))
-    held = _rms(left, still) <= 2 * _friction(state)  # from one limit to the other
+    held = _rms(left, still) <= 2 * np.sqrt((_friction(state) ** 2).mean(0))  # from one limit to the other
     if not np.all((seen & held)[looked_at]):
         return False
-    return not any(_law_of_velocity(problem, state, left, still, joint) for joint in looked_at.tolist())
+    beyond = np.sqrt(np.maximum(_rms(beyond_sliding(problem, state, left), still) ** 2 - noise**2, 0.0))
+    slides = [joint for joint in looked_at.tolist() if beyond[joint] > tolerance * torque[joint]]
+    return not any(_law_of_velocity(problem, state, left, still, joint) for joint in slides)
 
 
-def _friction(state: State) -> Float[np.ndarray, " nv"]:
-    """RMS of what all friction of the state takes of each joint, N m or N."""
+def beyond_sliding(problem: Problem, state: State, left: Float[np.ndarray, "n M nv"]) -> Float[np.ndarray, "n M nv"]:
+    """How far the friction of each row, which is that of the state and what it has `left`, lies outside the interval
+    from minus to plus the friction that the state has for sliding at the row's speed, N m or N; zero inside.
+
+    Where the state's friction turns over a width of the velocity, the limit is what it comes to beyond that width. The
+    row filter overshoots where friction turns at once, so the limit is as much larger as it makes the sign of the
+    velocity at the most.
+    """
+    n, samples, *_ = problem.records.shape
+    friction, turned = _friction(state), np.abs(np.asarray(state.motion.direction))
+    limit = np.empty_like(friction)
+    for joint, (own, part) in enumerate(zip(friction.T, turned.T, strict=True)):
+        told = np.flatnonzero(part > TURNED)
+        sliding = np.abs(own[told]) / part[told]
+        limit[:, joint] = np.interp(np.arange(n * samples), told, sliding) if len(told) else np.inf
+    response, sign = state.response(problem.records.omega), np.sign(np.asarray(state.motion.velocity))
+    inside, edge, turns = (open_rows(problem.records, x, response) for x in (friction, limit, sign))
+    over = np.maximum(np.abs(turns * problem.records.judged).max((0, 1)), 1.0)
+    return np.maximum(np.abs(inside + left) - over * edge, 0.0)
+
+
+def _friction(state: State) -> Float[np.ndarray, "nN nv"]:
+    """What all friction of the state takes of each joint, N m or N."""
     _, *shares = state.shares(state.theta)
     friction = np.zeros((state.rigid.samples, state.rigid.nv))
     for share, term in zip(shares, state.terms, strict=True):
         friction = friction + share * term.dissipative
-    return np.sqrt((friction**2).mean(0))
+    return friction
 
 
 def _rms(rows: Float[np.ndarray, "n M nv"], used: Bool[np.ndarray, "n M nv"]) -> Float[np.ndarray, " nv"]:

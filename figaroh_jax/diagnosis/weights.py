@@ -92,6 +92,7 @@ def white_where_better(
 
 
 def relative_speed(problem: Problem) -> Float[np.ndarray, "n M nv"]:
+    """Speed of every joint at the rows of every recording, as a share of its largest in the rows that are fitted."""
     records = problem.records
     speed = np.take_along_axis(np.abs(np.asarray(records.velocity)), records.row_samples()[..., None], axis=1)
     return speed / np.maximum((speed * records.fitted).max((0, 1)), 1e-12)

@@ -77,7 +77,15 @@ class Native(NamedTuple):
 
 
 class Motion(eqx.Module):
-    """Motion of the robot at `samples` instants, and what the current model makes of it."""
+    """Motion of the robot at `samples` instants, and what the current model makes of it; what an effect is given.
+
+    `time` (s) is (samples,); `position` (rad or m), `velocity` and `acceleration` are (samples, nv); `load`
+    (samples, nv) is the torque of the rigid body alone and `total` that of the whole model, friction included (N m or
+    N).
+    `direction` is the sign of the velocity, smooth within one sample: use it where a law of friction has a sign.
+    `angle` is the position of each coordinate, `elapsed` the time since the record began. Within an effect,
+    `self.here(motion.velocity)` is the column of its own joint.
+    """
 
     model: RobotModel
     time: Float[Leaf, " samples"]  # s
@@ -205,8 +213,24 @@ class Place(eqx.Module):
 class Effect(eqx.Module):
     """A physical effect at a place; subclass it, declare its parameters and write at least one form.
 
+    A subclass gives its `name`, a `title` in plain words, its `equation` as text and the kind of place that it
+    `acts_on`: "joint", "pair" (of joints), "link" or "robot". Parameters are fields made by `amplitude` (the torque is
+    linear in them) or `shape` (it is not). The forms are methods: `torque(motion)` for what is added at the joints,
+    positive as the drives' torque is (friction is positive where the joint moves forwards); the table at the head of
+    `figaroh_jax.effects.base` lists the others. Use `jax.numpy` in them. Relations to other effects (`contains`,
+    `excludes`, `resembles`, ...) and what physics asks (`dissipative`) are attributes of the class.
+
     `at` holds the indices of the place: one coordinate (`joint`), two (`pair`), a tree link (`link`), none (`robot`);
     in a model they are static (`Place`).
+
+    >>> import figaroh_jax as fj, jax.numpy as jnp
+    >>> class Wind(fj.Effect):
+    ...     name, title, acts_on, equation = "wind", "a gust of wind", "robot", "push sin(2 pi t)"
+    ...     push: float = fj.amplitude("N m")
+    ...     def torque(self, motion):
+    ...         return self.push * jnp.sin(2 * jnp.pi * motion.time)[:, None] * jnp.ones_like(motion.velocity)
+    >>> float(fj.place(Wind, fj.load_urdf(fj.DEMO), push=2.0).push)
+    2.0
     """
 
     at: Int[Leaf, "*many places"] | Place
@@ -337,7 +361,23 @@ class Effect(eqx.Module):
 
 
 class JointEffect(Effect):
-    """An effect at one joint."""
+    """An effect at one joint: `torque(motion)` is one number a sample, (samples,), N m or N; see `Effect`.
+
+    >>> import figaroh_jax as fj, jax.numpy as jnp
+    >>> class Grease(fj.JointEffect):
+    ...     name, title, equation = "grease", "friction of grease", "force s(v) log(1 + |v| / speed)"
+    ...     dissipative = True  # a negative force would drive the robot
+    ...     force: float = fj.amplitude("N m")
+    ...     speed: float = fj.shape("rad/s", (0.01, 0.03, 0.1))  # where a search begins
+    ...     def torque(self, motion):
+    ...         growth = jnp.log1p(abs(self.here(motion.velocity)) / self.speed)
+    ...         return self.force * self.here(motion.direction) * growth
+    >>> robot, q, v = fj.load_urdf(fj.DEMO), jnp.zeros(4), jnp.array([0.0, 0.0, 1.0, 0.0])
+    >>> more = fj.extend(robot, fj.place(Grease, robot, [robot.joint_names[2]], force=0.5, speed=0.1))
+    >>> added = more.inverse_dynamics(q, v, q) - fj.inverse_dynamics(robot, q, v, q)  # 0.5 log(1 + 1 / 0.1)
+    >>> [round(float(x), 3) for x in added]
+    [0.0, 0.0, 1.199, 0.0]
+    """
 
     acts_on = "joint"
 
@@ -359,8 +399,10 @@ def smooth_sign(
     return (velocity / (wider + 1e-9)).clip(-1.0, 1.0)
 
 
-def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **parameters: float) -> Effect:
+def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **parameters: Scalar) -> Effect:
     """The effect at the joints, pair or link named in `at`, with parameters by name (the others at their default).
+
+    A parameter is a number, also one that `jax.grad`, `jax.vmap` or `jax.jit` traces.
 
     >>> import figaroh_jax as fj
     >>> robot = fj.load_urdf(fj.DEMO)
@@ -381,7 +423,9 @@ def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **par
     return effect(indices, **{name: _number(effect, name, value) for name, value in parameters.items()})
 
 
-def _number(effect: type[Effect], name: str, value: Any) -> np.float64:
+def _number(effect: type[Effect], name: str, value: Any) -> Any:
+    if isinstance(value, Tracer) and value.ndim == 0:
+        return value
     try:
         number = np.float64(value)
     except (TypeError, ValueError):

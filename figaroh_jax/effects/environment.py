@@ -19,21 +19,24 @@ __all__ = ["Contact", "ExternalWrench", "GravityTilt", "PointEffect"]
 class GravityTilt(Effect):
     """A base that is not level: gravity in the base frame has a horizontal part."""
 
-    name, title, acts_on = "gravity_tilt", "tilt of the base", "robot"
+    name, title, acts_on = "gravity_tilt", "base tilt", "robot"
     equation = "tau(gravity + (x, y, 0)) - tau(gravity)"
     separated_by = "a full turn of the first joint with the arm stretched, or a level on the base"
     x: Scalar = amplitude("m/s2")
     y: Scalar = amplitude("m/s2")
 
     def change(self, model: RobotModel) -> RobotModel:
+        """The robot with x and y added to gravity in its base frame, m/s2."""
         tilted = model.gravity + jnp.stack([jnp.asarray(self.x), jnp.asarray(self.y), jnp.zeros(())])
         return eqx.tree_at(lambda m: m.gravity, model, tilted)
 
     def physical(self) -> dict[str, Scalar]:
+        """The tilt itself: angles about the base's x and y axes, rad, for a base that leans by little (9.81 m/s2)."""
         return {"about_x": -self.y / 9.81, "about_y": self.x / 9.81}
 
     @classmethod
     def units(cls) -> dict[str, str]:
+        """Those of `physical`: rad."""
         return {"about_x": "rad", "about_y": "rad"}
 
 
@@ -44,6 +47,7 @@ class PointEffect(Effect):
 
     @classmethod
     def may_act(cls, model: RobotModel, place: int) -> bool:
+        """At a link at the end of the tree: the index of its joint in `model.joints`."""
         return all(joint.parent != place for joint in model.joints)  # a link at the end of the tree
 
     def point(self, motion: Motion, offset: Array) -> tuple[Float[Array, "3 samples"], Float[Array, "nv 3 samples"]]:
@@ -60,7 +64,7 @@ class PointEffect(Effect):
 class ExternalWrench(PointEffect):
     """A constant force on the last link: a cable, a hose, somebody who pulls."""
 
-    name, title = "external_wrench", "a constant force from outside"
+    name, title = "external_wrench", "constant external force"
     equation = "-J(q)' (force_x, force_y, force_z) at the point (x, y, z) of the link"
     separated_by = "the same motion with {at} free, or with the base turned"
     resembles = ("gravity_tilt", "payload")  # six numbers that follow any constant load of a few postures
@@ -73,6 +77,10 @@ class ExternalWrench(PointEffect):
     z: Scalar = shape("m", (0.0,), (-0.6, 0.6))
 
     def torque(self, motion: Motion) -> Float[Array, "samples nv"]:
+        """Drive torque (samples, nv) that balances the force: -J(q)' f, N m or N.
+
+        The force (N) is constant in the world's axes; the point (m) is fixed in the frame of the link's joint.
+        """
         force = jnp.stack([jnp.asarray(f) for f in (self.force_x, self.force_y, self.force_z)])
         jacobian = self.point(motion, jnp.stack([jnp.asarray(c) for c in (self.x, self.y, self.z)]))[1]
         return -jnp.einsum("jcs,c->sj", jacobian, force)
@@ -85,6 +93,7 @@ class Contact(PointEffect):
     name, title = "contact", "contact with a horizontal plane"
     equation = "-J_z(q)' stiffness max(0, height - z(q)) at the point (x, y, z) of the link"
     separated_by = "the same motion of {at} farther away from the plane"
+    beside_rest = False  # any rest that is larger in one part of the space looks like a plane somewhere
     stiffness: Scalar = amplitude("N/m", lower=0.0)
     height: Scalar = shape("m", (0.0, 0.2, 0.5, 1.0), (-10.0, 10.0))
     x: Scalar = shape("m", (0.0,), (-0.6, 0.6))
@@ -92,12 +101,17 @@ class Contact(PointEffect):
     z: Scalar = shape("m", (0.0,), (-0.6, 0.6))
 
     def torque(self, motion: Motion) -> Float[Array, "samples nv"]:
+        """Drive torque (samples, nv) that balances the push of the plane: -J_z(q)' stiffness depth, N m or N.
+
+        The depth of the point is measured from `height` (m, in the world) downwards; above it, it is zero.
+        """
         at, jacobian = self.point(motion, jnp.stack([jnp.asarray(c) for c in (self.x, self.y, self.z)]))
         depth = jnp.maximum(self.height - at[2], 0.0)
         return -self.stiffness * (jacobian[:, 2] * depth).T
 
     @classmethod
     def starts(cls, motion: Motion, place: int) -> dict[str, tuple[float, ...]]:
+        """Heights (m) at which the search begins: low quantiles of the height of the link's joint in the recordings."""
         some = np.asarray(motion.position)[:: max(1, len(motion.position) // 400)]
         height = np.asarray(forward_kinematics(motion.model, some))[:, place, 2, 3]
         return {"height": tuple(np.unique(np.quantile(height, (0.05, 0.1, 0.2, 0.3, 0.45))).tolist())}

@@ -44,7 +44,11 @@ _NEWTON_STEPS = 12  # a load-dependent friction makes the torque piecewise affin
 
 
 class ExtendedModel(eqx.Module):
-    """A robot and the effects that act in it; immutable, every array a differentiable leaf."""
+    """A robot and the effects that act in it (`extend`); immutable, every array a differentiable leaf.
+
+    `robot` is the rigid body, `effects` the tuple of effects at their places, `width` (nv,) the half width of a
+    reversal within which dry friction is smooth, rad/s or m/s. `inverse_dynamics` and `forward_dynamics` have them all.
+    """
 
     robot: RobotModel
     effects: tuple[Effect, ...]

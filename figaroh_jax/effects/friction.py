@@ -45,9 +45,11 @@ class ViscousFriction(JointEffect):
     damping: Scalar = amplitude("N m s/rad")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """damping v, N m or N, positive where the joint moves forwards."""
         return self.damping * self.here(motion.velocity)
 
     def native(self) -> tuple[Native, ...]:
+        """`damping` of the joint, in MJCF and URDF."""
         return (Native("joint", "damping", float(self.damping)),)
 
 
@@ -62,9 +64,11 @@ class CoulombFriction(JointEffect):
     force: Scalar = amplitude("N m")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """force s(v), N m or N; s is the smooth sign of `Motion.direction`."""
         return self.force * self.here(motion.direction)
 
     def native(self) -> tuple[Native, ...]:
+        """`frictionloss` of the joint in MJCF, `friction` in URDF."""
         return (Native("joint", "frictionloss", float(self.force)),)
 
 
@@ -72,13 +76,14 @@ class CoulombFriction(JointEffect):
 class AsymmetricCoulombFriction(JointEffect):
     """Dry friction of another level in each direction; the part that differs."""
 
-    name, title = "asymmetric_coulomb_friction", "Coulomb friction that differs by direction"
+    name, title = "asymmetric_coulomb_friction", "direction-dependent Coulomb friction"
     indistinguishable_from = ("torque_offset",)
     equation = "difference |s(v)|"
     separated_by = "a dwell of {at} with the brake on, beside motion in both directions"
     difference: Scalar = amplitude("N m")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """difference |s(v)|, N m or N: half the difference of the two levels, added in both directions."""
         return self.difference * jnp.abs(self.here(motion.direction))
 
 
@@ -86,12 +91,13 @@ class AsymmetricCoulombFriction(JointEffect):
 class AsymmetricViscousFriction(JointEffect):
     """Viscous friction of another slope in each direction; the part that differs."""
 
-    name, title = "asymmetric_viscous_friction", "viscous friction that differs by direction"
+    name, title = "asymmetric_viscous_friction", "direction-dependent viscous friction"
     equation = "difference |v|"
     separated_by = "sweeps of {at} in both directions over its whole range of speed"
     difference: Scalar = amplitude("N m s/rad")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """difference |v|, N m or N: half the difference of the two slopes, added in both directions."""
         return self.difference * jnp.abs(self.here(motion.velocity))
 
 
@@ -107,6 +113,7 @@ class StribeckFriction(JointEffect):
     speed: Scalar = shape("rad/s", (0.03, 0.06, 0.1, 0.15, 0.25, 0.4), (0.012, 0.64))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """force exp(-(v / speed)^2) s(v), N m or N: what breakaway adds to the Coulomb level."""
         weight = jnp.exp(-((self.here(motion.velocity) / self.speed) ** 2))
         return self.force * weight * self.here(motion.direction)
 
@@ -115,7 +122,7 @@ class StribeckFriction(JointEffect):
 class PowerLawFriction(JointEffect):
     """Friction that grows with a power of the speed (lubricant, temperature)."""
 
-    name, title = "power_law_friction", "friction with a power of the speed"
+    name, title = "power_law_friction", "power-law friction"
     speed_law = True
     equation = "strength |v|^exponent s(v)"
     separated_by = "constant-speed sweeps of {at} from 0.05 rad/s to its maximum speed"
@@ -123,10 +130,12 @@ class PowerLawFriction(JointEffect):
     exponent: Scalar = shape("", (0.4, 0.6, 1.5, 2.0, 2.5, 3.0), (0.24, 4.0), hole=(0.85, 1.15))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """strength |v|^exponent s(v), N m or N; |v| is kept above 1e-6 rad/s so that gradients at rest stay finite."""
         speed = jnp.sqrt(self.here(motion.velocity) ** 2 + 1e-12)
         return self.strength * speed**self.exponent * self.here(motion.direction)
 
     def native(self) -> tuple[Native, ...]:
+        """`damping2` or `damping3` of the joint where the exponent is 2 or 3; other exponents have no element."""
         attribute = {2.0: "damping2", 3.0: "damping3"}.get(float(self.exponent))
         return (Native("joint", attribute, float(self.strength)),) if attribute else ()
 
@@ -135,13 +144,14 @@ class PowerLawFriction(JointEffect):
 class LoadDependentFriction(JointEffect):
     """Friction of the gears that grows with the torque they transmit."""
 
-    name, title = "load_dependent_friction", "friction that grows with the load"
+    name, title = "load_dependent_friction", "load-dependent friction"
     follows_torque = dissipative = True
     equation = "ratio |tau_load| s(v)"
     separated_by = "the same motion of {at} with and without a payload"
     ratio: Scalar = amplitude("")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """ratio |tau_load| s(v), N m or N; tau_load is the torque of the rigid body at this joint."""
         return self.ratio * jnp.abs(self.here(motion.load)) * self.here(motion.direction)
 
 
@@ -149,13 +159,14 @@ class LoadDependentFriction(JointEffect):
 class PositionDependentFriction(JointEffect):
     """Dry friction that changes over a turn (a bent shaft, a seal, a worn gear)."""
 
-    name, title = "position_dependent_friction", "friction that changes with the position"
+    name, title = "position_dependent_friction", "position-dependent friction"
     equation = "s(v) (cosine cos q + sine sin q)"
     separated_by = "the same motion of {at} in other postures of the other joints"
     cosine: Scalar = amplitude("N m")
     sine: Scalar = amplitude("N m")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """s(v) (cosine cos q + sine sin q), N m or N; q in rad."""
         q = self.here(motion.angle)
         return self.here(motion.direction) * (self.cosine * jnp.cos(q) + self.sine * jnp.sin(q))
 
@@ -164,7 +175,7 @@ class PositionDependentFriction(JointEffect):
 class FrictionDrift(JointEffect):
     """Friction above its later level that falls off as the joint warms up."""
 
-    name, title = "friction_drift", "friction that drifts with the warmth"
+    name, title = "friction_drift", "friction that falls as the joint warms up"
     beside_rest = False  # a rest that changes in the course of a recording looks like it
     equation = "(force s(v) + damping v) exp(-t/time)"
     separated_by = "the same motion of {at} at the start and again after the robot has warmed up"
@@ -173,6 +184,7 @@ class FrictionDrift(JointEffect):
     time: Scalar = shape("s", (3.0, 8.0, 20.0, 60.0), (1.0, 600.0))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """(force s(v) + damping v) exp(-t / time), N m or N; t counts from the beginning of the record, s."""
         level = self.force * self.here(motion.direction) + self.damping * self.here(motion.velocity)
         return level * jnp.exp(-motion.elapsed / self.time)
 
@@ -185,6 +197,7 @@ class Bristle(JointEffect):
     memory: Any = eqx.field(default=None, kw_only=True)  # the state, where it is known (`step`)
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """force (z - s(v)), N m or N: the bristle's friction beyond the Coulomb friction that it comes with."""
         return self.force * (self.bent(motion) - self.here(motion.direction))
 
     def level(self, velocity: Float[Array, "*samples"]) -> Float[Array, "*samples"]:
@@ -206,6 +219,7 @@ class Bristle(JointEffect):
         return jax.lax.scan(follow, jnp.zeros_like(end[0]), (end, stays), unroll=8)[1]
 
     def step(self, velocity: Float[Array, " nv"], dt: Float[Array, ""]) -> Bristle:
+        """The bristle `dt` seconds later at the velocity (nv,), by the exact solution for its deflection z."""
         end, stays = self._turn(velocity[self.at[0]], dt)
         return dataclasses.replace(self, memory=end + (self.memory - end) * stays)
 
@@ -219,17 +233,19 @@ class Bristle(JointEffect):
 class Presliding(Bristle):
     """Dry friction that builds up over a small distance after each reversal (Dahl 1968, exponent 1)."""
 
-    name, title = "presliding", "presliding: friction that lags behind the reversal"
+    name, title = "presliding", "presliding friction"
     beside_rest = False  # most of any rest stands at reversals, where it acts
     equation = "force (z - s(v)), z' = v/distance (1 - z s(v))"
     separated_by = "reversals of {at} at several accelerations: presliding is late in position, a delay in time"
 
     def physical(self) -> dict[str, Scalar]:
+        """Level (N m), distance of the build-up (rad) and their ratio, the stiffness at a reversal (N m/rad)."""
         force, distance = self.force, self.distance
         return {"force": force, "distance": distance, "stiffness": force / distance}
 
     @classmethod
     def units(cls) -> dict[str, str]:
+        """Those of `physical`."""
         return {"force": "N m", "distance": "rad", "stiffness": "N m/rad"}
 
 
@@ -237,7 +253,7 @@ class Presliding(Bristle):
 class LuGreFriction(Bristle):
     """Dry friction of a bristle whose level falls with the speed (Canudas de Wit et al. 1995), without its damping."""
 
-    name, title = "lugre_friction", "friction of a bristle (LuGre)"
+    name, title = "lugre_friction", "LuGre bristle friction"
     equation = "force (z - s(v)), z' = v/distance (1 - z s(v)/g), g = 1 + rise exp(-(v/speed)^2)"
     separated_by = "slow reversals of {at}, and constant speeds below 0.3 rad/s"
     searched = False  # presliding and Stribeck friction together, which a diagnosis finds one after the other
@@ -245,6 +261,7 @@ class LuGreFriction(Bristle):
     speed: Scalar = shape("rad/s", (0.05, 0.2), (0.012, 0.64))
 
     def level(self, velocity: Float[Array, "*samples"]) -> Float[Array, "*samples"]:
+        """g(v) = 1 + rise exp(-(v / speed)^2), in units of the level at high speed."""
         return 1 + self.rise * jnp.exp(-((velocity / self.speed) ** 2))
 
 
@@ -252,7 +269,7 @@ class LuGreFriction(Bristle):
 class DirectionalLoadFriction(JointEffect):
     """Friction in proportion to the load, of another share where the drive lifts it and where it is driven by it."""
 
-    name, title = "directional_load_friction", "friction that grows with the load, by the direction of the power"
+    name, title = "directional_load_friction", "load-dependent friction, driving and driven"
     follows_torque = dissipative = True
     contains = ("load_dependent_friction",)
     equation = "|tau_load| s(v) (driving where tau_load v > 0, driven elsewhere)"
@@ -262,6 +279,7 @@ class DirectionalLoadFriction(JointEffect):
     driven: Scalar = amplitude("")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """|tau_load| s(v) times `driving` where the drive lifts its load (tau_load v > 0), else `driven`, N m or N."""
         load, way = self.here(motion.load), self.here(motion.direction)
         lifts = (1 + jnp.sign(load) * way) / 2
         return jnp.abs(load) * way * (self.driving * lifts + self.driven * (1 - lifts))
@@ -271,7 +289,7 @@ class DirectionalLoadFriction(JointEffect):
 class LoadDependentStribeckFriction(JointEffect):
     """Friction in proportion to the load that falls as the speed rises."""
 
-    name, title = "load_dependent_stribeck_friction", "Stribeck friction that grows with the load"
+    name, title = "load_dependent_stribeck_friction", "load-dependent Stribeck friction"
     follows_torque = dissipative = True
     equation = "ratio |tau_load| exp(-(|v|/speed)^2) s(v)"
     separated_by = "slow sweeps of {at} below 0.3 rad/s with and without a payload"
@@ -280,5 +298,6 @@ class LoadDependentStribeckFriction(JointEffect):
     speed: Scalar = shape("rad/s", (0.03, 0.06, 0.1, 0.15, 0.25, 0.4), (0.012, 0.64))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """ratio |tau_load| exp(-(v / speed)^2) s(v), N m or N."""
         weight = jnp.exp(-((self.here(motion.velocity) / self.speed) ** 2))
         return self.ratio * jnp.abs(self.here(motion.load)) * weight * self.here(motion.direction)

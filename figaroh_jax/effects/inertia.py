@@ -34,6 +34,7 @@ class LinkEffect(Effect):
         return jnp.stack([jnp.asarray(getattr(self, name)) for name in self.parameters()])
 
     def change(self, model: RobotModel) -> RobotModel:
+        """The robot with the ten parameters added to the link's, in the frame of its joint (kg, kg m, kg m2)."""
         return eqx.tree_at(lambda m: m.inertia, model, jnp.asarray(model.inertia).at[self.at[0]].add(self.ten()))
 
 
@@ -41,7 +42,7 @@ class LinkEffect(Effect):
 class LinkInertia(LinkEffect):
     """A link whose inertia is not what the model says, further than it is trusted."""
 
-    name, title = "link_inertia", "inertia of a link"
+    name, title = "link_inertia", "link inertia"
     contains = ("payload",)
     indistinguishable_from = ("payload",)
     needs_trust = 0.05  # ten free parameters of a link make up for many a misfit
@@ -53,14 +54,16 @@ class LinkInertia(LinkEffect):
 class Payload(LinkEffect):
     """A body fixed to a link: ten parameters that a physical body can have."""
 
-    name, title = "payload", "a payload"
+    name, title = "payload", "payload"
     body = True
     equation = "W_k dpi_k, dpi_k a physical body: pseudo-inertia >= 0, mass > 0"
     separated_by = "the same motion with and without what is fixed to {at}"
 
     def physical(self) -> dict[str, Scalar]:
+        """Mass (kg) and centre of mass in the frame of the link's joint (m); not finite for a mass of zero."""
         return {"mass": self.mass} | {f"com_{k}": getattr(self, f"m{k}") / self.mass for k in "xyz"}
 
     @classmethod
     def units(cls) -> dict[str, str]:
+        """Those of `physical`: kg and m."""
         return {"mass": "kg"} | {f"com_{k}": "m" for k in "xyz"}

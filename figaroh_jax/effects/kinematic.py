@@ -229,11 +229,12 @@ class PostureMotion(Motion):
 class JointOffset(JointEffect):
     """A zero of the encoder that is not the model's, as a calibration names it."""
 
-    name, title, equation = "joint_offset", "zero offset of the encoder", "S c"
+    name, title, equation = "joint_offset", "encoder zero offset", "S c"
     levels, correction = ("pose",), -1.0
     offset: Scalar = amplitude("rad")
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        """The offset at every posture, rad: reading minus truth."""
         return self.offset * np.ones(len(motion.time))
 
 
@@ -241,7 +242,7 @@ class JointOffset(JointEffect):
 class LinkGeometry(JointEffect):
     """A link whose joint stands elsewhere than the model says."""
 
-    name, title, equation = "link_geometry", "geometry of the link", "three translations, two rotations"
+    name, title, equation = "link_geometry", "link geometry error", "three translations, two rotations"
     levels = ("pose",)
     twist = staticmethod(_geometry)
 
@@ -250,7 +251,7 @@ class LinkGeometry(JointEffect):
 class GearTransmissionError(JointEffect):
     """An error that comes back several times in a turn: teeth, the wave of a harmonic drive."""
 
-    name, title = "gear_transmission_error", "transmission error of the gear"
+    name, title = "gear_transmission_error", "gear transmission error"
     equation = "S (a sin N q + b cos N q)"
     levels, correction = ("pose",), -1.0
     separated_by = "a dense sweep of {at} alone"
@@ -259,6 +260,7 @@ class GearTransmissionError(JointEffect):
     order: Scalar = shape("", _ORDERS)
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        """sine sin(N q) + cosine cos(N q), rad: reading minus truth."""
         angle = self.order * self.here(motion.angle)
         return self.sine * _library(angle).sin(angle) + self.cosine * _library(angle).cos(angle)
 
@@ -267,12 +269,13 @@ class GearTransmissionError(JointEffect):
 class JointCompliance(JointEffect):
     """A joint that gives way under gravity, in proportion to its torque."""
 
-    name, title, equation = "joint_compliance", "compliance under gravity", "S c tau_g"
+    name, title, equation = "joint_compliance", "joint compliance under gravity", "S c tau_g"
     levels = ("pose",)
     separated_by = "the same postures with two payloads, on both sides of the vertical"
     compliance: Scalar = amplitude("rad/(N m)")
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        """compliance times the torque of gravity at the joint (N m), rad: reading minus truth."""
         return self.compliance * self.here(motion.load)
 
 
@@ -280,7 +283,7 @@ class JointCompliance(JointEffect):
 class LinkCompliance(JointEffect):
     """A link that bends under gravity."""
 
-    name, title = "link_compliance", "bending of the link under gravity"
+    name, title = "link_compliance", "link bending under gravity"
     equation = "two rotations across the axis, each in proportion to its moment"
     levels = ("pose",)
     separated_by = "the same postures with two payloads, the link horizontal and vertical"
@@ -293,7 +296,7 @@ class LinkCompliance(JointEffect):
 class ThermalGrowth(JointEffect):
     """A link that grows as the robot warms up."""
 
-    name, title = "thermal_growth", "growth of the link with warmth"
+    name, title = "thermal_growth", "thermal growth of the link"
     equation = "length of the link times g (1 - exp(-t / T))"
     levels = ("pose",)
     separated_by = "one posture measured again and again while the robot warms up"
@@ -312,6 +315,7 @@ class PayloadDeflection(JointEffect):
     compliance: Scalar = amplitude("rad/(N m)")
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        """compliance times the torque of the load that is carried (N m), rad: reading minus truth."""
         return self.compliance * self.here(motion.payload)
 
 
@@ -326,6 +330,7 @@ class Settling(Effect):
     amount: Scalar = amplitude("")
 
     def position_error(self, motion: Any) -> Float[Leaf, "samples nj"]:
+        """A share of the way from the posture before, in all joints (samples, joints), rad: reading minus truth."""
         return self.amount * motion.way
 
 
@@ -340,6 +345,7 @@ class ReversalHysteresis(JointEffect):
     width: Scalar = amplitude("rad")
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        """-width times the side from which the joint came, rad: reading minus truth; zero where it did not move."""
         way = self.here(motion.way)
         return -self.width * _library(way).sign(way)
 
@@ -348,12 +354,13 @@ class ReversalHysteresis(JointEffect):
 class JointCoupling(Effect):
     """A joint that follows another one in part."""
 
-    name, title, acts_on = "joint_coupling", "coupling of two joints", "pair"
+    name, title, acts_on = "joint_coupling", "joint coupling", "pair"
     equation = "S_j k q_i"
     levels, correction = ("pose",), -1.0
     ratio: Scalar = amplitude("")
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
+        """ratio times the angle of the first joint of the pair, read at the second, rad."""
         return self.ratio * self.here(motion.angle)
 
 
@@ -361,7 +368,7 @@ class JointCoupling(Effect):
 class BaseFrame(Effect):
     """A base frame that is said to be known and stands elsewhere."""
 
-    name, title, acts_on = "base_frame", "place of the base, said to be known", "frame"
+    name, title, acts_on = "base_frame", "base frame other than stated", "frame"
     equation = "a fixed twist"
     levels = ("pose",)
     twist = staticmethod(_base)
@@ -371,7 +378,7 @@ class BaseFrame(Effect):
 class ToolFrame(Effect):
     """A tool frame that is said to be known and stands elsewhere."""
 
-    name, title, acts_on = "tool_frame", "place of the tool frame, said to be known", "frame"
+    name, title, acts_on = "tool_frame", "tool frame other than stated", "frame"
     equation = "a fixed twist"
     levels = ("pose",)
     twist = staticmethod(_tool)
@@ -383,7 +390,7 @@ class _History(Effect):
     It competes, so that such an error gets no wrong name, but it is no name itself.
     """
 
-    name, title, acts_on = "history", "dependence on the posture before", "robot"
+    name, title, acts_on = "history", "dependence on the previous posture", "robot"
     equation = "S_j h_j(q' - q)"
     sign: Scalar = shape("", (0.0, 1.0))
     twist = staticmethod(_history)

@@ -38,7 +38,7 @@ def _masses(nominal: RobotModel, robot: RobotModel, trust: float) -> Iterator[st
             yield (
                 f"the mass of {name} is {after:.3g} kg, where {before:.3g} kg was trusted to {100 * trust:.0f} %"
                 f" (robot.trust): {abs(after - before) / (trust * before):.0f} sigma off; check units and signs of the"
-                " torque, and whether the motion tells this link"
+                " torque, and whether the motion excites this link"
             )
 
 
@@ -51,16 +51,14 @@ def _drive(model: RobotModel, effect: Effect) -> Iterator[str]:
     joint = int(np.ravel(effect.at[0])[0])
     effort, speed = (float(np.asarray(x)[joint]) for x in (model.effort_limit, model.velocity_limit))
     effort = effort if effort > 0 else np.inf
-    turns = not prismatic(model)[joint]
+    unit = "N" if prismatic(model)[joint] else "N m"
     for name, value in values.items():
         torque = abs(float(np.ravel(value)[0]))
-        text = f"{name} {torque:.3g}"
+        said = f"{name} {torque:.3g} {unit} is above"
         if effect.name == "viscous_friction" and 0 < speed < np.inf:
-            torque, text = torque * speed, f"{name} {torque:.3g} at the speed limit, {torque * speed:.3g}"
+            said = f"{name} {torque:.3g} gives {torque * speed:.3g} {unit} at the speed limit, above"
+            torque *= speed
         elif units[name] not in ("N m", "N", "torque"):
             continue
         if torque > effort:
-            yield (
-                f"{effect.name} of {model.dof_names[joint]}: {text} {'N m' if turns else 'N'} is above the model's"
-                f" effort limit of {effort:.3g}"
-            )
+            yield f"{effect.name} at {model.dof_names[joint]}: {said} the model's effort limit of {effort:.3g}"

@@ -36,9 +36,11 @@ class TorqueOffset(JointEffect):
     offset: Scalar = amplitude("N m")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """The offset at every sample, N m or N."""
         return self.offset * jnp.ones_like(motion.time)
 
     def native(self) -> tuple[Native, ...]:
+        """`bias` of the joint's actuator."""
         return (Native("actuator", "bias", float(self.offset)),)
 
 
@@ -46,13 +48,14 @@ class TorqueOffset(JointEffect):
 class TorqueGain(JointEffect):
     """A wrong torque constant or gear ratio: the reading is off by a factor."""
 
-    name, title = "torque_gain", "wrong torque gain"
+    name, title = "torque_gain", "torque gain error"
     follows_torque = follows_total = True
     equation = "gain tau_hat"
     separated_by = "the same motion of {at} with and without a payload of known mass"
     gain: Scalar = amplitude("")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """gain times the torque of the whole model, N m or N: what the sensor reads too much."""
         return self.gain * self.here(motion.total)
 
 
@@ -60,7 +63,7 @@ class TorqueGain(JointEffect):
 class TorqueDelay(Effect):
     """Torque that is stamped late against the position."""
 
-    name, title, acts_on = "torque_delay", "delay of the torque", "robot"
+    name, title, acts_on = "torque_delay", "torque delay", "robot"
     follows_torque = True
     excludes = ("torque_lag",)
     equation = "tau_hat(t - delay) - tau_hat(t)"
@@ -68,6 +71,7 @@ class TorqueDelay(Effect):
     delay: Scalar = shape("s", (0.001, 0.003, 0.006, 0.012, 0.025), (0.0, 0.06))
 
     def torque_response(self, omega: Float[Array, " freqs"]) -> Complex[Array, " freqs"]:
+        """exp(-i omega delay): the torque sensor reads what was true `delay` seconds before."""
         return jnp.exp(-1j * omega * self.delay)
 
 
@@ -75,13 +79,14 @@ class TorqueDelay(Effect):
 class TorqueLag(Effect):
     """Torque seen through a first-order low pass."""
 
-    name, title, acts_on = "torque_lag", "lag of the torque", "robot"
+    name, title, acts_on = "torque_lag", "torque lag", "robot"
     follows_torque = True
     equation = "(1/(1 + time p) - 1) tau_hat"
     separated_by = "faster motion: a lag weakens high frequencies, a delay does not"
     time: Scalar = shape("s", (0.001, 0.003, 0.006, 0.012, 0.025), (0.0002, 0.06))
 
     def torque_response(self, omega: Float[Array, " freqs"]) -> Complex[Array, " freqs"]:
+        """1 / (1 + i omega time): a low pass of first order."""
         return 1 / (1 + 1j * omega * self.time)
 
 
@@ -89,7 +94,7 @@ class TorqueLag(Effect):
 class TorqueSaturation(JointEffect):
     """A drive or a sensor that gives no more than its limit."""
 
-    name, title = "torque_saturation", "saturation of the torque"
+    name, title = "torque_saturation", "torque saturation"
     follows_torque = follows_total = True
     equation = "clip(tau_hat, -limit, limit) - tau_hat"
     separated_by = "motion of {at} at two larger accelerations: the largest torque stays"
@@ -97,22 +102,27 @@ class TorqueSaturation(JointEffect):
     limit: Scalar = shape("N m", (1.0, 3.0, 10.0, 30.0, 100.0, 300.0), (0.0, 1e5))
 
     def torque_error(self, motion: Motion) -> Float[Array, " samples"]:
+        """share (clip(tau, -limit, limit) - tau), N m or N, of the torque of the whole model."""
         total = self.here(motion.total)
         return self.share * (jnp.clip(total, -self.limit, self.limit) - total)
 
     def delivered(self, torque: Float[Array, " nv"]) -> Float[Array, " nv"]:
+        """The torques (nv,) with this joint's cut at its limit, N m or N."""
         own = torque[self.at[0]]
         return torque.at[self.at[0]].add(self.share * (jnp.clip(own, -self.limit, self.limit) - own))
 
     def physical(self) -> dict[str, Scalar]:
+        """The limit alone: the share is 1 where a drive is saturated."""
         return {"limit": self.limit}
 
     @classmethod
     def units(cls) -> dict[str, str]:
+        """N m; N of a prismatic joint."""
         return {"limit": "N m"}
 
     @classmethod
     def starts(cls, motion: Motion, place: int) -> dict[str, tuple[float, ...]]:
+        """Limits at which the search begins: high quantiles of the torque as measured, N m or N."""
         size = np.abs(np.asarray(motion.total)[:, place])
         return {"limit": tuple(np.unique(np.quantile(size, (0.7, 0.8, 0.88, 0.94, 0.97, 0.99))).tolist())}
 
@@ -121,7 +131,7 @@ class TorqueSaturation(JointEffect):
 class ClockError(Effect):
     """A clock of the torque that runs faster or slower than that of the position."""
 
-    name, title, acts_on = "clock_error", "clocks of position and torque that drift apart", "robot"
+    name, title, acts_on = "clock_error", "drift between the clocks of position and torque", "robot"
     follows_torque = follows_total = True
     beside_rest = False  # whatever is late in one part of a recording and not in another looks like it
     equation = "rate t p tau_hat"
@@ -129,6 +139,7 @@ class ClockError(Effect):
     rate: Scalar = amplitude("s/s", lower=-0.02, upper=0.02)
 
     def torque_error(self, motion: Motion) -> Float[Array, "samples nv"]:
+        """rate t d(tau)/dt (samples, nv), N m or N: a lag that grows with the time t since the record began."""
         return self.rate * motion.elapsed[:, None] * motion.rate(motion.total)
 
 
@@ -136,13 +147,14 @@ class ClockError(Effect):
 class EncoderOffset(JointEffect):
     """A zero of the encoder that is not the model's."""
 
-    name, title = "encoder_offset", "zero offset of the encoder"
+    name, title = "encoder_offset", "encoder zero offset"
     levels = ("torque",)  # to a calibration it is a `joint_offset`
     equation = "q_measured = q + offset"
     separated_by = "kinematic calibration, or a reference mark of {at}: torque hardly tells it from inertia"
     offset: Scalar = amplitude("rad", lower=-0.2, upper=0.2)
 
     def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
+        """The offset at every sample, rad or m."""
         return self.offset * jnp.ones_like(motion.time)
 
 
@@ -150,7 +162,7 @@ class EncoderOffset(JointEffect):
 class EncoderScale(JointEffect):
     """An encoder that counts too much or too little a turn, or a gear ratio that is not the model's."""
 
-    name, title = "encoder_scale", "scale of the encoder"
+    name, title = "encoder_scale", "encoder scale error"
     correction = -1.0
     equation = "q_measured = q + scale q"
     separated_by = "motion of {at} over more than half a turn, or kinematic calibration"
@@ -158,6 +170,7 @@ class EncoderScale(JointEffect):
     scale: Scalar = amplitude("", lower=-0.2, upper=0.2)
 
     def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
+        """scale q, rad or m."""
         return self.scale * self.here(motion.angle)
 
 
@@ -165,7 +178,7 @@ class EncoderScale(JointEffect):
 class EncoderEccentricity(JointEffect):
     """An encoder's disc that is not centred: an error that comes back with every turn."""
 
-    name, title = "encoder_eccentricity", "eccentricity of the encoder"
+    name, title = "encoder_eccentricity", "encoder eccentricity"
     correction = -1.0
     equation = "q_measured = q + sine sin q + cosine cos q"
     separated_by = "a whole turn of {at}, or kinematic calibration with two payloads"
@@ -174,6 +187,7 @@ class EncoderEccentricity(JointEffect):
     cosine: Scalar = amplitude("rad", lower=-0.05, upper=0.05)
 
     def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
+        """sine sin q + cosine cos q, rad."""
         q = self.here(motion.angle)
         space = np if isinstance(q, np.ndarray) else jnp
         return self.sine * space.sin(q) + self.cosine * space.cos(q)

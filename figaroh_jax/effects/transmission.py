@@ -37,9 +37,11 @@ class RotorInertia(JointEffect):
     inertia: Scalar = amplitude("kg m2", lower=0.0)
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """inertia a, N m or N; the inertia is seen at the joint: the rotor's own times the square of the gear ratio."""
         return self.inertia * self.here(motion.acceleration)
 
     def native(self) -> tuple[Native, ...]:
+        """`armature` of the joint."""
         return (Native("joint", "armature", float(self.inertia)),)
 
 
@@ -47,7 +49,7 @@ class RotorInertia(JointEffect):
 class CoupledTransmission(Effect):
     """A motor that turns the sum or the difference of two joints: its rotor and its friction act on both."""
 
-    name, title, acts_on = "coupled_transmission", "coupling of the transmission", "pair"
+    name, title, acts_on = "coupled_transmission", "transmission coupling", "pair"
     equation = "row i: inertia a_j + damping v_j + friction s(v_i + sign v_j); row j: i and j swapped, friction by sign"
     separated_by = "{at} alone, together and against each other"
     inertia: Scalar = amplitude("kg m2")
@@ -56,6 +58,11 @@ class CoupledTransmission(Effect):
     sign: Scalar = shape("", (1.0, -1.0), choice=True)
 
     def torque(self, motion: Motion) -> Float[Array, "samples 2"]:
+        """Torque (samples, 2) at both joints, N m.
+
+        The rotor turns with v_i + sign v_j. Its inertia and damping against a joint's own motion count as that
+        joint's own; here is what they do at the other joint, and all of the rotor's dry friction.
+        """
         v, a = (jnp.take(x, self.places, axis=1, mode="clip") for x in (motion.velocity, motion.acceleration))
         relative = jnp.stack([jnp.ones(()), jnp.asarray(self.sign)])  # of the motor to each joint
         reversal = motion.reversal(v @ relative, a @ relative, jnp.take(motion.width, self.places, mode="clip").mean())
@@ -63,6 +70,7 @@ class CoupledTransmission(Effect):
         return linear + self.friction * reversal[:, None] * relative
 
     def native(self) -> tuple[Native, ...]:
+        """A tendon over both joints; what it would add to each joint's own motion is taken off there."""
         sign = float(self.sign)
         inertia, damping, friction = float(self.inertia), float(self.damping), float(self.friction)
         return (
@@ -86,10 +94,12 @@ class TorqueRipple(JointEffect):
     order: Scalar = shape("1/rad", tuple(3.0 + 0.8 * k for k in range(30)), (2.9, 26.6))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """sine sin(order q) + cosine cos(order q), N m or N."""
         angle = self.order * self.here(motion.angle)
         return self.sine * jnp.sin(angle) + self.cosine * jnp.cos(angle)
 
     def shown_by(self, low: Float[np.ndarray, " nv"], high: Float[np.ndarray, " nv"]) -> bool:
+        """Whether the motion covers one and a half periods: less could be any smooth function of the position."""
         # one and a half periods: what has not come back is any smooth function of the position
         return bool(float(self.order) * (high - low)[int(self.at[0])] > 3 * np.pi)
 
@@ -98,7 +108,7 @@ class TorqueRipple(JointEffect):
 class JointSpring(JointEffect):
     """A spring across the joint: a balancer, a cable, a hose."""
 
-    name, title = "joint_spring", "spring at the joint"
+    name, title = "joint_spring", "joint spring"
     contains = ("torque_offset",)
     equation = "stiffness (q - rest)"
     separated_by = "motion of {at} over a larger range, or with the base turned"
@@ -106,16 +116,20 @@ class JointSpring(JointEffect):
     offset: Scalar = amplitude("N m")  # -stiffness rest: linear, where the rest position is not
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
+        """stiffness q + offset, N m or N."""
         return self.stiffness * self.here(motion.angle) + self.offset
 
     def physical(self) -> dict[str, Scalar]:
+        """Stiffness (N m/rad) and the rest position (rad), which is not finite for a stiffness of zero."""
         return {"stiffness": self.stiffness, "rest": -self.offset / self.stiffness}
 
     @classmethod
     def units(cls) -> dict[str, str]:
+        """Those of `physical`."""
         return {"stiffness": "N m/rad", "rest": "rad"}
 
     def native(self) -> tuple[Native, ...]:
+        """`stiffness` and `springref` of the joint."""
         rest = -float(self.offset) / float(self.stiffness)
         return (Native("joint", "stiffness", float(self.stiffness)), Native("joint", "springref", rest))
 
@@ -124,12 +138,13 @@ class JointSpring(JointEffect):
 class JointElasticity(JointEffect):
     """A gear that winds up under load: the sensor on the motor reads more than the link has turned."""
 
-    name, title = "joint_elasticity", "elasticity of the joint"
+    name, title = "joint_elasticity", "joint elasticity"
     equation = "q_measured = q + compliance tau_load"
     separated_by = "a chirp of {at} above a third of its resonance, or a sensor on the link side"
     compliance: Scalar = shape("rad/(N m)", (2e-5, 1e-4, 4e-4, 1.5e-3, 5e-3), (1e-7, 1e-2))
 
     def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
+        """compliance times the torque of the rigid body at the joint, rad: motor side minus link side."""
         return self.compliance * self.here(motion.load)
 
 
@@ -145,6 +160,7 @@ class Backlash(JointEffect):
     width: Scalar = amplitude("rad", lower=0.0, upper=0.05)
 
     def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
+        """Half of the play on the side of the load, rad; a change of side lasts as long as the motor needs."""
         load = self.here(motion.load)
         if isinstance(motion.dt, float) and motion.dt == 0.0:  # instants that are no record: the play has been crossed
             return self.width / 2 * (np if isinstance(load, np.ndarray) else jnp).sign(load)

@@ -1,4 +1,4 @@
-"""States condensed on devices: one program for one accelerator or several, and for batches of robots or trajectories.
+"""States condensed on devices: one accelerator or several, and batches of robots or trajectories in one program.
 
 A QR factorisation of every chunk, which `regression.condense` makes on the host, is slow on an accelerator; products
 are not, but they square the condition number. So the rows of each joint are first brought to coordinates in which they
@@ -10,7 +10,7 @@ and others, 2015), and all columns of the joint are Z R B with the matrix B of i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -31,7 +31,7 @@ from .columns import term_columns, term_places, term_rows
 from .regression import FOLDS, Condensed
 from .states import OwnFrame, States, check_piece
 
-__all__ = ["BatchFit", "Coordinates", "condense_on_devices", "coordinates", "fit_states"]
+__all__ = ["BatchFit", "Coordinates", "condense_on_devices", "conditioned_rows", "coordinates", "fit_states"]
 
 HOST_CHUNK = 128  # samples whose rows stay in the processor's cache
 CODE_CHUNK = 512  # the same where machine code makes them
@@ -39,7 +39,6 @@ TERMS_CHUNK = 4096  # samples of which the columns of friction and the like are 
 DEVICE_BYTES = 8e9  # of the rows of a chunk on an accelerator, at the most
 BESIDE = 32  # columns to a multiple of which a joint's rows are filled up on a device, so that few products serve all
 CLIPPED = 1e-13  # share of a joint's products that is rounding: what they say of smaller ones is left out
-_SAMPLES = PartitionSpec("samples")
 
 
 class Coordinates(NamedTuple):
@@ -97,10 +96,11 @@ def condense_on_devices(
     """`condense(states, states.used)`, the samples of every piece spread over `devices` (default: all of this host).
 
     Each device forms the rows of its own samples, `chunk` at a time, and sums their products; the sums of the devices
-    are added. Pieces of one length share a program; the source is read while the devices work. A single CPU takes
-    machine code for the rows of long pieces, where there is some. A direction in which the rows are less than 3e-7 of
-    the strongest one's is taken as not shown. Folds are whole chunks in turn. Raises `InputError` where a piece has a
-    wrong shape or holds a number that is not finite. An accelerator is busy with pieces of 1e5 samples and more.
+    are added at the end, on the host. Pieces of one length share a program; the source is read while the devices work.
+    A single CPU takes machine code for the rows of long pieces, where there is some. A direction in which the rows are
+    less than 3e-7 of the strongest one's is taken as not shown. Folds are whole chunks in turn. Raises `InputError`
+    where a piece has a wrong shape or holds a number that is not finite. An accelerator is busy with pieces of 1e5
+    samples and more.
 
     Where `jax.distributed` runs, each process takes the pieces that its own source gives, however many, on the devices
     of its host; the sums of all are added once at the end, and every process gets the same answer.
@@ -134,7 +134,7 @@ def fit_states(
     keeps the products well conditioned; states in rad, m, N m, N. Two solves: the second with the inverse mean squared
     residual of each joint as its weight. To be called where 64-bit JAX is on.
     """
-    Z, y = _rows(model, terms, jnp.zeros(model.nv), into, q, v, a, tau)
+    Z, y = conditioned_rows(model, terms, jnp.zeros(model.nv), into, q, v, a, tau)
     rows = Z.shape[-1]
     G, b = jnp.einsum("jks,jls->jkl", Z, Z), jnp.einsum("jks,js->jk", Z, y)
     theta = jnp.linalg.solve(G.sum(0), b.sum(0))
@@ -177,26 +177,26 @@ def _grouped(model: RobotModel, terms: tuple[Effect, ...], frames: Sequence[OwnF
 
 
 def _summed(states: States, frames: Sequence[OwnFrame], mesh: Mesh, folds: int, chunk: int | None) -> _Sums:
-    """Sums of all pieces by programs of JAX."""
+    """Sums of all pieces by programs of JAX, one for each device: none waits for another."""
     model, terms, nv = states.model, states.terms, states.model.nv
-    groups = _grouped(model, terms, frames)
-    everywhere = NamedSharding(mesh, PartitionSpec())
+    groups, devices = _grouped(model, terms, frames), list(mesh.devices.flat)
     width = np.broadcast_to(np.asarray(states.width, float), (nv,))
-    fixed = jax.device_put((model, terms, width, [group[1:] for group in groups]), everywhere)
     zero = (np.zeros((folds, len(g.joints), *2 * g.places.shape[1:])) for g in groups)
-    total = jax.device_put(_Sums(tuple(zero), *np.zeros((2, folds, nv))), everywhere)
+    start = (_Sums(tuple(zero), *np.zeros((2, folds, nv))), (model, terms, width, [group[1:] for group in groups]))
+    totals, fixed = zip(*(jax.device_put(start, device) for device in devices), strict=True)
     numbers = _places(model, terms)[1] + sum(2 * g.places.size for g in groups)
-    codes = block_codes(model) if mesh.devices.flat[0].platform == "gpu" else None
+    codes = block_codes(model) if devices[0].platform == "gpu" else None
     chunks, before = 0, None
     for number, part in enumerate(states.source()):
         check_piece(model, part, number, values=False)
         chunk = chunk or _chunk(mesh, numbers, len(part[0]) // folds)
-        program = _program(mesh, chunk, folds, codes)
-        total = program(total, fixed, _spread(part, chunk, mesh), chunks)
+        add, own = _program(chunk, folds, codes, devices[0].platform == "cpu"), -(-len(part[0]) // (chunk * mesh.size))
+        firsts = [np.int32(chunks + own * k) for k in range(mesh.size)]
+        totals = tuple(map(add, totals, fixed, _shares(part, chunk, mesh), firsts))
         chunks += -(-len(part[0]) // chunk)
         jax.block_until_ready(before)  # one piece ahead: no more wait in memory
-        before = total.rows
-    sums = jax.device_get(total)
+        before = [total.rows for total in totals]
+    sums = jax.tree.map(lambda *own: sum(own), *jax.device_get(totals))
     products: list[Any] = [None] * nv
     for group, found in zip(groups, sums.products, strict=True):
         for n, j in enumerate(group.joints):
@@ -220,41 +220,34 @@ def _chunk(mesh: Mesh, rows: int, most: int) -> int:
     return 1 << max(8, min(int(np.log2(memory / 8 / rows)), int(np.ceil(np.log2(max(1, most / mesh.size))))))
 
 
-def _spread(part: Sequence[Any], chunk: int, mesh: Mesh) -> tuple[Any, ...]:
-    """Arrays of a piece and the weight of its rows, filled up to whole chunks; a share on each device."""
+def _shares(part: Sequence[Any], chunk: int, mesh: Mesh) -> list[tuple[Array, ...]]:
+    """Each device's share of the arrays of a piece and of the weight of its rows, filled up to whole chunks."""
     samples = len(part[0])
     missing = -samples % (chunk * mesh.size)
-    sharding = NamedSharding(mesh, _SAMPLES)
+    sharding = NamedSharding(mesh, PartitionSpec("samples"))
     arrays = [x if isinstance(x, jax.Array) else np.asarray(x, float) for x in part]
     if missing:
         arrays = [np.concatenate([x, np.repeat(np.asarray(x[-1:]), missing, axis=0)]) for x in arrays]
     there = (np.arange(samples + missing) < samples).astype(float)
-    return tuple(jax.device_put(x, sharding) for x in (*arrays, there))
+    spread = (jax.device_put(x, sharding) for x in (*arrays, there))
+    own = [{share.device: share.data for share in x.addressable_shards} for x in spread]
+    return [tuple(x[device] for x in own) for device in mesh.devices.flat]
 
 
 @lru_cache(maxsize=16)
-def _program(mesh: Mesh, chunk: int, folds: int, codes: bytes | None) -> Callable[..., _Sums]:
-    def local(fixed: Any, part: tuple[Array, ...], before: Array) -> _Sums:
-        """Sums over this device's share of a piece, which begins after so many chunks."""
+def _program(chunk: int, folds: int, codes: bytes | None, cpu: bool) -> Callable[..., _Sums]:
+    """Adds the rows of a device's share of a piece, which begins after so many chunks, to the device's sums."""
+
+    def program(total: _Sums, fixed: Any, part: tuple[Array, ...], first: Array) -> _Sums:
         chunks = [x.reshape(-1, chunk, *x.shape[1:]) for x in part]
-        first = before + jax.lax.axis_index("samples") * len(chunks[0])
 
         def step(total: _Sums, k: Array) -> tuple[_Sums, None]:
             new, fold = _sums(codes, fixed, *(x[k] for x in chunks)), (first + k) % folds
             return jax.tree.map(lambda x, y: x.at[fold].add(y), total, new), None
 
-        shapes = jax.eval_shape(partial(_sums, codes, fixed), *(x[0] for x in chunks))
-        zero = jax.tree.map(lambda x: jnp.zeros((folds, *x.shape), x.dtype), shapes)
-        return jax.lax.psum(jax.lax.scan(step, zero, jnp.arange(len(chunks[0])))[0], "samples")
+        return jax.lax.scan(step, total, jnp.arange(len(chunks[0]), dtype=jnp.int32))[0]
 
-    specs = {"in_specs": (PartitionSpec(), _SAMPLES, PartitionSpec()), "out_specs": PartitionSpec()}
-    spread = jax.shard_map(local, mesh=mesh, check_vma=False, **specs)
-    options = CPU_OPTIONS if mesh.devices.flat[0].platform == "cpu" else None
-
-    def program(total: _Sums, fixed: Any, part: tuple[Array, ...], before: Any) -> _Sums:
-        return jax.tree.map(jnp.add, total, spread(fixed, part, before))
-
-    return jax.jit(program, compiler_options=options)
+    return jax.jit(program, compiler_options=CPU_OPTIONS if cpu else None)
 
 
 def _sums(codes: bytes | None, fixed: Any, q: Array, v: Array, a: Array, tau: Array, there: Array) -> _Sums:
@@ -323,7 +316,7 @@ def _coded(
         yield blocks.reshape(-1, blocks.shape[-1])[:, start - piece.start :], side[:, own], tau[start:end].T
 
 
-def _rows(
+def conditioned_rows(
     model: RobotModel, terms: tuple[Effect, ...], width: Array, into: Array, q: Array, v: Array, a: Array, tau: Array
 ) -> tuple[Float[Array, "nv rank samples"], Float[Array, "nv samples"]]:
     """Rows in the coordinates `into` and the torque, the samples last."""

@@ -39,16 +39,19 @@ class BlockLevenbergMarquardt(optimistix.AbstractLeastSquaresSolver):
     norm: Callable[..., Any] = optimistix.max_norm
 
     def init(self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any) -> State:
+        """State at the start `y` (unknowns,); nothing has been evaluated yet."""
         del fn, args, options, f_struct, aux_struct, tags
         return beginning(y)
 
     def step(self, fn: Any, y: Any, args: Any, options: Any, state: State, tags: Any) -> tuple[Array, State, None]:
+        """One damped step, from the data's own normal equations (`args.normal`) or those of a Jacobian of `fn`."""
         del y, options, tags
         normal = getattr(args, "normal", None) or (lambda at: normal_of(lambda x: fn(x, args)[0], at))
         state = attempt(normal, state)
         return state.at, state, None
 
     def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: State, tags: Any) -> Any:
+        """Whether it has converged, and `nonlinear_divergence` where no damping lowers the cost any more."""
         del fn, y, args, options, tags
         failed = optimistix.RESULTS.nonlinear_divergence
         good = optimistix.RESULTS.successful
@@ -57,6 +60,7 @@ class BlockLevenbergMarquardt(optimistix.AbstractLeastSquaresSolver):
     def postprocess(
         self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: State, tags: Any, result: Any
     ) -> tuple[Array, None, dict[str, Any]]:
+        """The solution, with its cost (half the sum of squares) and last damping as `stats`."""
         del fn, aux, args, options, tags, result
         return y, None, {"cost": state.normal.cost, "damping": state.damping}
 

@@ -57,7 +57,11 @@ class Data(Protocol):
 
 
 class TorqueData(eqx.Module):
-    """`n` recordings of at most `N` samples and `M` rows, joint side, SI units; rows are low-passed torques."""
+    """`n` recordings of at most `N` samples and `M` rows, joint side, SI units; rows are low-passed torques.
+
+    Made by `figaroh_jax.torque_data`. A pytree: `torque` (n, M, nv) are the measured rows in N m or N, `weight` one
+    over their sigma, zero for what does not count. `residual(model)` is pure: to jit, differentiate and map.
+    """
 
     time: Float[Leaf, "n N"]  # s
     position: Float[Leaf, "n N nq"]

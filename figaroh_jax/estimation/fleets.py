@@ -16,9 +16,10 @@ from ..effects.base import Effect
 from ..errors import InputError
 from ..rigid.model import RobotModel
 from .accelerators import BatchFit, coordinates, fit_states
+from .base_parameters import BaseParameters
 from .states import States
 
-__all__ = ["Fleet", "identify_fleet"]
+__all__ = ["AT_ONCE", "Fleet", "check_fleet", "fleet_of", "identify_fleet", "own_arrays"]
 
 AT_ONCE = 1.5e9  # bytes of the rows of the robots that are fitted at once
 
@@ -61,6 +62,23 @@ def identify_fleet(
     >>> fj.fleets.identify_fleet([robot, robot], (), q, v, a, tau).parameters.shape
     (2, 22)
     """
+    check_fleet(robots, q, v, a, tau)
+    first = robots[0]
+    rows = States(first, lambda: [], terms)
+    into = coordinates(rows.structure, rows.structural).into
+    bytes_each = 8 * np.shape(q)[1] * first.nv * (sum(into.shape) + 1)
+    with jax.enable_x64(True):
+        own = jax.tree.map(lambda *x: jnp.asarray(np.stack(x), float), *[own_arrays(robot) for robot in robots])
+        at_once = max(1, int(AT_ONCE / bytes_each))
+        state = tuple(jnp.asarray(x, float) for x in (q, v, a, tau))
+        found: Any = jax.device_get(_program(at_once, first, terms, jnp.asarray(into), own, state))
+    return fleet_of(rows.structural, found)
+
+
+def check_fleet(robots: Sequence[RobotModel], q: Any, v: Any, a: Any, tau: Any) -> None:
+    """Raise `InputError` where the robots have different joints or the arrays do not fit them."""
+    if not robots:
+        raise InputError("a fleet has one robot at least")
     first = robots[0]
     for k, robot in enumerate(robots):
         if robot.joints != first.joints:
@@ -70,15 +88,11 @@ def identify_fleet(
         expected = (len(robots), np.shape(q)[1] if np.ndim(q) == 3 else "samples", width)
         if np.shape(x) != expected:
             raise InputError(f"{name} has shape {np.shape(x)}; expected {expected}: robots, samples, columns")
-    rows = States(first, lambda: [], terms)
-    into = coordinates(rows.structure, rows.structural).into
-    kept = rows.structural.independent
-    bytes_each = 8 * np.shape(q)[1] * first.nv * (sum(into.shape) + 1)
-    with jax.enable_x64(True):
-        own = jax.tree.map(lambda *x: jnp.asarray(np.stack(x), float), *[_own(robot) for robot in robots])
-        at_once = max(1, int(AT_ONCE / bytes_each))
-        state = tuple(jnp.asarray(x, float) for x in (q, v, a, tau))
-        found: Any = jax.device_get(_program(at_once, first, terms, jnp.asarray(into), own, state))
+
+
+def fleet_of(base: BaseParameters, found: Any) -> Fleet:
+    """What the fits (`BatchFit`) of all robots say; raises `InputError` where one is not finite."""
+    kept = base.independent
     if not np.isfinite(found.parameters).all():
         wrong = int(np.flatnonzero(~np.isfinite(found.parameters).all(axis=1))[0])
         raise InputError(
@@ -87,10 +101,10 @@ def identify_fleet(
     values, std = found.parameters[:, kept], found.std[:, kept]
     within = values.var(axis=0, ddof=1) - (std**2).mean(axis=0) if len(values) > 1 else np.zeros(len(kept))
     spread = np.sqrt(np.maximum(within, 0.0))
-    return Fleet(tuple(rows.structural.expressions), values, std, found.rms, values.mean(axis=0), spread)
+    return Fleet(tuple(base.expressions), values, std, found.rms, values.mean(axis=0), spread)
 
 
-def _own(robot: RobotModel) -> tuple[Any, ...]:
+def own_arrays(robot: RobotModel) -> tuple[Any, ...]:
     """What may differ from robot to robot."""
     return robot.placement, robot.axis, robot.inertia, robot.ratio, robot.offset, robot.gravity
 
@@ -98,6 +112,6 @@ def _own(robot: RobotModel) -> tuple[Any, ...]:
 @partial(jax.jit, static_argnums=0)
 def _program(at_once: int, first: RobotModel, terms: tuple[Effect, ...], into: Any, own: Any, state: Any) -> BatchFit:
     def one(given: Any) -> BatchFit:
-        return fit_states(eqx.tree_at(_own, first, given[0]), terms, into, *given[1])
+        return fit_states(eqx.tree_at(own_arrays, first, given[0]), terms, into, *given[1])
 
     return jax.lax.map(one, (own, state), batch_size=at_once)

@@ -93,6 +93,18 @@ class Free(NamedTuple):
         """Typical size of each number."""
         return np.array([size for part in self.parts for size in part.sizes], float)
 
+    def held(self, model: ExtendedModel, values: Float[np.ndarray, " numbers"]) -> Float[np.ndarray, " numbers"]:
+        """Each number as the model holds it; where it holds no such number (frames, offsets, drives) its change."""
+        out, first = np.array(values, float), 0
+        for part in self.parts:
+            own = slice(first, first + len(part.index))
+            if part.kind == "effect":
+                out[own] = np.asarray(getattr(model.effects[part.key[0]], part.key[1])).reshape(-1)
+            elif part.kind in ("inertia", "gravity"):
+                out[own] = np.asarray(getattr(model.robot, part.kind)).reshape(-1)[list(part.index)]
+            first = own.stop
+        return out
+
     def cut(self, values: Float[Array, " numbers"]) -> Iterator[tuple[Part, Array]]:
         """Each part with its numbers in the whole array, zero where nothing is estimated."""
         first = 0

@@ -48,7 +48,10 @@ class Basis(eqx.Module):
 
 
 class LinearFit(eqx.Module):
-    """Base parameters of one fit; of many under `jax.vmap`."""
+    """Base parameters of one fit; of many under `jax.vmap`.
+
+    `values` and `std` (rank,) in SI units, in the order of the basis' `names`; `rms` (nv,) of the residual, N m or N.
+    """
 
     values: Float[Array, " rank"]  # SI units, in the order of `Basis.names`
     std: Float[Array, " rank"]  # for white residuals, each joint weighed by its own

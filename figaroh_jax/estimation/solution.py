@@ -24,7 +24,14 @@ HIDDEN = 1e-6  # share of a number in directions that nothing determines, above 
 
 
 class Fit(eqx.Module):
-    """What a fit found; one of `fit` is a pytree, differentiable through the solution, and a batch under `jax.vmap`."""
+    """What a fit found; one of `fit` is a pytree, differentiable through the solution, and a batch under `jax.vmap`.
+
+    `model` is the model with the fitted numbers in it, `parameters` each of them by name with value, sigma and unit;
+    `values` (numbers,) are their changes from the model that was given, `covariance` (numbers, numbers) and
+    `std` what the rows tell of them, `rank` how many directions data and prior determine. `cost` is half of the squares
+    of all rows, `rows` the weighted residual. `result` is `optimistix.RESULTS.successful` or why not, `reason` the
+    same in words.
+    """
 
     model: ExtendedModel  # with the numbers in it
     data: tuple[Data, ...]  # with the devices' frames put in
@@ -65,8 +72,13 @@ class Fit(eqx.Module):
 
     @property
     def parameters(self) -> dict[str, Estimate]:
-        """Each number by its name: change, one sigma, unit."""
-        each = zip(self.free.names, np.asarray(self.values), self.std, self.free.units, strict=True)
+        """Each number by its name: value, one sigma, unit.
+
+        Of effects, links and gravity the value is the fitted one; of joint offsets, geometry, frames and drives it is
+        the change from what was given.
+        """
+        values = self.free.held(self.model, np.asarray(self.values))
+        each = zip(self.free.names, values, self.std, self.free.units, strict=True)
         return {name: Estimate(float(value), float(std), unit) for name, value, std, unit in each}
 
 

@@ -21,7 +21,7 @@ from .motions import Basis, Trajectory
 from .objectives import condition_objective, information_objective, prediction_objective, smooth_condition_objective
 from .sampling import CHUNK, Sampler
 from .separation import Causes, Separated, causes, check_told, separated, separation_objective
-from .solvers import FEW_ROWS, NEAR, ROUGH, GramObjective, Problem, solve
+from .solvers import FEW_ROWS, NEAR, ROUGH, STEPS, GramObjective, Problem, polished, solve, within
 
 __all__ = ["Cause", "Design", "Stage", "best_motion", "excite", "random_motion"]
 
@@ -29,7 +29,9 @@ TIGHTENED, TIGHTENING = 3, 40  # times that a motion is designed again with a ma
 TRIED_SHORTLY = 8  # random motions that a start improves a little, the best of them then as far as it goes
 WAVE, OVER = 8, 4  # samples of a wave, rows of a column: enough to look for a motion, which all samples then improve
 TRIED, ROOMY = 400, 3  # random postures in which a motion may begin; one of so many that are clear does
-FINALISTS = 3  # of these that are improved as far as it goes, where thousands of rows make many optima
+TRIED_WITHIN = 5  # random motions that a start improves from within, the best of them then joint by joint
+EXCHANGED = 15  # times that a start tries another motion of one joint, where thousands of rows make many optima
+GENTLY = 1.0  # how strongly limits are felt before they are reached, at the beginning of such a trial
 CHECKED = 8  # motions, the best first, until none promises more than one that is feasible at 1 kHz
 ROUNDING = 1e-6  # of a limit
 CLEAR_RATE = 40.0  # Hz at which a random motion touches nothing: what begins on the wrong side of a body stays there
@@ -141,9 +143,9 @@ def excite(
     limits = _without(limits, robot, learned.held, begin)
     sampler = Sampler(robot, learned.terms, np.asarray(learned.width))
     torque = torque_of(model, learned, sampler)
-    if learned.held:
-        _stands(torque, robot, limits, begin)
-    problem = unmeetable(torque, robot, limits, begin)
+    if begin is not None:
+        check_start(torque, robot, limits, begin)
+    problem = unmeetable(torque, robot, limits) if begin is None else None
     if problem is not None:
         raise InputError(problem)
     with jax.enable_x64(True):
@@ -252,17 +254,15 @@ def _inside(robot: RobotModel, start: np.ndarray, limits: Limits) -> np.ndarray:
     return start
 
 
-def _stands(torque: Torque, robot: RobotModel, limits: Limits, start: np.ndarray | None) -> None:
-    """`InputError` where who stands on joints that are held falls over in the posture in which a motion begins."""
-    if start is None or not np.isfinite(limits.torque).any():
-        return
+def check_start(torque: Torque, robot: RobotModel, limits: Limits, start: Float[np.ndarray, " nv"]) -> None:
+    """`InputError` where the posture in which a motion begins takes more torque than there is, as of who falls over."""
     share = np.abs(torque(np.stack([start, 0 * start, 0 * start])[:, None]))[0] / limits.torque
     worst = int(share.argmax())
     if share[worst] > 1.0:
         raise InputError(
             f"start: holding still there takes {share[worst]:.2f} times the torque limit of '{robot.dof_names[worst]}'"
             f" ({limits.torque[worst]:g}), and a motion begins at rest: begin elsewhere (a person on a plate: where"
-            " `people.balanced` says)"
+            " `people.balanced` says), or leave the start open"
         )
 
 
@@ -370,10 +370,9 @@ def random_motion(problem: Problem, generator: np.random.Generator, amplitude: f
     scale = amplitude * np.where(np.isfinite(scale), scale, 1.0)
     if not _distances_count(limits):
         return _within_torque(problem, problem.numbers(Trajectory(start, weights * scale[:, None], problem.basis)))
-    assert limits.clearance is not None
     for smaller in SMALLER:
         motion = Trajectory(start, weights * (smaller * scale)[:, None], problem.basis)
-        if (limits.clearance.distances(np.asarray(motion.states(CLEAR_RATE)[0])) > 0).all():
+        if _clear(problem, motion):
             break
     return problem.numbers(motion)
 
@@ -411,35 +410,92 @@ def best_motion(
     columns = np.array(learned.independent) if columns is None else columns
     kept = (columns, basis, limits, start, rate)
     final = Problem(learned, sampler, ways[0][-1], *kept, shifts=shifts)
-    few = _few_samples(final)
+    few = _few_samples(final) if final.linear_rows <= FEW_ROWS else None
     made = [[Problem(learned, sampler, one, *kept, shifts=shifts, samples=few) for one in way] for way in ways]
     found: list[tuple[float, np.ndarray]] = []
     for k in range(starts):
-        problems = made[k % len(made)]
-        tried: list[tuple[float, np.ndarray]] = []
-        for n in range(TRIED_SHORTLY):
-            progress((k + n / (2 * TRIED_SHORTLY)) / starts)
-            x = solve(problems[0], random_motion(final, generator), steps=ROUGH)
-            tried.append((problems[0].value(x), x))
-        for _, x in sorted(tried, key=lambda one: one[0])[: 1 if final.linear_rows <= FEW_ROWS else FINALISTS]:
-            for problem in problems:
-                x = solve(problem, x)
-            found.append((problems[-1].value(x), x))
-    each = len(found) // starts
-    reached = tuple(min(value for value, _ in found[k : k + each]) for k in range(0, len(found), each))
+
+        def told(share: float, k: int = k) -> None:
+            progress((k + share) / starts)
+
+        search = _best_of_some if final.linear_rows <= FEW_ROWS else _by_joints
+        found.append(search(made[k % len(made)], final, generator, told))
     ends: list[tuple[bool, float, Trajectory, tuple[Use, ...], Limits]] = []
     for value, x in sorted(found, key=lambda one: one[0])[:CHECKED]:
         if ends and min(ends, key=lambda one: one[:2])[:2] <= (False, value):
             break  # no motion that is left promises more
         own = _fitted(final, final.trajectory(x))
-        x = x if few is None else solve(own, x)
+        if few is not None:
+            x = solve(own, x)
+        elif own is not final:
+            x = polished(own, x, {}, STEPS)
         motion, uses, kept_limits = _feasible(torque, own, x)
         met = all(use.met for use in uses)
         ends.append((not met, final.value(final.numbers(motion)), motion, uses, kept_limits))
-        final.evaluations += own.evaluations
+        final.evaluations += own.evaluations if own is not final else 0
     _, _, motion, uses, kept_limits = min(ends, key=lambda one: one[:2])
     evaluations = sum(problem.evaluations for way in (*made, [final]) for problem in way)
-    return Stage(motion, uses, np.nan, reached, evaluations, kept_limits.clearance)
+    return Stage(motion, uses, np.nan, tuple(value for value, _ in found), evaluations, kept_limits.clearance)
+
+
+def _best_of_some(
+    problems: Sequence[Problem], final: Problem, generator: np.random.Generator, told: Callable[[float], None]
+) -> tuple[float, np.ndarray]:
+    """Of several random motions that are improved a little, the best one as far as it goes."""
+    tried: list[tuple[float, np.ndarray]] = []
+    for n in range(TRIED_SHORTLY):
+        told(n / (2 * TRIED_SHORTLY))
+        x = solve(problems[0], random_motion(final, generator), steps=ROUGH)
+        tried.append((problems[0].value(x), x))
+    _, x = min(tried, key=lambda one: one[0])
+    for problem in problems:
+        x = solve(problem, x)
+    return problems[-1].value(x), x
+
+
+def _by_joints(
+    problems: Sequence[Problem], final: Problem, generator: np.random.Generator, told: Callable[[float], None]
+) -> tuple[float, np.ndarray]:
+    """A random motion as far as it goes, then again and again with another motion of one joint, while that is better.
+
+    Thousands of rows make many optima; what is best for one joint among the others' motions is found joint by joint.
+    """
+    last, best, x = problems[-1], np.inf, np.zeros(0)
+    for n in range(TRIED_WITHIN):
+        told(n / (TRIED_WITHIN + EXCHANGED))
+        other = random_motion(final, generator)
+        for problem in problems:
+            other = within(problem, other)
+        if (value := last.value(other)) < best:
+            best, x = value, other
+    for n in range(EXCHANGED):
+        told((TRIED_WITHIN + n) / (TRIED_WITHIN + EXCHANGED))
+        other = _exchanged(final, x, int(generator.choice(np.flatnonzero(last.moved))), generator)
+        if other is not None:
+            other = within(last, other, GENTLY)
+            if (value := last.value(other)) < best:
+                best, x = value, other
+    x = polished(last, x, {}, STEPS)
+    return last.value(x), x
+
+
+def _exchanged(
+    problem: Problem, x: Float[np.ndarray, " n"], joint: int, generator: np.random.Generator
+) -> Float[np.ndarray, " n"] | None:
+    """The motion with a random one of one joint; None where it touches something."""
+    own, other = problem.trajectory(x), problem.trajectory(random_motion(problem, generator))
+    start, weights = np.array(own.start), np.array(own.weights)
+    start[joint], weights[joint] = np.asarray(other.start)[joint], np.asarray(other.weights)[joint]
+    motion = Trajectory(start, weights, own.basis)
+    return problem.numbers(motion) if _clear(problem, motion) else None
+
+
+def _clear(problem: Problem, motion: Trajectory) -> bool:
+    """Whether nothing touches in a motion."""
+    clearance = problem.limits.clearance
+    if clearance is None or not _distances_count(problem.limits):
+        return True
+    return bool((clearance.distances(np.asarray(motion.states(CLEAR_RATE)[0])) > 0).all())
 
 
 def _few_samples(problem: Problem) -> int | None:
@@ -462,7 +518,7 @@ def _feasible(
         if max(over.values(), default=0.0) < ALLOWED:
             break
         margin = {kind: margin.get(kind, 0.0) + 1.2 * over.get(kind, 0.0) for kind in {*margin, *over}}
-        x = solve(problem, x, margin, steps=TIGHTENING)
+        x = polished(problem, x, margin, TIGHTENING)
     return _smaller(torque, problem, problem.trajectory(x))
 
 

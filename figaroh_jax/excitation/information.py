@@ -63,6 +63,10 @@ class Learned(eqx.Module):
         """The same after an experiment of this information."""
         return eqx.tree_at(lambda one: one.prior, self, self.prior + information)
 
+    def with_noise(self, sigma: Float[Leaf, " nv"]) -> Learned:
+        """The same with other standard deviations of the torques, N m or N."""
+        return eqx.tree_at(lambda one: one.weight, self, 1 / np.asarray(sigma) ** 2)
+
 
 def learn(
     model: RobotModel | ExtendedModel,

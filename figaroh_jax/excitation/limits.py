@@ -26,6 +26,7 @@ CHECK_RATE = 1000.0  # Hz
 ALLOWED = 1e-3  # of a limit: what may be exceeded at 1 kHz
 _SKIPPED = 10  # samples of 1 kHz, between two that are always looked at
 _POSTURES, _FIRST = 512, 64  # at which the torque of standing still is looked at, and how many of them first
+_NEAR, _AROUND, _NEARER = 4, 32, 24  # of these the easiest, postures around each, and how often these come nearer
 
 # torques (samples, nv) of states (3, samples, nv)
 Torque = Callable[[Float[np.ndarray, "3 samples nv"]], Float[np.ndarray, "samples nv"]]
@@ -149,34 +150,52 @@ def _dof(robot: RobotModel, kind: str, name: str) -> int:
     return robot.dof_names.index(name)
 
 
-def unmeetable(
-    torque: Torque,
-    robot: RobotModel,
-    limits: Limits,
-    start: Float[np.ndarray, " nv"] | None = None,
-    seed: int = 0,
-) -> str | None:
-    """Why no motion meets the limits, where the torque of standing still says so: which joint, by how much.
-
-    `start`: where every motion begins; None: anywhere.
-    """
+def unmeetable(torque: Torque, robot: RobotModel, limits: Limits, seed: int = 0) -> str | None:
+    """Why no motion meets the limits, where the torque of standing still says so: which joint, by how much."""
     if not np.isfinite(limits.torque).any():
         return None
     generator = np.random.default_rng(seed)
     low, high = (np.where(np.isfinite(x), x, end) for x, end in zip(limits.position.T, (-np.pi, np.pi), strict=True))
     q = generator.uniform(low, high, (_POSTURES, robot.nv))
-    if start is not None:
-        q[0] = start  # with others: the message tells of the easiest
     for some in (q[:_FIRST], q):
-        held = np.abs(torque(np.stack([some, 0 * some, 0 * some]))) / limits.torque
-        best = int(held.max(axis=1).argmin())
-        if held[best].max() <= 1.0:
+        held = _held_still(torque, limits, some)
+        if held.max(axis=1).min() <= 1.0:
             return None
-    worst = int(held[best].argmax())
+    best, shares = _easiest(torque, limits, q, held, (low, high), generator)
+    if shares.max() <= 1.0:
+        return None
+    worst = int(shares.argmax())
+    at = ", ".join(f"{x:.3g}" for x in best)
     return (
-        f"limits.torque: holding still takes {held[best, worst]:.2f} times the limit of '{robot.dof_names[worst]}'"
-        f" ({limits.torque[worst]:g}) in the easiest of {_POSTURES} postures; no motion meets it"
+        f"limits.torque: holding still takes {shares[worst]:.2f} times the limit of '{robot.dof_names[worst]}'"
+        f" ({limits.torque[worst]:g}) in the easiest posture that was found ({at}); no motion meets it"
     )
+
+
+def _held_still(torque: Torque, limits: Limits, q: Float[np.ndarray, "samples nv"]) -> Float[np.ndarray, "samples nv"]:
+    return np.abs(torque(np.stack([q, 0 * q, 0 * q]))) / limits.torque
+
+
+def _easiest(
+    torque: Torque,
+    limits: Limits,
+    q: Float[np.ndarray, "samples nv"],
+    held: Float[np.ndarray, "samples nv"],
+    ends: tuple[np.ndarray, np.ndarray],
+    generator: np.random.Generator,
+) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " nv"]]:
+    """The posture that is easiest to hold of all near the easiest of some, nearer and nearer; and the shares there."""
+    first = held.max(axis=1).argsort()[:_NEAR]
+    q, held = q[first], held[first]
+    for reach in np.geomspace(0.5, 1e-3, _NEARER):
+        others = np.repeat(q, _AROUND, axis=0)
+        others = np.clip(others + reach * generator.standard_normal(others.shape), *ends)
+        every = np.concatenate([q, others]), np.concatenate([held, _held_still(torque, limits, others)])
+        best = every[1].max(axis=1).argsort()[:_NEAR]
+        q, held = every[0][best], every[1][best]
+        if held[0].max() <= 1.0:
+            break
+    return q[0], held[0]
 
 
 def checked(

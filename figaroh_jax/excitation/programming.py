@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 if TYPE_CHECKING:
     from .solvers import Problem
 
-__all__ = ["Rows", "descend", "drawn_in", "lapack", "quadratic_step"]
+__all__ = ["FIRST", "LONGEST", "Rows", "at_rest", "descend", "drawn_in", "lapack", "quadratic_step", "updated"]
 
 BAND = 0.15  # of a limit: rows nearer to it than this are in
 JOINING, JOINED = 5, 150  # times that rows join one step, and how many of them at once
@@ -160,26 +160,32 @@ def descend(
         bent = np.flatnonzero(curved & (step.held > 0))
         if len(bent):
             y = y + step.held[bent] @ (rows.slopes(there.x, step.rows[bent]) - step.slopes[bent])
-        H = _updated(H, there.x - here.x, y, fresh)
+        H = updated(H, there.x - here.x, y, fresh)
         here, fresh = there, False
     return here.x
 
 
 def drawn_in(problem: Problem, x: Float[np.ndarray, " n"], margin: dict[str, float]) -> Float[np.ndarray, " n"]:
     """The motion made as much smaller as position, velocity and acceleration ask for."""
-    rows, still = Rows(problem, margin), problem.trajectory(x)
+    rows = Rows(problem, margin)
     room = rows.of_linear(x)
     if room.min(initial=0.0) >= 0.0:
         return x
-    start = np.asarray(still.start)
-    if problem.start is None:
-        middle, reach = problem.limits.middle, (1.0 - margin.get("position", 0.0)) * problem.limits.reach
-        start = np.clip(start, middle - reach, middle + reach)
-    rest = problem.numbers(replace(still, start=start, weights=0.0 * np.asarray(still.weights)))
+    rest = at_rest(problem, x, margin.get("position", 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
         share = -room / (rows.of_linear(rest) - room)
     share = np.where(room < 0, share, 0.0).max()
     return x + min(max(float(share), 0.0), 1.0) * (rest - x)
+
+
+def at_rest(problem: Problem, x: Float[np.ndarray, " n"], margin: float) -> Float[np.ndarray, " n"]:
+    """Standing still where the motion begins, or so far within the positions as a margin asks for (a share)."""
+    still = problem.trajectory(x)
+    start = np.asarray(still.start)
+    if problem.start is None:
+        middle, reach = problem.limits.middle, (1.0 - margin) * problem.limits.reach
+        start = np.clip(start, middle - reach, middle + reach)
+    return problem.numbers(replace(still, start=start, weights=0.0 * np.asarray(still.weights)))
 
 
 def _at(problem: Problem, rows: Rows, x: np.ndarray) -> _Point:
@@ -187,7 +193,7 @@ def _at(problem: Problem, rows: Rows, x: np.ndarray) -> _Point:
     return _Point(x, value, problem.slope(x), rows.of_linear(x), rows.of_curved(x))
 
 
-def _updated(H: np.ndarray, s: np.ndarray, y: np.ndarray, fresh: bool) -> np.ndarray:
+def updated(H: np.ndarray, s: np.ndarray, y: np.ndarray, fresh: bool) -> np.ndarray:
     """The Hessian after a step s that changed the gradient by y, still positive (Powell's damping)."""
     if fresh and s @ y > 0:
         H = np.eye(len(s)) * max(float(y @ y) / float(s @ y), 1e-8)

@@ -148,14 +148,6 @@ class Sampler:
         with jax.enable_x64(True):
             self.on_device, self.others, self.widths = jax.device_put((robot, tuple(others), self.width))
 
-    def wider(self, times: float) -> Sampler | None:
-        """The same with a reversal of dry friction so many times as wide; None where nothing reverses."""
-        if not self.others and all(column is not _coulomb for column, _, _ in self.plain):
-            return None
-        other = Sampler(self.robot, self.terms, times * self.width)
-        other.codes = self.codes
-        return other
-
     def _code(self, states: Float[np.ndarray, "3 samples nv"], back: bool) -> Any:
         """Machine code of the links' rows, or of their gradient; None where JAX has to serve."""
         if states.shape[1] < FEWEST or not np.abs(states[0]).max() < FARTHEST:

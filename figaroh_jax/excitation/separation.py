@@ -41,7 +41,7 @@ SHARPNESS = 8.0  # of the soft minimum over rivals
 SHIFTS = (0.0, 0.012, 0.025, 0.04, 0.06)  # s before, whose torques delays and lags are made of
 FASTEST = 8.0  # Hz up to which they are
 AROUND = 3.0  # times a delay or lag, up and down, that its rival may have
-NOTHING = 1e-8  # share of the squares of a cause's torque
+NOTHING = 1e-6  # share of the squares of a cause's torque
 _RIDGE = 1e-10
 
 

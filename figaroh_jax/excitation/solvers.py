@@ -1,35 +1,35 @@
 r"""Maximising a function of a motion's rows within limits.
 
 Few linear rows: sequential quadratic programming (SLSQP). Rows of torque and distance, or thousands of linear ones: the
-same with the rows alone that are near their limits (`programming`). At a sample dry friction reverses within some .03
-rad/s, which makes many small optima of one; a descent therefore begins with a wider reversal. Limits are kept at the
-samples of the design, tightened by what the motion exceeds them between, and at last the motion is made smaller until
-it meets them at 1 kHz.
+motion is improved from within (`interior`), then with the rows alone that are near their limits (`programming`). Limits
+are kept at the samples of the design, tightened by what the motion exceeds them between, and at last the motion is made
+smaller until it meets them at 1 kHz.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from .information import Learned
+from .interior import BEGUN, from_within
 from .limits import KINDS, Limits
 from .motions import Basis, Trajectory
-from .programming import Rows, descend, drawn_in
+from .programming import Rows, at_rest, descend, drawn_in
 from .sampling import Sampler
 
-__all__ = ["FEW_ROWS", "GramObjective", "Problem", "solve"]
+__all__ = ["FEW_ROWS", "GramObjective", "Problem", "polished", "solve", "within"]
 
 # f and its gradient by the (symmetric) Gram matrix of the weighted rows
 GramObjective = Callable[[Float[np.ndarray, "n n"]], tuple[float, Float[np.ndarray, "n n"]]]
 
 FEW_ROWS = 600  # linear rows that SLSQP takes
-STEPS, SMOOTHED = 200, 60  # of a descent; with a wider reversal of dry friction before it
+STEPS = 200  # of a descent
 ROUGH = 12  # steps up to which a descent only shows whether a motion is worth more
-WIDER = 5.0  # times the width of that reversal
+ROOM = 0.1  # share of its way to rest from which a motion is improved from within
 NEAR = 0.05  # m: a distance that misses its margin by this violates it as much as a whole limit
 
 
@@ -92,11 +92,6 @@ class Problem:
         finite = (np.isfinite(self.limits.of(kind)).sum() * len(functions) for kind, functions in self.rows)
         return 2 * int(sum(finite))
 
-    def smoother(self) -> Problem | None:
-        """The same with a wider reversal of dry friction; None where there is none."""
-        sampler = self.sampler.wider(WIDER)
-        return None if sampler is None else replace(self, sampler=sampler, evaluations=0, _seen=None)
-
     def trajectory(self, x: Float[np.ndarray, " n"]) -> Trajectory:
         """The motion of the numbers x; joints that are held stand still, whatever rounding a solve has left them."""
         start, weights = self._split(x)
@@ -136,7 +131,8 @@ class Problem:
             own = np.concatenate([own, late[:, self.measured]])
         own *= self.root[:, None]
         flat = own.reshape(len(own), -1)
-        return flat, flat @ flat.T
+        lower = flat @ flat.T
+        return flat, lower
 
     def value(self, x: Float[np.ndarray, " n"]) -> float:
         """The objective."""
@@ -155,8 +151,13 @@ class Problem:
         assert self._seen is not None
         return self._seen
 
-    def slope(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Its gradient."""
+    def slope(
+        self,
+        x: Float[np.ndarray, " n"],
+        by_torque: Float[np.ndarray, "samples nv"] | None = None,
+        by_distance: Float[np.ndarray, "samples rows"] | None = None,
+    ) -> Float[np.ndarray, " n"]:
+        """Its gradient; that of a sum where a further part has slopes by `torque_shares` and `distances`."""
         seen = self._at(x)
         nv, columns, samples = seen.rows.shape
         cotangent, theta = np.zeros((columns, nv, samples)), np.asarray(self.learned.theta)
@@ -168,7 +169,14 @@ class Problem:
         if self.shifts:
             late = by_rows[len(self.columns) :].swapaxes(0, 1).reshape(nv, samples)
             cotangent[: len(theta)] += late * theta[:, None, None]
-        return self.to_numbers(self.sampler.back(seen.states, cotangent.swapaxes(0, 1)))
+        if by_torque is not None:
+            cotangent[: len(theta), :, : self.count] += theta[:, None, None] * (by_torque / self.limits.torque).T
+        by_states = self.sampler.back(seen.states, cotangent.swapaxes(0, 1))
+        if by_distance is not None:
+            assert self.limits.clearance is not None
+            _, back = self.limits.clearance.with_gradient(seen.states[0, : self.count])
+            by_states[0, : self.count] += back(by_distance / NEAR)
+        return self.to_numbers(by_states)
 
     def torque_shares(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "samples nv"]:
         """Torques as shares of their limits."""
@@ -251,22 +259,37 @@ class Problem:
         return (np.concatenate(blocks), np.concatenate(bounds)) if blocks else (np.zeros((0, size)), np.zeros(0))
 
 
-def solve(
-    problem: Problem, x: Float[np.ndarray, " n"], margin: dict[str, float] | None = None, steps: int = STEPS
+def solve(problem: Problem, x: Float[np.ndarray, " n"], steps: int = STEPS) -> Float[np.ndarray, " n"]:
+    """The numbers of the best motion found from x in so many steps, within the limits at the samples of the design."""
+    if problem.linear_rows <= FEW_ROWS:
+        found = _sequential(problem, x, *problem.linear_matrix({}), steps)
+        if Rows(problem, {}).of_curved(found).min(initial=0.0) >= 0.0:
+            return found
+    if steps > ROUGH:
+        x = within(problem, x)
+    return descend(problem, drawn_in(problem, x, {}), {}, steps)
+
+
+def within(problem: Problem, x: Float[np.ndarray, " n"], begun: float = BEGUN) -> Float[np.ndarray, " n"]:
+    """A better motion from x, first made a little smaller; of position, velocity and acceleration it leaves some.
+
+    `begun`: how strongly limits are felt before they are reached, at first.
+    """
+    x = drawn_in(problem, x, {})
+    return from_within(problem, x + ROOM * (at_rest(problem, x, ROOM) - x), begun)
+
+
+def polished(
+    problem: Problem, x: Float[np.ndarray, " n"], margin: dict[str, float], steps: int
 ) -> Float[np.ndarray, " n"]:
-    """The numbers of the best motion found from x in so many steps, within the limits at the samples of the design.
+    """A better motion near x, after so many steps along the limits at the most.
 
     `margin`: of each kind of limit, a share of it that is kept beyond (of distances, in units of `NEAR`).
     """
-    margin = {} if margin is None else margin
-    A, b = problem.linear_matrix(margin) if problem.linear_rows <= FEW_ROWS else (None, None)
-    if A is not None and b is not None:
-        found = _sequential(problem, x, A, b, steps)
+    if problem.linear_rows <= FEW_ROWS:
+        found = _sequential(problem, x, *problem.linear_matrix(margin), steps)
         if Rows(problem, margin).of_curved(found).min(initial=0.0) >= 0.0:
             return found
-    if steps > ROUGH and (smoother := problem.smoother()) is not None:
-        x = descend(smoother, drawn_in(problem, x, margin), margin, SMOOTHED)
-        problem.evaluations += smoother.evaluations
     return descend(problem, drawn_in(problem, x, margin), margin, steps)
 
 

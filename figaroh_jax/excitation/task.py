@@ -5,26 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
-import equinox as eqx
-import jax
 import numpy as np
-from jaxtyping import Float
+from scipy.interpolate import make_interp_spline
 
 from ..errors import InputError
+from ..formats.collision import read_shapes
+from ..formats.config import Excite, Sight, SizedEffect, Task, robot_options
+from ..formats.robotfile import load_extended, load_robot, stated_baseline
 from ..recordings.reading import read_table
 from ..rigid.model import RobotModel
 from .clearance import Box, Capsule, Clearance, clearance_of
 from .design import Cause, Design, excite
-from .information import Learned, learn
+from .information import learn
 from .limits import limits_of
 from .motions import Basis, fourier, quintic, spline
 from .postures import ACCURACY, Instrument, PostureDesign, View, excite_postures
 from .touch import Touch
-
-if TYPE_CHECKING:
-    from ..formats.config import Baseline, Excite, Sight, SizedEffect, Task
 
 __all__ = ["excite_task"]
 
@@ -55,9 +53,6 @@ def excite_task(
     >>> len(found.stages)
     1
     """
-    from ..formats.config import robot_options
-    from ..formats.robotfile import load_extended, load_robot, stated_baseline
-
     asked = task.excite
     if separate:
         asked = excite_block(asked)
@@ -79,10 +74,12 @@ def excite_task(
     learned = learn(model, known, noise=noise, trust=task.robot.trust)
     said = [*notes, *around]
     if task.data:
+        from .known import with_recordings  # the machinery of fits, which a design without recordings does without
+
         progress("what the recordings tell", 0.0)
         after, texts = with_recordings(task, model.robot, known, learned, asked.noise is None)
         if separate or asked.objective == "separate":  # the causes were at work in the recordings too
-            learned, texts = with_noise(learned, 1 / np.sqrt(np.asarray(after.weight))), (*texts[:-1], ONLY_NOISE)
+            learned, texts = learned.with_noise(1 / np.sqrt(np.asarray(after.weight))), (*texts[:-1], ONLY_NOISE)
         else:
             learned = after
         said += texts
@@ -108,8 +105,6 @@ def excite_task(
 
 def clearance_asked(task: Task, asked: Excite, robot: RobotModel) -> tuple[Clearance | None, tuple[str, ...]]:
     """The distances that a task asks for, and what is to be said of them."""
-    from ..formats.collision import read_shapes
-
     margin = asked.limits.clearance
     if margin is None:
         return None, ("no limits.clearance is given: distances between bodies are not looked at",)
@@ -135,8 +130,6 @@ def told(one: SizedEffect) -> Cause:
 
 def excite_block(asked: Excite | None) -> Excite:
     """The block of a task that has one, else its defaults; of a motion."""
-    from ..formats.config import Excite
-
     return Excite() if asked is None else asked.model_copy(update={"kind": "trajectory"})
 
 
@@ -219,56 +212,8 @@ def read_motion(path: Path, robot: RobotModel) -> tuple[np.ndarray, np.ndarray, 
             raise InputError(f"{path} ({key}): {name} is {values[row, column]} in row {row}, column {column} (from 0)")
     if whole:
         return arrays["q"], arrays["v"], arrays["a"]
-    from scipy.interpolate import make_interp_spline  # slow to import
-
     time = table.vector("t", key)
     if len(time) != len(arrays["q"]) or len(time) < 6 or not (np.diff(time) > 0).all():
         raise InputError(f"{path} ({key}): t must increase, one stamp for each row of q, six at the least")
     curve = make_interp_spline(time, arrays["q"], 5)
     return arrays["q"], np.asarray(curve.derivative(1)(time)), np.asarray(curve.derivative(2)(time))
-
-
-def with_recordings(
-    task: Task, robot: RobotModel, known: Baseline, learned: Learned, noise_too: bool
-) -> tuple[Learned, tuple[str, ...]]:
-    """What is known after the recordings, in words too: their information is the prior, their residual the noise."""
-    from ..estimation.base_parameters import base_parameters
-    from ..estimation.columns import friction_terms, structural_columns
-    from ..estimation.intervals import coloured_covariance
-    from ..estimation.least_squares import WeightedByJoint, solve
-    from ..estimation.regression import Regression, condense
-    from ..recordings.checks import check_recordings
-    from ..recordings.dataset import read_recordings
-    from ..recordings.signals import prepare_all
-    from ..simulators.native import NativeBackend
-
-    recordings = read_recordings(task, robot)
-    warnings = check_recordings(task, robot, recordings)
-    for one in recordings:
-        if one.torque is None and one.role == "fit":
-            raise InputError(f"{one.file}: no torque; recordings of `excite` tell what is known of the dynamics")
-    with jax.enable_x64(True):
-        terms = friction_terms(robot, known)
-        signals = prepare_all(tuple(recordings), task.preprocess, slowed=False, model=robot)
-        regression = Regression(NativeBackend(robot), terms, np.zeros(robot.nv), signals)
-        used = np.asarray(np.abs(structural_columns(robot, terms)).max(axis=0) > 0)
-        data = condense(regression, used)
-        base = base_parameters(data.factor()[:, :-1], data.names)
-        found = solve(data, WeightedByJoint(), kept=base.independent)
-        covariance = coloured_covariance(regression, found.parameters, base.independent, found.weight)
-        A = data.factor(found.weight)
-        own = A[:, base.independent]
-        inflation = max(1.0, float(np.trace(covariance @ (own.T @ own))) / base.rank)
-        seen = A[:, np.array(learned.independent)]
-        learned = learned.with_prior(seen.T @ seen / inflation)
-    many = len(recordings) > 1
-    text = f"{len(recordings)} recording{'s count' if many else ' counts'} as known already"
-    if noise_too:
-        learned = with_noise(learned, 1 / np.sqrt(found.weight))
-        text += "; the noise is the residual of their fit"
-    return learned, (*warnings, text)
-
-
-def with_noise(learned: Learned, sigma: Float[np.ndarray, " nv"]) -> Learned:
-    """The same with other standard deviations of the torques, N m or N."""
-    return eqx.tree_at(lambda one: one.weight, learned, 1 / np.asarray(sigma) ** 2)

@@ -6,6 +6,7 @@ file and key. The models can also be built in Python: `Preprocess(cutoff=15)`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -136,7 +137,7 @@ class Robot(_Keys):
 
 
 class Load(_Keys):
-    """A known payload carried during a recording."""
+    """A known payload carried during a recording: `mass` in kg, `com` in m in the axes of the model's `frame`."""
 
     frame: str
     mass: Positive  # kg
@@ -279,7 +280,16 @@ class Transmission(_Keys):
 
 
 class Preprocess(_Keys):
-    """What happens to every recording before anything is fitted; None leaves the choice to `signals`."""
+    """What happens to every recording before anything is fitted; what is not given is chosen from the recordings.
+
+    `window` (begin, end) in s is the part that is kept; `cutoff` in Hz that of one zero-phase low pass for position,
+    torque and every column of the regressor; `rate` in Hz that of the rows after it; `gate` drops the rows of a joint
+    that moves more slowly, `{"elbow": 0.05}` in rad/s (m/s).
+
+    >>> import figaroh_jax as fj
+    >>> fj.Preprocess(cutoff=15, rate=50).cutoff
+    15.0
+    """
 
     window: tuple[Number, Number] | None = None  # s, kept
     cutoff: Positive | None = None  # Hz
@@ -302,7 +312,15 @@ class BaselineEffect(_Keys):
 
 
 class Baseline(_Keys):
-    """What is fitted before anything is named."""
+    """What is fitted beside the rigid body before anything is named, and what `identify` fits.
+
+    At every joint `viscous` friction (N m s/rad), `coulomb` friction (N m), the inertia of the `rotor` (kg m2) and a
+    torque `offset` (N m); `effects` names more, each with its place: `{"effect": "joint_spring", "at": ["elbow"]}`.
+
+    >>> import figaroh_jax as fj
+    >>> fj.Baseline(rotor=True, effects=[{"effect": "joint_spring", "at": ["elbow"]}]).effects[0].at
+    ('elbow',)
+    """
 
     viscous: bool = True
     coulomb: bool = True
@@ -583,8 +601,8 @@ def load_limits(path: str | Path) -> Limits:
     try:
         return Limits.model_validate(merge(chain))
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise InputError(f"{where(chain, first['loc'])}: {_message(first)}") from None
+        place, text = _mistake(error.errors(include_url=False))
+        raise InputError(f"{where(chain, place)}: {text}") from None
 
 
 def load_task(path: str | Path) -> Task:
@@ -598,8 +616,8 @@ def load_task(path: str | Path) -> Task:
     try:
         task = Task.model_validate(merge(chain))
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise InputError(f"{where(chain, first['loc'])}: {_message(first)}") from None
+        place, text = _mistake(error.errors(include_url=False))
+        raise InputError(f"{where(chain, place)}: {text}") from None
     task._file = Path(path)
     return task
 
@@ -630,13 +648,37 @@ _EXPECTED = {  # pydantic's kinds of mistakes, in fewer words
 }
 
 
-def _message(error: Any) -> str:
-    """One mistake in the words of the task file."""
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]).lstrip(".")
-    context, kind = error.get("ctx", {}), error["type"]
-    if kind == "missing":
-        return f"{key} is missing"
+def _mistake(errors: Sequence[Any]) -> tuple[tuple[str | int, ...], str]:
+    """Place and text of the first mistake; where a key takes one of several forms, of all of them together."""
+    place = _keys(errors[0]["loc"])
+    if len(place) == len(errors[0]["loc"]):
+        return place, _message(place, errors[0], _expected(errors[0]))
+    same = [error for error in errors if _keys(error["loc"])[: len(place)] == place]
+    depth = max(len(_keys(error["loc"])) for error in same)
+    near = [error for error in same if len(_keys(error["loc"])) == depth]  # of the form that was meant
+    forms = list(dict.fromkeys(_expected(error) for error in near))
+    text = " or ".join([", ".join(forms[:-1]), forms[-1]] if len(forms) > 1 else forms)
+    place = _keys(near[0]["loc"])
+    return place, _message(place, near[0], text)
+
+
+def _keys(place: Sequence[str | int]) -> tuple[str | int, ...]:
+    """Of a place, the keys of the task file, without the forms that pydantic tells apart."""
+    return tuple(part for part in place if isinstance(part, int) or "[" not in part)
+
+
+def _expected(error: Any) -> str:
+    kind = error["type"]
     if kind == "value_error":
-        return f"{key}: {context['error']}" if key else str(context["error"])
-    expected = _EXPECTED[kind].format(**context) if kind in _EXPECTED else error["msg"]
+        return str(error["ctx"]["error"]).removeprefix("expected ")
+    return _EXPECTED[kind].format(**error.get("ctx", {})) if kind in _EXPECTED else error["msg"]
+
+
+def _message(place: Sequence[str | int], error: Any, expected: str) -> str:
+    """One mistake in the words of the task file."""
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
+    if error["type"] == "missing":
+        return f"{key} is missing"
+    if error["type"] == "value_error":
+        return f"{key}: {error['ctx']['error']}" if key else str(error["ctx"]["error"])
     return f"{key} is {error['input']!r:.80}, expected {expected}"

@@ -244,6 +244,7 @@ def _generic(prim: Any, physics: Any) -> tuple[str, np.ndarray]:
 
 
 def schemas(prim: Any) -> list[str]:
+    """Names of the API schemas that are applied to a prim, such as `PhysicsRigidBodyAPI`."""
     return list(prim.GetPrimTypeInfo().GetAppliedAPISchemas())
 
 

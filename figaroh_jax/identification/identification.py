@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -60,6 +60,7 @@ Fit = Literal["physical", "log_cholesky", "unconstrained"]
 MOVED = 2.0
 SHOWN = 0.01  # information of the data in a direction below which it stays as stated; 1 is the prior's own (a root)
 TRUSTS = (1.0, 3.0, 10.0, 100.0)  # multiples of the stated trust that cross-validation chooses from
+CLEARLY = 0.05  # of the squares left out: what letting go of all that no torque shows must gain
 DRIVE_PRECISION = 1e-6
 DEAD = 0.5  # share of samples at one single value: such a torque is not measured
 
@@ -91,20 +92,27 @@ class _Problem:
         room = np.maximum(1.0 - MOVED * self.told, 1e-12)
         return np.sqrt(np.clip(MOVED / (self.told * room), 1.0, slack**2))
 
-    def root_at(self, slack: float) -> Float[np.ndarray, "columns columns"]:
+    def root_at(self, slack: float, everywhere: bool = False) -> Float[np.ndarray, "columns columns"]:
         """R with R'R the precision of the prior, the nominal links believed up to `slack` times less (`loosened`).
 
         A direction that no torque shows stays as near to the nominal as was stated, however little that is believed
-        elsewhere: nothing would hold it.
+        elsewhere: nothing would hold it. `everywhere` lets it go too: a link that carries much more than it weighs is
+        no body unless the moments that no torque shows grow with those that one does.
         """
         root, own = np.diag(np.sqrt(self.precision)), self.nominal.size
+        if everywhere:
+            root[:own, :own] /= slack
+            return root
         tighter = self.shown * (1 - 1 / self.loosened(slack))
         root[:own, :own] -= (tighter @ self.shown.T) * np.sqrt(self.precision[:own])
         return root
 
-    def spread_at(self, slack: float) -> Float[np.ndarray, "columns columns"]:
+    def spread_at(self, slack: float, everywhere: bool = False) -> Float[np.ndarray, "columns columns"]:
         """S with SS' the covariance of that prior: the inverse of `root_at`."""
         spread, own = np.diag(1 / np.sqrt(self.precision)), self.nominal.size
+        if everywhere:
+            spread[:own, :own] *= slack
+            return spread
         wider = self.shown * (self.loosened(slack) - 1)
         spread[:own, :own] += (wider @ self.shown.T) / np.sqrt(self.precision[:own, None])
         return spread
@@ -173,8 +181,7 @@ def identify(
     with jax.enable_x64(True):
         progress("preparing signals", 0.05)
         regression, left_out = _regression(backend, recordings, preprocess or Preprocess(), known or Baseline(), joints)
-        notes, terms, signals = [*warned, *left_out], regression.terms, regression.signals
-        structure = structural_columns(model, terms)
+        structure = structural_columns(model, regression.terms)
         used = np.asarray(np.abs(structure).max(axis=0) > 0)
         structural = base_parameters(structure.reshape(-1, structure.shape[2]), regression.names)
         progress("condensing the recordings", 0.15)
@@ -183,52 +190,71 @@ def identify(
         covariance = coloured_covariance(regression, start.parameters, base.independent, start.weight)
         problem = _problem(regression, data, base, start, covariance, trust, fit, bounds)
         progress("fitting", 0.6)
-        chosen, validated = _validated(problem)
-        last = _fitted(problem, None, chosen)
-        theta = last.theta
+        last = _best(problem)
         progress("judging", 0.85)
-        if chosen > 1:
-            notes.append(
-                f"the nominal links are believed within {chosen * trust:.0%} where the torque shows them, not"
-                f" {trust:.0%} as stated: that predicts data left out of the fit better; elsewhere as stated"
-            )
-        own = 10 * len(model.joints)
-        posterior = posterior_covariance(problem.base, covariance, problem.spread_at(chosen))
-        judged = Judged(data, base, theta, posterior, covariance, prior_sigma(data, own, model, trust), problem.bounded)
-        ten = theta[:own].reshape(-1, 10)
-        given = _given_links(problem)
-        traces, holdout, outlying = predicted(regression, theta, given)
-        if last.failure:
-            notes.append(f"{last.failure}: do not trust these values")
-        rows = [np.asarray(t.after) - t.measured for t in traces if t.role == "fit" and t.measured is not None]
-        weighted = np.concatenate([(row * np.sqrt(problem.weight)).reshape(-1) for row in rows])
-        solution = solution_of(regression, last, posterior, base.rank, weighted)
-        kept = essential(data.factor(start.weight)[:, [*base.independent, -1]])
-        return Identification(
-            solution=solution,
-            joints=model.dof_names,
-            structural_rank=structural.rank,
-            condition=base.condition,
-            scaled_condition=base.scaled_condition,
-            base=judged.base_parameters(),
-            parameters=judged.parameters(),
-            null_directions=base.null_directions,
-            links=described_links(ten, model.link_names),
-            effects=described_effects(model, terms, theta[own:], np.sqrt(np.maximum(np.diag(posterior)[own:], 0.0))),
-            fit=quality(data, data.squares(theta)),
-            unconstrained=quality(data, data.squares(start.parameters)),
-            nominal=quality(data, data.squares(given)),
-            validated=validated,
-            holdout=holdout,
-            trust=chosen * trust,
-            width=regression.width,
-            method=fit,
-            essential=tuple(base.expressions[k] for k in kept),
-            traces=traces,
-            correlations=correlations(base, covariance),
-            notes=(*notes, *dropped(signals, model), *outlying, *(note for one in signals for note in one.notes)),
-            prismatic=prismatic(model),
-        )
+        found = _judged(problem, regression, start.parameters, covariance, last, trust, structural.rank)
+    notes = [*warned, *left_out, *found.notes, *dropped(regression.signals, model)]
+    return replace(found, notes=(*notes, *(note for one in regression.signals for note in one.notes)))
+
+
+_LOOSENED = (
+    "the nominal links are believed within {:.0%} where the torque shows them, not {:.0%} as stated: that predicts data"
+    " left out of the fit better; elsewhere as stated"
+)
+_LOOSENED_EVERYWHERE = (
+    "the nominal links are believed within {:.0%}, not {:.0%} as stated: that predicts data left out of the fit clearly"
+    " better; what no torque shows of them may be far off"
+)
+
+
+def _judged(
+    problem: _Problem,
+    regression: Regression,
+    free: Float[np.ndarray, " columns"],
+    covariance: Float[np.ndarray, "rank rank"],
+    last: _Best,
+    trust: float,
+    structural_rank: int,
+) -> Identification:
+    """What a fit is worth; `free` are the parameters without prior and bounds."""
+    model, data, base, theta = regression.model, problem.data, problem.base, last.fit.theta
+    own = 10 * len(model.joints)
+    posterior = posterior_covariance(base, covariance, problem.spread_at(last.slack, last.everywhere))
+    judged = Judged(data, base, theta, posterior, covariance, prior_sigma(data, own, model, trust), problem.bounded)
+    given = _given_links(problem)
+    traces, holdout, outlying = predicted(regression, theta, given)
+    loosened = _LOOSENED_EVERYWHERE if last.everywhere else _LOOSENED
+    notes = [loosened.format(last.slack * trust, trust)] if last.slack > 1 else []
+    notes += [f"{last.fit.failure}: do not trust these values"] if last.fit.failure else []
+    rows = [np.asarray(t.after) - t.measured for t in traces if t.role == "fit" and t.measured is not None]
+    weighted = np.concatenate([(row * np.sqrt(problem.weight)).reshape(-1) for row in rows])
+    kept = essential(data.factor(problem.weight)[:, [*base.independent, -1]])
+    sigma = np.sqrt(np.maximum(np.diag(posterior)[own:], 0.0))
+    return Identification(
+        solution=solution_of(regression, last.fit, posterior, base.rank, weighted),
+        joints=model.dof_names,
+        structural_rank=structural_rank,
+        condition=base.condition,
+        scaled_condition=base.scaled_condition,
+        base=judged.base_parameters(),
+        parameters=judged.parameters(),
+        null_directions=base.null_directions,
+        links=described_links(theta[:own].reshape(-1, 10), model.link_names),
+        effects=described_effects(model, regression.terms, theta[own:], sigma),
+        fit=quality(data, data.squares(theta)),
+        unconstrained=quality(data, data.squares(free)),
+        nominal=quality(data, data.squares(given)),
+        validated=last.validated,
+        holdout=holdout,
+        trust=last.slack * trust,
+        width=regression.width,
+        method=problem.fit,
+        essential=tuple(base.expressions[k] for k in kept),
+        traces=traces,
+        correlations=correlations(base, covariance),
+        notes=(*notes, *outlying),
+        prismatic=prismatic(model),
+    )
 
 
 def _regression(
@@ -345,9 +371,9 @@ def _least(terms: Sequence[Effect]) -> Float[np.ndarray, " drives"]:
     return np.array(out)
 
 
-def _fitted(problem: _Problem, folds: Sequence[int] | None, slack: float) -> Solved:
-    """All columns fitted to the rows of `folds` (None: all), the nominal believed `slack` times less."""
-    root = np.sqrt(problem.inflation) * problem.root_at(slack)
+def _fitted(problem: _Problem, folds: Sequence[int] | None, slack: float, everywhere: bool = False) -> Solved:
+    """All columns fitted to the rows of `folds` (None: all), the nominal believed `slack` times less (`root_at`)."""
+    root = np.sqrt(problem.inflation) * problem.root_at(slack, everywhere)
     rows = np.column_stack([root, root @ problem.mean])
     own = problem.data.factor(problem.weight, folds)
     factor = np.asarray(np.linalg.qr(np.concatenate([own, rows]), mode="r"))
@@ -375,18 +401,39 @@ def _given_links(problem: _Problem) -> Float[np.ndarray, " columns"]:
     return np.append(problem.mean[:own], drives)
 
 
-def _validated(problem: _Problem) -> tuple[float, Quality]:
-    """How much less than stated the nominal is to be believed, and the quality on blocks that were left out."""
+class _Best(NamedTuple):
+    """The fit to all rows with the trust that predicts best, and its quality on blocks that were left out."""
+
+    slack: float  # how much less than stated the nominal is believed
+    everywhere: bool  # also where no torque shows it
+    validated: Quality
+    fit: Solved
+
+
+def _best(problem: _Problem) -> _Best:
+    """What cross-validation chooses; what no torque shows is let go only where that predicts clearly better."""
+    tried = {slack: _left_out(problem, slack) for slack in TRUSTS}
+    cost = {slack: float(squares @ problem.weight) for slack, squares in tried.items()}
+    slack = TRUSTS[0]
+    for other in TRUSTS[1:]:
+        slack = other if cost[other] < cost[slack] * (1 - 1e-3) else slack
+    squares, everywhere = tried[slack], False
+    if slack > 1:
+        for other in TRUSTS[2:]:
+            free = _left_out(problem, other, everywhere=True)
+            if float(free @ problem.weight) > (1 - CLEARLY) * float(squares @ problem.weight):
+                break
+            slack, squares, everywhere = other, free, True
+    fit = _fitted(problem, None, slack, everywhere)
+    return _Best(slack, everywhere, quality(problem.data, squares), fit)
+
+
+def _left_out(problem: _Problem, slack: float, everywhere: bool = False) -> Float[np.ndarray, " nv"]:
+    """Squares of each joint in blocks that were left out of the fit in turn."""
     folds = [k for k in range(len(problem.data.factors)) if problem.data.count[k].any()]
-    best: tuple[float, float, np.ndarray] | None = None
-    for slack in TRUSTS:
-        squares = np.zeros(len(problem.weight))
-        for fold in folds:
-            others = [k for k in folds if k != fold]
-            theta = _fitted(problem, others, slack).theta if others else problem.mean
-            squares += problem.data.squares(theta, [fold])
-        cost = float(squares @ problem.weight)
-        if best is None or cost < best[0] * (1 - 1e-3):
-            best = cost, slack, squares
-    assert best is not None
-    return best[1], quality(problem.data, best[2])
+    squares = np.zeros(len(problem.weight))
+    for fold in folds:
+        others = [k for k in folds if k != fold]
+        theta = _fitted(problem, others, slack, everywhere).theta if others else problem.mean
+        squares += problem.data.squares(theta, [fold])
+    return squares

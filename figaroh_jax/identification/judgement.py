@@ -304,9 +304,9 @@ def dropped(signals: Sequence[Signals], model: RobotModel) -> tuple[str, ...]:
     for one in signals:
         weight = np.asarray(one.rows.weight)
         lost = {name: int(n) for name, n in zip(model.dof_names, (weight == 0).sum(axis=0), strict=True) if n}
-        text = f"{one.name}: {one.rows.kept} rows a joint at {1 / (one.dt * one.rows.step):.4g} Hz, low-passed at"
+        text = f"{one.name}: {one.rows.kept} rows per joint at {1 / (one.dt * one.rows.step):.4g} Hz, low-passed at"
         text += f" {one.cutoff:.4g} Hz"
         if lost:
-            text += "; left out by gate, mask or gap: " + ", ".join(f"{name} {n}" for name, n in lost.items())
+            text += "; excluded by gate, mask or gap: " + ", ".join(f"{name} {n}" for name, n in lost.items())
         out.append(text)
     return tuple(out)

@@ -48,7 +48,11 @@ class Memory(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One recording on the joint side: rad and N m, or m and N for prismatic joints."""
+    """One recording on the joint side: rad and N m, or m and N for prismatic joints; see `figaroh_jax.recording`.
+
+    `time` (samples,) in s, `position` (samples, nq), `torque` and `command` (samples, nv) or None; `role` "fit" or
+    "holdout", `repeat` the label of its excitation.
+    """
 
     name: str  # stem of the file
     file: Path | Memory

@@ -118,11 +118,13 @@ class Points(Placed):
     markers: Float[Leaf, "markers 3"]  # in the tool frame, m, at the start
 
     def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, " rows"]:
+        """Predicted minus measured points, m, marker by marker (3 markers,); `datum` is (markers, 3)."""
         device_T_tool = self.device_T_base(unknown) @ pose
         points = self.points(unknown) @ device_T_tool[:3, :3].T + device_T_tool[:3, 3]
         return (points - datum).reshape(-1)
 
     def places(self, unknown: Array) -> dict[str, Array]:
+        """Pose of the base frame in the device's frame, and the markers in the tool frame (m)."""
         return {"base_frame": self.device_T_base(unknown), "tool_frame": self.points(unknown)}
 
     def points(self, unknown: Float[Array, " k"]) -> Float[Array, "markers 3"]:
@@ -132,11 +134,13 @@ class Points(Placed):
         return self.markers + self._tool(unknown).reshape(-1, 3)
 
     def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        """Twist of the base frame, then the coordinates of every marker, of what is estimated."""
         return self._base_unknowns() + (
             _points("tool_frame", len(self.markers)) if "tool_frame" in self.estimated else ()
         )
 
     def channels(self) -> tuple[int, ...]:
+        """Positions alone."""
         return (POSITION,) * (3 * len(self.markers))
 
 
@@ -152,6 +156,7 @@ class Poses(Placed):
     axes: Literal["device", "body", "twist"] = eqx.field(static=True, default="device")
 
     def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, "6"]:
+        """Predicted against measured pose (4, 4): three rows in m, three in rad; see the class for their axes."""
         predicted = self.device_T_base(unknown) @ pose @ self.tool_T_marker(unknown)
         if self.axes == "twist":
             return lie.log_se3(lie.inverse_pose(datum) @ predicted)
@@ -160,6 +165,7 @@ class Poses(Placed):
         return jnp.concatenate([datum[:3, :3].T @ away if self.axes == "body" else away, turn])
 
     def places(self, unknown: Array) -> dict[str, Array]:
+        """Poses (4, 4): the base frame in the device's frame, the marker in the tool frame."""
         return {"base_frame": self.device_T_base(unknown), "tool_frame": self.tool_T_marker(unknown)}
 
     def tool_T_marker(self, unknown: Float[Array, " k"]) -> Float[Array, "4 4"]:
@@ -169,9 +175,11 @@ class Poses(Placed):
         )
 
     def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        """Twist of the base frame, then of the marker in the tool frame, of what is estimated."""
         return self._base_unknowns() + (_frame("tool_frame") if "tool_frame" in self.estimated else ())
 
     def channels(self) -> tuple[int, ...]:
+        """Three positions, three angles."""
         return (POSITION,) * 3 + (ORIENTATION,) * 3
 
 
@@ -187,6 +195,7 @@ class Camera(Poses):
     mount: str = eqx.field(static=True, default="hand")
 
     def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, " rows"]:
+        """Predicted minus measured corners over the focal length (2 corners,): angles in rad; `datum` in pixels."""
         seen = self.device_T_base(unknown) @ pose @ self.tool_T_marker(unknown)
         camera_T_board = lie.inverse_pose(seen) if self.mount == "hand" else seen
         points = self.board @ camera_T_board[:3, :3].T + camera_T_board[:3, 3]
@@ -195,6 +204,7 @@ class Camera(Poses):
         return (points[:, :2] / points[:, 2:] - measured).reshape(-1)
 
     def channels(self) -> tuple[int, ...]:
+        """Angles alone."""
         return (ORIENTATION,) * (2 * len(self.board))
 
 
@@ -231,9 +241,11 @@ class Sockets(_Touch):
         return self.sockets + self._fixed(unknown)
 
     def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, "3"]:
+        """From the centre of the socket numbered `datum` to the tool point, in the base frame (3,), m."""
         return pose[:3, :3] @ self.tool_point(unknown) + pose[:3, 3] - self.centres(unknown)[datum]
 
     def constraint(self, unknown: Float[Array, " k"]) -> Float[Array, " pairs"]:
+        """Distances of the `pairs` of sockets minus the known ones (pairs,), m, weighted as the postures are many."""
         place = self.centres(unknown)
         if not self.pairs:
             return jnp.zeros(0)
@@ -241,6 +253,7 @@ class Sockets(_Touch):
         return self.weight * (jnp.linalg.norm(place[a] - place[b], axis=1) - self.distance)
 
     def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        """The tool point, if it is estimated, then the centre of every socket."""
         return self._tool_unknowns() + _points("socket", len(self.sockets))
 
 
@@ -254,6 +267,7 @@ class Planes(_Touch):
     origin: Float[Leaf, "planes 3"]  # m
 
     def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, "1"]:
+        """Height of the tool point over the plane numbered `datum` (1,), m."""
         tilt_x, tilt_y, shift = self._fixed(unknown)[datum]
         x, y, normal = self.axes[datum]
         tilted = normal + tilt_x * x + tilt_y * y
@@ -261,9 +275,11 @@ class Planes(_Touch):
         return jnp.atleast_1d((tilted @ (point - self.origin[datum])) / jnp.linalg.norm(tilted) - shift)
 
     def channels(self) -> tuple[int, ...]:
+        """One position."""
         return (POSITION,)
 
     def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        """The tool point, if it is estimated, then two tilts (rad) and a shift (m) of every plane."""
         each = (("tilt x", "rad"), ("tilt y", "rad"), ("shift", "m"))
         planes = ((f"plane {k} {name}", unit, 1e-2) for k in range(len(self.axes)) for name, unit in each)
         return self._tool_unknowns() + tuple(planes)
@@ -275,13 +291,16 @@ class Distance(_Touch):
     anchor: Float[Leaf, "3"]  # in the base frame, m, at the start
 
     def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, "1"]:
+        """Predicted minus measured distance of the tool point from the anchor (1,), m."""
         point = pose[:3, :3] @ self.tool_point(unknown) + pose[:3, 3]
         return jnp.atleast_1d(jnp.linalg.norm(point - self.anchor - self._fixed(unknown)[0]) - datum)
 
     def channels(self) -> tuple[int, ...]:
+        """One position."""
         return (POSITION,)
 
     def unknowns(self) -> tuple[tuple[str, str, float], ...]:
+        """The tool point, if it is estimated, then the anchor in the base frame."""
         return self._tool_unknowns() + _points("anchor", 1)
 
 

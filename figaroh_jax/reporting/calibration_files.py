@@ -17,7 +17,15 @@ import numpy as np
 
 from ..calibration.calibrated import Calibration, Error, quality_of
 from ..calibration.corrections import twist_pose
+from ..effects.extended import extend
 from ..errors import InputError
+from ..formats.export import dump_yaml, model_files
+from ..formats.urdf import load_urdf
+from ..formats.urdf_text import roll_pitch_yaw
+from ..formats.xmlfile import read_xml
+from ..rigid.kinematics import forward_kinematics
+from .answer import cause
+from .calibration_report import write_calibration_report
 
 if TYPE_CHECKING:
     from ..calibration.kinematic_diagnosis import PoseDiagnosis
@@ -29,8 +37,6 @@ _PARITY = 1e-9  # m and entries of the rotation, between the model and the file 
 
 def write_calibration(calibration: Calibration, folder: Path, source: Path) -> None:
     """Write everything that the contract asks of a calibration; `source` is the robot's own URDF."""
-    from ..formats.export import dump_yaml
-    from .calibration_report import write_calibration_report
 
     write_calibration_report(calibration, folder / "report.html")
     model = folder / "model"
@@ -47,7 +53,6 @@ def write_calibration(calibration: Calibration, folder: Path, source: Path) -> N
 
 def result(calibration: Calibration) -> dict[str, Any]:
     """The calibration as the dictionary of `result.json`; a number that is not finite becomes None (JSON null)."""
-    from .answer import cause
 
     return {
         "level": calibration.level,
@@ -92,7 +97,6 @@ def _json(content: dict[str, Any]) -> str:
 
 def pose_answer_json(diagnosis: PoseDiagnosis) -> str:
     """The text of `answer.json` of a diagnosis of poses; residuals are RMS in mm and deg, as far as measured."""
-    from .answer import cause
 
     experiment = diagnosis.experiment
     answer = {
@@ -111,9 +115,6 @@ def pose_answer_json(diagnosis: PoseDiagnosis) -> str:
 def corrected_urdf(calibration: Calibration, source: Path) -> str:
     """The robot's own URDF with the origin of every corrected joint, all else as it was."""
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
-
-    from ..formats.urdf_text import roll_pitch_yaw
-    from ..formats.xmlfile import read_xml
 
     root = read_xml(source, "robot")
     for joint, pose in _corrected_joints(calibration, root):
@@ -140,8 +141,6 @@ def origin_changes(calibration: Calibration, source: Path) -> dict[str, Any]:
     The angles are those whose sum with the ones written in the URDF gives the corrected rotation, the smaller ones of
     the two triplets that do.
     """
-    from ..formats.urdf_text import roll_pitch_yaw
-    from ..formats.xmlfile import read_xml
 
     found = {}
     for joint, pose in _corrected_joints(calibration, read_xml(source, "robot")):
@@ -170,8 +169,6 @@ def _origin(element: Any) -> np.ndarray:
 
 def _parity(calibration: Calibration, urdf: Path) -> float:
     """Largest difference (m) of the file, read back, from the calibrated model in 100 random postures."""
-    from ..formats.urdf import load_urdf
-    from ..rigid.kinematics import forward_kinematics
 
     model = calibration.model
     again = load_urdf(urdf, joints=model.joint_names, posture=calibration.posture)
@@ -185,8 +182,6 @@ def _parity(calibration: Calibration, urdf: Path) -> float:
 
 
 def _write_mjcf(calibration: Calibration, path: Path) -> None:
-    from ..effects.extended import extend
-    from ..formats.export import model_files
 
     try:
         text = model_files(extend(calibration.model))["robot.xml"]

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..rigid.kinematics import forward_kinematics
+from ..rigid.manifold import neutral
 from ..rigid.model import RobotModel
 
 __all__ = ["middle_posture", "robot_picture", "segments"]
@@ -80,8 +81,6 @@ def _tips(model: RobotModel, q: Float[np.ndarray, " nq"]) -> Float[np.ndarray, "
 def middle_posture(model: RobotModel) -> Float[np.ndarray, " nq"]:
     """The middle of every joint's range within half a turn, bent a little, so that no links hide each other."""
     if model.nq != model.nv:
-        from ..rigid.manifold import neutral
-
         return np.asarray(neutral(model))
     limits = np.clip(np.nan_to_num(np.asarray(model.position_limit)), -1.2, 1.2)
     middle = limits.mean(axis=1)

@@ -16,6 +16,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
+from ..formats.config import load_task
+from ..formats.export import load_model
+from ..formats.robotfile import load_robot, read_robot
+from ..recordings.dataset import read_recordings
 from ..results import Diagnosis
 from ..rigid.inertia import to_com
 from ..rigid.kinematics import forward_kinematics
@@ -111,9 +115,6 @@ def show_run(folder: Path, port: int = 8080, *, magnify: float = 20.0) -> viser.
 
 def view_of(folder: Path) -> tuple[RobotView, Motions]:
     """The view of a run directory and the motions that its task's recordings hold, as far as they are still there."""
-    from ..formats.config import load_task
-    from ..formats.export import load_model
-    from ..formats.robotfile import load_robot, read_robot
 
     answer = next((folder / name for name in ("answer.json", "result.json") if (folder / name).is_file()), None)
     if answer is None or not (folder / "model").is_dir():
@@ -139,7 +140,6 @@ def view_of(folder: Path) -> tuple[RobotView, Motions]:
 
 
 def _motions(task: Any, robot: RobotModel) -> Motions:
-    from ..recordings.dataset import read_recordings
 
     if any(entry.measurement is not None for entry in task.data):
         return {}

@@ -29,7 +29,7 @@ _NONE = "no simulator's file: `model/loop.json` holds it, and `fj.rollout` simul
 
 ROLLOUT_EFFECTS = {
     "joint_damping": RolloutEffect(
-        "damping of the joint", "A torque against the velocity, in proportion to it.", "-damping v", "joint",
+        "joint damping", "A torque against the velocity, in proportion to it.", "-damping v", "joint",
         {"damping": "N m s/rad"}, "damping", 0.6,
         "the drive's own velocity gain kd, which does the same: `actuator: {gains: known}` says that kd is right",
         "sweeps of {at} at several constant speeds", "MuJoCo (damping), URDF (damping)",
@@ -52,13 +52,13 @@ ROLLOUT_EFFECTS = {
         "slow constant-velocity sweeps of {at} below 0.3 rad/s", _NONE,
     ),
     "load_dependent_friction": RolloutEffect(
-        "friction that depends on the load", "Dry friction in proportion to the torque that the gear carries.",
+        "load-dependent friction", "Dry friction in proportion to the torque that the gear carries.",
         "-ratio |tau_gear| sign(v)", "joint", {"ratio": "1"}, "load_ratio", 0.25,
         "dry friction, where the load of the joint is always the same",
         "the same motion of {at} with and without a known payload", _NONE,
     ),
     "joint_spring": RolloutEffect(
-        "spring at the joint", "A torque back to a rest position: a cable, a hose, a balancer.",
+        "joint spring", "A torque back to a rest position: a cable, a hose, a balancer.",
         "-stiffness (q - rest)", "joint", {"stiffness": "N m/rad", "rest": "rad"}, "stiffness", 3.0,
         "gravity, where the joint moves a little only",
         "{at} over its whole range, with the base turned if that can be",
@@ -71,47 +71,47 @@ ROLLOUT_EFFECTS = {
         "MuJoCo (a drive's constant bias)",
     ),
     "encoder_offset": RolloutEffect(
-        "offset of the encoder", "The encoder reads a constant beside the position.",
+        "encoder offset", "The encoder reads a constant beside the position.",
         "q_measured = q + offset", "joint",
         {"offset": "rad"}, "reading", 0.05, "a constant torque at a position servo",
         "a reference mark of {at}, or gravity in several postures", _NONE,
     ),
     "actuator_gain": RolloutEffect(
-        "gain of the drive", "The drive gives more or less torque than its gains say; looked for with `gains: free`.",
+        "drive gain", "The drive gives more or less torque than its gains say; looked for with `gains: free`.",
         "(1 + gain) kp (u - q) - kd v", "joint", {"gain": "1"}, "scale", 0.6,
         "all masses and frictions at once: gains and inertias scale together",
         "the same motion with {at} carrying a known mass", "MuJoCo (gainprm, biasprm)",
     ),
     "command_delay": RolloutEffect(
-        "delay of the command", "The drive sees the command late.", "u(t - delay)", "joint", {"delay": "s"},
+        "command delay", "The drive sees the command late.", "u(t - delay)", "joint", {"delay": "s"},
         "delay", 0.04,
         "positions that are stamped early", "steps of {at} that are small enough not to saturate its drive", _NONE,
     ),
     "actuator_saturation": RolloutEffect(
-        "limit of the torque", "The drive gives no more than a limit.", "clip(tau, -limit, limit)", "joint",
+        "torque limit", "The drive gives no more than a limit.", "clip(tau, -limit, limit)", "joint",
         {"limit": "N m"}, "force_limit", 5.0, "gentle motion, which never asks for as much",
         "steps of {at} of two sizes", "MuJoCo (forcerange), URDF (effort)",
     ),
     "voltage_saturation": RolloutEffect(
-        "limit of the voltage",
+        "voltage limit",
         "The torque is limited before the motor's back-EMF is taken off, so that fast motion gets less.",
         "clip(kp (u - q), -limit, limit) - kd v", "joint", {"limit": "N m"}, "voltage", 5.0,
         "gentle motion, and a limit of the torque where the joint is slow",
         "large steps of {at} in both directions", _NONE,
     ),
     "dead_band": RolloutEffect(
-        "dead band of the drive", "The drive gives no torque while the error is small, and less by as much beyond.",
+        "drive dead band", "The drive gives no torque while the error is small, and less by as much beyond.",
         "kp (e - clip(e, -band, band)), e = u - q", "joint", {"band": "rad"}, "dead_band", 0.05, "dry friction",
         "slow ramps of {at} of a few times the band", _NONE,
     ),
     "payload": RolloutEffect(
-        "mass at a link", "A body that the model does not have, or has and the robot has not.",
+        "payload", "A body that the model does not have, or has and the robot has not.",
         "a point mass at the link's centre of mass", "link", {"mass": "kg"}, "payload", 1.0,
         "the gain of the drive: with `gains: free` the two are told as a pair",
         "the same motion with and without what is fixed to {at}", "MuJoCo, URDF and every simulator: it is an inertia",
     ),
     "joint_elasticity": RolloutEffect(
-        "elasticity of the joint", "A spring between motor and link; the encoder reads the motor.",
+        "joint elasticity", "A spring between motor and link; the encoder reads the motor.",
         "tau_link = stiffness (q_motor - q_link)", "joint", {"stiffness": "N m/rad", "damping": "N m s/rad"}, "", 0.0,
         "motion that is slow against the resonance", "a chirp of {at} above a third of its resonance",
         "MuJoCo (a second joint with stiffness and damping)",
@@ -123,12 +123,12 @@ ROLLOUT_EFFECTS = {
         "elasticity, and dry friction", "slow reversals of the load of {at}", _NONE,
     ),
     "contact_stiffness": RolloutEffect(
-        "stiffness of a contact", "How hard the ground is.", "force = stiffness depth", "pair of bodies",
+        "contact stiffness", "How hard the ground is.", "force = stiffness depth", "pair of bodies",
         {"stiffness": "N/m"}, "", 0.0, "everything but a recording with contacts",
         "landings of two heights", "MuJoCo (solref)",
     ),
     "contact_friction": RolloutEffect(
-        "friction of a contact", "How slippery the ground is.", "|force along| <= friction force across",
+        "contact friction", "How slippery the ground is.", "|force along| <= friction force across",
         "pair of bodies", {"friction": "1"}, "", 0.0, "everything but a recording with contacts",
         "pushes beyond sliding", "MuJoCo (friction)",
     ),

@@ -76,7 +76,7 @@ def _notes(notes: Sequence[str], verbose: bool) -> list[RenderableType]:
     if verbose:
         return [Text(f"Note: {note}", style="dim") for note in notes]
     count = f"{len(notes)} note{'s'[: len(notes) != 1]}"
-    return [Text(f"{count} on the data: in the report, or with --verbose", style="dim")] if notes else []
+    return [Text(f"{count} on the data: see the report, or add --verbose", style="dim")] if notes else []
 
 
 def summary(diagnosis: Diagnosis, robot: str = "the robot", *, verbose: bool = False) -> RenderableType:
@@ -90,7 +90,7 @@ def summary(diagnosis: Diagnosis, robot: str = "the robot", *, verbose: bool = F
     if diagnosis.verdict in ("named+rest", "unknown"):
         parts += [Text(), *(Text(line) for line in wording.rest(diagnosis))]
     if diagnosis.rest.nearest:
-        parts.append(Text("\nFound, but not named:"))
+        parts.append(Text("\nConsidered, but not named:"))
         parts += [Padding(Text(wording.nearest(near)), (0, 0, 0, 3), expand=False) for near in diagnosis.rest.nearest]
     parts += [Text(), _residuals(diagnosis), Text()]
     parts.append(Text(f"Held out: {diagnosis.holdout_scheme}. {wording.p_value(diagnosis.p_value)}.", style="dim"))

@@ -68,7 +68,7 @@ def rest(diagnosis: Diagnosis) -> list[str]:
     for joint in dict.fromkeys(part.at for part in left.parts):
         own = [part for part in left.parts if part.at == joint]
         shares = ", ".join(f"{dependence(part)} ({100 * part.share:.0f} %)" for part in own)
-        out.append(f"What is left at {place(joint)} goes with {shares}.")
+        out.append(f"The residual at {place(joint)} varies with {shares}.")
     return out
 
 
@@ -95,8 +95,9 @@ def calibration_sentence(calibration: Calibration) -> str:
             f"The nominal kinematics are as accurate as these measurements can show: {after} on held-out postures with"
             " only the base and tool frames fitted; no correction of the robot predicts better."
         )
-    fall = f"On held-out postures the error falls from {before} (base and tool frames only) to {after}"
-    return f"{fall}, with {level(calibration.level)}."
+    found = level(calibration.level)
+    fall = f"the error on held-out postures falls from {before} (base and tool frames only) to {after}"
+    return f"With {found}, {fall}."
 
 
 def distances(calibration: Calibration) -> str:

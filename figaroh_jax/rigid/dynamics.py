@@ -15,8 +15,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from ..compiled.batching import aligned, on_host, over_samples, to_device, two_axes
-from ..compiled.machine_code import machine_code
+from ..compiled.batching import on_host, over_samples, to_device, two_axes
+from ..compiled.machine_code import machine_code, own_room
 from ..compiled.precision import in_float64
 from .inertia import pseudo_inertia
 from .kinematics import Motion, add_up, ancestors, axis_twists, check_shapes, gather, motion, movers, pose_columns, take
@@ -63,7 +63,7 @@ def inverse_dynamics(
     if on_host(model, q, v, a) and prod(np.shape(q)[:-1]) >= MANY:
         rows = two_axes(q, v, a, host=True)
         if (code := machine_code(_TORQUES, model, *rows)) is not None:
-            return to_device(code(aligned, *rows).reshape(*np.shape(q)[:-1], model.nv))
+            return to_device(code(own_room, *rows).reshape(*np.shape(q)[:-1], model.nv))
         if (robot := written(model)) is not None:
             return over_samples(written_torques, robot, q, v, a)
     return over_samples(joint_torques, model, q, v, a, straight=_TORQUES)

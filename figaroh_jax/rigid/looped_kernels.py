@@ -111,18 +111,16 @@ def looped_rows(
     model: RobotModel,
     arrays: Sequence[Float[Array, "samples _"]],
     rows: Rows,
-    by_ratio: bool = False,
     side: int = 0,
     interpret: bool = False,
 ) -> list[Float[Array, "length samples"]]:
     """The columns of the links that each degree of freedom moves, ten a link, the links in the order of the tree.
 
-    With `by_ratio` rows of mimic joints are times their ratio. The arrays are q, v, a and, for weighted rows, the roots
-    of the weights and `side` columns a coordinate that follow those of the links, as `scalar_forms.weighted_rows`
-    takes them.
+    Rows of mimic joints are times their ratio. The arrays are q, v, a and, for weighted rows, the roots of the weights
+    and `side` columns a coordinate that follow those of the links, as `scalar_forms.weighted_rows` takes them.
     """
     tree, dtype, places = _tree(model.joints, rows), arrays[0].dtype, model.dofs
-    ratio = jnp.asarray(model.ratio, dtype)[places.joint] if by_ratio else jnp.ones(len(places.joint), dtype)
+    ratio = jnp.asarray(model.ratio, dtype)[places.joint]
     behind = rows.start + 10 * ancestors(model.joints)[places.joint].sum(1).astype(int)
     beside = np.stack([rows.array, behind], 1)[np.argsort(places.column)] if side else np.zeros((0, SIDE))
     tables = [tree.joints, tree.pairs, beside, places.column[:, None]]

@@ -60,7 +60,7 @@ _TURNING: dict[str, tuple[bool, ...]] = {
 
 
 class Joint(NamedTuple):
-    """A moving joint of the tree and the link that it carries."""
+    """A moving joint of the tree and the link that it carries; `parent` and `coordinate` are indices."""
 
     name: str
     kind: Kind

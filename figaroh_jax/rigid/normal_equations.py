@@ -25,7 +25,8 @@ from ..errors import InputError, check_real
 from .kinematics import check_shapes
 from .model import RobotModel
 from .regressor import BLOCK_FORM, coordinate_blocks, coordinate_rows, dense_rows
-from .scalar_forms import row_groups, weighted_rows
+from .regrouped import Kept, kept_columns, orderly, regrouping
+from .scalar_forms import looped, row_groups, weighted_rows
 
 __all__ = ["NormalMatrix", "normal_matrix", "triangular_factor"]
 
@@ -69,19 +70,22 @@ def normal_matrix(
     (40, 40)
     """
     rows = _rows(model, q, v, a, tau, weight, extra)
-    columns = 10 * len(model.joints) + (0 if extra is None else np.shape(extra)[-1]) + 1
-    on_gpu = usable(*rows) and len(rows.q) > 0
-    groups = _groups(model, columns, whole=on_gpu)
+    beside = (0 if extra is None else np.shape(extra)[-1]) + 1
+    columns, on_gpu = 10 * len(model.joints) + beside, usable(*rows) and len(rows.q) > 0
+    kept = _kept(model) if on_gpu else None
+    groups = _groups(model, columns) if not on_gpu else _kept_groups(model, kept, beside)
+    columns = columns if kept is None else sum(map(len, kept)) + beside
     library: Any = np if on_host(model, rows) else jnp
     start = tuple(library.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
     parts = _by_machine_code(model, groups, rows) if on_host(model, rows) else None
     if on_gpu:
-        parts = _by_kernels(model, start, rows)
+        parts = _by_kernels(model, kept, start, rows)
     # a small matrix is added to from the innermost cache; a large one costs more to add to than its rows to make
     chunk = 32 if on_host() and columns <= SMALL else chunk_size()
     parts = _fold(_add_products, chunk, start, model, rows) if parts is None else parts
     index = np.concatenate([_flat(group, columns).ravel() for group in groups])
     new = _scattered(columns, index, parts)
+    new = new if kept is None else _regrouped(regrouping(model, kept), new)
     return new if total is None else NormalMatrix(*(x + y for x, y in zip(total, new, strict=True)))
 
 
@@ -197,21 +201,53 @@ class _Group(NamedTuple):
     columns: np.ndarray
 
 
-def _groups(model: RobotModel, columns: int, whole: bool = False) -> list[_Group]:
-    """`whole`: the columns in the order of the regressor, as kernels of a GPU write them."""
+def _groups(model: RobotModel, columns: int) -> list[_Group]:
     blocks, _ = coordinate_blocks(model)
     members = [np.flatnonzero(blocks[:, 0] == coordinate) for coordinate in range(model.nv)]
-    groups, order = [], ((0, 10),) if whole else ((0, 4), (4, 10))
+    groups = []
     for which in row_groups(model):
         index = np.stack([members[k] for k in which])
         # the columns of mass and first moments of all links before those of their inertia, as the kernel gives them
         first = 10 * blocks[index, 1][..., None]
-        own = np.concatenate([(first + np.arange(*ends)).reshape(len(which), -1) for ends in order], axis=1)
+        own = np.concatenate([(first + np.arange(*ends)).reshape(len(which), -1) for ends in ((0, 4), (4, 10))], axis=1)
         shared = np.broadcast_to(
             np.arange(10 * len(model.joints), columns), (len(which), columns - 10 * len(model.joints))
         )
         groups.append(_Group(which, index, np.concatenate([own, shared], axis=1)))
     return groups
+
+
+def _kept_groups(model: RobotModel, kept: Kept | None, beside: int) -> list[_Group]:
+    """As kernels of a GPU write them: the kept columns in the order of the regressor, then those beside."""
+    blocks, _ = coordinate_blocks(model)
+    ends = np.cumsum([0, *([10] * len(model.joints) if kept is None else map(len, kept))]).tolist()
+    groups = []
+    for which in row_groups(model, kept):
+        index = np.stack([np.flatnonzero(blocks[:, 0] == k) for k in which])
+        own = [
+            np.concatenate([*(np.arange(ends[link], ends[link + 1]) for link in links), ends[-1] + np.arange(beside)])
+            for links in blocks[index, 1].tolist()
+        ]
+        groups.append(_Group(which, index, np.stack(own)))
+    return groups
+
+
+def _kept(model: RobotModel) -> Kept | None:
+    """Columns that are computed on a GPU, where the robot is known and its kernels leave much out; None for all."""
+    codes = known_codes(_row_form(0, None), model)
+    if traced(model) or (looped(model) and not orderly(model.joints, codes)):
+        return None
+    return kept_columns(model.joints, codes)
+
+
+@jax.jit
+def _regrouped(whole: Float[Array, "kept columns"], found: NormalMatrix) -> NormalMatrix:
+    """Of all columns from those that were kept; those beside them follow."""
+    matrix, moment, n = found.matrix, found.moment, whole.shape[0]
+    times = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
+    rows = jnp.concatenate([times(whole.T, matrix[:n]), matrix[n:]])
+    rows = jnp.concatenate([times(rows[:, :n], whole), rows[:, n:]], axis=1)
+    return NormalMatrix(rows, jnp.concatenate([times(whole.T, moment[:n]), moment[n:]]), found.square)
 
 
 def _flat(group: _Group, columns: int) -> np.ndarray:
@@ -239,7 +275,7 @@ def _add_products(model: RobotModel, totals: tuple[Array, ...], rows: _Rows) -> 
     return tuple(new)
 
 
-def _by_kernels(model: RobotModel, start: tuple[Array, ...], rows: _Rows) -> tuple[Array, ...]:
+def _by_kernels(model: RobotModel, kept: Kept | None, start: tuple[Array, ...], rows: _Rows) -> tuple[Array, ...]:
     """The products of each coordinate on a GPU, from rows that a kernel writes as they are multiplied."""
     samples, nv = len(rows.q), model.nv
     given = [x.reshape(samples, nv, -1) for x in (rows.extra, rows.tau) if x is not None]
@@ -249,24 +285,29 @@ def _by_kernels(model: RobotModel, start: tuple[Array, ...], rows: _Rows) -> tup
     if whole > samples:
         modes = ("edge", "edge", "edge", "constant", "edge")
         arrays = [jnp.pad(x, ((0, whole - samples), (0, 0)), mode=m) for x, m in zip(arrays, modes, strict=True)]
-    told = known_codes(_row_form(0), model), min(whole, _rows_at_once(model))
+    told = kept, known_codes(_row_form(0, kept), model), min(whole, _rows_at_once(model))
     if traced(model, start, arrays):
         return _sums_of_rows(*told, model, start, *arrays)
     return (_kept_sums(*told) if kept_here(*arrays) else partial(_program_of_sums, *told))(model, start, *arrays)
 
 
 @lru_cache(maxsize=64)
-def _kept_sums(codes: bytes, chunk: int) -> Program:
+def _kept_sums(kept: Kept | None, codes: bytes, chunk: int) -> Program:
     def sums_of_rows(model: RobotModel, start: tuple[Array, ...], *arrays: Array) -> tuple[Array, ...]:
-        return _sums_of_rows(codes, chunk, model, start, *arrays)
+        return _sums_of_rows(kept, codes, chunk, model, start, *arrays)
 
-    return Program(sums_of_rows, key=f"{chunk} {codes.hex()}")
+    return Program(sums_of_rows, key=f"{kept} {chunk} {codes.hex()}")
 
 
 def _sums_of_rows(
-    codes: bytes, chunk: int, model: RobotModel, start: tuple[Array, ...], *arrays: Float[Array, "samples _"]
+    kept: Kept | None,
+    codes: bytes,
+    chunk: int,
+    model: RobotModel,
+    start: tuple[Array, ...],
+    *arrays: Float[Array, "samples _"],
 ) -> tuple[Array, ...]:
-    form = _row_form(arrays[4].shape[1] // model.nv)
+    form = _row_form(arrays[4].shape[1] // model.nv, kept)
     chunks = [x.reshape(-1, chunk, x.shape[1]) for x in arrays]
 
     def step(total: tuple[Array, ...], arrays: list[Array]) -> tuple[tuple[Array, ...], None]:
@@ -276,20 +317,26 @@ def _sums_of_rows(
     return jax.lax.scan(step, start, chunks)[0] if len(arrays[0]) else start
 
 
-_program_of_sums = jax.jit(_sums_of_rows, static_argnums=(0, 1))
+_program_of_sums = jax.jit(_sums_of_rows, static_argnums=(0, 1, 2))
 
 
 @lru_cache(maxsize=16)
-def _row_form(side: int) -> Straight:
-    return weighted_rows(side, partial(_plain_rows, side))
+def _row_form(side: int, kept: Kept | None) -> Straight:
+    return weighted_rows(side, kept, partial(_plain_rows, side, kept))
 
 
-def _plain_rows(side: int, model: RobotModel, q: Any, v: Any, a: Any, root: Any, given: Any) -> list[Array]:
-    blocks, samples = jnp.concatenate(coordinate_rows(model, q.T, v.T, a.T), axis=1), len(q)
-    own = [np.flatnonzero(coordinate_blocks(model)[0][:, 0] == row) for row in range(model.nv)]
+def _plain_rows(
+    side: int, kept: Kept | None, model: RobotModel, q: Any, v: Any, a: Any, root: Any, given: Any
+) -> list[Array]:
+    blocks, samples = jnp.concatenate(coordinate_rows(model, q.T, v.T, a.T), axis=1).reshape(-1, len(q)), len(q)
+    order = coordinate_blocks(model)[0]
     beside = given.T.reshape(model.nv, side, samples)
-    parts = [jnp.concatenate([blocks[k].reshape(-1, samples), beside[row]]) for row, k in enumerate(own)]
-    return [jnp.stack([parts[row] * root[:, row] for row in group]) for group in row_groups(model)]
+    parts = []
+    for row in range(model.nv):
+        own = ((k, order[k, 1]) for k in np.flatnonzero(order[:, 0] == row).tolist())
+        index = [10 * k + c for k, link in own for c in (range(10) if kept is None else kept[link])]
+        parts.append(jnp.concatenate([blocks[np.array(index, int)], beside[row]]))
+    return [jnp.stack([parts[row] * root[:, row] for row in group]) for group in row_groups(model, kept)]
 
 
 def row_products(rows: Float[Array, "c k samples"]) -> Float[Array, "c k k"]:

@@ -18,12 +18,12 @@ from jaxtyping import Array, Float, Int
 
 from ..compiled.batching import aligned, chunk_size, host_blocks, on_host, over_samples, put, to_device, two_axes
 from ..compiled.kernels import known_codes, straight_answers, usable
-from ..compiled.machine_code import machine_code
+from ..compiled.machine_code import machine_code, own_room
 from ..compiled.precision import in_float64
 from ..errors import InputError
 from .kinematics import Motion, ancestors, check_shapes, motion, take
 from .model import Joint, RobotModel, dofs
-from .scalar_forms import BLOCKS, DENSE, PACKED, straight
+from .scalar_forms import BLOCKS, DENSE, PACKED, looped_blocks, straight
 from .spatial import cross, rotate_back
 
 __all__ = [
@@ -85,7 +85,7 @@ def joint_torque_regressor(
     if on_host(model, q, v, a):
         rows = two_axes(q, v, a, host=True)
         code = machine_code(_DENSE, model, *rows)
-        whole = code(aligned, *rows) if code else _dense_on_host(model, chunk_size(width), *rows)
+        whole = code(own_room, *rows) if code else _dense_on_host(model, chunk_size(width), *rows)
         return to_device(whole.reshape(*np.shape(q)[:-1], model.nv, 10 * len(model.joints)))
     return over_samples(dense_rows, model, q, v, a, width=width, straight=_DENSE)
 
@@ -219,6 +219,7 @@ def packed_rows(
 
 
 BLOCK_FORM = straight(BLOCKS, coordinate_rows, lambda model: 10 * len(coordinate_blocks(model)[0]))
+BLOCK_FORM = BLOCK_FORM._replace(looped=looped_blocks)
 _DENSE = straight(DENSE, dense_rows, lambda model: 10 * len(pairs(model)))
 _PACKED = straight(PACKED, packed_rows, lambda model: 10 * len(pairs(model)))
 

@@ -15,6 +15,7 @@ from ..compiled.kernels import Load, Number, Program, Read, Straight, Write
 from .kinematics import ancestors
 from .looped_kernels import Rows, looped_rows
 from .model import Joint, RobotModel, dofs
+from .regrouped import Kept
 from .scalar_programs import accelerations, mass_entries, regressor_blocks, torques
 from .scalars import Robot, constants, known, known_lengths, nothing_known
 
@@ -29,6 +30,7 @@ __all__ = [
     "TORQUES",
     "in_limbs",
     "looped",
+    "looped_blocks",
     "row_groups",
     "straight",
     "weighted_rows",
@@ -124,66 +126,86 @@ def _blocks(coordinates: bool, model: RobotModel, codes: bytes) -> list[Program]
     return [of_links(links) for links in _pieces(model)]
 
 
-def _weighted_rows(side: int, model: RobotModel, codes: bytes) -> list[Program]:
-    """Of each coordinate all of a normal matrix's columns: those of the links, then `side` given ones; weighed."""
-    blocks = _rows(model, True)
-    first = {int(row): int(np.flatnonzero(blocks[:, 0] == row)[0]) for row in blocks[:, 0]}
-    place = {tuple(block): 10 * (k - first[block[0]]) for k, block in enumerate(blocks.tolist())}
-    where = {int(row): (g, n) for g, rows in enumerate(row_groups(model)) for n, row in enumerate(rows)}
-    pieces, lengths = _pieces(model), _row_lengths(side, model)
+def _weighted_rows(side: int, kept: Kept | None, model: RobotModel, codes: bytes) -> list[Program]:
+    """Of each coordinate the columns of a normal matrix: those of the links, then `side` given ones; weighed."""
+    places = {key: (group, member, at) for group, member, key, at in _row_places(model.joints, kept)}
+    where = {row: (group, member) for (row, _), (group, member, _) in places.items()}
+    pieces, lengths = _pieces(model), _row_lengths(side, kept, model)
 
     def of_links(links: list[int]) -> Program:
         def weighted_rows(load: Load, reads: list[Read], write: Write) -> None:
             q, v, a, root, given = reads[:5]
 
-            def put(row: int, link: int, ten: list[Number]) -> None:
-                write([((*where[row], place[row, link] + k), number * root(row)) for k, number in enumerate(ten)])
+            def put(row: int, link: int, own: list[Number]) -> None:
+                *row_place, first = places[row, link]
+                if own:
+                    write([((*row_place, first + n), number * root(row)) for n, number in enumerate(own)])
 
             if links is pieces[0]:
                 for row, (group, member) in where.items():
                     own, behind = range(row * side, (row + 1) * side), lengths[group][1] - side
                     write([((group, member, behind + n), given(k) * root(row)) for n, k in enumerate(own)])
-            regressor_blocks(Robot(model.joints, codes, load), q, v, a, put, links, True)
+            regressor_blocks(Robot(model.joints, codes, load), q, v, a, put, links, True, kept)
 
         return weighted_rows
 
     return [of_links(links) for links in pieces]
 
 
-def row_groups(model: RobotModel) -> list[np.ndarray]:
-    """Coordinates that move equally many links."""
-    return _row_groups(model.joints)
+def row_groups(model: RobotModel, kept: Kept | None = None) -> list[np.ndarray]:
+    """Coordinates that move equally many links, of which equally many columns are `kept` (all, where not told)."""
+    return _row_groups(model.joints, kept)
 
 
 @lru_cache(maxsize=64)
-def _row_groups(joints: tuple[Joint, ...]) -> list[np.ndarray]:
-    counts = np.bincount(sorted_rows(joints, True)[:, 0])
-    return [np.flatnonzero(counts == count) for count in np.unique(counts)]
+def _row_groups(joints: tuple[Joint, ...], kept: Kept | None) -> list[np.ndarray]:
+    rows = sorted_rows(joints, True)
+    width = np.full(len(joints), 10) if kept is None else np.array([len(columns) for columns in kept])
+    counts = np.stack([np.bincount(rows[:, 0]), np.bincount(rows[:, 0], width[rows[:, 1]]).astype(int)], 1)
+    return [np.flatnonzero((counts == one).all(1)) for one in np.unique(counts, axis=0)]
 
 
-def _row_lengths(side: int, model: RobotModel) -> list[tuple[int, ...]]:
-    counts = np.bincount(_rows(model, True)[:, 0])
-    return [(len(group), 10 * int(counts[group[0]]) + side) for group in row_groups(model)]
+@lru_cache(maxsize=64)
+def _row_places(joints: tuple[Joint, ...], kept: Kept | None) -> list[tuple[int, int, tuple[int, int], int]]:
+    """Of each coordinate and link: group, place in the group, both, and where its columns begin in the row."""
+    rows, out = sorted_rows(joints, True), []
+    for group, members in enumerate(_row_groups(joints, kept)):
+        for member, row in enumerate(members.tolist()):
+            at = 0
+            for link in rows[rows[:, 0] == row, 1].tolist():
+                out.append((group, member, (row, link), at))
+                at += 10 if kept is None else len(kept[link])
+    return out
 
 
-def weighted_rows(side: int, plain: Callable[..., list[Array]]) -> Straight:
+def _row_lengths(side: int, kept: Kept | None, model: RobotModel) -> list[tuple[int, ...]]:
+    links, rows = sorted_rows(model.joints, True), row_groups(model, kept)
+    own = (links[links[:, 0] == group[0], 1] for group in rows)
+    width = [sum(10 if kept is None else len(kept[link]) for link in one.tolist()) for one in own]
+    return [(len(group), columns + side) for group, columns in zip(rows, width, strict=True)]
+
+
+def weighted_rows(side: int, kept: Kept | None, plain: Callable[..., list[Array]]) -> Straight:
     """Rows (coordinates, columns, samples) of each of `row_groups`: of the links moved, then `side` given ones.
 
-    The arrays are q, v, a, the roots of the weights (samples, nv) and the given columns (samples, nv * side).
+    The arrays are q, v, a, the roots of the weights (samples, nv) and the given columns (samples, nv * side). Of the
+    columns of each link those are written that are `kept`, all ten where this is not told.
     """
-    form = _Form(f"rows beside {side}", partial(_weighted_rows, side), partial(_row_lengths, side), last=True)
+    name = f"rows beside {side}" + ("" if kept is None else f" of {kept}")
+    form = _Form(name, partial(_weighted_rows, side, kept), partial(_row_lengths, side, kept), last=True)
 
     def read(model: RobotModel) -> list[list[tuple[int, int]]]:
         given = ([(4, row * side + n) for n in range(side)] for row in range(model.nv))
         return [*columns(model), *([(3, row)] for row in range(model.nv)), *(one for one in given if one)]
 
-    return straight(form, plain)._replace(plain=plain, columns=read, looped=partial(_looped_weighted_rows, side))
+    whole = straight(form, plain)._replace(plain=plain, columns=read)
+    return whole._replace(looped=partial(_looped_weighted_rows, side)) if kept is None else whole
 
 
 def looped(model: RobotModel) -> bool:
-    """Whether weighted rows are written by one kernel that loops: of trees that are more than one kernel, written out.
+    """Whether rows may be written by one kernel that loops: of trees that are more than one kernel, written out.
 
-    It is there in seconds where those take most of a minute. Rows without weights stay written out, which are quicker
+    It is there in seconds where those take most of a minute. The public regressors stay written out, which are quicker
     once they are there (TALOS on an H100: 121 for 85 million samples a second). Rows of joints that share a coordinate
     add up, which a loop does not.
     """
@@ -193,13 +215,23 @@ def looped(model: RobotModel) -> bool:
 def _looped_weighted_rows(side: int, model: RobotModel, *arrays: Array) -> list[Array] | None:
     if not looped(model):
         return None
-    lengths, (group, start) = _row_lengths(side, model), np.zeros((2, model.nv), int)
+    lengths, (group, start) = _row_lengths(side, None, model), np.zeros((2, model.nv), int)
     for k, members in enumerate(row_groups(model)):
         group[members], start[members] = k, lengths[k][1] * np.arange(len(members))
     column = model.dofs.column
     rows = Rows(tuple(n * length for n, length in lengths), group[column], start[column])
-    found = looped_rows(model, arrays, rows, by_ratio=True, side=side)
+    found = looped_rows(model, arrays, rows, side=side)
     return [x.reshape(*shape, -1) for x, shape in zip(found, lengths, strict=True)]
+
+
+def looped_blocks(model: RobotModel, *arrays: Array) -> Array | None:
+    """The blocks of `BLOCKS` by a kernel that loops, of trees for which there is one."""
+    if not looped(model):
+        return None
+    blocks, column = _rows(model, True), model.dofs.column
+    start = 10 * np.searchsorted(blocks[:, 0], column)
+    (found,) = looped_rows(model, arrays, Rows((10 * len(blocks),), np.zeros_like(start), start))
+    return found.reshape(len(blocks), 10, -1)
 
 
 def _pieces(model: RobotModel) -> list[list[int]]:
@@ -258,6 +290,7 @@ def _rows(model: RobotModel, coordinates: bool) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def sorted_rows(joints: tuple[Joint, ...], coordinates: bool) -> np.ndarray:
+    """As `_rows`, of a tree; kept, since kernels ask for it at every call."""
     places = dofs(joints)
     row = places.column if coordinates else np.arange(len(places.column))
     dof, link = np.nonzero(ancestors(joints)[places.joint] > 0)

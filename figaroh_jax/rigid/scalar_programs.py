@@ -8,6 +8,7 @@ limb is finished before the next begins, so that few numbers are alive at a time
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -42,7 +43,6 @@ from .scalars import (
     second_moments,
     spin_of,
     turned,
-    turned_back,
 )
 
 __all__ = [
@@ -201,15 +201,16 @@ def regressor_blocks(
     put: Callable[[int, int, list[Number]], None],
     links: Sequence[int] | None = None,
     coordinates: bool = False,
+    wanted: Sequence[Sequence[int]] | None = None,
 ) -> None:
     """`put(row, link, ten)` for every link (of `links`) and every degree of freedom, or coordinate, that moves it.
 
-    The ten columns of a link: lin . F + ang . T with the force and the torque of a unit of each parameter, where
-    F = [ac, D, 0] and T = [0, -[ac], L(al) + [w] L(w)].
+    Of each link's ten columns those that are `wanted`, where this is told. They are lin . F + ang . T
+    with the force and the torque of a unit of each parameter: F = [ac, D, 0], T = [0, -[ac], L(al) + [w] L(w)].
     """
-    wanted = set(range(len(robot.joints)) if links is None else links)
-    needed = set(wanted)
-    for i in sorted(wanted, reverse=True):
+    own = set(range(len(robot.joints)) if links is None else links)
+    needed = set(own)
+    for i in sorted(own, reverse=True):
         while robot.joints[i].parent >= 0:
             i = robot.joints[i].parent
             needed.add(i)
@@ -217,14 +218,14 @@ def regressor_blocks(
     def visit(i: int, above: Motion, spin: Matrix, twists: list[Twist]) -> None:
         pose = pose_of(robot, i, q)
         motion = moved_by(robot, i, pose, above, spin, v, a)
-        own = spin_of(motion)
+        own_spin = spin_of(motion)
         here = _merged(robot, i, [_seen(pose, t) for t in twists], coordinates)
-        if i in wanted:
+        if i in own:
             for twist in here:
-                put(twist.row, i, ten_columns(twist, motion, own))
+                put(twist.row, i, ten_columns(twist, motion, own_spin, range(10) if wanted is None else wanted[i]))
         for child in robot.children(i):
             if child in needed:
-                visit(child, motion, own, here)
+                visit(child, motion, own_spin, here)
 
     still = at_rest(robot)
     for i in robot.children(-1):
@@ -256,16 +257,23 @@ def _merged(robot: Robot, i: int, twists: list[Twist], coordinates: bool) -> lis
     return here
 
 
-def ten_columns(twist: Twist, motion: Motion, spin: Matrix) -> list[Number]:
+def ten_columns(twist: Twist, motion: Motion, spin: Matrix, wanted: Sequence[int] = range(10)) -> list[Number]:
+    """Those that are wanted of a link's ten columns in the row of a twist."""
     lin, ang, (w, al, ac) = twist.linear, twist.angular, motion
-    first = add(turned_back(spin, lin), cross(ac, ang))
     g = cross(ang, w)
+
+    def first(k: int) -> Number:
+        return dot(tuple(row[k] for row in spin), lin) + cross(ac, ang)[k]
 
     def one(i: int, j: int) -> Number:
         straight = ang[i] * al[j] + g[i] * w[j]
         return straight if i == j else straight + ang[j] * al[i] + g[j] * w[i]
 
-    return [dot(lin, ac), *first, one(0, 0), one(0, 1), one(1, 1), one(0, 2), one(1, 2), one(2, 2)]
+    columns = [lambda: dot(lin, ac), *(partial(first, k) for k in range(3)), *(partial(one, *ij) for ij in _ENTRIES)]
+    return [columns[k]() for k in wanted]
+
+
+_ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))  # of the inertia, in Pinocchio's order
 
 
 class Body(NamedTuple):

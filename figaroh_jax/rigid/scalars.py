@@ -65,6 +65,7 @@ Matrix = tuple[Vector, ...]  # its rows
 
 
 def dot(u: Vector, v: Vector) -> Number:
+    """u . v"""
     total = ZERO
     for x, y in zip(u, v, strict=True):
         total = total + x * y
@@ -72,10 +73,12 @@ def dot(u: Vector, v: Vector) -> Number:
 
 
 def cross(u: Vector, v: Vector) -> Vector:
+    """u x v"""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
 def add(*vectors: Vector) -> Vector:
+    """Sum of vectors."""
     first, *more = vectors
     for v in more:
         first = tuple(x + y for x, y in zip(first, v, strict=True))
@@ -83,14 +86,17 @@ def add(*vectors: Vector) -> Vector:
 
 
 def scaled(u: Vector, x: Number) -> Vector:
+    """x u"""
     return tuple(y * x for y in u)
 
 
 def turned(R: Matrix, u: Vector) -> Vector:
+    """R u"""
     return tuple(dot(row, u) for row in R)
 
 
 def turned_back(R: Matrix, u: Vector) -> Vector:
+    """R' u"""
     return tuple(dot(tuple(row[k] for row in R), u) for k in range(3))
 
 
@@ -137,6 +143,7 @@ def known_lengths(model: RobotModel, table: Float[np.ndarray, " constants"]) -> 
 
 
 def codes_of_lengths(table: Float[np.ndarray, " constants"], joints: int) -> np.ndarray:
+    """What `known_lengths` keeps as bytes: -1, 0 or 1 for a constant of that value, else `LOADED`."""
     codes = np.where(np.isin(table, (-1.0, 0.0, 1.0)), table, LOADED).astype(np.int8)
     codes[: joints * PER_JOINT].reshape(-1, PER_JOINT)[:, PLACES["inertia"] : PLACES["ratio"]] = LOADED
     return codes
@@ -231,6 +238,7 @@ class Pose(NamedTuple):
 
 
 def pose_of(robot: Robot, i: int, q: Read) -> Pose:
+    """Pose of joint `i` in its parent joint's frame at the coordinates `q`, with what is simple about it kept apart."""
     joint, own, at = robot.joints[i], robot.own(i), robot.dofs.positions[i]
     ratio, offset = robot.of_joint(i, "ratio")[0], robot.of_joint(i, "offset")[0]
     rotation, origin = robot.matrix(i, "rotation"), tuple(robot.of_joint(i, "origin"))
@@ -263,6 +271,7 @@ def _rodrigues(robot: Robot, i: int, sine: Number, cosine: Number) -> Matrix:
 
 
 def product(A: Matrix, B: Matrix) -> Matrix:
+    """A B"""
     return tuple(tuple(dot(row, tuple(b[k] for b in B)) for k in range(3)) for row in A)
 
 

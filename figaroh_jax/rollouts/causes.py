@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from ..rigid.model import Frame, Joint, RobotModel
-from .loop import Loop
+from .loop import Joints, Loop
 from .parameters import Entry, Table
 
 __all__ = ["BASELINE", "Candidate", "Catalogue", "catalogue", "elastic_loop"]
@@ -122,55 +122,17 @@ def elastic_loop(loop: Loop, coordinate: int, stiffness: float, damping: float, 
     """
     robot = loop.robot
     n, i = robot.nv, next(i for i, joint in enumerate(robot.joints) if joint.coordinate == coordinate)
-    joints = list(robot.joints)
-    mine = joints[i]
-    motor = Joint(mine.name, mine.kind, mine.parent, mine.coordinate, f"{mine.link}_motor")
-    moved = [joint._replace(parent=joint.parent + 1) if joint.parent >= i else joint for joint in joints]
-    spring = Joint(f"{mine.name}_spring", mine.kind, i, n, mine.link)
-    tree = (*moved[:i], motor, spring, *moved[i + 1 :])
-
-    def inserted(values, new):  # noqa: ANN001
-        values = np.asarray(values)
-        return np.concatenate([values[: i + 1], np.asarray(new)[None], values[i + 1 :]])
-
-    ten, placement = np.asarray(robot.inertia), np.asarray(robot.placement)
-    inertia = np.concatenate([ten[:i], _BODY[None], ten[i:]])
-    free = np.array([-np.inf, np.inf])
-    new = RobotModel(
-        placement=inserted(placement, np.eye(4)),
-        axis=inserted(robot.axis, np.asarray(robot.axis)[i]),
-        inertia=inertia,
-        ratio=inserted(robot.ratio, 1.0),
-        offset=inserted(robot.offset, 0.0),
-        gravity=robot.gravity,
-        frame_placement=robot.frame_placement,
-        position_limit=np.concatenate([np.asarray(robot.position_limit), free[None]]),
-        velocity_limit=np.append(np.asarray(robot.velocity_limit), np.inf),
-        effort_limit=np.append(np.asarray(robot.effort_limit), np.inf),
-        joints=tree,
-        frames=tuple(Frame(f.name, f.parent + 1 if f.parent >= i else f.parent) for f in robot.frames),
-        name=robot.name,
-    )
-    own = {}
-    for name in loop.joints.__dataclass_fields__:
-        values = np.asarray(getattr(loop.joints, name))
-        fill = {"stribeck_speed": 0.1, "ripple_order": 1.0, "stiffness": stiffness, "damping": damping}.get(name, 0.0)
-        last = values[-1:] if values.ndim > 1 or name.startswith("friction_") else np.array([fill])
-        if name in ("limit", "torque_range"):
-            last = free[None]
-        own[name] = np.concatenate([values, last])
+    moved = np.asarray(loop.drives.transmission)
     drives = eqx.tree_at(
-        lambda d: d.transmission,
-        loop.drives,
-        np.concatenate([np.asarray(loop.drives.transmission), np.zeros((len(loop.drives.names), 1))], 1),
+        lambda d: d.transmission, loop.drives, np.concatenate([moved, np.zeros((len(loop.drives.names), 1))], 1)
     )
     summed = tuple(
         n if link_side and k == coordinate else more for k, more in zip(loop.measured, loop.summed, strict=True)
     )
     return Loop(
-        robot=new,
+        robot=_with_motor(robot, i),
         drives=drives,
-        joints=type(loop.joints)(**own),
+        joints=_with_spring(loop.joints, stiffness, damping),
         start=np.append(np.asarray(loop.start), 0.0),
         dt=loop.dt,
         integrator=loop.integrator,
@@ -182,4 +144,47 @@ def elastic_loop(loop: Loop, coordinate: int, stiffness: float, damping: float, 
     )
 
 
+def _with_motor(robot: RobotModel, i: int) -> RobotModel:
+    """The robot with joint `i` twice: a motor without a body, behind it the link on a spring (the last coordinate)."""
+    mine = robot.joints[i]
+    motor = Joint(mine.name, mine.kind, mine.parent, mine.coordinate, f"{mine.link}_motor")
+    moved = [joint._replace(parent=joint.parent + 1) if joint.parent >= i else joint for joint in robot.joints]
+    spring = Joint(f"{mine.name}_spring", mine.kind, i, robot.nv, mine.link)
+
+    def inserted(values: Any, new: Any) -> np.ndarray:
+        values = np.asarray(values)
+        return np.concatenate([values[: i + 1], np.asarray(new)[None], values[i + 1 :]])
+
+    ten = np.asarray(robot.inertia)
+    return RobotModel(
+        placement=inserted(robot.placement, np.eye(4)),
+        axis=inserted(robot.axis, np.asarray(robot.axis)[i]),
+        inertia=np.concatenate([ten[:i], _BODY[None], ten[i:]]),
+        ratio=inserted(robot.ratio, 1.0),
+        offset=inserted(robot.offset, 0.0),
+        gravity=robot.gravity,
+        frame_placement=robot.frame_placement,
+        position_limit=np.concatenate([np.asarray(robot.position_limit), _FREE[None]]),
+        velocity_limit=np.append(np.asarray(robot.velocity_limit), np.inf),
+        effort_limit=np.append(np.asarray(robot.effort_limit), np.inf),
+        joints=(*moved[:i], motor, spring, *moved[i + 1 :]),
+        frames=tuple(Frame(f.name, f.parent + 1 if f.parent >= i else f.parent) for f in robot.frames),
+        name=robot.name,
+    )
+
+
+def _with_spring(joints: Joints, stiffness: float, damping: float) -> Joints:
+    """The terms of the joints with those of a spring behind them."""
+    own = {}
+    for name in joints.__dataclass_fields__:
+        values = np.asarray(getattr(joints, name))
+        fill = {"stribeck_speed": 0.1, "ripple_order": 1.0, "stiffness": stiffness, "damping": damping}.get(name, 0.0)
+        last = values[-1:] if values.ndim > 1 or name.startswith("friction_") else np.array([fill])
+        if name in ("limit", "torque_range"):
+            last = _FREE[None]
+        own[name] = np.concatenate([values, last])
+    return type(joints)(**own)
+
+
+_FREE = np.array([-np.inf, np.inf])
 _BODY = np.zeros(10)  # the motor's own inertia is the joint's armature

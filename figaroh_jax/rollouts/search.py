@@ -193,6 +193,7 @@ def excess(error: np.ndarray, weight: np.ndarray) -> float:
 
 
 def free_entries(fitted: Sequence[int], extra: Sequence[int]) -> list[int]:
+    """Entries of theta of both lists, each once, in the order in which they come first."""
     return list(dict.fromkeys([*fitted, *extra]))
 
 
@@ -276,6 +277,7 @@ def _begins(here: Setting, theta: np.ndarray) -> np.ndarray:
 
 
 def level_of(found: Fit, weight: np.ndarray) -> float:
+    """Mean square of the misfit over the samples that count, in units of the noise's variance."""
     return found.squares / max((weight > 0).sum(), 1)
 
 

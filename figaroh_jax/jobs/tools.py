@@ -12,19 +12,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .errors import InputError
-from .reporting.provenance import read_provenance
-from .reporting.run_directory import write_file
+from ..errors import InputError
+from ..reporting.provenance import read_provenance
+from ..reporting.run_directory import write_file
 
 if TYPE_CHECKING:
-    from .recordings.draft import Draft
+    from ..recordings.draft import Draft
 
 __all__ = ["command_of", "compare", "list", "migrate", "new", "verify", "view"]
 
 
 def new(args: argparse.Namespace) -> int:
     """Draft a task file, on standard output or where `--out` says."""
-    from .recordings.draft import draft_task
+    from ..recordings.draft import draft_task
 
     if args.out is not None and args.out.exists():
         raise InputError(f"--out {args.out}: exists already; a draft replaces no file")
@@ -52,7 +52,7 @@ def new(args: argparse.Namespace) -> int:
 
 def migrate(args: argparse.Namespace) -> int:
     """Translate a configuration of FIGAROH, and say what became of each of its keys."""
-    from .recordings.migration import migrate as translated
+    from ..recordings.migration import migrate as translated
 
     if args.out is not None and args.out.exists():
         raise InputError(f"--out {args.out}: exists already; a translation replaces no file")
@@ -70,7 +70,7 @@ def migrate(args: argparse.Namespace) -> int:
 
 def _asked(args: argparse.Namespace, drafted: Callable[[], Draft]) -> Draft:
     """The draft, once the user has answered what the recordings cannot decide; an empty answer gives up."""
-    from .recordings.draft_columns import Undecided
+    from ..recordings.draft_columns import Undecided
 
     while True:
         try:
@@ -97,8 +97,8 @@ def _numbers(text: str | None, option: str) -> tuple[float, ...] | None:
 
 def verify(args: argparse.Namespace) -> int:
     """One line a limit; 1 where one fails."""
-    from .formats.config import Limits, load_limits
-    from .reporting.verification import DEFAULT_LIMITS, JUNIT, junit, verify as judged
+    from ..formats.config import Limits, load_limits
+    from ..reporting.verification import DEFAULT_LIMITS, JUNIT, junit, verify as judged
 
     limits = load_limits(args.limits) if args.limits else Limits.model_validate(DEFAULT_LIMITS)
     checks = judged(args.run, limits)
@@ -113,7 +113,7 @@ def verify(args: argparse.Namespace) -> int:
 
 def compare(args: argparse.Namespace) -> int:
     """Tables of all runs, and a page of them where `--out` names one."""
-    from .reporting.side_by_side import PAGE, compare_runs, comparison_page, comparison_text
+    from ..reporting.side_by_side import PAGE, compare_runs, comparison_page, comparison_text
 
     if len(args.runs) < 2:
         raise InputError("compare: one run directory is given; expected two or more, the first is the reference")
@@ -128,7 +128,7 @@ def compare(args: argparse.Namespace) -> int:
 
 def view(args: argparse.Namespace) -> int:
     """The robot of a run in a browser, until the command is interrupted."""
-    from .reporting.robot_view import show_run
+    from ..reporting.robot_view import show_run
 
     if not 0 < args.port < 65536:
         raise InputError(f"--port {args.port}: expected a number from 1 to 65535")
@@ -143,7 +143,7 @@ def view(args: argparse.Namespace) -> int:
 
 def list(args: argparse.Namespace) -> int:
     """The runs below a folder."""
-    from .reporting.side_by_side import comparison_text, list_runs
+    from ..reporting.side_by_side import comparison_text, list_runs
 
     if not args.folder.is_dir():
         raise InputError(f"{args.folder} is no directory")

@@ -1,0 +1,164 @@
+"""Which causes predict data that was kept out: what does not lower its error is not named, however well it fits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..effects.base import Effect
+from ..results import Gain, Name
+from .holdout import held_squares
+from .joint import Joint, polished
+from .problem import Problem
+from .search import Found
+from .state import State
+from .thresholds import BY_CHANCE
+
+__all__ = ["Fall", "Gaining", "fall", "without_losses"]
+
+EXACT, DRAWS = 12, 4000  # blocks up to which every choice of signs is made; choices beyond
+
+
+class Gaining(NamedTuple):
+    """Causes that all lower the error on the data held out, with that error."""
+
+    named: list[Found]
+    joint: Joint
+    order: list[int]  # of the named, by what each gains as it comes in
+    gains: list[Gain]  # of each, in that order
+    holdout: Gain  # of all together
+    worse: list[Name]  # those that did not
+
+
+class Fall(NamedTuple):
+    """What a cause does to the error on data kept out as it comes in."""
+
+    own: float  # share of the squares that goes of the joints where it acts, while they move
+    chance: float  # p-value of that: of the blocks' differences with signs at random
+    each: float  # sum over the joints of that share
+    whole: float  # squares of all rows that go, N m or N, squared
+    worse: float  # p-value of their rise
+
+    def gains(self, strict: bool) -> bool:
+        """Whether the cause predicts better where it acts, and the robot is not predicted worse for it.
+
+        Beside a rest (`strict`) a fall may be chance and must be sure. There the squares of the robot are asked joint
+        by joint: those in N m are the large joints', which any change of the fit moves by more than a small joint has.
+        """
+        if not strict:
+            return self.own > 0 and self.whole > 0
+        return self.own > 0 and self.chance < BY_CHANCE and self.each > 0 and self.worse > BY_CHANCE
+
+
+def fall(
+    before: Float[np.ndarray, "2 blocks nv"], after: Float[np.ndarray, "2 blocks nv"], joints: Sequence[int]
+) -> Fall:
+    """What becomes of the squares of each block and joint (`held_squares`) for a cause that acts at the `joints`."""
+    places, (rows, moving) = list(joints), before - after
+    drop, had = moving.sum(0), np.maximum(before[1].sum(0), 1e-300)
+    return Fall(
+        own=float(drop[places].sum() / had[places].sum()),
+        chance=_by_chance(moving[:, places].sum(1)),
+        each=float((drop / had).sum()),
+        whole=float(rows.sum()),
+        worse=_by_chance(-rows.sum(1)),
+    )
+
+
+def _by_chance(gain: Float[np.ndarray, " blocks"]) -> float:
+    """How often the blocks' differences with signs at random sum to as much: exact for few blocks.
+
+    What a cause takes is most where it acts most: a few blocks have nearly all of it, and their mean and deviation say
+    little of whether every block has some.
+    """
+    if len(gain) <= EXACT:
+        signs = 1.0 - 2.0 * ((np.arange(2 ** len(gain))[:, None] >> np.arange(len(gain))) & 1)
+    else:
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (DRAWS, len(gain)))
+        signs[0] = 1.0
+    return float(np.mean(signs @ gain >= gain.sum() - 1e-12 * np.abs(gain).sum()))
+
+
+def without_losses(
+    problem: Problem,
+    start: State,
+    whitening: Float[np.ndarray, "F nv"],
+    named: list[Found],
+    joint: Joint,
+    strict: bool,
+) -> Gaining:
+    """The causes without those that do not lower the error on the data held out, the worst first (`Fall`).
+
+    Each is judged as it comes in: by what it gains alone, or else after all the others, for some show only beside
+    another.
+    """
+    worse: list[Name] = []
+    later: list[Name] = []  # come in behind the others
+    passed: set[Name] = set()  # in some order of these causes
+    while True:
+        order, squares, power = _by_gain(problem, start, whitening, joint.causes, [f.name in later for f in named])
+        falls = [fall(a, b, named[k].joints) for k, (a, b) in zip(order, pairwise(squares), strict=True)]
+        passed |= {named[k].name for k, one in zip(order, falls, strict=True) if one.gains(strict)}
+        failing = [
+            (one.own, k)
+            for k, one in zip(order, falls, strict=True)
+            if not one.gains(strict) and not (one.own > 0 and strict and named[k].name in passed)
+        ]
+        if not failing:
+            gains = [_told(a, b, power, named[k], problem) for k, (a, b) in zip(order, pairwise(squares), strict=True)]
+            whole = _relative(squares[0][0], squares[-1][0], power[0])
+            return Gaining(named, joint, order, gains, whole, worse)
+        least = min(failing)[1]
+        if named[least].name not in later and len(named) > 1:
+            later.append(named[least].name)
+            continue
+        worse.append(named[least].name)
+        passed.clear()
+        named = [f for k, f in enumerate(named) if k != least]
+        joint = polished(problem, start, [f.effect for f in named], whitening)
+
+
+def _told(
+    before: Float[np.ndarray, "2 blocks nv"],
+    after: Float[np.ndarray, "2 blocks nv"],
+    power: Float[np.ndarray, "2 nv"],
+    one: Found,
+    problem: Problem,
+) -> Gain:
+    """Error of the robot without and with a cause; where chance moves that by more than the cause gains, the error of
+    the joints where it acts, while they move."""
+    if after[0].sum() < before[0].sum():
+        return _relative(before[0], after[0], power[0])
+    places = list(one.joints)
+    names = ", ".join(problem.model.joint_names[k] for k in places)
+    own = _relative(before[1][:, places], after[1][:, places], power[1][places])
+    return Gain(own.before, own.after, f"relative RMS of {names} in motion")
+
+
+def _relative(before: np.ndarray, after: np.ndarray, power: np.ndarray) -> Gain:
+    first, last = (float(np.sqrt(x.sum() / power.sum())) for x in (before, after))
+    return Gain(first, last)
+
+
+def _by_gain(
+    problem: Problem,
+    start: State,
+    whitening: Float[np.ndarray, "F nv"],
+    causes: Sequence[Effect],
+    later: Sequence[bool],
+) -> tuple[list[int], list[Float[np.ndarray, "2 blocks nv"]], Float[np.ndarray, "2 nv"]]:
+    """The order of what each cause gains on held-out data as it comes in, those that come `later` behind the others.
+
+    With the squares of the error in that order, and of the torque.
+    """
+    order = list(range(len(causes)))
+    squares, power = held_squares(problem, start, list(causes), whitening)
+    drops = [float((before - after)[0].sum()) for before, after in pairwise(squares)]
+    ranked = sorted(order, key=lambda k: (later[k], -drops[k]))
+    if ranked != order:
+        squares, power = held_squares(problem, start, [causes[k] for k in ranked], whitening)
+    return ranked, squares, power

@@ -1,0 +1,1 @@
+"""The commands of the command line: what each reads, runs and writes into its run directory."""

@@ -1,0 +1,49 @@
+"""The loop of a finished run of rollouts in the words of a simulator."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from ..errors import InputError, as_written
+from ..reporting.run_directory import refusals, write_file
+from ..rollouts.export import for_simulator, with_drives
+
+__all__ = ["LOOP", "export_loop"]
+
+LOOP = "loop.json"
+
+
+def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
+    """The loop of a run's `model` directory in the words of a simulator, as JSON; with `out`, written there too.
+
+    For MuJoCo `out` also gets `robot.xml`, with everything that MuJoCo has words for. Raises `InputError` for another
+    directory, and for a simulator that is not known.
+    """
+    try:
+        content = json.loads((model / LOOP).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        raise InputError(f"{model}: no readable {LOOP}; name the `model` directory of a rollout's run") from None
+    with as_written(model / LOOP):
+        text = json.dumps(for_simulator(content, simulator), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        files = {f"{simulator}.json": text}
+        if simulator == "mujoco" and out is not None:
+            files["robot.xml"] = with_drives(model / "robot.xml", content)
+    if out is not None:
+        _write_files(out, files)
+    return text
+
+
+def _write_files(out: Path, files: Mapping[str, str]) -> None:
+    """Files into a folder that may be there, all or none; one that says something else stops it."""
+    for name, text in files.items():
+        path = out / name
+        with refusals(out):
+            if os.path.lexists(path) and not (path.is_file() and path.read_bytes() == text.encode()):
+                raise InputError(f"--out {out}: {name} is there and says something else; name another folder")
+    with refusals(out):
+        out.mkdir(parents=True, exist_ok=True)
+    for name, text in files.items():
+        write_file(out / name, text, "--out")

@@ -1,0 +1,51 @@
+"""What an extended model predicts of recordings that were kept out of the fit."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import numpy as np
+
+from ..effects.extended import ExtendedModel, predict
+from ..formats.config import Load, Task
+from ..recordings.dataset import carried_body, read_recordings
+from ..recordings.signals import choose_rates, prepare, to_recording_times
+
+__all__ = ["predictions"]
+
+
+def predictions(
+    task: Task, extended: ExtendedModel, *, identified: bool = False, slowed: bool = False
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Time (s) and the extended model's torque (N m or N) of each holdout recording, on its own time stamps.
+
+    The recording's motion is prepared as for the fit (`slowed`: positions taken down to the band of their own motion),
+    but over its whole length, whatever window the fit kept. Where the model is an identified one, a known payload is
+    carried in addition.
+    """
+    if all(entry.role == "fit" for entry in task.data):
+        return {}
+    recordings = read_recordings(task, extended.robot, floating=identified)
+    rates = choose_rates(recordings, task.preprocess)
+    whole = task.preprocess.model_copy(update={"window": None, "gate": {}})
+    found = {}
+    for recording in recordings:
+        if recording.role == "holdout":
+            motion = prepare(recording, whole, rates, slowed=slowed, model=extended.robot)
+            carrying = _carrying(extended, recording.load if identified else None)
+            state = motion.position, motion.velocity, motion.acceleration
+            if extended.robot.nq == extended.robot.nv:
+                torque = predict(carrying, motion.time, *state, motion.dt)
+            else:
+                torque = carrying.inverse_dynamics(*state)
+            found[recording.name] = recording.time, to_recording_times(motion.time, np.asarray(torque), recording.time)
+    return found
+
+
+def _carrying(extended: ExtendedModel, load: Load | None) -> ExtendedModel:
+    """The model with a known payload at its link."""
+    if load is None:
+        return extended
+    link, ten = carried_body(extended.robot, load)
+    inertia = np.array(extended.robot.inertia, float)
+    inertia[link] += ten
+    return eqx.tree_at(lambda m: m.robot.inertia, extended, inertia)

@@ -1,0 +1,75 @@
+"""What a check of recordings looks at, what it finds, and the words for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..rigid.model import RobotModel, prismatic
+from .dataset import Recording
+from .likeness import Sampled
+
+if TYPE_CHECKING:
+    from ..formats.config import RecordingEntry
+
+__all__ = ["LIKE", "SOFT", "UNLIKE", "Finding", "Look", "and_more", "effort_unit", "named", "unit_of"]
+
+LIKE = 0.8  # partial correlation of a torque, or a velocity, that belongs to its joint
+UNLIKE = 0.4
+SOFT = 3.0  # times a limit, or what the model needs: worth a word
+
+
+class Finding(NamedTuple):
+    """Something about a recording; `wrong` is refused, else it is a warning."""
+
+    wrong: bool
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What the checks look at; those of positions alone need no recording."""
+
+    position: Float[np.ndarray, "samples nv"]
+    joints: tuple[str, ...]
+    model: RobotModel
+    unit: str = "rad"  # that the task says of the position
+    series: Recording | None = None
+    entry: RecordingEntry | None = None
+    motion: Sampled | None = None
+
+    @property
+    def recording(self) -> Recording:
+        assert self.series is not None
+        return self.series
+
+    @cached_property
+    def span(self) -> Float[np.ndarray, " nv"]:
+        """Range of each joint without its outermost per cent."""
+        low, high = np.percentile(self.position, [1, 99], axis=0)
+        return high - low
+
+
+def named(look: Look, which: np.ndarray) -> str:
+    """The joints of a mask by name."""
+    names = [name for name, at in zip(look.joints, which, strict=True) if at]
+    return "every joint" if len(names) == len(look.joints) > 1 else ", ".join(names)
+
+
+def unit_of(look: Look, joint: int) -> str:
+    """Unit of a joint's position."""
+    return "m" if prismatic(look.model)[joint] else "rad"
+
+
+def effort_unit(look: Look, joint: int) -> str:
+    """Unit of a joint's torque."""
+    return "N" if prismatic(look.model)[joint] else "N m"
+
+
+def and_more(rows: np.ndarray) -> str:
+    """How many rows there are beside the one that is named."""
+    return f" and {len(rows) - 1} more" if len(rows) > 1 else ""

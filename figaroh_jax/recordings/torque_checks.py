@@ -1,0 +1,210 @@
+"""The recorded torque against that of the model: columns, signs, units, gravity and clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..rigid.model import RobotModel, prismatic
+from .findings import LIKE, SOFT, UNLIKE, Finding, Look, named
+from .likeness import Likeness, Sampled, likeness, matrix_of_likeness, rigid_torque, share_of_gravity, stretch_of_time
+
+__all__ = ["torque_findings"]
+
+DEGREE = np.pi / 180
+LIGHT = 4.0  # times too small: a nominal model may well be three times too heavy
+HEAVY = 0.2  # share of a torque's spread that the rigid body should make up before its absence means anything
+
+
+class _Fit(NamedTuple):
+    """Each joint's own torque against the nominal model's, and which of them tell anything."""
+
+    own: list[Likeness]
+    nominal: Float[np.ndarray, "rows nv"]
+    heavy: np.ndarray  # joints whose torque should show the rigid body
+
+
+def torque_findings(look: Look, motion: Sampled) -> Iterator[Finding]:
+    """What looks wrong about the torque, since the model needs another one for this motion."""
+    assert motion.torque is not None
+    fit = _fit(look.model, motion)
+    like = np.array([one.correlation for one in fit.own])
+    if (fit.heavy & (like < 0.9)).any():
+        found = _other_reading(look, motion)
+        if found is not None:
+            yield found
+            return
+    lacks = fit.heavy & (like < UNLIKE)
+    if fit.heavy.any() and lacks.sum() >= 0.5 * fit.heavy.sum():
+        yield Finding(
+            False,
+            f"torque of {named(look, lacks)} does not follow what the model needs for this motion (correlation"
+            f" {', '.join(f'{r:.2f}' for r in like[lacks])}): is it measured torque or current with its sign, with"
+            " gravity in it, of this robot, at these columns and stamps?",
+        )
+        return
+    weightless = _weightless(look.model, motion) & (like < 0.9)  # alike but small is a unit
+    if weightless.any():
+        yield Finding(
+            False,
+            f"torque of {named(look, weightless)} holds none of the gravity that the model needs there: is it what a"
+            " controller adds to its gravity compensation? Record the torque or current of the drives",
+        )
+        return
+    yield from _scale(look, fit, like)
+    stretch, error = stretch_of_time(look.model, motion)
+    if error < 0.15 and abs(np.log(stretch)) > max(np.log(1.5), 3 * error):
+        yield Finding(
+            False,
+            f"the clock looks wrong: inertial torque fits one {stretch:.2g} times as fast, {motion.rate * stretch:.4g}"
+            f" Hz in place of {motion.rate:.4g} Hz (+-{100 * error:.0f} %)",
+        )
+
+
+def _fit(model: RobotModel, motion: Sampled) -> _Fit:
+    assert motion.torque is not None
+    nominal, torque = rigid_torque(model, motion), motion.torque
+    columns = zip(nominal.T, torque.T, motion.velocity.T, motion.acceleration.T, strict=True)
+    own = [likeness(*each) for each in columns]
+    return _Fit(own, nominal, _heavy(own, torque))
+
+
+def _heavy(own: Sequence[Likeness], torque: np.ndarray) -> np.ndarray:
+    """Joints that carry something: what the rigid body needs beside friction and rotor is much of their torque."""
+    expected = np.array([one.expected for one in own])
+    return (expected > HEAVY * np.std(torque, axis=0)) & (expected > 0.03 * expected.max())
+
+
+def _weightless(model: RobotModel, motion: Sampled) -> np.ndarray:
+    """Joints without gravity in their torque; none unless most of those that should have it lack it."""
+    assert motion.torque is not None
+    slope, error, expected = share_of_gravity(model, motion)
+    asked = (expected > HEAVY * np.std(motion.torque, axis=0)) & (expected > 0.05 * expected.max())
+    lacks = asked & (slope + 3 * error < 0.3) & (slope > -0.3)
+    return lacks if lacks.sum() > 0.5 * asked.sum() else np.zeros(len(lacks), bool)
+
+
+def _scale(look: Look, fit: _Fit, like: np.ndarray) -> Iterator[Finding]:
+    """Torque in another unit: the model's gravity says how large it should be."""
+    slopes = np.array([one.slope for one in fit.own])
+    sure = (like > LIKE) & fit.heavy
+    if not sure.any():  # a torque that is read far too large leaves no joint heavy
+        sure = (like > LIKE) & (slopes > 20)
+    if not sure.any():
+        return
+    slopes = slopes[sure]
+    middle = float(np.median(slopes))
+    if 1 / LIGHT < middle < SOFT:
+        return
+    names = ", ".join(f"{look.joints[j]} {slope:.3g}" for j, slope in zip(np.flatnonzero(sure), slopes, strict=True))
+    guess = next((f"it looks like {u}" for u, s in _TORQUE_UNITS if 0.5 < middle / s < 2), None)
+    guess = guess or "a current or a share of the rated torque needs its constant (transmission.torque)"
+    yield Finding(False, f"torque is {middle:.3g} times what the model needs ({names}): {guess}")
+
+
+_TORQUE_UNITS = (("mN m", 1e3), ("N cm", 1e2), ("kN m", 1e-3))
+
+
+def _other_reading(look: Look, motion: Sampled) -> Finding | None:
+    """The reading of the columns that makes torque and motion belong together, where the given one does not."""
+    motion = motion.thinned(120)
+    assert motion.torque is not None
+    given = _fit(look.model, motion)
+    best, text = -np.inf, ""
+    for said, other in _readings(look, motion, given.nominal):
+        fit = _fit(look.model, other)
+        heavy = given.heavy | fit.heavy
+        gain = _misfit(given.own, heavy) - _misfit(fit.own, heavy)
+        if gain > best + 0.3 and _belongs(fit, heavy):  # the simpler reading, which comes first, wins a draw
+            best, text = gain, said
+    if best < np.log(5.0):
+        return None
+    return Finding(False, f"torque does not belong to the motion as read; {text}")
+
+
+def _belongs(fit: _Fit, heavy: np.ndarray) -> bool:
+    """Whether nearly every joint that carries something follows the model, at a size that is no accident."""
+    if not heavy.any():
+        return False
+    like = np.array([one.correlation for one in fit.own])[heavy]
+    slope = np.array([one.slope for one in fit.own])[heavy]
+    return bool(np.median(like) > LIKE and np.mean(like > UNLIKE) > 0.6 and np.median(slope) > 0.1)
+
+
+def _misfit(own: Sequence[Likeness], heavy: np.ndarray) -> float:
+    """Sum of the logarithms of what is not explained; a correlation of the wrong sign explains nothing."""
+    like = np.array([one.correlation for one, at in zip(own, heavy, strict=True) if at])
+    return float(np.sum(np.log(1.02 - like * np.abs(like))))
+
+
+def _readings(look: Look, motion: Sampled, nominal: np.ndarray) -> Iterator[tuple[str, Sampled]]:
+    """Other readings of the same columns, the simpler first: units, signs, swapped pairs, zeros a quarter turn off."""
+    torque, joints, n = motion.torque, look.joints, len(look.joints)
+    assert torque is not None
+    turns = ~np.array(prismatic(look.model))
+    if look.unit == "rad":
+        text = "it would with positions in degrees: add units: {position: deg}"
+        yield text, motion.scaled(np.where(turns, DEGREE, 1e-3))
+    else:
+        text = f"it would with positions in rad: leave units: {{position: {look.unit}}} out"
+        yield text, motion.scaled(np.where(turns, 1 / DEGREE, 1e3))
+    if n > 1:
+        yield (
+            "torque of every joint has the opposite sign of what the model needs: the log gives the load's torque"
+            " (transmission.torque with -1 on its diagonal), or robot.gravity points the wrong way",
+            replace(motion, torque=-torque),
+        )
+    yield from _turned(joints, motion, torque)
+    order = _assigned(matrix_of_likeness(motion, nominal, torque))
+    if order is not None:
+        text = ", ".join(f"{joints[j]} takes the column given for {joints[c]}" for j, c in enumerate(order) if c != j)
+        yield f"the torque columns stand in another order: {text}", replace(motion, torque=torque[:, order])
+    yield from _swapped(joints, motion, torque, turns)
+    for j in np.flatnonzero(turns):
+        for quarter in (1, 2, -1):
+            offset = np.zeros(n)
+            offset[j] = quarter * np.pi / 2
+            text = f"it would with {offset[j]:+.4f} rad added to the position of {joints[j]} (transmission.offset)"
+            yield text, motion.moved(offset)
+
+
+def _turned(joints: Sequence[str], motion: Sampled, torque: np.ndarray) -> Iterator[tuple[str, Sampled]]:
+    """The sign of one joint's torque, of its position, of both."""
+    for j, name in enumerate(joints):
+        sign = np.ones(len(joints))
+        sign[j] = -1.0
+        text = f"torque of {name} has the opposite sign of what the model needs (-1 in transmission.torque)"
+        yield text, replace(motion, torque=torque * sign)
+        turned = motion.scaled(sign)
+        yield f"it would with the opposite sign of the position of {name} (-1 in transmission.position)", turned
+        text = f"it would with the opposite sign of position and torque of {name} (-1 in both matrices of transmission)"
+        yield text, replace(turned, torque=torque * sign)
+
+
+def _swapped(
+    joints: Sequence[str], motion: Sampled, torque: np.ndarray, turns: np.ndarray
+) -> Iterator[tuple[str, Sampled]]:
+    """Columns of two joints exchanged: of position, or of everything."""
+    for i in range(len(joints)):
+        for j in range(i + 1, len(joints)):
+            if turns[i] != turns[j]:
+                continue
+            swap = list(range(len(joints)))
+            swap[i], swap[j] = j, i
+            pair, moved = f"{joints[i]} and {joints[j]}", motion.with_columns(swap)
+            yield f"it would with the position columns of {pair} swapped", moved
+            text = f"it would with position and torque columns of {pair} swapped"
+            yield text, replace(moved, torque=torque[:, swap])
+
+
+def _assigned(matrix: Sequence[Sequence[Likeness]]) -> list[int] | None:
+    """Torque column of each joint that makes all of them most alike; None for the order as it is."""
+    from scipy.optimize import linear_sum_assignment
+
+    like = np.array([[max(one.correlation, 0.0) for one in row] for row in matrix])
+    _, order = linear_sum_assignment(-like)
+    return None if (order == np.arange(len(order))).all() else order.tolist()

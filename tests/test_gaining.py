@@ -1,0 +1,82 @@
+"""A cause that predicts kept-out data no better is not named; one that does is not lost to a larger joint's chance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from figaroh_jax.diagnosis.gaining import fall
+
+BLOCKS = 12
+
+
+def squares(rng: np.random.Generator, *joints: float) -> np.ndarray:
+    """Squares of each block and joint, of the sizes `joints`: of all rows, and of those that move, all of them."""
+    return np.stack([np.array(joints) * rng.uniform(0.8, 1.2, (BLOCKS, len(joints)))] * 2)
+
+
+@pytest.mark.parametrize("strict", [True, False])
+@pytest.mark.parametrize("factor", [1.0, 1.02, 1.5])
+def test_what_does_not_lower_the_error_of_its_joint_is_never_named(factor: float, strict: bool):
+    """Nor where another joint happens to gain by it."""
+    before = squares(np.random.default_rng(0), 100.0, 4.0)
+    one = fall(before, before * [0.9, factor], [1])
+    assert one.own == pytest.approx(1 - factor)
+    assert not one.gains(strict)
+
+
+def test_beside_a_rest_a_fall_that_chance_makes_is_none():
+    """One block in twelve gains, the others lose a little: the sum falls."""
+    before = squares(np.random.default_rng(1), 4.0)
+    after = 1.01 * before
+    after[:, 0] *= 0.6
+    one = fall(before, after, [0])
+    assert one.own > 0
+    assert one.gains(strict=False)
+    assert not one.gains(strict=True)
+
+
+def test_a_fall_in_every_block_is_sure_however_unlike_they_are():
+    """Most of it in one block: mean over deviation is 1, and yet it is a chance of 2^-12."""
+    before = squares(np.random.default_rng(1), 4.0)
+    before[:, 0] *= 50
+    one = fall(before, 0.5 * before, [0])
+    assert one.chance == pytest.approx(2.0**-BLOCKS)
+    assert one.gains(strict=True)
+
+
+def test_no_difference_is_sure_as_often_as_the_level_says():
+    rng, chances = np.random.default_rng(4), []
+    for _ in range(300):
+        before, after = (np.stack([1 + rng.standard_normal((30, 1)) ** 2] * 2) for _ in range(2))
+        chances.append(fall(before, after, [0]).chance)
+    assert 0.02 < np.mean(np.array(chances) < 0.05) < 0.08
+
+
+def test_a_small_joint_gains_though_chance_moves_a_large_one_by_more():
+    rng = np.random.default_rng(2)
+    before = squares(rng, 1000.0, 1.0)
+    moved = 1 + 0.01 * rng.standard_normal(BLOCKS)
+    moved *= 1.0005 / np.mean(moved)  # the large joint's squares rise, by less than their blocks differ
+    one = fall(before, before * np.stack([moved, np.full(BLOCKS, 0.7)], 1), [1])
+    assert one.whole < 0
+    assert one.gains(strict=True)
+
+
+def test_a_robot_that_is_surely_predicted_worse_is_no_gain():
+    before = squares(np.random.default_rng(3), 1000.0, 1.0)
+    one = fall(before, before * [1.05, 0.7], [1])
+    assert one.own > 0
+    assert not one.gains(strict=True)
+
+
+def test_rows_in_which_a_joint_stands_do_not_decide():
+    """Dry friction holds any torque there: the error of a right law may rise by chance where most of it is."""
+    rng = np.random.default_rng(5)
+    moving = 1 + 0.1 * rng.uniform(-1, 1, (BLOCKS, 1))
+    standing = 10 * rng.uniform(0.5, 1.5, (BLOCKS, 1))
+    moved = standing * (1 + 0.3 * rng.standard_normal((BLOCKS, 1)))
+    moved *= 1.05 * standing.sum() / moved.sum()
+    one = fall(np.stack([standing + moving, moving]), np.stack([moved + 0.5 * moving, 0.5 * moving]), [0])
+    assert one.own == pytest.approx(0.5)
+    assert one.gains(strict=True)
