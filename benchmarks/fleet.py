@@ -1,12 +1,15 @@
 """A fleet of robots of one structure, each with its own lengths, masses and friction, identified in one program.
 
-    PYTHONPATH=. python benchmarks/fleet.py [--robots N] [--samples N] [--at-once N]
+    PYTHONPATH=. python benchmarks/fleet.py [--robots N] [--samples N] [--at-once N] [--screen [EFFECT ...]]
 
 Arms of six joints whose lengths, inertias and drives differ from one to the next. Each has a recording of its own,
 made on the device with noise of 0.05 N m. `fit_states` under `jax.vmap` gives base parameters and standard deviations
 of every robot, weighed by joint. Told are seconds of the first and of later calls, from arrays on the device and from
 the host's, how the errors compare with the standard deviations, the population's mean and spread, and the differences
 of the first robots from the same on the host's CPU.
+
+`--screen` makes smooth motions instead, gives one robot in fifty a cause of its own by a formula of this file, and
+screens the fleet for every single cause of the catalogue (or those told): which robots are flagged, with what.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from figaroh_jax.diagnosis.fleet import screen_fleet
 from figaroh_jax.estimation.accelerators import BatchFit, coordinates, fit_states
 from figaroh_jax.estimation.base_parameters import BaseParameters
 from figaroh_jax.rigid.dynamics import inverse_dynamics
@@ -37,8 +41,12 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=1000)
     parser.add_argument("--samples", type=int, default=10_000)
     parser.add_argument("--at-once", type=int, help="robots whose rows exist at once")
+    parser.add_argument("--screen", nargs="*", metavar="EFFECT", help="screen for causes in place of identifying")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    if options.screen is not None:
+        _screen(options.robots, options.samples, options.screen or None)
+        return
     rows = gpu_identification._Source(gpu_identification.MODELS["arm"]()).states
     base, into = rows.structural, jnp.asarray(coordinates(rows.structure, rows.structural).into)
     fleet, drives = _fleet(rows.model, options.robots)
@@ -86,6 +94,69 @@ def main() -> None:
         seconds = (time.perf_counter() - start) / COMPARED
     apart = np.abs(found.parameters[:COMPARED] - cpu.parameters).max() / np.abs(cpu.parameters).max()
     print(f"host's CPU: {seconds:.3f} s a robot; parameters differ by {apart:.1e} of the largest", flush=True)
+
+
+DT, ONE_IN = 0.01, 50  # s; robots, of which one has a cause
+
+
+def _screen(robots: int, samples: int, effects: list[str] | None) -> None:
+    rows = gpu_identification._Source(gpu_identification.MODELS["arm"]()).states
+    model, nv = rows.model, rows.model.nv
+    fleet, drives = _fleet(model, robots)
+    axes = jax.tree.map(lambda yes: 0 if yes else None, _axes(model))
+
+    @jax.jit
+    def recordings(key: Any) -> tuple[Any, ...]:
+        keys = jax.random.split(key, 4)
+        t, shape = jnp.arange(samples)[:, None] * DT, (robots, 4, 1, nv)
+        rate, size, phase = (jax.random.uniform(k, shape) for k in keys[:3])
+        rate, size, angle = 0.5 + 3 * rate, 0.1 + 0.5 * size, (0.5 + 3 * rate) * t + 6.3 * phase
+        q, v, a = (size * jnp.sin(angle)).sum(1), (size * rate * jnp.cos(angle)).sum(1), None
+        a = -(size * rate**2 * jnp.sin(angle)).sum(1)
+        load = jax.vmap(inverse_dynamics, in_axes=(axes, 0, 0, 0))(fleet, q, v, a)
+        viscous, coulomb, rotor, offset = (jnp.asarray(drives)[:, None, :, k] for k in range(4))
+        drive = viscous * v + coulomb * jnp.sign(v) + rotor * a + offset
+        return q, v, a, load, drive + NOISE * jax.random.normal(keys[3], q.shape)
+
+    q, v, a, load, beside = (np.array(x) for x in recordings(jax.random.key(1)))
+    tau, hidden = load + beside, {}
+    for n, robot in enumerate(range(ONE_IN // 2, robots, ONE_IN)):
+        joint = n % nv
+        name = ("load_dependent_friction", "stribeck_friction", "torque_ripple", "joint_spring", "torque_delay")[n % 5]
+        way, own = np.sign(v[robot, :, joint]), tau[robot, :, joint]
+        if name == "load_dependent_friction":
+            own += 0.1 * np.abs(load[robot, :, joint]) * way
+        if name == "stribeck_friction":
+            own += 0.4 * np.exp(-((v[robot, :, joint] / 0.1) ** 2)) * way
+        if name == "torque_ripple":
+            own += 0.2 * np.sin(20 * q[robot, :, joint])
+        if name == "joint_spring":
+            own += 0.5 * q[robot, :, joint]
+        if name == "torque_delay":
+            instants = np.arange(samples) * DT
+            tau[robot] = np.stack([np.interp(instants - 0.004, instants, x) for x in tau[robot].T], axis=1)
+        hidden[robot] = (name, () if name == "torque_delay" else (model.joint_names[joint],))
+    parts = zip(np.asarray(fleet.placement), np.asarray(fleet.inertia), strict=True)
+    each = [eqx.tree_at(lambda m: (m.placement, m.inertia), model, part) for part in parts]
+    seconds, found = [], None
+    for _ in range(2):
+        start = time.perf_counter()
+        found = screen_fleet(each, rows.terms, q, v, a, tau, DT, effects)
+        seconds.append(time.perf_counter() - start)
+    assert found is not None
+    flags = {flag.robot: (flag.cause.effect, flag.cause.at) for flag in found.flagged()}
+    right = sum(flags.get(robot) == cause for robot, cause in hidden.items())
+    device = jax.devices()[0].device_kind
+    print(
+        f"jax {jax.__version__}, {device}, float64; {robots} robots of {samples} samples screened for"
+        f" {len(found.causes)} causes in {seconds[1]:.2f} s, first {seconds[0]:.1f} s",
+        flush=True,
+    )
+    print(f"{len(hidden)} robots have a cause: {len(flags.keys() & hidden.keys())} are flagged, {right} with it first;"
+          f" {len(flags.keys() - hidden.keys())} others are flagged", flush=True)  # fmt: skip
+    for robot, cause in hidden.items():
+        if flags.get(robot) != cause:
+            print(f"robot {robot} has {cause}, told {flags.get(robot)}", flush=True)
 
 
 def _fleet(model: RobotModel, robots: int) -> tuple[RobotModel, np.ndarray]:

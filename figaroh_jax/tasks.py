@@ -7,10 +7,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, overload
 
 from .errors import InputError
+from .formats.config import Preprocess
+from .recordings.checks import check_recordings
+from .simulators.native import as_backend
 
 if TYPE_CHECKING:
     from .calibration.kinematic_diagnosis import PoseDiagnosis
-    from .formats.config import Baseline, Preprocess, Task
+    from .formats.config import Baseline, Task
     from .identification.result import Identification
     from .recordings.dataset import Recording
     from .recordings.poses import PoseRecording
@@ -102,7 +105,6 @@ def diagnose(
     postures = [one for one in recordings if isinstance(one, PoseRecording)]
     if postures:
         from .calibration.kinematic_diagnosis import diagnose_poses
-        from .simulators.native import as_backend
 
         if len(postures) < len(recordings):
             raise InputError("recordings of torque and postures are diagnosed each by themselves")
@@ -110,7 +112,6 @@ def diagnose(
             raise InputError("postures have no preprocess, baseline or further options: leave them out")
         return diagnose_poses(as_backend(model).robot, postures, forbid, alpha, progress)
     from .diagnosis.diagnosis import diagnose as of_torques
-    from .formats.config import Preprocess
 
     torques: Any = recordings
     notes = _checked(model, torques)
@@ -149,7 +150,4 @@ def _native_alone(backend: str, what: str) -> None:
 
 def _checked(model: RobotModel | Backend, recordings: Sequence[Recording]) -> tuple[str, ...]:
     """Warnings about the recordings; `InputError` where one cannot be right."""
-    from .recordings.checks import check_recordings
-    from .simulators.native import as_backend
-
     return check_recordings(None, as_backend(model).robot, recordings)

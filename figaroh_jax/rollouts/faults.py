@@ -8,9 +8,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
-from .alone import carried_by
+from ..compiled.batching import program
+from ..rigid.dynamics import joint_torques
+from .alone import motion
 from .data import Run, regular
 from .loop import Loop
 
@@ -21,6 +24,7 @@ _BLOCK, _JUMP, _ALIKE = 2.0, 2.0, 0.5  # s of one lag, periods of a jump, share 
 _MOST_LATE, _SHIFTED, _FEW = 0.3, 0.15, 3  # s, share of the power that a shift leaves, blocks on either side of a jump
 _WRONG, _HOLDS = 6.0, 1.2  # multiples of the usual error and of the friction, of a joint that stands
 _MOVING = 0.1  # rad/s
+_SAMPLES = 1024  # one program takes so many
 
 
 class Fault(NamedTuple):
@@ -77,7 +81,7 @@ def _held(loop: Loop, runs: Sequence[Run], simulated: Sequence[np.ndarray]) -> l
     drives, places = loop.drives, np.array(loop.measured)
     way = np.asarray(drives.transmission)
     low, high = np.asarray(drives.force_range).T
-    for run, carried in zip(runs, carried_by(loop, runs), strict=True):
+    for run in runs:
         period = regular(run.name, run.time)
         v, a = np.zeros((len(run.time), loop.robot.nv)), np.zeros((len(run.time), loop.robot.nv))
         q = np.zeros_like(v)
@@ -87,7 +91,7 @@ def _held(loop: Loop, runs: Sequence[Run], simulated: Sequence[np.ndarray]) -> l
         gain, bias = np.asarray(drives.gain), np.asarray(drives.bias)
         scale = np.asarray(drives.scale)
         force = bias[:, 0] + scale * (gain[:, 0] * run.command + bias[:, 1] * (q @ way.T)) + bias[:, 2] * (v @ way.T)
-        net = np.clip(force, low, high) @ way - carried[..., 1]
+        net = np.clip(force, low, high) @ way - _carried(loop, run)
         nets.append(net)
         rows = max(1, round(_LONG / 2 / period))
         kernel = np.ones(rows) / rows
@@ -103,6 +107,21 @@ def _held(loop: Loop, runs: Sequence[Run], simulated: Sequence[np.ndarray]) -> l
         beyond = (np.abs(net) > _REACH * usual) | ((np.abs(net) > _HOLDS * usual) & (far > _WRONG))
         found.append(np.where((rate < _SLOW) & beyond, np.abs(net) - usual, 0.0))
     return found
+
+
+def _carried(loop: Loop, run: Run) -> np.ndarray:
+    """Torque that the measured motion takes without friction, (rows, nv)."""
+    q, v, a = motion(loop, run, None)
+    found = np.zeros_like(q)
+    with jax.enable_x64(True):
+        for first in range(0, len(q), _SAMPLES):
+            part = np.clip(np.arange(first, first + _SAMPLES), 0, len(q) - 1)
+            torque = np.asarray(_torques(loop.robot, q[part].T, v[part].T, a[part].T)).T
+            found[first : first + _SAMPLES] = torque[: len(q) - first]
+    return found
+
+
+_torques = program(joint_torques)
 
 
 def _level(values: np.ndarray) -> float:
