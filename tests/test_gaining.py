@@ -36,6 +36,16 @@ def test_beside_a_rest_a_fall_that_chance_makes_is_none():
     assert not one.gains(strict=True)
 
 
+def test_a_fall_that_may_be_chance_counts_if_it_is_what_the_cause_claims():
+    before = squares(np.random.default_rng(1), 4.0)
+    after = before.copy()
+    after[:, :2] *= 0.1  # two blocks of twelve: a chance of one in four
+    one = fall(before, after, [0])
+    assert one.chance == pytest.approx(0.25)
+    assert one.gains(strict=True, claim=2.9 * one.own)
+    assert not one.gains(strict=True, claim=3.1 * one.own)
+
+
 def test_a_fall_in_every_block_is_sure_however_unlike_they_are():
     """Most of it in one block: mean over deviation is 1, and yet it is a chance of 2^-12."""
     before = squares(np.random.default_rng(1), 4.0)
