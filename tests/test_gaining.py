@@ -25,15 +25,25 @@ def test_what_does_not_lower_the_error_of_its_joint_is_never_named(factor: float
     assert not one.gains(strict)
 
 
-def test_beside_a_rest_a_fall_that_chance_makes_is_none():
+@pytest.mark.parametrize("strict", [True, False])
+def test_a_fall_that_chance_makes_is_none(strict: bool):
     """One block in twelve gains, the others lose a little: the sum falls."""
     before = squares(np.random.default_rng(1), 4.0)
     after = 1.01 * before
     after[:, 0] *= 0.6
     one = fall(before, after, [0])
     assert one.own > 0
-    assert one.gains(strict=False)
-    assert not one.gains(strict=True)
+    assert not one.gains(strict)
+
+
+def test_a_fall_that_may_be_chance_counts_if_it_is_what_the_cause_claims():
+    before = squares(np.random.default_rng(1), 4.0)
+    after = before.copy()
+    after[:, :2] *= 0.1  # two blocks of twelve: a chance of one in four
+    one = fall(before, after, [0])
+    assert one.chance == pytest.approx(0.25)
+    assert one.gains(strict=True, claim=2.9 * one.own)
+    assert not one.gains(strict=True, claim=3.1 * one.own)
 
 
 def test_a_fall_in_every_block_is_sure_however_unlike_they_are():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from .joint import Joint, polished
 from .problem import Problem
 from .search import Found
 from .state import State
-from .thresholds import BY_CHANCE
+from .thresholds import BY_CHANCE, KEPT_OF_CLAIM
 
 __all__ = ["Fall", "Gaining", "fall", "without_losses"]
 
@@ -43,15 +43,18 @@ class Fall(NamedTuple):
     whole: float  # squares of all rows that go, N m or N, squared
     worse: float  # p-value of their rise
 
-    def gains(self, strict: bool) -> bool:
+    def gains(self, strict: bool, claim: float = np.inf) -> bool:
         """Whether the cause predicts better where it acts, and the robot is not predicted worse for it.
 
-        Beside a rest (`strict`) a fall may be chance and must be sure. There the squares of the robot are asked joint
-        by joint: those in N m are the large joints', which any change of the fit moves by more than a small joint has.
+        A fall may be chance: it must be sure, or beside a rest (`strict`) a good part of the `claim`, the share that
+        the cause takes in slices of the recordings that are fitted. There the squares of the robot are asked joint by
+        joint: those in N m are the large joints', which any change of the fit moves by more than a small joint has.
         """
+        sure = self.own > 0 and self.chance < BY_CHANCE
         if not strict:
-            return self.own > 0 and self.whole > 0
-        return self.own > 0 and self.chance < BY_CHANCE and self.each > 0 and self.worse > BY_CHANCE
+            return sure and self.whole > 0
+        claimed = self.own > 0 and self.own >= KEPT_OF_CLAIM * claim
+        return (sure or claimed) and self.each > 0 and self.worse > BY_CHANCE
 
 
 def fall(
@@ -90,6 +93,7 @@ def without_losses(
     named: list[Found],
     joint: Joint,
     strict: bool,
+    claims: Mapping[Name, float],
 ) -> Gaining:
     """The causes without those that do not lower the error on the data held out, the worst first (`Fall`).
 
@@ -102,12 +106,9 @@ def without_losses(
     while True:
         order, squares, power = _by_gain(problem, start, whitening, joint.causes, [f.name in later for f in named])
         falls = [fall(a, b, named[k].joints) for k, (a, b) in zip(order, pairwise(squares), strict=True)]
-        passed |= {named[k].name for k, one in zip(order, falls, strict=True) if one.gains(strict)}
-        failing = [
-            (one.own, k)
-            for k, one in zip(order, falls, strict=True)
-            if not one.gains(strict) and not (one.own > 0 and strict and named[k].name in passed)
-        ]
+        pairs = [(named[k].name, k, one) for k, one in zip(order, falls, strict=True)]
+        passed |= {name for name, _, one in pairs if one.gains(strict, claims[name])}
+        failing = [(one.own, k) for name, k, one in pairs if name not in passed or one.own <= 0]
         if not failing:
             gains = [_told(a, b, power, named[k], problem) for k, (a, b) in zip(order, pairwise(squares), strict=True)]
             whole = _relative(squares[0][0], squares[-1][0], power[0])
