@@ -91,6 +91,8 @@ def diagnose_poses(
             note = "held-out postures are predicted no better than by the frames alone: nothing that was found is named"
             calibration = replace(calibration, notes=(*calibration.notes, note))
         outliers = [c for c in calibration.causes if c.name.effect == "outlier"]
+        if plays:  # the postures that a joint's play moves farthest are no errors of their own
+            outliers = []
         causes = tuple([*outliers, *geometry, *_with_rivals(effects, run)])
         p_value = min(1.0, 2.0 * min(p_geometry, p_effects))
         if plays:

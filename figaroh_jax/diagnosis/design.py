@@ -11,7 +11,7 @@ JAX evaluates the equations, many effects in one program; samples, shifts and fi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
+from functools import lru_cache, partial
 from math import prod
 from typing import Literal, NamedTuple
 
@@ -62,7 +62,12 @@ class Units(NamedTuple):
 
 def kind(effect: Effect | type[Effect]) -> Literal["columns", "position", "response"]:
     """How the effect acts on the rows."""
-    if effect.has("position_error") and shapes(effect if isinstance(effect, type) else type(effect)):
+    return _kind(effect if isinstance(effect, type) else type(effect))
+
+
+@lru_cache(maxsize=512)
+def _kind(effect: type[Effect]) -> Literal["columns", "position", "response"]:
+    if effect.has("position_error") and shapes(effect):
         return "position"
     return "response" if effect.has("torque_response") else "columns"
 
@@ -184,7 +189,12 @@ def local(effect: Effect) -> bool:
 
 def _way(effect: Effect | type[Effect]) -> Literal["torque", "change", "shift", "position", "response"]:
     """Where the torque comes from: an equation of its own, or the rigid body with another model or motion."""
-    way = kind(effect)
+    return _way_of(effect if isinstance(effect, type) else type(effect))
+
+
+@lru_cache(maxsize=512)
+def _way_of(effect: type[Effect]) -> Literal["torque", "change", "shift", "position", "response"]:
+    way = _kind(effect)
     if way != "columns":
         return way
     if effect.has("position_error"):

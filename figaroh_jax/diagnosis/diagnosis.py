@@ -250,7 +250,8 @@ def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], to
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
     here, joint = _as_predicts_best([here] if same else [here, before], named)
-    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict)
+    claims = {one.name: one.gain for one in each}
+    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, claims)
     gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from .joint import Joint, polished
 from .problem import Problem
 from .search import Found
 from .state import State
-from .thresholds import BY_CHANCE
+from .thresholds import BY_CHANCE, KEPT_OF_CLAIM
 
 __all__ = ["Fall", "Gaining", "fall", "without_losses"]
 
@@ -37,33 +37,38 @@ class Gaining(NamedTuple):
 class Fall(NamedTuple):
     """What a cause does to the error on data kept out as it comes in."""
 
-    own: float  # share of the squares of the joints where it acts that goes
+    own: float  # share of the squares that goes of the joints where it acts, while they move
     chance: float  # p-value of that: of the blocks' differences with signs at random
     each: float  # sum over the joints of that share
-    whole: float  # squares of all joints that go, N m or N, squared
+    whole: float  # squares of all rows that go, N m or N, squared
     worse: float  # p-value of their rise
 
-    def gains(self, strict: bool) -> bool:
+    def gains(self, strict: bool, claim: float = np.inf) -> bool:
         """Whether the cause predicts better where it acts, and the robot is not predicted worse for it.
 
-        Beside a rest (`strict`) a fall may be chance and must be sure. There the squares of the robot are asked joint
-        by joint: those in N m are the large joints', which any change of the fit moves by more than a small joint has.
+        A fall may be chance: it must be sure, or beside a rest (`strict`) a good part of the `claim`, the share that
+        the cause takes in slices of the recordings that are fitted. There the squares of the robot are asked joint by
+        joint: those in N m are the large joints', which any change of the fit moves by more than a small joint has.
         """
+        sure = self.own > 0 and self.chance < BY_CHANCE
         if not strict:
-            return self.own > 0 and self.whole > 0
-        return self.own > 0 and self.chance < BY_CHANCE and self.each > 0 and self.worse > BY_CHANCE
+            return sure and self.whole > 0
+        claimed = self.own > 0 and self.own >= KEPT_OF_CLAIM * claim
+        return (sure or claimed) and self.each > 0 and self.worse > BY_CHANCE
 
 
-def fall(before: Float[np.ndarray, "blocks nv"], after: Float[np.ndarray, "blocks nv"], joints: Sequence[int]) -> Fall:
-    """What becomes of the squares of each block and joint for a cause that acts at the `joints`."""
-    places, less, had = list(joints), before - after, np.maximum(before.sum(0), 1e-300)
-    drop = less.sum(0)
+def fall(
+    before: Float[np.ndarray, "2 blocks nv"], after: Float[np.ndarray, "2 blocks nv"], joints: Sequence[int]
+) -> Fall:
+    """What becomes of the squares of each block and joint (`held_squares`) for a cause that acts at the `joints`."""
+    places, (rows, moving) = list(joints), before - after
+    drop, had = moving.sum(0), np.maximum(before[1].sum(0), 1e-300)
     return Fall(
         own=float(drop[places].sum() / had[places].sum()),
-        chance=_by_chance(less[:, places].sum(1)),
+        chance=_by_chance(moving[:, places].sum(1)),
         each=float((drop / had).sum()),
-        whole=float(drop.sum()),
-        worse=_by_chance(-less.sum(1)),
+        whole=float(rows.sum()),
+        worse=_by_chance(-rows.sum(1)),
     )
 
 
@@ -88,44 +93,51 @@ def without_losses(
     named: list[Found],
     joint: Joint,
     strict: bool,
+    claims: Mapping[Name, float],
 ) -> Gaining:
     """The causes without those that do not lower the error on the data held out, the worst first (`Fall`).
 
-    Each is judged as it comes in, by what it gains alone, or else after all the others: some show only beside another.
+    Each is judged as it comes in: by what it gains alone, or else after all the others, for some show only beside
+    another.
     """
     worse: list[Name] = []
     later: list[Name] = []  # come in behind the others
+    passed: set[Name] = set()  # in some order of these causes
     while True:
         order, squares, power = _by_gain(problem, start, whitening, joint.causes, [f.name in later for f in named])
         falls = [fall(a, b, named[k].joints) for k, (a, b) in zip(order, pairwise(squares), strict=True)]
-        failing = [(one.own, k) for k, one in zip(order, falls, strict=True) if not one.gains(strict)]
+        pairs = [(named[k].name, k, one) for k, one in zip(order, falls, strict=True)]
+        passed |= {name for name, _, one in pairs if one.gains(strict, claims[name])}
+        failing = [(one.own, k) for name, k, one in pairs if name not in passed or one.own <= 0]
         if not failing:
             gains = [_told(a, b, power, named[k], problem) for k, (a, b) in zip(order, pairwise(squares), strict=True)]
-            return Gaining(named, joint, order, gains, _relative(squares[0], squares[-1], power), worse)
+            whole = _relative(squares[0][0], squares[-1][0], power[0])
+            return Gaining(named, joint, order, gains, whole, worse)
         least = min(failing)[1]
         if named[least].name not in later and len(named) > 1:
             later.append(named[least].name)
             continue
         worse.append(named[least].name)
+        passed.clear()
         named = [f for k, f in enumerate(named) if k != least]
         joint = polished(problem, start, [f.effect for f in named], whitening)
 
 
 def _told(
-    before: Float[np.ndarray, "blocks nv"],
-    after: Float[np.ndarray, "blocks nv"],
-    power: Float[np.ndarray, " nv"],
+    before: Float[np.ndarray, "2 blocks nv"],
+    after: Float[np.ndarray, "2 blocks nv"],
+    power: Float[np.ndarray, "2 nv"],
     one: Found,
     problem: Problem,
 ) -> Gain:
-    """Error of the robot without and with a cause; where it gains less than chance moves that, of the joints where it
-    acts."""
-    if after.sum() < before.sum():
-        return _relative(before, after, power)
+    """Error of the robot without and with a cause; where chance moves that by more than the cause gains, the error of
+    the joints where it acts, while they move."""
+    if after[0].sum() < before[0].sum():
+        return _relative(before[0], after[0], power[0])
     places = list(one.joints)
     names = ", ".join(problem.model.joint_names[k] for k in places)
-    own = _relative(before[:, places], after[:, places], power[places])
-    return Gain(own.before, own.after, f"relative RMS of {names}")
+    own = _relative(before[1][:, places], after[1][:, places], power[1][places])
+    return Gain(own.before, own.after, f"relative RMS of {names} in motion")
 
 
 def _relative(before: np.ndarray, after: np.ndarray, power: np.ndarray) -> Gain:
@@ -139,14 +151,14 @@ def _by_gain(
     whitening: Float[np.ndarray, "F nv"],
     causes: Sequence[Effect],
     later: Sequence[bool],
-) -> tuple[list[int], list[Float[np.ndarray, "blocks nv"]], Float[np.ndarray, " nv"]]:
+) -> tuple[list[int], list[Float[np.ndarray, "2 blocks nv"]], Float[np.ndarray, "2 nv"]]:
     """The order of what each cause gains on held-out data as it comes in, those that come `later` behind the others.
 
     With the squares of the error in that order, and of the torque.
     """
     order = list(range(len(causes)))
     squares, power = held_squares(problem, start, list(causes), whitening)
-    drops = [float((before - after).sum()) for before, after in pairwise(squares)]
+    drops = [float((before - after)[0].sum()) for before, after in pairwise(squares)]
     ranked = sorted(order, key=lambda k: (later[k], -drops[k]))
     if ranked != order:
         squares, power = held_squares(problem, start, [causes[k] for k in ranked], whitening)

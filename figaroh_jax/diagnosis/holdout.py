@@ -19,6 +19,7 @@ from .search import Found
 from .shifts import torque_change
 from .state import State, batched, extended_state
 from .step import Step, stand
+from .thresholds import LEAST_MOVING, STANDS
 
 __all__ = ["fold_error", "held_squares", "part_error", "predicted", "residual_rms", "traces"]
 
@@ -27,20 +28,31 @@ BLOCK, FEWEST = 1.0, 8  # s; blocks of a recording
 
 def held_squares(
     problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]
-) -> tuple[list[Float[np.ndarray, "blocks nv"]], Float[np.ndarray, " nv"]]:
+) -> tuple[list[Float[np.ndarray, "2 blocks nv"]], Float[np.ndarray, "2 nv"]]:
     """Squares of each joint's error on data not fitted, block by block, of the baseline, then after each cause; and of
-    its torque.
+    its torque. First of all rows, then of those in which the joint moves.
 
     Of the filtered torque (N m or N), over the holdout recordings with torque; without any, over parts of the others,
     each predicted by a fit to the rest.
     """
-    out, step, block = [], None, _blocks(problem)
+    out, step, block, kept = [], None, _blocks(problem), _kept_out(problem)
+    rows = np.stack([np.ones(kept.shape), _moves(problem)])
     for effect in [None, *causes]:
         grown = start if step is None or effect is None else extended_state(problem, step.state, effect)
         step = stand(problem, grown, whitening, step)
-        squares = _error(problem, step) ** 2
-        out.append(np.stack([np.bincount(block[block >= 0], x[block >= 0]) for x in np.moveaxis(squares, 2, 0)], 1))
-    return out, ((problem.torque * _kept_out(problem)) ** 2).sum((0, 1))
+        squares = np.moveaxis(_error(problem, step) ** 2 * rows, 3, 1)[..., block >= 0]
+        out.append(np.stack([[np.bincount(block[block >= 0], x) for x in some] for some in squares]).swapaxes(1, 2))
+    return out, ((problem.torque * kept) ** 2 * rows).sum((1, 2))
+
+
+def _moves(problem: Problem) -> Float[np.ndarray, "n M nv"]:
+    """1 in the rows in which a joint moves: where it stands, dry friction holds any torque up to its limit, and what a
+    model of the motion says of it is chance. 1 everywhere for a joint that hardly moves in the data not fitted."""
+    speed, kept = np.abs(np.asarray(problem.records.velocity)), _kept_out(problem) > 0
+    rows = np.take_along_axis(speed, problem.records.row_samples()[..., None], axis=1)
+    moves = rows >= STANDS * speed.max((0, 1))
+    seldom = (moves & kept).sum((0, 1)) < LEAST_MOVING * kept.sum((0, 1))
+    return np.where(seldom, 1.0, moves)
 
 
 def _error(problem: Problem, step: Step) -> Float[np.ndarray, "n M nv"]:

@@ -126,8 +126,10 @@ class Filtered:
         used = np.asarray(records.weight).any((1, 2))
         key = (id(part.series), id(source), code + used.tobytes())
         known = self._kept.pop(key, None)
-        same = known is not None and known[0]() is part.series and known[1]() is source
-        block = known[2] if known is not None and same else _through(records, part, response)
+        if known is not None and known[0]() is part.series and known[1]() is source:
+            self._kept[key] = known
+            return known[2]
+        block = _through(records, part, response)
         self._kept[key] = ref(part.series), ref(source), block
         for old in [k for k, (one, other, _) in self._kept.items() if one() is None or other() is None]:
             del self._kept[old]

@@ -21,7 +21,8 @@ bounds from their grid. Torques are those of the drive: what has to be added to 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
@@ -210,6 +211,14 @@ class Place(eqx.Module):
         return (len(self.index),)
 
 
+@lru_cache(maxsize=512)
+def _declared(cls: type[Effect]) -> Mapping[str, Parameter]:
+    own = {f.name: f.metadata["parameter"] for f in dataclasses.fields(cls) if "parameter" in f.metadata}
+    if not cls.dissipative:
+        return own
+    return {n: p._replace(lower=max(p.lower, 0.0)) if p.linear else p for n, p in own.items()}
+
+
 class Effect(eqx.Module):
     """A physical effect at a place; subclass it, declare its parameters and write at least one form.
 
@@ -322,10 +331,7 @@ class Effect(eqx.Module):
     @classmethod
     def parameters(cls) -> dict[str, Parameter]:
         """Declared parameters by field name, in order; amplitudes of a dissipative effect are not below zero."""
-        own = {f.name: f.metadata["parameter"] for f in dataclasses.fields(cls) if "parameter" in f.metadata}
-        if not cls.dissipative:
-            return own
-        return {n: p._replace(lower=max(p.lower, 0.0)) if p.linear else p for n, p in own.items()}
+        return dict(_declared(cls))
 
     @classmethod
     def units(cls) -> dict[str, str]:

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
+from weakref import ref
 
 import equinox as eqx
 import jax
@@ -209,13 +210,32 @@ def _tied(device: Device, own: Array) -> tuple[Array, Array]:
 
 
 def host_parts(problem: Problem) -> tuple[Part | HostRows, ...]:
-    """For `linearise`: groups of few postures, measured by a device that has one, in a form that compiles nothing."""
+    """For `linearise`: groups of few postures, measured by a device that has one, in a form that compiles nothing.
+
+    Those of the last problem are kept: it is solved with other weights, folds and columns.
+    """
+    if _last and _last[0]() is problem:
+        return _last[1]
     by_hand = [_by_hand(group) for group in problem.groups]
     parts = (None,) * len(by_hand) if all(by_hand) else parts_of(problem)
-    return tuple(
-        HostRows(g.chain, g.device, np.asarray(g.position), g.datum) if part is None or own else part
+    found = tuple(
+        HostRows(g.chain, g.device, np.asarray(g.position), g.datum, np.asarray(g.steady), _pieces(g))
+        if part is None or own
+        else part
         for g, own, part in zip(problem.groups, by_hand, parts, strict=True)
     )
+    if not traced(problem):
+        _last[:] = [ref(problem), found]
+    return found
+
+
+_last: list[Any] = []
+
+
+def _pieces(group: Group) -> list[tuple[int, int, Float[np.ndarray, "6 samples"]]]:
+    """Column, joint of the chain and twists of each piece that changes with the posture."""
+    column, at = (np.asarray(x).tolist() for x in (group.column, group.at))
+    return list(zip(column, at, np.asarray(group.fields), strict=True))
 
 
 def _by_hand(group: Group) -> bool:
@@ -227,43 +247,59 @@ def linearise(
     problem: Problem, unknowns: Float[Any, " unknowns"], parts: tuple[Part | HostRows, ...] | None = None
 ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows unknowns"]]:
     """Residual in m and rad at the scaled unknowns, and its exact Jacobian; `parts` are those of the problem."""
-    scale = np.asarray(problem.scale)
-    values, first = np.asarray(unknowns) * scale, problem.columns
+    scale, count = np.asarray(problem.scale), problem.columns
+    values, first = np.asarray(unknowns) * scale, count
     residuals, jacobians = [], []
-    for group, part in zip(problem.groups, parts or host_parts(problem), strict=True):
-        by_hand = isinstance(part, HostRows)
-        own = slice(first, first + (part.unknowns if by_hand else len(group.device.unknowns())))
-        residual, response, by_own = _flat_rows(group, part, values[: problem.columns], values[own])
+    for k, part in enumerate(parts or host_parts(problem)):
+        group = None if isinstance(part, HostRows) else problem.groups[k]
+        if isinstance(part, HostRows):
+            own, steady, pieces = slice(first, first + part.unknowns), part.steady, part.pieces
+            residual, response, by_own = part.rows(_twists(steady, pieces, part.samples, values[:count]), values[own])
+        else:
+            assert group is not None
+            own, pieces = slice(first, first + len(group.device.unknowns())), _pieces(group)
+            steady = np.reshape(group.steady, (-1, count))
+            twists = _twists(steady, pieces, np.shape(group.position)[1], values[:count])
+            residual, response, by_own = _compiled_rows(part, twists, values[own], np.shape(group.position)[1])
         columns = np.zeros((len(values), residual.size))  # the Jacobian's columns, each in one piece
-        columns[: problem.columns] = np.reshape(group.steady, (len(response), -1)).T @ response.reshape(
-            -1, residual.size
-        )
-        for column, at, field in zip(group.column, group.at, np.asarray(group.fields), strict=True):
+        columns[:count] = steady.T @ response.reshape(-1, residual.size)
+        for column, at, field in pieces:
             columns[column] += np.sum(response[6 * at : 6 * at + 6] * field[:, None], axis=0).reshape(-1)
         columns[own] = by_own.reshape(-1, residual.size)
         residuals.append(residual.reshape(-1))
         jacobians.append(columns.T)
-        if not by_hand and ties(group.device):
+        if group is not None and ties(group.device):
             tied, by_own = _tied(group.device, values[own])
             residuals.append(np.asarray(tied))
             jacobians.append(np.zeros((len(tied), len(values))))
             jacobians[-1][:, own] = by_own
         first = own.stop
+    if len(residuals) == 1:
+        return residuals[0], jacobians[0] * scale
     return np.concatenate(residuals), np.concatenate(jacobians) * scale
 
 
-def _flat_rows(
-    group: Group, part: Part | HostRows, coefficients: np.ndarray, own: np.ndarray
+def _twists(
+    steady: Float[np.ndarray, "n6 columns"],
+    pieces: list[tuple[int, int, Float[np.ndarray, "6 samples"]]],
+    samples: int,
+    coefficients: Float[np.ndarray, " columns"],
+) -> Float[np.ndarray, "n 6 #samples"]:
+    """Twist of each joint, one for all postures where no piece changes with them."""
+    twists = (steady @ coefficients).reshape(-1, 6, 1)
+    if not pieces:
+        return twists
+    twists = np.repeat(twists, samples, axis=2)
+    for column, at, field in pieces:
+        twists[at] += coefficients[column] * field
+    return twists
+
+
+def _compiled_rows(
+    part: Part, twists: np.ndarray, own: np.ndarray, samples: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows (rows, samples) of a group and their derivatives by joint twists and by the device's unknowns."""
-    samples, twists = np.shape(group.position)[1], (np.asarray(group.steady) @ coefficients)[..., None]
-    if isinstance(part, HostRows) and not len(group.at):
-        return part.rows(twists, own)
-    twists = np.repeat(twists, samples, axis=2)
-    np.add.at(twists, np.asarray(group.at), coefficients[np.asarray(group.column)][:, None, None] * group.fields)
-    if isinstance(part, HostRows):
-        return part.rows(twists, own)
-    block = part.position.shape[2]
+    twists, block = np.broadcast_to(twists, (*twists.shape[:2], samples)), part.position.shape[2]
     cut = np.moveaxis(_cut(np.moveaxis(twists, -1, 0), block), 1, -1)
     rows = _rows_quick if samples <= DRAFT else _rows_fast
     found = rows(part.chain, part.device, own, cut, part.position, part.datum)

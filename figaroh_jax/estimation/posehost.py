@@ -27,9 +27,21 @@ def written_out(device: Any) -> bool:
 
 
 class HostRows:
-    """Rows of one group; what depends on the joint positions and on the measurement alone is computed once."""
+    """Rows of one group; what depends on the joint positions and on the measurement alone is computed once.
 
-    def __init__(self, chain: Chain, device: Any, position: Float[np.ndarray, "nv samples"], datum: Any) -> None:
+    `steady` and `pieces` are the group's columns as `posefit` takes them: for its use, at hand without a module.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        device: Any,
+        position: Float[np.ndarray, "nv samples"],
+        datum: Any,
+        steady: Float[np.ndarray, "n 6 columns"],
+        pieces: list[tuple[int, int, Float[np.ndarray, "6 samples"]]],
+    ) -> None:
+        self.steady, self.pieces = np.reshape(steady, (-1, steady.shape[2])), pieces
         self.samples, self.unknowns = position.shape[1], len(device.unknowns())
         self.placement = np.asarray(chain.placement, float)
         self.first, self.last = np.asarray(chain.first, float), np.asarray(chain.last, float)

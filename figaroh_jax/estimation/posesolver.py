@@ -243,9 +243,7 @@ def _solved(matrix: Float[Any, "n n"], right: Float[Any, " n"]) -> Float[Any, " 
     """By Cholesky's factor; NaN where there is none."""
     if _library(right) is jnp:
         return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), right)
-    from scipy.linalg import LinAlgError, cho_factor, cho_solve  # slow to import
+    from scipy.linalg.lapack import dposv  # pyright: ignore[reportAttributeAccessIssue]  (scipy is slow to import)
 
-    try:
-        return cho_solve(cho_factor(matrix, lower=True, check_finite=False), right, check_finite=False)
-    except LinAlgError:
-        return np.full_like(right, np.nan)
+    _, found, failed = dposv(matrix, right, lower=1)
+    return np.full_like(right, np.nan) if failed else found

@@ -22,7 +22,7 @@ from .data import Run, regular
 from .loop import Carried, Loop
 from .parameters import unit_payload
 
-__all__ = ["alone", "carried_by", "separable"]
+__all__ = ["alone", "carried_by", "motion", "separable"]
 
 _SPAN, _ORDER = 0.06, 3  # s over which, and degree of the polynomial by which, motions are differentiated
 _SMOOTH = 0.12  # s, of what a model of the arm leaves
@@ -125,7 +125,7 @@ def carried_by(loop: Loop, runs: Sequence[Run], simulated: Sequence[np.ndarray] 
 
 def _carried(loop: Loop, run: Run, model: np.ndarray | None) -> np.ndarray:
     n, links = loop.robot.nv, len(loop.robot.joints)
-    q, v, a = _motion(loop, run, model)
+    q, v, a = motion(loop, run, model)
     found = np.zeros((len(q), n, 4 + 3 * links))
     with jax.enable_x64(True):
         units = np.asarray(unit_payload(loop, np.arange(links)))
@@ -141,7 +141,7 @@ def _carried(loop: Loop, run: Run, model: np.ndarray | None) -> np.ndarray:
     return found
 
 
-def _motion(loop: Loop, run: Run, model: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def motion(loop: Loop, run: Run, model: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Position, velocity and acceleration of every joint between each row and the next, (rows, nv) each."""
     n, places = loop.robot.nv, np.array(loop.measured)
     period = regular(run.name, run.time)

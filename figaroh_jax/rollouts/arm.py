@@ -1,8 +1,8 @@
-"""The search for causes in an arm: each joint alone, payloads in all joints at once, then the whole arm simulated.
+"""The search for causes in an arm: the whole arm simulated from its commands, each joint judged by its own encoder.
 
-Every joint has its own search with the others moving as measured (`alone`). What acts at several joints at once is
-sought over all of them: a payload is named before anything else where it explains more than any cause of one joint.
-The verdict is that of the arm's simulation from the command alone.
+One linearisation of the arm ranks what every joint could lack; the best of each joint are fitted with everything else
+free. Causes of several joints may be found in one round: each must lower what its own encoder shows in recordings or
+quarters of the time that a fit has not seen, and must be missed where it alone is taken away again.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
+from scipy.special import ndtr
 
-from .alone import alone, carried_by
-from .causes import Candidate, Catalogue, elastic_loop
+from ..results import Name
+from .causes import BASELINE, CONTAINS, Candidate, elastic_loop
 from .data import windows
 from .faults import Fault, faults, without
-from .fit import Fit, System, fit, held_out
+from .fit import Fit, fit, refitted_without
 from .parameters import Entry, put, values
 from .search import (
     Model,
@@ -27,569 +27,487 @@ from .search import (
     Search,
     Setting,
     Structure,
+    Tried,
     begun,
+    by_recording,
     excess,
-    judged,
+    free_entries,
+    largest_forces,
     level_of,
     residuals,
-    search,
+    scored,
+    settled,
+    sized,
+    start_values,
     t_of,
 )  # fmt: skip
-from .sensitivity import Sums, predicted
+from .sensitivity import predicted
 
-__all__ = ["arm_begun", "search_arm"]
+__all__ = ["search_arm"]
 
-_WEAK = 0.3  # share of the largest gain below which a joint is looked at again
-_ROUNDS = 3  # times that a cause of several joints may be named and the joints searched again
-_ROOM = 8  # numbers of causes beside the baseline, at one joint
-_SHARED = 6  # steps of a payload's fit
-_WHOLE = 5  # steps of the arm's own fit
-_LEAST, _CERTAIN = 0.002, 2.5  # held-out gain and t of a cause in the arm's own simulation, below which it goes
-_PLAIN = 0.2  # of the squares: a cause that explains so much stays without another fit
-_SPREADS = "encoder_offset"  # of a joint: what the others carry is wrong by it, too
+_WORTH, _SURE, _UNSURE = 0.004, 1.64, 2.5  # held-out gain and t of a name, where more than noise is left and where not
+_CLEAR, _MUCH = 3.0, 0.25  # t and gain of a name beside which more than noise stays, unless every joint has it
+_ALIKE, _NEAR = 1.7, 0.1  # t and share of the gain within which two causes are alike
+_USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
+_TOP, _RACE = 3, 2  # candidates of a joint that are fitted, and that are fitted to the end
+_EARLY, _LATE = 3, 30  # iterations
+_ROUGH = 1e-4  # share of the squares that a step must promise while candidates are ranked
+_MOST, _CHECKS = 6, 4  # causes of a joint; candidates whose held-out squares are looked at in a round
+_LEAST = 0.002  # held-out gain below which a cause found with others is not missed
+_HOPE = 0.1  # share of a joint's squares that a cause must promise where it must take `_MUCH` in the end
+_MORE = 1.02  # of the promise of a simpler cause, which a richer one must exceed to be fitted
+_LIMITS = ("actuator_saturation", "voltage_saturation")
+_STILL = ("encoder_offset", "torque_offset", "joint_spring")  # of one joint: each makes up for the others
+_ELASTIC = ("joint_elasticity", "backlash")
+_SHARES = (0.005, 0.05, 0.3)  # twists of a spring under the largest torque, rad or m
 
 
-class _Joint(NamedTuple):
-    """One joint of the arm: its own setting, and where its numbers stand in the arm's table."""
+class _Standing(NamedTuple):
+    """The model that stands, its squares and those held out by outputs, and how far it is from noise by joint."""
 
-    setting: Setting
-    entries: np.ndarray  # of the arm's table, by the joint's
-    fit: Fit  # baseline
+    model: Model
+    squares: np.ndarray  # (blocks, windows, joints)
+    held: np.ndarray  # the same, of fits without some recordings or quarters
+    excess: np.ndarray  # (joints,)
 
 
 def search_arm(
     here: Setting, progress: Callable[[str, float], None] = lambda phase, share: None, *, forbid: Sequence[str] = ()
 ) -> Search:
     """Causes of an arm whose drives act at one joint each and whose joints are all measured."""
-    joints = _begun(here, values(here.loop, here.known.table), progress, 0.1)
-    first = _together(here, joints, [one.fit for one in joints])
+    progress("fitting the baseline", 0.05)
+    first = begun(here)
     here, wrong = _sound(here, first)
     if wrong:
-        joints = _begun(here, first.theta, progress, 0.15)
-        first = _together(here, joints, [one.fit for one in joints])
-    shared: list[Named] = []
-    theta = values(here.loop, here.known.table)
-    found: list[Search] = []
-    for number in range(_ROUNDS + 1):
-        found = _each(here, joints, [True] * len(joints), [], progress, forbid)
-        best = _shared(here, joints, found, shared, theta) if number < _ROUNDS else None
-        if best is None:
+        first = begun(here)
+    now = begin = _standing(here, Structure(here.loop, here.known.table, here.data), first, here.baseline)
+    found: list[Named] = []
+    held, steps, fits = [_rms(here, begin.held)], [("baseline", _level(here, first))], list[Fit]()
+    nearest: list[tuple[Name, float, str]] = []
+    p_value = 1.0 if not np.isfinite(first.cost) else float(max(ndtr(-4 * begin.excess.max()), 1e-12))
+    while np.isfinite(first.cost):
+        number = len(steps)
+        progress(f"looking for causes, round {number}", min(0.1 + 0.12 * number, 0.9))
+        new, now, nearest = _round(here, now, found, forbid, nearest)
+        found += new
+        if not new:
             break
-        shared.append(best[0])
-        theta = best[1]
-        joints = _begun(here, theta, progress, 0.3, [e for one in shared for e in one.candidate.entries])
-    joints, found = _rest_again(here, joints, found, theta, shared, progress, forbid)
-    progress("simulating the arm", 0.85)
-    result = _judged(here, joints, first, found, shared, theta)
-    result.setting, result.faults = here, wrong
+        steps.append(
+            (", ".join(str(Name(n.candidate.effect, n.candidate.at)) for n in new), _level(here, now.model.fit))
+        )
+        held.append(_rms(here, now.held))
+        fits.append(now.model.fit)
+        if now.excess.max() < 1.0:
+            break
+    progress("judging", 0.9)
+    result = Search(
+        "nothing", found, now.model.structure, first, now.model.fit, p_value, [], nearest, steps, held, fits,
+        begin.model.structure, here, wrong,
+    )  # fmt: skip
+    return _judged(here, result, now)
+
+
+def _judged(here: Setting, result: Search, now: _Standing) -> Search:
+    """`named` where every joint's rest is noise; `named+rest` where the names hold without each of three recordings."""
+    found = result.named
+    if now.excess.max() < 1.0:
+        result.verdict = "named" if found else "nothing"
+    elif found and by_recording(here) and found[0].t > _CLEAR:
+        result.verdict = "named+rest"
+    else:
+        result.verdict, result.proxy, result.named = "unknown", found, []
     return result
 
 
 def _sound(here: Setting, first: Fit) -> tuple[Setting, list[Fault]]:
     """The setting without the rows that no loop explains, and what is wrong with these."""
-    structure = Structure(here.loop, here.known.table, here.data)
-    model = _simulated(here, structure, first.theta, first.start)
-    if model is None:
+    read = _simulated(here, first)
+    if read is None:
         return here, []
-    n, places = here.loop.robot.nv, np.array(here.loop.measured)
-    loop = put(here.loop, here.known.table, first.theta)
-    read = [x[:, :n][:, places] + np.asarray(loop.joints.reading)[places] for x in model]
-    found = faults(loop, here.runs, read)
+    found = faults(put(here.loop, here.known.table, first.theta), here.runs, read)
     if not found:
         return here, []
     runs = without(here.runs, found)
-    data = windows(here.loop, runs, here.stretches, here.noise, here.block)
-    return replace(here, runs=runs, data=data), found
+    return replace(here, runs=runs, data=windows(here.loop, runs, here.stretches, here.noise, here.block)), found
 
 
-def _begun(
-    here: Setting, theta: np.ndarray, progress: Callable[[str, float], None], share: float, known: Sequence[int] = ()
-) -> list[_Joint]:
-    """The joints with their baselines fitted: among the measured others, then among the simulated ones corrected."""
-    joints = _joints(here, theta, progress, share, known)
-    new = theta
-    for joint in joints:
-        new = _with_own(new, joint, joint.fit.theta)
-    structure = Structure(here.loop, here.known.table, here.data)
-    model = _simulated(here, structure, new, np.concatenate(_halves([one.fit.start for one in joints])))
-    return _joints(here, new, progress, share, known, model)
-
-
-def _with_own(theta: np.ndarray, joint: _Joint, own: np.ndarray) -> np.ndarray:
-    """The arm's numbers with a joint's own in them; payloads are the arm's."""
-    new, mine = theta.copy(), [e.name != "payload" for e in joint.setting.known.table]
-    new[joint.entries[mine]] = own[: len(mine)][mine]
-    return new
-
-
-def _halves(starts: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Positions of all joints, then their rates; of an elastic joint those of the motor."""
-    return [x[[0]] for x in starts] + [x[[len(x) // 2]] for x in starts]
-
-
-def _simulated(here: Setting, structure: Structure, theta: np.ndarray, start: np.ndarray) -> list[np.ndarray] | None:
-    """Positions and rates of the joints at the rows of each recording, (rows, 2 nv), or None where they diverge."""
-    data, n = structure.data, here.loop.robot.nv
-    ny = len(here.loop.measured)
-    wide = np.zeros((data.reading.shape[0], 2 * ny, data.reading.shape[2]))
-    loop = eqx.tree_at(lambda m: m.joints.reading, structure.loop, np.zeros(structure.loop.robot.nv))
-    table = tuple(e for e in structure.table if e.name != "reading")
-    kept = np.array([e.name != "reading" for e in structure.table])
+def _simulated(here: Setting, first: Fit) -> list[np.ndarray] | None:
+    """What the encoders of a baseline read, (rows, joints) of each recording, or None where it diverges."""
     with jax.enable_x64(True):
-        both = eqx.tree_at(lambda d: (d.reading, d.weight), data, (wide, wide))
-        read = np.asarray(predicted(loop, table, theta[None, kept], both, start[None]))[0]
+        read = np.asarray(predicted(here.loop, here.known.table, first.theta[None], here.data, first.start[None]))[0]
     if not (np.abs(read) < 1e3).all():
         return None
-    places = [*here.loop.measured, *(n + k for k in here.loop.measured)]
-    found = []
+    found, ny = [], len(here.loop.measured)
     for k, run in enumerate(here.runs):
-        model = np.zeros((len(run.time), 2 * n))
+        model = np.zeros((len(run.time), ny))
         for w, one in enumerate(here.stretches):
             if one.run == k:
-                model[one.first : one.first + one.rows, places] = read[: one.rows, :, w]
-                model[one.first + one.rows :, places] = read[one.rows - 1, :, w]  # rows that no window covers
+                model[one.first : one.first + one.rows] = read[: one.rows, :ny, w]
+                model[one.first + one.rows :] = read[one.rows - 1, :ny, w]  # rows that no window covers
         found.append(model)
     return found
 
 
-def _each(
-    here: Setting,
-    joints: Sequence[_Joint],
-    wanted: Sequence[bool],
-    found: Sequence[Search],
-    progress: Callable[[str, float], None],
-    forbid: Sequence[str],
-) -> list[Search]:
-    """The search at each of the wanted joints; what was found at the others stays."""
-    new = []
-    for j, (one, again) in enumerate(zip(joints, wanted, strict=True)):
-        if again:
-            progress(f"looking for causes at joint {j + 1} of {len(joints)}", 0.2 + 0.5 * j / len(joints))
-        new.append(search(one.setting, forbid=forbid, begin=one.fit) if again else found[j])
-    return new
+def _standing(here: Setting, structure: Structure, one: Fit, free: Sequence[int]) -> _Standing:
+    """A fit with what it leaves, on the rows it was fitted to and without them."""
+    if not np.isfinite(one.cost):
+        return _Standing(Model(structure, one, tuple(free), np.inf), *(np.zeros((1, 1, 1)),) * 2, np.full(1, np.inf))
+    beyond = _excess(here, structure, one)
+    model = Model(structure, one, tuple(free), float(beyond.max()))
+    held = refitted_without(*structure, [one], here.folds, lanes=1, outputs=True)[0]
+    return _Standing(model, _outputs(here, one.sums.cost), _outputs(here, held), beyond)
 
 
-def _rest_again(
-    here: Setting,
-    joints: list[_Joint],
-    found: list[Search],
-    theta: np.ndarray,
-    shared: Sequence[Named],
-    progress: Callable[[str, float], None],
-    forbid: Sequence[str],
-) -> tuple[list[_Joint], list[Search]]:
-    """What is left at the other joints once the causes of those that gain most are in the simulation of the arm."""
-    gains = [sum(n.gain for n in (one.named or one.proxy)[:1]) * one.first.squares for one in found]
-    weak = [0 < gain < _WEAK * max(gains) for gain in gains]
-    if not any(weak):
-        return joints, found
-    kept = [[] if w else list(one.named or one.proxy) for w, one in zip(weak, found, strict=True)]
-    plain = [_plain(one) if w else one for w, one in zip(weak, found, strict=True)]
-    structure, last, _ = _assembled(here, joints, plain, kept, theta, [])
-    model = _simulated(here, structure, last.theta, last.start)
-    new = last.theta[: len(here.known.table)].copy()
-    known = [e for one in shared for e in one.candidate.entries]
-    again = _joints(here, new, progress, 0.7, known, model)
-    mixed = [again[j] if weak[j] else joints[j] for j in range(len(joints))]
-    return mixed, _each(here, mixed, weak, found, progress, forbid)
-
-
-def _plain(one: Search) -> Search:
-    """The search before its first cause."""
-    return Search("nothing", [], one.origin or one.structure, one.first, one.first, 1.0)
-
-
-def arm_begun(here: Setting) -> Fit:
-    """The baseline's fit of an arm, joint by joint; its sums leave out what a joint does to the others."""
-    joints = _begun(here, values(here.loop, here.known.table), lambda phase, share: None, 0.0)
-    return _together(here, joints, [one.fit for one in joints])
-
-
-def _joints(
-    here: Setting,
-    theta: np.ndarray,
-    progress: Callable[[str, float], None],
-    share: float,
-    known: Sequence[int] = (),
-    simulated: Sequence[np.ndarray] | None = None,
-) -> list[_Joint]:
-    """Each joint's own setting, at the arm's numbers `theta`, with the baseline fitted; entries `known` stay."""
-    loop = put(here.loop, here.known.table, theta)
-    loop = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array_like(x) else x, loop)
-    carried = carried_by(loop, here.runs, simulated)
-    found = []
-    for j in range(here.loop.robot.nv):
-        progress(f"fitting joint {j + 1} of {here.loop.robot.nv}", share + 0.1 * j / here.loop.robot.nv)
-        small, runs = alone(loop, here.runs, carried, j)
-        drives = np.flatnonzero(np.asarray(loop.drives.transmission)[:, j])
-        mine = [k for k, e in enumerate(here.known.table) if _of(e, j, drives)]
-        place = {int(d): i for i, d in enumerate(drives)}
-        table = tuple(Entry(e.name, _place(e, place)) for e in (here.known.table[k] for k in mine))
-        at = {k: i for i, k in enumerate(mine)}
-        own = tuple(
-            c._replace(entries=tuple(at[e] for e in c.entries))
-            for c in here.known.candidates
-            if c.effect != "payload" and all(e in at for e in c.entries) and not set(c.entries) & set(known)
-        )
-        column = int(np.flatnonzero(np.array(here.loop.measured) == j)[0])
-        noise = tuple(x[[column]] for x in here.noise)
-        data = windows(small, runs, here.stretches, noise, here.block)
-        free = tuple(at[k] for k in (*here.baseline, *known) if k in at and here.known.table[k].name != "payload")
-        links = sum(e.name == "payload" for e in table)
-        setting = Setting(
-            small, runs, data, noise, Catalogue(table, own), free, here.folds, 8, len(free) + max(_ROOM, links),
-            here.stretches, here.block,
-        )  # fmt: skip
-        found.append(_Joint(setting, np.array(mine), begun(setting)))
+def _outputs(here: Setting, squares: np.ndarray) -> np.ndarray:
+    """Squares by outputs as squares by joints of the robot: rates go with their positions."""
+    places, count = list(here.loop.measured), len(here.loop.measured)
+    found = np.zeros((*squares.shape[:2], here.loop.robot.nv))
+    for first in range(0, squares.shape[2], count):
+        found[..., places] += squares[..., first : first + count]
     return found
 
 
-_OF_DRIVES = ("scale", "delay", "dead_band", "voltage", "force_limit", "kp", "kd", "time_constant")
+def _excess(here: Setting, structure: Structure, one: Fit) -> np.ndarray:
+    """How far each joint's residual is above noise."""
+    error, weight = residuals(structure, one), np.asarray(structure.data.weight)
+    count, found = len(here.loop.measured), np.zeros(here.loop.robot.nv)
+    for k, place in enumerate(here.loop.measured):
+        mine = slice(k, None, count)
+        found[place] = excess(error[:, mine], weight[:, mine]) if (weight[:, mine] > 0).any() else 0.0
+    return found
 
 
-def _of(entry: Entry, joint: int, drives: np.ndarray) -> bool:
-    if entry.name == "payload":
-        return True
-    return all(k in drives for k in entry.at) if entry.name in _OF_DRIVES else entry.at == (joint,)
+def _round(
+    here: Setting, now: _Standing, found: Sequence[Named], forbid: Sequence[str], nearest: list
+) -> tuple[list[Named], _Standing, list]:
+    """Causes to name next, at most one of each joint, and the model with them."""
+    tried = _tried(here, now, [n.candidate for n in found], forbid)
+    lists: dict[int, list[Tried]] = {}
+    for one in tried:
+        lists.setdefault(_joint(here, one.candidate), []).append(one)
+    if not lists:
+        return [], now, nearest
+    ordered = {j: [one for one in _ordered(now, ones) if _worthy(here, now, one)] for j, ones in lists.items()}
+    kept: list[Named] = []
+    for _ in range(_CHECKS):
+        firsts = sorted((ones[0] for ones in ordered.values() if ones), key=lambda one: -_gained(now, one))
+        if not firsts:
+            break
+        chosen = firsts[:1]
+        if chosen[0].candidate.effect in BASELINE:  # what every joint has is found at all of them at once
+            chosen = [one for one in firsts if one.candidate.effect in BASELINE]
+        new = _named(here, now, lists, chosen)
+        if new is not None:
+            kept, now = new
+            break
+        ordered = {j: [one for one in ones if all(one is not x for x in chosen)] for j, ones in ordered.items()}
+    close = sorted(tried, key=lambda one: one.state.fit.cost)[:_TOP]
+    total = float(now.squares.sum())
+    if not kept:
+        nearest = [
+            (Name(one.candidate.effect, one.candidate.at), max((total - one.state.fit.squares) / total, 0.0),
+             "gains too little on data that it was not fitted to")
+            for one in close
+        ]  # fmt: skip
+    return kept, now, nearest
 
 
-def _place(entry: Entry, drives: dict[int, int]) -> tuple[int, ...]:
-    if entry.name == "payload":
-        return entry.at
-    return tuple(drives[k] for k in entry.at) if entry.name in _OF_DRIVES else (0,)
+def _joint(here: Setting, c: Candidate) -> int:
+    """The joint whose encoder shows a cause; -1: those of several."""
+    return -1 if c.effect == "payload" else here.loop.robot.dof_names.index(c.at[0])
 
 
-def _shared(
-    here: Setting, joints: Sequence[_Joint], found: Sequence[Search], named: Sequence[Named], base: np.ndarray
-) -> tuple[Named, np.ndarray] | None:
-    """The cause of several joints that explains more than any cause of one, with the arm's numbers where it stands."""
-    before = [held_out(one.fit, one.setting.data, here.folds) for one in joints]
-    firsts = [(one.named or one.proxy)[:1] for one in found]
-    gains = [float(b.sum() * f[0].gain) if f else 0.0 for b, f in zip(before, firsts, strict=True)]
-    whole = float(sum(b.sum() for b in before))
-    best: tuple[Named, np.ndarray] | None = None
-    most = max(gains, default=0.0)
-    links = [c for c in here.known.candidates if c.effect == "payload" and c not in [n.candidate for n in named]]
-    rest = max(level_of(one.fit, np.asarray(one.setting.data.weight)) for one in joints)
-    if links and rest > 1.05:
-        candidate, thetas, fits = _payload(here, joints, links, base)
-        after = [held_out(f, one.setting.data, here.folds) for f, one in zip(fits, joints, strict=True)]
-        gain = sum(float((b - a).sum()) for b, a in zip(before, after, strict=True))
-        t = t_of(np.concatenate([b.ravel() for b in before]), np.concatenate([a.ravel() for a in after]))
-        if gain > most and t > 2.5 and gain > 0.004 * whole:
-            rms = [_rms(here, np.concatenate([x.ravel() for x in part])) for part in (before, after)]
-            return Named(candidate, t, gain / whole, (), *rms), thetas
-    j = int(np.argmax(gains))
-    if most > 0 and firsts[j] and firsts[j][0].candidate.effect == _SPREADS and len([g for g in gains if g > 0]) > 1:
-        one, fitted = firsts[j][0], found[j].fits[0]
-        theta = base
-        for joint in joints:
-            theta = _with_own(theta, joint, joint.fit.theta)
-        theta = _with_own(theta, joints[j], fitted.theta)
-        mine = one.candidate._replace(entries=tuple(int(joints[j].entries[e]) for e in one.candidate.entries))
-        best = one._replace(candidate=mine), theta
-    return best
+def _gained(now: _Standing, one: Tried) -> float:
+    """Squares of the whole arm by which a fitted candidate is better."""
+    return float(now.squares.sum() - one.sse.sum())
+
+
+def _worthy(here: Setting, now: _Standing, one: Tried) -> bool:
+    """Whether a candidate takes so much of what it was fitted to that held-out rows can bear it out."""
+    j = _joint(here, one.candidate)
+    mine = slice(None) if j < 0 else slice(j, j + 1)
+    gain = 1 - one.sse[..., mine].sum() / max(now.squares[..., mine].sum(), 1e-300)
+    rest = by_recording(here) and one.state.excess >= 1.0
+    return bool(gain > (_MUCH if rest and one.candidate.effect not in BASELINE else _WORTH))
+
+
+def _ordered(now: _Standing, ones: Sequence[Tried]) -> list[Tried]:
+    """Candidates of a joint in the order in which they may be named: what every joint has before what few have."""
+    ranked = sorted(ones, key=lambda one: -_gained(now, one))
+    first, best = ranked[0], _gained(now, ranked[0])
+    if best <= 0:
+        return []
+    rest = first.state.excess >= 1.0
+    usual = [x for x in ranked if rest and x.candidate.effect in BASELINE and _gained(now, x) > _USUAL * best]
+    if first.candidate.effect == "stribeck_friction":  # more friction at rest: beside friction, not without it
+        usual += [x for x in ranked if rest and x.candidate.effect == "friction_loss" and x not in usual]
+    simple = [
+        x for x in ranked
+        if x.candidate.effect in CONTAINS.get(first.candidate.effect, ())
+        and (t_of(x.sse.sum(-1), first.sse.sum(-1)) < _ALIKE or x.sse.sum() <= 1.002 * first.sse.sum())
+    ]  # fmt: skip
+    front = usual[:1] or simple[:1]
+    return front + [x for x in ranked if all(x is not other for other in front)]
+
+
+def _named(
+    here: Setting, now: _Standing, lists: dict[int, list[Tried]], chosen: Sequence[Tried]
+) -> tuple[list[Named], _Standing] | None:
+    """The chosen causes that hold: all fitted together, those that held-out rows or the others do not need left out."""
+    chosen = list(chosen)
+    while chosen:
+        new = chosen[0].state if len(chosen) == 1 else _together(here, now, chosen)
+        new = _again(here, new)
+        with_all = _standing(here, new.structure, new.fit, new.free)
+        checks = [_check(here, now, with_all, one) for one in chosen]
+        keep = [one for one, (good, _, _) in zip(chosen, checks, strict=True) if good]
+        if len(keep) < len(chosen):
+            chosen = keep
+            continue
+        spare = _spare(here, with_all, chosen) if len(chosen) > 1 else None
+        if spare is None:
+            named = [_name(here, now, with_all, one, lists, check) for one, check in zip(chosen, checks, strict=True)]
+            return sorted(named, key=lambda n: n.after**2 - n.before**2), with_all
+        chosen = [one for one in chosen if one is not spare]
+    return None
+
+
+def _together(here: Setting, now: _Standing, chosen: Sequence[Tried]) -> Model:
+    """All chosen causes in one fit, from where each ended by itself."""
+    elastic = next((one for one in chosen if one.candidate.elastic), None)
+    structure, start = (now.model.structure, now.model.fit.start) if elastic is None else (
+        elastic.state.structure, elastic.state.fit.start)  # fmt: skip
+    theta = (now.model.fit if elastic is None else elastic.state.fit).theta.copy()
+    free = list(now.model.free)
+    for one in chosen:
+        entries = list(one.candidate.entries)
+        own = free_entries([k for k in now.model.free if _of_joint(here, k, one.candidate)], entries)
+        theta[own] = one.state.fit.theta[own]
+        free = free_entries(free, entries)
+    last = fit(*structure, theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
+               iterations=_LATE)[0]  # fmt: skip
+    return Model(structure, last, tuple(free), 0.0)
+
+
+def _again(here: Setting, new: Model) -> Model:
+    """The fit once more from the numbers of the model file, the causes where they are: the better of both.
+
+    A baseline that was fitted without a cause may end in another valley than with it.
+    """
+    structure, last = new.structure, new.fit
+    if not np.isfinite(last.cost) or _excess(here, structure, last).max() < 1.0:
+        return new
+    theta, stated = last.theta.copy(), values(structure.loop, structure.table)
+    theta[list(here.baseline)] = stated[list(here.baseline)]
+    start, n, more = np.array(last.start), here.loop.robot.nv, structure.loop.robot.nv - here.loop.robot.nv
+    begin = np.asarray(here.data.start)
+    start[:n], start[n + more : 2 * n + more] = begin[:n], begin[n:]
+    other = fit(*structure, theta[None], [new.free], start[None], width=max(here.width, len(new.free)), lanes=1,
+                iterations=_LATE)[0]  # fmt: skip
+    return new._replace(fit=other) if other.cost < last.cost else new
+
+
+def _of_joint(here: Setting, entry: int, c: Candidate) -> bool:
+    """Whether a number belongs to the joint of a cause."""
+    mine = {k for other in here.known.candidates if other.at == c.at for k in other.entries}
+    name = here.known.table[entry] if entry < len(here.known.table) else None
+    return entry in mine or (name is not None and entry in _numbers(here, c))
+
+
+def _numbers(here: Setting, c: Candidate) -> set[int]:
+    """Entries of the table at the joint of a cause."""
+    j = here.loop.robot.dof_names.index(c.at[0]) if c.effect != "payload" else -1
+    drives = np.flatnonzero(np.asarray(here.loop.drives.transmission)[:, j]) if j >= 0 else []
+    of_drive = ("scale", "delay", "dead_band", "voltage", "force_limit")
+    return {k for k, e in enumerate(here.known.table)
+            if (e.at[0] in drives if e.name in of_drive else e.at == (j,) and e.name != "payload")}  # fmt: skip
+
+
+def _check(here: Setting, now: _Standing, new: _Standing, one: Tried) -> tuple[bool, float, float]:
+    """Whether a cause holds on rows that were not fitted, with its gain there and its t."""
+    j = _joint(here, one.candidate)
+    mine = slice(None) if j < 0 else slice(j, j + 1)
+    before, after = now.held[..., mine].sum(-1), new.held[..., mine].sum(-1)
+    gain = 1 - after.sum() / max(before.sum(), 1e-300)
+    if by_recording(here):  # no more than on the data themselves: the rest is luck of a fit without a recording
+        gain = min(gain, 1 - new.squares[..., mine].sum() / max(now.squares[..., mine].sum(), 1e-300))
+    t, noise = t_of(before, after), float(new.excess[mine].max()) < 1.0
+    if noise and float(now.excess[mine].max()) >= 1.0:  # all that is seen is explained, be it in a few places only
+        t = max(t, float(np.sqrt(max(before.sum() - after.sum(), 0.0))) / 2)
+    rest = by_recording(here) and not noise
+    usual = one.candidate.effect in BASELINE
+    sure = _SURE if float(now.excess[mine].max()) >= 1.0 else _UNSURE
+    needed = _CLEAR if rest and not (usual and gain > _MUCH) else sure
+    worth = _MUCH if rest and not usual else _WORTH
+    state = Model(new.model.structure, new.model.fit, new.model.free, 0.0)
+    good = gain > worth and t > needed and sized(here, one._replace(state=state))
+    return bool(good), float(gain), t
+
+
+def _spare(here: Setting, new: _Standing, chosen: Sequence[Tried]) -> Tried | None:
+    """The cause, if any, that its joint does not need beside the others: the least one first."""
+    structure, last = new.model.structure, new.model.fit
+    for one in sorted(chosen, key=lambda one: _gained(new, one), reverse=True):
+        if one.candidate.elastic:
+            continue
+        j, entries = _joint(here, one.candidate), list(one.candidate.entries)
+        theta = last.theta.copy()
+        theta[entries] = values(structure.loop, structure.table)[entries]
+        free = [k for k in new.model.free if k not in entries or k in here.baseline]
+        other = fit(*structure, theta[None], [free], last.start[None], width=max(here.width, len(free)), lanes=1,
+                    iterations=_LATE, rough=_ROUGH)[0]  # fmt: skip
+        if not np.isfinite(other.cost):
+            continue
+        before, after = _outputs(here, other.sums.cost)[..., j], new.squares[..., j]
+        if (before.sum() - after.sum()) / before.sum() < _LEAST or t_of(before, after) < _SURE:
+            return one
+    return None
+
+
+def _name(
+    here: Setting,
+    now: _Standing,
+    new: _Standing,
+    one: Tried,
+    lists: dict[int, list[Tried]],
+    check: tuple[bool, float, float],
+) -> Named:
+    """The name with its gain and with the causes that the rows tell no better."""
+    j = _joint(here, one.candidate)
+    mine = slice(None) if j < 0 else slice(j, j + 1)
+    most = _gained(now, one)
+    alike = []
+    for other in lists.get(j, []):
+        contained = other.candidate.effect in CONTAINS and one.candidate.effect in CONTAINS[other.candidate.effect]
+        comparable = other.state.excess < 1.0 or one.state.excess >= 1.0
+        if other is one or contained or not comparable or most - _gained(now, other) > _NEAR * most:
+            continue
+        if t_of(other.sse[..., mine].sum(-1), one.sse[..., mine].sum(-1)) < _ALIKE and sized(here, other):
+            alike.append(Name(other.candidate.effect, other.candidate.at))
+    before, after = (_rms(here, x[..., mine]) for x in (now.held, new.held))
+    return Named(one.candidate, check[2], check[1], tuple(alike), before, after)
+
+
+def _level(here: Setting, one: Fit) -> float:
+    return level_of(one, np.asarray(here.data.weight))
 
 
 def _rms(here: Setting, squares: np.ndarray) -> float:
-    count = (np.asarray(here.data.weight) > 0).sum()
-    return float(np.sqrt(max(squares.sum(), 0.0) / count * np.mean(here.noise[0] ** 2)))
+    """Whitened squares by joints as an RMS over the rows of all of them: rad, or m."""
+    count = (np.asarray(here.data.weight) > 0).sum() / here.loop.robot.nv * squares.shape[-1]
+    return float(np.sqrt(max(squares.sum(), 0.0) / max(count, 1) * np.mean(here.noise[0] ** 2)))
 
 
-def _payload(
-    here: Setting, joints: Sequence[_Joint], links: Sequence[Candidate], base: np.ndarray
-) -> tuple[Candidate, np.ndarray, list[Fit]]:
-    """The link whose payload lowers the squares of all joints most, fitted with every joint's own numbers."""
-    entries = [c.entries[0] for c in links]
-    fits, systems = _payload_systems(here, joints, [one.fit for one in joints], entries)
-    scores = [_shared_step(systems, k, 1e-6)[2] for k in range(len(links))]
-    best = int(np.argmax(scores))
-    fits, systems = _payload_systems(here, joints, fits, entries[best : best + 1])
-    cost, damping = sum(f.cost for f in fits), 1e-4
-    for _ in range(_SHARED):
-        steps, mass, promised = _shared_step(systems, 0, damping)
-        if promised < 0.05:
-            break
-        moved = [
-            _moved(f, joint, step, mass, entries[best]) for f, joint, step in zip(fits, joints, steps, strict=True)
-        ]
-        new, other = _payload_systems(here, joints, moved, entries[best : best + 1])
-        if sum(f.cost for f in new) < cost:
-            fits, systems, cost, damping = new, other, sum(f.cost for f in new), damping / 5
-        else:
-            damping *= 10
-    theta = base
-    for joint, one in zip(joints, fits, strict=True):
-        theta = _with_own(theta, joint, one.theta)
-    theta[entries[best]] += fits[0].theta[int(np.flatnonzero(joints[0].entries == entries[best])[0])]
-    return links[best], theta, [_without(f, joint, entries[best]) for f, joint in zip(fits, joints, strict=True)]
-
-
-def _payload_systems(
-    here: Setting, joints: Sequence[_Joint], fits: Sequence[Fit], entries: Sequence[int]
-) -> tuple[list[Fit], list[tuple]]:
-    """Each joint evaluated with its own numbers and the payloads free: normal equations without the states."""
-    made, systems = [], []
-    for joint, one in zip(joints, fits, strict=True):
-        s = joint.setting
-        local = [int(np.flatnonzero(joint.entries == e)[0]) for e in entries]
-        free = [*s.baseline, *local]
-        new = fit(s.loop, s.known.table, s.data, one.theta[None], [free], one.start[None],
-                  width=s.width, lanes=s.lanes, iterations=0)[0]  # fmt: skip
-        made.append(new)
-        system = System(new.sums, s.data, new.start)
-        systems.append((*system.reduced(1e-9), len(s.baseline), system))
-    return made, systems
-
-
-def _shared_step(systems: Sequence[tuple], which: int, damping: float) -> tuple[list[np.ndarray], float, float]:
-    """Damped step of every joint's own numbers and of one payload for all, and the decrease that it promises."""
-    own, right, curve, slope = [], [], 0.0, 0.0
-    for matrix, vector, count, _ in systems:
-        keep = [*range(count), count + which]
-        m, v = matrix[np.ix_(keep, keep)], vector[keep]
-        m = m + damping * np.diag(np.diag(m)) + 1e-12 * np.eye(len(m))
-        inner = np.linalg.solve(m[:-1, :-1], np.column_stack([m[:-1, -1], v[:-1]])) if count else np.zeros((0, 2))
-        own.append(inner)
-        right.append((m, v))
-        curve += m[-1, -1] - m[-1, :-1] @ inner[:, 0]
-        slope += v[-1] - m[-1, :-1] @ inner[:, 1]
-    mass = slope / max(curve, 1e-12)
-    steps = [inner[:, 1] - inner[:, 0] * mass for inner in own]
-    gain = slope * mass + sum(float(v[:-1] @ inner[:, 1]) for (_, v), inner in zip(right, own, strict=True))
-    return steps, float(mass), float(gain)
-
-
-def _moved(one: Fit, joint: _Joint, step: np.ndarray, mass: float, entry: int) -> Fit:
-    theta = one.theta.copy()
-    low, high = joint.setting.bounds.T
-    free = list(joint.setting.baseline)
-    theta[free] = np.clip(theta[free] + step, low[free], high[free])
-    theta[int(np.flatnonzero(joint.entries == entry)[0])] += mass
-    return one._replace(theta=theta)
-
-
-def _without(one: Fit, joint: _Joint, entry: int) -> Fit:
-    """The fit with that entry known."""
-    local = int(np.flatnonzero(joint.entries == entry)[0])
-    return one._replace(free=np.where(one.free == local, -1, one.free))
-
-
-def _judged(
-    here: Setting,
-    joints: Sequence[_Joint],
-    first: Fit,
-    found: Sequence[Search],
-    shared: list[Named],
-    base: np.ndarray,
-) -> Search:
-    """All causes in the arm's own structure, the arm simulated, and what is left of it."""
-    lists = [list(one.named or one.proxy) for one in found]
-    payloads = [one.candidate.entries[0] for one in shared if one.candidate.effect == "payload"]
-    structure, last, named = _needed(here, joints, found, lists, base, payloads)
-    weight = np.asarray(here.data.weight)
-    left = excess(residuals(structure, last), np.asarray(structure.data.weight))
-    begin = Model(Structure(here.loop, here.known.table, here.data), first, here.baseline, 0.0)
-    now = Model(structure, last, tuple(last.free), left)
-    named = [*shared, *named]
-    steps = [("baseline", level_of(first, weight)), ("all causes", level_of(last, weight))]
-    nearest = [x for one in found for x in one.nearest]
-    p = min([one.p_value for one in found] + ([1e-12] if shared else []))
-    return judged(here, begin, now, named, p, steps, nearest)
-
-
-def _needed(
-    here: Setting,
-    joints: Sequence[_Joint],
-    found: Sequence[Search],
-    lists: list[list[Named]],
-    base: np.ndarray,
-    payloads: Sequence[int],
-) -> tuple[Structure, Fit, list[Named]]:
-    """The arm's own fit with the causes that its simulation needs: a joint alone also shows what others' noise makes.
-
-    The cause that explains least goes first; it stays where held-out squares of the arm are clearly fewer with it.
-    """
-    structure, last, named = _assembled(here, joints, found, lists, base, payloads)
-    last, gone = _refitted(here, structure, last), set[tuple]()
-    for one in reversed(named[1:] if len(named) > 1 and not payloads else list(named)):
-        if one.candidate.elastic:
-            j = here.loop.robot.dof_names.index(one.candidate.at[0])
-            fewer = [[n for n in own if not n.candidate.elastic] if k == j else own for k, own in enumerate(lists)]
-            rigid = [_rigid(joints[k], f) if k == j else f for k, f in enumerate(found)]
-            other, without, names = _assembled(here, joints, rigid, fewer, base, payloads)
-            for past in [n for n in names if (n.candidate.effect, n.candidate.at) in gone]:
-                without = _fitted_without(here, other, without, past)
-            without = _refitted(here, other, without)
-            if not _worse(here, other, without, structure, last):
-                structure, last, found, lists = other, without, rigid, fewer
-                gone.add((one.candidate.effect, one.candidate.at))
-                named = [n for n in names if (n.candidate.effect, n.candidate.at) not in gone]
+def _tried(here: Setting, now: _Standing, named: Sequence[Candidate], forbid: Sequence[str]) -> list[Tried]:
+    """The candidates that one linear step promises most at each joint that is open, fitted."""
+    model, n = now.model, here.loop.robot.nv
+    rigid = model.structure.loop.robot.nv == n
+    open_joints = [j for j in range(n) if now.excess[j] >= 1.0] or list(range(n))
+    used = {(c.effect, c.at) for c in named}
+    still = {c.at for c in named if c.effect in _STILL}
+    count = {at: sum(c.at == at for c in named) for at in {c.at for c in named}}
+    left = [
+        c for c in here.known.candidates
+        if (c.effect, c.at) not in used and not set(c.entries) <= set(model.free)
+        and not (c.effect in _STILL and c.at in still) and count.get(c.at, 0) < _MOST
+        and (_joint(here, c) < 0 or _joint(here, c) in open_joints)
+    ]  # fmt: skip
+    own, cost = now.squares.sum((0, 1)), model.fit.cost
+    plain = [c for c in left if c.effect not in _LIMITS]
+    best: dict[int, list[_Ranked]] = {}
+    for k, (score, theta) in scored(here, model, plain).items():
+        best.setdefault(_joint(here, plain[k]), []).append(_Ranked(cost - score, model.structure, plain[k], theta))
+    for j in open_joints:
+        common = [one for one in best.get(j, []) if one.candidate.effect in BASELINE and one.promise > _USUAL * own[j]]
+        if common and now.excess[j] >= 1.0:  # nothing that few joints have can come before it
+            best[j] = [max(common, key=lambda one: one.promise)]
             continue
-        if _promised(structure, last, one) > _PLAIN * last.squares:
+        limits = [c for c in left if c.effect in _LIMITS and _joint(here, c) == j]
+        for k, (score, theta) in scored(here, model, limits).items():
+            best.setdefault(j, []).append(_Ranked(cost - score, model.structure, limits[k], theta))
+        if rigid and now.excess.max() >= 1.0:
+            best.setdefault(j, []).extend(_sprung(here, now, j, forbid))
+    tried = []
+    for j, ones in best.items():
+        ranked = sorted(ones, key=lambda one: -one.promise)
+        ranked = [one for k, one in enumerate(ranked) if all(one[2] is not other[2] for other in ranked[:k])]
+        ranked = [one for one in ranked if not _no_more(one, ranked)]
+        least = (_HOPE if by_recording(here) and now.excess.max() >= 1.0 else 0.0) * own[j]
+        hopeful = [one for one in ranked if j < 0 or one.promise > least or one.candidate.effect in BASELINE]
+        tried += _fitted(here, now, hopeful[: _TOP if j >= 0 else 1])
+    return tried
+
+
+def _no_more(one: _Ranked, ranked: Sequence[_Ranked]) -> bool:
+    """Whether a candidate promises hardly more than one that it contains."""
+    simple = CONTAINS.get(one.candidate.effect, ())
+    return any(other.candidate.effect in simple and one.promise < _MORE * other.promise for other in ranked)
+
+
+class _Ranked(NamedTuple):
+    """A candidate with the decrease of the squares that one linear step promises."""
+
+    promise: float
+    structure: Structure
+    candidate: Candidate
+    theta: np.ndarray
+
+
+def _fitted(here: Setting, now: _Standing, ranked: Sequence[_Ranked]) -> list[Tried]:
+    """Candidates of one joint: a few steps of each, then the leaders to the end."""
+    early = []
+    for _, structure, c, theta in ranked:
+        starts = [theta] if c.elastic or not c.starts else [start_values(theta, c, x) for x in c.starts]
+        start = _start_of(now, structure)
+        free = free_entries(now.model.free, c.entries)
+        fits = [
+            fit(*structure, x[None], [free], start[None], width=max(here.width, len(free)), lanes=1, iterations=_EARLY,
+                rough=_ROUGH)[0]
+            for x in starts
+        ]  # fmt: skip
+        early.append((min(fits, key=lambda f: f.cost), structure, c, free))
+    found = []
+    for one, structure, c, free in sorted(early, key=lambda x: x[0].cost)[:_RACE]:
+        if not np.isfinite(one.cost):
             continue
-        without = _fitted_without(here, structure, last, one)
-        if not _worse(here, structure, without, structure, last):
-            last = without
-            gone.add((one.candidate.effect, one.candidate.at))
-            named = [n for n in named if (n.candidate.effect, n.candidate.at) not in gone]
-    return structure, last, named
+        last = fit(*structure, one.theta[None], [free], one.start[None], width=max(here.width, len(free)), lanes=1,
+                   iterations=_LATE, rough=_ROUGH / 10)[0]  # fmt: skip
+        beyond = _excess(here, structure, last)
+        j = _joint(here, c)
+        state = Model(structure, last, tuple(free), float(beyond.max() if j < 0 else beyond[j]))
+        found.append(Tried(c, state, _outputs(here, last.sums.cost)))
+    return found
 
 
-def _neutral(structure: Structure, one: Named) -> np.ndarray:
-    """The numbers of a cause where it does nothing: those of the model as stated."""
-    stated = values(structure.loop, structure.table)
-    return stated[list(one.candidate.entries)]
+def _start_of(now: _Standing, structure: Structure) -> np.ndarray:
+    """The states at the windows' starts, in a structure that may have a spring more."""
+    start, n = now.model.fit.start, now.model.structure.loop.robot.nv
+    more = structure.loop.robot.nv - n
+    zero = np.zeros((more, start.shape[1]))
+    return np.concatenate([start[:n], zero, start[n:], zero]) if more else start
 
 
-def _promised(structure: Structure, last: Fit, one: Named) -> float:
-    """Squares that come back without a cause, to second order, everything else following."""
-    free, entries = last.free.tolist(), list(one.candidate.entries)
-    if any(entry not in free for entry in entries):
-        return 0.0
-    matrix, _ = System(last.sums, structure.data, last.start).reduced(1e-9)
-    mine = np.array([free.index(entry) for entry in entries])
-    rest = np.array([k for k, entry in enumerate(free) if entry >= 0 and entry not in entries])
-    step = last.theta[entries] - _neutral(structure, one)
-    if not np.isfinite(step).all():  # a limit that is far away
-        return 0.0
-    inner = np.linalg.lstsq(matrix[np.ix_(rest, rest)], matrix[np.ix_(rest, mine)], rcond=1e-12)[0]
-    return float(step @ (matrix[np.ix_(mine, mine)] - matrix[np.ix_(mine, rest)] @ inner) @ step)
-
-
-def _fitted_without(here: Setting, structure: Structure, last: Fit, one: Named) -> Fit:
-    theta, entries = last.theta.copy(), list(one.candidate.entries)
-    theta[entries] = _neutral(structure, one)
-    free = [k for k in last.free.tolist() if k >= 0 and (k not in entries or k in here.baseline)]
-    return fit(
-        *structure, theta[None], [free], last.start[None], width=max(here.width, len(free)), lanes=1, iterations=_WHOLE
-    )[0]
-
-
-def _worse(here: Setting, structure: Structure, without: Fit, full: Structure, last: Fit) -> bool:
-    """Whether held-out squares of the arm are clearly more without a cause than with it."""
-    if not np.isfinite(without.cost):
-        return True
-    before, after = held_out(without, structure.data, here.folds), held_out(last, full.data, here.folds)
-    gain = (before.sum() - after.sum()) / before.sum()
-    return bool(gain > _LEAST and t_of(before, after) > _CERTAIN)
-
-
-def _rigid(joint: _Joint, one: Search) -> Search:
-    """What was found at a joint, its spring left out."""
-    known, n = len(joint.setting.known.table), joint.setting.loop.robot.nv
-    keep = [n2 for n2 in (one.named or one.proxy) if not n2.candidate.elastic]
-    s, last = joint.setting, one.last
-    free = [int(k) for k in last.free if 0 <= k < known]
-    start = last.start[[0, len(last.start) // 2]] if len(last.start) > 2 * n else last.start
-    plain = Structure(s.loop, s.known.table, s.data)
-    again = fit(
-        *plain, last.theta[None, :known], [free], start[None],
-        width=max(s.width, len(free)), lanes=s.lanes, iterations=_SHARED,
-    )[0]  # fmt: skip
-    return Search(one.verdict, keep, plain, one.first, again, one.p_value, [], one.nearest)
-
-
-def _refitted(here: Setting, structure: Structure, last: Fit) -> Fit:
-    """The arm's own fit of everything that is free, by its exact sensitivities, from where its joints' fits ended."""
-    width = max(here.width, len(last.free))
-    begin = fit(
-        *structure, last.theta[None], [list(last.free)], last.start[None], width=width, lanes=1, iterations=_WHOLE
-    )
-    return begin[0] if np.isfinite(begin[0].cost) and begin[0].cost <= last.cost else last
-
-
-def _assembled(
-    here: Setting,
-    joints: Sequence[_Joint],
-    found: Sequence[Search],
-    lists: Sequence[list[Named]],
-    base: np.ndarray,
-    payloads: Sequence[int],
-) -> tuple[Structure, Fit, list[Named]]:
-    """The arm with every joint's causes, and the payloads that were named, at the arm's numbers `base`."""
-    loop, table, data = here.loop, here.known.table, here.data
-    theta = base.copy()
-    n, sprung = loop.robot.nv, [j for j, one in enumerate(found) if len(one.structure.table) > len(joints[j].entries)]
-    for j in sprung:
-        loop = elastic_loop(loop, j, *found[j].last.theta[len(joints[j].entries) :][:2])
-        at = loop.robot.nv - 1
-        table = (*table, *(Entry(name, (at,)) for name in ("stiffness", "damping", "play")))
-        theta = np.concatenate([theta, found[j].last.theta[-3:]])
-    if sprung:
-        data = windows(loop, here.runs, here.stretches, here.noise, here.block)
-    maps, named = [], []
-    for j, one in enumerate(found):
-        extra = len(here.known.table) + 3 * sprung.index(j) + np.arange(3) if j in sprung else np.zeros(0, int)
-        maps.append(np.concatenate([joints[j].entries, extra]).astype(int))
-        payload = [here.known.table[k].name == "payload" for k in joints[j].entries]
-        own = np.append(~np.array(payload), np.ones(len(extra), bool))
-        theta[maps[j][own]] = one.last.theta[own]
-        for cause in lists[j]:
-            entries = tuple(int(maps[j][e]) for e in cause.candidate.entries)
-            own = cause.candidate._replace(entries=entries, at=(here.loop.robot.dof_names[j],))
-            alike = tuple(a._replace(at=own.at) for a in cause.alike)
-            named.append((cause._replace(candidate=own, alike=alike), j))
-    named = [c for c, _ in _in_order(named, joints)]
-    structure = Structure(loop, table, data)
-    fits = [_with_payloads(one, joint, payloads) for one, joint in zip(found, joints, strict=True)]
-    return structure, _assembled_fit(structure, fits, maps, theta, n), named
-
-
-def _with_payloads(found: Search, joint: _Joint, payloads: Sequence[int]) -> Fit:
-    """The joint's last fit, evaluated with the arm's payloads free as well."""
-    if not payloads:
-        return found.last
-    last, s = found.last, joint.setting
-    local = [int(np.flatnonzero(joint.entries == e)[0]) for e in payloads]
-    free = [*last.free[last.free >= 0], *local]
-    return fit(*found.structure, last.theta[None], [free], last.start[None],
-               width=max(s.width, len(free)), lanes=s.lanes, iterations=0)[0]  # fmt: skip
-
-
-def _in_order(named: list[tuple], joints: Sequence[_Joint]) -> list[tuple]:
-    """The causes of all joints by what they explain, each joint's own order kept."""
-    size = lambda one: one[0].before ** 2 - one[0].after ** 2  # noqa: E731
-    queues = [[one for one in named if one[1] == j] for j in range(len(joints))]
-    ordered = []
-    while any(queues):
-        best = max((q for q in queues if q), key=lambda q: size(q[0]))
-        ordered.append(best.pop(0))
-    return ordered
-
-
-def _together(here: Setting, joints: Sequence[_Joint], fits: Sequence[Fit]) -> Fit:
-    theta = values(here.loop, here.known.table)
-    for joint, one in zip(joints, fits, strict=True):
-        theta[joint.entries] = one.theta
-    structure = Structure(here.loop, here.known.table, here.data)
-    return _assembled_fit(structure, fits, [joint.entries for joint in joints], theta, here.loop.robot.nv)
-
-
-def _assembled_fit(
-    structure: Structure, fits: Sequence[Fit], maps: Sequence[np.ndarray], theta: np.ndarray, n: int
-) -> Fit:
-    """One fit of the arm: squares of its own simulation, each joint's sensitivities to its own numbers."""
-    size = structure.loop.robot.nv
-    frees = [one.free[one.free >= 0] for one in fits]
-    free = np.array(list(dict.fromkeys(int(k) for j, f in enumerate(frees) for k in maps[j][f])), int)
-    place = {int(k): i for i, k in enumerate(free)}
-    blocks, count, m = *fits[0].sums.cost.shape[:2], len(free)
-    states, start = 2 * size, np.zeros((2 * size, count))
-    gradient = np.zeros((blocks, count, m + states))
-    matrix = np.zeros((blocks, count, m + states, m + states))
-    spring = n
-    for j, (one, mine) in enumerate(zip(fits, frees, strict=True)):
-        own = len(one.start) // 2
-        places = [j] + ([spring] if own == 2 else [])
-        spring += own == 2
-        rows = [*places, *(size + p for p in places)]
-        start[rows] = one.start
-        used = np.concatenate([np.flatnonzero(one.free >= 0), len(one.free) + np.arange(2 * own)])
-        columns = np.array([*(place[int(k)] for k in maps[j][mine]), *(m + r for r in rows)], int)
-        gradient[..., columns] += one.sums.gradient[..., used]
-        matrix[..., columns[:, None], columns[None]] += one.sums.matrix[..., used[:, None], used[None]]
-    whole = Fit(theta, free, start, 0.0, Sums(np.zeros((blocks, count, 1)), gradient, matrix), True)  # pyright: ignore[reportArgumentType]
-    error = residuals(structure, whole)
-    cost = (error.reshape(blocks, -1, *error.shape[1:]) ** 2).sum(1).swapaxes(1, 2)
-    return whole._replace(cost=float(cost.sum()), sums=Sums(cost, gradient, matrix))  # pyright: ignore[reportArgumentType]
+def _sprung(here: Setting, now: _Standing, joint: int, forbid: Sequence[str]) -> list[_Ranked]:
+    """A spring, and a spring with play, between motor and link of a joint."""
+    wanted = [name for name in _ELASTIC if name not in forbid]
+    forces, name = largest_forces(here.loop, here.runs), here.loop.robot.dof_names[joint]
+    way = np.abs(np.asarray(here.loop.drives.transmission))[:, joint]
+    torque = float(max((way * forces).max(initial=0.0), 1e-6))
+    if not wanted or not np.isfinite(torque):
+        return []
+    loop = elastic_loop(here.loop, joint, 10.0 * torque, 0.01 * torque)
+    n, k = here.loop.robot.nv, len(here.known.table)
+    table = (*here.known.table, *(Entry(x, (n,)) for x in ("stiffness", "damping", "play")))
+    structure = Structure(loop, table, windows(loop, here.runs, here.stretches, here.noise, here.block))
+    found = []
+    for effect in wanted:
+        entries, reported = (k, k + 1), ("stiffness", "damping")
+        if effect == "backlash":
+            entries, reported = (k, k + 1, k + 2), (*reported, "width")
+        c = Candidate(effect, (name,), entries, (), reported, True)
+        for share in _SHARES:
+            play = 0.0 if effect == "joint_elasticity" else 0.1 * share
+            theta = np.concatenate([now.model.fit.theta, [torque / share, 0.002 * torque / share, play]])
+            score = settled(here, structure, theta, free_entries(now.model.free, entries), _start_of(now, structure))
+            found.append(_Ranked(now.model.fit.cost - score, structure, c, theta))
+    return found

@@ -16,6 +16,7 @@ from .sensitivity import Windows
 __all__ = ["Run", "Stretch", "noise_of", "regular", "windows"]
 
 _LEAD = 0.2  # s of command kept before a window: no delay is longer
+_KEPT = 0.97334  # variance of a normal variable that never leaves three sigma
 _SMOOTH = 0.99  # level of the squares left by a cubic, up to which it follows the rows
 
 
@@ -55,11 +56,16 @@ def regular(name: str, time: np.ndarray) -> float:
 
 
 def noise_of(values: np.ndarray) -> np.ndarray:
-    """Standard deviation of white noise on smooth records, by fourth differences; at least 0.3 of a counter's step."""
-    fourth = np.diff(values, 4, axis=0)
-    spread = np.median(np.abs(fourth), axis=0) / 0.67449 / np.sqrt(70.0)
-    full = np.sqrt(np.mean(fourth**2, axis=0) / 70.0)
-    white = np.where(full < 1.5 * np.maximum(spread, 1e-300), full, spread)
+    """Standard deviation of white noise on smooth records, by fourth differences; at least 0.3 of a counter's step.
+
+    Differences beyond three sigma, as where a motion changes suddenly, are left out, twice.
+    """
+    fourth = np.abs(np.diff(values, 4, axis=0)) / np.sqrt(70.0)
+    white = np.median(fourth, axis=0) / 0.67449
+    for _ in range(2):
+        inside = fourth <= 3 * np.maximum(white, 1e-300)
+        kept = np.where(inside, fourth**2, 0.0).sum(0) / np.maximum(inside.sum(0), 1)
+        white = np.where(kept > 0, np.sqrt(kept / _KEPT), white)
     return np.maximum(white, np.maximum(0.3 * _step(values), 1e-9))
 
 

@@ -25,6 +25,7 @@ _PAIR = 2
 _FEW = 12  # windows up to which starts and numbers always move together
 _MOSTLY = 0.5  # share of a step's gain from which the starts move alone, every other time
 _GROUPS, _REFITS = 6, 10  # of recordings that are left out, steps of each fit without one
+_SETTLED = 1e-5  # predicted share of the squares at which a fit without some recordings ends
 _CLOSE = 0.02  # predicted decrease of the sum of whitened squares at which a fit ends
 
 
@@ -60,18 +61,19 @@ def fit(
     width: int,
     lanes: int,
     iterations: int = _ITERATIONS,
+    rough: float = 0.0,
 ) -> list[Fit]:
     """Fit each row of `theta` in the entries `free` names for it, from there and from the states `start`.
 
     `width` pads the number of free entries and `lanes` the number of rows that one program takes, so that one
-    compilation serves all fits.
+    compilation serves all fits. A fit ends where a step promises less than the share `rough` of the squares.
     """
     start = start_of(data, len(theta)) if start is None else start
     lots = range(0, len(theta), lanes)
     found = []
     for lot in lots:
         rows = slice(lot, lot + lanes)
-        found += _Lanes(loop, table, data, theta[rows], free[rows], start[rows], width, lanes).run(iterations)
+        found += _Lanes(loop, table, data, theta[rows], free[rows], start[rows], width, lanes).run(iterations, rough)
     return found
 
 
@@ -104,19 +106,23 @@ class _Lanes:
         return [Sums(cost[k], gradient[k], matrix[k]) for k in range(len(which))]
 
     def several(self, now: list[Sums], steps: int) -> list[Sums]:
-        """The sums of every lane after some damped steps of what it keeps; starts of what it leaves out stay."""
+        """The sums of every lane after some damped steps of what it keeps; starts without their first rows stay."""
         count = len(self.theta)
         cost = np.array([self.cost(self.kept(now[k], k), self.start[k]) for k in range(count)])
-        damping = np.full(count, 1e-3)
+        damping, active = np.full(count, 1e-3), np.arange(count)
         for _ in range(steps):
-            made = [self.step(self.kept(now[k], k), k, damping[k]) for k in range(count)]
-            stay = [self.left[k].all(0) for k in range(count)]
-            starts = np.stack([np.where(stay[k], self.start[k], made[k].start) for k in range(count)])
+            made = {k: self.step(self.kept(now[k], k), k, damping[k]) for k in active}
+            active = np.array([k for k in active if made[k].gain > _SETTLED * cost[k]], int)
+            if not len(active):
+                break
+            starts = {k: np.where(self.left[k][0], self.start[k], made[k].start) for k in active}
             trial: list[Sums] = []
-            for lot in range(0, count, self.lanes):
-                which = np.arange(lot, min(lot + self.lanes, count))
-                trial += self.sums(which, np.stack([made[k].theta for k in which]), starts[which])
-            for k, new in enumerate(trial):
+            for lot in range(0, len(active), self.lanes):
+                which = active[lot : lot + self.lanes]
+                trial += self.sums(
+                    which, np.stack([made[k].theta for k in which]), np.stack([starts[k] for k in which])
+                )
+            for k, new in zip(active, trial, strict=True):
                 after = self.cost(self.kept(new, k), starts[k])
                 if after <= cost[k]:
                     self.theta[k], self.start[k], now[k], cost[k] = made[k].theta, starts[k], new, after
@@ -135,7 +141,7 @@ class _Lanes:
         total = float(sums.cost.sum() + (prior**2).sum())
         return total if np.isfinite(total) and np.isfinite(sums.matrix).all() else np.inf
 
-    def run(self, iterations: int) -> list[Fit]:
+    def run(self, iterations: int, rough: float) -> list[Fit]:
         count = len(self.theta)
         everyone = np.arange(count)
         now = self.sums(everyone, self.theta, self.start)
@@ -148,7 +154,8 @@ class _Lanes:
                 break
             steps = [self.step(now[k], k, damping[k]) for k in active]
             for k, step in zip(active, steps, strict=True):
-                done[k] |= step.gain < _CLOSE * max(1.0, cost[k] / self.rows) and damping[k] <= 1.0
+                least = max(_CLOSE * max(1.0, cost[k] / self.rows), rough * cost[k])
+                done[k] |= step.gain < least and damping[k] <= 1.0
             tried = [(k, step) for k, step in zip(active, steps, strict=True) if not done[k]]
             if not tried:
                 continue
@@ -294,9 +301,18 @@ def standard_errors(found: Fit, data: Windows, level: float = 1.0) -> np.ndarray
 
 
 def refitted_without(
-    loop: Loop, table: Table, data: Windows, found: Sequence[Fit], folds: np.ndarray, *, lanes: int
+    loop: Loop,
+    table: Table,
+    data: Windows,
+    found: Sequence[Fit],
+    folds: np.ndarray,
+    *,
+    lanes: int,
+    outputs: bool = False,
 ) -> np.ndarray:
     """Squares of each block and window by fits of all others, (fits, blocks, windows): `held_out` to every order.
+
+    With `outputs` a last axis tells the squares of each column that is read.
 
     Recordings that hold much of what tells a number leave a direction open that one linear step follows out of sight.
     A few damped steps do not. `folds` are recordings, left out in groups, six at the most.
@@ -308,10 +324,10 @@ def refitted_without(
     free = [one.free for one in found for _ in left]
     fits = _Lanes(loop, table, data, theta, free, start, width, lanes, left * len(found))
     sums = fits.several([one.sums for one in found for _ in left], _REFITS)
-    answers = np.zeros((len(found), *folds.shape))
+    answers = np.zeros((len(found), *sums[0].cost.shape))
     for k, one in enumerate(sums):
-        answers[k // many] = np.where(left[k % many], one.cost.sum(-1), answers[k // many])
-    return answers
+        answers[k // many] = np.where(left[k % many][..., None], one.cost, answers[k // many])
+    return answers if outputs else answers.sum(-1)
 
 
 def held_out(found: Fit, data: Windows, folds: np.ndarray) -> np.ndarray:

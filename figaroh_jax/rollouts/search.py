@@ -24,15 +24,20 @@ __all__ = [
     "Named",
     "Search",
     "Setting",
+    "Tried",
     "begun",
+    "by_recording",
     "excess",
     "free_entries",
-    "judged",
-    "level_of",
     "largest_forces",
+    "level_of",
     "residuals",
+    "scored",
     "search",
     "setting",
+    "settled",
+    "sized",
+    "start_values",
     "t_of",
 ]
 
@@ -41,11 +46,13 @@ _CLEAR = 3.0  # t of a name beside which more than noise is left
 _MUCH = 0.25  # held-out gain of such a name, unless it is one that every joint has: less may stand in for the rest
 _SHORT = 6  # candidates that are fitted where a linear screening can order them
 _CHECKED = 3  # candidates whose held-out squares are those of fits without some recordings
+_ROOM = 24  # columns beside what is free that one linearisation takes
 _SHORTER = 4  # of one joint of an arm
 _GROUP = 25  # rows whose mean shows a slow misfit
 _MOST, _MOST_ONE = 6, 4  # causes, and where only a rest that is noise gives them a name
 _USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
 _PAIR = 2  # starts of the baseline that are followed to the end
+_ROUGH = 1e-3  # share of the squares that a step of such a start must promise
 _EARLY, _LATE = 4, 30  # iterations of a race among all starts, and of its leaders
 _LIMITS = ("actuator_saturation", "voltage_saturation")
 _STILL = ("encoder_offset", "torque_offset", "joint_spring")  # of one joint: each makes up for the others
@@ -190,7 +197,7 @@ def free_entries(fitted: Sequence[int], extra: Sequence[int]) -> list[int]:
     return list(dict.fromkeys([*fitted, *extra]))
 
 
-def _start_values(theta: np.ndarray, candidate: Candidate, values: Sequence[float]) -> np.ndarray:
+def start_values(theta: np.ndarray, candidate: Candidate, values: Sequence[float]) -> np.ndarray:
     new = theta.copy()
     for entry, value in zip(candidate.entries, values, strict=True):
         if not np.isnan(value):
@@ -221,7 +228,7 @@ def search(
     weight = np.asarray(here.data.weight)
     now = Model(structure, first, here.baseline, excess(residuals(structure, first), weight))
     stood, found, p_value, steps, nearest = [now], [], 1.0, [("baseline", level_of(first, weight))], []
-    most = _MOST if _by_recording(here) else _MOST_ONE
+    most = _MOST if by_recording(here) else _MOST_ONE
     while len(found) < most:
         progress(f"looking for cause {len(found) + 1}", min(0.2 + 0.15 * len(found), 0.9))
         tried = _tried(here, now, [n.candidate for n in found], forbid)
@@ -235,7 +242,7 @@ def search(
         steps.append((str(Name(best[0].candidate.effect, best[0].candidate.at)), level_of(now.fit, weight)))
         if now.excess < 1.0:
             break
-    result = judged(here, stood[0], now, found, p_value, steps, nearest)
+    result = _judged(here, stood[0], now, found, p_value, steps, nearest)
     result.fits, result.origin = [one.fit for one in stood[1:]], stood[0].structure
     return result
 
@@ -250,8 +257,9 @@ def begun(here: Setting) -> Fit:
     early = fit(*structure, begins, [here.baseline] * len(begins), iterations=_EARLY, **sizes)
     order = sorted(early, key=lambda f: f.cost)[:_PAIR]
     states = np.stack([f.theta for f in order]), np.stack([f.start for f in order])
-    fits = fit(*structure, states[0], [here.baseline] * len(order), states[1], **sizes)
-    return min(fits, key=lambda f: f.cost)
+    fits = fit(*structure, states[0], [here.baseline] * len(order), states[1], rough=_ROUGH, **sizes)
+    best = min(fits, key=lambda f: f.cost)
+    return fit(*structure, best.theta[None], [here.baseline], best.start[None], **sizes)[0]
 
 
 def _begins(here: Setting, theta: np.ndarray) -> np.ndarray:
@@ -273,13 +281,15 @@ def level_of(found: Fit, weight: np.ndarray) -> float:
     return found.squares / max((weight > 0).sum(), 1)
 
 
-class _Tried(NamedTuple):
+class Tried(NamedTuple):
+    """A candidate that was fitted."""
+
     candidate: Candidate
     state: Model
-    sse: np.ndarray  # held out, by blocks and windows
+    sse: np.ndarray  # held out, by blocks and windows; of an arm those of its fit, by joints too
 
 
-def _tried(here: Setting, now: Model, named: Sequence[Candidate], forbid: Sequence[str]) -> list[_Tried]:
+def _tried(here: Setting, now: Model, named: Sequence[Candidate], forbid: Sequence[str]) -> list[Tried]:
     """Every candidate that may still come, fitted from the present optimum from each of its starts."""
     used = {(c.effect, c.at) for c in named}
     left = [c for c in here.known.candidates if (c.effect, c.at) not in used and not set(c.entries) <= set(now.free)]
@@ -291,7 +301,7 @@ def _tried(here: Setting, now: Model, named: Sequence[Candidate], forbid: Sequen
     thetas, free, owner = [], [], []
     for c in left:
         for start in c.starts:
-            thetas.append(_start_values(now.fit.theta, c, start))
+            thetas.append(start_values(now.fit.theta, c, start))
             free.append(free_entries(now.free, c.entries))
             owner.append(c)
     found = []
@@ -325,10 +335,10 @@ def _raced(
     return list(zip(order, last, strict=True))
 
 
-def _tried_one(here: Setting, structure: Structure, c: Candidate, best: Fit, free: Sequence[int]) -> _Tried:
+def _tried_one(here: Setting, structure: Structure, c: Candidate, best: Fit, free: Sequence[int]) -> Tried:
     weight = np.asarray(structure.data.weight)
     state = Model(structure, best, tuple(free), excess(residuals(structure, best), weight))
-    return _Tried(c, state, held_out(best, structure.data, here.folds))
+    return Tried(c, state, held_out(best, structure.data, here.folds))
 
 
 def _screened(here: Setting, now: Model, left: Sequence[Candidate]) -> list[Candidate]:
@@ -338,6 +348,18 @@ def _screened(here: Setting, now: Model, left: Sequence[Candidate]) -> list[Cand
     """
     room = here.width - len(now.free)
     left = [c for c in left if len(c.entries) <= room]
+    scores = scored(here, now, left)
+    most = _SHORT if here.loop.carried is None else _SHORTER
+    return [left[k] for k in sorted(scores, key=lambda k: scores[k][0])[:most]]
+
+
+def scored(here: Setting, now: Model, left: Sequence[Candidate]) -> dict[int, tuple[float, np.ndarray]]:
+    """The cost that one linear step of each candidate leaves, and from which numbers; those that diverge are left out.
+
+    Several candidates share one linearisation; a limit of a drive changes the model before it can be differentiated:
+    each is linearised at one start of its own.
+    """
+    room = max(here.width - len(now.free), _ROOM)
     limits = [k for k, c in enumerate(left) if c.effect in _LIMITS]
     packs, filled = [], 0
     for k in [k for k in range(len(left)) if k not in limits]:
@@ -355,31 +377,40 @@ def _screened(here: Setting, now: Model, left: Sequence[Candidate]) -> list[Cand
                     theta[left[k].entries[1]] = left[k].starts[variant][1]
             lanes.append((theta, pack))
     for k in limits:
-        lanes += [(_start_values(now.fit.theta, left[k], start), [k]) for start in left[k].starts]
-    scores = _scores(here, now, left, lanes) if lanes else {}
-    most = _SHORT if here.loop.carried is None else _SHORTER
-    return [left[k] for k in sorted(scores, key=lambda k: scores[k])[:most]]
+        lanes += [(start_values(now.fit.theta, left[k], start), [k]) for start in left[k].starts]
+    return _scores(here, now, left, lanes) if lanes else {}
 
 
 def _scores(
     here: Setting, now: Model, left: Sequence[Candidate], lanes: Sequence[tuple[np.ndarray, list[int]]]
-) -> dict[int, float]:
+) -> dict[int, tuple[float, np.ndarray]]:
     """Cost after a linear step of each candidate of each lane's pack beside what is free already."""
     columns = [free_entries(now.free, [entry for k in pack for entry in left[k].entries]) for _, pack in lanes]
     thetas, start = np.array([theta for theta, _ in lanes]), np.repeat(now.fit.start[None], len(lanes), 0)
-    fits = fit(*now.structure, thetas, columns, start, width=here.width, lanes=here.lanes, iterations=0)
-    scores: dict[int, float] = {}
-    for one, (_, pack) in zip(fits, lanes, strict=True):
+    width = max(here.width, *(len(one) for one in columns))
+    fits = fit(*now.structure, thetas, columns, start, width=width, lanes=here.lanes, iterations=0)
+    scores: dict[int, tuple[float, np.ndarray]] = {}
+    for one, (theta, pack) in zip(fits, lanes, strict=True):
         for k in pack if np.isfinite(one.cost) else ():
             mine = set(now.free) | set(left[k].entries)
             fixed = np.array([entry < 0 or entry not in mine for entry in one.free])
             system = System(one.sums, now.structure.data, one.start)
             cost = one.cost - system.decrease(*system.solve(fixed, 1e-6))
-            scores[k] = min(scores.get(k, np.inf), cost)
+            if k not in scores or cost < scores[k][0]:
+                scores[k] = cost, theta
     return scores
 
 
-def _elastic(here: Setting, now: Model, forbid: Sequence[str]) -> list[_Tried]:
+def settled(here: Setting, structure: Structure, theta: np.ndarray, free: Sequence[int], start: np.ndarray) -> float:
+    """The cost that one linear step of all that is free leaves; infinite where the loop diverges."""
+    one = fit(*structure, theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1, iterations=0)[0]
+    if not np.isfinite(one.cost):
+        return np.inf
+    system = System(one.sums, structure.data, one.start)
+    return one.cost - system.decrease(*system.solve(one.free < 0, 1e-6))
+
+
+def _elastic(here: Setting, now: Model, forbid: Sequence[str]) -> list[Tried]:
     """A spring, and a spring with play, between motor and link."""
     wanted = [name for name in ("joint_elasticity", "backlash") if name not in forbid]
     if not wanted or len(now.free) + 3 > here.width:
@@ -424,12 +455,12 @@ def t_of(worse: np.ndarray, better: np.ndarray) -> float:
 
 
 def _best(
-    here: Setting, now: Model, tried: Sequence[_Tried], nearest: list[tuple[Name, float, str]]
+    here: Setting, now: Model, tried: Sequence[Tried], nearest: list[tuple[Name, float, str]]
 ) -> tuple[tuple[Named, Model] | None, float]:
     """The cause to name next with the state it makes, and p of what is left before it being noise."""
     tried, before = _held_out(here, now, tried)
     gains = [(before.sum() - one.sse.sum()) / before.sum() for one in tried]
-    if _by_recording(here):  # no more than on the data themselves: the rest is luck of a fit without a recording
+    if by_recording(here):  # no more than on the data themselves: the rest is luck of a fit without a recording
         gains = [min(g, 1 - one.state.fit.squares / now.fit.squares) for g, one in zip(gains, tried, strict=True)]
     ts = [t_of(before, one.sse) for one in tried]
     nearest.clear()
@@ -437,12 +468,12 @@ def _best(
         return None, 1.0
     p = float(max(ndtr(-4 * now.excess), 1e-12))
     sure = _SURE if now.excess >= 1.0 else 2.5
-    several = here.loop.carried is not None and _by_recording(here)
+    several = here.loop.carried is not None and by_recording(here)
     beside = [several and one.state.excess >= 1.0 for one in tried]  # a rest, of an arm: more is asked
     common = [t.candidate.effect in BASELINE and g > _MUCH for t, g in zip(tried, gains, strict=True)]
     needs = [_CLEAR if rest and not usual else sure for rest, usual in zip(beside, common, strict=True)]
     worth = [_MUCH if r and t.candidate.effect not in BASELINE else _WORTH for r, t in zip(beside, tried, strict=True)]
-    passing = [k for k in range(len(tried)) if gains[k] > worth[k] and ts[k] > needs[k] and _sized(here, tried[k])]
+    passing = [k for k in range(len(tried)) if gains[k] > worth[k] and ts[k] > needs[k] and sized(here, tried[k])]
     for k in np.argsort(gains)[::-1][:3]:
         why = "no better than another" if k in passing else "gains too little on data that it was not fitted to"
         nearest.append((Name(tried[k].candidate.effect, tried[k].candidate.at), float(max(gains[k], 0.0)), why))
@@ -473,10 +504,10 @@ def _best(
     return (named, best.state), p
 
 
-def _held_out(here: Setting, now: Model, tried: Sequence[_Tried]) -> tuple[list[_Tried], np.ndarray]:
+def _held_out(here: Setting, now: Model, tried: Sequence[Tried]) -> tuple[list[Tried], np.ndarray]:
     """The candidates that fit best, and the squares of the present model, held out by fits without some recordings."""
     tried = list(tried)
-    if not _by_recording(here) or here.loop.robot.nv > 1:
+    if not by_recording(here) or here.loop.robot.nv > 1:
         return tried, held_out(now.fit, now.structure.data, here.folds)
     order = sorted(range(len(tried)), key=lambda k: tried[k].state.fit.cost)[:_CHECKED]
     same = [k for k in order if tried[k].state.structure is now.structure]
@@ -497,7 +528,7 @@ def _rms(here: Setting, squares: np.ndarray) -> float:
     return float(np.sqrt(max(squares.sum(), 0.0) / count * np.mean(here.noise[0] ** 2)))
 
 
-def _sized(here: Setting, one: _Tried) -> bool:
+def sized(here: Setting, one: Tried) -> bool:
     """Whether its first number is clear of no effect, and on no bound of the search."""
     found = one.state.fit
     column = int(np.flatnonzero(found.free == one.candidate.entries[0])[0])
@@ -532,12 +563,12 @@ def _top_speed(here: Setting, coordinate: int) -> float:
     )
 
 
-def _by_recording(here: Setting) -> bool:
+def by_recording(here: Setting) -> bool:
     """Whether the folds are recordings, three or more."""
     return len(np.unique(here.folds)) == len({s.run for s in here.stretches}) >= 3
 
 
-def judged(
+def _judged(
     here: Setting, begin: Model, now: Model, found: list[Named], p_value: float, steps: list, nearest: list
 ) -> Search:
     """`named` where the rest is noise; `named+rest` where the names hold without each of three recordings or more."""
@@ -546,7 +577,7 @@ def judged(
     if now.excess < 1.0:
         result.verdict = "named" if found else "nothing"
         return result
-    if found and _by_recording(here) and all(n.t > _CLEAR for n in found[:1]):
+    if found and by_recording(here) and all(n.t > _CLEAR for n in found[:1]):
         result.verdict = "named+rest"
         return result
     result.verdict, result.proxy, result.named = "unknown", found, []

@@ -111,6 +111,7 @@ def record(
                 -stiffness * (twist - np.clip(twist, -width / 2, width / 2)) - 0.002 * stiffness * data.qvel[at]
             )
         mujoco.mj_step(model, data)
+    assert np.isfinite(q).all() and np.abs(q).max() < 10, "the generator's own simulation is unstable"
     q = q[::EVERY] + _noise(noise, len(q[::EVERY]), np.random.default_rng([seed, number, 9]))
     if "encoder_offset" in what:
         q[:, what["encoder_offset"][0]] += what["encoder_offset"][1]
