@@ -25,15 +25,15 @@ def test_what_does_not_lower_the_error_of_its_joint_is_never_named(factor: float
     assert not one.gains(strict)
 
 
-def test_beside_a_rest_a_fall_that_chance_makes_is_none():
+@pytest.mark.parametrize("strict", [True, False])
+def test_a_fall_that_chance_makes_is_none(strict: bool):
     """One block in twelve gains, the others lose a little: the sum falls."""
     before = squares(np.random.default_rng(1), 4.0)
     after = 1.01 * before
     after[:, 0] *= 0.6
     one = fall(before, after, [0])
     assert one.own > 0
-    assert one.gains(strict=False)
-    assert not one.gains(strict=True)
+    assert not one.gains(strict)
 
 
 def test_a_fall_that_may_be_chance_counts_if_it_is_what_the_cause_claims():
