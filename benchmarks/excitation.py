@@ -185,12 +185,13 @@ def ipopt(iterations: int = 300, seed: int = 0, starts: int = 4, robots: Sequenc
 
 def _beside_ipopt(minimize_ipopt: Any, name: str, model: Any, options: tuple[int, int, int]) -> None:
     seed, starts, iterations = options
-    from figaroh_jax.excitation.design import excite, random_motion
+    from figaroh_jax.excitation.design import excite
     from figaroh_jax.excitation.information import learn
     from figaroh_jax.excitation.limits import limits_of
     from figaroh_jax.excitation.motions import fourier
     from figaroh_jax.excitation.objectives import information_objective
     from figaroh_jax.excitation.sampling import Sampler
+    from figaroh_jax.excitation.search import random_motion
     from figaroh_jax.excitation.solvers import Problem
 
     learned, bounds, basis = learn(model, trust=None), limits_of(model, acceleration=8.0), fourier(5, 0.1, 10.0)
@@ -394,12 +395,13 @@ PAIRS = {
 
 def separation(names: Sequence[str] = tuple(PAIRS), seed: int = 0, starts: int = 2) -> None:
     """Pairs of causes at the UR10e's elbow, 10 s: sigmas of random, D-optimal and designed motions, both ways."""
-    from figaroh_jax.excitation.design import excite, gram_of, random_motion
+    from figaroh_jax.excitation.design import excite, gram_of
     from figaroh_jax.excitation.information import learn
     from figaroh_jax.excitation.limits import limits_of
     from figaroh_jax.excitation.motions import fourier
     from figaroh_jax.excitation.objectives import information_objective
     from figaroh_jax.excitation.sampling import Sampler
+    from figaroh_jax.excitation.search import random_motion
     from figaroh_jax.excitation.separation import causes, separated
     from figaroh_jax.excitation.solvers import Problem
 
@@ -615,10 +617,11 @@ def pays(draws: int = 60, seed: int = 0, starts: int = 8, peer: str | None = Non
     sys.path.insert(0, str(ROOT / "backends"))
     from figaroh_jax_pinocchio import PinocchioBackend
 
-    from figaroh_jax.excitation.design import excite, random_motion
+    from figaroh_jax.excitation.design import excite
     from figaroh_jax.excitation.information import learn
     from figaroh_jax.excitation.objectives import information_objective
     from figaroh_jax.excitation.sampling import Sampler
+    from figaroh_jax.excitation.search import random_motion
     from figaroh_jax.excitation.solvers import Problem
 
     model, basis, bounds, plain = peer_problem()
@@ -788,9 +791,9 @@ def gpu(starts: int = 256, outer: int = 5, inner: int = 100, compared: int = 4) 
     import jax
     import jax.numpy as jnp
 
-    from figaroh_jax.excitation.design import random_motion
     from figaroh_jax.excitation.objectives import information_objective
     from figaroh_jax.excitation.sampling import Sampler
+    from figaroh_jax.excitation.search import random_motion
     from figaroh_jax.excitation.solvers import Problem, solve
     from figaroh_jax.rigid.regressor import joint_torque_regressor
 

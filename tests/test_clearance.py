@@ -205,13 +205,21 @@ def test_a_designed_motion_keeps_its_distances_and_the_run_shows_them(
     use = next(one for one in told["use_at_1_kHz"] if one["limit"] == "clearance")
     assert use["joint"] in ("b - table", "b - shelf") and 0.03 * 0.999 <= use["value"] < 0.06
     model = robots.load(text, tmp_path)
-    with np.load(tmp_path / "run" / "trajectory_1.npz") as motion:
-        poses = np.asarray(forward_kinematics(model, motion["q"][::5]))[:, 1]
-    along = np.linspace(0, 0.3, 61)
-    points = poses[:, None, :3, 0] * along[:, None] + poses[:, None, :3, 3]
-    out = np.abs(np.stack([points - [0.75, 0, z] for z in (-0.3, 0.3)])) - [0.25, 0.3, 0.1]
-    nearest = np.linalg.norm(np.maximum(out, 0), axis=-1).min() - 0.02
-    assert nearest == pytest.approx(use["value"], abs=2e-3)
+
+    def nearest(run: str) -> float:
+        with np.load(tmp_path / run / "trajectory_1.npz") as motion:
+            poses = np.asarray(forward_kinematics(model, motion["q"][::5]))[:, 1]
+        points = poses[:, None, :3, 0] * np.linspace(0, 0.3, 61)[:, None] + poses[:, None, :3, 3]
+        out = np.abs(np.stack([points - [0.75, 0, z] for z in (-0.3, 0.3)])) - [0.25, 0.3, 0.1]
+        return float(np.linalg.norm(np.maximum(out, 0), axis=-1).min()) - 0.02
+
+    assert nearest("run") == pytest.approx(use["value"], abs=2e-3)
+    free = keys[: keys.index("  boxes")].replace("clearance: 0.03, ", "")
+    (tmp_path / "free.yaml").write_text("robot: {model: robot.urdf}\nexcite:" + free)
+    assert main(["excite", str(tmp_path / "free.yaml"), "--out", str(tmp_path / "free"), "--json", "--quiet"]) == 0
+    unkept = json.loads(capsys.readouterr().out)
+    assert nearest("free") == pytest.approx(-0.02, abs=1e-9)  # right through the boxes: the distances hold the motion
+    assert unkept["logdet"] > answer["logdet"] + 0.5  # what keeping clear costs
     assert min(told["clearance"]["distance"]) == pytest.approx(use["value"], abs=3e-3)
     page = (tmp_path / "run" / "report.html").read_text()
     assert "least distance between bodies" in page

@@ -12,7 +12,7 @@ import robots
 
 from figaroh_jax.errors import InputError
 from figaroh_jax.excitation import information as info
-from figaroh_jax.excitation.design import excite, random_motion
+from figaroh_jax.excitation.design import excite
 from figaroh_jax.excitation.limits import limits_of
 from figaroh_jax.excitation.motions import Basis, Trajectory, fourier, quintic, spline
 from figaroh_jax.excitation.objectives import (
@@ -23,6 +23,7 @@ from figaroh_jax.excitation.objectives import (
 )
 from figaroh_jax.excitation.programming import Rows, quadratic_step
 from figaroh_jax.excitation.sampling import Sampler
+from figaroh_jax.excitation.search import random_motion
 from figaroh_jax.excitation.solvers import Problem, solve
 from figaroh_jax.formats.config import Baseline
 from figaroh_jax.rigid.model import RobotModel

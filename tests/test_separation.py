@@ -125,14 +125,24 @@ def test_an_effect_of_ones_own_takes_part_and_its_repeats_are_those_of_rows_repe
 
 
 @pytest.mark.slow
-def test_a_motion_designed_for_two_causes_tells_them_apart_better_than_one_that_tells_most_of_all(arm: RobotModel):
+@pytest.mark.parametrize(
+    ("pair", "times"),
+    [
+        ((("torque_gain", ("bend",), {"gain": 0.05}), ("link_inertia", ("b",), {})), 2.0),
+        ((("stribeck_friction", ("bend",), {"force": 0.3, "speed": 0.1}), POWER), 1.25),
+    ],
+    ids=["gain and link", "Stribeck and power law"],
+)
+def test_a_motion_designed_for_two_causes_tells_them_apart_better_than_one_that_tells_most_of_all(
+    arm: RobotModel, pair: tuple, times: float
+):
     basis, limits, learned = fourier(3, 0.5, 4.0), limits_of(arm, acceleration=8.0), info.learn(arm)
-    pairs = [(ROTOR, INERTIA)]
-    most = excite(arm, basis, limits, learned, separate=pairs, starts=2, start=[0.0, 0.0])
-    told = excite(arm, basis, limits, learned, objective="separate", separate=pairs, starts=4, start=[0.0, 0.0])
+    most = excite(arm, basis, limits, learned, separate=[pair], starts=2, start=[0.0, 0.0])
+    told = excite(arm, basis, limits, learned, objective="separate", separate=[pair], starts=2, start=[0.0, 0.0])
     assert told.met and most.met
-    worst = [found.separated[0].sigmas for found in (most, told)]
-    assert worst[1] > worst[0]
+    counted = 1 if pair[1][0] == "link_inertia" else 2  # how a link is wrong nobody knows beforehand
+    worst = [min(one.sigmas for one in found.separated[:counted]) for found in (most, told)]
+    assert worst[1] > times * worst[0]
 
 
 def test_effects_that_no_instant_shows_are_refused(arm: RobotModel):

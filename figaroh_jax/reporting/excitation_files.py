@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..excitation.design import Design, Stage, torque_of
+from ..excitation.design import Design, torque_of
 from ..excitation.limits import CHECK_RATE, Use
 from ..excitation.postures import PostureDesign
 from ..excitation.sampling import Sampler
+from ..excitation.search import Stage
 from ..excitation.separation import MOST
 from ..rigid.model import prismatic
 from .report import page_template

@@ -55,6 +55,7 @@ _ROUGH = 1e-4  # share of the squares that a step must promise while candidates 
 _MOST, _CHECKS = 6, 4  # causes of a joint; candidates whose held-out squares are looked at in a round
 _LEAST = 0.002  # held-out gain below which a cause found with others is not missed
 _HOPE = 0.1  # share of a joint's squares that a cause must promise where it must take `_MUCH` in the end
+_MORE = 1.02  # of the promise of a simpler cause, which a richer one must exceed to be fitted
 _LIMITS = ("actuator_saturation", "voltage_saturation")
 _STILL = ("encoder_offset", "torque_offset", "joint_spring")  # of one joint: each makes up for the others
 _ELASTIC = ("joint_elasticity", "backlash")
@@ -330,8 +331,10 @@ def _check(here: Setting, now: _Standing, new: _Standing, one: Tried) -> tuple[b
     gain = 1 - after.sum() / max(before.sum(), 1e-300)
     if by_recording(here):  # no more than on the data themselves: the rest is luck of a fit without a recording
         gain = min(gain, 1 - new.squares[..., mine].sum() / max(now.squares[..., mine].sum(), 1e-300))
-    t = t_of(before, after)
-    rest = by_recording(here) and float(new.excess[mine].max()) >= 1.0
+    t, noise = t_of(before, after), float(new.excess[mine].max()) < 1.0
+    if noise and float(now.excess[mine].max()) >= 1.0:  # all that is seen is explained, be it in a few places only
+        t = max(t, float(np.sqrt(max(before.sum() - after.sum(), 0.0))) / 2)
+    rest = by_recording(here) and not noise
     usual = one.candidate.effect in BASELINE
     sure = _SURE if float(now.excess[mine].max()) >= 1.0 else _UNSURE
     needed = _CLEAR if rest and not (usual and gain > _MUCH) else sure
@@ -428,10 +431,17 @@ def _tried(here: Setting, now: _Standing, named: Sequence[Candidate], forbid: Se
     for j, ones in best.items():
         ranked = sorted(ones, key=lambda one: -one.promise)
         ranked = [one for k, one in enumerate(ranked) if all(one[2] is not other[2] for other in ranked[:k])]
+        ranked = [one for one in ranked if not _no_more(one, ranked)]
         least = (_HOPE if by_recording(here) and now.excess.max() >= 1.0 else 0.0) * own[j]
         hopeful = [one for one in ranked if j < 0 or one.promise > least or one.candidate.effect in BASELINE]
         tried += _fitted(here, now, hopeful[: _TOP if j >= 0 else 1])
     return tried
+
+
+def _no_more(one: _Ranked, ranked: Sequence[_Ranked]) -> bool:
+    """Whether a candidate promises hardly more than one that it contains."""
+    simple = CONTAINS.get(one.candidate.effect, ())
+    return any(other.candidate.effect in simple and one.promise < _MORE * other.promise for other in ranked)
 
 
 class _Ranked(NamedTuple):

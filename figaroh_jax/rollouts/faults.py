@@ -24,6 +24,7 @@ _BLOCK, _JUMP, _ALIKE = 2.0, 2.0, 0.5  # s of one lag, periods of a jump, share 
 _MOST_LATE, _SHIFTED, _FEW = 0.3, 0.15, 3  # s, share of the power that a shift leaves, blocks on either side of a jump
 _WRONG, _HOLDS = 6.0, 1.2  # multiples of the usual error and of the friction, of a joint that stands
 _MOVING = 0.1  # rad/s
+_OFF, _SEVERAL = 3.0, 3  # multiples of the usual error, joints that are off by so much at once
 _SAMPLES = 1024  # one program takes so many
 
 
@@ -35,7 +36,7 @@ class Fault(NamedTuple):
     first: float  # s
     last: float  # s
     joints: tuple[int, ...]
-    size: float  # N m beyond what friction holds; s of a clock
+    size: float  # N m beyond what friction holds (of several joints: of the drive at most); s of a clock
 
     def text(self, loop: Loop, runs: Sequence[Run]) -> str:
         """One line for people."""
@@ -43,22 +44,55 @@ class Fault(NamedTuple):
         if self.kind == "clock_error":
             return f"clock_error: {where}: all joints follow {1e3 * self.size:.0f} ms later than before, stamps regular"
         at = ", ".join(names[j] for j in self.joints)
+        if len(self.joints) > 1:
+            return (
+                f"contact: {where}: {at} stand off the model's motion at once, the drives push by {self.size:.2g} N m"
+            )
         return f"contact: {where}: {at} stands against {self.size:.2g} N m more than its friction holds"
 
 
 def faults(loop: Loop, runs: Sequence[Run], simulated: Sequence[np.ndarray]) -> list[Fault]:
     """The faults of the recordings; `simulated` (rows, joints) is what a fitted loop does with their commands."""
     found = []
+    usual = np.median(
+        np.abs(np.concatenate([run.position - x for run, x in zip(runs, simulated, strict=True)])), axis=0
+    )
     for k, (run, read, held) in enumerate(zip(runs, simulated, _held(loop, runs, simulated), strict=True)):
         jump = _jump(run, read)
         if jump is not None:
             time, late = jump
             found.append(Fault("clock_error", k, time, float(run.time[-1]), tuple(range(read.shape[1])), late))
+        together = _together(loop, run, read, usual)
+        found += [fault._replace(run=k) for fault in together]
         for j in range(held.shape[1]):
             for first, last in _stretches(held[:, j] > 0):
-                if run.time[last] - run.time[first] >= _LONG:
+                told = any(x.first <= run.time[last] and run.time[first] <= x.last and j in x.joints for x in together)
+                if run.time[last] - run.time[first] >= _LONG and not told:
                     size = float(np.median(held[first : last + 1, j]))
                     found.append(Fault("contact", k, float(run.time[first]), float(run.time[last]), (j,), size))
+    return found
+
+
+def _together(loop: Loop, run: Run, read: np.ndarray, usual: np.ndarray) -> list[Fault]:
+    """Stretches in which three joints or more stand, or nearly so, far from where the model has them, all at once.
+
+    Friction alone may hold each of them there, but not by chance all at the same time: something pushes the arm.
+    """
+    period = regular(run.name, run.time)
+    rows = max(1, round(_LONG / period))
+    mean = lambda x: np.stack([np.convolve(c, np.ones(rows) / rows, mode="same") for c in x.T], 1)  # noqa: E731
+    error = mean(run.position - read)
+    slow = mean(np.abs(np.gradient(run.position, period, axis=0))) < _MOVING
+    far = slow & (np.abs(error) > _OFF * np.maximum(usual, 1e-12))
+    drives, places = loop.drives, list(loop.measured)
+    stiff = np.abs((np.asarray(drives.scale) * np.asarray(drives.bias)[:, 1]) @ np.asarray(drives.transmission) ** 2)
+    found = []
+    for first, last in _stretches(far.sum(1) >= _SEVERAL):
+        if run.time[last] - run.time[first] >= _LONG:
+            part = slice(first, last + 1)
+            joints = tuple(places[c] for c in np.flatnonzero(far[part].mean(0) > 0.5))
+            size = float(np.median((np.abs(error[part]) * stiff[places]).max(1)))
+            found.append(Fault("contact", 0, float(run.time[first]), float(run.time[last]), joints, size))
     return found
 
 
