@@ -47,14 +47,11 @@ class Fall(NamedTuple):
         """Whether the cause predicts better where it acts, and the robot is not predicted worse for it.
 
         A fall may be chance: it must be sure, or beside a rest (`strict`) a good part of the `claim`, the share that
-        the cause takes in slices of the recordings that are fitted. There the squares of the robot are asked joint by
-        joint: those in N m are the large joints', which any change of the fit moves by more than a small joint has.
+        the cause takes in slices of the recordings that are fitted. The squares of the robot are asked joint by joint:
+        those in N m are the large joints', which any change of the fit moves by more than a small joint has.
         """
-        sure = self.own > 0 and self.chance < BY_CHANCE
-        if not strict:
-            return sure and self.whole > 0
-        claimed = self.own > 0 and self.own >= KEPT_OF_CLAIM * claim
-        return (sure or claimed) and self.each > 0 and self.worse > BY_CHANCE
+        kept = self.chance < BY_CHANCE or (strict and self.own >= KEPT_OF_CLAIM * claim)
+        return self.own > 0 and kept and self.each > 0 and self.worse > BY_CHANCE
 
 
 def fall(
