@@ -219,7 +219,7 @@ def test_a_designed_motion_keeps_its_distances_and_the_run_shows_them(
     assert main(["excite", str(tmp_path / "free.yaml"), "--out", str(tmp_path / "free"), "--json", "--quiet"]) == 0
     unkept = json.loads(capsys.readouterr().out)
     assert nearest("free") == pytest.approx(-0.02, abs=1e-9)  # right through the boxes: the distances hold the motion
-    assert unkept["logdet"] > answer["logdet"] + 3.0
+    assert unkept["logdet"] > answer["logdet"] + 0.5  # what keeping clear costs
     assert min(told["clearance"]["distance"]) == pytest.approx(use["value"], abs=3e-3)
     page = (tmp_path / "run" / "report.html").read_text()
     assert "least distance between bodies" in page

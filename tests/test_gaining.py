@@ -25,15 +25,15 @@ def test_what_does_not_lower_the_error_of_its_joint_is_never_named(factor: float
     assert not one.gains(strict)
 
 
-def test_beside_a_rest_a_fall_that_chance_makes_is_none():
+@pytest.mark.parametrize("strict", [True, False])
+def test_a_fall_that_chance_makes_is_none(strict: bool):
     """One block in twelve gains, the others lose a little: the sum falls."""
     before = squares(np.random.default_rng(1), 4.0)
     after = 1.01 * before
     after[:, 0] *= 0.6
     one = fall(before, after, [0])
     assert one.own > 0
-    assert one.gains(strict=False)
-    assert not one.gains(strict=True)
+    assert not one.gains(strict)
 
 
 def test_a_fall_that_may_be_chance_counts_if_it_is_what_the_cause_claims():
@@ -63,14 +63,15 @@ def test_no_difference_is_sure_as_often_as_the_level_says():
     assert 0.02 < np.mean(np.array(chances) < 0.05) < 0.08
 
 
-def test_a_small_joint_gains_though_chance_moves_a_large_one_by_more():
+@pytest.mark.parametrize("strict", [True, False])
+def test_a_small_joint_gains_though_chance_moves_a_large_one_by_more(strict: bool):
     rng = np.random.default_rng(2)
     before = squares(rng, 1000.0, 1.0)
     moved = 1 + 0.01 * rng.standard_normal(BLOCKS)
     moved *= 1.0005 / np.mean(moved)  # the large joint's squares rise, by less than their blocks differ
     one = fall(before, before * np.stack([moved, np.full(BLOCKS, 0.7)], 1), [1])
     assert one.whole < 0
-    assert one.gains(strict=True)
+    assert one.gains(strict)
 
 
 def test_a_robot_that_is_surely_predicted_worse_is_no_gain():

@@ -163,11 +163,11 @@ def _of_some(
     first: RobotModel, terms: tuple[Effect, ...], into: np.ndarray, batches: dict[str, Effect], given: Any, dt: float
 ) -> tuple[BatchFit, dict[str, _Shown]]:
     """A program for the fits, then one for each effect: together they would take longer to compile than all do."""
-    fit, *beside = _fitted(first, terms, into, *given)
-    shown = {
-        name: _Shown(*jax.device_get(_shown_in(first, batch, *given, dt, beside))) for name, batch in batches.items()
-    }
-    return BatchFit(*jax.device_get(fit)), shown
+    own, state = jax.device_put(given)
+    fit, *beside = _fitted(first, terms, into, own, state)
+    shown = {name: _shown_in(first, batch, own, state, dt, beside) for name, batch in batches.items()}
+    fit, shown = jax.device_get((fit, shown))
+    return BatchFit(*fit), {name: _Shown(*x) for name, x in shown.items()}
 
 
 class _Shown(NamedTuple):

@@ -46,13 +46,11 @@ class Fall(NamedTuple):
     def gains(self, strict: bool, claim: float = np.inf) -> bool:
         """Whether the cause predicts better where it acts, and the robot is not predicted worse for it.
 
-        Beside a rest (`strict`) a fall may be chance: it must be sure, or a good part of the `claim`, the share that
-        the cause takes in slices of the recordings that are fitted. There the squares of the robot are asked joint by
-        joint: those in N m are the large joints', which any change of the fit moves by more than a small joint has.
+        A fall may be chance: it must be sure, or beside a rest (`strict`) a good part of the `claim`, the share that
+        the cause takes in slices of the recordings that are fitted. The squares of the robot are asked joint by joint:
+        those in N m are the large joints', which any change of the fit moves by more than a small joint has.
         """
-        if not strict:
-            return self.own > 0 and self.whole > 0
-        kept = self.chance < BY_CHANCE or self.own >= KEPT_OF_CLAIM * claim
+        kept = self.chance < BY_CHANCE or (strict and self.own >= KEPT_OF_CLAIM * claim)
         return self.own > 0 and kept and self.each > 0 and self.worse > BY_CHANCE
 
 

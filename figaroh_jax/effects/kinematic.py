@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -451,9 +451,22 @@ def _shifts(
     unit_shape = {shape_of(effect)[0]: shape} if shape_of(effect)[0] else {}
     for name, parameter in effect.parameters().items():
         if parameter.linear:
-            one = partial(effect, np.array(at, int), **{name: effect.correction}, **unit_shape)
+            one = partial(_sized, effect, at, **{name: effect.correction}, **unit_shape)
             unit = joint_unit(parameter.unit or "1", bool(at) and model.joints[at[-1]].kind != "revolute")
             yield name, unit, [(j, _shift(model, j, one)) for j in joints]
+
+
+@cache
+def _still(effect: type[Effect], at: tuple[int, ...]) -> Effect:
+    """The effect at a place, without a size."""
+    return effect(np.array(at, int))
+
+
+def _sized(effect: type[Effect], at: tuple[int, ...], **values: float) -> Effect:
+    """The effect with sizes; without what equinox checks of every new module, for a search makes thousands."""
+    one = object.__new__(effect)
+    vars(one).update(vars(_still(effect, at)), **values)
+    return one
 
 
 def _shift(
@@ -463,7 +476,8 @@ def _shift(
     motion = axis_twist(model, joint)
 
     def field(postures: Postures) -> Float[np.ndarray, "6 samples"]:
-        error = np.asarray(one().position_error(postures.motion(model)))
+        made = one()
+        error = np.asarray(type(made).position_error(made, postures.motion(model)))  # a bound method is a module too
         return -motion[:, None] * (error if error.ndim == 1 else error[:, joint])
 
     return field

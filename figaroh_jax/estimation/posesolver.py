@@ -89,10 +89,12 @@ def solve(
         normal_at, found = partial(_normal_on_host, *given), beginning(start)
         while _going(found, max_steps):
             found = attempt(normal_at, found)
+        ended = _ended(found)
     else:
         parts = parts_of(problem)
-        found = _minimise(parts, cut_weights(problem, parts, weights), precision, free, start, max_steps)
-    return Solution(np.asarray(found.at), bool(found.converged), int(found.steps), float(found.normal.cost))
+        ended = _minimise(parts, cut_weights(problem, parts, weights), precision, free, start, max_steps)
+    at, converged, steps, cost = ended
+    return Solution(np.asarray(at), bool(converged), int(steps), float(cost))
 
 
 def cut_weights(
@@ -209,9 +211,15 @@ def stuck(state: State) -> Bool[Any, ""]:
 
 def _search(
     parts: tuple[Part, ...], weights: Any, precision: Array, free: Array, start: Array, max_steps: Int[Array, ""]
-) -> State:
+) -> tuple[Any, Any, Any, Any]:
     normal_at = partial(normal_equations, parts, weights, precision, free)
-    return jax.lax.while_loop(partial(_going, max_steps=max_steps), partial(attempt, normal_at), beginning(start))
+    going = partial(_going, max_steps=max_steps)
+    return _ended(jax.lax.while_loop(going, partial(attempt, normal_at), beginning(start)))
+
+
+def _ended(state: State) -> tuple[Any, Any, Any, Any]:
+    """What a solution takes of a state; a plain tuple, for only programs that give one are kept between processes."""
+    return state.at, state.converged, state.steps, state.normal.cost
 
 
 def _going(state: State, max_steps: Any) -> Any:

@@ -22,8 +22,8 @@ TIGHTENED, TIGHTENING = 3, 40  # times that a motion is designed again with a ma
 TRIED_SHORTLY = 8  # random motions that a start improves a little, the best of them then as far as it goes
 WAVE, OVER = 8, 4  # samples of a wave, rows of a column: enough to look for a motion, which all samples then improve
 TRIED, ROOMY = 400, 3  # random postures in which a motion may begin; one of so many that are clear does
-TRIED_WITHIN = 5  # random motions that a start improves from within, the best of them then joint by joint
-EXCHANGED = 15  # times that a start tries another motion of one joint, where thousands of rows make many optima
+TRIED_WITHIN, EXCHANGED = 5, 15  # random motions that a start improves from within; trials of others of one joint
+APART = 2, 4  # the same where distances count, which cost as much as ten times the rest
 GENTLY = 1.0  # how strongly limits are felt before they are reached, at the beginning of such a trial
 CHECKED = 8  # motions, the best first, until none promises more than one that is feasible at 1 kHz
 ROUNDING = 1e-6  # of a limit
@@ -131,7 +131,8 @@ def best_motion(
     columns = np.array(learned.independent) if columns is None else columns
     kept = (columns, basis, limits, start, rate)
     final = Problem(learned, sampler, ways[0][-1], *kept, shifts=shifts)
-    few = _few_samples(final) if final.linear_rows <= FEW_ROWS else None
+    simple, apart = final.linear_rows <= FEW_ROWS, _distances_count(limits)
+    few = _few_samples(final) if simple or apart else None
     made = [[Problem(learned, sampler, one, *kept, shifts=shifts, samples=few) for one in way] for way in ways]
     found: list[tuple[float, np.ndarray]] = []
     for k in range(starts):
@@ -139,16 +140,16 @@ def best_motion(
         def told(share: float, k: int = k) -> None:
             progress((k + share) / starts)
 
-        search = _best_of_some if final.linear_rows <= FEW_ROWS else _by_joints
+        search = _best_of_some if simple else _by_joints
         found.append(search(made[k % len(made)], final, generator, told))
     ends: list[tuple[bool, float, Trajectory, tuple[Use, ...], Limits]] = []
     for value, x in sorted(found, key=lambda one: one[0])[:CHECKED]:
         if ends and min(ends, key=lambda one: one[:2])[:2] <= (False, value):
             break  # no motion that is left promises more
         own = _fitted(final, final.trajectory(x))
-        if few is not None:
+        if simple and few is not None:
             x = solve(own, x)
-        elif own is not final:
+        elif few is not None or own is not final:
             x = polished(own, x, {}, STEPS)
         motion, uses, kept_limits = _feasible(torque, own, x)
         met = all(use.met for use in uses)
@@ -182,15 +183,16 @@ def _by_joints(
     Thousands of rows make many optima; what is best for one joint among the others' motions is found joint by joint.
     """
     last, best, x = problems[-1], np.inf, np.zeros(0)
-    for n in range(TRIED_WITHIN):
-        told(n / (TRIED_WITHIN + EXCHANGED))
+    tried, exchanged = APART if _distances_count(final.limits) else (TRIED_WITHIN, EXCHANGED)
+    for n in range(tried):
+        told(n / (tried + exchanged))
         other = random_motion(final, generator)
         for problem in problems:
             other = within(problem, other)
         if (value := last.value(other)) < best:
             best, x = value, other
-    for n in range(EXCHANGED):
-        told((TRIED_WITHIN + n) / (TRIED_WITHIN + EXCHANGED))
+    for n in range(exchanged):
+        told((tried + n) / (tried + exchanged))
         other = _exchanged(final, x, int(generator.choice(np.flatnonzero(last.moved))), generator)
         if other is not None:
             other = within(last, other, GENTLY)
@@ -249,7 +251,7 @@ def _fitted(problem: Problem, motion: Trajectory) -> Problem:
     if limits.clearance is None or not _distances_count(limits):
         return problem
     q = np.asarray(motion.states(CLEAR_RATE)[0])
-    return replace(problem, limits=replace(limits, clearance=limits.clearance.fitted(q)))
+    return replace(problem, limits=replace(limits, clearance=limits.clearance.fitted(q)), _near=None)
 
 
 def _excess(use: Use) -> float:

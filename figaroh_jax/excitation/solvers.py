@@ -63,6 +63,7 @@ class Problem:
     samples: int | None = None  # at which these many are evaluated, each for several; None: at all
     evaluations: int = 0
     _seen: _Seen | None = None
+    _near: tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]] | None = None  # at a point, and back
 
     def __post_init__(self) -> None:
         every = self.basis.instants(self.rate)
@@ -173,9 +174,9 @@ class Problem:
             cotangent[: len(theta), :, : self.count] += theta[:, None, None] * (by_torque / self.limits.torque).T
         by_states = self.sampler.back(seen.states, cotangent.swapaxes(0, 1))
         if by_distance is not None:
-            assert self.limits.clearance is not None
-            _, back = self.limits.clearance.with_gradient(seen.states[0, : self.count])
-            by_states[0, : self.count] += back(by_distance / NEAR)
+            self.distances(x)
+            assert self._near is not None
+            by_states[0, : self.count] += self._near[2](by_distance / NEAR)
         return self.to_numbers(by_states)
 
     def torque_shares(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "samples nv"]:
@@ -202,7 +203,10 @@ class Problem:
         clearance = self.limits.clearance
         if clearance is None or not clearance.rows.names:
             return np.zeros((self.count, 0))
-        return (clearance.distances(self.states(x)[0, : self.count]) - clearance.margin) / NEAR
+        if self._near is None or not np.array_equal(self._near[0], x):
+            near, back = clearance.with_gradient(self.states(x)[0, : self.count])
+            self._near = x.copy(), (near - clearance.margin) / NEAR, back
+        return self._near[1]
 
     def distance_slopes(
         self, x: Float[np.ndarray, " n"], samples: np.ndarray, pairs: np.ndarray
