@@ -328,7 +328,7 @@ def _compared(before: dict[str, Any], now: dict[str, Any]) -> str:
 def _held(answer: dict[str, Any]) -> float | None:
     if answer.get("position"):
         return answer["position"]["validated_after"]
-    if answer.get("holdout"):
+    if "base_parameters" in answer and answer.get("holdout"):
         return float(np.mean([x for one in answer["holdout"].values() for x in one["relative"]]))
     if answer.get("cross_validation"):
         return float(np.sqrt(np.mean([x**2 for x in answer["cross_validation"]["rms"] if x is not None])))
