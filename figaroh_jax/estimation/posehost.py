@@ -50,6 +50,10 @@ class HostRows:
         angle, across = np.where(turns, q, 0.0)[..., None, None], _skew(axis)[:, None]
         self.turn = _EYE + np.sin(angle) * across + (2.0 * np.sin(angle / 2.0) ** 2) * (across @ across)
         self.slide = None if turns.all() else np.where(turns, 0.0, q)[..., None] * axis[:, None]
+        last = np.concatenate([self.placement[1:, :3, :3], self.last[None, :3, :3]])
+        self.onward = self.turn @ last[:, None]  # from behind a joint's twist to before that of the next
+        self.ahead = (np.swapaxes(self.placement[:, :3, :3], 1, 2) @ self.placement[:, :3, 3:])[:, None, :, 0]
+        self.beyond = self.last[:3, :3].T @ self.last[:3, 3]
         self.base, self.centre = np.asarray(device.base, float), np.asarray(device.centre, float)
         self.poses = type(device) is Poses
         self.free_base, self.free_tool = (name in device.estimated for name in ("base_frame", "tool_frame"))
@@ -82,19 +86,20 @@ class HostRows:
         return residual.T, response, by_own.transpose(2, 1, 0)
 
     def _poses(self, shift: np.ndarray, exponent: np.ndarray, bend: np.ndarray) -> tuple[np.ndarray, ...]:
-        samples, n = self.samples, len(self.turn)
-        R, p = np.broadcast_to(self.first[:3, :3], (samples, 3, 3)), np.broadcast_to(self.first[:3, 3], (samples, 3))
-        before, turned, origin = np.empty((n, samples, 3, 3)), np.empty((n, samples, 3, 3)), np.empty((n, samples, 3))
-        for j, placement in enumerate(self.placement):
-            np.matmul(R, placement[:3, :3], out=before[j])
-            p = p + R @ placement[:3, 3] + _times(before[j], shift[j])
-            origin[j] = p
-            np.matmul(before[j], bend[j], out=turned[j])
-            R = before[j] @ exponent[j]
-            if self.slide is not None:
-                p = p + _times(R, self.slide[j])
-            R = R @ self.turn[j]
-        return R @ self.last[:3, :3], p + R @ self.last[:3, 3], before, turned, origin
+        """Tool's pose in the base, and of each joint the axes before its twist, turned by it, and its origin."""
+        n = len(self.turn)
+        axes, onward = np.empty((n + 1, self.samples, 3, 3)), exponent @ self.onward
+        axes[0] = self.first[:3, :3] @ self.placement[0, :3, :3] if n else self.first[:3, :3] @ self.last[:3, :3]
+        for j in range(n):
+            np.matmul(axes[j], onward[j], out=axes[j + 1])
+        before = axes[:-1]
+        step = _times(before, self.ahead + shift)
+        slid = None if self.slide is None else _times(before @ exponent, self.slide)
+        if slid is not None:
+            step[1:] += slid[:-1]
+        origin = self.first[:3, 3] + np.cumsum(step, axis=0)
+        p = (origin[-1] if n else self.first[:3, 3]) + _times(axes[-1], self.beyond)
+        return axes[-1], p if slid is None else p + slid[-1], before, before @ bend, origin
 
     def _placed(self, moved: _Moved) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rotation and origin of the base in the device, and the left Jacobian of its unknowns, if it has any."""
