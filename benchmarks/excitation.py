@@ -244,20 +244,23 @@ def _beside_ipopt(minimize_ipopt: Any, name: str, model: Any, options: tuple[int
         )
 
 
-def limits() -> None:
-    """All limits at once (position, velocity, 8 rad/s^2, torque), 10 s, five harmonics or nine control points."""
+def limits(robots: Sequence[str] = ("UR10e", "Panda"), seed: int = 0, starts: int = 1) -> None:
+    """All limits at once (position, velocity, 8 rad/s^2, torque), 10 s, five harmonics or nine control points.
+
+    Three seeds from `seed` on.
+    """
     from figaroh_jax.excitation.design import excite
     from figaroh_jax.excitation.information import learn
     from figaroh_jax.excitation.limits import limits_of
     from figaroh_jax.excitation.motions import fourier, spline
 
-    for name, model in arms().items():
+    for name, model in ((name, arms()[name]) for name in robots):
         learned, bounds = learn(model, trust=None), limits_of(model, acceleration=8.0)
         for basis in (fourier(5, 0.1, 10.0), spline(9, 10.0)):
-            for seed in range(3):
+            for own in range(seed, seed + 3):
                 since = time.process_time()
-                found = excite(model, basis, bounds, learned, starts=1, seed=seed)
-                told(f"{name} {basis.kind} seed {seed}", found, spent(since))
+                found = excite(model, basis, bounds, learned, starts=starts, seed=own)
+                told(f"{name} {basis.kind} seed {own}", found, spent(since))
 
 
 def sequence() -> None:
