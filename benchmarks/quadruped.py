@@ -120,7 +120,7 @@ def soft(seconds: float, seed: int, folder: Path) -> None:
     for column, entry in enumerate(found.free[found.free >= 0]):
         kind, place = here.known.table[entry].name, here.known.table[entry].at[0]
         truth = TRUTH[kind][PARTS.index(loop.robot.dof_names[place].rsplit("_", 1)[1])]
-        wrong.setdefault(kind, []).append(abs(found.theta[entry] / truth - 1))
+        wrong.setdefault(kind, []).append(float(abs(found.theta[entry] / truth - 1)))
         inside += abs(found.theta[entry] - truth) <= 1.96 * errors[column]
     moved = np.max([r["trunk"] for r in made], axis=0)
     print(f"trunk moves by {1e3 * moved[:3].max():.0f} mm and {moved[3:].max():.2f} rad, not measured")

@@ -77,7 +77,7 @@ def mujoco(folder: Path) -> np.ndarray:
 
 
 def newton(folder: Path) -> np.ndarray:
-    import newton as engine
+    import newton as engine  # pyright: ignore[reportMissingImports]
 
     api: Any = engine
     own, command, _, names, dt = numbers(folder, "newton")
@@ -112,7 +112,7 @@ def newton(folder: Path) -> np.ndarray:
 
 
 def genesis(folder: Path) -> np.ndarray:
-    import genesis as engine
+    import genesis as engine  # pyright: ignore[reportMissingImports]
 
     api: Any = engine
     own, command, _, names, dt = numbers(folder, "genesis")

@@ -70,6 +70,34 @@ def test_a_clock_that_jumps_and_a_joint_that_is_held_are_told_with_time_and_plac
     assert trusted is not None and not trusted[450:550].any()
 
 
+def test_an_arm_that_rests_on_something_is_told_where_several_joints_stand_off_at_once(tmp_path: Path):
+    """Each of three joints is off by less than a lone one must be; two at once are not enough."""
+    (tmp_path / "arm.xml").write_text(servo_arm6.model_text())
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    sound = recorded([])
+    theirs = mujoco.MjModel.from_xml_string(servo_arm6.model_text())  # pyright: ignore[reportAttributeAccessIssue]
+    state = mujoco.MjData(theirs)  # pyright: ignore[reportAttributeAccessIssue]
+    state.qpos[:] = sound.position[400]
+    mujoco.mj_forward(theirs, state)  # pyright: ignore[reportAttributeAccessIssue]
+    command = sound.command.copy()
+    command[400:600] = sound.position[400] + state.qfrc_bias / np.array(servo_arm6.KP)  # what gravity asks for
+    sound = sound._replace(command=command)
+    model = sound.position + 2e-3 * np.random.default_rng(1).normal(size=sound.position.shape)
+    found = {}
+    for joints in ((1, 2), (1, 2, 3)):
+        position = sound.position.copy()
+        position[400:600] = position[400]
+        read = np.where((np.arange(len(position)) // 200 == 2)[:, None], position, model)
+        position[400:600, joints] += 0.012
+        found[joints] = faults(loop, [sound, sound._replace(position=position)], [model, read])
+    assert found[1, 2] == []
+    (one,) = found[1, 2, 3]
+    assert (one.kind, one.run, one.joints) == ("contact", 1, (1, 2, 3))
+    assert abs(one.first - 4.0) < 0.5 and abs(one.last - 6.0) < 0.5
+    assert one.size == pytest.approx(0.012 * servo_arm6.KP[1], rel=0.2)
+    assert "lift, elbow, flex stand off the model's motion at once" in one.text(loop, [sound, sound])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("hidden", [[], [("stribeck_friction", 2, 0.3)]])
 def test_an_arm_gets_no_wrong_name(tmp_path: Path, hidden: list):
