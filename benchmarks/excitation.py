@@ -137,8 +137,11 @@ TOUCHING = {  # pairs that are nearer than 20 mm by their construction
 }
 
 
-def clearance(seed: int | None = None) -> None:
-    """All limits, 20 mm between all bodies and the floor, 10 s; one start, three seeds; meshes by coal afterwards."""
+def clearance(seed: int | None = None, cold: bool = False) -> None:
+    """All limits, 20 mm between all bodies and the floor, 10 s; one start, three seeds; meshes by coal afterwards.
+
+    `cold`: the first of these alone.
+    """
     from figaroh_jax.excitation.clearance import clearance_of
     from figaroh_jax.excitation.design import excite
     from figaroh_jax.excitation.information import learn
@@ -151,14 +154,14 @@ def clearance(seed: int | None = None) -> None:
         print("FIGAROH_JAX_MESHES does not say where robots with meshes are: left out")
         return
     files = {"UR10": "ur_description/urdf/ur10_robot.urdf", "Panda": "panda_description/urdf/panda.urdf"}
-    for name, file in files.items():
+    for name, file in list(files.items())[: 1 if cold else None]:
         joints = None if name == "UR10" else [f"panda_joint{k}" for k in range(1, 8)]
         model = load_urdf(Path(MESHES) / file, joints=joints)
         shapes, _ = read_shapes(Path(MESHES) / file)
         kept = clearance_of(model, shapes, margin=0.02, ignore=TOUCHING[name], floor=-0.05)
         learned, bounds = learn(model, trust=None), limits_of(model, acceleration=8.0, clearance=kept)
-        for basis in (fourier(5, 0.1, 10.0), spline(9, 10.0)):
-            for k in range(3) if seed is None else [seed]:
+        for basis in (fourier(5, 0.1, 10.0), spline(9, 10.0))[: 1 if cold else None]:
+            for k in ([0] if cold else range(3)) if seed is None else [seed]:
                 since = time.process_time()
                 found = excite(model, basis, bounds, learned, starts=1, seed=k)
                 told(f"{name} {basis.kind} seed {k}", found, spent(since))
@@ -241,20 +244,23 @@ def _beside_ipopt(minimize_ipopt: Any, name: str, model: Any, options: tuple[int
         )
 
 
-def limits() -> None:
-    """All limits at once (position, velocity, 8 rad/s^2, torque), 10 s, five harmonics or nine control points."""
+def limits(robots: Sequence[str] = ("UR10e", "Panda"), seed: int = 0, starts: int = 1) -> None:
+    """All limits at once (position, velocity, 8 rad/s^2, torque), 10 s, five harmonics or nine control points.
+
+    Three seeds from `seed` on.
+    """
     from figaroh_jax.excitation.design import excite
     from figaroh_jax.excitation.information import learn
     from figaroh_jax.excitation.limits import limits_of
     from figaroh_jax.excitation.motions import fourier, spline
 
-    for name, model in arms().items():
+    for name, model in ((name, arms()[name]) for name in robots):
         learned, bounds = learn(model, trust=None), limits_of(model, acceleration=8.0)
         for basis in (fourier(5, 0.1, 10.0), spline(9, 10.0)):
-            for seed in range(3):
+            for own in range(seed, seed + 3):
                 since = time.process_time()
-                found = excite(model, basis, bounds, learned, starts=1, seed=seed)
-                told(f"{name} {basis.kind} seed {seed}", found, spent(since))
+                found = excite(model, basis, bounds, learned, starts=starts, seed=own)
+                told(f"{name} {basis.kind} seed {own}", found, spent(since))
 
 
 def sequence() -> None:
@@ -898,7 +904,10 @@ def main() -> None:
     parser.add_argument("--names", nargs="+", choices=list(PAIRS), help="pairs of causes, where a part takes them")
     args = parser.parse_args()
     if args.cold:
-        told("one start, cold", *on_peer_problem(1))
+        if "clearance" in args.parts:
+            clearance(args.seed, cold=True)
+        else:
+            told("one start, cold", *on_peer_problem(1))
         spent_by = os.times()
         compiler = spent_by.children_user + spent_by.children_system
         print(f"whole process {time.process_time():.2f} CPU s, C compiler {compiler:.2f}")

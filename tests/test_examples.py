@@ -44,7 +44,7 @@ SAYS = {
     "real_calibrations": "TALOS: 16 parameters, 1.430 mm",
     "real_identifications": "TX40",
     "fleet": "robot 5: load_dependent_friction",
-    "so101": "friction by joint",
+    "so101": "causes named by this library",
 }
 NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
 

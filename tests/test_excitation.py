@@ -13,6 +13,7 @@ import robots
 from figaroh_jax.errors import InputError
 from figaroh_jax.excitation import information as info
 from figaroh_jax.excitation.design import excite
+from figaroh_jax.excitation.interior import _Curved
 from figaroh_jax.excitation.limits import limits_of
 from figaroh_jax.excitation.motions import Basis, Trajectory, fourier, quintic, spline
 from figaroh_jax.excitation.objectives import (
@@ -21,10 +22,10 @@ from figaroh_jax.excitation.objectives import (
     prediction_objective,
     smooth_condition_objective,
 )
-from figaroh_jax.excitation.programming import Rows, quadratic_step
+from figaroh_jax.excitation.programming import Rows, drawn_in, quadratic_step
 from figaroh_jax.excitation.sampling import Sampler
 from figaroh_jax.excitation.search import random_motion
-from figaroh_jax.excitation.solvers import Problem, solve
+from figaroh_jax.excitation.solvers import Problem, solve, within
 from figaroh_jax.formats.config import Baseline
 from figaroh_jax.rigid.model import RobotModel
 from figaroh_jax.rigid.regressor_gradient import regressor_pullback
@@ -200,6 +201,28 @@ def test_a_descent_within_torques_ends_where_slsqp_with_all_rows_does(arm: Robot
             problem.value, found, jac=problem.slope, method="SLSQP", constraints=[kept_rows], options=options
         ).x
         assert problem.value(found) < problem.value(theirs) + 1e-3
+
+
+def test_a_motion_that_begins_at_the_edge_is_drawn_in_a_little_and_from_within_keeps_its_limits(arm: RobotModel):
+    with jax.enable_x64(True):
+        learned, basis = info.learn(arm), spline(5, 4.0)
+        limits = limits_of(arm, acceleration=9.0, torque={"turn": 9.4, "bend": 2.7})
+        sampler = Sampler(arm, learned.terms, np.asarray(learned.width))
+        objective = information_objective(np.asarray(learned.prior))
+        problem = Problem(learned, sampler, objective, np.array(learned.independent), basis, limits, None)
+        away = -0.2 * np.random.default_rng(0).uniform(0.5, 1.0, (2, basis.size))  # from the edge, and back to it never
+        x = problem.numbers(Trajectory(limits.position[:, 1], away, basis))
+        margin = {"position": 2e-3}
+        drawn = drawn_in(problem, x, margin)
+        assert Rows(problem, margin).of_linear(drawn).min() > -1e-12
+        assert (problem.trajectory(drawn).weights < 0.8 * away).all()  # it still moves
+        found = within(problem, x)
+        assert Rows(problem, {}).of_linear(found).min() > 0
+        assert problem.value(found) < problem.value(x) - 0.1
+        curved, step, h = _Curved(problem), np.random.default_rng(1).normal(size=x.shape), 1e-6
+        assert np.abs(problem.torque_shares(x)).max() > 1  # beyond its limit the logarithm goes on as a parabola
+        ends = [problem.value(y) + 0.7 * curved.value(y) for y in (x - h * step, x + h * step)]
+        assert curved.slope(x, 0.7) @ step == pytest.approx((ends[1] - ends[0]) / (2 * h), rel=1e-5)
 
 
 def test_gradients_by_the_gram_matrix_are_those_of_finite_differences():

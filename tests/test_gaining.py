@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 
-from figaroh_jax.diagnosis.gaining import fall
+from figaroh_jax.diagnosis import gaining
+from figaroh_jax.diagnosis.gaining import fall, without_losses
 
 BLOCKS = 12
 
@@ -91,3 +96,32 @@ def test_rows_in_which_a_joint_stands_do_not_decide():
     one = fall(np.stack([standing + moving, moving]), np.stack([moved + 0.5 * moving, 0.5 * moving]), [0])
     assert one.own == pytest.approx(0.5)
     assert one.gains(strict=True)
+
+
+def test_two_causes_that_show_only_beside_each_other_stay_when_a_third_goes(monkeypatch: pytest.MonkeyPatch):
+    """The first of the two loses alone, the second gains little alone; a third one, in between, gains nothing."""
+    base = squares(np.random.default_rng(6), 4.0)
+    left = {"": 1.0, "a": 1.04, "b": 0.9, "ab": 0.5}  # of the squares, by which of the two are in; c adds a hundredth
+
+    def by_gain(problem: Any, start: Any, whitening: Any, causes: Sequence[str], later: Sequence[bool]) -> Any:
+        order = sorted(range(len(causes)), key=lambda k: (later[k], causes[k]))
+        inside, out = "", [base]
+        for k in order:
+            inside += causes[k]
+            known = "".join(sorted(c for c in inside if c in "ab"))
+            noise = 1 + 0.6 * np.random.default_rng(len(known)).standard_normal(base.shape) * (known == "b")
+            out.append(base * left[known] * noise * (1.01 if "c" in inside else 1.0))
+        return order, out, base.sum(1)
+
+    def joint(causes: Sequence[str]) -> Any:
+        return SimpleNamespace(causes=list(causes))
+
+    monkeypatch.setattr(gaining, "_by_gain", by_gain)
+    monkeypatch.setattr(gaining, "polished", lambda problem, start, causes, whitening: joint(causes))
+    found: Any = [SimpleNamespace(name=c, effect=c, joints=(0,)) for c in "abc"]
+    problem: Any = SimpleNamespace(model=SimpleNamespace(joint_names=("one",)))
+    claims: Any = dict.fromkeys("abc", np.inf)
+    kept = without_losses(problem, cast(Any, None), np.zeros((1, 1)), found, joint("abc"), True, claims)
+    assert [f.name for f in kept.named] == ["a", "b"]
+    assert kept.worse == ["c"]
+    assert kept.holdout.after == pytest.approx(np.sqrt(0.5) * kept.holdout.before)

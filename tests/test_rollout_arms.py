@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import jax
+import mujoco
 import numpy as np
 import pytest
 from generators import servo_arm6
@@ -13,9 +15,10 @@ from figaroh_jax.rollouts.alone import alone, carried_by, separable
 from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.data import Run, Stretch, windows
 from figaroh_jax.rollouts.faults import faults, without
+from figaroh_jax.rollouts.fit import standard_errors
 from figaroh_jax.rollouts.parameters import Entry
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import setting
+from figaroh_jax.rollouts.search import begun, setting
 from figaroh_jax.rollouts.sensitivity import predicted
 
 ROWS = 400
@@ -67,6 +70,34 @@ def test_a_clock_that_jumps_and_a_joint_that_is_held_are_told_with_time_and_plac
     assert trusted is not None and not trusted[450:550].any()
 
 
+def test_an_arm_that_rests_on_something_is_told_where_several_joints_stand_off_at_once(tmp_path: Path):
+    """Each of three joints is off by less than a lone one must be; two at once are not enough."""
+    (tmp_path / "arm.xml").write_text(servo_arm6.model_text())
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    sound = recorded([])
+    theirs = mujoco.MjModel.from_xml_string(servo_arm6.model_text())  # pyright: ignore[reportAttributeAccessIssue]
+    state = mujoco.MjData(theirs)  # pyright: ignore[reportAttributeAccessIssue]
+    state.qpos[:] = sound.position[400]
+    mujoco.mj_forward(theirs, state)  # pyright: ignore[reportAttributeAccessIssue]
+    command = sound.command.copy()
+    command[400:600] = sound.position[400] + state.qfrc_bias / np.array(servo_arm6.KP)  # what gravity asks for
+    sound = sound._replace(command=command)
+    model = sound.position + 2e-3 * np.random.default_rng(1).normal(size=sound.position.shape)
+    found = {}
+    for joints in ((1, 2), (1, 2, 3)):
+        position = sound.position.copy()
+        position[400:600] = position[400]
+        read = np.where((np.arange(len(position)) // 200 == 2)[:, None], position, model)
+        position[400:600, joints] += 0.012
+        found[joints] = faults(loop, [sound, sound._replace(position=position)], [model, read])
+    assert found[1, 2] == []
+    (one,) = found[1, 2, 3]
+    assert (one.kind, one.run, one.joints) == ("contact", 1, (1, 2, 3))
+    assert abs(one.first - 4.0) < 0.5 and abs(one.last - 6.0) < 0.5
+    assert one.size == pytest.approx(0.012 * servo_arm6.KP[1], rel=0.2)
+    assert "lift, elbow, flex stand off the model's motion at once" in one.text(loop, [sound, sound])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("hidden", [[], [("stribeck_friction", 2, 0.3)]])
 def test_an_arm_gets_no_wrong_name(tmp_path: Path, hidden: list):
@@ -80,3 +111,36 @@ def test_an_arm_gets_no_wrong_name(tmp_path: Path, hidden: list):
     told = {(n.candidate.effect, n.candidate.at[0]) for n in found.named}
     assert not found.faults
     assert told <= {(effect, servo_arm6.NAMES[joint]) for effect, joint, _ in hidden}
+
+
+SWING = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/><worldbody>
+<body pos="0 0 1"><joint name="swing" axis="0 1 0" stiffness="25" damping="0.4"/>
+<inertial pos="0 0 0" mass="2" diaginertia=".05 .05 .05"/>
+<body pos="0 0 -0.1">
+<joint name="leg" axis="0 1 0" armature="{armature}" damping="{damping}" frictionloss="{friction}"/>
+<inertial pos="0 0 -0.15" mass="0.8" diaginertia=".006 .006 .001"/></body></body></worldbody>
+<actuator><position name="leg" joint="leg" kp="40" kv="0.8"/></actuator></mujoco>"""
+
+
+def test_a_base_that_swings_unmeasured_is_simulated_and_the_leg_identified(tmp_path: Path):
+    """The leg's numbers from its encoder alone; MuJoCo C made the motion of both."""
+    truth = {"armature": 0.012, "damping": 0.2, "friction": 0.25}
+    theirs = mujoco.MjModel.from_xml_string(SWING.format(**truth))  # pyright: ignore[reportAttributeAccessIssue]
+    state, rows = mujoco.MjData(theirs), 400  # pyright: ignore[reportAttributeAccessIssue]
+    t = 0.01 * np.arange(rows)
+    u, q, swing = 0.4 * np.sin(6 * t) + 0.2 * np.sign(np.sin(2.3 * t)), np.zeros(rows), np.zeros(rows)
+    for k in range(rows):
+        q[k], swing[k], state.ctrl[0] = state.qpos[1], state.qpos[0], u[k]
+        mujoco.mj_step(theirs, state, 5)  # pyright: ignore[reportAttributeAccessIssue]
+    assert np.ptp(swing) > 0.1
+    (tmp_path / "leg.xml").write_text(SWING.format(**{name: 1.6 * value for name, value in truth.items()}))
+    loop = dataclasses.replace(load_loop(tmp_path / "leg.xml")[0], measured=(1,), summed=(-1,))
+    noisy = q + 2e-4 * np.random.default_rng(0).normal(size=rows)
+    more = [(effect, "leg") for effect in ("rotor_inertia", "joint_damping", "friction_loss")]
+    here = setting(loop, [Run("swing", t, u[:, None], noisy[:, None], None)], baseline=(), more=more)
+    assert not any(c.effect == "encoder_offset" and c.at == ("swing",) for c in here.known.candidates)
+    found = begun(here)
+    for entry, error in zip(found.free[found.free >= 0], standard_errors(found, here.data), strict=False):
+        value = truth[here.known.table[entry].name]
+        assert abs(found.theta[entry] - value) < 4 * error < 0.1 * value
+    assert 0.8 < found.squares / rows < 1.2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import equinox as eqx
@@ -186,6 +187,20 @@ def test_wrong_recordings_are_refused_with_row_and_joint(tmp_path: Path, change,
     np.savez(tmp_path / "seen.npz", **change(servo_arm.record("none", 7)))
     assert main(["diagnose", str(path), "--out", str(tmp_path / "run"), "--quiet"]) == 2
     assert words in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("command", ["diagnose", "identify"])
+@pytest.mark.parametrize("gain", ["-30", "4e7"])
+def test_gains_that_let_the_loop_diverge_are_told_with_row_and_joint(tmp_path: Path, capsys, command: str, gain: str):
+    """A wrong sign, and a unit a million times too small."""
+    path = task(tmp_path, "none")
+    text = re.sub(r'kp="[^"]*"', f'kp="{gain}"', NOMINAL).replace("implicitfast", "Euler")
+    (tmp_path / "arm.xml").write_text(text)
+    assert main([command, str(path), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert re.search(r"diverges at joint joint, in row \d+ \(from 0, [0-9.]+ s\) of seen", said), said
+    assert "kp" in said and len(said.strip().splitlines()) == 1
     assert not (tmp_path / "run").exists()
 
 

@@ -94,8 +94,8 @@ def diagnose(
     with jax.enable_x64(True):
         progress("preparing signals", 0.03)
         backend = as_backend(model)
-        signals, slowed = _signals(backend, recordings, preprocess, known, trust)
-        here = _setting(backend, signals, known, trust, forbid, progress)
+        signals, slowed, begun = _signals(backend, recordings, preprocess, known, trust)
+        here = _setting(*begun, forbid, progress)
         generator = np.random.default_rng(seed)
         searched = _searched(here, forbid, CERTAIN * alpha, tolerance, progress, generator)
         judged = _judged(searched, [s.name for s in signals], forbid, tolerance)
@@ -138,8 +138,8 @@ class _Judged(NamedTuple):
 
 def _signals(
     backend: Backend, recordings: Sequence[Recording], preprocess: Preprocess, known: Baseline | None, trust: float
-) -> tuple[list[Signals], bool]:
-    """The recordings prepared, holdout recordings behind the others, and whether their positions are slowed.
+) -> tuple[list[Signals], bool, tuple[Problem, State]]:
+    """The recordings prepared, holdout recordings behind the others, whether their positions are slowed, the baseline.
 
     Each position is taken down to the band of its own motion only where the baseline then predicts left-out parts
     better, by their error in N m: coarse encoders need it, and it takes the abrupt parts of a fine one away.
@@ -148,9 +148,10 @@ def _signals(
     prepared = (prepare_all(recordings, preprocess, slowed=slowed, resampled=resampled) for slowed in (False, True))
     plain, slow = both = [sorted(checked_repeats(each), key=lambda s: s.role == "holdout") for each in prepared]
     if all(np.array_equal(a.position, b.position) for a, b in zip(plain, slow, strict=True)):
-        return plain, False
-    errors = [_baseline_error(*_begun(backend, signals, known, trust)) for signals in both]
-    return (slow, True) if errors[1] < errors[0] else (plain, False)
+        return plain, False, _begun(backend, plain, known, trust)
+    first, second = (_begun(backend, signals, known, trust) for signals in both)
+    slower = _baseline_error(*second) < _baseline_error(*first)
+    return (slow, True, second) if slower else (plain, False, first)
 
 
 def _baseline_error(problem: Problem, start: State) -> float:
@@ -170,16 +171,8 @@ def _begun(backend: Backend, signals: Sequence[Signals], known: Baseline | None,
     return problem, baseline(problem, *_baseline_effects(backend.robot, known))
 
 
-def _setting(
-    backend: Backend,
-    signals: Sequence[Signals],
-    known: Baseline | None,
-    trust: float,
-    forbid: Sequence[str],
-    progress: Callable[[str, float], None],
-) -> _Setting:
+def _setting(problem: Problem, start: State, forbid: Sequence[str], progress: Callable[[str, float], None]) -> _Setting:
     """The recordings on one clock, the baseline, and the noise; holdout recordings stand behind the others."""
-    problem, start = _begun(backend, signals, known, trust)
     progress("estimating the noise", 0.08)
     spectrum, whitening = noise_floor(problem, start, forbid)
     problem = friction_width(problem, start, whitening)

@@ -115,6 +115,7 @@ def without_losses(
             later.append(named[least].name)
             continue
         worse.append(named[least].name)
+        later.clear()
         passed.clear()
         named = [f for k, f in enumerate(named) if k != least]
         joint = polished(problem, start, [f.effect for f in named], whitening)

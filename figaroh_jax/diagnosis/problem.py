@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 from weakref import ref
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
@@ -19,7 +20,7 @@ from ..effects.catalogue import CATALOGUE
 from ..recordings.stacked import Records, filter_rows, open_rows
 from ..rigid.model import RobotModel
 from ..simulators.contract import Backend
-from .design import Units, candidates, flattened, kind, shapes, units
+from .design import SHORT, Units, candidates, flattened, kind, shapes, units
 from .shifts import links_torque, rigid_torque
 
 T = TypeVar("T")
@@ -29,6 +30,7 @@ __all__ = ["Layout", "Part", "Problem", "family_of", "without_factor"]
 # cached, and the same for all weights of the rows
 _OF_THE_MOTION = ("torque", "gain", "motion", "families", "fixed", "plain", "_terms")
 KEPT = 160 << 20  # bytes of filtered columns that are held: two responses of an arm in 18 recordings of half a minute
+AT_ONCE = 36  # effects with a shape that are evaluated at once along long recordings
 MOST_TERMS = 48  # terms of models whose columns are held
 TURNED = 128  # samples that are turned at once: they stay in the processor's cache
 
@@ -66,7 +68,7 @@ class Part:
     ) -> Part:
         """The part of ten columns for each joint and link that the tree does not make zero, in order of the joints."""
         flat = blocks.reshape(-1, blocks.shape[2])
-        used = flat[:, :TURNED].any(1)
+        used = np.asarray(flat[:, :TURNED].any(1))
         used[~used] = flat[~used].any(1)
         joint, first = np.repeat(where, 10, axis=0).T
         column = 10 * first + np.tile(np.arange(10), len(where))
@@ -236,12 +238,13 @@ class Problem:
     def plain(self) -> dict[str, tuple[Float[np.ndarray, "e k r n M"], Int[np.ndarray, "e r"]]]:
         """Rows, neither whitened nor weighted, of the effects that depend on the measured motion alone, and joints."""
         n, samples, _, _ = self.records.shape
-        given = self.fixed | self.family("shaped", self.motion)
-        return {
-            name: (filter_rows(self.records, own.torque.reshape(*own.torque.shape[:3], n, samples), fitted=True), at)
-            for name, own in given.items()
-            for at in [own.joints]
-        }
+        out = {}
+        for given in [self.fixed, *self.shaped_in_parts()]:
+            for name, own in given.items():
+                torque = own.torque.reshape(*own.torque.shape[:3], n, samples)
+                known = out.get(name, ([], []))
+                out[name] = [*known[0], filter_rows(self.records, torque, fitted=True)], [*known[1], own.joints]
+        return {name: (np.concatenate(rows), np.concatenate(at)) for name, (rows, at) in out.items()}
 
     def family(self, name: str, motion: Motion) -> dict[str, Units]:
         """Unit torques of a family, on one axis of places and grid points.
@@ -251,6 +254,20 @@ class Problem:
         if name == "following":
             return {n: self.following(n, motion) for n in self.families[name]}
         return units({n: flattened(b) for n, b in self.families[name].items()}, motion, self.records)
+
+    def shaped_in_parts(self) -> Iterator[dict[str, Units]]:
+        """Unit torques of the effects with a shape: all at once, of long recordings a few of one effect at a time.
+
+        The torque of all grid points at all samples would be the largest thing in memory by far.
+        """
+        if len(self.motion.time) <= SHORT:
+            yield self.family("shaped", self.motion)
+            return
+        for name, batch in self.families["shaped"].items():
+            whole = flattened(batch)
+            for start in range(0, len(whole.at), AT_ONCE):
+                few = jax.tree.map(lambda x, start=start: np.asarray(x)[start : start + AT_ONCE], whole)
+                yield units({name: few}, self.motion, self.records)
 
     def following(self, effect: str, motion: Motion) -> Units:
         """Unit torques of one effect that follows the torque of the current model."""

@@ -99,9 +99,15 @@ def _fresh_columns(
     response = whitening * state.response(problem.records.omega)[:, None]
     batches = {n: b for family in problem.families.values() for n, b in family.items()}
     weight, out = np.moveaxis(np.asarray(problem.records.weight), 2, 0), {}
+    parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
 
     def placed(name: str, rows: np.ndarray, at: np.ndarray) -> None:
         places, grid = batches[name].at.shape[:2]
+        parts.setdefault(name, []).append((rows, at))
+        if sum(len(joints) for _, joints in parts[name]) < places * grid:
+            return
+        known = parts.pop(name)
+        rows, at = known[0] if len(known) == 1 else (np.concatenate([part[k] for part in known]) for k in (0, 1))
         rows = rows.reshape(places, grid, *rows.shape[1:3], -1)
         out[name] = [Columns(tuple(joints), Z) for joints, Z in zip(at[::grid].tolist(), rows, strict=True)]
 
@@ -123,7 +129,7 @@ def _fresh_families(
     yield problem.family("following", state.motion)
     if everything and not plain:
         yield problem.fixed
-        yield problem.family("shaped", state.motion)
+        yield from problem.shaped_in_parts()
     sensors = {n: b for n, b in problem.families["sensor"].items() if n in wanted and (everything or b.follows_torque)}
     yield units({n: flattened(b) for n, b in sensors.items()}, state.motion, problem.records)
 

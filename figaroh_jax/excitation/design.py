@@ -214,10 +214,15 @@ def _finished(
         rate=rate,
         stages=tuple(stages),
         information=information,
-        condition=float(np.sqrt(np.linalg.cond(gram))),
-        scaled_condition=float(np.sqrt(np.linalg.cond(gram / np.outer(size, size)))),
+        condition=_condition(gram),
+        scaled_condition=_condition(gram / np.outer(size, size)) if (size > 0).all() else np.inf,
         separated=() if aim.given is None else separated(aim.given, seen, prior),
     )
+
+
+def _condition(gram: Float[np.ndarray, "n n"]) -> float:
+    """Condition number of rows with this Gram matrix."""
+    return float(np.sqrt(np.linalg.cond(gram))) if gram.any() else np.inf
 
 
 def gram_of(

@@ -30,6 +30,7 @@ LONGEST = 1.5  # rad (or at 2 rad/s, 8 rad/s^2) that a step changes a number
 SHORTEST = 1e-9  # share of a step
 ENOUGH = 1e-4  # share of the expected decrease that a step must bring
 ENDED, IN_A_ROW = 1e-6, 3  # of the objective: what so many steps must gain
+INWARDS = 0.05  # of a range: how far within it a motion that is drawn in may stand still
 HELD = 1e-8  # a step's violation of rows that are in, which is rounding
 CUT = 12  # times that a step is shortened
 DEPENDENT = 1e-14  # square of what is left of a row of length one beside others, which is rounding
@@ -171,7 +172,7 @@ def drawn_in(problem: Problem, x: Float[np.ndarray, " n"], margin: dict[str, flo
     room = rows.of_linear(x)
     if room.min(initial=0.0) >= 0.0:
         return x
-    rest = at_rest(problem, x, margin.get("position", 0.0))
+    rest = at_rest(problem, x, margin.get("position", 0.0) + INWARDS)  # at the edge itself nothing would be left of it
     with np.errstate(divide="ignore", invalid="ignore"):
         share = -room / (rows.of_linear(rest) - room)
     share = np.where(room < 0, share, 0.0).max()

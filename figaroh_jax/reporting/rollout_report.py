@@ -23,7 +23,7 @@ TITLES = {
     "kp": "gain kp",
     "kd": "gain kd",
     "scale": "drive gain",
-    "delay": "delay of the command",
+    "delay": "command delay",
     "dead_band": "dead band",
     "voltage": "voltage limit",
     "reading": "encoder offset",

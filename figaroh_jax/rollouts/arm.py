@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -151,14 +151,15 @@ def _simulated(here: Setting, first: Fit) -> list[np.ndarray] | None:
 def _standing(here: Setting, structure: Structure, one: Fit, free: Sequence[int]) -> _Standing:
     """A fit with what it leaves, on the rows it was fitted to and without them."""
     if not np.isfinite(one.cost):
-        return _Standing(Model(structure, one, tuple(free), np.inf), *(np.zeros((1, 1, 1)),) * 2, np.full(1, np.inf))
+        nothing = np.zeros((1, 1, 1))
+        return _Standing(Model(structure, one, tuple(free), np.inf), nothing, nothing, np.full(1, np.inf))
     beyond = _excess(here, structure, one)
     model = Model(structure, one, tuple(free), float(beyond.max()))
     held = refitted_without(*structure, [one], here.folds, lanes=1, outputs=True)[0]
     return _Standing(model, _outputs(here, one.sums.cost), _outputs(here, held), beyond)
 
 
-def _outputs(here: Setting, squares: np.ndarray) -> np.ndarray:
+def _outputs(here: Setting, squares: Any) -> np.ndarray:
     """Squares by outputs as squares by joints of the robot: rates go with their positions."""
     places, count = list(here.loop.measured), len(here.loop.measured)
     found = np.zeros((*squares.shape[:2], here.loop.robot.nv))
@@ -455,7 +456,7 @@ class _Ranked(NamedTuple):
 
 def _fitted(here: Setting, now: _Standing, ranked: Sequence[_Ranked]) -> list[Tried]:
     """Candidates of one joint: a few steps of each, then the leaders to the end."""
-    early = []
+    early: list[tuple[Fit, Structure, Candidate, list[int]]] = []
     for _, structure, c, theta in ranked:
         starts = [theta] if c.elastic or not c.starts else [start_values(theta, c, x) for x in c.starts]
         start = _start_of(now, structure)

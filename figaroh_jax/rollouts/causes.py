@@ -58,10 +58,11 @@ def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbi
     names = robot.dof_names
     levers = np.asarray(loop.joints.friction)
     for j, name in enumerate(names):
-        for number in _JOINT_ENTRIES:
-            table.append(Entry(number, (j,)))
+        read = j in loop.measured
+        table += [Entry(number, (j,)) for number in _JOINT_ENTRIES if read or number != "reading"]
         torque = _largest(loop, forces, j)
-        candidates += [(*one, name) for one in _of_joint(j, max(float(levers[j]), 0.02 * torque), torque)]
+        own = _of_joint(j, max(float(levers[j]), 0.02 * torque), torque)
+        candidates += [(*one, name) for one in own if read or one[0] != "encoder_offset"]
     for k in range(len(loop.drives.names)):
         table += [Entry(number, (k,)) for number in _DRIVE_ENTRIES]
         name = names[int(np.argmax(np.abs(np.asarray(loop.drives.transmission)[k])))]

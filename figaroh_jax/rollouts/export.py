@@ -109,12 +109,13 @@ SIMULATORS: dict[str, tuple[dict[str, str], str]] = {
     "newton": (
         {
             "armature": "joint_armature",
+            "damping": "joint_damping",
             "friction": "joint_friction",
             "kp": "joint_target_ke",
             "kd": "joint_target_kd",
             "force": "joint_effort_limit",
         },
-        "read by its MuJoCo solver, where friction is MuJoCo's; add the joint's damping to joint_target_kd",
+        "read by its MuJoCo solver, where friction is MuJoCo's; single precision",
     ),
     "isaaclab": (
         {

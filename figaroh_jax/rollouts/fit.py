@@ -131,7 +131,7 @@ class _Lanes:
                     damping[k] *= 30
         return now
 
-    def kept(self, sums: Sums, lane: int) -> Sums:
+    def kept(self, sums: Sums, lane: Any) -> Sums:
         """Without what a lane leaves out."""
         keep = ~self.left[lane]
         return Sums(*(np.where(keep.reshape(keep.shape + (1,) * (x.ndim - 2)), x, 0.0) for x in sums))  # pyright: ignore[reportArgumentType]
@@ -203,7 +203,7 @@ class _Lanes:
         wide = lambda x: good.reshape(1, -1, *(1,) * (x.ndim - 2))  # noqa: E731
         return Sums(*(np.where(wide(x), x, y) for x, y in zip(new, old, strict=True)))  # pyright: ignore[reportArgumentType]
 
-    def step(self, sums: Sums, lane: int, damping: Any) -> _Step:
+    def step(self, sums: Sums, lane: Any, damping: Any) -> _Step:
         """The damped step within the bounds; entries that would leave them stay where they are."""
         system = System(sums, self.data, self.start[lane])
         free = self.free[lane]

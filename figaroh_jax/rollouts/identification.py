@@ -19,7 +19,7 @@ from .loop import Loop
 from .parameters import BOUNDS, UNITS, put
 from .search import Setting, Structure, begun, residuals
 from .sensitivity import predicted
-from .task import diagnosis_setting, extended_of, read_rollouts, simulated
+from .task import diagnosis_setting, diverged, extended_of, read_rollouts, simulated
 
 if TYPE_CHECKING:
     from ..effects.extended import ExtendedModel
@@ -63,7 +63,7 @@ def identify_rollout_task(
         progress("fitting", 0.2)
         first = begun(here)
         if not np.isfinite(first.cost):
-            raise InputError(f"{task.robot.model}: the simulation diverges with the model's own gains; check kp and kd")
+            raise InputError(f"{task.robot.model}: {diverged(here, first)}")
         final = put(here.loop, here.known.table, first.theta)
         held = {run.name: (run, simulated(final, run)) for run in runs if run.holdout}
         notes = (*notes, *implausible(loop.robot, extended_of(final), task.robot.trust))

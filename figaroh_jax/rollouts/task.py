@@ -23,7 +23,7 @@ from .alone import separable
 from .arm import search_arm
 from .causes import BASELINE
 from .data import Run, Stretch, noise_of, regular, windows
-from .fit import standard_errors
+from .fit import Fit, standard_errors
 from .loop import Loop
 from .parameters import UNITS, put
 from .reading import load_loop
@@ -39,6 +39,7 @@ __all__ = [
     "RolloutDiagnosis",
     "diagnose_rollout_task",
     "diagnosis_setting",
+    "diverged",
     "extended_of",
     "read_rollouts",
     "simulated",
@@ -53,6 +54,7 @@ EFFECTS = {  # parameters of effects and the fields of `Joints` that hold them
     "joint_spring": {"stiffness": "stiffness", "offset": "offset"},
 }
 _WINDOW, _OPEN = 15.0, 1.0  # s
+_FAR = 1e3  # rad or m: a simulation that gets there has diverged
 _TURN = 12.0  # a command that many times beyond what the joint did is in other units
 
 
@@ -75,10 +77,7 @@ def diagnose_rollout_task(
         seek = search_arm if separable(loop) else search
         found = seek(here, progress, forbid=task.diagnose.forbid)
         if not np.isfinite(found.first.cost):
-            raise InputError(
-                f"{task.robot.model}: the simulation diverges with the model's own gains: they contradict its inertia "
-                "and time step; check kp, kd (their units and signs) and armature"
-            )
+            raise InputError(f"{task.robot.model}: {diverged(here, found.first)}")
         progress("measuring the gain", 0.9)
         here = found.setting or here
         notes = (*notes, *(one.text(loop, here.runs) for one in found.faults))
@@ -227,6 +226,27 @@ def _faulty(found: Search, here: Setting) -> list[Cause]:
         gain = Gain(found.held[0], found.held[0], "rad")
         causes.append(Cause(Name(one.kind, at), parameters, 0.9, gain, note=one.text(here.loop, here.runs)))
     return causes
+
+
+def diverged(here: Setting, first: Fit) -> str:
+    """Where the simulation with the model's own numbers leaves all bounds: recording, row, joint."""
+    read = np.asarray(predicted(here.loop, here.known.table, first.theta[None], here.data, first.start[None]))[0]
+    count = len(here.loop.measured)
+    lost = ~(np.abs(read[:, :count]) < _FAR)
+    where = [(int(lost[..., w].any(1).argmax()), w) for w in range(read.shape[2]) if lost[..., w].any()]
+    place = ""
+    if where:
+        row, w = min(where)
+        joint = here.loop.robot.dof_names[here.loop.measured[int(lost[row, :, w].argmax())]]
+        one = here.stretches[w]
+        run = here.runs[one.run]
+        row += one.first
+        stamp = run.time[min(row, len(run.time) - 1)]
+        place = f" at joint {joint}, in row {row} (from 0, {stamp:.4g} s) of {run.name}"
+    return (
+        f"the simulation diverges{place} with the model's own gains: they contradict its inertia and time step; check"
+        " kp, kd (their units and signs) and armature"
+    )
 
 
 def simulated(loop: Loop, run: Run) -> np.ndarray:
