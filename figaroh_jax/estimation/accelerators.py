@@ -192,7 +192,9 @@ def _summed(states: States, frames: Sequence[OwnFrame], mesh: Mesh, folds: int, 
         chunk = chunk or _chunk(mesh, numbers, len(part[0]) // folds)
         add, own = _program(chunk, folds, codes, devices[0].platform == "cpu"), -(-len(part[0]) // (chunk * mesh.size))
         firsts = [np.int32(chunks + own * k) for k in range(mesh.size)]
-        totals = tuple(map(add, totals, fixed, _shares(part, chunk, mesh), firsts))
+        share = own * chunk
+        there = [np.int32(np.clip(len(part[0]) - k * share, 0, share)) for k in range(mesh.size)]
+        totals = tuple(map(add, totals, fixed, _shares(part, chunk, mesh), there, firsts))
         chunks += -(-len(part[0]) // chunk)
         jax.block_until_ready(before)  # one piece ahead: no more wait in memory
         before = [total.rows for total in totals]
@@ -221,25 +223,25 @@ def _chunk(mesh: Mesh, rows: int, most: int) -> int:
 
 
 def _shares(part: Sequence[Any], chunk: int, mesh: Mesh) -> list[tuple[Array, ...]]:
-    """Each device's share of the arrays of a piece and of the weight of its rows, filled up to whole chunks."""
+    """Each device's share of the arrays of a piece, filled up to whole chunks."""
     samples = len(part[0])
     missing = -samples % (chunk * mesh.size)
     sharding = NamedSharding(mesh, PartitionSpec("samples"))
     arrays = [x if isinstance(x, jax.Array) else np.asarray(x, float) for x in part]
     if missing:
         arrays = [np.concatenate([x, np.repeat(np.asarray(x[-1:]), missing, axis=0)]) for x in arrays]
-    there = (np.arange(samples + missing) < samples).astype(float)
-    spread = (jax.device_put(x, sharding) for x in (*arrays, there))
+    spread = (jax.device_put(x, sharding) for x in arrays)
     own = [{share.device: share.data for share in x.addressable_shards} for x in spread]
     return [tuple(x[device] for x in own) for device in mesh.devices.flat]
 
 
 @lru_cache(maxsize=16)
 def _program(chunk: int, folds: int, codes: bytes | None, cpu: bool) -> Callable[..., _Sums]:
-    """Adds the rows of a device's share of a piece, which begins after so many chunks, to the device's sums."""
+    """Adds a device's share of a piece, of which so many samples are there and which begins after so many chunks."""
 
-    def program(total: _Sums, fixed: Any, part: tuple[Array, ...], first: Array) -> _Sums:
-        chunks = [x.reshape(-1, chunk, *x.shape[1:]) for x in part]
+    def program(total: _Sums, fixed: Any, part: tuple[Array, ...], count: Array, first: Array) -> _Sums:
+        there = (jnp.arange(len(part[0]), dtype=jnp.int32) < count).astype(float)  # made here: it need not travel
+        chunks = [x.reshape(-1, chunk, *x.shape[1:]) for x in (*part, there)]
 
         def step(total: _Sums, k: Array) -> tuple[_Sums, None]:
             new, fold = _sums(codes, fixed, *(x[k] for x in chunks)), (first + k) % folds
