@@ -106,7 +106,7 @@ OTHERS = frozenset(
     " load_model load_robot load_task load_urdf load_usd own_device place pose_data postures read_recordings recording"
     " register shape torque_data write_model write_report"
     " Design Instrument Learned PostureDesign Trajectory excite excite_postures excite_task fourier learn limits_of"
-    " quintic spline"
+    " quintic screen_fleet spline"
     " JointEffect Load PoseRecording RolloutData Selection load_loop rollout_data select".split()
 ) | {"rollout"}  # its gradients stand in test_rollouts and test_rollout_data
 

@@ -114,7 +114,7 @@ def block_scores(
 ) -> Float[np.ndarray, "blocks columns"]:
     """The scores' share of each block, then of each prior row; they sum to the scores."""
     own = linear.residual * rows.paired
-    model = sum(block_sums(rows, r, x.T) for x, r in zip(rows.Xi, own, strict=True))
+    model = np.sum([block_sums(rows, r, x.T) for x, r in zip(rows.Xi, own, strict=True)], axis=0)
     total = np.zeros((stock.width, rows.block.max() + 1))
     for joint, columns, Zi in stock.blocks:
         total[columns] += block_sums(rows, linear.residual[joint], Zi)
