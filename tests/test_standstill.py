@@ -89,6 +89,15 @@ def test_friction_up_to_its_limit_is_no_law_where_the_model_has_less(model: Robo
     assert only_sticks(problem, state, noise, relative_rest(problem, state, noise), TOLERANCE)
 
 
+def test_a_joint_that_never_slides_holds_nothing_for_sure(model: RobotModel) -> None:
+    """Its friction turns over a width that no speed leaves: how much holds it at rest is not known, and no number."""
+    problem, state = recorded(model, stick, width=50.0)
+    left = problem.torque - predicted(problem, state)
+    beyond = beyond_sliding(problem, state, left)
+    assert np.isfinite(beyond).all()
+    assert beyond.max() > 0.1 * SLIDING.max()
+
+
 def test_what_is_tolerable_everywhere_is_no_stick(model: RobotModel) -> None:
     problem, state = recorded(model, lambda v, top, rng: 0.0 * v)
     assert not only_sticks(problem, state, np.full(2, NOISE), np.zeros(2), TOLERANCE)

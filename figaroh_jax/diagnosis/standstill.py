@@ -71,7 +71,8 @@ def beyond_sliding(problem: Problem, state: State, left: Float[np.ndarray, "n M 
     """How far the friction of each row, which is that of the state and what it has `left`, lies outside the interval
     from minus to plus the friction that the state has for sliding at the row's speed, N m or N; zero inside.
 
-    Where the state's friction turns over a width of the velocity, the limit is what it comes to beyond that width. The
+    Where the state's friction turns over a width of the velocity, the limit is what it comes to beyond that width; of a
+    joint that never gets there it is not known, and nothing counts as held. The
     row filter overshoots where friction turns at once, so the limit is as much larger as it makes the sign of the
     velocity at the most.
     """
@@ -81,7 +82,7 @@ def beyond_sliding(problem: Problem, state: State, left: Float[np.ndarray, "n M 
     for joint, (own, part) in enumerate(zip(friction.T, turned.T, strict=True)):
         told = np.flatnonzero(part > TURNED)
         sliding = np.abs(own[told]) / part[told]
-        limit[:, joint] = np.interp(np.arange(n * samples), told, sliding) if len(told) else np.inf
+        limit[:, joint] = np.interp(np.arange(n * samples), told, sliding) if len(told) else 0.0
     response, sign = state.response(problem.records.omega), np.sign(np.asarray(state.motion.velocity))
     inside, edge, turns = (open_rows(problem.records, x, response) for x in (friction, limit, sign))
     over = np.maximum(np.abs(turns * problem.records.judged).max((0, 1)), 1.0)

@@ -44,6 +44,7 @@ class Look:
 
     @property
     def recording(self) -> Recording:
+        """The recording that is looked at, once it has been read."""
         assert self.series is not None
         return self.series
 

@@ -198,6 +198,7 @@ def free_entries(fitted: Sequence[int], extra: Sequence[int]) -> list[int]:
 
 
 def start_values(theta: np.ndarray, candidate: Candidate, values: Sequence[float]) -> np.ndarray:
+    """Theta with a candidate's entries at the values that it starts from; where one is not a number it stays."""
     new = theta.copy()
     for entry, value in zip(candidate.entries, values, strict=True):
         if not np.isnan(value):
