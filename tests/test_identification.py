@@ -150,14 +150,16 @@ def test_a_known_payload_is_no_part_of_the_robot(truth: Truth):
     np.testing.assert_allclose(values[0], values[1], rtol=1e-3, atol=5e-3)
 
 
-def test_a_payload_that_nobody_told_of_is_found_however_well_the_links_are_believed(truth: Truth):
+@pytest.mark.parametrize("trust", [0.02, 0.1])
+def test_a_payload_that_nobody_told_of_is_found_however_well_the_links_are_believed(truth: Truth, trust: float):
     """Its moments that no torque shows have to grow with the others, or the link would be no body."""
     load = 3.0, np.array([0.2, 0.1, 0.3])
     held = recording(truth, 10.0, seed=7, role="holdout", name="other", payload=load)
-    found = identify(truth.nominal, [recording(truth, seed=1, payload=load), held], SETTINGS, trust=0.02)
+    found = identify(truth.nominal, [recording(truth, seed=1, payload=load), held], SETTINGS, trust=trust)
     passed = np.sqrt(2 * 10.0 / simulated_arm.RATE)
     assert (found.holdout["other.npz"].rms < 1.5 * passed * simulated_arm.TORQUE_NOISE).all()
     assert any("clearly better" in note for note in found.notes)
+    assert found.trust <= 2.0  # what no torque shows is held by the nominal alone
 
 
 def test_bounds_of_cad_hold(truth: Truth):

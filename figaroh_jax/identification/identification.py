@@ -60,6 +60,7 @@ Fit = Literal["physical", "log_cholesky", "unconstrained"]
 MOVED = 2.0
 SHOWN = 0.01  # information of the data in a direction below which it stays as stated; 1 is the prior's own (a root)
 TRUSTS = (1.0, 3.0, 10.0, 100.0)  # multiples of the stated trust that cross-validation chooses from
+MOST_UNSEEN = 2.0  # relative sigma of a link beyond which nothing is let go that no torque shows
 CLEARLY = 0.05  # of the squares left out: what letting go of all that no torque shows must gain
 DRIVE_PRECISION = 1e-6
 DEAD = 0.5  # share of samples at one single value: such a torque is not measured
@@ -190,7 +191,7 @@ def identify(
         covariance = coloured_covariance(regression, start.parameters, base.independent, start.weight)
         problem = _problem(regression, data, base, start, covariance, trust, fit, bounds)
         progress("fitting", 0.6)
-        last = _best(problem)
+        last = _best(problem, trust)
         progress("judging", 0.85)
         found = _judged(problem, regression, start.parameters, covariance, last, trust, structural.rank)
     notes = [*warned, *left_out, *found.notes, *dropped(regression.signals, model)]
@@ -410,8 +411,9 @@ class _Best(NamedTuple):
     fit: Solved
 
 
-def _best(problem: _Problem) -> _Best:
-    """What cross-validation chooses; what no torque shows is let go only where that predicts clearly better."""
+def _best(problem: _Problem, trust: float) -> _Best:
+    """What cross-validation chooses; what no torque shows is let go only where that predicts clearly better, and never
+    beyond `MOST_UNSEEN`: nothing but the nominal holds it."""
     tried = {slack: _left_out(problem, slack) for slack in TRUSTS}
     cost = {slack: float(squares @ problem.weight) for slack, squares in tried.items()}
     slack = TRUSTS[0]
@@ -419,7 +421,7 @@ def _best(problem: _Problem) -> _Best:
         slack = other if cost[other] < cost[slack] * (1 - 1e-3) else slack
     squares, everywhere = tried[slack], False
     if slack > 1:
-        for other in TRUSTS[2:]:
+        for other in (x for x in TRUSTS[2:] if x * trust <= MOST_UNSEEN):
             free = _left_out(problem, other, everywhere=True)
             if float(free @ problem.weight) > (1 - CLEARLY) * float(squares @ problem.weight):
                 break
