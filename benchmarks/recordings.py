@@ -36,7 +36,7 @@ def identified(name: str, folder: Path) -> tuple[Any, Any]:
     file = getattr(real_tasks, f"{name.removesuffix('_ungated')}_task")(folder, DATA, **options)
     kept: list[Any] = []
     validate = identification._best
-    identification._best = lambda problem: kept.append(problem) or validate(problem)
+    identification._best = lambda problem, trust: kept.append(problem) or validate(problem, trust)
     try:
         return identification.identify_task(fj.load_task(file)), kept[0]
     finally:
