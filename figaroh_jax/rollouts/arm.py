@@ -19,7 +19,7 @@ from ..results import Name
 from .causes import BASELINE, CONTAINS, Candidate, elastic_loop
 from .data import windows
 from .faults import Fault, faults, without
-from .fit import Fit, fit, refitted_without
+from .fit import Fit, System, fit, refitted_without
 from .parameters import Entry, put, values
 from .search import (
     Model,
@@ -28,6 +28,7 @@ from .search import (
     Setting,
     Structure,
     Tried,
+    begins_of,
     begun,
     by_recording,
     excess,
@@ -41,7 +42,7 @@ from .search import (
     start_values,
     t_of,
 )  # fmt: skip
-from .sensitivity import predicted
+from .sensitivity import Windows, predicted
 
 __all__ = ["search_arm"]
 
@@ -50,12 +51,20 @@ _CLEAR, _MUCH = 3.0, 0.25  # t and gain of a name beside which more than noise s
 _ALIKE, _NEAR = 1.7, 0.1  # t and share of the gain within which two causes are alike
 _USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
 _TOP, _RACE = 3, 2  # candidates of a joint that are fitted, and that are fitted to the end
-_EARLY, _LATE = 3, 30  # iterations
-_ROUGH = 1e-4  # share of the squares that a step must promise while candidates are ranked
+_EARLY, _AGAIN, _LATE = 3, 6, 30  # iterations
+_ROUGH = 1e-4  # share of the squares that a step must promise
+_PART = 3  # of the windows, one in so many shows whether a limit or a spring is worth a fit
 _MOST, _CHECKS = 6, 4  # causes of a joint; candidates whose held-out squares are looked at in a round
+_SURELY = 0.1  # share of the squares by which a cause that is surely missed would make them larger
 _LEAST = 0.002  # held-out gain below which a cause found with others is not missed
 _HOPE = 0.1  # share of a joint's squares that a cause must promise where it must take `_MUCH` in the end
+_SAME = 0.02  # change of a joint's squares below which nothing new is looked for there
+_WINS = 0.45  # share of the best gain after a few steps from which a candidate may still be named
+_ALL = 1.1  # squares of a sample up to which nothing is left to explain by a spring
+_SHARE_OF_T = 0.7  # of the t that a name needs on held-out rows, which it must have on those that were fitted
 _MORE = 1.02  # of the promise of a simpler cause, which a richer one must exceed to be fitted
+_FIRST = 4  # iterations from each start of the baseline
+_OF_DRIVE = ("scale", "delay", "dead_band", "voltage", "force_limit")
 _LIMITS = ("actuator_saturation", "voltage_saturation")
 _STILL = ("encoder_offset", "torque_offset", "joint_spring")  # of one joint: each makes up for the others
 _ELASTIC = ("joint_elasticity", "backlash")
@@ -76,19 +85,20 @@ def search_arm(
 ) -> Search:
     """Causes of an arm whose drives act at one joint each and whose joints are all measured."""
     progress("fitting the baseline", 0.05)
-    first = begun(here)
+    first = _begun(here)
     here, wrong = _sound(here, first)
     if wrong:
-        first = begun(here)
+        first = _begun(here)
     now = begin = _standing(here, Structure(here.loop, here.known.table, here.data), first, here.baseline)
     found: list[Named] = []
     held, steps, fits = [_rms(here, begin.held)], [("baseline", _level(here, first))], list[Fit]()
     nearest: list[tuple[Name, float, str]] = []
+    known: _Known = {}
     p_value = 1.0 if not np.isfinite(first.cost) else float(max(ndtr(-4 * begin.excess.max()), 1e-12))
     while np.isfinite(first.cost):
         number = len(steps)
         progress(f"looking for causes, round {number}", min(0.1 + 0.12 * number, 0.9))
-        new, now, nearest = _round(here, now, found, forbid, nearest)
+        new, now, nearest = _round(here, now, found, forbid, nearest, known)
         found += new
         if not new:
             break
@@ -105,6 +115,45 @@ def search_arm(
         begin.model.structure, here, wrong,
     )  # fmt: skip
     return _judged(here, result, now)
+
+
+def _begun(here: Setting) -> Fit:
+    """The baseline's fit: where it has several starts, each joint goes on from the one that its encoder likes best."""
+    structure = Structure(here.loop, here.known.table, here.data)
+    begins = begins_of(here, values(here.loop, here.known.table))
+    if len(begins) == 1:
+        return begun(here)
+    early = [
+        fit(*structure, x[None], [here.baseline], width=here.width, lanes=1, iterations=_FIRST, rough=_ROUGH)[0]
+        for x in begins
+    ]
+    early = [one for one in early if np.isfinite(one.cost)]
+    if not early:
+        return begun(here)
+    best = min(early, key=lambda one: one.cost)
+    theta, start, n = best.theta.copy(), best.start.copy(), here.loop.robot.nv
+    squares = [_outputs(here, one.sums.cost).sum((0, 1)) for one in early]
+    for j in range(n):
+        own = early[int(np.argmin([x[j] for x in squares]))]
+        mine = [k for k in here.baseline if _joint_of(here, k) == j]
+        theta[mine], start[[j, n + j]] = own.theta[mine], own.start[[j, n + j]]
+    mixed, usual = (
+        fit(*structure, x[None], [here.baseline], y[None], width=here.width, lanes=1, rough=_ROUGH, iterations=most)[0]
+        for x, y, most in ((theta, start, _LATE), (best.theta, best.start, 0))
+    )
+    if mixed.cost < usual.cost:
+        return mixed
+    return fit(*structure, best.theta[None], [here.baseline], best.start[None], width=here.width, lanes=1)[0]
+
+
+def _joint_of(here: Setting, entry: int) -> int:
+    """The joint whose encoder shows a number of the table; -1: those of several."""
+    one = here.known.table[entry] if entry < len(here.known.table) else None
+    if one is None or len(one.at) > 1 or one.name == "payload":
+        return -1
+    if one.name in _OF_DRIVE:
+        return int(np.argmax(np.abs(np.asarray(here.loop.drives.transmission)[one.at[0]])))
+    return one.at[0]
 
 
 def _judged(here: Setting, result: Search, now: _Standing) -> Search:
@@ -179,16 +228,19 @@ def _excess(here: Setting, structure: Structure, one: Fit) -> np.ndarray:
 
 
 def _round(
-    here: Setting, now: _Standing, found: Sequence[Named], forbid: Sequence[str], nearest: list
+    here: Setting, now: _Standing, found: Sequence[Named], forbid: Sequence[str], nearest: list, known: _Known
 ) -> tuple[list[Named], _Standing, list]:
     """Causes to name next, at most one of each joint, and the model with them."""
-    tried = _tried(here, now, [n.candidate for n in found], forbid)
+    tried = _tried(here, now, [n.candidate for n in found], forbid, known)
     lists: dict[int, list[Tried]] = {}
     for one in tried:
         lists.setdefault(_joint(here, one.candidate), []).append(one)
     if not lists:
         return [], now, nearest
-    ordered = {j: [one for one in _ordered(now, ones) if _worthy(here, now, one)] for j, ones in lists.items()}
+    ordered = {
+        j: [one for one in _ordered(now, ones) if one.candidate not in known[j].refused and _worthy(here, now, one)]
+        for j, ones in lists.items()
+    }
     kept: list[Named] = []
     for _ in range(_CHECKS):
         firsts = sorted((ones[0] for ones in ordered.values() if ones), key=lambda one: -_gained(now, one))
@@ -197,20 +249,33 @@ def _round(
         chosen = firsts[:1]
         if chosen[0].candidate.effect in BASELINE:  # what every joint has is found at all of them at once
             chosen = [one for one in firsts if one.candidate.effect in BASELINE]
-        new = _named(here, now, lists, chosen)
+        new = _named(here, now, lists, chosen, found)
         if new is not None:
             kept, now = new
             break
+        for one in chosen:
+            known[_joint(here, one.candidate)].refused.append(one.candidate)
         ordered = {j: [one for one in ones if all(one is not x for x in chosen)] for j, ones in ordered.items()}
-    close = sorted(tried, key=lambda one: one.state.fit.cost)[:_TOP]
+    close = sorted(tried, key=lambda one: one.sse.sum())[:_TOP]
     total = float(now.squares.sum())
     if not kept:
         nearest = [
-            (Name(one.candidate.effect, one.candidate.at), max((total - one.state.fit.squares) / total, 0.0),
+            (Name(one.candidate.effect, one.candidate.at), max(float((total - one.sse.sum()) / total), 0.0),
              "gains too little on data that it was not fitted to")
             for one in close
         ]  # fmt: skip
     return kept, now, nearest
+
+
+class _Seen(NamedTuple):
+    """What was tried at a joint, when its squares were so large, and what held-out rows have refused since."""
+
+    squares: float
+    tried: list[Tried]
+    refused: list[Candidate]
+
+
+_Known = dict[int, _Seen]
 
 
 def _joint(here: Setting, c: Candidate) -> int:
@@ -227,9 +292,13 @@ def _worthy(here: Setting, now: _Standing, one: Tried) -> bool:
     """Whether a candidate takes so much of what it was fitted to that held-out rows can bear it out."""
     j = _joint(here, one.candidate)
     mine = slice(None) if j < 0 else slice(j, j + 1)
-    gain = 1 - one.sse[..., mine].sum() / max(now.squares[..., mine].sum(), 1e-300)
-    rest = by_recording(here) and one.state.excess >= 1.0
-    return bool(gain > (_MUCH if rest and one.candidate.effect not in BASELINE else _WORTH))
+    before, after = now.squares[..., mine].sum(-1), one.sse[..., mine].sum(-1)
+    gain = 1 - after.sum() / max(before.sum(), 1e-300)
+    if one.state.excess < 1.0:
+        return bool(gain > _WORTH)
+    usual, rest = one.candidate.effect in BASELINE, by_recording(here)
+    needed = _CLEAR if rest and not (usual and gain > _MUCH) else _SURE
+    return bool(gain > (_MUCH if rest and not usual else _WORTH) and t_of(before, after) > _SHARE_OF_T * needed)
 
 
 def _ordered(now: _Standing, ones: Sequence[Tried]) -> list[Tried]:
@@ -252,13 +321,12 @@ def _ordered(now: _Standing, ones: Sequence[Tried]) -> list[Tried]:
 
 
 def _named(
-    here: Setting, now: _Standing, lists: dict[int, list[Tried]], chosen: Sequence[Tried]
+    here: Setting, now: _Standing, lists: dict[int, list[Tried]], chosen: Sequence[Tried], found: Sequence[Named]
 ) -> tuple[list[Named], _Standing] | None:
     """The chosen causes that hold: all fitted together, those that held-out rows or the others do not need left out."""
     chosen = list(chosen)
     while chosen:
-        new = chosen[0].state if len(chosen) == 1 else _together(here, now, chosen)
-        new = _again(here, new)
+        new = _together(here, now, chosen)
         with_all = _standing(here, new.structure, new.fit, new.free)
         checks = [_check(here, now, with_all, one) for one in chosen]
         keep = [one for one, (good, _, _) in zip(chosen, checks, strict=True) if good]
@@ -267,6 +335,10 @@ def _named(
             continue
         spare = _spare(here, with_all, chosen) if len(chosen) > 1 else None
         if spare is None:
+            better = new if found else _again(here, new)
+            if better is not new:
+                with_all = _standing(here, better.structure, better.fit, better.free)
+                checks = [_check(here, now, with_all, one) for one in chosen]
             named = [_name(here, now, with_all, one, lists, check) for one, check in zip(chosen, checks, strict=True)]
             return sorted(named, key=lambda n: n.after**2 - n.before**2), with_all
         chosen = [one for one in chosen if one is not spare]
@@ -275,6 +347,8 @@ def _named(
 
 def _together(here: Setting, now: _Standing, chosen: Sequence[Tried]) -> Model:
     """All chosen causes in one fit, from where each ended by itself."""
+    if len(chosen) == 1 and chosen[0].alone:
+        return chosen[0].state
     elastic = next((one for one in chosen if one.candidate.elastic), None)
     structure, start = (now.model.structure, now.model.fit.start) if elastic is None else (
         elastic.state.structure, elastic.state.fit.start)  # fmt: skip
@@ -286,7 +360,7 @@ def _together(here: Setting, now: _Standing, chosen: Sequence[Tried]) -> Model:
         theta[own] = one.state.fit.theta[own]
         free = free_entries(free, entries)
     last = fit(*structure, theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
-               iterations=_LATE)[0]  # fmt: skip
+               iterations=_LATE, rough=_ROUGH)[0]  # fmt: skip
     return Model(structure, last, tuple(free), 0.0)
 
 
@@ -303,9 +377,16 @@ def _again(here: Setting, new: Model) -> Model:
     start, n, more = np.array(last.start), here.loop.robot.nv, structure.loop.robot.nv - here.loop.robot.nv
     begin = np.asarray(here.data.start)
     start[:n], start[n + more : 2 * n + more] = begin[:n], begin[n:]
-    other = fit(*structure, theta[None], [new.free], start[None], width=max(here.width, len(new.free)), lanes=1,
-                iterations=_LATE)[0]  # fmt: skip
-    return new._replace(fit=other) if other.cost < last.cost else new
+    for most, near in ((_AGAIN, 2.0), (_LATE, 1.0)):
+        other = fit(*structure, theta[None], [new.free], start[None], width=max(here.width, len(new.free)), lanes=1,
+                    iterations=most, rough=_ROUGH)[0]  # fmt: skip
+        if not other.cost < near * last.cost:
+            return new
+        theta, start = other.theta, other.start
+        own = list(new.free)
+        if (np.abs(theta[own] - last.theta[own]) <= _NEAR * np.abs(last.theta[own])).all():  # the same valley
+            return new
+    return new._replace(fit=other) if other.cost < (1 - _ROUGH) * last.cost else new
 
 
 def _of_joint(here: Setting, entry: int, c: Candidate) -> bool:
@@ -317,11 +398,8 @@ def _of_joint(here: Setting, entry: int, c: Candidate) -> bool:
 
 def _numbers(here: Setting, c: Candidate) -> set[int]:
     """Entries of the table at the joint of a cause."""
-    j = here.loop.robot.dof_names.index(c.at[0]) if c.effect != "payload" else -1
-    drives = np.flatnonzero(np.asarray(here.loop.drives.transmission)[:, j]) if j >= 0 else []
-    of_drive = ("scale", "delay", "dead_band", "voltage", "force_limit")
-    return {k for k, e in enumerate(here.known.table)
-            if (e.at[0] in drives if e.name in of_drive else e.at == (j,) and e.name != "payload")}  # fmt: skip
+    j = _joint(here, c)
+    return {k for k in range(len(here.known.table)) if j >= 0 and _joint_of(here, k) == j}
 
 
 def _check(here: Setting, now: _Standing, new: _Standing, one: Tried) -> tuple[bool, float, float]:
@@ -352,6 +430,8 @@ def _spare(here: Setting, new: _Standing, chosen: Sequence[Tried]) -> Tried | No
         if one.candidate.elastic:
             continue
         j, entries = _joint(here, one.candidate), list(one.candidate.entries)
+        if _costs(here, new, entries) > _SURELY * new.squares[..., j].sum():
+            continue
         theta = last.theta.copy()
         theta[entries] = values(structure.loop, structure.table)[entries]
         free = [k for k in new.model.free if k not in entries or k in here.baseline]
@@ -363,6 +443,16 @@ def _spare(here: Setting, new: _Standing, chosen: Sequence[Tried]) -> Tried | No
         if (before.sum() - after.sum()) / before.sum() < _LEAST or t_of(before, after) < _SURE:
             return one
     return None
+
+
+def _costs(here: Setting, new: _Standing, entries: list[int]) -> float:
+    """Squares by which the fit would be worse without numbers, to second order."""
+    structure, last = new.model.structure, new.model.fit
+    covariance = System(last.sums, structure.data, last.start).covariance(last.free < 0)
+    at = [int(np.flatnonzero(last.free == k)[0]) for k in entries]
+    away = (last.theta - values(structure.loop, structure.table))[entries]
+    block = covariance[np.ix_(at, at)]
+    return float(away @ np.linalg.pinv(block) @ away) if np.isfinite(block).all() and np.isfinite(away).all() else 0.0
 
 
 def _name(
@@ -399,11 +489,22 @@ def _rms(here: Setting, squares: np.ndarray) -> float:
     return float(np.sqrt(max(squares.sum(), 0.0) / max(count, 1) * np.mean(here.noise[0] ** 2)))
 
 
-def _tried(here: Setting, now: _Standing, named: Sequence[Candidate], forbid: Sequence[str]) -> list[Tried]:
-    """The candidates that one linear step promises most at each joint that is open, fitted."""
+def _tried(
+    here: Setting, now: _Standing, named: Sequence[Candidate], forbid: Sequence[str], known: _Known
+) -> list[Tried]:
+    """The candidates that one linear step promises most at each joint that is open, fitted.
+
+    Where a joint is off by as much as when it was looked at last, what was found then stands.
+    """
     model, n = now.model, here.loop.robot.nv
     rigid = model.structure.loop.robot.nv == n
     open_joints = [j for j in range(n) if now.excess[j] >= 1.0] or list(range(n))
+    sizes = {-1: float(now.squares.sum())} | {j: float(now.squares[..., j].sum()) for j in range(n)}
+    same = {j for j, one in known.items() if abs(one.squares - sizes[j]) < _SAME * sizes[j]}
+    stands = [one._replace(alone=False) for j in sorted(same) if j < 0 or j in open_joints for one in known[j].tried]
+    open_joints = [j for j in open_joints if j not in same]
+    if not open_joints:
+        return stands
     used = {(c.effect, c.at) for c in named}
     still = {c.at for c in named if c.effect in _STILL}
     count = {at: sum(c.at == at for c in named) for at in {c.at for c in named}}
@@ -411,7 +512,7 @@ def _tried(here: Setting, now: _Standing, named: Sequence[Candidate], forbid: Se
         c for c in here.known.candidates
         if (c.effect, c.at) not in used and not set(c.entries) <= set(model.free)
         and not (c.effect in _STILL and c.at in still) and count.get(c.at, 0) < _MOST
-        and (_joint(here, c) < 0 or _joint(here, c) in open_joints)
+        and ((_joint(here, c) < 0 and -1 not in same) or _joint(here, c) in open_joints)
     ]  # fmt: skip
     own, cost = now.squares.sum((0, 1)), model.fit.cost
     plain = [c for c in left if c.effect not in _LIMITS]
@@ -423,20 +524,70 @@ def _tried(here: Setting, now: _Standing, named: Sequence[Candidate], forbid: Se
         if common and now.excess[j] >= 1.0:  # nothing that few joints have can come before it
             best[j] = [max(common, key=lambda one: one.promise)]
             continue
-        limits = [c for c in left if c.effect in _LIMITS and _joint(here, c) == j]
-        for k, (score, theta) in scored(here, model, limits).items():
-            best.setdefault(j, []).append(_Ranked(cost - score, model.structure, limits[k], theta))
-        if rigid and now.excess.max() >= 1.0:
-            best.setdefault(j, []).extend(_sprung(here, now, j, forbid))
-    tried = []
+        best.setdefault(j, []).extend(_limits_and_springs(here, now, left, best.get(j, []), j, rigid, forbid))
+    hopeful: dict[int, list[_Ranked]] = {}
     for j, ones in best.items():
         ranked = sorted(ones, key=lambda one: -one.promise)
         ranked = [one for k, one in enumerate(ranked) if all(one[2] is not other[2] for other in ranked[:k])]
         ranked = [one for one in ranked if not _no_more(one, ranked)]
         least = (_HOPE if by_recording(here) and now.excess.max() >= 1.0 else 0.0) * own[j]
-        hopeful = [one for one in ranked if j < 0 or one.promise > least or one.candidate.effect in BASELINE]
-        tried += _fitted(here, now, hopeful[: _TOP if j >= 0 else 1])
-    return tried
+        enough = [one for one in ranked if j < 0 or one.promise > least or one.candidate.effect in BASELINE]
+        usual = [one for one in enough if one.candidate.effect in BASELINE][:1]  # may come before what promises more
+        rest = [one for one in enough if all(one is not x for x in usual)]
+        hopeful[j] = [*usual, *rest][: _TOP if j >= 0 else 1]
+    found = _fitted(here, now, hopeful)
+    for j in (-1, *open_joints) if -1 not in same else open_joints:
+        known[j] = _Seen(sizes[j], [one for one in found if _joint(here, one.candidate) == j], [])
+    return stands + found
+
+
+def _limits_and_springs(
+    here: Setting, now: _Standing, left: Sequence[Candidate], plain: Sequence[_Ranked], joint: int, rigid: bool,
+    forbid: Sequence[str],
+) -> list[_Ranked]:  # fmt: skip
+    """What changes the model before it can be differentiated, ranked on the windows where the joint is off the most."""
+    (part, share, _), model = _part(now, joint), now.model
+    mine = [c for c in left if _joint(here, c) == joint]
+    leader = max(plain, key=lambda one: one.promise, default=None)
+    chosen = [c for c in mine if c.effect in _LIMITS or (leader is not None and c is leader.candidate)]
+    scores = {chosen[k].effect: (part.fit.cost - x, theta) for k, (x, theta) in scored(here, part, chosen).items()}
+    if leader is not None and scores.get(leader.candidate.effect, (0.0, None))[0] > 0:
+        share = leader.promise / scores[leader.candidate.effect][0]  # as much more as the same cause promises in all
+    found = [
+        _Ranked(scores[c.effect][0] * share, model.structure, c, scores[c.effect][1])
+        for c in chosen if c.effect in _LIMITS and c.effect in scores
+    ]  # fmt: skip
+    most = max((one.promise for one in [*plain, *found]), default=0.0)
+    if rigid and now.excess.max() >= 1.0 and now.squares[..., joint].sum() - most > _ALL * _rows(here, joint):
+        found += [one._replace(promise=one.promise * share) for one in _sprung(here, now, joint, forbid)]
+    return found
+
+
+def _part(now: _Standing, joint: int) -> tuple[Model, float, np.ndarray]:
+    """The model on the windows where a joint is off the most, how much more it is off in all, and which they are."""
+    structure, one = now.model.structure, now.model.fit
+    own = now.squares[..., joint].sum(0)
+    which = np.sort(np.argsort(own)[::-1][: -(-len(own) // _PART)])
+    data = _only(structure.data, which)
+    start = one.start[:, which]
+    prior = (start - data.start) * data.precision
+    cost = float(one.sums.cost[:, which].sum() + (prior**2).sum())
+    sums = type(one.sums)(*(np.asarray(x)[:, which] for x in one.sums))
+    part = now.model._replace(
+        structure=structure._replace(data=data), fit=one._replace(start=start, cost=cost, sums=sums)
+    )
+    return part, float(own.sum() / max(own[which].sum(), 1e-300)), which
+
+
+def _only(data: Windows, which: np.ndarray) -> Windows:
+    """Some of the windows."""
+    return jax.tree.map(lambda x: np.asarray(x)[..., which], data)
+
+
+def _rows(here: Setting, joint: int) -> int:
+    """Samples of a joint that count."""
+    column = here.loop.measured.index(joint)
+    return int((np.asarray(here.data.weight)[:, column :: len(here.loop.measured)] > 0).sum())
 
 
 def _no_more(one: _Ranked, ranked: Sequence[_Ranked]) -> bool:
@@ -454,29 +605,85 @@ class _Ranked(NamedTuple):
     theta: np.ndarray
 
 
-def _fitted(here: Setting, now: _Standing, ranked: Sequence[_Ranked]) -> list[Tried]:
-    """Candidates of one joint: a few steps of each, then the leaders to the end."""
-    early: list[tuple[Fit, Structure, Candidate, list[int]]] = []
-    for _, structure, c, theta in ranked:
-        starts = [theta] if c.elastic or not c.starts else [start_values(theta, c, x) for x in c.starts]
-        start = _start_of(now, structure)
-        free = free_entries(now.model.free, c.entries)
-        fits = [
-            fit(*structure, x[None], [free], start[None], width=max(here.width, len(free)), lanes=1, iterations=_EARLY,
-                rough=_ROUGH)[0]
-            for x in starts
-        ]  # fmt: skip
-        early.append((min(fits, key=lambda f: f.cost), structure, c, free))
+def _fitted(here: Setting, now: _Standing, hopeful: dict[int, list[_Ranked]]) -> list[Tried]:
+    """Candidates of all joints: a few steps of each, then those that may win to the end.
+
+    One of each joint share a fit, for each joint's encoder judges its own: what another joint lacks hardly moves it.
+    """
+    early: dict[int, list[tuple[float, _Ranked, np.ndarray]]] = {}
+    lists = {j: [one for each in ones for one in _from_starts(each)] for j, ones in hopeful.items()}
+    for one in _all_in_lanes(here, now, lists, _EARLY, 0.0):
+        early.setdefault(one.joint, []).append((one.own, one.ranked, one.fit.theta))
+    leaders: dict[int, list[tuple[_Ranked, np.ndarray]]] = {}
+    for j, ones in early.items():
+        before = now.squares[..., j].sum() if j >= 0 else now.squares.sum()
+        ordered = sorted(ones, key=lambda x: x[0])
+        ordered = [x for k, x in enumerate(ordered) if all(x[1].candidate is not y[1].candidate for y in ordered[:k])]
+        near = [x for x in ordered if before - x[0] > _WINS * (before - ordered[0][0])]
+        leaders[j] = [(x[1], x[2]) for x in near[:_RACE]]
     found = []
-    for one, structure, c, free in sorted(early, key=lambda x: x[0].cost)[:_RACE]:
-        if not np.isfinite(one.cost):
+    for one in _all_in_lanes(here, now, leaders, _LATE, now.model.fit.cost):
+        c, beyond = one.ranked.candidate, _excess(here, one.ranked.structure, one.fit)
+        own = float(beyond.max() if one.joint < 0 else beyond[one.joint])
+        state = Model(one.ranked.structure, one.fit, one.free, own)
+        sse = _outputs(here, one.fit.sums.cost)
+        if not one.alone:
+            mine, sse = sse[..., one.joint], now.squares.copy()
+            sse[..., one.joint] = mine
+        found.append(Tried(c, state, sse, one.alone))
+    return found
+
+
+class _OneOf(NamedTuple):
+    """A candidate of a fit, with the squares of its own joint."""
+
+    joint: int
+    own: float
+    ranked: _Ranked
+    fit: Fit
+    free: tuple[int, ...]
+    alone: bool
+
+
+def _from_starts(one: _Ranked) -> list[tuple[_Ranked, np.ndarray]]:
+    """A candidate with the numbers from which its fit starts, once for each start."""
+    c = one.candidate
+    return [(one, x) for x in ([one.theta] if c.elastic or not c.starts or c.effect in _LIMITS else
+                               [start_values(one.theta, c, start) for start in c.starts])]  # fmt: skip
+
+
+def _all_in_lanes(
+    here: Setting, now: _Standing, lists: dict[int, list[tuple[_Ranked, np.ndarray]]], most: int, below: float
+) -> list[_OneOf]:
+    """Every candidate of the lists fitted, the first of each joint together, then the second ones, and so on.
+
+    A spring changes the structure, a payload shows at several joints, a limit may hold up the steps of the others:
+    these are fitted by themselves.
+    """
+    lonely = lambda c: c.elastic or c.effect in _LIMITS or c.effect == "payload"  # noqa: E731
+    single = [(j, *one) for j, ones in lists.items() for one in ones if lonely(one[0].candidate)]
+    plain = {j: [one for one in ones if not lonely(one[0].candidate)] for j, ones in lists.items() if j >= 0}
+    lanes = [[(j, *ones[m]) for j, ones in plain.items() if m < len(ones)]
+             for m in range(max((len(ones) for ones in plain.values()), default=0))]  # fmt: skip
+    found, queue = [], [*lanes, *([one] for one in single)]
+    while queue:
+        lane = queue.pop(0)
+        structure, theta, free = lane[0][1].structure, lane[0][2].copy(), list(now.model.free)
+        for j, ranked, begin in lane:
+            mine = list(ranked.candidate.entries)
+            own = [*mine, *(k for k in free if _joint_of(here, k) == j)] if len(lane) > 1 else list(range(len(begin)))
+            theta, free = theta if len(lane) > 1 else begin.copy(), free_entries(free, mine)
+            theta[own] = begin[own]
+        start = _start_of(now, structure)
+        one = fit(*structure, theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
+                  iterations=most, rough=_ROUGH / 10, below=below or np.inf)[0]  # fmt: skip
+        if not np.isfinite(one.cost):  # one of them diverges: each by itself
+            queue += [[x] for x in lane] if len(lane) > 1 else []
             continue
-        last = fit(*structure, one.theta[None], [free], one.start[None], width=max(here.width, len(free)), lanes=1,
-                   iterations=_LATE, rough=_ROUGH / 10)[0]  # fmt: skip
-        beyond = _excess(here, structure, last)
-        j = _joint(here, c)
-        state = Model(structure, last, tuple(free), float(beyond.max() if j < 0 else beyond[j]))
-        found.append(Tried(c, state, _outputs(here, last.sums.cost)))
+        squares = _outputs(here, one.sums.cost)
+        for j, ranked, _ in lane:
+            own = float(squares[..., j].sum() if j >= 0 else squares.sum())
+            found.append(_OneOf(j, own, ranked, one, tuple(free), len(lane) == 1))
     return found
 
 
@@ -500,6 +707,9 @@ def _sprung(here: Setting, now: _Standing, joint: int, forbid: Sequence[str]) ->
     n, k = here.loop.robot.nv, len(here.known.table)
     table = (*here.known.table, *(Entry(x, (n,)) for x in ("stiffness", "damping", "play")))
     structure = Structure(loop, table, windows(loop, here.runs, here.stretches, here.noise, here.block))
+    part, _, which = _part(now, joint)
+    small = structure._replace(data=_only(structure.data, which))
+    start = _start_of(now, structure)[:, which]
     found = []
     for effect in wanted:
         entries, reported = (k, k + 1), ("stiffness", "damping")
@@ -509,6 +719,6 @@ def _sprung(here: Setting, now: _Standing, joint: int, forbid: Sequence[str]) ->
         for share in _SHARES:
             play = 0.0 if effect == "joint_elasticity" else 0.1 * share
             theta = np.concatenate([now.model.fit.theta, [torque / share, 0.002 * torque / share, play]])
-            score = settled(here, structure, theta, free_entries(now.model.free, entries), _start_of(now, structure))
-            found.append(_Ranked(now.model.fit.cost - score, structure, c, theta))
+            score = settled(here, small, theta, free_entries(now.model.free, entries), start)
+            found.append(_Ranked(part.fit.cost - score, structure, c, theta))
     return found
