@@ -9,18 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from scipy.special import ndtr
 
 from ..results import Name
-from .causes import BASELINE, CONTAINS, Candidate, elastic_loop
+from .causes import BASELINE, CONTAINS, Candidate
 from .data import windows
 from .faults import Fault, faults, without
 from .fit import Fit, System, fit, refitted_without
-from .parameters import Entry, put, values
+from .parameters import put, values
+from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_of_entry, outputs, tried_now
 from .search import (
     Model,
     Named,
@@ -31,18 +31,12 @@ from .search import (
     begins_of,
     begun,
     by_recording,
-    excess,
     free_entries,
-    largest_forces,
     level_of,
-    residuals,
-    scored,
-    settled,
     sized,
-    start_values,
     t_of,
 )  # fmt: skip
-from .sensitivity import Windows, predicted
+from .sensitivity import predicted
 
 __all__ = ["search_arm"]
 
@@ -50,34 +44,12 @@ _WORTH, _SURE, _UNSURE = 0.004, 1.64, 2.5  # held-out gain and t of a name, wher
 _CLEAR, _MUCH = 3.0, 0.25  # t and gain of a name beside which more than noise stays, unless every joint has it
 _ALIKE, _NEAR = 1.7, 0.1  # t and share of the gain within which two causes are alike
 _USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
-_TOP, _RACE = 3, 2  # candidates of a joint that are fitted, and that are fitted to the end
-_EARLY, _AGAIN, _LATE = 3, 6, 30  # iterations
-_ROUGH = 1e-4  # share of the squares that a step must promise
-_PART = 3  # of the windows, one in so many shows whether a limit or a spring is worth a fit
-_MOST, _CHECKS = 6, 4  # causes of a joint; candidates whose held-out squares are looked at in a round
+_AGAIN = 6  # iterations from the numbers of the model file
+_TOP, _CHECKS = 3, 4  # candidates told as the nearest; those whose held-out squares are looked at in a round
 _SURELY = 0.1  # share of the squares by which a cause that is surely missed would make them larger
 _LEAST = 0.002  # held-out gain below which a cause found with others is not missed
-_HOPE = 0.1  # share of a joint's squares that a cause must promise where it must take `_MUCH` in the end
-_SAME = 0.02  # change of a joint's squares below which nothing new is looked for there
-_WINS = 0.45  # share of the best gain after a few steps from which a candidate may still be named
-_ALL = 1.1  # squares of a sample up to which nothing is left to explain by a spring
 _SHARE_OF_T = 0.7  # of the t that a name needs on held-out rows, which it must have on those that were fitted
-_MORE = 1.02  # of the promise of a simpler cause, which a richer one must exceed to be fitted
 _FIRST = 4  # iterations from each start of the baseline
-_OF_DRIVE = ("scale", "delay", "dead_band", "voltage", "force_limit")
-_LIMITS = ("actuator_saturation", "voltage_saturation")
-_STILL = ("encoder_offset", "torque_offset", "joint_spring")  # of one joint: each makes up for the others
-_ELASTIC = ("joint_elasticity", "backlash")
-_SHARES = (0.005, 0.05, 0.3)  # twists of a spring under the largest torque, rad or m
-
-
-class _Standing(NamedTuple):
-    """The model that stands, its squares and those held out by outputs, and how far it is from noise by joint."""
-
-    model: Model
-    squares: np.ndarray  # (blocks, windows, joints)
-    held: np.ndarray  # the same, of fits without some recordings or quarters
-    excess: np.ndarray  # (joints,)
 
 
 def search_arm(
@@ -93,7 +65,7 @@ def search_arm(
     found: list[Named] = []
     held, steps, fits = [_rms(here, begin.held)], [("baseline", _level(here, first))], list[Fit]()
     nearest: list[tuple[Name, float, str]] = []
-    known: _Known = {}
+    known: Known = {}
     p_value = 1.0 if not np.isfinite(first.cost) else float(max(ndtr(-4 * begin.excess.max()), 1e-12))
     while np.isfinite(first.cost):
         number = len(steps)
@@ -124,7 +96,7 @@ def _begun(here: Setting) -> Fit:
     if len(begins) == 1:
         return begun(here)
     early = [
-        fit(*structure, x[None], [here.baseline], width=here.width, lanes=1, iterations=_FIRST, rough=_ROUGH)[0]
+        fit(*structure, x[None], [here.baseline], width=here.width, lanes=1, iterations=_FIRST, rough=ROUGH)[0]
         for x in begins
     ]
     early = [one for one in early if np.isfinite(one.cost)]
@@ -132,31 +104,21 @@ def _begun(here: Setting) -> Fit:
         return begun(here)
     best = min(early, key=lambda one: one.cost)
     theta, start, n = best.theta.copy(), best.start.copy(), here.loop.robot.nv
-    squares = [_outputs(here, one.sums.cost).sum((0, 1)) for one in early]
+    squares = [outputs(here, one.sums.cost).sum((0, 1)) for one in early]
     for j in range(n):
         own = early[int(np.argmin([x[j] for x in squares]))]
-        mine = [k for k in here.baseline if _joint_of(here, k) == j]
+        mine = [k for k in here.baseline if joint_of_entry(here, k) == j]
         theta[mine], start[[j, n + j]] = own.theta[mine], own.start[[j, n + j]]
     mixed, usual = (
-        fit(*structure, x[None], [here.baseline], y[None], width=here.width, lanes=1, rough=_ROUGH, iterations=most)[0]
-        for x, y, most in ((theta, start, _LATE), (best.theta, best.start, 0))
+        fit(*structure, x[None], [here.baseline], y[None], width=here.width, lanes=1, rough=ROUGH, iterations=most)[0]
+        for x, y, most in ((theta, start, LATE), (best.theta, best.start, 0))
     )
     if mixed.cost < usual.cost:
         return mixed
     return fit(*structure, best.theta[None], [here.baseline], best.start[None], width=here.width, lanes=1)[0]
 
 
-def _joint_of(here: Setting, entry: int) -> int:
-    """The joint whose encoder shows a number of the table; -1: those of several."""
-    one = here.known.table[entry] if entry < len(here.known.table) else None
-    if one is None or len(one.at) > 1 or one.name == "payload":
-        return -1
-    if one.name in _OF_DRIVE:
-        return int(np.argmax(np.abs(np.asarray(here.loop.drives.transmission)[one.at[0]])))
-    return one.at[0]
-
-
-def _judged(here: Setting, result: Search, now: _Standing) -> Search:
+def _judged(here: Setting, result: Search, now: Standing) -> Search:
     """`named` where every joint's rest is noise; `named+rest` where the names hold without each of three recordings."""
     found = result.named
     if now.excess.max() < 1.0:
@@ -197,44 +159,25 @@ def _simulated(here: Setting, first: Fit) -> list[np.ndarray] | None:
     return found
 
 
-def _standing(here: Setting, structure: Structure, one: Fit, free: Sequence[int]) -> _Standing:
+def _standing(here: Setting, structure: Structure, one: Fit, free: Sequence[int]) -> Standing:
     """A fit with what it leaves, on the rows it was fitted to and without them."""
     if not np.isfinite(one.cost):
         nothing = np.zeros((1, 1, 1))
-        return _Standing(Model(structure, one, tuple(free), np.inf), nothing, nothing, np.full(1, np.inf))
-    beyond = _excess(here, structure, one)
+        return Standing(Model(structure, one, tuple(free), np.inf), nothing, nothing, np.full(1, np.inf))
+    beyond = excess_of(here, structure, one)
     model = Model(structure, one, tuple(free), float(beyond.max()))
     held = refitted_without(*structure, [one], here.folds, lanes=1, outputs=True)[0]
-    return _Standing(model, _outputs(here, one.sums.cost), _outputs(here, held), beyond)
-
-
-def _outputs(here: Setting, squares: Any) -> np.ndarray:
-    """Squares by outputs as squares by joints of the robot: rates go with their positions."""
-    places, count = list(here.loop.measured), len(here.loop.measured)
-    found = np.zeros((*squares.shape[:2], here.loop.robot.nv))
-    for first in range(0, squares.shape[2], count):
-        found[..., places] += squares[..., first : first + count]
-    return found
-
-
-def _excess(here: Setting, structure: Structure, one: Fit) -> np.ndarray:
-    """How far each joint's residual is above noise."""
-    error, weight = residuals(structure, one), np.asarray(structure.data.weight)
-    count, found = len(here.loop.measured), np.zeros(here.loop.robot.nv)
-    for k, place in enumerate(here.loop.measured):
-        mine = slice(k, None, count)
-        found[place] = excess(error[:, mine], weight[:, mine]) if (weight[:, mine] > 0).any() else 0.0
-    return found
+    return Standing(model, outputs(here, one.sums.cost), outputs(here, held), beyond)
 
 
 def _round(
-    here: Setting, now: _Standing, found: Sequence[Named], forbid: Sequence[str], nearest: list, known: _Known
-) -> tuple[list[Named], _Standing, list]:
+    here: Setting, now: Standing, found: Sequence[Named], forbid: Sequence[str], nearest: list, known: Known
+) -> tuple[list[Named], Standing, list]:
     """Causes to name next, at most one of each joint, and the model with them."""
-    tried = _tried(here, now, [n.candidate for n in found], forbid, known)
+    tried = tried_now(here, now, [n.candidate for n in found], forbid, known)
     lists: dict[int, list[Tried]] = {}
     for one in tried:
-        lists.setdefault(_joint(here, one.candidate), []).append(one)
+        lists.setdefault(joint_of(here, one.candidate), []).append(one)
     if not lists:
         return [], now, nearest
     ordered = {
@@ -254,7 +197,7 @@ def _round(
             kept, now = new
             break
         for one in chosen:
-            known[_joint(here, one.candidate)].refused.append(one.candidate)
+            known[joint_of(here, one.candidate)].refused.append(one.candidate)
         ordered = {j: [one for one in ones if all(one is not x for x in chosen)] for j, ones in ordered.items()}
     close = sorted(tried, key=lambda one: one.sse.sum())[:_TOP]
     total = float(now.squares.sum())
@@ -267,30 +210,14 @@ def _round(
     return kept, now, nearest
 
 
-class _Seen(NamedTuple):
-    """What was tried at a joint, when its squares were so large, and what held-out rows have refused since."""
-
-    squares: float
-    tried: list[Tried]
-    refused: list[Candidate]
-
-
-_Known = dict[int, _Seen]
-
-
-def _joint(here: Setting, c: Candidate) -> int:
-    """The joint whose encoder shows a cause; -1: those of several."""
-    return -1 if c.effect == "payload" else here.loop.robot.dof_names.index(c.at[0])
-
-
-def _gained(now: _Standing, one: Tried) -> float:
+def _gained(now: Standing, one: Tried) -> float:
     """Squares of the whole arm by which a fitted candidate is better."""
     return float(now.squares.sum() - one.sse.sum())
 
 
-def _worthy(here: Setting, now: _Standing, one: Tried) -> bool:
+def _worthy(here: Setting, now: Standing, one: Tried) -> bool:
     """Whether a candidate takes so much of what it was fitted to that held-out rows can bear it out."""
-    j = _joint(here, one.candidate)
+    j = joint_of(here, one.candidate)
     mine = slice(None) if j < 0 else slice(j, j + 1)
     before, after = now.squares[..., mine].sum(-1), one.sse[..., mine].sum(-1)
     gain = 1 - after.sum() / max(before.sum(), 1e-300)
@@ -301,7 +228,7 @@ def _worthy(here: Setting, now: _Standing, one: Tried) -> bool:
     return bool(gain > (_MUCH if rest and not usual else _WORTH) and t_of(before, after) > _SHARE_OF_T * needed)
 
 
-def _ordered(now: _Standing, ones: Sequence[Tried]) -> list[Tried]:
+def _ordered(now: Standing, ones: Sequence[Tried]) -> list[Tried]:
     """Candidates of a joint in the order in which they may be named: what every joint has before what few have."""
     ranked = sorted(ones, key=lambda one: -_gained(now, one))
     first, best = ranked[0], _gained(now, ranked[0])
@@ -321,8 +248,8 @@ def _ordered(now: _Standing, ones: Sequence[Tried]) -> list[Tried]:
 
 
 def _named(
-    here: Setting, now: _Standing, lists: dict[int, list[Tried]], chosen: Sequence[Tried], found: Sequence[Named]
-) -> tuple[list[Named], _Standing] | None:
+    here: Setting, now: Standing, lists: dict[int, list[Tried]], chosen: Sequence[Tried], found: Sequence[Named]
+) -> tuple[list[Named], Standing] | None:
     """The chosen causes that hold: all fitted together, those that held-out rows or the others do not need left out."""
     chosen = list(chosen)
     while chosen:
@@ -345,14 +272,11 @@ def _named(
     return None
 
 
-def _together(here: Setting, now: _Standing, chosen: Sequence[Tried]) -> Model:
+def _together(here: Setting, now: Standing, chosen: Sequence[Tried]) -> Model:
     """All chosen causes in one fit, from where each ended by itself."""
-    if len(chosen) == 1 and chosen[0].alone:
-        return chosen[0].state
-    elastic = next((one for one in chosen if one.candidate.elastic), None)
-    structure, start = (now.model.structure, now.model.fit.start) if elastic is None else (
-        elastic.state.structure, elastic.state.fit.start)  # fmt: skip
-    theta = (now.model.fit if elastic is None else elastic.state.fit).theta.copy()
+    lone = next((one for one in chosen if one.candidate.elastic or (one.alone and len(chosen) == 1)), None)
+    begin = now.model if lone is None else lone.state
+    structure, start, theta = begin.structure, begin.fit.start, begin.fit.theta.copy()
     free = list(now.model.free)
     for one in chosen:
         entries = list(one.candidate.entries)
@@ -360,7 +284,7 @@ def _together(here: Setting, now: _Standing, chosen: Sequence[Tried]) -> Model:
         theta[own] = one.state.fit.theta[own]
         free = free_entries(free, entries)
     last = fit(*structure, theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
-               iterations=_LATE, rough=_ROUGH)[0]  # fmt: skip
+               iterations=LATE, rough=ROUGH)[0]  # fmt: skip
     return Model(structure, last, tuple(free), 0.0)
 
 
@@ -370,23 +294,23 @@ def _again(here: Setting, new: Model) -> Model:
     A baseline that was fitted without a cause may end in another valley than with it.
     """
     structure, last = new.structure, new.fit
-    if not np.isfinite(last.cost) or _excess(here, structure, last).max() < 1.0:
+    if not np.isfinite(last.cost) or excess_of(here, structure, last).max() < 1.0:
         return new
     theta, stated = last.theta.copy(), values(structure.loop, structure.table)
     theta[list(here.baseline)] = stated[list(here.baseline)]
     start, n, more = np.array(last.start), here.loop.robot.nv, structure.loop.robot.nv - here.loop.robot.nv
     begin = np.asarray(here.data.start)
     start[:n], start[n + more : 2 * n + more] = begin[:n], begin[n:]
-    for most, near in ((_AGAIN, 2.0), (_LATE, 1.0)):
+    for most, near in ((_AGAIN, 2.0), (LATE, 1.0)):
         other = fit(*structure, theta[None], [new.free], start[None], width=max(here.width, len(new.free)), lanes=1,
-                    iterations=most, rough=_ROUGH)[0]  # fmt: skip
+                    iterations=most, rough=ROUGH)[0]  # fmt: skip
         if not other.cost < near * last.cost:
             return new
         theta, start = other.theta, other.start
         own = list(new.free)
         if (np.abs(theta[own] - last.theta[own]) <= _NEAR * np.abs(last.theta[own])).all():  # the same valley
             return new
-    return new._replace(fit=other) if other.cost < (1 - _ROUGH) * last.cost else new
+    return new._replace(fit=other) if other.cost < (1 - ROUGH) * last.cost else new
 
 
 def _of_joint(here: Setting, entry: int, c: Candidate) -> bool:
@@ -398,13 +322,13 @@ def _of_joint(here: Setting, entry: int, c: Candidate) -> bool:
 
 def _numbers(here: Setting, c: Candidate) -> set[int]:
     """Entries of the table at the joint of a cause."""
-    j = _joint(here, c)
-    return {k for k in range(len(here.known.table)) if j >= 0 and _joint_of(here, k) == j}
+    j = joint_of(here, c)
+    return {k for k in range(len(here.known.table)) if j >= 0 and joint_of_entry(here, k) == j}
 
 
-def _check(here: Setting, now: _Standing, new: _Standing, one: Tried) -> tuple[bool, float, float]:
+def _check(here: Setting, now: Standing, new: Standing, one: Tried) -> tuple[bool, float, float]:
     """Whether a cause holds on rows that were not fitted, with its gain there and its t."""
-    j = _joint(here, one.candidate)
+    j = joint_of(here, one.candidate)
     mine = slice(None) if j < 0 else slice(j, j + 1)
     before, after = now.held[..., mine].sum(-1), new.held[..., mine].sum(-1)
     gain = 1 - after.sum() / max(before.sum(), 1e-300)
@@ -423,29 +347,29 @@ def _check(here: Setting, now: _Standing, new: _Standing, one: Tried) -> tuple[b
     return bool(good), float(gain), t
 
 
-def _spare(here: Setting, new: _Standing, chosen: Sequence[Tried]) -> Tried | None:
+def _spare(here: Setting, new: Standing, chosen: Sequence[Tried]) -> Tried | None:
     """The cause, if any, that its joint does not need beside the others: the least one first."""
     structure, last = new.model.structure, new.model.fit
     for one in sorted(chosen, key=lambda one: _gained(new, one), reverse=True):
         if one.candidate.elastic:
             continue
-        j, entries = _joint(here, one.candidate), list(one.candidate.entries)
+        j, entries = joint_of(here, one.candidate), list(one.candidate.entries)
         if _costs(here, new, entries) > _SURELY * new.squares[..., j].sum():
             continue
         theta = last.theta.copy()
         theta[entries] = values(structure.loop, structure.table)[entries]
         free = [k for k in new.model.free if k not in entries or k in here.baseline]
         other = fit(*structure, theta[None], [free], last.start[None], width=max(here.width, len(free)), lanes=1,
-                    iterations=_LATE, rough=_ROUGH)[0]  # fmt: skip
+                    iterations=LATE, rough=ROUGH)[0]  # fmt: skip
         if not np.isfinite(other.cost):
             continue
-        before, after = _outputs(here, other.sums.cost)[..., j], new.squares[..., j]
+        before, after = outputs(here, other.sums.cost)[..., j], new.squares[..., j]
         if (before.sum() - after.sum()) / before.sum() < _LEAST or t_of(before, after) < _SURE:
             return one
     return None
 
 
-def _costs(here: Setting, new: _Standing, entries: list[int]) -> float:
+def _costs(here: Setting, new: Standing, entries: list[int]) -> float:
     """Squares by which the fit would be worse without numbers, to second order."""
     structure, last = new.model.structure, new.model.fit
     covariance = System(last.sums, structure.data, last.start).covariance(last.free < 0)
@@ -457,14 +381,14 @@ def _costs(here: Setting, new: _Standing, entries: list[int]) -> float:
 
 def _name(
     here: Setting,
-    now: _Standing,
-    new: _Standing,
+    now: Standing,
+    new: Standing,
     one: Tried,
     lists: dict[int, list[Tried]],
     check: tuple[bool, float, float],
 ) -> Named:
     """The name with its gain and with the causes that the rows tell no better."""
-    j = _joint(here, one.candidate)
+    j = joint_of(here, one.candidate)
     mine = slice(None) if j < 0 else slice(j, j + 1)
     most = _gained(now, one)
     alike = []
@@ -487,238 +411,3 @@ def _rms(here: Setting, squares: np.ndarray) -> float:
     """Whitened squares by joints as an RMS over the rows of all of them: rad, or m."""
     count = (np.asarray(here.data.weight) > 0).sum() / here.loop.robot.nv * squares.shape[-1]
     return float(np.sqrt(max(squares.sum(), 0.0) / max(count, 1) * np.mean(here.noise[0] ** 2)))
-
-
-def _tried(
-    here: Setting, now: _Standing, named: Sequence[Candidate], forbid: Sequence[str], known: _Known
-) -> list[Tried]:
-    """The candidates that one linear step promises most at each joint that is open, fitted.
-
-    Where a joint is off by as much as when it was looked at last, what was found then stands.
-    """
-    model, n = now.model, here.loop.robot.nv
-    rigid = model.structure.loop.robot.nv == n
-    open_joints = [j for j in range(n) if now.excess[j] >= 1.0] or list(range(n))
-    sizes = {-1: float(now.squares.sum())} | {j: float(now.squares[..., j].sum()) for j in range(n)}
-    same = {j for j, one in known.items() if abs(one.squares - sizes[j]) < _SAME * sizes[j]}
-    stands = [one._replace(alone=False) for j in sorted(same) if j < 0 or j in open_joints for one in known[j].tried]
-    open_joints = [j for j in open_joints if j not in same]
-    if not open_joints:
-        return stands
-    used = {(c.effect, c.at) for c in named}
-    still = {c.at for c in named if c.effect in _STILL}
-    count = {at: sum(c.at == at for c in named) for at in {c.at for c in named}}
-    left = [
-        c for c in here.known.candidates
-        if (c.effect, c.at) not in used and not set(c.entries) <= set(model.free)
-        and not (c.effect in _STILL and c.at in still) and count.get(c.at, 0) < _MOST
-        and ((_joint(here, c) < 0 and -1 not in same) or _joint(here, c) in open_joints)
-    ]  # fmt: skip
-    own, cost = now.squares.sum((0, 1)), model.fit.cost
-    plain = [c for c in left if c.effect not in _LIMITS]
-    best: dict[int, list[_Ranked]] = {}
-    for k, (score, theta) in scored(here, model, plain).items():
-        best.setdefault(_joint(here, plain[k]), []).append(_Ranked(cost - score, model.structure, plain[k], theta))
-    for j in open_joints:
-        common = [one for one in best.get(j, []) if one.candidate.effect in BASELINE and one.promise > _USUAL * own[j]]
-        if common and now.excess[j] >= 1.0:  # nothing that few joints have can come before it
-            best[j] = [max(common, key=lambda one: one.promise)]
-            continue
-        best.setdefault(j, []).extend(_limits_and_springs(here, now, left, best.get(j, []), j, rigid, forbid))
-    hopeful: dict[int, list[_Ranked]] = {}
-    for j, ones in best.items():
-        ranked = sorted(ones, key=lambda one: -one.promise)
-        ranked = [one for k, one in enumerate(ranked) if all(one[2] is not other[2] for other in ranked[:k])]
-        ranked = [one for one in ranked if not _no_more(one, ranked)]
-        least = (_HOPE if by_recording(here) and now.excess.max() >= 1.0 else 0.0) * own[j]
-        enough = [one for one in ranked if j < 0 or one.promise > least or one.candidate.effect in BASELINE]
-        usual = [one for one in enough if one.candidate.effect in BASELINE][:1]  # may come before what promises more
-        rest = [one for one in enough if all(one is not x for x in usual)]
-        hopeful[j] = [*usual, *rest][: _TOP if j >= 0 else 1]
-    found = _fitted(here, now, hopeful)
-    for j in (-1, *open_joints) if -1 not in same else open_joints:
-        known[j] = _Seen(sizes[j], [one for one in found if _joint(here, one.candidate) == j], [])
-    return stands + found
-
-
-def _limits_and_springs(
-    here: Setting, now: _Standing, left: Sequence[Candidate], plain: Sequence[_Ranked], joint: int, rigid: bool,
-    forbid: Sequence[str],
-) -> list[_Ranked]:  # fmt: skip
-    """What changes the model before it can be differentiated, ranked on the windows where the joint is off the most."""
-    (part, share, _), model = _part(now, joint), now.model
-    mine = [c for c in left if _joint(here, c) == joint]
-    leader = max(plain, key=lambda one: one.promise, default=None)
-    chosen = [c for c in mine if c.effect in _LIMITS or (leader is not None and c is leader.candidate)]
-    scores = {chosen[k].effect: (part.fit.cost - x, theta) for k, (x, theta) in scored(here, part, chosen).items()}
-    if leader is not None and scores.get(leader.candidate.effect, (0.0, None))[0] > 0:
-        share = leader.promise / scores[leader.candidate.effect][0]  # as much more as the same cause promises in all
-    found = [
-        _Ranked(scores[c.effect][0] * share, model.structure, c, scores[c.effect][1])
-        for c in chosen if c.effect in _LIMITS and c.effect in scores
-    ]  # fmt: skip
-    most = max((one.promise for one in [*plain, *found]), default=0.0)
-    if rigid and now.excess.max() >= 1.0 and now.squares[..., joint].sum() - most > _ALL * _rows(here, joint):
-        found += [one._replace(promise=one.promise * share) for one in _sprung(here, now, joint, forbid)]
-    return found
-
-
-def _part(now: _Standing, joint: int) -> tuple[Model, float, np.ndarray]:
-    """The model on the windows where a joint is off the most, how much more it is off in all, and which they are."""
-    structure, one = now.model.structure, now.model.fit
-    own = now.squares[..., joint].sum(0)
-    which = np.sort(np.argsort(own)[::-1][: -(-len(own) // _PART)])
-    data = _only(structure.data, which)
-    start = one.start[:, which]
-    prior = (start - data.start) * data.precision
-    cost = float(one.sums.cost[:, which].sum() + (prior**2).sum())
-    sums = type(one.sums)(*(np.asarray(x)[:, which] for x in one.sums))
-    part = now.model._replace(
-        structure=structure._replace(data=data), fit=one._replace(start=start, cost=cost, sums=sums)
-    )
-    return part, float(own.sum() / max(own[which].sum(), 1e-300)), which
-
-
-def _only(data: Windows, which: np.ndarray) -> Windows:
-    """Some of the windows."""
-    return jax.tree.map(lambda x: np.asarray(x)[..., which], data)
-
-
-def _rows(here: Setting, joint: int) -> int:
-    """Samples of a joint that count."""
-    column = here.loop.measured.index(joint)
-    return int((np.asarray(here.data.weight)[:, column :: len(here.loop.measured)] > 0).sum())
-
-
-def _no_more(one: _Ranked, ranked: Sequence[_Ranked]) -> bool:
-    """Whether a candidate promises hardly more than one that it contains."""
-    simple = CONTAINS.get(one.candidate.effect, ())
-    return any(other.candidate.effect in simple and one.promise < _MORE * other.promise for other in ranked)
-
-
-class _Ranked(NamedTuple):
-    """A candidate with the decrease of the squares that one linear step promises."""
-
-    promise: float
-    structure: Structure
-    candidate: Candidate
-    theta: np.ndarray
-
-
-def _fitted(here: Setting, now: _Standing, hopeful: dict[int, list[_Ranked]]) -> list[Tried]:
-    """Candidates of all joints: a few steps of each, then those that may win to the end.
-
-    One of each joint share a fit, for each joint's encoder judges its own: what another joint lacks hardly moves it.
-    """
-    early: dict[int, list[tuple[float, _Ranked, np.ndarray]]] = {}
-    lists = {j: [one for each in ones for one in _from_starts(each)] for j, ones in hopeful.items()}
-    for one in _all_in_lanes(here, now, lists, _EARLY, 0.0):
-        early.setdefault(one.joint, []).append((one.own, one.ranked, one.fit.theta))
-    leaders: dict[int, list[tuple[_Ranked, np.ndarray]]] = {}
-    for j, ones in early.items():
-        before = now.squares[..., j].sum() if j >= 0 else now.squares.sum()
-        ordered = sorted(ones, key=lambda x: x[0])
-        ordered = [x for k, x in enumerate(ordered) if all(x[1].candidate is not y[1].candidate for y in ordered[:k])]
-        near = [x for x in ordered if before - x[0] > _WINS * (before - ordered[0][0])]
-        leaders[j] = [(x[1], x[2]) for x in near[:_RACE]]
-    found = []
-    for one in _all_in_lanes(here, now, leaders, _LATE, now.model.fit.cost):
-        c, beyond = one.ranked.candidate, _excess(here, one.ranked.structure, one.fit)
-        own = float(beyond.max() if one.joint < 0 else beyond[one.joint])
-        state = Model(one.ranked.structure, one.fit, one.free, own)
-        sse = _outputs(here, one.fit.sums.cost)
-        if not one.alone:
-            mine, sse = sse[..., one.joint], now.squares.copy()
-            sse[..., one.joint] = mine
-        found.append(Tried(c, state, sse, one.alone))
-    return found
-
-
-class _OneOf(NamedTuple):
-    """A candidate of a fit, with the squares of its own joint."""
-
-    joint: int
-    own: float
-    ranked: _Ranked
-    fit: Fit
-    free: tuple[int, ...]
-    alone: bool
-
-
-def _from_starts(one: _Ranked) -> list[tuple[_Ranked, np.ndarray]]:
-    """A candidate with the numbers from which its fit starts, once for each start."""
-    c = one.candidate
-    return [(one, x) for x in ([one.theta] if c.elastic or not c.starts or c.effect in _LIMITS else
-                               [start_values(one.theta, c, start) for start in c.starts])]  # fmt: skip
-
-
-def _all_in_lanes(
-    here: Setting, now: _Standing, lists: dict[int, list[tuple[_Ranked, np.ndarray]]], most: int, below: float
-) -> list[_OneOf]:
-    """Every candidate of the lists fitted, the first of each joint together, then the second ones, and so on.
-
-    A spring changes the structure, a payload shows at several joints, a limit may hold up the steps of the others:
-    these are fitted by themselves.
-    """
-    lonely = lambda c: c.elastic or c.effect in _LIMITS or c.effect == "payload"  # noqa: E731
-    single = [(j, *one) for j, ones in lists.items() for one in ones if lonely(one[0].candidate)]
-    plain = {j: [one for one in ones if not lonely(one[0].candidate)] for j, ones in lists.items() if j >= 0}
-    lanes = [[(j, *ones[m]) for j, ones in plain.items() if m < len(ones)]
-             for m in range(max((len(ones) for ones in plain.values()), default=0))]  # fmt: skip
-    found, queue = [], [*lanes, *([one] for one in single)]
-    while queue:
-        lane = queue.pop(0)
-        structure, theta, free = lane[0][1].structure, lane[0][2].copy(), list(now.model.free)
-        for j, ranked, begin in lane:
-            mine = list(ranked.candidate.entries)
-            own = [*mine, *(k for k in free if _joint_of(here, k) == j)] if len(lane) > 1 else list(range(len(begin)))
-            theta, free = theta if len(lane) > 1 else begin.copy(), free_entries(free, mine)
-            theta[own] = begin[own]
-        start = _start_of(now, structure)
-        one = fit(*structure, theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
-                  iterations=most, rough=_ROUGH / 10, below=below or np.inf)[0]  # fmt: skip
-        if not np.isfinite(one.cost):  # one of them diverges: each by itself
-            queue += [[x] for x in lane] if len(lane) > 1 else []
-            continue
-        squares = _outputs(here, one.sums.cost)
-        for j, ranked, _ in lane:
-            own = float(squares[..., j].sum() if j >= 0 else squares.sum())
-            found.append(_OneOf(j, own, ranked, one, tuple(free), len(lane) == 1))
-    return found
-
-
-def _start_of(now: _Standing, structure: Structure) -> np.ndarray:
-    """The states at the windows' starts, in a structure that may have a spring more."""
-    start, n = now.model.fit.start, now.model.structure.loop.robot.nv
-    more = structure.loop.robot.nv - n
-    zero = np.zeros((more, start.shape[1]))
-    return np.concatenate([start[:n], zero, start[n:], zero]) if more else start
-
-
-def _sprung(here: Setting, now: _Standing, joint: int, forbid: Sequence[str]) -> list[_Ranked]:
-    """A spring, and a spring with play, between motor and link of a joint."""
-    wanted = [name for name in _ELASTIC if name not in forbid]
-    forces, name = largest_forces(here.loop, here.runs), here.loop.robot.dof_names[joint]
-    way = np.abs(np.asarray(here.loop.drives.transmission))[:, joint]
-    torque = float(max((way * forces).max(initial=0.0), 1e-6))
-    if not wanted or not np.isfinite(torque):
-        return []
-    loop = elastic_loop(here.loop, joint, 10.0 * torque, 0.01 * torque)
-    n, k = here.loop.robot.nv, len(here.known.table)
-    table = (*here.known.table, *(Entry(x, (n,)) for x in ("stiffness", "damping", "play")))
-    structure = Structure(loop, table, windows(loop, here.runs, here.stretches, here.noise, here.block))
-    part, _, which = _part(now, joint)
-    small = structure._replace(data=_only(structure.data, which))
-    start = _start_of(now, structure)[:, which]
-    found = []
-    for effect in wanted:
-        entries, reported = (k, k + 1), ("stiffness", "damping")
-        if effect == "backlash":
-            entries, reported = (k, k + 1, k + 2), (*reported, "width")
-        c = Candidate(effect, (name,), entries, (), reported, True)
-        for share in _SHARES:
-            play = 0.0 if effect == "joint_elasticity" else 0.1 * share
-            theta = np.concatenate([now.model.fit.theta, [torque / share, 0.002 * torque / share, play]])
-            score = settled(here, small, theta, free_entries(now.model.free, entries), start)
-            found.append(_Ranked(part.fit.cost - score, structure, c, theta))
-    return found
