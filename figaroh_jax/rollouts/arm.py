@@ -284,7 +284,7 @@ def _together(here: Setting, now: Standing, chosen: Sequence[Tried]) -> Model:
         theta[own] = one.state.fit.theta[own]
         free = free_entries(free, entries)
     last = fit(*structure, theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
-               iterations=LATE, rough=ROUGH)[0]  # fmt: skip
+               iterations=LATE, rough=ROUGH if by_recording(here) else 0.0)[0]  # fmt: skip
     return Model(structure, last, tuple(free), 0.0)
 
 
@@ -307,9 +307,6 @@ def _again(here: Setting, new: Model) -> Model:
         if not other.cost < near * last.cost:
             return new
         theta, start = other.theta, other.start
-        own = list(new.free)
-        if (np.abs(theta[own] - last.theta[own]) <= _NEAR * np.abs(last.theta[own])).all():  # the same valley
-            return new
     return new._replace(fit=other) if other.cost < (1 - ROUGH) * last.cost else new
 
 

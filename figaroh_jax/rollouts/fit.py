@@ -161,7 +161,7 @@ class _Lanes:
             steps = [self.step(now[k], k, damping[k]) for k in active]
             for k, step in zip(active, steps, strict=True):
                 least = max(_CLOSE * max(1.0, cost[k] / self.rows), rough * cost[k], _OF_GAIN * (below - cost[k]))
-                done[k] |= step.gain < least and (damping[k] <= 1.0 or worse[k] > 1)
+                done[k] |= step.gain < least and (damping[k] <= 1.0 or (rough > 0 and worse[k] > 1))
             tried = [(k, step) for k, step in zip(active, steps, strict=True) if not done[k]]
             if not tried:
                 continue
