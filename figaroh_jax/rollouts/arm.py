@@ -371,9 +371,11 @@ def _costs(here: Setting, new: Standing, entries: list[int]) -> float:
     structure, last = new.model.structure, new.model.fit
     covariance = System(last.sums, structure.data, last.start).covariance(last.free < 0)
     at = [int(np.flatnonzero(last.free == k)[0]) for k in entries]
-    away = (last.theta - values(structure.loop, structure.table))[entries]
-    block = covariance[np.ix_(at, at)]
-    return float(away @ np.linalg.pinv(block) @ away) if np.isfinite(block).all() and np.isfinite(away).all() else 0.0
+    stated, block = values(structure.loop, structure.table)[entries], covariance[np.ix_(at, at)]
+    if not (np.isfinite(block).all() and np.isfinite(stated).all()):  # a limit at infinity: the fit tells
+        return 0.0
+    away = last.theta[entries] - stated
+    return float(away @ np.linalg.pinv(block) @ away)
 
 
 def _name(
