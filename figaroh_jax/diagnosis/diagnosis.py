@@ -184,7 +184,7 @@ def _setting(problem: Problem, start: State, forbid: Sequence[str], progress: Ca
         problem = weighted
         spectrum, whitening = noise_floor(problem, start, forbid)
     whitening, white = white_where_better(problem, start, whitening)
-    return _Setting(problem, start, spectrum, whitening, white)
+    return _Setting(problem.within_trust(), start, spectrum, whitening, white)
 
 
 def _searched(

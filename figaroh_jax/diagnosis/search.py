@@ -13,6 +13,7 @@ from ..effects.base import Effect
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Prior
 from ..results import Name
+from .believed import believed
 from .comparison import Hypothesis, Verdicts, fewer_sums, ground, judge, overlap, shares_of_wins, t_value
 from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
@@ -255,7 +256,8 @@ def judged_without(
     place = amplitude_places(full.state, [f.effect for f in found], problem.model)[found.index(one)]
     X, prior = np.delete(full.rows.X, place, axis=2), full.state.prior
     fewer = Prior(np.delete(prior.mean, place), np.delete(prior.precision, place))
-    return judge(full.rows, Hypothesis(X, fewer), fewer_sums(full.folded, place))
+    sums = fewer_sums(full.folded, place)
+    return judge(full.rows, Hypothesis(X, believed(problem, fewer, sums)), sums)
 
 
 def stood_without(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from ..effects.base import Effect
 from ..estimation.rows import Linear, Rows, fit
+from .believed import believed
 from .comparison import FoldSums, Hypothesis, Verdicts, coefficients, fold_sums, grown_sums, judge
 from .design import kind
 from .problem import Problem
@@ -48,6 +49,7 @@ def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], 
         folded = grown_sums(rows, before.folded, rows.X)
     else:
         folded = fold_sums(rows, rows.X)
+    state = replace(state, prior=believed(problem, state.prior, folded))
     return Step(solved(problem, state, coefficients(folded, state.prior)), rows, folded)
 
 

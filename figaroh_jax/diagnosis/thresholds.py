@@ -51,6 +51,10 @@ STANDS = SPEED_EDGES[1]  # of a joint's top speed: below, it stands, and its row
 SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
 BESIDE_SMOOTH = 0.05  # gain of a cause of the whole robot beside smooth functions at every joint, or in their place
 
+# Links that are well known (`believed`)
+TRUSTED = 0.05  # stated trust in the inertials (relative) up to which the links move no further than that
+BEYOND_TRUST = 0.01  # p-value of the squares of their deviations: below, they are not as believed
+
 # The rest (`rest`)
 REST_P = 0.01  # p-value of a rest
 LINE_P = 1e-3  # p-value of a line in the spectrum
