@@ -95,6 +95,14 @@ def test_effects_in_an_arm_with_a_slide_are_named(effect: str):
     assert score.grade == "right" and not score.false, table([score])
 
 
+def test_a_payload_on_links_that_are_trusted_is_named_and_not_taken_in_by_them():
+    """Left out of the catalogue it is no `nothing` either: the links are not as they are believed."""
+    case = make_case([("payload", 0.05)], robot="small", repeats=2, trajectories=3, seed=412)
+    score = judge("payload", case.truth, diagnosis_of(case))
+    assert score.grade == "right" and not score.false, table([score])
+    assert diagnosis_of(case, ("payload", "link_inertia")).verdict == "unknown"
+
+
 @cache
 def score_of_hidden_effect(k: int) -> Score:
     """Robots and layouts take turns."""

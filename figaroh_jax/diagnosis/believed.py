@@ -3,7 +3,8 @@
 Enough data move the links wherever they fit best, whatever a prior says of them: a body that is fixed to a link then
 shows nowhere but in links far from what is believed, and predicts no better than they do. Where the inertials are
 trusted (`TRUSTED`), the squares of their deviations, each over its stated one sigma, stay within what chance makes of
-links as they are believed. What lies beyond is left to the causes, or to the rest.
+links as they are believed. What lies beyond is left to bodies and links as causes, or to the rest: any other cause must
+also predict better beside links that may move, for many follow them some of the way.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from .comparison import FoldSums, coefficients, told
 from .problem import Problem
 from .thresholds import BEYOND_TRUST
 
-__all__ = ["believed", "held_back"]
+__all__ = ["believed", "let_go"]
 
 TIGHTEST, HALVINGS = 1e8, 30  # times the stated precision; of its logarithm
 
@@ -46,6 +47,8 @@ def believed(problem: Problem, prior: Prior, sums: FoldSums) -> Prior:
     return tighter(high)
 
 
-def held_back(problem: Problem, prior: Prior) -> bool:
-    """Whether the links would have moved beyond what is believed."""
-    return problem.bounded and bool(prior.precision[0] > problem.believed[0])
+def let_go(problem: Problem, prior: Prior) -> Prior | None:
+    """The prior as stated where it holds links back that would have moved beyond what is believed; else None."""
+    if not problem.bounded or prior.precision[0] <= problem.believed[0]:
+        return None
+    return prior._replace(precision=np.append(problem.believed, prior.precision[len(problem.believed) :]))

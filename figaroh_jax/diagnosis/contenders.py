@@ -13,7 +13,7 @@ from ..effects.base import Effect
 from ..estimation.priors import physical_body
 from ..estimation.rows import Rows
 from ..results import Name
-from .believed import believed, held_back
+from .believed import believed
 from .comparison import Ground, Hypothesis, Verdicts, coefficients, grown_sums, judge, judge_grown, sums_of
 from .design import BATCH, kind, shapes, with_shape
 from .estimates import torque_slope
@@ -37,6 +37,7 @@ class Contender:
     effect: Effect
     verdicts: Verdicts
     joints: tuple[int, ...]  # by whose rows it is judged
+    free: Verdicts | None = None  # where links are held back (`believed`): the same beside links that are not
 
 
 def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray, float]]:
@@ -94,13 +95,15 @@ def contend(
     if way == "position":
         return _position_contender(problem, step, whitening, ready, group)
     effect, Z = _exact_columns(problem, step, ready, group, order)
+    free = None
     if effect.body:
         effect, verdicts = _body_verdicts(problem, step, base, effect, Z)
     else:
-        verdicts = _judged_beside(problem, step, base, group.columns.joints, Z)
+        verdicts, free = _judged_beside(problem, step, base, group.columns.joints, Z)
         names = [n for n, p in effect.parameters().items() if p.linear]
         effect = with_shape(effect, names, list(verdicts.theta[-len(names) :]))
-    return Contender(group.name, effect, verdicts, acting(effect, len(step.rows.y), group.columns.joints))
+    free = None if effect.inertial else free
+    return Contender(group.name, effect, verdicts, acting(effect, len(step.rows.y), group.columns.joints), free)
 
 
 def _to_first_order(step: Step, base: Ground, group: Group, point: int) -> Contender:
@@ -130,15 +133,16 @@ def _exact_columns(
 
 def _judged_beside(
     problem: Problem, step: Step, base: Ground, joints: Sequence[int], Z: Float[np.ndarray, "k rows T"]
-) -> Verdicts:
-    """The current model with columns more; links that it holds back (`believed`) are held no more than with these."""
-    if not held_back(problem, step.state.prior):
-        return judge_grown(step.rows, base, joints, Z)
+) -> tuple[Verdicts, Verdicts | None]:
+    """The current model with columns more; links that it holds back are held no more than with these, or not at all."""
+    if step.loose is None:
+        return judge_grown(step.rows, base, joints, Z), None
     more = np.zeros((*step.rows.y.shape, len(Z)))
     more[list(joints)] = np.moveaxis(Z, 0, 2)
     X = np.concatenate([step.rows.X, more], axis=2)
-    sums = grown_sums(step.rows, step.folded, X)
-    return judge(step.rows, Hypothesis(X, believed(problem, step.state.prior.extended(len(Z)), sums)), sums)
+    sums, loose = grown_sums(step.rows, step.folded, X), step.loose.extended(len(Z))
+    held, free = (judge(step.rows, Hypothesis(X, p), sums) for p in (believed(problem, loose, sums), loose))
+    return held, free
 
 
 def _body_verdicts(
@@ -146,7 +150,7 @@ def _body_verdicts(
 ) -> tuple[Effect, Verdicts]:
     """An effect that is a body, with the parameters of the nearest body that can exist."""
     rows, full = step.rows, np.moveaxis(Z, 0, 2)
-    free = _judged_beside(problem, step, base, range(len(rows.y)), Z)
+    free, _ = _judged_beside(problem, step, base, range(len(rows.y)), Z)
     body = physical_body(free.theta[-10:], _information(rows, base, full))
     fixed = full @ body
     sums = sums_of(rows, step.folded, rows.y - fixed)
@@ -200,4 +204,5 @@ def _sensor_contender(
         elif done:
             break
     here = stand(problem, extended_state(problem, base, effect), whitening)
-    return Contender(group.name, effect, here.verdicts, acting(effect, len(step.rows.y), group.columns.joints))
+    free = None if step.loose is None else here.free
+    return Contender(group.name, effect, here.verdicts, acting(effect, len(step.rows.y), group.columns.joints), free)
