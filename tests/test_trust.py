@@ -43,7 +43,7 @@ def test_what_no_torque_shows_stays_as_near_to_the_nominal_as_was_stated(slack: 
 
 @pytest.mark.parametrize("off", [0.5, 20.0])
 def test_trusted_links_are_those_that_fit_best_among_the_believed_ones(off: float) -> None:
-    """Beside SLSQP on the fit with the bound as a constraint; links that are near enough are left alone."""
+    """Beside SLSQP, with the bound as a constraint of the fit; links that are near enough are left alone."""
     rng = np.random.default_rng(8)
     stated = rng.uniform(1.0, 9.0, 6)
     X, mean = rng.standard_normal((40, 8)), rng.standard_normal(8)

@@ -44,7 +44,7 @@ from .rest import Significance, excess, lines, parts_of, predictable, relative_r
 from .search import Found, Search, eliminate, find_causes
 from .standstill import only_sticks
 from .state import State, baseline, with_width
-from .step import stand, with_causes
+from .step import Step, stand, with_causes
 from .thresholds import CERTAIN, FEW_CAUSES, NO_REST, WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_reversals
 
@@ -348,7 +348,7 @@ def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judg
         baseline=fitted_model(problem, first.state, []),
         model=fitted_model(problem, last.state, joint.causes),
         rest=judged.rest,
-        notes=(*_notes(signals, here), *([_AT_REST] if judged.sticks else [])),
+        notes=(*_notes(signals, here, last), *([_AT_REST] if judged.sticks else [])),
         prismatic=prismatic(model),
     )
 
@@ -384,7 +384,7 @@ def _scheme(signals: Sequence[Signals]) -> str:
     return describe_folds(signals)
 
 
-def _notes(signals: Sequence[Signals], here: _Setting) -> tuple[str, ...]:
+def _notes(signals: Sequence[Signals], here: _Setting, last: Step) -> tuple[str, ...]:
     notes = [note for s in signals for note in s.notes]
     if not here.problem.layout.repeats:
         notes.append(
@@ -395,5 +395,11 @@ def _notes(signals: Sequence[Signals], here: _Setting) -> tuple[str, ...]:
         notes.append(
             "the model's error exceeds the noise: rows are weighted by each joint's residual, which predicts held-out"
             " data better than weights from the noise spectrum"
+        )
+    if last.loose is not None:
+        notes.append(
+            "the data would move the link inertials further than is likely with a robot.trust of"
+            f" {here.problem.trust:.0%}, and no cause explains why: they are kept within it, and what that leaves"
+            " counts as unexplained"
         )
     return tuple(notes)

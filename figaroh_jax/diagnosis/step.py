@@ -42,9 +42,9 @@ class Step:
     @cached_property
     def free(self) -> Verdicts:
         """The same with links that no trust holds back."""
-        return (
-            self.verdicts if self.loose is None else judge(self.rows, Hypothesis(self.rows.X, self.loose), self.folded)
-        )
+        if self.loose is None:
+            return self.verdicts
+        return judge(self.rows, Hypothesis(self.rows.X, self.loose), self.folded)
 
 
 def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], before: Step | None = None) -> Step:
