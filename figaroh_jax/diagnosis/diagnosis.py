@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -24,7 +25,7 @@ from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Resampled, Signals, prepare_all
 from ..recordings.stacked import stack
-from ..results import Cause, Diagnosis, Nearest, Rest, Verdict
+from ..results import Cause, Diagnosis, Name, Nearest, Rest, Verdict
 from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
 from ..simulators.native import as_backend
@@ -34,7 +35,7 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .gaining import Gaining, without_losses
+from .gaining import Gaining, surely_beside_all, without_losses
 from .holdout import fold_error, part_error, residual_rms, traces
 from .joint import Joint, opened, polished, sized
 from .layout import checked_repeats, describe_folds, held_rows, layout
@@ -244,7 +245,12 @@ def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], to
     same = before.problem is here.problem
     here, joint = _as_predicts_best([here] if same else [here, before], named)
     claims = {one.name: one.gain for one in each}
-    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, claims)
+
+    def borne_out(name: Name) -> bool:
+        one = next(f for f in found if f.name == name)
+        return surely_beside_all(problem, searched.here.start, whitening, found, searched.joint, one, claims[name])
+
+    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, claims, cache(borne_out))
     gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
