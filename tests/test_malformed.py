@@ -51,7 +51,7 @@ YAML = {
     "a mapping of a scalar": ("a: !!map abc\n", ""),
     "Python": ("a: !!python/object/apply:os.mkdir [ran]\n", "python/object"),
     "an unknown alias": ("a: *b\n", "line 1"),
-    "an alias in itself": ("a: &a [*a]\n", "stands inside of what it stands for"),
+    "an alias in itself": ("a: &a [*a]\n", "is inside what it refers to"),
     "nested": ("[" * 5000, ""),
     "laughs": (
         "a: &a [x, x, x, x, x, x, x, x, x]\n"
@@ -319,7 +319,7 @@ refused = {
     "time holds complex": lambda: fj.recording(q=x, tau=x, time=c[:, 0]),
     "position holds complex": lambda: fj.postures(q=x, position=c[:, :3], base_frame="base", tool_frame="hand"),
     "stamps that look like ns": lambda: fj.recording(q=x, tau=x, time=np.arange(20) * 1e7),
-    "no array of numbers": lambda: fj.recording(q=[[0.1], [0.1, 0.2]], tau=x, rate=100),
+    "not an array of numbers": lambda: fj.recording(q=[[0.1], [0.1, 0.2]], tau=x, rate=100),
     "q holds text": lambda: fj.mass_matrix(m, [["1", "2", "3", "4"]]),
     "q holds objects": lambda: fj.mass_matrix(m, [[None] * 4]),
     "q is not an array of numbers": lambda: fj.mass_matrix(m, [[0.1], [0.1, 0.2]]),

@@ -361,9 +361,7 @@ class Actuator(BaseModel):
         for key, drive in value.items() if isinstance(value, dict) else ():
             if key != "gains" and not isinstance(drive, dict | JointDrive):
                 hint = nearest(str(key), ["gains"])
-                raise ValueError(
-                    f"unknown key '{key}'{hint}; other keys are joints: joint_1: {{kp: 20, kd: 1}}"
-                )
+                raise ValueError(f"unknown key '{key}'{hint}; other keys are joints: joint_1: {{kp: 20, kd: 1}}")
         return value
 
     @property

@@ -227,9 +227,7 @@ def _without_torque(robot: RobotModel, reads: Sequence[Columns]) -> list[str]:
     if any(read.command is None for read in reads):
         return ["the recordings hold no torque: neither diagnose nor identify can use them without"]
     said = [
-        f"{read.unsigned} never changes its sign, so it is not torque: left out"
-        for read in reads[:1]
-        if read.unsigned
+        f"{read.unsigned} never changes its sign, so it is not torque: left out" for read in reads[:1] if read.unsigned
     ]
     said.append("the recordings hold no torque: rollouts of the command")
     if not all(read.named for read in reads):

@@ -237,9 +237,7 @@ def _stamps(
         return np.arange(samples) / rate, entry | {"rate": rate}
     time = table.vector(clock, "time")
     if len(time) != samples or not (np.diff(time) > 0).all():
-        raise InputError(
-            f"{table.file}: '{clock}' is not the positions' clock: it does not increase, or is shorter"
-        )
+        raise InputError(f"{table.file}: '{clock}' is not the positions' clock: it does not increase, or is shorter")
     step = float(np.median(np.diff(time)))
     unit = next((u for u, s in _CLOCKS.items() if _SLOW <= 1 / (step * s) <= _FAST), None)
     if unit is None:

@@ -57,9 +57,7 @@ def verify(folder: Path, limits: Limits, *, write: bool = True) -> tuple[Check, 
 def read_run(folder: Path) -> dict[str, Any]:
     """`answer.json` and `result.json` of a run directory, under "answer" and "result" (None where there is none)."""
     if not folder.is_dir():
-        raise InputError(
-            f"{folder}: is not a directory; give that of a run (--out of diagnose, identify, ...)"
-        )
+        raise InputError(f"{folder}: is not a directory; give that of a run (--out of diagnose, identify, ...)")
     found: dict[str, Any] = {}
     for key in ("answer", "result"):
         path = folder / f"{key}.json"
