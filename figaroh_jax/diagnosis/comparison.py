@@ -25,6 +25,7 @@ __all__ = [
     "overlap",
     "shares_of_wins",
     "sums_of",
+    "told",
     "t_value",
 ]
 
@@ -122,6 +123,13 @@ def coefficients(sums: FoldSums, prior: Prior) -> Float[np.ndarray, " P"]:
     """The fit to all rows."""
     gram, moment, square = (part.sum(0) for part in sums)
     return _solve(gram, moment, square, prior)[0]
+
+
+def told(sums: FoldSums, prior: Prior, count: int) -> float:
+    """How many of the first `count` coefficients the data tell, not the prior: trace of (G + L)^-1 G."""
+    gram = sums.gram.sum(0)
+    A = gram + np.diag(prior.precision)
+    return float(np.trace(np.linalg.solve(A + TINY * np.diag(np.maximum(np.diag(A), TINY)), gram)[:count, :count]))
 
 
 def judge(rows: Rows, hypothesis: Hypothesis, known: FoldSums | None = None) -> Verdicts:

@@ -13,12 +13,13 @@ from ..effects.base import Effect
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Prior
 from ..results import Name
+from .believed import believed
 from .comparison import Hypothesis, Verdicts, fewer_sums, ground, judge, overlap, shares_of_wins, t_value
 from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
 from .flexible import friction_width
-from .gates import ambiguous, exists, gains, passes, physical_sign, rivals, simpler
+from .gates import ambiguous, exists, gains, passes, rivals, simpler
 from .problem import Problem
 from .screening import DRAWS, Null, Screen, catalogue, family_p, place_p, screen
 from .state import State, solved, with_width
@@ -45,11 +46,6 @@ class Found:
     ambiguous: tuple[Name, ...]
     joints: tuple[int, ...] = ()  # by whose rows it is judged
     alike: tuple[Name, ...] = ()  # what else explains much of the same misfit, though not as well
-
-    @property
-    def nuisance(self) -> bool:
-        """Whether physics forbids its sign: it stands in the fit and is no cause."""
-        return not physical_sign(self.effect)
 
 
 class Search(NamedTuple):
@@ -255,7 +251,8 @@ def judged_without(
     place = amplitude_places(full.state, [f.effect for f in found], problem.model)[found.index(one)]
     X, prior = np.delete(full.rows.X, place, axis=2), full.state.prior
     fewer = Prior(np.delete(prior.mean, place), np.delete(prior.precision, place))
-    return judge(full.rows, Hypothesis(X, fewer), fewer_sums(full.folded, place))
+    sums = fewer_sums(full.folded, place)
+    return judge(full.rows, Hypothesis(X, believed(problem, fewer, sums)), sums)
 
 
 def stood_without(
