@@ -22,6 +22,7 @@ __all__ = [
     "grown_sums",
     "judge",
     "judge_grown",
+    "last_coefficient",
     "overlap",
     "shares_of_wins",
     "sums_of",
@@ -122,6 +123,16 @@ def coefficients(sums: FoldSums, prior: Prior) -> Float[np.ndarray, " P"]:
     """The fit to all rows."""
     gram, moment, square = (part.sum(0) for part in sums)
     return _solve(gram, moment, square, prior)[0]
+
+
+def last_coefficient(sums: FoldSums, prior: Prior) -> tuple[Float[np.ndarray, " P"], float]:
+    """`coefficients`, and the variance of the last of them."""
+    gram, moment, square = (part.sum(0) for part in sums)
+    theta = _solve(gram, moment, square, prior)[0]
+    unit = np.zeros(len(theta))
+    unit[-1] = 1.0
+    nothing = prior._replace(mean=np.zeros(len(theta)))
+    return theta, max(float(_solve(gram, unit, 0.0, nothing)[0][-1]), 0.0)
 
 
 def judge(rows: Rows, hypothesis: Hypothesis, known: FoldSums | None = None) -> Verdicts:

@@ -91,6 +91,7 @@ def find_causes(
     null = Null(problem, spectrum, whitening, generator)
     screened, groups = None, None
     failed: dict[Name, float] = {}  # share of its joints' squares that a candidate scored when it last failed
+    fitted: dict[Name, Effect] = {}  # position sensors as they were last fitted exactly
     while len(found) < MOST_CAUSES:
         progress("screening the catalogue", len(found) / MOST_CAUSES)
         groups = catalogue(problem, step.state, step.rows, whitening, forbid, groups)
@@ -100,7 +101,7 @@ def find_causes(
         if p_values[-1] > alpha:
             break
         progress("comparing causes on held-out data", len(found) / MOST_CAUSES)
-        contenders = _contenders(problem, step, screened, whitening, failed)
+        contenders = _contenders(problem, step, screened, whitening, failed, fitted)
         chosen = _chosen(problem, step, contenders, found)
         if not chosen:
             break
@@ -148,7 +149,12 @@ def _chance(
 
 
 def _contenders(
-    problem: Problem, step: Step, screened: Screen, whitening: Float[np.ndarray, "F nv"], failed: dict[Name, float]
+    problem: Problem,
+    step: Step,
+    screened: Screen,
+    whitening: Float[np.ndarray, "F nv"],
+    failed: dict[Name, float],
+    fitted: dict[Name, Effect],
 ) -> list[Contender]:
     """The shortlist with exact shapes, without what cannot exist, the best on held-out data first.
 
@@ -160,10 +166,11 @@ def _contenders(
         share = score / squares[list(acting(group.effect, len(squares), group.columns.joints))].sum()
         if share <= AGAIN * failed.get(group.name, 0.0):
             continue
-        one = contend(problem, step, whitening, base, ready, group, order)
+        one = contend(problem, step, whitening, base, ready, group, order, fitted)
         if exists(problem, one.effect):
             out.append(one)
         else:
+            fitted.pop(group.name, None)
             failed[group.name] = share
         if not gains(step, one):
             failed[group.name] = share
