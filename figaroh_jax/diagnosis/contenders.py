@@ -177,15 +177,13 @@ def _position_contender(
     The torque changes by what the links' true motion makes of the coefficients so far, which is exact; that a change
     of coefficients acts along the true motion too is of second order, and left to the step that takes the cause in.
     """
-    rows, prior, state, theta = step.rows, step.state.prior, step.state, base.verdicts.theta
+    rows, prior, state = step.rows, step.state.prior, step.state
     effect = before
     if effect is None:
         effect = refit_shift(group.effect, group.columns.Z[:, 0], state.motion, problem.records, ready)
     ((name, parameter),) = effect.parameters().items()
-    for turn in range(TURNS + 1):
-        change, slope = _shift(problem, state, effect, name, ready.whitening)
-        if turn == TURNS:
-            break
+    change, slope = _shift(problem, state, effect, name, ready.whitening)
+    for _ in range(TURNS):
         missing, cross = rows.y - change, np.tensordot(slope, rows.X, 2)
         theta = base.inverse[-1] @ (np.tensordot(missing, rows.X, 2) + prior.precision * prior.mean)
         taken = base.inverse[-1] @ cross
@@ -197,6 +195,7 @@ def _position_contender(
             break
         effect = with_shape(effect, [name], [np.float64(value)])
         state = solved(problem, step.state, theta - taken * move)
+        change, slope = _shift(problem, state, effect, name, ready.whitening)
     verdicts = judge(rows, Hypothesis(rows.X, prior, change), sums_of(rows, step.folded, rows.y - change))
     return Contender(group.name, effect, verdicts, acting(effect, len(rows.y), group.columns.joints))
 
@@ -209,7 +208,8 @@ def _shift(
     h = SMALL * max(abs(size), SMALL)
     sides = jax.tree.map(lambda *x: np.stack(x), *(with_shape(effect, [name], [size + s]) for s in (0.0, h)))
     change, more = torque_change(sides, link_motion(problem, state), problem.records)
-    return tuple(filtered_rows(problem.records, x, response) for x in (change, (more - change) / h))
+    rows = [filtered_rows(problem.records, x, response) for x in (change, (more - change) / h)]
+    return rows[0], rows[1]
 
 
 def _response_contender(

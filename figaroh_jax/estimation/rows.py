@@ -104,7 +104,7 @@ def block_sums(
     numbers, out = rows.block[firsts], np.zeros((len(columns), rows.block.max() + 1))
     if len(columns) < FEW:
         sums, used = np.add.reduceat(columns * weight, firsts, axis=1), numbers >= 0
-        np.add.at(out, (slice(None), numbers[used]), sums[:, used])
+        np.add.at(out.T, numbers[used], sums.T[used])
         return out
     for first, end, number in zip(firsts, [*firsts[1:], len(rows.block)], numbers, strict=True):
         if number >= 0:
