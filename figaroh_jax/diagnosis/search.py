@@ -11,9 +11,8 @@ from jaxtyping import Float
 
 from ..effects.base import Effect
 from ..estimation.noise import Spectrum
-from ..estimation.rows import Prior
 from ..results import Name
-from .comparison import Hypothesis, Verdicts, fewer_sums, ground, judge, overlap, shares_of_wins, t_value
+from .comparison import Hypothesis, Verdicts, ground, judge, overlap, shares_of_wins, t_value
 from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
@@ -160,7 +159,7 @@ def _contenders(
 
     A candidate that has failed is tried again where it scores more of what its joints leave than it did then.
     """
-    base = ground(step.rows, step.verdicts, step.state.prior, step.folded)
+    base = ground(step.verdicts, step.state.prior, step.folded)
     ready, squares, out = for_refit(problem, step, base, whitening), (step.verdicts.error**2).sum(1), []
     for group, order, score in shortlist(step, screened):
         share = score / squares[list(acting(group.effect, len(squares), group.columns.joints))].sum()
@@ -260,9 +259,7 @@ def judged_without(
     if kind(one.effect) != "columns":
         return stood_without(problem, start, found, one, whitening).verdicts
     place = amplitude_places(full.state, [f.effect for f in found], problem.model)[found.index(one)]
-    X, prior = np.delete(full.rows.X, place, axis=2), full.state.prior
-    fewer = Prior(np.delete(prior.mean, place), np.delete(prior.precision, place))
-    return judge(full.rows, Hypothesis(X, fewer), fewer_sums(full.folded, place))
+    return judge(full.rows, Hypothesis(full.rows.X, full.state.prior), full.folded, place)
 
 
 def stood_without(
