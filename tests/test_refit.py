@@ -201,14 +201,16 @@ def box_minimum(A: np.ndarray, b: np.ndarray, lower: np.ndarray, upper: np.ndarr
 def test_box_minima_are_those_of_quadratics_in_the_box() -> None:
     made, asked = [quadratic(seed) for seed in range(6)], []
 
-    def function(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def function(x: np.ndarray, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         asked.append(np.array(x))
-        each = [(u @ A @ u / 2 - b @ u, A @ u - b) for u, (A, b) in zip(x, made, strict=True)]
-        return np.array([value for value, _ in each]) - 1e3 * np.arange(6), np.stack([slope for _, slope in each])
+        each = [(x[k] @ A @ x[k] / 2 - b @ x[k] - 1e3 * k, A @ x[k] - b) for k, (A, b) in enumerate(made) if k in some]
+        return np.array([value for value, _ in each]), np.stack([slope for _, slope in each])
 
     for one, (A, b) in enumerate(made):  # one that stands above another by far is left where it is
 
-        def alone(x: np.ndarray, A: np.ndarray = A, b: np.ndarray = b) -> tuple[np.ndarray, np.ndarray]:
+        def alone(
+            x: np.ndarray, some: np.ndarray, A: np.ndarray = A, b: np.ndarray = b
+        ) -> tuple[np.ndarray, np.ndarray]:
             return np.array([x[0] @ A @ x[0] / 2 - b @ x[0]]), (A @ x[0] - b)[None]
 
         found, least = box_minima(alone, np.array([[0.1, 0.2, 0.3]]))

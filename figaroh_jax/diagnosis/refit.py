@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from ..effects.base import Effect, Motion
 from ..recordings.stacked import Records
@@ -39,18 +39,18 @@ class Whitened(NamedTuple):
 
 
 def box_minima(
-    function: Callable[[Float[np.ndarray, "starts p"]], tuple[np.ndarray, np.ndarray]],
+    function: Callable[[Float[np.ndarray, "starts p"], Int[np.ndarray, " some"]], tuple[np.ndarray, np.ndarray]],
     start: Float[np.ndarray, "starts p"],
     close: float = SETTLED,
 ) -> tuple[Float[np.ndarray, "starts p"], Float[np.ndarray, " starts"]]:
-    """Minimisers in the unit box of one smooth function a start, all evaluated together, and the minima.
+    """Minimisers in the unit box of one smooth function a start, evaluated together, and the minima.
 
-    `function` answers the values and their gradients. Each start goes its own way by projected quasi-Newton steps
-    (BFGS), which are shortened until the value falls; it is left where a step promises less than `close` of its first
-    value, and where it promises by far too little to become the best.
+    `function` answers the values of some of the starts and their gradients. Each start goes its own way by projected
+    quasi-Newton steps (BFGS), which are shortened until the value falls; it is left where a step promises less than
+    `close` of its first value, and where it promises by far too little to become the best.
     """
     x = np.clip(start, 0.0, 1.0)
-    value, slope = function(x)
+    value, slope = function(x, np.arange(len(x)))
     scale = np.abs(value) + 1e-9
     # a first step of a quarter of the box
     bend = np.eye(x.shape[1]) * (4 * np.abs(slope).max(1) + 1e-300)[:, None, None]
@@ -63,14 +63,16 @@ def box_minima(
         promised = -(step * pull).sum(1) / 2
         hopeless = seen & (value - FAR * promised > value.min())
         going = (promised > close * scale) & ~hopeless & (length > 1e-3)
-        if not going.any():
+        some = np.flatnonzero(going)
+        if not len(some):
             break
         tried = np.where(going[:, None], np.clip(x + length[:, None] * step, 0.0, 1.0), x)
-        new, turned = function(tried)
+        new, turned = value.copy(), slope.copy()
+        new[some], turned[some] = function(tried, some)
         better = going & (new <= value + 1e-4 * (pull * (tried - x)).sum(1))
-        for one in np.flatnonzero(going):
+        for one in some:
             bend[one], seen[one] = _bent(bend[one], tried[one] - x[one], turned[one] - slope[one], seen[one])
-        length = np.where(better | ~going, 1.0, length / 3)
+        length = np.where(better, 1.0, np.where(going, length / 3, length))
         x, slope = (np.where(better[:, None], after, before) for after, before in ((tried, x), (turned, slope)))
         value = np.where(better, new, value)
     return x, value
@@ -127,25 +129,23 @@ def refit(
     low, width = box[:, 0], box[:, 1] - box[:, 0]
     # a start that stands there more than once (the grid is short) is followed once
     fields = np.concatenate([np.reshape(x, (len(start), -1)) for x in jax.tree.leaves(effects)], axis=1)
-    _, once, copies = np.unique(fields, axis=0, return_index=True, return_inverse=True)
-    device_effects, device_motion = jax.device_put((jax.tree.map(lambda x: np.asarray(x)[once], effects), motion))
-    known: dict[str, Any] = {}
+    once = np.unique(fields, axis=0, return_index=True)[1]
+    few, low, width = jax.tree.map(lambda x: np.asarray(x)[once], effects), low[once], width[once]
+    device_effects, device_motion = jax.device_put((few, motion))
+    known: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # shape and columns of each start as last evaluated
 
-    def profiles(values: Float[np.ndarray, "starts p"]) -> dict[str, Any]:
-        found = _profiles(device_effects, device_motion, values[once], records, whitened)
-        return {name: x[copies.reshape(-1)] for name, x in found.items() if name != "Z"} | {"Z": found["Z"]}
-
-    def function(u: Float[np.ndarray, "starts p"]) -> tuple[np.ndarray, np.ndarray]:
+    def function(u: Float[np.ndarray, "starts p"], some: Int[np.ndarray, " some"]) -> tuple[np.ndarray, np.ndarray]:
         values = low + u * width
-        known.update(profiles(values), at=values)
-        return known["value"], known["slope"] * width
+        value, slope, Z = _profiles(device_effects, device_motion, values, some, records, whitened)
+        known.update({one: (values[one], own) for one, own in zip(some.tolist(), Z, strict=True)})
+        return value, slope * width[some]
 
-    shares, least = box_minima(function, (start - low) / width)
+    shares, least = box_minima(function, (start[once] - low) / width)
     values, best = low + shares * width, int(np.argmin(np.where(np.isfinite(least), least, np.inf)))
-    if not np.array_equal(known["at"][best], values[best]):
-        known = profiles(values)
-    one = jax.tree.map(lambda x: np.asarray(x)[best], effects)
-    return with_shape(one, names, list(values[best])), known["Z"][copies.reshape(-1)[best]]
+    if not np.array_equal(known[best][0], values[best]):
+        function(shares, np.array([best]))
+    one = jax.tree.map(lambda x: np.asarray(x)[best], few)
+    return with_shape(one, names, list(values[best])), known[best][1]
 
 
 def shift_profile(change: Float[np.ndarray, "sizes nv T"], whitened: Whitened) -> Float[np.ndarray, " sizes"]:
@@ -172,7 +172,7 @@ def refit_shift(
     as_read = links_torque(motion.model, motion.position, motion.velocity, motion.acceleration, records)
     joints = np.tile(np.arange(as_read.shape[1]), (2, 1))
 
-    def function(u: Float[np.ndarray, "1 1"]) -> tuple[np.ndarray, np.ndarray]:
+    def function(u: Float[np.ndarray, "1 1"], _: Int[np.ndarray, " 1"]) -> tuple[np.ndarray, np.ndarray]:
         size = low + u[0] * (high - low)
         both = jax.tree.map(lambda x: np.repeat(x, 2, axis=0), one)
         both = with_shape(both, [name], [np.append(size, size + STEP * (high - low))])
@@ -186,17 +186,22 @@ def refit_shift(
 
 
 def _profiles(
-    effects: Effect, motion: Motion, values: Float[np.ndarray, "starts p"], records: Records, whitened: Whitened
-) -> dict[str, Any]:
-    """Profile, gradient and columns of several starts at one place, each its own effect with its own shape."""
-    torque, slope = units_and_slopes(effects, values, motion)
-    starts, p, k = slope.shape[:3]
-    joints = np.asarray(effects.at) if local(effects) else np.tile(np.arange(len(whitened.residual)), (starts, 1))
-    both = np.concatenate([torque[:, None], slope], axis=1).reshape(starts, (1 + p) * k, *torque.shape[2:])
+    effects: Effect,
+    motion: Motion,
+    values: Float[np.ndarray, "starts p"],
+    some: Int[np.ndarray, " some"],
+    records: Records,
+    whitened: Whitened,
+) -> tuple[Float[np.ndarray, " some"], Float[np.ndarray, "some p"], Float[np.ndarray, "some k rows n M"]]:
+    """Profile, gradient and columns of some of the starts at one place, each its own effect with its own shape."""
+    torque, slope = (x[some] for x in units_and_slopes(effects, values, motion))
+    count, p, k = slope.shape[:3]
+    joints = np.asarray(effects.at)[some] if local(effects) else np.tile(np.arange(len(whitened.residual)), (count, 1))
+    both = np.concatenate([torque[:, None], slope], axis=1).reshape(count, (1 + p) * k, *torque.shape[2:])
     rows = unit_rows(Units(both, joints), records, whitened.whitening)
-    rows = rows.reshape(starts, 1 + p, k, *rows.shape[2:])
+    rows = rows.reshape(count, 1 + p, k, *rows.shape[2:])
     value, gradient = profile(rows[:, 0], rows[:, 1:], joints[0].tolist(), whitened)
-    return {"value": value, "slope": gradient, "Z": rows[:, 0]}
+    return value, gradient, rows[:, 0]
 
 
 def _box(
