@@ -24,6 +24,8 @@ __all__ = ["Joint", "has_size", "joint_fit", "moved", "opened", "polished", "siz
 
 KEPT = 1e-12
 SURE = 0.95  # of the region of a cause's amplitudes that must not hold zero
+LATE = 4  # turns: most fits have settled by then
+BACK = 0.5  # of its last move: what a shape goes back by where steps overshoot
 POLISH, SETTLED = 10, 0.03  # turns at the most; a turn that moves nothing by more of its standard deviation is the last
 
 
@@ -39,15 +41,31 @@ def polished(problem: Problem, start: State, causes: list[Effect], whitening: Fl
     """All causes fitted together: Gauss-Newton steps over coefficients and shapes until they settle.
 
     Sensor effects follow the load and the torque, so each turn begins with what the last one made of the baseline.
+    A shape that late turns send back as far as it came would go on so for ever: it moves half of the way from then on.
     """
     joint = _together(problem, start, causes, whitening)
-    for _ in range(0 if all(map(_settled, causes)) else POLISH):
-        causes = [moved(e, joint.fitted, at) for e, at in zip(joint.causes, joint.fitted.places, strict=True)]
+    share, before = np.ones_like(joint.fitted.value), np.zeros_like(joint.fitted.value)
+    for turn in range(0 if all(map(_settled, causes)) else POLISH):
+        move = _move(joint)
+        if turn >= LATE:
+            share = np.where(move * before < -BACK * before**2, share / 2, share)
+        goal = replace(joint.fitted, value=joint.fitted.value - (1 - share) * move)
+        causes = [moved(e, goal, at) for e, at in zip(joint.causes, goal.places, strict=True)]
         base = solved(problem, start, joint.step.state.theta[: len(start.theta)])
-        last, joint = joint.fitted, _together(problem, base, causes, whitening)
+        before, last, joint = move, joint.fitted, _together(problem, base, causes, whitening)
         if np.all(np.abs(joint.fitted.value - last.value) <= SETTLED * np.sqrt(np.diag(joint.fitted.covariance))):
             break
     return joint
+
+
+def _move(joint: Joint) -> Float[np.ndarray, " parameters"]:
+    """How far the fit would move each shape; zero for the coefficients, which have moved."""
+    move = np.zeros_like(joint.fitted.value)
+    for effect, place in zip(joint.causes, joint.fitted.places, strict=True):
+        names = shapes(type(effect))
+        at = list(place[len(place) - len(names) :])
+        move[at] = joint.fitted.value[at] - [float(getattr(effect, name)) for name in names]
+    return move
 
 
 def _settled(effect: Effect) -> bool:
@@ -69,7 +87,7 @@ def joint_fit(problem: Problem, step: Step, causes: list[Effect], whitening: Flo
     slopes = np.stack(each) if each else np.zeros((0, *rows.y.shape))
     precision = np.append(state.prior.precision, np.zeros(len(slopes)))
     cross = np.stack([np.tensordot(slope, rows.X, 2) for slope in slopes]) if each else np.zeros((0, rows.X.shape[2]))
-    flat = slopes.reshape(len(slopes), -1)
+    flat = slopes.reshape(len(slopes), rows.y.size)
     A = np.block([[step.folded.gram.sum(0), cross.T], [cross, flat @ flat.T]]) + np.diag(precision)
     inverse = np.linalg.inv(A + KEPT * np.diag(np.maximum(np.diag(A), KEPT)))
     residual = rows.y - rows.X @ state.theta

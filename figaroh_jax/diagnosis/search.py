@@ -110,9 +110,11 @@ def find_causes(
             step = with_cause(problem, step, best.effect, whitening)
         if len(found) > 1 and any(type(f.effect).follows_total for f in found):
             step, screened = _refreshed(problem, state, step, found, whitening), None
-        if any(kind(best.effect) != "columns" for best in chosen):
-            problem = friction_width(problem, step.state, whitening)
-            step, groups, screened = stand(problem, with_width(problem, step.state), whitening), None, None
+        ways = {kind(best.effect) for best in chosen}
+        if ways != {"columns"}:
+            known, problem, screened = problem, friction_width(problem, step.state, whitening), None
+            groups = None if problem is not known or "response" in ways else groups
+            step = step if problem is known else stand(problem, with_width(problem, step.state), whitening)
     begun = solved(problem, with_width(problem, state), step.state.theta[: len(state.theta)])
     return Search(problem, begun, step, found, p_values[0], p_values[-1], screens[0])
 
