@@ -26,6 +26,7 @@ __all__ = [
     "overlap",
     "shares_of_wins",
     "sums_of",
+    "told",
     "t_value",
 ]
 
@@ -139,6 +140,13 @@ def last_coefficient(sums: FoldSums, prior: Prior) -> tuple[Float[np.ndarray, " 
     unit[-1] = 1.0
     nothing = prior._replace(mean=np.zeros(len(theta)))
     return theta, max(float(_solve(gram, unit, 0.0, nothing)[0][-1]), 0.0)
+
+
+def told(sums: FoldSums, prior: Prior, count: int) -> float:
+    """How many of the first `count` coefficients the data tell, not the prior: trace of (G + L)^-1 G."""
+    gram = sums.gram.sum(0)
+    A = gram + np.diag(prior.precision)
+    return float(np.trace(np.linalg.solve(A + TINY * np.diag(np.maximum(np.diag(A), TINY)), gram)[:count, :count]))
 
 
 def judge(rows: Rows, hypothesis: Hypothesis, known: FoldSums | None = None, without: Sequence[int] = ()) -> Verdicts:

@@ -14,6 +14,7 @@ from ..estimation.priors import physical_body
 from ..estimation.rows import UNKNOWN, Rows
 from ..recordings.stacked import filtered_rows
 from ..results import Name
+from .believed import believed
 from .comparison import Ground, Hypothesis, Verdicts, grown_sums, judge, judge_grown, last_coefficient, sums_of
 from .design import BATCH, kind, shapes, with_shape
 from .estimates import torque_slope
@@ -40,6 +41,7 @@ class Contender:
     effect: Effect
     verdicts: Verdicts
     joints: tuple[int, ...]  # by whose rows it is judged
+    free: Verdicts | None = None  # where links are held back (`believed`): the same beside links that are not
 
 
 def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray, float]]:
@@ -101,13 +103,15 @@ def contend(
         fitted[group.name] = one.effect
         return one
     effect, Z = _exact_columns(problem, step, ready, group, order)
+    free = None
     if effect.body:
-        effect, verdicts = _body_verdicts(step, base, effect, Z)
+        effect, verdicts = _body_verdicts(problem, step, base, effect, Z)
     else:
-        verdicts = judge_grown(step.rows, base, group.columns.joints, Z)
+        verdicts, free = _judged_beside(problem, step, base, group.columns.joints, Z)
         names = [n for n, p in effect.parameters().items() if p.linear]
         effect = with_shape(effect, names, list(verdicts.theta[-len(names) :]))
-    return Contender(group.name, effect, verdicts, acting(effect, len(step.rows.y), group.columns.joints))
+    free = None if effect.inertial else free
+    return Contender(group.name, effect, verdicts, acting(effect, len(step.rows.y), group.columns.joints), free)
 
 
 def _to_first_order(step: Step, base: Ground, group: Group, point: int) -> Contender:
@@ -135,16 +139,30 @@ def _exact_columns(
     return effect, Z.reshape(*Z.shape[:2], -1)
 
 
+def _judged_beside(
+    problem: Problem, step: Step, base: Ground, joints: Sequence[int], Z: Float[np.ndarray, "k rows T"]
+) -> tuple[Verdicts, Verdicts | None]:
+    """The current model with columns more; links that it holds back are held no more than with these, or not at all."""
+    if step.loose is None:
+        return judge_grown(step.rows, base, joints, Z), None
+    more = np.zeros((*step.rows.y.shape, len(Z)))
+    more[list(joints)] = np.moveaxis(Z, 0, 2)
+    X = np.concatenate([step.rows.X, more], axis=2)
+    sums, loose = grown_sums(step.rows, step.folded, X), step.loose.extended(len(Z))
+    held, free = (judge(step.rows, Hypothesis(X, p), sums) for p in (believed(problem, loose, sums), loose))
+    return held, free
+
+
 def _body_verdicts(
-    step: Step, base: Ground, effect: Effect, Z: Float[np.ndarray, "10 nv T"]
+    problem: Problem, step: Step, base: Ground, effect: Effect, Z: Float[np.ndarray, "10 nv T"]
 ) -> tuple[Effect, Verdicts]:
     """An effect that is a body, with the parameters of the nearest body that can exist."""
     rows, full = step.rows, np.moveaxis(Z, 0, 2)
-    free = judge_grown(rows, base, range(len(rows.y)), Z)
+    free, _ = _judged_beside(problem, step, base, range(len(rows.y)), Z)
     body = physical_body(free.theta[-10:], _information(rows, base, full))
     fixed = full @ body
     sums = sums_of(rows, step.folded, rows.y - fixed)
-    verdicts = judge(rows, Hypothesis(rows.X, step.state.prior, fixed), sums)
+    verdicts = judge(rows, Hypothesis(rows.X, believed(problem, step.state.prior, sums), fixed), sums)
     return with_shape(effect, list(effect.parameters()), list(body)), verdicts
 
 
@@ -196,8 +214,11 @@ def _position_contender(
         effect = with_shape(effect, [name], [np.float64(value)])
         state = solved(problem, step.state, theta - taken * move)
         change, slope = _shift(problem, state, effect, name, ready.whitening)
-    verdicts = judge(rows, Hypothesis(rows.X, prior, change), sums_of(rows, step.folded, rows.y - change))
-    return Contender(group.name, effect, verdicts, acting(effect, len(rows.y), group.columns.joints))
+    sums, loose = sums_of(rows, step.folded, rows.y - change), step.loose
+    free = None if loose is None else judge(rows, Hypothesis(rows.X, loose, change), sums)
+    held = prior if loose is None else believed(problem, loose, sums)
+    verdicts = judge(rows, Hypothesis(rows.X, held, change), sums)
+    return Contender(group.name, effect, verdicts, acting(effect, len(rows.y), group.columns.joints), free)
 
 
 def _shift(
@@ -229,4 +250,5 @@ def _response_contender(
             break
         effect, here = with_shape(effect, [name], [np.float64(value)]), None
     here = here or stand(problem, extended_state(problem, step.state, effect), whitening)
-    return Contender(group.name, effect, here.verdicts, acting(effect, len(step.rows.y), group.columns.joints))
+    free = None if step.loose is None else here.free
+    return Contender(group.name, effect, here.verdicts, acting(effect, len(step.rows.y), group.columns.joints), free)

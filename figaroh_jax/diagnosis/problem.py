@@ -17,12 +17,14 @@ from jaxtyping import Complex, Float, Int
 
 from ..effects.base import Effect, Motion
 from ..effects.catalogue import CATALOGUE
+from ..estimation.priors import rigid_prior
 from ..recordings.stacked import Records, filter_rows, open_rows
 from ..rigid.model import RobotModel
 from ..rigid.regressor import packed_regressor, pairs
 from ..simulators.contract import Backend
 from .design import SHORT, Units, candidates, flattened, kind, shapes, units
 from .shifts import links_torque, rigid_torque
+from .thresholds import TRUSTED
 
 T = TypeVar("T")
 
@@ -226,6 +228,7 @@ class Problem:
     trust: float
     width: Float[np.ndarray, " nv"]  # half width of the friction's reversal, rad/s or m/s
     held: Float[np.ndarray, "n M nv"]  # 1: a row of a holdout recording with torque
+    bounded: bool = False  # whether the links stay within what is believed of them (`believed`)
     filtered: Filtered = field(default_factory=Filtered, compare=False, repr=False)
 
     @property
@@ -258,6 +261,11 @@ class Problem:
         if r.carried is not None:
             load = load + links_torque(self.model, q, v, a, r) - rigid_torque(self.model, q, v, a)
         return Motion(self.model, r.flat(r.time), q, v, a, load, load, r.dt, self.width)
+
+    @cached_property
+    def believed(self) -> Float[np.ndarray, " P"]:
+        """Precision of the links' inertial parameters as the task states it."""
+        return rigid_prior(self.model, self.trust)[1]
 
     @cached_property
     def families(self) -> dict[str, dict[str, Effect]]:
@@ -330,6 +338,14 @@ class Problem:
         while len(self._terms) > MOST_TERMS:
             self._terms.popitem(last=False)
         return made
+
+    def within_trust(self) -> Problem:
+        """The problem with links that stay within what is believed of them, where that is much."""
+        if self.trust > TRUSTED:
+            return self
+        other = replace(self, bounded=True)
+        other.__dict__.update({k: v for k, v in self.__dict__.items() if k not in other.__dict__})
+        return other
 
     def with_width(self, width: Float[np.ndarray, " nv"]) -> Problem:
         """The problem with another width of the friction's reversal, which no candidate's place and grid depends on."""

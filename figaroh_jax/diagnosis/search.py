@@ -11,8 +11,10 @@ from jaxtyping import Float
 
 from ..effects.base import Effect
 from ..estimation.noise import Spectrum
+from ..estimation.rows import Prior
 from ..results import Name
-from .comparison import Hypothesis, Verdicts, ground, judge, overlap, shares_of_wins, t_value
+from .believed import believed
+from .comparison import Hypothesis, Verdicts, fewer_sums, ground, judge, overlap, shares_of_wins, t_value
 from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
@@ -261,7 +263,11 @@ def judged_without(
     if kind(one.effect) != "columns":
         return stood_without(problem, start, found, one, whitening).verdicts
     place = amplitude_places(full.state, [f.effect for f in found], problem.model)[found.index(one)]
-    return judge(full.rows, Hypothesis(full.rows.X, full.state.prior), full.folded, place)
+    prior, kept = full.state.prior, np.delete(np.arange(len(full.state.theta)), place)
+    fewer = believed(problem, Prior(prior.mean[kept], prior.precision[kept]), fewer_sums(full.folded, place))
+    precision = prior.precision.copy()
+    precision[kept] = fewer.precision
+    return judge(full.rows, Hypothesis(full.rows.X, Prior(prior.mean, precision)), full.folded, place)
 
 
 def stood_without(

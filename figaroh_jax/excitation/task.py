@@ -28,7 +28,7 @@ __all__ = ["excite_task"]
 
 DEFAULT_NOISE = 0.01  # of the largest torque
 ONLY_NOISE = (
-    "the noise is that of the recordings; what they tell of the links is not counted, since either cause changes it"
+    "the noise is that of the recordings; what they say about the links is not counted, since either cause changes it"
 )
 
 
@@ -76,7 +76,7 @@ def excite_task(
     if task.data:
         from .known import with_recordings  # the machinery of fits, which a design without recordings does without
 
-        progress("what the recordings tell", 0.0)
+        progress("reading what is known", 0.0)
         after, texts = with_recordings(task, model.robot, known, learned, asked.noise is None)
         if separate or asked.objective == "separate":  # the causes were at work in the recordings too
             learned, texts = learned.with_noise(1 / np.sqrt(np.asarray(after.weight))), (*texts[:-1], ONLY_NOISE)

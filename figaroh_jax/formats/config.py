@@ -130,7 +130,7 @@ class Robot(_Keys):
     def _once(cls, joints: tuple[str, ...] | None) -> tuple[str, ...] | None:
         for joint in joints or ():
             if joints is not None and joints.count(joint) > 1:
-                raise ValueError(f"joint '{joint}' stands there twice")
+                raise ValueError(f"joint '{joint}' appears twice")
         if joints == ():
             raise ValueError("expected at least one joint")
         return joints
@@ -361,7 +361,7 @@ class Actuator(BaseModel):
         for key, drive in value.items() if isinstance(value, dict) else ():
             if key != "gains" and not isinstance(drive, dict | JointDrive):
                 hint = nearest(str(key), ["gains"])
-                raise ValueError(f"unknown key '{key}'{hint}; beside it stand joints, as in joint_1: {{kp: 20, kd: 1}}")
+                raise ValueError(f"unknown key '{key}'{hint}; other keys are joints: joint_1: {{kp: 20, kd: 1}}")
         return value
 
     @property
@@ -517,7 +517,7 @@ class Excite(_Keys):
         if self.objective == "prediction" and not self.predict:
             raise ValueError("objective: prediction needs `predict`, the motions that matter")
         if self.objective == "separate" and not self.separate:
-            raise ValueError("objective: separate needs `separate`, pairs of causes that are to be told apart")
+            raise ValueError("objective: separate needs `separate`, pairs of causes to be distinguished")
         return self
 
 

@@ -385,7 +385,7 @@ def _altered(place: Path) -> str | None:
     """What in a run directory is not as the run wrote it."""
     written = _written(place)
     if written is None:
-        return f"its {MARKER} is damaged, so nobody can tell what the run wrote; name another directory"
+        return f"its {MARKER} is damaged, so it is unknown which files the run wrote; choose another directory"
     folders = {str(parent) for name in written for parent in PurePosixPath(name).parents}
     for path in _below(place):
         name = path.relative_to(place).as_posix()
