@@ -107,7 +107,7 @@ def standings(
     grown = _Grown(problem, full, whitening, ground(full.verdicts, full.state.prior, full.folded), size)
     out = []
     for one, effect, place, at in zip(found, joint.causes, places, joint.fitted.places, strict=True):
-        late, coupled = kind(effect) == "response", effect.name == "coupled_transmission"
+        late, coupled = kind(effect) == "response", bool(effect.one_rotor)
         bare = stood_without(problem, start, found, one, whitening) if late else None
         without = bare.verdicts if bare else judged_without(problem, start, full, found, one, whitening)
         worse, better = (v.own(full.rows, one.joints) for v in (without, full.verdicts))
@@ -267,7 +267,7 @@ def _with_smooth(grown: _Grown, step: Step) -> Hypothesis:
 def _inertia_alone(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
     """Whether neither friction of a coupling is surely there (two standard deviations)."""
     deviations = _deviations(effect, fitted, place)
-    return all(abs(deviations[n]) < 2 for n in ("damping", "friction"))
+    return all(abs(deviations[n]) < 2 for n in effect.one_rotor[1:])
 
 
 def _turns_against_itself(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
@@ -275,7 +275,7 @@ def _turns_against_itself(effect: Effect, fitted: Fitted, place: tuple[int, ...]
 
     One rotor that turns the sum, or the difference, of two joints has inertia, damping and friction of that sign.
     """
-    return min(_deviations(effect, fitted, place)[n] for n in ("inertia", "damping", "friction")) < -3
+    return min(_deviations(effect, fitted, place)[n] for n in effect.one_rotor) < -3
 
 
 def _deviations(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> dict[str, float]:

@@ -19,7 +19,7 @@ from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
 from .flexible import friction_width
-from .gates import ambiguous, exists, gains, passes, physical_sign, rivals, simpler
+from .gates import ambiguous, exists, gains, passes, rivals, simpler
 from .problem import Problem
 from .screening import DRAWS, Null, Screen, catalogue, family_p, place_p, screen
 from .state import State, solved, with_width
@@ -46,11 +46,6 @@ class Found:
     ambiguous: tuple[Name, ...]
     joints: tuple[int, ...] = ()  # by whose rows it is judged
     alike: tuple[Name, ...] = ()  # what else explains much of the same misfit, though not as well
-
-    @property
-    def nuisance(self) -> bool:
-        """Whether physics forbids its sign: it stands in the fit and is no cause."""
-        return not physical_sign(self.effect)
 
 
 class Search(NamedTuple):

@@ -12,7 +12,8 @@ from scipy.interpolate import make_interp_spline
 
 from ..errors import InputError
 from ..formats.collision import read_shapes
-from ..formats.config import Excite, Sight, SizedEffect, Task, robot_options
+from ..formats.config import Task, robot_options
+from ..formats.excite_keys import Excite, Sight, SizedEffect
 from ..formats.robotfile import load_extended, load_robot, stated_baseline
 from ..recordings.reading import read_table
 from ..rigid.model import RobotModel

@@ -48,9 +48,6 @@ def compare_runs(folders: Sequence[Path], units: Sequence[str] | None = None) ->
         return (*_sections(folders, runs, names), *_spread(runs, units))
 
 
-_PARAMETERS = "Parameters (± one standard deviation; * differs by more than 3)"
-
-
 def _sections(folders: Sequence[Path], runs: Sequence[dict[str, Any]], names: tuple[str, ...]) -> tuple[Section, ...]:
     sections = (
         Section("What was found", ("cause", *names), tuple(_found(runs))),

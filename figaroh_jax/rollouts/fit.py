@@ -267,13 +267,6 @@ class System:
         starts = inner[..., -1] - np.einsum("wip,p->wi", inner[..., :-1], change)
         return change, starts.T
 
-    def reduced(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
-        """Matrix and right side of the parameters, the windows' starts solved for."""
-        hss = self.hss + damping * np.einsum("wii,ij->wij", self.hss, np.eye(self.hss.shape[1]))
-        inner = np.linalg.solve(hss, np.concatenate([np.swapaxes(self.hps, 1, 2), self.gs[..., None]], 2))
-        schur = self.hpp - np.einsum("wpi,wiq->pq", self.hps, inner[..., :-1])
-        return schur, self.gp - np.einsum("wpi,wi->p", self.hps, inner[..., -1])
-
     def decrease(self, change: np.ndarray, starts: np.ndarray) -> float:
         """Of the sum of squares, as the quadratic model promises it for a step."""
         s = starts.T
