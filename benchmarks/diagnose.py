@@ -4,7 +4,8 @@
 
 The task is the TX40 recording where it is there (FIGAROH_JAX_DATA, default ../shared/data), else the embedded demo.
 `--eighteen` takes the UR10e's 18 recordings of `ur10e_innopolis`, 8.6 minutes in all.
-Every run is a process of its own; its user and system seconds are counted, not the time it waited.
+Every run is a process of its own; its user and system seconds are counted, not the time it waited. Python keeps the
+byte code of what it imports, as an installed package has it, whatever PYTHONDONTWRITEBYTECODE says here.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ USE = "import jax, figaroh_jax as fj; fj.RobotModel, fj.inverse_dynamics, fj.joi
 
 
 def main() -> None:
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=3, help="runs of each kind; medians are printed (default 3)")
     parser.add_argument("--task", type=Path, help="a task file in place of the TX40's")
@@ -50,6 +52,7 @@ def main() -> None:
 
 def _imports(runs: int) -> None:
     lines = {"import jax": "import jax", "and import figaroh_jax": "import jax, figaroh_jax", "and its dynamics": USE}
+    cpu_seconds([sys.executable, "-c", "import figaroh_jax.jobs.commands, figaroh_jax.jobs.diagnosis"])  # byte code
     rounds = [{name: cpu_seconds([sys.executable, "-c", line]) for name, line in lines.items()} for _ in range(runs)]
     _row("import jax", [r["import jax"] for r in rounds])
     for name in list(lines)[1:]:

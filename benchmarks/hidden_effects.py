@@ -3,6 +3,7 @@
     python benchmarks/hidden_effects.py --seeds 0 1 --robots tx40 panda      # every effect, with and without repeats
     python benchmarks/hidden_effects.py --clean 48                           # false names, p-values on clean recordings
     python benchmarks/hidden_effects.py --left-out --size 0.08               # families missing in the catalogue
+    python benchmarks/hidden_effects.py --trusted --clean 12                 # links that the task trusts to 2 %
     python benchmarks/hidden_effects.py --foreign --size 0.08                # laws that no catalogue holds
     python benchmarks/hidden_effects.py --closed-loop --robots ur10e         # MuJoCo C in place of inverse dynamics
 
@@ -17,6 +18,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +88,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--size", type=float, default=0.05)
     parser.add_argument("--noise", type=float, default=1.0)
     parser.add_argument("--clean", type=int, default=0, metavar="N", help="N clean cases instead, with their p-values")
+    parser.add_argument("--trusted", action="store_true", help="inertials 1 %% off and trusted to 2 %% in every case")
     parser.add_argument("--left-out", action="store_true", help="forbid the hidden effect: `unknown` is right")
     parser.add_argument("--foreign", action="store_true", help="hide laws that stand in no catalogue")
     parser.add_argument("--closed-loop", action="store_true", help="MuJoCo C in place of inverse dynamics")
@@ -95,6 +98,8 @@ def _arguments() -> argparse.Namespace:
 def _cases(args: argparse.Namespace) -> Iterator[tuple[str, Case, tuple[str, ...]]]:
     """Label, case and forbidden effects of the study, one after another."""
     make = make_closed_loop_case if args.closed_loop else make_case
+    if args.trusted:
+        make = partial(make, trusted=True)
     for number in range(args.clean):
         layout = args.layouts[number % len(args.layouts)]
         robot, seed = args.robots[number // 2 % len(args.robots)], args.seeds[0] + number

@@ -128,7 +128,9 @@ def _one_hidden(folder: Path, robot: str, seed: int, effect: str) -> list[dict[s
     sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(ROOT / "tests")]
     import hidden_effects
 
-    args = argparse.Namespace(closed_loop=False, clean=0, foreign=False, left_out=0, size=0.05, noise=1.0)
+    args = argparse.Namespace(
+        closed_loop=False, clean=0, trusted=False, foreign=False, left_out=0, size=0.05, noise=1.0
+    )
     args.robots, args.seeds, args.effects, args.layouts = [robot], [seed], [effect], list(hidden_effects.LAYOUTS)
     made = []
     for label, case, _ in hidden_effects._cases(args):

@@ -3,6 +3,7 @@
     python -m benchmarks.real                       # torque recordings, each beside `identify` on the same rows
     python -m benchmarks.real --postures            # the pose sets of `benchmarks/calibration.py`
     python -m benchmarks.real --only tx40 --jobs 2 --out RESULTS.json
+    python -m benchmarks.real --commands identify   # one of the two alone
 
 The tasks are those of `hide_in_real`, without anything hidden; the data folder is `$FIGAROH_JAX_DATA`.
 """
@@ -24,6 +25,7 @@ import numpy as np
 from . import blackbox
 
 IDENTIFY = f"{shlex.quote(sys.executable)} -m figaroh_jax identify {{task}} --out {{out}} --quiet"
+COMMANDS = {"diagnose": blackbox.default_command(), "identify": IDENTIFY}
 PARTS = 4  # of the rest that are told
 
 
@@ -32,13 +34,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--postures", action="store_true", help="pose sets in place of torque recordings")
     parser.add_argument("--only", nargs="+", default=[], metavar="WORD")
+    parser.add_argument("--commands", nargs="+", choices=COMMANDS, default=list(COMMANDS), help="of torque recordings")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, help="JSON file of all answers")
     args = parser.parse_args()
     names = [n for n in _names(args.postures) if not args.only or any(word in n for word in args.only)]
     results = {}
     with ProcessPoolExecutor(args.jobs) as pool:
-        for name, told in zip(names, pool.map(_postures if args.postures else _torque, names), strict=True):
+        work = pool.map(_postures, names) if args.postures else pool.map(_torque, names, [args.commands] * len(names))
+        for name, told in zip(names, work, strict=True):
             results[name] = told
             print(*_lines(name, told), sep="\n", flush=True)
     if args.out:
@@ -60,8 +64,8 @@ def _pose_sets() -> dict[str, Any]:
     return calibration.SETS
 
 
-def _torque(name: str) -> dict[str, Any]:
-    """Answers of both commands on the untouched recordings."""
+def _torque(name: str, commands: list[str]) -> dict[str, Any]:
+    """Answers of the commands on the untouched recordings."""
     from .hide_in_real.generate import twin_of
     from .hide_in_real.recordings import SETS
 
@@ -69,8 +73,8 @@ def _torque(name: str) -> dict[str, Any]:
         cases, runs = Path(scratch, "cases"), Path(scratch, "runs")
         twin = twin_of(cases, SETS[name]())
         told = {}
-        for command, words in (("diagnose", blackbox.default_command()), ("identify", IDENTIFY)):
-            blackbox.run(cases, runs / command, {twin["name"]: twin}, words, 1, 3600, ["named"])
+        for command in commands:
+            blackbox.run(cases, runs / command, {twin["name"]: twin}, COMMANDS[command], 1, 3600, ["named"])
             kept = runs / command / twin["name"] / "all"
             told[command] = blackbox.read(kept) or {}
             told[f"{command}_run"] = json.loads((kept / "run.json").read_text())
@@ -101,9 +105,12 @@ def _postures(name: str) -> dict[str, Any]:
 
 
 def _lines(name: str, told: dict[str, Any]) -> list[str]:
+    identified = [f"   `identify`, held out: {_pooled(told['identify'])}"] if told.get("identify") else []
+    if "diagnose" not in told:
+        return [f"## {name}", *(identified or [f"   no answer: {told['identify_run'].get('said', '')[-300:]}"])]
     answer = told["diagnose"]
     if not answer:
-        return [f"## {name}: no answer", told.get("diagnose_run", {}).get("said", "")[-300:]]
+        return [f"## {name}: no answer", told.get("diagnose_run", {}).get("said", "")[-300:], *identified]
     held, run = answer["holdout"], told.get("diagnose_run", {})
     cost = f", {run['cpu_s']:.0f} CPU s, {run['peak_mb']:.0f} MiB" if run else ""
     lines = [f"## {name}: {answer['verdict']}, held out {_of(held, 'before')} -> {_of(held, 'after')}{cost}"]
@@ -117,9 +124,7 @@ def _lines(name: str, told: dict[str, Any]) -> list[str]:
         lines.append("   rest " + " ".join(f"{x:.3f}" for x in rest["relative"]) + " of each joint's torque")
         parts = sorted(rest.get("parts", ()), key=lambda p: -p["share"])[:PARTS]
         lines += [f"   rest goes with {p['kind']} at {', '.join(p['at'])} ({p['share']:.0%})" for p in parts]
-    if told.get("identify"):
-        lines.append(f"   `identify`, held out: {_pooled(told['identify'])}")
-    return lines
+    return [*lines, *identified]
 
 
 def _pooled(result: dict[str, Any]) -> str:

@@ -33,7 +33,7 @@ _TASKS = {  # commands that take a task file
     "diagnose": "the main job, on a task file of yours",
     "identify": "fit the dynamics: links, friction, intervals",
     "calibrate": "fit the kinematics from measured poses or points",
-    "excite": "design the motion that tells most, within limits",
+    "excite": "design the most informative motion within limits",
 }
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # of glibc's mallopt
 _READING = 0.03  # of a command's work, for the progress bar
@@ -247,7 +247,7 @@ def _parser() -> argparse.ArgumentParser:
         "--backend",
         default="native",
         metavar="NAME",
-        help="simulator of the rigid body: native (default), mujoco, pinocchio, mjx or another one that is installed",
+        help="simulator of the rigid body: native (default), mujoco, pinocchio, mjx or any other that is installed",
     )
     common.add_argument("--no-cache", action="store_true", help="keep no compiled programs for the next run")
     parser = argparse.ArgumentParser(prog="figaroh-jax", description=_DESCRIPTION, epilog=_STATUS)
@@ -257,7 +257,7 @@ def _parser() -> argparse.ArgumentParser:
         command = commands.add_parser(name, parents=[common], help=explained)
         command.add_argument("task", type=Path, metavar="TASK.yaml", nargs="?" if name == "excite" else None)
         if name == "excite":
-            of_run = "a finished diagnosis: the motion that tells apart what it could not"
+            of_run = "a finished diagnosis: design the motion that resolves its ambiguities"
             command.add_argument("--from", dest="of_run", type=Path, metavar="RUN_DIR", help=of_run)
         if name == "calibrate":
             command.add_argument("--level", help="frames, joint_offset or full, in place of what predicts best")

@@ -32,7 +32,7 @@ def check_real(name: str, array: Any) -> None:
         try:
             kind = np.asarray(array).dtype.kind
         except (TypeError, ValueError) as error:  # rows of different lengths
-            raise InputError(f"{name} is no array of numbers: {str(error)[:200]}") from None
+            raise InputError(f"{name} is not an array of numbers: {str(error)[:200]}") from None
         except Exception as error:  # a list of what JAX traces: NumPy may not look into it, JAX checks it later
             if type(error).__module__.partition(".")[0] != "jax":
                 raise

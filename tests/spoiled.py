@@ -250,7 +250,7 @@ KINDS: dict[str, tuple[Spoil, str]] = {
     "one spike of 1e3 rad": (_row("q", 1e3), r"jumps by .* in row"),
     "lost packets as zeros": (_lost, r"zero at every joint in row|jumps by .* in row"),
     "encoder wraps around": (_wrapped, r"unwrap|limits"),
-    "every row four times": (_held(4), r"every row stands there 4 times"),
+    "every row four times": (_held(4), r"every row appears 4 times"),
     "coarse position": (_coarse, r"comes in steps"),
     "never moves": (_still, r"no joint moves"),
     "motor side": (_motor, r"motor side|transmission.position"),

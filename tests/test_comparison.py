@@ -94,7 +94,7 @@ def test_a_hypothesis_grown_by_columns_is_judged_as_one_of_all_columns(rows: Row
     full = np.zeros((NV, COUNT, 2))
     full[list(joints)] = np.moveaxis(more, 0, 2)
     known = fold_sums(rows, rows.X)
-    base = ground(rows, judge(rows, Hypothesis(rows.X, PRIOR), known), PRIOR, known)
+    base = ground(judge(rows, Hypothesis(rows.X, PRIOR), known), PRIOR, known)
     whole = judge(rows, Hypothesis(np.concatenate([rows.X, full], axis=2), PRIOR.extended(2)))
     for one, other in zip(judge_grown(rows, base, joints, more), whole, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)

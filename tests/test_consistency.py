@@ -10,15 +10,7 @@ from robots import REAL, TREE, load
 
 import figaroh_jax as fj
 from figaroh_jax.errors import InputError
-from figaroh_jax.estimation.conic import Body
-from figaroh_jax.estimation.consistency import (
-    bodies,
-    full_parameters,
-    inconsistencies,
-    log_cholesky_fit,
-    physical_fit,
-    project,
-)
+from figaroh_jax.estimation.consistency import bodies, inconsistencies, log_cholesky_fit, physical_fit, project
 from figaroh_jax.estimation.priors import rigid_prior
 from figaroh_jax.rigid.inertia import from_com, pseudo_inertia
 
@@ -120,22 +112,6 @@ def test_entropic_prior_pulls_to_the_nominal_robot(tree: fj.RobotModel):
         for s in (0.0, 1e2, 1e7)
     ]
     assert far[0] > far[1] > far[2] and far[2] < 1e-2
-
-
-def test_full_parameters_have_the_base_values_and_can_exist(tree: fj.RobotModel):
-    generator = np.random.default_rng(3)
-    matrix = generator.normal(size=(20, 50))
-    truth = project(np.asarray(tree.inertia) * (1 + 0.1 * generator.normal(size=(5, 10))), bodies(tree)).ravel()
-    found = full_parameters(matrix, matrix @ truth, np.asarray(tree.inertia).ravel(), bodies(tree))
-    np.testing.assert_allclose(matrix @ found, matrix @ truth, rtol=0, atol=1e-6)
-    assert not inconsistencies(found.reshape(-1, 10), tree.link_names)
-
-
-def test_base_values_that_no_body_has_are_refused():
-    body = Body("only", range(10), 1.0, 0.1)
-    nominal = from_com(1.0, np.zeros(3), 0.01 * np.eye(3))
-    with pytest.raises(InputError, match="no parameters satisfy"):
-        full_parameters(np.eye(10)[:1], np.array([-1.0]), nominal, [body])
 
 
 @pytest.mark.slow

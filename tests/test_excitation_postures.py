@@ -154,7 +154,7 @@ def test_the_command_writes_postures_with_their_share_of_the_bound(tmp_path: Pat
             "postures that touch a plane need its place and axis",
         ),
         ("{kind: postures, measurement: {pose: p, tool_frame: d}}", "has no frame 'd'"),
-        ("{kind: postures, postures: 2, measurement: {pose: p, tool_frame: c}}", "2 postures cannot tell"),
+        ("{kind: postures, postures: 2, measurement: {pose: p, tool_frame: c}}", "2 postures cannot determine"),
         ("{kind: postures, measurement: {pose: p, base_frame: c, tool_frame: c}}", "no joint moves tool_frame"),
     ],
 )

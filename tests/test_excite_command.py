@@ -108,7 +108,7 @@ def test_a_task_without_recordings_is_for_excite_alone(tmp_path: Path, capsys: p
         (
             "objective: separate, separate:"
             " [[{effect: viscous_friction, at: [turn]}, {effect: coulomb_friction, at: [turn]}]]",
-            "no motion tells viscous_friction at turn from coulomb_friction at turn: what is fitted anyway",
+            "no motion distinguishes viscous_friction at turn from coulomb_friction at turn: what is fitted anyway",
         ),
         ("objective: prediction, predict: [no.npz]", "no.npz (excite.predict) does not exist"),
     ],

@@ -96,6 +96,21 @@ def test_effects_in_an_arm_with_a_slide_are_named(effect: str):
 
 
 @cache
+def carrying() -> Case:
+    return make_case([("payload", 0.05)], robot="small", repeats=2, trajectories=3, seed=412)
+
+
+def test_a_payload_on_links_that_are_trusted_is_named_and_not_taken_in_by_them():
+    score = judge("payload", carrying().truth, diagnosis_of(carrying()))
+    assert score.grade == "right" and not score.false, table([score])
+
+
+@pytest.mark.slow
+def test_trusted_links_that_are_not_as_believed_are_no_nothing():
+    assert diagnosis_of(carrying(), ("payload", "link_inertia")).verdict == "unknown"
+
+
+@cache
 def score_of_hidden_effect(k: int) -> Score:
     """Robots and layouts take turns."""
     robot, layout = ROBOTS[k % 2], (WITH_REPEATS, WITHOUT_REPEATS)[(k // 2) % 2]

@@ -20,7 +20,7 @@ OUTSIDE = {
     "pyarrow": {"recordings.containers"},
     "h5py": {"recordings.containers"},
     "rosbags": {"recordings.bags"},
-    "pydantic": {"formats.config", "formats.reference"},
+    "pydantic": {f"formats.{name}" for name in ("config", "excite_keys", "fields", "recording_keys", "reference")},
     "rich": {"reporting.terminal"},
     "jinja2": {"reporting.report"},
     "jaxopt": {"diagnosis.refit", "estimation.fit"},

@@ -45,13 +45,13 @@ YAML = {
     "a mapping as a key": ("{{a: 1}: 2}\n", "line 1", "a key is a list or a mapping"),
     "a timestamp that is none": ("a: !!timestamp abc\n", "cannot be read as YAML"),
     "a bool that is none": ("a: !!bool maybe\n", "cannot be read as YAML"),
-    "half of a character": ('"\\uD800": 1\n', "line 1", "half of a character"),
+    "half of a character": ('"\\uD800": 1\n', "line 1", "half a character"),
     "an int that is none": ("a: !!int abc\n", "cannot be read as YAML"),
     "a set of a scalar": ("a: !!set abc\n", ""),
     "a mapping of a scalar": ("a: !!map abc\n", ""),
     "Python": ("a: !!python/object/apply:os.mkdir [ran]\n", "python/object"),
     "an unknown alias": ("a: *b\n", "line 1"),
-    "an alias in itself": ("a: &a [*a]\n", "stands inside of what it stands for"),
+    "an alias in itself": ("a: &a [*a]\n", "is inside what it refers to"),
     "nested": ("[" * 5000, ""),
     "laughs": (
         "a: &a [x, x, x, x, x, x, x, x, x]\n"
@@ -319,10 +319,10 @@ refused = {
     "time holds complex": lambda: fj.recording(q=x, tau=x, time=c[:, 0]),
     "position holds complex": lambda: fj.postures(q=x, position=c[:, :3], base_frame="base", tool_frame="hand"),
     "stamps that look like ns": lambda: fj.recording(q=x, tau=x, time=np.arange(20) * 1e7),
-    "no array of numbers": lambda: fj.recording(q=[[0.1], [0.1, 0.2]], tau=x, rate=100),
+    "not an array of numbers": lambda: fj.recording(q=[[0.1], [0.1, 0.2]], tau=x, rate=100),
     "q holds text": lambda: fj.mass_matrix(m, [["1", "2", "3", "4"]]),
     "q holds objects": lambda: fj.mass_matrix(m, [[None] * 4]),
-    "q is no array of numbers": lambda: fj.mass_matrix(m, [[0.1], [0.1, 0.2]]),
+    "q is not an array of numbers": lambda: fj.mass_matrix(m, [[0.1], [0.1, 0.2]]),
     "q has shape ()": lambda: derivatives.coriolis_matrix(m, 3.0, none),
 }
 complex_ones = {

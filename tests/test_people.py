@@ -102,7 +102,7 @@ def test_the_tables_numbers_are_those_of_the_links(tmp_path: Path) -> None:
         shares = {kind: row[sex].mass for kind, row in people._TABLE.items()}
         assert abs(2 * sum(shares.values()) - shares["head"] - shares["trunk"] - 1) < 2e-4
     odd = robots.load(STICK.replace("thigh", "widget"), tmp_path, root="free_flyer")
-    with pytest.raises(InputError, match="link 'widget' is no segment of the table"):
+    with pytest.raises(InputError, match="link 'widget' is not a segment of the table"):
         people.anthropometric(odd, 80.0)
 
 
@@ -241,7 +241,7 @@ def test_a_motion_on_a_plate_keeps_limits_and_balance_and_tells_more(tmp_path: P
         people.balanced(person, hold=["kneee"])
     with pytest.raises(InputError, match="mm off in the best posture within the limits"):
         people.balanced(person, np.repeat([0.0, 1.2], [6, 3]), hold=["hip", "knee"])
-    with pytest.raises(InputError, match="stands on no plate"):
+    with pytest.raises(InputError, match="does not stand on a plate"):
         people.balanced(robot)
     with pytest.raises(InputError, match="measured: no moving joint 'plate_fx'"):
         fj.learn(person, measured={"plate_fx": 1.0})

@@ -167,6 +167,8 @@ def test_an_effect_exists_within_its_bounds_only(model: RobotModel) -> None:
     assert not physical_sign(place(find("stribeck_friction"), model, ("turn",), force=-0.1, speed=0.1))
     assert physical_sign(place(find("stribeck_friction"), model, ("turn",), force=0.1, speed=0.1))
     assert not known("torque_offset", "turn", offset=1e3)  # more than the joint ever feels
+    largest = np.abs(rigid_torque(model, signals)[:, model.joint_names.index("turn")]).max()
+    assert known("friction_drift", "turn", force=0.9 * largest, time=3.0)  # it passes: no more on average
 
 
 LOAD = Load(frame="tool", mass=1.7, com=(0.05, -0.1, 0.2))

@@ -65,7 +65,7 @@ def test_a_clock_that_jumps_and_a_joint_that_is_held_are_told_with_time_and_plac
     clock, contact = found
     assert abs(clock.first - 14.0) <= 2.0 and abs(clock.size - 0.08) <= 0.015
     assert contact.joints == (2,) and abs(contact.first - 4.0) < 0.5 and abs(contact.last - 6.0) < 0.5
-    assert "elbow stands against" in contact.text(loop, runs)
+    assert "elbow is held against" in contact.text(loop, runs)
     trusted = without(runs, found)[2].trusted
     assert trusted is not None and not trusted[450:550].any()
 

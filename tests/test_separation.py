@@ -196,7 +196,7 @@ def test_delays_and_lags_are_torques_of_moments_before_and_tell_each_other(arm: 
         ]
         own = np.einsum("k,ksj->sj", weights[first:], late)
         assert np.abs(own - exact).max() < 0.05 * np.abs(exact).max()
-    with pytest.raises(InputError, match="no motion tells viscous_friction at turn from"):
+    with pytest.raises(InputError, match="no motion distinguishes viscous_friction at turn from"):
         excite(
             arm,
             fourier(3, 0.5, 4.0),

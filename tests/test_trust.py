@@ -1,4 +1,4 @@
-"""A prior that is believed less, but only in the directions that the torque shows."""
+"""How far links move from what is believed: less in the directions that no torque shows, no further where trusted."""
 
 from __future__ import annotations
 
@@ -7,7 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
+from scipy.stats import chi2
 
+from figaroh_jax.diagnosis.believed import believed, let_go
+from figaroh_jax.diagnosis.comparison import FoldSums, coefficients, told
+from figaroh_jax.diagnosis.thresholds import BEYOND_TRUST
+from figaroh_jax.estimation.rows import Prior
 from figaroh_jax.identification.identification import _Problem
 
 
@@ -33,3 +39,35 @@ def test_what_no_torque_shows_stays_as_near_to_the_nominal_as_was_stated(slack: 
     moved = (shown * told**2) @ np.linalg.solve(np.diag(told**2 + loose**-2.0), np.diag(1 / told))
     assert (np.linalg.norm(moved, axis=0) <= 2.0 * (1 + 1e-9) + (loose == 1.0)).all()
     np.testing.assert_allclose(scaled[10:, 10:], np.eye(2), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("off", [0.5, 20.0])
+def test_trusted_links_are_those_that_fit_best_among_the_believed_ones(off: float) -> None:
+    """Beside SLSQP, with the bound as a constraint of the fit; links that are near enough are left alone."""
+    rng = np.random.default_rng(8)
+    stated = rng.uniform(1.0, 9.0, 6)
+    X, mean = rng.standard_normal((40, 8)), rng.standard_normal(8)
+    true = mean + off * rng.standard_normal(8) * np.append(stated**-0.5, [1.0, 1.0])
+    y = X @ true + 0.1 * rng.standard_normal(40)
+    parts = [(x.T @ x, x.T @ z, z @ z) for x, z in zip(np.split(X, 4), np.split(y, 4), strict=True)]
+    sums = FoldSums(*(np.array(part) for part in zip(*parts, strict=True)))
+    prior = Prior(mean, np.append(stated, [1e-6, 1e-6]))
+    problem: Any = SimpleNamespace(bounded=True, believed=stated)
+    most = chi2.ppf(1 - BEYOND_TRUST, told(sums, prior, 6))
+
+    def squares(theta: np.ndarray) -> float:
+        return float(stated @ (theta[:6] - mean[:6]) ** 2)
+
+    def cost(theta: np.ndarray) -> float:
+        return float(((y - X @ theta) ** 2).sum() + prior.precision @ (theta - mean) ** 2)
+
+    within: Any = {"type": "ineq", "fun": lambda theta: most - squares(theta)}
+    best = minimize(cost, mean, constraints=[within], method="SLSQP", options={"ftol": 1e-14, "maxiter": 500})
+    found = believed(problem, prior, sums)
+    np.testing.assert_allclose(coefficients(sums, found), best.x, rtol=0, atol=1e-5)
+    back = let_go(problem, found)
+    assert (back is None) == (off < 1.0)
+    np.testing.assert_array_equal((back or found).precision, prior.precision)
+    assert squares(coefficients(sums, found)) <= most * (1 + 1e-9)
+    loose: Any = SimpleNamespace(bounded=False)
+    assert believed(loose, prior, sums) is prior

@@ -115,7 +115,7 @@ def test_compare_tells_what_differs_between_robots_and_days(tmp_path: Path) -> N
     }
     assert "between days" in comparison_text(sections)
     assert not any("Spread" in section.title for section in compare_runs(runs[:2]))
-    with pytest.raises(InputError, match="from three runs on"):
+    with pytest.raises(InputError, match="at least three runs"):
         compare_runs(runs[:2], ["a", "b"])
     with pytest.raises(InputError, match="--units: 2 labels for 6 runs"):
         compare_runs(runs, ["a", "b"])

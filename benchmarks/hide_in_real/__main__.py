@@ -26,6 +26,8 @@ def main() -> None:
         return
     cases = blackbox.load_cases(args.cases, args.only)
     if args.step == "run":
+        if args.visible:
+            cases = {name: case for name, case in cases.items() if case.get("visible", True)}
         command = args.command or blackbox.default_command()
         blackbox.run(args.cases, args.out, cases, command, args.jobs, args.limit, args.modes)
     else:
@@ -41,9 +43,10 @@ def _arguments() -> argparse.Namespace:
     made.add_argument("--effects", nargs="+", help="default: twelve for every robot")
     made.add_argument("--sizes", nargs="+", type=float, default=[0.05, 0.1, 0.2])
     called = steps.add_parser("run", help="call the command for every case")
-    called.add_argument("--command", help=f"default: {blackbox.COMMAND}")
+    called.add_argument("--command", help=f"default: {blackbox.COMMAND}; {blackbox.HERE} ...: in this process")
     called.add_argument("--jobs", type=int, default=1)
     called.add_argument("--limit", type=float, default=1800, help="s of one call")
+    called.add_argument("--visible", action="store_true", help="without the effects that the baseline takes in")
     told = steps.add_parser("score", help="compare the answers with the truth")
     for step in (called, told):
         step.add_argument("--only", nargs="+", default=[], metavar="WORD")

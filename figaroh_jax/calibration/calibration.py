@@ -34,7 +34,7 @@ from .shapes import refine
 if TYPE_CHECKING:
     from ..formats.config import Task
 
-__all__ = ["Run", "as_holdout", "calibrate", "calibrate_task"]
+__all__ = ["Run", "calibrate", "calibrate_task"]
 
 _RECURS = 4  # of five outer folds must choose an effect
 _NESTED_GAIN = 0.05  # of the error on the outer folds, that the effects must take away
@@ -343,8 +343,3 @@ def _polish(measured, linear, posterior, used, free) -> Solution:
     starts += [turned, -turned] if turned.any() else []
     found = [solve(measured.problem, rows, precision, free, start) for start in starts]
     return min(found, key=lambda solution: solution.cost)
-
-
-def as_holdout(recordings: Sequence[PoseRecording], names: Sequence[str]) -> tuple[PoseRecording, ...]:
-    """The recordings with those called `names` held out."""
-    return tuple(replace(r, role="holdout") if r.name in names else r for r in recordings)

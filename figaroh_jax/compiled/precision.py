@@ -82,7 +82,7 @@ def _bridged(function: Callable[..., Any], args: Any, kwargs: Any, *, narrow: bo
 def _say_once() -> None:
     warnings.warn(
         "JAX's 64-bit mode is off: under jit, grad or vmap arrays come in and go out as float32, with which no rank"
-        " and no small residual can be told; figaroh_jax computes in float64 between. For float64 throughout:"
+        " and small residuals are lost; figaroh_jax computes in float64 between. For float64 throughout:"
         " jax.config.update('jax_enable_x64', True) before the first array.",
         Float32Boundary,
         stacklevel=5,

@@ -22,9 +22,11 @@ __all__ = [
     "grown_sums",
     "judge",
     "judge_grown",
+    "last_coefficient",
     "overlap",
     "shares_of_wins",
     "sums_of",
+    "told",
     "t_value",
 ]
 
@@ -66,7 +68,6 @@ class Ground(NamedTuple):
 
     verdicts: Verdicts
     inverse: Float[np.ndarray, "folds+1 P P"]  # of the normal matrix without each fold, then of all rows
-    member: Float[np.ndarray, "T folds"]  # 1 where a row belongs to the fold
 
 
 class FoldSums(NamedTuple):
@@ -80,12 +81,21 @@ class FoldSums(NamedTuple):
 def fold_sums(rows: Rows, X: Float[np.ndarray, "nv T P"], y: Float[np.ndarray, "nv T"] | None = None) -> FoldSums:
     """X'X, X'y and y'y over each fold; `y` is the rows' own unless given."""
     y = rows.y if y is None else y
-    parts = []
-    for fold in range(rows.fold.max() + 1):
-        own = rows.fold == fold
-        tall, target = X[:, own].reshape(-1, X.shape[-1]), y[:, own].reshape(-1)
-        parts.append((tall.T @ tall, tall.T @ target, target @ target))
-    return FoldSums(*(np.array(part) for part in zip(*parts, strict=True)))
+    folds, P = rows.fold.max() + 1, X.shape[2]
+    gram, moment, square = np.zeros((folds, P, P)), np.zeros((folds, P)), np.zeros(folds)
+    for fold, own in _stretches(rows):
+        for columns, target in zip(X[:, own], y[:, own], strict=True):
+            gram[fold] += columns.T @ columns
+            moment[fold] += columns.T @ target
+            square[fold] += target @ target
+    return FoldSums(gram, moment, square)
+
+
+def _stretches(rows: Rows) -> list[tuple[int, slice]]:
+    """The rows of each fold as stretches that follow one another, with its number; rows of no fold are in none."""
+    firsts = np.append(0, np.flatnonzero(np.diff(rows.fold)) + 1)
+    ends = np.append(firsts[1:], len(rows.fold))
+    return [(int(rows.fold[a]), slice(int(a), int(b))) for a, b in zip(firsts, ends, strict=True) if rows.fold[a] >= 0]
 
 
 def grown_sums(rows: Rows, known: FoldSums, X: Float[np.ndarray, "nv T P"]) -> FoldSums:
@@ -93,12 +103,11 @@ def grown_sums(rows: Rows, known: FoldSums, X: Float[np.ndarray, "nv T P"]) -> F
     P, folds = known.gram.shape[1], len(known.gram)
     gram, moment = np.zeros((folds, X.shape[2], X.shape[2])), np.zeros((folds, X.shape[2]))
     gram[:, :P, :P], moment[:, :P] = known.gram, known.moment
-    for fold in range(folds):
-        own = rows.fold == fold
-        tall = X[:, own].reshape(-1, X.shape[2])
-        cross = tall.T @ tall[:, P:]
-        gram[fold, :, P:], gram[fold, P:, :P] = cross, cross[:P].T
-        moment[fold, P:] = tall[:, P:].T @ rows.y[:, own].reshape(-1)
+    for fold, own in _stretches(rows):
+        for columns, target in zip(X[:, own], rows.y[:, own], strict=True):
+            gram[fold, :, P:] += columns.T @ columns[:, P:]
+            moment[fold, P:] += columns[:, P:].T @ target
+    gram[:, P:, :P] = np.swapaxes(gram[:, :P, P:], 1, 2)
     return FoldSums(gram, moment, known.square)
 
 
@@ -111,10 +120,9 @@ def fewer_sums(known: FoldSums, without: Sequence[int]) -> FoldSums:
 def sums_of(rows: Rows, known: FoldSums, y: Float[np.ndarray, "nv T"]) -> FoldSums:
     """The sums of the same columns with another torque `y`."""
     moment, square = np.zeros_like(known.moment), np.zeros_like(known.square)
-    for fold in range(len(known.gram)):
-        own = y * (rows.fold == fold)
-        moment[fold] = np.tensordot(own, rows.X, 2)
-        square[fold] = (own**2).sum()
+    for fold, own in _stretches(rows):
+        moment[fold] += sum(target @ columns for columns, target in zip(rows.X[:, own], y[:, own], strict=True))
+        square[fold] += (y[:, own] ** 2).sum()
     return FoldSums(known.gram, moment, square)
 
 
@@ -124,29 +132,51 @@ def coefficients(sums: FoldSums, prior: Prior) -> Float[np.ndarray, " P"]:
     return _solve(gram, moment, square, prior)[0]
 
 
-def judge(rows: Rows, hypothesis: Hypothesis, known: FoldSums | None = None) -> Verdicts:
-    """Fit to all rows and to all but each fold, and predict the fold that was left out."""
+def last_coefficient(sums: FoldSums, prior: Prior) -> tuple[Float[np.ndarray, " P"], float]:
+    """`coefficients`, and the variance of the last of them."""
+    gram, moment, square = (part.sum(0) for part in sums)
+    theta = _solve(gram, moment, square, prior)[0]
+    unit = np.zeros(len(theta))
+    unit[-1] = 1.0
+    nothing = prior._replace(mean=np.zeros(len(theta)))
+    return theta, max(float(_solve(gram, unit, 0.0, nothing)[0][-1]), 0.0)
+
+
+def told(sums: FoldSums, prior: Prior, count: int) -> float:
+    """How many of the first `count` coefficients the data tell, not the prior: trace of (G + L)^-1 G."""
+    gram = sums.gram.sum(0)
+    A = gram + np.diag(prior.precision)
+    return float(np.trace(np.linalg.solve(A + TINY * np.diag(np.maximum(np.diag(A), TINY)), gram)[:count, :count]))
+
+
+def judge(rows: Rows, hypothesis: Hypothesis, known: FoldSums | None = None, without: Sequence[int] = ()) -> Verdicts:
+    """Fit to all rows and to all but each fold, and predict the fold that was left out.
+
+    `known` are the sums of the hypothesis. The columns `without` are not fitted: their coefficients are zero.
+    """
     X, y, prior = hypothesis.X, rows.y - hypothesis.fixed, hypothesis.prior
-    sums = known or fold_sums(rows, X, y)
+    sums, kept = known or fold_sums(rows, X, y), np.delete(np.arange(X.shape[2]), without)
+    if len(without):
+        sums, prior = fewer_sums(sums, without), Prior(prior.mean[kept], prior.precision[kept])
     G, b, yy = (part.sum(0) for part in sums)
-    theta, cost = _solve(G, b, yy, prior)
-    left = [_solve(G - g, b - m, yy - s, prior) for g, m, s in zip(*sums, strict=True)]
-    each = np.stack([solution for solution, _ in left])
-    error = y.copy()
-    for fold, solution in enumerate(each):
-        own = rows.fold == fold
-        error[:, own] -= X[:, own] @ solution
-    costs = np.array([cost for _, cost in left])
-    return Verdicts(cost, theta, each, _block_squares(rows, error), costs, y - X @ theta, error)
+    solved = [_solve(G - g, b - m, yy - s, prior) for g, m, s in zip(*sums, strict=True)]
+    solved.append(_solve(G, b, yy, prior))
+    each, costs = np.zeros((len(solved), X.shape[2])), np.array([cost for _, cost in solved])
+    each[:, kept] = [solution for solution, _ in solved]
+    error = np.array(y)
+    for fold, own in _stretches(rows):
+        error[:, own] -= X[:, own] @ each[fold]
+    squares, theta = _block_squares(rows, error), each[-1]
+    return Verdicts(float(costs[-1]), theta, each[:-1], squares, costs[:-1], y - X @ theta, error)
 
 
-def ground(rows: Rows, verdicts: Verdicts, prior: Prior, sums: FoldSums) -> Ground:
+def ground(verdicts: Verdicts, prior: Prior, sums: FoldSums) -> Ground:
     """What judging hypotheses that extend one (its verdicts, prior and sums) needs once."""
     gram = sums.gram.sum(0) - np.concatenate([sums.gram, np.zeros_like(sums.gram[:1])])
     A = gram + np.diag(prior.precision)
     diagonal = np.maximum(np.diagonal(A, axis1=1, axis2=2), TINY)
     inverse = np.linalg.inv(A + TINY * diagonal[:, None] * np.eye(A.shape[1]))
-    return Ground(verdicts, inverse, (rows.fold[:, None] == np.arange(len(sums.gram))).astype(float))
+    return Ground(verdicts, inverse)
 
 
 def judge_grown(rows: Rows, base: Ground, joints: Sequence[int], more: Float[np.ndarray, "k rows T"]) -> Verdicts:
@@ -155,13 +185,15 @@ def judge_grown(rows: Rows, base: Ground, joints: Sequence[int], more: Float[np.
     By block elimination: with C = X'Z and S = Z'Z - C'A^-1 C the new coefficients are t = S^-1 (Z'y - C'theta), the
     others change by -A^-1 C t and the squares by -t'S t; all for the whole fit and for that without each fold.
     """
-    was, k, folds = base.verdicts, len(more), base.member.shape[1]
-    X, y = rows.X[list(joints)].reshape(-1, rows.X.shape[2]), rows.y[list(joints)].reshape(-1)
-    Z = np.moveaxis(more, 0, -1)
-    split = (Z[:, :, None] * base.member[..., None]).reshape(len(y), -1)  # a column for each fold and candidate column
-    products = (side.T @ split for side in (X, Z.reshape(-1, k), y[:, None]))
-    shared, own, right = (_without(np.swapaxes(x.reshape(-1, folds, k), 0, 1)) for x in products)
-    right = np.swapaxes(right, 1, 2)
+    was, k, (folds, P) = base.verdicts, len(more), base.verdicts.folds.shape
+    crossed, gram, moment = np.zeros((folds, P, k)), np.zeros((folds, k, k)), np.zeros((folds, k))
+    for fold, here in _stretches(rows):
+        for one, joint in enumerate(joints):
+            Z = more[:, one, here]
+            crossed[fold] += rows.X[joint, here].T @ Z.T
+            gram[fold] += Z @ Z.T
+            moment[fold] += Z @ rows.y[joint, here]
+    shared, own, right = _without(crossed), _without(gram), _without(moment)[..., None]
     known = np.concatenate([was.folds, was.theta[None]])[..., None]
     across = np.matmul(base.inverse, shared)
     S = own - np.matmul(np.swapaxes(shared, 1, 2), across)
@@ -172,11 +204,12 @@ def judge_grown(rows: Rows, base: Ground, joints: Sequence[int], more: Float[np.
     drop = (left * t).sum((1, 2))
     change = -np.matmul(across, t)
     theta = np.concatenate([known + change, t], axis=1)[..., 0]
-    moved = rows.X @ change[..., 0].T  # (nv, T, folds + 1)
-    moved[list(joints)] += Z @ t[..., 0].T
-    error = was.error - (moved[..., :folds] * base.member).sum(2)
+    error, residual = np.array(was.error), was.residual - rows.X @ change[folds, :, 0]
+    residual[list(joints)] -= np.tensordot(t[folds, :, 0], more, 1)
+    for fold, here in _stretches(rows):
+        error[:, here] -= rows.X[:, here] @ change[fold, :, 0]
+        error[list(joints), here] -= np.tensordot(t[fold, :, 0], more[:, :, here], 1)
     squares, costs = _block_squares(rows, error), was.without - drop[:folds]
-    residual = was.residual - moved[..., folds]
     return Verdicts(was.cost - float(drop[folds]), theta[folds], theta[:folds], squares, costs, residual, error)
 
 

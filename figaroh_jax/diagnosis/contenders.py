@@ -11,21 +11,26 @@ from jaxtyping import Float
 
 from ..effects.base import Effect
 from ..estimation.priors import physical_body
-from ..estimation.rows import Rows
+from ..estimation.rows import UNKNOWN, Rows
+from ..recordings.stacked import filtered_rows
 from ..results import Name
-from .comparison import Ground, Hypothesis, Verdicts, coefficients, grown_sums, judge, judge_grown, sums_of
+from .believed import believed
+from .comparison import Ground, Hypothesis, Verdicts, grown_sums, judge, judge_grown, last_coefficient, sums_of
 from .design import BATCH, kind, shapes, with_shape
 from .estimates import torque_slope
 from .problem import Problem
 from .refit import Whitened, refit, refit_shift
 from .screening import Group, Screen
-from .state import extended_state, solved
+from .shifts import torque_change
+from .state import State, extended_state, link_motion, solved
 from .step import Step, stand
 from .thresholds import BEST_OF_A_PLACE, GAIN, SHARE_OF_BEST, SHIFTS, SHORTLIST
 
 __all__ = ["Contender", "acting", "contend", "for_refit", "shortlist"]
 
 TURNS, RESPONSE_TURNS = 3, 6  # of Gauss-Newton on a shift of the position; on a response of the torque
+SMALL = 1e-5  # step of a derivative, relative
+NEAR_ENOUGH = 0.1  # of its standard deviation: a step that moves the size by less is not taken
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,7 @@ class Contender:
     effect: Effect
     verdicts: Verdicts
     joints: tuple[int, ...]  # by whose rows it is judged
+    free: Verdicts | None = None  # where links are held back (`believed`): the same beside links that are not
 
 
 def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray, float]]:
@@ -80,8 +86,10 @@ def contend(
     ready: Whitened,
     group: Group,
     order: np.ndarray,
+    fitted: dict[Name, Effect],
 ) -> Contender:
-    """The candidate with its exact shape, started from its best grid points."""
+    """The candidate with its exact shape, started from its best grid points; a position sensor from how it was last
+    `fitted`, where it then is kept."""
     way = kind(group.effect)
     if way != "columns":
         near = _to_first_order(step, base, group, int(order[0]))
@@ -89,17 +97,21 @@ def contend(
             return near
     if way == "response":
         first = jax.tree.map(lambda x: x[order[0]], group.effect)
-        return _sensor_contender(problem, step, whitening, group, first, RESPONSE_TURNS)
+        return _response_contender(problem, step, whitening, group, first)
     if way == "position":
-        return _position_contender(problem, step, whitening, ready, group)
+        one = _position_contender(problem, step, base, ready, group, fitted.get(group.name))
+        fitted[group.name] = one.effect
+        return one
     effect, Z = _exact_columns(problem, step, ready, group, order)
+    free = None
     if effect.body:
-        effect, verdicts = _body_verdicts(step, base, effect, Z)
+        effect, verdicts = _body_verdicts(problem, step, base, effect, Z)
     else:
-        verdicts = judge_grown(step.rows, base, group.columns.joints, Z)
+        verdicts, free = _judged_beside(problem, step, base, group.columns.joints, Z)
         names = [n for n, p in effect.parameters().items() if p.linear]
         effect = with_shape(effect, names, list(verdicts.theta[-len(names) :]))
-    return Contender(group.name, effect, verdicts, acting(effect, len(step.rows.y), group.columns.joints))
+    free = None if effect.inertial else free
+    return Contender(group.name, effect, verdicts, acting(effect, len(step.rows.y), group.columns.joints), free)
 
 
 def _to_first_order(step: Step, base: Ground, group: Group, point: int) -> Contender:
@@ -127,16 +139,30 @@ def _exact_columns(
     return effect, Z.reshape(*Z.shape[:2], -1)
 
 
+def _judged_beside(
+    problem: Problem, step: Step, base: Ground, joints: Sequence[int], Z: Float[np.ndarray, "k rows T"]
+) -> tuple[Verdicts, Verdicts | None]:
+    """The current model with columns more; links that it holds back are held no more than with these, or not at all."""
+    if step.loose is None:
+        return judge_grown(step.rows, base, joints, Z), None
+    more = np.zeros((*step.rows.y.shape, len(Z)))
+    more[list(joints)] = np.moveaxis(Z, 0, 2)
+    X = np.concatenate([step.rows.X, more], axis=2)
+    sums, loose = grown_sums(step.rows, step.folded, X), step.loose.extended(len(Z))
+    held, free = (judge(step.rows, Hypothesis(X, p), sums) for p in (believed(problem, loose, sums), loose))
+    return held, free
+
+
 def _body_verdicts(
-    step: Step, base: Ground, effect: Effect, Z: Float[np.ndarray, "10 nv T"]
+    problem: Problem, step: Step, base: Ground, effect: Effect, Z: Float[np.ndarray, "10 nv T"]
 ) -> tuple[Effect, Verdicts]:
     """An effect that is a body, with the parameters of the nearest body that can exist."""
     rows, full = step.rows, np.moveaxis(Z, 0, 2)
-    free = judge_grown(rows, base, range(len(rows.y)), Z)
+    free, _ = _judged_beside(problem, step, base, range(len(rows.y)), Z)
     body = physical_body(free.theta[-10:], _information(rows, base, full))
     fixed = full @ body
     sums = sums_of(rows, step.folded, rows.y - fixed)
-    verdicts = judge(rows, Hypothesis(rows.X, step.state.prior, fixed), sums)
+    verdicts = judge(rows, Hypothesis(rows.X, believed(problem, step.state.prior, sums), fixed), sums)
     return with_shape(effect, list(effect.parameters()), list(body)), verdicts
 
 
@@ -156,34 +182,73 @@ def for_refit(problem: Problem, step: Step, base: Ground, whitening: Float[np.nd
 
 
 def _position_contender(
-    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], ready: Whitened, group: Group
+    problem: Problem,
+    step: Step,
+    base: Ground,
+    ready: Whitened,
+    group: Group,
+    before: Effect | None,
 ) -> Contender:
-    """A shift of the links' motion: its size by the profile, then with the regressor and the load at the true motion.
+    """A shift of the links' motion: Gauss-Newton on its size and all coefficients, from a search of its profile, or
+    from how it stood `before`, beside fewer causes.
 
-    The load that the profile knows is that of a fit without the effect.
+    The torque changes by what the links' true motion makes of the coefficients so far, which is exact; that a change
+    of coefficients acts along the true motion too is of second order, and left to the step that takes the cause in.
     """
-    Z = group.columns.Z[:, 0]
-    effect = refit_shift(group.effect, Z, step.state.motion, problem.records, ready)
-    return _sensor_contender(problem, step, whitening, group, effect, TURNS)
-
-
-def _sensor_contender(
-    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group, effect: Effect, turns: int
-) -> Contender:
-    """Gauss-Newton on the one parameter of a sensor effect, all coefficients fitted anew each time."""
+    rows, prior, state = step.rows, step.state.prior, step.state
+    effect = before
+    if effect is None:
+        effect = refit_shift(group.effect, group.columns.Z[:, 0], state.motion, problem.records, ready)
     ((name, parameter),) = effect.parameters().items()
-    base = step.state
-    for _ in range(turns):
-        here = stand(problem, extended_state(problem, base, effect), whitening)
+    change, slope = _shift(problem, state, effect, name, ready.whitening)
+    for _ in range(TURNS):
+        missing, cross = rows.y - change, np.tensordot(slope, rows.X, 2)
+        theta = base.inverse[-1] @ (np.tensordot(missing, rows.X, 2) + prior.precision * prior.mean)
+        taken = base.inverse[-1] @ cross
+        own = float((slope**2).sum() - cross @ taken) + UNKNOWN
+        move = float((slope * missing).sum() - cross @ theta) / own
+        size = float(getattr(effect, name))
+        value = float(np.clip(size + move, parameter.lower, parameter.upper))
+        if abs(value - size) < NEAR_ENOUGH / np.sqrt(own):
+            break
+        effect = with_shape(effect, [name], [np.float64(value)])
+        state = solved(problem, step.state, theta - taken * move)
+        change, slope = _shift(problem, state, effect, name, ready.whitening)
+    sums, loose = sums_of(rows, step.folded, rows.y - change), step.loose
+    free = None if loose is None else judge(rows, Hypothesis(rows.X, loose, change), sums)
+    held = prior if loose is None else believed(problem, loose, sums)
+    verdicts = judge(rows, Hypothesis(rows.X, held, change), sums)
+    return Contender(group.name, effect, verdicts, acting(effect, len(rows.y), group.columns.joints), free)
+
+
+def _shift(
+    problem: Problem, state: State, effect: Effect, name: str, response: np.ndarray
+) -> tuple[Float[np.ndarray, "nv T"], Float[np.ndarray, "nv T"]]:
+    """What a shift of the links' motion changes of the whitened torque, and the derivative of that in its size."""
+    size = float(getattr(effect, name))
+    h = SMALL * max(abs(size), SMALL)
+    sides = jax.tree.map(lambda *x: np.stack(x), *(with_shape(effect, [name], [size + s]) for s in (0.0, h)))
+    change, more = torque_change(sides, link_motion(problem, state), problem.records)
+    rows = [filtered_rows(problem.records, x, response) for x in (change, (more - change) / h)]
+    return rows[0], rows[1]
+
+
+def _response_contender(
+    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group, effect: Effect
+) -> Contender:
+    """Gauss-Newton on the one parameter of a torque sensor's response, all coefficients fitted anew each time."""
+    ((name, parameter),) = effect.parameters().items()
+    here = None
+    for _ in range(RESPONSE_TURNS):
+        here = stand(problem, extended_state(problem, step.state, effect), whitening)
         slope = torque_slope(problem, here.state, effect, name, whitening)
         X = np.concatenate([here.rows.X, slope[..., None]], axis=2)
-        theta = coefficients(grown_sums(here.rows, here.folded, X), here.state.prior.extended(1))
-        value = float(np.clip(float(getattr(effect, name)) + theta[-1], parameter.lower, parameter.upper))
-        done = abs(value - float(getattr(effect, name))) < 1e-7
-        effect = with_shape(effect, [name], [np.float64(value)])
-        if kind(effect) == "position":
-            base = solved(problem, step.state, theta[:-1])
-        elif done:
+        theta, variance = last_coefficient(grown_sums(here.rows, here.folded, X), here.state.prior.extended(1))
+        size = float(getattr(effect, name))
+        value = float(np.clip(size + theta[-1], parameter.lower, parameter.upper))
+        if abs(value - size) < max(NEAR_ENOUGH * np.sqrt(variance), 1e-7):
             break
-    here = stand(problem, extended_state(problem, base, effect), whitening)
-    return Contender(group.name, effect, here.verdicts, acting(effect, len(step.rows.y), group.columns.joints))
+        effect, here = with_shape(effect, [name], [np.float64(value)]), None
+    here = here or stand(problem, extended_state(problem, step.state, effect), whitening)
+    free = None if step.loose is None else here.free
+    return Contender(group.name, effect, here.verdicts, acting(effect, len(step.rows.y), group.columns.joints), free)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -24,7 +25,7 @@ from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Resampled, Signals, prepare_all
 from ..recordings.stacked import stack
-from ..results import Cause, Diagnosis, Nearest, Rest, Verdict
+from ..results import Cause, Diagnosis, Name, Nearest, Rest, Verdict
 from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
 from ..simulators.native import as_backend
@@ -34,7 +35,7 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .gaining import Gaining, without_losses
+from .gaining import Gaining, surely_beside_all, without_losses
 from .holdout import fold_error, part_error, residual_rms, traces
 from .joint import Joint, opened, polished, sized
 from .layout import checked_repeats, describe_folds, held_rows, layout
@@ -44,7 +45,7 @@ from .rest import Significance, excess, lines, parts_of, predictable, relative_r
 from .search import Found, Search, eliminate, find_causes
 from .standstill import only_sticks
 from .state import State, baseline, with_width
-from .step import stand, with_causes
+from .step import Step, stand, with_causes
 from .thresholds import CERTAIN, FEW_CAUSES, NO_REST, WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_reversals
 
@@ -184,7 +185,7 @@ def _setting(problem: Problem, start: State, forbid: Sequence[str], progress: Ca
         problem = weighted
         spectrum, whitening = noise_floor(problem, start, forbid)
     whitening, white = white_where_better(problem, start, whitening)
-    return _Setting(problem, start, spectrum, whitening, white)
+    return _Setting(problem.within_trust(), start, spectrum, whitening, white)
 
 
 def _searched(
@@ -244,7 +245,12 @@ def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], to
     same = before.problem is here.problem
     here, joint = _as_predicts_best([here] if same else [here, before], named)
     claims = {one.name: one.gain for one in each}
-    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, claims)
+
+    def borne_out(name: Name) -> bool:
+        one = next(f for f in found if f.name == name)
+        return surely_beside_all(problem, searched.here.start, whitening, found, searched.joint, one, claims[name])
+
+    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, claims, cache(borne_out))
     gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
@@ -348,7 +354,7 @@ def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judg
         baseline=fitted_model(problem, first.state, []),
         model=fitted_model(problem, last.state, joint.causes),
         rest=judged.rest,
-        notes=(*_notes(signals, here), *([_AT_REST] if judged.sticks else [])),
+        notes=(*_notes(signals, here, last), *([_AT_REST] if judged.sticks else [])),
         prismatic=prismatic(model),
     )
 
@@ -384,7 +390,7 @@ def _scheme(signals: Sequence[Signals]) -> str:
     return describe_folds(signals)
 
 
-def _notes(signals: Sequence[Signals], here: _Setting) -> tuple[str, ...]:
+def _notes(signals: Sequence[Signals], here: _Setting, last: Step) -> tuple[str, ...]:
     notes = [note for s in signals for note in s.notes]
     if not here.problem.layout.repeats:
         notes.append(
@@ -395,5 +401,11 @@ def _notes(signals: Sequence[Signals], here: _Setting) -> tuple[str, ...]:
         notes.append(
             "the model's error exceeds the noise: rows are weighted by each joint's residual, which predicts held-out"
             " data better than weights from the noise spectrum"
+        )
+    if last.loose is not None:
+        notes.append(
+            "the data would move the link inertials further than is likely with a robot.trust of"
+            f" {here.problem.trust:.0%}, and no cause explains why: they are kept within it, and what that leaves"
+            " counts as unexplained"
         )
     return tuple(notes)

@@ -79,7 +79,7 @@ def _designed(one: Found) -> str:
         known = any(effect.has(form) for form in ("torque", "torque_error", "change", "torque_response"))
         if shaped > 1 or not known:
             return ""
-    return "; figaroh-jax excite --from RUN_DIR (this run's directory) designs a motion that tells them apart"
+    return "; figaroh-jax excite --from RUN_DIR (this run's directory) designs a motion that distinguishes them"
 
 
 class _Idea(NamedTuple):

@@ -69,7 +69,7 @@ def friction_width(problem: Problem, state: State, whitening: Float[np.ndarray, 
         z = tried[best]
         G, b = _replaced(G, b, column, z @ rows.X[joint], z @ z, z @ rows.y[joint])[1:]
         rows.X[joint, :, column] = z
-    return problem.with_width(width)
+    return problem if np.array_equal(width, problem.width) else problem.with_width(width)
 
 
 def _smooth_columns(

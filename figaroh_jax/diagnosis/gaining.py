@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -11,14 +11,14 @@ from jaxtyping import Float
 
 from ..effects.base import Effect
 from ..results import Gain, Name
-from .holdout import held_squares
+from .holdout import held_squares, weighted_squares
 from .joint import Joint, polished
 from .problem import Problem
-from .search import Found
+from .search import Found, stood_without
 from .state import State
-from .thresholds import BY_CHANCE, KEPT_OF_CLAIM
+from .thresholds import BY_CHANCE, KEPT_OF_CLAIM, SURELY
 
-__all__ = ["Fall", "Gaining", "fall", "without_losses"]
+__all__ = ["Fall", "Gaining", "fall", "surely_beside_all", "without_losses"]
 
 EXACT, DRAWS = 12, 4000  # blocks up to which every choice of signs is made; choices beyond
 
@@ -91,12 +91,13 @@ def without_losses(
     joint: Joint,
     strict: bool,
     claims: Mapping[Name, float],
+    borne_out: Callable[[Name], bool] = lambda name: False,
 ) -> Gaining:
     """The causes without those that do not lower the error on the data held out, the worst first (`Fall`).
 
     Each is judged as it comes in: by what it gains alone, or else after all the others, for some show only beside
-    another. All together never raise the error of the robot on all rows held out, be it by chance: what is handed over
-    predicts no worse than the model without causes.
+    another, or beside what has no name (`borne_out`). All together never raise the error of the robot on all rows held
+    out, be it by chance: what is handed over predicts no worse than the model without causes.
     """
     worse: list[Name] = []
     later: list[Name] = []  # come in behind the others
@@ -106,6 +107,7 @@ def without_losses(
         falls = [fall(a, b, named[k].joints) for k, (a, b) in zip(order, pairwise(squares), strict=True)]
         pairs = [(named[k].name, k, one) for k, one in zip(order, falls, strict=True)]
         passed |= {name for name, _, one in pairs if one.gains(strict, claims[name])}
+        passed |= {name for name, _, one in pairs if name not in passed and strict and one.own > 0 and borne_out(name)}
         failing = [(one.own, k) for name, k, one in pairs if name not in passed or one.own <= 0]
         if not failing and squares[-1][0].sum() > squares[0][0].sum():
             failing = [(one.whole, k) for _, k, one in pairs]
@@ -122,6 +124,26 @@ def without_losses(
         passed.clear()
         named = [f for k, f in enumerate(named) if k != least]
         joint = polished(problem, start, [f.effect for f in named], whitening)
+
+
+def surely_beside_all(
+    problem: Problem,
+    start: State,
+    whitening: Float[np.ndarray, "F nv"],
+    found: list[Found],
+    joint: Joint,
+    one: Found,
+    claim: float,
+) -> bool:
+    """Whether a cause surely lowers the kept-out error of its joints with all else in that was found, named or not.
+
+    What has no name is still there: without it the fit bends, and a cause that is true may seem to predict nothing. The
+    squares have the weights of the fit, in which slow rows count little.
+    """
+    bare = stood_without(problem, start, found, one, whitening)
+    here = fall(weighted_squares(problem, bare), weighted_squares(problem, joint.step), one.joints)
+    sure = here.chance < SURELY and here.own >= KEPT_OF_CLAIM * claim
+    return sure and here.each > 0 and here.worse > BY_CHANCE
 
 
 def _told(

@@ -7,7 +7,7 @@ import numpy as np
 from ..effects.base import Effect, Parameter
 from ..effects.catalogue import find, related
 from ..results import Name
-from .comparison import overlap, t_value
+from .comparison import Verdicts, overlap, t_value
 from .contenders import Contender
 from .problem import Problem
 from .screening import Screen
@@ -18,7 +18,7 @@ __all__ = ["ambiguous", "exists", "gains", "passes", "physical_sign", "rivals", 
 
 
 def exists(problem: Problem, effect: Effect) -> bool:
-    """Whether the data can show such an effect: shapes inside their bounds, forces no larger than the joint's torque.
+    """Whether the data can show such an effect: shapes inside their bounds, forces no larger than any of the joint.
 
     A wrong sign (`physical_sign`) does not count here: such an effect is no cause, but it may stand in the fit.
     """
@@ -36,7 +36,8 @@ def exists(problem: Problem, effect: Effect) -> bool:
     forces = [abs(values[n]) for n, p in own.items() if p.unit == "N m"]
     if effect.acts_on != "joint" or not forces:
         return True
-    return max(forces) <= np.sqrt((problem.torque[..., int(effect.at[0])] ** 2).mean())
+    # one that passes, or that only slow motion shows, may be larger than the joint's torque on average
+    return max(forces) <= np.abs(problem.torque[..., int(effect.at[0])]).max()
 
 
 def physical_sign(effect: Effect) -> bool:
@@ -54,10 +55,18 @@ def _within(parameter: Parameter, value: float) -> bool:
 
 
 def gains(step: Step, one: Contender) -> bool:
-    """Whether the cause predicts what it was not fitted to, at its joints and on the whole: by enough, and surely."""
-    before, after = (v.own(step.rows, one.joints) for v in (step.verdicts, one.verdicts))
-    gain, surely = 1 - after.sum() / before.sum(), t_value(before, after) > CONFIDENT
-    return bool(gain > GAIN and surely and one.verdicts.heldout < step.verdicts.heldout)
+    """Whether the cause predicts what it was not fitted to, at its joints and on the whole: by enough, and surely.
+
+    Where links are held back (`believed`), what is no body must also do so beside links that are not.
+    """
+    pairs = [(step.verdicts, one.verdicts)] + ([] if one.free is None else [(step.free, one.free)])
+    return all(_predicts_better(step, one.joints, before, after) for before, after in pairs)
+
+
+def _predicts_better(step: Step, joints: tuple[int, ...], before: Verdicts, after: Verdicts) -> bool:
+    worse, better = (v.own(step.rows, joints) for v in (before, after))
+    gain, surely = 1 - better.sum() / worse.sum(), t_value(worse, better) > CONFIDENT
+    return bool(gain > GAIN and surely and after.heldout < before.heldout)
 
 
 def passes(step: Step, contenders: list[Contender], one: Contender) -> bool:

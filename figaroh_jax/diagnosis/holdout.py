@@ -21,7 +21,7 @@ from .state import State, batched, extended_state
 from .step import Step, stand
 from .thresholds import LEAST_MOVING, STANDS
 
-__all__ = ["fold_error", "held_squares", "part_error", "predicted", "residual_rms", "traces"]
+__all__ = ["fold_error", "held_squares", "part_error", "predicted", "residual_rms", "traces", "weighted_squares"]
 
 BLOCK, FEWEST = 1.0, 8  # s; blocks of a recording
 
@@ -35,14 +35,42 @@ def held_squares(
     Of the filtered torque (N m or N), over the holdout recordings with torque; without any, over parts of the others,
     each predicted by a fit to the rest.
     """
-    out, step, block, kept = [], None, _blocks(problem), _kept_out(problem)
+    out, step, kept = [], None, _kept_out(problem)
     rows = np.stack([np.ones(kept.shape), _moves(problem)])
     for effect in [None, *causes]:
         grown = start if step is None or effect is None else extended_state(problem, step.state, effect)
         step = stand(problem, grown, whitening, step)
-        squares = np.moveaxis(_error(problem, step) ** 2 * rows, 3, 1)[..., block >= 0]
-        out.append(np.stack([[np.bincount(block[block >= 0], x) for x in some] for some in squares]).swapaxes(1, 2))
+        out.append(_block_squares(problem, step, rows))
     return out, ((problem.torque * kept) ** 2 * rows).sum((1, 2))
+
+
+def weighted_squares(problem: Problem, step: Step) -> Float[np.ndarray, "2 blocks nv"]:
+    """Squares of each joint's error on data not fitted, block by block: of all rows, then with the weights by speed."""
+    return _block_squares(problem, step, np.stack([np.ones(problem.held.shape), _by_speed(problem)]))
+
+
+def _block_squares(
+    problem: Problem, step: Step, rows: Float[np.ndarray, "k n M nv"]
+) -> Float[np.ndarray, "k blocks nv"]:
+    block = _blocks(problem)
+    squares = np.moveaxis(_error(problem, step) ** 2 * rows, 3, 1)[..., block >= 0]
+    return np.stack([[np.bincount(block[block >= 0], x) for x in some] for some in squares]).swapaxes(1, 2)
+
+
+def _by_speed(problem: Problem) -> Float[np.ndarray, "n M nv"]:
+    """What a square of each row weighs, as the fit weighs rows of that joint and speed (1: as fast ones)."""
+    records = problem.records
+    weight, fitted = np.asarray(records.weight), np.asarray(records.fitted)
+    speed = np.take_along_axis(np.abs(np.asarray(records.velocity)), records.row_samples()[..., None], axis=1)
+    out = np.ones(speed.shape)
+    for joint in range(speed.shape[2]):
+        used = (fitted[..., joint] > 0) & (weight[..., joint] > 0)
+        own = speed[..., joint][used]
+        if len(own):
+            order = np.argsort(own)
+            share = (weight[..., joint][used] / fitted[..., joint][used])[order]
+            out[..., joint] = np.interp(speed[..., joint], own[order], share) ** 2
+    return out
 
 
 def _moves(problem: Problem) -> Float[np.ndarray, "n M nv"]:

@@ -24,6 +24,8 @@ __all__ = ["Joint", "has_size", "joint_fit", "moved", "opened", "polished", "siz
 
 KEPT = 1e-12
 SURE = 0.95  # of the region of a cause's amplitudes that must not hold zero
+LATE = 4  # turns: most fits have settled by then
+BACK = 0.5  # of its last move: what a shape goes back by where steps overshoot
 POLISH, SETTLED = 10, 0.03  # turns at the most; a turn that moves nothing by more of its standard deviation is the last
 
 
@@ -39,15 +41,31 @@ def polished(problem: Problem, start: State, causes: list[Effect], whitening: Fl
     """All causes fitted together: Gauss-Newton steps over coefficients and shapes until they settle.
 
     Sensor effects follow the load and the torque, so each turn begins with what the last one made of the baseline.
+    A shape that late turns send back as far as it came would go on so for ever: it moves half of the way from then on.
     """
     joint = _together(problem, start, causes, whitening)
-    for _ in range(0 if all(map(_settled, causes)) else POLISH):
-        causes = [moved(e, joint.fitted, at) for e, at in zip(joint.causes, joint.fitted.places, strict=True)]
+    share, before = np.ones_like(joint.fitted.value), np.zeros_like(joint.fitted.value)
+    for turn in range(0 if all(map(_settled, causes)) else POLISH):
+        move = _move(joint)
+        if turn >= LATE:
+            share = np.where(move * before < -BACK * before**2, share / 2, share)
+        goal = replace(joint.fitted, value=joint.fitted.value - (1 - share) * move)
+        causes = [moved(e, goal, at) for e, at in zip(joint.causes, goal.places, strict=True)]
         base = solved(problem, start, joint.step.state.theta[: len(start.theta)])
-        last, joint = joint.fitted, _together(problem, base, causes, whitening)
+        before, last, joint = move, joint.fitted, _together(problem, base, causes, whitening)
         if np.all(np.abs(joint.fitted.value - last.value) <= SETTLED * np.sqrt(np.diag(joint.fitted.covariance))):
             break
     return joint
+
+
+def _move(joint: Joint) -> Float[np.ndarray, " parameters"]:
+    """How far the fit would move each shape; zero for the coefficients, which have moved."""
+    move = np.zeros_like(joint.fitted.value)
+    for effect, place in zip(joint.causes, joint.fitted.places, strict=True):
+        names = shapes(type(effect))
+        at = list(place[len(place) - len(names) :])
+        move[at] = joint.fitted.value[at] - [float(getattr(effect, name)) for name in names]
+    return move
 
 
 def _settled(effect: Effect) -> bool:
@@ -58,27 +76,27 @@ def _settled(effect: Effect) -> bool:
 def _together(problem: Problem, base: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> Joint:
     step = stand(problem, assembled(problem, base, causes), whitening)
     causes = with_amplitudes(step.state, causes, problem.model)
-    return Joint(step, causes, joint_fit(problem, step.state, step.rows, causes, whitening))
+    return Joint(step, causes, joint_fit(problem, step, causes, whitening))
 
 
-def joint_fit(
-    problem: Problem, state: State, rows: Rows, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]
-) -> Fitted:
+def joint_fit(problem: Problem, step: Step, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> Fitted:
     """Gauss-Newton step of all coefficients and shapes at once, and a covariance from the scores of the blocks."""
+    state, rows = step.state, step.rows
     causes = with_amplitudes(state, causes, problem.model)
-    slopes = [slope for e in causes for slope in torque_slopes(problem, state, e, whitening)]
-    J = np.concatenate([rows.X, *[s[..., None] for s in slopes]], axis=2)
+    each = [slope for e in causes for slope in torque_slopes(problem, state, e, whitening)]
+    slopes = np.stack(each) if each else np.zeros((0, *rows.y.shape))
     precision = np.append(state.prior.precision, np.zeros(len(slopes)))
-    tall = J.reshape(-1, J.shape[2])
-    A = tall.T @ tall + np.diag(precision)
+    cross = np.stack([np.tensordot(slope, rows.X, 2) for slope in slopes]) if each else np.zeros((0, rows.X.shape[2]))
+    flat = slopes.reshape(len(slopes), rows.y.size)
+    A = np.block([[step.folded.gram.sum(0), cross.T], [cross, flat @ flat.T]]) + np.diag(precision)
     inverse = np.linalg.inv(A + KEPT * np.diag(np.maximum(np.diag(A), KEPT)))
     residual = rows.y - rows.X @ state.theta
     pull = np.append(state.prior.precision * (state.prior.mean - state.theta), np.zeros(len(slopes)))
-    step = inverse @ (tall.T @ residual.reshape(-1) + pull)
+    move = inverse @ (np.append(np.tensordot(residual, rows.X, 2), flat @ residual.reshape(-1)) + pull)
     values = [float(getattr(e, n)) for e in causes for n in shapes(type(e))]
-    covariance = inverse @ (_scatter(rows, J, residual) + np.diag(precision)) @ inverse
-    covariance = _widened(covariance, inverse, rows, residual, J.shape[2])
-    return Fitted(np.append(state.theta, values) + step, covariance, _places(problem, state, causes))
+    covariance = inverse @ (_scatter(rows, slopes, residual) + np.diag(precision)) @ inverse
+    covariance = _widened(covariance, inverse, rows, residual, len(A))
+    return Fitted(np.append(state.theta, values) + move, covariance, _places(problem, state, causes))
 
 
 def _widened(
@@ -98,10 +116,14 @@ def _widened(
     return covariance * np.outer(wider, wider)
 
 
-def _scatter(rows: Rows, J: Float[np.ndarray, "nv T P"], residual: Float[np.ndarray, "nv T"]) -> np.ndarray:
-    """sum_b g_b g_b' of the blocks' scores g_b = J_b' r_b: right for coloured residuals too."""
+def _scatter(
+    rows: Rows, slopes: Float[np.ndarray, "shapes nv T"], residual: Float[np.ndarray, "nv T"]
+) -> Float[np.ndarray, "P P"]:
+    """sum_b g_b g_b' of the blocks' scores g_b = J_b' r_b: right for coloured residuals too. J are X and the slopes."""
     blocks = rows.block.max() + 1
-    scores = np.sum([block_sums(rows, r, x.T) for x, r in zip(J, residual, strict=True)], axis=0)
+    linear = np.sum([block_sums(rows, r, x.T) for x, r in zip(rows.X, residual, strict=True)], axis=0)
+    others = np.sum([block_sums(rows, r, slopes[:, joint]) for joint, r in enumerate(residual)], axis=0)
+    scores = np.concatenate([linear, others])
     return scores @ scores.T * blocks / max(blocks - 1, 1)
 
 

@@ -17,7 +17,7 @@ from ..effects.base import Effect
 from ..estimation.rows import Prior
 from ..recordings.stacked import filter_rows, filtered_rows, open_rows
 from ..results import Name
-from .comparison import Ground, Hypothesis, Verdicts, ground, judge, judge_grown, t_value
+from .comparison import Ground, Hypothesis, Verdicts, fold_sums, ground, judge, judge_grown, t_value
 from .design import kind, sensor_response, shapes
 from .estimates import Fitted, amplitude_places, torque_slope
 from .flexible import smooth_functions
@@ -104,10 +104,10 @@ def standings(
         return []
     full, places = joint.step, amplitude_places(joint.step.state, joint.causes, problem.model)
     size = residual_rms(problem, stand(problem, start, whitening).state)
-    grown = _Grown(problem, full, whitening, ground(full.rows, full.verdicts, full.state.prior, full.folded), size)
+    grown = _Grown(problem, full, whitening, ground(full.verdicts, full.state.prior, full.folded), size)
     out = []
     for one, effect, place, at in zip(found, joint.causes, places, joint.fitted.places, strict=True):
-        late, coupled = kind(effect) == "response", effect.name == "coupled_transmission"
+        late, coupled = kind(effect) == "response", bool(effect.one_rotor)
         bare = stood_without(problem, start, found, one, whitening) if late else None
         without = bare.verdicts if bare else judged_without(problem, start, full, found, one, whitening)
         worse, better = (v.own(full.rows, one.joints) for v in (without, full.verdicts))
@@ -231,11 +231,10 @@ def _beside_smooth(
     if kind(effect) == "position":
         return 1.0
     full = _with_smooth(grown, step)
-    within = judge(step.rows, full)
+    sums = fold_sums(step.rows, full.X)
+    within = judge(step.rows, full, sums)
     if bare is None:
-        X, prior = full.X, full.prior
-        fewer = prior._replace(mean=np.delete(prior.mean, place), precision=np.delete(prior.precision, place))
-        without = judge(step.rows, Hypothesis(np.delete(X, place, axis=2), fewer))
+        without = judge(step.rows, full, sums, place)
     else:
         without = judge(bare.rows, _with_smooth(grown, bare))
     alone, both, smooth = (v.own(step.rows, joints).sum() for v in (step.verdicts, within, without))
@@ -268,7 +267,7 @@ def _with_smooth(grown: _Grown, step: Step) -> Hypothesis:
 def _inertia_alone(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
     """Whether neither friction of a coupling is surely there (two standard deviations)."""
     deviations = _deviations(effect, fitted, place)
-    return all(abs(deviations[n]) < 2 for n in ("damping", "friction"))
+    return all(abs(deviations[n]) < 2 for n in effect.one_rotor[1:])
 
 
 def _turns_against_itself(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
@@ -276,7 +275,7 @@ def _turns_against_itself(effect: Effect, fitted: Fitted, place: tuple[int, ...]
 
     One rotor that turns the sum, or the difference, of two joints has inertia, damping and friction of that sign.
     """
-    return min(_deviations(effect, fitted, place)[n] for n in ("inertia", "damping", "friction")) < -3
+    return min(_deviations(effect, fitted, place)[n] for n in effect.one_rotor) < -3
 
 
 def _deviations(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> dict[str, float]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 from weakref import ref
 
 import equinox as eqx
@@ -17,11 +17,14 @@ from jaxtyping import Complex, Float, Int
 
 from ..effects.base import Effect, Motion
 from ..effects.catalogue import CATALOGUE
+from ..estimation.priors import rigid_prior
 from ..recordings.stacked import Records, filter_rows, open_rows
 from ..rigid.model import RobotModel
+from ..rigid.regressor import packed_regressor, pairs
 from ..simulators.contract import Backend
 from .design import SHORT, Units, candidates, flattened, kind, shapes, units
 from .shifts import links_torque, rigid_torque
+from .thresholds import TRUSTED
 
 T = TypeVar("T")
 
@@ -35,22 +38,56 @@ MOST_TERMS = 48  # terms of models whose columns are held
 TURNED = 128  # samples that are turned at once: they stay in the processor's cache
 
 
-@dataclass(frozen=True, eq=False)
-class Part:
-    """Columns of a regressor at all samples, without the zeros: a tree leaves many joints of a column untouched."""
+class _Columns(NamedTuple):
+    """Columns at all samples, without those that are zero, each at one joint."""
 
     series: Float[np.ndarray, "series nN"]  # by joint, then by column
     joint: Int[np.ndarray, " series"]
     column: Int[np.ndarray, " series"]
-    nv: int
-    width: int  # columns
-    _last: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)  # coefficients and their torque
+
+
+class Part:
+    """Columns of a regressor at all samples, without the zeros: a tree leaves many joints of a column untouched.
+
+    They are made when they are first asked for: `quick` is their torque by another way, all that many models need.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[], _Columns],
+        shape: tuple[int, int, int],
+        quick: Callable[[Float[np.ndarray, " k"]], Float[np.ndarray, "nN nv"]] | None = None,
+    ) -> None:
+        self._make, self._quick = make, quick
+        self.samples, self.nv, self.width = shape  # samples of all recordings, coordinates, columns
+        self._last: list[tuple[np.ndarray, np.ndarray]] = []  # coefficients and their torque
+
+    @cached_property
+    def _columns(self) -> _Columns:
+        made, self._quick = self._make(), None
+        return made
+
+    @property
+    def series(self) -> Float[np.ndarray, "series nN"]:
+        """The columns that are not zero, by joint, then by column."""
+        return self._columns.series
+
+    @property
+    def joint(self) -> Int[np.ndarray, " series"]:
+        """Joint of each of `series`."""
+        return self._columns.joint
+
+    @property
+    def column(self) -> Int[np.ndarray, " series"]:
+        """Column of each of `series`."""
+        return self._columns.column
 
     @classmethod
     def of(cls, columns: Float[np.ndarray, "nv k nN"]) -> Part:
         """The part of columns as they are."""
         joint, column = np.nonzero(columns.any(2))
-        return cls(columns[joint, column], joint, column, *columns.shape[:2])
+        made = _Columns(columns[joint, column], joint, column)
+        return cls(lambda: made, (columns.shape[2], *columns.shape[:2]))
 
     @classmethod
     def of_samples(cls, columns: Float[np.ndarray, "nN nv k"]) -> Part:
@@ -60,39 +97,39 @@ class Part:
         for start in range(0, len(columns), TURNED):
             few = slice(start, start + TURNED)
             series[:, few] = columns[few][:, joint, column].T
-        return cls(series, joint, column, *columns.shape[1:])
+        made = _Columns(series, joint, column)
+        return cls(lambda: made, columns.shape)
 
     @classmethod
-    def of_blocks(
-        cls, blocks: Float[np.ndarray, "pairs 10 nN"], where: Int[np.ndarray, "pairs 2"], model: RobotModel
-    ) -> Part:
-        """The part of ten columns for each joint and link that the tree does not make zero, in order of the joints."""
-        flat = blocks.reshape(-1, blocks.shape[2])
-        used = np.asarray(flat[:, :TURNED].any(1))
-        used[~used] = flat[~used].any(1)
-        joint, first = np.repeat(where, 10, axis=0).T
-        column = 10 * first + np.tile(np.arange(10), len(where))
-        series = flat if used.all() else flat[used]
-        return cls(series, joint[used], column[used], model.nv, 10 * len(model.joints))
+    def of_rigid(cls, model: RobotModel, motion: Sequence[Float[np.ndarray, "nN nv"]]) -> Part:
+        """Ten columns a link along a motion, each joint a coordinate of its own; their torque by inverse dynamics."""
 
-    @property
-    def samples(self) -> int:
-        """Samples of all recordings."""
-        return self.series.shape[1]
+        def make() -> _Columns:
+            return _of_blocks(np.asarray(packed_regressor(model, *motion)), pairs(model))
+
+        def quick(theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, "nN nv"]:
+            return rigid_torque(eqx.tree_at(lambda m: m.inertia, model, theta.reshape(-1, 10)), *motion)
+
+        return cls(make, (len(motion[0]), model.nv, 10 * len(model.joints)), quick)
 
     def torque(self, theta: Float[np.ndarray, " k"], rows: slice = slice(None)) -> Float[np.ndarray, "rows nv"]:
         """Torque (samples, nv) of the coefficients `theta`, N m or N; `rows` are samples."""
         if rows == slice(None) and self._last and np.array_equal(self._last[0][0], theta):
             return self._last[0][1]
+        if rows == slice(None) and self._quick is not None:
+            return self._held(theta, self._quick(theta))
         series = self.series[:, rows]
         out, ends = np.zeros((series.shape[1], self.nv)), np.searchsorted(self.joint, np.arange(self.nv + 1))
         for joint in range(self.nv):
             own = slice(ends[joint], ends[joint + 1])
             out[:, joint] = theta[self.column[own]] @ series[own]
-        if rows == slice(None):  # states that grow out of one another ask for the same
-            out.setflags(write=False)
-            self._last[:] = [(theta.copy(), out)]
-        return out
+        return self._held(theta, out) if rows == slice(None) else out
+
+    def _held(self, theta: Float[np.ndarray, " k"], torque: Float[np.ndarray, "nN nv"]) -> Float[np.ndarray, "nN nv"]:
+        """The torque, which states that grow out of one another ask for again."""
+        torque.setflags(write=False)
+        self._last[:] = [(theta.copy(), torque)]
+        return torque
 
     def dense(self, columns: range) -> Float[np.ndarray, "k nv nN"]:
         """Some of the columns in the rows of all joints."""
@@ -100,6 +137,16 @@ class Part:
         own = np.flatnonzero((self.column >= columns.start) & (self.column < columns.stop))
         out[self.column[own] - columns.start, self.joint[own]] = self.series[own]
         return out
+
+
+def _of_blocks(blocks: Float[np.ndarray, "pairs 10 nN"], where: Int[np.ndarray, "pairs 2"]) -> _Columns:
+    """Ten columns for each joint and link that the tree does not make zero, in order of the joints."""
+    flat = blocks.reshape(-1, blocks.shape[2])
+    used = np.asarray(flat[:, :TURNED].any(1))
+    used[~used] = flat[~used].any(1)
+    joint, first = np.repeat(where, 10, axis=0).T
+    column = 10 * first + np.tile(np.arange(10), len(where))
+    return _Columns(flat if used.all() else flat[used], joint[used], column[used])
 
 
 class Filtered:
@@ -181,6 +228,7 @@ class Problem:
     trust: float
     width: Float[np.ndarray, " nv"]  # half width of the friction's reversal, rad/s or m/s
     held: Float[np.ndarray, "n M nv"]  # 1: a row of a holdout recording with torque
+    bounded: bool = False  # whether the links stay within what is believed of them (`believed`)
     filtered: Filtered = field(default_factory=Filtered, compare=False, repr=False)
 
     @property
@@ -213,6 +261,11 @@ class Problem:
         if r.carried is not None:
             load = load + links_torque(self.model, q, v, a, r) - rigid_torque(self.model, q, v, a)
         return Motion(self.model, r.flat(r.time), q, v, a, load, load, r.dt, self.width)
+
+    @cached_property
+    def believed(self) -> Float[np.ndarray, " P"]:
+        """Precision of the links' inertial parameters as the task states it."""
+        return rigid_prior(self.model, self.trust)[1]
 
     @cached_property
     def families(self) -> dict[str, dict[str, Effect]]:
@@ -285,6 +338,14 @@ class Problem:
         while len(self._terms) > MOST_TERMS:
             self._terms.popitem(last=False)
         return made
+
+    def within_trust(self) -> Problem:
+        """The problem with links that stay within what is believed of them, where that is much."""
+        if self.trust > TRUSTED:
+            return self
+        other = replace(self, bounded=True)
+        other.__dict__.update({k: v for k, v in self.__dict__.items() if k not in other.__dict__})
+        return other
 
     def with_width(self, width: Float[np.ndarray, " nv"]) -> Problem:
         """The problem with another width of the friction's reversal, which no candidate's place and grid depends on."""

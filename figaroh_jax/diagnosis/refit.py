@@ -12,18 +12,21 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from ..effects.base import Effect, Motion
 from ..recordings.stacked import Records
 from .design import Units, local, shapes, unit_rows, units_and_slopes, with_shape
 from .shifts import links_torque, torque_change
 
-__all__ = ["Whitened", "bounded_minimum", "profile", "refit", "refit_shift", "shift_profile"]
+__all__ = ["Whitened", "box_minima", "profile", "refit", "refit_shift", "shift_profile"]
 
-STEPS = 12
+STEPS = 12  # evaluations of a search at the most, beside the first
+SETTLED = 1e-7  # of the first value: a step that promises less is not taken
+CLOSE = 1e-4  # the same for the size of a shift, which is fitted exactly later
+STEP = 1e-5  # of its bracket: over which the profile of a shift is differentiated
+FAR = 10.0  # times what its next step promises: what a start may lie above the best to be followed
 RIDGE = 1e-9
-CLOSE = 1e-2  # of its bracket: how exactly the size of a shift is searched
 
 
 class Whitened(NamedTuple):
@@ -35,24 +38,57 @@ class Whitened(NamedTuple):
     whitening: Complex[np.ndarray, "F nv"] | Float[np.ndarray, "F nv"]
 
 
-def bounded_minimum(
-    function: Callable[[Any], tuple[Any, Any]], start: Any, lower: Any, upper: Any, *, native: bool = False
-) -> Any:
-    """Minimiser in a box of a smooth function that answers its value and its gradient, by L-BFGS-B.
+def box_minima(
+    function: Callable[[Float[np.ndarray, "starts p"], Int[np.ndarray, " some"]], tuple[np.ndarray, np.ndarray]],
+    start: Float[np.ndarray, "starts p"],
+    close: float = SETTLED,
+) -> tuple[Float[np.ndarray, "starts p"], Float[np.ndarray, " starts"]]:
+    """Minimisers in the unit box of one smooth function a start, evaluated together, and the minima.
 
-    The only place that knows the minimisers. SciPy's runs on the host around one compiled function. `native` takes
-    jaxopt's, which works inside `jit` and `vmap` but compiles its own loop around every function (6 CPU s around a
-    trivial one, 13 to 38 s around a refit), and is no longer maintained.
+    `function` answers the values of some of the starts and their gradients. Each start goes its own way by projected
+    quasi-Newton steps (BFGS), which are shortened until the value falls; it is left where a step promises less than
+    `close` of its first value, and where it promises by far too little to become the best.
     """
-    if native:
-        from jaxopt import LBFGSB
+    x = np.clip(start, 0.0, 1.0)
+    value, slope = function(x, np.arange(len(x)))
+    scale = np.abs(value) + 1e-9
+    # a first step of a quarter of the box
+    bend = np.eye(x.shape[1]) * (4 * np.abs(slope).max(1) + 1e-300)[:, None, None]
+    length, seen = np.ones(len(x)), np.zeros(len(x), bool)  # `seen`: the curvature
+    for _ in range(STEPS):
+        free = ((x > 0) | (slope < 0)) & ((x < 1) | (slope > 0))
+        pull = np.where(free, slope, 0.0)
+        apart = free[:, :, None] & free[:, None]
+        step = -np.linalg.solve(np.where(apart, bend, np.eye(x.shape[1])), pull[..., None])[..., 0]
+        promised = -(step * pull).sum(1) / 2
+        hopeless = seen & (value - FAR * promised > value.min())
+        going = (promised > close * scale) & ~hopeless & (length > 1e-3)
+        some = np.flatnonzero(going)
+        if not len(some):
+            break
+        tried = np.where(going[:, None], np.clip(x + length[:, None] * step, 0.0, 1.0), x)
+        new, turned = value.copy(), slope.copy()
+        new[some], turned[some] = function(tried, some)
+        better = going & (new <= value + 1e-4 * (pull * (tried - x)).sum(1))
+        for one in some:
+            bend[one], seen[one] = _bent(bend[one], tried[one] - x[one], turned[one] - slope[one], seen[one])
+        length = np.where(better, 1.0, np.where(going, length / 3, length))
+        x, slope = (np.where(better[:, None], after, before) for after, before in ((tried, x), (turned, slope)))
+        value = np.where(better, new, value)
+    return x, value
 
-        solver = LBFGSB(function, value_and_grad=True, maxiter=STEPS, tol=1e-6, implicit_diff=False)
-        return solver.run(start, bounds=(lower, upper)).params
-    from scipy.optimize import minimize  # slow to import
 
-    options = {"maxiter": STEPS, "ftol": 1e-7, "gtol": 1e-6}
-    return minimize(function, start, jac=True, bounds=list(zip(lower, upper, strict=True)), options=options).x
+def _bent(
+    bend: Float[np.ndarray, "p p"], moved: Float[np.ndarray, " p"], turned: Float[np.ndarray, " p"], seen: bool
+) -> tuple[Float[np.ndarray, "p p"], bool]:
+    """The curvature after a move that has turned the gradient (BFGS); one that bends down says nothing."""
+    rise = float(moved @ turned)
+    if not rise > 1e-12 * float(np.sqrt((moved @ moved) * (turned @ turned))):
+        return bend, seen
+    if not seen:
+        bend = np.eye(len(moved)) * float(turned @ turned) / rise
+    across = bend @ moved
+    return bend + np.outer(turned, turned) / rise - np.outer(across, across) / float(moved @ across), True
 
 
 def profile(
@@ -85,7 +121,6 @@ def refit(
     """Best shape over the starts (leading axis of `effects`), each between its neighbours on the grid; its columns.
 
     The `grid` is that of the place where it is not the parameters' own.
-    All starts are one box problem: the sum of their profiles, whose gradient is that of each.
     """
     names = shapes(type(effects))
     start = np.stack([np.asarray(getattr(effects, name)) for name in names], axis=-1)
@@ -94,29 +129,23 @@ def refit(
     low, width = box[:, 0], box[:, 1] - box[:, 0]
     # a start that stands there more than once (the grid is short) is followed once
     fields = np.concatenate([np.reshape(x, (len(start), -1)) for x in jax.tree.leaves(effects)], axis=1)
-    _, once, copies = np.unique(fields, axis=0, return_index=True, return_inverse=True)
-    device_effects, device_motion = jax.device_put((jax.tree.map(lambda x: np.asarray(x)[once], effects), motion))
-    scale, known = 1.0, {}
+    once = np.unique(fields, axis=0, return_index=True)[1]
+    few, low, width = jax.tree.map(lambda x: np.asarray(x)[once], effects), low[once], width[once]
+    device_effects, device_motion = jax.device_put((few, motion))
+    known: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # shape and columns of each start as last evaluated
 
-    def profiles(values: Float[np.ndarray, "starts p"]) -> dict[str, Any]:
-        found = _profiles(device_effects, device_motion, values[once], records, whitened)
-        return {name: x[copies.reshape(-1)] for name, x in found.items() if name != "Z"} | {"Z": found["Z"]}
+    def function(u: Float[np.ndarray, "starts p"], some: Int[np.ndarray, " some"]) -> tuple[np.ndarray, np.ndarray]:
+        values = low + u * width
+        value, slope, Z = _profiles(device_effects, device_motion, values, some, records, whitened)
+        known.update({one: (values[one], own) for one, own in zip(some.tolist(), Z, strict=True)})
+        return value, slope * width[some]
 
-    def function(u: Float[np.ndarray, " startsp"]) -> tuple[float, Float[np.ndarray, " startsp"]]:
-        values = low + u.reshape(low.shape) * width
-        known.update(profiles(values), at=values)
-        return float(known["value"].sum()) / scale, (known["slope"] * width).reshape(-1) / scale
-
-    first = ((start - low) / width).reshape(-1)
-    scale = abs(function(first)[0]) + 1e-9
-    values = (
-        low + bounded_minimum(function, first, np.zeros_like(first), np.ones_like(first)).reshape(low.shape) * width
-    )
-    if not np.array_equal(known["at"], values):
-        known = profiles(values)
-    best = int(np.argmin(np.where(np.isfinite(known["value"]), known["value"], np.inf)))
-    one = jax.tree.map(lambda x: np.asarray(x)[best], effects)
-    return with_shape(one, names, list(values[best])), known["Z"][copies.reshape(-1)[best]]
+    shares, least = box_minima(function, (start[once] - low) / width)
+    values, best = low + shares * width, int(np.argmin(np.where(np.isfinite(least), least, np.inf)))
+    if not np.array_equal(known[best][0], values[best]):
+        function(shares, np.array([best]))
+    one = jax.tree.map(lambda x: np.asarray(x)[best], few)
+    return with_shape(one, names, list(values[best])), known[best][1]
 
 
 def shift_profile(change: Float[np.ndarray, "sizes nv T"], whitened: Whitened) -> Float[np.ndarray, " sizes"]:
@@ -132,41 +161,47 @@ def refit_shift(
     """The effect of a position sensor with the size that fits best, between the neighbours of the best grid point.
 
     `effects` are the grid of its size, `Z` their columns. The profile of a shift has one valley. It is searched
-    without its gradient: that of the inverse dynamics takes longer to compile than all the values that a search in
-    one number needs. The load is that of the motion as read: right to first order, and near enough to begin with.
+    with a difference for its gradient: that of the inverse dynamics takes longer to compile than all the values that a
+    search in one number needs. The load is that of the motion as read: right to first order, near enough to begin with.
     """
-    from scipy.optimize import minimize_scalar  # slow to import
-
     ((name, parameter),) = effects.parameters().items()
     sizes, one = np.asarray(getattr(effects, name)), jax.tree.map(lambda x: np.asarray(x)[:1], effects)
     best = sizes[np.argmin(shift_profile(Z * sizes[:, None, None], whitened))]
     edges = np.array([parameter.lower, *np.sort(sizes), parameter.upper])
     low, high = edges[edges < best].max(initial=parameter.lower), edges[edges > best].min(initial=parameter.upper)
     as_read = links_torque(motion.model, motion.position, motion.velocity, motion.acceleration, records)
-    joints = np.arange(as_read.shape[1])[None]
+    joints = np.tile(np.arange(as_read.shape[1]), (2, 1))
 
-    def value(size: float) -> float:
-        change = torque_change(with_shape(one, [name], [np.array([size])]), motion, records, as_read, turns=0)
+    def function(u: Float[np.ndarray, "1 1"], _: Int[np.ndarray, " 1"]) -> tuple[np.ndarray, np.ndarray]:
+        size = low + u[0] * (high - low)
+        both = jax.tree.map(lambda x: np.repeat(x, 2, axis=0), one)
+        both = with_shape(both, [name], [np.append(size, size + STEP * (high - low))])
+        change = torque_change(both, motion, records, as_read, turns=0)
         rows = unit_rows(Units(np.swapaxes(change, 1, 2)[:, None], joints), records, whitened.whitening)
-        return float(shift_profile(rows, whitened)[0])
+        value, beside = shift_profile(rows, whitened)
+        return np.array([value]), np.array([[(beside - value) / STEP]])
 
-    options = {"xatol": CLOSE * (high - low), "maxiter": 2 * STEPS}
-    found: Any = minimize_scalar(value, bounds=(low, high), method="bounded", options=options)
-    return with_shape(jax.tree.map(lambda x: x[0], one), [name], [np.float64(found.x)])
+    share = float(box_minima(function, np.array([[(best - low) / (high - low)]]), CLOSE)[0][0, 0])
+    return with_shape(jax.tree.map(lambda x: x[0], one), [name], [np.float64(low + share * (high - low))])
 
 
 def _profiles(
-    effects: Effect, motion: Motion, values: Float[np.ndarray, "starts p"], records: Records, whitened: Whitened
-) -> dict[str, Any]:
-    """Profile, gradient and columns of several starts at one place, each its own effect with its own shape."""
-    torque, slope = units_and_slopes(effects, values, motion)
-    starts, p, k = slope.shape[:3]
-    joints = np.asarray(effects.at) if local(effects) else np.tile(np.arange(len(whitened.residual)), (starts, 1))
-    both = np.concatenate([torque[:, None], slope], axis=1).reshape(starts, (1 + p) * k, *torque.shape[2:])
+    effects: Effect,
+    motion: Motion,
+    values: Float[np.ndarray, "starts p"],
+    some: Int[np.ndarray, " some"],
+    records: Records,
+    whitened: Whitened,
+) -> tuple[Float[np.ndarray, " some"], Float[np.ndarray, "some p"], Float[np.ndarray, "some k rows n M"]]:
+    """Profile, gradient and columns of some of the starts at one place, each its own effect with its own shape."""
+    torque, slope = (x[some] for x in units_and_slopes(effects, values, motion))
+    count, p, k = slope.shape[:3]
+    joints = np.asarray(effects.at)[some] if local(effects) else np.tile(np.arange(len(whitened.residual)), (count, 1))
+    both = np.concatenate([torque[:, None], slope], axis=1).reshape(count, (1 + p) * k, *torque.shape[2:])
     rows = unit_rows(Units(both, joints), records, whitened.whitening)
-    rows = rows.reshape(starts, 1 + p, k, *rows.shape[2:])
+    rows = rows.reshape(count, 1 + p, k, *rows.shape[2:])
     value, gradient = profile(rows[:, 0], rows[:, 1:], joints[0].tolist(), whitened)
-    return {"value": value, "slope": gradient, "Z": rows[:, 0]}
+    return value, gradient, rows[:, 0]
 
 
 def _box(

@@ -124,7 +124,7 @@ def significance(
 
 def predictable(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"]) -> bool:
     """Whether smooth functions of the motion predict what is left at some joint on data they were not fitted to."""
-    base = ground(step.rows, step.verdicts, step.state.prior, step.folded)
+    base = ground(step.verdicts, step.state.prior, step.folded)
     for group in families(problem, step.state, whitening):
         joints = group.columns.joints
         own = judge_grown(step.rows, base, joints, group.columns.Z[0])
@@ -145,7 +145,7 @@ def parts_of(
 
     Shares are of that power, by what each predicts alone: what goes with two things counts twice.
     """
-    base = ground(step.rows, step.verdicts, step.state.prior, step.folded)
+    base = ground(step.verdicts, step.state.prior, step.folded)
     weight, speed = (
         np.moveaxis(x, 2, 0).reshape(len(step.rows.y), -1)
         for x in (np.asarray(problem.records.weight), relative_speed(problem))

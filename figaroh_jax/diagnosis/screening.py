@@ -29,6 +29,7 @@ __all__ = ["Group", "Null", "Screen", "catalogue", "family_p", "place_p", "scree
 
 DRAWS, CHUNK = 400, 50  # draws, and how many are made at once
 LOCAL_DRAWS = 4000  # where each place is asked for itself, and counted as one of many
+FAR = 3.0  # times the largest score of a part's noise: a score from which no further noise is asked for
 KEPT = 16_000_000  # numbers of noise that are held from step to step
 
 
@@ -202,9 +203,14 @@ def family_p(
     highest = max(float(result.z.max()) for result in found.scores)
     parts = block_scores(rows, linear, found.stock, found.H)
     signs = generator.choice([-1.0, 1.0], (draws, len(parts)))
-    drawn = np.concatenate([null.scores(part, rows, linear, found) for part in range(draws // CHUNK)])
-    nulls = (largest(found.stock.span, found.scores, x) for x in (signs @ parts, drawn))
-    return max((1 + np.sum(z >= highest)) / (draws + 1) for z in nulls)
+    above = np.sum(largest(found.stock.span, found.scores, signs @ parts) >= highest)
+    drawn = 0
+    for part in range(draws // CHUNK):
+        z = largest(found.stock.span, found.scores, null.scores(part, rows, linear, found))
+        drawn += np.sum(z >= highest)
+        if highest > FAR * max(float(z.max()), 1.0):  # no other draw comes near
+            break
+    return float(1 + max(above, drawn)) / (draws + 1)
 
 
 def place_p(

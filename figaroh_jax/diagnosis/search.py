@@ -13,12 +13,13 @@ from ..effects.base import Effect
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Prior
 from ..results import Name
+from .believed import believed
 from .comparison import Hypothesis, Verdicts, fewer_sums, ground, judge, overlap, shares_of_wins, t_value
 from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
 from .flexible import friction_width
-from .gates import ambiguous, exists, gains, passes, physical_sign, rivals, simpler
+from .gates import ambiguous, exists, gains, passes, rivals, simpler
 from .problem import Problem
 from .screening import DRAWS, Null, Screen, catalogue, family_p, place_p, screen
 from .state import State, solved, with_width
@@ -45,11 +46,6 @@ class Found:
     ambiguous: tuple[Name, ...]
     joints: tuple[int, ...] = ()  # by whose rows it is judged
     alike: tuple[Name, ...] = ()  # what else explains much of the same misfit, though not as well
-
-    @property
-    def nuisance(self) -> bool:
-        """Whether physics forbids its sign: it stands in the fit and is no cause."""
-        return not physical_sign(self.effect)
 
 
 class Search(NamedTuple):
@@ -91,6 +87,7 @@ def find_causes(
     null = Null(problem, spectrum, whitening, generator)
     screened, groups = None, None
     failed: dict[Name, float] = {}  # share of its joints' squares that a candidate scored when it last failed
+    fitted: dict[Name, Effect] = {}  # position sensors as they were last fitted exactly
     while len(found) < MOST_CAUSES:
         progress("screening the catalogue", len(found) / MOST_CAUSES)
         groups = catalogue(problem, step.state, step.rows, whitening, forbid, groups)
@@ -100,7 +97,7 @@ def find_causes(
         if p_values[-1] > alpha:
             break
         progress("comparing causes on held-out data", len(found) / MOST_CAUSES)
-        contenders = _contenders(problem, step, screened, whitening, failed)
+        contenders = _contenders(problem, step, screened, whitening, failed, fitted)
         chosen = _chosen(problem, step, contenders, found)
         if not chosen:
             break
@@ -110,9 +107,11 @@ def find_causes(
             step = with_cause(problem, step, best.effect, whitening)
         if len(found) > 1 and any(type(f.effect).follows_total for f in found):
             step, screened = _refreshed(problem, state, step, found, whitening), None
-        if any(kind(best.effect) != "columns" for best in chosen):
-            problem = friction_width(problem, step.state, whitening)
-            step, groups, screened = stand(problem, with_width(problem, step.state), whitening), None, None
+        ways = {kind(best.effect) for best in chosen}
+        if ways != {"columns"}:
+            known, problem, screened = problem, friction_width(problem, step.state, whitening), None
+            groups = None if problem is not known or "response" in ways else groups
+            step = step if problem is known else stand(problem, with_width(problem, step.state), whitening)
     begun = solved(problem, with_width(problem, state), step.state.theta[: len(state.theta)])
     return Search(problem, begun, step, found, p_values[0], p_values[-1], screens[0])
 
@@ -148,22 +147,28 @@ def _chance(
 
 
 def _contenders(
-    problem: Problem, step: Step, screened: Screen, whitening: Float[np.ndarray, "F nv"], failed: dict[Name, float]
+    problem: Problem,
+    step: Step,
+    screened: Screen,
+    whitening: Float[np.ndarray, "F nv"],
+    failed: dict[Name, float],
+    fitted: dict[Name, Effect],
 ) -> list[Contender]:
     """The shortlist with exact shapes, without what cannot exist, the best on held-out data first.
 
     A candidate that has failed is tried again where it scores more of what its joints leave than it did then.
     """
-    base = ground(step.rows, step.verdicts, step.state.prior, step.folded)
+    base = ground(step.verdicts, step.state.prior, step.folded)
     ready, squares, out = for_refit(problem, step, base, whitening), (step.verdicts.error**2).sum(1), []
     for group, order, score in shortlist(step, screened):
         share = score / squares[list(acting(group.effect, len(squares), group.columns.joints))].sum()
         if share <= AGAIN * failed.get(group.name, 0.0):
             continue
-        one = contend(problem, step, whitening, base, ready, group, order)
+        one = contend(problem, step, whitening, base, ready, group, order, fitted)
         if exists(problem, one.effect):
             out.append(one)
         else:
+            fitted.pop(group.name, None)
             failed[group.name] = share
         if not gains(step, one):
             failed[group.name] = share
@@ -253,9 +258,11 @@ def judged_without(
     if kind(one.effect) != "columns":
         return stood_without(problem, start, found, one, whitening).verdicts
     place = amplitude_places(full.state, [f.effect for f in found], problem.model)[found.index(one)]
-    X, prior = np.delete(full.rows.X, place, axis=2), full.state.prior
-    fewer = Prior(np.delete(prior.mean, place), np.delete(prior.precision, place))
-    return judge(full.rows, Hypothesis(X, fewer), fewer_sums(full.folded, place))
+    prior, kept = full.state.prior, np.delete(np.arange(len(full.state.theta)), place)
+    fewer = believed(problem, Prior(prior.mean[kept], prior.precision[kept]), fewer_sums(full.folded, place))
+    precision = prior.precision.copy()
+    precision[kept] = fewer.precision
+    return judge(full.rows, Hypothesis(full.rows.X, Prior(prior.mean, precision)), full.folded, place)
 
 
 def stood_without(

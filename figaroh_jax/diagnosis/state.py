@@ -20,7 +20,6 @@ from ..estimation.priors import body_precision, rigid_prior
 from ..estimation.rows import Prior, Rows, instruments
 from ..recordings.stacked import filtered_rows
 from ..rigid.model import Leaf, dofs
-from ..rigid.regressor import packed_regressor, pairs
 from ..simulators.native import NativeBackend
 from .design import Units, batch_size, flattened, kind, local, sensor_response, shapes, units, units_and_slopes
 from .problem import Layout, Part, Problem, family_of
@@ -305,7 +304,7 @@ def _rigid(problem: Problem, motion: Motion) -> Part:
     state = [np.asarray(x) for x in (motion.position, motion.velocity, motion.acceleration)]
     separate = len(dofs(problem.model.joints).column) == problem.model.nv  # no two joints share a coordinate
     if isinstance(problem.backend, NativeBackend) and separate:
-        return Part.of_blocks(np.asarray(packed_regressor(problem.model, *state)), pairs(problem.model), problem.model)
+        return Part.of_rigid(problem.model, state)
     return Part.of_samples(np.asarray(problem.backend.joint_torque_regressor(*state)))
 
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect
-from ..estimation.rows import Linear, Rows, fit
+from ..estimation.rows import Linear, Prior, Rows, fit
+from .believed import believed, let_go
 from .comparison import FoldSums, Hypothesis, Verdicts, coefficients, fold_sums, grown_sums, judge
 from .design import kind
 from .problem import Problem
@@ -26,6 +27,7 @@ class Step:
     state: State
     rows: Rows
     folded: FoldSums
+    loose: Prior | None = None  # as stated, where the state's prior holds links back (`believed`)
 
     @cached_property
     def linear(self) -> Linear:
@@ -36,6 +38,13 @@ class Step:
     def verdicts(self) -> Verdicts:
         """What the data say of the state, on rows that it was not fitted to."""
         return judge(self.rows, Hypothesis(self.rows.X, self.state.prior), self.folded)
+
+    @cached_property
+    def free(self) -> Verdicts:
+        """The same with links that no trust holds back."""
+        if self.loose is None:
+            return self.verdicts
+        return judge(self.rows, Hypothesis(self.rows.X, self.loose), self.folded)
 
 
 def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], before: Step | None = None) -> Step:
@@ -48,7 +57,9 @@ def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], 
         folded = grown_sums(rows, before.folded, rows.X)
     else:
         folded = fold_sums(rows, rows.X)
-    return Step(solved(problem, state, coefficients(folded, state.prior)), rows, folded)
+    state = replace(state, prior=believed(problem, state.prior, folded))
+    solution = solved(problem, state, coefficients(folded, state.prior))
+    return Step(solution, rows, folded, let_go(problem, state.prior))
 
 
 def with_cause(problem: Problem, step: Step, effect: Effect, whitening: Float[np.ndarray, "F nv"]) -> Step:

@@ -265,6 +265,9 @@ class Effect(eqx.Module):
     dissipative: ClassVar[bool] = False  # whether amplitudes below zero would feed energy to the robot
     speed_law: ClassVar[bool] = False  # whether it is a law of dry friction over the speed, one of several alike
     beside_rest: ClassVar[bool] = True  # whether it can be told from a rest that stays; no law of what any rest does
+    one_rotor: ClassVar[
+        tuple[str, ...]
+    ] = ()  # of a rotor that turns two joints: inertia, then what tells it from links
     needs_trust: ClassVar[float] = np.inf  # trust in the inertials (relative) above which it is no cause
     separated_by: ClassVar[str] = ""  # the experiment that tells it from what looks alike; {at} stands for the place
     separated_by_postures: ClassVar[str] = ""  # the same of postures, where it is another one

@@ -79,7 +79,7 @@ class AsymmetricCoulombFriction(JointEffect):
     name, title = "asymmetric_coulomb_friction", "direction-dependent Coulomb friction"
     indistinguishable_from = ("torque_offset",)
     equation = "difference |s(v)|"
-    separated_by = "a dwell of {at} with the brake on, beside motion in both directions"
+    separated_by = "a dwell of {at} with the brake on, and motion in both directions"
     difference: Scalar = amplitude("N m")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:

@@ -22,7 +22,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import InputError, nearest
 from ..rigid.chain import joint_axis
 from ..rigid.model import Leaf, RobotModel, dofs
 from . import catalogue as catalogue  # its effects with an error of the position are effects of postures too
@@ -38,7 +37,6 @@ __all__ = [
     "across",
     "axis_twist",
     "columns_of",
-    "find_kinematic",
     "shape_of",
     "twists_of",
 ]
@@ -405,13 +403,6 @@ for _name in (
     *("reversal_hysteresis", "backlash", "joint_coupling", "base_frame", "tool_frame"),
 ):
     CATALOGUE[_name] = CATALOGUE.pop(_name)
-
-
-def find_kinematic(name: str) -> type[Effect]:
-    """The effect of postures called `name`; raises `InputError` with the nearest known name."""
-    if name not in CATALOGUE:
-        raise InputError(f"no kinematic effect '{name}' in the catalogue{nearest(name, CATALOGUE)}")
-    return CATALOGUE[name]
 
 
 def shape_of(effect: type[Effect]) -> tuple[str, tuple[float, ...]]:

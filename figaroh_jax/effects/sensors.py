@@ -150,7 +150,7 @@ class EncoderOffset(JointEffect):
     name, title = "encoder_offset", "encoder zero offset"
     levels = ("torque",)  # to a calibration it is a `joint_offset`
     equation = "q_measured = q + offset"
-    separated_by = "kinematic calibration, or a reference mark of {at}: torque hardly tells it from inertia"
+    separated_by = "kinematic calibration, or a reference mark of {at}: torque hardly distinguishes it from inertia"
     offset: Scalar = amplitude("rad", lower=-0.2, upper=0.2)
 
     def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:

@@ -52,6 +52,7 @@ class CoupledTransmission(Effect):
     name, title, acts_on = "coupled_transmission", "transmission coupling", "pair"
     equation = "row i: inertia a_j + damping v_j + friction s(v_i + sign v_j); row j: i and j swapped, friction by sign"
     separated_by = "{at} alone, together and against each other"
+    one_rotor = ("inertia", "damping", "friction")
     inertia: Scalar = amplitude("kg m2")
     damping: Scalar = amplitude("N m s/rad")
     friction: Scalar = amplitude("N m")

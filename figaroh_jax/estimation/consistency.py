@@ -26,7 +26,6 @@ from .conic import Body, Constraints, constrained
 __all__ = [
     "Inconsistency",
     "bodies",
-    "full_parameters",
     "inconsistencies",
     "log_cholesky_fit",
     "physical_fit",
@@ -171,22 +170,6 @@ def _outside(ten: Float[np.ndarray, "10"], body: Body) -> bool:
     boxed = body.box is not None and bool(((com < body.box[0]) | (com > body.box[1])).any())
     massive = not body.least_mass <= ten[0] <= body.greatest_mass
     return bool(inconsistencies(ten[None], [body.name])) or massive or boxed
-
-
-def full_parameters(
-    matrix: Float[np.ndarray, "rank columns"],
-    base: Float[np.ndarray, " rank"],
-    nominal: Float[np.ndarray, " columns"],
-    links: Sequence[Body],
-    lower: Float[np.ndarray, " columns"] | None = None,
-) -> Float[np.ndarray, " columns"]:
-    """Parameters with `matrix @ x = base` exactly, links that are bodies, as near to `nominal` as that allows.
-
-    Near in each link's own units. Raises `InputError` where no robot of bodies has these base values.
-    """
-    root = 1 / _scales(matrix.shape[1], links)
-    factor = np.column_stack([np.diag(root), root * nominal])
-    return constrained(factor, Constraints(links, lower, equal=(matrix, base)), 1 / root)
 
 
 def log_cholesky_fit(

@@ -78,7 +78,7 @@ def identify_fleet(
 def check_fleet(robots: Sequence[RobotModel], q: Any, v: Any, a: Any, tau: Any) -> None:
     """Raise `InputError` where the robots have different joints or the arrays do not fit them."""
     if not robots:
-        raise InputError("a fleet has one robot at least")
+        raise InputError("a fleet needs at least one robot")
     first = robots[0]
     for k, robot in enumerate(robots):
         if robot.joints != first.joints:

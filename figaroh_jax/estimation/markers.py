@@ -145,7 +145,7 @@ def marker_data(
             raise InputError(f"marker '{label}': its place on '{link}' is {place}; three finite numbers in m")
     unknown = [label for label in seen if label not in markers]
     if unknown or not seen:
-        raise InputError(f"markers: {'no marker was seen' if not seen else unknown[0] + ' stands on no link'}")
+        raise InputError(f"markers: {'no marker was seen' if not seen else unknown[0] + ' is not on a link'}")
     frames = {np.shape(one) for one in seen.values()}
     if len(frames) > 1 or len(next(iter(frames))) != 2 or next(iter(frames))[1] != 3:
         raise InputError(f"markers: shapes {sorted(frames)}; each is (frames, 3), all with the same frames")

@@ -218,7 +218,7 @@ def _sockets(recordings, R, p, fit) -> tuple[Device, np.ndarray, np.ndarray]:
             if len(names) != 2:
                 raise InputError(
                     f"{r.file}: distance is that of two sockets, but the recording has {len(names)}"
-                    f" ({', '.join(str(n) for n in names)}); give each pair a recording of its own"
+                    f" ({', '.join(str(n) for n in names)}); give each pair its own recording"
                 )
             if r.role == "fit":
                 pairs.append((count, count + 1))

@@ -30,7 +30,7 @@ def with_recordings(
     warnings = check_recordings(task, robot, recordings)
     for one in recordings:
         if one.torque is None and one.role == "fit":
-            raise InputError(f"{one.file}: no torque; recordings of `excite` tell what is known of the dynamics")
+            raise InputError(f"{one.file}: no torque; recordings of `excite` say what is already known of the dynamics")
     with jax.enable_x64(True):
         terms = friction_terms(robot, known)
         signals = prepare_all(tuple(recordings), task.preprocess, slowed=False, model=robot)

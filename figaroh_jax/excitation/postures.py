@@ -304,7 +304,7 @@ def excite_postures(
     if count * J.shape[1] < rank:
         least = int(np.ceil(rank / J.shape[1]))
         raise InputError(
-            f"excite.postures: {count} postures cannot tell {rank} parameters; at least {least} are needed"
+            f"excite.postures: {count} postures cannot determine {rank} parameters; at least {least} are needed"
         )
     if count > candidates:
         raise InputError(f"excite.candidates: {candidates} candidates for {count} postures; give more than that")

@@ -156,10 +156,15 @@ class Sampler:
             self.codes[back] = code_of_few(_COLUMNS, self.robot, (self.robot.nv,) * 3, back=back)
         return self.codes[back]
 
-    def rows(self, states: Float[np.ndarray, "3 samples nv"]) -> Float[np.ndarray, "nv columns samples"]:
-        """The rows at q, v, a (rad or m, and their rates); N m or N for a unit of each parameter."""
+    def rows(
+        self, states: Float[np.ndarray, "3 samples nv"], out: Float[np.ndarray, "columns nv samples"] | None = None
+    ) -> Float[np.ndarray, "nv columns samples"]:
+        """The rows at q, v, a (rad or m, and their rates); N m or N for a unit of each parameter.
+
+        `out`: memory for them, of zeros or earlier rows of this sampler.
+        """
         samples, nv = states.shape[1:]
-        out = np.zeros((self.columns, nv, samples))
+        out = np.zeros((self.columns, nv, samples)) if out is None else out
         code = self._code(states, False)
         if code is not None:
             code(lambda shape, fill: out[: self.own], *states)

@@ -262,8 +262,8 @@ def check_told(given: Causes, G: Float[np.ndarray, "n n"]) -> None:
         if t < NOTHING * float(case.truth @ G @ case.truth):
             pair = given.pairs[case.pair]
             raise InputError(
-                f"separate: no motion tells {pair.truth} from {pair.rival}: what is fitted anyway (`baseline`) and the"
-                " rival make the same torques; leave one of them out of the baseline, or another pair"
+                f"separate: no motion distinguishes {pair.truth} from {pair.rival}: what is fitted anyway (`baseline`)"
+                " and the rival make the same torques; leave one of them out of the baseline, or another pair"
             )
 
 

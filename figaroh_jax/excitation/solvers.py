@@ -9,7 +9,7 @@ smaller until it meets them at 1 kHz.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -39,9 +39,8 @@ class _Seen:
 
     x: np.ndarray
     states: np.ndarray
-    own: np.ndarray
     by_gram: np.ndarray
-    rows: np.ndarray
+    rows: np.ndarray  # in memory that the next point takes
 
 
 @dataclass
@@ -62,7 +61,7 @@ class Problem:
     shifts: tuple[float, ...] = ()  # s: torques of so long before are further columns
     samples: int | None = None  # at which these many are evaluated, each for several; None: at all
     evaluations: int = 0
-    _seen: _Seen | None = None
+    _seen: _Seen | None = field(default=None, init=False)
     _near: tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]] | None = None  # at a point, and back
 
     def __post_init__(self) -> None:
@@ -86,6 +85,10 @@ class Problem:
             if np.isfinite(self.limits.of(kind)).any()
         ]
         self.torque = np.isfinite(self.limits.torque).any()
+        # new memory at each point would cost as much as the numbers that go there; what nothing writes stays zero
+        shape, counted = (self.sampler.columns, self.nv, self.matrix.shape[1]), len(self.columns) + len(self.shifts)
+        self._rows, self._cotangent = np.zeros(shape), np.zeros(shape)
+        self._own = np.zeros((counted + 1, len(self.measured), self.count))  # the last for torques, in a gradient
 
     @property
     def linear_rows(self) -> int:
@@ -123,26 +126,32 @@ class Problem:
 
     def gram(self, rows: Float[np.ndarray, "nv columns samples"]) -> tuple[np.ndarray, np.ndarray]:
         """Weighted rows (columns that count, then late torques; joints and samples), and their Gram matrix."""
-        own = np.take(rows.swapaxes(0, 1), self.columns, axis=0)
-        if len(self.measured) < self.nv or self.shifts:
-            own = own[:, self.measured, : self.count]
+        own, by_columns = self._own[:-1], rows.swapaxes(0, 1)
+        if self._whole:
+            np.take(by_columns, self.columns, axis=0, out=own, mode="clip")  # "raise" would copy
+        else:
+            own[: len(self.columns)] = by_columns[self.columns][:, self.measured, : self.count]
         if self.shifts:
             torque = np.asarray(self.learned.theta) @ rows[:, : len(self.learned.theta)]
             late = torque.reshape(self.nv, len(self.shifts), self.count).swapaxes(0, 1)
-            own = np.concatenate([own, late[:, self.measured]])
+            own[len(self.columns) :] = late[:, self.measured]
         own *= self.root[:, None]
         flat = own.reshape(len(own), -1)
-        lower = flat @ flat.T
-        return flat, lower
+        return flat, flat @ flat.T
+
+    @property
+    def _whole(self) -> bool:
+        """Whether all rows of the sampler count."""
+        return len(self.measured) == self.nv and not self.shifts
 
     def value(self, x: Float[np.ndarray, " n"]) -> float:
         """The objective."""
         self.evaluations += 1
         states = self.states(x)
-        rows = self.sampler.rows(states)
-        own, gram = self.gram(rows)
-        value, by_gram = self.objective(gram)
-        self._seen = _Seen(x.copy(), states, own, by_gram, rows)
+        self._seen = None
+        rows = self.sampler.rows(states, self._rows)
+        value, by_gram = self.objective(self.gram(rows)[1])
+        self._seen = _Seen(x.copy(), states, by_gram, rows)
         return value
 
     def _at(self, x: np.ndarray) -> _Seen:
@@ -160,24 +169,40 @@ class Problem:
     ) -> Float[np.ndarray, " n"]:
         """Its gradient; that of a sum where a further part has slopes by `torque_shares` and `distances`."""
         seen = self._at(x)
-        nv, columns, samples = seen.rows.shape
-        cotangent, theta = np.zeros((columns, nv, samples)), np.asarray(self.learned.theta)
-        by_rows = ((2.0 * seen.by_gram) @ seen.own).reshape(-1, len(self.measured), self.count) * self.root[:, None]
-        if len(self.measured) < nv:
-            by_own, by_rows = by_rows, np.zeros((len(by_rows), nv, self.count))
-            by_rows[:, self.measured] = by_own
-        cotangent[self.columns, :, : self.count] = by_rows[: len(self.columns)]
-        if self.shifts:
-            late = by_rows[len(self.columns) :].swapaxes(0, 1).reshape(nv, samples)
-            cotangent[: len(theta)] += late * theta[:, None, None]
-        if by_torque is not None:
-            cotangent[: len(theta), :, : self.count] += theta[:, None, None] * (by_torque / self.limits.torque).T
-        by_states = self.sampler.back(seen.states, cotangent.swapaxes(0, 1))
+        shares = None if by_torque is None else np.ascontiguousarray((by_torque / self.limits.torque).T)
+        by_rows = self._by_whole_rows(seen, shares) if self._whole else self._by_rows(seen, shares)
+        by_states = self.sampler.back(seen.states, by_rows.swapaxes(0, 1))
         if by_distance is not None:
             self.distances(x)
             assert self._near is not None
             by_states[0, : self.count] += self._near[2](by_distance / NEAR)
         return self.to_numbers(by_states)
+
+    def _by_whole_rows(self, seen: _Seen, by_torque: np.ndarray | None) -> Float[np.ndarray, "columns nv samples"]:
+        """Gradient by the sampler's rows, where all of them count: one product of what counts and of the torque."""
+        own, theta = self._own, np.asarray(self.learned.theta)
+        factor = np.zeros((len(self._cotangent), len(own)))
+        factor[self.columns, :-1] = 2.0 * seen.by_gram
+        own[-1] = 0.0 if by_torque is None else by_torque / self.root[:, None]
+        factor[: len(theta), -1] = theta
+        np.matmul(factor, own.reshape(len(own), -1), out=self._cotangent.reshape(len(factor), -1))
+        self._cotangent *= self.root[:, None]
+        return self._cotangent
+
+    def _by_rows(self, seen: _Seen, by_torque: np.ndarray | None) -> Float[np.ndarray, "columns nv samples"]:
+        """The same where some joints are not measured, or late torques are among what counts."""
+        cotangent, theta = np.zeros(self._cotangent.shape), np.asarray(self.learned.theta)
+        own = self._own[:-1].reshape(len(seen.by_gram), -1)
+        by_own = ((2.0 * seen.by_gram) @ own).reshape(-1, len(self.measured), self.count) * self.root[:, None]
+        by_rows = np.zeros((len(by_own), self.nv, self.count))
+        by_rows[:, self.measured] = by_own
+        cotangent[self.columns, :, : self.count] = by_rows[: len(self.columns)]
+        if self.shifts:
+            late = by_rows[len(self.columns) :].swapaxes(0, 1).reshape(self.nv, -1)
+            cotangent[: len(theta)] += late * theta[:, None, None]
+        if by_torque is not None:
+            cotangent[: len(theta), :, : self.count] += np.multiply.outer(theta, by_torque)
+        return cotangent
 
     def torque_shares(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "samples nv"]:
         """Torques as shares of their limits."""

@@ -12,7 +12,8 @@ from scipy.interpolate import make_interp_spline
 
 from ..errors import InputError
 from ..formats.collision import read_shapes
-from ..formats.config import Excite, Sight, SizedEffect, Task, robot_options
+from ..formats.config import Task, robot_options
+from ..formats.excite_keys import Excite, Sight, SizedEffect
 from ..formats.robotfile import load_extended, load_robot, stated_baseline
 from ..recordings.reading import read_table
 from ..rigid.model import RobotModel
@@ -28,7 +29,7 @@ __all__ = ["excite_task"]
 
 DEFAULT_NOISE = 0.01  # of the largest torque
 ONLY_NOISE = (
-    "the noise is that of the recordings; what they tell of the links is not counted, since either cause changes it"
+    "the noise is that of the recordings; what they say about the links is not counted, since either cause changes it"
 )
 
 
@@ -76,7 +77,7 @@ def excite_task(
     if task.data:
         from .known import with_recordings  # the machinery of fits, which a design without recordings does without
 
-        progress("what the recordings tell", 0.0)
+        progress("reading what is known", 0.0)
         after, texts = with_recordings(task, model.robot, known, learned, asked.noise is None)
         if separate or asked.objective == "separate":  # the causes were at work in the recordings too
             learned, texts = learned.with_noise(1 / np.sqrt(np.asarray(after.weight))), (*texts[:-1], ONLY_NOISE)

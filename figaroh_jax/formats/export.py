@@ -171,7 +171,7 @@ def _fields(effect: Effect) -> list[str]:
     others = [field.name for field in dataclasses.fields(effect) if field.name not in ("at", "memory", *known)]
     if others:
         raise InputError(
-            f"effect '{effect.name}' has a field '{others[0]}' that is no parameter; declare it with "
+            f"effect '{effect.name}' has a field '{others[0]}' that is not a parameter; declare it with "
             "`amplitude` or `shape`, or the model cannot be written"
         )
     return known

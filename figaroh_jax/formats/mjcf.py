@@ -320,9 +320,7 @@ def _joint(
     if kind == "spherical":
         last = mj.body_jntadr[mj.jnt_bodyid[j]] + mj.body_jntnum[mj.jnt_bodyid[j]] - 1
         if j != last:
-            raise InputError(
-                f"ball joint '{name}' stands before other joints of its body; give those a body of their own"
-            )
+            raise InputError(f"ball joint '{name}' comes before other joints of its body; give those their own body")
         return JointPart(name, kind, *ends, placement, np.zeros(3))
     axis = mj.jnt_axis[j]
     placement = placement @ displacement(kind, axis, -at_zero)

@@ -48,18 +48,18 @@ class _Loader(yaml.SafeLoader):
         if len(node.value) > LONGEST_NUMBER and node.tag in _NUMBERS:
             node.tag = "tag:yaml.org,2002:str"
         if any("\ud800" <= c <= "\udfff" for c in node.value):  # written as an escape
-            raise InputError(f"{_line(node)}: {node.value[:60]!a} holds half of a character, which is no text")
+            raise InputError(f"{_line(node)}: {node.value[:60]!a} ends in half a character")
         return node
 
     def construct_mapping(self, node, deep=False):
         if not isinstance(node, yaml.MappingNode):
-            raise InputError(f"{_line(node)}: the tag {node.tag} stands at something that has no keys")
+            raise InputError(f"{_line(node)}: the tag {node.tag} is on something that has no keys")
         seen: set[str] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 raise InputError(f"{_line(key)}: a key is a list or a mapping; a name is expected")
             if key.value in seen:
-                raise InputError(f"{_line(key)}: the key '{key.value}' stands there twice")
+                raise InputError(f"{_line(key)}: the key '{key.value}' appears twice")
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
@@ -73,7 +73,7 @@ def _expanded(node: yaml.Node, known: dict[int, tuple[int, int] | None]) -> tupl
     if id(node) in known:
         found = known[id(node)]
         if found is None:
-            raise InputError(f"{_line(node)}: an alias (`*`) stands inside of what it stands for")
+            raise InputError(f"{_line(node)}: an alias (`*`) is inside what it refers to")
         return found
     known[id(node)] = None
     children = node.value if isinstance(node, yaml.SequenceNode) else []

@@ -95,7 +95,7 @@ def _parts(stage: Stage, root: Root | None) -> tuple[list[LinkPart], list[JointP
     base, edges, beside = _tree(stage)
     if beside and root == "free_flyer":
         raise InputError(
-            f"root: free_flyer, but the bodies {', '.join(beside)} are welded to the world beside the base"
+            f"root: free_flyer, but the bodies {', '.join(beside)} are welded to the world as well as the base"
         )
     inside = [path for path in stage.bodies if path == base or any(path in edge.ends for edge in edges)]
     offset = {"": np.eye(4)} | {path: np.eye(4) for path in inside}
@@ -355,7 +355,7 @@ def _mimic(stage: Stage, edge: Edge, leaders: dict[str, Edge]) -> tuple[str, flo
         return None
     path, ratio, offset = found
     if path not in leaders:
-        raise InputError(f"joint '{edge.name}' mimics '{path}', which is no joint of the robot")
+        raise InputError(f"joint '{edge.name}' mimics '{path}', which is not a joint of the robot")
     leader = leaders[path]
     return leader.name, ratio, offset + _reference(stage, edge) - ratio * _reference(stage, leader)
 

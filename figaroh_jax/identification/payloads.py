@@ -131,8 +131,8 @@ def drive_gains(
     clearness = float(values[-1] / values[-2]) if nv > 1 else 0.0
     if clearness > CLEAR or abs(others[-1]) < 1e-9 * np.abs(others).max():
         raise InputError(
-            f"the payload does not tell the gains: smallest singular value {clearness:.2g} of the next; move the joints"
-            " more, or carry a heavier payload"
+            f"the payload does not determine the gains: smallest singular value {clearness:.2g} of the next; move the"
+            " joints more, or carry a heavier payload"
         )
     theta = np.zeros(len(base.names))
     theta[base.independent] = others[:-1] / others[-1]

@@ -357,7 +357,7 @@ def _kind(link: str) -> str:
         if any(word in own for word in _WORDS[kind]):
             return kind
     known = ", ".join(word for words in _WORDS.values() for word in words)
-    raise InputError(f"anthropometric: link '{link}' is no segment of the table; names hold one of {known}")
+    raise InputError(f"anthropometric: link '{link}' is not a segment of the table; names contain one of {known}")
 
 
 def _distal(robot: RobotModel, index: int) -> Float[np.ndarray, "3"] | None:

@@ -96,7 +96,7 @@ def balanced(
     posture within the limits is in balance.
     """
     if person.dof_names[:6] != PLATE:
-        raise InputError(f"balanced: '{person.name}' stands on no plate; `standing` makes the model of one who does")
+        raise InputError(f"balanced: '{person.name}' does not stand on a plate; `standing` makes a model that does")
     given = np.zeros(person.nv) if near is None else np.asarray(near, float)
     if given.shape != (person.nv,) or not np.isfinite(given).all():
         raise InputError(f"balanced: near has shape {given.shape}; ({person.nv},) finite numbers are expected")

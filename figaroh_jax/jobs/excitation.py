@@ -54,5 +54,5 @@ def ambiguous_pairs(folder: Path) -> list[tuple[Cause, Cause]]:
         size = {} if find(effect).inertial else size
         pairs += [((effect, tuple(at), size), (other["effect"], tuple(other["at"]), {})) for other in others]
     if not pairs:
-        raise InputError(f"--from {folder}: no cause of this diagnosis is ambiguous; there is nothing to tell apart")
+        raise InputError(f"--from {folder}: no cause of this diagnosis is ambiguous; there is nothing to resolve")
     return pairs

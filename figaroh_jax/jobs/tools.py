@@ -146,7 +146,7 @@ def list(args: argparse.Namespace) -> int:
     from ..reporting.side_by_side import comparison_text, list_runs
 
     if not args.folder.is_dir():
-        raise InputError(f"{args.folder} is no directory")
+        raise InputError(f"{args.folder} is not a directory")
     section = list_runs(args.folder)
     _print((section,), args.json, comparison_text([section]) if section.rows else f"no run below {args.folder}")
     return 0

@@ -197,7 +197,7 @@ def _numbers(x: ArrayLike, key: str, source: Memory) -> np.ndarray:
     try:
         return np.array(x, float)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{source}: {key} is no array of numbers: {error}") from None
+        raise InputError(f"{source}: {key} is not an array of numbers: {error}") from None
 
 
 def _check_columns(
@@ -229,7 +229,7 @@ def _check_pace(stamps: np.ndarray, source: Memory) -> None:
     if step > _SLOWEST:
         unit = next((unit for unit, factor in SECONDS.items() if step * factor <= 0.1), "ns")
         raise InputError(
-            f"{source}: one sample in {step:.4g} s is no record of a motion; stamps that look like {unit}:"
+            f"{source}: one sample in {step:.4g} s is too few for a motion; stamps that look like {unit}:"
             f' units={{"time": "{unit}"}}'
         )
 

@@ -48,7 +48,7 @@ def check_recordings(task: Task | None, model: RobotModel, recordings: Sequence[
     fitted = [recording for recording in recordings if recording.role == "fit"]
     if fitted and all(_stands(recording) for recording in fitted):
         names = ", ".join(recording.file.name for recording in fitted)
-        found.append((names, Finding(True, "no joint moves: a fit needs a motion of every joint that is to be told")))
+        found.append((names, Finding(True, "no joint moves: a fit needs motion of every joint that it is to identify")))
     return report_findings(found)
 
 
@@ -275,7 +275,7 @@ def _held_samples(look: Look) -> Iterator[Finding]:
     rate = (len(position) - 1) / (look.recording.time[-1] - look.recording.time[0])
     yield Finding(
         False,
-        f"every row stands there {times:.0f} times: the recording was held at about {rate / times:.4g} Hz, the stamps"
+        f"every row appears {times:.0f} times: the recording was held at about {rate / times:.4g} Hz, the stamps"
         f" say {rate:.4g} Hz; keep one row of each",
     )
 

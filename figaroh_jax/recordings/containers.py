@@ -158,7 +158,7 @@ def _arrow(file: Path, table: Any) -> Table:
     check_columns(file, len(names))
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise InputError(f"{file}: the column '{twice}' stands there twice")
+        raise InputError(f"{file}: the column '{twice}' appears twice")
 
     def read(name: str) -> np.ndarray:
         column = table.column(name)
@@ -242,7 +242,7 @@ def _info(folder: Path) -> dict[str, Any]:
         info = json.loads(path.read_text(encoding="utf-8"))
         version = str(info["codebase_version"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{path}: is no description of a LeRobot folder ({error!r})") from None
+        raise InputError(f"{path}: does not describe a LeRobot folder ({error!r})") from None
     if not version.startswith(("v2", "v3")):
         raise InputError(f"{path}: codebase_version is {version}; v2.0, v2.1 and v3.0 are read")
     return info

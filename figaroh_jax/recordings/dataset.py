@@ -91,7 +91,7 @@ def read_recordings(
     if rollouts:
         lacking = next((r for r in recordings if r.command is None), None)
         if lacking is not None:
-            raise InputError(f"{lacking.file}: a rollout needs `command`, what the drives were told at each sample")
+            raise InputError(f"{lacking.file}: a rollout needs `command`: the drives' setpoints at each sample")
         return recordings
     lacking = next((r for r in recordings if r.role == "fit" and r.torque is None), None)
     if lacking is not None:

@@ -141,7 +141,7 @@ def _unit_of_position(robot: RobotModel, reads: Sequence[Columns]) -> str:
         return "deg"
     raise Undecided(
         "unit",
-        f"{reads[0].file}: positions span {span:.3g}: rad or degrees? Neither limits nor torque tell; give --unit",
+        f"{reads[0].file}: positions span {span:.3g}: rad or degrees? Neither limits nor torque decide; give --unit",
     )
 
 
@@ -153,7 +153,7 @@ def _doubt_percent(reads: Sequence[Columns], unit: str | None) -> None:
             raise Undecided(
                 "unit",
                 f"{read.file}: positions reach {span:.3g}: LeRobot keeps degrees or, by default, a share of the range"
-                " of motion (-100 to 100), which no file tells; give --unit deg where they are degrees",
+                " of motion (-100 to 100), which no file confirms; give --unit deg where they are degrees",
             )
 
 
@@ -189,7 +189,7 @@ def _torques(robot: RobotModel, reads: Sequence[Columns]) -> tuple[list[float] |
     if not motions:
         return None, _without_torque(robot, reads)
     if without_sign(*(read.torque for read in reads if read.torque is not None)):
-        raise InputError(f"{reads[0].file}: no joint's torque changes its sign: an absolute value tells no direction")
+        raise InputError(f"{reads[0].file}: no joint's torque changes its sign: an absolute value has no direction")
     _order(robot, reads, motions)
     scales = [_scale(robot, motions, j) for j in range(robot.nv)]
     current = any(read.current for read in reads)
@@ -202,7 +202,7 @@ def _torques(robot: RobotModel, reads: Sequence[Columns]) -> tuple[list[float] |
         if open_joints:
             raise Undecided(
                 "constants",
-                f"{reads[0].file}: what holds the torque is no N m, and the motion does not tell the constants of"
+                f"{reads[0].file}: the torque columns are not in N m, and the motion does not show the constants of"
                 f" {', '.join(open_joints)}; those found: {_constants(names, scales)} N m a unit. Give all of them"
                 " by --constants (data sheet: torque constant times gear ratio), N m a unit in the order of the joints",
             )
@@ -219,7 +219,7 @@ def _torques(robot: RobotModel, reads: Sequence[Columns]) -> tuple[list[float] |
         )
     if not all(read.named for read in reads):
         told = [n for n, s in zip(names, scales, strict=True) if s.told]
-        said.append(f"no column names a joint; gravity or friction bear the order out at {', '.join(told) or 'none'}")
+        said.append(f"no column names a joint; gravity or friction confirm the order at {', '.join(told) or 'none'}")
     return ([-1.0 if n in turned else 1.0 for n in names] if turned else None), said
 
 
@@ -227,7 +227,7 @@ def _without_torque(robot: RobotModel, reads: Sequence[Columns]) -> list[str]:
     if any(read.command is None for read in reads):
         return ["the recordings hold no torque: neither diagnose nor identify can use them without"]
     said = [
-        f"{read.unsigned} never changes its sign, so it is no torque: left out" for read in reads[:1] if read.unsigned
+        f"{read.unsigned} never changes its sign, so it is not torque: left out" for read in reads[:1] if read.unsigned
     ]
     said.append("the recordings hold no torque: rollouts of the command")
     if not all(read.named for read in reads):

@@ -237,14 +237,14 @@ def _stamps(
         return np.arange(samples) / rate, entry | {"rate": rate}
     time = table.vector(clock, "time")
     if len(time) != samples or not (np.diff(time) > 0).all():
-        raise InputError(f"{table.file}: '{clock}' is no clock of the positions: it does not increase, or is shorter")
+        raise InputError(f"{table.file}: '{clock}' is not the positions' clock: it does not increase, or is shorter")
     step = float(np.median(np.diff(time)))
     unit = next((u for u, s in _CLOCKS.items() if _SLOW <= 1 / (step * s) <= _FAST), None)
     if unit is None:
         raise Undecided(
             "rate",
-            f"{table.file}: '{clock}' steps by {step:.4g}, which is no rate from {_SLOW:g} to {_FAST:g} Hz in s, ms, us"
-            " or ns; give --rate HZ",
+            f"{table.file}: '{clock}' steps by {step:.4g}, which is not a rate from {_SLOW:g} to {_FAST:g} Hz in s, ms,"
+            " us or ns; give --rate HZ",
         )
     return (time - time[0]) * _CLOCKS[unit], entry | {"time": clock} | (
         {"units": {"time": unit}} if unit != "s" else {}

@@ -42,8 +42,8 @@ KEYS: dict[str, str] = {
     "tool_pose": "nothing: `unknown: [tool_frame]` needs no first guess",
     "coeff_regularize": "nothing: priors have the size of what is unknown",
     "regularization_coefficient": "nothing: priors have the size of what is unknown",
-    "outlier_eps": "nothing: outliers are told by their own statistics and named",
-    "outlier_threshold": "nothing: outliers are told by their own statistics and named",
+    "outlier_eps": "nothing: outliers are found by their own statistics and named",
+    "outlier_threshold": "nothing: outliers are found by their own statistics and named",
     "tolerance": "nothing: of a solver",
     "max_iterations": "nothing: of a solver",
     "data_file": ".data[].file",
@@ -225,7 +225,7 @@ def _becomes(path: str) -> str:
     if known is not None and not set(words[:-1]) & {"variants", "custom", "environment", "optimal_configuration"}:
         return known
     if set(words) & set(_BRANCHES):
-        return "nothing: it is no part of a task"
+        return "nothing: it is not part of a task"
     return "NOT TRANSLATED: this key is not known"
 
 

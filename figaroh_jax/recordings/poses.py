@@ -234,5 +234,5 @@ def whole_numbers(values: np.ndarray, table: Any, key: str) -> np.ndarray:
     wrong = ~missing & (np.isinf(values) | (np.where(missing, 0.0, values) % 1 != 0))
     if wrong.any():
         row = int(np.argmax(wrong))
-        raise InputError(f"{table.file}: {key}, row {row} (from 0): {values[row]} is no whole number")
+        raise InputError(f"{table.file}: {key}, row {row} (from 0): {values[row]} is not a whole number")
     return np.where(missing, -1, values).astype(int)

@@ -72,7 +72,7 @@ class Table(NamedTuple):
         found = {name: int(match[1]) for name in self.names if (match := numbered.fullmatch(name))}
         twice = next((name for name in found if self.names.count(name) > 1), None)
         if twice is not None:
-            raise InputError(f"{self.file}: the column '{twice}' stands there twice")
+            raise InputError(f"{self.file}: the column '{twice}' appears twice")
         if not found:
             self._known(source, key)
         if len(found) != len(joints):

@@ -52,7 +52,7 @@ def read_text(file: Path, form: str | None = None) -> Table:
 
     def read(name: str) -> np.ndarray:
         if names.count(name) > 1:
-            raise InputError(f"{file}: the column '{name}' stands there twice")
+            raise InputError(f"{file}: the column '{name}' appears twice")
         column = names.index(name)
         return numbers[:, column] if column not in texts else _as_time(file, name, texts[column])
 
@@ -93,7 +93,7 @@ def _first_lines(file: Path) -> list[str]:
     try:
         return [line.decode("utf-8-sig").rstrip("\r\n") for line in lines if line]
     except UnicodeDecodeError as error:
-        raise InputError(f"{file}: its first lines are no text in UTF-8 ({error}); save it as UTF-8") from None
+        raise InputError(f"{file}: its first lines are not UTF-8 text ({error}); save it as UTF-8") from None
 
 
 def _cells(line: str, delimiter: str | None) -> list[str]:
@@ -155,7 +155,7 @@ def _decoded(file: Path, block: bytes) -> str:
     try:
         return block.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{file}: is no text in UTF-8 ({error}); save it as UTF-8") from None
+        raise InputError(f"{file}: is not UTF-8 text ({error}); save it as UTF-8") from None
 
 
 def _read(file: Path, layout: _Layout) -> tuple[Float[np.ndarray, "rows columns"], dict[int, list[str]]]:
@@ -172,7 +172,7 @@ def _read(file: Path, layout: _Layout) -> tuple[Float[np.ndarray, "rows columns"
         if share < 1.0 or len(parts) > 1:
             told(f"reading {file.name}", share)
     if not row:
-        raise InputError(f"{file} is not a table of numbers with a header line: no row stands below its header")
+        raise InputError(f"{file} is not a table of numbers with a header line: there is no row below its header")
     return np.concatenate(parts), texts
 
 

@@ -199,7 +199,7 @@ def summary_lines(found: Design | PostureDesign) -> list[str]:
         )
         lines.append(f"trajectory {k + 1}: largest use at 1 kHz: {used or 'no limits'}")
     for s in found.separated:
-        lines.append(f"{s.truth} is told from {s.rival} by {s.sigmas:.2g} standard deviations; {_times(s.repeats)}")
+        lines.append(f"{s.truth} and {s.rival} differ by {s.sigmas:.2g} standard deviations; {_times(s.repeats)}")
     return [*lines, *(f"Note: {note}" for note in found.notes)]
 
 

@@ -45,7 +45,7 @@ def read_provenance(folder: Path) -> dict[str, Any]:
             raise ValueError("keys are missing")
         words = [content["command"], content["task"], *content["options"]]
         if not all(isinstance(word, str) and "\0" not in word for word in words):
-            raise ValueError("command, task and options are no words")
+            raise ValueError("command, task and options are not strings")
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: what made this run cannot be read ({error}); name a run directory") from None
     return content

@@ -41,7 +41,7 @@ ROLLOUT_EFFECTS = {
         "MuJoCo (frictionloss), URDF (friction)",
     ),
     "rotor_inertia": RolloutEffect(
-        "rotor inertia", "The drive's inertia behind its gear, which the links do not have.", "-inertia a", "joint",
+        "rotor inertia", "The drive's own inertia, seen through its gear.", "-inertia a", "joint",
         {"inertia": "kg m2"}, "armature", 0.08, "the inertia of the links beyond the joint",
         "fast steps of {at} in several postures of the joints beyond it", "MuJoCo (armature)",
     ),
@@ -58,26 +58,26 @@ ROLLOUT_EFFECTS = {
         "the same motion of {at} with and without a known payload", _NONE,
     ),
     "joint_spring": RolloutEffect(
-        "joint spring", "A torque back to a rest position: a cable, a hose, a balancer.",
+        "joint spring", "A torque towards a rest position: a cable, a hose, a balancer.",
         "-stiffness (q - rest)", "joint", {"stiffness": "N m/rad", "rest": "rad"}, "stiffness", 3.0,
         "gravity, where the joint moves a little only",
         "{at} over its whole range, with the base turned if that can be",
         "MuJoCo (stiffness, springref)",
     ),
     "torque_offset": RolloutEffect(
-        "constant torque", "A torque that is always there: a pre-load, a drive's offset.", "-offset", "joint",
+        "constant torque", "A constant torque: a preload, or an offset of the drive.", "-offset", "joint",
         {"offset": "N m"}, "offset", 1.0, "an encoder's offset at a position servo",
         "{at} at several gains of its drive",
         "MuJoCo (a drive's constant bias)",
     ),
     "encoder_offset": RolloutEffect(
-        "encoder offset", "The encoder reads a constant beside the position.",
+        "encoder offset", "The encoder reads the position plus a constant.",
         "q_measured = q + offset", "joint",
         {"offset": "rad"}, "reading", 0.05, "a constant torque at a position servo",
         "a reference mark of {at}, or gravity in several postures", _NONE,
     ),
     "actuator_gain": RolloutEffect(
-        "drive gain", "The drive gives more or less torque than its gains say; looked for with `gains: free`.",
+        "drive gain", "The drive gives more or less torque than its gains say; considered only with `gains: free`.",
         "(1 + gain) kp (u - q) - kd v", "joint", {"gain": "1"}, "scale", 0.6,
         "all masses and frictions at once: gains and inertias scale together",
         "the same motion with {at} carrying a known mass", "MuJoCo (gainprm, biasprm)",
@@ -88,7 +88,7 @@ ROLLOUT_EFFECTS = {
         "positions that are stamped early", "steps of {at} that are small enough not to saturate its drive", _NONE,
     ),
     "actuator_saturation": RolloutEffect(
-        "torque limit", "The drive gives no more than a limit.", "clip(tau, -limit, limit)", "joint",
+        "torque limit", "The drive's torque is limited.", "clip(tau, -limit, limit)", "joint",
         {"limit": "N m"}, "force_limit", 5.0, "gentle motion, which never asks for as much",
         "steps of {at} of two sizes", "MuJoCo (forcerange), URDF (effort)",
     ),
@@ -100,14 +100,14 @@ ROLLOUT_EFFECTS = {
         "large steps of {at} in both directions", _NONE,
     ),
     "dead_band": RolloutEffect(
-        "drive dead band", "The drive gives no torque while the error is small, and less by as much beyond.",
+        "drive dead band", "The drive ignores errors within a band, and subtracts the band from larger ones.",
         "kp (e - clip(e, -band, band)), e = u - q", "joint", {"band": "rad"}, "dead_band", 0.05, "dry friction",
         "slow ramps of {at} of a few times the band", _NONE,
     ),
     "payload": RolloutEffect(
-        "payload", "A body that the model does not have, or has and the robot has not.",
+        "payload", "A body that the robot carries and the model lacks, or the other way round.",
         "a point mass at the link's centre of mass", "link", {"mass": "kg"}, "payload", 1.0,
-        "the gain of the drive: with `gains: free` the two are told as a pair",
+        "the gain of the drive: with `gains: free` the two are reported as a pair",
         "the same motion with and without what is fixed to {at}", "MuJoCo, URDF and every simulator: it is an inertia",
     ),
     "joint_elasticity": RolloutEffect(

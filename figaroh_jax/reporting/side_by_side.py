@@ -41,14 +41,11 @@ def compare_runs(folders: Sequence[Path], units: Sequence[str] | None = None) ->
     if units is not None and len(units) != len(folders):
         raise InputError(f"--units: {len(units)} labels for {len(folders)} runs; one for each is expected")
     if units is not None and len(folders) < 3:
-        raise InputError("--units: what differs between robots and days is told from three runs on")
+        raise InputError("--units: at least three runs are needed to compare robots and days")
     runs = [read_run(folder) for folder in folders]
     names = _names(folders)
     with as_written(" or ".join(map(str, folders))):
         return (*_sections(folders, runs, names), *_spread(runs, units))
-
-
-_PARAMETERS = "Parameters (± one standard deviation; * differs by more than 3)"
 
 
 def _sections(folders: Sequence[Path], runs: Sequence[dict[str, Any]], names: tuple[str, ...]) -> tuple[Section, ...]:

@@ -57,7 +57,7 @@ def verify(folder: Path, limits: Limits, *, write: bool = True) -> tuple[Check, 
 def read_run(folder: Path) -> dict[str, Any]:
     """`answer.json` and `result.json` of a run directory, under "answer" and "result" (None where there is none)."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: is no directory; name the directory of a run (--out of diagnose, identify, ...)")
+        raise InputError(f"{folder}: is not a directory; give that of a run (--out of diagnose, identify, ...)")
     found: dict[str, Any] = {}
     for key in ("answer", "result"):
         path = folder / f"{key}.json"
@@ -68,7 +68,7 @@ def read_run(folder: Path) -> dict[str, Any]:
         if found[key] is not None and not isinstance(found[key], dict):
             raise InputError(f"{path}: holds no object with keys, so no run wrote it")
     if found["answer"] is None and found["result"] is None:
-        raise InputError(f"{folder}: holds neither answer.json nor result.json, so it is no run directory")
+        raise InputError(f"{folder}: has neither answer.json nor result.json, so it is not a run directory")
     return found
 
 
@@ -78,7 +78,7 @@ def figures(run: dict[str, Any]) -> dict[str, Any]:
     causes = answer.get("causes") if run["answer"] else result.get("causes")
     verdict = answer.get("verdict", result.get("verdict") if "level" in result else None)
     if verdict is not None and not isinstance(verdict, str):
-        raise TypeError("the verdict is no text")
+        raise TypeError("the verdict is not a string")
     return {
         "verdict": verdict,
         "p_value": _finite(answer.get("p_value")),

@@ -48,7 +48,7 @@ class Fault(NamedTuple):
             return (
                 f"contact: {where}: {at} stand off the model's motion at once, the drives push by {self.size:.2g} N m"
             )
-        return f"contact: {where}: {at} stands against {self.size:.2g} N m more than its friction holds"
+        return f"contact: {where}: {at} is held against {self.size:.2g} N m more than its friction can hold"
 
 
 def faults(loop: Loop, runs: Sequence[Run], simulated: Sequence[np.ndarray]) -> list[Fault]:

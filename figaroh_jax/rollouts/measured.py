@@ -132,7 +132,7 @@ def rollout_data(
 
 def _run(loop: Loop, one: Recording) -> Run:
     if one.command is None:
-        raise InputError(f"{one.file} has no command: a rollout simulates what the drives were told")
+        raise InputError(f"{one.file} has no command: a rollout simulates the drives' setpoints")
     period, steps = regular(str(one.file), one.time), float(loop.dt)
     if abs(period / steps - round(period / steps)) > 1e-3:
         raise InputError(f"{one.file}: the period is {period:.6g} s, no multiple of the loop's step of {steps:.6g} s")

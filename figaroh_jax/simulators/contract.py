@@ -274,7 +274,7 @@ def announced(name: str) -> Any:  # type[Backend]: a protocol, which no run-time
     if not found:
         raise InputError(
             f"no backend '{name}' is installed; installed: {', '.join(names())}. Those of this library are installed "
-            f"with: pip install 'figaroh-jax[mujoco,mjx,pinocchio,newton,genesis]'; another one is a package with an "
+            f"with: pip install 'figaroh-jax[mujoco,mjx,pinocchio,newton,genesis]'; another needs a package with an "
             f"entry point '{name}' in the group '{GROUP}'"
         )
     try:

@@ -70,6 +70,6 @@ class FromTorques(Backend):
             return samples.restore(np.linalg.solve(self._masses(q), (tau - bias)[..., None])[..., 0])
         except np.linalg.LinAlgError:
             raise InputError(
-                f"robot '{self.robot.name}': a joint moves no mass, so no torque tells its acceleration; "
+                f"robot '{self.robot.name}': a joint moves no mass, so its torque does not determine its acceleration; "
                 "give its link an inertia"
             ) from None
