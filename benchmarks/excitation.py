@@ -861,15 +861,16 @@ def gpu(starts: int = 256, outer: int = 5, inner: int = 100, compared: int = 4) 
     )
 
 
-def peer(seeds: int = 20) -> None:
-    """FIGAROH's problem: information and condition number, warm."""
+def peer(seeds: int = 20, seed: int = 0) -> None:
+    """FIGAROH's problem: information and condition number, warm; so many seeds from `seed` on."""
     on_peer_problem(1)
-    many = [on_peer_problem(1, seed=seed) for seed in range(seeds)]
-    for seed, one in enumerate(many[:3]):
-        told(f"one start, seed {seed}", *one)
+    every = range(seed, seed + seeds)
+    many = [on_peer_problem(1, seed=own) for own in every]
+    for own, one in zip(every, many[:3], strict=False):
+        told(f"one start, seed {own}", *one)
     for starts in (1, 2, 3):
         if starts > 1:
-            many = [on_peer_problem(starts, seed=seed) for seed in range(seeds)]
+            many = [on_peer_problem(starts, seed=own) for own in every]
         logdet, cpu = (np.percentile(x, (25, 50, 75)) for x in zip(*((a.logdet, b) for a, b in many), strict=True))
         print(f"{seeds} seeds, {starts} starts, quartiles: logdet {np.round(logdet, 2)}, CPU s {np.round(cpu, 3)}")
     told("best of 32", *on_peer_problem(32))
