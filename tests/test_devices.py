@@ -6,6 +6,7 @@ import os
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import equinox as eqx
@@ -115,27 +116,45 @@ HOSTS = """
 import sys
 from pathlib import Path
 import jax, numpy as np
-from test_devices import States, condense_on_devices, tree_states
-jax.distributed.initialize(sys.argv[2], num_processes=2, process_id=int(sys.argv[3]))
-rows = tree_states(Path(sys.argv[1]))
+from test_devices import States, address, condense_on_devices, tree_states
+folder, number = Path(sys.argv[1]), int(sys.argv[2])
+jax.distributed.initialize(address(folder, number), num_processes=2, process_id=number)
+own = folder / str(number)  # both come here at once: a file written by both would be empty for one that reads it
+own.mkdir()
+rows = tree_states(own)
 pieces = list(rows.source())
-own = States(rows.model, lambda: pieces[:1] if sys.argv[3] == "0" else pieces[1:], rows.terms)
-np.save(Path(sys.argv[1]) / f"factor{sys.argv[3]}.npy", condense_on_devices(own).factor())
+own = States(rows.model, lambda: pieces[:1] if number == 0 else pieces[1:], rows.terms)
+np.save(folder / f"factor{number}.npy", condense_on_devices(own).factor())
 """
 
 
+def address(folder: Path, number: int) -> str:
+    """Where process 0 listens: it takes a free port at the last moment, and says which."""
+    told, patience = folder / "address", time.monotonic() + 200
+    if number == 0:
+        with socket.socket() as free:
+            free.bind(("localhost", 0))
+            (folder / "saying").write_text(f"localhost:{free.getsockname()[1]}")
+        (folder / "saying").rename(told)
+    while not told.exists():
+        assert time.monotonic() < patience, "process 0 has not said where it listens"
+        time.sleep(0.05)
+    return told.read_text()
+
+
 def test_two_processes_with_pieces_of_their_own_give_the_sums_of_one(tmp_path: Path):
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        address = f"localhost:{free.getsockname()[1]}"
     paths = os.pathsep.join([str(TESTS), str(TESTS.parent)])
     environment = os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"}
     rows = tree_states(tmp_path)
     # without the tests' programs: JAX takes one of the only process for a device that is another one's here
-    command = [sys.executable, "-c", HOSTS, str(tmp_path), address]
+    command = [sys.executable, "-c", HOSTS, str(tmp_path)]
     starts = {"env": environment, "stderr": subprocess.PIPE, "text": True}
     running = [subprocess.Popen([*command, str(k)], **starts) for k in range(2)]
-    said = [one.communicate(timeout=300)[1] for one in running]
+    try:
+        said = [one.communicate(timeout=300)[1] for one in running]
+    finally:
+        for one in running:
+            one.kill()
     assert [one.returncode for one in running] == [0, 0], said
     first, second = (np.load(tmp_path / f"factor{k}.npy") for k in range(2))
     np.testing.assert_array_equal(first, second)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import hashlib
 import json
 import os
 import re
@@ -27,6 +26,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ..errors import InputError
+from .marker import LARGEST, MARKER, altered, below, digest, marker_text, seal, synchronise, unchanged, written
 
 try:
     import fcntl
@@ -35,11 +35,9 @@ except ImportError:  # Windows
 
 __all__ = ["MARKER", "add_to_run", "check_directory", "refusals", "task_inputs", "whole_directory", "write_file"]
 
-MARKER = "figaroh-jax-run.json"
 _WORK = ".figaroh-jax-"  # prefix of the hidden folder in which a run is made
 _OWNER = "owner.json"  # in it, locked by the process that makes the run
 _ABANDONED = 60.0  # s, after which a hidden folder whose file says nothing belongs to nobody
-_LARGEST_MARKER = 1 << 20  # bytes
 _BEGINNING = 4096  # bytes of a file that are looked at
 _OLD_RUNS = ("answer.json", "result.json")  # what versions without a marker left
 _REFERENCES = re.compile(rb"""\b(?:file|filename)\s*=\s*["']([^"'\0]{1,1000})["']""")  # of an XML file to others
@@ -98,17 +96,17 @@ def add_to_run(folder: Path, name: str, text: str) -> None:
     """
     data = text.encode("utf-8")
     with refusals(folder):
-        files = _written(folder) if _exists(folder / MARKER) else None
+        files = written(folder) if _exists(folder / MARKER) else None
         path, known = folder / name, (files or {}).get(name)
-        if _exists(path) and (known is None or not _unchanged(path, known)):
+        if _exists(path) and (known is None or not unchanged(path, known)):
             raise InputError(f"{_shown(path)}: is there and was not written by this run; move it away")
         if files is None:
             _whole_file(path, data, replace=False)
             return
         if _exists(path):
             path.unlink()
-        files[name] = {"bytes": len(data), "sha256": _digest(data)}
-        _whole_file(folder / MARKER, _marker_text(files).encode(), replace=True)
+        files[name] = {"bytes": len(data), "sha256": digest(data)}
+        _whole_file(folder / MARKER, marker_text(files).encode(), replace=True)
         _whole_file(path, data, replace=False)
 
 
@@ -171,7 +169,7 @@ def _whole_file(path: Path, data: bytes, *, replace: bool) -> None:
 
 def _beside(name: str) -> str:
     """The name under which a file of this name is written first; short enough wherever the name itself is."""
-    return f"{_WORK}{_digest(os.fsencode(name))[:24]}"
+    return f"{_WORK}{digest(os.fsencode(name))[:24]}"
 
 
 def _linked(a: Path, b: Path) -> bool:
@@ -212,7 +210,7 @@ class _Work:
         """Put the new run in its place; the earlier one is then in `folder`, from where `clean` removes it."""
         assert self.folder is not None
         new, place = self.folder / "new", self.place
-        _seal(new)
+        seal(new)
         problem = _occupied(place)
         if problem is None:
             try:
@@ -307,7 +305,7 @@ def _sweep_one(folder: Path) -> None:
 
 def _content(owner: Path) -> dict[str, Any]:
     try:
-        content = json.loads(owner.read_bytes()[:_LARGEST_MARKER])
+        content = json.loads(owner.read_bytes()[:LARGEST])
     except (ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) and content.get("format") == 1 else {}
@@ -362,7 +360,7 @@ def _occupied(place: Path) -> str | None:
         return "is a mount point, which cannot be replaced; name a directory below it"
     names = sorted(os.listdir(place))
     if not names or MARKER in names:
-        return (_altered(place) if names else None) or _stood_in(place)
+        return (altered(place, _LEFT) if names else None) or _stood_in(place)
     shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
     if any(name in names for name in _OLD_RUNS):
         return (
@@ -381,102 +379,6 @@ def _stood_in(place: Path) -> str | None:
     return "is the working directory or above it; name a new directory, such as run1" if inside else None
 
 
-def _altered(place: Path) -> str | None:
-    """What in a run directory is not as the run wrote it."""
-    written = _written(place)
-    if written is None:
-        return f"its {MARKER} is damaged, so it is unknown which files the run wrote; choose another directory"
-    folders = {str(parent) for name in written for parent in PurePosixPath(name).parents}
-    for path in _below(place):
-        name = path.relative_to(place).as_posix()
-        info = path.lstat()
-        if name in _LEFT and stat.S_ISREG(info.st_mode):
-            continue
-        if name == MARKER or stat.S_ISDIR(info.st_mode) and name in folders:
-            continue
-        if name not in written:
-            return f"'{name}' was not written by the run that is there; move it away or name another directory"
-        if not _unchanged(path, written[name]):
-            return f"'{name}' was changed after the run wrote it; move it away or name another directory"
-    return None
-
-
-def _below(folder: Path) -> Iterator[Path]:
-    """Everything in a folder, links not followed, a folder before what is in it."""
-    for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
-        yield Path(entry.path)
-        if entry.is_dir(follow_symlinks=False):
-            yield from _below(Path(entry.path))
-
-
-def _written(place: Path) -> dict[str, Any] | None:
-    """The files that the marker lists, by name; None where it is not one that a run wrote."""
-    marker = place / MARKER
-    if not stat.S_ISREG(marker.lstat().st_mode) or marker.stat().st_size > _LARGEST_MARKER:
-        return None
-    try:
-        content = json.loads(marker.read_bytes())
-        files = content["files"]
-        own = content["format"] == 1 and content["sha256"] == _digest(_canonical(files))
-        good = all(
-            isinstance(name, str)
-            and not PurePosixPath(name).is_absolute()
-            and ".." not in PurePosixPath(name).parts
-            and set(entry) == {"bytes", "sha256"}
-            for name, entry in files.items()
-        )
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-        return None
-    return files if own and good else None
-
-
-def _canonical(files: dict[str, Any]) -> bytes:
-    return json.dumps(files, sort_keys=True).encode()
-
-
-def _digest(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
-
-
-def _file_digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _unchanged(path: Path, entry: dict[str, Any]) -> bool:
-    info = path.lstat()
-    plain = stat.S_ISREG(info.st_mode) and info.st_size == entry["bytes"]
-    return plain and _file_digest(path) == entry["sha256"]
-
-
-def _seal(new: Path) -> None:
-    """Write the marker of a finished run, and have everything on the disk before it takes its place."""
-    files = {
-        path.relative_to(new).as_posix(): {"bytes": path.stat().st_size, "sha256": _file_digest(path)}
-        for path in _below(new)
-        if not path.is_dir() and path != new / MARKER
-    }
-    (new / MARKER).write_text(_marker_text(files), encoding="utf-8")
-    for path in [*_below(new), new]:
-        _synchronise(path)
-
-
-def _marker_text(files: dict[str, Any]) -> str:
-    content = {"format": 1, "what": "files of this run; a directory that holds others is never replaced"}
-    content |= {"files": files, "sha256": _digest(_canonical(files))}
-    return json.dumps(content, indent=1) + "\n"
-
-
-def _synchronise(path: Path) -> None:
-    if path.is_dir() and sys.platform == "win32":
-        return  # folders cannot be opened there
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
 def _put(new: Path, place: Path) -> str | None:
     """Move the new run to its place; the earlier one, if any, stays beside `new`. Says what got in the way."""
     if not _exists(place) or not os.listdir(place):
@@ -488,7 +390,7 @@ def _put(new: Path, place: Path) -> str | None:
             raise
     elif not _exchange(new, place):
         _exchange_by_renames(new, place)
-    _synchronise(place.parent)
+    synchronise(place.parent)
     return None
 
 
@@ -544,16 +446,16 @@ def _restore(place: Path) -> None:
 def _remove_run(folder: Path, place: Path) -> None:
     """Remove an earlier run file by file, each only as it was written; what else turns up gets a name of its own."""
     with suppress(OSError):
-        written = _written(folder) or {}
-        for name in _LEFT if written else ():
+        files = written(folder) or {}
+        for name in _LEFT if files else ():
             (folder / name).unlink(missing_ok=True)
-        for name, entry in written.items():
+        for name, entry in files.items():
             path = folder / name
-            if _exists(path) and _unchanged(path, entry):
+            if _exists(path) and unchanged(path, entry):
                 path.unlink()
-        if written and {path.name for path in _below(folder) if not path.is_dir()} == {MARKER}:
+        if files and {path.name for path in below(folder) if not path.is_dir()} == {MARKER}:
             (folder / MARKER).unlink()
-        for path in sorted(_below(folder), reverse=True):
+        for path in sorted(below(folder), reverse=True):
             if path.is_dir() and not path.is_symlink():
                 with suppress(OSError):
                     path.rmdir()
