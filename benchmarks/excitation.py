@@ -264,6 +264,43 @@ def limits(robots: Sequence[str] = ("UR10e", "Panda"), seed: int = 0, starts: in
                 told(f"{name} {basis.kind} seed {own}", found, spent(since))
 
 
+def descents(robots: Sequence[str] = ("UR10e", "Panda"), seed: int = 5, starts: int = 24) -> None:
+    """All limits at once, five harmonics: where single random motions end, from within and then along the limits.
+
+    The Hessian of the first of both knows six steps, and three and 25 besides.
+    """
+    from figaroh_jax.excitation import interior
+    from figaroh_jax.excitation.information import learn
+    from figaroh_jax.excitation.limits import limits_of
+    from figaroh_jax.excitation.motions import fourier
+    from figaroh_jax.excitation.objectives import information_objective
+    from figaroh_jax.excitation.sampling import Sampler
+    from figaroh_jax.excitation.search import random_motion
+    from figaroh_jax.excitation.solvers import STEPS, Problem, polished, within
+
+    for name, remembered in itertools.product(robots, (6, 3, 25)):
+        interior.REMEMBERED = remembered
+        model = arms()[name]
+        learned, bounds = learn(model, trust=None), limits_of(model, acceleration=8.0)
+        sampler = Sampler(model, learned.terms, np.asarray(learned.width))
+        objective, kept = information_objective(np.asarray(learned.prior)), np.array(learned.independent)
+        problem = Problem(learned, sampler, objective, kept, fourier(5, 0.1, 10.0), bounds, None)
+        ends, since = [], time.process_time()
+        for k in range(starts):
+            before = problem.evaluations
+            x = within(problem, random_motion(problem, np.random.default_rng([seed, k])))
+            first, until = -learned.rank * problem.value(x), problem.evaluations
+            x = polished(problem, x, {}, STEPS)
+            ends.append((first, -learned.rank * problem.value(x), until - before, problem.evaluations - before))
+        one, two, evaluations, both = np.mean(ends, axis=0)
+        print(
+            f"{name}, {remembered} steps remembered: {starts} motions, log determinant {one:.2f} after"
+            f" {evaluations:.0f} evaluations, {two:.2f} (deviation {np.std([x[1] for x in ends]):.2f}) after"
+            f" {both:.0f}, {spent(since) / starts:.2f} CPU s each",
+            flush=True,
+        )
+
+
 def sequence() -> None:
     """Four motions one after another on FIGAROH's problem, weighted, with friction: worth how many repeats."""
     from figaroh_jax.excitation.design import excite, gram_of
@@ -861,15 +898,16 @@ def gpu(starts: int = 256, outer: int = 5, inner: int = 100, compared: int = 4) 
     )
 
 
-def peer(seeds: int = 20) -> None:
-    """FIGAROH's problem: information and condition number, warm."""
+def peer(seeds: int = 20, seed: int = 0) -> None:
+    """FIGAROH's problem: information and condition number, warm; so many seeds from `seed` on."""
     on_peer_problem(1)
-    many = [on_peer_problem(1, seed=seed) for seed in range(seeds)]
-    for seed, one in enumerate(many[:3]):
-        told(f"one start, seed {seed}", *one)
+    every = range(seed, seed + seeds)
+    many = [on_peer_problem(1, seed=own) for own in every]
+    for own, one in zip(every, many[:3], strict=False):
+        told(f"one start, seed {own}", *one)
     for starts in (1, 2, 3):
         if starts > 1:
-            many = [on_peer_problem(starts, seed=seed) for seed in range(seeds)]
+            many = [on_peer_problem(starts, seed=own) for own in every]
         logdet, cpu = (np.percentile(x, (25, 50, 75)) for x in zip(*((a.logdet, b) for a, b in many), strict=True))
         print(f"{seeds} seeds, {starts} starts, quartiles: logdet {np.round(logdet, 2)}, CPU s {np.round(cpu, 3)}")
     told("best of 32", *on_peer_problem(32))
@@ -882,6 +920,7 @@ PARTS = {
     "limits": limits,
     "clearance": clearance,
     "ipopt": ipopt,
+    "descents": descents,
     "sequence": sequence,
     "postures": postures,
     "fresh": fresh,

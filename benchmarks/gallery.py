@@ -107,8 +107,9 @@ ROBOTS = {
         "LGPL-3.0",
         "torque sensors at the joints at 200 Hz; one motion twice, another held out",
         hidden("kuka"),
-        "Offsets of the torque sensors differ between the motions, and the last joint's torque is hardly above its"
-        " noise: that is the rest at joints 0 and 6, which stays without a name.",
+        "What is named is position-dependent torque of unknown origin: it predicts the motion that was held out, but"
+        " the names are not vouched for. Offsets of the torque sensors differ between the motions: that is the rest at"
+        " joint 0.",
     ),
     "tiago": Robot(
         "PAL TIAGo, arm_1 to arm_4",

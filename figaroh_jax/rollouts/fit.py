@@ -25,7 +25,8 @@ _PAIR = 2
 _FEW = 12  # windows up to which starts and numbers always move together
 _MOSTLY = 0.5  # share of a step's gain from which the starts move alone, every other time
 _GROUPS, _REFITS = 6, 10  # of recordings that are left out, steps of each fit without one
-_SETTLED = 1e-5  # predicted share of the squares at which a fit without some recordings ends
+_SETTLED, _RESTING = 1e-5, 10.0  # predicted share of the squares at which a fit without some recordings ends
+_OF_GAIN = 0.02  # share of what a fit has gained that a step must promise, where it is asked how much it gains
 _CLOSE = 0.02  # predicted decrease of the sum of whitened squares at which a fit ends
 
 
@@ -62,18 +63,21 @@ def fit(
     lanes: int,
     iterations: int = _ITERATIONS,
     rough: float = 0.0,
+    below: float = np.inf,
 ) -> list[Fit]:
     """Fit each row of `theta` in the entries `free` names for it, from there and from the states `start`.
 
     `width` pads the number of free entries and `lanes` the number of rows that one program takes, so that one
-    compilation serves all fits. A fit ends where a step promises less than the share `rough` of the squares.
+    compilation serves all fits. A fit ends where a step promises less than the share `rough` of the squares, or less
+    than a fiftieth of what it has gained on the cost `below`.
     """
     start = start_of(data, len(theta)) if start is None else start
     lots = range(0, len(theta), lanes)
     found = []
     for lot in lots:
         rows = slice(lot, lot + lanes)
-        found += _Lanes(loop, table, data, theta[rows], free[rows], start[rows], width, lanes).run(iterations, rough)
+        mine = _Lanes(loop, table, data, theta[rows], free[rows], start[rows], width, lanes)
+        found += mine.run(iterations, rough, below)
     return found
 
 
@@ -112,7 +116,8 @@ class _Lanes:
         damping, active = np.full(count, 1e-3), np.arange(count)
         for _ in range(steps):
             made = {k: self.step(self.kept(now[k], k), k, damping[k]) for k in active}
-            active = np.array([k for k in active if made[k].gain > _SETTLED * cost[k]], int)
+            least = _SETTLED * cost * np.clip(cost / self.rows, 1.0, _RESTING)  # a large rest tells less of a number
+            active = np.array([k for k in active if made[k].gain > least[k]], int)
             if not len(active):
                 break
             starts = {k: np.where(self.left[k][0], self.start[k], made[k].start) for k in active}
@@ -141,21 +146,22 @@ class _Lanes:
         total = float(sums.cost.sum() + (prior**2).sum())
         return total if np.isfinite(total) and np.isfinite(sums.matrix).all() else np.inf
 
-    def run(self, iterations: int, rough: float) -> list[Fit]:
+    def run(self, iterations: int, rough: float, below: float = np.inf) -> list[Fit]:
         count = len(self.theta)
         everyone = np.arange(count)
         now = self.sums(everyone, self.theta, self.start)
         cost = [self.cost(s, x) for s, x in zip(now, self.start, strict=True)]
         damping, done = np.full(count, 1e-3), ~np.isfinite(cost)  # one that diverges has no derivative
-        alone = np.zeros(count, bool)
+        alone, worse = np.zeros(count, bool), np.zeros(count)
+        below = below if np.isfinite(below) else 0.0
         for _ in range(iterations):
             active = everyone[~done]
             if not len(active):
                 break
             steps = [self.step(now[k], k, damping[k]) for k in active]
             for k, step in zip(active, steps, strict=True):
-                least = max(_CLOSE * max(1.0, cost[k] / self.rows), rough * cost[k])
-                done[k] |= step.gain < least and damping[k] <= 1.0
+                least = max(_CLOSE * max(1.0, cost[k] / self.rows), rough * cost[k], _OF_GAIN * (below - cost[k]))
+                done[k] |= step.gain < least and (damping[k] <= 1.0 or (rough > 0 and worse[k] > 1))
             tried = [(k, step) for k, step in zip(active, steps, strict=True) if not done[k]]
             if not tried:
                 continue
@@ -175,10 +181,11 @@ class _Lanes:
                 new = self.cost(sums, step.start)
                 if new < cost[k]:
                     self.theta[k], self.start[k], now[k], damping[k] = step.theta, step.start, sums, damping[k] / 5
+                    worse[k] = 0
                     done[k] = cost[k] - new < 1e-7 * cost[k]
                     cost[k] = new
                 else:
-                    damping[k] = max(damping[k] * 6, 1e-6)
+                    damping[k], worse[k] = max(damping[k] * 6 * 2 ** worse[k], 1e-6), worse[k] + 1
                     done[k] = damping[k] > 1e8
         return [Fit(self.theta[k], self.free[k], self.start[k], cost[k], now[k], bool(done[k])) for k in everyone]
 
@@ -266,6 +273,27 @@ class System:
             change[keep] = np.linalg.lstsq(scaled, right[keep] / size, rcond=1e-12)[0] / size
         starts = inner[..., -1] - np.einsum("wip,p->wi", inner[..., :-1], change)
         return change, starts.T
+
+    def promises(self, subsets: Sequence[np.ndarray]) -> np.ndarray:
+        """`decrease` of the undamped step of the columns of each subset and of the windows' starts; others stay."""
+        schur, right = self.reduced(1e-6)
+        scale = 1e-6 * np.einsum("wii,ij->wij", self.hss, np.eye(self.hss.shape[1]))
+        own = float((self.gs * np.linalg.solve(self.hss + scale, self.gs[..., None])[..., 0]).sum())
+        found = np.full(len(subsets), own)
+        for k, one in enumerate(subsets):
+            keep = np.asarray(one)[np.diag(schur)[one] > 0]
+            if len(keep):
+                size = np.sqrt(np.diag(schur)[keep])
+                scaled = schur[np.ix_(keep, keep)] / np.outer(size, size) + 1e-12 * np.eye(len(keep))
+                found[k] += right[keep] / size @ np.linalg.lstsq(scaled, right[keep] / size, rcond=1e-12)[0]
+        return found
+
+    def reduced(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
+        """Matrix and right side of the parameters, the windows' starts solved for."""
+        hss = self.hss + damping * np.einsum("wii,ij->wij", self.hss, np.eye(self.hss.shape[1]))
+        inner = np.linalg.solve(hss, np.concatenate([np.swapaxes(self.hps, 1, 2), self.gs[..., None]], 2))
+        schur = self.hpp - np.einsum("wpi,wiq->pq", self.hps, inner[..., :-1])
+        return schur, self.gp - np.einsum("wpi,wi->p", self.hps, inner[..., -1])
 
     def decrease(self, change: np.ndarray, starts: np.ndarray) -> float:
         """Of the sum of squares, as the quadratic model promises it for a step."""

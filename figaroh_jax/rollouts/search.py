@@ -25,6 +25,7 @@ __all__ = [
     "Search",
     "Setting",
     "Tried",
+    "begins_of",
     "begun",
     "by_recording",
     "excess",
@@ -46,7 +47,8 @@ _CLEAR = 3.0  # t of a name beside which more than noise is left
 _MUCH = 0.25  # held-out gain of such a name, unless it is one that every joint has: less may stand in for the rest
 _SHORT = 6  # candidates that are fitted where a linear screening can order them
 _CHECKED = 3  # candidates whose held-out squares are those of fits without some recordings
-_ROOM = 24  # columns beside what is free that one linearisation takes
+_ROOM = 120  # columns beside what is free that one linearisation takes: each is a fiftieth of the first
+_LEAST_ROOM, _SUMS = 24, 2.5e7  # columns that it takes at least; numbers of its matrices by blocks of time
 _SHORTER = 4  # of one joint of an arm
 _GROUP = 25  # rows whose mean shows a slow misfit
 _MOST, _MOST_ONE = 6, 4  # causes, and where only a rest that is noise gives them a name
@@ -250,7 +252,7 @@ def search(
 
 def begun(here: Setting) -> Fit:
     """The baseline's fit."""
-    begins: Any = _begins(here, values(here.loop, here.known.table))
+    begins: Any = begins_of(here, values(here.loop, here.known.table))
     structure = Structure(here.loop, here.known.table, here.data)
     sizes: Any = {"width": here.width, "lanes": here.lanes}
     if len(begins) == 1:
@@ -263,7 +265,7 @@ def begun(here: Setting) -> Fit:
     return fit(*structure, best.theta[None], [here.baseline], best.start[None], **sizes)[0]
 
 
-def _begins(here: Setting, theta: np.ndarray) -> np.ndarray:
+def begins_of(here: Setting, theta: np.ndarray) -> np.ndarray:
     """Where the baseline's fit starts: at the model; where the gains are free, also stiffer and heavier."""
     gains = [k for k in here.baseline if here.known.table[k].name == "scale"]
     if not gains:
@@ -288,6 +290,7 @@ class Tried(NamedTuple):
     candidate: Candidate
     state: Model
     sse: np.ndarray  # held out, by blocks and windows; of an arm those of its fit, by joints too
+    alone: bool = True  # no other joint had a candidate in the same fit
 
 
 def _tried(here: Setting, now: Model, named: Sequence[Candidate], forbid: Sequence[str]) -> list[Tried]:
@@ -360,7 +363,8 @@ def scored(here: Setting, now: Model, left: Sequence[Candidate]) -> dict[int, tu
     Several candidates share one linearisation; a limit of a drive changes the model before it can be differentiated:
     each is linearised at one start of its own.
     """
-    room = max(here.width - len(now.free), _ROOM)
+    many = max(int(np.sqrt(_SUMS / now.fit.sums.cost[..., 0].size)) - len(now.free) - len(now.fit.start), _LEAST_ROOM)
+    room = max(here.width - len(now.free), min(many, _ROOM))
     limits = [k for k, c in enumerate(left) if c.effect in _LIMITS]
     packs, filled = [], 0
     for k in [k for k in range(len(left)) if k not in limits]:
@@ -392,13 +396,13 @@ def _scores(
     fits = fit(*now.structure, thetas, columns, start, width=width, lanes=here.lanes, iterations=0)
     scores: dict[int, tuple[float, np.ndarray]] = {}
     for one, (theta, pack) in zip(fits, lanes, strict=True):
-        for k in pack if np.isfinite(one.cost) else ():
-            mine = set(now.free) | set(left[k].entries)
-            fixed = np.array([entry < 0 or entry not in mine for entry in one.free])
-            system = System(one.sums, now.structure.data, one.start)
-            cost = one.cost - system.decrease(*system.solve(fixed, 1e-6))
-            if k not in scores or cost < scores[k][0]:
-                scores[k] = cost, theta
+        if not np.isfinite(one.cost):
+            continue
+        subsets = [np.flatnonzero(np.isin(one.free, [*now.free, *left[k].entries])) for k in pack]
+        promised = System(one.sums, now.structure.data, one.start).promises(subsets)
+        for k, promise in zip(pack, promised, strict=True):
+            if k not in scores or one.cost - promise < scores[k][0]:
+                scores[k] = one.cost - float(promise), theta
     return scores
 
 

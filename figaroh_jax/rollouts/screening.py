@@ -1,0 +1,344 @@
+"""What could be missing in an arm: candidates ranked by one linear step each, the best of every joint fitted.
+
+One linearisation of the arm ranks all that is linear; limits of drives and springs, which change the model before it
+can be differentiated, are ranked on the windows where their joint is off the most. Candidates of different joints share
+a fit, and a joint that is off by as much as when it was looked at last is not looked at again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from .causes import BASELINE, CONTAINS, Candidate, elastic_loop
+from .data import windows
+from .fit import Fit, fit
+from .parameters import Entry
+from .search import (
+    Model,
+    Setting,
+    Structure,
+    Tried,
+    by_recording,
+    excess,
+    free_entries,
+    largest_forces,
+    residuals,
+    scored,
+    settled,
+    start_values,
+)  # fmt: skip
+from .sensitivity import Windows
+
+__all__ = ["LATE", "ROUGH", "Known", "Standing", "excess_of", "joint_of", "joint_of_entry", "outputs", "tried_now"]
+
+LATE, ROUGH = 30, 1e-4  # iterations; share of the squares that a step must promise
+_EARLY = 3  # iterations of each candidate
+_USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
+_MOST = 6  # causes of a joint
+_TOP, _RACE = 3, 2  # candidates of a joint that are fitted, and that are fitted to the end
+_PART = 3  # of the windows, one in so many shows whether a limit or a spring is worth a fit
+_HOPE = 0.1  # share of a joint's squares that a cause must promise where it must take `_MUCH` in the end
+_SAME = 0.02  # change of a joint's squares below which nothing new is looked for there
+_WINS = 0.45  # share of the best gain after a few steps from which a candidate may still be named
+_ALL = 1.1  # squares of a sample up to which nothing is left to explain by a spring
+_MORE = 1.02  # of the promise of a simpler cause, which a richer one must exceed to be fitted
+_LIMITS = ("actuator_saturation", "voltage_saturation")
+_STILL = ("encoder_offset", "torque_offset", "joint_spring")  # of one joint: each makes up for the others
+_ELASTIC = ("joint_elasticity", "backlash")
+_SHARES = (0.005, 0.05, 0.3)  # twists of a spring under the largest torque, rad or m
+_OF_DRIVE = ("scale", "delay", "dead_band", "voltage", "force_limit")
+
+
+class Standing(NamedTuple):
+    """The model that stands, its squares and those held out by outputs, and how far it is from noise by joint."""
+
+    model: Model
+    squares: np.ndarray  # (blocks, windows, joints)
+    held: np.ndarray  # the same, of fits without some recordings or quarters
+    excess: np.ndarray  # (joints,)
+
+
+class _Seen(NamedTuple):
+    """What was tried at a joint, when its squares were so large, and what held-out rows have refused since."""
+
+    squares: float
+    tried: list[Tried]
+    refused: list[Candidate]
+
+
+Known = dict[int, _Seen]
+
+
+class _Ranked(NamedTuple):
+    """A candidate with the decrease of the squares that one linear step promises."""
+
+    promise: float
+    structure: Structure
+    candidate: Candidate
+    theta: np.ndarray
+
+
+def tried_now(
+    here: Setting, now: Standing, named: Sequence[Candidate], forbid: Sequence[str], known: Known
+) -> list[Tried]:
+    """The candidates that one linear step promises most at each joint that is open, fitted.
+
+    Where a joint is off by as much as when it was looked at last, what was found then stands.
+    """
+    model, n = now.model, here.loop.robot.nv
+    rigid = model.structure.loop.robot.nv == n
+    open_joints = [j for j in range(n) if now.excess[j] >= 1.0] or list(range(n))
+    sizes = {-1: float(now.squares.sum())} | {j: float(now.squares[..., j].sum()) for j in range(n)}
+    same = {j for j, one in known.items() if abs(one.squares - sizes[j]) < _SAME * sizes[j]}
+    stands = [one._replace(alone=False) for j in sorted(same) if j < 0 or j in open_joints for one in known[j].tried]
+    open_joints = [j for j in open_joints if j not in same]
+    if not open_joints:
+        return stands
+    used = {(c.effect, c.at) for c in named}
+    still = {c.at for c in named if c.effect in _STILL}
+    count = {at: sum(c.at == at for c in named) for at in {c.at for c in named}}
+    left = [
+        c for c in here.known.candidates
+        if (c.effect, c.at) not in used and not set(c.entries) <= set(model.free)
+        and not (c.effect in _STILL and c.at in still) and count.get(c.at, 0) < _MOST
+        and ((joint_of(here, c) < 0 and -1 not in same) or joint_of(here, c) in open_joints)
+    ]  # fmt: skip
+    own, cost = now.squares.sum((0, 1)), model.fit.cost
+    plain = [c for c in left if c.effect not in _LIMITS]
+    best: dict[int, list[_Ranked]] = {}
+    for k, (score, theta) in scored(here, model, plain).items():
+        best.setdefault(joint_of(here, plain[k]), []).append(_Ranked(cost - score, model.structure, plain[k], theta))
+    for j in open_joints:
+        common = [one for one in best.get(j, []) if one.candidate.effect in BASELINE and one.promise > _USUAL * own[j]]
+        if common and now.excess[j] >= 1.0:  # nothing that few joints have can come before it
+            best[j] = [max(common, key=lambda one: one.promise)]
+            continue
+        best.setdefault(j, []).extend(_limits_and_springs(here, now, left, best.get(j, []), j, rigid, forbid))
+    hopeful: dict[int, list[_Ranked]] = {}
+    for j, ones in best.items():
+        ranked = sorted(ones, key=lambda one: -one.promise)
+        ranked = [one for k, one in enumerate(ranked) if all(one[2] is not other[2] for other in ranked[:k])]
+        ranked = [one for one in ranked if not _no_more(one, ranked)]
+        least = (_HOPE if by_recording(here) and now.excess.max() >= 1.0 else 0.0) * own[j]
+        enough = [one for one in ranked if j < 0 or one.promise > least or one.candidate.effect in BASELINE]
+        usual = [one for one in enough if one.candidate.effect in BASELINE][:1]  # may come before what promises more
+        rest = [one for one in enough if all(one is not x for x in usual)]
+        hopeful[j] = [*usual, *rest][: _TOP if j >= 0 else 1]
+    found = _fitted(here, now, hopeful)
+    for j in (-1, *open_joints) if -1 not in same else open_joints:
+        known[j] = _Seen(sizes[j], [one for one in found if joint_of(here, one.candidate) == j], [])
+    return stands + found
+
+
+def _limits_and_springs(
+    here: Setting, now: Standing, left: Sequence[Candidate], plain: Sequence[_Ranked], joint: int, rigid: bool,
+    forbid: Sequence[str],
+) -> list[_Ranked]:  # fmt: skip
+    """What changes the model before it can be differentiated, ranked on the windows where the joint is off the most."""
+    (part, share, _), model = _part(now, joint), now.model
+    mine = [c for c in left if joint_of(here, c) == joint]
+    leader = max(plain, key=lambda one: one.promise, default=None)
+    chosen = [c for c in mine if c.effect in _LIMITS or (leader is not None and c is leader.candidate)]
+    scores = {chosen[k].effect: (part.fit.cost - x, theta) for k, (x, theta) in scored(here, part, chosen).items()}
+    if leader is not None and scores.get(leader.candidate.effect, (0.0, None))[0] > 0:
+        share = leader.promise / scores[leader.candidate.effect][0]  # as much more as the same cause promises in all
+    found = [
+        _Ranked(scores[c.effect][0] * share, model.structure, c, scores[c.effect][1])
+        for c in chosen if c.effect in _LIMITS and c.effect in scores
+    ]  # fmt: skip
+    most = max((one.promise for one in [*plain, *found]), default=0.0)
+    if rigid and now.excess.max() >= 1.0 and now.squares[..., joint].sum() - most > _ALL * _rows(here, joint):
+        found += [one._replace(promise=one.promise * share) for one in _sprung(here, now, joint, forbid)]
+    return found
+
+
+def _part(now: Standing, joint: int) -> tuple[Model, float, np.ndarray]:
+    """The model on the windows where a joint is off the most, how much more it is off in all, and which they are."""
+    structure, one = now.model.structure, now.model.fit
+    own = now.squares[..., joint].sum(0)
+    which = np.sort(np.argsort(own)[::-1][: -(-len(own) // _PART)])
+    data = _only(structure.data, which)
+    start = one.start[:, which]
+    prior = (start - data.start) * data.precision
+    cost = float(one.sums.cost[:, which].sum() + (prior**2).sum())
+    sums = type(one.sums)(*(np.asarray(x)[:, which] for x in one.sums))  # pyright: ignore[reportArgumentType]
+    part = now.model._replace(
+        structure=structure._replace(data=data), fit=one._replace(start=start, cost=cost, sums=sums)
+    )
+    return part, float(own.sum() / max(own[which].sum(), 1e-300)), which
+
+
+def _only(data: Windows, which: np.ndarray) -> Windows:
+    """Some of the windows."""
+    return jax.tree.map(lambda x: np.asarray(x)[..., which], data)
+
+
+def _rows(here: Setting, joint: int) -> int:
+    """Samples of a joint that count."""
+    column = here.loop.measured.index(joint)
+    return int((np.asarray(here.data.weight)[:, column :: len(here.loop.measured)] > 0).sum())
+
+
+def _no_more(one: _Ranked, ranked: Sequence[_Ranked]) -> bool:
+    """Whether a candidate promises hardly more than one that it contains."""
+    simple = CONTAINS.get(one.candidate.effect, ())
+    return any(other.candidate.effect in simple and one.promise < _MORE * other.promise for other in ranked)
+
+
+def _fitted(here: Setting, now: Standing, hopeful: dict[int, list[_Ranked]]) -> list[Tried]:
+    """Candidates of all joints: a few steps of each, then those that may win to the end.
+
+    One of each joint share a fit, for each joint's encoder judges its own: what another joint lacks hardly moves it.
+    """
+    early: dict[int, list[tuple[float, _Ranked, np.ndarray]]] = {}
+    lists = {j: [one for each in ones for one in _from_starts(each)] for j, ones in hopeful.items()}
+    for one in _all_in_lanes(here, now, lists, _EARLY, 0.0):
+        early.setdefault(one.joint, []).append((one.own, one.ranked, one.fit.theta))
+    leaders: dict[int, list[tuple[_Ranked, np.ndarray]]] = {}
+    for j, ones in early.items():
+        before = now.squares[..., j].sum() if j >= 0 else now.squares.sum()
+        ordered = sorted(ones, key=lambda x: x[0])
+        ordered = [x for k, x in enumerate(ordered) if all(x[1].candidate is not y[1].candidate for y in ordered[:k])]
+        near = [x for x in ordered if before - x[0] > _WINS * (before - ordered[0][0])]
+        leaders[j] = [(x[1], x[2]) for x in near[:_RACE]]
+    found = []
+    for one in _all_in_lanes(here, now, leaders, LATE, now.model.fit.cost):
+        c, beyond = one.ranked.candidate, excess_of(here, one.ranked.structure, one.fit)
+        own = float(beyond.max() if one.joint < 0 else beyond[one.joint])
+        state = Model(one.ranked.structure, one.fit, one.free, own)
+        sse = outputs(here, one.fit.sums.cost)
+        if not one.alone:
+            mine, sse = sse[..., one.joint], now.squares.copy()
+            sse[..., one.joint] = mine
+        found.append(Tried(c, state, sse, one.alone))
+    return found
+
+
+class _OneOf(NamedTuple):
+    """A candidate of a fit, with the squares of its own joint."""
+
+    joint: int
+    own: float
+    ranked: _Ranked
+    fit: Fit
+    free: tuple[int, ...]
+    alone: bool
+
+
+def _from_starts(one: _Ranked) -> list[tuple[_Ranked, np.ndarray]]:
+    """A candidate with the numbers from which its fit starts, once for each start."""
+    c = one.candidate
+    return [(one, x) for x in ([one.theta] if c.elastic or not c.starts or c.effect in _LIMITS else
+                               [start_values(one.theta, c, start) for start in c.starts])]  # fmt: skip
+
+
+def _all_in_lanes(
+    here: Setting, now: Standing, lists: dict[int, list[tuple[_Ranked, np.ndarray]]], most: int, below: float
+) -> list[_OneOf]:
+    """Every candidate of the lists fitted, the first of each joint together, then the second ones, and so on.
+
+    A spring changes the structure, a payload shows at several joints, a limit may hold up the steps of the others:
+    these are fitted by themselves.
+    """
+    lonely = lambda c: c.elastic or c.effect in _LIMITS or c.effect == "payload"  # noqa: E731
+    single = [(j, *one) for j, ones in lists.items() for one in ones if lonely(one[0].candidate)]
+    plain = {j: [one for one in ones if not lonely(one[0].candidate)] for j, ones in lists.items() if j >= 0}
+    lanes = [[(j, *ones[m]) for j, ones in plain.items() if m < len(ones)]
+             for m in range(max((len(ones) for ones in plain.values()), default=0))]  # fmt: skip
+    found, queue = [], [*lanes, *([one] for one in single)]
+    while queue:
+        lane = queue.pop(0)
+        structure, theta, free = lane[0][1].structure, lane[0][2].copy(), list(now.model.free)
+        for j, ranked, begin in lane:
+            mine = list(ranked.candidate.entries)
+            if len(lane) == 1:
+                theta = begin.copy()
+            own = [*mine, *(k for k in free if joint_of_entry(here, k) == j)]
+            theta[own], free = begin[own], free_entries(free, mine)
+        start = _start_of(now, structure)
+        one = fit(*structure, theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
+                  iterations=most, rough=ROUGH / 10, below=below or np.inf)[0]  # fmt: skip
+        if not np.isfinite(one.cost):  # one of them diverges: each by itself
+            queue += [[x] for x in lane] if len(lane) > 1 else []
+            continue
+        squares = outputs(here, one.sums.cost)
+        for j, ranked, _ in lane:
+            own = float(squares[..., j].sum() if j >= 0 else squares.sum())
+            found.append(_OneOf(j, own, ranked, one, tuple(free), len(lane) == 1))
+    return found
+
+
+def _start_of(now: Standing, structure: Structure) -> np.ndarray:
+    """The states at the windows' starts, in a structure that may have a spring more."""
+    start, n = now.model.fit.start, now.model.structure.loop.robot.nv
+    more = structure.loop.robot.nv - n
+    zero = np.zeros((more, start.shape[1]))
+    return np.concatenate([start[:n], zero, start[n:], zero]) if more else start
+
+
+def _sprung(here: Setting, now: Standing, joint: int, forbid: Sequence[str]) -> list[_Ranked]:
+    """A spring, and a spring with play, between motor and link of a joint."""
+    wanted = [name for name in _ELASTIC if name not in forbid]
+    forces, name = largest_forces(here.loop, here.runs), here.loop.robot.dof_names[joint]
+    way = np.abs(np.asarray(here.loop.drives.transmission))[:, joint]
+    torque = float(max((way * forces).max(initial=0.0), 1e-6))
+    if not wanted or not np.isfinite(torque):
+        return []
+    loop = elastic_loop(here.loop, joint, 10.0 * torque, 0.01 * torque)
+    n, k = here.loop.robot.nv, len(here.known.table)
+    table = (*here.known.table, *(Entry(x, (n,)) for x in ("stiffness", "damping", "play")))
+    structure = Structure(loop, table, windows(loop, here.runs, here.stretches, here.noise, here.block))
+    part, _, which = _part(now, joint)
+    small = structure._replace(data=_only(structure.data, which))
+    start = _start_of(now, structure)[:, which]
+    found = []
+    for effect in wanted:
+        entries, reported = (k, k + 1), ("stiffness", "damping")
+        if effect == "backlash":
+            entries, reported = (k, k + 1, k + 2), (*reported, "width")
+        c = Candidate(effect, (name,), entries, (), reported, True)
+        for share in _SHARES:
+            play = 0.0 if effect == "joint_elasticity" else 0.1 * share
+            theta = np.concatenate([now.model.fit.theta, [torque / share, 0.002 * torque / share, play]])
+            score = settled(here, small, theta, free_entries(now.model.free, entries), start)
+            found.append(_Ranked(part.fit.cost - score, structure, c, theta))
+    return found
+
+
+def outputs(here: Setting, squares: Any) -> np.ndarray:
+    """Squares by outputs as squares by joints of the robot: rates go with their positions."""
+    places, count = list(here.loop.measured), len(here.loop.measured)
+    found = np.zeros((*squares.shape[:2], here.loop.robot.nv))
+    for first in range(0, squares.shape[2], count):
+        found[..., places] += squares[..., first : first + count]
+    return found
+
+
+def excess_of(here: Setting, structure: Structure, one: Fit) -> np.ndarray:
+    """How far each joint's residual is above noise."""
+    error, weight = residuals(structure, one), np.asarray(structure.data.weight)
+    count, found = len(here.loop.measured), np.zeros(here.loop.robot.nv)
+    for k, place in enumerate(here.loop.measured):
+        mine = slice(k, None, count)
+        found[place] = excess(error[:, mine], weight[:, mine]) if (weight[:, mine] > 0).any() else 0.0
+    return found
+
+
+def joint_of(here: Setting, c: Candidate) -> int:
+    """The joint whose encoder shows a cause; -1: those of several."""
+    return -1 if c.effect == "payload" else here.loop.robot.dof_names.index(c.at[0])
+
+
+def joint_of_entry(here: Setting, entry: int) -> int:
+    """The joint whose encoder shows a number of the table; -1: those of several."""
+    one = here.known.table[entry] if entry < len(here.known.table) else None
+    if one is None or len(one.at) != 1 or one.name == "payload":
+        return -1
+    (place,) = one.at
+    if one.name in _OF_DRIVE:
+        return int(np.argmax(np.abs(np.asarray(here.loop.drives.transmission)[place])))
+    return place
