@@ -72,6 +72,7 @@ def test_the_run_holds_the_motion_at_1_khz_with_its_torques_and_a_joint_trajecto
         ("noise: -1", "more than 0"),
         ("limits: {velocity: 0.0}", "excite.limits.velocity is 0.0, expected 'model', more than 0 or keys and values"),
         ("limits: {position: {turn: [1, a]}}", "excite.limits.position.turn[1] is 'a', expected a number"),
+        ("basis: {fourier: 2.5}", "excite.basis.fourier is 2.5, expected a whole number"),
         ("limits: {torque: true}", "excite.limits.torque is True, expected 'model', a number or keys and values"),
     ],
 )
