@@ -15,11 +15,11 @@ from figaroh_jax.rollouts.alone import alone, carried_by, separable
 from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.data import Run, Stretch, windows
 from figaroh_jax.rollouts.faults import faults, without
-from figaroh_jax.rollouts.fit import standard_errors
+from figaroh_jax.rollouts.fit import System, standard_errors
 from figaroh_jax.rollouts.parameters import Entry
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.search import begun, setting
-from figaroh_jax.rollouts.sensitivity import predicted
+from figaroh_jax.rollouts.sensitivity import Sums, Windows, predicted
 
 ROWS = 400
 
@@ -111,6 +111,26 @@ def test_an_arm_gets_no_wrong_name(tmp_path: Path, hidden: list):
     told = {(n.candidate.effect, n.candidate.at[0]) for n in found.named}
     assert not found.faults
     assert told <= {(effect, servo_arm6.NAMES[joint]) for effect, joint, _ in hidden}
+
+
+def test_one_linear_step_promises_what_least_squares_gives():
+    """Numbers of all windows and the states at each window's start; columns that are left out stay where they are."""
+    rng, numbers, states, windows_, rows = np.random.default_rng(5), 4, 2, 3, 30
+    slope = rng.normal(size=(windows_, rows, numbers + states))
+    error = rng.normal(size=(windows_, rows)) + slope[:, :, 0] - 0.5 * slope[:, :, 2]
+    gradient, matrix = np.einsum("wrc,wr->wc", slope, error), np.einsum("wrc,wrd->wcd", slope, slope)
+    sums = Sums((error**2).sum(1)[None, :, None], gradient[None], matrix[None])  # pyright: ignore[reportArgumentType]
+    nothing = np.zeros((states, windows_))
+    data = Windows(None, None, None, nothing, nothing, None, 1, 0, rows)
+    subsets = [np.arange(numbers), np.array([0]), np.array([2, 3]), np.array([], int)]
+    promised = System(sums, data, nothing).promises(subsets)
+    for subset, promise in zip(subsets, promised, strict=True):
+        own = [np.zeros((windows_, rows, states)) for _ in range(windows_)]
+        for k in range(windows_):
+            own[k][k] = slope[k, :, numbers:]
+        columns = np.concatenate([slope[:, :, subset], *own], 2).reshape(windows_ * rows, -1)
+        left = error.ravel() - columns @ np.linalg.lstsq(columns, error.ravel(), rcond=None)[0]
+        assert promise == pytest.approx((error**2).sum() - (left**2).sum(), rel=1e-4)
 
 
 SWING = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/><worldbody>

@@ -219,6 +219,7 @@ def _searched(
     kept = first.search.found[:taken]
     step = with_causes(here.problem, here.start, [f.effect for f in kept], here.whitening)
     begun = first.search._replace(problem=here.problem, start=here.start, step=step, found=kept)
+    del first  # its rows and columns are large
     return ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun))
 
 

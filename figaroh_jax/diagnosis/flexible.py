@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..effects.base import Motion
 from ..estimation.noise import Spectrum
-from ..estimation.rows import Rows, fit, with_columns
+from ..estimation.rows import Rows, fit
 from ..recordings.stacked import filtered_rows
 from ..results import Dependence, Name
 from .bank import Columns
@@ -52,10 +52,23 @@ def friction_width(problem: Problem, state: State, whitening: Float[np.ndarray, 
     A joint keeps a width of zero unless another lowers the squares by more than `WIDTH_GAIN`. Smooth functions of
     position and time stand beside, so that the width does not make up for a cause that is not in yet.
     """
-    rows = with_columns(whitened(problem, state, whitening), _smooth_columns(problem, state, whitening))
-    prior = state.prior.extended(rows.X.shape[2] - len(state.theta))
-    X, y = rows.X.reshape(-1, rows.X.shape[-1]), rows.y.reshape(-1)
-    G, b = X.T @ X + np.diag(prior.precision), X.T @ y + prior.precision * prior.mean
+    rows, smooth = whitened(problem, state, whitening), _smooth_rows(problem, state, whitening)
+    (nv, _, P), k = rows.X.shape, smooth.shape[2]
+    prior = state.prior.extended(nv * k)
+
+    def columns(joint: int, z: Float[np.ndarray, "rows T"]) -> Float[np.ndarray, "rows P+"]:
+        """Products with all columns of rows of one joint, where only its own smooth functions are not zero."""
+        out = np.zeros((len(z), P + nv * k))
+        out[:, :P], out[:, P + joint * k : P + (joint + 1) * k] = z @ rows.X[joint], z @ smooth[joint]
+        return out
+
+    G, b = np.diag(prior.precision), prior.precision * prior.mean
+    for joint, (X, S, y) in enumerate(zip(rows.X, smooth, rows.y, strict=True)):
+        own = slice(P + joint * k, P + (joint + 1) * k)
+        G[:P, :P] += X.T @ X
+        G[own] += columns(joint, S.T)
+        G[:P, own] = G[own, :P].T
+        b += columns(joint, y[None])[0]
     width = np.array(problem.width)
     signs = [_with_width(problem, state, whitening, w) for w in WIDTHS]
     for joint in range(problem.model.nv):
@@ -63,28 +76,28 @@ def friction_width(problem: Problem, state: State, whitening: Float[np.ndarray, 
         if column is None:
             continue
         tried = [rows_of_width[joint] for rows_of_width in signs]
-        costs = [_replaced(G, b, column, z @ rows.X[joint], z @ z, z @ rows.y[joint])[0] for z in tried]
+        crossed = columns(joint, np.stack(tried))
+        costs = [_replaced(G, b, column, c, z @ z, z @ rows.y[joint])[0] for z, c in zip(tried, crossed, strict=True)]
         best = int(np.argmin(np.array(costs) - WIDTH_GAIN * (np.array(WIDTHS) == 0)))
         width[joint] = WIDTHS[best]
         z = tried[best]
-        G, b = _replaced(G, b, column, z @ rows.X[joint], z @ z, z @ rows.y[joint])[1:]
+        G, b = _replaced(G, b, column, crossed[best], z @ z, z @ rows.y[joint])[1:]
         rows.X[joint, :, column] = z
     return problem if np.array_equal(width, problem.width) else problem.with_width(width)
 
 
-def _smooth_columns(
+def _smooth_rows(
     problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]
-) -> Float[np.ndarray, "nv T columns"]:
-    """Position, time, offset and acceleration of each joint as columns of their own."""
-    nv, columns = problem.model.nv, []
-    joints = [_smooth(state.motion, joint) for joint in range(nv)]
+) -> Float[np.ndarray, "nv T functions"]:
+    """Position, time, offset and acceleration of each joint, each in its own rows."""
+    joints = [_smooth(state.motion, joint) for joint in range(problem.model.nv)]
     acceleration = np.asarray(state.motion.acceleration)
     series = [np.stack([j["position"][k] for j in joints], 1) for k in range(DEGREES)]
     series += [np.stack([j["time"][k] for j in joints], 1) for k in range(DEGREES - 1)]
-    for one in [*series, acceleration, np.ones_like(acceleration)]:
-        rows = filtered_rows(problem.records, one, whitening)
-        columns += [rows * (np.arange(nv) == joint)[:, None] for joint in range(nv)]
-    return np.stack(columns, axis=2)
+    each = [
+        filtered_rows(problem.records, one, whitening) for one in (*series, acceleration, np.ones_like(acceleration))
+    ]
+    return np.stack(each, axis=2)
 
 
 def _coulomb_column(problem: Problem, state: State, joint: int) -> int | None:

@@ -20,7 +20,7 @@ from ..estimation.rows import Linear, Rows
 from ..results import Name
 from ..rigid.model import RobotModel
 from .bank import Bank, Columns, bank
-from .design import Units, flattened, unit_rows, units
+from .design import Units, flattened, kind, unit_rows, units
 from .evidence import Score, block_scores, largest, other_scores, projection, pulled, scores
 from .problem import Problem, without_factor
 from .state import State
@@ -132,7 +132,9 @@ def _fresh_families(
         yield problem.fixed
         yield from problem.shaped_in_parts()
     sensors = {n: b for n, b in problem.families["sensor"].items() if n in wanted and (everything or b.follows_torque)}
-    yield units({n: flattened(b) for n, b in sensors.items()}, state.motion, problem.records)
+    late = [n for n in sensors if kind(sensors[n]) == "response"]  # one program
+    for names in [late, *([n] for n in sensors if n not in late)]:
+        yield units({n: flattened(sensors[n]) for n in names}, state.motion, problem.records)
 
 
 def place_names(model: RobotModel, effect: Effect | type[Effect], at: tuple[int, ...]) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-__all__ = ["Linear", "Prior", "Rows", "block_sums", "fit", "instruments", "tall", "with_columns"]
+__all__ = ["Linear", "Prior", "Rows", "block_sums", "fit", "instruments", "tall"]
 
 FEW = 50  # columns of which sums over blocks are quicker than a product for each block
 UNKNOWN = 1e-8  # precision of a coefficient of which nothing is known
@@ -74,11 +74,6 @@ def fit(rows: Rows, prior: Prior, gram: Float[np.ndarray, "P P"] | None = None) 
     moment = (Xi.T @ Xi if repeats else cross) + np.diag(prior.precision)
     residual = rows.y - rows.X @ theta
     return Linear(theta, inverse, residual, moment, prior.precision * (theta - prior.mean))
-
-
-def with_columns(rows: Rows, more: Float[np.ndarray, "nv T k"]) -> Rows:
-    """Rows whose model has more columns, which are their own instruments."""
-    return rows._replace(X=np.concatenate([rows.X, more], axis=2), Xi=np.concatenate([rows.Xi, more], axis=2))
 
 
 def instruments(

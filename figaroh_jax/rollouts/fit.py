@@ -26,7 +26,7 @@ _FEW = 12  # windows up to which starts and numbers always move together
 _MOSTLY = 0.5  # share of a step's gain from which the starts move alone, every other time
 _GROUPS, _REFITS = 6, 10  # of recordings that are left out, steps of each fit without one
 _SETTLED, _RESTING = 1e-5, 10.0  # predicted share of the squares at which a fit without some recordings ends
-_OF_GAIN = 0.02  # share of what a fit has gained that a step must promise, where it is asked how much it gains
+_OF_GAIN, _OF_REST = 0.02, 0.003  # shares of what a fit has gained and of what is left, where only its gain is asked
 _CLOSE = 0.02  # predicted decrease of the sum of whitened squares at which a fit ends
 
 
@@ -69,7 +69,7 @@ def fit(
 
     `width` pads the number of free entries and `lanes` the number of rows that one program takes, so that one
     compilation serves all fits. A fit ends where a step promises less than the share `rough` of the squares, or less
-    than a fiftieth of what it has gained on the cost `below`.
+    than a fiftieth of what it has gained on the cost `below` and than three thousandths of what is left.
     """
     start = start_of(data, len(theta)) if start is None else start
     lots = range(0, len(theta), lanes)
@@ -160,7 +160,8 @@ class _Lanes:
                 break
             steps = [self.step(now[k], k, damping[k]) for k in active]
             for k, step in zip(active, steps, strict=True):
-                least = max(_CLOSE * max(1.0, cost[k] / self.rows), rough * cost[k], _OF_GAIN * (below - cost[k]))
+                enough = min(_OF_GAIN * (below - cost[k]), _OF_REST * cost[k])
+                least = max(_CLOSE * max(1.0, cost[k] / self.rows), rough * cost[k], enough)
                 done[k] |= step.gain < least and (damping[k] <= 1.0 or (rough > 0 and worse[k] > 1))
             tried = [(k, step) for k, step in zip(active, steps, strict=True) if not done[k]]
             if not tried:
