@@ -38,6 +38,7 @@ TIGHT = 0.05  # of a limit: room of a torque or distance below which its logarit
 ENOUGH, CUT, SHORTER = 1e-8, 12, 0.5
 TRUSTED = 1e10  # times mu / room, up and down, that a multiplier may be
 REMEMBERED = 6  # steps
+VANISHED = 1e-2  # of what is left at last: mu follows multipliers and rooms no further down, where nothing converges
 SHARPEST, CENTRED, TRIED, GOLDEN = (
     1e6,
     1e2,
@@ -179,7 +180,7 @@ def from_within(
                 break
             curved.weight = max(FASTER * curved.weight, last)
             slope = curved.slope(here.x)
-        way = _step(linear, here, held, slope, past.hessian(), gap)
+        way = _step(linear, here, held, slope, past.hessian(), max(gap, VANISHED * last))
         there = None if way is None else _along(at, here, way, curved.weight)
         if way is None or there is None:
             if stopped:
@@ -306,7 +307,8 @@ def _along(at: Callable[[np.ndarray], _Point], here: _Point, way: _Way, weight: 
     before, share = here.merit(way.mu, weight), way.most
     for _ in range(CUT):
         there = at(here.x + share * way.d)
-        if there.merit(way.mu, weight) <= before + ENOUGH * share * way.fall:
+        inside = there.rooms.min(initial=1.0) > 0.0  # but for rounding, all steps are
+        if inside and there.merit(way.mu, weight) <= before + ENOUGH * share * way.fall:
             return there
         share *= SHORTER
     return None
