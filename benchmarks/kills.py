@@ -182,15 +182,15 @@ def checksums(folder: Path) -> dict[str, str]:
 
 def whole(out: Path) -> str | None:
     """The kind of run in the directory; None where it is not whole, or a single file beside it is not."""
-    from figaroh_jax.reporting import run_directory
+    from figaroh_jax.reporting import marker, run_directory
 
     for path in (*out.parent.glob("*.*"), *(out.parent / "exported").glob("*")):
         if path.is_file() and path.name in ENDS and not path.read_text().endswith(ENDS[path.name]):
             return None
-    if not out.is_dir() or run_directory._altered(out) is not None:
+    if not out.is_dir() or marker.altered(out, run_directory._LEFT) is not None:
         return None
     names = {path.name for path in out.iterdir()}
-    written = run_directory._written(out) or {}
+    written = marker.written(out) or {}
     there = {"verification.json"}  # the marker lists it before it is there
     if set(written) - there - {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}:
         return None
