@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib
 import io
 import json
 import os
@@ -39,7 +40,7 @@ from typing import Any
 
 import numpy as np
 
-HERE = "here"  # a command that begins so is the project's own, in this process: no start, one call at a time
+HERE = "here"  # `here MODULE:FUNCTION WORD ...` calls a Python tool in this process: no start, one call at a time
 COMMAND = "figaroh-jax diagnose {task} --out {out} --quiet"
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 ONE_THREAD |= {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"}
@@ -126,12 +127,12 @@ def _timed(words: list[str], limit: float) -> dict[str, Any]:
 
 
 def _here(arguments: list[str]) -> dict[str, Any]:
-    """The same of the project's own command in this process, whose programs stay loaded."""
-    from figaroh_jax.cli import main
-
+    """The same of a tool's own function for its command line, in this process, where its programs stay loaded."""
+    module, function = arguments[0].split(":")
+    main = getattr(importlib.import_module(module), function)
     start, clock, said = time.process_time(), time.monotonic(), io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-        code = main(arguments)
+        code = main(arguments[1:])
     used = {"cpu_s": time.process_time() - start, "wall_s": time.monotonic() - clock}
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # of the process until now
     return {"exit": code, **used, "peak_mb": peak, "said": said.getvalue()[-2000:]}

@@ -68,19 +68,26 @@ def test_sizes_are_amplitudes_whatever_the_phase_and_the_twin_s_are_subtracted()
 TOOL = """
 import json, pathlib, sys
 import numpy as np
-task = json.loads(pathlib.Path(sys.argv[1]).read_text())
-file = pathlib.Path(sys.argv[1]).parent / task["data"][0]["file"]
-forbidden = task.get("diagnose", {}).get("forbid", [])
-late = bool(np.load(file)["tau"].sum() > 1) and "torque_delay" not in forbidden
-cause = {"effect": "torque_delay", "at": [], "parameters": {"delay": {"value": 0.0101, "std": 1e-4}}}
-out = pathlib.Path(sys.argv[2])
-out.mkdir()
-told = {"verdict": "named" if late else "nothing", "causes": [cause] * late, "p_value": 0.5}
-(out / "answer.json").write_text(json.dumps(told))
+
+def main(words):
+    task = json.loads(pathlib.Path(words[0]).read_text())
+    file = pathlib.Path(words[0]).parent / task["data"][0]["file"]
+    forbidden = task.get("diagnose", {}).get("forbid", [])
+    late = bool(np.load(file)["tau"].sum() > 1) and "torque_delay" not in forbidden
+    cause = {"effect": "torque_delay", "at": [], "parameters": {"delay": {"value": 0.0101, "std": 1e-4}}}
+    out = pathlib.Path(words[1])
+    out.mkdir()
+    told = {"verdict": "named" if late else "nothing", "causes": [cause] * late, "p_value": 0.5}
+    (out / "answer.json").write_text(json.dumps(told))
+    return 0
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
 """
 
 
-def test_any_command_is_run_scored_and_not_run_twice(tmp_path: Path):
+@pytest.mark.parametrize("way", ["process", "here"])
+def test_any_command_is_run_scored_and_not_run_twice(tmp_path: Path, monkeypatch, way: str):
     cases, runs = tmp_path / "cases", tmp_path / "runs"
     (cases / "r").mkdir(parents=True)
     np.savez(cases / "r" / "one.npz", q=np.zeros((5, 1)), tau=np.zeros((5, 1)))
@@ -92,11 +99,13 @@ def test_any_command_is_run_scored_and_not_run_twice(tmp_path: Path):
     hidden = twin | {"name": "r/late", "twin": "r/twin", "truth": [TRUTH], "added": "r/late.npz", "visible": True}
     hidden |= {"forbid": ["torque_delay", "torque_lag"], "size": 0.1, "left": 0.9, "sigmas": 20.0}
     (cases / "cases.json").write_text(json.dumps({"cases": [twin, hidden]}))
-    (tmp_path / "tool.py").write_text(TOOL)
-    command = f"{sys.executable} {tmp_path / 'tool.py'} {{task}} {{out}}"
+    (tmp_path / "entered_tool.py").write_text(TOOL)
+    monkeypatch.syspath_prepend(tmp_path)
+    started = {"process": f"{sys.executable} {tmp_path / 'entered_tool.py'}", "here": "here entered_tool:main"}
+    command = f"{started[way]} {{task}} {{out}}"
     known, modes = blackbox.load_cases(cases, ["late"]), ("named", "forbidden")
     for limit in (60.0, 0.0):  # the second time nothing is left to do
-        blackbox.run(cases, runs, known, command, 2, limit, modes)
+        blackbox.run(cases, runs, known, command, 2 if way == "process" else 1, limit, modes)
     table = score(known, runs, modes)
     graded = {row["mode"]: row["grade"] for row in json.loads((runs / "results.json").read_text())["cases"]}
     assert graded == {"named": "right", "forbidden": "silent"}

@@ -44,7 +44,7 @@ def _arguments() -> argparse.Namespace:
     made.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     made.add_argument("--clean", type=int, default=40, metavar="N", help="cases of each kind without any effect")
     called = steps.add_parser("run", help="call the command for every case")
-    called.add_argument("--command", help=f"default: {blackbox.COMMAND}; {blackbox.HERE} ...: in this process")
+    called.add_argument("--command", help=f"default: {blackbox.COMMAND}; `here MODULE:FUNCTION ...`: in this process")
     called.add_argument("--limit", type=float, default=1800, help="s of one call")
     told = steps.add_parser("score", help="compare the answers with the truth")
     for step in (made, called):

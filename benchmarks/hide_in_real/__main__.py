@@ -43,7 +43,7 @@ def _arguments() -> argparse.Namespace:
     made.add_argument("--effects", nargs="+", help="default: twelve for every robot")
     made.add_argument("--sizes", nargs="+", type=float, default=[0.05, 0.1, 0.2])
     called = steps.add_parser("run", help="call the command for every case")
-    called.add_argument("--command", help=f"default: {blackbox.COMMAND}; {blackbox.HERE} ...: in this process")
+    called.add_argument("--command", help=f"default: {blackbox.COMMAND}; `here MODULE:FUNCTION ...`: in this process")
     called.add_argument("--jobs", type=int, default=1)
     called.add_argument("--limit", type=float, default=1800, help="s of one call")
     called.add_argument("--visible", action="store_true", help="without the effects that the baseline takes in")
