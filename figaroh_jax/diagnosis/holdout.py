@@ -57,11 +57,16 @@ def _block_squares(
     return np.stack([[np.bincount(block[block >= 0], x) for x in some] for some in squares]).swapaxes(1, 2)
 
 
+def _speed(problem: Problem) -> Float[np.ndarray, "n M nv"]:
+    """Speed of every joint at the rows of every recording, rad/s or m/s."""
+    records = problem.records
+    return np.take_along_axis(np.abs(np.asarray(records.velocity)), records.row_samples()[..., None], axis=1)
+
+
 def _by_speed(problem: Problem) -> Float[np.ndarray, "n M nv"]:
     """What a square of each row weighs, as the fit weighs rows of that joint and speed (1: as fast ones)."""
-    records = problem.records
-    weight, fitted = np.asarray(records.weight), np.asarray(records.fitted)
-    speed = np.take_along_axis(np.abs(np.asarray(records.velocity)), records.row_samples()[..., None], axis=1)
+    weight, fitted = np.asarray(problem.records.weight), np.asarray(problem.records.fitted)
+    speed = _speed(problem)
     out = np.ones(speed.shape)
     for joint in range(speed.shape[2]):
         used = (fitted[..., joint] > 0) & (weight[..., joint] > 0)
@@ -76,9 +81,8 @@ def _by_speed(problem: Problem) -> Float[np.ndarray, "n M nv"]:
 def _moves(problem: Problem) -> Float[np.ndarray, "n M nv"]:
     """1 in the rows in which a joint moves: where it stands, dry friction holds any torque up to its limit, and what a
     model of the motion says of it is chance. 1 everywhere for a joint that hardly moves in the data not fitted."""
-    speed, kept = np.abs(np.asarray(problem.records.velocity)), _kept_out(problem) > 0
-    rows = np.take_along_axis(speed, problem.records.row_samples()[..., None], axis=1)
-    moves = rows >= STANDS * speed.max((0, 1))
+    top, kept = np.abs(np.asarray(problem.records.velocity)).max((0, 1)), _kept_out(problem) > 0
+    moves = _speed(problem) >= STANDS * top
     seldom = (moves & kept).sum((0, 1)) < LEAST_MOVING * kept.sum((0, 1))
     return np.where(seldom, 1.0, moves)
 

@@ -244,9 +244,8 @@ def _all_in_lanes(
     A spring changes the structure, a payload shows at several joints, a limit may hold up the steps of the others:
     these are fitted by themselves.
     """
-    lonely = lambda c: c.elastic or c.effect in _LIMITS or c.effect == "payload"  # noqa: E731
-    single = [(j, *one) for j, ones in lists.items() for one in ones if lonely(one[0].candidate)]
-    plain = {j: [one for one in ones if not lonely(one[0].candidate)] for j, ones in lists.items() if j >= 0}
+    single = [(j, *one) for j, ones in lists.items() for one in ones if _fitted_alone(one[0].candidate)]
+    plain = {j: [one for one in ones if not _fitted_alone(one[0].candidate)] for j, ones in lists.items() if j >= 0}
     lanes = [[(j, *ones[m]) for j, ones in plain.items() if m < len(ones)]
              for m in range(max((len(ones) for ones in plain.values()), default=0))]  # fmt: skip
     found, queue = [], [*lanes, *([one] for one in single)]
@@ -270,6 +269,11 @@ def _all_in_lanes(
             own = float(squares[..., j].sum() if j >= 0 else squares.sum())
             found.append(_OneOf(j, own, ranked, one, tuple(free), len(lane) == 1))
     return found
+
+
+def _fitted_alone(one: Candidate) -> bool:
+    """Whether a candidate shares no fit with those of other joints."""
+    return one.elastic or one.effect in _LIMITS or one.effect == "payload"
 
 
 def _start_of(now: Standing, structure: Structure) -> np.ndarray:
