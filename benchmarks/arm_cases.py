@@ -24,7 +24,8 @@ from generators import servo_arm6  # noqa: E402
 from figaroh_jax.rollouts.arm import search_arm  # noqa: E402
 from figaroh_jax.rollouts.data import Run, Stretch  # noqa: E402
 from figaroh_jax.rollouts.reading import load_loop  # noqa: E402
-from figaroh_jax.rollouts.search import search, setting  # noqa: E402
+from figaroh_jax.rollouts.search import search  # noqa: E402
+from figaroh_jax.rollouts.setting import setting  # noqa: E402
 
 LINKS = 5  # the last link carries the payload
 
