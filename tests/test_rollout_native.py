@@ -59,7 +59,8 @@ def checked(loop: Loop, table: Table, theta: np.ndarray, data: Windows, start: n
 
     def squares(theta: np.ndarray, start: np.ndarray) -> np.ndarray:
         error = (data.reading - code.read(theta, start)) * data.weight
-        return np.einsum("ywrs,syw->ryw", np.broadcast_to(whiten, (*error.shape[1:], rows, rows)), error)
+        every = np.broadcast_to(whiten, (error.shape[1], error.shape[2], rows, rows))
+        return np.einsum("ywrs,syw->ryw", every, error)
 
     found = code.sums(theta, np.arange(len(table)), start)
     error = squares(theta, start)

@@ -38,8 +38,8 @@ def colour_of(
     found = [_colour(list(_stretches(error[:, y], counted[:, y]))) for y in range(error.shape[1])]
     if any(one is None for one in found):
         return None
-    poles = np.array([one for one in found if one is not None])
-    return Colour(poles, np.array([_level(pole) for pole in poles]))
+    both = np.array([one for one in found if one is not None])
+    return Colour(both[:, 0], both[:, 1])
 
 
 def filtered(
@@ -64,8 +64,8 @@ def _stretches(error: np.ndarray, counted: np.ndarray) -> Iterator[np.ndarray]:
                 yield error[first:last, w]
 
 
-def _colour(stretches: list[np.ndarray]) -> float | None:
-    """The pole of the noise of one encoder, or None where its residual is no such noise."""
+def _colour(stretches: list[np.ndarray]) -> tuple[float, float] | None:
+    """The pole and the level of the noise of one encoder, or None where its residual is no such noise."""
     if not stretches:
         return None
     spectra = [_periodogram(x) for x in stretches]
@@ -77,14 +77,14 @@ def _colour(stretches: list[np.ndarray]) -> float | None:
 
     pole = float(minimize_scalar(unlikely, bounds=(0.0, 1.0 - 1e-3), method="bounded").x)  # pyright: ignore[reportAttributeAccessIssue]
     level, rows = (power / _shape(frequency, pole)).mean(), sum(map(len, stretches))
-    loud = np.sqrt(level) / _level(pole)
+    loud = level / _level(pole) ** 2
     corner = -np.log(max(pole, 1e-9)) / (2 * np.pi)
-    if corner < LOWEST_CORNER or loud**2 > 1 + LOUDER * np.sqrt(6 / rows):
+    if corner < LOWEST_CORNER or loud > 1 + LOUDER * np.sqrt(6 / rows):
         return None
     ratio = power / (level * _shape(frequency, pole))
     if _beyond_bands(frequency, ratio) > COLOUR or _in_bursts(stretches, pole) > BURST:
         return None
-    return pole
+    return pole, float(np.sqrt(level))
 
 
 def _periodogram(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
