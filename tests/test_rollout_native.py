@@ -59,8 +59,8 @@ def checked(loop: Loop, table: Table, theta: np.ndarray, data: Windows, start: n
 
     def squares(theta: np.ndarray, start: np.ndarray) -> np.ndarray:
         error = (data.reading - code.read(theta, start)) * data.weight
-        every = np.broadcast_to(whiten, (error.shape[1], error.shape[2], rows, rows))
-        return np.einsum("ywrs,syw->ryw", every, error)
+        every = whiten if len(whiten) > 1 else whiten[0, 0]
+        return np.einsum("ywrs,syw->ryw" if every.ndim > 2 else "rs,syw->ryw", every, error)
 
     found = code.sums(theta, np.arange(len(table)), start)
     error = squares(theta, start)
