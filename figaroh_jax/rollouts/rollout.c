@@ -481,8 +481,9 @@ INLINE void settled(const Given *g, Work *w, const int n) {
     w->K[0] = 1 / (w->M[0] + stiffness(w, 0));
     return;
   }
-  acting(g, w, n, w->a);
+  /* the first turn takes what slipped and what was met in the step before: mostly it still does */
   for (int turn = 0; turn < TURNS; turn++) {
+    if (turn == 1) acting(g, w, n, w->a);
     double way[MOST], gap[MOST], full[MOST];
     int slip[MOST], low[MOST], high[MOST], same = 1;
     with_stiffness(w, n, w->K);
@@ -502,6 +503,7 @@ INLINE void settled(const Given *g, Work *w, const int n) {
       memcpy(w->a, full, sizeof(double) * n);
       return;
     }
+    if (turn == 0) continue;
     const double s = step_length(g, w, n, r, way);
     if (!isfinite(s)) {
       for (int j = 0; j < n; j++) w->a[j] = NAN;
@@ -933,7 +935,8 @@ INLINE void window_of(const Given *g, const int n, const int carried, const int 
 }
 
 INLINE void all_windows(const Given *g, const int n, const int carried, const int want) {
-  static __thread Work w;
+  Work w; /* no static one: its address would be asked for at each use */
+  memset(&w, 0, sizeof w);
   double mobile[n * g->many + 1];
   mobility(g, &w, n, mobile);
   w.often = 1 / g->dt;
