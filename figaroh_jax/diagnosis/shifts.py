@@ -7,17 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
-from ..compiled.batching import CPU_OPTIONS
-from ..compiled.executable_cache import Program
 from ..effects.base import Effect, Motion
 from ..recordings.stacked import Records
 from ..rigid.dynamics import torques_on_host
@@ -263,8 +259,7 @@ def shift_torques(effects: Effect, motion: Motion, records: Records) -> Float[np
     velocity and the acceleration of the joint: the same for all sensors.
     """
     names = [name for name, p in effects.parameters().items() if p.linear]
-    errors = np.asarray(_unit_errors(effects, motion))
-    errors = errors.reshape(len(effects.at), len(names), *records.position.shape[:2])
+    errors = _unit_errors(effects, motion).reshape(len(effects.at), len(names), *records.position.shape[:2])
     rates = difference(errors, float(records.dt))
     pushes = difference(rates, float(records.dt))
     loads = _load_slopes(motion, records)
@@ -294,11 +289,12 @@ def _load_slopes(motion: Motion, records: Records) -> Float[np.ndarray, "3 nv nv
     return _SLOPES[0][2]
 
 
-@partial(Program, options=CPU_OPTIONS)
-def _unit_errors(effects: Effect, motion: Motion) -> Float[Array, "effects k nN"]:
-    names = [name for name, p in effects.parameters().items() if p.linear]
-
-    def one(effect: Effect, unit: Array) -> Array:
-        return eqx.tree_at(lambda e: [getattr(e, n) for n in names], effect, list(unit)).position_error(motion)
-
-    return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(effects, jnp.eye(len(names)))
+def _unit_errors(effects: Effect, motion: Motion) -> Float[np.ndarray, "effects k nN"]:
+    """What each sensor reads beside the truth with a unit of each of its amplitudes."""
+    names, out = [name for name, p in effects.parameters().items() if p.linear], []
+    for one in range(len(effects.at)):
+        effect = jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects)
+        for unit in np.eye(len(names)):
+            units = replace(effect, **dict(zip(names, unit, strict=True)))
+            out.append(np.asarray(type(effect).position_error(units, motion)))
+    return np.reshape(out, (len(effects.at), len(names), -1))

@@ -100,7 +100,7 @@ def filter_rows(
     flat, out = torque.reshape(count, *torque.shape[-2:]), np.empty((count, *records.kept.shape))
     shared = factor.ndim == 1 or factor.size == factor.shape[-1]
     each = None if shared else np.broadcast_to(factor, (*series, factor.shape[-1])).reshape(count, factor.shape[-1])
-    used = np.asarray(records.weight).any((1, 2)) if fitted else np.ones(len(records.kept), bool)
+    used = np.any(records.weight, axis=(1, 2)) if fitted else np.ones(len(records.kept), bool)
     out[:, ~used] = 0.0
     few = max(1, AT_ONCE // records.source.shape[1])
     parts = [slice(start, start + few) for start in range(0, count, few)]
