@@ -481,7 +481,9 @@ def separation(names: Sequence[str] = tuple(PAIRS), seed: int = 0, starts: int =
             )
 
 
-def chooser(draws: int = 100, names: Sequence[str] = tuple(PAIRS), seed: int = 0, starts: int = 3) -> None:
+def chooser(
+    draws: int = 100, names: Sequence[str] = tuple(PAIRS), seed: int = 0, starts: int = 3, harmonics: int = 20
+) -> None:
     """Four pairs of causes at the UR10e's elbow, 10 s, 20 harmonics: 100 simulated runs with either as the truth.
 
     Torques are Pinocchio's; each run has its own link errors (10 % of the inertias), noise of 1 % of the largest torque
@@ -494,7 +496,7 @@ def chooser(draws: int = 100, names: Sequence[str] = tuple(PAIRS), seed: int = 0
     from figaroh_jax.excitation.motions import fourier
 
     model = arms()["UR10e"]
-    learned, bounds, basis = learn(model), limits_of(model, acceleration=8.0), fourier(20, 0.1, 10.0)
+    learned, bounds, basis = learn(model), limits_of(model, acceleration=8.0), fourier(harmonics, 0.1, 10.0)
     for name, pair in ((name, PAIRS[name]) for name in names):
         since = time.process_time()
         options = {"starts": starts, "rate": 50.0, "seed": seed}
@@ -941,6 +943,7 @@ def main() -> None:
     parser.add_argument("--starts", type=int, help="random starts, where a part takes them")
     parser.add_argument("--robots", nargs="+", choices=["UR10e", "Panda"], help="where a part takes them")
     parser.add_argument("--draws", type=int, help="simulations, where a part takes them")
+    parser.add_argument("--harmonics", type=int, help="of the motions of `chooser`, of 0.1 Hz")
     parser.add_argument("--peer", help="FIGAROH's motion, of `peer_motion.py`, that `pays` compares with")
     parser.add_argument("--names", nargs="+", choices=list(PAIRS), help="pairs of causes, where a part takes them")
     args = parser.parse_args()

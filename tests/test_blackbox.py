@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -134,3 +135,26 @@ def test_what_is_added_at_the_joints_of_the_tx40_is_added_at_its_motors(data_dir
     np.testing.assert_allclose(stored.arrays["tau"] @ tx40.TORQUE.T, stored.torque, rtol=0, atol=1e-9)
     joint = np.linalg.solve(tx40.POSITION, stored.arrays["q"][0]) + tx40.OFFSET
     np.testing.assert_allclose(joint, stored.position[0], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("law", "sure"),
+    [(lambda s: np.sin(7 * s.q), True), (lambda s: 0.001 * np.sin(7 * s.q), False), (lambda s: 1 + 0 * s.q, False)],
+    ids=["large", "small", "a part of the baseline"],
+)
+def test_the_oracle_believes_what_the_recording_kept_out_shows(
+    data_dir: Path, monkeypatch: Any, law: Callable[[Any], np.ndarray], sure: bool
+):
+    """A ripple of half the torque, of the two-thousandth, and a constant, which the baseline has itself."""
+    from benchmarks.hide_in_real import recordings
+    from benchmarks.hide_in_real.baseline import fit
+    from benchmarks.hide_in_real.motion import scene_of
+    from benchmarks.hide_in_real.oracle import Oracle
+
+    monkeypatch.setattr(recordings, "DATA", data_dir)
+    real = recordings.simple_pendulum()
+    baseline, scenes = fit(real, [scene_of(real, r) for r in real.recordings])
+    size = 0.5 * np.sqrt(np.mean(scenes[0].torque ** 2))
+    borne = Oracle(baseline, scenes).borne_out([size * law(s) for s in scenes], (0,))
+    assert borne.sure is sure
+    assert (borne.share > 0.1) is sure

@@ -24,6 +24,11 @@ def main() -> None:
 
         generate(args.cases, args.seed, args.robots, args.effects, args.sizes)
         return
+    if args.step == "oracle":
+        from .generate import with_oracle
+
+        with_oracle(args.cases)
+        return
     cases = blackbox.load_cases(args.cases, args.only)
     if args.step == "run":
         if args.visible:
@@ -42,6 +47,9 @@ def _arguments() -> argparse.Namespace:
     made.add_argument("--robots", nargs="+", help="default: all seven")
     made.add_argument("--effects", nargs="+", help="default: twelve for every robot")
     made.add_argument("--sizes", nargs="+", type=float, default=[0.05, 0.1, 0.2])
+    asked = steps.add_parser(
+        "oracle", help="tell of cases that were made before whether the kept-out data bear them out"
+    )
     called = steps.add_parser("run", help="call the command for every case")
     called.add_argument("--command", help=f"default: {blackbox.COMMAND}; `here MODULE:FUNCTION ...`: in this process")
     called.add_argument("--jobs", type=int, default=1)
@@ -52,7 +60,7 @@ def _arguments() -> argparse.Namespace:
         step.add_argument("--only", nargs="+", default=[], metavar="WORD")
         step.add_argument("--modes", nargs="+", choices=["named", "forbidden"], default=["named", "forbidden"])
         step.add_argument("--out", type=Path, required=True)
-    for step in (made, called, told):
+    for step in (made, asked, called, told):
         step.add_argument("--cases", type=Path, required=True)
     return parser.parse_args()
 

@@ -27,7 +27,8 @@ class Baseline(NamedTuple):
     """Weighted rows of the fitted recordings and what is needed to project on them."""
 
     columns: Array  # (rows * joints, parameters), in sigmas
-    precision: Array  # of the prior, by parameter
+    mean: Array  # of the prior, by parameter
+    precision: Array
     sigma: Array  # (joints,) N m
     parameters: Array
 
@@ -46,9 +47,9 @@ class Seen(NamedTuple):
 def fit(real: RealSet, scenes: Sequence[Scene]) -> tuple[Baseline, list[Scene]]:
     """The baseline of the untouched recordings, and the scenes with the links that it finds."""
     fitted = [s.thin() for s in scenes if s.fitted]
-    columns = np.concatenate([_rows(s, _columns(s)) for s in fitted])
-    flexible = np.concatenate([_rows(s, _smooth(s, fitted)) for s in fitted])
-    torque = np.concatenate([_rows(s, s.torque[:, :, None]) for s in fitted])[:, :, 0]
+    columns = np.concatenate([rows_of(s, columns_of(s)) for s in fitted])
+    flexible = np.concatenate([rows_of(s, smooth_of(s, fitted)) for s in fitted])
+    torque = np.concatenate([rows_of(s, s.torque[:, :, None]) for s in fitted])[:, :, 0]
     mean, precision = _prior(real, columns.shape[2])
     sigma = np.sqrt(np.mean(torque**2, 0)) / 10
     theta = mean
@@ -57,12 +58,12 @@ def fit(real: RealSet, scenes: Sequence[Scene]) -> tuple[Baseline, list[Scene]]:
         rest = torque - columns @ theta
         sigma = np.array([_scatter(flexible[:, j], rest[:, j]) for j in range(len(sigma))])
     inertial = theta[: 10 * len(real.joints)]
-    return Baseline(_tall(columns, sigma), precision, sigma, theta), [s.loaded(inertial) for s in scenes]
+    return Baseline(_tall(columns, sigma), mean, precision, sigma, theta), [s.loaded(inertial) for s in scenes]
 
 
 def seen(baseline: Baseline, scenes: Sequence[Scene], law: Law, strength: float) -> Seen:
     """Project the torque that an effect adds on the baseline's columns with their prior."""
-    added = [_rows(s, law.torque(s, strength)[:, :, None]) for s in scenes if s.fitted]
+    added = [rows_of(s, law.torque(s, strength)[:, :, None]) for s in scenes if s.fitted]
     z = _tall(np.concatenate(added), baseline.sigma)[:, 0]
     take = baseline.columns.T @ z
     gram = baseline.columns.T @ baseline.columns + np.diag(baseline.precision)
@@ -70,7 +71,7 @@ def seen(baseline: Baseline, scenes: Sequence[Scene], law: Law, strength: float)
     return Seen(max(left, 0.0) / float(z @ z), float(np.sqrt(max(left, 0.0))))
 
 
-def _rows(scene: Scene, columns: Array) -> Array:
+def rows_of(scene: Scene, columns: Array) -> Array:
     """Columns (samples, joints, ...) low-passed, at twice the cutoff: (rows, joints, ...)."""
     samples = len(scene.time)
     low = scene.low(columns.reshape(samples, -1)).reshape(columns.shape)
@@ -84,7 +85,7 @@ def _tall(rows: Array, sigma: Array) -> Array:
     return (rows / sigma[:, None]).reshape(-1, rows.shape[2])
 
 
-def _columns(scene: Scene) -> Array:
+def columns_of(scene: Scene) -> Array:
     """(samples, joints, parameters) of the baseline."""
     nv = len(scene.joints)
     coarse = scene.regressor()
@@ -103,7 +104,7 @@ def _coupling(scene: Scene, i: int, j: int) -> Array:
     return out
 
 
-def _smooth(scene: Scene, scenes: Sequence[Scene]) -> Array:
+def smooth_of(scene: Scene, scenes: Sequence[Scene]) -> Array:
     """(samples, joints, k): hat functions of a joint's position and speed, even and odd in its direction."""
     out = []
     for j in range(len(scene.joints)):

@@ -13,6 +13,7 @@ from .. import blackbox
 from .baseline import fit, seen
 from .laws import TWELVE, Draw, Law, scaled
 from .motion import Scene, scene_of
+from .oracle import Borne, Oracle
 from .recordings import SETS, RealSet
 
 MOVES = 0.15  # rad, least range of a joint that an effect is put on
@@ -44,6 +45,7 @@ def _robot(
     """The twin and the cases of one robot."""
     twin = twin_of(folder, real)
     baseline, scenes = fit(real, [scene_of(real, r) for r in real.recordings])
+    oracle = Oracle(baseline, scenes)
     cases = [twin]
     for effect in effects or _twelve(real, scenes, seed):
         for size in sizes:
@@ -55,12 +57,14 @@ def _robot(
             law, strength = found
             shown = seen(baseline, scenes, law, strength)
             name = f"{real.name}/{effect}-{100 * size:g}"
-            _save(folder / f"{name}.npz", _added(real, scenes, law, strength))
+            added = [law.torque(s, strength) for s in scenes]
+            _save(folder / f"{name}.npz", _added(real, added))
             cases.append(
                 twin
                 | {"name": name, "twin": twin["name"], "size": size, "added": f"{name}.npz"}
                 | {"truth": [_truth(draw, law, strength)], "forbid": _forbidden(effect)}
                 | {"left": shown.left, "sigmas": shown.sigmas, "visible": shown.visible}
+                | {"oracle": told_by(oracle.borne_out(added, law.rows))}
             )
     return cases
 
@@ -102,11 +106,32 @@ def _twelve(real: RealSet, scenes: Sequence[Scene], seed: int) -> list[str]:
     return found[:12]
 
 
-def _added(real: RealSet, scenes: Sequence[Scene], law: Law, strength: float) -> dict[str, np.ndarray]:
+def told_by(borne: Borne) -> dict[str, Any]:
+    """What the oracle says of a case, as it stands in `cases.json`."""
+    return {"share": borne.share, "chance": borne.chance, "sure": borne.sure}
+
+
+def with_oracle(folder: Path) -> None:
+    """Ask the oracle of cases that were made without it."""
+    told = json.loads((folder / "cases.json").read_text())
+    for group in dict.fromkeys(case["group"] for case in told["cases"]):
+        real = SETS[group]()
+        baseline, scenes = fit(real, [scene_of(real, r) for r in real.recordings])
+        oracle, back = Oracle(baseline, scenes), np.linalg.inv(real.stored(np.eye(len(real.joints))))
+        for case in told["cases"]:
+            if case["group"] == group and case["truth"]:
+                with np.load(folder / case["added"]) as file:
+                    added = [np.asarray(file[f"{r.name}/tau"], float) @ back for r in real.recordings]
+                own = max(float(np.abs(x).max()) for x in added)
+                joints = [j for j in range(len(real.joints)) if any(np.abs(x[:, j]).max() > 1e-6 * own for x in added)]
+                case["oracle"] = told_by(oracle.borne_out(added, joints))
+    (folder / "cases.json").write_text(json.dumps(told, indent=1))
+
+
+def _added(real: RealSet, added: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
     """What the effect adds to the torque of each file, in the file's words."""
-    parts = zip(real.recordings, scenes, strict=True)
-    torque = {r.name: real.stored(law.torque(s, strength)) for r, s in parts}
-    return {f"{name}/tau": added.astype(np.float32) for name, added in torque.items()}
+    pairs = zip(real.recordings, added, strict=True)
+    return {f"{r.name}/tau": real.stored(torque).astype(np.float32) for r, torque in pairs}
 
 
 def _truth(draw: Draw, law: Law, strength: float) -> dict[str, Any]:

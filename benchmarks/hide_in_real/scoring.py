@@ -44,7 +44,12 @@ def _rows(name: str, case: Case, out: Path, modes: Iterable[str]) -> list[dict[s
             {"case": name, "group": case["group"], "size": case["size"], "mode": mode, "visible": case["visible"]}
             | {"left": case["left"], "sigmas": case["sigmas"], "effect": case["truth"][0]["effect"]}
             | {"grade": graded.grade, "new": graded.new, "false": graded.false, "size_errors": graded.sizes}
-            | {"inside": graded.inside, "verdict": answer["verdict"] if answer else None, "cpu_s": ran["cpu_s"]}
+            | {
+                "borne_out": case.get("oracle", {}).get("sure"),
+                "inside": graded.inside,
+                "verdict": answer["verdict"] if answer else None,
+                "cpu_s": ran["cpu_s"],
+            }
         )
     return found
 
@@ -52,6 +57,7 @@ def _rows(name: str, case: Case, out: Path, modes: Iterable[str]) -> list[dict[s
 def _table(rows: list[dict[str, Any]], titles: dict[str, str]) -> list[str]:
     """Markdown: one line for each robot and size, then for each size."""
     head = ["robot", "size", "cases", *titles.values(), "size error, median", "within 15 %"]
+    head += ["borne out", "right of these"] * (rows[0]["mode"] == "named")
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     groups = list(dict.fromkeys(r["group"] for r in rows))
     for group in [*groups, None]:
@@ -66,6 +72,10 @@ def _line(group: str, size: float, rows: list[dict[str, Any]], titles: dict[str,
     counts = [sum(r["grade"] == g for r in rows) for g in titles]
     errors = np.array([e for r in rows for e in r["size_errors"]])
     told = [f"{np.nanmedian(errors):.2f}", f"{np.sum(errors < 0.15)} of {len(errors)}"] if len(errors) else ["", ""]
+    if rows[0]["mode"] == "named":  # by the truth itself: see oracle.py
+        borne = [r for r in rows if r["borne_out"]]
+        right = sum(r["grade"] in ("right", "more") for r in borne)
+        told += [str(len(borne)), f"{right} ({100 * right / len(borne):.0f} %)" if borne else ""]
     return "| " + " | ".join([group, f"{100 * size:g} %", str(len(rows)), *map(str, counts), *told]) + " |"
 
 
@@ -75,8 +85,10 @@ def _detail(rows: list[dict[str, Any]]) -> list[str]:
         new = "; ".join(f"{effect} ({', '.join(at)})" for effect, at in r["new"])
         size = ", ".join(f"{e:.2f}" for e in r["size_errors"])
         shown = f"left {r['left']:.2f} D {r['sigmas']:.1f}"
+        borne = {True: "borne out", False: "not borne out", None: ""}[r["borne_out"]]
         lines.append(
             f"{r['case']:<48} {r['mode']:<9} {'visible ' if r['visible'] else 'absorbed'} {shown:<18} "
-            f"{r['grade']:<7} {r['verdict'] or '-':<10} new: {new or '-'}" + (f"   size off by {size}" if size else "")
+            f"{borne:<13} {r['grade']:<7} {r['verdict'] or '-':<10} new: {new or '-'}"
+            + (f"   size off by {size}" if size else "")
         )
     return lines

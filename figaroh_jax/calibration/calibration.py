@@ -24,7 +24,7 @@ from ..recordings.poses import PoseRecording, read_pose_recordings
 from ..recordings.posture_checks import check_pose_recordings
 from ..rigid.chain import chain_between
 from ..rigid.model import RobotModel
-from . import corrections, levels
+from . import corrections, levels, thresholds
 from .calibrated import Calibration, Error, Outlier
 from .candidates import Block, blocks_of, effects_on, empty_columns, geometry_columns, known_frames
 from .distances import socket_distances
@@ -35,9 +35,6 @@ if TYPE_CHECKING:
     from ..formats.config import Task
 
 __all__ = ["Run", "calibrate", "calibrate_task"]
-
-_RECURS = 4  # of five outer folds must choose an effect
-_NESTED_GAIN = 0.05  # of the error on the outer folds, that the effects must take away
 
 
 def calibrate_task(
@@ -267,7 +264,7 @@ class Run:
             scheme = "recordings with role: holdout"
         else:
             validated = list(zip(table["frames"], table["chosen"], strict=True))
-            scheme = f"{levels.FOLDS} folds of every fifth posture; level and effects are selected within each fold"
+            scheme = f"{thresholds.FOLDS} folds of every fifth posture; level and effects are selected within each fold"
         both: list[Error | None] = [None, None]
         for c, (unit, scale) in enumerate((("mm", 1e3), ("deg", 180.0 / np.pi))):
             if len(fitted[0][c]):
@@ -285,11 +282,11 @@ def _enough(measured: Measured, recordings: Sequence[PoseRecording]) -> None:
     used = measured.fitted
     rows, unknowns = int(used.sum()), len(measured.own)
     postures = len(np.unique(measured.posture[used & (measured.posture >= 0)]))
-    if rows <= unknowns or postures < levels.FOLDS:
+    if rows <= unknowns or postures < thresholds.FOLDS:
         names = ", ".join(str(r.file.name) for r in recordings if r.role == "fit")
         raise InputError(
             f"{names}: {postures} measured postures give {rows} numbers for {unknowns} unknowns of the frames alone;"
-            f" measure at least {max(levels.FOLDS, unknowns // 2)} postures, better 30 or more"
+            f" measure at least {max(thresholds.FOLDS, unknowns // 2)} postures, better 30 or more"
         )
 
 
@@ -307,11 +304,15 @@ def _recurring(choice: levels.Choice, folds: Sequence[levels.Fold], blocks: Sequ
     """Effects of the choice that most outer folds choose too, or a rival of theirs, if all gain on the outer folds."""
     plain, chosen = (levels.pooled([getattr(f, which) for f in folds]) for which in ("plain", "chosen"))
     gains = [1.0 - c / p for p, c in zip(plain, chosen, strict=True) if np.isfinite(p) and p > 0.0]
-    if not gains or np.mean(gains) < _NESTED_GAIN:
+    if not gains or np.mean(gains) < thresholds.OUTER_GAIN:
         return []
     # a fold that takes one which it does not tell apart chooses the other too
     places = [[blocks[k] for k in (*f.choice.effects, *sum(f.choice.rivals, ()))] for f in folds]
-    return [k for k in choice.effects if sum(any(map(blocks[k].near, place)) for place in places) >= _RECURS]
+    return [
+        k
+        for k in choice.effects
+        if sum(any(map(blocks[k].near, place)) for place in places) >= thresholds.FOLDS_THAT_CHOOSE
+    ]
 
 
 def _never_worse(choice: levels.Choice, folds: list[levels.Fold]) -> tuple[levels.Choice, list[levels.Fold]]:

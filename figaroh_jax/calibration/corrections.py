@@ -24,7 +24,7 @@ from ..recordings.devices import Device
 from ..recordings.poses import PoseRecording
 from ..results import Cause, Estimate, Gain, Name
 from ..rigid.model import RobotModel
-from . import levels
+from . import levels, thresholds
 from .calibrated import Outlier, Parameter, Shown
 from .candidates import Block
 from .gauge import Gauge, find_gauge
@@ -44,9 +44,6 @@ __all__ = [
     "twist_pose",
     "twists_of",
 ]
-
-_KNOWN = 0.7  # a posterior wider than this share of its prior tells nothing new
-_OFFSET = 1e-3  # rad or m: what a good zeroing leaves; beyond it an offset is a cause
 
 
 def gauge_of(final: Measured, fit: marginal.Linear, used, free) -> tuple[Gauge, list[int]]:
@@ -164,7 +161,7 @@ def parameters_of(final: Measured, linear, posterior, gauge: Gauge, order: list[
     for place, k in enumerate(order):
         prior = posterior.precision[k] ** -0.5 if linear.prior[k] != marginal.FLAT else np.inf
         std = float(np.sqrt(covariance[k, k]))
-        known = "identified" if std < _KNOWN * prior else "prior only"
+        known = "identified" if std < thresholds.KNOWN * prior else "prior only"
         status = "gauge" if place in gauge.dependent else known
         found.append(Parameter(*(names[k][0], float(linear.at[k] * scale[k]), std * scale[k], names[k][1]), status))
     return tuple(sorted(found, key=lambda p: p.name.split()[0] in ("base_frame", "tool_frame", "socket")))
@@ -201,7 +198,7 @@ def causes_of(
     found = [
         Cause(Name("joint_offset", tuple(p.name.split()[1:])), {"offset": Estimate(p.value, p.std, p.unit)}, 1.0, fall)
         for p in sorted(offsets, key=lambda p: -abs(p.value))
-        if level != "frames" and abs(p.value) > 3.0 * np.hypot(p.std, _OFFSET)
+        if level != "frames" and abs(p.value) > thresholds.OFFSET_SIGMAS * np.hypot(p.std, thresholds.OFFSET)
     ]
     gain = Gain(scale * levels.pooled([f.plain for f in folds])[channel], scale * table["chosen"][channel], unit)
     by_name = {p.name: p for p in parameters}

@@ -21,7 +21,7 @@ from ..recordings.poses import PoseRecording, read_pose_recordings
 from ..recordings.posture_checks import check_pose_recordings
 from ..results import Cause, Estimate, Experiment, Gain, Name, Selection, Verdict
 from ..rigid.model import RobotModel
-from . import levels
+from . import levels, thresholds
 from .calibrated import Calibration
 from .calibration import Run
 from .candidates import GEOMETRY, moved_rows, moves, twist_rows
@@ -32,11 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PoseDiagnosis", "diagnose_pose_task", "diagnose_poses"]
 
-_TOLERANCE = (1.0, 0.5, 1.0, 1.0, 1.0)  # mrad, mm, mrad: how well a good robot is built and zeroed
 _WIDE, _HELD = 100.0, 1e-6  # of a block that was named: free; of one that is taken away
-_MOST = 16
-_SURE = 1.0  # standard errors by which left-out postures must be worse without a named geometry
-_NOISY = 1.5  # times the device's stated accuracy: the rest is no noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +75,7 @@ def diagnose_poses(
         p_effects, p_rest = _effect_scores(run)
         effects = [c for c in calibration.causes if c.name.effect not in (*GEOMETRY, "outlier")]
         p_play, joint = _play(run)
-        plays = p_play < alpha / 5
+        plays = p_play < thresholds.OF_ALPHA * alpha
         if p_effects > alpha:
             effects = []
         elif plays:  # a law that leaves its own joint erring at random is not the right one
@@ -99,7 +95,7 @@ def diagnose_poses(
             what = "backlash, or poor repeatability"
             note = f"the true position of {joint} varies about its reading between postures: {what}"
             calibration = replace(calibration, notes=(*calibration.notes, note))
-        rest = run.history or plays or p_rest < alpha / 5 or _beyond_accuracy(recordings, calibration)
+        rest = run.history or plays or p_rest < thresholds.OF_ALPHA * alpha or _beyond_accuracy(recordings, calibration)
         rest = rest or (found and not (geometry or effects))
         return _answer(calibration, causes, p_value, rest)
 
@@ -123,7 +119,7 @@ def _geometry_of(run: Run) -> _Geometry:
     sizes = np.array([size for block in extra for size in block.sizes])
     scale = np.asarray(measured.problem.scale)
     columns = [(c.parameter, c.unit, float(size)) for c, size in zip(measured.columns, scale, strict=False)]
-    width = np.array(_TOLERANCE)[np.maximum(linear.prior, 0)]
+    width = np.array(thresholds.TOLERANCE)[np.maximum(linear.prior, 0)]
     names = [Name(c.effect, c.at) for c in measured.columns]
     places = {name: np.array([k for k, n in enumerate(names) if n == name]) for name in names}
     if added:
@@ -136,7 +132,9 @@ def _geometry_of(run: Run) -> _Geometry:
             at=np.concatenate([linear.at, np.zeros(len(added))]),
             prior=np.concatenate([linear.prior, group]),
         )
-        width = np.concatenate([width, [_TOLERANCE[1 if c.unit == "m" else 2] for c in added] * (1e-3 / sizes)])
+        width = np.concatenate(
+            [width, [thresholds.TOLERANCE[1 if c.unit == "m" else 2] for c in added] * (1e-3 / sizes)]
+        )
         columns += [("", "", 1.0)] * (first - len(columns))
         columns += [(c.parameter, c.unit, float(size)) for c, size in zip(added, sizes, strict=True)]
         if known:
@@ -152,13 +150,13 @@ def _geometry(run: Run, calibration: Calibration, alpha: float) -> tuple[list[Ca
     first = 1.0
     free = np.ones(len(width), bool)
     at, covariance = linear.at, np.zeros((len(width),) * 2)
-    while len(named) < _MOST:
+    while len(named) < thresholds.MOST_GEOMETRY:
         at, covariance = _posterior_mode(linear, noise, run.used, width)
         here = linear._replace(residual=linear.residual + linear.jacobian @ (at - linear.at), at=at)
         blocks = [linear.jacobian[:, p] if k not in named else np.zeros((len(noise), 0)) for k, p in enumerate(places)]
         scores = score_blocks(here, noise, run.used, width**-2.0, blocks, free, seed=len(named))
         first = scores.p_value if not named else first
-        if scores.p_value > alpha / 5:
+        if scores.p_value > thresholds.OF_ALPHA * alpha:
             break
         named.append(_simplest(scores))
         width[places[named[-1]]] = _WIDE
@@ -200,7 +198,7 @@ def _needed(
             loss = _left_out_squares(linear, noise, used, held) - free
             worth.append(loss.mean() / (loss.std(ddof=1) / np.sqrt(len(loss)) + 1e-300))
         least = int(np.argmin(worth))
-        if worth[least] > _SURE:
+        if worth[least] > thresholds.SURE:
             break
         width[places[kept.pop(least)]] = _HELD
     return kept
@@ -210,8 +208,8 @@ def _left_out_squares(linear: marginal.Linear, noise: np.ndarray, used: np.ndarr
     """Sum of the whitened squares of each posture, predicted without its fold."""
     postures = np.unique(linear.posture[used & (linear.posture >= 0)])
     found = np.zeros(len(postures))
-    for k in range(min(levels.FOLDS, len(postures))):
-        out = np.isin(linear.posture, postures[k :: levels.FOLDS])
+    for k in range(min(thresholds.FOLDS, len(postures))):
+        out = np.isin(linear.posture, postures[k :: thresholds.FOLDS])
         at, _ = _posterior_mode(linear, noise, used & ~out, width)
         rows = np.flatnonzero(out & used)
         square = ((linear.residual[rows] + linear.jacobian[rows] @ (at - linear.at)) / noise[rows]) ** 2
@@ -301,7 +299,7 @@ def _beyond_accuracy(recordings: Sequence[PoseRecording], calibration: Calibrati
     """Whether the noise that is left is more than the device is said to have."""
     for c in (0, 1):
         stated = [r.accuracy[c] for r in recordings if r.accuracy[c] is not None]
-        if stated and calibration.noise[c] > _NOISY * max(s for s in stated if s is not None):
+        if stated and calibration.noise[c] > thresholds.NOISY * max(s for s in stated if s is not None):
             return True
     return False
 

@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..estimation.marginal import FLAT, Linear, Posterior
+from . import thresholds
 
 __all__ = ["Scores", "row_noise", "score_blocks", "score_jitter", "score_waves", "waves_shown"]
 
 _CUT = 1e-7  # of a column's length, that must be left beside the fit
 _DRAWS = 400
 _WAVE_DRAWS = 200
-_SHOWN = 1e-2  # chance that noise alone gives the largest wave of a joint, for it to be looked at
 
 Array = np.ndarray
 
@@ -144,7 +144,7 @@ def waves_shown(
         phase = np.outer(one.angle, one.order)
         taken = _by_posture(np.sin(phase), np.cos(phase), pull, square)
         best = int(np.argmax(taken))
-        if len(one.order) * (1.0 - min(taken[best] / (e @ e), 1.0)) ** (0.5 * (freedom - 2)) < _SHOWN:
+        if len(one.order) * (1.0 - min(taken[best] / (e @ e), 1.0)) ** (0.5 * (freedom - 2)) < thresholds.WAVE:
             found.append(int(one.blocks[best]))
     return found
 

@@ -20,11 +20,11 @@ from ..estimation import marginal, posefit
 from ..estimation.marginal import FLAT, Linear, Posterior
 from ..estimation.posegroups import Measured
 from ..estimation.posesolver import solve
+from . import thresholds
 from .kinematic_scores import Waves, row_noise, waves_shown
 
 __all__ = [
     "EFFECT",
-    "FOLDS",
     "LEVELS",
     "Choice",
     "Effects",
@@ -40,16 +40,11 @@ __all__ = [
 ]
 
 LEVELS = ("frames", "joint_offset", "full")
-FOLDS = 5
 EFFECT, _EMPTY = 3, 4  # prior groups: 0 offsets, 1 translations, 2 rotations, 3 effects, 4 empty columns
 _TOLERANCE = (5.0, 1.0, 1.0, 1.0, 1.0)  # stated widths in mrad or mm
 _NO_WIDTH = 1e6  # of a prior that says nothing
 _PATIENCE = 2000  # steps along the valleys of what the data hardly show
 _EFFECT_WIDTH = 3.0  # of an effect's coefficient, in sizes that move its joint by 1 mrad or 1 mm RMS
-_LEVEL_GAIN = 0.01  # of the held-out error, that a level must take away from the one below it
-_LEAST_GAIN = 0.03  # of the held-out error, that an effect must take away to be taken in
-_MOST = 6  # effects
-_RIVAL = 0.9  # of the gain: what gains that much is not told apart
 
 Array = np.ndarray
 
@@ -181,7 +176,7 @@ def choose(measured: Measured, used: Bool[Array, " rows"], effects: Effects | No
         fits[level] = linear, posterior
         if asked is None:
             scores[level] = _held_out(measured, linear, used, posterior)
-            if best is None or scores[level] < (1.0 - _LEVEL_GAIN) * scores[best]:
+            if best is None or scores[level] < (1.0 - thresholds.LEVEL_GAIN) * scores[best]:
                 best = level
     assert best is not None
     linear, posterior = fits[best]
@@ -194,7 +189,7 @@ def choose(measured: Measured, used: Bool[Array, " rows"], effects: Effects | No
 def _inner_folds(measured: Measured, used: Array) -> list[tuple[Array, Array]]:
     """Rows to fit, and postures left out, of each inner fold."""
     inside = np.unique(measured.posture[used & (measured.posture >= 0)])
-    folds = [inside[k::FOLDS] for k in range(min(FOLDS, len(inside)))]
+    folds = [inside[k :: thresholds.FOLDS] for k in range(min(thresholds.FOLDS, len(inside)))]
     return [(used & ~np.isin(measured.posture, fold), fold) for fold in folds]
 
 
@@ -256,15 +251,15 @@ def _joined(
     """Of the blocks `which`, those that join, what gains nearly as much as each, and the errors on the inner folds."""
     slices, chosen, rivals, scores = effects.slices(which), [], [], {}
     current = _score_of(folds)
-    while len(chosen) < _MOST:
+    while len(chosen) < thresholds.MOST_EFFECTS:
         ranked = _screen(folds, slices, chosen)
         trials = {k: _score_of(folds, np.r_[slices[k]]) for k in ranked[:12]}
         best = min(trials, key=lambda k: trials[k] * (1.0 + effects.handicap[k]), default=None)
-        if best is None or trials[best] > (1.0 - _LEAST_GAIN) * current:
+        if best is None or trials[best] > (1.0 - thresholds.EFFECT_GAIN) * current:
             break
         for inner in folds:
             inner.take(np.r_[slices[best]])
-        close = current - _RIVAL * (current - trials[best])
+        close = current - thresholds.RIVAL * (current - trials[best])
         rivals.append(tuple(k for k in trials if k != best and trials[k] < close))
         current = trials[best]
         chosen.append(best)
@@ -369,13 +364,13 @@ def nested(
     """
     inside = np.unique(measured.posture[used & (measured.posture >= 0)])
     folds = []
-    for k in range(min(FOLDS, len(inside))):
-        fold = inside[k::FOLDS]
+    for k in range(min(thresholds.FOLDS, len(inside))):
+        fold = inside[k :: thresholds.FOLDS]
         rows = used & ~np.isin(measured.posture, fold)
         choice = choose(measured, rows, effects, asked)
         each = {level: errors(measured, fit[0].residual, fold) for level, fit in choice.fits.items()}
         plain = each[choice.level]
         chosen = errors(measured, extended(choice, rows), fold) if choice.effects else plain
         folds.append(Fold(choice, each, plain, chosen))
-        progress((k + 1) / FOLDS)
+        progress((k + 1) / thresholds.FOLDS)
     return folds

@@ -11,13 +11,9 @@ from jaxtyping import Bool
 
 from ..estimation import marginal
 from ..estimation.marginal import Linear, Posterior
+from . import thresholds
 
 __all__ = ["find_outliers"]
-
-_FAR = 8.0  # sizes of the noise; what is nearer may be a heavy tail, which the robust fit bears,
-_ALONE = 4.5  # unless it is that many standard deviations off the logarithms of the others' sizes
-_ENOUGH = 20  # postures that show how those spread
-_MOST = 0.1  # of the postures
 
 
 def find_outliers(
@@ -26,7 +22,7 @@ def find_outliers(
     """Postures among the rows `used` that are outliers to a fit of the `free` unknowns, and the size of each."""
     found: dict[int, float] = {}
     postures = len(np.unique(linear.posture[used]))
-    while len(found) < max(1, int(_MOST * postures)):
+    while len(found) < max(1, int(thresholds.OUTLIERS_AT_MOST * postures)):
         rows = used & ~np.isin(linear.posture, list(found))
         posterior = marginal.fit(linear, rows, free, robust=True)
         numbers, sizes, counts = _sizes(linear, posterior, rows)
@@ -42,11 +38,11 @@ def _limit(logarithms: np.ndarray, count: int) -> float:
 
     That deviation is known from few postures: it is no less than that of normal noise, 1/sqrt(2 n) for n numbers.
     """
-    if len(logarithms) < _ENOUGH:
-        return _FAR
+    if len(logarithms) < thresholds.ENOUGH:
+        return thresholds.FAR
     middle = np.median(logarithms)
     spread = max(1.4826 * float(np.median(np.abs(logarithms - middle))), (2 * count) ** -0.5)
-    return min(_FAR, float(np.exp(middle + _ALONE * spread)))
+    return min(thresholds.FAR, float(np.exp(middle + thresholds.ALONE * spread)))
 
 
 def _sizes(linear: Linear, posterior: Posterior, used: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ and others, 2015), and all columns of the joint are Z R B with the matrix B of i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from jaxtyping import Array, Float, Int
 
 from ..compiled.batching import CPU_OPTIONS, aligned, program
 from ..compiled.machine_code import machine_code
+from ..compiled.precision import in_float64
 from ..effects.base import Effect
 from ..errors import InputError
 from ..rigid.model import RobotModel
@@ -186,18 +188,22 @@ def _summed(states: States, frames: Sequence[OwnFrame], mesh: Mesh, folds: int, 
     totals, fixed = zip(*(jax.device_put(start, device) for device in devices), strict=True)
     numbers = _places(model, terms)[1] + sum(2 * g.places.size for g in groups)
     codes = block_codes(model) if devices[0].platform == "gpu" else None
-    chunks, before = 0, None
-    for number, part in enumerate(states.source()):
-        check_piece(model, part, number, values=False)
-        chunk = chunk or _chunk(mesh, numbers, len(part[0]) // folds)
-        add, own = _program(chunk, folds, codes, devices[0].platform == "cpu"), -(-len(part[0]) // (chunk * mesh.size))
-        firsts = [np.int32(chunks + own * k) for k in range(mesh.size)]
-        share = own * chunk
-        there = [np.int32(np.clip(len(part[0]) - k * share, 0, share)) for k in range(mesh.size)]
-        totals = tuple(map(add, totals, fixed, _shares(part, chunk, mesh), there, firsts))
-        chunks += -(-len(part[0]) // chunk)
-        jax.block_until_ready(before)  # one piece ahead: no more wait in memory
-        before = [total.rows for total in totals]
+    chunks, before, lengths = 0, None, set()
+    with ThreadPoolExecutor(mesh.size) as threads:  # a call ends only when its device has taken nearly all the work
+        for number, part in enumerate(states.source()):
+            check_piece(model, part, number, values=False)
+            chunk = chunk or _chunk(mesh, numbers, len(part[0]) // folds)
+            add = in_float64(_program(chunk, folds, codes, devices[0].platform == "cpu"))
+            own = -(-len(part[0]) // (chunk * mesh.size))
+            firsts = [np.int32(chunks + own * k) for k in range(mesh.size)]
+            share = own * chunk
+            there = [np.int32(np.clip(len(part[0]) - k * share, 0, share)) for k in range(mesh.size)]
+            beside = map if len(part[0]) not in lengths else threads.map  # compiled one after the other
+            totals = tuple(beside(add, totals, fixed, _shares(part, chunk, mesh), there, firsts))
+            lengths.add(len(part[0]))
+            chunks += -(-len(part[0]) // chunk)
+            jax.block_until_ready(before)  # one piece ahead: no more wait in memory
+            before = [total.rows for total in totals]
     sums = jax.tree.map(lambda *own: sum(own), *jax.device_get(totals))
     products: list[Any] = [None] * nv
     for group, found in zip(groups, sums.products, strict=True):
