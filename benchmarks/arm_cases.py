@@ -2,10 +2,12 @@
 
     python benchmarks/arm_cases.py --seeds 1 2 [--effects payload none] [--sizes 0 1 2] [--noise white|coloured|counts]
     python benchmarks/arm_cases.py --seeds 1 --pairs
+    python benchmarks/arm_cases.py --seeds 1 --forbid
 
 Each arm is made by MuJoCo C (`tests/generators/servo_arm6.py`, no code shared with the library) and diagnosed with a
 model whose armature, damping and frictionloss are 1.6 times too large, on two recordings of 12 s. The joint follows
-from the seed. One line a run; `wrong` is a name that is neither hidden nor told to be alike.
+from the seed. One line a run; `wrong` is a name that is neither hidden nor told to be alike. `--forbid` leaves the true
+effect out of the catalogue: the answer must be `unknown` then.
 """
 
 from __future__ import annotations
@@ -24,13 +26,14 @@ from generators import servo_arm6  # noqa: E402
 from figaroh_jax.rollouts.arm import search_arm  # noqa: E402
 from figaroh_jax.rollouts.data import Run, Stretch  # noqa: E402
 from figaroh_jax.rollouts.reading import load_loop  # noqa: E402
-from figaroh_jax.rollouts.search import search, setting  # noqa: E402
+from figaroh_jax.rollouts.search import search  # noqa: E402
+from figaroh_jax.rollouts.setting import setting  # noqa: E402
 
 LINKS = 5  # the last link carries the payload
 
 
 def run(
-    hidden: list[tuple[str, int, float]], seed: int, noise: str, *, whole: bool, known: bool
+    hidden: list[tuple[str, int, float]], seed: int, noise: str, *, whole: bool, known: bool, forbid: bool = False
 ) -> tuple[str, str, float]:
     """Verdict with its names, what was found, CPU seconds."""
     with tempfile.NamedTemporaryFile("w", suffix=".xml") as file:
@@ -43,14 +46,17 @@ def run(
         runs.append(Run(f"run {number}", r["t"], r["u"], r["q"], None))
     cut = [Stretch(k, f, 600) for k in range(2) for f in range(0, 1200, 600)]
     start = time.process_time()
-    here = setting(loop, runs, gains_known=known, stretches=cut)
-    found = (search if whole else search_arm)(here)
+    left_out = tuple(effect for effect, _, _ in hidden) if forbid else ()
+    here = setting(loop, runs, gains_known=known, stretches=cut, forbid=left_out)
+    found = (search if whole else search_arm)(here, forbid=left_out)
     names = {(n.candidate.effect, *n.candidate.at) for n in found.named}
     alike = {(a.effect, *a.at) for n in found.named for a in n.alike}
     truth = {(effect, "payload" if effect == "payload" else servo_arm6.NAMES[j]) for effect, j, _ in hidden}
     told = {(e, "payload" if e == "payload" else place) for e, place in names}
     also = {(e, "payload" if e == "payload" else place) for e, place in alike}
-    if not hidden:
+    if left_out:
+        word = "right" if found.verdict == "unknown" else "wrong" if names else "missed"
+    elif not hidden:
         word = "right" if found.verdict == "nothing" else "wrong" if names else "unknown"
     elif told == truth or (truth <= told | also and told <= truth | also):
         word = "right"
@@ -73,12 +79,14 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--noise", choices=["white", "coloured", "counts"], default="white")
     parser.add_argument("--pairs", action="store_true", help="two effects at a time, of the middle size")
+    parser.add_argument("--forbid", action="store_true", help="leave the true effect out of the catalogue")
     parser.add_argument("--whole", action="store_true", help="search with the whole arm in place of joint by joint")
     args = parser.parse_args()
     count: dict[str, int] = {}
     for seed in args.seeds:
         for hidden in _cases(args, np.random.default_rng([seed, 3])):
-            word, text, seconds = run(hidden, seed, args.noise, whole=args.whole, known=True)
+            given = {"whole": args.whole, "known": True, "forbid": args.forbid}
+            word, text, seconds = run(hidden, seed, args.noise, **given)
             count[word] = count.get(word, 0) + 1
             label = "+".join(f"{e}@{servo_arm6.NAMES[j]}:{size:g}" for e, j, size in hidden) or "none"
             print(f"seed {seed} {args.noise} {label}: {word}; {text}, {seconds:.0f} CPU s", flush=True)

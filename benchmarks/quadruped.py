@@ -30,7 +30,7 @@ from figaroh_jax.cli import main as command_line
 from figaroh_jax.rollouts.data import Run, Stretch, windows
 from figaroh_jax.rollouts.fit import fit, standard_errors
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import begun, setting
+from figaroh_jax.rollouts.setting import begun, setting
 
 mujoco: Any = engine
 DT, EVERY, NOISE = 0.002, 5, 2e-4

@@ -31,8 +31,9 @@ from figaroh_jax.rollouts.fit import fit, start_of
 from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.parameters import Entry, put, values
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import Search, Setting, search, setting
+from figaroh_jax.rollouts.search import Search, search
 from figaroh_jax.rollouts.sensitivity import linear_sums
+from figaroh_jax.rollouts.setting import Setting, setting
 from figaroh_jax.rollouts.task import simulated
 
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", "/data"))

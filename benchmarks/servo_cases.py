@@ -23,7 +23,8 @@ from generators import servo_arm  # noqa: E402
 from figaroh_jax.rollouts.data import Run  # noqa: E402
 from figaroh_jax.rollouts.fit import standard_errors  # noqa: E402
 from figaroh_jax.rollouts.reading import load_loop  # noqa: E402
-from figaroh_jax.rollouts.search import Search, search, setting  # noqa: E402
+from figaroh_jax.rollouts.search import Search, search  # noqa: E402
+from figaroh_jax.rollouts.setting import setting  # noqa: E402
 
 TRUTH = {"armature": 0.05, "damping": 0.4, "friction": 0.3}
 EFFECT = {

@@ -12,6 +12,7 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 # these have tests of their own, or make what the package ships
 ELSEWHERE = {"make_demo", "own_device", "own_effect"}
 SLOW = {
+    "any_optimiser",
     "calibrate_tracker",
     "design_a_motion",
     "diagnose_arrays",
@@ -27,6 +28,7 @@ SLOW = {
     "so101",
 }
 SAYS = {
+    "any_optimiser": "any optimiser: -2",
     "dynamics_and_gradients": "by the mass of each link",
     "batch": "200 resamples",
     "friction_by_gradient": "damping 1.19",

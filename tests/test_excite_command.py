@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ import reference
 import yaml
 from schema import matches
 from test_excitation import ARM
+from test_robot_view import Server
 
 from figaroh_jax.cli import main
 from figaroh_jax.errors import InputError
@@ -18,6 +22,7 @@ from figaroh_jax.excitation import design, solvers
 from figaroh_jax.excitation.task import excite_task, read_motion
 from figaroh_jax.formats.config import load_task
 from figaroh_jax.formats.urdf import load_urdf
+from figaroh_jax.reporting.motion_view import show_design_run
 
 BASIS = "basis: {quintic: 3}, duration: 2"
 
@@ -29,8 +34,24 @@ def task_of(folder: Path, keys: str, more: str = "") -> Path:
     return file
 
 
+def moves_in_the_view(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second motion of a run, as the view draws it at half its time."""
+    monkeypatch.setitem(sys.modules, "viser", SimpleNamespace(ViserServer=Server))
+    server: Any = show_design_run(run, play=False)[0]
+    server.controls["motion"].value = "trajectory 2"
+    server.controls["time, s"].value = 1.0
+    server.controls["time, s"].calls[0]()
+    with np.load(run / "trajectory_2.npz") as motion:
+        middle = motion["q"][1000]
+    tips = reference.forward_kinematics(load_urdf(run.parent / "robot.urdf"), middle)[:, :3, 3]
+    np.testing.assert_allclose(server.drawn["/robot"][0][0][:, 1], tips, rtol=0, atol=1e-9)
+    (run.parent / "task.yaml").write_text("robot: {model: robot.urdf, joints: [bend]}\nexcite: {duration: 2}")
+    with pytest.raises(InputError, match="made for the joints turn, bend"):
+        show_design_run(run)
+
+
 def test_the_run_holds_the_motion_at_1_khz_with_its_torques_and_a_joint_trajectory(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     file = task_of(tmp_path, f"{BASIS}, limits: {{acceleration: 7.0}}, starts: 1, trajectories: 2, noise: 0.02")
     assert main(["excite", str(file), "--out", str(tmp_path / "run"), "--json", "--quiet"]) == 0
@@ -57,7 +78,8 @@ def test_the_run_holds_the_motion_at_1_khz_with_its_torques_and_a_joint_trajecto
     for one in answer["parameters"]:
         assert one["std"] < one["std_before"]
     page = (tmp_path / "run" / "report.html").read_text()
-    assert "within limits" in page and "1 kHz" in page and page.count("<polyline") == 12
+    assert "within limits" in page and "1 kHz" in page and page.count("<polyline") == 16
+    moves_in_the_view(tmp_path / "run", monkeypatch)
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,8 @@ from figaroh_jax.rollouts.faults import faults, without
 from figaroh_jax.rollouts.fit import System, standard_errors
 from figaroh_jax.rollouts.parameters import Entry
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import begun, setting
 from figaroh_jax.rollouts.sensitivity import Sums, Windows, predicted
+from figaroh_jax.rollouts.setting import begun, setting
 
 ROWS = 400
 

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 from generators import servo_arm6
+from scipy.linalg import toeplitz
 from test_rollouts import chain, mujoco_c, waves, written
 
 from figaroh_jax.rollouts import sensitivity
@@ -45,11 +46,21 @@ def test_seven_joints_with_friction_and_limits_are_mujocos(tmp_path: Path, integ
 
 
 def checked(loop: Loop, table: Table, theta: np.ndarray, data: Windows, start: np.ndarray, least: float = 1e-3) -> None:
-    """Gradients of the whitened squares against central differences of the simulation's own."""
-    code = native(loop, table, data)
+    """Gradients of the whitened squares against central differences of the simulation's own.
+
+    Coloured noise is whitened by the inverse of its covariance's triangular factor.
+    """
+    code, rows = native(loop, table, data), len(data.reading)
+    whiten = (
+        np.eye(rows)[None, None]
+        if data.pole is None
+        else np.array([[_whitener(p, rows) for p in x] for x in data.pole])
+    )
 
     def squares(theta: np.ndarray, start: np.ndarray) -> np.ndarray:
-        return (data.reading - code.read(theta, start)) * data.weight
+        error = (data.reading - code.read(theta, start)) * data.weight
+        every = whiten if len(whiten) > 1 else whiten[0, 0]
+        return np.einsum("ywrs,syw->ryw" if every.ndim > 2 else "rs,syw->ryw", every, error)
 
     found = code.sums(theta, np.arange(len(table)), start)
     error = squares(theta, start)
@@ -68,6 +79,11 @@ def checked(loop: Loop, table: Table, theta: np.ndarray, data: Windows, start: n
     assert wrong.max() < 2e-5, f"{names[k]}: {wrong[k, k]}"
     gradient, size = found.gradient.sum((0, 1)) / scale, float(np.linalg.norm(error))
     np.testing.assert_allclose(gradient, np.asarray(rows @ error.ravel()) / scale, rtol=0, atol=2e-5 * size)
+
+
+def _whitener(pole: float, rows: int) -> np.ndarray:
+    """Inverse of the triangular factor of the covariance of a first-order low pass of white noise of variance 1."""
+    return np.linalg.inv(np.linalg.cholesky(toeplitz(pole ** np.arange(rows)) / (1 - pole**2)))
 
 
 def arm(folder: Path) -> tuple[Loop, Run]:
@@ -107,6 +123,14 @@ def test_derivatives_of_an_arm_are_those_of_differences(tmp_path: Path, law: str
     checked(loop, table, theta, data, np.asarray(data.start))
 
 
+def test_derivatives_with_coloured_noise_are_those_of_differences(tmp_path: Path):
+    loop, run = arm(tmp_path)
+    pole = np.array([0.6, 0.0, 0.3, 0.9, 0.5, 0.1])
+    data = windows(loop, [run], [Stretch(0, 100, 60), Stretch(0, 300, 60)], [np.full(6, 2e-4)], 0.3, pole=pole)
+    table = (Entry("friction", (1,)), Entry("reading", (3,)), Entry("delay", (2,)))
+    checked(loop, table, np.array([0.3, 0.01, 0.0043]), data, np.asarray(data.start))
+
+
 @pytest.mark.parametrize("elastic", [False, True])
 def test_derivatives_of_a_carried_joint_are_those_of_differences(tmp_path: Path, elastic: bool):
     loop, run = arm(tmp_path)
@@ -131,12 +155,14 @@ def test_what_the_code_does_not_know_is_left_to_the_plain_form(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_the_plain_form_gives_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Sums of a carried joint by JAX's program, which machines without a compiler run."""
+@pytest.mark.parametrize("pole", [None, np.array([0.6])])
+def test_the_plain_form_gives_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pole: np.ndarray | None):
+    """Sums of a carried joint by JAX's program, which machines without a compiler run; some rows do not count."""
     loop, run = arm(tmp_path)
     small, (mine,) = alone(loop, [run], carried_by(loop, [run]), 2)
     table = tuple(Entry(name, (0,)) for name in ("armature", "friction", "load_ratio", "scale", "delay"))
-    data = windows(small, [mine], [Stretch(0, 100, 60)], [np.array([2e-4])], 0.3)
+    mine = mine._replace(trusted=(np.arange(len(mine.time)) < 115) | (np.arange(len(mine.time)) > 120))
+    data = windows(small, [mine], [Stretch(0, 100, 60)], [np.array([2e-4])], 0.3, pole=pole)
     given = np.array([[0.05, 0.2, 0.1, 1.1, 0.0043]]), np.arange(5)[None], data, np.asarray(data.start)[None]
     own = linear_sums(small, table, *given)
     monkeypatch.setattr(sensitivity, "native", lambda *_: SimpleNamespace(usable=False))

@@ -40,7 +40,7 @@ __all__ = ["FARTHEST", "FEWEST", "code_of_few", "library", "machine_code", "own_
 
 FEWEST = 8  # samples: no vector is longer
 FROM = 512  # samples; below, handing them over costs as much as it saves
-TO_COMPILE = 2048  # samples from which a program that is nowhere yet is compiled
+TO_COMPILE = 512  # samples from which a program that is nowhere yet is compiled
 SMALL = 700  # constants of a robot (12 joints) up to which this holds; a larger one takes longer to compile than XLA's
 PIECE = 4096  # samples of one call, on one core
 ALIGNMENT = 64  # bytes; XLA takes such memory over without a copy

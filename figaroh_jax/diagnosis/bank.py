@@ -62,6 +62,9 @@ def bank(rows: Rows, candidates: list[Columns], before: Bank | None = None) -> B
     `before` is the bank of rows whose model these rows have only added columns to: of a candidate that was there, the
     same object, only the products with the new columns are computed.
     """
+    if before and len(before.candidates) == len(candidates):
+        if all(old is new for old, new in zip(before.candidates, candidates, strict=True)):
+            return _beside_more(rows, before)
     old = {id(one): place for place, one in enumerate(before.candidates)} if before else {}
     place = [old.get(id(one), -1) for one in candidates]
     parts = [before.parts[i] if before and i >= 0 else _parts(rows, c) for i, c in zip(place, candidates, strict=True)]
@@ -80,6 +83,15 @@ def bank(rows: Rows, candidates: list[Columns], before: Bank | None = None) -> B
     ZX = _grown_product(rows.X, blocks, kept, before.ZX if before else None)
     ZXi = _grown_product(rows.Xi, blocks, kept, before.ZXi if before else None) if len(rows.partner) else ZX
     return Bank(candidates, span, parts, blocks, own, ZX, ZXi)
+
+
+def _beside_more(rows: Rows, before: Bank) -> Bank:
+    """The same bank beside a model with more columns."""
+    ZX = np.concatenate([before.ZX, before.product([x[:, before.ZX.shape[1] :] for x in rows.X])], axis=1)
+    if not len(rows.partner):
+        return before._replace(ZX=ZX, ZXi=ZX)
+    more = before.product([x[:, before.ZXi.shape[1] :] for x in rows.Xi])
+    return before._replace(ZX=ZX, ZXi=np.concatenate([before.ZXi, more], axis=1))
 
 
 def _blocks(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
+from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
 from weakref import ref
 
@@ -114,16 +115,22 @@ class Part:
 
     def torque(self, theta: Float[np.ndarray, " k"], rows: slice = slice(None)) -> Float[np.ndarray, "rows nv"]:
         """Torque (samples, nv) of the coefficients `theta`, N m or N; `rows` are samples."""
-        if rows == slice(None) and self._last and np.array_equal(self._last[0][0], theta):
+        whole = rows == slice(None)
+        if whole and self._last and np.array_equal(self._last[0][0], theta):
             return self._last[0][1]
-        if rows == slice(None) and self._quick is not None:
+        if whole and self._quick is not None:
             return self._held(theta, self._quick(theta))
-        series = self.series[:, rows]
-        out, ends = np.zeros((series.shape[1], self.nv)), np.searchsorted(self.joint, np.arange(self.nv + 1))
-        for joint in range(self.nv):
-            own = slice(ends[joint], ends[joint + 1])
-            out[:, joint] = theta[self.column[own]] @ series[own]
-        return self._held(theta, out) if rows == slice(None) else out
+        series = self.series if whole else self.series[:, rows]
+        out = np.zeros((self.nv, series.shape[1]))
+        for joint, own in self._stretches:
+            np.dot(theta[self.column[own]], series[own], out=out[joint])
+        return self._held(theta, out.T) if whole else out.T
+
+    @cached_property
+    def _stretches(self) -> list[tuple[int, slice]]:
+        """The joints that have any of `series`, and where these stand."""
+        ends = np.searchsorted(self.joint, np.arange(self.nv + 1)).tolist()
+        return [(joint, slice(a, b)) for joint, (a, b) in enumerate(pairwise(ends)) if b > a]
 
     def _held(self, theta: Float[np.ndarray, " k"], torque: Float[np.ndarray, "nN nv"]) -> Float[np.ndarray, "nN nv"]:
         """The torque, which states that grow out of one another ask for again."""

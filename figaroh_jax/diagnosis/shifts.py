@@ -7,20 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
-from ..compiled.batching import CPU_OPTIONS
-from ..compiled.executable_cache import Program
 from ..effects.base import Effect, Motion
 from ..recordings.stacked import Records
-from ..rigid.dynamics import inverse_dynamics
+from ..rigid.dynamics import torques_on_host
 from ..rigid.model import Leaf, RobotModel
 
 __all__ = ["difference", "links_torque", "rigid_torque", "shift_torques", "shifted", "torque_change"]
@@ -37,7 +33,7 @@ def rigid_torque(
     model: RobotModel, q: Float[Leaf, "*batch nv"], v: Float[Leaf, "*batch nv"], a: Float[Leaf, "*batch nv"]
 ) -> Float[np.ndarray, "*batch nv"]:
     """`inverse_dynamics` in NumPy."""
-    return np.asarray(inverse_dynamics(model, q, v, a))
+    return torques_on_host(model, *(np.asarray(x) for x in (q, v, a)))
 
 
 def links_torque(
@@ -97,26 +93,32 @@ class _Compliance(NamedTuple):
     """1 + c dload/dq of one sensor along its own joint, c (K q + D v + M a) changing with the motion; diagonals.
 
     Below, on and above the diagonal, by central differences, sample by sample; the ends of a recording say nothing.
+    What the inertia alone would need is damped: nothing at low frequencies, all at the link's resonance, where a motion
+    of any size leaves no error.
     """
 
     whole: Float[np.ndarray, "3 n N"]
-    inertial: Float[np.ndarray, "3 n N"]  # c M a alone
+    factors: list[np.ndarray]  # Cholesky factor of the damped normal matrix of each recording, as LAPACK keeps it
+
+    @classmethod
+    def of(cls, whole: Float[np.ndarray, "3 n N"], inertial: Float[np.ndarray, "3 n N"]) -> _Compliance:
+        """`inertial` is the part c M a."""
+        from scipy.linalg import cholesky_banded  # slow to import
+
+        square = _square(whole) + _square(inertial)
+        square[2] += TINY
+        return cls(whole, [cholesky_banded(own, check_finite=False) for own in np.moveaxis(square, 1, 0)])
 
     def solve(self, missing: Float[np.ndarray, "n N"]) -> Float[np.ndarray, "n N"]:
-        """The change of position behind a missing error, by damped least squares.
-
-        What the inertia alone would need is damped: nothing at low frequencies, all at the link's resonance, where
-        a motion of any size leaves no error.
-        """
-        from scipy.linalg import solveh_banded  # slow to import
+        """The change of position behind a missing error, by damped least squares."""
+        from scipy.linalg import cho_solve_banded  # slow to import
 
         below, on, above = self.whole
         right = on * missing
         right[:, 1:] += above[:, :-1] * missing[:, :-1]
         right[:, :-1] += below[:, 1:] * missing[:, 1:]
-        square = _square(self.whole) + _square(self.inertial)
-        square[2] += TINY
-        return np.stack([solveh_banded(square[:, k], right[k]) for k in range(len(on))])
+        each = zip(self.factors, right, strict=True)
+        return np.stack([cho_solve_banded((factor, False), one, check_finite=False) for factor, one in each])
 
 
 def _square(diagonals: Float[np.ndarray, "3 n N"]) -> Float[np.ndarray, "3 n N"]:
@@ -149,7 +151,7 @@ def _compliances(
             part[:, :, :count] = part[:, :, -count:] = 0.0
             for slot, first in records.joins:
                 part[:, slot, first - count : first + count] = 0.0
-        out.append(_Compliance(whole, inertial))
+        out.append(_Compliance.of(whole, inertial))
     return out
 
 
@@ -196,7 +198,9 @@ def _errors(
     out = []
     for one in range(len(effects.at)):
         here = motion if loads is None else replace(motion, load=loads[one])
-        out.append(np.asarray(_error(jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects), here)))
+        effect = jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects)
+        # as it is written, on NumPy's arrays; a bound method would be a module of its own
+        out.append(np.asarray(type(effect).position_error(effect, here)))
     return np.stack(out)
 
 
@@ -255,8 +259,7 @@ def shift_torques(effects: Effect, motion: Motion, records: Records) -> Float[np
     velocity and the acceleration of the joint: the same for all sensors.
     """
     names = [name for name, p in effects.parameters().items() if p.linear]
-    errors = np.asarray(_unit_errors(effects, motion))
-    errors = errors.reshape(len(effects.at), len(names), *records.position.shape[:2])
+    errors = _unit_errors(effects, motion).reshape(len(effects.at), len(names), *records.position.shape[:2])
     rates = difference(errors, float(records.dt))
     pushes = difference(rates, float(records.dt))
     loads = _load_slopes(motion, records)
@@ -286,16 +289,12 @@ def _load_slopes(motion: Motion, records: Records) -> Float[np.ndarray, "3 nv nv
     return _SLOPES[0][2]
 
 
-@partial(Program, options=CPU_OPTIONS)
-def _unit_errors(effects: Effect, motion: Motion) -> Float[Array, "effects k nN"]:
-    names = [name for name, p in effects.parameters().items() if p.linear]
-
-    def one(effect: Effect, unit: Array) -> Array:
-        return eqx.tree_at(lambda e: [getattr(e, n) for n in names], effect, list(unit)).position_error(motion)
-
-    return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(effects, jnp.eye(len(names)))
-
-
-@partial(Program, options=CPU_OPTIONS)
-def _error(effect: Effect, motion: Motion) -> Float[Array, " nN"]:
-    return effect.position_error(motion)
+def _unit_errors(effects: Effect, motion: Motion) -> Float[np.ndarray, "effects k nN"]:
+    """What each sensor reads beside the truth with a unit of each of its amplitudes."""
+    names, out = [name for name, p in effects.parameters().items() if p.linear], []
+    for one in range(len(effects.at)):
+        effect = jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects)
+        for unit in np.eye(len(names)):
+            units = replace(effect, **dict(zip(names, unit, strict=True)))
+            out.append(np.asarray(type(effect).position_error(units, motion)))
+    return np.reshape(out, (len(effects.at), len(names), -1))

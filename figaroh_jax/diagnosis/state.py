@@ -84,9 +84,11 @@ class State:
 
     def shares(self, theta: Float[np.ndarray, " P"]) -> Iterator[Float[np.ndarray, "nN nv"]]:
         """Torque of the rigid body with what it carries, then of each term."""
-        split = np.split(theta, np.cumsum([part.width for part in self.parts])[:-1])
-        for part, own, known in zip(self.parts, split, (self.known, *(0.0 for _ in self.terms)), strict=True):
-            yield part.torque(own) + known
+        first = 0
+        for part in self.parts:
+            torque = part.torque(theta[first : first + part.width])
+            yield torque if first or self.carried is None else torque + self.known
+            first += part.width
 
     def response(self, omega: Float[Leaf, " F"]) -> Complex[np.ndarray, " F"] | Float[np.ndarray, " F"]:
         """Response of the torque sensor of all sensor effects together."""

@@ -107,7 +107,7 @@ class Motion(eqx.Module):
     def angle(self) -> Float[Leaf, "samples nv"]:
         """Position of each coordinate, rad or m; zero where no one number tells it (joints of several axes)."""
         if self.model.nq == len(self.model.joint_names):
-            return jnp.asarray(self.position)
+            return self.position if isinstance(self.position, np.ndarray) else jnp.asarray(self.position)
         column = np.full(self.model.nv, -1)
         for joint, at in zip(self.model.joints, self.model.dofs.positions, strict=True):
             if joint.kind in ("revolute", "prismatic"):
@@ -126,13 +126,15 @@ class Motion(eqx.Module):
         t = jnp.asarray(self.time)
         return t - jnp.where(jnp.asarray(self.dt) > 0, t.min(), 0.0)
 
-    def rate(self, signal: Float[Array, "samples *rows"]) -> Float[Array, "samples *rows"]:
+    def rate(self, signal: Float[Leaf, "samples *rows"]) -> Any:
         """Time derivative of a signal, by five-point central differences; zero at the two ends of each recording."""
-        x, t, dt = jnp.asarray(signal), jnp.asarray(self.time), jnp.asarray(self.dt)
-        slope = 8 * (jnp.roll(x, -1, 0) - jnp.roll(x, 1, 0)) - (jnp.roll(x, -2, 0) - jnp.roll(x, 2, 0))
-        inside = jnp.abs(jnp.roll(t, -2) - jnp.roll(t, 2) - 4 * dt) < dt / 2
+        on_host = all(isinstance(x, (np.ndarray, np.generic, float)) for x in (signal, self.time, self.dt))
+        space: Any = np if on_host else jnp  # on the host it costs no program
+        x, t, dt = space.asarray(signal), space.asarray(self.time), space.asarray(self.dt)
+        slope = 8 * (space.roll(x, -1, 0) - space.roll(x, 1, 0)) - (space.roll(x, -2, 0) - space.roll(x, 2, 0))
+        inside = abs(space.roll(t, -2) - space.roll(t, 2) - 4 * dt) < dt / 2
         inside = inside.reshape(-1, *(1 for _ in x.shape[1:]))
-        return jnp.where(inside, slope / jnp.where(dt > 0, 12 * dt, 1.0), 0.0)
+        return space.where(inside, slope / space.where(dt > 0, 12 * dt, 1.0), 0.0)
 
     def reversal(
         self, velocity: Float[Array, " samples"], acceleration: Float[Array, " samples"], width: Float[Array, ""]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..rigid.kinematics import axis_twists, forward_kinematics, gather, movers, pose_columns
+from ..rigid.kinematics import axis_twists, gather, movers, pose_columns, poses_on_host
 from ..rigid.model import RobotModel
 from .base import Effect, Motion, Scalar, amplitude, shape
 from .registry import register
@@ -113,5 +113,5 @@ class Contact(PointEffect):
     def starts(cls, motion: Motion, place: int) -> dict[str, tuple[float, ...]]:
         """Heights (m) at which the search begins: low quantiles of the height of the link's joint in the recordings."""
         some = np.asarray(motion.position)[:: max(1, len(motion.position) // 400)]
-        height = np.asarray(forward_kinematics(motion.model, some))[:, place, 2, 3]
+        height = poses_on_host(motion.model, some)[:, place, 2, 3]
         return {"height": tuple(np.unique(np.quantile(height, (0.05, 0.1, 0.2, 0.3, 0.45))).tolist())}

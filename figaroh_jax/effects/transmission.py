@@ -163,7 +163,8 @@ class Backlash(JointEffect):
     def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
         """Half of the play on the side of the load, rad; a change of side lasts as long as the motor needs."""
         load = self.here(motion.load)
+        space = np if isinstance(load, np.ndarray) else jnp
         if isinstance(motion.dt, float) and motion.dt == 0.0:  # instants that are no record: the play has been crossed
-            return self.width / 2 * (np if isinstance(load, np.ndarray) else jnp).sign(load)
-        ramp = jnp.abs(motion.rate(load)) * jnp.maximum(motion.dt, _CROSSING) / 2
-        return self.width / 2 * jnp.clip(load / (ramp + 1e-12), -1.0, 1.0)
+            return self.width / 2 * space.sign(load)
+        ramp = abs(motion.rate(load)) * space.maximum(motion.dt, _CROSSING) / 2
+        return self.width / 2 * (load / (ramp + 1e-12)).clip(-1.0, 1.0)

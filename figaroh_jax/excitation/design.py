@@ -113,7 +113,8 @@ def excite(
         for k in range(trajectories):
 
             def told(share: float, k: int = k) -> None:
-                progress(f"trajectory {k + 1} of {trajectories}", (k + share) / trajectories)
+                at = "" if starts == 1 else f", start {min(int(share * starts), starts - 1) + 1} of {starts}"
+                progress(f"trajectory {k + 1} of {trajectories}{at}", (k + share) / trajectories)
 
             own, generator = aim.objectives(np.asarray(before.prior), seen), np.random.default_rng([seed, k])
             kept = (basis, asked.limits, asked.start)

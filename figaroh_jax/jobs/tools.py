@@ -127,12 +127,13 @@ def compare(args: argparse.Namespace) -> int:
 
 
 def view(args: argparse.Namespace) -> int:
-    """The robot of a run in a browser, until the command is interrupted."""
+    """The robot of a run in a browser, until the command is interrupted; of a design its motions."""
+    from ..reporting.motion_view import is_design, show_design_run
     from ..reporting.robot_view import show_run
 
     if not 0 < args.port < 65536:
         raise InputError(f"--port {args.port}: expected a number from 1 to 65535")
-    server = show_run(args.run, args.port)
+    server = show_design_run(args.run, args.port)[0] if is_design(args.run) else show_run(args.run, args.port)
     print(f"The robot of {args.run}: http://localhost:{args.port} (Ctrl-C ends)", file=sys.stderr, flush=True)
     try:
         server.sleep_forever()

@@ -35,6 +35,7 @@ __all__ = [
 ORDER = 4
 REACH = 12.0  # impulse response that is kept beyond each end, in 1/cutoff
 LATEST = 0.5  # s: at least as much, so that a delay or lag of tens of milliseconds stays inside the extension as well
+MOST_STRETCHES = 64  # of an index that is followed stretch by stretch
 END = 2.0  # part of a record at each end that is not used, in 1/cutoff
 
 
@@ -114,27 +115,60 @@ def on_host(
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """`filtered` of a signal and a response in NumPy: what depends on the record alone is made once.
 
-    Where only every second, fourth, ... number is asked for, the spectrum is folded before it is transformed back.
+    Where only every second, fifth, ... number is asked for, the spectrum is folded before it is transformed back.
     """
     length = len(source)
-    common = int(np.gcd.reduce(place - place[:1], initial=length))
-    step = common & -common
+    step = int(np.gcd.reduce(place - place[:1], initial=length))
     first = int(place[0]) % step if len(place) else 0
-    turned, at = np.roll(source, -first), place // step
+    extended, wanted, count = _taking(np.roll(source, -first)), _taking(place // step), length // step
 
     def run(signal: np.ndarray, response: np.ndarray) -> np.ndarray:
-        spectrum = np.fft.rfft(np.take(signal, turned, axis=-1), axis=-1)
+        spectrum = np.fft.rfft(extended(signal), axis=-1)
         shape = np.broadcast_shapes(spectrum.shape, response.shape)  # memory that is new takes longer than the product
-        spectrum = np.multiply(spectrum, response, out=spectrum if shape == spectrum.shape else None)
-        for size in (length >> k for k in range(step.bit_length() - 1)):
-            lower = slice(size // 4 + 1)
-            folded = np.conjugate(spectrum[..., ::-1][..., lower])
-            folded += spectrum[..., lower]
-            folded *= 0.5
-            spectrum = folded
-        return np.take(np.fft.irfft(spectrum, length // step, axis=-1), at, axis=-1)
+        factor = response.astype(complex) if response.ndim == 1 else response
+        spectrum = np.multiply(spectrum, factor, out=spectrum if shape == spectrum.shape else None)
+        return wanted(np.fft.irfft(_folded(spectrum, step, count), count, axis=-1))
 
     return run
+
+
+def _folded(spectrum: Complex[np.ndarray, "*series freqs"], step: int, count: int) -> Complex[np.ndarray, "*series _"]:
+    """Spectrum of every `step`th number, `count` in all: the mean of what it cannot tell apart."""
+    if step == 1:
+        return spectrum
+    kept = count // 2 + 1
+    out, back = spectrum[..., :kept].copy(), spectrum[..., count - kept + 1 : count + 1].copy()
+    for m in range(2, step // 2 + 1):
+        back += spectrum[..., m * count - kept + 1 : m * count + 1]
+    for m in range(1, (step + 1) // 2):
+        out += spectrum[..., m * count : m * count + kept]
+    out += np.conjugate(back, out=back)[..., ::-1]
+    out *= 1 / step
+    return out
+
+
+def _taking(index: Int[np.ndarray, " places"]) -> Callable[[np.ndarray], np.ndarray]:
+    """`np.take(..., index, axis=-1)` of an index that runs up, runs down or stays over a few long stretches."""
+    stretches, at = [], 0
+    change = np.append(np.diff(index), 2)
+    turns = np.flatnonzero(np.diff(change)) + 1  # where another stretch begins, or one number stands between two
+    while at < len(index) and len(stretches) < MOST_STRETCHES:
+        step, first = int(change[at]), int(index[at])
+        end = at + 1 if abs(step) > 1 else int(turns[np.searchsorted(turns, at, "right")]) + 1
+        last = first + step * (end - at)
+        here = slice(first, first + 1) if step == 0 or end == at + 1 else slice(first, None if last < 0 else last, step)
+        stretches.append((slice(at, end), here))
+        at = end
+    if at < len(index):
+        return lambda x: np.take(x, index, axis=-1)
+
+    def taken(x: np.ndarray) -> np.ndarray:
+        out = np.empty((*x.shape[:-1], len(index)), x.dtype)
+        for to, here in stretches:
+            out[..., to] = x[..., here]
+        return out
+
+    return taken
 
 
 def frequencies(rows: RowFilter) -> Float[np.ndarray, " freqs"]:

@@ -6,9 +6,9 @@ Everything that is compared with the measured torque (the torque itself, each re
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -100,15 +100,27 @@ def filter_rows(
     flat, out = torque.reshape(count, *torque.shape[-2:]), np.empty((count, *records.kept.shape))
     shared = factor.ndim == 1 or factor.size == factor.shape[-1]
     each = None if shared else np.broadcast_to(factor, (*series, factor.shape[-1])).reshape(count, factor.shape[-1])
-    used = np.asarray(records.weight).any((1, 2)) if fitted else np.ones(len(records.kept), bool)
+    used = np.any(records.weight, axis=(1, 2)) if fitted else np.ones(len(records.kept), bool)
     out[:, ~used] = 0.0
     few = max(1, AT_ONCE // records.source.shape[1])
     parts = [slice(start, start + few) for start in range(0, count, few)]
-    for k in np.flatnonzero(used):
-        run = on_host(np.asarray(records.source[k]), np.asarray(records.kept[k]))
-        for part in parts:
+    for k, run in enumerate(_filters(records.source, records.kept)):
+        for part in parts if used[k] else ():
             out[part, k] = run(flat[part, k], factor.reshape(-1) if each is None else each[part])
     return out.reshape(*series, *records.kept.shape)
+
+
+_FILTERS: list[tuple[Any, Any, list[Callable[[np.ndarray, np.ndarray], np.ndarray]]]] = []  # of the last records
+
+
+def _filters(source: Int[Leaf, "n L"], kept: Int[Leaf, "n M"]) -> list[Callable[[np.ndarray, np.ndarray], np.ndarray]]:
+    """What filters a recording, for each of them; the recordings stay the same over a thousand calls."""
+    for known in _FILTERS:
+        if known[0] is source and known[1] is kept:
+            return known[2]
+    made = [on_host(*each) for each in zip(np.asarray(source), np.asarray(kept), strict=True)]
+    _FILTERS[:] = [(source, kept, made), *_FILTERS[:1]]
+    return made
 
 
 def open_rows(

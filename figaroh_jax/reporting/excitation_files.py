@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..excitation.design import Design, torque_of
+from ..excitation.information import UNKNOWN_DRIVE
 from ..excitation.limits import CHECK_RATE, Use
 from ..excitation.postures import PostureDesign
 from ..excitation.sampling import Sampler
@@ -25,6 +26,7 @@ __all__ = ["answer", "failure", "summary_lines", "to_json", "write_design", "wri
 ANSWER, PAGE = "excitation.json", "report.html"
 POINTS = 50.0  # Hz of the points of a JointTrajectory, which controllers join by quintics
 _DRAWN = 400  # points of a curve on the page
+OPEN = 0.9 / math.sqrt(UNKNOWN_DRIVE)  # a deviation that says that nothing is known
 
 
 def to_json(found: Design | PostureDesign) -> str:
@@ -183,15 +185,18 @@ def summary_lines(found: Design | PostureDesign) -> list[str]:
     """The design in a few lines."""
     if isinstance(found, PostureDesign):
         return posture_lines(found)
-    better = found.std_before / found.std
+    known = found.std_before < OPEN
+    better = (found.std_before / found.std)[known]
     seconds = sum(stage.motion.duration for stage in found.stages)
     lines = [
         f"{found.learned.robot.name}: {_count(found)}, {seconds:g} s; log determinant {found.logdet:.2f} of the"
         f" information on {found.learned.rank} parameters, condition number {found.condition:.4g}"
         f" ({found.scaled_condition:.3g} with normalised columns)"
     ]
-    if np.isfinite(better).all():
-        lines.append(f"expected standard deviations fall {np.exp(np.log(better).mean()):.3g} times (geometric mean)")
+    if len(better):
+        less = f"expected standard deviations fall {np.exp(np.log(better).mean()):.3g} times (geometric mean"
+        unknown = found.learned.rank - len(better)
+        lines.append(f"{less}; of {unknown} more nothing was known)" if unknown else f"{less})")
     for k, stage in enumerate(found.stages):
         used = ", ".join(
             f"{use.kind} {use.share:.1%} ({use.joint})" if use.kind != "clearance" else _apart(use)
@@ -199,14 +204,16 @@ def summary_lines(found: Design | PostureDesign) -> list[str]:
         )
         lines.append(f"trajectory {k + 1}: largest use at 1 kHz: {used or 'no limits'}")
     for s in found.separated:
-        lines.append(f"{s.truth} and {s.rival} differ by {s.sigmas:.2g} standard deviations; {_times(s.repeats)}")
+        lines.append(
+            f"{s.truth} and {s.rival} differ by {s.sigmas:.2g} standard deviations; {_times(s.repeats, seconds)}"
+        )
     return [*lines, *(f"Note: {note}" for note in found.notes)]
 
 
-def _times(repeats: int | None) -> str:
+def _times(repeats: int | None, seconds: float) -> str:
     if repeats is None:
         return f"{MOST} repeats do not make the name sure: the links would have to be known better (`trust`)"
-    return f"{'one run' if repeats == 1 else f'{repeats} repeats'} for a sure name"
+    return f"{'one run' if repeats == 1 else f'{repeats} repeats'} for a sure name, {repeats * seconds:g} s"
 
 
 def _apart(use: Use) -> str:
@@ -231,7 +238,7 @@ def write_design(found: Design, folder: Path, model: Any) -> None:
         np.savez_compressed(folder / f"{name}.npz", t=time, q=q, v=v, a=a, torque=tau)
         _write_table(folder / f"{name}.csv", learned.robot.dof_names, time, {"q": q, "v": v, "a": a, "torque": tau})
         (folder / f"{name}.yaml").write_text(joint_trajectory(learned.robot.dof_names, stage), encoding="utf-8")
-        drawn.append((time, {"position": q, "velocity": v, "torque": tau}))
+        drawn.append((time, {"position": q, "velocity": v, "acceleration": a, "torque": tau}))
     (folder / PAGE).write_text(_page(found, drawn, folder), encoding="utf-8")
 
 
@@ -265,7 +272,9 @@ def _page(found: Design, drawn: list[tuple[np.ndarray, dict[str, np.ndarray]]], 
         d=found,
         robot=found.learned.robot.name,
         joints=list(found.learned.robot.dof_names),
-        units=[("m", "m/s", "N") if slides else ("rad", "rad/s", "N m") for slides in sliding],
+        units=[("m", "m/s", "m/s²", "N") if slides else ("rad", "rad/s", "rad/s²", "N m") for slides in sliding],
+        open=OPEN,
+        seconds=sum(stage.motion.duration for stage in found.stages),
         lines=summary_lines(found),
         failure=failure(found),
         parameters=list(zip(found.learned.expressions, found.std_before.tolist(), found.std.tolist(), strict=True)),

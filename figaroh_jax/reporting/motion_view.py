@@ -1,4 +1,4 @@
-"""A designed motion in a browser, with `viser` (extra `view`): the robot moves, its capsules and the boxes around it.
+"""Designed motions and postures in a browser, with `viser` (extra `view`): the robot, its capsules, boxes around it.
 
 Links are drawn as lines from joint to joint, so that no mesh is needed; where the design looked at distances, the
 capsules that it kept apart are drawn too.
@@ -6,10 +6,12 @@ capsules that it kept apart are drawn too.
 
 from __future__ import annotations
 
+import json
 import threading
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,17 +19,39 @@ from jaxtyping import Float
 from ..errors import InputError
 from ..excitation.clearance import Clearance, link_poses
 from ..excitation.design import Design
+from ..excitation.task import clearance_asked, excite_block
 from ..formats.collision import rotation
+from ..formats.config import load_task
+from ..formats.robotfile import load_robot
 from ..rigid.model import RobotModel
+from .provenance import read_provenance
 
 if TYPE_CHECKING:
     import viser  # pyright: ignore[reportMissingImports]
 
-__all__ = ["capsule_lines", "show_motion", "skeleton"]
+__all__ = ["Played", "capsule_lines", "designed", "is_design", "show_design_run", "show_motion", "skeleton"]
 
+ANSWER = "excitation.json"
 FRAMES = 25.0  # pictures a second
 _BODY, _SHELL, _BOX = (0, 114, 178), (150, 150, 150), (213, 94, 0)
 _RIM = 12  # corners of a circle
+_SQUARE = 0.1  # m, of the floor's grid
+
+
+class Played(NamedTuple):
+    """What is shown: the robot, its motions (times in s and positions), and what was kept apart."""
+
+    model: RobotModel
+    motions: Mapping[str, tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n nv"]]]
+    clearance: Clearance | None
+    still: bool = False  # postures, one after another, in place of motions
+
+    def at(self, name: str, moment: float) -> Float[np.ndarray, " nv"]:
+        """Positions in a motion at a time (s); in postures the one of that number, from 1."""
+        times, q = self.motions[name]
+        if self.still:
+            return q[int(np.clip(round(moment) - 1, 0, len(q) - 1))]
+        return np.array([np.interp(moment, times, column) for column in q.T])
 
 
 def skeleton(model: RobotModel, q: Float[np.ndarray, " nv"]) -> Float[np.ndarray, "nj 2 3"]:
@@ -62,36 +86,105 @@ def show_motion(
     A slider stands for the time; with `play` the motion repeats. Raises `InputError` where viser is not installed, or
     the design has no such trajectory.
     """
+    if not 1 <= trajectory <= len(design.stages):
+        raise InputError(f"trajectory {trajectory}: the design has {len(design.stages)}, counted from 1")
+    motion = design.stages[trajectory - 1].motion
+    times = motion.basis.instants(4 * FRAMES)
+    motions = {f"trajectory {trajectory}": (times, np.asarray(motion.at(times)[0]))}
+    return _served(Played(design.learned.robot, motions, design.limits.clearance), port, play)
+
+
+def is_design(folder: Path) -> bool:
+    """Whether the folder holds a run of `excite`."""
+    return (folder / ANSWER).is_file()
+
+
+def show_design_run(
+    folder: Path, port: int = 8080, *, play: bool = True
+) -> tuple[viser.ViserServer, Callable[[], None]]:
+    """The same of a run directory of `excite`: all of its motions, or its postures."""
+    return _served(designed(folder), port, play)
+
+
+def designed(folder: Path) -> Played:
+    """The robot, the motions or postures of a run directory of `excite`, and what they keep apart.
+
+    Raises `InputError` where the run cannot be read or the task that it was made from has gone.
+    """
+    try:
+        answer = json.loads((folder / ANSWER).read_text(encoding="utf-8"))
+        still, joints = answer["kind"] == "postures", list(answer["joints"])
+        if still:
+            q = np.asarray(answer["postures"], float)
+            motions = {"postures": (np.arange(1.0, len(q) + 1), q)}
+        else:
+            motions = {}
+            for stem in (Path(one["file"]).stem for one in answer["trajectories"]):
+                with np.load(folder / f"{stem}.npz") as arrays:
+                    motions[stem.replace("_", " ")] = np.asarray(arrays["t"]), np.asarray(arrays["q"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{folder / ANSWER}: cannot be read; name a run directory as this library writes it") from None
+    task = load_task(Path(read_provenance(folder)["task"]))
+    robot = load_robot(task)
+    if list(robot.dof_names) != joints:
+        raise InputError(f"{folder}: made for the joints {', '.join(joints)}; {task.file} has others now")
+    asked = task.excite if still and task.excite is not None else excite_block(task.excite)
+    return Played(robot, motions, clearance_asked(task, asked, robot)[0], still)
+
+
+def _served(shown: Played, port: int, play: bool) -> tuple[viser.ViserServer, Callable[[], None]]:
     try:
         import viser  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise InputError("the view needs viser: pip install 'figaroh-jax[view]'") from None
-    if not 1 <= trajectory <= len(design.stages):
-        raise InputError(f"trajectory {trajectory}: the design has {len(design.stages)}, counted from 1")
     server = viser.ViserServer(port=port, verbose=False)
-    motion, model, clearance = design.stages[trajectory - 1].motion, design.learned.robot, design.limits.clearance
+    model, clearance, names = shown.model, shown.clearance, list(shown.motions)
     for box in () if clearance is None else clearance.boxes:
         server.scene.add_line_segments(f"/{box.name}", _edges(box), colors=_BOX)
-    slider = server.gui.add_slider("time, s", min=0.0, max=motion.duration, step=1 / FRAMES, initial_value=0.0)
+    chosen = server.gui.add_dropdown("motion", tuple(names)) if len(names) > 1 else None
+    last = max(float(times[-1]) for times, _ in shown.motions.values())
+    first, label, step = (1.0, "posture", 1.0) if shown.still else (0.0, "time, s", 1 / FRAMES)
+    slider = server.gui.add_slider(label, min=first, max=last, step=step, initial_value=first)
+
+    def name() -> str:
+        return names[0] if chosen is None else str(chosen.value)
 
     def draw(_: Any = None) -> None:
-        q = np.asarray(motion.at(np.array([slider.value]))[0])[0]
-        server.scene.add_line_segments("/robot", skeleton(model, q), colors=_BODY)
+        q = shown.at(name(), float(slider.value))
+        server.scene.add_line_segments("/robot", skeleton(model, q), colors=_BODY, line_width=4.0)
         if clearance is not None:
             server.scene.add_line_segments("/capsules", capsule_lines(clearance, q), colors=_SHELL)
 
-    slider.on_update(draw)
+    for control in (slider, *(() if chosen is None else (chosen,))):
+        control.on_update(draw)
     draw()
+    _look(server, shown)
     ended = threading.Event()
 
     def run() -> None:
         begun = time.monotonic()
         while not ended.wait(1 / FRAMES):
-            slider.value = float((time.monotonic() - begun) % motion.duration)
+            slider.value = float((time.monotonic() - begun) % float(shown.motions[name()][0][-1]))
 
-    if play:
+    if play and not shown.still:
         threading.Thread(target=run, daemon=True).start()
     return server, ended.set
+
+
+def _look(server: Any, shown: Played) -> None:
+    """A floor, and a camera that sees the robot as far as it reaches."""
+    every = np.concatenate([q[:: max(1, len(q) // 20)] for _, q in shown.motions.values()])
+    corners = np.concatenate([skeleton(shown.model, q).reshape(-1, 3) for q in every])
+    size = float(np.ptp(corners, axis=0).max()) or 1.0
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    floor = 0.0 if shown.clearance is None or shown.clearance.floor is None else shown.clearance.floor
+    server.scene.add_grid("/floor", width=4 * size, height=4 * size, cell_size=_SQUARE, position=(0.0, 0.0, floor))
+
+    def look(client: Any) -> None:
+        client.camera.position = tuple(middle + 1.2 * size * np.array([1.0, -1.0, 0.5]))
+        client.camera.look_at = tuple(middle)  # after the position, which moves both
+
+    server.on_client_connect(look)
 
 
 def _edges(box: Any) -> Float[np.ndarray, "12 2 3"]:

@@ -11,7 +11,7 @@ from html import escape
 import numpy as np
 from jaxtyping import Float
 
-from ..rigid.kinematics import forward_kinematics
+from ..rigid.kinematics import poses_on_host
 from ..rigid.manifold import neutral
 from ..rigid.model import RobotModel
 
@@ -25,7 +25,7 @@ _ELEVATION = np.deg2rad(18.0)
 
 def segments(model: RobotModel, q: Float[np.ndarray, " nv"]) -> Float[np.ndarray, "nj 2 3"]:
     """From the parent's joint (or the world's origin) to every joint, m."""
-    origins = np.concatenate([np.zeros((1, 3)), np.asarray(forward_kinematics(model, q))[:, :3, 3]])
+    origins = np.concatenate([np.zeros((1, 3)), poses_on_host(model, np.asarray(q, float)[None])[0, :, :3, 3]])
     parents = np.array([joint.parent for joint in model.joints]) + 1
     return np.stack([origins[parents], origins[1:]], axis=1)
 
@@ -64,7 +64,7 @@ def robot_picture(
 
 def _tips(model: RobotModel, q: Float[np.ndarray, " nq"]) -> Float[np.ndarray, "tips 2 3"]:
     """From each joint that carries no other to the farthest frame fixed to it, or to its centre of mass."""
-    poses = np.asarray(forward_kinematics(model, q))
+    poses = poses_on_host(model, np.asarray(q, float)[None])[0]
     lines = []
     for k in set(range(len(model.joints))) - {joint.parent for joint in model.joints}:
         places = [

@@ -32,6 +32,7 @@ __all__ = [
     "joint_masses",
     "joint_torques",
     "mass_matrix",
+    "torques_on_host",
 ]
 
 MOST_JOINTS = 12  # of a robot whose mass matrix is factorised in registers
@@ -67,6 +68,21 @@ def inverse_dynamics(
         if (robot := written(model)) is not None:
             return over_samples(written_torques, robot, q, v, a)
     return over_samples(joint_torques, model, q, v, a, straight=_TORQUES)
+
+
+def torques_on_host(
+    model: RobotModel,
+    q: Float[np.ndarray, "*batch nq"],
+    v: Float[np.ndarray, "*batch nv"],
+    a: Float[np.ndarray, "*batch nv"],
+) -> Float[np.ndarray, "*batch nv"]:
+    """`inverse_dynamics` of arrays of the host, without the way through JAX where it can be."""
+    if on_host(model) and prod(q.shape[:-1]) >= MANY:
+        check_shapes(model, q=q, v=v, a=a)
+        rows = two_axes(q, v, a, host=True)
+        if (code := machine_code(_TORQUES, model, *rows)) is not None:
+            return code(own_room, *rows).reshape(*q.shape[:-1], model.nv)
+    return np.asarray(inverse_dynamics(model, q, v, a))
 
 
 def joint_torques(

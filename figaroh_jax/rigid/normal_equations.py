@@ -278,8 +278,9 @@ def _add_products(model: RobotModel, totals: tuple[Array, ...], rows: _Rows) -> 
 def _by_kernels(model: RobotModel, kept: Kept | None, start: tuple[Array, ...], rows: _Rows) -> tuple[Array, ...]:
     """The products of each coordinate on a GPU, from rows that a kernel writes as they are multiplied."""
     samples, nv = len(rows.q), model.nv
-    given = [x.reshape(samples, nv, -1) for x in (rows.extra, rows.tau) if x is not None]
-    side = jnp.concatenate([jnp.zeros((samples, nv, 0)), *map(jnp.asarray, given)], axis=2).reshape(samples, -1)
+    # no empty array of so many rows: XLA takes seconds to make its program, and as long to read it again
+    given = [jnp.asarray(x).reshape(samples, nv, -1) for x in (rows.extra, rows.tau) if x is not None]
+    side = jnp.concatenate(given, axis=2).reshape(samples, -1)
     whole = rounded(samples)
     arrays = [jnp.asarray(x) for x in (rows.q, rows.v, rows.a, rows.root, side)]
     if whole > samples:

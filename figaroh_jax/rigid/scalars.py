@@ -138,8 +138,10 @@ def known(model: RobotModel) -> bytes:
 
 
 def known_lengths(model: RobotModel, table: Float[np.ndarray, " constants"]) -> bytes:
-    """As `known`, of the model's constants, but for inertial parameters: what a robot is taken to weigh is loaded."""
-    return codes_of_lengths(table, len(model.joints)).tobytes()
+    """As `known`, of the model's constants, but for what is fitted and tried: inertial parameters and gravity."""
+    codes = codes_of_lengths(table, len(model.joints))
+    codes[-3:] = LOADED
+    return codes.tobytes()
 
 
 def codes_of_lengths(table: Float[np.ndarray, " constants"], joints: int) -> np.ndarray:

@@ -15,40 +15,33 @@ import numpy as np
 from scipy.special import ndtr
 
 from ..results import Name
-from .causes import BASELINE, CONTAINS, Candidate
-from .data import windows
+from .causes import Candidate
 from .faults import Fault, faults, without
 from .fit import Fit, System, fit, refitted_without
 from .parameters import put, values
 from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_of_entry, outputs, tried_now
-from .search import (
-    Model,
-    Named,
-    Search,
-    Setting,
-    Structure,
-    Tried,
-    begins_of,
-    begun,
-    by_recording,
-    free_entries,
-    level_of,
-    sized,
-    t_of,
-)  # fmt: skip
+from .search import Model, Named, Search, Tried, judged_by_colour, sized, t_of
 from .sensitivity import predicted
+from .setting import Setting, Structure, begins_of, begun, by_recording, free_entries, level_of  # fmt: skip
+from .thresholds import (
+    CLEARLY,
+    CONFIDENT,
+    FITTED_FOR_HELD,
+    GAIN,
+    MUCH,
+    NEAR,
+    NO_WORSE,
+    SMALL,
+    SURELY,
+    UNSURE,
+    UNTOLD,
+    USUAL,
+)
 
 __all__ = ["search_arm"]
 
-_WORTH, _SURE, _UNSURE = 0.004, 1.64, 2.5  # held-out gain and t of a name, where more than noise is left and where not
-_CLEAR, _MUCH = 3.0, 0.25  # t and gain of a name beside which more than noise stays, unless every joint has it
-_ALIKE, _NEAR = 1.7, 0.1  # t and share of the gain within which two causes are alike
-_USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
 _AGAIN = 6  # iterations from the numbers of the model file
 _TOP, _CHECKS = 3, 4  # candidates told as the nearest; those whose held-out squares are looked at in a round
-_SURELY = 0.1  # share of the squares by which a cause that is surely missed would make them larger
-_LEAST = 0.002  # held-out gain below which a cause found with others is not missed
-_SHARE_OF_T = 0.7  # of the t that a name needs on held-out rows, which it must have on those that were fitted
 _FIRST = 4  # iterations from each start of the baseline
 
 
@@ -56,9 +49,14 @@ def search_arm(
     here: Setting, progress: Callable[[str, float], None] = lambda phase, share: None, *, forbid: Sequence[str] = ()
 ) -> Search:
     """Causes of an arm whose drives act at one joint each and whose joints are all measured."""
+    found = _searched(here, progress, forbid)
+    return judged_by_colour(here, found, lambda again: _searched(again, lambda phase, share: None, forbid))
+
+
+def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Sequence[str]) -> Search:
     progress("fitting the baseline", 0.05)
     first = _begun(here)
-    here, wrong = _sound(here, first)
+    here, wrong = _sound(here, first) if here.pole is None else (here, [])  # a colour is told from sound rows
     if wrong:
         first = _begun(here)
     now = begin = _standing(here, Structure(here.loop, here.known.table, here.data), first, here.baseline)
@@ -123,7 +121,7 @@ def _judged(here: Setting, result: Search, now: Standing) -> Search:
     found = result.named
     if now.excess.max() < 1.0:
         result.verdict = "named" if found else "nothing"
-    elif found and by_recording(here) and found[0].t > _CLEAR:
+    elif found and by_recording(here) and found[0].t > CLEARLY:
         result.verdict = "named+rest"
     else:
         result.verdict, result.proxy, result.named = "unknown", found, []
@@ -139,7 +137,8 @@ def _sound(here: Setting, first: Fit) -> tuple[Setting, list[Fault]]:
     if not found:
         return here, []
     runs = without(here.runs, found)
-    return replace(here, runs=runs, data=windows(here.loop, runs, here.stretches, here.noise, here.block)), found
+    here = replace(here, runs=runs)
+    return replace(here, data=here.cut(here.loop)), found
 
 
 def _simulated(here: Setting, first: Fit) -> list[np.ndarray] | None:
@@ -190,8 +189,8 @@ def _round(
         if not firsts:
             break
         chosen = firsts[:1]
-        if chosen[0].candidate.effect in BASELINE:  # what every joint has is found at all of them at once
-            chosen = [one for one in firsts if one.candidate.effect in BASELINE]
+        if chosen[0].candidate.kind.usual:  # what every joint has is found at all of them at once
+            chosen = [one for one in firsts if one.candidate.kind.usual]
         new = _named(here, now, lists, chosen, found)
         if new is not None:
             kept, now = new
@@ -222,10 +221,10 @@ def _worthy(here: Setting, now: Standing, one: Tried) -> bool:
     before, after = now.squares[..., mine].sum(-1), one.sse[..., mine].sum(-1)
     gain = 1 - after.sum() / max(before.sum(), 1e-300)
     if one.state.excess < 1.0:
-        return bool(gain > _WORTH)
-    usual, rest = one.candidate.effect in BASELINE, by_recording(here)
-    needed = _CLEAR if rest and not (usual and gain > _MUCH) else _SURE
-    return bool(gain > (_MUCH if rest and not usual else _WORTH) and t_of(before, after) > _SHARE_OF_T * needed)
+        return bool(gain > GAIN)
+    usual, rest = one.candidate.kind.usual, by_recording(here)
+    needed = CLEARLY if rest and not (usual and gain > MUCH) else CONFIDENT
+    return bool(gain > (MUCH if rest and not usual else GAIN) and t_of(before, after) > FITTED_FOR_HELD * needed)
 
 
 def _ordered(now: Standing, ones: Sequence[Tried]) -> list[Tried]:
@@ -235,13 +234,13 @@ def _ordered(now: Standing, ones: Sequence[Tried]) -> list[Tried]:
     if best <= 0:
         return []
     rest = first.state.excess >= 1.0
-    usual = [x for x in ranked if rest and x.candidate.effect in BASELINE and _gained(now, x) > _USUAL * best]
-    if first.candidate.effect == "stribeck_friction":  # more friction at rest: beside friction, not without it
-        usual += [x for x in ranked if rest and x.candidate.effect == "friction_loss" and x not in usual]
+    usual = [x for x in ranked if rest and x.candidate.kind.usual and _gained(now, x) > USUAL * best]
+    more = first.candidate.kind.adds_to
+    usual += [x for x in ranked if rest and x.candidate.effect == more and all(x is not y for y in usual)]
     simple = [
         x for x in ranked
-        if x.candidate.effect in CONTAINS.get(first.candidate.effect, ())
-        and (t_of(x.sse.sum(-1), first.sse.sum(-1)) < _ALIKE or x.sse.sum() <= 1.002 * first.sse.sum())
+        if first.candidate.kind.holds(x.candidate.effect)
+        and (t_of(x.sse.sum(-1), first.sse.sum(-1)) < UNTOLD or x.sse.sum() <= NO_WORSE * first.sse.sum())
     ]  # fmt: skip
     front = usual[:1] or simple[:1]
     return front + [x for x in ranked if all(x is not other for other in front)]
@@ -274,7 +273,7 @@ def _named(
 
 def _together(here: Setting, now: Standing, chosen: Sequence[Tried]) -> Model:
     """All chosen causes in one fit, from where each ended by itself."""
-    lone = next((one for one in chosen if one.candidate.elastic or (one.alone and len(chosen) == 1)), None)
+    lone = next((one for one in chosen if one.candidate.kind.elastic or (one.alone and len(chosen) == 1)), None)
     begin = now.model if lone is None else lone.state
     structure, start, theta = begin.structure, begin.fit.start, begin.fit.theta.copy()
     free = list(now.model.free)
@@ -335,10 +334,10 @@ def _check(here: Setting, now: Standing, new: Standing, one: Tried) -> tuple[boo
     if noise and float(now.excess[mine].max()) >= 1.0:  # all that is seen is explained, be it in a few places only
         t = max(t, float(np.sqrt(max(before.sum() - after.sum(), 0.0))) / 2)
     rest = by_recording(here) and not noise
-    usual = one.candidate.effect in BASELINE
-    sure = _SURE if float(now.excess[mine].max()) >= 1.0 else _UNSURE
-    needed = _CLEAR if rest and not (usual and gain > _MUCH) else sure
-    worth = _MUCH if rest and not usual else _WORTH
+    usual = one.candidate.kind.usual
+    sure = CONFIDENT if float(now.excess[mine].max()) >= 1.0 else UNSURE
+    needed = CLEARLY if rest and not (usual and gain > MUCH) else sure
+    worth = MUCH if rest and not usual else GAIN
     state = Model(new.model.structure, new.model.fit, new.model.free, 0.0)
     good = gain > worth and t > needed and sized(here, one._replace(state=state))
     return bool(good), float(gain), t
@@ -348,10 +347,10 @@ def _spare(here: Setting, new: Standing, chosen: Sequence[Tried]) -> Tried | Non
     """The cause, if any, that its joint does not need beside the others: the least one first."""
     structure, last = new.model.structure, new.model.fit
     for one in sorted(chosen, key=lambda one: _gained(new, one), reverse=True):
-        if one.candidate.elastic:
+        if one.candidate.kind.elastic:
             continue
         j, entries = joint_of(here, one.candidate), list(one.candidate.entries)
-        if _costs(here, new, entries) > _SURELY * new.squares[..., j].sum():
+        if _costs(here, new, entries) > SURELY * new.squares[..., j].sum():
             continue
         theta = last.theta.copy()
         theta[entries] = values(structure.loop, structure.table)[entries]
@@ -361,7 +360,7 @@ def _spare(here: Setting, new: Standing, chosen: Sequence[Tried]) -> Tried | Non
         if not np.isfinite(other.cost):
             continue
         before, after = outputs(here, other.sums.cost)[..., j], new.squares[..., j]
-        if (before.sum() - after.sum()) / before.sum() < _LEAST or t_of(before, after) < _SURE:
+        if (before.sum() - after.sum()) / before.sum() < SMALL or t_of(before, after) < CONFIDENT:
             return one
     return None
 
@@ -392,11 +391,11 @@ def _name(
     most = _gained(now, one)
     alike = []
     for other in lists.get(j, []):
-        contained = other.candidate.effect in CONTAINS and one.candidate.effect in CONTAINS[other.candidate.effect]
+        contained = other.candidate.kind.holds(one.candidate.effect)
         comparable = other.state.excess < 1.0 or one.state.excess >= 1.0
-        if other is one or contained or not comparable or most - _gained(now, other) > _NEAR * most:
+        if other is one or contained or not comparable or most - _gained(now, other) > NEAR * most:
             continue
-        if t_of(other.sse[..., mine].sum(-1), one.sse[..., mine].sum(-1)) < _ALIKE and sized(here, other):
+        if t_of(other.sse[..., mine].sum(-1), one.sse[..., mine].sum(-1)) < UNTOLD and sized(here, other):
             alike.append(Name(other.candidate.effect, other.candidate.at))
     before, after = (_rms(here, x[..., mine]) for x in (now.held, new.held))
     return Named(one.candidate, check[2], check[1], tuple(alike), before, after)
@@ -409,4 +408,4 @@ def _level(here: Setting, one: Fit) -> float:
 def _rms(here: Setting, squares: np.ndarray) -> float:
     """Whitened squares by joints as an RMS over the rows of all of them: rad, or m."""
     count = (np.asarray(here.data.weight) > 0).sum() / here.loop.robot.nv * squares.shape[-1]
-    return float(np.sqrt(max(squares.sum(), 0.0) / max(count, 1) * np.mean(here.noise[0] ** 2)))
+    return float(np.sqrt(max(squares.sum(), 0.0) / max(count, 1) * np.mean(here.spread**2)))

@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
+from ..effects.catalogue import find
 from ..rigid.model import Frame, Joint, RobotModel
 from .loop import Joints, Loop
 from .parameters import Entry, Table
 
-__all__ = ["BASELINE", "Candidate", "Catalogue", "catalogue", "elastic_loop"]
+__all__ = ["BASELINE", "KINDS", "Candidate", "Catalogue", "Kind", "catalogue", "elastic_loop", "springs"]
 
 _JOINT_ENTRIES = (
     "armature", "damping", "friction", "stribeck_force", "stribeck_speed", "load_ratio", "stiffness",
@@ -20,6 +21,30 @@ _JOINT_ENTRIES = (
 )  # fmt: skip
 _DRIVE_ENTRIES = ("scale", "delay", "dead_band", "voltage", "force_limit")
 BASELINE = {"rotor_inertia": "armature", "joint_damping": "damping", "friction_loss": "friction"}
+
+
+class Kind(NamedTuple):
+    """What sets an effect apart from others; the search asks this and never a name."""
+
+    usual: bool = False  # every joint has it
+    adds_to: str = ""  # the effect of which it is more: found beside it, not without it
+    contains: tuple[str, ...] = ()  # what it can imitate exactly: the simpler one is preferred
+    limit: bool = False  # it changes the model before that can be differentiated
+    elastic: bool = False  # another structure: a spring between motor and link
+    constant: bool = False  # it shows at a joint that stands: one such makes up for another there
+    several: bool = False  # it shows at several joints
+    signed: bool = True  # its size may be of either sign
+    neutral: float = 0.0  # its size where it is none
+    falls_off: int | None = (
+        None  # number that is a speed: it shows nothing without a size, and no end beyond all motion
+    )
+    telling: int | None = None  # number that tells it from what it contains
+    looks_like: str = ""  # what looks the same, in words
+    experiment: str = "steps of {at} of two sizes, and slow sweeps"  # that tells it from others
+
+    def holds(self, other: str) -> bool:
+        """Whether it can imitate another effect."""
+        return other in self.contains
 
 
 class Candidate(NamedTuple):
@@ -30,7 +55,11 @@ class Candidate(NamedTuple):
     entries: tuple[int, ...]
     starts: tuple[tuple[float, ...], ...]  # of its entries; NaN: where the present model stands
     reported: tuple[str, ...]  # names of the entries in the answer
-    elastic: bool = False  # another structure: two bodies at the joint
+
+    @property
+    def kind(self) -> Kind:
+        """What sets its effect apart."""
+        return KINDS.get(self.effect, Kind())
 
 
 class Catalogue(NamedTuple):
@@ -44,9 +73,31 @@ class Catalogue(NamedTuple):
         return next(k for k, e in enumerate(self.table) if e.name == name and place in e.at)
 
 
-CONTAINS = {  # what an effect can imitate exactly: the simpler one is preferred
-    "joint_spring": ("torque_offset",),
-    "backlash": ("joint_elasticity",),
+_KNOWN_MASS = "the same motion with {at} carrying a known mass"
+KINDS = {
+    **dict.fromkeys(BASELINE, Kind(usual=True, signed=False)),
+    "joint_damping": Kind(usual=True, signed=False, looks_like="a wrong velocity gain of the drive looks the same"),
+    "stribeck_friction": Kind(
+        adds_to="friction_loss", falls_off=1, experiment="slow constant-velocity sweeps of {at} below 0.3 rad/s"
+    ),
+    "load_dependent_friction": Kind(experiment="the same motion of {at} with and without a known payload"),
+    "joint_spring": Kind(constant=True, contains=find("joint_spring").contains),
+    "torque_offset": Kind(constant=True),
+    "encoder_offset": Kind(constant=True),
+    "actuator_gain": Kind(neutral=1.0, experiment=f"{_KNOWN_MASS}: else gains and inertias scale together"),
+    "command_delay": Kind(
+        looks_like="positions that are stamped late by as much look the same",
+        experiment="steps of {at} small enough not to saturate its drive",
+    ),
+    "actuator_saturation": Kind(limit=True, signed=False),
+    "voltage_saturation": Kind(limit=True, signed=False),
+    "payload": Kind(several=True, experiment=f"{_KNOWN_MASS}, or without what is fixed to it"),
+    "joint_elasticity": Kind(
+        elastic=True,
+        signed=False,
+        experiment="a chirp of {at} above a third of its resonance, and an encoder on the link",
+    ),
+    "backlash": Kind(elastic=True, signed=False, contains=("joint_elasticity",), telling=2),
 }
 _HERE = float("nan")
 
@@ -112,6 +163,16 @@ def _of_drive(k: int, force: float, gains_known: bool) -> list[tuple]:
         ("actuator_saturation", (("force_limit", k),), limits, ("limit",)),
         ("voltage_saturation", (("voltage", k),), limits, ("limit",)),
         ("dead_band", (("dead_band", k),), ((0.002,), (0.02,)), ("band",)),
+    ]
+
+
+def springs(joint: str, first: int, forbid: Sequence[str] = ()) -> list[Candidate]:
+    """A spring, and a spring with play, between motor and link of a joint; their numbers stand from `first` on."""
+    reported = {"joint_elasticity": ("stiffness", "damping"), "backlash": ("stiffness", "damping", "width")}
+    return [
+        Candidate(effect, (joint,), tuple(range(first, first + len(names))), (), names)
+        for effect, names in reported.items()
+        if effect not in forbid
     ]
 
 

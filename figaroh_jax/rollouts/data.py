@@ -87,11 +87,13 @@ def windows(
     block: float,
     *,
     smooth: bool = False,
+    pole: Float[np.ndarray, " ny"] | None = None,
 ) -> Windows:
     """Windows of equal length in rows of one period; shorter ones are padded and count for nothing there.
 
     `noise` holds the standard deviations of positions, and of velocities where they count. `smooth` starts each from
-    as many rows as a polynomial follows, for windows whose start is not fitted.
+    as many rows as a polynomial follows, for windows whose start is not fitted. `pole` is that of noise which is white
+    noise behind a first-order low pass; `noise` is then what goes in.
     """
     period = regular(runs[0].name, runs[0].time)
     substeps = max(1, round(period / float(loop.dt)))
@@ -126,6 +128,7 @@ def windows(
         substeps=substeps,
         lead=lead,
         block=rows_of_block,
+        pole=None if pole is None else np.repeat(np.asarray(pole, float)[:, None], len(stretches), 1),
     )
 
 

@@ -14,12 +14,12 @@ from ..effects.plausibility import implausible
 from ..errors import InputError
 from ..results import Trace
 from .data import Run, Stretch, noise_of, windows
-from .fit import Fit, System, standard_errors
+from .fit import Fit, System, fit, standard_errors
 from .loop import Loop
-from .parameters import BOUNDS, UNITS, put
-from .search import Setting, Structure, begun, residuals
+from .parameters import BOUNDS, OF_DRIVES, UNITS, put
 from .sensitivity import predicted
-from .task import diagnosis_setting, diverged, extended_of, read_rollouts, simulated
+from .setting import Setting, Structure, begun, coloured, residuals
+from .task import colour_notes, diagnosis_setting, diverged, extended_of, read_rollouts, simulated
 
 if TYPE_CHECKING:
     from ..effects.extended import ExtendedModel
@@ -64,9 +64,10 @@ def identify_rollout_task(
         first = begun(here)
         if not np.isfinite(first.cost):
             raise InputError(f"{task.robot.model}: {diverged(here, first)}")
+        here, first = _by_colour(here, first)
         final = put(here.loop, here.known.table, first.theta)
         held = {run.name: (run, simulated(final, run)) for run in runs if run.holdout}
-        notes = (*notes, *implausible(loop.robot, extended_of(final), task.robot.trust))
+        notes = (*notes, *colour_notes(here), *implausible(loop.robot, extended_of(final), task.robot.trust))
         result = _result(here, first, held, notes)
         progress("simulating the recordings", 0.9)
         traces = _traces(loop, final, runs)
@@ -75,6 +76,16 @@ def identify_rollout_task(
     joints = tuple(loop.robot.dof_names[k] for k in loop.measured)
     units = tuple("m" if name in straight else "rad" for name in joints)
     return RolloutIdentification(result, final, extended_of(final), predictions, joints, units, traces)
+
+
+def _by_colour(here: Setting, first: Fit) -> tuple[Setting, Fit]:
+    """The fit once more with the colour of the noise, where noise is all that it leaves."""
+    again = coloured(here, Structure(here.loop, here.known.table, here.data), first)
+    if again is None:
+        return here, first
+    structure = Structure(again.loop, again.known.table, again.data)
+    new = fit(*structure, first.theta[None], [again.baseline], first.start[None], width=again.width, lanes=1)[0]
+    return (again, new) if np.isfinite(new.cost) else (here, first)
 
 
 def _traces(given: Loop, fitted: Loop, runs: Sequence[Run]) -> tuple[Trace, ...]:
@@ -118,7 +129,7 @@ def _result(
         "base_parameters": parameters,
         "links": [],
         "effects": [],
-        "fit": {"rms": rms.tolist(), "relative": _relative(here, rms), "noise": here.noise[0].tolist()},
+        "fit": {"rms": rms.tolist(), "relative": _relative(here, rms), "noise": here.spread.tolist()},
         "holdout": {name: _held(run, read) for name, (run, read) in held.items()},
         "notes": [*notes, *_trades([names[free.index(k)] for k in told], correlation)],
         "unit": "rad",
@@ -128,7 +139,7 @@ def _result(
 def _expression(here: Setting, entry: int) -> str:
     one = here.known.table[entry]
     names, place = here.loop.robot.dof_names, one.at[0]
-    if one.name in ("scale", "delay", "dead_band", "voltage", "force_limit"):
+    if one.name in OF_DRIVES:
         place = int(np.abs(np.asarray(here.loop.drives.transmission)[place]).argmax())
     return f"{one.name} {here.loop.robot.link_names[place] if one.name == 'payload' else names[place]}"
 

@@ -42,7 +42,7 @@ _LONGS = ("n", "nu", "links", "ny", "rates", "carried", "hard", "limited", "impl
 _ARRAYS = (
     "measured", "summed", "parent", "coordinate", "slides", "placement", "axis", "inertia", "gravity", "start", "joint",
     "drive", "way", "payload", "resting", "kind", "place", "column", "ten", "command", "reading", "weight", "load",
-    "begin", "cost", "gradient", "matrix", "read",
+    "begin", "pole", "cost", "gradient", "matrix", "read",
 )  # fmt: skip
 _MOST, _MOST_COLUMNS = 32, 500
 
@@ -230,7 +230,8 @@ def _fixed(loop: Loop, data: Windows) -> dict[str, np.ndarray]:
         "way": f(loop.drives.transmission), "command": f(data.command), "reading": f(data.reading),
         "weight": f(data.weight),
     }  # fmt: skip
-    return found if data.carried is None else found | {"load": f(data.carried)}
+    more = {"load": data.carried, "pole": data.pole}
+    return found | {name: f(x) for name, x in more.items() if x is not None}
 
 
 @lru_cache

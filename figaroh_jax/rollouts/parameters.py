@@ -16,9 +16,10 @@ from jaxtyping import Array
 
 from .loop import Loop
 
-__all__ = ["BOUNDS", "TEN", "UNITS", "Entry", "Table", "current", "put", "unit_payload", "values"]
+__all__ = ["BOUNDS", "OF_DRIVES", "TEN", "UNITS", "Entry", "Table", "current", "put", "unit_payload", "values"]
 
-_OF_DRIVES = ("scale", "delay", "dead_band", "voltage", "time_constant")
+_DRIVES = ("scale", "delay", "dead_band", "voltage", "time_constant")  # fields of `Drives`
+OF_DRIVES = (*_DRIVES, "force_limit", "kp", "kd")  # places that are drives
 
 
 class Entry(NamedTuple):
@@ -77,7 +78,7 @@ def _get(loop: Loop, name: str, xp: Any = np) -> Any:
     }
     if name in special:
         return special[name]()
-    return xp.asarray(getattr(drives if name in _OF_DRIVES else loop.joints, name))
+    return xp.asarray(getattr(drives if name in _DRIVES else loop.joints, name))
 
 
 def put(loop: Loop, table: Table, theta: Array | np.ndarray) -> Loop:
@@ -114,7 +115,7 @@ def _put(loop: Loop, name: str, at: np.ndarray, new: Array | np.ndarray) -> Loop
         return eqx.tree_at(lambda m: (m.drives.gain, m.drives.bias), loop, both)
     if name == "kd":
         return eqx.tree_at(lambda m: m.drives.bias, loop, jnp.asarray(loop.drives.bias).at[at, 2].set(-new))
-    group = "drives" if name in _OF_DRIVES else "joints"
+    group = "drives" if name in _DRIVES else "joints"
     old = jnp.asarray(getattr(getattr(loop, group), name))
     return eqx.tree_at(lambda m: getattr(getattr(m, group), name), loop, old.at[at].set(new))
 

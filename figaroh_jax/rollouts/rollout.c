@@ -41,6 +41,7 @@ typedef struct {
   const long *kind, *place, *column;         /* (many) of the unknowns */
   const double *ten;                         /* (many, 10), of unknowns of the rigid body */
   const double *command, *reading, *weight, *load, *begin; /* (lead + rows, nu, windows) ... (2 n, windows) */
+  const double *pole;                        /* (wide, windows) of the noise, or none where it is white */
   double *cost, *gradient, *matrix, *read;   /* sums, or what is read alone where `cost` is none */
 } Given;
 
@@ -480,8 +481,9 @@ INLINE void settled(const Given *g, Work *w, const int n) {
     w->K[0] = 1 / (w->M[0] + stiffness(w, 0));
     return;
   }
-  acting(g, w, n, w->a);
+  /* the first turn takes what slipped and what was met in the step before: mostly it still does */
   for (int turn = 0; turn < TURNS; turn++) {
+    if (turn == 1) acting(g, w, n, w->a);
     double way[MOST], gap[MOST], full[MOST];
     int slip[MOST], low[MOST], high[MOST], same = 1;
     with_stiffness(w, n, w->K);
@@ -501,6 +503,7 @@ INLINE void settled(const Given *g, Work *w, const int n) {
       memcpy(w->a, full, sizeof(double) * n);
       return;
     }
+    if (turn == 0) continue;
     const double s = step_length(g, w, n, r, way);
     if (!isfinite(s)) {
       for (int j = 0; j < n; j++) w->a[j] = NAN;
@@ -825,15 +828,37 @@ WIDE void multiplied(const long width, const long many, const double *restrict k
     }
 }
 
+/* the row before, of each number that is read: its error and its sensitivities */
+typedef struct {
+  double error[ROWS], *slope;
+  int had[ROWS];
+} Before;
+
+/* what a row tells beyond the row before it, where the noise is a first-order low pass */
+INLINE double beyond(const double pole, const long width, const long y, double error, double *restrict slope, Before *before) {
+  double *restrict past = before->slope + y * width;
+  const double now = error, alone = sqrt(1 - pole * pole);
+  error = before->had[y] ? error - pole * before->error[y] : alone * error;
+  for (long c = 0; c < width; c++) {
+    const double own = slope[c];
+    slope[c] = before->had[y] ? own - pole * past[c] : alone * own;
+    past[c] = own;
+  }
+  before->error[y] = now, before->had[y] = 1;
+  return error;
+}
+
 /* sums of a row: squares, gradient, and what the normal matrix will be made of */
-WIDE void collected(const Given *g, const Work *w, const int n, const long window, const long row, const long width,
-                    const double *S, double *cost, double *gradient, double *matrix, double *kept, long *many) {
+WIDE void collected(const Given *g, const Work *w, const int n, const long window, const long row, const long width, const double *S,
+                    double *cost, double *gradient, double *matrix, double *kept, long *many, Before *before) {
   const long wide = g->ny * (g->rates ? 2 : 1);
   for (long y = 0; y < wide; y++) {
     const double sure = g->weight[(row * wide + y) * g->windows + window];
-    if (sure == 0) continue;
-    const double error = (g->reading[(row * wide + y) * g->windows + window] - seen(g, w, n, y)) * sure;
-    cost[y] += error * error;
+    if (sure == 0) {
+      before->had[y] = 0;
+      continue;
+    }
+    double error = (g->reading[(row * wide + y) * g->windows + window] - seen(g, w, n, y)) * sure;
     const long half = y < g->ny ? 0 : n, j = g->measured[y % g->ny], k = g->summed[y % g->ny];
     const double *own = S + (half + j) * width, *twin = k < 0 ? 0 : S + (half + k) * width;
     double *restrict slope = kept + *many * width;
@@ -843,6 +868,8 @@ WIDE void collected(const Given *g, const Work *w, const int n, const long windo
     if (!half)
       for (long p = 0; p < g->many; p++)
         if (g->kind[p] == READING && g->place[p] == j) slope[g->column[p]] += sure;
+    if (g->pole) error = beyond(g->pole[y * g->windows + window], width, y, error, slope, before);
+    cost[y] += error * error;
     for (long c = 0; c < width; c++) gradient[c] += slope[c] * error;
     if (++*many == KEPT) multiplied(width, *many, kept, matrix), *many = 0;
   }
@@ -870,6 +897,8 @@ INLINE void window_of(const Given *g, const int n, const int carried, const int 
   double gradient[want ? width : 1], matrix[want ? width * width : 1] __attribute__((aligned(64))), cost[ROWS];
   double kept[want ? KEPT * width : 1] __attribute__((aligned(64)));
   long waiting = 0;
+  double past[want && g->pole ? wide * width : 1];
+  Before before = {.slope = past};
   double by[want ? (2 * n + g->many) * n : 1];
   for (int j = 0; j < n; j++) w->q[j] = g->begin[j * g->windows + window], w->v[j] = g->begin[(n + j) * g->windows + window], w->a[j] = 0;
   if (want) {
@@ -882,7 +911,7 @@ INLINE void window_of(const Given *g, const int n, const int carried, const int 
     if (want) memset(gradient, 0, sizeof gradient), memset(matrix, 0, sizeof matrix);
     for (long row = b * g->block; row < (b + 1) * g->block; row++) {
       for (int j = 0; j < n; j++) lost |= !(fabs(w->v[j]) < 1e12);
-      if (want && !lost) collected(g, w, n, window, row, width, S, cost, gradient, matrix, kept, &waiting);
+      if (want && !lost) collected(g, w, n, window, row, width, S, cost, gradient, matrix, kept, &waiting, &before);
       if (!want)
         for (long y = 0; y < wide; y++) g->read[(row * wide + y) * g->windows + window] = lost ? NAN : seen(g, w, n, y);
       if (lost) continue;
@@ -906,7 +935,8 @@ INLINE void window_of(const Given *g, const int n, const int carried, const int 
 }
 
 INLINE void all_windows(const Given *g, const int n, const int carried, const int want) {
-  static __thread Work w;
+  Work w; /* no static one: its address would be asked for at each use */
+  memset(&w, 0, sizeof w);
   double mobile[n * g->many + 1];
   mobility(g, &w, n, mobile);
   w.often = 1 / g->dt;

@@ -13,44 +13,31 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from .causes import BASELINE, CONTAINS, Candidate, elastic_loop
-from .data import windows
+from .causes import Candidate, elastic_loop, springs
 from .fit import Fit, fit
-from .parameters import Entry
-from .search import (
-    Model,
+from .parameters import OF_DRIVES, Entry
+from .search import Model, Tried, scored, settled
+from .sensitivity import Windows
+from .setting import (  # fmt: skip
     Setting,
     Structure,
-    Tried,
     by_recording,
     excess,
     free_entries,
     largest_forces,
-    residuals,
-    scored,
-    settled,
     start_values,
-)  # fmt: skip
-from .sensitivity import Windows
+    whitened,
+)
+from .thresholds import EXPLAINED, HOPEFUL, MAY_WIN, RICHER, UNCHANGED, USUAL
 
 __all__ = ["LATE", "ROUGH", "Known", "Standing", "excess_of", "joint_of", "joint_of_entry", "outputs", "tried_now"]
 
 LATE, ROUGH = 30, 1e-4  # iterations; share of the squares that a step must promise
 _EARLY = 3  # iterations of each candidate
-_USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
 _MOST = 6  # causes of a joint
 _TOP, _RACE = 3, 2  # candidates of a joint that are fitted, and that are fitted to the end
 _PART = 3  # of the windows, one in so many shows whether a limit or a spring is worth a fit
-_HOPE = 0.1  # share of a joint's squares that a cause must promise where it must take `_MUCH` in the end
-_SAME = 0.02  # change of a joint's squares below which nothing new is looked for there
-_WINS = 0.45  # share of the best gain after a few steps from which a candidate may still be named
-_ALL = 1.1  # squares of a sample up to which nothing is left to explain by a spring
-_MORE = 1.02  # of the promise of a simpler cause, which a richer one must exceed to be fitted
-_LIMITS = ("actuator_saturation", "voltage_saturation")
-_STILL = ("encoder_offset", "torque_offset", "joint_spring")  # of one joint: each makes up for the others
-_ELASTIC = ("joint_elasticity", "backlash")
 _SHARES = (0.005, 0.05, 0.3)  # twists of a spring under the largest torque, rad or m
-_OF_DRIVE = ("scale", "delay", "dead_band", "voltage", "force_limit")
 
 
 class Standing(NamedTuple):
@@ -93,27 +80,27 @@ def tried_now(
     rigid = model.structure.loop.robot.nv == n
     open_joints = [j for j in range(n) if now.excess[j] >= 1.0] or list(range(n))
     sizes = {-1: float(now.squares.sum())} | {j: float(now.squares[..., j].sum()) for j in range(n)}
-    same = {j for j, one in known.items() if abs(one.squares - sizes[j]) < _SAME * sizes[j]}
+    same = {j for j, one in known.items() if abs(one.squares - sizes[j]) < UNCHANGED * sizes[j]}
     stands = [one._replace(alone=False) for j in sorted(same) if j < 0 or j in open_joints for one in known[j].tried]
     open_joints = [j for j in open_joints if j not in same]
     if not open_joints:
         return stands
     used = {(c.effect, c.at) for c in named}
-    still = {c.at for c in named if c.effect in _STILL}
+    constant = {c.at for c in named if c.kind.constant}
     count = {at: sum(c.at == at for c in named) for at in {c.at for c in named}}
     left = [
         c for c in here.known.candidates
         if (c.effect, c.at) not in used and not set(c.entries) <= set(model.free)
-        and not (c.effect in _STILL and c.at in still) and count.get(c.at, 0) < _MOST
+        and not (c.kind.constant and c.at in constant) and count.get(c.at, 0) < _MOST
         and ((joint_of(here, c) < 0 and -1 not in same) or joint_of(here, c) in open_joints)
     ]  # fmt: skip
     own, cost = now.squares.sum((0, 1)), model.fit.cost
-    plain = [c for c in left if c.effect not in _LIMITS]
+    plain = [c for c in left if not c.kind.limit]
     best: dict[int, list[_Ranked]] = {}
     for k, (score, theta) in scored(here, model, plain).items():
         best.setdefault(joint_of(here, plain[k]), []).append(_Ranked(cost - score, model.structure, plain[k], theta))
     for j in open_joints:
-        common = [one for one in best.get(j, []) if one.candidate.effect in BASELINE and one.promise > _USUAL * own[j]]
+        common = [one for one in best.get(j, []) if one.candidate.kind.usual and one.promise > USUAL * own[j]]
         if common and now.excess[j] >= 1.0:  # nothing that few joints have can come before it
             best[j] = [max(common, key=lambda one: one.promise)]
             continue
@@ -123,9 +110,9 @@ def tried_now(
         ranked = sorted(ones, key=lambda one: -one.promise)
         ranked = [one for k, one in enumerate(ranked) if all(one[2] is not other[2] for other in ranked[:k])]
         ranked = [one for one in ranked if not _no_more(one, ranked)]
-        least = (_HOPE if by_recording(here) and now.excess.max() >= 1.0 else 0.0) * own[j]
-        enough = [one for one in ranked if j < 0 or one.promise > least or one.candidate.effect in BASELINE]
-        usual = [one for one in enough if one.candidate.effect in BASELINE][:1]  # may come before what promises more
+        least = (HOPEFUL if by_recording(here) and now.excess.max() >= 1.0 else 0.0) * own[j]
+        enough = [one for one in ranked if j < 0 or one.promise > least or one.candidate.kind.usual]
+        usual = [one for one in enough if one.candidate.kind.usual][:1]  # may come before what promises more
         rest = [one for one in enough if all(one is not x for x in usual)]
         hopeful[j] = [*usual, *rest][: _TOP if j >= 0 else 1]
     found = _fitted(here, now, hopeful)
@@ -142,16 +129,16 @@ def _limits_and_springs(
     (part, share, _), model = _part(now, joint), now.model
     mine = [c for c in left if joint_of(here, c) == joint]
     leader = max(plain, key=lambda one: one.promise, default=None)
-    chosen = [c for c in mine if c.effect in _LIMITS or (leader is not None and c is leader.candidate)]
+    chosen = [c for c in mine if c.kind.limit or (leader is not None and c is leader.candidate)]
     scores = {chosen[k].effect: (part.fit.cost - x, theta) for k, (x, theta) in scored(here, part, chosen).items()}
     if leader is not None and scores.get(leader.candidate.effect, (0.0, None))[0] > 0:
         share = leader.promise / scores[leader.candidate.effect][0]  # as much more as the same cause promises in all
     found = [
         _Ranked(scores[c.effect][0] * share, model.structure, c, scores[c.effect][1])
-        for c in chosen if c.effect in _LIMITS and c.effect in scores
+        for c in chosen if c.kind.limit and c.effect in scores
     ]  # fmt: skip
     most = max((one.promise for one in [*plain, *found]), default=0.0)
-    if rigid and now.excess.max() >= 1.0 and now.squares[..., joint].sum() - most > _ALL * _rows(here, joint):
+    if rigid and now.excess.max() >= 1.0 and now.squares[..., joint].sum() - most > EXPLAINED * _rows(here, joint):
         found += [one._replace(promise=one.promise * share) for one in _sprung(here, now, joint, forbid)]
     return found
 
@@ -185,8 +172,8 @@ def _rows(here: Setting, joint: int) -> int:
 
 def _no_more(one: _Ranked, ranked: Sequence[_Ranked]) -> bool:
     """Whether a candidate promises hardly more than one that it contains."""
-    simple = CONTAINS.get(one.candidate.effect, ())
-    return any(other.candidate.effect in simple and one.promise < _MORE * other.promise for other in ranked)
+    kind = one.candidate.kind
+    return any(kind.holds(other.candidate.effect) and one.promise < RICHER * other.promise for other in ranked)
 
 
 def _fitted(here: Setting, now: Standing, hopeful: dict[int, list[_Ranked]]) -> list[Tried]:
@@ -203,7 +190,7 @@ def _fitted(here: Setting, now: Standing, hopeful: dict[int, list[_Ranked]]) -> 
         before = now.squares[..., j].sum() if j >= 0 else now.squares.sum()
         ordered = sorted(ones, key=lambda x: x[0])
         ordered = [x for k, x in enumerate(ordered) if all(x[1].candidate is not y[1].candidate for y in ordered[:k])]
-        near = [x for x in ordered if before - x[0] > _WINS * (before - ordered[0][0])]
+        near = [x for x in ordered if before - x[0] > MAY_WIN * (before - ordered[0][0])]
         leaders[j] = [(x[1], x[2]) for x in near[:_RACE]]
     found = []
     for one in _all_in_lanes(here, now, leaders, LATE, now.model.fit.cost):
@@ -232,7 +219,7 @@ class _OneOf(NamedTuple):
 def _from_starts(one: _Ranked) -> list[tuple[_Ranked, np.ndarray]]:
     """A candidate with the numbers from which its fit starts, once for each start."""
     c = one.candidate
-    return [(one, x) for x in ([one.theta] if c.elastic or not c.starts or c.effect in _LIMITS else
+    return [(one, x) for x in ([one.theta] if c.kind.elastic or not c.starts or c.kind.limit else
                                [start_values(one.theta, c, start) for start in c.starts])]  # fmt: skip
 
 
@@ -273,7 +260,7 @@ def _all_in_lanes(
 
 def _fitted_alone(one: Candidate) -> bool:
     """Whether a candidate shares no fit with those of other joints."""
-    return one.elastic or one.effect in _LIMITS or one.effect == "payload"
+    return one.kind.elastic or one.kind.limit or one.kind.several
 
 
 def _start_of(now: Standing, structure: Structure) -> np.ndarray:
@@ -286,29 +273,25 @@ def _start_of(now: Standing, structure: Structure) -> np.ndarray:
 
 def _sprung(here: Setting, now: Standing, joint: int, forbid: Sequence[str]) -> list[_Ranked]:
     """A spring, and a spring with play, between motor and link of a joint."""
-    wanted = [name for name in _ELASTIC if name not in forbid]
-    forces, name = largest_forces(here.loop, here.runs), here.loop.robot.dof_names[joint]
+    wanted = springs(here.loop.robot.dof_names[joint], len(here.known.table), forbid)
+    forces = largest_forces(here.loop, here.runs)
     way = np.abs(np.asarray(here.loop.drives.transmission))[:, joint]
     torque = float(max((way * forces).max(initial=0.0), 1e-6))
     if not wanted or not np.isfinite(torque):
         return []
     loop = elastic_loop(here.loop, joint, 10.0 * torque, 0.01 * torque)
-    n, k = here.loop.robot.nv, len(here.known.table)
+    n = here.loop.robot.nv
     table = (*here.known.table, *(Entry(x, (n,)) for x in ("stiffness", "damping", "play")))
-    structure = Structure(loop, table, windows(loop, here.runs, here.stretches, here.noise, here.block))
+    structure = Structure(loop, table, here.cut(loop))
     part, _, which = _part(now, joint)
     small = structure._replace(data=_only(structure.data, which))
     start = _start_of(now, structure)[:, which]
     found = []
-    for effect in wanted:
-        entries, reported = (k, k + 1), ("stiffness", "damping")
-        if effect == "backlash":
-            entries, reported = (k, k + 1, k + 2), (*reported, "width")
-        c = Candidate(effect, (name,), entries, (), reported, True)
+    for c in wanted:
         for share in _SHARES:
-            play = 0.0 if effect == "joint_elasticity" else 0.1 * share
+            play = 0.0 if c.kind.telling is None else 0.1 * share
             theta = np.concatenate([now.model.fit.theta, [torque / share, 0.002 * torque / share, play]])
-            score = settled(here, small, theta, free_entries(now.model.free, entries), start)
+            score = settled(here, small, theta, free_entries(now.model.free, c.entries), start)
             found.append(_Ranked(part.fit.cost - score, structure, c, theta))
     return found
 
@@ -324,7 +307,7 @@ def outputs(here: Setting, squares: Any) -> np.ndarray:
 
 def excess_of(here: Setting, structure: Structure, one: Fit) -> np.ndarray:
     """How far each joint's residual is above noise."""
-    error, weight = residuals(structure, one), np.asarray(structure.data.weight)
+    error, weight = whitened(structure, one), np.asarray(structure.data.weight)
     count, found = len(here.loop.measured), np.zeros(here.loop.robot.nv)
     for k, place in enumerate(here.loop.measured):
         mine = slice(k, None, count)
@@ -334,7 +317,7 @@ def excess_of(here: Setting, structure: Structure, one: Fit) -> np.ndarray:
 
 def joint_of(here: Setting, c: Candidate) -> int:
     """The joint whose encoder shows a cause; -1: those of several."""
-    return -1 if c.effect == "payload" else here.loop.robot.dof_names.index(c.at[0])
+    return -1 if c.kind.several else here.loop.robot.dof_names.index(c.at[0])
 
 
 def joint_of_entry(here: Setting, entry: int) -> int:
@@ -343,6 +326,6 @@ def joint_of_entry(here: Setting, entry: int) -> int:
     if one is None or len(one.at) != 1 or one.name == "payload":
         return -1
     (place,) = one.at
-    if one.name in _OF_DRIVE:
+    if one.name in OF_DRIVES:
         return int(np.argmax(np.abs(np.asarray(here.loop.drives.transmission)[place])))
     return place

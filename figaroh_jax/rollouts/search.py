@@ -6,89 +6,63 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from scipy.special import ndtr
 
 from ..results import Name, Verdict
-from .causes import BASELINE, CONTAINS, Candidate, Catalogue, catalogue, elastic_loop
-from .data import Run, Stretch, noise_of, windows
+from .causes import Candidate, elastic_loop, springs
+from .colour import colour_of
 from .faults import Fault
 from .fit import Fit, System, fit, held_out, refitted_without, standard_errors
-from .loop import Loop
-from .parameters import BOUNDS, Entry, Table, values
-from .sensitivity import Windows, predicted
+from .parameters import Entry
+from .setting import (
+    Setting,
+    Structure,
+    begun,
+    by_recording,
+    coloured,
+    excess,
+    free_entries,
+    largest_forces,
+    level_of,
+    residuals,
+    start_values,
+    whitened,
+)
+from .thresholds import (
+    CLEAR_OF_NOTHING,
+    CLEARLY,
+    CONFIDENT,
+    GAIN,
+    MUCH,
+    NEAR,
+    NO_WORSE,
+    OF_ITS_SIZE,
+    UNSURE,
+    UNTOLD,
+    USUAL,
+)
 
 __all__ = [
     "Model",
     "Named",
     "Search",
-    "Setting",
     "Tried",
-    "begins_of",
-    "begun",
-    "by_recording",
-    "excess",
-    "free_entries",
-    "largest_forces",
-    "level_of",
-    "residuals",
+    "judged_by_colour",
     "scored",
     "search",
-    "setting",
     "settled",
     "sized",
-    "start_values",
     "t_of",
 ]
 
-_WORTH, _SURE, _ALIKE = 0.004, 1.64, 1.7  # held-out gain and t of a name; t below which two causes are alike
-_CLEAR = 3.0  # t of a name beside which more than noise is left
-_MUCH = 0.25  # held-out gain of such a name, unless it is one that every joint has: less may stand in for the rest
 _SHORT = 6  # candidates that are fitted where a linear screening can order them
 _CHECKED = 3  # candidates whose held-out squares are those of fits without some recordings
 _ROOM = 120  # columns beside what is free that one linearisation takes: each is a fiftieth of the first
 _LEAST_ROOM, _SUMS = 24, 2.5e7  # columns that it takes at least; numbers of its matrices by blocks of time
 _SHORTER = 4  # of one joint of an arm
-_GROUP = 25  # rows whose mean shows a slow misfit
 _MOST, _MOST_ONE = 6, 4  # causes, and where only a rest that is noise gives them a name
-_USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
-_PAIR = 2  # starts of the baseline that are followed to the end
-_ROUGH = 1e-3  # share of the squares that a step of such a start must promise
 _EARLY, _LATE = 4, 30  # iterations of a race among all starts, and of its leaders
-_LIMITS = ("actuator_saturation", "voltage_saturation")
-_STILL = ("encoder_offset", "torque_offset", "joint_spring")  # of one joint: each makes up for the others
-_SHAPED = ("stribeck_friction",)  # without an amplitude their shape shows nothing
-
-
-@dataclass(frozen=True)
-class Setting:
-    """Everything that stays the same during a search."""
-
-    loop: Loop
-    runs: tuple[Run, ...]
-    data: Windows
-    noise: tuple[np.ndarray, ...]
-    known: Catalogue
-    baseline: tuple[int, ...]  # entries that every fit frees
-    folds: np.ndarray  # (blocks, windows)
-    lanes: int
-    width: int
-    stretches: tuple[Stretch, ...]
-    block: float
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """(entries, 2): what the numbers can be."""
-        return np.array([BOUNDS[entry.name] for entry in self.known.table])
-
-
-class Structure(NamedTuple):
-    """The loop with the table of its numbers: plain, or with a spring in one joint."""
-
-    loop: Loop
-    table: Table
-    data: Windows
 
 
 class Named(NamedTuple):
@@ -122,89 +96,25 @@ class Search:
     faults: list[Fault] = field(default_factory=list)  # why they were
 
 
-def setting(
-    loop: Loop,
-    runs: Sequence[Run],
-    *,
-    baseline: Sequence[str] = ("rotor_inertia", "joint_damping", "friction_loss"),
-    more: Sequence[tuple[str, str]] = (),
-    gains_known: bool = True,
-    forbid: Sequence[str] = (),
-    block: float = 0.3,
-    stretches: Sequence[Stretch] = (),
-    rates: bool = True,
-) -> Setting:
-    """Data, catalogue and baseline; `more` are (effect, joint) that it has beside `baseline` at every joint."""
-    fitted = [r for r in runs if not r.holdout]
-    noise = [np.sqrt(np.mean([noise_of(r.position) ** 2 for r in fitted], axis=0))]
-    if rates and all(r.velocity is not None for r in fitted):
-        noise.append(np.sqrt(np.mean([noise_of(r.velocity) ** 2 for r in fitted if r.velocity is not None], axis=0)))
-    stretches = tuple(stretches) or tuple(Stretch(k, 0, len(r.time)) for k, r in enumerate(fitted))
-    data = windows(loop, fitted, stretches, noise, block)
-    known = catalogue(loop, largest_forces(loop, fitted), gains_known=gains_known, forbid=forbid)
-    names = loop.robot.dof_names
-    wanted = [(effect, name) for effect in baseline for name in names] + list(more)
-    all_of = catalogue(loop, largest_forces(loop, fitted), gains_known=False).candidates
-    free = [k for c in all_of if (c.effect, c.at[0]) in wanted for k in c.entries]
-    keep = tuple(c for c in known.candidates if not set(c.entries) <= set(free))
-    count = loop.robot.nv
-    return Setting(
-        loop, tuple(fitted), data, tuple(noise), Catalogue(known.table, keep), tuple(free),
-        _folds(data, stretches), 8 if count == 1 else 1, len(free) + (5 if count == 1 else 8), stretches, block,
-    )  # fmt: skip
-
-
-def _folds(data: Windows, stretches: Sequence[Stretch]) -> np.ndarray:
-    """Recordings where there are three or more, else four quarters of the time."""
-    blocks, count = data.reading.shape[0] // data.block, len(stretches)
-    runs = [s.run for s in stretches]
-    if len(set(runs)) >= 3:
-        return np.broadcast_to(np.array(runs), (blocks, count)).copy()
-    return np.broadcast_to((np.arange(blocks) * 4 // blocks)[:, None], (blocks, count)).copy()
-
-
-def largest_forces(loop: Loop, runs: Sequence[Run]) -> np.ndarray:
-    """The largest force of each drive, its law taken at what was recorded."""
-    drives, found = loop.drives, np.zeros(len(loop.drives.names))
-    for run in runs:
-        position = np.zeros((len(run.time), loop.robot.nv))
-        position[:, list(loop.measured)] = run.position
-        length = position @ np.asarray(drives.transmission).T
-        force = np.asarray(drives.bias)[:, 0] + np.asarray(drives.gain)[:, 0] * run.command
-        force = np.abs(force + np.asarray(drives.bias)[:, 1] * length)
-        found = np.maximum(found, np.quantile(force, 0.999, axis=0))
-    return np.minimum(found, np.asarray(drives.force_range)[:, 1])
-
-
-def residuals(structure: Structure, found: Fit) -> np.ndarray:
-    """Whitened residuals, (rows, ny, windows)."""
-    with jax.enable_x64(True):
-        read = predicted(structure.loop, structure.table, found.theta[None], structure.data, found.start[None])[0]
-    return (np.asarray(structure.data.reading) - np.asarray(read)) * np.asarray(structure.data.weight)
-
-
-def excess(error: np.ndarray, weight: np.ndarray) -> float:
-    """How many sigmas the residual is above white noise: its power, and that of its means over 25 rows."""
-    count = (weight > 0).sum()
-    power = ((error**2).sum() / count - 1) / np.sqrt(6 / count)
-    rows = len(error) // _GROUP * _GROUP
-    means = error[:rows].reshape(-1, _GROUP, *error.shape[1:]).sum(1) / np.sqrt(_GROUP)
-    full = (weight[:rows] > 0).reshape(-1, _GROUP, *error.shape[1:]).all(1)
-    slow = ((means[full] ** 2).mean() - 1.0) / np.sqrt(4 / max(full.sum(), 1)) if full.any() else 0.0
-    return float(max(power / 4, slow / 5))
-
-
-def free_entries(fitted: Sequence[int], extra: Sequence[int]) -> list[int]:
-    """Entries of theta of both lists, each once, in the order in which they come first."""
-    return list(dict.fromkeys([*fitted, *extra]))
-
-
-def start_values(theta: np.ndarray, candidate: Candidate, values: Sequence[float]) -> np.ndarray:
-    """Theta with a candidate's entries at the values that it starts from; where one is not a number it stays."""
-    new = theta.copy()
-    for entry, value in zip(candidate.entries, values, strict=True):
-        if not np.isnan(value):
-            new[entry] = value
+def judged_by_colour(here: Setting, found: Search, seek: Callable[[Setting], Search]) -> Search:
+    """Where what is left may be coloured noise: the search once more with that noise, if then noise alone is left."""
+    if found.verdict in ("nothing", "named"):
+        return found
+    sound = found.setting or here
+    again = coloured(sound, found.structure, found.last)
+    if again is None:
+        return found
+    new = seek(again)
+    levels = np.concatenate([one / white for one, white in zip(again.noise, sound.noise, strict=True)])
+    counted = np.asarray(new.structure.data.weight) > 0
+    left = residuals(new.structure, new.last) * levels[:, None]
+    if new.verdict not in ("nothing", "named") or colour_of(left, counted) is None:
+        return found
+    new.setting, new.faults = again, found.faults
+    if [n.candidate for n in new.named] == [n.candidate for n in found.named or found.proxy]:  # in plain squares
+        old = found.named or found.proxy
+        new.held = found.held
+        new.named = [n._replace(before=o.before, after=o.after) for n, o in zip(new.named, old, strict=True)]
     return new
 
 
@@ -225,11 +135,18 @@ def search(
     begin: Fit | None = None,
 ) -> Search:
     """Baseline, then one cause after another while held-out data gain; what is left decides the verdict."""
+    found = _searched(here, progress, forbid, begin)
+    return judged_by_colour(here, found, lambda again: _searched(again, lambda phase, share: None, forbid))
+
+
+def _searched(
+    here: Setting, progress: Callable[[str, float], None], forbid: Sequence[str], begin: Fit | None = None
+) -> Search:
     structure = Structure(here.loop, here.known.table, here.data)
     progress("fitting the baseline", 0.1)
     first = begun(here) if begin is None else begin
     weight = np.asarray(here.data.weight)
-    now = Model(structure, first, here.baseline, excess(residuals(structure, first), weight))
+    now = Model(structure, first, here.baseline, excess(whitened(structure, first), weight))
     stood, found, p_value, steps, nearest = [now], [], 1.0, [("baseline", level_of(first, weight))], []
     most = _MOST if by_recording(here) else _MOST_ONE
     while len(found) < most:
@@ -250,40 +167,6 @@ def search(
     return result
 
 
-def begun(here: Setting) -> Fit:
-    """The baseline's fit."""
-    begins: Any = begins_of(here, values(here.loop, here.known.table))
-    structure = Structure(here.loop, here.known.table, here.data)
-    sizes: Any = {"width": here.width, "lanes": here.lanes}
-    if len(begins) == 1:
-        return fit(*structure, begins, [here.baseline], **sizes)[0]
-    early = fit(*structure, begins, [here.baseline] * len(begins), iterations=_EARLY, **sizes)
-    order = sorted(early, key=lambda f: f.cost)[:_PAIR]
-    states = np.stack([f.theta for f in order]), np.stack([f.start for f in order])
-    fits = fit(*structure, states[0], [here.baseline] * len(order), states[1], rough=_ROUGH, **sizes)
-    best = min(fits, key=lambda f: f.cost)
-    return fit(*structure, best.theta[None], [here.baseline], best.start[None], **sizes)[0]
-
-
-def begins_of(here: Setting, theta: np.ndarray) -> np.ndarray:
-    """Where the baseline's fit starts: at the model; where the gains are free, also stiffer and heavier."""
-    gains = [k for k in here.baseline if here.known.table[k].name == "scale"]
-    if not gains:
-        return theta[None]
-    rotors = [k for k in here.baseline if here.known.table[k].name == "armature"]
-    begins = []
-    for stiff, heavy in ((1.0, 1.0), (4.0, 1.0), (1.0, 8.0), (4.0, 8.0), (0.1, 1.0), (0.02, 1.0)):
-        begins.append(theta.copy())
-        begins[-1][gains] *= stiff
-        begins[-1][rotors] = np.maximum(begins[-1][rotors], 1e-3) * heavy
-    return np.array(begins)
-
-
-def level_of(found: Fit, weight: np.ndarray) -> float:
-    """Mean square of the misfit over the samples that count, in units of the noise's variance."""
-    return found.squares / max((weight > 0).sum(), 1)
-
-
 class Tried(NamedTuple):
     """A candidate that was fitted."""
 
@@ -297,8 +180,8 @@ def _tried(here: Setting, now: Model, named: Sequence[Candidate], forbid: Sequen
     """Every candidate that may still come, fitted from the present optimum from each of its starts."""
     used = {(c.effect, c.at) for c in named}
     left = [c for c in here.known.candidates if (c.effect, c.at) not in used and not set(c.entries) <= set(now.free)]
-    placed = {c.at for c in named if c.effect in _STILL}
-    left = [c for c in left if not (c.effect in _STILL and c.at in placed)]
+    placed = {c.at for c in named if c.kind.constant}
+    left = [c for c in left if not (c.kind.constant and c.at in placed)]
     left = [c for c in left if len(now.free) + len(c.entries) <= here.width]
     if here.loop.robot.nv > 1 or here.loop.carried is not None:
         left = _screened(here, now, left) if left else []
@@ -341,7 +224,7 @@ def _raced(
 
 def _tried_one(here: Setting, structure: Structure, c: Candidate, best: Fit, free: Sequence[int]) -> Tried:
     weight = np.asarray(structure.data.weight)
-    state = Model(structure, best, tuple(free), excess(residuals(structure, best), weight))
+    state = Model(structure, best, tuple(free), excess(whitened(structure, best), weight))
     return Tried(c, state, held_out(best, structure.data, here.folds))
 
 
@@ -365,7 +248,7 @@ def scored(here: Setting, now: Model, left: Sequence[Candidate]) -> dict[int, tu
     """
     many = max(int(np.sqrt(_SUMS / now.fit.sums.cost[..., 0].size)) - len(now.free) - len(now.fit.start), _LEAST_ROOM)
     room = max(here.width - len(now.free), min(many, _ROOM))
-    limits = [k for k, c in enumerate(left) if c.effect in _LIMITS]
+    limits = [k for k, c in enumerate(left) if c.kind.limit]
     packs, filled = [], 0
     for k in [k for k in range(len(left)) if k not in limits]:
         if not packs or filled + len(left[k].entries) > room:
@@ -375,11 +258,11 @@ def scored(here: Setting, now: Model, left: Sequence[Candidate]) -> dict[int, tu
         filled += len(left[k].entries)
     lanes = []
     for pack in packs:
-        for variant in range(max([1, *(len(left[k].starts) for k in pack if left[k].effect in _SHAPED)])):
+        for variant in range(max([1, *(len(left[k].starts) for k in pack if left[k].kind.falls_off)])):
             theta = now.fit.theta.copy()
             for k in pack:
-                if left[k].effect in _SHAPED:
-                    theta[left[k].entries[1]] = left[k].starts[variant][1]
+                if shape := left[k].kind.falls_off:
+                    theta[left[k].entries[shape]] = left[k].starts[variant][shape]
             lanes.append((theta, pack))
     for k in limits:
         lanes += [(start_values(now.fit.theta, left[k], start), [k]) for start in left[k].starts]
@@ -417,7 +300,7 @@ def settled(here: Setting, structure: Structure, theta: np.ndarray, free: Sequen
 
 def _elastic(here: Setting, now: Model, forbid: Sequence[str]) -> list[Tried]:
     """A spring, and a spring with play, between motor and link."""
-    wanted = [name for name in ("joint_elasticity", "backlash") if name not in forbid]
+    wanted = springs(here.loop.robot.dof_names[0], len(here.known.table), forbid)
     if not wanted or len(now.free) + 3 > here.width:
         return []
     n = here.loop.robot.nv
@@ -425,30 +308,26 @@ def _elastic(here: Setting, now: Model, forbid: Sequence[str]) -> list[Tried]:
     loop = elastic_loop(here.loop, 0, 10.0 * torque, 0.01 * torque)
     extra = tuple(Entry(name, (n,)) for name in ("stiffness", "damping", "play"))
     table = (*here.known.table, *extra)
-    data = windows(loop, here.runs, here.stretches, here.noise, here.block)
-    structure = Structure(loop, table, data)
+    structure = Structure(loop, table, here.cut(loop))
     base = np.concatenate([now.fit.theta, [0.0, 0.0, 0.0]])
     k = len(here.known.table)
-    made, thetas, free, owner = {}, [], [], []
-    for name in wanted:
-        entries = (k, k + 1) if name == "joint_elasticity" else (k, k + 1, k + 2)
-        reported = ("stiffness", "damping") if name == "joint_elasticity" else ("stiffness", "damping", "width")
-        made[name] = Candidate(name, (here.loop.robot.dof_names[0],), entries, (), reported, True)
+    thetas, free, owner = [], [], []
+    for one in wanted:
         for share in (0.005, 0.05, 0.3):
             stiffness = torque / share
             theta = base.copy()
-            theta[k : k + 3] = stiffness, 0.002 * stiffness, 0.0 if name == "joint_elasticity" else 0.1 * share
+            theta[k : k + 3] = stiffness, 0.002 * stiffness, 0.0 if one.kind.telling is None else 0.1 * share
             thetas.append(theta)
-            free.append(free_entries(now.free, entries))
-            owner.append(name)
+            free.append(free_entries(now.free, one.entries))
+            owner.append(one)
     start = np.zeros((len(thetas), 2 * (n + 1), now.fit.start.shape[1]))
     start[:, :n], start[:, n + 1 : 2 * n + 1] = now.fit.start[:n], now.fit.start[n:]
     most = 40 if here.loop.carried is None else _LATE
     fits = fit(*structure, np.array(thetas), free, start, width=here.width, lanes=6, iterations=most)
     found = []
-    for name in wanted:
-        best = min((f for f, o in zip(fits, owner, strict=True) if o == name), key=lambda f: f.cost)
-        found.append(_tried_one(here, structure, made[name], best, free_entries(now.free, made[name].entries)))
+    for one in wanted:
+        best = min((f for f, o in zip(fits, owner, strict=True) if o == one), key=lambda f: f.cost)
+        found.append(_tried_one(here, structure, one, best, free_entries(now.free, one.entries)))
     return found
 
 
@@ -472,12 +351,12 @@ def _best(
     if not tried:
         return None, 1.0
     p = float(max(ndtr(-4 * now.excess), 1e-12))
-    sure = _SURE if now.excess >= 1.0 else 2.5
+    sure = CONFIDENT if now.excess >= 1.0 else UNSURE
     several = here.loop.carried is not None and by_recording(here)
     beside = [several and one.state.excess >= 1.0 for one in tried]  # a rest, of an arm: more is asked
-    common = [t.candidate.effect in BASELINE and g > _MUCH for t, g in zip(tried, gains, strict=True)]
-    needs = [_CLEAR if rest and not usual else sure for rest, usual in zip(beside, common, strict=True)]
-    worth = [_MUCH if r and t.candidate.effect not in BASELINE else _WORTH for r, t in zip(beside, tried, strict=True)]
+    common = [t.candidate.kind.usual and g > MUCH for t, g in zip(tried, gains, strict=True)]
+    needs = [CLEARLY if rest and not usual else sure for rest, usual in zip(beside, common, strict=True)]
+    worth = [MUCH if r and not t.candidate.kind.usual else GAIN for r, t in zip(beside, tried, strict=True)]
     passing = [k for k in range(len(tried)) if gains[k] > worth[k] and ts[k] > needs[k] and sized(here, tried[k])]
     for k in np.argsort(gains)[::-1][:3]:
         why = "no better than another" if k in passing else "gains too little on data that it was not fitted to"
@@ -486,24 +365,24 @@ def _best(
         return None, p
     k = max(passing, key=lambda k: gains[k])
     if tried[k].state.excess >= 1.0:  # more is to come: what every joint has before what few have
-        usual = [j for j in passing if tried[j].candidate.effect in BASELINE and gains[j] > _USUAL * gains[k]]
-        if tried[k].candidate.effect == "stribeck_friction":  # more friction at rest: beside friction, not without it
-            usual += [j for j in passing if tried[j].candidate[:2] == ("friction_loss", tried[k].candidate.at)]
+        usual = [j for j in passing if tried[j].candidate.kind.usual and gains[j] > USUAL * gains[k]]
+        first = tried[k].candidate
+        usual += [j for j in passing if tried[j].candidate[:2] == (first.kind.adds_to, first.at)]
         k = max(usual, key=lambda j: gains[j], default=k)
     for simple in passing:  # what it contains is preferred unless clearly worse
-        if tried[simple].candidate.effect in CONTAINS.get(tried[k].candidate.effect, ()):
-            if t_of(tried[simple].sse, tried[k].sse) < _ALIKE or tried[simple].sse.sum() <= 1.002 * tried[k].sse.sum():
+        if tried[k].candidate.kind.holds(tried[simple].candidate.effect):
+            if (
+                t_of(tried[simple].sse, tried[k].sse) < UNTOLD
+                or tried[simple].sse.sum() <= NO_WORSE * tried[k].sse.sum()
+            ):
                 k = simple
     best = tried[k]
     alike = []
     for other in passing:
-        contained = (
-            tried[other].candidate.effect in CONTAINS
-            and best.candidate.effect in CONTAINS[tried[other].candidate.effect]
-        )
+        contained = tried[other].candidate.kind.holds(best.candidate.effect)
         noise = tried[other].state.excess < 1.0 or best.state.excess >= 1.0
-        near = tried[other].sse.sum() - best.sse.sum() < 0.1 * (before.sum() - best.sse.sum())
-        if other != k and not contained and noise and near and t_of(tried[other].sse, best.sse) < _ALIKE:
+        near = tried[other].sse.sum() - best.sse.sum() < NEAR * (before.sum() - best.sse.sum())
+        if other != k and not contained and noise and near and t_of(tried[other].sse, best.sse) < UNTOLD:
             alike.append(Name(tried[other].candidate.effect, tried[other].candidate.at))
     named = Named(best.candidate, ts[k], float(gains[k]), tuple(alike), _rms(here, before), _rms(here, best.sse))
     return (named, best.state), p
@@ -530,7 +409,7 @@ def _held_out(here: Setting, now: Model, tried: Sequence[Tried]) -> tuple[list[T
 def _rms(here: Setting, squares: np.ndarray) -> float:
     """Whitened squares as an RMS of position: rad, or m."""
     count = (np.asarray(here.data.weight) > 0).sum()
-    return float(np.sqrt(max(squares.sum(), 0.0) / count * np.mean(here.noise[0] ** 2)))
+    return float(np.sqrt(max(squares.sum(), 0.0) / count * np.mean(here.spread**2)))
 
 
 def sized(here: Setting, one: Tried) -> bool:
@@ -539,22 +418,22 @@ def sized(here: Setting, one: Tried) -> bool:
     column = int(np.flatnonzero(found.free == one.candidate.entries[0])[0])
     error = standard_errors(found, one.state.structure.data)[column]
     value = found.theta[one.candidate.entries[0]]
-    if one.candidate.effect == "backlash":  # without a width it is an elasticity
-        width = one.candidate.entries[2]
+    kind = one.candidate.kind
+    if kind.telling is not None:  # without it it is what it contains
+        width = one.candidate.entries[kind.telling]
         spread = standard_errors(found, one.state.structure.data)[int(np.flatnonzero(found.free == width)[0])]
-        if not found.theta[width] > 3 * spread:
+        if not found.theta[width] > CLEAR_OF_NOTHING * spread:
             return False
-    bounds = here.bounds[list(one.candidate.entries)] if not one.candidate.elastic else np.zeros((0, 2))
+    bounds = here.bounds[list(one.candidate.entries)] if not kind.elastic else np.zeros((0, 2))
     if any(found.theta[e] >= high for e, (_, high) in zip(one.candidate.entries, bounds, strict=False)):
         return False
-    if one.candidate.effect == "stribeck_friction":  # falling off beyond every speed it is plain friction
-        coordinate = one.state.structure.table[one.candidate.entries[1]].at[0]
-        if found.theta[one.candidate.entries[1]] > _top_speed(here, coordinate):
+    if kind.falls_off is not None:  # beyond every speed it is plain friction
+        speed = one.candidate.entries[kind.falls_off]
+        if found.theta[speed] > _top_speed(here, one.state.structure.table[speed].at[0]):
             return False
-    neutral = 1.0 if one.candidate.effect == "actuator_gain" else 0.0
-    if one.candidate.effect in (*BASELINE, "actuator_saturation", "voltage_saturation", "joint_elasticity", "backlash"):
-        return bool(np.isfinite(error) and error < 0.5 * abs(value) + 1e-12)
-    return bool(np.isfinite(error) and abs(value - neutral) > 3 * error)
+    if not kind.signed:
+        return bool(np.isfinite(error) and error < OF_ITS_SIZE * abs(value) + 1e-12)
+    return bool(np.isfinite(error) and abs(value - kind.neutral) > CLEAR_OF_NOTHING * error)
 
 
 def _top_speed(here: Setting, coordinate: int) -> float:
@@ -568,11 +447,6 @@ def _top_speed(here: Setting, coordinate: int) -> float:
     )
 
 
-def by_recording(here: Setting) -> bool:
-    """Whether the folds are recordings, three or more."""
-    return len(np.unique(here.folds)) == len({s.run for s in here.stretches}) >= 3
-
-
 def _judged(
     here: Setting, begin: Model, now: Model, found: list[Named], p_value: float, steps: list, nearest: list
 ) -> Search:
@@ -582,7 +456,7 @@ def _judged(
     if now.excess < 1.0:
         result.verdict = "named" if found else "nothing"
         return result
-    if found and by_recording(here) and all(n.t > _CLEAR for n in found[:1]):
+    if found and by_recording(here) and all(n.t > CLEARLY for n in found[:1]):
         result.verdict = "named+rest"
         return result
     result.verdict, result.proxy, result.named = "unknown", found, []

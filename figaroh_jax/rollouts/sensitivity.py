@@ -42,6 +42,7 @@ class Windows(eqx.Module):
     substeps: int = eqx.field(static=True)
     lead: int = eqx.field(static=True)
     block: int = eqx.field(static=True)  # rows that one sum covers; divides the rows
+    pole: Any = None  # (ny, windows) of noise that is a first-order low pass of white noise; None: it is white
 
 
 class Sums(NamedTuple):
@@ -187,9 +188,11 @@ def _lane(loop: Loop, table: Table, theta: Array, free: Array, data: Windows, st
         spread = spread.at[2 * n :, len(free) : len(free) + n].set(begin[..., None])
     look = _looking(loop, size, rates)
     direct = _direct(loop, table, look.shape[0])[:, free]
+    wide, columns = look.shape[0], spread.shape[1]
+    nothing = () if data.pole is None else _Before.none(wide, columns, windows)
 
-    def chunk(carry: tuple[State, Array, Array], block: Array) -> Any:
-        state, warm, spread = carry
+    def chunk(carry: tuple[State, Array, Array, Any], block: Array) -> Any:
+        state, warm, spread, before = carry
         (state, warm), (states, steps) = _rollout(here, data, state, warm, weight, block)
         a, b = _linearised(loop, table, theta, free, data, states, steps, block)
         spread, rows = _spread(a, b, spread, data.substeps)
@@ -200,11 +203,37 @@ def _lane(loop: Loop, table: Table, theta: Array, free: Array, data: Windows, st
         slope = jnp.sum(look[None, :, :, None, None] * rows[:, None], 2)
         slope = slope.at[:, :, : len(free)].add(direct[None, :, :, None]) * precise[:, :, None]
         error = (truth - read) * precise
+        if data.pole is not None:
+            error, slope, before = before.beyond(jnp.asarray(data.pole), error, slope, precise > 0)
         cost, gradient = jnp.sum(error**2, 0).T, jnp.einsum("typw,tyw->wp", slope, error)
-        return (state, warm, spread), (cost, gradient, jnp.einsum("typw,tyrw->wpr", slope, slope))
+        return (state, warm, spread, before), (cost, gradient, jnp.einsum("typw,tyrw->wpr", slope, slope))
 
     blocks = jnp.arange(data.reading.shape[0] // data.block)
-    return jax.lax.scan(chunk, (state, jnp.zeros_like(state.v), spread), blocks)[1]
+    return jax.lax.scan(chunk, (state, jnp.zeros_like(state.v), spread, nothing), blocks)[1]
+
+
+class _Before(NamedTuple):
+    """The row before a block: its weighed errors, their sensitivities, and which of them count."""
+
+    error: Array  # (ny, windows)
+    slope: Array  # (ny, columns, windows)
+    counted: Array  # (ny, windows)
+
+    @staticmethod
+    def none(outputs: int, columns: int, windows: int) -> _Before:
+        return _Before(
+            jnp.zeros((outputs, windows)), jnp.zeros((outputs, columns, windows)), jnp.zeros((outputs, windows), bool)
+        )
+
+    def beyond(self, pole: Array, error: Array, slope: Array, counted: Array) -> tuple[Array, Array, _Before]:
+        """What each row tells beyond the row before it, where the noise is a first-order low pass."""
+        last = _Before(error[-1], slope[-1], counted[-1])
+        past = [jnp.concatenate([old[None], x[:-1]]) for old, x in zip(self, (error, slope, counted), strict=True)]
+        had, alone = past[2], jnp.sqrt(1 - pole**2)
+        error = jnp.where(had, error - pole * past[0], alone * error) * counted
+        wide, thin = pole[:, None], alone[:, None]
+        slope = jnp.where(had[:, :, None], slope - wide * past[1], thin * slope) * counted[:, :, None]
+        return error, slope, last
 
 
 def _looking(loop: Loop, size: int, rates: bool) -> np.ndarray:

@@ -28,8 +28,9 @@ from .loop import Loop
 from .parameters import UNITS, put
 from .reading import load_loop
 from .rest import nearest_of, parts_of, relative_rest
-from .search import Named, Search, Setting, Structure, residuals, search, setting
+from .search import Named, Search, search
 from .sensitivity import predicted
+from .setting import Setting, Structure, residuals, setting
 
 if TYPE_CHECKING:
     from ..formats.config import Task
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 __all__ = [
     "EFFECTS",
     "RolloutDiagnosis",
+    "colour_notes",
     "diagnose_rollout_task",
     "diagnosis_setting",
     "diverged",
@@ -187,7 +189,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
         joints=tuple(loop.robot.dof_names[k] for k in loop.measured),
         before=before,
         after=after if named else before,
-        noise=scale,
+        noise=here.spread,
         holdout=gain,
         holdout_scheme="recordings kept out of the fit" if held else "quarters of the recording left out in turn",
         experiment=_experiment(found),
@@ -195,8 +197,8 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
         traces=traces,
         baseline=extended_of(start),
         model=model,
-        rest=_rest(found, before if not named else after, scale, loop, traces),
-        notes=(*notes, *implausible(loop.robot, model, task.robot.trust)),
+        rest=_rest(found, before if not named else after, here.spread, loop, traces),
+        notes=(*notes, *colour_notes(here), *implausible(loop.robot, model, task.robot.trust)),
         prismatic=tuple(j.kind == "prismatic" for j in loop.robot.joints if not j.follows),
         of_positions=True,
     )
@@ -263,6 +265,17 @@ def _rms(structure: Structure, fitted: Any, scale: np.ndarray) -> np.ndarray:
     return np.sqrt((error**2).sum((0, 2)) / count) * scale
 
 
+def colour_notes(here: Setting) -> tuple[str, ...]:
+    """What the noise of the encoders is, where it is not white."""
+    if here.pole is None:
+        return ()
+    period = regular(here.runs[0].name, here.runs[0].time)
+    names = [here.loop.robot.dof_names[k] for k in here.loop.measured]
+    slow = [(name, -1e3 * period / np.log(p)) for name, p in zip(names, here.pole, strict=False) if p > 0]
+    text = ", ".join(f"{name} {time:.2g} ms" for name, time in slow)
+    return (f"the noise of the positions is white noise behind a low pass, and is judged as that: {text}",)
+
+
 def _gain(held: dict[str, tuple[np.ndarray, np.ndarray]], runs: Sequence[Run], found: Search) -> Gain:
     measured = {run.name: run.position for run in runs if run.holdout}
     if measured:
@@ -289,35 +302,19 @@ def _cause(one: Named, found: Search, here: Setting) -> Cause:
         if one.candidate.effect == "joint_spring" and name == "offset":
             stiffness = float(fitted.theta[one.candidate.entries[0]])
             name, value, error, unit = "rest", -value / stiffness, error / abs(stiffness), "rad"
-        if one.candidate.effect == "actuator_gain":
-            value -= 1.0
+        value -= one.candidate.kind.neutral
         parameters[name] = Estimate(value, error, unit)
     at = one.candidate.at
     sure = 1.0 / (1 + len(one.alike)) * (0.98 if found.verdict == "named" else 0.8)
     gain = Gain(one.before, one.after, "rad")
-    note = _NOTES.get(one.candidate.effect, "")
-    return Cause(Name(one.candidate.effect, at), parameters, sure, gain, one.alike, note=note)
-
-
-_NOTES = {
-    "command_delay": "positions that are stamped late by as much look the same",
-    "joint_damping": "a wrong velocity gain of the drive looks the same",
-}
+    return Cause(Name(one.candidate.effect, at), parameters, sure, gain, one.alike, note=one.candidate.kind.looks_like)
 
 
 def _experiment(found: Search) -> Experiment | None:
-    texts = {
-        "stribeck_friction": "slow constant-velocity sweeps of {at} below 0.3 rad/s",
-        "load_dependent_friction": "the same motion of {at} with and without a known payload",
-        "payload": "the same motion with {at} carrying a known mass, or without what is fixed to it",
-        "actuator_gain": "the same motion with {at} carrying a known mass: else gains and inertias scale together",
-        "command_delay": "steps of {at} small enough not to saturate its drive",
-        "joint_elasticity": "a chirp of {at} above a third of its resonance, and an encoder on the link",
-    }
     for one in found.named or found.proxy:
         if one.alike or found.proxy:
             other = one.alike[0].effect if one.alike else "what is not in the catalogue"
-            text = texts.get(one.candidate.effect, "steps of {at} of two sizes, and slow sweeps")
+            text = one.candidate.kind.experiment
             pair = ((one.candidate.effect, other),)
             return Experiment(text.format(at=one.candidate.at[0]), pair if one.alike else ())
     return None

@@ -1,0 +1,225 @@
+"""What stays the same during a search for causes, what a fit leaves, and the baseline's fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from .causes import Candidate, Catalogue, catalogue
+from .colour import colour_of, filtered
+from .data import Run, Stretch, noise_of, windows
+from .fit import Fit, fit
+from .loop import Loop
+from .parameters import BOUNDS, Table, values
+from .sensitivity import Windows, predicted
+from .thresholds import POWER, SLOW, SLOW_ROWS
+
+__all__ = [
+    "Setting",
+    "Structure",
+    "begins_of",
+    "begun",
+    "by_recording",
+    "coloured",
+    "excess",
+    "free_entries",
+    "largest_forces",
+    "level_of",
+    "residuals",
+    "setting",
+    "start_values",
+    "whitened",
+]
+
+_PAIR = 2  # starts of the baseline that are followed to the end
+_ROUGH = 1e-3  # share of the squares that a step of such a start must promise
+_EARLY = 4  # iterations of a race among all starts
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Everything that stays the same during a search."""
+
+    loop: Loop
+    runs: tuple[Run, ...]
+    data: Windows
+    noise: tuple[np.ndarray, ...]
+    known: Catalogue
+    baseline: tuple[int, ...]  # entries that every fit frees
+    folds: np.ndarray  # (blocks, windows)
+    lanes: int
+    width: int
+    stretches: tuple[Stretch, ...]
+    block: float
+    pole: np.ndarray | None = None  # of coloured noise, of which `noise` drives the low pass
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Standard deviation of the noise of each position, rad or m."""
+        own = self.noise[0]
+        return own if self.pole is None else own / np.sqrt(1 - self.pole[: len(own)] ** 2)
+
+    def cut(self, loop: Loop) -> Windows:
+        """The recordings in windows, for a loop of these joints."""
+        return windows(loop, self.runs, self.stretches, self.noise, self.block, pole=self.pole)
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """(entries, 2): what the numbers can be."""
+        return np.array([BOUNDS[entry.name] for entry in self.known.table])
+
+
+class Structure(NamedTuple):
+    """The loop with the table of its numbers: plain, or with a spring in one joint."""
+
+    loop: Loop
+    table: Table
+    data: Windows
+
+
+def setting(
+    loop: Loop,
+    runs: Sequence[Run],
+    *,
+    baseline: Sequence[str] = ("rotor_inertia", "joint_damping", "friction_loss"),
+    more: Sequence[tuple[str, str]] = (),
+    gains_known: bool = True,
+    forbid: Sequence[str] = (),
+    block: float = 0.3,
+    stretches: Sequence[Stretch] = (),
+    rates: bool = True,
+) -> Setting:
+    """Data, catalogue and baseline; `more` are (effect, joint) that it has beside `baseline` at every joint."""
+    fitted = [r for r in runs if not r.holdout]
+    noise = [np.sqrt(np.mean([noise_of(r.position) ** 2 for r in fitted], axis=0))]
+    if rates and all(r.velocity is not None for r in fitted):
+        noise.append(np.sqrt(np.mean([noise_of(r.velocity) ** 2 for r in fitted if r.velocity is not None], axis=0)))
+    stretches = tuple(stretches) or tuple(Stretch(k, 0, len(r.time)) for k, r in enumerate(fitted))
+    data = windows(loop, fitted, stretches, noise, block)
+    known = catalogue(loop, largest_forces(loop, fitted), gains_known=gains_known, forbid=forbid)
+    names = loop.robot.dof_names
+    wanted = [(effect, name) for effect in baseline for name in names] + list(more)
+    all_of = catalogue(loop, largest_forces(loop, fitted), gains_known=False).candidates
+    free = [k for c in all_of if (c.effect, c.at[0]) in wanted for k in c.entries]
+    keep = tuple(c for c in known.candidates if not set(c.entries) <= set(free))
+    count = loop.robot.nv
+    return Setting(
+        loop, tuple(fitted), data, tuple(noise), Catalogue(known.table, keep), tuple(free),
+        _folds(data, stretches), 8 if count == 1 else 1, len(free) + (5 if count == 1 else 8), stretches, block,
+    )  # fmt: skip
+
+
+def _folds(data: Windows, stretches: Sequence[Stretch]) -> np.ndarray:
+    """Recordings where there are three or more, else four quarters of the time."""
+    blocks, count = data.reading.shape[0] // data.block, len(stretches)
+    runs = [s.run for s in stretches]
+    if len(set(runs)) >= 3:
+        return np.broadcast_to(np.array(runs), (blocks, count)).copy()
+    return np.broadcast_to((np.arange(blocks) * 4 // blocks)[:, None], (blocks, count)).copy()
+
+
+def largest_forces(loop: Loop, runs: Sequence[Run]) -> np.ndarray:
+    """The largest force of each drive, its law taken at what was recorded."""
+    drives, found = loop.drives, np.zeros(len(loop.drives.names))
+    for run in runs:
+        position = np.zeros((len(run.time), loop.robot.nv))
+        position[:, list(loop.measured)] = run.position
+        length = position @ np.asarray(drives.transmission).T
+        force = np.asarray(drives.bias)[:, 0] + np.asarray(drives.gain)[:, 0] * run.command
+        force = np.abs(force + np.asarray(drives.bias)[:, 1] * length)
+        found = np.maximum(found, np.quantile(force, 0.999, axis=0))
+    return np.minimum(found, np.asarray(drives.force_range)[:, 1])
+
+
+def residuals(structure: Structure, found: Fit) -> np.ndarray:
+    """Residuals over their noise, (rows, ny, windows)."""
+    with jax.enable_x64(True):
+        read = predicted(structure.loop, structure.table, found.theta[None], structure.data, found.start[None])[0]
+    return (np.asarray(structure.data.reading) - np.asarray(read)) * np.asarray(structure.data.weight)
+
+
+def whitened(structure: Structure, found: Fit) -> np.ndarray:
+    """What each row's residual tells beyond the row before it, (rows, ny, windows): white where it is noise."""
+    pole = None if structure.data.pole is None else np.asarray(structure.data.pole)
+    return filtered(residuals(structure, found), np.asarray(structure.data.weight) > 0, pole)
+
+
+def coloured(here: Setting, structure: Structure, found: Fit) -> Setting | None:
+    """The setting with the colour of what a fit leaves, or None where that is more than noise, or white."""
+    if here.pole is not None:
+        return None
+    colour = colour_of(residuals(structure, found), np.asarray(structure.data.weight) > 0)
+    if colour is None or not colour.pole.any():
+        return None
+    levels = colour.level.reshape(len(here.noise), -1)
+    noise = tuple(one * level for one, level in zip(here.noise, levels, strict=True))
+    again = replace(here, noise=noise, pole=colour.pole)
+    return replace(again, data=again.cut(here.loop))
+
+
+def excess(error: np.ndarray, weight: np.ndarray) -> float:
+    """How many times what noise may reach the whitened residual is: its power, and that of its means over 25 rows."""
+    count = (weight > 0).sum()
+    power = ((error**2).sum() / count - 1) / np.sqrt(6 / count)
+    rows = len(error) // SLOW_ROWS * SLOW_ROWS
+    means = error[:rows].reshape(-1, SLOW_ROWS, *error.shape[1:]).sum(1) / np.sqrt(SLOW_ROWS)
+    full = (weight[:rows] > 0).reshape(-1, SLOW_ROWS, *error.shape[1:]).all(1)
+    slow = ((means[full] ** 2).mean() - 1.0) / np.sqrt(4 / max(full.sum(), 1)) if full.any() else 0.0
+    return float(max(power / POWER, slow / SLOW))
+
+
+def level_of(found: Fit, weight: np.ndarray) -> float:
+    """Mean square of the misfit over the samples that count, in units of the noise's variance."""
+    return found.squares / max((weight > 0).sum(), 1)
+
+
+def by_recording(here: Setting) -> bool:
+    """Whether the folds are recordings, three or more."""
+    return len(np.unique(here.folds)) == len({s.run for s in here.stretches}) >= 3
+
+
+def begun(here: Setting) -> Fit:
+    """The baseline's fit."""
+    begins: Any = begins_of(here, values(here.loop, here.known.table))
+    structure = Structure(here.loop, here.known.table, here.data)
+    sizes: Any = {"width": here.width, "lanes": here.lanes}
+    if len(begins) == 1:
+        return fit(*structure, begins, [here.baseline], **sizes)[0]
+    early = fit(*structure, begins, [here.baseline] * len(begins), iterations=_EARLY, **sizes)
+    order = sorted(early, key=lambda f: f.cost)[:_PAIR]
+    states = np.stack([f.theta for f in order]), np.stack([f.start for f in order])
+    fits = fit(*structure, states[0], [here.baseline] * len(order), states[1], rough=_ROUGH, **sizes)
+    best = min(fits, key=lambda f: f.cost)
+    return fit(*structure, best.theta[None], [here.baseline], best.start[None], **sizes)[0]
+
+
+def begins_of(here: Setting, theta: np.ndarray) -> np.ndarray:
+    """Where the baseline's fit starts: at the model; where the gains are free, also stiffer and heavier."""
+    gains = [k for k in here.baseline if here.known.table[k].name == "scale"]
+    if not gains:
+        return theta[None]
+    rotors = [k for k in here.baseline if here.known.table[k].name == "armature"]
+    begins = []
+    for stiff, heavy in ((1.0, 1.0), (4.0, 1.0), (1.0, 8.0), (4.0, 8.0), (0.1, 1.0), (0.02, 1.0)):
+        begins.append(theta.copy())
+        begins[-1][gains] *= stiff
+        begins[-1][rotors] = np.maximum(begins[-1][rotors], 1e-3) * heavy
+    return np.array(begins)
+
+
+def free_entries(fitted: Sequence[int], extra: Sequence[int]) -> list[int]:
+    """Entries of theta of both lists, each once, in the order in which they come first."""
+    return list(dict.fromkeys([*fitted, *extra]))
+
+
+def start_values(theta: np.ndarray, candidate: Candidate, values: Sequence[float]) -> np.ndarray:
+    """Theta with a candidate's entries at the values that it starts from; where one is not a number it stays."""
+    new = theta.copy()
+    for entry, value in zip(candidate.entries, values, strict=True):
+        if not np.isnan(value):
+            new[entry] = value
+    return new

@@ -1,0 +1,46 @@
+"""Every number that decides what is named, and what it is compared with.
+
+Squares are those of whitened rows (noise has one a row) unless a comment says otherwise; a gain is the share of squares
+that is gone on data that was not fitted, t that of its blocks of time.
+"""
+
+from __future__ import annotations
+
+__all__: list[str] = []
+
+# What a name needs (`search`, `arm`)
+GAIN = 0.004  # of the squares
+CONFIDENT = 1.64  # t, where more than noise is left to explain
+UNSURE = 2.5  # t, where nothing but noise is left
+CLEARLY = 3.0  # t, where more than noise stays beside it
+MUCH = 0.25  # gain, where more than noise stays beside it: less may stand in for the rest; not of what every joint has
+SMALL = 0.002  # gain below which a cause found with others is not missed
+SURELY = 0.1  # of the squares, by which a cause that is surely missed would make them larger
+FITTED_FOR_HELD = 0.7  # of the t that a name needs: what it must have on the rows that it was fitted to
+OF_ITS_SIZE = 0.5  # standard deviation of a size that is known, of numbers that cannot be negative
+CLEAR_OF_NOTHING = 3.0  # standard deviations of a size from no effect, of numbers of either sign
+
+# Which of several (`search`, `arm`, `screening`)
+USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
+UNTOLD = 1.7  # t below which two causes are alike
+NEAR = 0.1  # of the best gain, within which another may be alike
+NO_WORSE = 1.002  # times the squares of what contains it, up to which the simpler cause is taken
+RICHER = 1.02  # times the promise of a simpler cause, which a richer one must exceed to be fitted
+MAY_WIN = 0.45  # share of the best gain after a few steps from which a candidate is fitted to the end
+HOPEFUL = 0.1  # share of a joint's squares that a cause must promise where it must take `MUCH` in the end
+UNCHANGED = 0.02  # change of a joint's squares below which nothing new is looked for there
+EXPLAINED = 1.1  # squares of a sample up to which nothing is left to explain by a spring
+
+# Whether what is left is noise (`search.excess`)
+POWER = 4.0  # sigmas of the mean square: one sigma is the root of 6 over the rows, fourth differences being as rough
+SLOW = 5.0  # sigmas of the mean square of means of `SLOW_ROWS` rows
+SLOW_ROWS = 25
+
+# Whether it is coloured noise (`colour`)
+COLOUR = 4.0  # sigmas by which octaves with levels of their own are likelier than a low pass
+BURST = 5.0  # sigmas by which the power of groups of `BURST_ROWS` rows varies more than noise's
+BURST_ROWS = 25
+LOUDER = 4.0  # sigmas of the power over that which the record's fourth differences tell, as `POWER`
+LOWEST_CORNER = 0.02  # of the sampling rate: a corner below that is not seen in the data
+SHORTEST = 100  # rows one after the other that tell a spectrum
+LEAST_OF_A_BAND = 4  # frequencies of an octave that is looked at
