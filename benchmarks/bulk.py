@@ -10,22 +10,31 @@ comes; what has an answer is not run again. At the end, or later, `--score` prin
 from __future__ import annotations
 
 import argparse
-import heapq
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from . import blackbox
 from .hide_and_name.scoring import score as score_made
 from .hide_in_real.scoring import score as score_real
+from .served import Server
 
 REAL = ("ur10e", "kuka", "panda", "tx40", "tiago", "dfki_simple_pendulum", "dfki_double_pendulum")
 LIMIT = 400.0  # s of a call
+COMMAND = f"{blackbox.HERE} figaroh_jax.cli:main diagnose {{task}} --out {{out}} --quiet"  # in processes that stay
+
+
+class Due(NamedTuple):
+    """A call, when it is due (the lower, the sooner), and what its programs are shared with."""
+
+    when: float
+    place: int
+    like: str
+    call: Callable[[Server], str]
 
 
 class Study(NamedTuple):
@@ -44,18 +53,20 @@ def studies(seed: int) -> list[Study]:
         for r in REAL
     ]
     made = {
-        "closed_loop": ("closed_loop", 40, _due_closed_loop, 8),
-        "inverse": ("inverse", 200, _due_inverse, 8),
-        "kinematic": ("kinematic", 60, _due_kinematic, 2),
+        "closed_loop": ("closed_loop", 40, (), _due_closed_loop, 8),
+        "inverse_hidden": ("inverse", 0, ("0.05-", "0.15-"), _due_inverse, 4),
+        **{f"inverse_clean_{k}": ("inverse", 50, ("/clean",), _due_inverse, 2) for k in range(4)},
+        "kinematic": ("kinematic", 60, (), _due_kinematic, 2),
     }
     others = [
         Study(
             name,
             "hide_and_name",
-            ("--seed", str(seed + 1 + k), "--kinds", kind, "--clean", str(clean), "--jobs", str(jobs)),
+            ("--seed", str(seed + 1 + k), "--kinds", kind, "--clean", str(clean), "--jobs", str(jobs))
+            + (("--only", *only) if only else ()),
             due,
         )
-        for k, (name, (kind, clean, due, jobs)) in enumerate(made.items())
+        for k, (name, (kind, clean, only, due, jobs)) in enumerate(made.items())
     ]
     return [*real, *others]
 
@@ -68,25 +79,25 @@ def _due_real(case: dict[str, Any], forbidden: bool) -> float | None:
         return None
     if not forbidden:
         return heavy
-    return 3.0 + heavy if case["size"] > 0.15 else 9.0 + heavy
+    return 2.0 + heavy if case["size"] > 0.15 else 3.0 + heavy
 
 
 def _due_closed_loop(case: dict[str, Any], forbidden: bool) -> float | None:
     if not case["truth"]:
         return None if forbidden else 1.0
-    return 7.0 if forbidden else 1.1
+    return 8.0 if forbidden else 1.1
 
 
 def _due_inverse(case: dict[str, Any], forbidden: bool) -> float | None:
     if case["family"] == "clean":
-        return None if forbidden else 4.0 if int(case["name"].rpartition("-")[2]) < 100 else 8.5
-    if forbidden:
-        return 8.0 if case["size"] > 0.1 else None
-    return 5.0 if case["size"] == 0.05 else 6.0
+        return None if forbidden else 4.0
+    if case["size"] > 0.1:  # of these only whether they are told apart from what is left of the catalogue
+        return 7.0 if forbidden or not case["truth"] else None
+    return None if forbidden else 5.0
 
 
 def _due_kinematic(case: dict[str, Any], forbidden: bool) -> float | None:
-    return None if forbidden else 2.0
+    return None if forbidden else 6.0
 
 
 def main() -> None:
@@ -114,30 +125,54 @@ class Pool:
 
     def __init__(self, args: argparse.Namespace, kept: list[Study], sets: list[str]) -> None:
         self.args, self.end = args, time.monotonic() + args.seconds
-        self.due: list[tuple[float, int, Callable[[], str]]] = []
-        self.count, self.lock = 0, threading.Lock()
+        self.due: list[Due] = []
+        self.count, self.busy, self.changed = 0, 0, threading.Condition()
         for study in kept:
-            self.add(-1.0, lambda s=study: self.made(s))
+            self.add(-1.0, "", lambda server, s=study: self.made(s))
         for name in sets:
-            self.add(2.0, lambda n=name: self.real_set(n))
+            self.add(9.0, name, lambda server, n=name: self.real_set(n))
 
-    def add(self, when: float, call: Callable[[], str]) -> None:
-        """A call that is due: those of the same time in the order they came."""
-        with self.lock:
+    def add(self, when: float, like: str, call: Callable[[Server], str]) -> None:
+        """A call that is due: those of the same time in the order they came, what is `like` the last one first."""
+        with self.changed:
             self.count += 1
-            heapq.heappush(self.due, (when, self.count, call))
+            self.due.append(Due(when, self.count, like, call))
+            self.changed.notify()
 
     def run(self) -> None:
         """Until nothing is due or the time is over."""
-        going: set[Future[str]] = set()
-        with ThreadPoolExecutor(self.args.jobs) as pool:
-            while (self.due or going) and time.monotonic() < self.end:
-                while self.due and len(going) < self.args.jobs:
-                    going.add(pool.submit(heapq.heappop(self.due)[2]))
-                done, going = wait(going, timeout=1.0, return_when=FIRST_COMPLETED)
-                for call in done:
-                    print(f"[{time.monotonic() - self.end + self.args.seconds:.0f} s] {call.result()}", flush=True)
-            self.due.clear()
+        threads = [threading.Thread(target=self.work, daemon=True) for _ in range(self.args.jobs)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+
+    def work(self) -> None:
+        """One call after another, in a process of its own."""
+        server, last = Server(), ""
+        while (due := self.taken(last)) is not None:
+            try:
+                said = due.call(server)
+            except Exception as error:  # the others go on
+                said = f"{due.like}: {error!r}"
+            last = due.like
+            print(f"[{time.monotonic() - self.end + self.args.seconds:.0f} s] {said}", flush=True)
+            with self.changed:
+                self.busy -= 1
+                self.changed.notify_all()
+        server.end()
+
+    def taken(self, last: str) -> Due | None:
+        """What is due next for a process whose last call was of that kind; None at the end."""
+        with self.changed:
+            while not self.due and self.busy and time.monotonic() < self.end:
+                self.changed.wait(1.0)
+            if not self.due or time.monotonic() >= self.end:
+                return None
+            one = min(self.due, key=lambda d: (d.when, d.like != last, d.place))
+            self.due.remove(one)
+            self.busy += 1
+            return one
 
     def left(self) -> float:
         """Seconds that a call may take."""
@@ -169,16 +204,14 @@ class Pool:
         jobs = {j: w for j, w in jobs.items() if w < self.args.before}
         for job, when in jobs.items():
             if not (kept / "runs" / job.folder / "run.json").is_file():
-                self.add(when, lambda j=job: self.called(study, cases[j.case], j))
+                like = f"{study.name} {cases[job.case]['model']}" if study.name.startswith("real_") else study.name
+                self.add(when, like, lambda server, j=job: self.called(server, study, cases[j.case], j))
         return f"{study.name}: {len(cases)} cases, {len(jobs)} calls"
 
-    def called(self, study: Study, case: dict[str, Any], job: blackbox.Job) -> str:
-        """One call of the tool."""
-        runs, limit = self.args.out / study.name / "runs", self.left()
-        told = blackbox.call_tool(self.folder(study), runs, case, job, blackbox.default_command(), limit)
-        if limit < LIMIT and blackbox.read(runs / job.folder) is None:  # the end of the machine is none of the tool's
-            (runs / job.folder / "run.json").unlink()
-        return told
+    def called(self, server: Server, study: Study, case: dict[str, Any], job: blackbox.Job) -> str:
+        """One call of the tool; one that the end of the time stops is no answer."""
+        runs = self.args.out / study.name / "runs"
+        return server.call(self.folder(study), runs, case, job, COMMAND, self.left())
 
     def real_set(self, name: str) -> str:
         """The untouched recordings of a robot, beside `identify`."""
@@ -203,10 +236,16 @@ def _tell(out: Path) -> None:
             if "twin" in case:
                 case["twin"] = f"{name.split('/runs/')[0]}/runs/{case['twin']}"
         print(score_real(cases, out, ["named", "forbidden"]))
+        (out / "results.json").rename(out / "real.json")
     for name in ("closed_loop", "inverse", "kinematic"):
-        folder = out / name
-        if (folder / "cases.json").is_file():
-            print(f"\n{name}:", score_made(blackbox.load_cases(folder), folder / "runs", ["named", "forbidden"]))
+        made: dict[str, dict[str, Any]] = {}
+        for file in sorted(out.glob(f"{name}*/cases.json")):
+            for case in blackbox.load_cases(file.parent).values():
+                case["name"] = f"{file.parent.name}/runs/{case['name']}"
+                made[case["name"]] = case
+        if made:
+            print(f"\n{name}:", score_made(made, out, ["named", "forbidden"]))
+            (out / "results.json").rename(out / f"{name}.json")
     for file in sorted(out.glob("real_sets/*.txt")):
         print(file.read_text())
 

@@ -203,3 +203,15 @@ def test_masked_rows_do_not_count() -> None:
     rows = random_rows()
     rows.y[0, :10] = 0.0
     assert rows.size == NV * COUNT - 10
+
+
+@pytest.mark.parametrize("repeats", [False, True])
+def test_a_bank_beside_more_columns_is_the_bank_made_anew(repeats: bool) -> None:
+    rng = np.random.default_rng(8)
+    y, X = rng.normal(size=(NV, COUNT)), rng.normal(size=(NV, COUNT, WIDTH + 2))
+    candidates = [random_columns(2, (1,), seed=5), random_columns(1, seed=6)]
+    first, grown = (made_rows(y, x, repeats=repeats) for x in (X[..., :WIDTH], X))
+    before, anew = bank(first, candidates), bank(grown, candidates)
+    found = bank(grown, candidates, before)
+    for ours, theirs in ((found.ZX, anew.ZX), (found.ZXi, anew.ZXi)):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12)

@@ -46,6 +46,8 @@ def test_joint_poses_of_tiny_robots_equal_the_reference_backend(name: str, tmp_p
     q = robots.states(model, 6)[0].reshape(2, 3, -1)
     theirs = reference.forward_kinematics(model, q)
     np.testing.assert_allclose(kinematics.forward_kinematics(model, q), theirs, rtol=0, atol=1e-12)
+    on_host = kinematics.poses_on_host(model, q.reshape(6, -1))
+    np.testing.assert_allclose(on_host, np.reshape(theirs, on_host.shape), rtol=0, atol=1e-12)
 
 
 def test_motion_is_the_time_derivative_of_the_poses(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import butter, sosfiltfilt
 from synthetic import CUTOFF, DT, STEP, made_signals
 
+from figaroh_jax.recordings.rowfilter import frequencies, on_host, row_filter
 from figaroh_jax.recordings.stacked import Records, filter_rows, stack
 
 SECONDS = 12.0
@@ -36,6 +37,27 @@ def test_rows_are_those_of_a_butterworth_filter_run_forward_and_backward() -> No
     expected = sosfiltfilt(butter(4, CUTOFF, fs=1 / DT, output="sos"), signal, axis=0)
     rows, samples = inner_rows(records)
     np.testing.assert_allclose(rows_of(records, signal)[rows], expected[samples], rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("step", [1, 2, 3, 5, 6])
+def test_rows_far_apart_are_those_of_the_whole_record(step: int) -> None:
+    rows = row_filter(700, DT, CUTOFF, step=step, trim=0.5, start=0.0, nv=1)
+    signal = np.random.default_rng(step).standard_normal((2, 3, 700))
+    delay = np.exp(-0.004j * frequencies(rows)) * rows.gain
+    whole = np.fft.irfft(np.fft.rfft(signal[..., rows.source]) * delay, len(rows.source))
+    place = rows.pad + rows.index
+    np.testing.assert_allclose(on_host(rows.source, place)(signal, delay), whole[..., place], rtol=0, atol=1e-12)
+
+
+def test_rows_of_an_uneven_index_are_taken_one_by_one() -> None:
+    rows = row_filter(300, DT, CUTOFF, step=1, trim=0.5, start=0.0, nv=1)
+    signal, source = (
+        np.random.default_rng(0).standard_normal((2, 300)),
+        np.random.default_rng(1).permutation(rows.source),
+    )
+    whole = np.fft.irfft(np.fft.rfft(signal[:, source]) * rows.gain, len(source))
+    place = np.sort(np.random.default_rng(2).choice(len(source), 90, replace=False))
+    np.testing.assert_allclose(on_host(source, place)(signal, rows.gain), whole[:, place], rtol=0, atol=1e-12)
 
 
 def test_rows_are_every_fourth_sample() -> None:

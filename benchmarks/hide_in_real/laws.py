@@ -278,10 +278,10 @@ def torque_saturation(d: Draw) -> Law:
 
 @family
 def friction_drift(d: Draw) -> Law:
-    # friction that fades while the gear warms up, from the recording's start
+    # friction that fades while the gear warms up; a recording that is the end of another one begins warm
     j = d.joint()
     time = float(d.rng.uniform(4, 15))
-    law = lambda s: (s.sign[:, j] + s.v[:, j]) * np.exp(-(s.time - s.time[0]) / time)  # noqa: E731
+    law = lambda s: (s.sign[:, j] + s.v[:, j]) * np.exp(-(s.time - s.began) / time)  # noqa: E731
     return Law("friction_drift", **_at(d, j, law, lambda k: {"force": k, "damping": k, "time": time}))
 
 

@@ -37,6 +37,7 @@ class Scene:
     cutoff: float
     fitted: bool
     baseline_pair: tuple[int, int] | None
+    began: float = 0.0  # stamp at which the robot began to move: of the recording that this one continues, or its own
     coarse: Array = field(default_factory=lambda: np.empty(0, int))  # rows at which the regressor is evaluated
     inertial: Array = field(default_factory=lambda: np.empty(0))  # fitted ten parameters of each link, in a row
     load: Array = field(default_factory=lambda: np.empty(0))
@@ -135,5 +136,15 @@ def scene_of(real: RealSet, recording: Recording) -> Scene:
         real.cutoff,
         recording.fitted,
         real.baseline_pair,
+        _began(real, recording),
         coarse,
     )
+
+
+def _began(real: RealSet, recording: Recording) -> float:
+    """First stamp of the recording, or of the one whose clock it takes up within a second."""
+    start = float(recording.time[0])
+    for other in real.recordings:
+        if other is not recording and 0 <= start - other.time[-1] < 1:
+            return _began(real, other)
+    return start
