@@ -54,7 +54,7 @@ def studies(seed: int) -> list[Study]:
     ]
     made = {
         "closed_loop": ("closed_loop", 40, (), _due_closed_loop, 8),
-        "inverse_hidden": ("inverse", 0, ("-0.05-", "-0.15-"), _due_inverse, 4),
+        "inverse_hidden": ("inverse", 0, ("0.05-", "0.15-"), _due_inverse, 4),
         **{f"inverse_clean_{k}": ("inverse", 50, ("/clean",), _due_inverse, 2) for k in range(4)},
         "kinematic": ("kinematic", 60, (), _due_kinematic, 2),
     }

@@ -113,6 +113,17 @@ def test_an_arm_gets_no_wrong_name(tmp_path: Path, hidden: list):
     assert told <= {(effect, servo_arm6.NAMES[joint]) for effect, joint, _ in hidden}
 
 
+@pytest.mark.slow
+def test_what_a_later_cause_made_needless_is_not_named(tmp_path: Path):
+    """A lift that its drive's voltage limits: a torque offset makes up for a part of it until the limit is found."""
+    (tmp_path / "arm.xml").write_text(servo_arm6.model_text(1.6))
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    recordings = [servo_arm6.record([("voltage_saturation", 1, 0.6)], 56694, k) for k in range(2)]
+    runs = [Run(f"run {k}", r["t"], r["u"], r["q"], None) for k, r in enumerate(recordings)]
+    found = search_arm(setting(loop, runs, stretches=[Stretch(k, f, 600) for k in range(2) for f in (0, 600)]))
+    assert [n.candidate[:2] for n in found.named] == [("voltage_saturation", ("lift",))]
+
+
 def test_one_linear_step_promises_what_least_squares_gives():
     """Numbers of all windows and the states at each window's start; columns that are left out stay where they are."""
     rng, numbers, states, windows_, rows = np.random.default_rng(5), 4, 2, 3, 30

@@ -80,6 +80,7 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
         if now.excess.max() < 1.0:
             break
     progress("judging", 0.9)
+    found, now = _still_needed(here, found, now)
     result = Search(
         "nothing", found, now.model.structure, first, now.model.fit, p_value, [], nearest, steps, held, fits,
         begin.model.structure, here, wrong,
@@ -363,6 +364,27 @@ def _spare(here: Setting, new: Standing, chosen: Sequence[Tried]) -> Tried | Non
         if (before.sum() - after.sum()) / before.sum() < SMALL or t_of(before, after) < CONFIDENT:
             return one
     return None
+
+
+def _still_needed(here: Setting, found: list[Named], now: Standing) -> tuple[list[Named], Standing]:
+    """The causes without those that a later one made needless, where noise is all that is left with and without."""
+    while len(found) > 1 and now.excess.max() < 1.0:
+        structure, one = now.model.structure, now.model.fit
+        own = [Tried(n.candidate, now.model, now.squares) for n in found if not n.candidate.kind.several]
+        spare = _spare(here, now, own)
+        if spare is None:
+            break
+        entries = list(spare.candidate.entries)
+        free = [k for k in now.model.free if k not in entries or k in here.baseline]
+        theta = one.theta.copy()
+        theta[entries] = values(structure.loop, structure.table)[entries]
+        other = fit(*structure, theta[None], [free], one.start[None], width=max(here.width, len(free)), lanes=1,
+                    iterations=LATE)[0]  # fmt: skip
+        new = _standing(here, structure, other, free)
+        if not new.excess.max() < 1.0:
+            break
+        found, now = [n for n in found if n.candidate is not spare.candidate], new
+    return found, now
 
 
 def _costs(here: Setting, new: Standing, entries: list[int]) -> float:
