@@ -98,7 +98,7 @@ class Search:
 
 def judged_by_colour(here: Setting, found: Search, seek: Callable[[Setting], Search]) -> Search:
     """Where what is left may be coloured noise: the search once more with that noise, if then noise alone is left."""
-    if found.verdict in ("nothing", "named"):
+    if found.verdict in ("nothing", "named") or not np.isfinite(found.last.cost):
         return found
     sound = found.setting or here
     again = coloured(sound, found.structure, found.last)
