@@ -48,6 +48,11 @@ def moves_in_the_view(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (run.parent / "task.yaml").write_text("robot: {model: robot.urdf, joints: [bend]}\nexcite: {duration: 2}")
     with pytest.raises(InputError, match="made for the joints turn, bend"):
         show_design_run(run)
+    whole = (run / "trajectory_2.npz").read_bytes()
+    for part in (b"", whole[: len(whole) // 2]):
+        (run / "trajectory_2.npz").write_bytes(part)
+        with pytest.raises(InputError, match="the design cannot be read"):
+            show_design_run(run)
 
 
 def test_the_run_holds_the_motion_at_1_khz_with_its_torques_and_a_joint_trajectory(

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float
@@ -120,10 +121,10 @@ def designed(folder: Path) -> Played:
         else:
             motions = {}
             for stem in (Path(one["file"]).stem for one in answer["trajectories"]):
-                with np.load(folder / f"{stem}.npz") as arrays:
+                with (folder / f"{stem}.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                     motions[stem.replace("_", " ")] = np.asarray(arrays["t"]), np.asarray(arrays["q"])
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"{folder / ANSWER}: cannot be read; name a run directory as this library writes it") from None
+    except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile):
+        raise InputError(f"{folder}: the design cannot be read; name a run directory of `excite`") from None
     task = load_task(Path(read_provenance(folder)["task"]))
     robot = load_robot(task)
     if list(robot.dof_names) != joints:
