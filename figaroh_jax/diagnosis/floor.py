@@ -141,7 +141,7 @@ def _fit(problem: Problem, rows: Float[np.ndarray, "nv T"], taken: np.ndarray | 
     records = problem.records
     n, _, count, nv = records.shape
     rate = float(records.rate)
-    frequency = np.fft.rfftfreq(count, 1 / rate)[1:]
+    frequency = np.fft.rfftfreq(count, 1 / rate)
     power, left = np.zeros((len(frequency), nv)), np.zeros((len(frequency), nv))
     weights = 0
     for at in records.spans:
@@ -151,7 +151,7 @@ def _fit(problem: Problem, rows: Float[np.ndarray, "nv T"], taken: np.ndarray | 
         if len(used) < 20:
             continue
         inside = slice(used[0], used[-1] + 1)
-        own, p = noise.periodogram(series[inside], rate)
+        own, p = noise.periodogram(series[inside], rate, level=True)
         power += len(used) * _onto(frequency, own, p)
         left += len(used) * (series[inside] != 0).mean(0)
         if taken is not None:
@@ -160,6 +160,7 @@ def _fit(problem: Problem, rows: Float[np.ndarray, "nv T"], taken: np.ndarray | 
     power, left = power / weights, np.maximum(left / weights, 0.1)
     gain = np.interp(frequency, np.asarray(records.omega) / (2 * np.pi), problem.gain)
     degrees = np.full(len(frequency), max(1.0, weights / count)) * left.mean(1) * news
+    degrees[0] /= 2  # one real number
     lowest = max(LOWEST_RESOLVED * rate / count, LOWEST_FREQUENCY)
     return noise.fit_spectrum(frequency, power / left, gain, degrees, rate / 2, lowest)
 

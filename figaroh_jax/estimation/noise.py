@@ -43,8 +43,8 @@ class Spectrum(NamedTuple):
     ) -> Float[np.ndarray, "draws freqs nv"]:
         """Powers that the data leave possible: the coefficients drawn from their covariance, each joint for itself.
 
-        Below the lowest frequency that the data resolve the power law goes on: there noise may be larger than where it
-        was seen, whatever is held constant to weight rows by.
+        Below the lowest frequency that is resolved the power law goes on: there the noise may be larger, though rows
+        are weighted as if it were not.
         """
         terms, count = self.coefficients.shape
         if not self.covariance.any():
@@ -56,14 +56,17 @@ class Spectrum(NamedTuple):
 
 
 def periodogram(
-    rows: Float[np.ndarray, "samples *series"], rate: float
+    rows: Float[np.ndarray, "samples *series"], rate: float, level: bool = False
 ) -> tuple[Float[np.ndarray, " freqs"], Float[np.ndarray, "freqs *series"]]:
-    """Frequencies (Hz, without 0) and Hann periodogram of a series, scaled so that white noise gives its variance."""
+    """Frequencies (Hz) and Hann periodogram of a series, scaled so that white noise gives its variance.
+
+    Without its mean and the frequency 0, or with both (`level`).
+    """
     count = rows.shape[0]
     window = np.hanning(count + 2)[1:-1].reshape(-1, *[1] * (rows.ndim - 1))
-    spectrum = np.fft.rfft((rows - rows.mean(0)) * window, axis=0)
-    power = np.abs(spectrum) ** 2 / (window**2).sum()
-    return np.fft.rfftfreq(count, 1 / rate)[1:], power[1:]
+    spectrum = np.fft.rfft((rows if level else rows - rows.mean(0)) * window, axis=0)
+    power, first = np.abs(spectrum) ** 2 / (window**2).sum(), 0 if level else 1
+    return np.fft.rfftfreq(count, 1 / rate)[first:], power[first:]
 
 
 def fit_spectrum(
@@ -78,14 +81,14 @@ def fit_spectrum(
 
     Gamma GLM with log link: log S = log gain + a0 + a1 log(f + .05) + Legendre polynomials 2 to 5 of log f above
     .3 Hz, less their value and slope there, by iteratively reweighted least squares. `degrees` counts the independent
-    Hann periodograms averaged at each frequency.
+    Hann periodograms averaged at each frequency. Below `lowest` the fit serves `drawn` alone.
 
     Short recordings have few bins at low frequency, which alone would draw a spectrum that the noise does not have. So
     the squared second derivative of the polynomials is penalised, and each joint's shape is expected to be that of the
     other joints; the weights of both are those of largest marginal likelihood (empirical Bayes, with Laplace's
     approximation): joints whose noise is not alike are not made so.
     """
-    used = (gain > PASSED) & (frequency >= min(lowest, nyquist / 4))
+    used = gain > PASSED
     basis, weight = _basis(frequency[used], nyquist), degrees[used] / NEIGHBOURS
     observed = np.maximum(power[used] / gain[used, None], 1e-300)
     nv, terms = observed.shape[1], basis.shape[1]
@@ -99,7 +102,7 @@ def fit_spectrum(
     _, common, spread = each[smooth]
     if nv == 1:
         return Spectrum(common + np.log(observed / relative)[:1] * np.eye(terms)[:, :1], spread, nyquist, lowest)
-    even = _basis(np.geomspace(max(frequency[used][0], 1e-9), nyquist, 50), nyquist)
+    even = _basis(np.geomspace(LOWEST / 10, nyquist, 50), nyquist)
     even[:, 0] = 0.0
     apart = even.T @ even / len(even) + np.diag([1e-9] + [0.0] * (terms - 1))
     common[0] = 0.0
@@ -159,10 +162,8 @@ def whitening(
 
 
 def leverage(basis: Float[np.ndarray, "samples nv columns"]) -> Float[np.ndarray, "freqs nv"]:
-    """Share of white noise that a projection on orthonormal `basis` takes away at each frequency and joint."""
-    count = basis.shape[0]
-    power = np.abs(np.fft.rfft(basis, axis=0)[1:]) ** 2
-    return power.sum(-1) / count * 2 / 2
+    """Share of white noise that a projection on orthonormal `basis` takes away at each frequency, from 0, and joint."""
+    return (np.abs(np.fft.rfft(basis, axis=0)) ** 2).sum(-1) / basis.shape[0]
 
 
 def spectral_line(
