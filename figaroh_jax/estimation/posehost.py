@@ -115,7 +115,8 @@ class HostRows:
             "start": self.first[:3, :3] @ ahead[:3, :3], "base": self.base[:3, :3], "origin": self.base[:3, 3],
             "tool": self.tool[:3, :3] if poses else none, "arm": self.tool[:3, 3] if poses else none,
             "centre": self.centre, "first": self.first[:3, 3], "ahead": self.ahead, "beyond": self.beyond,
-            "onward": self.onward, "back": self.back if poses else none, "seen": self.seen, "marker": none if poses else self.markers,
+            "onward": self.onward, "back": self.back if poses else none, "seen": self.seen,
+            "marker": none if poses else self.markers,
         }  # fmt: skip
         fixed |= {} if self.slide is None else {"slide": self.slide}
         self.fixed = {name: np.ascontiguousarray(x, float) for name, x in fixed.items()}
