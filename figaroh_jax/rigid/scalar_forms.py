@@ -153,16 +153,19 @@ def _weighted_rows(side: int, kept: Kept | None, model: RobotModel, codes: bytes
 
 
 def row_groups(model: RobotModel, kept: Kept | None = None) -> list[np.ndarray]:
-    """Coordinates that move equally many links, of which equally many columns are `kept` (all, where not told)."""
+    """Coordinates that move equally many links; where columns are `kept`, on a GPU, every coordinate by itself.
+
+    There a product goes in pieces of the samples, and XLA copies the rows of several coordinates before it multiplies.
+    """
     return _row_groups(model.joints, kept)
 
 
 @lru_cache(maxsize=64)
 def _row_groups(joints: tuple[Joint, ...], kept: Kept | None) -> list[np.ndarray]:
-    rows = sorted_rows(joints, True)
-    width = np.full(len(joints), 10) if kept is None else np.array([len(columns) for columns in kept])
-    counts = np.stack([np.bincount(rows[:, 0]), np.bincount(rows[:, 0], width[rows[:, 1]]).astype(int)], 1)
-    return [np.flatnonzero((counts == one).all(1)) for one in np.unique(counts, axis=0)]
+    counts = np.bincount(sorted_rows(joints, True)[:, 0])
+    if kept is not None:
+        return [np.array([k]) for k in range(len(counts))]
+    return [np.flatnonzero(counts == one) for one in np.unique(counts)]
 
 
 @lru_cache(maxsize=64)
