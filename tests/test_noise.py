@@ -143,7 +143,7 @@ def test_short_recordings_with_rows_left_out_show_white_noise_as_white() -> None
         degrees = np.append(1.5, np.full(len(frequency) - 1, 3.0))
         found = noise.fit_spectrum(frequency, power, response**2, degrees, rate / 2, 0.22)
         off.append(np.log(found.power(low)))
-    # a fit to each joint alone, and to what leaks beyond the cutoff, was off by a factor of five
+    # a fit to each joint alone, and to what leaks beyond the cutoff, was off by a factor of seven
     assert np.abs(off).max() < np.log(2.5) and np.std(off) < 0.25, (np.abs(off).max(), np.std(off))
     assert abs(np.mean(off)) < 0.05, np.mean(off)
 
