@@ -21,7 +21,16 @@ from .state import State, batched, extended_state
 from .step import Step, stand
 from .thresholds import LEAST_MOVING, STANDS
 
-__all__ = ["fold_error", "held_squares", "part_error", "predicted", "residual_rms", "traces", "weighted_squares"]
+__all__ = [
+    "fold_error",
+    "fold_squares",
+    "held_squares",
+    "part_error",
+    "predicted",
+    "residual_rms",
+    "traces",
+    "weighted_squares",
+]
 
 BLOCK, FEWEST = 1.0, 8  # s; blocks of a recording
 
@@ -177,9 +186,16 @@ def fold_error(
     problem: Problem, state: State, folds: Float[np.ndarray, "folds P"], fold: Int[np.ndarray, " T"]
 ) -> float:
     """Relative RMS error (N m over N m, all joints) of each fold, predicted with the coefficients without it."""
-    judged = np.asarray(problem.records.judged)
-    error = _left_out(problem, state, folds, fold) * judged
-    return float(np.sqrt((error**2).sum() / ((problem.torque * judged) ** 2).sum()))
+    torque = problem.torque * np.asarray(problem.records.judged)
+    return float(np.sqrt(fold_squares(problem, state, folds, fold).sum() / (torque**2).sum()))
+
+
+def fold_squares(
+    problem: Problem, state: State, folds: Float[np.ndarray, "folds P"], fold: Int[np.ndarray, " T"]
+) -> Float[np.ndarray, " nv"]:
+    """Squares of each joint's error ((N m)^2 or N^2), each fold predicted with the coefficients without it."""
+    error = _left_out(problem, state, folds, fold) * np.asarray(problem.records.judged)
+    return (error**2).sum((0, 1))
 
 
 def part_error(problem: Problem, step: Step) -> float:
