@@ -19,6 +19,7 @@ from jaxtyping import Array
 from ..compiled.batching import program, traced
 from ..rigid.dynamics import joint_masses, joint_torques
 from ..rigid.model import RobotModel
+from . import lanes
 from .loop import Linear, Loop, State, advance, integrated, mobility, observe
 from .native import native
 from .parameters import TEN, Table, put, unit_payload
@@ -166,11 +167,14 @@ def linear_sums(loop: Loop, table: Table, theta: Any, free: Any, data: Windows, 
     starts.
     """
     code = None if traced(loop, theta, free, data, start) else native(loop, table, data)
+    if code is not None and lanes.fits(loop, table, data):
+        each = [lanes.sums(loop, table, *one[:2], data, one[2]) for one in zip(theta, free, start, strict=True)]
+        return Sums(*(jnp.stack(parts) for parts in zip(*each, strict=True)))  # pyright: ignore[reportArgumentType]
     if code is None or not code.usable:
         at = np.maximum(free, 0) if isinstance(free, np.ndarray) else free
         return _sums_program(loop, table, theta, at, data, start)
-    lanes = zip(theta, free, start, strict=True)
-    found = [code.sums(np.asarray(one), np.asarray(f), np.asarray(x)) for one, f, x in lanes]
+    each = zip(theta, free, start, strict=True)
+    found = [code.sums(np.asarray(one), np.asarray(f), np.asarray(x)) for one, f, x in each]
     return Sums(*(np.stack(parts) for parts in zip(*found, strict=True)))  # pyright: ignore[reportArgumentType]
 
 
