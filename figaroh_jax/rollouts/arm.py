@@ -15,6 +15,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from ..results import Name
+from .alike import instead, names
 from .causes import Candidate
 from .faults import Fault, faults, without
 from .fit import Fit, System, fit, refitted_without
@@ -30,7 +31,9 @@ from .thresholds import (
     GAIN,
     MUCH,
     NEAR,
+    NO_CHOICE,
     NO_WORSE,
+    SLIGHT,
     SMALL,
     SURELY,
     UNSURE,
@@ -69,7 +72,7 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
         number = len(steps)
         progress(f"looking for causes, round {number}", min(0.1 + 0.12 * number, 0.9))
         new, now, nearest = _round(here, now, found, forbid, nearest, known)
-        found += new
+        found = [n for n in found if not any(_replaced(n, one) for one in new)] + new
         if not new:
             break
         steps.append(
@@ -80,12 +83,19 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
         if now.excess.max() < 1.0:
             break
     progress("judging", 0.9)
-    found, now = _still_needed(here, found, now)
+    found, now = _still_needed(here, found, now, begin)
+    found, now = _alike(here, found, now)
     result = Search(
         "nothing", found, now.model.structure, first, now.model.fit, p_value, [], nearest, steps, held, fits,
         begin.model.structure, here, wrong,
     )  # fmt: skip
     return _judged(here, result, now)
+
+
+def _replaced(old: Named, new: Named) -> bool:
+    """Whether a new cause contains one at the same place that is a structure of its own: a spring that has play."""
+    kind = new.candidate.kind
+    return kind.elastic and kind.holds(old.candidate.effect) and old.candidate.at == new.candidate.at
 
 
 def _begun(here: Setting) -> Fit:
@@ -344,14 +354,19 @@ def _check(here: Setting, now: Standing, new: Standing, one: Tried) -> tuple[boo
     return bool(good), float(gain), t
 
 
-def _spare(here: Setting, new: Standing, chosen: Sequence[Tried]) -> Tried | None:
-    """The cause, if any, that its joint does not need beside the others: the least one first."""
+def _spare(here: Setting, new: Standing, chosen: Sequence[Tried], begin: Standing | None = None) -> Tried | None:
+    """The cause, if any, that its joint does not need beside the others: the least one first.
+
+    With the model at the `begin` also one that is worth next to nothing of what the others have explained there since:
+    where their laws are off by as little, it makes up for that.
+    """
     structure, last = new.model.structure, new.model.fit
     for one in sorted(chosen, key=lambda one: _gained(new, one), reverse=True):
         if one.candidate.kind.elastic:
             continue
         j, entries = joint_of(here, one.candidate), list(one.candidate.entries)
-        if _costs(here, new, entries) > SURELY * new.squares[..., j].sum():
+        mine = slice(None) if j < 0 else slice(j, j + 1)
+        if _costs(here, new, entries) > SURELY * new.squares[..., mine].sum():
             continue
         theta = last.theta.copy()
         theta[entries] = values(structure.loop, structure.table)[entries]
@@ -360,18 +375,20 @@ def _spare(here: Setting, new: Standing, chosen: Sequence[Tried]) -> Tried | Non
                     iterations=LATE, rough=ROUGH)[0]  # fmt: skip
         if not np.isfinite(other.cost):
             continue
-        before, after = outputs(here, other.sums.cost)[..., j], new.squares[..., j]
-        if (before.sum() - after.sum()) / before.sum() < SMALL or t_of(before, after) < CONFIDENT:
+        before, after = outputs(here, other.sums.cost)[..., mine].sum(-1), new.squares[..., mine].sum(-1)
+        worth = before.sum() - after.sum()
+        slight = 0.0 if begin is None else SLIGHT * (begin.squares[..., mine].sum() - before.sum())
+        if worth < max(SMALL * before.sum(), slight) or t_of(before, after) < CONFIDENT:
             return one
     return None
 
 
-def _still_needed(here: Setting, found: list[Named], now: Standing) -> tuple[list[Named], Standing]:
+def _still_needed(here: Setting, found: list[Named], now: Standing, begin: Standing) -> tuple[list[Named], Standing]:
     """The causes without those that a later one made needless, where noise is all that is left with and without."""
     while len(found) > 1 and now.excess.max() < 1.0:
         structure, one = now.model.structure, now.model.fit
-        own = [Tried(n.candidate, now.model, now.squares) for n in found if not n.candidate.kind.several]
-        spare = _spare(here, now, own)
+        own = [Tried(n.candidate, now.model, now.squares) for n in found]
+        spare = _spare(here, now, own, begin)
         if spare is None:
             break
         entries = list(spare.candidate.entries)
@@ -384,6 +401,22 @@ def _still_needed(here: Setting, found: list[Named], now: Standing) -> tuple[lis
         if not new.excess.max() < 1.0:
             break
         found, now = [n for n in found if n.candidate is not spare.candidate], new
+    return found, now
+
+
+def _alike(here: Setting, found: list[Named], now: Standing) -> tuple[list[Named], Standing]:
+    """The causes with all that would do as well in place of each, where noise is all that is left."""
+    if not now.excess.max() < 1.0:
+        return found, now
+    for k, one in enumerate(found):
+        others = instead(here, now, one, found)
+        if others and others[0].worse < -NO_CHOICE:  # the other is the likelier one
+            best = others[0]
+            now = _standing(here, now.model.structure, best.fit, best.free)
+            found = [*found[:k], one._replace(candidate=best.candidate, alike=()), *found[k + 1 :]]
+            others = instead(here, now, found[k], found)
+        told = found[k].alike if found[k].candidate.kind.elastic else names(others)
+        found = [*found[:k], found[k]._replace(alike=told), *found[k + 1 :]]
     return found, now
 
 

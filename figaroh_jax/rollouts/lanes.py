@@ -482,7 +482,9 @@ def _jitted(program: _Program, given: tuple[int, ...], table: Table, free: tuple
 
 def _spread(program, given, table, free, interpret, loop, theta, data, start) -> Spread:  # noqa: ANN001
     with jax.enable_x64(True):
-        return Spread(*_jitted(program, given, table, free, interpret)(loop, jnp.asarray(theta), data, jnp.asarray(start)))
+        return Spread(
+            *_jitted(program, given, table, free, interpret)(loop, jnp.asarray(theta), data, jnp.asarray(start))
+        )
 
 
 def _launched(
@@ -554,7 +556,9 @@ def _launched(
             du = [zero] * n
             if late:
                 chosen = jnp.maximum(mine, 0)
-                more = apart(lambda _: [triton.load(faster_ref.at[chosen, k, d, at]) for d in drives], [zero] * len(drives))
+                more = apart(
+                    lambda _: [triton.load(faster_ref.at[chosen, k, d, at]) for d in drives], [zero] * len(drives)
+                )
                 has = jnp.where(jnp.broadcast_to(mine, (LANES,)) >= 0, zero + 1.0, zero)
                 du = [has * more[drives.index(d)] if d >= 0 else zero for d in program.drives]
             step = _Step(program, number)
