@@ -36,7 +36,8 @@ class Instead(NamedTuple):
 def instead(here: Setting, now: Standing, named: Named, found: Sequence[Named]) -> list[Instead]:
     """Causes at the same joint that leave noise alone in place of a named one, the best first."""
     tried = [*_beside(here, now, named, found), *_told(here, now, named)]
-    return sorted((x for x in tried if x.worse < NO_CHOICE), key=lambda x: x.worse)
+    good = sorted((x for x in tried if x.worse < NO_CHOICE), key=lambda x: x.worse)
+    return [x for x in good if not any(x.candidate.kind.holds(other.candidate.effect) for other in good)]
 
 
 def _told(here: Setting, now: Standing, named: Named) -> list[Instead]:
