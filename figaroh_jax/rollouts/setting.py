@@ -16,7 +16,7 @@ from .fit import Fit, fit
 from .loop import Loop
 from .parameters import BOUNDS, Table, values
 from .sensitivity import Windows, predicted
-from .thresholds import POWER, SLOW, SLOW_ROWS
+from .thresholds import POWER, SLOW, SLOW_ROWS, TO_TRY
 
 __all__ = [
     "Setting",
@@ -152,7 +152,7 @@ def coloured(here: Setting, structure: Structure, found: Fit) -> Setting | None:
     """The setting with the colour of what a fit leaves, or None where that is more than noise, or white."""
     if here.pole is not None:
         return None
-    colour = colour_of(residuals(structure, found), np.asarray(structure.data.weight) > 0)
+    colour = colour_of(residuals(structure, found), np.asarray(structure.data.weight) > 0, TO_TRY)
     if colour is None or not colour.pole.any():
         return None
     levels = colour.level.reshape(len(here.noise), -1)

@@ -43,6 +43,7 @@ SLOW_ROWS = 25
 
 # Whether it is coloured noise (`colour`)
 COLOUR = 4.0  # sigmas by which octaves with levels of their own are likelier than a low pass
+TO_TRY = 8.0  # the same of what a fit that takes it for white noise leaves: such a fit bends to it
 BURST = 5.0  # sigmas by which the power of groups of `BURST_ROWS` rows varies more than noise's
 BURST_ROWS = 25
 LOUDER = 4.0  # sigmas of the power over that which the record's fourth differences tell, as `POWER`
