@@ -23,7 +23,7 @@ from .parameters import put, values
 from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_of_entry, outputs, tried_now
 from .search import Model, Named, Search, Tried, judged_by_colour, sized, t_of
 from .sensitivity import predicted
-from .setting import Setting, Structure, begins_of, begun, by_recording, free_entries, level_of  # fmt: skip
+from .setting import Setting, Structure, begins_of, begun, by_recording, free_entries, level_of, thinned  # fmt: skip
 from .thresholds import (
     CLEARLY,
     CONFIDENT,
@@ -58,9 +58,12 @@ def search_arm(
 
 def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Sequence[str]) -> Search:
     progress("fitting the baseline", 0.05)
-    first = _begun(here)
-    here, wrong = _sound(here, first) if here.pole is None else (here, [])  # a colour is told from sound rows
+    whole, here = here, thinned(here)
+    first, wrong = _begun(here), list[Fault]()
+    if here.pole is None:  # a colour is told from sound rows
+        whole, wrong = _sound(whole, first if whole is here else _started(whole, first))
     if wrong:
+        here = thinned(whole)
         first = _begun(here)
     now = begin = _standing(here, Structure(here.loop, here.known.table, here.data), first, here.baseline)
     found: list[Named] = []
@@ -85,11 +88,33 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
     progress("judging", 0.9)
     found, now = _still_needed(here, found, now, begin)
     found, now = _alike(here, found, now)
+    if whole is not here:
+        progress("fitting all that was recorded", 0.95)
+        here, (begin, now) = whole, (_on_all(whole, one.model) for one in (begin, now))
+        first = begin.model.fit
+        steps.append(("all that was recorded", _level(here, now.model.fit)))
+        held = [_rms(here, begin.held), *held[1:-1], *([_rms(here, now.held)] if found else [])]
     result = Search(
         "nothing", found, now.model.structure, first, now.model.fit, p_value, [], nearest, steps, held, fits,
         begin.model.structure, here, wrong,
     )  # fmt: skip
     return _judged(here, result, now)
+
+
+def _started(here: Setting, first: Fit) -> Fit:
+    """The states at the starts of all windows with numbers that were fitted to some."""
+    structure = Structure(here.loop, here.known.table, here.data)
+    return fit(*structure, first.theta[None], [[]], width=1, lanes=1, iterations=_FIRST, rough=ROUGH)[0]
+
+
+def _on_all(here: Setting, model: Model) -> Standing:
+    """A model of some windows fitted to all of them."""
+    structure = model.structure._replace(data=here.cut(model.structure.loop))
+    if not np.isfinite(model.fit.cost):
+        return _standing(here, structure, model.fit, model.free)
+    new = fit(*structure, model.fit.theta[None], [model.free], width=max(here.width, len(model.free)), lanes=1,
+              iterations=LATE, rough=ROUGH)[0]  # fmt: skip
+    return _standing(here, structure, new, model.free)
 
 
 def _replaced(old: Named, new: Named) -> bool:

@@ -32,11 +32,13 @@ __all__ = [
     "residuals",
     "setting",
     "start_values",
+    "thinned",
     "whitened",
 ]
 
 _PAIR = 2  # starts of the baseline that are followed to the end
 _ROUGH = 1e-3  # share of the squares that a step of such a start must promise
+_ENOUGH = 6000  # rows of an arm's recordings that a search is made on; the more are asked at the end
 _EARLY = 4  # iterations of a race among all starts
 
 
@@ -111,6 +113,23 @@ def setting(
         loop, tuple(fitted), data, tuple(noise), Catalogue(known.table, keep), tuple(free),
         _folds(data, stretches), 8 if count == 1 else 1, len(free) + (5 if count == 1 else 8), stretches, block,
     )  # fmt: skip
+
+
+def thinned(here: Setting) -> Setting:
+    """Where there is more than a search needs, some windows of each recording, evenly spread; else the same."""
+    total = sum(one.rows for one in here.stretches)
+    if total <= _ENOUGH:
+        return here
+    kept = []
+    for run in sorted({one.run for one in here.stretches}):
+        mine = [one for one in here.stretches if one.run == run]
+        many = int(np.ceil(len(mine) * _ENOUGH / total))
+        kept += [mine[k] for k in np.unique(np.round((np.arange(many) + 0.5) * len(mine) / many - 0.5).astype(int))]
+    if len(kept) == len(here.stretches):
+        return here
+    some = replace(here, stretches=tuple(kept))
+    data = some.cut(here.loop)
+    return replace(some, data=data, folds=_folds(data, kept))
 
 
 def _folds(data: Windows, stretches: Sequence[Stretch]) -> np.ndarray:
