@@ -16,12 +16,12 @@ from ..results import Name
 from .causes import Candidate
 from .fit import Fit, System, fit
 from .parameters import values
-from .screening import LATE, Standing, excess_of, joint_of
-from .search import Named
+from .screening import LATE, ROUGH, Standing, excess_of, joint_of, outputs
+from .search import Named, t_of
 from .setting import Setting, free_entries, start_values
-from .thresholds import NO_CHOICE, STILL_NEEDED
+from .thresholds import NO_CHOICE, STILL_NEEDED, UNTOLD
 
-__all__ = ["Instead", "instead", "names"]
+__all__ = ["Instead", "instead", "names", "rivals"]
 
 
 class Instead(NamedTuple):
@@ -125,6 +125,37 @@ def _begin(
     for k, change in zip(rest, (beside @ away) / size, strict=True):
         begin[entries[k]] += change
     return begin
+
+
+def rivals(here: Setting, now: Standing, found: Sequence[Named]) -> list[tuple[Name, ...]]:
+    """Of each named cause the effects that may stand for it (`Kind.rival_of`) and tell the rows no worse.
+
+    Those of all joints are fitted at once, each in the place of its cause; each joint is judged by its own encoder.
+    """
+    structure, last = now.model.structure, now.model.fit
+    stated, theta, free = values(structure.loop, structure.table), last.theta.copy(), list(now.model.free)
+    pairs: dict[int, Candidate] = {}
+    for k, one in enumerate(found):
+        mine = one.candidate
+        same = [c for c in here.known.candidates if c.at == mine.at and c.kind.rival_of == mine.effect]
+        same = [c for c in same if not set(c.entries) & set(now.model.free)]
+        if mine.kind.usual and same:
+            pairs[k] = same[0]
+            theta[list(mine.entries)] = stated[list(mine.entries)]
+            theta = start_values(theta, same[0], same[0].starts[0])
+            free = [x for x in free_entries(free, same[0].entries) if x not in mine.entries]
+    if not pairs:
+        return [() for _ in found]
+    new = fit(*structure, theta[None], [free], last.start[None], width=max(here.width, len(free)), lanes=1,
+              iterations=LATE, rough=ROUGH)[0]  # fmt: skip
+    if not np.isfinite(new.cost):
+        return [() for _ in found]
+    other, told = outputs(here, new.sums.cost), []
+    for k, one in enumerate(found):
+        j = joint_of(here, one.candidate)
+        good = k in pairs and t_of(other[..., j], now.squares[..., j]) < UNTOLD
+        told.append((Name(pairs[k].effect, pairs[k].at),) if good else ())
+    return told
 
 
 def names(alternatives: Sequence[Instead]) -> tuple[Name, ...]:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from ..results import Name
-from .alike import instead, names
+from .alike import instead, names, rivals
 from .causes import Candidate
 from .faults import Fault, faults, without
 from .fit import Fit, System, fit, refitted_without
@@ -430,9 +430,10 @@ def _still_needed(here: Setting, found: list[Named], now: Standing, begin: Stand
 
 
 def _alike(here: Setting, found: list[Named], now: Standing) -> tuple[list[Named], Standing]:
-    """The causes with all that would do as well in place of each, where noise is all that is left."""
+    """The causes with all that would do as well in place of each; beside a rest, with what may stand for friction."""
     if not now.excess.max() < 1.0:
-        return found, now
+        more = rivals(here, now, found) if found else []
+        return [n._replace(alike=tuple(dict.fromkeys([*n.alike, *m]))) for n, m in zip(found, more, strict=True)], now
     for k, one in enumerate(found):
         others = instead(here, now, one, found)
         if others and others[0].worse < -NO_CHOICE:  # the other is the likelier one
