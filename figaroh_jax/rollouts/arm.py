@@ -289,6 +289,7 @@ def _named(
     chosen = list(chosen)
     while chosen:
         new = _together(here, now, chosen)
+        new = new if found else _again(here, new)
         with_all = _standing(here, new.structure, new.fit, new.free)
         checks = [_check(here, now, with_all, one) for one in chosen]
         keep = [one for one, (good, _, _) in zip(chosen, checks, strict=True) if good]
@@ -297,10 +298,6 @@ def _named(
             continue
         spare = _spare(here, with_all, chosen) if len(chosen) > 1 else None
         if spare is None:
-            better = new if found else _again(here, new)
-            if better is not new:
-                with_all = _standing(here, better.structure, better.fit, better.free)
-                checks = [_check(here, now, with_all, one) for one in chosen]
             named = [_name(here, now, with_all, one, lists, check) for one, check in zip(chosen, checks, strict=True)]
             return sorted(named, key=lambda n: n.after**2 - n.before**2), with_all
         chosen = [one for one in chosen if one is not spare]

@@ -29,7 +29,7 @@ from .simulation import delayed
 if TYPE_CHECKING:
     from .sensitivity import Windows
 
-__all__ = ["Spread", "fits", "known_to_it", "spread", "sums"]
+__all__ = ["Spread", "Step", "fits", "known_to_it", "program_of", "spread", "sums"]
 
 LANES = 32
 _TURNS, _SEARCH = 60, 8  # Newton steps of the friction; evaluations of a search along one
@@ -113,7 +113,7 @@ def _zero(x: Any) -> bool:
     return isinstance(x, float) and x == 0.0
 
 
-class _Step:
+class Step:
     """One step of a loop in numbers of lanes."""
 
     def __init__(self, program: _Program, number: Callable[[int], Any]):
@@ -336,7 +336,7 @@ def _solved(M: dict, more: Sequence[Any], right: Sequence[Any]) -> list:
     return x
 
 
-def _program(loop: Loop, table: Table) -> tuple[_Program, np.ndarray]:
+def program_of(loop: Loop, table: Table) -> tuple[_Program, np.ndarray]:
     """The program, and the places of the numbers that it is given."""
     robot, n = loop.robot, loop.robot.nv
     way = np.asarray(loop.drives.transmission)
@@ -372,7 +372,7 @@ def spread(
     loop: Loop, table: Table, theta: Any, free: Sequence[int], data: Windows, start: Any, *, interpret: bool = False
 ) -> Spread:
     """States and sensitivities of one lane: `free` entries of the table, then the states at the start."""
-    program, given = _program(loop, table)
+    program, given = program_of(loop, table)
     return _spread(program, tuple(map(int, given)), table, tuple(map(int, free)), interpret, loop, theta, data, start)
 
 
@@ -561,7 +561,7 @@ def _launched(
                 )
                 has = jnp.where(jnp.broadcast_to(mine, (LANES,)) >= 0, zero + 1.0, zero)
                 du = [has * more[drives.index(d)] if d >= 0 else zero for d in program.drives]
-            step = _Step(program, number)
+            step = Step(program, number)
             a, whole, slip, M = step.solved(q, v, u, a, slip)
 
             def gaps(q: list, v: list, u: list, values: list) -> tuple:
