@@ -142,7 +142,7 @@ def rivals(here: Setting, now: Standing, found: Sequence[Named]) -> list[tuple[N
         if mine.kind.usual and same:
             pairs[k] = same[0]
             theta[list(mine.entries)] = stated[list(mine.entries)]
-            theta = start_values(theta, same[0], same[0].starts[0])
+            theta[list(same[0].entries)] = same[0].kind.rival_start
             free = [x for x in free_entries(free, same[0].entries) if x not in mine.entries]
     if not pairs:
         return [() for _ in found]

@@ -1,23 +1,24 @@
-"""Rollouts and their sensitivities on a GPU: one window and one direction a lane, all steps in one kernel.
+"""Rollouts on a GPU: one window a lane, all steps in one kernel.
 
-A step waits for the step before it, so that what counts on a GPU is how long one step takes, not how much it computes.
-Here the state and its derivative along one direction stay in a lane's registers from the first step to the last; every
-lane computes the motion itself, which costs less than to wait for another's. The rigid body is written out in scalars
-(`rigid.scalar_programs`), Triton compiles the kernel. Fixed trees of turning and sliding joints with one drive or none
-at each, without joint limits; the robot's own numbers belong to the program. Everything else takes the plain form.
+A step waits for the step before it, so that what counts on a GPU is how long one step takes, not how much it computes:
+in kernels of JAX's own it takes a millisecond, most of it waiting. Here the state stays in a lane's registers from the
+first step to the last. The rigid body is written out in scalars (`rigid.scalar_programs`), Triton compiles the kernel.
+Fixed trees of turning and sliding joints with one drive or none at each, without joint limits; the robot's own numbers
+belong to the program. Everything else takes the plain form. Derivatives need no kernel: given the states and what each
+step has solved, all steps are linearised at once (`sensitivity`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ..compiled.kernels import Number, usable
 from ..rigid.scalar_programs import mass_entries, torques
@@ -29,7 +30,7 @@ from .simulation import delayed
 if TYPE_CHECKING:
     from .sensitivity import Windows
 
-__all__ = ["Spread", "Step", "fits", "known_to_it", "program_of", "spread", "sums"]
+__all__ = ["Rolled", "Step", "fits", "known_to_it", "program_of", "rolled"]
 
 LANES = 32
 _TURNS, _SEARCH = 60, 8  # Newton steps of the friction; evaluations of a search along one
@@ -42,11 +43,14 @@ _DRIVE = ("scale", "dead_band", "voltage")
 _MOST = 10  # joints: the numbers of more are not held by a lane's registers
 
 
-class Spread(NamedTuple):
-    """States (steps, 2 nv, windows) before each step, and their derivatives (steps, 2 nv, directions, windows)."""
+class Rolled(NamedTuple):
+    """Of each step, (steps, nv, windows): the state before it, accelerations of friction and of integrator, slip."""
 
-    states: Float[Array, "steps states windows"]
-    slopes: Float[Array, "steps states directions windows"]
+    q: Array
+    v: Array
+    a: Array
+    whole: Array
+    slip: Array
 
 
 def fits(loop: Loop, table: Table, data: Windows) -> bool:
@@ -178,7 +182,7 @@ class Step:
         if not _zero(get("stribeck_force")):
             level = level + get("stribeck_force") * jnp.exp(-((v / get("stribeck_speed")) ** 2))
         if self.p.loaded:
-            level = level + get("load_ratio") * jnp.abs(motor - bias)
+            level = level + get("load_ratio") * jnp.abs(motor + bias)
         level = jnp.maximum(level, 0.0)
         pull = -v / self.p.dt if self.p.hard else -(get("friction_rate") * v)
         soft = get("weight") * (_HARD if self.p.hard else get("friction_share")) + 0.0 * v
@@ -254,8 +258,8 @@ class Step:
         """Torques of gravity and rates."""
         return self.inverse(q, v, [0.0] * self.n)
 
-    def solved(self, q: list, v: list, u: list, a: list, slip: list) -> tuple[list, list, list, dict]:
-        """Accelerations of the friction and of the integrator, which joints slip, masses."""
+    def solved(self, q: list, v: list, u: list, a: list, slip: list) -> tuple[list, list, list]:
+        """Accelerations of the friction and of the integrator, and which joints slip."""
         n = self.n
         bias = self.bias(q, v)
         M = self.masses(q)
@@ -265,29 +269,7 @@ class Step:
         right = [rows[j][0] - bias[j] for j in range(n)]
         a, slip = self.settled(M, right, rows, a, slip)
         whole = _solved(M, [self.p.dt * row[4] for row in rows], _times(M, a))
-        return a, whole, slip, M
-
-    def moved(
-        self, q: list, v: list, u: list, numbers: Callable[[int], Any], a: list, whole: list, slip: list
-    ) -> tuple[list, list, list, list]:
-        """Gaps of both equations at given accelerations, and friction's stiffness and the step's damping: its
-        derivatives carry the sensitivities."""
-        outer, self.number = self.number, numbers
-        try:
-            bias = self.bias(q, v) if self.p.loaded else [0.0] * self.n
-            first, second = self.inverse(q, v, a), self.inverse(q, v, whole)
-            hold, damping, gaps, ends = [], [], [], []
-            for j in range(self.n):
-                torque, level, pull, soft, damp = self.joint(j, q[j], v[j], u[j], bias[j])
-                force = jnp.where(slip[j] == 0.0, (pull - a[j]) / soft, slip[j] * level)
-                arm = self.get("armature", j)
-                gaps.append(first[j] + arm * a[j] - torque - force)
-                ends.append(second[j] + arm * whole[j] + self.p.dt * damp * whole[j] - torque - force)
-                hold.append(lax.stop_gradient(jnp.where(slip[j] == 0.0, 1.0 / soft, 0.0)))
-                damping.append(lax.stop_gradient(self.p.dt * damp))
-            return gaps, ends, hold, damping
-        finally:
-            self.number = outer
+        return a, whole, slip
 
 
 def _infinite(x: Any) -> bool:
@@ -368,237 +350,87 @@ def program_of(loop: Loop, table: Table) -> tuple[_Program, np.ndarray]:
                     float(loop.dt), 1), given  # fmt: skip
 
 
-def spread(
-    loop: Loop, table: Table, theta: Any, free: Sequence[int], data: Windows, start: Any, *, interpret: bool = False
-) -> Spread:
-    """States and sensitivities of one lane: `free` entries of the table, then the states at the start."""
+def rolled(loop: Loop, table: Table, theta: Any, data: Windows, start: Any, *, interpret: bool = False) -> Rolled:
+    """States before each step and what each step has solved, of numbers (entries,) and starts (2 nv, windows)."""
     program, given = program_of(loop, table)
-    return _spread(program, tuple(map(int, given)), table, tuple(map(int, free)), interpret, loop, theta, data, start)
-
-
-def sums(
-    loop: Loop, table: Table, theta: Any, free: Any, data: Windows, start: Any, *, interpret: bool = False
-) -> tuple[Array, Array, Array]:
-    """`sensitivity.Sums` of one lane: cost (blocks, windows, ny), gradient and matrix by `free`, then by the starts.
-
-    `free` (columns,) may hold -1: a column of zeros. Windows are taken in groups whose derivatives fit in memory.
-    """
-    free = np.asarray(free)
-    kept, n = np.flatnonzero(free >= 0), loop.robot.nv
-    wanted = [int(free[k]) for k in kept]
-    each = data.command.shape[0] * data.substeps * 2 * n * (len(kept) + 2 * n) * 8
-    many = max(LANES, int(_ROOM / each) // LANES * LANES)
-    direct = np.zeros((data.reading.shape[1], len(kept) + 2 * n))
-    for c, k in enumerate(wanted):
-        if table[k].name == "reading":
-            direct[[loop.measured.index(at) for at in table[k].at], c] = 1.0
-    offset = values_of(loop, table, theta)
-    parts = []
     with jax.enable_x64(True):
-        for first in range(0, np.shape(start)[1], many):
-            which = slice(first, first + many)
-            one = jax.tree.map(lambda x: x[..., which], data)  # noqa: B023
-            found = spread(loop, table, theta, wanted, one, start[:, which], interpret=interpret)
-            parts.append(_summed(loop.measured, found, one, jnp.asarray(direct), offset))
-        cost, gradient, matrix = (jnp.concatenate(x, 1) if len(parts) > 1 else x[0] for x in zip(*parts, strict=True))
-        if len(kept) == len(free):
-            return cost, gradient, matrix
-        at = np.concatenate([kept, len(free) + np.arange(2 * n)])
-        total = len(free) + 2 * n
-        wide = jnp.zeros((*gradient.shape[:2], total)).at[..., at].set(gradient)
-        square = jnp.zeros((*gradient.shape[:2], total, total)).at[..., at[:, None], at[None]].set(matrix)
-        return cost, wide, square
-
-
-_ROOM = 4e9  # bytes of the derivatives of a group of windows
-
-
-def values_of(loop: Loop, table: Table, theta: Any) -> np.ndarray:
-    """What the encoders read beside the position, (measured,)."""
-    reading = np.array(loop.joints.reading, float)
-    for entry, value in zip(table, np.asarray(theta), strict=True):
-        if entry.name == "reading":
-            reading[list(entry.at)] = value
-    return reading[list(loop.measured)]
-
-
-@partial(jax.jit, static_argnums=0)
-def _summed(
-    measured: tuple[int, ...], found: Spread, data: Windows, direct: Array, offset: Array
-) -> tuple[Array, Array, Array]:
-    """Sums by blocks and windows of what the kernel found."""
-    n, count = found.states.shape[1] // 2, data.reading.shape[1]
-    at = np.concatenate([np.array(measured), n + np.array(measured)])[:count]
-    precise = jnp.asarray(data.weight)
-    more = jnp.concatenate([offset, jnp.zeros(count - len(measured))])
-    read = found.states[:: data.substeps, at] + more[:, None]
-    error = (jnp.asarray(data.reading) - read) * precise
-    slope = (found.slopes[:: data.substeps, at] + direct[None, :, :, None]) * precise[:, :, None]
-    if data.pole is not None:
-        error, slope = _beyond(jnp.asarray(data.pole), error, slope, precise > 0)
-    blocks = len(error) // data.block
-    error, slope = (x.reshape(blocks, data.block, *x.shape[1:]) for x in (error, slope))
-    cost = jnp.moveaxis(jnp.sum(error**2, 1), 1, 2)
-    gradient = jnp.einsum("btypw,btyw->bwp", slope, error)
-    return cost, gradient, jnp.einsum("btypw,btyrw->bwpr", slope, slope)
-
-
-def _beyond(pole: Array, error: Array, slope: Array, counted: Array) -> tuple[Array, Array]:
-    """What each row tells beyond the row before it, where the noise is a first-order low pass."""
-    before = lambda x: jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])  # noqa: E731
-    had, alone = before(counted), jnp.sqrt(1 - pole**2)
-    error = jnp.where(had, error - pole * before(error), alone * error) * counted
-    slope = jnp.where(had[:, :, None], slope - pole[:, None] * before(slope), alone[:, None] * slope)
-    return error, slope * counted[:, :, None]
+        run = _jitted(program, tuple(map(int, given)), table, interpret)
+        return Rolled(*run(loop, jnp.asarray(theta), data, jnp.asarray(start)))
 
 
 @lru_cache(maxsize=16)
-def _jitted(program: _Program, given: tuple[int, ...], table: Table, free: tuple[int, ...], interpret: bool) -> Any:
-    n, at = len(program.drives), np.array(given, int)
-    directions = len(free) + 2 * n
+def _jitted(program: _Program, given: tuple[int, ...], table: Table, interpret: bool) -> Any:
+    at = np.array(given, int)
 
-    def run(loop: Loop, theta: Array, data: Windows, start: Array) -> tuple[Array, Array]:
-        def numbers(theta: Array) -> Array:
-            return _numbers_of(put(loop, table, theta), program.drives).ravel()[at]
-
-        def commands(theta: Array) -> Array:
-            late = put(loop, table, theta).drives.delay
-            fine = jnp.repeat(jnp.asarray(data.command), data.substeps, axis=0)
-            return delayed(fine, jnp.asarray(late), loop.dt)[data.lead * data.substeps :]
-
-        unit = jnp.zeros((directions, len(theta))).at[np.arange(len(free)), np.array(free, int)].set(1.0)
-        own = numbers(theta)
-        by = jax.vmap(lambda d: jax.jvp(numbers, (theta,), (d,))[1])(unit)  # (directions, numbers)
-        seen = commands(theta)
-        each = []
-        if program.late:
-            for k, entry in enumerate(free):
-                if table[entry].name == "delay":
-                    each.append((k, jax.jvp(commands, (theta,), (unit[k],))[1]))
-        return _launched(program, len(free), own, by, seen, each, start, interpret)
+    def run(loop: Loop, theta: Array, data: Windows, start: Array) -> list[Array]:
+        here = put(loop, table, theta)
+        own = _numbers_of(here, program.drives).ravel()[at]
+        fine = jnp.repeat(jnp.asarray(data.command), data.substeps, axis=0)
+        seen = delayed(fine, jnp.asarray(here.drives.delay), loop.dt)[data.lead * data.substeps :]
+        return _launched(program, own, seen, start, interpret)
 
     return jax.jit(run)
 
 
-def _spread(program, given, table, free, interpret, loop, theta, data, start) -> Spread:  # noqa: ANN001
-    with jax.enable_x64(True):
-        return Spread(
-            *_jitted(program, given, table, free, interpret)(loop, jnp.asarray(theta), data, jnp.asarray(start))
-        )
-
-
-def _launched(
-    program: _Program, columns: int, own: Array, by: Array, seen: Array, late: list, start: Array, interpret: bool
-) -> tuple[Array, Array]:
+def _launched(program: _Program, own: Array, seen: Array, start: Array, interpret: bool) -> list[Array]:
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
     n, steps, windows = len(program.drives), seen.shape[0], seen.shape[2]
-    directions = columns + 2 * n
     rounds = -(-windows // LANES)
     missing = rounds * LANES - windows
     if missing:
         seen, start = (jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, missing)], mode="edge") for x in (seen, start))
-    faster = jnp.zeros((1, *seen.shape))
-    which = jnp.full(directions, -1, jnp.int32)
-    if late:
-        faster = jnp.stack([x for _, x in late])
-        faster = jnp.pad(faster, [(0, 0)] * 3 + [(0, missing)], mode="edge") if missing else faster
-        which = which.at[np.array([k for k, _ in late])].set(jnp.arange(len(late), dtype=jnp.int32))
+    drives = [d for d in program.drives if d >= 0]
+    given = len([k for k in program.numbers.place if k >= 0])
 
-    def kernel(own_ref, by_ref, seen_ref, faster_ref, which_ref, start_ref, once_ref, states_ref, slopes_ref) -> None:  # noqa: ANN001
+    def kernel(own_ref: Any, seen_ref: Any, start_ref: Any, once_ref: Any, *outs: Any) -> None:
         at = pl.program_id(0) * LANES + lax.iota(jnp.int32, LANES)
-        way = pl.program_id(1)
-        once = once_ref[0]
+        once, zero = once_ref[0], jnp.zeros(LANES, seen.dtype)
 
         def apart(access: Callable[[list], list], begin: list) -> list:
+            """As in `compiled.kernels`: a loop of one round, through which Triton does not look."""
+
             def step(carry: tuple) -> tuple:
                 return carry[0] + 1, access(carry[1])
 
             return lax.while_loop(lambda carry: carry[0] * 2 < once, step, (jnp.int32(0), begin))[1]
 
-        zero = jnp.zeros(LANES, seen.dtype)
-        given = len([k for k in program.numbers.place if k >= 0])
         places = [jnp.full(LANES, k, jnp.int32) for k in range(given)]
-        ways = jnp.broadcast_to(way, (LANES,))
         values = apart(lambda _: [triton.load(own_ref.at[k]) for k in places], [zero] * given)
-        slopes = apart(lambda _: [triton.load(by_ref.at[ways, k]) for k in places], [zero] * given)
+        both = apart(lambda _: [triton.load(start_ref.at[j, at]) for j in range(2 * n)], [zero] * (2 * n))
 
         def number(k: int) -> Any:
             place = program.numbers.place[k]
             return program.numbers.literal[k] if place < 0 else values[place]
 
-        both = apart(lambda _: [triton.load(start_ref.at[j, at]) for j in range(2 * n)], [zero] * (2 * n))
-        q, v = both[:n], both[n:]
-        dq = [jnp.where(ways == columns + j, zero + 1.0, zero) for j in range(n)]
-        dv = [jnp.where(ways == columns + n + j, zero + 1.0, zero) for j in range(n)]
-        mine = which_ref[way] if late else None
-
         def one(k: Any, carry: tuple) -> tuple:
-            q, v, dq, dv, a, slip = carry
-
-            def stored(values: list) -> list:
-                for c, x in enumerate(values):
-                    triton.store(slopes_ref.at[k, c, way, at], x)
-                return [*values[1:], -values[0]]
-
-            apart(stored, [*dq, *dv])
+            q, v, a, slip = carry
+            loaded = apart(lambda _: [triton.load(seen_ref.at[k, d, at]) for d in drives], [zero] * len(drives))
+            u = [loaded[drives.index(d)] if d >= 0 else zero for d in program.drives]
+            a, whole, slip = Step(program, number).solved(q, v, u, a, slip)
 
             def kept(values: list) -> list:
                 for c, x in enumerate(values):
-                    triton.store(states_ref.at[k, c, at], x, mask=ways == 0)
+                    triton.store(outs[c // n].at[k, c % n, at], x)
                 return [*values[1:], -values[0]]
 
-            apart(kept, [*q, *v])
-            drives = [d for d in program.drives if d >= 0]
-            loaded = apart(lambda _: [triton.load(seen_ref.at[k, d, at]) for d in drives], [zero] * len(drives))
-            u = [loaded[drives.index(d)] if d >= 0 else zero for d in program.drives]
-            du = [zero] * n
-            if late:
-                chosen = jnp.maximum(mine, 0)
-                more = apart(
-                    lambda _: [triton.load(faster_ref.at[chosen, k, d, at]) for d in drives], [zero] * len(drives)
-                )
-                has = jnp.where(jnp.broadcast_to(mine, (LANES,)) >= 0, zero + 1.0, zero)
-                du = [has * more[drives.index(d)] if d >= 0 else zero for d in program.drives]
-            step = Step(program, number)
-            a, whole, slip, M = step.solved(q, v, u, a, slip)
+            apart(kept, [*q, *v, *a, *whole, *slip])
+            v = [x + program.dt * y for x, y in zip(v, whole, strict=True)]
+            q = [x + program.dt * y for x, y in zip(q, v, strict=True)]
+            return q, v, a, slip
 
-            def gaps(q: list, v: list, u: list, values: list) -> tuple:
-                def here(k: int) -> Any:
-                    place = program.numbers.place[k]
-                    return program.numbers.literal[k] if place < 0 else values[place]
-
-                return step.moved(q, v, u, here, a, whole, slip)
-
-            (_, _, hold, damp), (first, second, _, _) = jax.jvp(
-                gaps, (q, v, u, [zero + x for x in values]), (dq, dv, du, [zero + x for x in slopes])
-            )
-            da = _solved(M, hold, [-x for x in first])
-            faster = _solved(M, damp, [-(x + h * y) for x, h, y in zip(second, hold, da, strict=True)])
-            dt = program.dt
-            v = [x + dt * y for x, y in zip(v, whole, strict=True)]
-            q = [x + dt * y for x, y in zip(q, v, strict=True)]
-            dv = [x + dt * y for x, y in zip(dv, faster, strict=True)]
-            dq = [x + dt * y for x, y in zip(dq, dv, strict=True)]
-            return q, v, dq, dv, a, slip
-
-        lax.fori_loop(0, steps, one, (q, v, dq, dv, [zero] * n, [zero] * n))
+        lax.fori_loop(0, steps, one, (both[:n], both[n:], [zero] * n, [zero] * n))
 
     anywhere = pl.BlockSpec(memory_space=pl.ANY)
-    shapes = [
-        jax.ShapeDtypeStruct((steps, 2 * n, rounds * LANES), seen.dtype),
-        jax.ShapeDtypeStruct((steps, 2 * n, directions, rounds * LANES), seen.dtype),
-    ]
-    own, by = (x if x.shape[-1] else jnp.zeros((*x.shape[:-1], 1)) for x in (own, by))
-    states, slopes = pl.pallas_call(
+    found = pl.pallas_call(
         kernel,
-        out_shape=shapes,
-        grid=(rounds, directions),
-        in_specs=[anywhere] * 7,
-        out_specs=[anywhere] * 2,
+        out_shape=[jax.ShapeDtypeStruct((steps, n, rounds * LANES), seen.dtype)] * len(Rolled._fields),
+        grid=(rounds,),
+        in_specs=[anywhere] * 4,
+        out_specs=[anywhere] * len(Rolled._fields),
         compiler_params=None if interpret else triton.CompilerParams(num_warps=1, num_stages=1),
         interpret=interpret,
-        name="rollout_and_slopes",
-    )(own, by, seen, faster, which, start, jnp.ones(1, jnp.int32))
-    return states[..., :windows], slopes[..., :windows]
+        name="rolled",
+    )(own if given else jnp.zeros(1), seen, start, jnp.ones(1, jnp.int32))
+    return [x[..., :windows] for x in found]

@@ -83,7 +83,7 @@ def tried_now(
     open_joints = [j for j in range(n) if now.excess[j] >= 1.0] or list(range(n))
     sizes = {-1: float(now.squares.sum())} | {j: float(now.squares[..., j].sum()) for j in range(n)}
     same = {j for j, one in known.items() if abs(one.squares - sizes[j]) < UNCHANGED * sizes[j]}
-    stands = [one._replace(alone=False) for j in sorted(same) if j < 0 or j in open_joints for one in known[j].tried]
+    stands = [_as_now(now, j, one) for j in sorted(same) if j < 0 or j in open_joints for one in known[j].tried]
     open_joints = [j for j in open_joints if j not in same]
     if not open_joints:
         return stands
@@ -121,6 +121,15 @@ def tried_now(
     for j in (-1, *open_joints) if -1 not in same else open_joints:
         known[j] = _Seen(sizes[j], [one for one in found if joint_of(here, one.candidate) == j], [])
     return stands + found
+
+
+def _as_now(now: Standing, joint: int, one: Tried) -> Tried:
+    """What was tried at a joint before, the other joints as they are now."""
+    if joint < 0:
+        return one._replace(alone=False)
+    sse = now.squares.copy()
+    sse[..., joint] = one.sse[..., joint]
+    return one._replace(alone=False, sse=sse)
 
 
 def _limits_and_springs(
@@ -274,7 +283,8 @@ def _all_in_lanes(
             if len(lane) == 1:
                 theta = begin.copy()
             own = [*mine, *(k for k in free if joint_of_entry(here, k) == j)]
-            theta[own], free = begin[own], free_entries(free, mine)
+            held = ranked.candidate.kind.falls_off if most == _EARLY else None  # a speed waits until its size is found
+            theta[own], free = begin[own], free_entries(free, [k for i, k in enumerate(mine) if i != held])
         start = _start_of(now, structure)
         one = fit(*structure, theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
                   iterations=most, rough=ROUGH / 10, below=below or np.inf)[0]  # fmt: skip
