@@ -117,7 +117,7 @@ def _on_all(here: Setting, model: Model) -> Standing:
     return _standing(here, structure, new, model.free)
 
 
-def _replaced(old: Named, new: Named) -> bool:
+def _replaced(old: Named, new: Named | Tried) -> bool:
     """Whether a new cause contains one at the same place that is a structure of its own: a spring that has play."""
     kind = new.candidate.kind
     return kind.elastic and kind.holds(old.candidate.effect) and old.candidate.at == new.candidate.at
@@ -224,7 +224,7 @@ def _round(
         firsts = sorted((ones[0] for ones in ordered.values() if ones), key=lambda one: -_gained(now, one))
         if not firsts:
             break
-        chosen = firsts[:1]
+        chosen = [one for one in firsts if any(_replaced(n, one) for n in found)][:1] or firsts[:1]
         if chosen[0].candidate.kind.usual:  # what every joint has is found at all of them at once
             chosen = [one for one in firsts if one.candidate.kind.usual]
         new = _named(here, now, lists, chosen, found)
@@ -289,7 +289,8 @@ def _named(
     chosen = list(chosen)
     while chosen:
         new = _together(here, now, chosen)
-        new = new if found else _again(here, new)
+        if not found or any(one.candidate.kind.elastic for one in chosen):
+            new = _again(here, new, [n.candidate for n in found])
         with_all = _standing(here, new.structure, new.fit, new.free)
         checks = [_check(here, now, with_all, one) for one in chosen]
         keep = [one for one, (good, _, _) in zip(chosen, checks, strict=True) if good]
@@ -320,16 +321,17 @@ def _together(here: Setting, now: Standing, chosen: Sequence[Tried]) -> Model:
     return Model(structure, last, tuple(free), 0.0)
 
 
-def _again(here: Setting, new: Model) -> Model:
-    """The fit once more from the numbers of the model file, the causes where they are: the better of both.
+def _again(here: Setting, new: Model, before: Sequence[Candidate]) -> Model:
+    """The fit once more from the numbers of the model file, the new causes where they are: the better of both.
 
-    A baseline that was fitted without a cause may end in another valley than with it.
+    A baseline that was fitted without a cause may end in another valley than with it, and so may causes found before.
     """
     structure, last = new.structure, new.fit
     if not np.isfinite(last.cost) or excess_of(here, structure, last).max() < 1.0:
         return new
     theta, stated = last.theta.copy(), values(structure.loop, structure.table)
-    theta[list(here.baseline)] = stated[list(here.baseline)]
+    old = [k for c in before if not c.kind.elastic for k in c.entries if np.isfinite(stated[k])]
+    theta[[*here.baseline, *old]] = stated[[*here.baseline, *old]]
     start, n, more = np.array(last.start), here.loop.robot.nv, structure.loop.robot.nv - here.loop.robot.nv
     begin = np.asarray(here.data.start)
     start[:n], start[n + more : 2 * n + more] = begin[:n], begin[n:]

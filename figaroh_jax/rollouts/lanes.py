@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jaxtyping import Array
 
 from ..compiled.kernels import Number, usable
@@ -61,7 +62,7 @@ def fits(loop: Loop, table: Table, data: Windows) -> bool:
 def known_to_it(loop: Loop, table: Table) -> bool:
     """Whether the kernel knows everything of the loop."""
     robot, way = loop.robot, loop.drives.transmission
-    if isinstance(way, jax.core.Tracer) or isinstance(robot.inertia, jax.core.Tracer):
+    if isinstance(way, Tracer) or isinstance(robot.inertia, Tracer):
         return False
     way = np.asarray(way)
     plain = all(j.kind in ("revolute", "prismatic") and not j.follows for j in robot.joints)
