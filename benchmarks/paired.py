@@ -3,9 +3,9 @@
     python benchmarks/paired.py before=/path/a now=/path/b [--rounds 3] [--only calibrate] [--task TASK.yaml]
 
 `diagnose` and `identify` on the TX40, `calibrate` on TALOS ($FIGAROH_JAX_DATA); `--task` takes the place of these, for
-the commands that `--only` names, or for `diagnose` (`parity.py make` writes those of the public sets). In each round every version runs cold (no program kept) and
-warm, one after the other, the first one alternating. Printed are medians, and the ratio of the second version to the
-first as median of the rounds, with the smallest and the largest.
+the commands that `--only` names, or for `diagnose` (`parity.py make` writes those of the public sets). In each round
+every version runs cold (no program kept) and warm, one after the other, the first one alternating. Printed are medians,
+and the ratio of the second version to the first as median of the rounds, with the smallest and the largest.
 """
 
 from __future__ import annotations
