@@ -54,7 +54,9 @@ def test_verdicts_follow_causes_and_rest() -> None:
     assert verdict(True, True) == "named+rest"
 
 
-RIGHT = Standing(Name("torque_ripple", ("elbow",)), whole=False, physical=True, gain=0.4, t=4.0, share=0.1)
+RIGHT = Standing(
+    Name("torque_ripple", ("elbow",)), whole=False, physical=True, gain=0.4, t=4.0, t_needed=2.4, share=0.1
+)
 
 
 @pytest.mark.parametrize(

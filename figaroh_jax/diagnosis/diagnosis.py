@@ -251,7 +251,7 @@ def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], to
         one = next(f for f in found if f.name == name)
         return surely_beside_all(problem, searched.here.start, whitening, found, searched.joint, one, claims[name])
 
-    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, claims, cache(borne_out))
+    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, cache(borne_out))
     gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")

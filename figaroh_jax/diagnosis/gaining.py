@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -43,15 +43,14 @@ class Fall(NamedTuple):
     whole: float  # squares of all rows that go, N m or N, squared
     worse: float  # p-value of their rise
 
-    def gains(self, strict: bool, claim: float = np.inf) -> bool:
-        """Whether the cause predicts better where it acts, and the robot is not predicted worse for it.
+    @property
+    def gains(self) -> bool:
+        """Whether the cause predicts better where it acts, not by chance, and the robot is not predicted worse for it.
 
-        A fall may be chance: it must be sure, or beside a rest (`strict`) a good part of the `claim`, the share that
-        the cause takes in slices of the recordings that are fitted. The squares of the robot are asked joint by joint:
-        those in N m are the large joints', which any change of the fit moves by more than a small joint has.
+        The squares of the robot are asked joint by joint: those in N m are the large joints', which any change of the
+        fit moves by more than a small joint has.
         """
-        kept = self.chance < BY_CHANCE or (strict and self.own >= KEPT_OF_CLAIM * claim)
-        return self.own > 0 and kept and self.each > 0 and self.worse > BY_CHANCE
+        return self.own > 0 and self.chance < BY_CHANCE and self.each > 0 and self.worse > BY_CHANCE
 
 
 def fall(
@@ -90,7 +89,6 @@ def without_losses(
     named: list[Found],
     joint: Joint,
     strict: bool,
-    claims: Mapping[Name, float],
     borne_out: Callable[[Name], bool] = lambda name: False,
 ) -> Gaining:
     """The causes without those that do not lower the error on the data held out, the worst first (`Fall`).
@@ -106,7 +104,7 @@ def without_losses(
         order, squares, power = _by_gain(problem, start, whitening, joint.causes, [f.name in later for f in named])
         falls = [fall(a, b, named[k].joints) for k, (a, b) in zip(order, pairwise(squares), strict=True)]
         pairs = [(named[k].name, k, one) for k, one in zip(order, falls, strict=True)]
-        passed |= {name for name, _, one in pairs if one.gains(strict, claims[name])}
+        passed |= {name for name, _, one in pairs if one.gains}
         passed |= {name for name, _, one in pairs if name not in passed and strict and one.own > 0 and borne_out(name)}
         failing = [(one.own, k) for name, k, one in pairs if name not in passed or one.own <= 0]
         if not failing and squares[-1][0].sum() > squares[0][0].sum():

@@ -17,7 +17,18 @@ from ..effects.base import Effect
 from ..estimation.rows import Prior
 from ..recordings.stacked import filter_rows, filtered_rows, open_rows
 from ..results import Name
-from .comparison import Ground, Hypothesis, Verdicts, fold_sums, ground, judge, judge_grown, t_value
+from .comparison import (
+    Ground,
+    Hypothesis,
+    Verdicts,
+    drop_by_chance,
+    fold_sums,
+    ground,
+    judge,
+    judge_grown,
+    t_needed,
+    t_value,
+)
 from .design import kind, sensor_response, shapes
 from .estimates import Fitted, amplitude_places, torque_slope
 from .flexible import smooth_functions
@@ -29,15 +40,7 @@ from .search import Found, judged_without, stood_without
 from .shifts import torque_change
 from .state import State, batched
 from .step import Step, stand
-from .thresholds import (
-    BESIDE_SMOOTH,
-    GAIN_NAMED,
-    GAIN_NAMED_ROBOT,
-    MODULATION,
-    MODULATION_HELD_OUT,
-    SHARE_NAMED,
-    T_NAMED,
-)
+from .thresholds import BESIDE_SMOOTH, GAIN_NAMED, GAIN_NAMED_ROBOT, MODULATION, SHARE_NAMED, T_NAMED
 
 __all__ = ["Standing", "cause_torque", "reason_against", "standings"]
 
@@ -51,9 +54,10 @@ class Standing:
     physical: bool  # whether its sign is one that exists
     gain: float
     t: float
+    t_needed: float  # by the number of blocks
     share: float  # RMS torque over that of the joint, where it is largest
-    modulation: float = 0.0  # squares that an amplitude which varies gains, over those of the cause
-    modulation_held_out: float = 0.0
+    modulation: float = 0.0  # squares that an amplitude which varies gains beyond chance, over those of the cause
+    modulation_held_out: float = 0.0  # the same on data left out
     beside_smooth: float = 1.0  # gain of a cause of the whole robot beside smooth functions, or in their place
     inertia_alone: bool = False  # a coupling of inertia, without friction of its own
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
@@ -75,10 +79,13 @@ def reason_against(one: Standing, rest: bool, tolerance: float) -> str:
     ]
     if rest or not one.beside_rest:  # what any rest looks like is never taken on less
         checks += [
-            (one.t >= T_NAMED, f"its gain on held-out data is not significant: t = {one.t:.1f}, {T_NAMED:g} needed"),
+            (
+                one.t >= one.t_needed,
+                f"its gain on held-out data is not significant: t = {one.t:.1f}, {one.t_needed:.1f} needed",
+            ),
             (one.gain >= least, f"it removes {one.gain:.0%} of the held-out error where it acts, {least:.0%} needed"),
             (
-                one.modulation <= MODULATION and one.modulation_held_out <= MODULATION_HELD_OUT,
+                max(one.modulation, one.modulation_held_out) <= MODULATION,
                 "its amplitude varies with position, speed, load or time"
                 f" (that would add {max(one.modulation, one.modulation_held_out):.2f} of its gain)",
             ),
@@ -122,6 +129,7 @@ def standings(
                 beside_rest=effect.beside_rest,
                 gain=1 - float(better.sum() / max(worse.sum(), 1e-300)),
                 t=t_value(worse, better),
+                t_needed=t_needed(len(worse), T_NAMED),
                 share=_share_of_torque(problem, full.state, torque, effect),
                 modulation=modulation[0],
                 modulation_held_out=modulation[1],
@@ -170,13 +178,17 @@ def _share_of_torque(problem: Problem, state: State, torque: np.ndarray, effect:
 def _modulation(
     grown: _Grown, effect: Effect, torque: np.ndarray, without: Verdicts, joints: tuple[int, ...], whole: bool
 ) -> tuple[float, float]:
-    """What an amplitude that varies gains more, in the fit and on held-out data, over what the cause gains."""
+    """What an amplitude that varies gains more, in the fit and on held-out data, over what the cause gains.
+
+    In the fit less what as many columns gain by chance.
+    """
     step = grown.step
     columns = _varied_robot(grown, effect, torque) if whole else _varied_joint(grown, torque, joints)
     base, more = grown.base, columns
     if kind(effect) == "response":  # it has no amplitude: its tangent must be free before
         (name,) = effect.parameters()
         tangent = torque_slope(grown.problem, step.state, effect, name, grown.whitening)
+        touched = list(range(len(tangent)))
         free = judge_grown(step.rows, base, range(len(tangent)), tangent[None])
         varied = judge_grown(step.rows, base, range(len(tangent)), np.concatenate([tangent[None], more]))
     else:
@@ -184,7 +196,7 @@ def _modulation(
         touched = list(range(len(step.rows.y))) if whole else list(joints)
         varied = judge_grown(step.rows, base, touched, more)
     drop, held = without.cost - free.cost, without.own(step.rows, joints).sum() - free.own(step.rows, joints).sum()
-    more_drop = free.cost - varied.cost
+    more_drop = free.cost - varied.cost - drop_by_chance(step.rows, base, touched, more)
     more_held = free.own(step.rows, joints).sum() - varied.own(step.rows, joints).sum()
     return float(more_drop / max(drop, 1e-9)), float(more_held / max(held, 1e-9))
 
