@@ -253,11 +253,11 @@ def t_value(worse: Float[np.ndarray, " blocks"], better: Float[np.ndarray, " blo
     return float(gain.mean() / spread) if spread > 0 else 0.0
 
 
-def t_needed(blocks: int, p: float) -> float:
-    """The Student t of so many blocks' differences that chance exceeds with probability `p`."""
-    from scipy.special import stdtrit  # scipy is slow to import
+def t_needed(blocks: int, t: float) -> float:
+    """The Student t of so many blocks' differences that chance exceeds as often as it exceeds `t` of very many."""
+    from scipy.special import ndtr, stdtrit  # scipy is slow to import
 
-    return float(stdtrit(max(blocks - 1, 1), 1 - p))
+    return float(stdtrit(max(blocks - 1, 1), ndtr(t)))
 
 
 def overlap(current: Verdicts, one: Verdicts, other: Verdicts) -> float:

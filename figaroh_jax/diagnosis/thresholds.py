@@ -41,7 +41,7 @@ OTHER = 0.2  # overlap up to which causes at other joints are taken in at once
 CERTAIN = 0.2  # of alpha: what a name needs, for p is not uniform under coloured noise
 
 # Naming beside a rest (`naming`)
-T_NAMED = 0.01  # p-value of Student's t of the held-out squares of the cause's joints: few blocks ask for more
+T_NAMED = 2.3  # t of the held-out squares of the cause's joints, of many blocks; of few by Student's, the chance alike
 GAIN_NAMED = 0.25  # gain there with all other causes in
 GAIN_NAMED_ROBOT = 0.04  # the same of a cause that acts on the whole robot
 MODULATION = 0.2  # squares that an amplitude which varies gains, in the fit (less chance) or held out, over the cause's
