@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from figaroh_jax.diagnosis import gaining
-from figaroh_jax.diagnosis.gaining import fall, surely_beside_all, without_losses
+from figaroh_jax.diagnosis.gaining import Fall, surely_beside_all, without_losses
+from figaroh_jax.diagnosis.holdout import Held
 
 BLOCKS = 12
 
@@ -18,6 +19,21 @@ BLOCKS = 12
 def squares(rng: np.random.Generator, *joints: float) -> np.ndarray:
     """Squares of each block and joint, of the sizes `joints`: of all rows, and of those that move, all of them."""
     return np.stack([np.array(joints) * rng.uniform(0.8, 1.2, (BLOCKS, len(joints)))] * 2)
+
+
+def held(before: np.ndarray, after: np.ndarray) -> Held:
+    """What such squares are of errors that a cause makes larger or smaller, block by block, all in one direction."""
+    return Held(after, before[1] - np.sqrt(before[1] * after[1]))
+
+
+def fall(before: np.ndarray, after: np.ndarray, joints: Sequence[int]) -> Fall:
+    """The fall of a cause with such squares."""
+    return gaining.fall(held(before, before), held(before, after), joints)
+
+
+def in_turn(*squares: np.ndarray) -> list[Held]:
+    """The same of causes that come in one after another."""
+    return [held(a, b) for a, b in zip((squares[0], *squares), squares, strict=False)]
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.02, 1.5])
@@ -57,12 +73,28 @@ def test_a_fall_in_every_block_is_sure_however_unlike_they_are():
     assert one.gains
 
 
-def test_no_difference_is_sure_as_often_as_the_level_says():
+def test_a_cause_that_is_not_there_is_sure_as_often_as_the_level_says():
+    """Its size is chance, made in other data; what these have of it is chance too, whether squares fall or not."""
     rng, chances = np.random.default_rng(4), []
-    for _ in range(300):
-        before, after = (np.stack([1 + rng.standard_normal((30, 1)) ** 2] * 2) for _ in range(2))
-        chances.append(fall(before, after, [0]).chance)
+    for _ in range(400):
+        error, column = rng.standard_normal((2, 30, 8))
+        after = error - 0.1 * rng.standard_normal() * column
+        before, wanted = (error**2).sum(1)[:, None], (error * (error - after)).sum(1)[:, None]
+        now = Held(np.stack([(after**2).sum(1)[:, None]] * 2), wanted)
+        chances.append(gaining.fall(Held(np.stack([before] * 2), 0 * wanted), now, [0]).chance)
     assert 0.02 < np.mean(np.array(chances) < 0.05) < 0.08
+
+
+def test_a_cause_of_half_its_size_is_sure_though_the_squares_hardly_fall():
+    """Kept-out data have half of what was fitted: the squares say nothing, their products with it say it is there."""
+    rng = np.random.default_rng(5)
+    column = rng.standard_normal((BLOCKS, 40))
+    noise = 0.5 * rng.standard_normal(column.shape)
+    error = 0.52 * column + noise - column * (noise * column).sum() / (column**2).sum()
+    before, after = (np.stack([(x**2).sum(1)[:, None]] * 2) for x in (error, error - column))
+    one = gaining.fall(Held(before, 0 * before[0]), Held(after, (error * column).sum(1)[:, None]), [0])
+    assert abs(one.own) < 0.1
+    assert one.chance == pytest.approx(2.0**-BLOCKS)
 
 
 def test_a_small_joint_gains_though_chance_moves_a_large_one_by_more():
@@ -107,7 +139,7 @@ def test_two_causes_that_show_only_beside_each_other_stay_when_a_third_goes(monk
             known = "".join(sorted(c for c in inside if c in "ab"))
             noise = 1 + 0.6 * np.random.default_rng(len(known)).standard_normal(base.shape) * (known == "b")
             out.append(base * left[known] * noise * (1.01 if "c" in inside else 1.0))
-        return order, out, base.sum(1)
+        return order, in_turn(*out), base.sum(1)
 
     kept = stood_by(monkeypatch, by_gain, "abc")
     assert [f.name for f in kept.named] == ["a", "b"]
@@ -125,7 +157,7 @@ def test_causes_that_raise_the_error_of_all_rows_by_chance_are_not_handed_over(m
     assert fall(base, other, [0]).gains
 
     def by_gain(problem: Any, start: Any, whitening: Any, causes: Sequence[str], later: Sequence[bool]) -> Any:
-        return list(range(len(causes))), [base, *[other for _ in causes]], base.sum(1)
+        return list(range(len(causes))), in_turn(base, *[other for _ in causes]), base.sum(1)
 
     assert stood_by(monkeypatch, by_gain, "a").worse == ["a"]
 
@@ -142,7 +174,7 @@ def test_a_cause_that_is_sure_beside_what_has_no_name_is_named_where_it_does_not
     assert not fall(base, other, [0]).gains
 
     def by_gain(problem: Any, start: Any, whitening: Any, causes: Sequence[str], later: Sequence[bool]) -> Any:
-        return list(range(len(causes))), [base, *[other for _ in causes]], base.sum(1)
+        return list(range(len(causes))), in_turn(base, *[other for _ in causes]), base.sum(1)
 
     assert stood_by(monkeypatch, by_gain, "a").worse == ["a"]
     assert stood_by(monkeypatch, by_gain, "a", strict, borne_out="a").worse == ([] if kept else ["a"])
@@ -156,7 +188,7 @@ def test_a_fall_beside_all_that_was_found_is_sure_and_a_good_part_of_the_claim(
     full = bare * np.array([left, 1.0]) * (1 + 0.3 * np.random.default_rng(13).standard_normal(bare.shape))
     full *= bare.sum(1, keepdims=True) / full.sum(1, keepdims=True) * np.array([left, 0.999])
     monkeypatch.setattr(gaining, "stood_without", lambda problem, start, found, one, whitening: "bare")
-    monkeypatch.setattr(gaining, "weighted_squares", lambda problem, step: {"bare": bare, "full": full}[step])
+    monkeypatch.setattr(gaining, "weighted_squares", lambda problem, bare_step, step: in_turn(bare, full))
     one, joint = cast(Any, SimpleNamespace(joints=(0,))), cast(Any, SimpleNamespace(step="full"))
     nothing = cast(Any, None)
     assert surely_beside_all(nothing, nothing, np.zeros((1, 2)), [one], joint, one, claim) is sure

@@ -11,12 +11,12 @@ from jaxtyping import Float
 
 from ..effects.base import Effect
 from ..results import Gain, Name
-from .holdout import held_squares, weighted_squares
+from .holdout import Held, held_squares, weighted_squares
 from .joint import Joint, polished
 from .problem import Problem
 from .search import Found, stood_without
 from .state import State
-from .thresholds import BY_CHANCE, KEPT_OF_CLAIM, SURELY
+from .thresholds import BY_CHANCE, KEPT_OF_CLAIM, RISES, SURELY
 
 __all__ = ["Fall", "Gaining", "fall", "surely_beside_all", "without_losses"]
 
@@ -38,7 +38,7 @@ class Fall(NamedTuple):
     """What a cause does to the error on data kept out as it comes in."""
 
     own: float  # share of the squares that goes of the joints where it acts, while they move
-    chance: float  # p-value of that: of the blocks' differences with signs at random
+    chance: float  # p-value of what these data want of it: of the blocks' products with signs at random
     each: float  # sum over the joints of that share
     whole: float  # squares of all rows that go, N m or N, squared
     worse: float  # p-value of their rise
@@ -50,18 +50,21 @@ class Fall(NamedTuple):
         The squares of the robot are asked joint by joint: those in N m are the large joints', which any change of the
         fit moves by more than a small joint has.
         """
-        return self.own > 0 and self.chance < BY_CHANCE and self.each > 0 and self.worse > BY_CHANCE
+        return self.own > 0 and self.chance < BY_CHANCE and self.each > 0 and self.worse > RISES
 
 
-def fall(
-    before: Float[np.ndarray, "2 blocks nv"], after: Float[np.ndarray, "2 blocks nv"], joints: Sequence[int]
-) -> Fall:
-    """What becomes of the squares of each block and joint (`held_squares`) for a cause that acts at the `joints`."""
-    places, (rows, moving) = list(joints), before - after
-    drop, had = moving.sum(0), np.maximum(before[1].sum(0), 1e-300)
+def fall(before: Held, after: Held, joints: Sequence[int]) -> Fall:
+    """What becomes of the error of each block and joint for a cause that acts at the `joints`.
+
+    Whether data kept out show a cause is asked of the products of their error without it and of what it takes of that:
+    of a cause that is not there their signs are chance. Half of the squares' fall is that; the other half asks for its
+    size as fitted too, and tells little in few blocks.
+    """
+    places, (rows, moving) = list(joints), before.squares - after.squares
+    drop, had = moving.sum(0), np.maximum(before.squares[1].sum(0), 1e-300)
     return Fall(
         own=float(drop[places].sum() / had[places].sum()),
-        chance=_by_chance(moving[:, places].sum(1)),
+        chance=_by_chance(after.wanted[:, places].sum(1)),
         each=float((drop / had).sum()),
         whole=float(rows.sum()),
         worse=_by_chance(-rows.sum(1)),
@@ -107,11 +110,12 @@ def without_losses(
         passed |= {name for name, _, one in pairs if one.gains}
         passed |= {name for name, _, one in pairs if name not in passed and strict and one.own > 0 and borne_out(name)}
         failing = [(one.own, k) for name, k, one in pairs if name not in passed or one.own <= 0]
-        if not failing and squares[-1][0].sum() > squares[0][0].sum():
+        if not failing and squares[-1].squares[0].sum() > squares[0].squares[0].sum():
             failing = [(one.whole, k) for _, k, one in pairs]
         if not failing:
-            gains = [_told(a, b, power, named[k], problem) for k, (a, b) in zip(order, pairwise(squares), strict=True)]
-            whole = _relative(squares[0][0], squares[-1][0], power[0])
+            pairs = zip(order, pairwise([one.squares for one in squares]), strict=True)
+            gains = [_told(a, b, power, named[k], problem) for k, (a, b) in pairs]
+            whole = _relative(squares[0].squares[0], squares[-1].squares[0], power[0])
             return Gaining(named, joint, order, gains, whole, worse)
         least = min(failing)[1]
         if named[least].name not in later and len(named) > 1:
@@ -139,9 +143,9 @@ def surely_beside_all(
     squares have the weights of the fit, in which slow rows count little.
     """
     bare = stood_without(problem, start, found, one, whitening)
-    here = fall(weighted_squares(problem, bare), weighted_squares(problem, joint.step), one.joints)
+    here = fall(*weighted_squares(problem, bare, joint.step), one.joints)
     sure = here.chance < SURELY and here.own >= KEPT_OF_CLAIM * claim
-    return sure and here.each > 0 and here.worse > BY_CHANCE
+    return sure and here.each > 0 and here.worse > RISES
 
 
 def _told(
@@ -172,14 +176,14 @@ def _by_gain(
     whitening: Float[np.ndarray, "F nv"],
     causes: Sequence[Effect],
     later: Sequence[bool],
-) -> tuple[list[int], list[Float[np.ndarray, "2 blocks nv"]], Float[np.ndarray, "2 nv"]]:
+) -> tuple[list[int], list[Held], Float[np.ndarray, "2 nv"]]:
     """The order of what each cause gains on held-out data as it comes in, those that come `later` behind the others.
 
     With the squares of the error in that order, and of the torque.
     """
     order = list(range(len(causes)))
     squares, power = held_squares(problem, start, list(causes), whitening)
-    drops = [float((before - after)[0].sum()) for before, after in pairwise(squares)]
+    drops = [float((before.squares - after.squares)[0].sum()) for before, after in pairwise(squares)]
     ranked = sorted(order, key=lambda k: (later[k], -drops[k]))
     if ranked != order:
         squares, power = held_squares(problem, start, [causes[k] for k in ranked], whitening)
