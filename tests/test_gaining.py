@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from figaroh_jax.diagnosis import gaining
-from figaroh_jax.diagnosis.gaining import Fall, surely_beside_all, without_losses
+from figaroh_jax.diagnosis.gaining import Fall, beside_all, without_losses
 from figaroh_jax.diagnosis.holdout import Held
 
 BLOCKS = 12
@@ -191,7 +191,7 @@ def test_a_fall_beside_all_that_was_found_is_sure_and_a_good_part_of_the_claim(
     monkeypatch.setattr(gaining, "weighted_squares", lambda problem, bare_step, step: in_turn(bare, full))
     one, joint = cast(Any, SimpleNamespace(joints=(0,))), cast(Any, SimpleNamespace(step="full"))
     nothing = cast(Any, None)
-    assert surely_beside_all(nothing, nothing, np.zeros((1, 2)), [one], joint, one, claim) is sure
+    assert beside_all(nothing, nothing, np.zeros((1, 2)), [one], joint, one).surely(claim) is sure
 
 
 def stood_by(

@@ -66,7 +66,7 @@ RIGHT = Standing(
         ({"gain": 0.2}, "held-out error"),
         ({"t": 2.0}, "not significant"),
         ({"share": 0.015}, "needed"),
-        ({"modulation": 0.5}, "varies"),
+        ({"modulation": 0.15}, "varies"),
         ({"modulation_held_out": 0.25}, "varies"),
         ({"physical": False}, "physically impossible"),
         ({"beside_rest": False}, "named only where nothing else"),
@@ -77,6 +77,15 @@ RIGHT = Standing(
 def test_beside_a_rest_a_cause_is_named_by_what_it_alone_explains(changes: dict[str, float], word: str) -> None:
     reason = reason_against(replace(RIGHT, **changes), True, 0.01)
     assert word in reason and bool(word) == bool(reason)
+
+
+@pytest.mark.parametrize(("changes", "named"), [({"t": 1.5}, True), ({"t": 1.5, "gain": 0.1}, False)])
+def test_recordings_kept_out_may_show_what_few_blocks_of_the_others_cannot(
+    changes: dict[str, float], named: bool
+) -> None:
+    one = replace(RIGHT, **changes)
+    assert reason_against(one, True, 0.01)
+    assert bool(reason_against(one, True, 0.01, lambda name: True)) is not named
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,9 @@ from .joint import Joint, polished
 from .problem import Problem
 from .search import Found, stood_without
 from .state import State
-from .thresholds import BY_CHANCE, KEPT_OF_CLAIM, RISES, SURELY
+from .thresholds import BY_CHANCE, CERTAINLY, KEPT_OF_CLAIM, RISES, SURELY
 
-__all__ = ["Fall", "Gaining", "fall", "surely_beside_all", "without_losses"]
+__all__ = ["Fall", "Gaining", "beside_all", "fall", "without_losses"]
 
 EXACT, DRAWS = 12, 4000  # blocks up to which every choice of signs is made; choices beyond
 
@@ -51,6 +51,18 @@ class Fall(NamedTuple):
         fit moves by more than a small joint has.
         """
         return self.own > 0 and self.chance < BY_CHANCE and self.each > 0 and self.worse > RISES
+
+    def surely(self, claim: float) -> bool:
+        """The same of a cause that shows beside what has no name alone; `claim` is the share that it takes in slices of
+        the recordings that are fitted."""
+        return self.chance < SURELY and self.own >= KEPT_OF_CLAIM * claim and self.each > 0 and self.worse > RISES
+
+    def certainly(self, claim: float) -> bool:
+        """Whether the joints where it acts show the cause beyond doubt.
+
+        Where few blocks have most of what it takes, slices cannot tell it from chance: a recording of its own can.
+        """
+        return self.chance < CERTAINLY and self.own >= KEPT_OF_CLAIM * claim
 
 
 def fall(before: Held, after: Held, joints: Sequence[int]) -> Fall:
@@ -128,24 +140,21 @@ def without_losses(
         joint = polished(problem, start, [f.effect for f in named], whitening)
 
 
-def surely_beside_all(
+def beside_all(
     problem: Problem,
     start: State,
     whitening: Float[np.ndarray, "F nv"],
     found: list[Found],
     joint: Joint,
     one: Found,
-    claim: float,
-) -> bool:
-    """Whether a cause surely lowers the kept-out error of its joints with all else in that was found, named or not.
+) -> Fall:
+    """What a cause does to the kept-out error with all else in that was found, named or not.
 
     What has no name is still there: without it the fit bends, and a cause that is true may seem to predict nothing. The
     squares have the weights of the fit, in which slow rows count little.
     """
     bare = stood_without(problem, start, found, one, whitening)
-    here = fall(*weighted_squares(problem, bare, joint.step), one.joints)
-    sure = here.chance < SURELY and here.own >= KEPT_OF_CLAIM * claim
-    return sure and here.each > 0 and here.worse > RISES
+    return fall(*weighted_squares(problem, bare, joint.step), one.joints)
 
 
 def _told(

@@ -20,7 +20,7 @@ from .search import Found
 from .state import State, assembled, solved
 from .step import Step, stand
 
-__all__ = ["Joint", "has_size", "joint_fit", "moved", "opened", "polished", "sized"]
+__all__ = ["Joint", "has_size", "joint_fit", "moved", "opened", "polished", "sized", "with_misfit"]
 
 KEPT = 1e-12
 SURE = 0.95  # of the region of a cause's amplitudes that must not hold zero
@@ -56,6 +56,31 @@ def polished(problem: Problem, start: State, causes: list[Effect], whitening: Fl
         if np.all(np.abs(joint.fitted.value - last.value) <= SETTLED * np.sqrt(np.diag(joint.fitted.covariance))):
             break
     return joint
+
+
+def with_misfit(
+    problem: Problem,
+    start: State,
+    joint: Joint,
+    weights: Sequence[tuple[Float[np.ndarray, "n M nv"], Float[np.ndarray, "F nv"]]],
+) -> Joint:
+    """The fit with deviations that also say how far its values move where rows weigh otherwise.
+
+    A model that leaves noise alone gets the same values from all weights, but for the noise. What it leaves beyond
+    pulls them by what the rows weigh, the same way in every block, so that no scatter of blocks shows it. As in
+    Hausman's test of a model the squares of the moves count by which they exceed those that the variances of the two
+    fits explain. `weights` are those of the rows, with a whitening.
+    """
+    fitted = joint.fitted
+    variance, beyond = np.diag(fitted.covariance), np.zeros_like(fitted.value)
+    for weight, whitening in weights:
+        other = problem.weighted(weight)
+        base = solved(other, start, joint.step.state.theta[: len(start.theta)])
+        one = _together(other, base, joint.causes, whitening).fitted
+        explained = np.maximum(np.diag(one.covariance) - variance, 0.0)
+        beyond += np.maximum((one.value - fitted.value) ** 2 - explained, 0.0)
+    wider = np.sqrt(1 + beyond / np.maximum(variance, 1e-300))
+    return joint._replace(fitted=replace(fitted, covariance=fitted.covariance * np.outer(wider, wider)))
 
 
 def _move(joint: Joint) -> Float[np.ndarray, " parameters"]:

@@ -7,6 +7,7 @@ vary with position, speed, load or time stands for another law.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -40,7 +41,15 @@ from .search import Found, judged_without, stood_without
 from .shifts import torque_change
 from .state import State, batched
 from .step import Step, stand
-from .thresholds import BESIDE_SMOOTH, GAIN_NAMED, GAIN_NAMED_ROBOT, MODULATION, SHARE_NAMED, T_NAMED
+from .thresholds import (
+    BESIDE_SMOOTH,
+    GAIN_NAMED,
+    GAIN_NAMED_ROBOT,
+    MODULATION,
+    MODULATION_HELD_OUT,
+    SHARE_NAMED,
+    T_NAMED,
+)
 
 __all__ = ["Standing", "cause_torque", "reason_against", "standings"]
 
@@ -63,10 +72,13 @@ class Standing:
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
 
 
-def reason_against(one: Standing, rest: bool, tolerance: float) -> str:
+def reason_against(
+    one: Standing, rest: bool, tolerance: float, certain: Callable[[Name], bool] = lambda name: False
+) -> str:
     """Why the cause is not named, in words with the number that failed; empty where it is.
 
     Beside a `rest` it must explain much of its joints' error with one amplitude; without one it must only be there.
+    `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not.
     """
     least = GAIN_NAMED_ROBOT if one.whole else GAIN_NAMED
     checks = [
@@ -80,12 +92,12 @@ def reason_against(one: Standing, rest: bool, tolerance: float) -> str:
     if rest or not one.beside_rest:  # what any rest looks like is never taken on less
         checks += [
             (
-                one.t >= one.t_needed,
+                one.t >= one.t_needed or certain(one.name),
                 f"its gain on held-out data is not significant: t = {one.t:.1f}, {one.t_needed:.1f} needed",
             ),
             (one.gain >= least, f"it removes {one.gain:.0%} of the held-out error where it acts, {least:.0%} needed"),
             (
-                max(one.modulation, one.modulation_held_out) <= MODULATION,
+                one.modulation <= MODULATION and one.modulation_held_out <= MODULATION_HELD_OUT,
                 "its amplitude varies with position, speed, load or time"
                 f" (that would add {max(one.modulation, one.modulation_held_out):.2f} of its gain)",
             ),
