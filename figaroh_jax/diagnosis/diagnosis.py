@@ -262,7 +262,7 @@ def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], to
     gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
     if named:
-        gaining = gaining._replace(joint=_as_weighed_otherwise(here, joint))
+        gaining = gaining._replace(joint=_as_weighed_otherwise(here, searched.here.problem, joint))
     against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
@@ -307,13 +307,14 @@ def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple
     return best[1:]
 
 
-def _as_weighed_otherwise(here: _Setting, joint: Joint) -> Joint:
+def _as_weighed_otherwise(here: _Setting, by_speed: Problem, joint: Joint) -> Joint:
     """The answer's fit with what its intervals owe to the weights of slow rows and to the noise's spectrum."""
     problem, judged = here.problem, np.asarray(here.problem.records.judged)
-    fast = judged * (relative_speed(problem) >= STANDSTILL)
+    slow = [judged, np.asarray(by_speed.records.weight), judged * (relative_speed(problem) >= STANDSTILL)]
     white = np.ones_like(here.whitening) / np.maximum(residual_rms(problem, joint.step.state), 1e-300)
-    weights = [(judged, here.whitening), (fast, here.whitening), (fast, white)]
-    return with_misfit(problem, here.start, joint, weights)
+    own = np.asarray(problem.records.weight)
+    weights = [(w, here.whitening) for w in slow if not np.array_equal(w, own)]
+    return with_misfit(problem, here.start, joint, [*weights, (own, white)])
 
 
 def _left(

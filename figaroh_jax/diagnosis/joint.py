@@ -24,6 +24,7 @@ __all__ = ["Joint", "has_size", "joint_fit", "moved", "opened", "polished", "siz
 
 KEPT = 1e-12
 SURE = 0.95  # of the region of a cause's amplitudes that must not hold zero
+AS_SURE = 2.0  # times the deviation of a fit up to which another one counts in full
 LATE = 4  # turns: most fits have settled by then
 BACK = 0.5  # of its last move: what a shape goes back by where steps overshoot
 POLISH, SETTLED = 10, 0.03  # turns at the most; a turn that moves nothing by more of its standard deviation is the last
@@ -66,20 +67,21 @@ def with_misfit(
 ) -> Joint:
     """The fit with deviations that also say how far its values move where rows weigh otherwise.
 
-    A model that leaves noise alone gets the same values from all weights, but for the noise. What it leaves beyond
-    pulls them by what the rows weigh, the same way in every block, so that no scatter of blocks shows it. As in
-    Hausman's test of a model the squares of the moves count by which they exceed those that the variances of the two
-    fits explain. `weights` are those of the rows, with a whitening.
+    A model that leaves noise alone gets the same values from all weights, but for the noise (Hausman's test of a model
+    asks for that). What it leaves beyond pulls them by what the rows weigh, the same way in every block, so that no
+    scatter of blocks shows it: the squares of the moves are added to the variance. A fit whose own deviation is more
+    than `AS_SURE` times as large says less of that, and counts less. `weights` are those of the rows, with a whitening.
     """
     fitted = joint.fitted
-    variance, beyond = np.diag(fitted.covariance), np.zeros_like(fitted.value)
+    variance, moves = np.diag(fitted.covariance), np.zeros_like(fitted.value)
     for weight, whitening in weights:
         other = problem.weighted(weight)
         base = solved(other, start, joint.step.state.theta[: len(start.theta)])
         one = _together(other, base, joint.causes, whitening).fitted
-        explained = np.maximum(np.diag(one.covariance) - variance, 0.0)
-        beyond += np.maximum((one.value - fitted.value) ** 2 - explained, 0.0)
-    wider = np.sqrt(1 + beyond / np.maximum(variance, 1e-300))
+        share = AS_SURE**2 * variance / np.maximum(np.diag(one.covariance), 1e-300)
+        more = np.minimum(share, 1.0) * (one.value - fitted.value) ** 2
+        moves += np.where(np.isfinite(more), more, 0.0)  # a fit without rows of a joint says nothing of it
+    wider = np.sqrt(1 + moves / np.maximum(variance, 1e-300))
     return joint._replace(fitted=replace(fitted, covariance=fitted.covariance * np.outer(wider, wider)))
 
 
