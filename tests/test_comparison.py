@@ -10,7 +10,6 @@ from synthetic import made_rows
 from figaroh_jax.diagnosis.comparison import (
     Hypothesis,
     coefficients,
-    drop_by_chance,
     fewer_sums,
     fold_sums,
     ground,
@@ -156,21 +155,3 @@ def test_wins_are_certain_for_a_hypothesis_better_in_every_block_and_even_for_mi
     np.testing.assert_allclose(shares.sum(), 1.0, rtol=0, atol=1e-12)
     # even resamples are ties (12 %), which go to the first
     np.testing.assert_allclose(shares, 0.5, rtol=0, atol=0.1)
-
-
-def test_columns_that_mean_nothing_lower_the_squares_by_what_chance_says(rows: Rows) -> None:
-    """The mean fall s'S^-1 s over all choices of the blocks' signs in what is left, all joints' rows in one column."""
-    rng = np.random.default_rng(4)
-    more, joint = rng.normal(size=(2, COUNT)), 1
-    more[:, -5:] = 0.0
-    found = judge(rows, Hypothesis(rows.X, PRIOR))
-    said = drop_by_chance(rows, ground(found, PRIOR, fold_sums(rows, rows.X)), [joint], more[:, None])
-    X, Z = rows.X.reshape(-1, WIDTH), np.zeros((NV, COUNT, 2))
-    Z[joint] = more.T
-    Z = Z.reshape(-1, 2)
-    own = Z - X @ np.linalg.solve(X.T @ X + np.diag(PRIOR.precision), X.T @ Z)
-    falls = []
-    for signs in 1 - 2 * ((np.arange(2**BLOCKS)[:, None] >> np.arange(BLOCKS)) & 1):
-        left = np.where(rows.block >= 0, found.residual * signs[rows.block], 0.0).reshape(-1)
-        falls.append((own.T @ left) @ np.linalg.solve(Z.T @ own, own.T @ left))
-    assert said == pytest.approx(np.mean(falls), rel=1e-6)

@@ -66,7 +66,7 @@ RIGHT = Standing(
         ({"gain": 0.2}, "held-out error"),
         ({"t": 2.0}, "not significant"),
         ({"share": 0.015}, "needed"),
-        ({"modulation": 0.15}, "varies"),
+        ({"modulation": 0.5}, "varies"),
         ({"modulation_held_out": 0.25}, "varies"),
         ({"physical": False}, "physically impossible"),
         ({"beside_rest": False}, "named only where nothing else"),

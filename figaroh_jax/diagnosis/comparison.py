@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..estimation.rows import UNKNOWN, Prior, Rows, block_sums
+from ..estimation.rows import UNKNOWN, Prior, Rows
 
 __all__ = [
     "FoldSums",
@@ -16,7 +16,6 @@ __all__ = [
     "Hypothesis",
     "Verdicts",
     "coefficients",
-    "drop_by_chance",
     "fewer_sums",
     "fold_sums",
     "ground",
@@ -34,7 +33,6 @@ __all__ = [
 
 
 TINY = 1e-12  # of the diagonal: the rounding of columns that nothing excites
-SEEN = 1e-7  # of the unit diagonal: what is left of columns beside others that say the same
 
 
 class Hypothesis(NamedTuple):
@@ -214,26 +212,6 @@ def judge_grown(rows: Rows, base: Ground, joints: Sequence[int], more: Float[np.
         error[list(joints), here] -= np.tensordot(t[fold, :, 0], more[:, :, here], 1)
     squares, costs = _block_squares(rows, error), was.without - drop[:folds]
     return Verdicts(was.cost - float(drop[folds]), theta[folds], theta[:folds], squares, costs, residual, error)
-
-
-def drop_by_chance(rows: Rows, base: Ground, joints: Sequence[int], more: Float[np.ndarray, "k rows T"]) -> float:
-    """How far the squares of the ground hypothesis fall for columns more that mean nothing (as in `judge_grown`).
-
-    The fall is s'S^-1 s of the score s = sum over the blocks b of s_b; where the blocks' signs are chance it is on
-    average the sum of s_b'S^-1 s_b. A fit of many columns to few rows takes so much of what it has no part in.
-    """
-    touched, residual = list(joints), base.verdicts.residual
-    across = np.sum([rows.X[joint].T @ more[:, one].T for one, joint in enumerate(touched)], axis=0)
-    gram = np.sum([more[:, one] @ more[:, one].T for one in range(len(touched))], axis=0)
-    change = base.inverse[-1] @ across
-    own = np.sum([block_sums(rows, residual[joint], more[:, one]) for one, joint in enumerate(touched)], axis=0)
-    shared = np.sum([block_sums(rows, r, X.T) for X, r in zip(rows.X, residual, strict=True)], axis=0)
-    scores = own - change.T @ shared
-    size = np.sqrt(np.maximum(np.diagonal(gram), TINY))
-    values, vectors = np.linalg.eigh((gram - across.T @ change) / np.outer(size, size))
-    seen = values > SEEN
-    along = vectors[:, seen].T @ (scores / size[:, None])
-    return float(((along**2).sum(1) / values[seen]).sum())
 
 
 def _without(parts: Float[np.ndarray, "folds *rest"]) -> Float[np.ndarray, "folds+1 *rest"]:

@@ -18,18 +18,7 @@ from ..effects.base import Effect
 from ..estimation.rows import Prior
 from ..recordings.stacked import filter_rows, filtered_rows, open_rows
 from ..results import Name
-from .comparison import (
-    Ground,
-    Hypothesis,
-    Verdicts,
-    drop_by_chance,
-    fold_sums,
-    ground,
-    judge,
-    judge_grown,
-    t_needed,
-    t_value,
-)
+from .comparison import Ground, Hypothesis, Verdicts, fold_sums, ground, judge, judge_grown, t_needed, t_value
 from .design import kind, sensor_response, shapes
 from .estimates import Fitted, amplitude_places, torque_slope
 from .flexible import smooth_functions
@@ -65,8 +54,8 @@ class Standing:
     t: float
     t_needed: float  # by the number of blocks
     share: float  # RMS torque over that of the joint, where it is largest
-    modulation: float = 0.0  # squares that an amplitude which varies gains beyond chance, over those of the cause
-    modulation_held_out: float = 0.0  # the same on data left out
+    modulation: float = 0.0  # squares that an amplitude which varies gains, over those of the cause
+    modulation_held_out: float = 0.0
     beside_smooth: float = 1.0  # gain of a cause of the whole robot beside smooth functions, or in their place
     inertia_alone: bool = False  # a coupling of inertia, without friction of its own
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
@@ -190,17 +179,13 @@ def _share_of_torque(problem: Problem, state: State, torque: np.ndarray, effect:
 def _modulation(
     grown: _Grown, effect: Effect, torque: np.ndarray, without: Verdicts, joints: tuple[int, ...], whole: bool
 ) -> tuple[float, float]:
-    """What an amplitude that varies gains more, in the fit and on held-out data, over what the cause gains.
-
-    In the fit less what as many columns gain by chance.
-    """
+    """What an amplitude that varies gains more, in the fit and on held-out data, over what the cause gains."""
     step = grown.step
     columns = _varied_robot(grown, effect, torque) if whole else _varied_joint(grown, torque, joints)
     base, more = grown.base, columns
     if kind(effect) == "response":  # it has no amplitude: its tangent must be free before
         (name,) = effect.parameters()
         tangent = torque_slope(grown.problem, step.state, effect, name, grown.whitening)
-        touched = list(range(len(tangent)))
         free = judge_grown(step.rows, base, range(len(tangent)), tangent[None])
         varied = judge_grown(step.rows, base, range(len(tangent)), np.concatenate([tangent[None], more]))
     else:
@@ -208,7 +193,7 @@ def _modulation(
         touched = list(range(len(step.rows.y))) if whole else list(joints)
         varied = judge_grown(step.rows, base, touched, more)
     drop, held = without.cost - free.cost, without.own(step.rows, joints).sum() - free.own(step.rows, joints).sum()
-    more_drop = free.cost - varied.cost - drop_by_chance(step.rows, base, touched, more)
+    more_drop = free.cost - varied.cost
     more_held = free.own(step.rows, joints).sum() - varied.own(step.rows, joints).sum()
     return float(more_drop / max(drop, 1e-9)), float(more_held / max(held, 1e-9))
 

@@ -41,11 +41,10 @@ OTHER = 0.2  # overlap up to which causes at other joints are taken in at once
 CERTAIN = 0.2  # of alpha: what a name needs, for p is not uniform under coloured noise
 
 # Naming beside a rest (`naming`)
-T_NAMED = 2.3  # t of the held-out squares of the cause's joints, of many blocks; of few as unlikely (Student)
+T_NAMED = 2.25  # t of the held-out squares of the cause's joints, of many blocks; of few as unlikely (Student)
 GAIN_NAMED = 0.25  # gain there with all other causes in
 GAIN_NAMED_ROBOT = 0.04  # the same of a cause that acts on the whole robot
-MODULATION = 0.125  # squares that an amplitude which varies gains, beyond chance, over those of the cause
-MODULATION_HELD_OUT = 0.2  # the same on data left out
+MODULATION, MODULATION_HELD_OUT = 0.3, 0.2  # squares that an amplitude which varies gains, over those of the cause
 BY_CHANCE = 0.02  # p-value of what data kept out of the fit want of a cause: above, it is chance
 SURELY = 0.01  # the same beside causes without a name
 CERTAINLY = 0.001  # the same where slices of the recordings that are fitted do not surely show it
