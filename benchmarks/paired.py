@@ -47,7 +47,7 @@ def tasks(folder: Path) -> dict[str, Path]:
 
 def measured(command: str, task: Path, source: Path, cache: Path) -> tuple[float, float]:
     """CPU seconds and peak MB of one process."""
-    environment = os.environ | parity.ONE_THREAD | {"PYTHONPATH": str(source), "JAX_PLATFORMS": "cpu"}
+    environment = os.environ | parity.ONE_THREAD | {"PYTHONPATH": parity.path_of(source), "JAX_PLATFORMS": "cpu"}
     environment["XDG_CACHE_HOME"] = str(cache)
     with tempfile.TemporaryDirectory() as out:
         words = [sys.executable, "-m", "figaroh_jax", command, str(task), "--out", f"{out}/run", "--quiet"]

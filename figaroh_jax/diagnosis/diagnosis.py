@@ -35,9 +35,15 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
+<<<<<<< HEAD
 from .gaining import Fall, Gaining, beside_all, without_losses
 from .holdout import fold_error, part_error, residual_rms, traces
 from .joint import Joint, opened, polished, sized, with_misfit
+=======
+from .gaining import Gaining, surely_beside_all, without_losses
+from .holdout import fold_squares, part_error, residual_rms, traces
+from .joint import Joint, opened, polished, sized
+>>>>>>> main
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import reason_against, standings
 from .problem import Problem
@@ -143,7 +149,8 @@ def _signals(
     """The recordings prepared, holdout recordings behind the others, whether their positions are slowed, the baseline.
 
     Each position is taken down to the band of its own motion only where the baseline then predicts left-out parts
-    better, by their error in N m: coarse encoders need it, and it takes the abrupt parts of a fine one away.
+    better: coarse encoders need it, and it takes the abrupt parts of a fine one away. Every joint counts alike, by the
+    ratio of its errors, so that one with a cause in it does not decide for all.
     """
     resampled: Resampled = {}
     prepared = (prepare_all(recordings, preprocess, slowed=slowed, resampled=resampled) for slowed in (False, True))
@@ -151,17 +158,21 @@ def _signals(
     if all(np.array_equal(a.position, b.position) for a, b in zip(plain, slow, strict=True)):
         return plain, False, _begun(backend, plain, known, trust)
     first, second = (_begun(backend, signals, known, trust) for signals in both)
-    slower = _baseline_error(*second) < _baseline_error(*first)
+    slower = np.mean(np.log(_baseline_squares(*second) / _baseline_squares(*first))) < 0
     return (slow, True, second) if slower else (plain, False, first)
 
 
-def _baseline_error(problem: Problem, start: State) -> float:
-    """Relative error in N m of the baseline on parts left out, each joint weighted by what it leaves."""
+def _baseline_squares(problem: Problem, start: State) -> Float[np.ndarray, " nv"]:
+    """Squares of each joint's error on parts left out of the baseline's fit, in which a joint weighs by what it leaves.
+
+    None is less than 1e-12 of their sum: a joint without error decides nothing.
+    """
     torque = np.sqrt(((problem.torque * problem.records.judged) ** 2).mean((0, 1)))
     white = np.ones((len(problem.records.omega), 1)) / np.maximum(torque, 1e-9 * torque.max())
     residual = residual_rms(problem, stand(problem, start, white).state)
     step = stand(problem, start, white * torque / np.maximum(residual, 1e-9 * residual.max()))
-    return fold_error(problem, step.state, step.verdicts.folds, problem.layout.fold)
+    squares = fold_squares(problem, step.state, step.verdicts.folds, problem.layout.fold)
+    return np.maximum(squares, max(1e-12 * squares.sum(), 1e-300))
 
 
 def _begun(backend: Backend, signals: Sequence[Signals], known: Baseline | None, trust: float) -> tuple[Problem, State]:

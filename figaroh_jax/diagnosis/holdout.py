@@ -25,6 +25,7 @@ from .thresholds import LEAST_MOVING, STANDS
 __all__ = [
     "Held",
     "fold_error",
+    "fold_squares",
     "held_squares",
     "part_error",
     "predicted",
@@ -206,9 +207,16 @@ def fold_error(
     problem: Problem, state: State, folds: Float[np.ndarray, "folds P"], fold: Int[np.ndarray, " T"]
 ) -> float:
     """Relative RMS error (N m over N m, all joints) of each fold, predicted with the coefficients without it."""
-    judged = np.asarray(problem.records.judged)
-    error = _left_out(problem, state, folds, fold) * judged
-    return float(np.sqrt((error**2).sum() / ((problem.torque * judged) ** 2).sum()))
+    torque = problem.torque * np.asarray(problem.records.judged)
+    return float(np.sqrt(fold_squares(problem, state, folds, fold).sum() / (torque**2).sum()))
+
+
+def fold_squares(
+    problem: Problem, state: State, folds: Float[np.ndarray, "folds P"], fold: Int[np.ndarray, " T"]
+) -> Float[np.ndarray, " nv"]:
+    """Squares of each joint's error ((N m)^2 or N^2), each fold predicted with the coefficients without it."""
+    error = _left_out(problem, state, folds, fold) * np.asarray(problem.records.judged)
+    return (error**2).sum((0, 1))
 
 
 def part_error(problem: Problem, step: Step) -> float:
