@@ -35,15 +35,9 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-<<<<<<< HEAD
 from .gaining import Fall, Gaining, beside_all, without_losses
-from .holdout import fold_error, part_error, residual_rms, traces
-from .joint import Joint, opened, polished, sized, with_misfit
-=======
-from .gaining import Gaining, surely_beside_all, without_losses
 from .holdout import fold_squares, part_error, residual_rms, traces
-from .joint import Joint, opened, polished, sized
->>>>>>> main
+from .joint import Joint, opened, polished, sized, with_misfit
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import reason_against, standings
 from .problem import Problem
