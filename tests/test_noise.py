@@ -130,3 +130,32 @@ def test_white_noise_rarely_shows_a_line() -> None:
 
 def test_too_short_a_series_has_no_line() -> None:
     assert noise.spectral_line(np.ones((1, 60, 1)), RATE, CUTOFF) == (1.0, 0.0, 0)
+
+
+def test_short_recordings_with_rows_left_out_show_white_noise_as_white() -> None:
+    rng, count, joints, rate, cutoff = np.random.default_rng(8), 450, 6, 50.0, 15.0
+    response = 1 / (1 + (np.fft.rfftfreq(count, 1 / rate) / cutoff) ** 8)
+    frequency, low = np.fft.rfftfreq(count, 1 / rate), np.array([0.1, 0.25, 0.5, 1.0])
+    off = []
+    for _ in range(10):
+        rows = filtered(rng.standard_normal((3, count, joints)), response) * (rng.random((3, count, joints)) > 0.03)
+        power = np.mean([noise.periodogram(one, rate, level=True)[1] for one in rows], axis=0) / 0.97
+        degrees = np.append(1.5, np.full(len(frequency) - 1, 3.0))
+        found = noise.fit_spectrum(frequency, power, response**2, degrees, rate / 2, 0.22)
+        off.append(np.log(found.power(low)))
+    # a fit to each joint alone, and to what leaks beyond the cutoff, was off by a factor of seven
+    assert np.abs(off).max() < np.log(2.5) and np.std(off) < 0.25, (np.abs(off).max(), np.std(off))
+    assert abs(np.mean(off)) < 0.05, np.mean(off)
+
+
+def test_joints_are_taken_as_alike_only_where_they_are() -> None:
+    rng, count = np.random.default_rng(9), 1000
+    slow = np.asarray(lfilter([1.0], [1.0, -0.9], rng.standard_normal((4, count + 200))))[:, 200:]
+    rows = np.stack([slow, *rng.standard_normal((3, 4, count))], axis=2)
+    powers = [noise.periodogram(one, RATE, level=True) for one in rows]
+    frequency, power = powers[0][0], np.mean([p for _, p in powers], axis=0)
+    found = noise.fit_spectrum(frequency, power, np.ones(len(frequency)), np.full(len(frequency), 4.0), RATE / 2, 0.2)
+    band = np.array([0.5, 2.0, 8.0])
+    driven = 1 / abs(1 - 0.9 * np.exp(-2j * np.pi * band / RATE)) ** 2
+    np.testing.assert_allclose(np.log(found.power(band)[:, 0] / driven), 0.0, rtol=0, atol=0.5)
+    np.testing.assert_allclose(np.log(found.power(band)[:, 1:]), 0.0, rtol=0, atol=0.4)
