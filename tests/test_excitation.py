@@ -83,7 +83,7 @@ def test_gradient_by_the_regressor_is_that_of_pinocchios_regressor(text: str, tm
         return float(np.einsum("sjk,jks->", reference.regressor(model, *x.swapaxes(1, 2)), C))
 
     with jax.enable_x64(True):
-        slope, h = eqx.filter_jit(pullback_rows)(model, state[0], state[1], state[2], C), 1e-6
+        slope, h = eqx.filter_jit(pullback_rows)(model, *(jax.numpy.asarray(x) for x in (*state, C))), 1e-6
     for at in [(0, 0, 1), (0, 1, 3), (1, 0, 2), (1, 1, 4), (2, 1, 0)]:
         step = np.zeros_like(state)
         step[at] = h

@@ -114,7 +114,8 @@ def test_the_reverse_of_a_program_is_the_closed_gradient_of_its_rows(always: Non
     cotangent = np.random.default_rng(0).normal(size=rows.shape)
     q, v, a = (x.T for x in arrays)
     with jax.enable_x64(True):
-        closed = np.asarray(eqx.filter_jit(pullback_rows)(model, q, v, a, cotangent.swapaxes(0, 1)))
+        given = (jax.numpy.asarray(x) for x in (q, v, a, cotangent.swapaxes(0, 1)))
+        closed = np.asarray(eqx.filter_jit(pullback_rows)(model, *given))
     agree(back(cotangent, *arrays).reshape(closed.shape), closed)
     few = back(np.ascontiguousarray(cotangent[..., : code.FEWEST]), *(x[: code.FEWEST] for x in arrays))
     agree(few.reshape(3, model.nv, -1), closed[..., : code.FEWEST])
