@@ -374,7 +374,7 @@ def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judg
         holdout=holdout,
         holdout_scheme=_scheme(signals),
         experiment=next_experiment(judged.word, found, problem, here.start, causes, here.whitening),
-        candidates=explain(seen.rows, seen.linear, search.screened, noise),
+        candidates=explain(seen.rows, seen.linear, search.shown, noise),
         traces=traces(problem, signals, first.state, last.state, joint.causes, named),
         baseline=fitted_model(problem, first.state, []),
         model=fitted_model(problem, last.state, joint.causes),
