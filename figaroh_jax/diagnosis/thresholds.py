@@ -52,6 +52,7 @@ RISES = 0.1  # p-value of a rise of the error of all rows kept out: below, the r
 KEPT_OF_CLAIM = 1 / 3  # of what a cause takes in slices: what must be left of it in such a fall
 STANDS = SPEED_EDGES[1]  # of a joint's top speed: below, it stands, and its rows say nothing of a law of the motion
 SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
+MASS = 3.0  # standard deviations of a body's mass: below, what moves is the link that carries it
 BESIDE_SMOOTH = 0.05  # gain of a cause of the whole robot beside smooth functions at every joint, or in their place
 
 # Links that are well known (`believed`)
