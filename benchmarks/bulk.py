@@ -85,7 +85,7 @@ def _due_real(case: dict[str, Any], forbidden: bool) -> float | None:
 def _due_closed_loop(case: dict[str, Any], forbidden: bool) -> float | None:
     if not case["truth"]:
         return None if forbidden else 1.0
-    return 8.0 if forbidden else 1.1
+    return 3.5 if forbidden else 1.1
 
 
 def _due_inverse(case: dict[str, Any], forbidden: bool) -> float | None:
@@ -93,11 +93,11 @@ def _due_inverse(case: dict[str, Any], forbidden: bool) -> float | None:
         return None if forbidden else 4.0
     if case["size"] > 0.1:  # of these only whether they are told apart from what is left of the catalogue
         return 7.0 if forbidden or not case["truth"] else None
-    return None if forbidden else 5.0
+    return None if forbidden else 3.8
 
 
 def _due_kinematic(case: dict[str, Any], forbidden: bool) -> float | None:
-    return None if forbidden else 6.0
+    return None if forbidden else 9.0
 
 
 def main() -> None:

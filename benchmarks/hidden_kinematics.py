@@ -1,6 +1,7 @@
 """Hide kinematic effects in postures of two arms and count how the diagnosis does: right, in the set, abstained, wrong.
 
     python benchmarks/hidden_kinematics.py --seeds 0                        # every effect, three sizes, both arms
+    python benchmarks/hidden_kinematics.py --effects gear_transmission_error --orders 20 350   # harmonic drives
     python benchmarks/hidden_kinematics.py --clean 80 --seeds 100           # false names and p-values of good robots
     python benchmarks/hidden_kinematics.py --left-out --sizes 6            # errors with a history, not in the catalogue
     python benchmarks/hidden_kinematics.py --effects random_play --sizes 6  # a law that no catalogue holds
@@ -93,7 +94,7 @@ def main() -> None:
             robot = arm(name, Path(folder))
             for effect, size, seed in _cases(args):
                 rng = np.random.default_rng(seed + zlib.crc32(f"{effect} {name} {size}".encode()) % 100_000)
-                case = postures.hide(robot, effect, size, rng)
+                case = postures.hide(robot, effect, size, rng, orders=tuple(args.orders))
                 start = time.process_time()
                 found = diagnose(robot, case, (effect,) if effect and args.left_out else ())
                 seconds.append(time.process_time() - start)
@@ -140,6 +141,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--clean", type=int, default=0, metavar="N", help="N robots within their tolerance instead")
     parser.add_argument("--left-out", action="store_true", help="forbid the hidden effect: `unknown` is right")
+    parser.add_argument("--orders", nargs=2, type=float, default=[2.5, 11.0], help="range of a gear error's order")
     parser.add_argument("--cache", type=Path, help="folder of compiled programs")
     return parser.parse_args()
 

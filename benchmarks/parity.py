@@ -239,7 +239,7 @@ def _kept(out: Path, case: dict[str, Any], side: str) -> Path:
 
 def _called(folder: Path, out: Path, case: dict[str, Any], side: str, source: Path) -> str:
     """One process; keeps its answer with seconds and memory."""
-    environment = os.environ | ONE_THREAD | {"PYTHONPATH": str(source), "JAX_PLATFORMS": "cpu"}
+    environment = os.environ | ONE_THREAD | {"PYTHONPATH": path_of(source), "JAX_PLATFORMS": "cpu"}
     with tempfile.TemporaryDirectory() as scratch:
         task, answer = str((folder / case["task"]).resolve()), Path(scratch) / "out"
         words = [sys.executable, "-m", "figaroh_jax", case["command"], task, "--out", str(answer), "--quiet"]
@@ -259,6 +259,13 @@ def _called(folder: Path, out: Path, case: dict[str, Any], side: str, source: Pa
     kept.parent.mkdir(parents=True, exist_ok=True)
     kept.write_text(json.dumps(record))
     return f"{side} {case['name']}: exit {record['exit']}, {record['cpu_s']:.0f} CPU s"
+
+
+def path_of(source: Path) -> str:
+    """PYTHONPATH of one version: its folder before all that is there, without other folders of the package."""
+    given = [Path(one) for one in os.environ.get("PYTHONPATH", "").split(os.pathsep) if one]
+    others = [str(one) for one in given if not any((x / "figaroh_jax").is_dir() for x in (one, one.parent))]
+    return os.pathsep.join([str(source), *others])
 
 
 def _cpu(used: resource.struct_rusage) -> float:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from parity import path_of  # beside this file
 from scipy.signal import butter, sosfiltfilt
 
 GAINS = ("torque_gain_panda_joint2_panda_single_seed_5293", "torque_gain_panda_joint2_panda_repeats_seed_66889")
@@ -31,7 +32,7 @@ def called(command: str, folder: Path, task: dict[str, Any], side: str, source: 
     """The answer of one version and its run directory."""
     (folder / "task.yaml").write_text(json.dumps(task))
     run = folder / f"run_{side}"
-    environment = os.environ | {"PYTHONPATH": str(source), "JAX_PLATFORMS": "cpu"}
+    environment = os.environ | {"PYTHONPATH": path_of(source), "JAX_PLATFORMS": "cpu"}
     words = [sys.executable, "-m", "figaroh_jax", command, str(folder / "task.yaml"), "--out", str(run), "--quiet"]
     subprocess.run(words, env=environment, cwd=folder, check=True, stdout=subprocess.DEVNULL)
     answer = run / ("answer.json" if command == "diagnose" else "result.json")

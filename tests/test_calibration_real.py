@@ -42,7 +42,7 @@ def test_irb120_predicts_a_quarter_of_a_millimetre_and_its_third_joint_gives_way
     found = calibrated("irb120_wu2015", data_dir)
     assert found.position is not None
     assert abs(found.position.validated_before - 5.952) < 1e-3  # frames alone, an external fact
-    assert found.position.validated_after <= 0.24
+    assert found.position.validated_after <= 0.221  # .2245 where folds take gear errors of a high order by chance
     assert ("joint_compliance", "joint_3") in names(found)
     assert {("joint_offset", f"joint_{k}") for k in (2, 3, 4, 5)} <= names(found)
     assert any("500 m" in note for note in found.notes)

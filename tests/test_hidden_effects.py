@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 import yaml
@@ -15,7 +16,10 @@ from generators import Case, available, make_case, make_closed_loop_case
 from generators.scoring import Score, judge, named, table
 
 from figaroh_jax.formats import config
+from figaroh_jax.formats.robotfile import load_robot
+from figaroh_jax.recordings.dataset import read_recordings
 from figaroh_jax.results import Diagnosis
+from figaroh_jax.simulators.native import as_backend
 
 ROOT = Path(__file__).resolve().parents[1]
 ROBOTS = ("tx40", "panda")
@@ -103,6 +107,21 @@ def carrying() -> Case:
 def test_a_payload_on_links_that_are_trusted_is_named_and_not_taken_in_by_them():
     score = judge("payload", carrying().truth, diagnosis_of(carrying()))
     assert score.grade == "right" and not score.false, table([score])
+
+
+@needs_robots
+def test_a_cause_at_one_joint_does_not_decide_whether_positions_are_slowed():
+    """The motion of all joints is far below the cutoff, whether or not the largest reads its torque 5 % low."""
+    from figaroh_jax.diagnosis import diagnosis
+
+    for seed in (7301, 7302):
+        for effects in ([], [("torque_gain", 0.05, ("panda_joint2",))]):
+            case = make_case(effects, robot="panda", repeats=1, trajectories=4, seed=seed, trusted=True)
+            with tempfile.TemporaryDirectory() as folder, jax.enable_x64(True):
+                task = config.load_task(case.write(Path(folder)))
+                model = load_robot(task)
+                given = read_recordings(task, model), task.preprocess, None, task.robot.trust
+                assert diagnosis._signals(as_backend(model), *given)[1], (seed, effects)
 
 
 @pytest.mark.slow

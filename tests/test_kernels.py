@@ -197,6 +197,16 @@ def test_rows_of_a_normal_matrix_are_written_by_coordinate(tmp_path: Path, monke
     found = launch(program, constants, small, shape, columns, True, interpret=True)
     for one, expected in zip(found, plainly(form, arm, *small), strict=True):
         agree(one, expected)
+    arm_kept = regrouped.kept_columns(arm.joints, form.known(arm))
+    pieces = normal_equations._row_form(count, arm_kept, 32)
+    many = [jnp.asarray(random.standard_normal((64, x.shape[1]))) for x in small]
+    (program,) = pieces.programs(arm, pieces.known(arm))
+    columns, constants = pieces.columns(arm), pieces.constants(arm)
+    found = launch(program, constants, many, pieces.shape(arm), columns, True, interpret=True, piece=32)
+    whole = plainly(normal_equations._row_form(count, arm_kept), arm, *many)
+    for one, beside, expected in zip(found, plainly(pieces, arm, *many), whole, strict=True):
+        agree(one, beside)
+        agree(np.moveaxis(one, 1, 2).reshape(expected.shape), expected)
     expected = normal_equations.normal_matrix(model, q, v, a, tau, weight**2, extra)
     monkeypatch.setattr(normal_equations, "usable", lambda *x: True)
     monkeypatch.setattr(normal_equations, "on_host", lambda *x: False)

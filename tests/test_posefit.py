@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import equinox as eqx
@@ -12,7 +13,7 @@ import poses
 import pytest
 
 from figaroh_jax.estimation import posefit, starts
-from figaroh_jax.estimation.posehost import written_out
+from figaroh_jax.estimation.posehost import HostRows, written_out
 from figaroh_jax.estimation.posesolver import solve
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.recordings.devices import Camera, Device, Distance, Planes, Points, Poses, Sockets, own_device
@@ -107,6 +108,45 @@ def test_jacobian_of_every_device_is_the_derivative_of_its_rows(name: str, model
             np.testing.assert_allclose(size, angle, rtol=0, atol=1e-12)
             assert_derivative(whole, y, jacobian)
             datum = turned
+
+
+@pytest.mark.parametrize("estimated", [BOTH, BOTH[:1], BOTH[1:], ()])
+@pytest.mark.parametrize("name", ["points", "poses", "poses on the body"])
+def test_rows_in_c_are_those_in_numpy(name: str, estimated: tuple[str, ...], tmp_path: Path):
+    path = tmp_path / "slide.urdf"
+    path.write_text(poses.urdf().replace('name="j3" type="revolute"', 'name="j3" type="prismatic"'))
+    sliding, rng = load_urdf(path), np.random.default_rng(7)
+    device, datum = devices(rng)[name]
+    device = replace(device, estimated=estimated)  # pyright: ignore[reportArgumentType]
+    whole = problem(sliding, device, datum, poses.postures(rng, N), rng)
+    (part,) = posefit.host_parts(whole)
+    assert isinstance(part, HostRows)
+    assert part.slide is not None
+    if part.code is None:
+        pytest.skip("no C compiler")
+    for size in (1.0, 1e-3):  # turns for the formulas and for their series
+        for postures in (1, N):
+            twists, own = size * rng.normal(size=(6, 6, postures)), size * rng.normal(size=part.unknowns)
+            for found, expected in zip(part._coded(twists, own), part._plain(twists, own), strict=True):
+                np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+
+
+def test_many_postures_are_solved_by_rows_in_c_as_by_the_compiled_ones(model: RobotModel, monkeypatch):
+    rng, many = np.random.default_rng(11), 300
+    device, _ = devices(rng)["poses"]
+    near = np.array([turn(rng) for _ in range(many)])
+    whole = problem(model, device, near, poses.postures(rng, many), rng)
+    y = 0.1 * rng.normal(size=len(whole.scale))
+    residual, jacobian = posefit.linearise(whole, y)
+    compiled = posefit.linearise(whole, y, posefit.parts_of(whole))
+    np.testing.assert_allclose(residual, compiled[0], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(jacobian, compiled[1], rtol=0, atol=1e-12)
+    weights, free = np.ones(len(residual)), np.ones(len(y))
+    found = solve(whole, weights, 1e-2 * free, free, 0.0 * y, max_steps=3)
+    monkeypatch.setattr(posefit, "MANY", 0)
+    monkeypatch.setattr(posefit, "_last", [])
+    expected = solve(whole, weights, 1e-2 * free, free, 0.0 * y, max_steps=3)
+    np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-9)
 
 
 def at_angle(angle: float, datum: np.ndarray, away: np.ndarray) -> np.ndarray:

@@ -129,8 +129,31 @@ def waves_shown(
     waves: Iterable[Waves],
     free: Bool[Array, " unknowns"],
     beside: Float[Array, "rows _"],
+    parts: Sequence[Bool[Array, " rows"]] = (),
 ) -> list[int]:
-    """The blocks of the largest wave of each joint beside the fit and the columns `beside`, where noise is unlikely."""
+    """The blocks of the largest wave of each joint beside the fit and the columns `beside`, where noise is unlikely.
+
+    Each of the `parts` of the rows must have it as its largest wave too, to the resolution of its order: an order that
+    is found with rows which are left out later would be judged by them.
+    """
+    waves = list(waves)
+    whole = _spectra(linear, noise, used, precision, waves, free, beside)
+    best, count = [int(np.argmax(share)) for share, _ in whole], sum(len(share) for share, _ in whole)
+    shown = [
+        k
+        for k, (share, freedom) in enumerate(whole)
+        if count * (1.0 - min(share[best[k]], 1.0)) ** (0.5 * (freedom - 2)) < thresholds.WAVE
+    ]
+    for rows in parts if shown else ():
+        found = _spectra(linear, noise, rows, precision, [waves[k] for k in shown], free, beside)
+        shown = [k for k, (share, _) in zip(shown, found, strict=True) if abs(int(np.argmax(share)) - best[k]) <= 2]
+    return [int(waves[k].blocks[best[k]]) for k in shown]
+
+
+def _spectra(
+    linear: Linear, noise: Array, used: Array, precision: Array, waves: Sequence[Waves], free: Array, beside: Array
+) -> list[tuple[Array, int]]:
+    """What each order of each joint takes of the squares that the fit leaves, as a share, and the fit's freedom."""
     rows = np.flatnonzero(used)
     e, basis, freedom = _left(linear, noise, rows, precision, free)
     if beside.shape[1]:
@@ -142,10 +165,7 @@ def waves_shown(
         motion = one.motion[inside] / noise[inside]
         pull, square = (np.bincount(member, x, minlength=len(one.angle)) for x in (motion * left, motion**2))
         phase = np.outer(one.angle, one.order)
-        taken = _by_posture(np.sin(phase), np.cos(phase), pull, square)
-        best = int(np.argmax(taken))
-        if len(one.order) * (1.0 - min(taken[best] / (e @ e), 1.0)) ** (0.5 * (freedom - 2)) < thresholds.WAVE:
-            found.append(int(one.blocks[best]))
+        found.append((_by_posture(np.sin(phase), np.cos(phase), pull, square) / (e @ e), freedom))
     return found
 
 

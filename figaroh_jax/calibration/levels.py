@@ -234,7 +234,8 @@ def _forward(
 
     def shown(beside: Sequence[int]) -> list[int]:
         columns = effects.jacobian(linear.at, beside)
-        return waves_shown(linear, noise, used, posterior.precision, effects.waves(linear.at), free, columns)
+        waves, parts = effects.waves(linear.at), [rows for _, rows, _ in inner]
+        return waves_shown(linear, noise, used, posterior.precision, waves, free, columns, parts)
 
     which = [*range(effects.grid), *shown(())]
     chosen, rivals, found = joined(which)

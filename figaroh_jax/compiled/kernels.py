@@ -113,7 +113,8 @@ Shape = tuple[int, ...] | list[tuple[int, ...]]  # of a list: of several arrays,
 class Straight(NamedTuple):
     """A function of samples in two forms. Only `constants` and `known` look at the numbers of its parameters.
 
-    `last`: the samples stand last in the answer, which is then (*shape, samples), else (samples, *shape).
+    `last`: the samples stand last in the answer, which is then (*shape, samples), else (samples, *shape). In pieces of
+    so many samples, a power of two that divides them all, each array (n, k) of a list is (n, pieces, k, samples).
     """
 
     name: str  # of all forms with the same programs and places
@@ -132,6 +133,7 @@ class Straight(NamedTuple):
     places: Callable[[Any, tuple[int, ...]], Sequence[int]] | None = None  # in it, flat, of what a program writes
     apart: Callable[[Any], Straight | None] = lambda parameters: None  # the same in smaller kernels, where one is large
     looped: Callable[..., Any] | None = None  # of (parameters, *arrays): what programs write, the samples last, or None
+    piece: int = 0  # samples of a piece; 0: all in one
 
 
 def usable(*arrays: Any) -> bool:
@@ -230,6 +232,9 @@ def _batched(straight: Straight, codes: bytes) -> Callable[..., Array]:
             return found, jax.tree.map(lambda _: True, found)
         whole = [x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(arrays, batched[1:], strict=True)]
         answer = call(parameters, *(x.reshape(-1, x.shape[-1]) for x in whole))
+        if straight.piece:
+            apart = [jnp.moveaxis(x.reshape(x.shape[0], size, -1, *x.shape[2:]), 1, 0) for x in answer]
+            return apart, [True for _ in apart]
         if straight.last:
             apart = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], size, -1), -2, 0), answer)
             return apart, jax.tree.map(lambda _: True, apart)
@@ -246,7 +251,7 @@ def _kernel(straight: Straight, codes: bytes, parameters: Any, *arrays: Array) -
     answer: Any = straight.looped(parameters, *arrays) if straight.looped else None
     if answer is None:
         for program in straight.programs(parameters, codes):
-            answer = launch(program, constants, arrays, shape, columns, last, answer)
+            answer = launch(program, constants, arrays, shape, columns, last, answer, piece=straight.piece)
     assert answer is not None
     if straight.finish is not None:
         answer = straight.finish(parameters, answer)
@@ -266,8 +271,9 @@ def launch(
     last: bool,
     into: Any = None,
     interpret: bool = False,
+    piece: int = 0,
 ) -> Any:
-    """Answers of a program for arrays (samples, k): (samples, *shape), or samples `last`.
+    """Answers of a program for arrays (samples, k): (samples, *shape), or samples `last`, in pieces as of `Straight`.
 
     The program's `reads` are those of the arrays and, last, a `Back`. `interpret` computes them without a GPU, slowly.
     What the program does not write is as in the answer `into`, which is given away, or anything.
@@ -276,7 +282,10 @@ def launch(
     from jax.experimental.pallas import triton
 
     samples, many = len(arrays[0]), isinstance(shape, list)
-    shapes = [(*one, samples) if last else (samples, *one) for one in (shape if isinstance(shape, list) else [shape])]
+    numbers = shape if isinstance(shape, list) else [shape]
+    shapes = [(*one, samples) if last else (samples, *one) for one in numbers]
+    if piece:
+        shapes = [(prod(one) * samples,) for one in numbers]
     answers = [jax.ShapeDtypeStruct(one, arrays[0].dtype) for one in shapes]
     if not samples:
         empty = [jnp.zeros(one.shape, one.dtype) for one in answers]
@@ -285,9 +294,8 @@ def launch(
 
     def kernel(*refs: Any) -> None:
         (table, once, *given), outs = refs[: 2 + len(arrays)], refs[-len(answers) :]
-        lanes = _Lanes(
-            triton, given, list(outs) if many else outs[0], samples, last, once[0] if pieces else None, columns
-        )
+        out, seen = list(outs) if many else outs[0], once[0] if pieces else None
+        lanes = _Lanes(triton, given, out, samples, last, seen, columns, numbers, piece)
         program(
             lambda k: table[k],
             [*(partial(lanes.read, k) for k in range(len(arrays))), lanes.back],
@@ -295,6 +303,7 @@ def launch(
         )
 
     anywhere, before = pl.BlockSpec(memory_space=pl.ANY), jax.tree.leaves(into)
+    before = [x.reshape(-1) for x in before] if piece else before
     found = pl.pallas_call(
         kernel,
         out_shape=answers,
@@ -306,6 +315,8 @@ def launch(
         interpret=interpret,
         name=program.__name__,
     )(constants, jnp.ones(1, jnp.int32), *arrays, *before)
+    if piece:
+        return [x.reshape(n, samples // piece, k, piece) for x, (n, k) in zip(found, numbers, strict=True)]
     return list(found) if many else found[0]
 
 
@@ -318,11 +329,22 @@ class _Lanes:
     """
 
     def __init__(
-        self, triton: Any, given: Sequence[Any], out: Any, samples: int, last: bool, once: Any, columns: Columns
+        self,
+        triton: Any,
+        given: Sequence[Any],
+        out: Any,
+        samples: int,
+        last: bool,
+        once: Any,
+        columns: Columns,
+        shape: list[tuple[int, ...]],
+        piece: int,
     ) -> None:
         from jax.experimental import pallas as pl
 
         self.triton, self.given, self.out, self.samples, self.last = triton, given, out, samples, last
+        self.shape, self.piece = shape, piece
+        self.offsets: dict[int, tuple[Array, Array]] = {}
         self.dtype = (out[0] if isinstance(out, list) else out).dtype
         self.once, self.columns = once, columns
         self.index = pl.program_id(0) * LANES + lax.iota(jnp.int32, LANES)
@@ -349,8 +371,23 @@ class _Lanes:
         return [Number(x) for x in self._apart(read, [jnp.zeros(LANES, self.dtype)] * len(places))]
 
     def _at(self, place: tuple[int, ...], index: Array) -> Any:
+        if self.piece:
+            array, row, column = place
+            columns = self.shape[array][1]
+            return self.out[array].at[
+                self._offset(columns, index) + (row * self.samples * columns + column * self.piece)
+            ]
         out, place = (self.out[place[0]], place[1:]) if isinstance(self.out, list) else (self.out, place)
         return out.at[(*place, index) if self.last else (index, *place)]
+
+    def _offset(self, columns: int, index: Array) -> Array:
+        """Where the samples stand in a flat array (pieces, columns, samples of a piece), before its first column."""
+        known = self.offsets.get(columns)
+        if known is None or known[0] is not index:
+            piece = lax.shift_right_logical(index, jnp.int32(self.piece.bit_length() - 1))
+            offset = piece * jnp.int32(columns * self.piece) + lax.bitwise_and(index, jnp.int32(self.piece - 1))
+            known = self.offsets[columns] = index, offset
+        return known[1]
 
     def write(self, entries: Iterable[tuple[tuple[int, ...], Number]]) -> None:
         places, numbers = zip(*entries, strict=True)

@@ -35,9 +35,9 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .gaining import Gaining, surely_beside_all, without_losses
-from .holdout import fold_error, part_error, residual_rms, traces
-from .joint import Joint, opened, polished, sized
+from .gaining import Fall, Gaining, beside_all, without_losses
+from .holdout import fold_squares, part_error, residual_rms, traces
+from .joint import Joint, opened, polished, sized, with_misfit
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import reason_against, standings
 from .problem import Problem
@@ -46,8 +46,8 @@ from .search import Found, Search, eliminate, find_causes
 from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import Step, stand, with_causes
-from .thresholds import CERTAIN, FEW_CAUSES, NO_REST, WEIGHT_ROUNDS
-from .weights import weighted_by_speed, white_where_better, without_reversals
+from .thresholds import CERTAIN, FEW_CAUSES, NO_REST, STANDSTILL, WEIGHT_ROUNDS
+from .weights import relative_speed, weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess, Task
@@ -143,7 +143,8 @@ def _signals(
     """The recordings prepared, holdout recordings behind the others, whether their positions are slowed, the baseline.
 
     Each position is taken down to the band of its own motion only where the baseline then predicts left-out parts
-    better, by their error in N m: coarse encoders need it, and it takes the abrupt parts of a fine one away.
+    better: coarse encoders need it, and it takes the abrupt parts of a fine one away. Every joint counts alike, by the
+    ratio of its errors, so that one with a cause in it does not decide for all.
     """
     resampled: Resampled = {}
     prepared = (prepare_all(recordings, preprocess, slowed=slowed, resampled=resampled) for slowed in (False, True))
@@ -151,17 +152,21 @@ def _signals(
     if all(np.array_equal(a.position, b.position) for a, b in zip(plain, slow, strict=True)):
         return plain, False, _begun(backend, plain, known, trust)
     first, second = (_begun(backend, signals, known, trust) for signals in both)
-    slower = _baseline_error(*second) < _baseline_error(*first)
+    slower = np.mean(np.log(_baseline_squares(*second) / _baseline_squares(*first))) < 0
     return (slow, True, second) if slower else (plain, False, first)
 
 
-def _baseline_error(problem: Problem, start: State) -> float:
-    """Relative error in N m of the baseline on parts left out, each joint weighted by what it leaves."""
+def _baseline_squares(problem: Problem, start: State) -> Float[np.ndarray, " nv"]:
+    """Squares of each joint's error on parts left out of the baseline's fit, in which a joint weighs by what it leaves.
+
+    None is less than 1e-12 of their sum: a joint without error decides nothing.
+    """
     torque = np.sqrt(((problem.torque * problem.records.judged) ** 2).mean((0, 1)))
     white = np.ones((len(problem.records.omega), 1)) / np.maximum(torque, 1e-9 * torque.max())
     residual = residual_rms(problem, stand(problem, start, white).state)
     step = stand(problem, start, white * torque / np.maximum(residual, 1e-9 * residual.max()))
-    return fold_error(problem, step.state, step.verdicts.folds, problem.layout.fold)
+    squares = fold_squares(problem, step.state, step.verdicts.folds, problem.layout.fold)
+    return np.maximum(squares, max(1e-12 * squares.sum(), 1e-300))
 
 
 def _begun(backend: Backend, signals: Sequence[Signals], known: Baseline | None, trust: float) -> tuple[Problem, State]:
@@ -241,19 +246,28 @@ def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], to
     before, here, _, found, joint, left, line, strict = searched
     problem, whitening = here.problem, here.whitening
     each = standings(problem, here.start, found, joint, whitening)
-    against = {f.name: reason_against(one, strict, tolerance) for f, one in zip(found, each, strict=True)}
+    claims = {one.name: one.gain for one in each}
+
+    @cache
+    def beside(name: Name) -> Fall:
+        one = next(f for f in found if f.name == name)
+        return beside_all(searched.here.problem, searched.here.start, whitening, found, searched.joint, one)
+
+    def borne_out(name: Name) -> bool:
+        return beside(name).surely(claims[name])
+
+    def certain(name: Name) -> bool:
+        return bool(searched.here.problem.held.any()) and beside(name).certainly(claims[name])
+
+    against = {f.name: reason_against(one, strict, tolerance, certain) for f, one in zip(found, each, strict=True)}
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
     here, joint = _as_predicts_best([here] if same else [here, before], named)
-    claims = {one.name: one.gain for one in each}
-
-    def borne_out(name: Name) -> bool:
-        one = next(f for f in found if f.name == name)
-        return surely_beside_all(problem, searched.here.start, whitening, found, searched.joint, one, claims[name])
-
-    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, claims, cache(borne_out))
+    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, borne_out)
     gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
+    if named:
+        gaining = gaining._replace(joint=_as_weighed_otherwise(here, searched.here.problem, joint))
     against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
@@ -296,6 +310,16 @@ def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple
             best = (error, one, joint) if best is None or error < best[0] else best
     assert best is not None
     return best[1:]
+
+
+def _as_weighed_otherwise(here: _Setting, by_speed: Problem, joint: Joint) -> Joint:
+    """The answer's fit with what its intervals owe to the weights of slow rows and to the noise's spectrum."""
+    problem, judged = here.problem, np.asarray(here.problem.records.judged)
+    slow = [judged, np.asarray(by_speed.records.weight), judged * (relative_speed(problem) >= STANDSTILL)]
+    white = np.ones_like(here.whitening) / np.maximum(residual_rms(problem, joint.step.state), 1e-300)
+    own = np.asarray(problem.records.weight)
+    weights = [(w, here.whitening) for w in slow if not np.array_equal(w, own)]
+    return with_misfit(problem, here.start, joint, [*weights, (own, white)])
 
 
 def _left(
@@ -350,7 +374,7 @@ def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judg
         holdout=holdout,
         holdout_scheme=_scheme(signals),
         experiment=next_experiment(judged.word, found, problem, here.start, causes, here.whitening),
-        candidates=explain(seen.rows, seen.linear, search.screened, noise),
+        candidates=explain(seen.rows, seen.linear, search.shown, noise),
         traces=traces(problem, signals, first.state, last.state, joint.causes, named),
         baseline=fitted_model(problem, first.state, []),
         model=fitted_model(problem, last.state, joint.causes),

@@ -72,7 +72,8 @@ def _from_repeats(problem: Problem, rows: Rows, state: State) -> Spectrum:
     other = _mean_of_partners(rows, residual)
     partners = np.maximum((rows.partner >= 0).sum(0), 1)
     difference = (residual - other) / np.sqrt(1 + 1 / partners)
-    return _fit(problem, np.where(rows.paired > 0, difference, 0.0), None)
+    # the differences of one excitation's repeats sum to zero: one of them is no news
+    return _fit(problem, np.where(rows.paired > 0, difference, 0.0), None, 1 - 1 / (1 + partners[partners > 0].mean()))
 
 
 def _mean_of_partners(rows: Rows, residual: Float[np.ndarray, "nv T"]) -> Float[np.ndarray, "nv T"]:
@@ -132,13 +133,16 @@ def _orthonormal(rows: Rows) -> Float[np.ndarray, "nvT columns"]:
     return tall @ (vectors[:, keep] / np.sqrt(values[keep]))
 
 
-def _fit(problem: Problem, rows: Float[np.ndarray, "nv T"], taken: np.ndarray | None) -> Spectrum:
-    """Spectrum of unwhitened noise rows; `taken` is an orthonormal basis of what a model has removed from them."""
+def _fit(problem: Problem, rows: Float[np.ndarray, "nv T"], taken: np.ndarray | None, news: float = 1.0) -> Spectrum:
+    """Spectrum of unwhitened noise rows, of which a share `news` is independent.
+
+    `taken` is an orthonormal basis of what a model has removed from them.
+    """
     records = problem.records
     n, _, count, nv = records.shape
     rate = float(records.rate)
-    frequency = np.fft.rfftfreq(count, 1 / rate)[1:]
-    power, share = np.zeros((len(frequency), nv)), np.zeros((len(frequency), nv))
+    frequency = np.fft.rfftfreq(count, 1 / rate)
+    power, left = np.zeros((len(frequency), nv)), np.zeros((len(frequency), nv))
     weights = 0
     for at in records.spans:
         here = slice(at.row, at.row + at.rows)
@@ -146,16 +150,17 @@ def _fit(problem: Problem, rows: Float[np.ndarray, "nv T"], taken: np.ndarray | 
         used = np.flatnonzero(np.abs(series).max(1) > 0)
         if len(used) < 20:
             continue
-        own, p = noise.periodogram(series[used[0] : used[-1] + 1], rate)
+        inside = slice(used[0], used[-1] + 1)
+        own, p = noise.periodogram(series[inside], rate, level=True)
         power += len(used) * _onto(frequency, own, p)
+        left += len(used) * (series[inside] != 0).mean(0)
         if taken is not None:
-            basis = taken[at.slot][here][used[0] : used[-1] + 1]
-            share += len(used) * _onto(frequency, own, noise.leverage(basis))
+            left -= len(used) * _onto(frequency, own, noise.leverage(taken[at.slot][here][inside]))
         weights += len(used)
-    power, share = power / weights, share / weights
-    left = np.maximum(1 - share, 0.1)
+    power, left = power / weights, np.maximum(left / weights, 0.1)
     gain = np.interp(frequency, np.asarray(records.omega) / (2 * np.pi), problem.gain)
-    degrees = np.full(len(frequency), max(1.0, weights / count)) * left.mean(1)
+    degrees = np.full(len(frequency), max(1.0, weights / count)) * left.mean(1) * news
+    degrees[0] /= 2  # one real number
     lowest = max(LOWEST_RESOLVED * rate / count, LOWEST_FREQUENCY)
     return noise.fit_spectrum(frequency, power / left, gain, degrees, rate / 2, lowest)
 

@@ -17,7 +17,7 @@ from .comparison import ground, judge_grown, t_value
 from .flexible import dependences, families
 from .holdout import residual_rms
 from .problem import Problem
-from .screening import draw_noise
+from .screening import noise_squares
 from .state import State
 from .step import Step
 from .thresholds import (
@@ -76,7 +76,7 @@ def excess(
     With repeats the power that repeats (products of the two residuals; p from blocks); else the mean square less that
     of noise with the estimated spectrum (no p of its own: 1).
     """
-    level = (draw_noise(problem, spectrum, whitening, 20, np.random.default_rng(1)) ** 2).sum(2).mean(0)
+    level = noise_squares(problem, spectrum, whitening)
     if not problem.layout.repeats:
         own = (residual**2).sum(1) - level
         return float(own.sum() / level.sum()), 1.0, own / level

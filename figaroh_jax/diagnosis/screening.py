@@ -25,7 +25,7 @@ from .evidence import Score, block_scores, largest, other_scores, projection, pu
 from .problem import Problem, without_factor
 from .state import State
 
-__all__ = ["Group", "Null", "Screen", "catalogue", "family_p", "place_p", "screen"]
+__all__ = ["Group", "Null", "Screen", "Shown", "catalogue", "family_p", "noise_squares", "place_p", "screen"]
 
 DRAWS, CHUNK = 400, 50  # draws, and how many are made at once
 LOCAL_DRAWS = 4000  # where each place is asked for itself, and counted as one of many
@@ -41,6 +41,15 @@ class Group(NamedTuple):
     columns: Columns
 
 
+class Shown(NamedTuple):
+    """A candidate as a screen saw it, at the point of its grid with the largest score."""
+
+    name: Name
+    joints: tuple[int, ...]
+    Z: Float[np.ndarray, "k rows T"]
+    z: float  # its score
+
+
 class Screen(NamedTuple):
     """Scores of all groups, and what they were computed from."""
 
@@ -48,6 +57,14 @@ class Screen(NamedTuple):
     scores: list[Score]
     stock: Bank
     H: Float[np.ndarray, "P columns"]
+
+    def shown(self) -> list[Shown]:
+        """Every candidate at its best, without the memory of the others' columns."""
+        points = (int(np.argmax(result.Q)) for result in self.scores)
+        return [
+            Shown(group.name, group.columns.joints, group.columns.Z[p].copy(), float(result.z[p]))
+            for group, result, p in zip(self.groups, self.scores, points, strict=True)
+        ]
 
     def best(self, rows: Rows) -> list[tuple[float, int, int]]:
         """Rank (Q less its penalties), group and grid point, best first."""
@@ -69,14 +86,15 @@ def catalogue(
 ) -> list[Group]:
     """Whitened columns of every effect that may be named, at every place and grid point.
 
-    `before` are the groups of an earlier state with the same sensors: columns that do not follow the torque are kept.
+    `before` are the groups of an earlier state of the same problem with the same sensors: columns that do not follow
+    the torque are kept.
     """
     taken = {(type(e).name, at) for term in state.terms for e, at in _places_of(term)}
     taken |= {(effect.name, tuple(int(i) for i in np.asarray(effect.at))) for effect in state.sensors}
     closed = {n for t, _ in taken for n in related(t, "excludes")}
     wanted = [n for n in CATALOGUE if n not in forbid and n not in closed]
     batches = {n: b for family in problem.families.values() for n, b in family.items()}
-    old = {group.name: group.columns for group in before or ()}
+    old = {group.name: group for group in before or ()}
     fresh = _fresh_columns(problem, state, whitening, wanted, everything=before is None)
     groups = []
     for name in (n for n in wanted if n in batches):
@@ -84,11 +102,12 @@ def catalogue(
             title = Name(name, place_names(problem.model, batches[name], tuple(at)))
             if (name, tuple(at)) in taken:
                 continue
-            columns = fresh[name][place] if name in fresh else old.get(title)
+            known = old.get(title)
+            columns = fresh[name][place] if name in fresh else known.columns if known else None
             if columns is None and batches[name].inertial:
                 columns = _link_columns(rows, at[0], problem.model)
             if columns is not None and np.abs(columns.Z).max() > 0:
-                one = jax.tree.map(lambda x, p=place: np.asarray(x)[p], batches[name])
+                one = known.effect if known else jax.tree.map(lambda x, p=place: np.asarray(x)[p], batches[name])
                 groups.append(Group(title, one, columns))
     return groups
 
@@ -197,7 +216,7 @@ def family_p(
 ) -> float:
     """Chance that noise alone gives some candidate of the whole catalogue a score as large as the largest.
 
-    The larger of two nulls: noise drawn from the spectrum (its coefficients redrawn for each part), and fair signs of
+    The larger of two nulls: noise drawn from the spectrum (its coefficients redrawn each time), and fair signs of
     whole blocks of the residual, the prior's rows among the blocks.
     """
     if not found.scores:
@@ -244,22 +263,42 @@ def draw_noise(
     draws: int,
     generator: np.random.Generator,
 ) -> Float[np.ndarray, "draws nv T"]:
-    """Whitened rows of noise with the spectrum, its coefficients redrawn from their covariance (single precision).
+    """Whitened rows of noise with what the spectrum may be, drawn anew for each draw (single precision).
 
     Rows of little weight have the noise of all others: their weight stands for what is beyond it there.
     """
     records = problem.records
     n, _, count, nv = records.shape
-    frequency = np.fft.rfftfreq(count, 1 / float(records.rate))
-    known = np.asarray(records.omega) / (2 * np.pi)
-    response = [np.interp(frequency, known, np.asarray(records.low_pass) * whitening[:, j]) for j in range(nv)]
-    shape = np.sqrt(spectrum.redrawn(generator).power(frequency)).T * np.stack(response)
+    frequency, response = _row_response(problem, whitening)
+    shape = np.sqrt(np.swapaxes(spectrum.drawn(frequency, draws, generator), 1, 2)) * response
     # what `rfft` makes of white noise: equal real and imaginary parts, but for the two ends, which are real
     shape *= np.sqrt(count / 2)
-    shape[:, [0, -1] if count % 2 == 0 else [0]] *= np.sqrt(2)
+    shape[..., [0, -1] if count % 2 == 0 else [0]] *= np.sqrt(2)
     white = generator.standard_normal((draws, nv, n, len(frequency), 2), np.float32).view(np.complex64)[..., 0]
-    rows = np.fft.irfft(white * shape[:, None].astype(np.float32), count, axis=-1)
+    rows = np.fft.irfft(white * shape[:, :, None].astype(np.float32), count, axis=-1)
     return (rows * np.moveaxis(records.fitted.astype(np.float32), 2, 0)).reshape(draws, nv, -1)
+
+
+def noise_squares(
+    problem: Problem, spectrum: Spectrum, whitening: Float[np.ndarray, "F nv"]
+) -> Float[np.ndarray, " nv"]:
+    """Sum over each joint's whitened rows of the squares that noise with the spectrum has there, as in `draw_noise`."""
+    frequency, response = _row_response(problem, whitening)
+    power = spectrum._replace(lowest=0.0).power(frequency).T * response**2
+    count = problem.records.shape[2]
+    bins = np.full(len(frequency), 2.0)  # of all `count` frequencies, positive and negative
+    bins[[0, -1] if count % 2 == 0 else [0]] = 1.0
+    return power @ bins / count * problem.records.fitted.sum((0, 1))
+
+
+def _row_response(
+    problem: Problem, whitening: Float[np.ndarray, "F nv"]
+) -> tuple[Float[np.ndarray, " freqs"], Float[np.ndarray, "nv freqs"]]:
+    """Frequencies (Hz) of the rows of a slot, and what the row filter and the whitening do to each joint there."""
+    count = problem.records.shape[2]
+    frequency = np.fft.rfftfreq(count, 1 / float(problem.records.rate))
+    known, low_pass = np.asarray(problem.records.omega) / (2 * np.pi), np.asarray(problem.records.low_pass)
+    return frequency, np.stack([np.interp(frequency, known, low_pass * column) for column in whitening.T])
 
 
 def _link_columns(rows: Rows, link: int, model: RobotModel) -> Columns:

@@ -21,7 +21,7 @@ from .estimates import amplitude_places, with_amplitudes
 from .flexible import friction_width
 from .gates import ambiguous, exists, gains, passes, rivals, simpler
 from .problem import Problem
-from .screening import DRAWS, Null, Screen, catalogue, family_p, place_p, screen
+from .screening import DRAWS, Null, Screen, Shown, catalogue, family_p, place_p, screen
 from .state import State, solved, with_width
 from .step import Step, stand, with_cause, with_causes
 from .thresholds import AGAIN, CONFIDENT, GAIN, MOST_CAUSES, MUCH, OTHER, SMALLEST
@@ -57,7 +57,7 @@ class Search(NamedTuple):
     found: list[Found]
     p_value: float  # of the whole catalogue before anything was found
     p_left: float  # of the same once the causes were in
-    screened: Screen  # the first
+    shown: list[Shown]  # candidates, as the first screen saw them
 
 
 def find_causes(
@@ -80,10 +80,10 @@ def find_causes(
     """
     generator = generator or np.random.default_rng(0)
     if after is None:
-        step, found, p_values, screens = stand(problem, state, whitening), [], [], []
+        step, found, p_values, shown = stand(problem, state, whitening), [], [], []
     else:
         problem, step, found = after.problem, after.step, list(after.found)
-        p_values, screens = [after.p_value], [after.screened]
+        p_values, shown = [after.p_value], after.shown
     null = Null(problem, spectrum, whitening, generator)
     screened, groups = None, None
     failed: dict[Name, float] = {}  # share of its joints' squares that a candidate scored when it last failed
@@ -93,7 +93,7 @@ def find_causes(
         groups = catalogue(problem, step.state, step.rows, whitening, forbid, groups)
         screened = screen(step.rows, step.linear, groups, screened)
         p_values.append(_chance(step, screened, null, alpha, generator, not found))
-        screens = screens or [screened]
+        shown = shown or screened.shown()
         if p_values[-1] > alpha:
             break
         progress("comparing causes on held-out data", len(found) / MOST_CAUSES)
@@ -113,7 +113,7 @@ def find_causes(
             groups = None if problem is not known or "response" in ways else groups
             step = step if problem is known else stand(problem, with_width(problem, step.state), whitening)
     begun = solved(problem, with_width(problem, state), step.state.theta[: len(state.theta)])
-    return Search(problem, begun, step, found, p_values[0], p_values[-1], screens[0])
+    return Search(problem, begun, step, found, p_values[0], p_values[-1], shown)
 
 
 def _refreshed(

@@ -41,15 +41,18 @@ OTHER = 0.2  # overlap up to which causes at other joints are taken in at once
 CERTAIN = 0.2  # of alpha: what a name needs, for p is not uniform under coloured noise
 
 # Naming beside a rest (`naming`)
-T_NAMED = 2.3  # t of the held-out squares of the cause's joints
+T_NAMED = 2.25  # t of the held-out squares of the cause's joints, of many blocks; of few as unlikely (Student)
 GAIN_NAMED = 0.25  # gain there with all other causes in
 GAIN_NAMED_ROBOT = 0.04  # the same of a cause that acts on the whole robot
 MODULATION, MODULATION_HELD_OUT = 0.3, 0.2  # squares that an amplitude which varies gains, over those of the cause
-BY_CHANCE = 0.1  # p-value of the fall of the error on data kept out of the fit: above, it is chance
-SURELY = 0.05  # the same of a fall that shows only beside causes without a name
-KEPT_OF_CLAIM = 1 / 3  # of what a cause takes in slices: a fall on data kept out by so much needs no level
+BY_CHANCE = 0.02  # p-value of what data kept out of the fit want of a cause: above, it is chance
+SURELY = 0.01  # the same beside causes without a name
+CERTAINLY = 0.001  # the same where slices of the recordings that are fitted do not surely show it
+RISES = 0.1  # p-value of a rise of the error of all rows kept out: below, the robot is predicted worse
+KEPT_OF_CLAIM = 1 / 3  # of what a cause takes in slices: what must be left of it in such a fall
 STANDS = SPEED_EDGES[1]  # of a joint's top speed: below, it stands, and its rows say nothing of a law of the motion
 SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
+MASS = 3.0  # standard deviations of a body's mass: below, what moves is the link that carries it
 BESIDE_SMOOTH = 0.05  # gain of a cause of the whole robot beside smooth functions at every joint, or in their place
 
 # Links that are well known (`believed`)

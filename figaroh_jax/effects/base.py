@@ -98,6 +98,8 @@ class Motion(eqx.Module):
     dt: Float[Leaf, ""] | float  # sampling period, s; 0 for instants that are not a record
     width: Float[Leaf, " nv"]  # half width of a reversal of the joints' dry friction, rad/s or m/s
 
+    __getattribute__ = object.__getattribute__  # see `Effect`
+
     @property
     def direction(self) -> Float[Array, "samples nv"]:
         """Sign of the velocity, smooth within one sample (`smooth_sign`)."""
@@ -273,6 +275,9 @@ class Effect(eqx.Module):
     needs_trust: ClassVar[float] = np.inf  # trust in the inertials (relative) above which it is no cause
     separated_by: ClassVar[str] = ""  # the experiment that tells it from what looks alike; {at} stands for the place
     separated_by_postures: ClassVar[str] = ""  # the same of postures, where it is another one
+
+    # methods as Python has them: of each, whenever it is asked for, equinox makes a module, which takes 50 us
+    __getattribute__ = object.__getattribute__
 
     def torque(self, motion: Motion) -> Float[Array, "samples *rows"]:
         """Torque added, N m or N: `(samples,)` at a joint, `(samples, 2)` at a pair, else `(samples, nv)`."""

@@ -12,13 +12,18 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Shaped
-from numpy.polynomial import legendre
+from numpy.polynomial import Legendre
 
 __all__ = ["Spectrum", "fit_spectrum", "leverage", "periodogram", "spectral_line", "white", "whitening"]
 
 FLOOR = 0.05  # of the median power between 1 Hz and the cutoff: bounds what whitening amplifies
+PASSED = 0.1  # power gain of the row filter: where it passes less, what leaks from elsewhere is as large as the noise
 LEVEL = 16  # independent bins whose mean is as certain as the median of 41 bins of a Hann periodogram
 LOWEST = 0.3  # Hz: below, the spectrum follows a power of the frequency alone
+NEIGHBOURS = 1 + 2 * (4 / 9 + 1 / 36)  # bins of a Hann periodogram that tell as much as one: squared correlations
+SMOOTHNESS = 10.0 ** np.arange(-3, 3.1)  # weights of the bending that are compared: rough to straight
+ALIKE = 10.0 ** np.arange(-1, 4.1)  # the same of a joint's distance from the others: squared in log S, over its mean
+_POLYNOMIALS = [Legendre.basis(k) for k in range(2, 6)]
 
 
 class Spectrum(NamedTuple):
@@ -33,23 +38,35 @@ class Spectrum(NamedTuple):
         """Power at `frequency` (Hz), N^2 m^2 or N^2 a row; constant beyond what the rows resolve, at both ends."""
         return np.exp(_basis(np.clip(frequency, self.lowest, self.nyquist), self.nyquist) @ self.coefficients)
 
-    def redrawn(self, generator: np.random.Generator) -> Spectrum:
-        """The spectrum with its coefficients drawn from their covariance."""
+    def drawn(
+        self, frequency: Float[np.ndarray, " freqs"], draws: int, generator: np.random.Generator
+    ) -> Float[np.ndarray, "draws freqs nv"]:
+        """Powers that the data leave possible: the coefficients drawn from their covariance, each joint for itself.
+
+        Below the lowest frequency that is resolved the power law goes on: there the noise may be larger, though rows
+        are weighted as if it were not.
+        """
+        terms, count = self.coefficients.shape
         if not self.covariance.any():
-            return self
-        draws = [generator.multivariate_normal(c, s) for c, s in zip(self.coefficients.T, self.covariance, strict=True)]
-        return self._replace(coefficients=np.stack(draws, axis=1))
+            return np.broadcast_to(self.power(frequency), (draws, len(frequency), count))
+        low = np.linalg.cholesky(self.covariance + 1e-12 * np.eye(terms))
+        off = np.einsum("jab,djb->daj", low, generator.standard_normal((draws, count, terms)))
+        basis = _basis(np.minimum(frequency, self.nyquist), self.nyquist)
+        return np.exp(basis @ (self.coefficients + off))
 
 
 def periodogram(
-    rows: Float[np.ndarray, "samples *series"], rate: float
+    rows: Float[np.ndarray, "samples *series"], rate: float, level: bool = False
 ) -> tuple[Float[np.ndarray, " freqs"], Float[np.ndarray, "freqs *series"]]:
-    """Frequencies (Hz, without 0) and Hann periodogram of a series, scaled so that white noise gives its variance."""
+    """Frequencies (Hz) and Hann periodogram of a series, scaled so that white noise gives its variance.
+
+    Without its mean and the frequency 0, or with both (`level`).
+    """
     count = rows.shape[0]
     window = np.hanning(count + 2)[1:-1].reshape(-1, *[1] * (rows.ndim - 1))
-    spectrum = np.fft.rfft((rows - rows.mean(0)) * window, axis=0)
-    power = np.abs(spectrum) ** 2 / (window**2).sum()
-    return np.fft.rfftfreq(count, 1 / rate)[1:], power[1:]
+    spectrum = np.fft.rfft((rows if level else rows - rows.mean(0)) * window, axis=0)
+    power, first = np.abs(spectrum) ** 2 / (window**2).sum(), 0 if level else 1
+    return np.fft.rfftfreq(count, 1 / rate)[first:], power[first:]
 
 
 def fit_spectrum(
@@ -63,21 +80,60 @@ def fit_spectrum(
     """Smooth spectrum of noise that has passed a filter of power gain `gain`.
 
     Gamma GLM with log link: log S = log gain + a0 + a1 log(f + .05) + Legendre polynomials 2 to 5 of log f above
-    .3 Hz, by iteratively reweighted least squares. `degrees` counts the periodograms averaged at each frequency.
+    .3 Hz, less their value and slope there, by iteratively reweighted least squares. `degrees` counts the independent
+    Hann periodograms averaged at each frequency. Below `lowest` the fit serves `drawn` alone.
+
+    Short recordings have few bins at low frequency, which alone would draw a spectrum that the noise does not have. So
+    the squared second derivative of the polynomials is penalised, and each joint's shape is expected to be that of the
+    other joints; the weights of both are those of largest marginal likelihood (empirical Bayes, with Laplace's
+    approximation): joints whose noise is not alike are not made so.
     """
-    used = (gain > 1e-3) & (frequency >= min(lowest, nyquist / 4))
-    basis, weight = _basis(frequency[used], nyquist), degrees[used]
+    used = gain > PASSED
+    basis, weight = _basis(frequency[used], nyquist), degrees[used] / NEIGHBOURS
     observed = np.maximum(power[used] / gain[used, None], 1e-300)
-    curvature = basis.T @ (weight[:, None] * basis) + np.diag([1e-9, 1e-2] + [1e-1] * (basis.shape[1] - 2))
-    inverse = np.linalg.inv(curvature)
-    level = np.average(observed, axis=0, weights=weight)
-    coefficients = np.zeros((basis.shape[1], power.shape[1]))
-    coefficients[0] = np.log(level)
+    nv, terms = observed.shape[1], basis.shape[1]
+    bend = np.zeros((terms, terms))
+    bend[2:, 2:] = _bending()
+    free = np.diag([1e-9, 1e-2] + [0.0] * (terms - 2))
+    relative = observed / np.average(observed, axis=0, weights=weight)
+    others = relative if nv == 1 else (relative.sum(1, keepdims=True) - relative) / (nv - 1)
+    each = [_penalised(basis, max(nv - 1, 1) * weight, others, free + w * bend) for w in SMOOTHNESS]
+    smooth = int(np.argmax([likely for likely, *_ in each]))
+    _, common, spread = each[smooth]
+    if nv == 1:
+        return Spectrum(common + np.log(observed / relative)[:1] * np.eye(terms)[:, :1], spread, nyquist, lowest)
+    even = _basis(np.geomspace(LOWEST / 10, nyquist, 50), nyquist)
+    even[:, 0] = 0.0
+    apart = even.T @ even / len(even) + np.diag([1e-9] + [0.0] * (terms - 1))
+    common[0] = 0.0
+    each = [_penalised(basis, weight, observed, a * apart + SMOOTHNESS[smooth] * bend, common) for a in ALIKE]
+    best = int(np.argmax([likely for likely, *_ in each]))
+    _, coefficients, own = each[best]
+    drawn = own @ (ALIKE[best] * apart + SMOOTHNESS[smooth] * bend)  # how far each follows the others' shape
+    drawn[:, :, 0] = 0.0
+    return Spectrum(coefficients, own + drawn @ spread @ np.swapaxes(drawn, 1, 2), nyquist, lowest)
+
+
+def _penalised(
+    basis: Float[np.ndarray, "freqs terms"],
+    weight: Float[np.ndarray, " freqs"],
+    observed: Float[np.ndarray, "freqs nv"],
+    prior: Float[np.ndarray, "terms terms"],
+    mean: Float[np.ndarray, "terms nv"] | None = None,
+) -> tuple[float, Float[np.ndarray, "terms nv"], Float[np.ndarray, "nv terms terms"]]:
+    """Log marginal likelihood of a prior's precision (all joints together), the coefficients and their covariance."""
+    mean = np.zeros((basis.shape[1], observed.shape[1])) if mean is None else mean
+    inverse = np.linalg.inv(basis.T @ (weight[:, None] * basis) + prior)
+    coefficients = mean.copy()
+    coefficients[0] += np.log(np.average(observed / np.exp(basis @ mean), axis=0, weights=weight))
     for _ in range(30):
         ratio = np.minimum(observed / np.exp(basis @ coefficients), 20.0)
-        coefficients += inverse @ (basis.T @ (weight[:, None] * (ratio - 1)))
-    covariance = np.broadcast_to(inverse, (power.shape[1], *inverse.shape))
-    return Spectrum(coefficients, covariance, nyquist, lowest)
+        slope = basis.T @ (weight[:, None] * (ratio - 1)) - prior @ (coefficients - mean)
+        coefficients = coefficients + inverse @ slope
+    fitted, off = basis @ coefficients, coefficients - mean
+    likely = -weight @ (fitted + observed / np.exp(fitted)).sum(1) - (off * (prior @ off)).sum() / 2
+    likely += observed.shape[1] * (np.linalg.slogdet(prior)[1] + np.linalg.slogdet(inverse)[1]) / 2
+    return float(likely), coefficients, np.broadcast_to(inverse, (observed.shape[1], *inverse.shape))
 
 
 def white(variance: Float[np.ndarray, " nv"], nyquist: float) -> Spectrum:
@@ -106,10 +162,8 @@ def whitening(
 
 
 def leverage(basis: Float[np.ndarray, "samples nv columns"]) -> Float[np.ndarray, "freqs nv"]:
-    """Share of white noise that a projection on orthonormal `basis` takes away at each frequency and joint."""
-    count = basis.shape[0]
-    power = np.abs(np.fft.rfft(basis, axis=0)[1:]) ** 2
-    return power.sum(-1) / count * 2 / 2
+    """Share of white noise that a projection on orthonormal `basis` takes away at each frequency, from 0, and joint."""
+    return (np.abs(np.fft.rfft(basis, axis=0)) ** 2).sum(-1) / basis.shape[0]
 
 
 def spectral_line(
@@ -135,8 +189,13 @@ def spectral_line(
 
 
 def _basis(frequency: Shaped[np.ndarray, " freqs"], nyquist: float) -> Float[np.ndarray, "freqs terms"]:
-    span = np.log(nyquist / LOWEST)
-    x = np.clip(2 * np.log(np.maximum(frequency, LOWEST) / LOWEST) / span - 1, -1, 1)
-    polynomials = legendre.legvander(x, 5)[:, 2:]
-    start = legendre.legvander(np.array([-1.0]), 5)[:, 2:]
-    return np.column_stack([np.ones_like(x), np.log(frequency + 0.05), polynomials - start])
+    x = 2 * np.log(np.maximum(frequency, LOWEST) / LOWEST) / np.log(nyquist / LOWEST) - 1
+    x = np.clip(x, -1, 1)
+    bent = [p(x) - p(-1) - p.deriv()(-1) * (x + 1) for p in _POLYNOMIALS]
+    return np.column_stack([np.ones_like(x), np.log(frequency + 0.05), *bent])
+
+
+def _bending() -> Float[np.ndarray, "polynomials polynomials"]:
+    """Integrals from -1 to 1 of the products of the polynomials' second derivatives."""
+    whole = [[(p.deriv(2) * q.deriv(2)).integ() for q in _POLYNOMIALS] for p in _POLYNOMIALS]
+    return np.array([[float(w(1) - w(-1)) for w in row] for row in whole])

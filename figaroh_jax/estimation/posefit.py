@@ -28,7 +28,7 @@ from ..recordings.devices import Device
 from ..rigid import lie
 from ..rigid.chain import Chain, chain_pose, joint_response
 from ..rigid.model import Leaf
-from .posehost import HostRows, written_out
+from .posehost import HostRows, in_machine_code, written_out
 
 __all__ = [
     "DRAFT",
@@ -41,6 +41,7 @@ __all__ = [
     "group_of",
     "host_parts",
     "linearise",
+    "on_host",
     "parts_of",
     "predict",
     "rows_of",
@@ -199,6 +200,7 @@ def _blocks_rows(chain: Chain, device: Device, own: Array, *blocks: Any) -> tupl
 
 
 DRAFT = 256  # postures; for fewer the compiler takes longer to optimise than that saves later
+MANY = 16384  # postures of a group whose rows, in machine code, are held all at once
 
 _rows_quick = program(_blocks_rows, cpu=DRAFT_OPTIONS, kept=True)
 _rows_fast = program(_blocks_rows, kept=True)
@@ -210,7 +212,7 @@ def _tied(device: Device, own: Array) -> tuple[Array, Array]:
 
 
 def host_parts(problem: Problem) -> tuple[Part | HostRows, ...]:
-    """For `linearise`: groups of few postures, measured by a device that has one, in a form that compiles nothing.
+    """For `linearise`: groups whose device has one in a form that compiles no program, where they are not too many.
 
     Those of the last problem are kept: it is solved with other weights, folds and columns.
     """
@@ -239,8 +241,16 @@ def _pieces(group: Group) -> list[tuple[int, int, Float[np.ndarray, "6 samples"]
 
 
 def _by_hand(group: Group) -> bool:
-    few = np.shape(group.position)[1] <= DRAFT and jax.default_backend() == "cpu"
-    return few and written_out(group.device) and not traced(group)
+    if not written_out(group.device) or jax.default_backend() != "cpu" or traced(group):
+        return False
+    postures = np.shape(group.position)[1]
+    return postures <= DRAFT or (postures <= MANY and in_machine_code(group.chain))
+
+
+def on_host(problem: Problem) -> bool:
+    """Whether a solve's algebra is best done by NumPy: the rows are few, or made on the host."""
+    few = max(np.shape(group.position)[1] for group in problem.groups) <= DRAFT and jax.default_backend() == "cpu"
+    return few or all(_by_hand(group) for group in problem.groups)
 
 
 def linearise(
@@ -274,9 +284,9 @@ def linearise(
             jacobians.append(np.zeros((len(tied), len(values))))
             jacobians[-1][:, own] = by_own
         first = own.stop
-    if len(residuals) == 1:
-        return residuals[0], jacobians[0] * scale
-    return np.concatenate(residuals), np.concatenate(jacobians) * scale
+    whole = jacobians[0] if len(jacobians) == 1 else np.concatenate(jacobians)
+    whole *= scale
+    return residuals[0] if len(residuals) == 1 else np.concatenate(residuals), whole
 
 
 def _twists(

@@ -1,21 +1,26 @@
-"""The rows of `posefit` for few postures, in NumPy: nothing to compile, and less time than a program's call takes.
+"""The rows of `posefit` without a program of JAX's: in C (`pose_rows.c`), or for few postures in NumPy.
 
 For devices that measure points or poses (`recordings.devices.Points`, `Poses`), whose derivatives are written out here;
-others, and many postures, take the compiled rows. Samples stand first inside. Formulas: `rigid.chain`, and for the
-derivative of exponentials the left Jacobians of SO(3) and SE(3) (Barfoot, State Estimation for Robotics, 2017, 7.1).
+others, and many postures where there is no C compiler, take the compiled rows. Samples stand first inside. Formulas:
+`rigid.chain`, and for the derivative of exponentials the left Jacobians of SO(3) and SE(3) (Barfoot, State Estimation
+for Robotics, 2017, 7.1).
 """
 
 from __future__ import annotations
 
+import ctypes
+from functools import lru_cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from ..compiled.machine_code import library
 from ..recordings.devices import Points, Poses
 from ..rigid.chain import Chain
 
-__all__ = ["HostRows", "written_out"]
+__all__ = ["HostRows", "in_machine_code", "written_out"]
 
 _SMALL = 1e-4  # rad^2; below it the series is exact to rounding, and the quotients lose digits
 _EYE = np.eye(3)
@@ -24,6 +29,34 @@ _EYE = np.eye(3)
 def written_out(device: Any) -> bool:
     """Whether rows of the device have a form in NumPy."""
     return type(device) is Points or (type(device) is Poses and device.axes != "twist")
+
+
+_MOST_JOINTS = 64  # of the code in C
+_LONGS = ("samples", "joints", "moving", "poses", "body", "free_base", "free_tool", "markers")
+_FIXED = ("start", "base", "origin", "centre", "tool", "arm", "first", "ahead", "beyond", "onward", "slide", "back",
+          "seen", "marker")  # fmt: skip
+_GIVEN = ("twists", "own", "residual", "response", "by_own")
+
+
+class _Given(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_long) for name in _LONGS]
+    _fields_ += [(name, ctypes.c_void_p) for name in (*_FIXED, *_GIVEN)]
+
+
+@lru_cache(maxsize=1)
+def _code() -> Any:
+    """The compiled rows, or None."""
+    found = library((Path(__file__).parent / "pose_rows.c").read_text())
+    if found is None:
+        return None
+    function = found["pose_rows"]
+    function.restype, function.argtypes = None, [ctypes.c_void_p]
+    return function
+
+
+def in_machine_code(chain: Chain) -> bool:
+    """Whether there is code in C for the chain: then more postures than a few are taken on the host too."""
+    return len(chain.axis) <= _MOST_JOINTS and _code() is not None
 
 
 class HostRows:
@@ -64,11 +97,47 @@ class HostRows:
         else:
             self.markers = np.asarray(device.markers, float)
             self.seen = datum.reshape(self.samples, len(self.markers), 3)
+        self.code = _code() if in_machine_code(chain) else None
+        if self.code is not None:
+            self._hand_over()
 
     def rows(
         self, twists: Float[np.ndarray, "n 6 #samples"], own: Float[np.ndarray, " k"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rows (rows, samples), their derivatives by twists of joints (6n, rows, samples) and by `own` (k, ...)."""
+        return self._plain(twists, own) if self.code is None else self._coded(twists, own)
+
+    def _hand_over(self) -> None:
+        """What stays from call to call, as the code in C takes it."""
+        ahead = self.placement[0] if len(self.placement) else self.last
+        none, poses = np.zeros(0), self.poses
+        fixed = {
+            "start": self.first[:3, :3] @ ahead[:3, :3], "base": self.base[:3, :3], "origin": self.base[:3, 3],
+            "tool": self.tool[:3, :3] if poses else none, "arm": self.tool[:3, 3] if poses else none,
+            "centre": self.centre, "first": self.first[:3, 3], "ahead": self.ahead, "beyond": self.beyond,
+            "onward": self.onward, "back": self.back if poses else none, "seen": self.seen,
+            "marker": none if poses else self.markers,
+        }  # fmt: skip
+        fixed |= {} if self.slide is None else {"slide": self.slide}
+        self.fixed = {name: np.ascontiguousarray(x, float) for name, x in fixed.items()}
+        markers, body = (0, self.body) if poses else (len(self.markers), False)
+        longs = self.samples, len(self.turn), False, poses, body, self.free_base, self.free_tool, markers
+        self.given = _Given(*(int(x) for x in longs))
+        for name, x in self.fixed.items():
+            setattr(self.given, name, x.ctypes.data)
+
+    def _coded(self, twists: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        assert self.code is not None
+        count = 6 if self.poses else 3 * len(self.markers)
+        rows = np.empty((1 + 6 * len(self.turn) + self.unknowns, count, self.samples))
+        twists, own = np.ascontiguousarray(twists, float), np.ascontiguousarray(own, float)
+        given, first, one = self.given, rows.ctypes.data, 8 * count * self.samples
+        given.moving, given.twists, given.own = int(twists.shape[2] > 1), twists.ctypes.data, own.ctypes.data
+        given.residual, given.response, given.by_own = first, first + one, first + (1 + 6 * len(self.turn)) * one
+        self.code(ctypes.byref(given))
+        return rows[0], rows[1 : 1 + 6 * len(self.turn)], rows[1 + 6 * len(self.turn) :]
+
+    def _plain(self, twists: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         twists = np.moveaxis(twists, -1, 1)
         placed = own[: 6 * (self.free_base + (self.free_tool and self.poses))].reshape(-1, 6)
         turns = np.concatenate([twists[..., 3:].reshape(-1, 3), placed[:, 3:]])

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from ..compiled.batching import program
-from .posefit import DRAFT, Part, Problem, block_rows, host_parts, linearise, parts_of, ties
+from .posefit import Part, Problem, block_rows, host_parts, linearise, on_host, parts_of, ties
 
 __all__ = [
     "NormalEquations",
@@ -83,8 +83,7 @@ def solve(
     """
     weights, precision, free = (np.asarray(x, float) for x in (row_weights, precision, free))
     start = np.asarray(start, float) * free
-    few = max(np.shape(group.position)[1] for group in problem.groups) <= DRAFT
-    if few and jax.default_backend() == "cpu":  # on the host, by the rows that `linearise` takes too
+    if on_host(problem):  # by the rows that `linearise` takes too
         given = problem, host_parts(problem), weights, precision, free
         normal_at, found = partial(_normal_on_host, *given), beginning(start)
         while _going(found, max_steps):

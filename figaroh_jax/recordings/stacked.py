@@ -57,6 +57,8 @@ class Records(eqx.Module):
     carried: Float[Leaf, "n links 10"] | None = None  # known bodies on the links, at and in their joint frames
     spans: tuple[Span, ...] = eqx.field(static=True, default=())  # of the recordings in their order
 
+    __getattribute__ = object.__getattribute__  # methods as Python has them: equinox makes a module of each
+
     @property
     def joins(self) -> tuple[tuple[int, int], ...]:
         """Slot and sample of every recording that stands behind another one."""

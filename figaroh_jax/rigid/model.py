@@ -129,6 +129,8 @@ class RobotModel(eqx.Module):
     frames: tuple[Frame, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True)
 
+    __getattribute__ = object.__getattribute__  # methods as Python has them: equinox makes a module of each
+
     @property
     def nv(self) -> int:
         """Number of coordinates (columns of v, a, tau)."""

@@ -308,12 +308,15 @@ def _sums_of_rows(
     start: tuple[Array, ...],
     *arrays: Float[Array, "samples _"],
 ) -> tuple[Array, ...]:
-    form = _row_form(arrays[4].shape[1] // model.nv, kept)
+    # XLA would copy the rows of several coordinates, the samples last, before it multiplies them in pieces
+    piece = 0 if kept is None else min(TOGETHER, chunk & -chunk)
+    form = _row_form(arrays[4].shape[1] // model.nv, kept, piece)
     chunks = [x.reshape(-1, chunk, x.shape[1]) for x in arrays]
 
     def step(total: tuple[Array, ...], arrays: list[Array]) -> tuple[tuple[Array, ...], None]:
         rows = straight_answers(form, model, *arrays, codes=codes)
-        return tuple(x + row_products(one) for x, one in zip(total, rows, strict=True)), None
+        products = piece_products if piece else row_products
+        return tuple(x + products(one) for x, one in zip(total, rows, strict=True)), None
 
     return jax.lax.scan(step, start, chunks)[0] if len(arrays[0]) else start
 
@@ -322,12 +325,12 @@ _program_of_sums = jax.jit(_sums_of_rows, static_argnums=(0, 1, 2))
 
 
 @lru_cache(maxsize=16)
-def _row_form(side: int, kept: Kept | None) -> Straight:
-    return weighted_rows(side, kept, partial(_plain_rows, side, kept))
+def _row_form(side: int, kept: Kept | None, piece: int = 0) -> Straight:
+    return weighted_rows(side, kept, partial(_plain_rows, side, kept, piece), piece)
 
 
 def _plain_rows(
-    side: int, kept: Kept | None, model: RobotModel, q: Any, v: Any, a: Any, root: Any, given: Any
+    side: int, kept: Kept | None, piece: int, model: RobotModel, q: Any, v: Any, a: Any, root: Any, given: Any
 ) -> list[Array]:
     blocks, samples = jnp.concatenate(coordinate_rows(model, q.T, v.T, a.T), axis=1).reshape(-1, len(q)), len(q)
     order = coordinate_blocks(model)[0]
@@ -337,7 +340,13 @@ def _plain_rows(
         own = ((k, order[k, 1]) for k in np.flatnonzero(order[:, 0] == row).tolist())
         index = [10 * k + c for k, link in own for c in (range(10) if kept is None else kept[link])]
         parts.append(jnp.concatenate([blocks[np.array(index, int)], beside[row]]))
-    return [jnp.stack([parts[row] * root[:, row] for row in group]) for group in row_groups(model, kept)]
+    groups = [jnp.stack([parts[row] * root[:, row] for row in group]) for group in row_groups(model, kept)]
+    return [jnp.moveaxis(x.reshape(*x.shape[:2], -1, piece), 2, 1) for x in groups] if piece else groups
+
+
+def piece_products(rows: Float[Array, "c pieces k samples"]) -> Float[Array, "c k k"]:
+    """rows rows', for each c."""
+    return jnp.einsum("cpks,cpls->cpkl", rows, rows, precision=jax.lax.Precision.HIGHEST).sum(1)
 
 
 def row_products(rows: Float[Array, "c k samples"]) -> Float[Array, "c k k"]:

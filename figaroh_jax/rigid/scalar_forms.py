@@ -185,21 +185,25 @@ def _row_lengths(side: int, kept: Kept | None, model: RobotModel) -> list[tuple[
     return [(len(group), columns + side) for group, columns in zip(rows, width, strict=True)]
 
 
-def weighted_rows(side: int, kept: Kept | None, plain: Callable[..., list[Array]]) -> Straight:
+def weighted_rows(side: int, kept: Kept | None, plain: Callable[..., list[Array]], piece: int = 0) -> Straight:
     """Rows (coordinates, columns, samples) of each of `row_groups`: of the links moved, then `side` given ones.
+
+    In pieces of so many samples they are (coordinates, pieces, columns, samples), which are multiplied as they stand;
+    what `plain` gives is so too.
 
     The arrays are q, v, a, the roots of the weights (samples, nv) and the given columns (samples, nv * side). Of the
     columns of each link those are written that are `kept`, all ten where this is not told.
     """
-    name = f"rows beside {side}" + ("" if kept is None else f" of {kept}")
+    name = f"rows beside {side}" + ("" if kept is None else f" of {kept}") + (f" in {piece}" if piece else "")
     form = _Form(name, partial(_weighted_rows, side, kept), partial(_row_lengths, side, kept), last=True)
 
     def read(model: RobotModel) -> list[list[tuple[int, int]]]:
         given = ([(4, row * side + n) for n in range(side)] for row in range(model.nv))
         return [*columns(model), *([(3, row)] for row in range(model.nv)), *(one for one in given if one)]
 
-    whole = straight(form, plain)._replace(plain=plain, columns=read)
-    return whole._replace(looped=partial(_looped_weighted_rows, side)) if kept is None else whole
+    whole = straight(form, plain)._replace(plain=plain, columns=read, piece=piece)
+    looping = kept is None and not piece
+    return whole._replace(looped=partial(_looped_weighted_rows, side)) if looping else whole
 
 
 def looped(model: RobotModel) -> bool:
