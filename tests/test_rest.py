@@ -71,6 +71,7 @@ RIGHT = Standing(
         ({"physical": False}, "physically impossible"),
         ({"beside_rest": False}, "named only where nothing else"),
         ({"whole": True, "gain": 0.05}, ""),
+        ({"whole": True, "gain": 0.05, "massless": True}, "mass is not surely"),
         ({"whole": True, "gain": 0.05, "beside_smooth": 0.0}, "smooth functions"),
     ],
 )

@@ -34,6 +34,7 @@ from .thresholds import (
     BESIDE_SMOOTH,
     GAIN_NAMED,
     GAIN_NAMED_ROBOT,
+    MASS,
     MODULATION,
     MODULATION_HELD_OUT,
     SHARE_NAMED,
@@ -58,6 +59,7 @@ class Standing:
     modulation_held_out: float = 0.0
     beside_smooth: float = 1.0  # gain of a cause of the whole robot beside smooth functions, or in their place
     inertia_alone: bool = False  # a coupling of inertia, without friction of its own
+    massless: bool = False  # a body whose mass is not surely there
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
 
 
@@ -100,6 +102,7 @@ def reason_against(
                 not one.inertia_alone,
                 "a coupling without friction of its own cannot be distinguished from rotor or link inertia",
             ),
+            (not one.massless, "its mass is not surely above zero: a link other than believed explains as much"),
         ]
     return next((reason for passed, reason in checks if not passed), "")
 
@@ -136,6 +139,7 @@ def standings(
                 modulation_held_out=modulation[1],
                 beside_smooth=_beside_smooth(grown, bare, effect, place, one.joints) if whole else 1.0,
                 inertia_alone=coupled and _inertia_alone(effect, joint.fitted, at),
+                massless=effect.body and _deviations(effect, joint.fitted, at)["mass"] < MASS,
             )
         )
     return out
