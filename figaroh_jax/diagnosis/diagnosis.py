@@ -46,7 +46,7 @@ from .search import Found, Search, eliminate, find_causes
 from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import Step, stand, with_causes
-from .thresholds import CERTAIN, FEW_CAUSES, NO_REST, STANDSTILL, WEIGHT_ROUNDS
+from .thresholds import ALPHA_OF_A_NAME, FEW_CAUSES, NO_REST, STANDSTILL, WEIGHT_ROUNDS
 from .weights import relative_speed, weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def diagnose(
         signals, slowed, begun = _signals(backend, recordings, preprocess, known, trust)
         here = _setting(*begun, forbid, progress)
         generator = np.random.default_rng(seed)
-        searched = _searched(here, forbid, CERTAIN * alpha, tolerance, progress, generator)
+        searched = _searched(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
         judged = _judged(searched, [s.name for s in signals], forbid, tolerance)
         progress("measuring the gain", 0.9)
         return replace(_answer(searched.here, signals, searched.search, judged), slowed=slowed)

@@ -16,7 +16,7 @@ from .joint import Joint, polished
 from .problem import Problem
 from .search import Found, stood_without
 from .state import State
-from .thresholds import BY_CHANCE, CERTAINLY, KEPT_OF_CLAIM, RISES, SURELY
+from .thresholds import BY_CHANCE, BY_CHANCE_BESIDE, BY_CHANCE_UNSHOWN, KEPT_OF_CLAIM, RISES
 
 __all__ = ["Fall", "Gaining", "beside_all", "fall", "without_losses"]
 
@@ -55,14 +55,19 @@ class Fall(NamedTuple):
     def surely(self, claim: float) -> bool:
         """The same of a cause that shows beside what has no name alone; `claim` is the share that it takes in slices of
         the recordings that are fitted."""
-        return self.chance < SURELY and self.own >= KEPT_OF_CLAIM * claim and self.each > 0 and self.worse > RISES
+        return (
+            self.chance < BY_CHANCE_BESIDE
+            and self.own >= KEPT_OF_CLAIM * claim
+            and self.each > 0
+            and self.worse > RISES
+        )
 
     def certainly(self, claim: float) -> bool:
         """Whether the joints where it acts show the cause beyond doubt.
 
         Where few blocks have most of what it takes, slices cannot tell it from chance: a recording of its own can.
         """
-        return self.chance < CERTAINLY and self.own >= KEPT_OF_CLAIM * claim
+        return self.chance < BY_CHANCE_UNSHOWN and self.own >= KEPT_OF_CLAIM * claim
 
 
 def fall(before: Held, after: Held, joints: Sequence[int]) -> Fall:

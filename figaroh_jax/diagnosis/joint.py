@@ -19,11 +19,11 @@ from .problem import Problem, family_of
 from .search import Found
 from .state import State, assembled, solved
 from .step import Step, stand
+from .thresholds import SIZE_REGION
 
 __all__ = ["Joint", "has_size", "joint_fit", "moved", "opened", "polished", "sized", "with_misfit"]
 
 KEPT = 1e-12
-SURE = 0.95  # of the region of a cause's amplitudes that must not hold zero
 AS_SURE = 2.0  # times the deviation of a fit up to which another one counts in full
 LATE = 4  # turns: most fits have settled by then
 BACK = 0.5  # of its last move: what a shape goes back by where steps overshoot
@@ -226,4 +226,4 @@ def has_size(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
     at = np.array(place)[own]
     value = np.array([float(getattr(effect, names[k])) for k in own])
     covariance = fitted.covariance[np.ix_(at, at)]
-    return bool(value @ np.linalg.pinv(covariance, hermitian=True) @ value > chdtri(len(own), 1 - SURE))
+    return bool(value @ np.linalg.pinv(covariance, hermitian=True) @ value > chdtri(len(own), 1 - SIZE_REGION))

@@ -24,7 +24,7 @@ from .problem import Problem
 from .screening import DRAWS, Null, Screen, Shown, catalogue, family_p, place_p, screen
 from .state import State, solved, with_width
 from .step import Step, stand, with_cause, with_causes
-from .thresholds import AGAIN, CONFIDENT, GAIN, MOST_CAUSES, MUCH, OTHER, SMALLEST
+from .thresholds import GAIN, MOST_CAUSES, OVERLAP_ELSEWHERE, SHARE_AGAIN, SHARE_ALIKE, SMALLEST, T_BETTER
 
 __all__ = ["Found", "Search", "eliminate", "find_causes", "judged_without", "stood_without"]
 
@@ -162,7 +162,7 @@ def _contenders(
     ready, squares, out = for_refit(problem, step, base, whitening), (step.verdicts.error**2).sum(1), []
     for group, order, score in shortlist(step, screened):
         share = score / squares[list(acting(group.effect, len(squares), group.columns.joints))].sum()
-        if share <= AGAIN * failed.get(group.name, 0.0):
+        if share <= SHARE_AGAIN * failed.get(group.name, 0.0):
             continue
         one = contend(problem, step, whitening, base, ready, group, order, fitted)
         if exists(problem, one.effect):
@@ -194,7 +194,7 @@ def _apart(step: Step, one: Contender, other: Contender) -> bool:
     """Whether a cause acts at other joints than another one and changes another part of the residual."""
     local = one.effect.acts_on in ("joint", "pair") and kind(one.effect) == "columns"
     elsewhere = local and not set(one.joints) & set(other.joints)
-    return elsewhere and abs(overlap(step.verdicts, one.verdicts, other.verdicts)) < OTHER
+    return elsewhere and abs(overlap(step.verdicts, one.verdicts, other.verdicts)) < OVERLAP_ELSEWHERE
 
 
 def _best(problem: Problem, step: Step, contenders: list[Contender], before: list[Found]) -> Contender | None:
@@ -233,7 +233,7 @@ def _found(
         confidence=float(wins[0]) * (1 - p),
         ambiguous=ambiguous(step, best, alike, screened),
         joints=best.joints,
-        alike=tuple(c.name for c in alike if step.verdicts.cost - c.verdicts.cost > MUCH * drop),
+        alike=tuple(c.name for c in alike if step.verdicts.cost - c.verdicts.cost > SHARE_ALIKE * drop),
     )
 
 
@@ -245,7 +245,7 @@ def eliminate(problem: Problem, start: State, found: list[Found], whitening: Flo
     for one in list(found[:-1]):
         without = judged_without(problem, start, full, found, one, whitening)
         worse, better = (v.own(full.rows, one.joints) for v in (without, full.verdicts))
-        if 1 - better.sum() / worse.sum() < GAIN or t_value(worse, better) < CONFIDENT:
+        if 1 - better.sum() / worse.sum() < GAIN or t_value(worse, better) < T_BETTER:
             found = [f for f in found if f is not one]
             full = with_causes(problem, start, [f.effect for f in found], whitening)
     return found
