@@ -2,10 +2,10 @@
 
     python benchmarks/paired.py before=/path/a now=/path/b [--rounds 3] [--only calibrate] [--task TASK.yaml]
 
-`diagnose` and `identify` on the TX40, `calibrate` on TALOS ($FIGAROH_JAX_DATA); `--task` is diagnosed in place of the
-TX40 (`parity.py make` writes those of the public sets). In each round every version runs cold (no program kept) and
-warm, one after the other, the first one alternating. Printed are medians, and the ratio of the second version to the
-first as median of the rounds, with the smallest and the largest.
+`diagnose` and `identify` on the TX40, `calibrate` on TALOS ($FIGAROH_JAX_DATA); `--task` takes the place of these, for
+the commands that `--only` names, or for `diagnose` (`parity.py make` writes those of the public sets). In each round
+every version runs cold (no program kept) and warm, one after the other, the first one alternating. Printed are medians,
+and the ratio of the second version to the first as median of the rounds, with the smallest and the largest.
 """
 
 from __future__ import annotations
@@ -64,13 +64,14 @@ def main() -> None:
     parser.add_argument("sides", nargs=2, metavar="NAME=FOLDER")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--only", nargs="+", choices=COMMANDS, default=list(COMMANDS))
-    parser.add_argument("--task", type=Path, help="a task to diagnose in place of the TX40's")
+    parser.add_argument("--task", type=Path, help="a task in place of these")
     args = parser.parse_args()
     sides = [one.split("=", 1) for one in args.sides]
     with tempfile.TemporaryDirectory() as scratch:
         files = tasks(Path(scratch))
         if args.task:
-            files["diagnose"] = args.task.resolve()
+            named = args.only if len(args.only) < len(COMMANDS) else ["diagnose"]
+            files |= dict.fromkeys(named, args.task.resolve())
         for command in args.only:
             found: dict[tuple[str, str], list[tuple[float, float]]] = {}
             for k in range(args.rounds):

@@ -30,8 +30,10 @@ if TYPE_CHECKING:
         columns as columns,
         fleets as fleets,
         least_squares as least_squares,
+        markers as markers,
         regression as regression,
         states as states,
+        units as units,
     )
     from .estimation.blockwise import BlockLevenbergMarquardt as BlockLevenbergMarquardt
     from .estimation.data import (
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
     )
     from .estimation.fit import fit as fit
     from .estimation.linear import (
+        LinearFit as LinearFit,
         fit_linear as fit_linear,
         linear_basis as linear_basis,
         linear_limits as linear_limits,
@@ -69,10 +72,12 @@ if TYPE_CHECKING:
     from .formats.mjcf import load_mjcf as load_mjcf
     from .formats.robotfile import load_extended as load_extended, load_robot as load_robot
     from .formats.urdf import load_urdf as load_urdf
+    from .formats.usd import load_usd as load_usd
     from .identification import (
         acceleration_free as acceleration_free,
         instruments as instruments,
         payloads as payloads,
+        people as people,
         wrenches as wrenches,
     )
     from .identification.identification import identify as identify

@@ -83,16 +83,6 @@ def test_a_candidate_inside_the_model_scores_nothing() -> None:
     linear, stock = fit(rows, flat), bank(rows, [inside])
     (found,) = evidence.scores(linear, stock, evidence.projection(linear, stock))
     assert found.rank[0] == 0
-    np.testing.assert_allclose(evidence.absorbed(rows, linear, inside), 1.0, rtol=0, atol=1e-9)
-
-
-def test_nothing_of_a_column_orthogonal_to_the_model_is_absorbed() -> None:
-    rows = random_rows()
-    tall = rows.X.reshape(-1, WIDTH)
-    free = np.random.default_rng(2).normal(size=len(tall))
-    free -= tall @ np.linalg.lstsq(tall, free, rcond=None)[0]
-    columns = Columns((0, 1), free.reshape(1, 1, NV, COUNT))
-    np.testing.assert_allclose(evidence.absorbed(rows, fit(rows, PRIOR), columns), 0.0, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("k", [1, 3])

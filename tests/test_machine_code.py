@@ -9,6 +9,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -22,7 +24,7 @@ from figaroh_jax.compiled.kernels import Straight
 from figaroh_jax.rigid import normal_equations
 from figaroh_jax.rigid.model import RobotModel
 from figaroh_jax.rigid.regressor import dense_rows
-from figaroh_jax.rigid.regressor_gradient import regressor_pullback
+from figaroh_jax.rigid.regressor_gradient import pullback_rows
 from figaroh_jax.rigid.scalar_forms import COLUMNS, straight
 
 pytestmark = pytest.mark.skipif(code._compiler() is None, reason="needs a C compiler")
@@ -111,7 +113,9 @@ def test_the_reverse_of_a_program_is_the_closed_gradient_of_its_rows(always: Non
     agree(np.moveaxis(rows, -1, 0).swapaxes(1, 2), fj.joint_torque_regressor(model, *arrays))
     cotangent = np.random.default_rng(0).normal(size=rows.shape)
     q, v, a = (x.T for x in arrays)
-    closed = regressor_pullback(model, q, v, a, cotangent.swapaxes(0, 1))
+    with jax.enable_x64(True):
+        given = (jax.numpy.asarray(x) for x in (q, v, a, cotangent.swapaxes(0, 1)))
+        closed = np.asarray(eqx.filter_jit(pullback_rows)(model, *given))
     agree(back(cotangent, *arrays).reshape(closed.shape), closed)
     few = back(np.ascontiguousarray(cotangent[..., : code.FEWEST]), *(x[: code.FEWEST] for x in arrays))
     agree(few.reshape(3, model.nv, -1), closed[..., : code.FEWEST])

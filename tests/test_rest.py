@@ -54,7 +54,9 @@ def test_verdicts_follow_causes_and_rest() -> None:
     assert verdict(True, True) == "named+rest"
 
 
-RIGHT = Standing(Name("torque_ripple", ("elbow",)), whole=False, physical=True, gain=0.4, t=4.0, share=0.1)
+RIGHT = Standing(
+    Name("torque_ripple", ("elbow",)), whole=False, physical=True, gain=0.4, t=4.0, t_needed=2.4, share=0.1
+)
 
 
 @pytest.mark.parametrize(
@@ -69,12 +71,22 @@ RIGHT = Standing(Name("torque_ripple", ("elbow",)), whole=False, physical=True, 
         ({"physical": False}, "physically impossible"),
         ({"beside_rest": False}, "named only where nothing else"),
         ({"whole": True, "gain": 0.05}, ""),
+        ({"whole": True, "gain": 0.05, "massless": True}, "mass is not surely"),
         ({"whole": True, "gain": 0.05, "beside_smooth": 0.0}, "smooth functions"),
     ],
 )
 def test_beside_a_rest_a_cause_is_named_by_what_it_alone_explains(changes: dict[str, float], word: str) -> None:
     reason = reason_against(replace(RIGHT, **changes), True, 0.01)
     assert word in reason and bool(word) == bool(reason)
+
+
+@pytest.mark.parametrize(("changes", "named"), [({"t": 1.5}, True), ({"t": 1.5, "gain": 0.1}, False)])
+def test_recordings_kept_out_may_show_what_few_blocks_of_the_others_cannot(
+    changes: dict[str, float], named: bool
+) -> None:
+    one = replace(RIGHT, **changes)
+    assert reason_against(one, True, 0.01)
+    assert bool(reason_against(one, True, 0.01, lambda name: True)) is not named
 
 
 @pytest.mark.parametrize(

@@ -126,7 +126,7 @@ def test_derivatives_of_an_arm_are_those_of_differences(tmp_path: Path, law: str
 def test_derivatives_with_coloured_noise_are_those_of_differences(tmp_path: Path):
     loop, run = arm(tmp_path)
     pole = np.array([0.6, 0.0, 0.3, 0.9, 0.5, 0.1])
-    data = windows(loop, [run], [Stretch(0, 100, 60), Stretch(0, 300, 60)], [np.full(6, 2e-4)], 0.3, pole=pole)
+    data = windows(loop, [run], [Stretch(0, 120, 60), Stretch(0, 320, 60)], [np.full(6, 2e-4)], 0.3, pole=pole)
     table = (Entry("friction", (1,)), Entry("reading", (3,)), Entry("delay", (2,)))
     checked(loop, table, np.array([0.3, 0.01, 0.0043]), data, np.asarray(data.start))
 

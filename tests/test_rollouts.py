@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -148,8 +149,6 @@ def test_gradients_are_those_of_finite_differences(tmp_path: Path):
     command = waves(150, 0.002, 3, 0.5, seed=4) + 0.3
 
     def loss(values: jax.Array) -> jax.Array:
-        import equinox as eqx
-
         changed = eqx.tree_at(
             lambda m: (m.joints.friction, m.joints.damping, m.joints.armature, m.drives.scale, m.robot.inertia, m.drives.delay),
             loop,
@@ -190,3 +189,19 @@ def test_a_command_of_another_shape_and_a_loop_that_diverges_are_told(tmp_path: 
         rollout(loop, np.zeros((5, 2)), np.zeros(1))
     with pytest.raises(InputError, match="diverges at joint j0"):
         rollout(loop, np.ones((2000, 1)), np.zeros(1))
+
+
+def test_friction_that_follows_the_load_holds_a_weight_within_its_law(tmp_path: Path):
+    """Load w, drive m, friction up to r |m + w| (m against w): it holds for (1 - r) / (1 + r) < m / w < its inverse."""
+    inertial = '<inertial pos="0.3 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>'
+    text = (
+        f'<mujoco>{OPTION.format(dt=0.002, integrator="Euler")}<worldbody><body><joint name="j" axis="0 -1 0"/>{inertial}'
+        '</body></worldbody><actuator><motor name="u" joint="j"/></actuator></mujoco>'
+    )
+    loop, _ = load_loop(written(tmp_path, text), law="hard")
+    loop = eqx.tree_at(lambda m: m.joints.load_ratio, loop, np.array([0.2]))
+    weight = 0.3 * 9.81
+    for share, holds in ((0.68, True), (0.65, False), (1.0, True), (1.48, True), (1.52, False)):
+        moved = np.abs(np.asarray(rollout(loop, np.full((200, 1), share * weight), np.zeros(1)).reading)).max()
+        assert (moved < 1e-6) == holds, (share, moved)
+        assert holds or moved > 1e-2

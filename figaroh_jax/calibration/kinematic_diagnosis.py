@@ -198,7 +198,7 @@ def _needed(
             loss = _left_out_squares(linear, noise, used, held) - free
             worth.append(loss.mean() / (loss.std(ddof=1) / np.sqrt(len(loss)) + 1e-300))
         least = int(np.argmin(worth))
-        if worth[least] > thresholds.SURE:
+        if worth[least] > thresholds.LOSS_SIGMAS:
             break
         width[places[kept.pop(least)]] = _HELD
     return kept

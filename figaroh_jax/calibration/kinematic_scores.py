@@ -133,23 +133,21 @@ def waves_shown(
 ) -> list[int]:
     """The blocks of the largest wave of each joint beside the fit and the columns `beside`, where noise is unlikely.
 
-    A wave by chance is the largest by the postures that it was found in: of the `parts` of the rows as many as must
-    agree on an effect (`thresholds.FOLDS_THAT_CHOOSE`) must have it as their largest, to the resolution of its order.
+    Each of the `parts` of the rows must have it as its largest wave too, to the resolution of its order: an order that
+    is found with rows which are left out later would be judged by them.
     """
     waves = list(waves)
     whole = _spectra(linear, noise, used, precision, waves, free, beside)
-    best = [int(np.argmax(share)) for share, _ in whole]
+    best, count = [int(np.argmax(share)) for share, _ in whole], sum(len(share) for share, _ in whole)
     shown = [
         k
         for k, (share, freedom) in enumerate(whole)
-        if len(share) * (1.0 - min(share[best[k]], 1.0)) ** (0.5 * (freedom - 2)) < thresholds.WAVE
+        if count * (1.0 - min(share[best[k]], 1.0)) ** (0.5 * (freedom - 2)) < thresholds.WAVE
     ]
-    alike = np.zeros(len(shown), int)
     for rows in parts if shown else ():
         found = _spectra(linear, noise, rows, precision, [waves[k] for k in shown], free, beside)
-        alike += [abs(int(np.argmax(share)) - best[k]) <= 2 for k, (share, _) in zip(shown, found, strict=True)]
-    enough = min(thresholds.FOLDS_THAT_CHOOSE, len(parts))
-    return [int(waves[k].blocks[best[k]]) for k, n in zip(shown, alike, strict=True) if n >= enough]
+        shown = [k for k, (share, _) in zip(shown, found, strict=True) if abs(int(np.argmax(share)) - best[k]) <= 2]
+    return [int(waves[k].blocks[best[k]]) for k in shown]
 
 
 def _spectra(

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float
@@ -85,10 +84,13 @@ class Number:
         return Number(-self.x if self.known else lax.neg(self.x))
 
 
+_OF_FLOATS = {lax.add: float.__add__, lax.sub: float.__sub__, lax.mul: float.__mul__}
+
+
 def _binary(operation: Callable[[Any, Any], Any], one: Number, two: Number) -> Number:
     x, y = one.x, two.x
     if one.known and two.known:
-        return Number(float(operation(np.float64(x), np.float64(y))))
+        return Number(_OF_FLOATS[operation](x, y))
     shape, dtype = (jnp.shape(x) or jnp.shape(y)), (y.dtype if one.known else x.dtype)
     x, y = (
         lax.full(shape, z, dtype) if isinstance(z, float) else z if z.shape == shape else lax.broadcast(z, shape)

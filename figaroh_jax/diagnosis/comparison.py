@@ -27,6 +27,7 @@ __all__ = [
     "shares_of_wins",
     "sums_of",
     "told",
+    "t_needed",
     "t_value",
 ]
 
@@ -228,6 +229,13 @@ def t_value(worse: Float[np.ndarray, " blocks"], better: Float[np.ndarray, " blo
     gain = worse - better
     spread = gain.std(ddof=1) / np.sqrt(len(gain))
     return float(gain.mean() / spread) if spread > 0 else 0.0
+
+
+def t_needed(blocks: int, t: float) -> float:
+    """The Student t of so many blocks' differences that chance exceeds as often as it exceeds `t` of very many."""
+    from scipy.special import ndtr, stdtrit  # scipy is slow to import
+
+    return float(stdtrit(max(blocks - 1, 1), ndtr(t)))
 
 
 def overlap(current: Verdicts, one: Verdicts, other: Verdicts) -> float:

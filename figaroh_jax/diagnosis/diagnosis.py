@@ -35,9 +35,9 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .gaining import Gaining, surely_beside_all, without_losses
+from .gaining import Fall, Gaining, beside_all, without_losses
 from .holdout import fold_squares, part_error, residual_rms, traces
-from .joint import Joint, opened, polished, sized
+from .joint import Joint, opened, polished, sized, with_misfit
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import reason_against, standings
 from .problem import Problem
@@ -46,8 +46,8 @@ from .search import Found, Search, chance_beside, eliminate, find_causes
 from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import Step, stand, with_causes
-from .thresholds import CERTAIN, FEW_CAUSES, NO_REST, WEIGHT_ROUNDS
-from .weights import weighted_by_speed, white_where_better, without_reversals
+from .thresholds import ALPHA_OF_A_NAME, FEW_CAUSES, NO_REST, STANDSTILL, WEIGHT_ROUNDS
+from .weights import relative_speed, weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess, Task
@@ -98,7 +98,7 @@ def diagnose(
         signals, slowed, begun = _signals(backend, recordings, preprocess, known, trust)
         here = _setting(*begun, forbid, progress)
         generator = np.random.default_rng(seed)
-        searched = _searched(here, forbid, CERTAIN * alpha, tolerance, progress, generator)
+        searched = _searched(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
         judged = _judged(searched, [s.name for s in signals], forbid, tolerance)
         progress("measuring the gain", 0.9)
         return replace(_answer(searched.here, signals, searched.search, judged), slowed=slowed)
@@ -246,19 +246,28 @@ def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], to
     before, here, _, found, joint, left, line, strict = searched
     problem, whitening = here.problem, here.whitening
     each = standings(problem, here.start, found, joint, whitening)
-    against = {f.name: reason_against(one, strict, tolerance) for f, one in zip(found, each, strict=True)}
+    claims = {one.name: one.gain for one in each}
+
+    @cache
+    def beside(name: Name) -> Fall:
+        one = next(f for f in found if f.name == name)
+        return beside_all(searched.here.problem, searched.here.start, whitening, found, searched.joint, one)
+
+    def borne_out(name: Name) -> bool:
+        return beside(name).surely(claims[name])
+
+    def certain(name: Name) -> bool:
+        return bool(searched.here.problem.held.any()) and beside(name).certainly(claims[name])
+
+    against = {f.name: reason_against(one, strict, tolerance, certain) for f, one in zip(found, each, strict=True)}
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
     here, joint = _as_predicts_best([here] if same else [here, before], named)
-    claims = {one.name: one.gain for one in each}
-
-    def borne_out(name: Name) -> bool:
-        one = next(f for f in found if f.name == name)
-        return surely_beside_all(problem, searched.here.start, whitening, found, searched.joint, one, claims[name])
-
-    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, claims, cache(borne_out))
+    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, borne_out)
     gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
+    if named:
+        gaining = gaining._replace(joint=_as_weighed_otherwise(here, searched.here.problem, joint))
     against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
@@ -301,6 +310,16 @@ def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple
             best = (error, one, joint) if best is None or error < best[0] else best
     assert best is not None
     return best[1:]
+
+
+def _as_weighed_otherwise(here: _Setting, by_speed: Problem, joint: Joint) -> Joint:
+    """The answer's fit with what its intervals owe to the weights of slow rows and to the noise's spectrum."""
+    problem, judged = here.problem, np.asarray(here.problem.records.judged)
+    slow = [judged, np.asarray(by_speed.records.weight), judged * (relative_speed(problem) >= STANDSTILL)]
+    white = np.ones_like(here.whitening) / np.maximum(residual_rms(problem, joint.step.state), 1e-300)
+    own = np.asarray(problem.records.weight)
+    weights = [(w, here.whitening) for w in slow if not np.array_equal(w, own)]
+    return with_misfit(problem, here.start, joint, [*weights, (own, white)])
 
 
 def _left(
@@ -359,7 +378,7 @@ def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judg
         holdout=holdout,
         holdout_scheme=_scheme(signals),
         experiment=next_experiment(judged.word, found, problem, here.start, causes, here.whitening),
-        candidates=explain(seen.rows, seen.linear, search.screened, noise),
+        candidates=explain(seen.rows, seen.linear, search.shown, noise),
         traces=traces(problem, signals, first.state, last.state, joint.causes, named),
         baseline=fitted_model(problem, first.state, []),
         model=fitted_model(problem, last.state, joint.causes),

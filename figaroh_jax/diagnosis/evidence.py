@@ -15,7 +15,6 @@ from .bank import Bank, Columns
 
 __all__ = [
     "Score",
-    "absorbed",
     "block_scores",
     "largest",
     "other_scores",
@@ -120,14 +119,6 @@ def block_scores(
         total[columns] += block_sums(rows, linear.residual[joint], Zi)
     total = total.T - model.T @ H
     return np.concatenate([total, linear.pull[:, None] * H])
-
-
-def absorbed(rows: Rows, linear: Linear, columns: Columns) -> Float[np.ndarray, "grid"]:
-    """Share of the candidate's columns (by power) inside the span of the current model and its prior."""
-    ZX = sum(columns.Z[:, :, i] @ rows.X[j] for i, j in enumerate(columns.joints))
-    power = (columns.Z**2).sum((1, 2, 3))
-    left = np.maximum(power - (ZX @ linear.inverse * ZX).sum((1, 2)), 0)
-    return 1 - left / np.maximum(power, 1e-300)
 
 
 def wilson_hilferty(Q: Float[np.ndarray, " *n"], rank: Int[np.ndarray, " *n"]) -> Float[np.ndarray, " *n"]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
 from ..estimation.rows import Linear, Rows
 from ..results import Candidate
-from .screening import Screen
+from .screening import Shown
 
 __all__ = ["explain"]
 
@@ -15,33 +17,32 @@ VISIBLE = 4.0  # noise sigmas at which an effect is seen
 CUT = 1e-9
 
 
-def explain(rows: Rows, linear: Linear, found: Screen, noise: Float[np.ndarray, " nv"]) -> tuple[Candidate, ...]:
+def explain(
+    rows: Rows, linear: Linear, found: Sequence[Shown], noise: Float[np.ndarray, " nv"]
+) -> tuple[Candidate, ...]:
     """Share outside the current model, smallest torque that would show (N m or N), nearest other effect and angle."""
-    points = [int(np.argmax(result.Q)) for result in found.scores]
-    columns = [_full(rows, g.columns.joints, g.columns.Z[p]) for g, p in zip(found.groups, points, strict=True)]
-    sizes = [c.shape[0] for c in columns]
-    Z = np.concatenate(columns).astype(np.float32 if len(columns) > 400 else np.float64)
+    starts = np.cumsum([0, *(len(one.Z) for one in found)])
+    spans = [slice(a, b) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    Z = _full(rows, found, spans)
     ZX = Z @ rows.X.reshape(Z.shape[1], -1)
     raw = Z @ Z.T
     left = raw - ZX @ linear.inverse @ ZX.T
-    starts = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
-    spans = [slice(a, b) for a, b in zip(starts[:-1], starts[1:], strict=True)]
     angle, near = _angles(left, spans)
     out = []
-    for i, (group, own) in enumerate(zip(found.groups, spans, strict=True)):
+    for i, (one, own) in enumerate(zip(found, spans, strict=True)):
         share = float(np.clip(np.trace(left[own, own]) / max(np.trace(raw[own, own]), 1e-300), 0, 1))
-        count = np.count_nonzero(rows.y[list(group.columns.joints)])
-        level = float(np.mean(noise[list(group.columns.joints)]))
+        count = np.count_nonzero(rows.y[list(one.joints)])
+        level = float(np.mean(noise[list(one.joints)]))
         seen = VISIBLE * level / np.sqrt(max(count * share, 1e-12))
-        score = float(found.scores[i].z[points[i]])
-        out.append(Candidate(group.name, share, seen, found.groups[near[i]].name, float(angle[i]), score))
+        out.append(Candidate(one.name, share, seen, found[near[i]].name, float(angle[i]), one.z))
     return tuple(out)
 
 
-def _full(rows: Rows, joints: tuple[int, ...], Z: Float[np.ndarray, "k rows T"]) -> Float[np.ndarray, "k nvT"]:
-    full = np.zeros((len(Z), *rows.y.shape))
-    full[:, list(joints)] = Z
-    return full.reshape(len(Z), -1)
+def _full(rows: Rows, found: Sequence[Shown], spans: list[slice]) -> Float[np.ndarray, "columns nvT"]:
+    full = np.zeros((spans[-1].stop if spans else 0, *rows.y.shape), np.float32 if len(found) > 400 else np.float64)
+    for one, own in zip(found, spans, strict=True):
+        full[own, list(one.joints)] = one.Z
+    return full.reshape(len(full), rows.y.size)
 
 
 def _angles(

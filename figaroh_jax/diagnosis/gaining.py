@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -11,14 +11,14 @@ from jaxtyping import Float
 
 from ..effects.base import Effect
 from ..results import Gain, Name
-from .holdout import held_squares, weighted_squares
+from .holdout import Held, held_squares, weighted_squares
 from .joint import Joint, polished
 from .problem import Problem
 from .search import Found, stood_without
 from .state import State
-from .thresholds import BY_CHANCE, KEPT_OF_CLAIM, SURELY
+from .thresholds import BY_CHANCE, BY_CHANCE_BESIDE, BY_CHANCE_UNSHOWN, KEPT_OF_CLAIM, RISES
 
-__all__ = ["Fall", "Gaining", "fall", "surely_beside_all", "without_losses"]
+__all__ = ["Fall", "Gaining", "beside_all", "fall", "without_losses"]
 
 EXACT, DRAWS = 12, 4000  # blocks up to which every choice of signs is made; choices beyond
 
@@ -38,31 +38,50 @@ class Fall(NamedTuple):
     """What a cause does to the error on data kept out as it comes in."""
 
     own: float  # share of the squares that goes of the joints where it acts, while they move
-    chance: float  # p-value of that: of the blocks' differences with signs at random
+    chance: float  # p-value of what these data want of it: of the blocks' products with signs at random
     each: float  # sum over the joints of that share
     whole: float  # squares of all rows that go, N m or N, squared
     worse: float  # p-value of their rise
 
-    def gains(self, strict: bool, claim: float = np.inf) -> bool:
-        """Whether the cause predicts better where it acts, and the robot is not predicted worse for it.
+    @property
+    def gains(self) -> bool:
+        """Whether the cause predicts better where it acts, not by chance, and the robot is not predicted worse for it.
 
-        A fall may be chance: it must be sure, or beside a rest (`strict`) a good part of the `claim`, the share that
-        the cause takes in slices of the recordings that are fitted. The squares of the robot are asked joint by joint:
-        those in N m are the large joints', which any change of the fit moves by more than a small joint has.
+        The squares of the robot are asked joint by joint: those in N m are the large joints', which any change of the
+        fit moves by more than a small joint has.
         """
-        kept = self.chance < BY_CHANCE or (strict and self.own >= KEPT_OF_CLAIM * claim)
-        return self.own > 0 and kept and self.each > 0 and self.worse > BY_CHANCE
+        return self.own > 0 and self.chance < BY_CHANCE and self.each > 0 and self.worse > RISES
+
+    def surely(self, claim: float) -> bool:
+        """The same of a cause that shows beside what has no name alone; `claim` is the share that it takes in slices of
+        the recordings that are fitted."""
+        return (
+            self.chance < BY_CHANCE_BESIDE
+            and self.own >= KEPT_OF_CLAIM * claim
+            and self.each > 0
+            and self.worse > RISES
+        )
+
+    def certainly(self, claim: float) -> bool:
+        """Whether the joints where it acts show the cause beyond doubt.
+
+        Where few blocks have most of what it takes, slices cannot tell it from chance: a recording of its own can.
+        """
+        return self.chance < BY_CHANCE_UNSHOWN and self.own >= KEPT_OF_CLAIM * claim
 
 
-def fall(
-    before: Float[np.ndarray, "2 blocks nv"], after: Float[np.ndarray, "2 blocks nv"], joints: Sequence[int]
-) -> Fall:
-    """What becomes of the squares of each block and joint (`held_squares`) for a cause that acts at the `joints`."""
-    places, (rows, moving) = list(joints), before - after
-    drop, had = moving.sum(0), np.maximum(before[1].sum(0), 1e-300)
+def fall(before: Held, after: Held, joints: Sequence[int]) -> Fall:
+    """What becomes of the error of each block and joint for a cause that acts at the `joints`.
+
+    Whether data kept out show a cause is asked of the products of their error without it and of what it takes of that:
+    of a cause that is not there their signs are chance. Half of the squares' fall is that; the other half asks for its
+    size as fitted too, and tells little in few blocks.
+    """
+    places, (rows, moving) = list(joints), before.squares - after.squares
+    drop, had = moving.sum(0), np.maximum(before.squares[1].sum(0), 1e-300)
     return Fall(
         own=float(drop[places].sum() / had[places].sum()),
-        chance=_by_chance(moving[:, places].sum(1)),
+        chance=_by_chance(after.wanted[:, places].sum(1)),
         each=float((drop / had).sum()),
         whole=float(rows.sum()),
         worse=_by_chance(-rows.sum(1)),
@@ -90,7 +109,6 @@ def without_losses(
     named: list[Found],
     joint: Joint,
     strict: bool,
-    claims: Mapping[Name, float],
     borne_out: Callable[[Name], bool] = lambda name: False,
 ) -> Gaining:
     """The causes without those that do not lower the error on the data held out, the worst first (`Fall`).
@@ -106,14 +124,15 @@ def without_losses(
         order, squares, power = _by_gain(problem, start, whitening, joint.causes, [f.name in later for f in named])
         falls = [fall(a, b, named[k].joints) for k, (a, b) in zip(order, pairwise(squares), strict=True)]
         pairs = [(named[k].name, k, one) for k, one in zip(order, falls, strict=True)]
-        passed |= {name for name, _, one in pairs if one.gains(strict, claims[name])}
+        passed |= {name for name, _, one in pairs if one.gains}
         passed |= {name for name, _, one in pairs if name not in passed and strict and one.own > 0 and borne_out(name)}
         failing = [(one.own, k) for name, k, one in pairs if name not in passed or one.own <= 0]
-        if not failing and squares[-1][0].sum() > squares[0][0].sum():
+        if not failing and squares[-1].squares[0].sum() > squares[0].squares[0].sum():
             failing = [(one.whole, k) for _, k, one in pairs]
         if not failing:
-            gains = [_told(a, b, power, named[k], problem) for k, (a, b) in zip(order, pairwise(squares), strict=True)]
-            whole = _relative(squares[0][0], squares[-1][0], power[0])
+            pairs = zip(order, pairwise([one.squares for one in squares]), strict=True)
+            gains = [_told(a, b, power, named[k], problem) for k, (a, b) in pairs]
+            whole = _relative(squares[0].squares[0], squares[-1].squares[0], power[0])
             return Gaining(named, joint, order, gains, whole, worse)
         least = min(failing)[1]
         if named[least].name not in later and len(named) > 1:
@@ -126,24 +145,21 @@ def without_losses(
         joint = polished(problem, start, [f.effect for f in named], whitening)
 
 
-def surely_beside_all(
+def beside_all(
     problem: Problem,
     start: State,
     whitening: Float[np.ndarray, "F nv"],
     found: list[Found],
     joint: Joint,
     one: Found,
-    claim: float,
-) -> bool:
-    """Whether a cause surely lowers the kept-out error of its joints with all else in that was found, named or not.
+) -> Fall:
+    """What a cause does to the kept-out error with all else in that was found, named or not.
 
     What has no name is still there: without it the fit bends, and a cause that is true may seem to predict nothing. The
     squares have the weights of the fit, in which slow rows count little.
     """
     bare = stood_without(problem, start, found, one, whitening)
-    here = fall(weighted_squares(problem, bare), weighted_squares(problem, joint.step), one.joints)
-    sure = here.chance < SURELY and here.own >= KEPT_OF_CLAIM * claim
-    return sure and here.each > 0 and here.worse > BY_CHANCE
+    return fall(*weighted_squares(problem, bare, joint.step), one.joints)
 
 
 def _told(
@@ -174,14 +190,14 @@ def _by_gain(
     whitening: Float[np.ndarray, "F nv"],
     causes: Sequence[Effect],
     later: Sequence[bool],
-) -> tuple[list[int], list[Float[np.ndarray, "2 blocks nv"]], Float[np.ndarray, "2 nv"]]:
+) -> tuple[list[int], list[Held], Float[np.ndarray, "2 nv"]]:
     """The order of what each cause gains on held-out data as it comes in, those that come `later` behind the others.
 
     With the squares of the error in that order, and of the torque.
     """
     order = list(range(len(causes)))
     squares, power = held_squares(problem, start, list(causes), whitening)
-    drops = [float((before - after)[0].sum()) for before, after in pairwise(squares)]
+    drops = [float((before.squares - after.squares)[0].sum()) for before, after in pairwise(squares)]
     ranked = sorted(order, key=lambda k: (later[k], -drops[k]))
     if ranked != order:
         squares, power = held_squares(problem, start, [causes[k] for k in ranked], whitening)

@@ -12,7 +12,7 @@ from .contenders import Contender
 from .problem import Problem
 from .screening import Screen
 from .step import Step
-from .thresholds import CLEARLY, CONFIDENT, GAIN, SAME, UNSURE
+from .thresholds import GAIN, OVERLAP_SAME, T_ALIKE, T_APART, T_BETTER
 
 __all__ = ["ambiguous", "exists", "gains", "passes", "physical_sign", "rivals", "simpler"]
 
@@ -65,7 +65,7 @@ def gains(step: Step, one: Contender) -> bool:
 
 def _predicts_better(step: Step, joints: tuple[int, ...], before: Verdicts, after: Verdicts) -> bool:
     worse, better = (v.own(step.rows, joints) for v in (before, after))
-    gain, surely = 1 - better.sum() / worse.sum(), t_value(worse, better) > CONFIDENT
+    gain, surely = 1 - better.sum() / worse.sum(), t_value(worse, better) > T_BETTER
     return bool(gain > GAIN and surely and after.heldout < before.heldout)
 
 
@@ -92,7 +92,7 @@ def simpler(step: Step, contenders: list[Contender], one: Contender) -> list[Con
 def rivals(step: Step, contenders: list[Contender], one: Contender) -> list[Contender]:
     """The others that explain the same misfit; a cause of another misfit is no alternative to this one."""
     others = [c for c in contenders if c is not one]
-    return [c for c in others if overlap(step.verdicts, one.verdicts, c.verdicts) > SAME]
+    return [c for c in others if overlap(step.verdicts, one.verdicts, c.verdicts) > OVERLAP_SAME]
 
 
 def _member(step: Step, best: Contender, other: Contender) -> bool:
@@ -102,16 +102,16 @@ def _member(step: Step, best: Contender, other: Contender) -> bool:
     """
     worse = t_value(other.verdicts.blocks, best.verdicts.blocks)
     if other.name.effect in type(best.effect).resembles or best.name.effect in type(other.effect).resembles:
-        return worse < CLEARLY
+        return worse < T_APART
     drop = step.verdicts.cost - best.verdicts.cost
     close = other.verdicts.cost - best.verdicts.cost < max(0.1 * drop, 15)
-    return close and worse < UNSURE
+    return close and worse < T_ALIKE
 
 
 def ambiguous(step: Step, best: Contender, rivals: list[Contender], screened: Screen) -> tuple[Name, ...]:
     """What cannot be told from the best: rivals that predict as well, and effects that are the same while moving."""
     names = [c.name for c in rivals if _member(step, best, c)]
-    clearly_worse = {c.name for c in rivals if t_value(c.verdicts.blocks, best.verdicts.blocks) > CLEARLY}
+    clearly_worse = {c.name for c in rivals if t_value(c.verdicts.blocks, best.verdicts.blocks) > T_APART}
     known = {group.name for group in screened.groups}
     same = [Name(effect, best.name.at) for effect in related(best.name.effect, "indistinguishable_from")]
     return (*names, *(n for n in same if n in known and n not in names and n not in clearly_worse))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,6 +23,7 @@ from .step import Step, stand
 from .thresholds import LEAST_MOVING, STANDS
 
 __all__ = [
+    "Held",
     "fold_error",
     "fold_squares",
     "held_squares",
@@ -35,35 +37,54 @@ __all__ = [
 BLOCK, FEWEST = 1.0, 8  # s; blocks of a recording
 
 
+class Held(NamedTuple):
+    """What data not fitted say, block by block and joint by joint, N m or N, squared."""
+
+    squares: Float[np.ndarray, "2 blocks nv"]  # of the error: of all rows, then of those that say how a joint moves
+    wanted: Float[np.ndarray, "blocks nv"]  # error before the last cause times what it takes of it, of those rows
+
+
 def held_squares(
     problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]
-) -> tuple[list[Float[np.ndarray, "2 blocks nv"]], Float[np.ndarray, "2 nv"]]:
+) -> tuple[list[Held], Float[np.ndarray, "2 nv"]]:
     """Squares of each joint's error on data not fitted, block by block, of the baseline, then after each cause; and of
     its torque. First of all rows, then of those in which the joint moves.
 
     Of the filtered torque (N m or N), over the holdout recordings with torque; without any, over parts of the others,
     each predicted by a fit to the rest.
     """
-    out, step, kept = [], None, _kept_out(problem)
-    rows = np.stack([np.ones(kept.shape), _moves(problem)])
+    out, step, before, kept = [], None, None, _kept_out(problem)
+    moves = _moves(problem)
     for effect in [None, *causes]:
         grown = start if step is None or effect is None else extended_state(problem, step.state, effect)
         step = stand(problem, grown, whitening, step)
-        out.append(_block_squares(problem, step, rows))
+        error = _error(problem, step)
+        out.append(_held(problem, error if before is None else before, error, moves))
+        before = error
+    rows = np.stack([np.ones(kept.shape), moves])
     return out, ((problem.torque * kept) ** 2 * rows).sum((1, 2))
 
 
-def weighted_squares(problem: Problem, step: Step) -> Float[np.ndarray, "2 blocks nv"]:
-    """Squares of each joint's error on data not fitted, block by block: of all rows, then with the weights by speed."""
-    return _block_squares(problem, step, np.stack([np.ones(problem.held.shape), _by_speed(problem)]))
+def weighted_squares(problem: Problem, bare: Step, full: Step) -> tuple[Held, Held]:
+    """As `held_squares` of a fit without and with a cause; the rows that say how a joint moves by their weights."""
+    before, after, weight = _error(problem, bare), _error(problem, full), _by_speed(problem)
+    return _held(problem, before, before, weight), _held(problem, before, after, weight)
 
 
-def _block_squares(
-    problem: Problem, step: Step, rows: Float[np.ndarray, "k n M nv"]
-) -> Float[np.ndarray, "k blocks nv"]:
+def _held(
+    problem: Problem,
+    before: Float[np.ndarray, "n M nv"],
+    error: Float[np.ndarray, "n M nv"],
+    weight: Float[np.ndarray, "n M nv"],
+) -> Held:
     block = _blocks(problem)
-    squares = np.moveaxis(_error(problem, step) ** 2 * rows, 3, 1)[..., block >= 0]
-    return np.stack([[np.bincount(block[block >= 0], x) for x in some] for some in squares]).swapaxes(1, 2)
+    used = block >= 0
+
+    def of_blocks(x: Float[np.ndarray, "n M nv"]) -> Float[np.ndarray, "blocks nv"]:
+        return np.stack([np.bincount(block[used], own) for own in x[used].T], axis=1)
+
+    squares = [of_blocks(error**2), of_blocks(error**2 * weight)]
+    return Held(np.stack(squares), of_blocks(before * (before - error) * weight))
 
 
 def _speed(problem: Problem) -> Float[np.ndarray, "n M nv"]:

@@ -19,11 +19,12 @@ from .problem import Problem, family_of
 from .search import Found
 from .state import State, assembled, solved
 from .step import Step, stand
+from .thresholds import SIZE_REGION
 
-__all__ = ["Joint", "has_size", "joint_fit", "moved", "opened", "polished", "sized"]
+__all__ = ["Joint", "has_size", "joint_fit", "moved", "opened", "polished", "sized", "with_misfit"]
 
 KEPT = 1e-12
-SURE = 0.95  # of the region of a cause's amplitudes that must not hold zero
+AS_SURE = 2.0  # times the deviation of a fit up to which another one counts in full
 LATE = 4  # turns: most fits have settled by then
 BACK = 0.5  # of its last move: what a shape goes back by where steps overshoot
 POLISH, SETTLED = 10, 0.03  # turns at the most; a turn that moves nothing by more of its standard deviation is the last
@@ -56,6 +57,32 @@ def polished(problem: Problem, start: State, causes: list[Effect], whitening: Fl
         if np.all(np.abs(joint.fitted.value - last.value) <= SETTLED * np.sqrt(np.diag(joint.fitted.covariance))):
             break
     return joint
+
+
+def with_misfit(
+    problem: Problem,
+    start: State,
+    joint: Joint,
+    weights: Sequence[tuple[Float[np.ndarray, "n M nv"], Float[np.ndarray, "F nv"]]],
+) -> Joint:
+    """The fit with deviations that also say how far its values move where rows weigh otherwise.
+
+    A model that leaves noise alone gets the same values from all weights, but for the noise (Hausman's test of a model
+    asks for that). What it leaves beyond pulls them by what the rows weigh, the same way in every block, so that no
+    scatter of blocks shows it: the squares of the moves are added to the variance. A fit whose own deviation is more
+    than `AS_SURE` times as large says less of that, and counts less. `weights` are those of the rows, with a whitening.
+    """
+    fitted = joint.fitted
+    variance, moves = np.diag(fitted.covariance), np.zeros_like(fitted.value)
+    for weight, whitening in weights:
+        other = problem.weighted(weight)
+        base = solved(other, start, joint.step.state.theta[: len(start.theta)])
+        one = _together(other, base, joint.causes, whitening).fitted
+        share = AS_SURE**2 * variance / np.maximum(np.diag(one.covariance), 1e-300)
+        more = np.minimum(share, 1.0) * (one.value - fitted.value) ** 2
+        moves += np.where(np.isfinite(more), more, 0.0)  # a fit without rows of a joint says nothing of it
+    wider = np.sqrt(1 + moves / np.maximum(variance, 1e-300))
+    return joint._replace(fitted=replace(fitted, covariance=fitted.covariance * np.outer(wider, wider)))
 
 
 def _move(joint: Joint) -> Float[np.ndarray, " parameters"]:
@@ -199,4 +226,4 @@ def has_size(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
     at = np.array(place)[own]
     value = np.array([float(getattr(effect, names[k])) for k in own])
     covariance = fitted.covariance[np.ix_(at, at)]
-    return bool(value @ np.linalg.pinv(covariance, hermitian=True) @ value > chdtri(len(own), 1 - SURE))
+    return bool(value @ np.linalg.pinv(covariance, hermitian=True) @ value > chdtri(len(own), 1 - SIZE_REGION))

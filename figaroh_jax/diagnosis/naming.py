@@ -7,6 +7,7 @@ vary with position, speed, load or time stands for another law.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from ..effects.base import Effect
 from ..estimation.rows import Prior
 from ..recordings.stacked import filter_rows, filtered_rows, open_rows
 from ..results import Name
-from .comparison import Ground, Hypothesis, Verdicts, fold_sums, ground, judge, judge_grown, t_value
+from .comparison import Ground, Hypothesis, Verdicts, fold_sums, ground, judge, judge_grown, t_needed, t_value
 from .design import kind, sensor_response, shapes
 from .estimates import Fitted, amplitude_places, torque_slope
 from .flexible import smooth_functions
@@ -33,6 +34,7 @@ from .thresholds import (
     BESIDE_SMOOTH,
     GAIN_NAMED,
     GAIN_NAMED_ROBOT,
+    MASS,
     MODULATION,
     MODULATION_HELD_OUT,
     SHARE_NAMED,
@@ -51,18 +53,23 @@ class Standing:
     physical: bool  # whether its sign is one that exists
     gain: float
     t: float
+    t_needed: float  # by the number of blocks
     share: float  # RMS torque over that of the joint, where it is largest
     modulation: float = 0.0  # squares that an amplitude which varies gains, over those of the cause
     modulation_held_out: float = 0.0
     beside_smooth: float = 1.0  # gain of a cause of the whole robot beside smooth functions, or in their place
     inertia_alone: bool = False  # a coupling of inertia, without friction of its own
+    massless: bool = False  # a body whose mass is not surely there
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
 
 
-def reason_against(one: Standing, rest: bool, tolerance: float) -> str:
+def reason_against(
+    one: Standing, rest: bool, tolerance: float, certain: Callable[[Name], bool] = lambda name: False
+) -> str:
     """Why the cause is not named, in words with the number that failed; empty where it is.
 
     Beside a `rest` it must explain much of its joints' error with one amplitude; without one it must only be there.
+    `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not.
     """
     least = GAIN_NAMED_ROBOT if one.whole else GAIN_NAMED
     checks = [
@@ -75,7 +82,10 @@ def reason_against(one: Standing, rest: bool, tolerance: float) -> str:
     ]
     if rest or not one.beside_rest:  # what any rest looks like is never taken on less
         checks += [
-            (one.t >= T_NAMED, f"its gain on held-out data is not significant: t = {one.t:.1f}, {T_NAMED:g} needed"),
+            (
+                one.t >= one.t_needed or certain(one.name),
+                f"its gain on held-out data is not significant: t = {one.t:.1f}, {one.t_needed:.1f} needed",
+            ),
             (one.gain >= least, f"it removes {one.gain:.0%} of the held-out error where it acts, {least:.0%} needed"),
             (
                 one.modulation <= MODULATION and one.modulation_held_out <= MODULATION_HELD_OUT,
@@ -92,6 +102,7 @@ def reason_against(one: Standing, rest: bool, tolerance: float) -> str:
                 not one.inertia_alone,
                 "a coupling without friction of its own cannot be distinguished from rotor or link inertia",
             ),
+            (not one.massless, "its mass is not surely above zero: a link other than believed explains as much"),
         ]
     return next((reason for passed, reason in checks if not passed), "")
 
@@ -122,11 +133,13 @@ def standings(
                 beside_rest=effect.beside_rest,
                 gain=1 - float(better.sum() / max(worse.sum(), 1e-300)),
                 t=t_value(worse, better),
+                t_needed=t_needed(len(worse), T_NAMED),
                 share=_share_of_torque(problem, full.state, torque, effect),
                 modulation=modulation[0],
                 modulation_held_out=modulation[1],
                 beside_smooth=_beside_smooth(grown, bare, effect, place, one.joints) if whole else 1.0,
                 inertia_alone=coupled and _inertia_alone(effect, joint.fitted, at),
+                massless=effect.body and _deviations(effect, joint.fitted, at)["mass"] < MASS,
             )
         )
     return out

@@ -21,7 +21,6 @@ from .screening import noise_squares
 from .state import State
 from .step import Step
 from .thresholds import (
-    CONFIDENT,
     FITTED,
     FITTED_SHARE,
     LEAST_BEYOND,
@@ -32,6 +31,7 @@ from .thresholds import (
     REPEATED_SHARE,
     REST_P,
     STANDSTILL,
+    T_BETTER,
     T_REST,
     UNREPEATED,
 )
@@ -165,7 +165,7 @@ def parts_of(
             rows = _rows_at(problem, step.state, columns, whitening, joint)
             grown = judge_grown(step.rows, base, (joint,), rows[:, None])
             worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, grown))
-            if t_value(worse, better) > CONFIDENT:
+            if t_value(worse, better) > T_BETTER:
                 file = _recording_of(worse - better, step, problem, names) if kind == "recording" else None
                 shares.append((float((worse - better).sum()) / total, kind, None, file))
         if line[0] < LINE_P and line[2] == joint:

@@ -25,7 +25,7 @@ from .evidence import Score, block_scores, largest, other_scores, projection, pu
 from .problem import Problem, without_factor
 from .state import State
 
-__all__ = ["Group", "Null", "Screen", "catalogue", "family_p", "noise_squares", "place_p", "screen"]
+__all__ = ["Group", "Null", "Screen", "Shown", "catalogue", "family_p", "noise_squares", "place_p", "screen"]
 
 DRAWS, CHUNK = 400, 50  # draws, and how many are made at once
 LOCAL_DRAWS = 4000  # where each place is asked for itself, and counted as one of many
@@ -41,6 +41,15 @@ class Group(NamedTuple):
     columns: Columns
 
 
+class Shown(NamedTuple):
+    """A candidate as a screen saw it, at the point of its grid with the largest score."""
+
+    name: Name
+    joints: tuple[int, ...]
+    Z: Float[np.ndarray, "k rows T"]
+    z: float  # its score
+
+
 class Screen(NamedTuple):
     """Scores of all groups, and what they were computed from."""
 
@@ -48,6 +57,14 @@ class Screen(NamedTuple):
     scores: list[Score]
     stock: Bank
     H: Float[np.ndarray, "P columns"]
+
+    def shown(self) -> list[Shown]:
+        """Every candidate at its best, without the memory of the others' columns."""
+        points = (int(np.argmax(result.Q)) for result in self.scores)
+        return [
+            Shown(group.name, group.columns.joints, group.columns.Z[p].copy(), float(result.z[p]))
+            for group, result, p in zip(self.groups, self.scores, points, strict=True)
+        ]
 
     def best(self, rows: Rows) -> list[tuple[float, int, int]]:
         """Rank (Q less its penalties), group and grid point, best first."""
@@ -69,14 +86,15 @@ def catalogue(
 ) -> list[Group]:
     """Whitened columns of every effect that may be named, at every place and grid point.
 
-    `before` are the groups of an earlier state with the same sensors: columns that do not follow the torque are kept.
+    `before` are the groups of an earlier state of the same problem with the same sensors: columns that do not follow
+    the torque are kept.
     """
     taken = {(type(e).name, at) for term in state.terms for e, at in _places_of(term)}
     taken |= {(effect.name, tuple(int(i) for i in np.asarray(effect.at))) for effect in state.sensors}
     closed = {n for t, _ in taken for n in related(t, "excludes")}
     wanted = [n for n in CATALOGUE if n not in forbid and n not in closed]
     batches = {n: b for family in problem.families.values() for n, b in family.items()}
-    old = {group.name: group.columns for group in before or ()}
+    old = {group.name: group for group in before or ()}
     fresh = _fresh_columns(problem, state, whitening, wanted, everything=before is None)
     groups = []
     for name in (n for n in wanted if n in batches):
@@ -84,11 +102,12 @@ def catalogue(
             title = Name(name, place_names(problem.model, batches[name], tuple(at)))
             if (name, tuple(at)) in taken:
                 continue
-            columns = fresh[name][place] if name in fresh else old.get(title)
+            known = old.get(title)
+            columns = fresh[name][place] if name in fresh else known.columns if known else None
             if columns is None and batches[name].inertial:
                 columns = _link_columns(rows, at[0], problem.model)
             if columns is not None and np.abs(columns.Z).max() > 0:
-                one = jax.tree.map(lambda x, p=place: np.asarray(x)[p], batches[name])
+                one = known.effect if known else jax.tree.map(lambda x, p=place: np.asarray(x)[p], batches[name])
                 groups.append(Group(title, one, columns))
     return groups
 

@@ -21,10 +21,10 @@ from .estimates import amplitude_places, with_amplitudes
 from .flexible import friction_width
 from .gates import ambiguous, exists, gains, passes, rivals, simpler
 from .problem import Problem
-from .screening import DRAWS, Null, Screen, catalogue, family_p, place_p, screen
+from .screening import DRAWS, Null, Screen, Shown, catalogue, family_p, place_p, screen
 from .state import State, solved, with_width
 from .step import Step, stand, with_cause, with_causes
-from .thresholds import AGAIN, CONFIDENT, GAIN, MOST_CAUSES, MUCH, OTHER, SMALLEST
+from .thresholds import GAIN, MOST_CAUSES, OVERLAP_ELSEWHERE, SHARE_AGAIN, SHARE_ALIKE, SMALLEST, T_BETTER
 
 __all__ = ["Found", "Search", "chance_beside", "eliminate", "find_causes", "judged_without", "stood_without"]
 
@@ -57,7 +57,7 @@ class Search(NamedTuple):
     found: list[Found]
     p_value: float  # of the whole catalogue before anything was found
     p_left: float  # of the same once the causes were in
-    screened: Screen  # the first
+    shown: list[Shown]  # candidates, as the first screen saw them
 
 
 def find_causes(
@@ -80,10 +80,10 @@ def find_causes(
     """
     generator = generator or np.random.default_rng(0)
     if after is None:
-        step, found, p_values, screens = stand(problem, state, whitening), [], [], []
+        step, found, p_values, shown = stand(problem, state, whitening), [], [], []
     else:
         problem, step, found = after.problem, after.step, list(after.found)
-        p_values, screens = [after.p_value], [after.screened]
+        p_values, shown = [after.p_value], after.shown
     null = Null(problem, spectrum, whitening, generator)
     screened, groups = None, None
     failed: dict[Name, float] = {}  # share of its joints' squares that a candidate scored when it last failed
@@ -93,7 +93,7 @@ def find_causes(
         groups = catalogue(problem, step.state, step.rows, whitening, forbid, groups)
         screened = screen(step.rows, step.linear, groups, screened)
         p_values.append(_chance(step, screened, null, alpha, generator, not found))
-        screens = screens or [screened]
+        shown = shown or screened.shown()
         if p_values[-1] > alpha:
             break
         progress("comparing causes on held-out data", len(found) / MOST_CAUSES)
@@ -113,7 +113,7 @@ def find_causes(
             groups = None if problem is not known or "response" in ways else groups
             step = step if problem is known else stand(problem, with_width(problem, step.state), whitening)
     begun = solved(problem, with_width(problem, state), step.state.theta[: len(state.theta)])
-    return Search(problem, begun, step, found, p_values[0], p_values[-1], screens[0])
+    return Search(problem, begun, step, found, p_values[0], p_values[-1], shown)
 
 
 def chance_beside(
@@ -176,7 +176,7 @@ def _contenders(
     ready, squares, out = for_refit(problem, step, base, whitening), (step.verdicts.error**2).sum(1), []
     for group, order, score in shortlist(step, screened):
         share = score / squares[list(acting(group.effect, len(squares), group.columns.joints))].sum()
-        if share <= AGAIN * failed.get(group.name, 0.0):
+        if share <= SHARE_AGAIN * failed.get(group.name, 0.0):
             continue
         one = contend(problem, step, whitening, base, ready, group, order, fitted)
         if exists(problem, one.effect):
@@ -208,7 +208,7 @@ def _apart(step: Step, one: Contender, other: Contender) -> bool:
     """Whether a cause acts at other joints than another one and changes another part of the residual."""
     local = one.effect.acts_on in ("joint", "pair") and kind(one.effect) == "columns"
     elsewhere = local and not set(one.joints) & set(other.joints)
-    return elsewhere and abs(overlap(step.verdicts, one.verdicts, other.verdicts)) < OTHER
+    return elsewhere and abs(overlap(step.verdicts, one.verdicts, other.verdicts)) < OVERLAP_ELSEWHERE
 
 
 def _best(problem: Problem, step: Step, contenders: list[Contender], before: list[Found]) -> Contender | None:
@@ -247,7 +247,7 @@ def _found(
         confidence=float(wins[0]) * (1 - p),
         ambiguous=ambiguous(step, best, alike, screened),
         joints=best.joints,
-        alike=tuple(c.name for c in alike if step.verdicts.cost - c.verdicts.cost > MUCH * drop),
+        alike=tuple(c.name for c in alike if step.verdicts.cost - c.verdicts.cost > SHARE_ALIKE * drop),
     )
 
 
@@ -259,7 +259,7 @@ def eliminate(problem: Problem, start: State, found: list[Found], whitening: Flo
     for one in list(found[:-1]):
         without = judged_without(problem, start, full, found, one, whitening)
         worse, better = (v.own(full.rows, one.joints) for v in (without, full.verdicts))
-        if 1 - better.sum() / worse.sum() < GAIN or t_value(worse, better) < CONFIDENT:
+        if 1 - better.sum() / worse.sum() < GAIN or t_value(worse, better) < T_BETTER:
             found = [f for f in found if f is not one]
             full = with_causes(problem, start, [f.effect for f in found], whitening)
     return found

@@ -29,27 +29,31 @@ SHARE_OF_BEST = 0.35  # of the best rank: what another candidate needs, of the r
 BEST_OF_A_PLACE = 2  # candidates compared exactly of each joint, pair or link
 SHIFTS = 2  # candidates of a position sensor tried at a step: each is a fit of its own
 GAIN = 0.01  # of the held-out squares of the joints where the cause acts
-CONFIDENT = 1.64  # t of the blocks: that the cause predicts better
-UNSURE = 1.7  # t below which two causes predict alike
-SAME = 0.5  # overlap from which two causes explain the same misfit
-CLEARLY = 3.0  # t from which data tell effects apart that are the same while the joint moves
-MUCH = 0.5  # share of the best's drop from which another cause explains much of the same
+T_BETTER = 1.64  # t of the blocks: that the cause predicts better
+T_ALIKE = 1.7  # t below which two causes predict alike
+OVERLAP_SAME = 0.5  # overlap from which two causes explain the same misfit
+T_APART = 3.0  # t from which data tell effects apart that are the same while the joint moves
+SHARE_ALIKE = 0.5  # share of the best's drop from which another cause explains much of the same
 SMALLEST = 0.0005  # share of the first cause's drop below which a later one may be what the first left over
 MOST_CAUSES = 16
-AGAIN = 1.2  # times its share of its joints' squares when it failed: from here a candidate is tried again
-OTHER = 0.2  # overlap up to which causes at other joints are taken in at once
-CERTAIN = 0.2  # of alpha: what a name needs, for p is not uniform under coloured noise
+SHARE_AGAIN = 1.2  # times its share of its joints' squares when it failed: from here a candidate is tried again
+OVERLAP_ELSEWHERE = 0.2  # overlap up to which causes at other joints are taken in at once
+SIZE_REGION = 0.95  # of the region of a cause's amplitudes that must not hold zero
+ALPHA_OF_A_NAME = 0.2  # of alpha: what a name needs, for p is not uniform under coloured noise
 
 # Naming beside a rest (`naming`)
-T_NAMED = 2.3  # t of the held-out squares of the cause's joints
+T_NAMED = 2.25  # t of the held-out squares of the cause's joints, of many blocks; of few as unlikely (Student)
 GAIN_NAMED = 0.25  # gain there with all other causes in
 GAIN_NAMED_ROBOT = 0.04  # the same of a cause that acts on the whole robot
 MODULATION, MODULATION_HELD_OUT = 0.3, 0.2  # squares that an amplitude which varies gains, over those of the cause
-BY_CHANCE = 0.1  # p-value of the fall of the error on data kept out of the fit: above, it is chance
-SURELY = 0.05  # the same of a fall that shows only beside causes without a name
-KEPT_OF_CLAIM = 1 / 3  # of what a cause takes in slices: a fall on data kept out by so much needs no level
+BY_CHANCE = 0.02  # p-value of what data kept out of the fit want of a cause: above, it is chance
+BY_CHANCE_BESIDE = 0.01  # the same beside causes without a name
+BY_CHANCE_UNSHOWN = 0.001  # the same where slices of the recordings that are fitted do not surely show it
+RISES = 0.1  # p-value of a rise of the error of all rows kept out: below, the robot is predicted worse
+KEPT_OF_CLAIM = 1 / 3  # of what a cause takes in slices: what must be left of it in such a fall
 STANDS = SPEED_EDGES[1]  # of a joint's top speed: below, it stands, and its rows say nothing of a law of the motion
 SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
+MASS = 3.0  # standard deviations of a body's mass: below, what moves is the link that carries it
 BESIDE_SMOOTH = 0.05  # gain of a cause of the whole robot beside smooth functions at every joint, or in their place
 
 # Links that are well known (`believed`)

@@ -300,7 +300,7 @@ def as_data(model: ExtendedModel, data: Any) -> tuple[Data, ...]:
 def residual(model: RobotModel | ExtendedModel, data: Any) -> Float[Array, " rows"]:
     """What the model gets wrong in the data: predicted less measured, weighted, in float64; pure.
 
-    `data`: a `TorqueData` (rows N m or N), a `PoseData` of any device (m, rad), your own with a method
+    `data`: a `TorqueData` (rows N m or N), a `PoseData` of any device (m, rad), a `RolloutData`, your own with a method
     `residual(model)`, recordings and postures as they are (prepared anew at each call: prepare them once with
     `torque_data` or `pose_data` where that counts), or a sequence of those. Differentiable by every array of the
     model (placements, inertials, gravity, parameters of effects) and of the data; rows without weight are zero.

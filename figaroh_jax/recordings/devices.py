@@ -333,7 +333,7 @@ def own_device(
     predicted minus measured, m (POSITION) or rad (ORIENTATION) as `channels` says row by row. `unknowns` names what
     the device leaves open, in the order in which the function takes it: its start, its unit, and about how far off
     that is.
-    Put it into `PoseRecording(kind="own", device=...)`.
+    Hand it to `fj.postures(device=..., measured=...)`.
 
     >>> import jax.numpy as jnp, figaroh_jax as fj
     >>> wire = lambda pose, unknown, length: jnp.linalg.norm(pose[:3, 3] - unknown)[None] - length

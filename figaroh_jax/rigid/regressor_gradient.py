@@ -17,18 +17,16 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..compiled.batching import program
 from .kinematics import add_up, ancestors, axis_twists, gather, movers, pose_columns, take
 from .model import RobotModel
 from .regressor import pairs
 from .spatial import cross, rotate, rotate_back
 
-__all__ = ["pullback_rows", "regressor_pullback"]
+__all__ = ["pullback_rows"]
 
 _MATRIX = np.array([[4, 5, 7], [5, 6, 8], [7, 8, 9]])  # of xx xy yy xz yz zz behind mass and first moments
 
@@ -124,7 +122,11 @@ def pullback_rows(
     a: Float[Array, "nv samples"],
     cotangent: Float[Array, "nv columns samples"],
 ) -> Float[Array, "3 nv samples"]:
-    """Kernel of `regressor_pullback`: the samples last, to be traced."""
+    """Gradient by q, v and a of the sum over C * W, sample by sample; the samples last, to be traced.
+
+    `cotangent` is C, with the columns of `joint_torque_regressor`. For robots of revolute and prismatic joints (mimic
+    joints too). Rates per unit of C: N m/rad, N m s/rad, N m s^2/rad and the like.
+    """
     joint, column, above = model.dofs.joint, model.dofs.column, ancestors(model.joints)
     ratio = take(jnp.asarray(model.ratio, q.dtype), joint)[:, None, None]
     columns = pose_columns(model, q)
@@ -149,22 +151,3 @@ def pullback_rows(
     by_q = S.turn(V_p).dot(G.plus(carried, -1.0)) + S.turn(A_p).dot(F) + S.dot(Z)
     by_v = S.dot(G.plus(carried, -2.0))
     return jnp.stack([gather(model, x) for x in (-by_q, by_v, S.dot(F))])
-
-
-_program = program(pullback_rows)
-
-
-def regressor_pullback(
-    model: RobotModel,
-    q: Float[np.ndarray, "nv samples"],
-    v: Float[np.ndarray, "nv samples"],
-    a: Float[np.ndarray, "nv samples"],
-    cotangent: Float[np.ndarray, "nv columns samples"],
-) -> Float[np.ndarray, "3 nv samples"]:
-    """Gradient by q, v and a of the sum over C * W, sample by sample; the samples last, in float64.
-
-    `cotangent` is C, with the columns of `joint_torque_regressor`. For robots of revolute and prismatic joints (mimic
-    joints too). Rates per unit of C: N m/rad, N m s/rad, N m s^2/rad and the like.
-    """
-    with jax.enable_x64(True):
-        return np.asarray(_program(model, q, v, a, cotangent))

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from ..results import Name
+from .alike import instead, names, rivals
 from .causes import Candidate
 from .faults import Fault, faults, without
 from .fit import Fit, System, fit, refitted_without
@@ -22,7 +23,7 @@ from .parameters import put, values
 from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_of_entry, outputs, tried_now
 from .search import Model, Named, Search, Tried, judged_by_colour, sized, t_of
 from .sensitivity import predicted
-from .setting import Setting, Structure, begins_of, begun, by_recording, free_entries, level_of  # fmt: skip
+from .setting import Setting, Structure, begins_of, begun, by_recording, free_entries, level_of, thinned  # fmt: skip
 from .thresholds import (
     CLEARLY,
     CONFIDENT,
@@ -30,7 +31,9 @@ from .thresholds import (
     GAIN,
     MUCH,
     NEAR,
+    NO_CHOICE,
     NO_WORSE,
+    SLIGHT,
     SMALL,
     SURELY,
     UNSURE,
@@ -55,9 +58,12 @@ def search_arm(
 
 def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Sequence[str]) -> Search:
     progress("fitting the baseline", 0.05)
-    first = _begun(here)
-    here, wrong = _sound(here, first) if here.pole is None else (here, [])  # a colour is told from sound rows
+    whole, here = here, thinned(here)
+    first, wrong = _begun(here), list[Fault]()
+    if here.pole is None:  # a colour is told from sound rows
+        whole, wrong = _sound(whole, first if whole is here else _started(whole, first))
     if wrong:
+        here = thinned(whole)
         first = _begun(here)
     now = begin = _standing(here, Structure(here.loop, here.known.table, here.data), first, here.baseline)
     found: list[Named] = []
@@ -69,7 +75,7 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
         number = len(steps)
         progress(f"looking for causes, round {number}", min(0.1 + 0.12 * number, 0.9))
         new, now, nearest = _round(here, now, found, forbid, nearest, known)
-        found += new
+        found = [n for n in found if not any(_replaced(n, one) for one in new)] + new
         if not new:
             break
         steps.append(
@@ -80,12 +86,41 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
         if now.excess.max() < 1.0:
             break
     progress("judging", 0.9)
-    found, now = _still_needed(here, found, now)
+    found, now = _still_needed(here, found, now, begin)
+    found, now = _alike(here, found, now)
+    if whole is not here:
+        progress("fitting all that was recorded", 0.95)
+        here, (begin, now) = whole, (_on_all(whole, one.model) for one in (begin, now))
+        first = begin.model.fit
+        steps.append(("all that was recorded", _level(here, now.model.fit)))
+        held = [_rms(here, begin.held), *held[1:-1], *([_rms(here, now.held)] if found else [])]
     result = Search(
         "nothing", found, now.model.structure, first, now.model.fit, p_value, [], nearest, steps, held, fits,
         begin.model.structure, here, wrong,
     )  # fmt: skip
     return _judged(here, result, now)
+
+
+def _started(here: Setting, first: Fit) -> Fit:
+    """The states at the starts of all windows with numbers that were fitted to some."""
+    structure = Structure(here.loop, here.known.table, here.data)
+    return fit(*structure, first.theta[None], [[]], width=1, lanes=1, iterations=_FIRST, rough=ROUGH)[0]
+
+
+def _on_all(here: Setting, model: Model) -> Standing:
+    """A model of some windows fitted to all of them."""
+    structure = model.structure._replace(data=here.cut(model.structure.loop))
+    if not np.isfinite(model.fit.cost):
+        return _standing(here, structure, model.fit, model.free)
+    new = fit(*structure, model.fit.theta[None], [model.free], width=max(here.width, len(model.free)), lanes=1,
+              iterations=LATE, rough=ROUGH)[0]  # fmt: skip
+    return _standing(here, structure, new, model.free)
+
+
+def _replaced(old: Named, new: Named | Tried) -> bool:
+    """Whether a new cause contains one at the same place that is a structure of its own: a spring that has play."""
+    kind = new.candidate.kind
+    return kind.elastic and kind.holds(old.candidate.effect) and old.candidate.at == new.candidate.at
 
 
 def _begun(here: Setting) -> Fit:
@@ -189,7 +224,7 @@ def _round(
         firsts = sorted((ones[0] for ones in ordered.values() if ones), key=lambda one: -_gained(now, one))
         if not firsts:
             break
-        chosen = firsts[:1]
+        chosen = [one for one in firsts if any(_replaced(n, one) for n in found)][:1] or firsts[:1]
         if chosen[0].candidate.kind.usual:  # what every joint has is found at all of them at once
             chosen = [one for one in firsts if one.candidate.kind.usual]
         new = _named(here, now, lists, chosen, found)
@@ -254,6 +289,8 @@ def _named(
     chosen = list(chosen)
     while chosen:
         new = _together(here, now, chosen)
+        if not found or any(one.candidate.kind.elastic for one in chosen):
+            new = _again(here, new, [n.candidate for n in found])
         with_all = _standing(here, new.structure, new.fit, new.free)
         checks = [_check(here, now, with_all, one) for one in chosen]
         keep = [one for one, (good, _, _) in zip(chosen, checks, strict=True) if good]
@@ -262,10 +299,6 @@ def _named(
             continue
         spare = _spare(here, with_all, chosen) if len(chosen) > 1 else None
         if spare is None:
-            better = new if found else _again(here, new)
-            if better is not new:
-                with_all = _standing(here, better.structure, better.fit, better.free)
-                checks = [_check(here, now, with_all, one) for one in chosen]
             named = [_name(here, now, with_all, one, lists, check) for one, check in zip(chosen, checks, strict=True)]
             return sorted(named, key=lambda n: n.after**2 - n.before**2), with_all
         chosen = [one for one in chosen if one is not spare]
@@ -288,16 +321,17 @@ def _together(here: Setting, now: Standing, chosen: Sequence[Tried]) -> Model:
     return Model(structure, last, tuple(free), 0.0)
 
 
-def _again(here: Setting, new: Model) -> Model:
-    """The fit once more from the numbers of the model file, the causes where they are: the better of both.
+def _again(here: Setting, new: Model, before: Sequence[Candidate]) -> Model:
+    """The fit once more from the numbers of the model file, the new causes where they are: the better of both.
 
-    A baseline that was fitted without a cause may end in another valley than with it.
+    A baseline that was fitted without a cause may end in another valley than with it, and so may causes found before.
     """
     structure, last = new.structure, new.fit
     if not np.isfinite(last.cost) or excess_of(here, structure, last).max() < 1.0:
         return new
     theta, stated = last.theta.copy(), values(structure.loop, structure.table)
-    theta[list(here.baseline)] = stated[list(here.baseline)]
+    old = [k for c in before if not c.kind.elastic for k in c.entries if np.isfinite(stated[k])]
+    theta[[*here.baseline, *old]] = stated[[*here.baseline, *old]]
     start, n, more = np.array(last.start), here.loop.robot.nv, structure.loop.robot.nv - here.loop.robot.nv
     begin = np.asarray(here.data.start)
     start[:n], start[n + more : 2 * n + more] = begin[:n], begin[n:]
@@ -344,14 +378,19 @@ def _check(here: Setting, now: Standing, new: Standing, one: Tried) -> tuple[boo
     return bool(good), float(gain), t
 
 
-def _spare(here: Setting, new: Standing, chosen: Sequence[Tried]) -> Tried | None:
-    """The cause, if any, that its joint does not need beside the others: the least one first."""
+def _spare(here: Setting, new: Standing, chosen: Sequence[Tried], begin: Standing | None = None) -> Tried | None:
+    """The cause, if any, that its joint does not need beside the others: the least one first.
+
+    With the model at the `begin` also one that is worth next to nothing of what the others have explained there since:
+    where their laws are off by as little, it makes up for that.
+    """
     structure, last = new.model.structure, new.model.fit
     for one in sorted(chosen, key=lambda one: _gained(new, one), reverse=True):
         if one.candidate.kind.elastic:
             continue
         j, entries = joint_of(here, one.candidate), list(one.candidate.entries)
-        if _costs(here, new, entries) > SURELY * new.squares[..., j].sum():
+        mine = slice(None) if j < 0 else slice(j, j + 1)
+        if _costs(here, new, entries) > SURELY * new.squares[..., mine].sum():
             continue
         theta = last.theta.copy()
         theta[entries] = values(structure.loop, structure.table)[entries]
@@ -360,18 +399,20 @@ def _spare(here: Setting, new: Standing, chosen: Sequence[Tried]) -> Tried | Non
                     iterations=LATE, rough=ROUGH)[0]  # fmt: skip
         if not np.isfinite(other.cost):
             continue
-        before, after = outputs(here, other.sums.cost)[..., j], new.squares[..., j]
-        if (before.sum() - after.sum()) / before.sum() < SMALL or t_of(before, after) < CONFIDENT:
+        before, after = outputs(here, other.sums.cost)[..., mine].sum(-1), new.squares[..., mine].sum(-1)
+        worth = before.sum() - after.sum()
+        slight = 0.0 if begin is None else SLIGHT * (begin.squares[..., mine].sum() - before.sum())
+        if worth < max(SMALL * before.sum(), slight) or t_of(before, after) < CONFIDENT:
             return one
     return None
 
 
-def _still_needed(here: Setting, found: list[Named], now: Standing) -> tuple[list[Named], Standing]:
+def _still_needed(here: Setting, found: list[Named], now: Standing, begin: Standing) -> tuple[list[Named], Standing]:
     """The causes without those that a later one made needless, where noise is all that is left with and without."""
     while len(found) > 1 and now.excess.max() < 1.0:
         structure, one = now.model.structure, now.model.fit
-        own = [Tried(n.candidate, now.model, now.squares) for n in found if not n.candidate.kind.several]
-        spare = _spare(here, now, own)
+        own = [Tried(n.candidate, now.model, now.squares) for n in found]
+        spare = _spare(here, now, own, begin)
         if spare is None:
             break
         entries = list(spare.candidate.entries)
@@ -384,6 +425,23 @@ def _still_needed(here: Setting, found: list[Named], now: Standing) -> tuple[lis
         if not new.excess.max() < 1.0:
             break
         found, now = [n for n in found if n.candidate is not spare.candidate], new
+    return found, now
+
+
+def _alike(here: Setting, found: list[Named], now: Standing) -> tuple[list[Named], Standing]:
+    """The causes with all that would do as well in place of each; beside a rest, with what may stand for friction."""
+    if not now.excess.max() < 1.0:
+        more = rivals(here, now, found) if found else []
+        return [n._replace(alike=tuple(dict.fromkeys([*n.alike, *m]))) for n, m in zip(found, more, strict=True)], now
+    for k, one in enumerate(found):
+        others = instead(here, now, one, found)
+        if others and others[0].worse < -NO_CHOICE:  # the other is the likelier one
+            best = others[0]
+            now = _standing(here, now.model.structure, best.fit, best.free)
+            found = [*found[:k], one._replace(candidate=best.candidate, alike=()), *found[k + 1 :]]
+            others = instead(here, now, found[k], found)
+        told = found[k].alike if found[k].candidate.kind.elastic else names(others)
+        found = [*found[:k], found[k]._replace(alike=told), *found[k + 1 :]]
     return found, now
 
 

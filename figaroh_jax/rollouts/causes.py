@@ -28,6 +28,8 @@ class Kind(NamedTuple):
 
     usual: bool = False  # every joint has it
     adds_to: str = ""  # the effect of which it is more: found beside it, not without it
+    rival_of: str = ""  # the effect that it may stand for: asked where that is named, whatever else is left
+    rival_start: float = 0.0  # its size where that is asked
     contains: tuple[str, ...] = ()  # what it can imitate exactly: the simpler one is preferred
     limit: bool = False  # it changes the model before that can be differentiated
     elastic: bool = False  # another structure: a spring between motor and link
@@ -80,7 +82,9 @@ KINDS = {
     "stribeck_friction": Kind(
         adds_to="friction_loss", falls_off=1, experiment="slow constant-velocity sweeps of {at} below 0.3 rad/s"
     ),
-    "load_dependent_friction": Kind(experiment="the same motion of {at} with and without a known payload"),
+    "load_dependent_friction": Kind(
+        rival_of="friction_loss", rival_start=0.2, experiment="the same motion of {at} with and without a known payload"
+    ),
     "joint_spring": Kind(constant=True, contains=find("joint_spring").contains),
     "torque_offset": Kind(constant=True),
     "encoder_offset": Kind(constant=True),

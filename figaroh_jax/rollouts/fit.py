@@ -342,6 +342,9 @@ def refitted_without(
     groups = np.searchsorted(np.unique(folds), folds) % _GROUPS
     left = [groups == k for k in range(groups.max() + 1)]
     many, width = len(left), max(len(one.free) for one in found)
+    if native(loop, table, data).usable and all((mine.all(0) == mine.any(0)).all() for mine in left):
+        answers = np.stack([_squares_without(loop, table, data, one, [mine.any(0) for mine in left]) for one in found])
+        return answers if outputs else answers.sum(-1)
     theta, start = (np.repeat(np.stack([getattr(one, name) for one in found]), many, 0) for name in ("theta", "start"))
     free = [one.free for one in found for _ in left]
     fits = _Lanes(loop, table, data, theta, free, start, width, lanes, left * len(found))
@@ -350,6 +353,20 @@ def refitted_without(
     for k, one in enumerate(sums):
         answers[k // many] = np.where(left[k % many][..., None], one.cost, answers[k // many])
     return answers if outputs else answers.sum(-1)
+
+
+def _squares_without(loop: Loop, table: Table, data: Windows, one: Fit, left: Sequence[np.ndarray]) -> np.ndarray:
+    """Squares (blocks, windows, ny) of each group of windows by a fit of the others, which alone are simulated."""
+    answer = np.zeros(one.sums.cost.shape)
+    for out in left:
+        some = [jax.tree.map(lambda x: np.asarray(x)[..., which], data) for which in (~out, out)]  # noqa: B023
+        none = np.zeros((len(answer), int((~out).sum())), bool)
+        begin = one.theta[None], [one.free], one.start[None][..., ~out]
+        lane = _Lanes(loop, table, some[0], *begin, len(one.free), 1, [none])
+        lane.several([Sums(*(x[:, ~out] for x in one.sums))], _REFITS)  # pyright: ignore[reportArgumentType]
+        code = native(loop, table, some[1])
+        answer[:, out] = code.sums(lane.theta[0], np.zeros(0, int), one.start[:, out]).cost
+    return answer
 
 
 def held_out(found: Fit, data: Windows, folds: np.ndarray) -> np.ndarray:

@@ -78,7 +78,7 @@ class Joints(eqx.Module):
     friction: Any  # N m, level of dry friction
     stribeck_force: Any  # N m, more at rest
     stribeck_speed: Any  # rad/s
-    load_ratio: Any  # N m of friction per N m between motor and load
+    load_ratio: Any  # N m of friction per N m of |drive - external| torque at the gear: both where it holds a weight
     stiffness: Any  # N m/rad
     rest: Any  # rad, of the spring
     play: Any  # rad, of the spring: no torque within
@@ -290,7 +290,7 @@ def _rows(loop: Loop, angle: Array, v: Array, motor: Array, bias: Array, weight:
     """Dry friction and limits of each coordinate as soft constraints of its acceleration."""
     j = loop.joints
     peak, speed, ratio = (jnp.asarray(x)[:, None] for x in (j.stribeck_force, j.stribeck_speed, j.load_ratio))
-    level = jnp.asarray(j.friction)[:, None] + peak * jnp.exp(-((v / speed) ** 2)) + ratio * jnp.abs(motor - bias)
+    level = jnp.asarray(j.friction)[:, None] + peak * jnp.exp(-((v / speed) ** 2)) + ratio * jnp.abs(motor + bias)
     level = jnp.maximum(level, 0.0)
     if loop.law == "hard":
         pull, soft = -v / loop.dt, _HARD * weight * jnp.ones_like(v)

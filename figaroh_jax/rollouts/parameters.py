@@ -122,8 +122,9 @@ def _put(loop: Loop, name: str, at: np.ndarray, new: Array | np.ndarray) -> Loop
 
 def unit_payload(loop: Loop, at: np.ndarray) -> Array:
     """Ten parameters of a unit mass at the centre of mass of each link."""
-    own = jnp.asarray(loop.robot.inertia)[at]
-    c = own[:, 1:4] / jnp.maximum(own[:, :1], 1e-9)
+    xp: Any = np if isinstance(loop.robot.inertia, np.ndarray) else jnp
+    own = xp.asarray(loop.robot.inertia)[at]
+    c = own[:, 1:4] / xp.maximum(own[:, :1], 1e-9)
     x, y, z = c.T
-    inertia = jnp.stack([y * y + z * z, -x * y, x * x + z * z, -x * z, -y * z, x * x + y * y], 1)
-    return jnp.concatenate([jnp.ones((len(c), 1)), c, inertia], 1)
+    inertia = xp.stack([y * y + z * z, -x * y, x * x + z * z, -x * z, -y * z, x * x + y * y], 1)
+    return xp.concatenate([xp.ones((len(c), 1)), c, inertia], 1)

@@ -388,7 +388,7 @@ ALIKE void resisted(const Given *g, Work *w, const int n) {
     double level = JN(FRICTION);
     w->peak[j] = 0;
     if (JN(PEAK) != 0) w->peak[j] = exp(-(v / JN(SPEED)) * (v / JN(SPEED))), level += JN(PEAK) * w->peak[j];
-    if (JN(RATIO) != 0) level += JN(RATIO) * fabs(total - w->bias[j]);
+    if (JN(RATIO) != 0) level += JN(RATIO) * fabs(total + w->bias[j]);
     w->level[j] = level > 0 ? level : 0;
     w->pull[j] = g->hard ? -v / g->dt : -JN(RATE) * v;
     w->soft[j] = w->weight[j] * (g->hard ? 1e-9 : JN(SHARE));
@@ -631,7 +631,7 @@ INLINE void linearised(const Given *g, Work *w, const int n, const int carried, 
   for (int j = 0; j < n; j++) {
     x[j] = w->moved[j] - w->a[j];
     sign[j] = 0;
-    if (w->slip[j] && JN(RATIO) != 0 && w->level[j] > 0) sign[j] = w->slip[j] * JN(RATIO) * (w->motor[j] > w->bias[j] ? 1 : -1);
+    if (w->slip[j] && JN(RATIO) != 0 && w->level[j] > 0) sign[j] = w->slip[j] * JN(RATIO) * (w->motor[j] + w->bias[j] > 0 ? 1 : -1);
     loaded |= sign[j] != 0;
     load[j] = 1 + sign[j]; /* a torque of the drive also raises the friction */
   }
@@ -639,7 +639,7 @@ INLINE void linearised(const Given *g, Work *w, const int n, const int carried, 
   if (carried) {
     for (int k = 0; k < n * n; k++) by_q[k] = w->steep, by_v[k] = 0, second[k] = 0;
     for (int j = 0; j < n; j++)
-      for (int k = 0; k < n; k++) by_q[j * n + k] += sign[j] * w->steep;
+      for (int k = 0; k < n; k++) by_q[j * n + k] -= sign[j] * w->steep;
   } else {
     spread(g, w, n, w->a, A, F);
     for (int i = 0; i < n; i++)
@@ -652,7 +652,7 @@ INLINE void linearised(const Given *g, Work *w, const int n, const int carried, 
       for (int i = 0; i < n; i++) memcpy(rest[i], w->body[i].F, sizeof rest[i]);
       slopes(g, w, n, idle, rest, 1, own, bias_v);
       for (int j = 0; j < n; j++)
-        for (int k = 0; k < n; k++) by_q[j * n + k] += sign[j] * own[j * n + k], by_v[j * n + k] += sign[j] * bias_v[j * n + k];
+        for (int k = 0; k < n; k++) by_q[j * n + k] -= sign[j] * own[j * n + k], by_v[j * n + k] -= sign[j] * bias_v[j * n + k];
     }
   }
   for (long d = 0; d < g->nu; d++) {
@@ -710,12 +710,12 @@ INLINE void linearised(const Given *g, Work *w, const int n, const int carried, 
       for (int k = 0; k < n; k++) q += w->q[k], a += w->a[k], s += x[k];
       const double bias = w->more[(3 * at + 1) * g->windows] + w->more[(3 * at + 2) * g->windows] * q;
       const double mass = w->more[3 * at * g->windows];
-      for (int j = 0; j < n; j++) one[j] = mass * a + bias * (1 + sign[j]), more[j] = mass * s;
+      for (int j = 0; j < n; j++) one[j] = mass * a + bias * (1 - sign[j]), more[j] = mass * s;
     } else if (kind >= BODY) {
       unit_torques(g, w, n, p, A, 0, one);
       if (loaded) {
         unit_torques(g, w, n, p, idle, 0, more);
-        for (int j = 0; j < n; j++) one[j] += sign[j] * more[j];
+        for (int j = 0; j < n; j++) one[j] -= sign[j] * more[j];
       }
       unit_torques(g, w, n, p, X, 1, more);
     }
@@ -762,7 +762,7 @@ INLINE void linearised(const Given *g, Work *w, const int n, const int carried, 
         case FRICTION: t1 = -slip; break;
         case PEAK: t1 = -slip * exp(-(v / JN(SPEED)) * (v / JN(SPEED))); break;
         case SPEED: t1 = -slip * JN(PEAK) * w->peak[j] * 2 * v * v / (JN(SPEED) * JN(SPEED) * JN(SPEED)); break;
-        case RATIO: t1 = -slip * fabs(w->motor[j] - w->bias[j]); break;
+        case RATIO: t1 = -slip * fabs(w->motor[j] + w->bias[j]); break;
         case STIFFNESS: t1 = out - far * half - (far ? 0 : out); break;
         case REST: t1 = far || half == 0 ? -JN(STIFFNESS) : 0; break;
         case PLAY: t1 = -far * JN(STIFFNESS) / 2; break;

@@ -15,6 +15,7 @@ import numpy as np
 
 from .causes import Candidate, elastic_loop, springs
 from .fit import Fit, fit
+from .loop import Loop
 from .parameters import OF_DRIVES, Entry
 from .search import Model, Tried, scored, settled
 from .sensitivity import Windows
@@ -38,6 +39,7 @@ _MOST = 6  # causes of a joint
 _TOP, _RACE = 3, 2  # candidates of a joint that are fitted, and that are fitted to the end
 _PART = 3  # of the windows, one in so many shows whether a limit or a spring is worth a fit
 _SHARES = (0.005, 0.05, 0.3)  # twists of a spring under the largest torque, rad or m
+_PLAYS = (0.1, 0.4, 1.5)  # of a spring's twist under the largest torque
 
 
 class Standing(NamedTuple):
@@ -81,7 +83,7 @@ def tried_now(
     open_joints = [j for j in range(n) if now.excess[j] >= 1.0] or list(range(n))
     sizes = {-1: float(now.squares.sum())} | {j: float(now.squares[..., j].sum()) for j in range(n)}
     same = {j for j, one in known.items() if abs(one.squares - sizes[j]) < UNCHANGED * sizes[j]}
-    stands = [one._replace(alone=False) for j in sorted(same) if j < 0 or j in open_joints for one in known[j].tried]
+    stands = [_as_now(now, j, one) for j in sorted(same) if j < 0 or j in open_joints for one in known[j].tried]
     open_joints = [j for j in open_joints if j not in same]
     if not open_joints:
         return stands
@@ -121,6 +123,15 @@ def tried_now(
     return stands + found
 
 
+def _as_now(now: Standing, joint: int, one: Tried) -> Tried:
+    """What was tried at a joint before, the other joints as they are now."""
+    if joint < 0:
+        return one._replace(alone=False)
+    sse = now.squares.copy()
+    sse[..., joint] = one.sse[..., joint]
+    return one._replace(alone=False, sse=sse)
+
+
 def _limits_and_springs(
     here: Setting, now: Standing, left: Sequence[Candidate], plain: Sequence[_Ranked], joint: int, rigid: bool,
     forbid: Sequence[str],
@@ -138,9 +149,37 @@ def _limits_and_springs(
         for c in chosen if c.kind.limit and c.effect in scores
     ]  # fmt: skip
     most = max((one.promise for one in [*plain, *found]), default=0.0)
-    if rigid and now.excess.max() >= 1.0 and now.squares[..., joint].sum() - most > EXPLAINED * _rows(here, joint):
+    much = now.excess.max() >= 1.0 and now.squares[..., joint].sum() - most > EXPLAINED * _rows(here, joint)
+    if rigid and much:
         found += [one._replace(promise=one.promise * share) for one in _sprung(here, now, joint, forbid)]
+    elif much:
+        found += [one._replace(promise=one.promise * share) for one in _looser(here, now, joint, forbid)]
     return found
+
+
+def _looser(here: Setting, now: Standing, joint: int, forbid: Sequence[str]) -> list[_Ranked]:
+    """A spring that stands at a joint, with what contains it in its place: play as well."""
+    model, first = now.model, len(here.known.table)
+    wanted = [c for c in springs(here.loop.robot.dof_names[joint], first, forbid) if c.kind.telling is not None]
+    wanted = [c for c in wanted if set(c.entries) - set(model.free) == {c.entries[c.kind.telling or 0]}]
+    if not wanted or _sprung_joint(model.structure.loop) != joint:
+        return []
+    part, _, _ = _part(now, joint)
+    (c,), found = wanted, []
+    forces = np.abs(np.asarray(here.loop.drives.transmission))[:, joint] * largest_forces(here.loop, here.runs)
+    twist = float(forces.max(initial=0.0) / max(model.fit.theta[first], 1e-9))
+    for share in _PLAYS:
+        theta = model.fit.theta.copy()
+        theta[c.entries[c.kind.telling or 0]] = share * twist
+        score = settled(here, part.structure, theta, free_entries(model.free, c.entries), part.fit.start)
+        found.append(_Ranked(part.fit.cost - score, model.structure, c, theta))
+    return found
+
+
+def _sprung_joint(loop: Loop) -> int:
+    """The coordinate behind whose motor the last coordinate is the twist of a spring."""
+    spring = next(joint for joint in loop.robot.joints if joint.coordinate == loop.robot.nv - 1)
+    return loop.robot.joints[spring.parent].coordinate
 
 
 def _part(now: Standing, joint: int) -> tuple[Model, float, np.ndarray]:
@@ -244,7 +283,8 @@ def _all_in_lanes(
             if len(lane) == 1:
                 theta = begin.copy()
             own = [*mine, *(k for k in free if joint_of_entry(here, k) == j)]
-            theta[own], free = begin[own], free_entries(free, mine)
+            held = ranked.candidate.kind.falls_off if most == _EARLY else None  # a speed waits until its size is found
+            theta[own], free = begin[own], free_entries(free, [k for i, k in enumerate(mine) if i != held])
         start = _start_of(now, structure)
         one = fit(*structure, theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
                   iterations=most, rough=ROUGH / 10, below=below or np.inf)[0]  # fmt: skip

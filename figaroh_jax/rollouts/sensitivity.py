@@ -19,12 +19,14 @@ from jaxtyping import Array
 from ..compiled.batching import program, traced
 from ..rigid.dynamics import joint_masses, joint_torques
 from ..rigid.model import RobotModel
-from .loop import Linear, Loop, State, advance, integrated, mobility, observe
+from . import lanes
+from .friction import Solution
+from .loop import Linear, Loop, State, Step, advance, integrated, mobility, observe
 from .native import native
 from .parameters import TEN, Table, put, unit_payload
 from .simulation import delayed
 
-__all__ = ["Sums", "Windows", "began", "linear_sums", "predicted", "read_of", "state_size"]
+__all__ = ["Sums", "Windows", "began", "by_kernel", "linear_sums", "predicted", "read_of", "state_size"]
 
 
 class Windows(eqx.Module):
@@ -166,15 +168,31 @@ def linear_sums(loop: Loop, table: Table, theta: Any, free: Any, data: Windows, 
     starts.
     """
     code = None if traced(loop, theta, free, data, start) else native(loop, table, data)
+    if code is not None and not code.usable and lanes.fits(loop, table, data):
+        return by_kernel(loop, table, np.asarray(theta), np.maximum(np.asarray(free), 0), data, start)
     if code is None or not code.usable:
         at = np.maximum(free, 0) if isinstance(free, np.ndarray) else free
         return _sums_program(loop, table, theta, at, data, start)
-    lanes = zip(theta, free, start, strict=True)
-    found = [code.sums(np.asarray(one), np.asarray(f), np.asarray(x)) for one, f, x in lanes]
+    each = zip(theta, free, start, strict=True)
+    found = [code.sums(np.asarray(one), np.asarray(f), np.asarray(x)) for one, f, x in each]
     return Sums(*(np.stack(parts) for parts in zip(*found, strict=True)))  # pyright: ignore[reportArgumentType]
 
 
-def _lane(loop: Loop, table: Table, theta: Array, free: Array, data: Windows, start: Array) -> tuple[Array, ...]:
+def by_kernel(
+    loop: Loop, table: Table, theta: np.ndarray, free: np.ndarray, data: Windows, start: Any, *, interpret: bool = False
+) -> Sums:
+    """`linear_sums` where one kernel of a GPU rolls all windows out (`lanes`), lane after lane."""
+    found = []
+    for one, columns, begin in zip(theta, free, start, strict=True):
+        motion = lanes.rolled(loop, table, one, data, begin, interpret=interpret)
+        found.append(_given_program(loop, table, jnp.asarray(one), jnp.asarray(columns), data, begin, motion))
+    return Sums(*(jnp.stack(parts) for parts in zip(*found, strict=True)))  # pyright: ignore[reportArgumentType]
+
+
+def _lane(
+    loop: Loop, table: Table, theta: Array, free: Array, data: Windows, start: Array, motion: lanes.Rolled | None = None
+) -> tuple[Array, ...]:
+    """Sums of one lane; the `motion` where it is known before."""
     size, n, windows = state_size(loop), loop.robot.nv, start.shape[1]
     rates = data.reading.shape[1] > len(loop.measured)
     here = put(loop, table, theta)
@@ -193,7 +211,10 @@ def _lane(loop: Loop, table: Table, theta: Array, free: Array, data: Windows, st
 
     def chunk(carry: tuple[State, Array, Array, Any], block: Array) -> Any:
         state, warm, spread, before = carry
-        (state, warm), (states, steps) = _rollout(here, data, state, warm, weight, block)
+        if motion is None:
+            (state, warm), (states, steps) = _rollout(here, data, state, warm, weight, block)
+        else:
+            states, steps = _piece(motion, block, data.block * data.substeps, state.act)
         a, b = _linearised(loop, table, theta, free, data, states, steps, block)
         spread, rows = _spread(a, b, spread, data.substeps)
         first = data.block * block
@@ -210,6 +231,16 @@ def _lane(loop: Loop, table: Table, theta: Array, free: Array, data: Windows, st
 
     blocks = jnp.arange(data.reading.shape[0] // data.block)
     return jax.lax.scan(chunk, (state, jnp.zeros_like(state.v), spread, nothing), blocks)[1]
+
+
+_given_program = program(_lane, static_argnums=1)
+
+
+def _piece(motion: lanes.Rolled, block: Array, steps: int, act: Array) -> tuple[State, Step]:
+    """States and solved steps of a block of a motion."""
+    q, v, a, whole, slip = (jax.lax.dynamic_slice_in_dim(x, block * steps, steps) for x in motion)
+    still = jnp.zeros_like(a)
+    return State(q, v, jnp.broadcast_to(act, (steps, *act.shape))), Step(Solution(a, slip, still, still), whole)
 
 
 class _Before(NamedTuple):

@@ -16,7 +16,7 @@ from .fit import Fit, fit
 from .loop import Loop
 from .parameters import BOUNDS, Table, values
 from .sensitivity import Windows, predicted
-from .thresholds import POWER, SLOW, SLOW_ROWS
+from .thresholds import POWER, SLOW, SLOW_ROWS, TO_TRY
 
 __all__ = [
     "Setting",
@@ -32,11 +32,13 @@ __all__ = [
     "residuals",
     "setting",
     "start_values",
+    "thinned",
     "whitened",
 ]
 
 _PAIR = 2  # starts of the baseline that are followed to the end
 _ROUGH = 1e-3  # share of the squares that a step of such a start must promise
+_ENOUGH = 6000  # rows of an arm's recordings that a search is made on; the more are asked at the end
 _EARLY = 4  # iterations of a race among all starts
 
 
@@ -113,6 +115,23 @@ def setting(
     )  # fmt: skip
 
 
+def thinned(here: Setting) -> Setting:
+    """Where there is more than a search needs, some windows of each recording, evenly spread; else the same."""
+    total = sum(one.rows for one in here.stretches)
+    if total <= _ENOUGH:
+        return here
+    kept = []
+    for run in sorted({one.run for one in here.stretches}):
+        mine = [one for one in here.stretches if one.run == run]
+        many = int(np.ceil(len(mine) * _ENOUGH / total))
+        kept += [mine[k] for k in np.unique(np.round((np.arange(many) + 0.5) * len(mine) / many - 0.5).astype(int))]
+    if len(kept) == len(here.stretches):
+        return here
+    some = replace(here, stretches=tuple(kept))
+    data = some.cut(here.loop)
+    return replace(some, data=data, folds=_folds(data, kept))
+
+
 def _folds(data: Windows, stretches: Sequence[Stretch]) -> np.ndarray:
     """Recordings where there are three or more, else four quarters of the time."""
     blocks, count = data.reading.shape[0] // data.block, len(stretches)
@@ -152,7 +171,7 @@ def coloured(here: Setting, structure: Structure, found: Fit) -> Setting | None:
     """The setting with the colour of what a fit leaves, or None where that is more than noise, or white."""
     if here.pole is not None:
         return None
-    colour = colour_of(residuals(structure, found), np.asarray(structure.data.weight) > 0)
+    colour = colour_of(residuals(structure, found), np.asarray(structure.data.weight) > 0, TO_TRY)
     if colour is None or not colour.pole.any():
         return None
     levels = colour.level.reshape(len(here.noise), -1)

@@ -15,6 +15,9 @@ UNSURE = 2.5  # t, where nothing but noise is left
 CLEARLY = 3.0  # t, where more than noise stays beside it
 MUCH = 0.25  # gain, where more than noise stays beside it: less may stand in for the rest; not of what every joint has
 SMALL = 0.002  # gain below which a cause found with others is not missed
+SLIGHT = (
+    1e-3  # of the squares that others explain at its joint, below which a cause makes up for a law that is not theirs
+)
 SURELY = 0.1  # of the squares, by which a cause that is surely missed would make them larger
 FITTED_FOR_HELD = 0.7  # of the t that a name needs: what it must have on the rows that it was fitted to
 OF_ITS_SIZE = 0.5  # standard deviation of a size that is known, of numbers that cannot be negative
@@ -24,6 +27,8 @@ CLEAR_OF_NOTHING = 3.0  # standard deviations of a size from no effect, of numbe
 USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
 UNTOLD = 1.7  # t below which two causes are alike
 NEAR = 0.1  # of the best gain, within which another may be alike
+NO_CHOICE = 6.0  # squares between two fits that leave noise alone, below which neither is the likelier one (20 to 1)
+STILL_NEEDED = 9.0  # squares that a cause must be worth beside another, to first order, for the other not to be tried
 NO_WORSE = 1.002  # times the squares of what contains it, up to which the simpler cause is taken
 RICHER = 1.02  # times the promise of a simpler cause, which a richer one must exceed to be fitted
 MAY_WIN = 0.45  # share of the best gain after a few steps from which a candidate is fitted to the end
@@ -38,6 +43,7 @@ SLOW_ROWS = 25
 
 # Whether it is coloured noise (`colour`)
 COLOUR = 4.0  # sigmas by which octaves with levels of their own are likelier than a low pass
+TO_TRY = 8.0  # the same of what a fit that takes it for white noise leaves: such a fit bends to it
 BURST = 5.0  # sigmas by which the power of groups of `BURST_ROWS` rows varies more than noise's
 BURST_ROWS = 25
 LOUDER = 4.0  # sigmas of the power over that which the record's fourth differences tell, as `POWER`

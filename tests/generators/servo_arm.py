@@ -66,7 +66,7 @@ def record(case: str, seed: int) -> dict[str, np.ndarray]:
             model.dof_frictionloss[0] = 0.3 + 0.5 * np.exp(-((data.qvel[0] / 0.25) ** 2))
         if case == "load_dependent_friction":
             mujoco.mj_forward(model, data)
-            model.dof_frictionloss[0] = 0.15 + 0.25 * abs(data.qfrc_actuator[0] - data.qfrc_bias[0])
+            model.dof_frictionloss[0] = 0.15 + 0.25 * abs(data.qfrc_actuator[0] + data.qfrc_bias[0])
         mujoco.mj_step(model, data)
     rng = np.random.default_rng([seed, CASES.index(case)])
     offset = 0.03 if case == "encoder_offset" else 0.0

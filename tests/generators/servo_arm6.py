@@ -100,7 +100,7 @@ def record(
         if "load_dependent_friction" in what:
             j, ratio = what["load_dependent_friction"]
             mujoco.mj_forward(model, data)
-            load = abs(data.qfrc_actuator[dofs[j]] - data.qfrc_bias[dofs[j]])
+            load = abs(data.qfrc_actuator[dofs[j]] + data.qfrc_bias[dofs[j]])
             model.dof_frictionloss[dofs[j]] = 0.5 * FRICTION[j] + ratio * load
         if sprung >= 0:
             at = model.joint("spring").dofadr[0]

@@ -1,0 +1,48 @@
+"""Deviations of causes where the model is wrong: they count how far values move with the weights of the rows."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from figaroh_jax.diagnosis import joint as fits
+from figaroh_jax.diagnosis.estimates import Fitted
+from figaroh_jax.diagnosis.joint import AS_SURE, Joint, with_misfit
+
+SHARE = 0.25  # correlation of the two values
+
+
+def stood(value: list[float], deviation: list[float]) -> Any:
+    covariance = np.outer(deviation, deviation) * (np.eye(2) + SHARE * (1 - np.eye(2)))
+    step = SimpleNamespace(state=SimpleNamespace(theta=np.zeros(2)))
+    return SimpleNamespace(step=step, causes=[], fitted=Fitted(np.array(value), covariance, ((0, 1),)))
+
+
+def widened(monkeypatch: pytest.MonkeyPatch, *others: Any) -> np.ndarray:
+    """Covariance of the fit of values (1, 2) with deviations (.1, .2), beside others by other weights."""
+    own, left = stood([1.0, 2.0], [0.1, 0.2]), list(others)
+    monkeypatch.setattr(fits, "solved", lambda problem, start, theta: start)
+    monkeypatch.setattr(fits, "_together", lambda problem, base, causes, whitening: left.pop(0))
+    problem: Any = SimpleNamespace(weighted=lambda weight: problem)
+    start, nothing = cast(Any, SimpleNamespace(theta=np.zeros(2))), np.zeros(1)
+    joint = Joint(own.step, own.causes, own.fitted)
+    return with_misfit(problem, start, joint, [(nothing, nothing)] * len(others)).fitted.covariance
+
+
+def test_a_value_that_moves_with_the_weights_is_as_unsure_as_it_moves(monkeypatch: pytest.MonkeyPatch):
+    found = widened(monkeypatch, stood([1.3, 2.0], [0.1, 0.2]), stood([1.0, 2.0], [0.15, 0.2]))
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), [np.hypot(0.1, 0.3), 0.2], rtol=1e-12)
+    assert found[0, 1] == pytest.approx(SHARE * np.sqrt(found[0, 0] * found[1, 1]))
+
+
+def test_a_fit_that_says_little_of_a_value_moves_its_deviation_little(monkeypatch: pytest.MonkeyPatch):
+    found = widened(monkeypatch, stood([5.0, 2.0], [100.0, 0.2]))
+    np.testing.assert_allclose(found[0, 0], 0.1**2 + (AS_SURE * 0.1 * 4.0 / 100.0) ** 2, rtol=1e-12)
+
+
+def test_rows_that_say_nothing_of_a_value_leave_its_deviation(monkeypatch: pytest.MonkeyPatch):
+    found = widened(monkeypatch, stood([np.nan, 2.0], [np.inf, 0.2]))
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), [0.1, 0.2], rtol=1e-12)
