@@ -80,7 +80,7 @@ def test_what_a_rollout_has_no_form_for_is_refused(case):
 
 
 def test_one_joint_of_an_arm_is_fitted_by_itself_whatever_the_others_are(tmp_path: Path):
-    """All rotors and frictions of the model are 1.6 times MuJoCo's; the lift's are found though the others stay wrong."""
+    """Rotors and frictions of the model are 1.6 times MuJoCo's; the lift's are found while the others stay wrong."""
     (tmp_path / "arm.xml").write_text(servo_arm6.model_text(scale=1.6))
     loop, _ = fj.load_loop(tmp_path / "arm.xml")
     seen = servo_arm6.record([], 4, 0)
