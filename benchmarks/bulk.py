@@ -44,6 +44,7 @@ class Study(NamedTuple):
     module: str
     made: tuple[str, ...]
     due: Callable[[dict[str, Any], bool], float | None]  # of a case; whether its truth is forbidden
+    made_at: float = -1.0  # when its cases are made
 
 
 def studies(seed: int) -> list[Study]:
@@ -65,6 +66,7 @@ def studies(seed: int) -> list[Study]:
             ("--seed", str(seed + 1 + k), "--kinds", kind, "--clean", str(clean), "--jobs", str(jobs))
             + (("--only", *only) if only else ()),
             due,
+            {"closed_loop": -1.0, "inverse": 3.7, "kinematic": 8.9}[kind],
         )
         for k, (name, (kind, clean, only, due, jobs)) in enumerate(made.items())
     ]
@@ -128,7 +130,7 @@ class Pool:
         self.due: list[Due] = []
         self.count, self.busy, self.changed = 0, 0, threading.Condition()
         for study in kept:
-            self.add(-1.0, "", lambda server, s=study: self.made(s))
+            self.add(study.made_at, "", lambda server, s=study: self.made(s))
         for name in sets:
             self.add(9.0, name, lambda server, n=name: self.real_set(n))
 
