@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from generators import servo_arm6
 
 import figaroh_jax as fj
 
@@ -76,3 +77,19 @@ def test_what_a_rollout_has_no_form_for_is_refused(case):
         fj.residual(odd, data)
     with pytest.raises(fj.InputError, match="no number 'delays'; did you mean 'delay'"):
         fj.rollout_data(data.loop, [], drives=["delays"])
+
+
+def test_one_joint_of_an_arm_is_fitted_by_itself_whatever_the_others_are(tmp_path: Path):
+    """Rotors and frictions of the model are 1.6 times MuJoCo's; the lift's are found while the others stay wrong."""
+    (tmp_path / "arm.xml").write_text(servo_arm6.model_text(scale=1.6))
+    loop, _ = fj.load_loop(tmp_path / "arm.xml")
+    seen = servo_arm6.record([], 4, 0)
+    run = fj.recording(time=seen["t"][:600], q=seen["q"][:600], command=seen["u"][:600])
+    data = fj.rollout_data(loop, run, noise=servo_arm6.NOISE, joint="lift")
+    assert data.model.robot.dof_names == ("lift",)
+    found = fj.fit(data.model, data, ["effects", "start"]).parameters
+    assert found["viscous_friction lift damping"].value == pytest.approx(servo_arm6.DAMPING[1], rel=0.03)
+    assert found["coulomb_friction lift force"].value == pytest.approx(servo_arm6.FRICTION[1], rel=0.03)
+    assert found["rotor_inertia lift inertia"].value == pytest.approx(servo_arm6.ARMATURE[1], rel=0.06)
+    with pytest.raises(fj.InputError, match="did you mean 'lift'"):
+        fj.rollout_data(loop, run, joint="lfit")

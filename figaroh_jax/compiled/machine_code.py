@@ -76,6 +76,7 @@ static inline V down(V x) { V r = (x + whole) - whole; return choose((I)(r > x),
 static inline I bits(V x) { return (I)(x + whole); }
 int lanes_of_a_block(void) { return W; }
 """
+MOST_WANTED = 32  # robots whose constants are held: they take longer to compute than a hundred samples
 TOGETHER = 128  # samples whose answers are collected in the cache, for they go to as many places of memory as numbers
 
 
@@ -120,8 +121,16 @@ def code_of_few(
 
 
 def _wanted(straight: Straight, parameters: Any, widths: tuple[int, ...]) -> tuple[_Wanted, np.ndarray]:
-    constants = np.ascontiguousarray(straight.constants(parameters, float, np), float)
-    return _Wanted(straight, parameters, straight.known_lengths(parameters, constants), widths), constants
+    numbers = b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(parameters))
+    key = straight.name, straight.structure(parameters), widths, numbers
+    known = _last_wanted.get(key)
+    if known is None:
+        constants = np.ascontiguousarray(straight.constants(parameters, float, np), float)
+        known = _Wanted(straight, parameters, straight.known_lengths(parameters, constants), widths), constants
+        if len(_last_wanted) >= MOST_WANTED:
+            _last_wanted.clear()
+        _last_wanted[key] = known
+    return known
 
 
 def _run(code: _Code, last: bool, constants: np.ndarray, room: Room, *arrays: np.ndarray) -> np.ndarray:
@@ -227,6 +236,7 @@ class _Wanted(NamedTuple):
 
 
 _ready: dict[Any, _Code | None] = {}
+_last_wanted: dict[Any, tuple[_Wanted, np.ndarray]] = {}
 
 
 def _code(wanted: _Wanted, compile_it: bool) -> _Code | None:

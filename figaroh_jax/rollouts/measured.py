@@ -7,6 +7,7 @@ delay, limits) are the loop's, and the data leave the ones named in `drives` ope
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -20,10 +21,11 @@ from ..effects.extended import ExtendedModel, changed_robot
 from ..errors import InputError, nearest
 from ..recordings.dataset import Recording
 from ..rigid.model import Leaf, RobotModel
+from .alone import alone, carried_by, separable
 from .data import Run, Stretch, noise_of, regular, windows
 from .loop import Loop, State, advance, integrated, mobility
 from .parameters import UNITS, Entry, current, put, values
-from .sensitivity import Windows, began, read_of
+from .sensitivity import Windows, began, carrying, read_of
 from .simulation import delayed
 from .task import EFFECTS, extended_of
 
@@ -91,6 +93,7 @@ def rollout_data(
     *,
     noise: Float[ArrayLike, "..."] | None = None,
     drives: Sequence[str] = (),
+    joint: str | None = None,
 ) -> RolloutData:
     """Recordings with a `command` as data of a residual; all of one period, a multiple of the loop's step.
 
@@ -98,15 +101,21 @@ def rollout_data(
     numbers of the drives that a fit may free (`kp`, `kd`, `delay`, ... of `rollouts.parameters`). Held-out recordings
     are left out. Start the fit at `data.model`.
 
+    `joint`: that joint of an arm by itself, the others moving as they were measured; what it carries follows from their
+    motion (`alone`). A fit of it takes a hundredth of the arm's, and no error of another joint reaches it.
+
     >>> import numpy as np, figaroh_jax as fj
     >>> robot = fj.load_urdf(fj.DEMO)
     >>> drives = {name: {"kind": "position", "kp": 60.0, "kd": 4.0} for name in robot.joint_names}
     >>> loop, _ = fj.load_loop(fj.DEMO, drives, dt=0.01)
     >>> u = 0.3 * np.sin(0.05 * np.arange(60)[:, None] + np.arange(4))
     >>> seen = fj.rollout(loop, u, u[0]).reading
-    >>> data = fj.rollout_data(loop, fj.recording(q=seen, command=u, rate=100), noise=1e-3)
+    >>> run = fj.recording(q=seen, command=u, rate=100)
+    >>> data = fj.rollout_data(loop, run, noise=1e-3)
     >>> fj.residual(data.model, data).shape  # 60 readings of four joints, and how each of the states begins
     (248,)
+    >>> fj.rollout_data(loop, run, noise=1e-3, joint="elbow").model.robot.dof_names
+    ('elbow',)
     """
     unknown = next((name for name in drives if name not in DRIVES), None)
     if unknown is not None:
@@ -115,19 +124,38 @@ def rollout_data(
     runs = [_run(loop, one) for one in given if one.role == "fit"]
     if not runs:
         raise InputError("no recording to fit: all have role holdout")
-    measured = len(loop.measured)
     spread = np.mean([noise_of(run.position) ** 2 for run in runs], axis=0) ** 0.5 if noise is None else noise
+    spread = np.broadcast_to(np.asarray(spread, float), (len(loop.measured),))
+    if joint is not None:
+        loop, runs, spread = _alone(loop, runs, spread, joint)
     stretches = [Stretch(k, 0, len(run.time)) for k, run in enumerate(runs)]
     with jax.enable_x64(True):
-        cut = windows(loop, runs, stretches, [np.broadcast_to(np.asarray(spread, float), (measured,))], _WHOLE)
+        cut = windows(loop, runs, stretches, [spread], _WHOLE)
     rows = max(len(run.time) for run in runs)
     kept = eqx.tree_at(
         lambda w: (w.command, w.reading, w.weight),
         cut,
         (cut.command[: cut.lead + rows], cut.reading[:rows], cut.weight[:rows]),
     )
+    if cut.carried is not None:
+        kept = eqx.tree_at(lambda w: w.carried, kept, cut.carried[:rows])
     count = len(drives) * len(loop.drives.names)
     return RolloutData(loop, kept, cut.start, cut.start, np.zeros(count), tuple(drives))
+
+
+def _alone(
+    loop: Loop, runs: Sequence[Run], noise: Float[np.ndarray, " encoders"], joint: str
+) -> tuple[Loop, list[Run], Float[np.ndarray, "1"]]:
+    """The loop of one joint under its own name, its recordings with what it carries, and its encoder's noise."""
+    names = loop.robot.dof_names
+    if joint not in names:
+        raise InputError(f"joint: the loop has no joint '{joint}'{nearest(joint, names)}")
+    if not separable(loop):
+        raise InputError("joint: one joint alone needs drives that act at one joint each, and every joint measured")
+    number = names.index(joint)
+    small, mine = alone(loop, runs, carried_by(loop, runs), number)
+    named = replace(small.robot, joints=(small.robot.joints[0]._replace(name=joint),))
+    return replace(small, robot=named), list(mine), noise[[list(loop.measured).index(number)]]
 
 
 def _run(loop: Loop, one: Recording) -> Run:
@@ -166,15 +194,17 @@ def _with_model(loop: Loop, model: ExtendedModel) -> Loop:
 def _simulated(loop: Loop, data: Windows, start: Array) -> Array:
     """Readings (rows, readings, runs): each step is found without, and then taken with derivatives."""
     weight, rates = mobility(loop), data.reading.shape[1] > len(loop.measured)
+    carried = None if data.carried is None else jnp.repeat(data.carried, data.substeps, axis=0)
     fine = jnp.repeat(data.command, data.substeps, axis=0)
     seen = delayed(fine, jnp.asarray(loop.drives.delay), loop.dt)[data.lead * data.substeps :]
 
-    def one(carry: tuple[State, Array], control: Array) -> tuple[tuple[State, Array], State]:
-        state, warm = carry
-        step: Any = jax.lax.stop_gradient(advance(loop, state, control, weight, warm)[1])
-        return (integrated(loop, state, control, weight, step), step.a), state
+    def one(carry: tuple[State, Array], given: tuple[Array, Array | None]) -> tuple[tuple[State, Array], State]:
+        (state, warm), (control, load) = carry, given
+        here = carrying(loop, load)
+        step: Any = jax.lax.stop_gradient(advance(here, state, control, weight, warm)[1])
+        return (integrated(here, state, control, weight, step), step.a), state
 
     state = began(loop, data, start)
-    _, states = jax.lax.scan(one, (state, jnp.zeros_like(state.v)), seen)
+    _, states = jax.lax.scan(one, (state, jnp.zeros_like(state.v)), (seen, carried))
     rows = jax.tree.map(lambda x: x[:: data.substeps], states)
     return jax.vmap(lambda q, v, act: read_of(loop, State(q, v, act), rates))(*rows)

@@ -90,7 +90,7 @@ def _carried(data: Windows, block: Array) -> Array | None:
     return jnp.repeat(rows, data.substeps, axis=0)
 
 
-def _carrying(loop: Loop, carried: Array | None) -> Loop:
+def carrying(loop: Loop, carried: Array | None) -> Loop:
     """The loop at instants at which its joint carries that, (4 + 3 links, samples)."""
     if carried is None or loop.carried is None:
         return loop
@@ -111,7 +111,7 @@ def read_of(loop: Loop, state: State, rates: bool) -> Array:
 
 def _rollout(loop: Loop, data: Windows, state: State, warm: Array, weight: Array, block: Array) -> Any:
     def one(carry: tuple[State, Array], given: tuple[Array, Array | None]) -> Any:
-        after, step = advance(_carrying(loop, given[1]), carry[0], given[0], weight, carry[1])
+        after, step = advance(carrying(loop, given[1]), carry[0], given[0], weight, carry[1])
         return (after, step.a), (carry[0], step)
 
     return jax.lax.scan(one, (state, warm), (_seen(loop, data, block), _carried(data, block)))
@@ -314,7 +314,7 @@ def _linearised(
         at = put(loop, table, theta)
         seen, weight = flat(_seen(at, data, block)), mobility(at)
         at = at if rigid is None else rigid.put(at, theta)
-        after = integrated(_carrying(at, carried), State(q, v, act), seen, weight, fixed)
+        after = integrated(carrying(at, carried), State(q, v, act), seen, weight, fixed)
         return jnp.concatenate([after.q, after.v, after.act] if active else [after.q, after.v])
 
     _, pushed = jax.linearize(move, *here, theta)
