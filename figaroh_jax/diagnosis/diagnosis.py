@@ -42,7 +42,7 @@ from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import reason_against, standings
 from .problem import Problem
 from .rest import Significance, excess, lines, parts_of, predictable, relative_rest, significance, verdict, wrong_law
-from .search import Found, Search, eliminate, find_causes
+from .search import Found, Search, chance_beside, eliminate, find_causes
 from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import Step, stand, with_causes
@@ -212,7 +212,7 @@ def _searched(
         here = before._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
         found, joint = _fitted_together(here, search.found, forbid)
-        left, beyond, line = _left(here, search, found, joint, tolerance, generator)
+        left, beyond, line = _left(here, search, found, joint, forbid, tolerance, generator)
         strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
         return _Searched(before, here, search, found, joint, left, line, strict)
 
@@ -327,6 +327,7 @@ def _left(
     search: Search,
     found: list[Found],
     joint: Joint,
+    forbid: Sequence[str],
     tolerance: float,
     generator: np.random.Generator,
 ) -> tuple[Significance, float, tuple[float, float, int]]:
@@ -339,8 +340,11 @@ def _left(
     line = lines(problem, joint.step.linear.residual)
     size = float(relative_rest(problem, joint.step.state, noise_rms(problem, spectrum)).max())
     predicted = predictable(problem, joint.step, whitening)
+    p_left = search.p_left
+    if len(found) < len(search.found):  # it was asked beside causes that have gone
+        p_left = chance_beside(problem, joint.step, spectrum, whitening, forbid, generator)
     joints, tolerable = problem.model.joint_names, size <= tolerance
-    left = significance(now, max(before, 0.0), search.p_left, flexible, line, joints, predicted, tolerable)
+    left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
     return left._replace(there=left.there or (wrong and not tolerable)), now[0], line
 

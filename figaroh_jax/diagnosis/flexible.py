@@ -31,8 +31,8 @@ def flexible_p(
     whitening: Float[np.ndarray, "F nv"],
     generator: np.random.Generator,
 ) -> tuple[float, Name, float]:
-    """p-value of four smooth families a joint (position; friction over q and v; posture; time), the strongest of them,
-    and by how much its score exceeds what chance gives (squares of the whitened rows).
+    """p-value of the smooth families of each joint (`families`), the strongest of them, and by how much its score
+    exceeds what chance gives (squares of the whitened rows).
 
     They test and describe; they are never named as a cause.
     """
@@ -137,12 +137,13 @@ def _replaced(G: np.ndarray, b: np.ndarray, column: int, cross: np.ndarray, squa
 
 def families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], still: bool = False) -> list[Group]:
     """Smooth functions in the rows of each joint: of its position; of its velocity and position, odd in the velocity;
-    of all positions (second degree); and, unless `still`, of time."""
+    of all positions (second degree); a constant; and, unless `still`, of time."""
     nv = problem.model.nv
     joints = [_smooth(state.motion, joint) for joint in range(nv)]
     series = {
         title: [np.stack([j[title][k] for j in joints], 1) for k in range(len(joints[0][title]))] for title in joints[0]
     }
+    series["constant"] = [np.ones_like(np.asarray(state.motion.position))]
     series["posture"] = [np.repeat(column[:, None], nv, axis=1) for column in _posture(state.motion)]
     groups = []
     for title, columns in series.items():

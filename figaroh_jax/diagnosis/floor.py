@@ -161,8 +161,9 @@ def _fit(problem: Problem, rows: Float[np.ndarray, "nv T"], taken: np.ndarray | 
     gain = np.interp(frequency, np.asarray(records.omega) / (2 * np.pi), problem.gain)
     degrees = np.full(len(frequency), max(1.0, weights / count)) * left.mean(1) * news
     degrees[0] /= 2  # one real number
-    lowest = max(LOWEST_RESOLVED * rate / count, LOWEST_FREQUENCY)
-    return noise.fit_spectrum(frequency, power / left, gain, degrees, rate / 2, lowest)
+    lowest = min(max(LOWEST_RESOLVED * rate / count, LOWEST_FREQUENCY), rate / 8)
+    told = frequency >= (lowest if taken is not None else 0.0)  # what a model misses at low frequency is no noise
+    return noise.fit_spectrum(frequency[told], (power / left)[told], gain[told], degrees[told], rate / 2, lowest)
 
 
 def _onto(wanted: np.ndarray, own: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -103,13 +103,15 @@ def significance(
     """Whether the rest is more than noise and more than what is `tolerable`.
 
     Power that repeats is no noise. Where no recording repeats another the noise is an estimate, and what is left above
-    it counts only if smooth functions of the motion have `predicted` it on data that they were not fitted to.
+    it counts only if smooth functions of the motion have `predicted` it on data that they were not fitted to. What is
+    scored counts by the joint where it is largest: what is wrong at one of many is little of all.
     """
     size, p_repeat, own = now
+    largest = float(np.max(own))
     repeated = p_repeat < 1
     repeats = p_repeat < REST_P and size > max(REPEATED, REPEATED_SHARE * first)
     p = min(flexible[0], p_catalogue) if repeated else flexible[0]
-    scored = p < REST_P and size > max(FITTED if repeated else UNREPEATED, FITTED_SHARE * first)
+    scored = p < REST_P and largest > max(FITTED if repeated else UNREPEATED, FITTED_SHARE * first)
     vibrates = line[0] < LINE_P
     worst, text = int(np.argmax(own)), ""
     there = bool((repeats or (scored and (repeated or predicted))) and not tolerable)

@@ -284,7 +284,7 @@ def noise_squares(
 ) -> Float[np.ndarray, " nv"]:
     """Sum over each joint's whitened rows of the squares that noise with the spectrum has there, as in `draw_noise`."""
     frequency, response = _row_response(problem, whitening)
-    power = spectrum._replace(lowest=0.0).power(frequency).T * response**2
+    power = spectrum._replace(lowest=spectrum.known).power(frequency).T * response**2
     count = problem.records.shape[2]
     bins = np.full(len(frequency), 2.0)  # of all `count` frequencies, positive and negative
     bins[[0, -1] if count % 2 == 0 else [0]] = 1.0

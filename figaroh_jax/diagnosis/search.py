@@ -26,7 +26,7 @@ from .state import State, solved, with_width
 from .step import Step, stand, with_cause, with_causes
 from .thresholds import GAIN, MOST_CAUSES, OVERLAP_ELSEWHERE, SHARE_AGAIN, SHARE_ALIKE, SMALLEST, T_BETTER
 
-__all__ = ["Found", "Search", "eliminate", "find_causes", "judged_without", "stood_without"]
+__all__ = ["Found", "Search", "chance_beside", "eliminate", "find_causes", "judged_without", "stood_without"]
 
 NEAR, CLOSER = 4, 800  # times the level: p-values below which few draws cannot tell from it; draws that can
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
@@ -114,6 +114,20 @@ def find_causes(
             step = step if problem is known else stand(problem, with_width(problem, step.state), whitening)
     begun = solved(problem, with_width(problem, state), step.state.theta[: len(state.theta)])
     return Search(problem, begun, step, found, p_values[0], p_values[-1], shown)
+
+
+def chance_beside(
+    problem: Problem,
+    step: Step,
+    spectrum: Spectrum,
+    whitening: Float[np.ndarray, "F nv"],
+    forbid: Collection[str],
+    generator: np.random.Generator,
+) -> float:
+    """p-value of the whole catalogue beside the causes of a step."""
+    screened = screen(step.rows, step.linear, catalogue(problem, step.state, step.rows, whitening, forbid))
+    null = Null(problem, spectrum, whitening, generator)
+    return family_p(step.rows, step.linear, screened, null, generator, LATER)
 
 
 def _refreshed(

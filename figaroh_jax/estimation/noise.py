@@ -32,7 +32,8 @@ class Spectrum(NamedTuple):
     coefficients: Float[np.ndarray, "terms nv"]
     covariance: Float[np.ndarray, "nv terms terms"]
     nyquist: float  # Hz, of the rows
-    lowest: float = 0.0  # Hz: what the recordings resolve; below, the power is held constant
+    lowest: float = 0.0  # Hz: below, the power that rows are weighted by is held constant
+    known: float = 0.0  # Hz: the lowest frequency that the fit has seen
 
     def power(self, frequency: Float[np.ndarray, " freqs"]) -> Float[np.ndarray, "freqs nv"]:
         """Power at `frequency` (Hz), N^2 m^2 or N^2 a row; constant beyond what the rows resolve, at both ends."""
@@ -43,15 +44,15 @@ class Spectrum(NamedTuple):
     ) -> Float[np.ndarray, "draws freqs nv"]:
         """Powers that the data leave possible: the coefficients drawn from their covariance, each joint for itself.
 
-        Below the lowest frequency that is resolved the power law goes on: there the noise may be larger, though rows
-        are weighted as if it were not.
+        Below `lowest` too, as far as it is known: there the noise may be larger, though rows are weighted as if it were
+        not.
         """
         terms, count = self.coefficients.shape
         if not self.covariance.any():
             return np.broadcast_to(self.power(frequency), (draws, len(frequency), count))
         low = np.linalg.cholesky(self.covariance + 1e-12 * np.eye(terms))
         off = np.einsum("jab,djb->daj", low, generator.standard_normal((draws, count, terms)))
-        basis = _basis(np.minimum(frequency, self.nyquist), self.nyquist)
+        basis = _basis(np.clip(frequency, self.known, self.nyquist), self.nyquist)
         return np.exp(basis @ (self.coefficients + off))
 
 
@@ -86,32 +87,35 @@ def fit_spectrum(
     Short recordings have few bins at low frequency, which alone would draw a spectrum that the noise does not have. So
     the squared second derivative of the polynomials is penalised, and each joint's shape is expected to be that of the
     other joints; the weights of both are those of largest marginal likelihood (empirical Bayes, with Laplace's
-    approximation): joints whose noise is not alike are not made so.
+    approximation), of the second joint by joint: noise that is not alike is not made so.
     """
     used = gain > PASSED
     basis, weight = _basis(frequency[used], nyquist), degrees[used] / NEIGHBOURS
     observed = np.maximum(power[used] / gain[used, None], 1e-300)
-    nv, terms = observed.shape[1], basis.shape[1]
+    nv, terms, known = observed.shape[1], basis.shape[1], float(frequency[used][0])
     bend = np.zeros((terms, terms))
     bend[2:, 2:] = _bending()
     free = np.diag([1e-9, 1e-2] + [0.0] * (terms - 2))
     relative = observed / np.average(observed, axis=0, weights=weight)
     others = relative if nv == 1 else (relative.sum(1, keepdims=True) - relative) / (nv - 1)
     each = [_penalised(basis, max(nv - 1, 1) * weight, others, free + w * bend) for w in SMOOTHNESS]
-    smooth = int(np.argmax([likely for likely, *_ in each]))
+    smooth = int(np.argmax([likely.sum() for likely, *_ in each]))
     _, common, spread = each[smooth]
     if nv == 1:
-        return Spectrum(common + np.log(observed / relative)[:1] * np.eye(terms)[:, :1], spread, nyquist, lowest)
+        return Spectrum(common + np.log(observed / relative)[:1] * np.eye(terms)[:, :1], spread, nyquist, lowest, known)
     even = _basis(np.geomspace(LOWEST / 10, nyquist, 50), nyquist)
     even[:, 0] = 0.0
     apart = even.T @ even / len(even) + np.diag([1e-9] + [0.0] * (terms - 1))
     common[0] = 0.0
-    each = [_penalised(basis, weight, observed, a * apart + SMOOTHNESS[smooth] * bend, common) for a in ALIKE]
-    best = int(np.argmax([likely for likely, *_ in each]))
-    _, coefficients, own = each[best]
-    drawn = own @ (ALIKE[best] * apart + SMOOTHNESS[smooth] * bend)  # how far each follows the others' shape
+    priors = [a * apart + SMOOTHNESS[smooth] * bend for a in ALIKE]
+    each = [_penalised(basis, weight, observed, prior, common) for prior in priors]
+    best = np.argmax([likely for likely, *_ in each], axis=0)  # of each joint: one may be unlike all others
+    coefficients = np.stack([each[k][1][:, joint] for joint, k in enumerate(best)], axis=1)
+    own = np.stack([each[k][2][joint] for joint, k in enumerate(best)])
+    drawn = own @ np.stack([priors[k] for k in best])  # how far each follows the others' shape
     drawn[:, :, 0] = 0.0
-    return Spectrum(coefficients, own + drawn @ spread @ np.swapaxes(drawn, 1, 2), nyquist, lowest)
+    covariance = own + drawn @ spread @ np.swapaxes(drawn, 1, 2)
+    return Spectrum(coefficients, covariance, nyquist, lowest, known)
 
 
 def _penalised(
@@ -120,8 +124,8 @@ def _penalised(
     observed: Float[np.ndarray, "freqs nv"],
     prior: Float[np.ndarray, "terms terms"],
     mean: Float[np.ndarray, "terms nv"] | None = None,
-) -> tuple[float, Float[np.ndarray, "terms nv"], Float[np.ndarray, "nv terms terms"]]:
-    """Log marginal likelihood of a prior's precision (all joints together), the coefficients and their covariance."""
+) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, "terms nv"], Float[np.ndarray, "nv terms terms"]]:
+    """Log marginal likelihood of a prior's precision at each joint, the coefficients and their covariance."""
     mean = np.zeros((basis.shape[1], observed.shape[1])) if mean is None else mean
     inverse = np.linalg.inv(basis.T @ (weight[:, None] * basis) + prior)
     coefficients = mean.copy()
@@ -131,9 +135,9 @@ def _penalised(
         slope = basis.T @ (weight[:, None] * (ratio - 1)) - prior @ (coefficients - mean)
         coefficients = coefficients + inverse @ slope
     fitted, off = basis @ coefficients, coefficients - mean
-    likely = -weight @ (fitted + observed / np.exp(fitted)).sum(1) - (off * (prior @ off)).sum() / 2
-    likely += observed.shape[1] * (np.linalg.slogdet(prior)[1] + np.linalg.slogdet(inverse)[1]) / 2
-    return float(likely), coefficients, np.broadcast_to(inverse, (observed.shape[1], *inverse.shape))
+    likely = -weight @ (fitted + observed / np.exp(fitted)) - (off * (prior @ off)).sum(0) / 2
+    likely += (np.linalg.slogdet(prior)[1] + np.linalg.slogdet(inverse)[1]) / 2
+    return likely, coefficients, np.broadcast_to(inverse, (observed.shape[1], *inverse.shape))
 
 
 def white(variance: Float[np.ndarray, " nv"], nyquist: float) -> Spectrum:
