@@ -1,11 +1,13 @@
 """Two versions of the package judged on the same rows kept out, and on other folds: what `parity.py` sees, traced.
 
     python benchmarks/parity_kept.py tx40|gains|trust|irb120 --cases DIR --out OUT before=/path/a now=/path/b
+    python benchmarks/parity_kept.py slowed --cases DIR        # of this checkout
 
 Cases are those of `parity.py`. `tx40`: each quarter of the recording kept out in turn; `gains`: two recordings of six
 of a Panda with a wrong torque gain; `trust`: the same with other trust in the links; `irb120`: sixteen orders of the
 postures, which make other folds. Prints the RMS error of the kept-out rows, relative to that of the torque, low passed
-as the fit is, or the cross-validated error (mm).
+as the fit is, or the cross-validated error (mm). `slowed`: whether positions are taken down to the band of their
+motion, and by how much (logarithm) that changes the baseline's error, of all joints together and joint by joint.
 """
 
 from __future__ import annotations
@@ -110,16 +112,52 @@ def irb120(cases: Path, out: Path, sides: dict[str, Path], orders: int = 16) -> 
         print(f"order {seed}: {', '.join(told)}", flush=True)
 
 
+def slowed(cases: Path) -> None:
+    import figaroh_jax as fj
+    from figaroh_jax.diagnosis import diagnosis
+
+    seen: list[np.ndarray] = []
+    squares, kept = diagnosis._baseline_squares, diagnosis._signals
+
+    def noted(*given: Any) -> np.ndarray:
+        seen.append(squares(*given))
+        return seen[-1]
+
+    class Chosen(Exception):
+        pass
+
+    def ended(*given: Any) -> Any:
+        raise Chosen(kept(*given)[1])
+
+    diagnosis._baseline_squares, diagnosis._signals = noted, ended
+    for file in sorted(cases.glob("*/task.yaml")):
+        seen.clear()
+        try:
+            fj.diagnose_task(fj.load_task(file))
+        except Chosen as chosen:
+            if len(seen) == 2:
+                slow, plain = seen
+                whole, each = np.log(slow.sum() / plain.sum()) / 2, np.mean(np.log(slow / plain)) / 2
+                print(
+                    f"{file.parent.name}: {chosen.args[0]}, together {whole:+.4f}, joint by joint {each:+.4f}",
+                    flush=True,
+                )
+        except fj.InputError:
+            continue
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["tx40", "gains", "trust", "irb120"])
-    parser.add_argument("sides", nargs="+", metavar="NAME=FOLDER")
+    parser.add_argument("what", choices=["tx40", "gains", "trust", "irb120", "slowed"])
+    parser.add_argument("sides", nargs="*", metavar="NAME=FOLDER")
     parser.add_argument("--cases", type=Path, required=True)
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--out", type=Path, default=Path("parity_kept"))
     args = parser.parse_intermixed_args()
     sides = {name: Path(folder).resolve() for name, folder in (one.split("=", 1) for one in args.sides)}
     kept = args.cases.resolve(), args.out.resolve(), sides
-    if args.what == "trust":
+    if args.what == "slowed":
+        slowed(args.cases.resolve())
+    elif args.what == "trust":
         gains(*kept, trusts=(0.049, 0.051, 0.1))
     else:
         {"tx40": tx40, "gains": gains, "irb120": irb120}[args.what](*kept)

@@ -166,6 +166,9 @@ def test_an_effect_exists_within_its_bounds_only(model: RobotModel) -> None:
     # a wrong sign stays in a search, as a nuisance; it is never named
     assert not physical_sign(place(find("stribeck_friction"), model, ("turn",), force=-0.1, speed=0.1))
     assert physical_sign(place(find("stribeck_friction"), model, ("turn",), force=0.1, speed=0.1))
+    assert not physical_sign(place(find("power_law_friction"), model, ("turn",), strength=-1.0, exponent=0.5))
+    assert physical_sign(place(find("power_law_friction"), model, ("turn",), strength=1.0, exponent=0.5))
+    assert physical_sign(place(find("power_law_friction"), model, ("turn",), strength=-1.0, exponent=1.5))
     assert not known("torque_offset", "turn", offset=1e3)  # more than the joint ever feels
     largest = np.abs(rigid_torque(model, signals)[:, model.joint_names.index("turn")]).max()
     assert known("friction_drift", "turn", force=0.9 * largest, time=3.0)  # it passes: no more on average

@@ -45,6 +45,7 @@ _STILL = 1e-9  # rad or m per unit: the effect does nothing
 _HIGHEST = 400.0  # order of a gear error that is looked for: two periods a turn of a motor behind 200 : 1
 _NARROW = 0.2  # rad: a joint that moves less shows no order
 _RESOLVED = 8  # orders of a joint for each posture, that are looked for at the most
+_WAVES_KEPT = 1_000_000  # numbers of a joint's waves that are held from fit to fit
 _SLOTS = 6, 12  # columns and pieces of effects for which a fit has room
 
 
@@ -195,8 +196,16 @@ def effects_on(model: RobotModel, postures: Sequence[Postures], measured: Measur
         by_twist = twist_rows(measured, unknowns) if high else {}
         for joint, which in high.items():
             rows = by_twist[joint] @ axis_twist(model, joint) if joint in by_twist else np.zeros(len(measured.posture))
-            angle, order = positions_of(model, postures, joint), np.array([blocks[k].shape for k in which])
-            yield Waves(np.array(which), np.where(measured.posture >= 0, rows, 0.0), angle, order)
+            sine, cosine = turned.get(joint) or of_angle(joint, which)
+            if sine.size <= _WAVES_KEPT:
+                turned[joint] = sine, cosine
+            yield Waves(np.array(which), np.where(measured.posture >= 0, rows, 0.0), sine, cosine)
+
+    turned: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def of_angle(joint: int, which: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        phase = np.outer(positions_of(model, postures, joint), [blocks[k].shape for k in which])
+        return np.sin(phase), np.cos(phase)
 
     count = np.array([len(shape_of(b.effect)[1]) if not b.reach else len(blocks) - grid for b in blocks])
     handicap = 0.01 * (np.array([len(b.columns) for b in blocks]) - 1) + 0.005 * np.log(count)

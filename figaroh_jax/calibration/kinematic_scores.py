@@ -74,17 +74,16 @@ def row_noise(linear: Linear, posterior: Posterior) -> Float[Array, " rows"]:
 
 
 class Waves(NamedTuple):
-    """Gear errors of one joint: how its motion moves the rows, its angle in each posture, the orders in question."""
+    """Gear errors of one joint: how its motion moves the rows, and its waves in each posture."""
 
     blocks: Int[Array, " orders"]
     motion: Float[Array, " rows"]  # m or rad for 1 rad
-    angle: Float[Array, " postures"]  # rad
-    order: Float[Array, " orders"]
+    sine: Float[Array, "postures orders"]  # of the order times the joint's angle
+    cosine: Float[Array, "postures orders"]
 
     def columns(self, posture: Int[Array, " rows"]) -> tuple[Float[Array, "rows orders"], Float[Array, "rows orders"]]:
         """Sines and cosines of all orders in the rows of the given postures."""
-        phase = np.outer(np.where(posture >= 0, self.angle[posture], 0.0), self.order)
-        return self.motion[:, None] * np.sin(phase), self.motion[:, None] * np.cos(phase)
+        return self.motion[:, None] * self.sine[posture], self.motion[:, None] * self.cosine[posture]
 
 
 def score_waves(
@@ -163,9 +162,8 @@ def _spectra(
     left, member = e[: len(rows)][linear.posture[rows] >= 0], linear.posture[inside]
     for one in waves:
         motion = one.motion[inside] / noise[inside]
-        pull, square = (np.bincount(member, x, minlength=len(one.angle)) for x in (motion * left, motion**2))
-        phase = np.outer(one.angle, one.order)
-        found.append((_by_posture(np.sin(phase), np.cos(phase), pull, square) / (e @ e), freedom))
+        pull, square = (np.bincount(member, x, minlength=len(one.sine)) for x in (motion * left, motion**2))
+        found.append((_by_posture(one.sine, one.cosine, pull, square) / (e @ e), freedom))
     return found
 
 

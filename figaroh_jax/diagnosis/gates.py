@@ -42,7 +42,8 @@ def exists(problem: Problem, effect: Effect) -> bool:
 
 def physical_sign(effect: Effect) -> bool:
     """Whether no parameter has a sign that physics forbids: a rotor of negative inertia, a torque before its time."""
-    return all(float(getattr(effect, name)) >= p.lower for name, p in effect.parameters().items())
+    own = all(float(getattr(effect, name)) >= p.lower for name, p in effect.parameters().items())
+    return own and effect.possible()
 
 
 def _within(parameter: Parameter, value: float) -> bool:

@@ -284,6 +284,10 @@ class Effect(eqx.Module):
         q, v, a = motion.position, motion.velocity, motion.acceleration
         return inverse_dynamics(self.change(motion.model), q, v, a) - inverse_dynamics(motion.model, q, v, a)
 
+    def possible(self) -> bool:
+        """Whether physics allows its numbers together; for a single one see the bounds of `amplitude` and `shape`."""
+        return True
+
     def change(self, model: RobotModel) -> RobotModel:
         """The robot with the effect in it, for effects that change its inertia, gravity or geometry."""
         return model

@@ -134,6 +134,10 @@ class PowerLawFriction(JointEffect):
         speed = jnp.sqrt(self.here(motion.velocity) ** 2 + 1e-12)
         return self.strength * speed**self.exponent * self.here(motion.direction)
 
+    def possible(self) -> bool:
+        """Friction that falls from rest is another law's: this one may only bend what viscous friction makes rise."""
+        return float(self.strength) >= 0 or float(self.exponent) > 1
+
     def native(self) -> tuple[Native, ...]:
         """`damping2` or `damping3` of the joint where the exponent is 2 or 3; other exponents have no element."""
         attribute = {2.0: "damping2", 3.0: "damping3"}.get(float(self.exponent))

@@ -102,7 +102,7 @@ def rollout_data(
     are left out. Start the fit at `data.model`.
 
     `joint`: that joint of an arm by itself, the others moving as they were measured; what it carries follows from their
-    motion (`alone`). A fit of it takes a hundredth of the arm's, and no error of another joint reaches it.
+    motion (`alone`). No error of another joint reaches it.
 
     >>> import numpy as np, figaroh_jax as fj
     >>> robot = fj.load_urdf(fj.DEMO)
