@@ -26,7 +26,7 @@ from generators import servo_arm6  # noqa: E402
 from figaroh_jax.rollouts.arm import search_arm  # noqa: E402
 from figaroh_jax.rollouts.data import Run, Stretch  # noqa: E402
 from figaroh_jax.rollouts.reading import load_loop  # noqa: E402
-from figaroh_jax.rollouts.search import search  # noqa: E402
+from figaroh_jax.rollouts.search import Named, search  # noqa: E402
 from figaroh_jax.rollouts.setting import setting  # noqa: E402
 
 LINKS = 5  # the last link carries the payload
@@ -58,16 +58,23 @@ def run(
         word = "right" if found.verdict == "unknown" else "wrong" if names else "missed"
     elif not hidden:
         word = "right" if found.verdict == "nothing" else "wrong" if names else "unknown"
-    elif told == truth or (truth <= told | also and told <= truth | also):
+    elif told == truth or (truth <= told | also and all(_true(n, truth) for n in found.named)):
         word = "right"
     elif not told:
         word = "missed" if found.verdict == "nothing" else "unknown"
     else:
         word = "part" if told < truth else "wrong"
     names_text = "+".join(f"{e}({p})" for e, p in sorted(names)) or "-"
+    names_text += "".join(f" alike {e}({p})" for e, p in sorted(alike))
     proxy = "+".join(f"{n.candidate.effect}({n.candidate.at[0]})" for n in found.proxy) or "-"
     levels = " -> ".join(f"{x:.3f}" for _, x in found.table)
     return word, f"{found.verdict} {names_text}, chi2/N {levels}, proxy {proxy}", time.process_time() - start
+
+
+def _true(named: Named, truth: set[tuple[str, str]]) -> bool:
+    """Whether a name, or one that it is told to be alike, is hidden."""
+    told = [(named.candidate.effect, *named.candidate.at), *((a.effect, *a.at) for a in named.alike)]
+    return any((e, "payload" if e == "payload" else place) in truth for e, place in told)
 
 
 def main() -> None:

@@ -75,7 +75,7 @@ def _beside(here: Setting, now: Standing, named: Named, found: Sequence[Named]) 
     j, others = joint_of(here, mine), {(n.candidate.effect, n.candidate.at) for n in found}
     left = [
         c for c in here.known.candidates
-        if joint_of(here, c) == j and Name(c.effect, c.at) not in named.alike and (c.effect, c.at) not in others
+        if joint_of(here, c) == j and (c.effect, c.at) not in others
         and not c.kind.limit and not set(c.entries) & set(now.model.free) and not c.kind.holds(mine.effect)
     ]  # fmt: skip
     if not left:
@@ -160,4 +160,4 @@ def rivals(here: Setting, now: Standing, found: Sequence[Named]) -> list[tuple[N
 
 def names(alternatives: Sequence[Instead]) -> tuple[Name, ...]:
     """As the answer tells them."""
-    return tuple(Name(x.candidate.effect, x.candidate.at) for x in alternatives)
+    return tuple(dict.fromkeys(Name(x.candidate.effect, x.candidate.at) for x in alternatives))
