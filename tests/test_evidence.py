@@ -9,6 +9,7 @@ from synthetic import made_rows
 
 from figaroh_jax.diagnosis import evidence
 from figaroh_jax.diagnosis.bank import Columns, bank
+from figaroh_jax.diagnosis.floor import kept_columns
 from figaroh_jax.estimation.rows import Linear, Prior, Rows, fit, instruments
 
 NV, COUNT, WIDTH = 2, 90, 4
@@ -205,3 +206,22 @@ def test_a_bank_beside_more_columns_is_the_bank_made_anew(repeats: bool) -> None
     found = bank(grown, candidates, before)
     for ours, theirs in ((found.ZX, anew.ZX), (found.ZXi, anew.ZXi)):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12)
+
+
+def test_columns_that_the_model_has_already_do_not_come_in_again() -> None:
+    rows, rng = random_rows(), np.random.default_rng(12)
+    family = random_columns(3, grid=1, seed=13)
+    again = rows.X[:, :, 1] - 2 * rows.X[:, :, 3]  # what two columns of the model say, and rounding
+    Z = np.concatenate([family.Z, (again + 1e-10 * rng.normal(size=again.shape))[None, None]], axis=1)
+    own = Columns((0, 1), Z[:, rng.permutation(4)])
+    weak = Prior(np.zeros(WIDTH), np.full(WIDTH, 1e-8))
+    linear = fit(rows, weak)
+    stock = bank(rows, [own])
+    (score,) = evidence.scores(linear, stock, evidence.projection(linear, stock))
+    kept = spread(own, 0) @ kept_columns(score.root[0])
+    assert kept.shape[1] == 3
+    X = rows.X.reshape(-1, WIDTH)
+    left = kept - X @ np.linalg.lstsq(X, kept, rcond=None)[0]
+    np.testing.assert_allclose(left.T @ left, np.eye(3), rtol=0, atol=1e-6)
+    span = np.linalg.qr(np.hstack([X, spread(family, 0)]))[0]
+    np.testing.assert_allclose(span @ (span.T @ kept), kept, rtol=0, atol=1e-5)  # none is lost

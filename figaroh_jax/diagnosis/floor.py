@@ -16,7 +16,7 @@ from .screening import Group, catalogue, screen
 from .state import State, plain_rows, solved, whitened
 from .thresholds import LOWEST_FREQUENCY, LOWEST_RESOLVED
 
-__all__ = ["noise_floor", "noise_rms"]
+__all__ = ["kept_columns", "noise_floor", "noise_rms"]
 
 ROUNDS = 2
 RICHNESS = 10  # groups of columns in the rich model
@@ -103,7 +103,8 @@ def _from_rich_model(
             break
         # families have many columns: only z weighs them fairly
         best = int(np.argmax([(result.z if long else result.Q).max() for result in scores]))
-        blocks.append(_full(rows, groups[best], int(np.argmax(scores[best].Q))))
+        point = int(np.argmax(scores[best].Q))
+        blocks.append(_full(rows, groups[best], point) @ kept_columns(scores[best].root[point]))
         X = np.concatenate(blocks, axis=2)
         rows, prior = rows._replace(X=X, Xi=X), prior.extended(blocks[-1].shape[2])
     basis = _orthonormal(rows)
@@ -121,6 +122,16 @@ def _full(rows: Rows, group: Group, point: int) -> Float[np.ndarray, "nv T k"]:
     full = np.zeros((*rows.y.shape, group.columns.Z.shape[1]))
     full[list(group.columns.joints)] = np.moveaxis(group.columns.Z[point], 0, 2)
     return full
+
+
+def kept_columns(root: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k directions"]:
+    """What makes a group's columns those that the model before has not absorbed (`evidence.CUT`), with unit variance.
+
+    A family holds the friction of the baseline once more: with both, nothing tells the one from the other, the residual
+    of their fit is orthogonal to neither by as much as the noise, and a candidate of which little is left beside them
+    scores what is rounding.
+    """
+    return root[np.abs(root).max(1) > 0].T
 
 
 def _orthonormal(rows: Rows) -> Float[np.ndarray, "nvT columns"]:
