@@ -41,6 +41,7 @@ _JOINT = (
     "offset", "ripple_sine", "ripple_cosine", "ripple_order", "friction_rate", "friction_share",
 )  # fmt: skip
 _DRIVE = ("scale", "dead_band", "voltage")
+_FEWEST, _SHORTEST = 256, 100  # windows, rows: less is not worth its compilation
 _MOST = 10  # joints: the numbers of more are not held by a lane's registers
 
 
@@ -56,7 +57,8 @@ class Rolled(NamedTuple):
 
 def fits(loop: Loop, table: Table, data: Windows) -> bool:
     """Whether the kernel knows everything of the loop, and there is a GPU for it."""
-    return usable(data.command) and known_to_it(loop, table)
+    many = data.reading.shape[2] >= _FEWEST and len(data.reading) >= _SHORTEST
+    return many and usable(data.command) and known_to_it(loop, table)
 
 
 def known_to_it(loop: Loop, table: Table) -> bool:
@@ -95,6 +97,8 @@ def _numbers_of(loop: Loop, drives: tuple[int, ...]) -> Array:
     rows.append(mobility(loop)[:, 0])
     return jnp.stack(rows)
 
+
+_values = jax.jit(_numbers_of, static_argnums=1)  # one by one its operations take a second
 
 _ROWS = (*_JOINT, "least", "most", "way", *_DRIVE, "gain0", "gain1", "gain2", "bias0", "bias1", "bias2",
          "from", "to", "weakest", "strongest", "weight")  # fmt: skip
@@ -325,7 +329,7 @@ def program_of(loop: Loop, table: Table) -> tuple[_Program, np.ndarray]:
     way = np.asarray(loop.drives.transmission)
     drives = tuple(int(np.flatnonzero(way[:, j])[0]) if way[:, j].any() else -1 for j in range(n))
     with jax.enable_x64(True):
-        values = np.asarray(_numbers_of(loop, drives), float).ravel()
+        values = np.asarray(_values(loop, drives), float).ravel()
     changed = np.zeros((len(_ROWS), n), bool)
     for entry in table:
         at = list(entry.at)
