@@ -71,7 +71,8 @@ def main() -> None:
         files = tasks(Path(scratch))
         if args.task:
             named = args.only if len(args.only) < len(COMMANDS) else ["diagnose"]
-            files |= dict.fromkeys(named, args.task.resolve())
+            task: Path = args.task.resolve()
+            files |= dict.fromkeys(named, task)
         for command in args.only:
             found: dict[tuple[str, str], list[tuple[float, float]]] = {}
             for k in range(args.rounds):

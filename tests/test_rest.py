@@ -10,7 +10,7 @@ import pytest
 
 from figaroh_jax.diagnosis.estimates import Fitted
 from figaroh_jax.diagnosis.joint import has_size
-from figaroh_jax.diagnosis.naming import Standing, _turns_against_itself, reason_against
+from figaroh_jax.diagnosis.naming import Standing, _turns_against_itself, beside_rest, reason_against
 from figaroh_jax.diagnosis.rest import significance, verdict, wrong_law
 from figaroh_jax.effects.catalogue import find
 from figaroh_jax.results import Name
@@ -102,6 +102,14 @@ def test_recordings_kept_out_may_show_what_few_blocks_of_the_others_cannot(
 def test_without_a_rest_a_cause_need_only_be_there(changes: dict[str, float], word: str) -> None:
     reason = reason_against(replace(RIGHT, **changes), False, 0.01)
     assert word in reason and bool(word) == bool(reason)
+
+
+def test_a_law_that_cannot_be_is_a_rest_at_its_joints() -> None:
+    each = [replace(RIGHT, physical=False), RIGHT, RIGHT, replace(RIGHT, physical=False, whole=True)]
+    joints = [(1,), (1, 2), (0,), (0, 1, 2)]
+    assert beside_rest(each, joints, False) == [True, True, False, True]
+    assert beside_rest(each[1:], joints[1:], False) == [False] * 3
+    assert all(beside_rest(each, joints, True))
 
 
 def test_a_rest_without_repeats_counts_where_smooth_functions_predict_it() -> None:

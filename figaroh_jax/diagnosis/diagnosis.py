@@ -39,7 +39,7 @@ from .gaining import Fall, Gaining, beside_all, without_losses
 from .holdout import fold_squares, part_error, residual_rms, traces
 from .joint import Joint, opened, polished, sized, with_misfit
 from .layout import checked_repeats, describe_folds, held_rows, layout
-from .naming import reason_against, standings
+from .naming import beside_rest, reason_against, standings
 from .problem import Problem
 from .rest import Significance, excess, lines, parts_of, predictable, relative_rest, significance, verdict, wrong_law
 from .search import Found, Search, chance_beside, eliminate, find_causes
@@ -259,7 +259,8 @@ def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], to
     def certain(name: Name) -> bool:
         return bool(searched.here.problem.held.any()) and beside(name).certainly(claims[name])
 
-    against = {f.name: reason_against(one, strict, tolerance, certain) for f, one in zip(found, each, strict=True)}
+    rests = beside_rest(each, [f.joints for f in found], strict)
+    against = {one.name: reason_against(one, rest, tolerance, certain) for one, rest in zip(each, rests, strict=True)}
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
     here, joint = _as_predicts_best([here] if same else [here, before], named)

@@ -7,7 +7,7 @@ vary with position, speed, load or time stands for another law.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -41,7 +41,7 @@ from .thresholds import (
     T_NAMED,
 )
 
-__all__ = ["Standing", "cause_torque", "reason_against", "standings"]
+__all__ = ["Standing", "beside_rest", "cause_torque", "reason_against", "standings"]
 
 
 @dataclass(frozen=True)
@@ -105,6 +105,15 @@ def reason_against(
             (not one.massless, "its mass is not surely above zero: a link other than believed explains as much"),
         ]
     return next((reason for passed, reason in checks if not passed), "")
+
+
+def beside_rest(each: Sequence[Standing], joints: Sequence[Sequence[int]], rest: bool) -> list[bool]:
+    """Of each cause, by the joints where it acts, whether a rest stays beside it.
+
+    A law of those joints that cannot be is one too: whatever it stands for, another law may stand for what it leaves.
+    """
+    impossible = [set(at) for one, at in zip(each, joints, strict=True) if not (one.physical or one.whole)]
+    return [rest or any(other & set(at) for other in impossible) for at in joints]
 
 
 def standings(
