@@ -25,18 +25,18 @@ from .search import Model, Named, Search, Tried, judged_by_colour, sized, t_of
 from .sensitivity import predicted
 from .setting import Setting, Structure, begins_of, begun, by_recording, free_entries, level_of, thinned  # fmt: skip
 from .thresholds import (
-    CLEARLY,
     CONFIDENT,
+    COST_OF_A_MISSED,
     FITTED_FOR_HELD,
     GAIN,
-    MUCH,
+    GAIN_BESIDE_REST,
     NEAR,
     NO_CHOICE,
     NO_WORSE,
     SLIGHT,
     SMALL,
-    SURELY,
-    UNSURE,
+    T_BESIDE_REST,
+    T_WITHOUT_REST,
     UNTOLD,
     USUAL,
 )
@@ -157,7 +157,7 @@ def _judged(here: Setting, result: Search, now: Standing) -> Search:
     found = result.named
     if now.excess.max() < 1.0:
         result.verdict = "named" if found else "nothing"
-    elif found and by_recording(here) and found[0].t > CLEARLY:
+    elif found and by_recording(here) and found[0].t > T_BESIDE_REST:
         result.verdict = "named+rest"
     else:
         result.verdict, result.proxy, result.named = "unknown", found, []
@@ -259,8 +259,10 @@ def _worthy(here: Setting, now: Standing, one: Tried) -> bool:
     if one.state.excess < 1.0:
         return bool(gain > GAIN)
     usual, rest = one.candidate.kind.usual, by_recording(here)
-    needed = CLEARLY if rest and not (usual and gain > MUCH) else CONFIDENT
-    return bool(gain > (MUCH if rest and not usual else GAIN) and t_of(before, after) > FITTED_FOR_HELD * needed)
+    needed = T_BESIDE_REST if rest and not (usual and gain > GAIN_BESIDE_REST) else CONFIDENT
+    return bool(
+        gain > (GAIN_BESIDE_REST if rest and not usual else GAIN) and t_of(before, after) > FITTED_FOR_HELD * needed
+    )
 
 
 def _ordered(now: Standing, ones: Sequence[Tried]) -> list[Tried]:
@@ -370,9 +372,9 @@ def _check(here: Setting, now: Standing, new: Standing, one: Tried) -> tuple[boo
         t = max(t, float(np.sqrt(max(before.sum() - after.sum(), 0.0))) / 2)
     rest = by_recording(here) and not noise
     usual = one.candidate.kind.usual
-    sure = CONFIDENT if float(now.excess[mine].max()) >= 1.0 else UNSURE
-    needed = CLEARLY if rest and not (usual and gain > MUCH) else sure
-    worth = MUCH if rest and not usual else GAIN
+    sure = CONFIDENT if float(now.excess[mine].max()) >= 1.0 else T_WITHOUT_REST
+    needed = T_BESIDE_REST if rest and not (usual and gain > GAIN_BESIDE_REST) else sure
+    worth = GAIN_BESIDE_REST if rest and not usual else GAIN
     state = Model(new.model.structure, new.model.fit, new.model.free, 0.0)
     good = gain > worth and t > needed and sized(here, one._replace(state=state))
     return bool(good), float(gain), t
@@ -390,7 +392,7 @@ def _spare(here: Setting, new: Standing, chosen: Sequence[Tried], begin: Standin
             continue
         j, entries = joint_of(here, one.candidate), list(one.candidate.entries)
         mine = slice(None) if j < 0 else slice(j, j + 1)
-        if _costs(here, new, entries) > SURELY * new.squares[..., mine].sum():
+        if _costs(here, new, entries) > COST_OF_A_MISSED * new.squares[..., mine].sum():
             continue
         theta = last.theta.copy()
         theta[entries] = values(structure.loop, structure.table)[entries]

@@ -31,14 +31,14 @@ from .setting import (
 )
 from .thresholds import (
     CLEAR_OF_NOTHING,
-    CLEARLY,
     CONFIDENT,
     GAIN,
-    MUCH,
+    GAIN_BESIDE_REST,
     NEAR,
     NO_WORSE,
     OF_ITS_SIZE,
-    UNSURE,
+    T_BESIDE_REST,
+    T_WITHOUT_REST,
     UNTOLD,
     USUAL,
 )
@@ -351,12 +351,12 @@ def _best(
     if not tried:
         return None, 1.0
     p = float(max(ndtr(-4 * now.excess), 1e-12))
-    sure = CONFIDENT if now.excess >= 1.0 else UNSURE
+    sure = CONFIDENT if now.excess >= 1.0 else T_WITHOUT_REST
     several = here.loop.carried is not None and by_recording(here)
     beside = [several and one.state.excess >= 1.0 for one in tried]  # a rest, of an arm: more is asked
-    common = [t.candidate.kind.usual and g > MUCH for t, g in zip(tried, gains, strict=True)]
-    needs = [CLEARLY if rest and not usual else sure for rest, usual in zip(beside, common, strict=True)]
-    worth = [MUCH if r and not t.candidate.kind.usual else GAIN for r, t in zip(beside, tried, strict=True)]
+    common = [t.candidate.kind.usual and g > GAIN_BESIDE_REST for t, g in zip(tried, gains, strict=True)]
+    needs = [T_BESIDE_REST if rest and not usual else sure for rest, usual in zip(beside, common, strict=True)]
+    worth = [GAIN_BESIDE_REST if r and not t.candidate.kind.usual else GAIN for r, t in zip(beside, tried, strict=True)]
     passing = [k for k in range(len(tried)) if gains[k] > worth[k] and ts[k] > needs[k] and sized(here, tried[k])]
     for k in np.argsort(gains)[::-1][:3]:
         why = "no better than another" if k in passing else "gains too little on data that it was not fitted to"
@@ -456,7 +456,7 @@ def _judged(
     if now.excess < 1.0:
         result.verdict = "named" if found else "nothing"
         return result
-    if found and by_recording(here) and all(n.t > CLEARLY for n in found[:1]):
+    if found and by_recording(here) and all(n.t > T_BESIDE_REST for n in found[:1]):
         result.verdict = "named+rest"
         return result
     result.verdict, result.proxy, result.named = "unknown", found, []

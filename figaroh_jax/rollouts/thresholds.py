@@ -11,14 +11,12 @@ __all__: list[str] = []
 # What a name needs (`search`, `arm`)
 GAIN = 0.004  # of the squares
 CONFIDENT = 1.64  # t, where more than noise is left to explain
-UNSURE = 2.5  # t, where nothing but noise is left
-CLEARLY = 3.0  # t, where more than noise stays beside it
-MUCH = 0.25  # gain, where more than noise stays beside it: less may stand in for the rest; not of what every joint has
+T_WITHOUT_REST = 2.5  # t, where nothing but noise is left
+T_BESIDE_REST = 3.0  # t, where more than noise stays beside it
+GAIN_BESIDE_REST = 0.25  # less may stand in for the rest; not of what every joint has
 SMALL = 0.002  # gain below which a cause found with others is not missed
-SLIGHT = (
-    1e-3  # of the squares that others explain at its joint, below which a cause makes up for a law that is not theirs
-)
-SURELY = 0.1  # of the squares, by which a cause that is surely missed would make them larger
+SLIGHT = 1e-3  # of the squares that others explain at its joint: less makes up for a law that is not theirs
+COST_OF_A_MISSED = 0.1  # of the squares, by which a cause that is surely missed would make them larger
 FITTED_FOR_HELD = 0.7  # of the t that a name needs: what it must have on the rows that it was fitted to
 OF_ITS_SIZE = 0.5  # standard deviation of a size that is known, of numbers that cannot be negative
 CLEAR_OF_NOTHING = 3.0  # standard deviations of a size from no effect, of numbers of either sign
@@ -32,7 +30,7 @@ STILL_NEEDED = 9.0  # squares that a cause must be worth beside another, to firs
 NO_WORSE = 1.002  # times the squares of what contains it, up to which the simpler cause is taken
 RICHER = 1.02  # times the promise of a simpler cause, which a richer one must exceed to be fitted
 MAY_WIN = 0.45  # share of the best gain after a few steps from which a candidate is fitted to the end
-HOPEFUL = 0.1  # share of a joint's squares that a cause must promise where it must take `MUCH` in the end
+HOPEFUL = 0.1  # share of a joint's squares that a cause must promise where it must take `GAIN_BESIDE_REST` in the end
 UNCHANGED = 0.02  # change of a joint's squares below which nothing new is looked for there
 EXPLAINED = 1.1  # squares of a sample up to which nothing is left to explain by a spring
 
