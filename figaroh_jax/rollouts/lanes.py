@@ -216,7 +216,8 @@ class _Friction:
 
     def __init__(self, M: dict, right: list, rows: list):
         self.M, self.right, self.n = M, right, len(right)
-        self.level, self.pull, self.soft = ([row[k] for row in rows] for k in (1, 2, 3))
+        self.level, self.pull = ([row[k] for row in rows] for k in (1, 2))
+        self.stiff = [1.0 / row[3] for row in rows]  # once: a division takes as long as thirty products
 
     def settled(self, a: list, slip: list) -> tuple[list, list]:
         """Accelerations under friction, and which joints slip (-1, 1) or hold (0), from those of the step before."""
@@ -233,15 +234,15 @@ class _Friction:
 
     def acting(self, a: Sequence[Any]) -> list:
         """Which joints slip at these accelerations."""
-        raw = [(self.pull[j] - a[j]) / self.soft[j] for j in range(self.n)]
+        raw = [(self.pull[j] - a[j]) * self.stiff[j] for j in range(self.n)]
         level = self.level
         return [jnp.where(raw[j] >= level[j], 1.0, jnp.where(raw[j] <= -level[j], -1.0, 0.0)) for j in range(self.n)]
 
     def under(self, slip: Sequence[Any]) -> list:
         """Accelerations where these joints slip and the others hold."""
-        pull, soft, level = self.pull, self.soft, self.level
-        more = [jnp.where(slip[j] == 0.0, 1.0 / soft[j], 0.0) for j in range(self.n)]
-        held = [jnp.where(slip[j] == 0.0, pull[j] / soft[j], slip[j] * level[j]) for j in range(self.n)]
+        pull, stiff, level = self.pull, self.stiff, self.level
+        more = [jnp.where(slip[j] == 0.0, stiff[j], 0.0) for j in range(self.n)]
+        held = [jnp.where(slip[j] == 0.0, pull[j] * stiff[j], slip[j] * level[j]) for j in range(self.n)]
         return _solved(self.M, more, [r + h for r, h in zip(self.right, held, strict=True)])
 
     def newton(self, state: tuple) -> tuple:
@@ -262,7 +263,7 @@ class _Friction:
         curve = _sum([w * m for w, m in zip(way, moved, strict=True)])
 
         def slope(s: Any) -> Any:
-            at = [(self.pull[j] - (a[j] + s * way[j])) / self.soft[j] for j in range(self.n)]
+            at = [(self.pull[j] - (a[j] + s * way[j])) * self.stiff[j] for j in range(self.n)]
             force = [jnp.clip(x, -level, level) for x, level in zip(at, self.level, strict=True)]
             return begin + s * curve - _sum([w * f for w, f in zip(way, force, strict=True)])
 
