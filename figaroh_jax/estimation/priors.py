@@ -12,7 +12,8 @@ __all__ = ["body_precision", "physical_body", "rigid_prior"]
 
 UNSEEN = 1e-12  # of the largest information: what a direction without any counts for
 LEVENBERG = 1000  # steps at the most
-SETTLED = 1e-12  # of the square, by which a last step would still make it fall
+SETTLED = 1e-10  # of the square, by which a last step would still make it fall
+ROUNDING = 1e-20  # of the square of all that is wanted: a smaller one is none
 
 
 def rigid_prior(model: RobotModel, trust: float) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
@@ -72,7 +73,7 @@ def _quadratic_minimum(
         ahead = forms @ (x + step)
         error = ahead @ (x + step) - wanted
         fall = left @ left - error @ error
-        if expected <= SETTLED * (left @ left):
+        if expected <= SETTLED * (left @ left) + ROUNDING * (wanted @ wanted):
             break
         if fall > 0:
             x, half, left = x + step, ahead, error
