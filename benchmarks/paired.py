@@ -5,7 +5,7 @@
 `diagnose` and `identify` on the TX40, `calibrate` on TALOS ($FIGAROH_JAX_DATA); `--task` takes the place of these, for
 the commands that `--only` names, or for `diagnose` (`parity.py make` writes those of the public sets). In each round
 every version runs cold (no program kept) and warm, one after the other, the first one alternating. Both have byte code
-of what they import, as an installed package has it, whatever PYTHONDONTWRITEBYTECODE says here. Printed are medians, and
+of what they import, as an installed package has it, whatever PYTHONDONTWRITEBYTECODE says. Printed are medians, and
 the ratio of the second version to the first as median of the rounds, with the smallest and the largest.
 """
 
