@@ -37,7 +37,7 @@ from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
 from .gaining import Fall, Gaining, beside_all, without_losses
 from .holdout import fold_squares, part_error, residual_rms, traces
-from .joint import Joint, opened, polished, sized, with_misfit
+from .joint import Joint, opened, polished, sized, with_misfit, with_parts
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import beside_rest, reason_against, standings
 from .problem import Problem
@@ -329,12 +329,13 @@ def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple
 
 
 def _as_weighed_otherwise(here: _Setting, by_speed: Problem, joint: Joint) -> Joint:
-    """The answer's fit with what its intervals owe to the weights of slow rows and to the noise's spectrum."""
+    """The answer's fit with what its intervals owe to its parts, to weights of slow rows and to the spectrum."""
     problem, judged = here.problem, np.asarray(here.problem.records.judged)
     slow = [judged, np.asarray(by_speed.records.weight), judged * (relative_speed(problem) >= STANDSTILL)]
     white = np.ones_like(here.whitening) / np.maximum(residual_rms(problem, joint.step.state), 1e-300)
     own = np.asarray(problem.records.weight)
     weights = [(w, here.whitening) for w in slow if not np.array_equal(w, own)]
+    joint = with_parts(problem, joint, here.whitening)
     return with_misfit(problem, here.start, joint, [*weights, (own, white)])
 
 
