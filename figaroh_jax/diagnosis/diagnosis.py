@@ -57,7 +57,7 @@ from .search import Found, Search, chance_beside, eliminate, find_causes
 from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import Step, stand, with_causes
-from .thresholds import ALPHA_OF_A_NAME, FEW_CAUSES, NO_REST, STANDSTILL, WEIGHT_ROUNDS
+from .thresholds import ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, NO_REST, STANDSTILL, WEIGHT_ROUNDS
 from .weights import relative_speed, weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -216,7 +216,8 @@ def _searched(
 
     Beside a rest those (`Effect.beside_rest`) are not named, and take the place of causes that could be: the search is
     taken up again from where the first of them came in. Such an effect of the whole robot stays: what it stands for
-    would go into several others, each of which would look sure.
+    would go into several others, each of which would look sure. Where many causes are found, that is known before they
+    are in one fit.
     """
 
     def ended(before: _Setting, search: Search) -> _Searched:
@@ -227,15 +228,25 @@ def _searched(
         strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
         return _Searched(before, here, search, found, joint, left, line, strict)
 
-    first = ended(here, find_causes(*here[:4], forbid, alpha, progress, generator))
     like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
-    taken = next((k for k, f in enumerate(first.search.found) if f.effect.name in like_a_rest), None)
-    if taken is None or not first.strict:
-        return first
-    kept = first.search.found[:taken]
+
+    def first_of(found: list[Found]) -> int | None:
+        return next((k for k, f in enumerate(found) if f.effect.name in like_a_rest), None)
+
+    def too_many(found: list[Found]) -> bool:
+        return len(found) > FOR_SURE * FEW_CAUSES and first_of(found) is not None
+
+    search = find_causes(*here[:4], forbid, alpha, progress, generator, enough=too_many)
+    taken = first_of(search.found)
+    if taken is None or not too_many(search.found):
+        first = ended(here, search)
+        if taken is None or not first.strict:
+            return first
+        del first  # its rows and columns are large
+    kept = search.found[:taken]
     step = with_causes(here.problem, here.start, [f.effect for f in kept], here.whitening)
-    begun = first.search._replace(problem=here.problem, start=here.start, step=step, found=kept)
-    del first  # its rows and columns are large
+    begun = search._replace(problem=here.problem, start=here.start, step=step, found=kept)
+    del search
     return ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun))
 
 
