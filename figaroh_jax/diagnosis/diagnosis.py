@@ -37,16 +37,27 @@ from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
 from .gaining import Fall, Gaining, beside_all, without_losses
 from .holdout import fold_squares, part_error, residual_rms, traces
-from .joint import Joint, opened, polished, sized, with_misfit
+from .joint import Joint, opened, polished, sized, with_misfit, with_parts
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import beside_rest, reason_against, standings
 from .problem import Problem
-from .rest import Significance, excess, lines, parts_of, predictable, relative_rest, significance, verdict, wrong_law
+from .rest import (
+    Significance,
+    excess,
+    lines,
+    parts_of,
+    predictable,
+    relative_rest,
+    significance,
+    tolerated,
+    verdict,
+    wrong_law,
+)
 from .search import Found, Search, chance_beside, eliminate, find_causes
 from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import Step, stand, with_causes
-from .thresholds import ALPHA_OF_A_NAME, FEW_CAUSES, NO_REST, STANDSTILL, WEIGHT_ROUNDS
+from .thresholds import ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, NO_REST, STANDSTILL, WEIGHT_ROUNDS
 from .weights import relative_speed, weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -99,7 +110,7 @@ def diagnose(
         here = _setting(*begun, forbid, progress)
         generator = np.random.default_rng(seed)
         searched = _searched(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
-        judged = _judged(searched, [s.name for s in signals], forbid, tolerance)
+        judged = _judged(searched, [s.name for s in signals], forbid, tolerance, alpha)
         progress("measuring the gain", 0.9)
         return replace(_answer(searched.here, signals, searched.search, judged), slowed=slowed)
 
@@ -205,7 +216,8 @@ def _searched(
 
     Beside a rest those (`Effect.beside_rest`) are not named, and take the place of causes that could be: the search is
     taken up again from where the first of them came in. Such an effect of the whole robot stays: what it stands for
-    would go into several others, each of which would look sure.
+    would go into several others, each of which would look sure. Where many causes are found, that is known before they
+    are in one fit.
     """
 
     def ended(before: _Setting, search: Search) -> _Searched:
@@ -216,15 +228,25 @@ def _searched(
         strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
         return _Searched(before, here, search, found, joint, left, line, strict)
 
-    first = ended(here, find_causes(*here[:4], forbid, alpha, progress, generator))
     like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
-    taken = next((k for k, f in enumerate(first.search.found) if f.effect.name in like_a_rest), None)
-    if taken is None or not first.strict:
-        return first
-    kept = first.search.found[:taken]
+
+    def first_of(found: list[Found]) -> int | None:
+        return next((k for k, f in enumerate(found) if f.effect.name in like_a_rest), None)
+
+    def too_many(found: list[Found]) -> bool:
+        return len(found) > FOR_SURE * FEW_CAUSES and first_of(found) is not None
+
+    search = find_causes(*here[:4], forbid, alpha, progress, generator, enough=too_many)
+    taken = first_of(search.found)
+    if taken is None or not too_many(search.found):
+        first = ended(here, search)
+        if taken is None or not first.strict:
+            return first
+        del first  # its rows and columns are large
+    kept = search.found[:taken]
     step = with_causes(here.problem, here.start, [f.effect for f in kept], here.whitening)
-    begun = first.search._replace(problem=here.problem, start=here.start, step=step, found=kept)
-    del first  # its rows and columns are large
+    begun = search._replace(problem=here.problem, start=here.start, step=step, found=kept)
+    del search
     return ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun))
 
 
@@ -238,7 +260,9 @@ def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) 
     return kept, joint
 
 
-def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], tolerance: float) -> _Judged:
+def _judged(
+    searched: _Searched, names: Sequence[str], forbid: Sequence[str], tolerance: float, alpha: float
+) -> _Judged:
     """The verdict by what is left beside all causes; of these, the ones that stand beside it are named.
 
     What is not named is no part of the answer's model: the others are fitted anew without it.
@@ -283,7 +307,9 @@ def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], to
     text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
     parts = parts_of(problem, joint.step, whitening, line, names)
     nearest = tuple(sorted(nearest, key=lambda one: -one.share))
-    return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text), sticks, here)
+    quiet = not rest and not named and searched.search.p_value < alpha
+    why = tolerated(float(relative.max()), tolerance, sticks) if quiet else ""
+    return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text, why), sticks, here)
 
 
 def _sticks(here: _Setting, joint: Joint, tolerance: float) -> bool:
@@ -320,12 +346,13 @@ def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple
 
 
 def _as_weighed_otherwise(here: _Setting, by_speed: Problem, joint: Joint) -> Joint:
-    """The answer's fit with what its intervals owe to the weights of slow rows and to the noise's spectrum."""
+    """The answer's fit with what its intervals owe to its parts, to weights of slow rows and to the spectrum."""
     problem, judged = here.problem, np.asarray(here.problem.records.judged)
     slow = [judged, np.asarray(by_speed.records.weight), judged * (relative_speed(problem) >= STANDSTILL)]
     white = np.ones_like(here.whitening) / np.maximum(residual_rms(problem, joint.step.state), 1e-300)
     own = np.asarray(problem.records.weight)
     weights = [(w, here.whitening) for w in slow if not np.array_equal(w, own)]
+    joint = with_parts(problem, joint, here.whitening)
     return with_misfit(problem, here.start, joint, [*weights, (own, white)])
 
 
