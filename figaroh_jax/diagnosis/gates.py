@@ -100,8 +100,13 @@ def _member(step: Step, best: Contender, other: Contender) -> bool:
     """Whether the data cannot tell the other from the best: held-out blocks and penalised squares alike.
 
     Of two that resemble each other, one has more numbers to follow a misfit with: squares alone do not tell them apart.
+    Where the other has no more numbers and fits all rows as well as the one that predicts better, the two measures
+    disagree, which data that tell them apart do not leave.
     """
     worse = t_value(other.verdicts.blocks, best.verdicts.blocks)
+    no_more = len(other.effect.parameters()) <= len(best.effect.parameters())
+    if no_more and other.verdicts.cost <= best.verdicts.cost:
+        return worse < T_APART
     if other.name.effect in type(best.effect).resembles or best.name.effect in type(other.effect).resembles:
         return worse < T_APART
     drop = step.verdicts.cost - best.verdicts.cost

@@ -61,6 +61,7 @@ class Standing:
     inertia_alone: bool = False  # a coupling of inertia, without friction of its own
     massless: bool = False  # a body whose mass is not surely there
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
+    complete: bool = False  # whether smooth functions find next to nothing in what it leaves
 
 
 def reason_against(
@@ -80,7 +81,7 @@ def reason_against(
             f"its torque is {one.share:.2%} of the joint's, below the tolerance of {tolerance:.2%}",
         ),
     ]
-    if rest or not one.beside_rest:  # what any rest looks like is never taken on less
+    if rest or not (one.beside_rest or one.complete):  # what any rest looks like is taken on less only if it is all
         checks += [
             (
                 one.t >= one.t_needed or certain(one.name),
@@ -107,13 +108,26 @@ def reason_against(
     return next((reason for passed, reason in checks if not passed), "")
 
 
-def beside_rest(each: Sequence[Standing], joints: Sequence[Sequence[int]], rest: bool) -> list[bool]:
+def beside_rest(
+    each: Sequence[Standing],
+    joints: Sequence[Sequence[int]],
+    rest: bool,
+    left: Float[np.ndarray, " nv"] | None = None,
+    tolerance: float = 0.0,
+) -> list[bool]:
     """Of each cause, by the joints where it acts, whether a rest stays beside it.
 
     A law of those joints that cannot be is one too: whatever it stands for, another law may stand for what it leaves.
+    So is what is `left` at them beyond the noise (relative to their torque) where it is more than the cause itself and
+    than the `tolerance`: whether or not it can be told from noise, the cause is the smaller part of what is wrong.
     """
     impossible = [set(at) for one, at in zip(each, joints, strict=True) if not (one.physical or one.whole)]
-    return [rest or any(other & set(at) for other in impossible) for at in joints]
+
+    def larger(one: Standing, at: Sequence[int]) -> bool:
+        return left is not None and float(left[list(at)].max()) > max(one.share, tolerance)
+
+    pairs = zip(each, joints, strict=True)
+    return [rest or larger(one, at) or any(other & set(at) for other in impossible) for one, at in pairs]
 
 
 def standings(
