@@ -112,6 +112,21 @@ def test_a_law_that_cannot_be_is_a_rest_at_its_joints() -> None:
     assert all(beside_rest(each, joints, True))
 
 
+def test_what_is_left_at_its_joints_is_a_rest_where_it_is_more_than_the_cause() -> None:
+    small = replace(RIGHT, share=0.012)
+    left = np.array([0.002, 0.03, 0.011])
+    assert beside_rest([small] * 3, [(0,), (1,), (2,)], False, left, 0.01) == [False, True, False]
+    assert beside_rest([replace(small, share=0.1)], [(0, 1, 2)], False, left, 0.01) == [False]
+    assert beside_rest([replace(small, share=0.001)], [(0,)], False, left, 0.01) == [False]  # below the tolerance
+
+
+def test_a_law_like_a_rest_is_taken_on_less_where_it_leaves_nothing() -> None:
+    contact = replace(RIGHT, t=1.8, gain=0.1, beside_rest=False)
+    assert reason_against(contact, False, 0.01)
+    assert not reason_against(replace(contact, complete=True), False, 0.01)
+    assert reason_against(replace(contact, complete=True), True, 0.01)
+
+
 def test_a_rest_without_repeats_counts_where_smooth_functions_predict_it() -> None:
     flexible, line = (0.001, Name("position", ("elbow",)), 50.0), (1.0, 0.0, 0)
     now, joints = (0.2, 1.0, np.array([0.1, 0.3])), ("shoulder", "elbow")
