@@ -102,6 +102,7 @@ class Rest:
     parts: tuple[Part, ...] = ()
     nearest: tuple[Nearest, ...] = ()
     text: str = ""  # where it is more than noise, in words; empty where it is not
+    tolerated: str = ""  # why what is surely more than noise does not count, in words
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,16 @@ def test_sentence_says_which_alternative_remains():
 
 def test_sentence_names_nothing_where_nothing_or_no_name_was_found():
     assert "no missing effect is detectable" in sentence(VARIANTS["nothing"], "tx40")
+    assert "consistent with noise" in sentence(VARIANTS["nothing"], "tx40")
     assert "no effect in the catalogue explains" in sentence(VARIANTS["unknown"], "tx40")
     assert "remains unexplained" in sentence(VARIANTS["partly"], "tx40")
+
+
+def test_what_is_more_than_noise_is_not_called_noise_where_it_does_not_count():
+    quiet = VARIANTS["nothing"]
+    told = replace(quiet, p_value=0.0025, rest=replace(quiet.rest, tolerated="it is small"))
+    assert "not noise alone (p < 0.01), but it is small" in sentence(told, "tx40")
+    assert "consistent with noise" not in sentence(told, "tx40")
 
 
 @pytest.mark.parametrize(

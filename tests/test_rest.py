@@ -11,7 +11,7 @@ import pytest
 from figaroh_jax.diagnosis.estimates import Fitted
 from figaroh_jax.diagnosis.joint import has_size
 from figaroh_jax.diagnosis.naming import Standing, _turns_against_itself, beside_rest, reason_against
-from figaroh_jax.diagnosis.rest import significance, verdict, wrong_law
+from figaroh_jax.diagnosis.rest import significance, tolerated, verdict, wrong_law
 from figaroh_jax.effects.catalogue import find
 from figaroh_jax.results import Name
 
@@ -138,6 +138,12 @@ def test_a_rest_without_repeats_counts_where_smooth_functions_predict_it() -> No
     assert not there(predicted=False)
     assert there(p_repeat=1e-4, predicted=False)  # power that repeats is no noise
     assert not there(p_repeat=1e-4, tolerable=True)
+
+
+def test_what_is_more_than_noise_and_still_nothing_says_why() -> None:
+    assert "at most 0.6% of any joint's torque" in tolerated(0.006, 0.01, False)
+    assert "at rest" in tolerated(0.1, 0.01, True)
+    assert "than the noise has" in tolerated(0.1, 0.01, False)
 
 
 def test_a_coupling_turned_by_parts_of_opposite_signs_is_none() -> None:

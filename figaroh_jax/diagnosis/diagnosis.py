@@ -41,7 +41,18 @@ from .joint import Joint, opened, polished, sized, with_misfit
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import beside_rest, reason_against, standings
 from .problem import Problem
-from .rest import Significance, excess, lines, parts_of, predictable, relative_rest, significance, verdict, wrong_law
+from .rest import (
+    Significance,
+    excess,
+    lines,
+    parts_of,
+    predictable,
+    relative_rest,
+    significance,
+    tolerated,
+    verdict,
+    wrong_law,
+)
 from .search import Found, Search, chance_beside, eliminate, find_causes
 from .standstill import only_sticks
 from .state import State, baseline, with_width
@@ -99,7 +110,7 @@ def diagnose(
         here = _setting(*begun, forbid, progress)
         generator = np.random.default_rng(seed)
         searched = _searched(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
-        judged = _judged(searched, [s.name for s in signals], forbid, tolerance)
+        judged = _judged(searched, [s.name for s in signals], forbid, tolerance, alpha)
         progress("measuring the gain", 0.9)
         return replace(_answer(searched.here, signals, searched.search, judged), slowed=slowed)
 
@@ -239,7 +250,9 @@ def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) 
     return kept, joint
 
 
-def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], tolerance: float) -> _Judged:
+def _judged(
+    searched: _Searched, names: Sequence[str], forbid: Sequence[str], tolerance: float, alpha: float
+) -> _Judged:
     """The verdict by what is left beside all causes; of these, the ones that stand beside it are named.
 
     What is not named is no part of the answer's model: the others are fitted anew without it.
@@ -285,7 +298,9 @@ def _judged(searched: _Searched, names: Sequence[str], forbid: Sequence[str], to
     text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
     parts = parts_of(problem, joint.step, whitening, line, names)
     nearest = tuple(sorted(nearest, key=lambda one: -one.share))
-    return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text), sticks, here)
+    quiet = not rest and not named and searched.search.p_value < alpha
+    why = tolerated(float(relative.max()), tolerance, sticks) if quiet else ""
+    return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text, why), sticks, here)
 
 
 def _sticks(settings: Sequence[_Setting], causes: list[Effect], joint: Joint, tolerance: float) -> bool:

@@ -45,6 +45,7 @@ __all__ = [
     "predictable",
     "relative_rest",
     "significance",
+    "tolerated",
     "verdict",
     "wrong_law",
 ]
@@ -223,6 +224,15 @@ def wrong_law(at: tuple[str, ...], drop: float, flexible: tuple[float, Name, flo
     """
     p, (_, places), score = flexible
     return p < REST_P and (not at or places[0] in at) and score > OWN_SHARE * drop
+
+
+def tolerated(largest: float, tolerance: float, sticks: bool) -> str:
+    """Why a misfit that noise does not explain is no rest, in words; `largest` is that of any joint over its torque."""
+    if sticks:
+        return "it stands where joints are at rest, as dry friction allows"
+    if largest <= tolerance:
+        return f"it is at most {largest:.1%} of any joint's torque, within the tolerance of {tolerance:.1%}"
+    return "no more power is left than the noise has"
 
 
 def verdict(named: bool, rest: bool) -> Verdict:

@@ -44,6 +44,12 @@ _NORMAL_95 = 1.96  # standard deviations on each side of a 95 % interval
 def sentence(diagnosis: Diagnosis, robot: str) -> str:
     """The verdict in one sentence, e.g. "The simulation of tx40 is missing rotor inertia at joint_3: ..."."""
     subject = f"The simulation of {robot}"
+    if diagnosis.verdict == "nothing" and diagnosis.rest.tolerated:
+        return (
+            f"{subject} agrees with the data: no missing effect is detectable. The residual is not noise alone"
+            f" ({p_value(diagnosis.p_value)}), but {diagnosis.rest.tolerated}"
+            f" (error on held-out data {error(diagnosis.holdout.before, diagnosis.holdout.unit)})."
+        )
     if diagnosis.verdict == "nothing":
         return (
             f"{subject} agrees with the data: no missing effect is detectable, and the residual is consistent with"
