@@ -279,7 +279,7 @@ def _play(run: Run) -> tuple[float, str]:
 
 
 def _has_size(cause: Cause) -> bool:
-    """Whether some amplitude of an effect is surely not zero: one that came in for what another cause explains now is."""
+    """Whether some amplitude of an effect is surely not zero: a cause may have come in for what another explains."""
     entry = CATALOGUE.get(cause.name.effect)
     linear = {n for n, p in entry.parameters().items() if p.linear} if entry else set()
     sizes = [value for name, value in cause.parameters.items() if name in linear]
