@@ -68,6 +68,7 @@ RIGHT = Standing(
         ({"share": 0.015}, "needed"),
         ({"modulation": 0.5}, "varies"),
         ({"modulation_held_out": 0.25}, "varies"),
+        ({"share": 3.0, "cancels": True}, "cancels"),
         ({"physical": False}, "physically impossible"),
         ({"beside_rest": False}, "named only where nothing else"),
         ({"whole": True, "gain": 0.05}, ""),
@@ -97,6 +98,9 @@ def test_recordings_kept_out_may_show_what_few_blocks_of_the_others_cannot(
         ({"physical": False}, "physically"),
         ({"share": 0.005}, "tolerance"),
         ({"beside_rest": False}, ""),
+        ({"modulation": 0.5}, ""),  # by chance, of a small cause
+        ({"modulation_held_out": 0.3}, "varies"),
+        ({"share": 2.0, "cancels": True}, ""),
     ],
 )
 def test_without_a_rest_a_cause_need_only_be_there(changes: dict[str, float], word: str) -> None:
