@@ -15,7 +15,7 @@ MODULES = {".".join(path.relative_to(PACKAGE).with_suffix("").parts): path for p
 # Only these may touch a file format, a simulator, the terminal or the page.
 OUTSIDE = {
     "yaml": {"formats.taskfile", "formats.export", "recordings.migration"},
-    "mujoco": {"formats.mjcf"},
+    "mujoco": {"formats.mjcf", "rollouts.callback"},  # the second is a file for the user's own simulation
     "pinocchio": set(),
     "pyarrow": {"recordings.containers"},
     "h5py": {"recordings.containers"},

@@ -37,7 +37,7 @@ from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
 from .gaining import Fall, Gaining, beside_all, without_losses
 from .holdout import fold_squares, part_error, residual_rms, traces
-from .joint import Joint, opened, polished, sized, with_misfit
+from .joint import Joint, opened, polished, sized, with_misfit, with_parts
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import beside_rest, reason_against, standings
 from .problem import Problem
@@ -57,7 +57,7 @@ from .search import Found, Search, chance_beside, eliminate, find_causes
 from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import Step, stand, with_causes
-from .thresholds import ALL_BUT, ALPHA_OF_A_NAME, FEW_CAUSES, NO_REST, REST_P, STANDSTILL, WEIGHT_ROUNDS
+from .thresholds import ALL_BUT, ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, NO_REST, REST_P, STANDSTILL, WEIGHT_ROUNDS
 from .weights import relative_speed, weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -218,7 +218,8 @@ def _searched(
 
     Beside a rest those (`Effect.beside_rest`) are not named, and take the place of causes that could be: the search is
     taken up again from where the first of them came in. Such an effect of the whole robot stays: what it stands for
-    would go into several others, each of which would look sure.
+    would go into several others, each of which would look sure. Where many causes are found, that is known before they
+    are in one fit.
     """
 
     def ended(before: _Setting, search: Search) -> _Searched:
@@ -229,25 +230,35 @@ def _searched(
         strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
         return _Searched(before, here, search, found, joint, left, line, strict, more, p_left < REST_P)
 
-    first = ended(here, find_causes(*here[:4], forbid, alpha, progress, generator))
     like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
-    taken = next((k for k, f in enumerate(first.search.found) if f.effect.name in like_a_rest), None)
-    if taken is None or not first.strict:
-        return first
-    kept = first.search.found[:taken]
+
+    def first_of(found: list[Found]) -> int | None:
+        return next((k for k, f in enumerate(found) if f.effect.name in like_a_rest), None)
+
+    def too_many(found: list[Found]) -> bool:
+        return len(found) > FOR_SURE * FEW_CAUSES and first_of(found) is not None
+
+    search = find_causes(*here[:4], forbid, alpha, progress, generator, enough=too_many)
+    taken = first_of(search.found)
+    if taken is None or not too_many(search.found):
+        first = ended(here, search)
+        if taken is None or not first.strict:
+            return first
+        del first  # its rows and columns are large
+    kept = search.found[:taken]
     step = with_causes(here.problem, here.start, [f.effect for f in kept], here.whitening)
-    begun = first.search._replace(problem=here.problem, start=here.start, step=step, found=kept)
-    del first  # its rows and columns are large
+    begun = search._replace(problem=here.problem, start=here.start, step=step, found=kept)
+    del search
     return ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun))
 
 
 def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) -> tuple[list[Found], Joint]:
     """The causes that the others do not make needless and that surely have a size, all in one fit."""
     found = eliminate(here.problem, here.start, found, here.whitening)
-    joint = polished(here.problem, here.start, [f.effect for f in found], here.whitening)
+    joint = _together(here, found)
     kept = sized(found, joint, forbid)
     if len(kept) < len(found):
-        joint = polished(here.problem, here.start, [f.effect for f in kept], here.whitening)
+        joint = _together(here, kept)
     return kept, joint
 
 
@@ -283,7 +294,8 @@ def _judged(
     against = {one.name: reason_against(one, rest, tolerance, certain) for one, rest in zip(each, rests, strict=True)}
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
-    here, joint = _as_predicts_best([here] if same else [here, before], named)
+    here, joint, by_speed = _as_predicts_best([here] if same else [here, before], named)
+    asked = len(named)
     gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, borne_out)
     gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
@@ -294,7 +306,10 @@ def _judged(
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
     shown = left.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
-    sticks = shown and _sticks([here, searched.here], [f.effect for f in named], joint, tolerance)
+    sticks = shown and (
+        _sticks(here, joint, tolerance)
+        or _sticks(seen := searched.here, by_speed if asked == len(named) else _together(seen, named), tolerance)
+    )
     rest = shown and not sticks
     text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
     parts = parts_of(problem, joint.step, whitening, line, names)
@@ -304,44 +319,47 @@ def _judged(
     return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text, why), sticks, here)
 
 
-def _sticks(settings: Sequence[_Setting], causes: list[Effect], joint: Joint, tolerance: float) -> bool:
-    """Whether what is left beside the named causes is that of joints at rest (the answer's fit, or by speed).
+def _sticks(here: _Setting, joint: Joint, tolerance: float) -> bool:
+    """Whether what is left beside the causes of a fit is that of joints at rest.
 
     A fit that is also asked for slow rows gives part of their sticks to the friction of the joints that move.
     """
-    for k, here in enumerate(settings):
-        fitted = polished(here.problem, here.start, causes, here.whitening) if k else joint
-        state, noise = fitted.step.state, noise_rms(here.problem, here.spectrum)
-        if only_sticks(here.problem, state, noise, relative_rest(here.problem, state, noise), tolerance):
-            return True
-    return False
+    state, noise = joint.step.state, noise_rms(here.problem, here.spectrum)
+    return only_sticks(here.problem, state, noise, relative_rest(here.problem, state, noise), tolerance)
 
 
-def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple[_Setting, Joint]:
-    """The named causes in one fit as predicts parts left out best, by their error in N m.
+def _together(here: _Setting, found: list[Found]) -> Joint:
+    return polished(here.problem, here.start, [one.effect for one in found], here.whitening)
+
+
+def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple[_Setting, Joint, Joint]:
+    """The named causes in one fit as predicts parts left out best, by their error in N m; and as the first setting has
+    them.
 
     Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows, and
     the width of friction beside all causes need not be that beside the named ones.
     """
-    best = None
+    best, first = None, None
     for here in settings:
         weights = [np.asarray(here.problem.records.weight), np.asarray(here.problem.records.judged)]
         for weight in weights[: 1 if np.array_equal(weights[0], weights[1]) else 2]:
             one = here._replace(problem=here.problem.weighted(weight))
-            joint = polished(one.problem, one.start, [f.effect for f in named], one.whitening)
+            joint = _together(one, named)
             error = part_error(one.problem, joint.step)
             best = (error, one, joint) if best is None or error < best[0] else best
-    assert best is not None
-    return best[1:]
+            first = first or joint
+    assert best is not None and first is not None
+    return *best[1:], first
 
 
 def _as_weighed_otherwise(here: _Setting, by_speed: Problem, joint: Joint) -> Joint:
-    """The answer's fit with what its intervals owe to the weights of slow rows and to the noise's spectrum."""
+    """The answer's fit with what its intervals owe to its parts, to weights of slow rows and to the spectrum."""
     problem, judged = here.problem, np.asarray(here.problem.records.judged)
     slow = [judged, np.asarray(by_speed.records.weight), judged * (relative_speed(problem) >= STANDSTILL)]
     white = np.ones_like(here.whitening) / np.maximum(residual_rms(problem, joint.step.state), 1e-300)
     own = np.asarray(problem.records.weight)
     weights = [(w, here.whitening) for w in slow if not np.array_equal(w, own)]
+    joint = with_parts(problem, joint, here.whitening)
     return with_misfit(problem, here.start, joint, [*weights, (own, white)])
 
 

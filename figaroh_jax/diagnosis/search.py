@@ -19,7 +19,7 @@ from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
 from .flexible import friction_width
-from .gates import ambiguous, exists, gains, passes, rivals, simpler
+from .gates import ambiguous, exists, gains, passes, possible, rivals, simpler
 from .problem import Problem
 from .screening import DRAWS, Null, Screen, Shown, catalogue, family_p, place_p, screen
 from .state import State, solved, with_width
@@ -70,10 +70,11 @@ def find_causes(
     progress: Callable[[str, float], None] = lambda phase, share: None,
     generator: np.random.Generator | None = None,
     after: Search | None = None,
+    enough: Callable[[list[Found]], bool] = lambda found: False,
 ) -> Search:
     """Accept the best cause until none passes the gates, or until noise explains what the catalogue still scores.
 
-    `after` is a search of other effects, which this one takes up where it stands.
+    `after` is a search of other effects, which this one takes up where it stands. It ends once there are `enough`.
 
     A sensor that is late or that winds up rounds the reversals of dry friction, so that their width is fitted anew
     once such a cause is in: the old one would be made up for by a friction that is not there.
@@ -88,7 +89,7 @@ def find_causes(
     screened, groups = None, None
     failed: dict[Name, float] = {}  # share of its joints' squares that a candidate scored when it last failed
     fitted: dict[Name, Effect] = {}  # position sensors as they were last fitted exactly
-    while len(found) < MOST_CAUSES:
+    while len(found) < MOST_CAUSES and not (found and enough(found)):
         progress("screening the catalogue", len(found) / MOST_CAUSES)
         groups = catalogue(problem, step.state, step.rows, whitening, forbid, groups)
         screened = screen(step.rows, step.linear, groups, screened)
@@ -224,7 +225,7 @@ def _best(problem: Problem, step: Step, contenders: list[Contender], before: lis
     for one in passing:
         instead = simpler(step, passing, one)
         if not instead:
-            return one
+            return possible(step, passing, one)
         if type(one.effect).resembles:
             return instead[0]
     return None

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ..errors import InputError, as_written
 from ..reporting.run_directory import refusals, write_file
+from ..rollouts import callback
 from ..rollouts.export import for_simulator, with_drives
 
 __all__ = ["LOOP", "export_loop"]
@@ -19,8 +20,9 @@ LOOP = "loop.json"
 def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
     """The loop of a run's `model` directory in the words of a simulator, as JSON; with `out`, written there too.
 
-    For MuJoCo `out` also gets `robot.xml`, with everything that MuJoCo has words for. Raises `InputError` for another
-    directory, and for a simulator that is not known.
+    For MuJoCo `out` also gets `robot.xml`, with everything that MuJoCo has words for, and `callback.py` with
+    `loop.json`, which do the rest step by step. Raises `InputError` for another directory, and for a simulator that
+    is not known.
     """
     try:
         content = json.loads((model / LOOP).read_text(encoding="utf-8"))
@@ -31,6 +33,8 @@ def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
         files = {f"{simulator}.json": text}
         if simulator == "mujoco" and out is not None:
             files["robot.xml"] = with_drives(model / "robot.xml", content)
+            files["callback.py"] = Path(callback.__file__).read_text(encoding="utf-8")
+            files[LOOP] = json.dumps(content, indent=2) + "\n"
     if out is not None:
         _write_files(out, files)
     return text

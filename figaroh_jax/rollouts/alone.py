@@ -25,7 +25,6 @@ from .parameters import unit_payload
 __all__ = ["alone", "carried_by", "motion", "separable"]
 
 _SPAN, _ORDER = 0.06, 3  # s over which, and degree of the polynomial by which, motions are differentiated
-_SMOOTH = 0.12  # s, of what a model of the arm leaves
 _STEP = 1e-4  # rad or m, of the central difference that tells gravity's slope
 _SAMPLES = 1024  # one program takes so many
 
@@ -112,20 +111,18 @@ def _masses_at(loop: Loop) -> np.ndarray:
         return np.asarray(_masses(loop.robot, np.asarray(loop.start, float)[:, None]))[..., 0]
 
 
-def carried_by(loop: Loop, runs: Sequence[Run], simulated: Sequence[np.ndarray] | None = None) -> list[np.ndarray]:
+def carried_by(loop: Loop, runs: Sequence[Run]) -> list[np.ndarray]:
     """What each joint carries from each row of each recording to the next, (rows, nv, 4 + 3 links).
 
     Mass, bias, slope and place as in `loop.Carried`; then what a kilogram at each link's centre of mass adds to mass,
-    bias and slope. `simulated` (rows, 2 nv) are positions and rates of a model of the arm: what was measured less that
-    is smoother, and is all that is differentiated. Motions that change within a row, as after a step, are then exact.
+    bias and slope.
     """
-    models = [None] * len(runs) if simulated is None else simulated
-    return [_carried(loop, run, model) for run, model in zip(runs, models, strict=True)]
+    return [_carried(loop, run) for run in runs]
 
 
-def _carried(loop: Loop, run: Run, model: np.ndarray | None) -> np.ndarray:
+def _carried(loop: Loop, run: Run) -> np.ndarray:
     n, links = loop.robot.nv, len(loop.robot.joints)
-    q, v, a = motion(loop, run, model)
+    q, v, a = motion(loop, run)
     found = np.zeros((len(q), n, 4 + 3 * links))
     with jax.enable_x64(True):
         units = np.asarray(unit_payload(loop, np.arange(links)))
@@ -141,21 +138,16 @@ def _carried(loop: Loop, run: Run, model: np.ndarray | None) -> np.ndarray:
     return found
 
 
-def motion(loop: Loop, run: Run, model: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def motion(loop: Loop, run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Position, velocity and acceleration of every joint between each row and the next, (rows, nv) each."""
     n, places = loop.robot.nv, np.array(loop.measured)
     period = regular(run.name, run.time)
-    span = _SPAN if model is None else _SMOOTH
-    rows = min(max(5, round(span / period) // 2 * 2 + 1), (len(run.time) - 1) // 2 * 2 + 1)
-    left = np.zeros((len(run.time), n))
-    left[:, places] = run.position - np.asarray(loop.joints.reading)[places]
-    left -= 0.0 if model is None else model[:, :n]
-    q, v, a = (savgol_filter(left, rows, min(_ORDER, rows - 1), k, period, axis=0) for k in range(3))
-    if model is not None:
-        q, v = q + model[:, :n], v + model[:, n:]
+    rows = min(max(5, round(_SPAN / period) // 2 * 2 + 1), (len(run.time) - 1) // 2 * 2 + 1)
+    position = np.zeros((len(run.time), n))
+    position[:, places] = run.position - np.asarray(loop.joints.reading)[places]
     middle = lambda x: np.concatenate([(x[1:] + x[:-1]) / 2, x[-1:]])  # noqa: E731
-    faster = 0.0 if model is None else np.diff(model[:, n:], axis=0, append=model[-1:, n:]) / period
-    return middle(q), middle(v), middle(a) + faster
+    q, v, a = (middle(savgol_filter(position, rows, min(_ORDER, rows - 1), k, period, axis=0)) for k in range(3))
+    return q, v, a
 
 
 def _load_rows(robot: RobotModel, q: jax.Array, v: jax.Array, a: jax.Array) -> jax.Array:

@@ -104,7 +104,8 @@ SIMULATORS: dict[str, tuple[dict[str, str], str]] = {
             "force": "general forcerange",
             "delay": "general delay",
         },
-        "friction is a soft constraint (solreffriction, solimpfriction) that creeps under load; damping is implicit",
+        "friction is a soft constraint (solreffriction, solimpfriction) that creeps under load; damping is implicit;"
+        " what is unsaid is done by callback.py",
     ),
     "newton": (
         {

@@ -145,7 +145,7 @@ def _held(loop: Loop, runs: Sequence[Run], simulated: Sequence[np.ndarray]) -> l
 
 def _carried(loop: Loop, run: Run) -> np.ndarray:
     """Torque that the measured motion takes without friction, (rows, nv)."""
-    q, v, a = motion(loop, run, None)
+    q, v, a = motion(loop, run)
     found = np.zeros_like(q)
     with jax.enable_x64(True):
         for first in range(0, len(q), _SAMPLES):

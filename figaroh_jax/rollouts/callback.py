@@ -1,0 +1,103 @@
+"""What MuJoCo has no words for, beside an exported `robot.xml`: this file reads `loop.json` and needs no plugin.
+
+    import mujoco
+    from callback import Rest
+
+    model = mujoco.MjModel.from_xml_path("robot.xml")
+    rest, data = Rest(model, "loop.json"), mujoco.MjData(model)
+    rest.step(data, command)  # in place of data.ctrl[:] = command; mujoco.mj_step(model, data)
+    rest.reading(data)  # what the encoders show
+
+Friction that follows the speed (Stribeck) or the load, play of a spring, constant torques, dead bands, limited
+voltages and what is late at such drives, and offsets of encoders. It needs NumPy and MuJoCo alone.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Rest"]
+
+
+class Rest:
+    """Moves a model of `robot.xml` with everything that `loop.json` says; one for each simulation."""
+
+    def __init__(self, model: Any, file: str | Path = "loop.json"):
+        content = json.loads(Path(file).read_text(encoding="utf-8"))
+        joints, drives = list(content["joints"].items()), list(content["drives"].items())
+        self.model, self.late = model, []
+        self.at = np.array([model.joint(name).dofadr[0] for name, _ in joints], int)
+        self.place = np.array([model.joint(name).qposadr[0] for name, _ in joints], int)
+        self.drive = np.array([model.actuator(name).id for name, _ in drives], int)
+        self.joints = {name: np.array([one[name] for _, one in joints]) for name in joints[0][1]} if joints else {}
+        words = ("kp", "length", "constant", "delay", "dead_band")
+        self.drives = {name: np.array([float(one[name]) for _, one in drives]) for name in words}
+        self.volts = np.array([np.inf if one["voltage"] is None else one["voltage"] for _, one in drives])
+        self.bent = (self.drives["dead_band"] > 0) | np.isfinite(self.volts)
+        stateful = [name for (name, one), bent in zip(drives, self.bent, strict=True) if bent and _has_state(one)]
+        if stateful:
+            raise ValueError(
+                f"drive {stateful[0]} has a state of its own: its dead band or voltage cannot be said here"
+            )
+        own = self.drives["delay"] * self.bent  # MuJoCo's own delay would be behind what is added here
+        model.actuator_delay[self.drive[self.bent]] = 0.0
+        self.delay = own / model.opt.timestep
+
+    def step(self, data: Any, command: Any) -> None:
+        """One step of the model; `command` (drives,) in the order of `loop.json`."""
+        import mujoco
+
+        engine: Any = mujoco
+        model, data.ctrl[self.drive] = self.model, self._late(np.asarray(command, float))
+        engine.mj_forward(model, data)
+        length = data.actuator_length[self.drive]
+        u = data.ctrl[self.drive]
+        plain = self.drives["constant"] + self.drives["kp"] * u + self.drives["length"] * length
+        idle = np.abs(self.drives["kp"]) * self.drives["dead_band"]
+        force = np.clip(plain - np.clip(plain, -idle, idle), -self.volts, self.volts)
+        bent = self.bent & (self.drives["kp"] != 0)
+        data.ctrl[self.drive[bent]] += (force - plain)[bent] / self.drives["kp"][bent]
+        self._at_the_joints(engine, data, bool(bent.any()))
+        engine.mj_step(model, data)
+
+    def reading(self, data: Any) -> np.ndarray:
+        """What the encoders of the joints show, (joints,), rad or m."""
+        return data.qpos[self.place] + self.joints["reading"]
+
+    def _at_the_joints(self, engine: Any, data: Any, changed: bool) -> None:
+        """Levels of friction, and torques that no element gives."""
+        j, at, model = self.joints, self.at, self.model
+        joint = model.dof_jntid[at]
+        stretch = data.qpos[self.place] - j["rest"]
+        stretch = stretch - np.clip(stretch, -j["play"] / 2, j["play"] / 2)
+        own = model.jnt_stiffness[joint].reshape(len(at), -1)[:, 0] * (
+            data.qpos[self.place] - model.qpos_spring[self.place]
+        )
+        data.qfrc_applied[at] = own - j["stiffness"] * stretch - j["offset"]
+        if not (j["stribeck_force"].any() or j["load_ratio"].any()):
+            return
+        if changed and j["load_ratio"].any():
+            engine.mj_forward(self.model, data)
+        load = np.abs(data.qfrc_actuator[at] + data.qfrc_bias[at])
+        fall = np.exp(-((data.qvel[at] / np.where(j["stribeck_speed"] > 0, j["stribeck_speed"], 1.0)) ** 2))
+        level = j["friction"] + j["stribeck_force"] * fall + j["load_ratio"] * load
+        self.model.dof_frictionloss[at] = np.maximum(level, 0.0)
+
+    def _late(self, command: np.ndarray) -> np.ndarray:
+        """What the drives see: the mean over the step of what was held so long before."""
+        if not self.delay.any():
+            return command
+        whole = np.floor(self.delay).astype(int)
+        self.late = [command, *self.late[: int(whole.max()) + 1]]
+        now, before = (
+            np.array([self.late[min(k + more, len(self.late) - 1)][i] for i, k in enumerate(whole)]) for more in (0, 1)
+        )
+        return now + (self.delay - whole) * (before - now)
+
+
+def _has_state(drive: dict[str, Any]) -> bool:
+    return drive["activation"] != "none"

@@ -1,0 +1,76 @@
+"""What MuJoCo has no words for, said by the exported callback, against our own simulation of the same loop."""
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import mujoco as engine
+import numpy as np
+import pytest
+
+from figaroh_jax.formats.export import write_model
+from figaroh_jax.jobs.export import export_loop
+from figaroh_jax.jobs.rollouts import write_loop
+from figaroh_jax.rollouts.loop import Loop
+from figaroh_jax.rollouts.reading import load_loop
+from figaroh_jax.rollouts.simulation import rollout
+from figaroh_jax.rollouts.task import extended_of
+
+mujoco: Any = engine
+TWO = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast">
+<flag contact="disable"/></option><worldbody><body pos="0 0 1"><joint name="j1" axis="0 1 0" damping="0.4"
+armature="0.05" frictionloss="0.15"/><inertial pos=".15 0 .02" mass="1" diaginertia=".01 .02 .02"/>
+<body pos="0.3 0 0"><joint name="j2" axis="0 1 0" damping="0.3" armature="0.04" frictionloss="0.1"/>
+<inertial pos=".1 0 0" mass=".6" diaginertia=".004 .006 .006"/></body></body></worldbody>
+<actuator><position name="a" joint="j1" kp="60" kv="2"/><position name="b" joint="j2" kp="40" kv="1"/></actuator>
+</mujoco>"""
+NUMBERS = {
+    "friction": {"stribeck_force": [0.3, 0.0], "stribeck_speed": [0.2, 0.1], "load_ratio": [0.0, 0.15]},
+    "torques": {"stiffness": [3.0, 2.0], "play": [0.05, 0.0], "offset": [0.1, -0.2], "reading": [0.02, -0.01]},
+    "drives": {"dead_band": [0.01, 0.0], "voltage": [np.inf, 4.0], "delay": [0.0051, 0.008]},
+}
+NUMBERS["all"] = NUMBERS["friction"] | NUMBERS["torques"] | NUMBERS["drives"]
+
+
+def changed(loop: Loop, numbers: dict[str, list[float]]) -> Loop:
+    for name, value in numbers.items():
+        part = "drives" if hasattr(loop.drives, name) else "joints"
+        loop = eqx.tree_at(lambda m: getattr(getattr(m, part), name), loop, np.array(value))  # noqa: B023
+    return loop
+
+
+@pytest.mark.parametrize("which", NUMBERS)
+def test_the_exported_callback_moves_mujoco_as_the_loop_moves(which: str, tmp_path: Path):
+    """1000 steps with the files of `export --for mujoco --out`, read as a user reads them."""
+    (tmp_path / "arm.xml").write_text(TWO)
+    loop = changed(load_loop(tmp_path / "arm.xml")[0], NUMBERS[which])
+    write_model(extended_of(loop), tmp_path / "model")
+    write_loop(tmp_path / "model", loop)
+    export_loop(tmp_path / "model", "mujoco", tmp_path / "out")
+    spec = importlib.util.spec_from_file_location("callback", tmp_path / "out" / "callback.py")
+    assert spec is not None and spec.loader is not None
+    theirs = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(theirs)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "robot.xml"))
+    data, rest = mujoco.MjData(model), theirs.Rest(model, tmp_path / "out" / "loop.json")
+    t = 0.002 * np.arange(1000)[:, None]
+    u, seen = 0.4 * np.sin(t * [4.0, 7.0] + [0.0, 1.0]) * np.clip(t / 0.2, 0, 1) + [0.2, -0.3], []
+    for row in u:
+        seen.append(rest.reading(data))
+        rest.step(data, row)
+    ours = rollout(loop, u, np.zeros(2)).reading
+    assert np.ptp(seen, axis=0).min() > 0.1
+    np.testing.assert_allclose(ours, seen, rtol=0, atol=1e-9)
+
+
+def test_a_drive_with_a_state_is_refused(tmp_path: Path):
+    (tmp_path / "arm.xml").write_text(TWO.replace('<position name="a"', '<position timeconst=".05" name="a"'))
+    loop = changed(load_loop(tmp_path / "arm.xml")[0], {"dead_band": [0.01, 0.0]})
+    write_model(extended_of(loop), tmp_path / "model")
+    write_loop(tmp_path / "model", loop)
+    export_loop(tmp_path / "model", "mujoco", tmp_path / "out")
+    from figaroh_jax.rollouts.callback import Rest
+
+    with pytest.raises(ValueError, match="drive a has a state"):
+        Rest(mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "robot.xml")), tmp_path / "out" / "loop.json")
