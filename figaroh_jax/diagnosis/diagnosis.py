@@ -53,10 +53,10 @@ from .rest import (
     verdict,
     wrong_law,
 )
-from .search import Found, Search, chance_beside, eliminate, find_causes
+from .search import Begun, Found, Search, chance_beside, eliminate, find_causes
 from .standstill import only_sticks
 from .state import State, baseline, with_width
-from .step import Step, stand, with_causes
+from .step import Step, stand
 from .thresholds import ALL_BUT, ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, NO_REST, REST_P, STANDSTILL, WEIGHT_ROUNDS
 from .weights import relative_speed, weighted_by_speed, white_where_better, without_reversals
 
@@ -245,9 +245,7 @@ def _searched(
         if taken is None or not first.strict:
             return first
         del first  # its rows and columns are large
-    kept = search.found[:taken]
-    step = with_causes(here.problem, here.start, [f.effect for f in kept], here.whitening)
-    begun = search._replace(problem=here.problem, start=here.start, step=step, found=kept)
+    begun = Begun(search.found[:taken], search.p_value, search.shown)
     del search
     return ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun))
 

@@ -26,7 +26,7 @@ from .state import State, solved, with_width
 from .step import Step, stand, with_cause, with_causes
 from .thresholds import GAIN, MOST_CAUSES, OVERLAP_ELSEWHERE, SHARE_AGAIN, SHARE_ALIKE, SMALLEST, T_BETTER
 
-__all__ = ["Found", "Search", "chance_beside", "eliminate", "find_causes", "judged_without", "stood_without"]
+__all__ = ["Begun", "Found", "Search", "chance_beside", "eliminate", "find_causes", "judged_without", "stood_without"]
 
 NEAR, CLOSER = 4, 800  # times the level: p-values below which few draws cannot tell from it; draws that can
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
@@ -60,6 +60,14 @@ class Search(NamedTuple):
     shown: list[Shown]  # candidates, as the first screen saw them
 
 
+class Begun(NamedTuple):
+    """What a search takes over from one of other effects: the first causes of it, and what it began with."""
+
+    found: list[Found]
+    p_value: float
+    shown: list[Shown]
+
+
 def find_causes(
     problem: Problem,
     state: State,
@@ -69,12 +77,12 @@ def find_causes(
     alpha: float,
     progress: Callable[[str, float], None] = lambda phase, share: None,
     generator: np.random.Generator | None = None,
-    after: Search | None = None,
+    after: Begun | None = None,
     enough: Callable[[list[Found]], bool] = lambda found: False,
 ) -> Search:
     """Accept the best cause until none passes the gates, or until noise explains what the catalogue still scores.
 
-    `after` is a search of other effects, which this one takes up where it stands. It ends once there are `enough`.
+    `after` is what it takes over from another one. It ends once there are `enough`.
 
     A sensor that is late or that winds up rounds the reversals of dry friction, so that their width is fitted anew
     once such a cause is in: the old one would be made up for by a friction that is not there.
@@ -83,8 +91,8 @@ def find_causes(
     if after is None:
         step, found, p_values, shown = stand(problem, state, whitening), [], [], []
     else:
-        problem, step, found = after.problem, after.step, list(after.found)
-        p_values, shown = [after.p_value], after.shown
+        step = with_causes(problem, state, [f.effect for f in after.found], whitening)
+        found, p_values, shown = list(after.found), [after.p_value], after.shown
     null = Null(problem, spectrum, whitening, generator)
     screened, groups = None, None
     failed: dict[Name, float] = {}  # share of its joints' squares that a candidate scored when it last failed
@@ -113,6 +121,7 @@ def find_causes(
             known, problem, screened = problem, friction_width(problem, step.state, whitening), None
             groups = None if problem is not known or "response" in ways else groups
             step = step if problem is known else stand(problem, with_width(problem, step.state), whitening)
+        del before, contenders, chosen  # their rows and columns are large
     begun = solved(problem, with_width(problem, state), step.state.theta[: len(state.theta)])
     return Search(problem, begun, step, found, p_values[0], p_values[-1], shown)
 
