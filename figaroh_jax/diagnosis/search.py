@@ -247,6 +247,8 @@ def _found(
     alike = rivals(step, contenders, best)
     drop = step.verdicts.cost - best.verdicts.cost
     wins = shares_of_wins(np.stack([c.verdicts.blocks for c in [best, *alike]]), generator)
+    # laws that hold this one, and need not: where they win, it has won
+    outer = [best.name.effect in type(c.effect).contains and c.name.at == best.name.at for c in alike]
     return Found(
         name=best.name,
         effect=best.effect,
@@ -254,7 +256,7 @@ def _found(
         heldout=(step.verdicts.heldout, best.verdicts.heldout),
         cost=(step.verdicts.cost, best.verdicts.cost),
         t=t_value(step.verdicts.blocks, best.verdicts.blocks),
-        confidence=float(wins[0]) * (1 - p),
+        confidence=float(wins[0] + wins[1:][outer].sum()) * (1 - p),
         ambiguous=ambiguous(step, best, alike, screened),
         joints=best.joints,
         alike=tuple(c.name for c in alike if step.verdicts.cost - c.verdicts.cost > SHARE_ALIKE * drop),
