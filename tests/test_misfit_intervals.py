@@ -10,7 +10,8 @@ import pytest
 
 from figaroh_jax.diagnosis import joint as fits
 from figaroh_jax.diagnosis.estimates import Fitted
-from figaroh_jax.diagnosis.joint import AS_SURE, Joint, with_misfit
+from figaroh_jax.diagnosis.joint import AS_SURE, Joint, with_misfit, with_parts
+from figaroh_jax.estimation.rows import Prior, Rows
 
 SHARE = 0.25  # correlation of the two values
 
@@ -34,7 +35,7 @@ def widened(monkeypatch: pytest.MonkeyPatch, *others: Any) -> np.ndarray:
 
 def test_a_value_that_moves_with_the_weights_is_as_unsure_as_it_moves(monkeypatch: pytest.MonkeyPatch):
     found = widened(monkeypatch, stood([1.3, 2.0], [0.1, 0.2]), stood([1.0, 2.0], [0.15, 0.2]))
-    np.testing.assert_allclose(np.sqrt(np.diag(found)), [np.hypot(0.1, 0.3), 0.2], rtol=1e-12)
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), [np.hypot(0.1, 0.3 / np.sqrt(2)), 0.2], rtol=1e-12)
     assert found[0, 1] == pytest.approx(SHARE * np.sqrt(found[0, 0] * found[1, 1]))
 
 
@@ -46,3 +47,27 @@ def test_a_fit_that_says_little_of_a_value_moves_its_deviation_little(monkeypatc
 def test_rows_that_say_nothing_of_a_value_leave_its_deviation(monkeypatch: pytest.MonkeyPatch):
     found = widened(monkeypatch, stood([np.nan, 2.0], [np.inf, 0.2]))
     np.testing.assert_allclose(np.sqrt(np.diag(found)), [0.1, 0.2], rtol=1e-12)
+
+
+def test_values_are_as_unsure_as_parts_of_the_data_disagree():
+    """Against least squares without each part in turn (NumPy), with a residual that each part pulls another way."""
+    rng = np.random.default_rng(5)
+    X, truth, part = rng.normal(size=(2, 60, 3)), np.array([1.0, -2.0, 0.5]), np.repeat(np.arange(3), 20)
+    pull = np.array([[0.4, -0.3, 0.0], [-0.5, 0.2, 0.0], [0.1, 0.1, 0.0]])
+    y = X @ truth + np.einsum("jtp,tp->jt", X, pull[part]) + 0.01 * rng.normal(size=(2, 60))
+
+    def solution(rows: np.ndarray) -> np.ndarray:
+        return np.linalg.lstsq(X[:, rows].reshape(-1, 3), y[:, rows].reshape(-1), rcond=None)[0]
+
+    each = np.stack([solution(part != k) for k in range(3)])
+    jackknife = np.sqrt(2 / 3 * ((each - each.mean(0)) ** 2).sum(0))
+    rows = Rows(y, X, X, np.zeros((0, 60), int), np.ones((2, 60)), part, part)
+    theta = solution(part >= 0)
+    state = SimpleNamespace(theta=theta, prior=Prior(np.zeros(3), np.full(3, 1e-9)))
+    step: Any = SimpleNamespace(rows=rows, state=state)
+    deviation = np.array([1e-3, 1e-3, 1.0])  # the last is wider already
+    joint = Joint(step, [], Fitted(theta, np.diag(deviation**2), ()))
+    problem: Any = SimpleNamespace(layout=SimpleNamespace(part=part))
+    found = np.sqrt(np.diag(with_parts(problem, joint, np.ones((1, 2))).fitted.covariance))
+    np.testing.assert_allclose(found[:2], jackknife[:2], rtol=1e-6)
+    assert found[2] == deviation[2] > jackknife[2]

@@ -14,6 +14,7 @@ from ..estimation.rows import Rows
 
 __all__ = ["Bank", "Columns", "bank"]
 
+MANY, PIECE = 8, 512  # columns of a product that is made of all candidates of a joint at once; rows to a piece of it
 FEW = 8_000_000  # numbers of all columns that are put side by side joint by joint: one product is quicker than many
 
 
@@ -146,6 +147,28 @@ def _fresh(block: Block, new: Bool[np.ndarray, " columns"]) -> Block:
 
 def _product(width: int, blocks: list[Block], rows: list[Float[np.ndarray, "T m"]]) -> Float[np.ndarray, "columns m"]:
     out = np.zeros((width, rows[0].shape[1]))
-    for joint, columns, own in blocks:
-        out[columns] += own @ rows[joint]
+    for joint in sorted({block.joint for block in blocks}):
+        beside = [block for block in blocks if block.joint == joint and len(block.columns)]
+        own = rows[joint]
+        if len(beside) < 2 or own.shape[1] < MANY:
+            for block in beside:
+                out[block.columns] += block.Zi @ own
+            continue
+        used = np.flatnonzero(own.any(0))  # a tree leaves many columns of a joint zero
+        columns = np.concatenate([block.columns for block in beside])
+        out[np.ix_(columns, used)] += _product_in_pieces([block.Zi for block in beside], own[:, used])
     return out
+
+
+def _product_in_pieces(
+    parts: list[Float[np.ndarray, "columns T"]], rows: Float[np.ndarray, "T m"]
+) -> Float[np.ndarray, "width m"]:
+    """The parts below each other times the rows: a few rows of all at a time, which stay in the cache."""
+    ends = np.cumsum([len(part) for part in parts])
+    total, piece = np.zeros((ends[-1], rows.shape[1])), np.empty((ends[-1], PIECE))
+    for start in range(0, len(rows), PIECE):
+        few = rows[start : start + PIECE]
+        for part, end in zip(parts, ends, strict=True):
+            piece[end - len(part) : end, : len(few)] = part[:, start : start + len(few)]
+        total += piece[:, : len(few)] @ few
+    return total

@@ -37,7 +37,7 @@ from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
 from .gaining import Fall, Gaining, beside_all, without_losses
 from .holdout import fold_squares, part_error, residual_rms, traces
-from .joint import Joint, opened, polished, sized, with_misfit
+from .joint import Joint, opened, polished, sized, with_misfit, with_parts
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import beside_rest, reason_against, standings
 from .problem import Problem
@@ -53,11 +53,11 @@ from .rest import (
     verdict,
     wrong_law,
 )
-from .search import Found, Search, chance_beside, eliminate, find_causes
+from .search import Begun, Found, Search, chance_beside, eliminate, find_causes
 from .standstill import only_sticks
 from .state import State, baseline, with_width
-from .step import Step, stand, with_causes
-from .thresholds import ALPHA_OF_A_NAME, FEW_CAUSES, NO_REST, STANDSTILL, WEIGHT_ROUNDS
+from .step import Step, stand
+from .thresholds import ALL_BUT, ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, NO_REST, REST_P, STANDSTILL, WEIGHT_ROUNDS
 from .weights import relative_speed, weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -136,6 +136,8 @@ class _Searched(NamedTuple):
     left: Significance
     line: tuple[float, float, int]
     strict: bool  # whether a rest stays, beside which a cause must show more to be named
+    more: float  # squares by which smooth functions find more in it than chance gives
+    doubted: bool  # whether the catalogue still scores more than noise, though nothing in it passes
 
 
 class _Judged(NamedTuple):
@@ -216,36 +218,45 @@ def _searched(
 
     Beside a rest those (`Effect.beside_rest`) are not named, and take the place of causes that could be: the search is
     taken up again from where the first of them came in. Such an effect of the whole robot stays: what it stands for
-    would go into several others, each of which would look sure.
+    would go into several others, each of which would look sure. Where many causes are found, that is known before they
+    are in one fit.
     """
 
     def ended(before: _Setting, search: Search) -> _Searched:
         here = before._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
         found, joint = _fitted_together(here, search.found, forbid)
-        left, beyond, line = _left(here, search, found, joint, forbid, tolerance, generator)
+        left, p_left, beyond, line, more = _left(here, search, found, joint, forbid, tolerance, generator)
         strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
-        return _Searched(before, here, search, found, joint, left, line, strict)
+        return _Searched(before, here, search, found, joint, left, line, strict, more, p_left < REST_P)
 
-    first = ended(here, find_causes(*here[:4], forbid, alpha, progress, generator))
     like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
-    taken = next((k for k, f in enumerate(first.search.found) if f.effect.name in like_a_rest), None)
-    if taken is None or not first.strict:
-        return first
-    kept = first.search.found[:taken]
-    step = with_causes(here.problem, here.start, [f.effect for f in kept], here.whitening)
-    begun = first.search._replace(problem=here.problem, start=here.start, step=step, found=kept)
-    del first  # its rows and columns are large
+
+    def first_of(found: list[Found]) -> int | None:
+        return next((k for k, f in enumerate(found) if f.effect.name in like_a_rest), None)
+
+    def too_many(found: list[Found]) -> bool:
+        return len(found) > FOR_SURE * FEW_CAUSES and first_of(found) is not None
+
+    search = find_causes(*here[:4], forbid, alpha, progress, generator, enough=too_many)
+    taken = first_of(search.found)
+    if taken is None or not too_many(search.found):
+        first = ended(here, search)
+        if taken is None or not first.strict:
+            return first
+        del first  # its rows and columns are large
+    begun = Begun(search.found[:taken], search.p_value, search.shown)
+    del search
     return ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun))
 
 
 def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) -> tuple[list[Found], Joint]:
     """The causes that the others do not make needless and that surely have a size, all in one fit."""
     found = eliminate(here.problem, here.start, found, here.whitening)
-    joint = polished(here.problem, here.start, [f.effect for f in found], here.whitening)
+    joint = _together(here, found)
     kept = sized(found, joint, forbid)
     if len(kept) < len(found):
-        joint = polished(here.problem, here.start, [f.effect for f in kept], here.whitening)
+        joint = _together(here, kept)
     return kept, joint
 
 
@@ -256,9 +267,13 @@ def _judged(
 
     What is not named is no part of the answer's model: the others are fitted anew without it.
     """
-    before, here, _, found, joint, left, line, strict = searched
+    before, here, _, found, joint, left, line, strict, more, doubted = searched
     problem, whitening = here.problem, here.whitening
     each = standings(problem, here.start, found, joint, whitening)
+    each = [
+        replace(one, complete=more <= ALL_BUT * (f.cost[0] - f.cost[1])) for one, f in zip(each, found, strict=True)
+    ]
+    noise = noise_rms(problem, here.spectrum)
     claims = {one.name: one.gain for one in each}
 
     @cache
@@ -272,11 +287,13 @@ def _judged(
     def certain(name: Name) -> bool:
         return bool(searched.here.problem.held.any()) and beside(name).certainly(claims[name])
 
-    rests = beside_rest(each, [f.joints for f in found], strict)
+    beyond = relative_rest(problem, joint.step.state, noise)
+    rests = beside_rest(each, [f.joints for f in found], strict, beyond, tolerance)
     against = {one.name: reason_against(one, rest, tolerance, certain) for one, rest in zip(each, rests, strict=True)}
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
-    here, joint = _as_predicts_best([here] if same else [here, before], named)
+    here, joint, by_speed = _as_predicts_best([here] if same else [here, before], named)
+    asked = len(named)
     gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, borne_out)
     gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
@@ -286,8 +303,11 @@ def _judged(
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
-    shown = left.there or (bool(nearest) and float(relative.max()) > tolerance)
-    sticks = shown and _sticks([here, searched.here], [f.effect for f in named], joint, tolerance)
+    shown = left.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
+    sticks = shown and (
+        _sticks(here, joint, tolerance)
+        or _sticks(seen := searched.here, by_speed if asked == len(named) else _together(seen, named), tolerance)
+    )
     rest = shown and not sticks
     text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
     parts = parts_of(problem, joint.step, whitening, line, names)
@@ -297,44 +317,47 @@ def _judged(
     return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text, why), sticks, here)
 
 
-def _sticks(settings: Sequence[_Setting], causes: list[Effect], joint: Joint, tolerance: float) -> bool:
-    """Whether what is left beside the named causes is that of joints at rest (the answer's fit, or by speed).
+def _sticks(here: _Setting, joint: Joint, tolerance: float) -> bool:
+    """Whether what is left beside the causes of a fit is that of joints at rest.
 
     A fit that is also asked for slow rows gives part of their sticks to the friction of the joints that move.
     """
-    for k, here in enumerate(settings):
-        fitted = polished(here.problem, here.start, causes, here.whitening) if k else joint
-        state, noise = fitted.step.state, noise_rms(here.problem, here.spectrum)
-        if only_sticks(here.problem, state, noise, relative_rest(here.problem, state, noise), tolerance):
-            return True
-    return False
+    state, noise = joint.step.state, noise_rms(here.problem, here.spectrum)
+    return only_sticks(here.problem, state, noise, relative_rest(here.problem, state, noise), tolerance)
 
 
-def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple[_Setting, Joint]:
-    """The named causes in one fit as predicts parts left out best, by their error in N m.
+def _together(here: _Setting, found: list[Found]) -> Joint:
+    return polished(here.problem, here.start, [one.effect for one in found], here.whitening)
+
+
+def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple[_Setting, Joint, Joint]:
+    """The named causes in one fit as predicts parts left out best, by their error in N m; and as the first setting has
+    them.
 
     Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows, and
     the width of friction beside all causes need not be that beside the named ones.
     """
-    best = None
+    best, first = None, None
     for here in settings:
         weights = [np.asarray(here.problem.records.weight), np.asarray(here.problem.records.judged)]
         for weight in weights[: 1 if np.array_equal(weights[0], weights[1]) else 2]:
             one = here._replace(problem=here.problem.weighted(weight))
-            joint = polished(one.problem, one.start, [f.effect for f in named], one.whitening)
+            joint = _together(one, named)
             error = part_error(one.problem, joint.step)
             best = (error, one, joint) if best is None or error < best[0] else best
-    assert best is not None
-    return best[1:]
+            first = first or joint
+    assert best is not None and first is not None
+    return *best[1:], first
 
 
 def _as_weighed_otherwise(here: _Setting, by_speed: Problem, joint: Joint) -> Joint:
-    """The answer's fit with what its intervals owe to the weights of slow rows and to the noise's spectrum."""
+    """The answer's fit with what its intervals owe to its parts, to weights of slow rows and to the spectrum."""
     problem, judged = here.problem, np.asarray(here.problem.records.judged)
     slow = [judged, np.asarray(by_speed.records.weight), judged * (relative_speed(problem) >= STANDSTILL)]
     white = np.ones_like(here.whitening) / np.maximum(residual_rms(problem, joint.step.state), 1e-300)
     own = np.asarray(problem.records.weight)
     weights = [(w, here.whitening) for w in slow if not np.array_equal(w, own)]
+    joint = with_parts(problem, joint, here.whitening)
     return with_misfit(problem, here.start, joint, [*weights, (own, white)])
 
 
@@ -346,8 +369,9 @@ def _left(
     forbid: Sequence[str],
     tolerance: float,
     generator: np.random.Generator,
-) -> tuple[Significance, float, tuple[float, float, int]]:
-    """Whether all causes together leave more than noise, its excess over the noise, and the strongest line in it."""
+) -> tuple[Significance, float, float, tuple[float, float, int], float]:
+    """Whether all causes together leave more than noise, the p-value of the catalogue on it, its excess over
+    the noise, the strongest line in it, and the squares that smooth functions find in it beyond chance."""
     problem, start, spectrum, whitening, _ = here
     first = stand(problem, start, whitening)
     before, *_ = excess(problem, first.rows, first.linear.residual, spectrum, whitening)
@@ -362,7 +386,7 @@ def _left(
     joints, tolerable = problem.model.joint_names, size <= tolerance
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
-    return left._replace(there=left.there or (wrong and not tolerable)), now[0], line
+    return left._replace(there=left.there or (wrong and not tolerable)), p_left, now[0], line, flexible[2]
 
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:

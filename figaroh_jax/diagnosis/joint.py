@@ -13,6 +13,7 @@ from ..effects.base import Effect
 from ..effects.catalogue import CATALOGUE, find
 from ..estimation.rows import Rows, block_sums
 from ..results import Name
+from .comparison import fold_sums
 from .design import kind, shapes, with_shape
 from .estimates import Fitted, amplitude_places, torque_slopes, with_amplitudes
 from .problem import Problem, family_of
@@ -21,7 +22,7 @@ from .state import State, assembled, solved
 from .step import Step, stand
 from .thresholds import SIZE_REGION
 
-__all__ = ["Joint", "has_size", "joint_fit", "moved", "opened", "polished", "sized", "with_misfit"]
+__all__ = ["Joint", "has_size", "joint_fit", "moved", "opened", "polished", "sized", "with_misfit", "with_parts"]
 
 KEPT = 1e-12
 AS_SURE = 2.0  # times the deviation of a fit up to which another one counts in full
@@ -69,8 +70,9 @@ def with_misfit(
 
     A model that leaves noise alone gets the same values from all weights, but for the noise (Hausman's test of a model
     asks for that). What it leaves beyond pulls them by what the rows weigh, the same way in every block, so that no
-    scatter of blocks shows it: the squares of the moves are added to the variance. A fit whose own deviation is more
-    than `AS_SURE` times as large says less of that, and counts less. `weights` are those of the rows, with a whitening.
+    scatter of blocks shows it: which weights are right nobody knows, so the mean square of the moves is added to the
+    variance. A fit whose own deviation is more than `AS_SURE` times as large says less of that, and counts less.
+    `weights` are those of the rows, with a whitening.
     """
     fitted = joint.fitted
     variance, moves = np.diag(fitted.covariance), np.zeros_like(fitted.value)
@@ -81,8 +83,37 @@ def with_misfit(
         share = AS_SURE**2 * variance / np.maximum(np.diag(one.covariance), 1e-300)
         more = np.minimum(share, 1.0) * (one.value - fitted.value) ** 2
         moves += np.where(np.isfinite(more), more, 0.0)  # a fit without rows of a joint says nothing of it
-    wider = np.sqrt(1 + moves / np.maximum(variance, 1e-300))
-    return joint._replace(fitted=replace(fitted, covariance=fitted.covariance * np.outer(wider, wider)))
+    mean = moves / max(len(weights), 1)
+    return joint._replace(fitted=_wider(fitted, 1 + mean / np.maximum(variance, 1e-300)))
+
+
+def with_parts(problem: Problem, joint: Joint, whitening: Float[np.ndarray, "F nv"]) -> Joint:
+    """The fit with no deviation below what its values scatter by as each part of the data is left out (jackknife).
+
+    Parts are excitations, or quarters of recordings: what a model leaves goes on for longer than a block of the scores,
+    and pulls the values another way in each of them. To first order, with v_k the values without part k of K:
+    variance = (K - 1) / K sum_k (v_k - their mean)^2.
+    """
+    step, fitted, state = joint.step, joint.fitted, joint.step.state
+    rows = step.rows._replace(fold=problem.layout.part)
+    slopes = [slope for e in joint.causes for slope in torque_slopes(problem, state, e, whitening)]
+    J = np.concatenate([rows.X, *(slope[..., None] for slope in slopes)], axis=2)
+    shape = [float(getattr(e, n)) for e in joint.causes for n in shapes(type(e))]
+    sums = fold_sums(rows, J, rows.y - rows.X @ state.theta - J @ (fitted.value - np.append(state.theta, shape)))
+    count = len(sums.gram)
+    if count < 2:
+        return joint
+    A = sums.gram.sum(0) + np.diag(np.append(state.prior.precision, np.zeros(len(slopes)))) - sums.gram
+    diagonal = np.maximum(np.diagonal(A, axis1=1, axis2=2), KEPT)
+    moves = np.linalg.solve(A + KEPT * diagonal[:, None] * np.eye(A.shape[1]), sums.moment[..., None])[..., 0]
+    variance = (count - 1) / count * ((moves - moves.mean(0)) ** 2).sum(0)
+    return joint._replace(fitted=_wider(fitted, variance / np.maximum(np.diag(fitted.covariance), 1e-300)))
+
+
+def _wider(fitted: Fitted, times: Float[np.ndarray, " parameters"]) -> Fitted:
+    """The values with variances so many times as large, but no smaller ones."""
+    wider = np.sqrt(np.maximum(times, 1.0))
+    return replace(fitted, covariance=fitted.covariance * np.outer(wider, wider))
 
 
 def _move(joint: Joint) -> Float[np.ndarray, " parameters"]:

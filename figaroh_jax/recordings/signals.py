@@ -47,6 +47,7 @@ __all__ = [
 
 DEFAULT_CUTOFF = 20.0  # Hz
 WORKING = 13.2  # working rate over cutoff; the five-point differences are off by 0.2 % at the cutoff there
+MOST_WORKING, LONG = 16.0, 40_000  # the same at the most, where all recordings together have more samples than these
 ROWS = 3.3  # output rate over cutoff
 MOST_NUMBERS = 1 << 25  # of one signal at the working rate: 256 MiB, hours of a robot
 FEWEST_ROWS = 10
@@ -218,7 +219,8 @@ def choose_rates(recordings: Sequence[Recording], preprocess: Preprocess) -> Rat
 
     Default cutoff 20 Hz, at most 0.2 of the recording's rate; default output rate about 3.3 times the cutoff. The
     working rate is a whole multiple of the output rate; it lies above the recording's own where that is below 12
-    times the cutoff, because differences and friction signs need the finer samples.
+    times the cutoff, because differences and friction signs need the finer samples, and is 13.2 times the cutoff for
+    long data that it would else sample more than 16 times as fast.
     """
     raw, file = min((sampling_rate(recording.time), str(recording.file)) for recording in recordings)
     cutoff = preprocess.cutoff or min(DEFAULT_CUTOFF, 0.2 * raw)
@@ -234,6 +236,9 @@ def choose_rates(recordings: Sequence[Recording], preprocess: Preprocess) -> Rat
     if raw < 12 * cutoff:
         return Rates(WORKING * cutoff, round(WORKING / ROWS), cutoff)
     working = raw / int(raw / (12 * cutoff))  # a whole divisor needs no interpolation between samples
+    long = working * sum(recording.time[-1] - recording.time[0] for recording in recordings) > LONG
+    if long and working > MOST_WORKING * cutoff:
+        return Rates(WORKING * cutoff, round(WORKING / ROWS), cutoff)
     return Rates(working, max(1, round(working / (ROWS * cutoff))), cutoff)
 
 

@@ -7,6 +7,7 @@ Everything that is compared with the measured torque (the torque itself, each re
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -21,6 +22,8 @@ from .signals import Signals
 
 __all__ = ["Records", "filter_rows", "filtered_rows", "open_rows", "stack"]
 
+FEW_SLOTS = 8  # more of them may be longer than the longest recording, where less is padded then
+LONGER = (1.1, 1.15, 1.2, 1.3, 1.4, 1.5)  # times the longest recording
 AT_ONCE = 100_000  # numbers of series that are filtered at once: their spectra stay in the processor's cache
 
 
@@ -150,11 +153,14 @@ def stack(signals: Sequence[Signals], model: RobotModel | None = None, joined: b
     """
     first = signals[0]
     pad, samples = reach(first.dt, first.cutoff), max(s.time.size for s in signals)
-    count, length = max(s.rows.kept for s in signals), fast_length(samples + 2 * pad)
     carried = None if model is None else _carried(model, signals)
-    slots = (
-        _slots(signals, samples, length - 2 * pad) if joined and carried is None else [[k] for k in range(len(signals))]
-    )
+    slots = [[k] for k in range(len(signals))]
+    if joined and carried is None:
+        slots = _slots(signals, samples, fast_length(samples + 2 * pad) - 2 * pad)
+        longer = [_slots(signals, round(x * samples)) for x in LONGER] if len(slots) > FEW_SLOTS else []
+        slots = min([slots, *longer], key=partial(_padded_size, signals))
+    samples, count = (max(sum(sizes[k] for k in m) for m in slots) for sizes in _sizes(signals))
+    length = fast_length(max(samples + 2 * pad, *(_with_ends(signals, m) for m in slots)))
     spans, kept, source = [_NOWHERE] * len(signals), [], []
     for slot, members in enumerate(slots):
         sample = row = place = 0
@@ -197,7 +203,7 @@ def stack(signals: Sequence[Signals], model: RobotModel | None = None, joined: b
 _NOWHERE = Span(0, 0, 0, 0, 0)
 
 
-def _slots(signals: Sequence[Signals], samples: int, room: int) -> list[list[int]]:
+def _slots(signals: Sequence[Signals], samples: int, room: float = np.inf) -> list[list[int]]:
     """The recordings of each slot: long ones first, each into the first slot of its role that has room for it.
 
     A slot has `samples`, of which each further recording needs twice what the filter reaches more; `room` is what all
@@ -215,6 +221,23 @@ def _slots(signals: Sequence[Signals], samples: int, room: int) -> list[list[int
         else:
             slots.append([k])
     return sorted(map(sorted, slots))
+
+
+def _sizes(signals: Sequence[Signals]) -> tuple[list[int], list[int]]:
+    """Samples and rows of each recording."""
+    return [s.time.size for s in signals], [s.rows.kept for s in signals]
+
+
+def _with_ends(signals: Sequence[Signals], members: Sequence[int]) -> int:
+    """Samples of a slot with what the filter reaches on both sides of each recording in it."""
+    pad = reach(signals[0].dt, signals[0].cutoff)
+    return sum(signals[k].time.size + 2 * pad for k in members)
+
+
+def _padded_size(signals: Sequence[Signals], slots: list[list[int]]) -> int:
+    """Samples of all slots, and of what is transformed of them."""
+    samples = max(sum(signals[k].time.size for k in members) for members in slots)
+    return len(slots) * (samples + fast_length(max(_with_ends(signals, members) for members in slots)))
 
 
 def _apart(signals: Sequence[Signals], members: list[int]) -> bool:
