@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect, place
-from ..effects.catalogue import CATALOGUE, find
+from ..effects.catalogue import CATALOGUE, find, related
 from ..effects.plausibility import implausible
 from ..errors import InputError
 from ..estimation.noise import Spectrum
@@ -30,7 +30,7 @@ from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
 from ..simulators.native import as_backend
 from ..simulators.registry import backend as make_backend
-from .estimates import estimates, fitted_model
+from .estimates import amplitude_places, estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
@@ -39,7 +39,7 @@ from .gaining import Fall, Gaining, beside_all, without_losses
 from .holdout import fold_squares, part_error, residual_rms, traces
 from .joint import Joint, opened, polished, sized, with_misfit, with_parts
 from .layout import checked_repeats, describe_folds, held_rows, layout
-from .naming import beside_rest, reason_against, standings
+from .naming import beside_rest, beyond_simpler, reason_against, standings
 from .problem import Problem
 from .rest import (
     Significance,
@@ -223,7 +223,7 @@ def _searched(
     def ended(before: _Setting, search: Search) -> _Searched:
         here = before._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
-        found, joint = _fitted_together(here, search.found, forbid)
+        found, joint = _fitted_together(here, search.found, forbid, tolerance)
         left, beyond, line = _left(here, search, found, joint, forbid, tolerance, generator)
         strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
         return _Searched(before, here, search, found, joint, left, line, strict)
@@ -250,14 +250,33 @@ def _searched(
     return ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun))
 
 
-def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) -> tuple[list[Found], Joint]:
+def _fitted_together(
+    here: _Setting, found: list[Found], forbid: Sequence[str], tolerance: float
+) -> tuple[list[Found], Joint]:
     """The causes that the others do not make needless and that surely have a size, all in one fit."""
     found = eliminate(here.problem, here.start, found, here.whitening)
     joint = polished(here.problem, here.start, [f.effect for f in found], here.whitening)
-    kept = sized(found, joint, forbid)
+    kept = _simple(here, found, joint, forbid, tolerance)
+    if kept != found:
+        joint = polished(here.problem, here.start, [f.effect for f in kept], here.whitening)
+    found, kept = kept, sized(kept, joint, forbid)
     if len(kept) < len(found):
         joint = polished(here.problem, here.start, [f.effect for f in kept], here.whitening)
     return kept, joint
+
+
+def _simple(here: _Setting, found: list[Found], joint: Joint, forbid: Sequence[str], tolerance: float) -> list[Found]:
+    """The causes, each as the simpler effect that it contains where it adds to that no more than is tolerable."""
+    problem, state, out = here.problem, joint.step.state, []
+    for one, effect, at in zip(found, joint.causes, amplitude_places(state, joint.causes, problem.model), strict=True):
+        inside = next((n for n in type(effect).contains if n not in forbid), None)
+        if inside and beyond_simpler(problem, state, effect, at) < tolerance:
+            place_of = one.name.at
+            alike = tuple(Name(n, place_of) for n in related(inside, "indistinguishable_from") if n not in forbid)
+            simpler = place(find(inside), problem.model, place_of)
+            one = replace(one, name=Name(inside, place_of), effect=simpler, ambiguous=alike)
+        out.append(one)
+    return out
 
 
 def _judged(
