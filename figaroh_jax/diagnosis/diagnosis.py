@@ -35,7 +35,8 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .gaining import Fall, Gaining, beside_all, without_losses
+from .gaining import Fall, Gaining, beside_all, predicts_better, without_losses
+from .gates import physical_sign
 from .holdout import fold_squares, part_error, residual_rms, traces
 from .joint import Joint, opened, polished, sized, with_misfit, with_parts
 from .layout import checked_repeats, describe_folds, held_rows, layout
@@ -53,7 +54,7 @@ from .rest import (
     verdict,
     wrong_law,
 )
-from .search import Found, Search, chance_beside, eliminate, find_causes
+from .search import Found, Search, chance_beside, eliminate, find_causes, judged_without
 from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import Step, stand, with_causes
@@ -136,6 +137,7 @@ class _Searched(NamedTuple):
     left: Significance
     line: tuple[float, float, int]
     strict: bool  # whether a rest stays, beside which a cause must show more to be named
+    fading: tuple[Name, ...] = ()  # causes that were there and are gone in recordings kept out
 
 
 class _Judged(NamedTuple):
@@ -216,14 +218,15 @@ def _searched(
 
     Beside a rest those (`Effect.beside_rest`) are not named, and take the place of causes that could be: the search is
     taken up again from where the first of them came in. Such an effect of the whole robot stays: what it stands for
-    would go into several others, each of which would look sure. Where many causes are found, that is known before they
-    are in one fit.
+    would go into several others, each of which would look sure. One that fades stays where recordings kept out, in
+    which it is no longer there, surely show it: what any rest looks like would be there again. Where many causes are
+    found, that is known before they are in one fit.
     """
 
     def ended(before: _Setting, search: Search) -> _Searched:
         here = before._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
-        found, joint = _fitted_together(here, search.found, forbid, tolerance)
+        found, joint = _told_apart(here, *_fitted_together(here, search.found, forbid, tolerance))
         left, beyond, line = _left(here, search, found, joint, forbid, tolerance, generator)
         strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
         return _Searched(before, here, search, found, joint, left, line, strict)
@@ -244,10 +247,24 @@ def _searched(
             return first
         del first  # its rows and columns are large
     kept = search.found[:taken]
+    fading = [f for f in search.found[taken:] if f.effect.fades and _borne_out(here, kept, f)]
+    kept += fading
     step = with_causes(here.problem, here.start, [f.effect for f in kept], here.whitening)
     begun = search._replace(problem=here.problem, start=here.start, step=step, found=kept)
     del search
-    return ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun))
+    search = find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun)
+    return ended(here, search)._replace(fading=tuple(f.name for f in fading))
+
+
+def _borne_out(here: _Setting, before: list[Found], one: Found) -> bool:
+    """Whether recordings kept out surely show a cause beside those that were found before it."""
+    problem, start, whitening, found = here.problem, here.start, here.whitening, [*before, one]
+    if not problem.held.any():
+        return False
+    step = polished(problem, start, [f.effect for f in found], whitening).step
+    without = judged_without(problem, start, step, found, one, whitening)
+    worse, better = (v.own(step.rows, one.joints).sum() for v in (without, step.verdicts))
+    return beside_all(problem, start, whitening, found, step, one).surely(1 - float(better / max(worse, 1e-300)))
 
 
 def _fitted_together(
@@ -263,6 +280,26 @@ def _fitted_together(
     if len(kept) < len(found):
         joint = polished(here.problem, here.start, [f.effect for f in kept], here.whitening)
     return kept, joint
+
+
+def _told_apart(here: _Setting, found: list[Found], joint: Joint) -> tuple[list[Found], Joint]:
+    """The causes, each as that of those which slices cannot tell from it that recordings kept out surely prefer.
+
+    They are asked at the joints where both act: elsewhere only one of them says anything.
+    """
+    problem, start, whitening = here.problem, here.start, here.whitening
+    for k, one in enumerate(found if problem.held.any() else ()):
+        for other in one.instead:
+            if not physical_sign(other.effect) or other.name in [f.name for f in found]:
+                continue
+            effects = [other.effect if at == k else effect for at, effect in enumerate(joint.causes)]
+            full = with_causes(problem, start, effects, whitening)
+            if predicts_better(problem, joint.step, full, sorted({*one.joints} & {*other.joints})):
+                known = tuple(n for n in (one.name, *one.ambiguous) if n != other.name)
+                own = replace(one, name=other.name, effect=other.effect, joints=other.joints, ambiguous=known)
+                found = [own if f is found[k] else f for f in found]
+                joint = polished(problem, start, [f.effect for f in found], whitening)
+    return found, joint
 
 
 def _simple(here: _Setting, found: list[Found], joint: Joint, forbid: Sequence[str], tolerance: float) -> list[Found]:
@@ -286,7 +323,7 @@ def _judged(
 
     What is not named is no part of the answer's model: the others are fitted anew without it.
     """
-    before, here, _, found, joint, left, line, strict = searched
+    before, here, _, found, joint, left, line, strict, _ = searched
     problem, whitening = here.problem, here.whitening
     each = standings(problem, here.start, found, joint, whitening)
     claims = {one.name: one.gain for one in each}
@@ -294,7 +331,7 @@ def _judged(
     @cache
     def beside(name: Name) -> Fall:
         one = next(f for f in found if f.name == name)
-        return beside_all(searched.here.problem, searched.here.start, whitening, found, searched.joint, one)
+        return beside_all(searched.here.problem, searched.here.start, whitening, found, searched.joint.step, one)
 
     def borne_out(name: Name) -> bool:
         return beside(name).surely(claims[name])
@@ -303,7 +340,8 @@ def _judged(
         return bool(searched.here.problem.held.any()) and beside(name).certainly(claims[name])
 
     rests = beside_rest(each, [f.joints for f in found], strict)
-    against = {one.name: reason_against(one, rest, tolerance, certain) for one, rest in zip(each, rests, strict=True)}
+    asked = (tolerance, certain, searched.fading)
+    against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
     here, joint = _as_predicts_best([here] if same else [here, before], named)

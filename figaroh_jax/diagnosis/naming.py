@@ -7,7 +7,7 @@ vary with position, speed, load or time stands for another law.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -65,12 +65,17 @@ class Standing:
 
 
 def reason_against(
-    one: Standing, rest: bool, tolerance: float, certain: Callable[[Name], bool] = lambda name: False
+    one: Standing,
+    rest: bool,
+    tolerance: float,
+    certain: Callable[[Name], bool] = lambda name: False,
+    fading: Collection[Name] = (),
 ) -> str:
     """Why the cause is not named, in words with the number that failed; empty where it is.
 
     Beside a `rest` it must explain much of its joints' error with one amplitude; without one it must only be there.
-    `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not.
+    `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not; `fading`
+    are those that were surely there and are gone in recordings kept out.
     """
     least = GAIN_NAMED_ROBOT if one.whole else GAIN_NAMED
     checks = [
@@ -96,7 +101,7 @@ def reason_against(
             (one.share >= SHARE_NAMED, f"its torque is {one.share:.1%} of the joint's, {SHARE_NAMED:.0%} needed"),
             (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion explain as much"),
             (
-                one.beside_rest or not rest,
+                one.beside_rest or not rest or one.name in fading,
                 "the unexplained residual may imitate it: it is named only where nothing else is left",
             ),
             (

@@ -26,10 +26,18 @@ from .state import State, solved, with_width
 from .step import Step, stand, with_cause, with_causes
 from .thresholds import GAIN, MOST_CAUSES, OVERLAP_ELSEWHERE, SHARE_AGAIN, SHARE_ALIKE, SMALLEST, T_BETTER
 
-__all__ = ["Found", "Search", "chance_beside", "eliminate", "find_causes", "judged_without", "stood_without"]
+__all__ = ["Found", "Rival", "Search", "chance_beside", "eliminate", "find_causes", "judged_without", "stood_without"]
 
 NEAR, CLOSER = 4, 800  # times the level: p-values below which few draws cannot tell from it; draws that can
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
+
+
+class Rival(NamedTuple):
+    """What cannot be told from a cause, as it would be put in its place."""
+
+    name: Name
+    effect: Effect
+    joints: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -46,6 +54,7 @@ class Found:
     ambiguous: tuple[Name, ...]
     joints: tuple[int, ...] = ()  # by whose rows it is judged
     alike: tuple[Name, ...] = ()  # what else explains much of the same misfit, though not as well
+    instead: tuple[Rival, ...] = ()  # of the `ambiguous` those that were fitted in its place
 
 
 class Search(NamedTuple):
@@ -237,6 +246,7 @@ def _found(
     """The accepted cause with its gain, and with what explains the same misfit as well or nearly so."""
     alike = rivals(step, contenders, best)
     drop = step.verdicts.cost - best.verdicts.cost
+    open_to = ambiguous(step, best, alike, screened)
     wins = shares_of_wins(np.stack([c.verdicts.blocks for c in [best, *alike]]), generator)
     return Found(
         name=best.name,
@@ -246,9 +256,10 @@ def _found(
         cost=(step.verdicts.cost, best.verdicts.cost),
         t=t_value(step.verdicts.blocks, best.verdicts.blocks),
         confidence=float(wins[0]) * (1 - p),
-        ambiguous=ambiguous(step, best, alike, screened),
+        ambiguous=open_to,
         joints=best.joints,
         alike=tuple(c.name for c in alike if step.verdicts.cost - c.verdicts.cost > SHARE_ALIKE * drop),
+        instead=tuple(Rival(c.name, c.effect, c.joints) for c in alike if c.name in open_to),
     )
 
 
