@@ -2,10 +2,10 @@
 
     PYTHONPATH=. python benchmarks/gpu.py ROBOT.urdf ... [--only WORD ...] [--gpus 0 1] [--at-once N] [--out FILE]
 
-Inverse and forward dynamics, mass matrix and regressor (dense, packed, normal matrix with torque) in float64, and the
-kernels in float32 too. Each function of each robot is a process of its own, begun in the order of the goals of this
-library; several are compiled at once, one at a time runs on a GPU. Every figure is printed, and added to FILE as a line
-of JSON, as soon as it is taken, so that what is cut off has told what it knew.
+Inverse and forward dynamics, mass matrix and regressor (dense, packed; normal matrix and triangular factor, both with
+torque) in float64, and the kernels in float32 too. Each function of each robot is a process of its own, begun in the
+order of the goals of this library; several are compiled at once, one at a time runs on a GPU. Every figure is printed,
+and added to FILE as a line of JSON, as soon as it is taken, so that what is cut off has told what it knew.
 
 A process puts the states on the device, traces and compiles (told apart), compares the first 1000 answers with those of
 a process that sees the CPU alone, and calls until half a second has passed: the best call counts ("in a program"). Two
@@ -38,6 +38,7 @@ LONGEST = 170.0  # seconds that a process of a function may take with all its co
 # function: samples for a robot of up to ten joints and for a larger one; in the order of what is to be known first
 CASES = {
     "normal matrix": (1 << 22, 1 << 19),
+    "triangular factor": (1 << 20, 1 << 17),
     "inverse dynamics": (1 << 22, 1 << 20),
     "packed regressor": (1 << 20, 1 << 17),
     "forward dynamics": (1 << 21, 1 << 17),
@@ -51,6 +52,7 @@ CASES = {
 }
 
 
+SUMS = ("normal matrix", "triangular factor")  # over all samples: they are told weights, too
 _PUBLIC = (
     "inverse dynamics",
     "forward dynamics",
@@ -58,6 +60,7 @@ _PUBLIC = (
     "packed regressor",
     "dense regressor",
     "normal matrix",
+    "triangular factor",
 )
 STAGES = {"in a program": tuple(CASES), "called, none kept": _PUBLIC, "called, kept": _PUBLIC}
 
@@ -136,7 +139,7 @@ def _child(robot: Path, name: str, folder: str, stage: str, samples: int) -> Non
     model = fj.load_urdf(robot)
     reference = Path(folder) / "cpu.npz"
     if stage == "cpu":
-        found = _answer(jax.jit(_function(model, name))(*_states(model, name, CHECKED)))
+        found = _answer(jax.jit(_function(model, name))(*_states(model, name, CHECKED)), name)
         np.save(reference.with_suffix(".tmp.npy"), found)
         reference.with_suffix(".tmp.npy").replace(reference)
         return
@@ -160,14 +163,13 @@ def _child(robot: Path, name: str, folder: str, stage: str, samples: int) -> Non
         found = jax.block_until_ready(function(*state))
         first = time.perf_counter() - begin + traced + compiled
         row = {"samples": samples, "first": first, "traced": traced, "compiled": compiled}
-        sample = _first_samples(found, model, name)
+        if name in SUMS:  # the same program, of which the first samples alone count
+            found = function(*state[:-1], state[-1].at[CHECKED:].set(0.0))
+        sample = _first_samples(found, name)
         del found
         best = _best(function, state)
         peak = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", 0)
     row |= {"rate": samples / best / 1e6, "peak": peak, "device": jax.devices()[0].device_kind, "jax": jax.__version__}
-    if name == "normal matrix":  # a sum: of the same samples, on the GPU too
-        small = [x[:CHECKED] for x in state]
-        sample = _answer(jax.jit(_function(model, name))(*small))
     print(json.dumps(row | {"difference": _difference(sample, reference)}))
 
 
@@ -196,7 +198,7 @@ def _difference(found: Any, reference: Path) -> float:
 
 
 def _function(model: Any, name: str) -> Callable[..., Any]:
-    """The function of (q, v, a) or, for accelerations, (q, v, tau)."""
+    """The function of (q, v, a), for accelerations of (q, v, tau), for sums of (q, v, a, weight)."""
     import figaroh_jax as fj
     from figaroh_jax.compiled.kernels import straight_answers
     from figaroh_jax.rigid import dynamics, regressor
@@ -207,7 +209,8 @@ def _function(model: Any, name: str) -> Callable[..., Any]:
         "mass matrix": lambda model, q, v, a: fj.mass_matrix(model, q),
         "packed regressor": fj.packed_regressor,
         "dense regressor": fj.joint_torque_regressor,
-        "normal matrix": lambda model, q, v, a: fj.normal_matrix(model, q, v, a, tau=a),
+        "normal matrix": lambda model, q, v, a, weight: fj.normal_matrix(model, q, v, a, tau=a, weight=weight),
+        "triangular factor": lambda model, q, v, a, weight: fj.triangular_factor(model, q, v, a, tau=a, weight=weight),
     }
     kernels = {
         "inverse dynamics float32": lambda *x: straight_answers(dynamics._TORQUES, model, *x),
@@ -224,25 +227,29 @@ def _function(model: Any, name: str) -> Callable[..., Any]:
 
 
 def _states(model: Any, name: str, samples: int, lengths_alone: bool = False) -> list[np.ndarray]:
-    """q, v, a of which the first thousand are the same for all numbers of samples; in the function's precision."""
+    """q, v, a (and weights) of which the first thousand are the same for all numbers; in the function's precision."""
     dtype = np.float32 if "float32" in name else np.float64
     if lengths_alone:
-        return [np.broadcast_to(dtype(0), (samples, model.nv))] * 3
+        return [np.broadcast_to(dtype(0), (samples, model.nv))] * (4 if name in SUMS else 3)
     random = np.random.default_rng(0)
     checked = [random.uniform(-1.5, 1.5, (CHECKED, model.nv)) for _ in range(3)]
     rest = [random.random((max(0, samples - CHECKED), model.nv), np.float32) * 3.0 - 1.5 for _ in range(3)]
-    return [np.concatenate([x, y]).astype(dtype)[:samples] for x, y in zip(checked, rest, strict=True)]
+    states = [np.concatenate([x, y]).astype(dtype)[:samples] for x, y in zip(checked, rest, strict=True)]
+    return [*states, np.ones((samples, model.nv))] if name in SUMS else states
 
 
-def _first_samples(found: Any, model: Any, name: str) -> np.ndarray | None:
-    if name == "normal matrix":
-        return None
-    return _answer(found[..., :CHECKED] if name.startswith("packed") else found[:CHECKED])
+def _first_samples(found: Any, name: str) -> np.ndarray:
+    if name in SUMS:
+        return _answer(found, name)
+    return _answer(found[..., :CHECKED] if name.startswith("packed") else found[:CHECKED], name)
 
 
-def _answer(found: Any) -> np.ndarray:
+def _answer(found: Any, name: str) -> np.ndarray:
+    """All numbers; of a factor those of its products, since what no sample moves may stand in it anyhow."""
     import jax
 
+    if name == "triangular factor":
+        found = np.asarray(found).T @ np.asarray(found)
     return np.concatenate([np.ravel(np.asarray(x, np.float64)) for x in jax.tree.leaves(found)])
 
 

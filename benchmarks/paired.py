@@ -4,8 +4,9 @@
 
 `diagnose` and `identify` on the TX40, `calibrate` on TALOS ($FIGAROH_JAX_DATA); `--task` takes the place of these, for
 the commands that `--only` names, or for `diagnose` (`parity.py make` writes those of the public sets). In each round
-every version runs cold (no program kept) and warm, one after the other, the first one alternating. Printed are medians,
-and the ratio of the second version to the first as median of the rounds, with the smallest and the largest.
+every version runs cold (no program kept) and warm, one after the other, the first one alternating. Both have byte code
+of what they import, as an installed package has it, whatever PYTHONDONTWRITEBYTECODE says. Printed are medians, and
+the ratio of the second version to the first as median of the rounds, with the smallest and the largest.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ def tasks(folder: Path) -> dict[str, Path]:
 def measured(command: str, task: Path, source: Path, cache: Path) -> tuple[float, float]:
     """CPU seconds and peak MB of one process."""
     environment = os.environ | parity.ONE_THREAD | {"PYTHONPATH": parity.path_of(source), "JAX_PLATFORMS": "cpu"}
-    environment["XDG_CACHE_HOME"] = str(cache)
+    environment |= {"XDG_CACHE_HOME": str(cache), "PYTHONPYCACHEPREFIX": str(cache.parent / "bytecode")}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     with tempfile.TemporaryDirectory() as out:
         words = [sys.executable, "-m", "figaroh_jax", command, str(task), "--out", f"{out}/run", "--quiet"]
         process = subprocess.Popen(words, env=environment, cwd=out, stdout=subprocess.DEVNULL)
@@ -69,6 +71,9 @@ def main() -> None:
     sides = [one.split("=", 1) for one in args.sides]
     with tempfile.TemporaryDirectory() as scratch:
         files = tasks(Path(scratch))
+        for _, source in sides:
+            words = [sys.executable, "-m", "compileall", "-q", str(Path(source).resolve() / "figaroh_jax")]
+            subprocess.run(words, env=os.environ | {"PYTHONPYCACHEPREFIX": f"{scratch}/bytecode"}, check=True)
         if args.task:
             named = args.only if len(args.only) < len(COMMANDS) else ["diagnose"]
             task: Path = args.task.resolve()

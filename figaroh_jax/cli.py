@@ -7,6 +7,7 @@ message on standard error), 70 a fault of the program itself, 130 interrupted, 1
 from __future__ import annotations
 
 import argparse
+import atexit
 import gc
 import io
 import os
@@ -36,8 +37,8 @@ _TASKS = {  # commands that take a task file
     "calibrate": "fit the kinematics from measured poses or points",
     "excite": "design the most informative motion within limits",
 }
-_TRIM_THRESHOLD, _MMAP_MAX = -1, -4  # of glibc's mallopt
-_NEW_OBJECTS = 200_000  # between two searches of Python for circles of objects that nobody holds
+_TRIM_THRESHOLD, _MMAP_MAX, _ARENA_MAX = -1, -4, -8  # of glibc's mallopt
+_NEW_OBJECTS = 1_000_000  # between two searches of Python for circles of objects that nobody holds
 _READING = 0.03  # of a command's work, for the progress bar
 _OTHERS = ("verify", "compare", "list", "new", "migrate", "view")  # commands before and after a run
 _DESCRIPTION = "Name what a robot's simulation gets wrong, extend the model with it and measure the gain."
@@ -97,7 +98,8 @@ def _keep_freed_memory() -> None:
     """Have the C library keep the memory of arrays that are gone for those that follow.
 
     glibc gives each large array back to the system, which clears every page of the next one: with ten minutes of data
-    that was a fifth of the CPU seconds. Other C libraries do as they do.
+    that was a fifth of the CPU seconds. And JAX's threads take from the same memory as Python's: kept apart, each would
+    hold what it once needed. Other C libraries do as they do.
     """
     if sys.platform.startswith("linux"):
         import ctypes
@@ -106,6 +108,7 @@ def _keep_freed_memory() -> None:
             set_option = ctypes.CDLL(None).mallopt
             set_option(_MMAP_MAX, 0)
             set_option(_TRIM_THRESHOLD, 2**31 - 1)
+            set_option(_ARENA_MAX, 1)
 
 
 def _drop_standard_output() -> None:
@@ -119,6 +122,7 @@ def _run(args: argparse.Namespace) -> int:
         os.environ.setdefault(name, value)
     _keep_freed_memory()
     gc.set_threshold(_NEW_OBJECTS)  # what imports make lives on: with Python's 700 the searches take .2 s of a run
+    atexit.register(gc.freeze)  # and .1 s more at the end, where the system takes all memory back
     if args.command in _OTHERS:
         from .jobs import tools
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import equinox as eqx
 import numpy as np
@@ -15,9 +16,11 @@ import reference
 import robots
 from synthetic import DT, made_signals, swing
 
+from figaroh_jax.diagnosis.comparison import Verdicts
+from figaroh_jax.diagnosis.contenders import Contender
 from figaroh_jax.diagnosis.design import units
 from figaroh_jax.diagnosis.flexible import WIDTHS, friction_width
-from figaroh_jax.diagnosis.gates import exists, physical_sign
+from figaroh_jax.diagnosis.gates import exists, physical_sign, possible
 from figaroh_jax.diagnosis.layout import held_rows, layout
 from figaroh_jax.diagnosis.naming import beyond_simpler
 from figaroh_jax.diagnosis.problem import Problem
@@ -31,6 +34,7 @@ from figaroh_jax.estimation.rows import fit
 from figaroh_jax.formats.config import Load
 from figaroh_jax.recordings.signals import Signals
 from figaroh_jax.recordings.stacked import stack
+from figaroh_jax.results import Name
 from figaroh_jax.rigid.inertia import from_com, pseudo_inertia
 from figaroh_jax.rigid.model import RobotModel
 from figaroh_jax.simulators.native import NativeBackend
@@ -84,6 +88,21 @@ def test_a_body_that_cannot_exist_becomes_the_nearest_that_can(seed: int) -> Non
     towards = metric @ (found - free)
     for other in (SOLID, *(body(m, rng.normal(size=3) * 0.1, np.array([0.01, 0.02, 0.02])) for m in (0.2, 1.0, 3.0))):
         assert (other - found) @ towards >= -1e-3 * distance
+
+
+def test_what_the_metric_does_not_see_leaves_the_mass_finite() -> None:
+    """A moment and a negative inertia would be those of a mass without end, where nothing else is seen."""
+    solid = np.append(SOLID[:4] + [0, 0.3, 0, 0], SOLID[4:])
+    seen = np.zeros((10, 10))
+    for k, size in ((1, 1e4), (6, 1e3)):  # the moment m c_x and one inertia, as at a joint that turns about one axis
+        seen[k, k] = size
+    free = np.where(np.diag(seen) > 0, solid, 0.0)
+    found = physical_body(free, seen)
+    assert 0 < found[0] < 1e4
+    np.testing.assert_allclose(found[[1, 6]], free[[1, 6]], rtol=0, atol=1e-4)
+    free[6] *= -1  # no body turns by less than none
+    found = physical_body(free, seen)
+    assert 0 < found[0] < 1e8 and np.isfinite(found).all()
 
 
 def test_rigid_prior_is_trust_times_each_links_own_scale(tmp_path: Path) -> None:
@@ -152,6 +171,29 @@ def test_a_robot_near_its_nominal_values_is_fitted_without_rest(model: RobotMode
     assert np.abs(plain_rows(problem, state).y).max() > 10
     np.testing.assert_allclose(linear.residual / sure, 0.0, rtol=0, atol=1e-4)
     np.testing.assert_allclose(linear.theta[-2:], [4.0, 1.0], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_a_sign_that_physics_forbids_gives_way_to_a_law_that_does_as_well(model: RobotModel, told: bool) -> None:
+    """... and to no law that the data can tell from it, nor to one of another joint."""
+    noise = np.random.default_rng(0).normal(size=(40, 50)) * 0.1
+    speed = np.linspace(0.1, 1.0, 50)
+
+    def said(change: np.ndarray, more: float = 0.0) -> Verdicts:
+        error = noise + 0.3 * speed**0.4 - change + more * np.sign(noise)
+        blocks, none = (error**2).sum(1), np.zeros(0)
+        return Verdicts(float(blocks.sum()), none, none, blocks, none, error.reshape(1, -1), error.reshape(1, -1))
+
+    def contender(name: str, change: np.ndarray, joint: str, more: float = 0.0, **values: float) -> Contender:
+        return Contender(Name(name, (joint,)), place(find(name), model, (joint,), **values), said(change, more), (0,))
+
+    law = 0.3 * speed**0.4
+    wrong = contender("stribeck_friction", law, "turn", force=-0.1, speed=0.2)
+    other = contender("power_law_friction", law, "slide", strength=0.3, exponent=0.4)
+    right = contender("power_law_friction", law, "turn", more=0.1 * told, strength=0.3, exponent=0.4)
+    step = cast(Any, SimpleNamespace(verdicts=said(0 * speed)))
+    assert possible(step, [wrong, other, right], wrong) is (wrong if told else right)
+    assert possible(step, [right, wrong, other], right) is right
 
 
 def test_an_effect_exists_within_its_bounds_only(model: RobotModel) -> None:

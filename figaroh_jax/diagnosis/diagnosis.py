@@ -272,13 +272,13 @@ def _fitted_together(
 ) -> tuple[list[Found], Joint]:
     """The causes that the others do not make needless and that surely have a size, all in one fit."""
     found = eliminate(here.problem, here.start, found, here.whitening)
-    joint = polished(here.problem, here.start, [f.effect for f in found], here.whitening)
+    joint = _together(here, found)
     kept = _simple(here, found, joint, forbid, tolerance)
     if kept != found:
-        joint = polished(here.problem, here.start, [f.effect for f in kept], here.whitening)
+        joint = _together(here, kept)
     found, kept = kept, sized(kept, joint, forbid)
     if len(kept) < len(found):
-        joint = polished(here.problem, here.start, [f.effect for f in kept], here.whitening)
+        joint = _together(here, kept)
     return kept, joint
 
 
@@ -340,11 +340,12 @@ def _judged(
         return bool(searched.here.problem.held.any()) and beside(name).certainly(claims[name])
 
     rests = beside_rest(each, [f.joints for f in found], strict)
-    asked = (tolerance, certain, searched.fading)
-    against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
+    pairs, more = zip(each, rests, strict=True), (tolerance, certain, searched.fading)
+    against = {one.name: reason_against(one, rest, *more) for one, rest in pairs}
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
-    here, joint = _as_predicts_best([here] if same else [here, before], named)
+    here, joint, by_speed = _as_predicts_best([here] if same else [here, before], named)
+    asked = len(named)
     gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, borne_out)
     gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
@@ -355,7 +356,10 @@ def _judged(
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
     shown = left.there or (bool(nearest) and float(relative.max()) > tolerance)
-    sticks = shown and _sticks([here, searched.here], [f.effect for f in named], joint, tolerance)
+    sticks = shown and (
+        _sticks(here, joint, tolerance)
+        or _sticks(seen := searched.here, by_speed if asked == len(named) else _together(seen, named), tolerance)
+    )
     rest = shown and not sticks
     text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
     parts = parts_of(problem, joint.step, whitening, line, names)
@@ -365,35 +369,37 @@ def _judged(
     return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text, why), sticks, here)
 
 
-def _sticks(settings: Sequence[_Setting], causes: list[Effect], joint: Joint, tolerance: float) -> bool:
-    """Whether what is left beside the named causes is that of joints at rest (the answer's fit, or by speed).
+def _sticks(here: _Setting, joint: Joint, tolerance: float) -> bool:
+    """Whether what is left beside the causes of a fit is that of joints at rest.
 
     A fit that is also asked for slow rows gives part of their sticks to the friction of the joints that move.
     """
-    for k, here in enumerate(settings):
-        fitted = polished(here.problem, here.start, causes, here.whitening) if k else joint
-        state, noise = fitted.step.state, noise_rms(here.problem, here.spectrum)
-        if only_sticks(here.problem, state, noise, relative_rest(here.problem, state, noise), tolerance):
-            return True
-    return False
+    state, noise = joint.step.state, noise_rms(here.problem, here.spectrum)
+    return only_sticks(here.problem, state, noise, relative_rest(here.problem, state, noise), tolerance)
 
 
-def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple[_Setting, Joint]:
-    """The named causes in one fit as predicts parts left out best, by their error in N m.
+def _together(here: _Setting, found: list[Found]) -> Joint:
+    return polished(here.problem, here.start, [one.effect for one in found], here.whitening)
+
+
+def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple[_Setting, Joint, Joint]:
+    """The named causes in one fit as predicts parts left out best, by their error in N m; and as the first setting has
+    them.
 
     Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows, and
     the width of friction beside all causes need not be that beside the named ones.
     """
-    best = None
+    best, first = None, None
     for here in settings:
         weights = [np.asarray(here.problem.records.weight), np.asarray(here.problem.records.judged)]
         for weight in weights[: 1 if np.array_equal(weights[0], weights[1]) else 2]:
             one = here._replace(problem=here.problem.weighted(weight))
-            joint = polished(one.problem, one.start, [f.effect for f in named], one.whitening)
+            joint = _together(one, named)
             error = part_error(one.problem, joint.step)
             best = (error, one, joint) if best is None or error < best[0] else best
-    assert best is not None
-    return best[1:]
+            first = first or joint
+    assert best is not None and first is not None
+    return *best[1:], first
 
 
 def _as_weighed_otherwise(here: _Setting, by_speed: Problem, joint: Joint) -> Joint:

@@ -19,7 +19,7 @@ from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
 from .flexible import friction_width
-from .gates import ambiguous, exists, gains, passes, rivals, simpler
+from .gates import ambiguous, exists, gains, passes, possible, rivals, simpler
 from .problem import Problem
 from .screening import DRAWS, Null, Screen, Shown, catalogue, family_p, place_p, screen
 from .state import State, solved, with_width
@@ -234,7 +234,7 @@ def _best(problem: Problem, step: Step, contenders: list[Contender], before: lis
     for one in passing:
         instead = simpler(step, passing, one)
         if not instead:
-            return one
+            return possible(step, passing, one)
         if type(one.effect).resembles:
             return instead[0]
     return None

@@ -225,7 +225,7 @@ def unit_torques(problem: Problem, state: State, term: Effect) -> Units:
         return Units(torque, np.tile(np.arange(problem.model.nv), (len(links), 1)))
     family = family_of(type(term))
     if family == "shaped":
-        return _shaped_units(term, state.measured)  # its torque does not follow the model's
+        return _shaped_units(problem, term, state.measured)  # its torque does not follow the model's
     if family in ("fixed", "following"):
         place = _places_in(problem.families[family].get(term.name), term)
         if place is not None:
@@ -252,9 +252,11 @@ def _choices(effect: Effect) -> list[str]:
     return [name for name, p in effect.parameters().items() if not p.linear]
 
 
-def _shaped_units(term: Effect, motion: Motion) -> Units:
-    """By the program of the refits."""
-    torque, _ = shaped_units(term, motion)
+def _shaped_units(problem: Problem, term: Effect, motion: Motion) -> Units:
+    """By the program of the refits, whose slopes a fit of all causes asks for next."""
+    torque, slopes = shaped_units(term, motion)
+    if len(torque) == 1:
+        problem.kept((unit_slopes, *_identity(term)), motion, slopes[0].copy)
     everywhere = np.tile(np.arange(np.shape(motion.velocity)[1]), (len(torque), 1))
     return Units(torque, np.asarray(term.at) if local(term) else everywhere)
 

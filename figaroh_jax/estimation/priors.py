@@ -10,6 +10,11 @@ from ..rigid.model import RobotModel
 
 __all__ = ["body_precision", "physical_body", "rigid_prior"]
 
+UNSEEN = 1e-12  # of the largest information: what a direction without any counts for
+LEVENBERG = 1000  # steps at the most
+SETTLED = 1e-10  # of the square, by which a last step would still make it fall
+ROUNDING = 1e-20  # of the square of all that is wanted: a smaller one is none
+
 
 def rigid_prior(model: RobotModel, trust: float) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
     """Nominal inertial parameters and their precision: one sigma is `trust` times m, m L (three times), J (six times).
@@ -30,12 +35,11 @@ def rigid_prior(model: RobotModel, trust: float) -> tuple[Float[np.ndarray, " P"
 def physical_body(free: Float[np.ndarray, "10"], information: Float[np.ndarray, "10 10"]) -> Float[np.ndarray, "10"]:
     """The ten parameters nearest to `free` (in the metric `information`) that a body of positive mass can have.
 
-    The pseudo-inertia is L L' with L lower triangular (Wensing, Kim, Slotine 2018), L by Levenberg-Marquardt.
+    The pseudo-inertia is L L' with L lower triangular (Wensing, Kim, Slotine 2018), L by Levenberg-Marquardt. What the
+    metric does not see stays near `free`: else the mass may grow without end, for what that makes of a moment.
     """
-    from scipy.optimize import least_squares  # slow to import
-
     values, vectors = np.linalg.eigh((information + information.T) / 2)
-    root = np.sqrt(np.maximum(values, 0))[:, None] * vectors.T
+    root = np.sqrt(np.maximum(values, UNSEEN * values[-1]))[:, None] * vectors.T
     lower = np.tril_indices(4)
     start = np.diag(np.sqrt(max(float(free[0]), 0.05) * np.array([0.002, 0.002, 0.002, 1.0])))[lower]
     basis = np.zeros((10, 4, 4))
@@ -46,15 +50,37 @@ def physical_body(free: Float[np.ndarray, "10"], information: Float[np.ndarray, 
     forms = np.moveaxis(_ten((products + np.swapaxes(products, 2, 3)) / 2), 2, 0).reshape(100, 10)
     weighed, wanted = (root @ forms.reshape(10, 100)).reshape(100, 10), root @ free
 
-    def misfit(x: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
-        return (weighed @ x).reshape(10, 10) @ x - wanted
-
-    def slope(x: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10 10"]:
-        return 2 * (weighed @ x).reshape(10, 10)
-
-    options = {"method": "lm", "ftol": 1e-10, "xtol": 1e-10}
-    L = np.tensordot(least_squares(misfit, start, slope, **options).x, basis, 1)  # pyright: ignore[reportArgumentType]
+    L = np.tensordot(_quadratic_minimum(weighed.reshape(10, 10, 10), wanted, start), basis, 1)
     return _ten(L @ L.T)
+
+
+def _quadratic_minimum(
+    forms: Float[np.ndarray, "m k k"], wanted: Float[np.ndarray, " m"], start: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, " k"]:
+    """Least squares of x' A_i x - b_i, each A_i symmetric, by Levenberg-Marquardt (Nielsen's rule of its damping).
+
+    On the host: a call of another library's solver takes longer than this one, and its import ten times as long.
+    """
+    x, damping, growth = start, 1e-3, 2.0
+    half = forms @ x
+    left = half @ x - wanted
+    scale = np.zeros_like(x)
+    for _ in range(LEVENBERG):
+        hessian, slope = 4 * half.T @ half, 2 * left @ half
+        scale = np.maximum(scale, np.diag(hessian))
+        step = np.linalg.solve(hessian + damping * np.diag(np.maximum(scale, 1e-300)), -slope)
+        expected = step @ (damping * scale * step - slope)  # twice of what the square falls by in the linear model
+        ahead = forms @ (x + step)
+        error = ahead @ (x + step) - wanted
+        fall = left @ left - error @ error
+        if expected <= SETTLED * (left @ left) + ROUNDING * (wanted @ wanted):
+            break
+        if fall > 0:
+            x, half, left = x + step, ahead, error
+            damping, growth = damping * max(1 / 3, 1 - (2 * fall / expected - 1) ** 3), 2.0
+        else:
+            damping, growth = damping * growth, growth * 2
+    return x
 
 
 def body_precision(ten: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:
