@@ -54,11 +54,11 @@ from .rest import (
     verdict,
     wrong_law,
 )
-from .search import Found, Search, chance_beside, eliminate, find_causes, judged_without
+from .search import Begun, Found, Search, chance_beside, eliminate, find_causes, judged_without
 from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import Step, stand, with_causes
-from .thresholds import ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, NO_REST, STANDSTILL, WEIGHT_ROUNDS
+from .thresholds import ALL_BUT, ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, NO_REST, REST_P, STANDSTILL, WEIGHT_ROUNDS
 from .weights import relative_speed, weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -137,6 +137,8 @@ class _Searched(NamedTuple):
     left: Significance
     line: tuple[float, float, int]
     strict: bool  # whether a rest stays, beside which a cause must show more to be named
+    more: float  # squares by which smooth functions find more in it than chance gives
+    doubted: bool  # whether the catalogue still scores more than noise, though nothing in it passes
     fading: tuple[Name, ...] = ()  # causes that were there and are gone in recordings kept out
 
 
@@ -227,9 +229,9 @@ def _searched(
         here = before._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
         found, joint = _told_apart(here, *_fitted_together(here, search.found, forbid, tolerance))
-        left, beyond, line = _left(here, search, found, joint, forbid, tolerance, generator)
+        left, p_left, beyond, line, more = _left(here, search, found, joint, forbid, tolerance, generator)
         strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
-        return _Searched(before, here, search, found, joint, left, line, strict)
+        return _Searched(before, here, search, found, joint, left, line, strict, more, p_left < REST_P)
 
     like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
 
@@ -248,9 +250,7 @@ def _searched(
         del first  # its rows and columns are large
     kept = search.found[:taken]
     fading = [f for f in search.found[taken:] if f.effect.fades and _borne_out(here, kept, f)]
-    kept += fading
-    step = with_causes(here.problem, here.start, [f.effect for f in kept], here.whitening)
-    begun = search._replace(problem=here.problem, start=here.start, step=step, found=kept)
+    begun = Begun(kept + fading, search.p_value, search.shown)
     del search
     search = find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun)
     return ended(here, search)._replace(fading=tuple(f.name for f in fading))
@@ -323,9 +323,13 @@ def _judged(
 
     What is not named is no part of the answer's model: the others are fitted anew without it.
     """
-    before, here, _, found, joint, left, line, strict, _ = searched
+    before, here, _, found, joint, left, line, strict, more, doubted, fading = searched
     problem, whitening = here.problem, here.whitening
     each = standings(problem, here.start, found, joint, whitening)
+    each = [
+        replace(one, complete=more <= ALL_BUT * (f.cost[0] - f.cost[1])) for one, f in zip(each, found, strict=True)
+    ]
+    noise = noise_rms(problem, here.spectrum)
     claims = {one.name: one.gain for one in each}
 
     @cache
@@ -339,13 +343,17 @@ def _judged(
     def certain(name: Name) -> bool:
         return bool(searched.here.problem.held.any()) and beside(name).certainly(claims[name])
 
-    rests = beside_rest(each, [f.joints for f in found], strict)
-    pairs, more = zip(each, rests, strict=True), (tolerance, certain, searched.fading)
-    against = {one.name: reason_against(one, rest, *more) for one, rest in pairs}
+    beyond = relative_rest(problem, joint.step.state, noise)
+    rests = beside_rest(each, [f.joints for f in found], strict, beyond, tolerance)
+    asked = (tolerance, certain, fading)
+    against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
+    for one, rest in zip(found, rests, strict=True):
+        if rest and one.doubtful and not against[one.name]:
+            against[one.name] = "a law of impossible sign explains the same misfit: it may be the unexplained residual"
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
     here, joint, by_speed = _as_predicts_best([here] if same else [here, before], named)
-    asked = len(named)
+    count = len(named)
     gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, borne_out)
     gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
@@ -355,10 +363,10 @@ def _judged(
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
-    shown = left.there or (bool(nearest) and float(relative.max()) > tolerance)
+    shown = left.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
     sticks = shown and (
         _sticks(here, joint, tolerance)
-        or _sticks(seen := searched.here, by_speed if asked == len(named) else _together(seen, named), tolerance)
+        or _sticks(seen := searched.here, by_speed if count == len(named) else _together(seen, named), tolerance)
     )
     rest = shown and not sticks
     text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
@@ -421,8 +429,9 @@ def _left(
     forbid: Sequence[str],
     tolerance: float,
     generator: np.random.Generator,
-) -> tuple[Significance, float, tuple[float, float, int]]:
-    """Whether all causes together leave more than noise, its excess over the noise, and the strongest line in it."""
+) -> tuple[Significance, float, float, tuple[float, float, int], float]:
+    """Whether all causes together leave more than noise, the p-value of the catalogue on it, its excess over
+    the noise, the strongest line in it, and the squares that smooth functions find in it beyond chance."""
     problem, start, spectrum, whitening, _ = here
     first = stand(problem, start, whitening)
     before, *_ = excess(problem, first.rows, first.linear.residual, spectrum, whitening)
@@ -437,7 +446,7 @@ def _left(
     joints, tolerable = problem.model.joint_names, size <= tolerance
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
-    return left._replace(there=left.there or (wrong and not tolerable)), now[0], line
+    return left._replace(there=left.there or (wrong and not tolerable)), p_left, now[0], line, flexible[2]
 
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:
