@@ -87,7 +87,7 @@ def _due_real(case: dict[str, Any], forbidden: bool) -> float | None:
 def _due_closed_loop(case: dict[str, Any], forbidden: bool) -> float | None:
     if not case["truth"]:
         return None if forbidden else 1.0
-    return 3.5 if forbidden else 1.1
+    return 8.0 if forbidden else 1.1
 
 
 def _due_inverse(case: dict[str, Any], forbidden: bool) -> float | None:

@@ -1,6 +1,7 @@
 """Throughput on an accelerator, and that it gives the numbers of the CPU.
 
-    PYTHONPATH=. python benchmarks/gpu.py ROBOT.urdf ... [--only WORD ...] [--gpus 0 1] [--at-once N] [--out FILE]
+    PYTHONPATH=. python benchmarks/gpu.py ROBOT.urdf ... [--tree N] [--only WORD ...] [--gpus 0 1] [--at-once N]
+        [--out FILE]
 
 Inverse and forward dynamics, mass matrix and regressor (dense, packed; normal matrix and triangular factor, both with
 torque) in float64, and the kernels in float32 too. Each function of each robot is a process of its own, begun in the
@@ -11,7 +12,7 @@ A process puts the states on the device, traces and compiles (told apart), compa
 a process that sees the CPU alone, and calls until half a second has passed: the best call counts ("in a program"). Two
 more call the public function as it is ("called"), for the time of the first call without kept programs and with those
 that the one before kept. The robot is known when the function is compiled; "argument" says where it is an argument of
-the program.
+the program. `--tree N` adds a random tree of N joints, turning and sliding, its axes and placements at any angle.
 """
 
 from __future__ import annotations
@@ -67,8 +68,9 @@ STAGES = {"in a program": tuple(CASES), "called, none kept": _PUBLIC, "called, k
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("robots", type=Path, nargs="+", metavar="ROBOT.urdf")
-    parser.add_argument("--only", nargs="+", default=[""], help="functions whose names hold one of these words")
+    parser.add_argument("robots", type=Path, nargs="*", metavar="ROBOT.urdf")
+    parser.add_argument("--tree", type=int, help="joints of a random tree that is timed too")
+    parser.add_argument("--only", nargs="+", default=[""], help="functions, or words that their names hold")
     parser.add_argument("--gpus", nargs="+", default=["0"], help="as CUDA_VISIBLE_DEVICES tells them")
     parser.add_argument("--at-once", type=int, default=8, help="processes that compile beside each other")
     parser.add_argument("--samples", type=int, help="in place of each function's own number")
@@ -81,13 +83,39 @@ def main() -> None:
         return
     gpus = cycle(options.gpus)
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(options.at_once) as pool:
+        if options.tree:
+            options.robots.append(_tree(options.tree, Path(folder) / f"tree{options.tree}.urdf"))
         jobs = [
             (robot, name, next(gpus))
             for name in CASES
             for robot in options.robots
-            if any(word in name for word in options.only)
+            if name in options.only or any(word in name for word in options.only if word not in CASES)
         ]
         list(pool.map(lambda job: _case(*job, folder=Path(folder), options=options), jobs))
+
+
+def _tree(joints: int, file: Path) -> Path:
+    """A random tree of so many joints; each hangs on one of the five links before it."""
+    random, parts = np.random.default_rng(0), []
+
+    def three(size: float) -> str:
+        return " ".join(f"{x:.4f}" for x in random.uniform(-size, size, 3))
+
+    for k in range(joints + 1):
+        xx, yy, zz = random.uniform(0.02, 0.03, 3)
+        parts.append(
+            f'<link name="l{k}"><inertial><origin xyz="{three(0.1)}" rpy="{three(1.5)}"/><mass value="1.5"/>'
+            f'<inertia ixx="{xx:.4f}" iyy="{yy:.4f}" izz="{zz:.4f}" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        )
+        if k:
+            kind = "prismatic" if random.random() < 0.1 else "revolute"
+            parts.append(
+                f'<joint name="j{k}" type="{kind}"><parent link="l{random.integers(max(0, k - 5), k)}"/><child'
+                f' link="l{k}"/><origin xyz="{three(0.3)}" rpy="{three(1.5)}"/><axis xyz="{three(1.0)}"/>'
+                '<limit lower="-2" upper="2" velocity="3" effort="40"/></joint>'
+            )
+    file.write_text(f'<robot name="tree{joints}">{"".join(parts)}</robot>', encoding="utf-8")
+    return file
 
 
 def _case(robot: Path, name: str, gpu: str, folder: Path, options: argparse.Namespace) -> None:
