@@ -38,6 +38,7 @@ from .thresholds import (
     NEAR,
     NO_WORSE,
     OF_ITS_SIZE,
+    SLIGHT,
     T_BESIDE_REST,
     T_WITHOUT_REST,
     UNTOLD,
@@ -111,10 +112,14 @@ def judged_by_colour(here: Setting, found: Search, seek: Callable[[Setting], Sea
     new = seek(again)
     levels = np.concatenate([one / white for one, white in zip(again.noise, sound.noise, strict=True)])
     counted = np.asarray(new.structure.data.weight) > 0
-    left = residuals(new.structure, new.beside or new.last) * levels[:, None]
-    explained = new.verdict in ("nothing", "named") or new.beside is not None
-    if not explained or colour_of(left, counted) is None:
+    left = residuals(new.structure, new.beside or new.last)
+    if new.verdict not in ("nothing", "named") and new.beside is None:
         return found
+    if colour_of(left * levels[:, None], counted) is None:
+        begun = residuals(new.origin or new.structure, new.first)
+        if new.verdict == "nothing" or (left**2).sum() > SLIGHT * (begun**2).sum():
+            return found
+        new.verdict = "named+rest"  # all that is left, noise too, may be the error of the law that was found
     new.setting, new.faults = again, found.faults
     if [n.candidate for n in new.named] == [n.candidate for n in found.named or found.proxy]:  # in plain squares
         old = found.named or found.proxy

@@ -44,7 +44,10 @@ SLOW_ROWS = 25
 # Whether it is coloured noise (`colour`)
 COLOUR = 4.0  # sigmas by which octaves with levels of their own are likelier than a low pass
 BURST = 5.0  # sigmas by which the power of groups of `BURST_ROWS` rows varies more than noise's
-TO_TRY = (8.0, 20.0)  # both of what a fit that takes it for white noise leaves: such a fit bends to it
+TO_TRY = (
+    8.0,
+    float("inf"),
+)  # both of what a fit that takes it for white noise leaves: bent to it, short of what is rare
 BURST_ROWS = 25
 LOUDER = 4.0  # sigmas of the power over that which the record's fourth differences tell, as `POWER`
 LOWEST_CORNER = 0.02  # of the sampling rate: a corner below that is not seen in the data
