@@ -108,6 +108,14 @@ def test_without_a_rest_a_cause_need_only_be_there(changes: dict[str, float], wo
     assert word in reason and bool(word) == bool(reason)
 
 
+def test_friction_that_has_faded_in_recordings_kept_out_is_named_beside_a_rest() -> None:
+    drift = replace(RIGHT, name=Name("friction_drift", ("joint_2",)), beside_rest=False)
+    never = lambda name: False  # noqa: E731
+    assert "named only where nothing else" in reason_against(drift, True, 0.01)
+    assert not reason_against(drift, True, 0.01, never, [drift.name])
+    assert reason_against(replace(drift, gain=0.1), True, 0.01, never, [drift.name])
+
+
 def test_a_law_that_cannot_be_is_a_rest_at_its_joints() -> None:
     each = [replace(RIGHT, physical=False), RIGHT, RIGHT, replace(RIGHT, physical=False, whole=True)]
     joints = [(1,), (1, 2), (0,), (0, 1, 2)]

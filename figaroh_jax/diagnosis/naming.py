@@ -7,7 +7,7 @@ vary with position, speed, load or time stands for another law.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect
+from ..effects.catalogue import find
 from ..estimation.rows import Prior
 from ..recordings.stacked import filter_rows, filtered_rows, open_rows
 from ..results import Name
@@ -41,7 +42,7 @@ from .thresholds import (
     T_NAMED,
 )
 
-__all__ = ["Standing", "beside_rest", "cause_torque", "reason_against", "standings"]
+__all__ = ["Standing", "beside_rest", "beyond_simpler", "cause_torque", "reason_against", "standings"]
 
 
 @dataclass(frozen=True)
@@ -66,13 +67,18 @@ class Standing:
 
 
 def reason_against(
-    one: Standing, rest: bool, tolerance: float, certain: Callable[[Name], bool] = lambda name: False
+    one: Standing,
+    rest: bool,
+    tolerance: float,
+    certain: Callable[[Name], bool] = lambda name: False,
+    fading: Collection[Name] = (),
 ) -> str:
     """Why the cause is not named, in words with the number that failed; empty where it is.
 
     Beside a `rest` it must explain much of its joints' error, and surely; without one it must only be there, with one
     amplitude: one that would rather vary predicts better on data that were not fitted, whether or not a rest shows.
-    `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not.
+    `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not; `fading`
+    are those that were surely there and are gone in recordings kept out.
     """
     least = GAIN_NAMED_ROBOT if one.whole else GAIN_NAMED
     varies = "its amplitude varies with position, speed, load or time (that would add"
@@ -97,7 +103,7 @@ def reason_against(
             (not one.cancels, "it cancels most of the joint's torque, as no gain beside another cause does"),
             (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion explain as much"),
             (
-                one.beside_rest or not rest,
+                one.beside_rest or not rest or one.name in fading,
                 "the unexplained residual may imitate it: it is named only where nothing else is left",
             ),
             (
@@ -193,6 +199,30 @@ def cause_torque(problem: Problem, state: State, effect: Effect, place: list[int
         return np.asarray(state.motion.total)
     own = np.isin(np.arange(len(state.theta)), place)
     return state.torque(np.where(own, state.theta, 0.0)) - state.known
+
+
+def beyond_simpler(problem: Problem, state: State, effect: Effect, place: list[int]) -> float:
+    """What an effect of one joint adds to a simpler one that it contains: RMS torque over that of the joint.
+
+    Of a spring that rests far away all but a little is a constant. 1 for effects that contain none.
+    """
+    names = [n for n, p in effect.parameters().items() if p.linear]
+    simpler = {n for inside in type(effect).contains for n in find(inside).parameters()}
+    own = [n not in simpler for n in names]
+    if effect.acts_on != "joint" or kind(effect) != "columns" or all(own) or not any(own):
+        return 1.0
+    joint, judged = int(effect.at[0]), np.asarray(problem.records.judged)
+    used, response = judged[..., joint] > 0, state.response(problem.records.omega)
+
+    def rows(wanted: Sequence[int]) -> Float[np.ndarray, " rows"]:
+        theta = np.where(np.isin(np.arange(len(state.theta)), wanted), state.theta, 0.0)
+        return open_rows(problem.records, state.torque(theta) - state.known, response)[..., joint][used]
+
+    added = rows([at for at, mine in zip(place, own, strict=True) if mine])
+    shared = np.stack([rows([at]) for at, mine in zip(place, own, strict=True) if not mine], axis=1)
+    left = added - shared @ np.linalg.lstsq(shared, added, rcond=None)[0]
+    torque = problem.torque[..., joint][used]
+    return float(np.sqrt((left**2).sum() / max(float((torque**2).sum()), 1e-300)))
 
 
 def _share_of_torque(problem: Problem, state: State, torque: np.ndarray, effect: Effect) -> float:

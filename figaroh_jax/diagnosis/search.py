@@ -19,17 +19,35 @@ from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
 from .flexible import friction_width
-from .gates import ambiguous, exists, gains, passes, possible, rivals, simpler
+from .gates import ambiguous, exists, gains, passes, physical_sign, possible, rivals, simpler
 from .problem import Problem
 from .screening import DRAWS, Null, Screen, Shown, catalogue, family_p, place_p, screen
 from .state import State, solved, with_width
 from .step import Step, stand, with_cause, with_causes
 from .thresholds import GAIN, MOST_CAUSES, OVERLAP_ELSEWHERE, SHARE_AGAIN, SHARE_ALIKE, SMALLEST, T_BETTER
 
-__all__ = ["Begun", "Found", "Search", "chance_beside", "eliminate", "find_causes", "judged_without", "stood_without"]
+__all__ = [
+    "Begun",
+    "Found",
+    "Rival",
+    "Search",
+    "chance_beside",
+    "eliminate",
+    "find_causes",
+    "judged_without",
+    "stood_without",
+]
 
 NEAR, CLOSER = 4, 800  # times the level: p-values below which few draws cannot tell from it; draws that can
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
+
+
+class Rival(NamedTuple):
+    """What cannot be told from a cause, as it would be put in its place."""
+
+    name: Name
+    effect: Effect
+    joints: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -46,6 +64,8 @@ class Found:
     ambiguous: tuple[Name, ...]
     joints: tuple[int, ...] = ()  # by whose rows it is judged
     alike: tuple[Name, ...] = ()  # what else explains much of the same misfit, though not as well
+    instead: tuple[Rival, ...] = ()  # of the `ambiguous` those that were fitted in its place
+    doubtful: bool = False  # whether it came in for a law at its place whose sign physics forbids
 
 
 class Search(NamedTuple):
@@ -246,6 +266,7 @@ def _found(
     """The accepted cause with its gain, and with what explains the same misfit as well or nearly so."""
     alike = rivals(step, contenders, best)
     drop = step.verdicts.cost - best.verdicts.cost
+    open_to = ambiguous(step, best, alike, screened)
     wins = shares_of_wins(np.stack([c.verdicts.blocks for c in [best, *alike]]), generator)
     # laws that hold this one, and need not: where they win, it has won
     outer = [best.name.effect in type(c.effect).contains and c.name.at == best.name.at for c in alike]
@@ -257,10 +278,16 @@ def _found(
         cost=(step.verdicts.cost, best.verdicts.cost),
         t=t_value(step.verdicts.blocks, best.verdicts.blocks),
         confidence=float(wins[0] + wins[1:][outer].sum()) * (1 - p),
-        ambiguous=ambiguous(step, best, alike, screened),
+        ambiguous=open_to,
         joints=best.joints,
         alike=tuple(c.name for c in alike if step.verdicts.cost - c.verdicts.cost > SHARE_ALIKE * drop),
+        doubtful=any(c.name.at == best.name.at and _better_if_possible(c, best) for c in alike),
+        instead=tuple(Rival(c.name, c.effect, c.joints) for c in alike if c.name in open_to),
     )
+
+
+def _better_if_possible(other: Contender, best: Contender) -> bool:
+    return not physical_sign(other.effect) and other.verdicts.heldout < best.verdicts.heldout
 
 
 def eliminate(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> list[Found]:
