@@ -55,7 +55,7 @@ def studies(seed: int) -> list[Study]:
     ]
     made = {
         "closed_loop": ("closed_loop", 40, (), _due_closed_loop, 8),
-        "inverse_hidden": ("inverse", 0, ("0.05-", "0.15-"), _due_inverse, 4),
+        "inverse_hidden": ("inverse", 0, ("0.05-", "0.15-", "0.02-"), _due_inverse, 5),
         **{f"inverse_clean_{k}": ("inverse", 50, ("/clean",), _due_inverse, 2) for k in range(4)},
         "kinematic": ("kinematic", 60, (), _due_kinematic, 2),
     }
@@ -66,7 +66,7 @@ def studies(seed: int) -> list[Study]:
             ("--seed", str(seed + 1 + k), "--kinds", kind, "--clean", str(clean), "--jobs", str(jobs))
             + (("--only", *only) if only else ()),
             due,
-            {"closed_loop": -1.0, "inverse": 3.7, "kinematic": 8.9}[kind],
+            {"closed_loop": -1.0, "inverse": 3.7, "kinematic": 5.9}[kind],
         )
         for k, (name, (kind, clean, only, due, jobs)) in enumerate(made.items())
     ]
@@ -87,19 +87,21 @@ def _due_real(case: dict[str, Any], forbidden: bool) -> float | None:
 def _due_closed_loop(case: dict[str, Any], forbidden: bool) -> float | None:
     if not case["truth"]:
         return None if forbidden else 1.0
-    return 3.5 if forbidden else 1.1
+    return 8.0 if forbidden else 1.1
 
 
 def _due_inverse(case: dict[str, Any], forbidden: bool) -> float | None:
     if case["family"] == "clean":
         return None if forbidden else 4.0
-    if case["size"] > 0.1:  # of these only whether they are told apart from what is left of the catalogue
-        return 7.0 if forbidden or not case["truth"] else None
-    return None if forbidden else 3.8
+    if 0.03 < case["size"] < 0.1:
+        return None if forbidden else 3.8
+    if forbidden:  # of the large ones: whether they are told apart from what is left of the catalogue
+        return 4.1 if case["size"] > 0.1 else None
+    return 7.0 if case["size"] > 0.1 else 7.1
 
 
 def _due_kinematic(case: dict[str, Any], forbidden: bool) -> float | None:
-    return None if forbidden else 9.0
+    return None if forbidden else 6.0
 
 
 def main() -> None:

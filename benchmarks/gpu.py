@@ -1,17 +1,18 @@
 """Throughput on an accelerator, and that it gives the numbers of the CPU.
 
-    PYTHONPATH=. python benchmarks/gpu.py ROBOT.urdf ... [--only WORD ...] [--gpus 0 1] [--at-once N] [--out FILE]
+    PYTHONPATH=. python benchmarks/gpu.py ROBOT.urdf ... [--tree N] [--only WORD ...] [--gpus 0 1] [--at-once N]
+        [--out FILE]
 
-Inverse and forward dynamics, mass matrix and regressor (dense, packed, normal matrix with torque) in float64, and the
-kernels in float32 too. Each function of each robot is a process of its own, begun in the order of the goals of this
-library; several are compiled at once, one at a time runs on a GPU. Every figure is printed, and added to FILE as a line
-of JSON, as soon as it is taken, so that what is cut off has told what it knew.
+Inverse and forward dynamics, mass matrix and regressor (dense, packed; normal matrix and triangular factor, both with
+torque) in float64, and the kernels in float32 too. Each function of each robot is a process of its own, begun in the
+order of the goals of this library; several are compiled at once, one at a time runs on a GPU. Every figure is printed,
+and added to FILE as a line of JSON, as soon as it is taken, so that what is cut off has told what it knew.
 
 A process puts the states on the device, traces and compiles (told apart), compares the first 1000 answers with those of
 a process that sees the CPU alone, and calls until half a second has passed: the best call counts ("in a program"). Two
 more call the public function as it is ("called"), for the time of the first call without kept programs and with those
 that the one before kept. The robot is known when the function is compiled; "argument" says where it is an argument of
-the program.
+the program. `--tree N` adds a random tree of N joints, turning and sliding, its axes and placements at any angle.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ LONGEST = 170.0  # seconds that a process of a function may take with all its co
 # function: samples for a robot of up to ten joints and for a larger one; in the order of what is to be known first
 CASES = {
     "normal matrix": (1 << 22, 1 << 19),
+    "triangular factor": (1 << 20, 1 << 17),
     "inverse dynamics": (1 << 22, 1 << 20),
     "packed regressor": (1 << 20, 1 << 17),
     "forward dynamics": (1 << 21, 1 << 17),
@@ -51,6 +53,7 @@ CASES = {
 }
 
 
+SUMS = ("normal matrix", "triangular factor")  # over all samples: they are told weights, too
 _PUBLIC = (
     "inverse dynamics",
     "forward dynamics",
@@ -58,14 +61,16 @@ _PUBLIC = (
     "packed regressor",
     "dense regressor",
     "normal matrix",
+    "triangular factor",
 )
 STAGES = {"in a program": tuple(CASES), "called, none kept": _PUBLIC, "called, kept": _PUBLIC}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("robots", type=Path, nargs="+", metavar="ROBOT.urdf")
-    parser.add_argument("--only", nargs="+", default=[""], help="functions whose names hold one of these words")
+    parser.add_argument("robots", type=Path, nargs="*", metavar="ROBOT.urdf")
+    parser.add_argument("--tree", type=int, help="joints of a random tree that is timed too")
+    parser.add_argument("--only", nargs="+", default=[""], help="functions, or words that their names hold")
     parser.add_argument("--gpus", nargs="+", default=["0"], help="as CUDA_VISIBLE_DEVICES tells them")
     parser.add_argument("--at-once", type=int, default=8, help="processes that compile beside each other")
     parser.add_argument("--samples", type=int, help="in place of each function's own number")
@@ -78,13 +83,39 @@ def main() -> None:
         return
     gpus = cycle(options.gpus)
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(options.at_once) as pool:
+        if options.tree:
+            options.robots.append(_tree(options.tree, Path(folder) / f"tree{options.tree}.urdf"))
         jobs = [
             (robot, name, next(gpus))
             for name in CASES
             for robot in options.robots
-            if any(word in name for word in options.only)
+            if name in options.only or any(word in name for word in options.only if word not in CASES)
         ]
         list(pool.map(lambda job: _case(*job, folder=Path(folder), options=options), jobs))
+
+
+def _tree(joints: int, file: Path) -> Path:
+    """A random tree of so many joints; each hangs on one of the five links before it."""
+    random, parts = np.random.default_rng(0), []
+
+    def three(size: float) -> str:
+        return " ".join(f"{x:.4f}" for x in random.uniform(-size, size, 3))
+
+    for k in range(joints + 1):
+        xx, yy, zz = random.uniform(0.02, 0.03, 3)
+        parts.append(
+            f'<link name="l{k}"><inertial><origin xyz="{three(0.1)}" rpy="{three(1.5)}"/><mass value="1.5"/>'
+            f'<inertia ixx="{xx:.4f}" iyy="{yy:.4f}" izz="{zz:.4f}" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        )
+        if k:
+            kind = "prismatic" if random.random() < 0.1 else "revolute"
+            parts.append(
+                f'<joint name="j{k}" type="{kind}"><parent link="l{random.integers(max(0, k - 5), k)}"/><child'
+                f' link="l{k}"/><origin xyz="{three(0.3)}" rpy="{three(1.5)}"/><axis xyz="{three(1.0)}"/>'
+                '<limit lower="-2" upper="2" velocity="3" effort="40"/></joint>'
+            )
+    file.write_text(f'<robot name="tree{joints}">{"".join(parts)}</robot>', encoding="utf-8")
+    return file
 
 
 def _case(robot: Path, name: str, gpu: str, folder: Path, options: argparse.Namespace) -> None:
@@ -136,7 +167,7 @@ def _child(robot: Path, name: str, folder: str, stage: str, samples: int) -> Non
     model = fj.load_urdf(robot)
     reference = Path(folder) / "cpu.npz"
     if stage == "cpu":
-        found = _answer(jax.jit(_function(model, name))(*_states(model, name, CHECKED)))
+        found = _answer(jax.jit(_function(model, name))(*_states(model, name, CHECKED)), name)
         np.save(reference.with_suffix(".tmp.npy"), found)
         reference.with_suffix(".tmp.npy").replace(reference)
         return
@@ -160,14 +191,13 @@ def _child(robot: Path, name: str, folder: str, stage: str, samples: int) -> Non
         found = jax.block_until_ready(function(*state))
         first = time.perf_counter() - begin + traced + compiled
         row = {"samples": samples, "first": first, "traced": traced, "compiled": compiled}
-        sample = _first_samples(found, model, name)
+        if name in SUMS:  # the same program, of which the first samples alone count
+            found = function(*state[:-1], state[-1].at[CHECKED:].set(0.0))
+        sample = _first_samples(found, name)
         del found
         best = _best(function, state)
         peak = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", 0)
     row |= {"rate": samples / best / 1e6, "peak": peak, "device": jax.devices()[0].device_kind, "jax": jax.__version__}
-    if name == "normal matrix":  # a sum: of the same samples, on the GPU too
-        small = [x[:CHECKED] for x in state]
-        sample = _answer(jax.jit(_function(model, name))(*small))
     print(json.dumps(row | {"difference": _difference(sample, reference)}))
 
 
@@ -196,7 +226,7 @@ def _difference(found: Any, reference: Path) -> float:
 
 
 def _function(model: Any, name: str) -> Callable[..., Any]:
-    """The function of (q, v, a) or, for accelerations, (q, v, tau)."""
+    """The function of (q, v, a), for accelerations of (q, v, tau), for sums of (q, v, a, weight)."""
     import figaroh_jax as fj
     from figaroh_jax.compiled.kernels import straight_answers
     from figaroh_jax.rigid import dynamics, regressor
@@ -207,7 +237,8 @@ def _function(model: Any, name: str) -> Callable[..., Any]:
         "mass matrix": lambda model, q, v, a: fj.mass_matrix(model, q),
         "packed regressor": fj.packed_regressor,
         "dense regressor": fj.joint_torque_regressor,
-        "normal matrix": lambda model, q, v, a: fj.normal_matrix(model, q, v, a, tau=a),
+        "normal matrix": lambda model, q, v, a, weight: fj.normal_matrix(model, q, v, a, tau=a, weight=weight),
+        "triangular factor": lambda model, q, v, a, weight: fj.triangular_factor(model, q, v, a, tau=a, weight=weight),
     }
     kernels = {
         "inverse dynamics float32": lambda *x: straight_answers(dynamics._TORQUES, model, *x),
@@ -224,25 +255,29 @@ def _function(model: Any, name: str) -> Callable[..., Any]:
 
 
 def _states(model: Any, name: str, samples: int, lengths_alone: bool = False) -> list[np.ndarray]:
-    """q, v, a of which the first thousand are the same for all numbers of samples; in the function's precision."""
+    """q, v, a (and weights) of which the first thousand are the same for all numbers; in the function's precision."""
     dtype = np.float32 if "float32" in name else np.float64
     if lengths_alone:
-        return [np.broadcast_to(dtype(0), (samples, model.nv))] * 3
+        return [np.broadcast_to(dtype(0), (samples, model.nv))] * (4 if name in SUMS else 3)
     random = np.random.default_rng(0)
     checked = [random.uniform(-1.5, 1.5, (CHECKED, model.nv)) for _ in range(3)]
     rest = [random.random((max(0, samples - CHECKED), model.nv), np.float32) * 3.0 - 1.5 for _ in range(3)]
-    return [np.concatenate([x, y]).astype(dtype)[:samples] for x, y in zip(checked, rest, strict=True)]
+    states = [np.concatenate([x, y]).astype(dtype)[:samples] for x, y in zip(checked, rest, strict=True)]
+    return [*states, np.ones((samples, model.nv))] if name in SUMS else states
 
 
-def _first_samples(found: Any, model: Any, name: str) -> np.ndarray | None:
-    if name == "normal matrix":
-        return None
-    return _answer(found[..., :CHECKED] if name.startswith("packed") else found[:CHECKED])
+def _first_samples(found: Any, name: str) -> np.ndarray:
+    if name in SUMS:
+        return _answer(found, name)
+    return _answer(found[..., :CHECKED] if name.startswith("packed") else found[:CHECKED], name)
 
 
-def _answer(found: Any) -> np.ndarray:
+def _answer(found: Any, name: str) -> np.ndarray:
+    """All numbers; of a factor those of its products, since what no sample moves may stand in it anyhow."""
     import jax
 
+    if name == "triangular factor":
+        found = np.asarray(found).T @ np.asarray(found)
     return np.concatenate([np.ravel(np.asarray(x, np.float64)) for x in jax.tree.leaves(found)])
 
 

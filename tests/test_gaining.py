@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from figaroh_jax.diagnosis import gaining
-from figaroh_jax.diagnosis.gaining import Fall, beside_all, without_losses
+from figaroh_jax.diagnosis.gaining import Fall, beside_all, predicts_better, without_losses
 from figaroh_jax.diagnosis.holdout import Held
 
 BLOCKS = 12
@@ -189,9 +189,21 @@ def test_a_fall_beside_all_that_was_found_is_sure_and_a_good_part_of_the_claim(
     full *= bare.sum(1, keepdims=True) / full.sum(1, keepdims=True) * np.array([left, 0.999])
     monkeypatch.setattr(gaining, "stood_without", lambda problem, start, found, one, whitening: "bare")
     monkeypatch.setattr(gaining, "weighted_squares", lambda problem, bare_step, step: in_turn(bare, full))
-    one, joint = cast(Any, SimpleNamespace(joints=(0,))), cast(Any, SimpleNamespace(step="full"))
-    nothing = cast(Any, None)
-    assert beside_all(nothing, nothing, np.zeros((1, 2)), [one], joint, one).surely(claim) is sure
+    one, whole, nothing = cast(Any, SimpleNamespace(joints=(0,))), cast(Any, "full"), cast(Any, None)
+    assert beside_all(nothing, nothing, np.zeros((1, 2)), [one], whole, one).surely(claim) is sure
+
+
+def test_of_two_laws_the_one_that_surely_predicts_their_joints_better_is_preferred(monkeypatch: pytest.MonkeyPatch):
+    rng = np.random.default_rng(14)
+    first = squares(rng, 1.0, 1.0)
+    second = first * np.array([0.6, 1.8]) * (1 + 0.1 * rng.standard_normal(first.shape))
+    monkeypatch.setattr(gaining, "weighted_squares", lambda problem, before, after: in_turn(before, after))
+    problem, one, other = (cast(Any, x) for x in (None, first, second))
+    assert predicts_better(problem, one, other, [0])
+    assert not predicts_better(problem, one, other, [1])
+    assert not predicts_better(problem, other, one, [0])
+    even = first * (1 + 0.3 * rng.standard_normal(first.shape))
+    assert not predicts_better(problem, one, cast(Any, even), [0, 1])
 
 
 def stood_by(

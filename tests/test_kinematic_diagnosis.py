@@ -16,7 +16,9 @@ from generators import postures
 from schema import matches
 
 from figaroh_jax import cli
+from figaroh_jax.calibration.kinematic_diagnosis import _has_size
 from figaroh_jax.effects.kinematic import CATALOGUE
+from figaroh_jax.results import Cause, Estimate, Gain, Name
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZES = (1.5, 3.0, 10.0)
@@ -50,6 +52,17 @@ def answered(folder: Path, robot: str, effect: str | None, size: float, seed: in
 
 def test_every_kinematic_effect_of_the_contract_can_be_named_and_hidden():
     assert set(postures.EFFECTS) == set(CATALOGUE) | {"outlier"}
+
+
+def test_an_effect_whose_size_may_be_zero_is_no_cause() -> None:
+    def sized(**values: tuple[float, float]) -> bool:
+        own = {name: Estimate(value, std, "") for name, (value, std) in values.items()}
+        effect = "gear_transmission_error" if "order" in own else "joint_coupling"
+        return _has_size(Cause(Name(effect, ("j2",)), own, 0.9, Gain(1.0, 0.5, "mm")))
+
+    assert not sized(ratio=(-4e-5, 4e-5)) and sized(ratio=(-4e-4, 4e-5))
+    assert not sized(sine=(1e-5, 1e-4), cosine=(1e-4, 1e-4), order=(80.0, 0.1))  # an order is no size
+    assert sized(sine=(1e-5, 1e-4), cosine=(3e-4, 1e-4), order=(80.0, 0.1))
 
 
 @pytest.mark.parametrize(

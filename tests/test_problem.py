@@ -22,6 +22,7 @@ from figaroh_jax.diagnosis.design import units
 from figaroh_jax.diagnosis.flexible import WIDTHS, friction_width
 from figaroh_jax.diagnosis.gates import exists, physical_sign, possible
 from figaroh_jax.diagnosis.layout import held_rows, layout
+from figaroh_jax.diagnosis.naming import beyond_simpler
 from figaroh_jax.diagnosis.problem import Problem
 from figaroh_jax.diagnosis.shifts import shifted, torque_change
 from figaroh_jax.diagnosis.state import baseline, batched, extended_state, plain_rows, solved, whitened
@@ -310,3 +311,20 @@ def test_the_width_of_simulated_friction_is_found_and_a_hard_sign_keeps_none(mod
     weights = np.full((len(np.asarray(problem.records.omega)), 2), 1 / sigma)
     found = friction_width(problem, state, weights)
     np.testing.assert_array_equal(found.width, [0.0, width])
+
+
+def test_what_a_spring_adds_to_a_constant_is_how_its_torque_varies(model: RobotModel) -> None:
+    torque = np.random.default_rng(3).normal(2.0, 5.0, (round(8.0 / DT), 2))
+    problem = problem_of(model, made_signals(8.0, torque=torque))
+    joint, stiffness, offset = 1, 0.4, 25.0
+    spring = place(find("joint_spring"), model, [model.joint_names[joint]], stiffness=stiffness, offset=offset)
+    state = extended_state(problem, baseline(problem, ["viscous_friction"], []), spring)
+    at = [len(state.theta) - 2, len(state.theta) - 1]
+    theta = np.append(np.zeros(len(state.theta) - 2), [stiffness, offset])
+    state = dataclasses.replace(state, theta=theta)
+    judged = np.asarray(problem.records.judged)[..., joint] > 0
+    rows = np.take_along_axis(np.asarray(problem.records.position), problem.records.row_samples()[..., None], axis=1)
+    varies = stiffness * rows[..., joint][judged].std()  # the filter passes the motion as it is
+    size = np.sqrt((problem.torque[..., joint][judged] ** 2).mean())
+    assert beyond_simpler(problem, state, spring, at) == pytest.approx(varies / size, rel=1e-3)
+    assert beyond_simpler(problem, state, place(find("torque_offset"), model, [model.joint_names[joint]]), at[1:]) == 1

@@ -198,6 +198,20 @@ def box_minimum(A: np.ndarray, b: np.ndarray, lower: np.ndarray, upper: np.ndarr
     return best
 
 
+@pytest.mark.parametrize("seed", [0, 3])
+def test_box_minima_follow_a_narrow_valley_to_its_end(seed: int) -> None:
+    # a force at a point: its lever trades with its size along the valley, whose walls are the rows of a small joint
+    turn, _ = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))
+    A, end = turn @ np.diag([1.0, 30.0, 1e3]) @ turn.T, np.array([0.52, 0.47, 0.61])
+
+    def valley(x: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        off = x[0] - end
+        return np.array([off @ A @ off / 2]), (A @ off)[None]
+
+    found, _ = box_minima(valley, np.array([[0.5, 0.5, 0.2]]))
+    np.testing.assert_allclose(found[0], end, rtol=0, atol=1e-3)
+
+
 def test_box_minima_are_those_of_quadratics_in_the_box() -> None:
     made, asked = [quadratic(seed) for seed in range(6)], []
 

@@ -68,6 +68,7 @@ RIGHT = Standing(
         ({"share": 0.015}, "needed"),
         ({"modulation": 0.5}, "varies"),
         ({"modulation_held_out": 0.25}, "varies"),
+        ({"share": 3.0, "cancels": True}, "cancels"),
         ({"physical": False}, "physically impossible"),
         ({"beside_rest": False}, "named only where nothing else"),
         ({"whole": True, "gain": 0.05}, ""),
@@ -97,11 +98,22 @@ def test_recordings_kept_out_may_show_what_few_blocks_of_the_others_cannot(
         ({"physical": False}, "physically"),
         ({"share": 0.005}, "tolerance"),
         ({"beside_rest": False}, ""),
+        ({"modulation": 0.5}, ""),  # by chance, of a small cause
+        ({"modulation_held_out": 0.3}, "varies"),
+        ({"share": 2.0, "cancels": True}, ""),
     ],
 )
 def test_without_a_rest_a_cause_need_only_be_there(changes: dict[str, float], word: str) -> None:
     reason = reason_against(replace(RIGHT, **changes), False, 0.01)
     assert word in reason and bool(word) == bool(reason)
+
+
+def test_friction_that_has_faded_in_recordings_kept_out_is_named_beside_a_rest() -> None:
+    drift = replace(RIGHT, name=Name("friction_drift", ("joint_2",)), beside_rest=False)
+    never = lambda name: False  # noqa: E731
+    assert "named only where nothing else" in reason_against(drift, True, 0.01)
+    assert not reason_against(drift, True, 0.01, never, [drift.name])
+    assert reason_against(replace(drift, gain=0.1), True, 0.01, never, [drift.name])
 
 
 def test_a_law_that_cannot_be_is_a_rest_at_its_joints() -> None:
@@ -110,6 +122,21 @@ def test_a_law_that_cannot_be_is_a_rest_at_its_joints() -> None:
     assert beside_rest(each, joints, False) == [True, True, False, True]
     assert beside_rest(each[1:], joints[1:], False) == [False] * 3
     assert all(beside_rest(each, joints, True))
+
+
+def test_what_is_left_at_its_joints_is_a_rest_where_it_is_more_than_the_cause() -> None:
+    small = replace(RIGHT, share=0.012)
+    left = np.array([0.002, 0.03, 0.011])
+    assert beside_rest([small] * 3, [(0,), (1,), (2,)], False, left, 0.01) == [False, True, False]
+    assert beside_rest([replace(small, share=0.1)], [(0, 1, 2)], False, left, 0.01) == [False]
+    assert beside_rest([replace(small, share=0.001)], [(0,)], False, left, 0.01) == [False]  # below the tolerance
+
+
+def test_a_law_like_a_rest_is_taken_on_less_where_it_leaves_nothing() -> None:
+    contact = replace(RIGHT, t=1.8, gain=0.1, beside_rest=False)
+    assert reason_against(contact, False, 0.01)
+    assert not reason_against(replace(contact, complete=True), False, 0.01)
+    assert reason_against(replace(contact, complete=True), True, 0.01)
 
 
 def test_a_rest_without_repeats_counts_where_smooth_functions_predict_it() -> None:

@@ -9,17 +9,19 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from generators import servo_arm6
+from generators import servo_arm, servo_arm6
 
 from figaroh_jax.rollouts.alone import alone, carried_by, separable
 from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.data import Run, Stretch, windows
 from figaroh_jax.rollouts.faults import faults, without
-from figaroh_jax.rollouts.fit import System, standard_errors
-from figaroh_jax.rollouts.parameters import Entry
+from figaroh_jax.rollouts.fit import System, fit, standard_errors
+from figaroh_jax.rollouts.parameters import Entry, values
 from figaroh_jax.rollouts.reading import load_loop
+from figaroh_jax.rollouts.search import t_of, t_of_places
 from figaroh_jax.rollouts.sensitivity import Sums, Windows, predicted
-from figaroh_jax.rollouts.setting import begun, setting
+from figaroh_jax.rollouts.setting import Structure, begun, evened, setting
+from figaroh_jax.rollouts.simulation import rollout
 
 ROWS = 400
 
@@ -175,3 +177,37 @@ def test_a_base_that_swings_unmeasured_is_simulated_and_the_leg_identified(tmp_p
         value = truth[here.known.table[entry].name]
         assert abs(found.theta[entry] - value) < 4 * error < 0.1 * value
     assert 0.8 < found.squares / rows < 1.2
+
+
+def test_a_limit_that_is_met_in_a_few_places_is_told_by_places():
+    """Three of forty blocks gain, one of them most of all; blocks of noise alone gain nothing but by chance."""
+    rng = np.random.default_rng(8)
+    after = rng.chisquare(30, 40)
+    before = after.copy()
+    before[[3, 17, 30, 31]] += [90.0, 700.0, 20000.0, 150.0]
+    assert t_of(before, after) < 1.64 < t_of_places(before, after)
+    chance = [t_of_places(*(rng.chisquare(30, 40) for _ in range(2))) for _ in range(400)]
+    assert np.mean(np.array(chance) > 1.64) < 0.09
+
+
+def test_recordings_that_tell_alike_weigh_by_what_is_left_of_them(tmp_path: Path):
+    """Three recordings whose misfits are 1, 10 and 50 mrad: each tells as much, all together as before."""
+    (tmp_path / "arm.xml").write_text(servo_arm.model_text())
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    t, u = servo_arm.command()
+    u, runs = u[:1000, None], []
+    read = np.asarray(rollout(loop, u, np.zeros(1)).reading)
+    for k, size in enumerate((1e-3, 1e-2, 5e-2)):
+        noise = np.random.default_rng(k).normal(0, 2e-4, read.shape)
+        runs.append(Run(f"run {k}", t[:1000], u, read + noise + size * np.sin(9 * t[:1000, None]), None))
+    here = setting(loop, runs)
+    structure = Structure(loop, here.known.table, here.data)
+    at = values(loop, here.known.table)[None]
+    start = np.zeros((1, 2, 3))
+    one = fit(*structure, at, [here.baseline], start, width=here.width, lanes=1, iterations=0)[0]
+    even = evened(here, structure, one)
+    other = fit(loop, here.known.table, even.data, at, [here.baseline], start, width=here.width, lanes=1, iterations=0)
+    each, plain = (x.sums.cost.sum((0, 2)) for x in (other[0], one))
+    np.testing.assert_allclose(each, plain.sum() / 3, rtol=1e-9)
+    assert even.plain().even is None
+    np.testing.assert_array_equal(even.plain().data.weight, here.data.weight)

@@ -18,7 +18,14 @@ import robots
 from figaroh_jax.compiled.batching import BLOCK, chunk_size
 from figaroh_jax.errors import InputError
 from figaroh_jax.rigid.model import RobotModel
-from figaroh_jax.rigid.normal_equations import NormalMatrix, normal_matrix, triangular_factor
+from figaroh_jax.rigid.normal_equations import (
+    NormalMatrix,
+    _factor_by_kernels,
+    _joined,
+    _Rows,
+    normal_matrix,
+    triangular_factor,
+)
 from figaroh_jax.rigid.regressor import joint_torque_regressor
 
 CHUNK = chunk_size()
@@ -73,6 +80,24 @@ def test_normal_matrix_and_factor_of_real_robots(name: str, data_dir: Path) -> N
     assert_relatively_equal(assembled(normal_matrix(model, q, v, a, tau)), dense.T @ dense)
     R = np.asarray(triangular_factor(model, q, v, a))
     assert_relatively_equal(R.T @ R, dense[:, :-1].T @ dense[:, :-1])
+
+
+@pytest.mark.parametrize(("size", "beside"), [(1.0, 1), (1e-3, 1), (1.0, 0)])
+def test_the_factor_of_products_is_that_of_the_rows(size: float, beside: int, tmp_path: Path) -> None:
+    """As a GPU makes it, here by the plain form of its kernels; small motions leave directions 1e6 times smaller."""
+    arm = robots.load(robots.INLINE["arm"], tmp_path)
+    q, v, a, tau, weight = data(arm, 700)
+    q, v, a = size * q + 0.3, size * v, size * a
+    root = jnp.asarray(np.sqrt(weight))
+    given = _Rows(jnp.asarray(q), jnp.asarray(v), jnp.asarray(a), root, jnp.asarray(tau) if beside else None, None)
+    columns = 10 * len(arm.joints) + beside
+    got = np.asarray(_joined(jnp.zeros((columns, columns)), _factor_by_kernels(arm, columns, given)))
+    dense = rows(arm, q, v, a, *([tau[..., None]] if beside else [])) * np.sqrt(weight).reshape(-1, 1)
+    assert_relatively_equal(got.T @ got, dense.T @ dense)
+    values, expected = (np.linalg.svd(x, compute_uv=False) for x in (got, dense))
+    seen = expected > 1e-13 * expected[0]
+    np.testing.assert_allclose(values[seen], expected[seen], rtol=1e-7)
+    assert (values[~seen] < 1e-13 * values[0]).all()
 
 
 def test_pieces_add_up_to_the_whole(tree: RobotModel) -> None:

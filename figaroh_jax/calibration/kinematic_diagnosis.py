@@ -80,6 +80,7 @@ def diagnose_poses(
             effects = []
         elif plays:  # a law that leaves its own joint erring at random is not the right one
             effects = [cause for cause in effects if cause.name.at != (joint,)]
+        effects = [cause for cause in effects if _has_size(cause)]
         geometry = [c for c in geometry if c.name.effect not in forbid]
         found = bool(geometry or effects)
         if found and not _better(calibration):
@@ -275,6 +276,14 @@ def _play(run: Run) -> tuple[float, str]:
     ways = linear.jacobian[:, [k for _, k in joints]]
     p_value, worst = score_jitter(linear, row_noise(linear, posterior), run.used, posterior.precision, ways, free)
     return p_value, joints[worst][0]
+
+
+def _has_size(cause: Cause) -> bool:
+    """Whether some amplitude of an effect is surely not zero: a cause may have come in for what another explains."""
+    entry = CATALOGUE.get(cause.name.effect)
+    linear = {n for n, p in entry.parameters().items() if p.linear} if entry else set()
+    sizes = [value for name, value in cause.parameters.items() if name in linear]
+    return not sizes or any(abs(one.value) > thresholds.SIZE_SIGMAS * one.std for one in sizes)
 
 
 def _without_effects(linear: marginal.Linear, run: Run) -> np.ndarray:

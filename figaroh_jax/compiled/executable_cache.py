@@ -36,9 +36,11 @@ class Program:
     """A function of trees of arrays, compiled once for each type of its arguments; to be called outside of any trace.
 
     The first `static` arguments are functions; the arrays of argument `donate` are given away; `options` are those of
-    a CPU's compiler. For a CPU they are kept; for other devices where a `key` says all that the function depends on
-    beside its name, and then they are for arrays of the first device. Where trees other than tuples, lists and dicts
-    come out, or types of another package go in, the program lives as long as the process.
+    a CPU's compiler, `tuning` is how far a GPU's products are tried out (0 to 4; XLA's own is 4, which also checks what
+    each way gives: more than a second for each shape). For a CPU they are kept; for other devices where a `key` says
+    all that the function depends on beside its name, and then they are for arrays of the first device. Where trees
+    other than tuples, lists and dicts come out, or types of another package go in, the program lives as long as the
+    process.
     """
 
     def __init__(
@@ -48,8 +50,10 @@ class Program:
         donate: int | None = None,
         options: dict[str, Any] | None = None,
         key: str = "",
+        tuning: int | None = None,
     ) -> None:
         self.function, self.static, self.donate, self.options, self.key = function, static, donate, options, key
+        self.tuning = tuning
         self._ready: dict[Any, tuple[Any, Any]] = {}
 
     def __call__(self, *args: Any) -> Any:
@@ -92,6 +96,8 @@ class Program:
         flat.__name__ = f"{self.function.__name__}_{os.urandom(8).hex()}"
         types = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
         options = self.options if jax.default_backend() == "cpu" else None
+        if self.tuning is not None and jax.default_backend() == "gpu":
+            options = {"xla_gpu_autotune_level": str(self.tuning)}
         compiled = jax.jit(flat, donate_argnums=given, compiler_options=options).lower(*types).compile()
         return compiled, out[-1]
 
@@ -108,7 +114,7 @@ class Program:
             *(f"{f.__module__}.{f.__qualname__}" for f in functions),
             known,
             *(f"{x.shape} {x.dtype}" for x in leaves),
-            f"{self.options} {self.donate} {self.key} {jax.dtypes.canonicalize_dtype(float)}",
+            f"{self.options} {self.donate} {self.key} {self.tuning} {jax.dtypes.canonicalize_dtype(float)}",
             _device(),
             surroundings(),
         ]

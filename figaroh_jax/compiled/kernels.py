@@ -8,9 +8,13 @@ are known when it is made, those that are 0, 1 or -1 belong to the structure, an
 
 from __future__ import annotations
 
+import importlib.util
+import sys
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from functools import lru_cache, partial
 from math import ceil, prod
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -150,7 +154,20 @@ def _triton() -> bool:
         from jax.experimental.pallas import triton
     except ImportError:
         return False
+    _spare_a_search()
     return hasattr(triton, "CompilerParams")
+
+
+def _spare_a_search() -> None:
+    """Have jaxlib find a Python module of Triton's dialect, an empty one, where there is none.
+
+    It looks for one in every folder of the path whenever it makes one of the dialect's types, ten thousand times for
+    the kernels of a humanoid: more than half of the time in which they are lowered.
+    """
+    name = "jaxlib.mlir.dialects.tt"
+    with suppress(ImportError, ValueError):
+        if name not in sys.modules and importlib.util.find_spec(name) is None:
+            sys.modules[name] = ModuleType(name)
 
 
 def known_codes(straight: Straight, parameters: Any) -> bytes:

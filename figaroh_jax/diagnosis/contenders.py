@@ -51,12 +51,26 @@ def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray, float]
     """
     ranked = found.best(step.rows)
     shifts = [r for r in ranked if kind(found.groups[r[1]].effect) == "position"]
-    ranked = [r for r in ranked if r not in shifts[SHIFTS:]]
+    everything, ranked = ranked, [r for r in ranked if r not in shifts[SHIFTS:]]
     chosen = [r for r in ranked[:SHORTLIST] if r[0] > SHARE_OF_BEST * ranked[0][0]] or ranked[:1]
     chosen += [r for r in _best_of_places(step, found, ranked) if r not in chosen]
+    chosen += [r for r in _read_alike(found, everything, chosen) if r not in chosen]
     simpler = {Name(n, found.groups[g].name.at) for _, g, _ in chosen for n in type(found.groups[g].effect).contains}
     chosen += [r for r in ranked if found.groups[r[1]].name in simpler and r not in chosen]
     return [(found.groups[g], np.argsort(-found.scores[g].Q), float(found.scores[g].Q[p])) for _, g, p in chosen]
+
+
+def _read_alike(
+    found: Screen, ranked: list[tuple[float, int, int]], chosen: list[tuple[float, int, int]]
+) -> list[tuple[float, int, int]]:
+    """All errors of a joint's position where one of them is among the chosen.
+
+    To first order each is the joint's load, velocity and acceleration times some error, and the load itself is nearly
+    a scale or an eccentricity: which of them it is, only their exact torques tell.
+    """
+    near = {found.groups[g].name.at for _, g, _ in chosen if type(found.groups[g].effect).has("position_error")}
+    alike = [r for r in ranked if type(found.groups[r[1]].effect).has("position_error")]
+    return [r for r in alike if found.groups[r[1]].name.at in near]
 
 
 def _best_of_places(step: Step, found: Screen, ranked: list[tuple[float, int, int]]) -> list[tuple[float, int, int]]:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect, place
-from ..effects.catalogue import CATALOGUE, find
+from ..effects.catalogue import CATALOGUE, find, related
 from ..effects.plausibility import implausible
 from ..errors import InputError
 from ..estimation.noise import Spectrum
@@ -30,16 +30,17 @@ from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
 from ..simulators.native import as_backend
 from ..simulators.registry import backend as make_backend
-from .estimates import estimates, fitted_model
+from .estimates import amplitude_places, estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .gaining import Fall, Gaining, beside_all, without_losses
+from .gaining import Fall, Gaining, beside_all, predicts_better, without_losses
+from .gates import physical_sign
 from .holdout import fold_squares, part_error, residual_rms, traces
 from .joint import Joint, opened, polished, sized, with_misfit, with_parts
 from .layout import checked_repeats, describe_folds, held_rows, layout
-from .naming import beside_rest, reason_against, standings
+from .naming import beside_rest, beyond_simpler, reason_against, standings
 from .problem import Problem
 from .rest import (
     Significance,
@@ -53,11 +54,11 @@ from .rest import (
     verdict,
     wrong_law,
 )
-from .search import Found, Search, chance_beside, eliminate, find_causes
+from .search import Begun, Found, Search, chance_beside, eliminate, find_causes, judged_without
 from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import Step, stand, with_causes
-from .thresholds import ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, NO_REST, STANDSTILL, WEIGHT_ROUNDS
+from .thresholds import ALL_BUT, ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, NO_REST, REST_P, STANDSTILL, WEIGHT_ROUNDS
 from .weights import relative_speed, weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -136,6 +137,9 @@ class _Searched(NamedTuple):
     left: Significance
     line: tuple[float, float, int]
     strict: bool  # whether a rest stays, beside which a cause must show more to be named
+    more: float  # squares by which smooth functions find more in it than chance gives
+    doubted: bool  # whether the catalogue still scores more than noise, though nothing in it passes
+    fading: tuple[Name, ...] = ()  # causes that were there and are gone in recordings kept out
 
 
 class _Judged(NamedTuple):
@@ -216,17 +220,18 @@ def _searched(
 
     Beside a rest those (`Effect.beside_rest`) are not named, and take the place of causes that could be: the search is
     taken up again from where the first of them came in. Such an effect of the whole robot stays: what it stands for
-    would go into several others, each of which would look sure. Where many causes are found, that is known before they
-    are in one fit.
+    would go into several others, each of which would look sure. One that fades stays where recordings kept out, in
+    which it is no longer there, surely show it: what any rest looks like would be there again. Where many causes are
+    found, that is known before they are in one fit.
     """
 
     def ended(before: _Setting, search: Search) -> _Searched:
         here = before._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
-        found, joint = _fitted_together(here, search.found, forbid)
-        left, beyond, line = _left(here, search, found, joint, forbid, tolerance, generator)
+        found, joint = _told_apart(here, *_fitted_together(here, search.found, forbid, tolerance))
+        left, p_left, beyond, line, more = _left(here, search, found, joint, forbid, tolerance, generator)
         strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
-        return _Searched(before, here, search, found, joint, left, line, strict)
+        return _Searched(before, here, search, found, joint, left, line, strict, more, p_left < REST_P)
 
     like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
 
@@ -244,20 +249,71 @@ def _searched(
             return first
         del first  # its rows and columns are large
     kept = search.found[:taken]
-    step = with_causes(here.problem, here.start, [f.effect for f in kept], here.whitening)
-    begun = search._replace(problem=here.problem, start=here.start, step=step, found=kept)
+    fading = [f for f in search.found[taken:] if f.effect.fades and _borne_out(here, kept, f)]
+    begun = Begun(kept + fading, search.p_value, search.shown)
     del search
-    return ended(here, find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun))
+    search = find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun)
+    return ended(here, search)._replace(fading=tuple(f.name for f in fading))
 
 
-def _fitted_together(here: _Setting, found: list[Found], forbid: Sequence[str]) -> tuple[list[Found], Joint]:
+def _borne_out(here: _Setting, before: list[Found], one: Found) -> bool:
+    """Whether recordings kept out surely show a cause beside those that were found before it."""
+    problem, start, whitening, found = here.problem, here.start, here.whitening, [*before, one]
+    if not problem.held.any():
+        return False
+    step = polished(problem, start, [f.effect for f in found], whitening).step
+    without = judged_without(problem, start, step, found, one, whitening)
+    worse, better = (v.own(step.rows, one.joints).sum() for v in (without, step.verdicts))
+    return beside_all(problem, start, whitening, found, step, one).surely(1 - float(better / max(worse, 1e-300)))
+
+
+def _fitted_together(
+    here: _Setting, found: list[Found], forbid: Sequence[str], tolerance: float
+) -> tuple[list[Found], Joint]:
     """The causes that the others do not make needless and that surely have a size, all in one fit."""
     found = eliminate(here.problem, here.start, found, here.whitening)
     joint = _together(here, found)
-    kept = sized(found, joint, forbid)
+    kept = _simple(here, found, joint, forbid, tolerance)
+    if kept != found:
+        joint = _together(here, kept)
+    found, kept = kept, sized(kept, joint, forbid)
     if len(kept) < len(found):
         joint = _together(here, kept)
     return kept, joint
+
+
+def _told_apart(here: _Setting, found: list[Found], joint: Joint) -> tuple[list[Found], Joint]:
+    """The causes, each as that of those which slices cannot tell from it that recordings kept out surely prefer.
+
+    They are asked at the joints where both act: elsewhere only one of them says anything.
+    """
+    problem, start, whitening = here.problem, here.start, here.whitening
+    for k, one in enumerate(found if problem.held.any() else ()):
+        for other in one.instead:
+            if not physical_sign(other.effect) or other.name in [f.name for f in found]:
+                continue
+            effects = [other.effect if at == k else effect for at, effect in enumerate(joint.causes)]
+            full = with_causes(problem, start, effects, whitening)
+            if predicts_better(problem, joint.step, full, sorted({*one.joints} & {*other.joints})):
+                known = tuple(n for n in (one.name, *one.ambiguous) if n != other.name)
+                own = replace(one, name=other.name, effect=other.effect, joints=other.joints, ambiguous=known)
+                found = [own if f is found[k] else f for f in found]
+                joint = polished(problem, start, [f.effect for f in found], whitening)
+    return found, joint
+
+
+def _simple(here: _Setting, found: list[Found], joint: Joint, forbid: Sequence[str], tolerance: float) -> list[Found]:
+    """The causes, each as the simpler effect that it contains where it adds to that no more than is tolerable."""
+    problem, state, out = here.problem, joint.step.state, []
+    for one, effect, at in zip(found, joint.causes, amplitude_places(state, joint.causes, problem.model), strict=True):
+        inside = next((n for n in type(effect).contains if n not in forbid), None)
+        if inside and beyond_simpler(problem, state, effect, at) < tolerance:
+            place_of = one.name.at
+            alike = tuple(Name(n, place_of) for n in related(inside, "indistinguishable_from") if n not in forbid)
+            simpler = place(find(inside), problem.model, place_of)
+            one = replace(one, name=Name(inside, place_of), effect=simpler, ambiguous=alike)
+        out.append(one)
+    return out
 
 
 def _judged(
@@ -267,15 +323,19 @@ def _judged(
 
     What is not named is no part of the answer's model: the others are fitted anew without it.
     """
-    before, here, _, found, joint, left, line, strict = searched
+    before, here, _, found, joint, left, line, strict, more, doubted, fading = searched
     problem, whitening = here.problem, here.whitening
     each = standings(problem, here.start, found, joint, whitening)
+    each = [
+        replace(one, complete=more <= ALL_BUT * (f.cost[0] - f.cost[1])) for one, f in zip(each, found, strict=True)
+    ]
+    noise = noise_rms(problem, here.spectrum)
     claims = {one.name: one.gain for one in each}
 
     @cache
     def beside(name: Name) -> Fall:
         one = next(f for f in found if f.name == name)
-        return beside_all(searched.here.problem, searched.here.start, whitening, found, searched.joint, one)
+        return beside_all(searched.here.problem, searched.here.start, whitening, found, searched.joint.step, one)
 
     def borne_out(name: Name) -> bool:
         return beside(name).surely(claims[name])
@@ -283,12 +343,17 @@ def _judged(
     def certain(name: Name) -> bool:
         return bool(searched.here.problem.held.any()) and beside(name).certainly(claims[name])
 
-    rests = beside_rest(each, [f.joints for f in found], strict)
-    against = {one.name: reason_against(one, rest, tolerance, certain) for one, rest in zip(each, rests, strict=True)}
+    beyond = relative_rest(problem, joint.step.state, noise)
+    rests = beside_rest(each, [f.joints for f in found], strict, beyond, tolerance)
+    asked = (tolerance, certain, fading)
+    against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
+    for one, rest in zip(found, rests, strict=True):
+        if rest and one.doubtful and not against[one.name]:
+            against[one.name] = "a law of impossible sign explains the same misfit: it may be the unexplained residual"
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
     here, joint, by_speed = _as_predicts_best([here] if same else [here, before], named)
-    asked = len(named)
+    count = len(named)
     gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, borne_out)
     gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
     named, joint, problem = gaining.named, gaining.joint, here.problem
@@ -298,10 +363,10 @@ def _judged(
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
-    shown = left.there or (bool(nearest) and float(relative.max()) > tolerance)
+    shown = left.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
     sticks = shown and (
         _sticks(here, joint, tolerance)
-        or _sticks(seen := searched.here, by_speed if asked == len(named) else _together(seen, named), tolerance)
+        or _sticks(seen := searched.here, by_speed if count == len(named) else _together(seen, named), tolerance)
     )
     rest = shown and not sticks
     text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
@@ -364,8 +429,9 @@ def _left(
     forbid: Sequence[str],
     tolerance: float,
     generator: np.random.Generator,
-) -> tuple[Significance, float, tuple[float, float, int]]:
-    """Whether all causes together leave more than noise, its excess over the noise, and the strongest line in it."""
+) -> tuple[Significance, float, float, tuple[float, float, int], float]:
+    """Whether all causes together leave more than noise, the p-value of the catalogue on it, its excess over
+    the noise, the strongest line in it, and the squares that smooth functions find in it beyond chance."""
     problem, start, spectrum, whitening, _ = here
     first = stand(problem, start, whitening)
     before, *_ = excess(problem, first.rows, first.linear.residual, spectrum, whitening)
@@ -380,7 +446,7 @@ def _left(
     joints, tolerable = problem.model.joint_names, size <= tolerance
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
-    return left._replace(there=left.there or (wrong and not tolerable)), now[0], line
+    return left._replace(there=left.there or (wrong and not tolerable)), p_left, now[0], line, flexible[2]
 
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:

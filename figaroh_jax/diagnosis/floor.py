@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -10,6 +10,7 @@ from jaxtyping import Float
 from ..estimation import noise
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Prior, Rows, fit
+from .evidence import Score
 from .flexible import families
 from .problem import Problem
 from .screening import Group, catalogue, screen
@@ -103,6 +104,8 @@ def _from_rich_model(
             break
         # families have many columns: only z weighs them fairly
         best = int(np.argmax([(result.z if long else result.Q).max() for result in scores]))
+        if scores[best].z.max() < _largest_by_chance(scores):
+            break  # the best of so many that noise alone would have: without it, the residual would be less than noise
         point = int(np.argmax(scores[best].Q))
         blocks.append(_full(rows, groups[best], point) @ kept_columns(scores[best].root[point]))
         X = np.concatenate(blocks, axis=2)
@@ -115,6 +118,11 @@ def _from_rich_model(
         return noise.white((residual**2).sum(1) / np.maximum(degrees, count / 4), float(problem.records.rate) / 2)
     n, _, length, nv = problem.records.shape
     return _fit(problem, residual, np.moveaxis(basis.reshape(nv, n, length, -1), 0, 2))
+
+
+def _largest_by_chance(scores: Sequence[Score]) -> float:
+    """About the largest z that noise alone gives of as many candidates and grid points, were they independent."""
+    return float(np.sqrt(2 * np.log(max(sum(len(result.z) for result in scores), 1))))
 
 
 def _full(rows: Rows, group: Group, point: int) -> Float[np.ndarray, "nv T k"]:

@@ -16,9 +16,10 @@ from .joint import Joint, polished
 from .problem import Problem
 from .search import Found, stood_without
 from .state import State
+from .step import Step
 from .thresholds import BY_CHANCE, BY_CHANCE_BESIDE, BY_CHANCE_UNSHOWN, KEPT_OF_CLAIM, RISES
 
-__all__ = ["Fall", "Gaining", "beside_all", "fall", "without_losses"]
+__all__ = ["Fall", "Gaining", "beside_all", "fall", "predicts_better", "without_losses"]
 
 EXACT, DRAWS = 12, 4000  # blocks up to which every choice of signs is made; choices beyond
 
@@ -150,16 +151,25 @@ def beside_all(
     start: State,
     whitening: Float[np.ndarray, "F nv"],
     found: list[Found],
-    joint: Joint,
+    full: Step,
     one: Found,
 ) -> Fall:
     """What a cause does to the kept-out error with all else in that was found, named or not.
 
     What has no name is still there: without it the fit bends, and a cause that is true may seem to predict nothing. The
-    squares have the weights of the fit, in which slow rows count little.
+    squares have the weights of the fit, in which slow rows count little. `full` is the fit with all that was found.
     """
     bare = stood_without(problem, start, found, one, whitening)
-    return fall(*weighted_squares(problem, bare, joint.step), one.joints)
+    return fall(*weighted_squares(problem, bare, full), one.joints)
+
+
+def predicts_better(problem: Problem, before: Step, after: Step, joints: Sequence[int]) -> bool:
+    """Whether data kept out surely prefer one fit to another: by the squares of some joints, which count alike."""
+    worse, better = weighted_squares(problem, before, after)
+    places = list(joints)
+    drop, had = (worse.squares - better.squares)[1][:, places], worse.squares[1][:, places].sum(0)
+    gain = (drop / np.maximum(had, 1e-300)).sum(1)
+    return bool(gain.sum() > 0 and _by_chance(gain) < BY_CHANCE)
 
 
 def _told(

@@ -12,7 +12,7 @@ from .contenders import Contender
 from .problem import Problem
 from .screening import Screen
 from .step import Step
-from .thresholds import GAIN, OVERLAP_SAME, T_ALIKE, T_APART, T_BETTER
+from .thresholds import GAIN, OVERLAP_SAME, SIZE_REGION, T_ALIKE, T_APART, T_BETTER
 
 __all__ = ["ambiguous", "exists", "gains", "passes", "physical_sign", "possible", "rivals", "simpler"]
 
@@ -108,13 +108,29 @@ def _member(step: Step, best: Contender, other: Contender) -> bool:
     """Whether the data cannot tell the other from the best: held-out blocks and penalised squares alike.
 
     Of two that resemble each other, one has more numbers to follow a misfit with: squares alone do not tell them apart.
+    Where the other has no more numbers and fits all rows as well as the one that predicts better, the two measures
+    disagree, which data that tell them apart do not leave. A law inside the other (a spring of no stiffness is an
+    offset) is enough where the other's further numbers explain no more than noise.
     """
     worse = t_value(other.verdicts.blocks, best.verdicts.blocks)
+    if other.name.effect in type(best.effect).contains and other.name.at == best.name.at and not _needed(best, other):
+        return worse < T_APART
+    no_more = len(other.effect.parameters()) <= len(best.effect.parameters())
+    if no_more and other.verdicts.cost <= best.verdicts.cost:
+        return worse < T_APART
     if other.name.effect in type(best.effect).resembles or best.name.effect in type(other.effect).resembles:
         return worse < T_APART
     drop = step.verdicts.cost - best.verdicts.cost
     close = other.verdicts.cost - best.verdicts.cost < max(0.1 * drop, 15)
     return close and worse < T_ALIKE
+
+
+def _needed(best: Contender, inside: Contender) -> bool:
+    """Whether the numbers that a law has beyond one inside it lower the squares by more than noise would."""
+    from scipy.special import chdtri  # scipy is slow to import
+
+    more = len(best.effect.parameters()) - len(inside.effect.parameters())
+    return more < 1 or inside.verdicts.cost - best.verdicts.cost > chdtri(more, 1 - SIZE_REGION)
 
 
 def ambiguous(step: Step, best: Contender, rivals: list[Contender], screened: Screen) -> tuple[Name, ...]:

@@ -7,7 +7,7 @@ vary with position, speed, load or time stands for another law.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect
+from ..effects.catalogue import find
 from ..estimation.rows import Prior
 from ..recordings.stacked import filter_rows, filtered_rows, open_rows
 from ..results import Name
@@ -41,7 +42,7 @@ from .thresholds import (
     T_NAMED,
 )
 
-__all__ = ["Standing", "beside_rest", "cause_torque", "reason_against", "standings"]
+__all__ = ["Standing", "beside_rest", "beyond_simpler", "cause_torque", "reason_against", "standings"]
 
 
 @dataclass(frozen=True)
@@ -61,17 +62,26 @@ class Standing:
     inertia_alone: bool = False  # a coupling of inertia, without friction of its own
     massless: bool = False  # a body whose mass is not surely there
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
+    cancels: bool = False  # whether it is a share of all torque, and larger than it: a reading of less than half
+    complete: bool = False  # whether smooth functions find next to nothing in what it leaves
 
 
 def reason_against(
-    one: Standing, rest: bool, tolerance: float, certain: Callable[[Name], bool] = lambda name: False
+    one: Standing,
+    rest: bool,
+    tolerance: float,
+    certain: Callable[[Name], bool] = lambda name: False,
+    fading: Collection[Name] = (),
 ) -> str:
     """Why the cause is not named, in words with the number that failed; empty where it is.
 
-    Beside a `rest` it must explain much of its joints' error with one amplitude; without one it must only be there.
-    `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not.
+    Beside a `rest` it must explain much of its joints' error, and surely; without one it must only be there, with one
+    amplitude: one that would rather vary predicts better on data that were not fitted, whether or not a rest shows.
+    `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not; `fading`
+    are those that were surely there and are gone in recordings kept out.
     """
     least = GAIN_NAMED_ROBOT if one.whole else GAIN_NAMED
+    varies = "its amplitude varies with position, speed, load or time (that would add"
     checks = [
         (one.physical, "its fitted sign is physically impossible"),
         (one.gain > 0, f"it does not improve the prediction of held-out data (gain {one.gain:.2g})"),
@@ -79,23 +89,21 @@ def reason_against(
             one.share >= tolerance,
             f"its torque is {one.share:.2%} of the joint's, below the tolerance of {tolerance:.2%}",
         ),
+        (one.modulation_held_out <= MODULATION_HELD_OUT, f"{varies} {one.modulation_held_out:.2f} of its gain)"),
     ]
-    if rest or not one.beside_rest:  # what any rest looks like is never taken on less
+    if rest or not (one.beside_rest or one.complete):  # what any rest looks like is taken on less only if it is all
         checks += [
             (
                 one.t >= one.t_needed or certain(one.name),
                 f"its gain on held-out data is not significant: t = {one.t:.1f}, {one.t_needed:.1f} needed",
             ),
             (one.gain >= least, f"it removes {one.gain:.0%} of the held-out error where it acts, {least:.0%} needed"),
-            (
-                one.modulation <= MODULATION and one.modulation_held_out <= MODULATION_HELD_OUT,
-                "its amplitude varies with position, speed, load or time"
-                f" (that would add {max(one.modulation, one.modulation_held_out):.2f} of its gain)",
-            ),
+            (one.modulation <= MODULATION, f"{varies} {one.modulation:.2f} of its gain)"),
             (one.share >= SHARE_NAMED, f"its torque is {one.share:.1%} of the joint's, {SHARE_NAMED:.0%} needed"),
+            (not one.cancels, "it cancels most of the joint's torque, as no gain beside another cause does"),
             (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion explain as much"),
             (
-                one.beside_rest or not rest,
+                one.beside_rest or not rest or one.name in fading,
                 "the unexplained residual may imitate it: it is named only where nothing else is left",
             ),
             (
@@ -107,13 +115,26 @@ def reason_against(
     return next((reason for passed, reason in checks if not passed), "")
 
 
-def beside_rest(each: Sequence[Standing], joints: Sequence[Sequence[int]], rest: bool) -> list[bool]:
+def beside_rest(
+    each: Sequence[Standing],
+    joints: Sequence[Sequence[int]],
+    rest: bool,
+    left: Float[np.ndarray, " nv"] | None = None,
+    tolerance: float = 0.0,
+) -> list[bool]:
     """Of each cause, by the joints where it acts, whether a rest stays beside it.
 
     A law of those joints that cannot be is one too: whatever it stands for, another law may stand for what it leaves.
+    So is what is `left` at them beyond the noise (relative to their torque) where it is more than the cause itself and
+    than the `tolerance`: whether or not it can be told from noise, the cause is the smaller part of what is wrong.
     """
     impossible = [set(at) for one, at in zip(each, joints, strict=True) if not (one.physical or one.whole)]
-    return [rest or any(other & set(at) for other in impossible) for at in joints]
+
+    def larger(one: Standing, at: Sequence[int]) -> bool:
+        return left is not None and float(left[list(at)].max()) > max(one.share, tolerance)
+
+    pairs = zip(each, joints, strict=True)
+    return [rest or larger(one, at) or any(other & set(at) for other in impossible) for one, at in pairs]
 
 
 def standings(
@@ -134,6 +155,7 @@ def standings(
         whole = effect.acts_on not in ("joint", "pair")
         torque = cause_torque(problem, full.state, effect, place)
         modulation = _modulation(grown, effect, torque, without, one.joints, whole)
+        share = _share_of_torque(problem, full.state, torque, effect)
         out.append(
             Standing(
                 name=one.name,
@@ -143,7 +165,8 @@ def standings(
                 gain=1 - float(better.sum() / max(worse.sum(), 1e-300)),
                 t=t_value(worse, better),
                 t_needed=t_needed(len(worse), T_NAMED),
-                share=_share_of_torque(problem, full.state, torque, effect),
+                share=share,
+                cancels=bool(type(effect).follows_total) and not whole and share > 1,
                 modulation=modulation[0],
                 modulation_held_out=modulation[1],
                 beside_smooth=_beside_smooth(grown, bare, effect, place, one.joints) if whole else 1.0,
@@ -176,6 +199,30 @@ def cause_torque(problem: Problem, state: State, effect: Effect, place: list[int
         return np.asarray(state.motion.total)
     own = np.isin(np.arange(len(state.theta)), place)
     return state.torque(np.where(own, state.theta, 0.0)) - state.known
+
+
+def beyond_simpler(problem: Problem, state: State, effect: Effect, place: list[int]) -> float:
+    """What an effect of one joint adds to a simpler one that it contains: RMS torque over that of the joint.
+
+    Of a spring that rests far away all but a little is a constant. 1 for effects that contain none.
+    """
+    names = [n for n, p in effect.parameters().items() if p.linear]
+    simpler = {n for inside in type(effect).contains for n in find(inside).parameters()}
+    own = [n not in simpler for n in names]
+    if effect.acts_on != "joint" or kind(effect) != "columns" or all(own) or not any(own):
+        return 1.0
+    joint, judged = int(effect.at[0]), np.asarray(problem.records.judged)
+    used, response = judged[..., joint] > 0, state.response(problem.records.omega)
+
+    def rows(wanted: Sequence[int]) -> Float[np.ndarray, " rows"]:
+        theta = np.where(np.isin(np.arange(len(state.theta)), wanted), state.theta, 0.0)
+        return open_rows(problem.records, state.torque(theta) - state.known, response)[..., joint][used]
+
+    added = rows([at for at, mine in zip(place, own, strict=True) if mine])
+    shared = np.stack([rows([at]) for at, mine in zip(place, own, strict=True) if not mine], axis=1)
+    left = added - shared @ np.linalg.lstsq(shared, added, rcond=None)[0]
+    torque = problem.torque[..., joint][used]
+    return float(np.sqrt((left**2).sum() / max(float((torque**2).sum()), 1e-300)))
 
 
 def _share_of_torque(problem: Problem, state: State, torque: np.ndarray, effect: Effect) -> float:

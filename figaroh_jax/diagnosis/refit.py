@@ -21,7 +21,7 @@ from .shifts import links_torque, torque_change
 
 __all__ = ["Whitened", "box_minima", "profile", "refit", "refit_shift", "shift_profile"]
 
-STEPS = 12  # evaluations of a search at the most, beside the first
+STEPS = 12  # evaluations of a search at the most for each number of the shape, beside the first
 SETTLED = 1e-7  # of the first value: a step that promises less is not taken
 CLOSE = 1e-4  # the same for the size of a shift, which is fitted exactly later
 STEP = 1e-5  # of its bracket: over which the profile of a shift is differentiated
@@ -55,7 +55,7 @@ def box_minima(
     # a first step of a quarter of the box
     bend = np.eye(x.shape[1]) * (4 * np.abs(slope).max(1) + 1e-300)[:, None, None]
     length, seen = np.ones(len(x)), np.zeros(len(x), bool)  # `seen`: the curvature
-    for _ in range(STEPS):
+    for _ in range(STEPS * x.shape[1]):
         free = ((x > 0) | (slope < 0)) & ((x < 1) | (slope > 0))
         pull = np.where(free, slope, 0.0)
         apart = free[:, :, None] & free[:, None]

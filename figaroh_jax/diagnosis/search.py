@@ -19,17 +19,35 @@ from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
 from .flexible import friction_width
-from .gates import ambiguous, exists, gains, passes, possible, rivals, simpler
+from .gates import ambiguous, exists, gains, passes, physical_sign, possible, rivals, simpler
 from .problem import Problem
 from .screening import DRAWS, Null, Screen, Shown, catalogue, family_p, place_p, screen
 from .state import State, solved, with_width
 from .step import Step, stand, with_cause, with_causes
 from .thresholds import GAIN, MOST_CAUSES, OVERLAP_ELSEWHERE, SHARE_AGAIN, SHARE_ALIKE, SMALLEST, T_BETTER
 
-__all__ = ["Found", "Search", "chance_beside", "eliminate", "find_causes", "judged_without", "stood_without"]
+__all__ = [
+    "Begun",
+    "Found",
+    "Rival",
+    "Search",
+    "chance_beside",
+    "eliminate",
+    "find_causes",
+    "judged_without",
+    "stood_without",
+]
 
 NEAR, CLOSER = 4, 800  # times the level: p-values below which few draws cannot tell from it; draws that can
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
+
+
+class Rival(NamedTuple):
+    """What cannot be told from a cause, as it would be put in its place."""
+
+    name: Name
+    effect: Effect
+    joints: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -46,6 +64,8 @@ class Found:
     ambiguous: tuple[Name, ...]
     joints: tuple[int, ...] = ()  # by whose rows it is judged
     alike: tuple[Name, ...] = ()  # what else explains much of the same misfit, though not as well
+    instead: tuple[Rival, ...] = ()  # of the `ambiguous` those that were fitted in its place
+    doubtful: bool = False  # whether it came in for a law at its place whose sign physics forbids
 
 
 class Search(NamedTuple):
@@ -60,6 +80,14 @@ class Search(NamedTuple):
     shown: list[Shown]  # candidates, as the first screen saw them
 
 
+class Begun(NamedTuple):
+    """What a search takes over from one of other effects: the first causes of it, and what it began with."""
+
+    found: list[Found]
+    p_value: float
+    shown: list[Shown]
+
+
 def find_causes(
     problem: Problem,
     state: State,
@@ -69,12 +97,12 @@ def find_causes(
     alpha: float,
     progress: Callable[[str, float], None] = lambda phase, share: None,
     generator: np.random.Generator | None = None,
-    after: Search | None = None,
+    after: Begun | None = None,
     enough: Callable[[list[Found]], bool] = lambda found: False,
 ) -> Search:
     """Accept the best cause until none passes the gates, or until noise explains what the catalogue still scores.
 
-    `after` is a search of other effects, which this one takes up where it stands. It ends once there are `enough`.
+    `after` is what it takes over from another one. It ends once there are `enough`.
 
     A sensor that is late or that winds up rounds the reversals of dry friction, so that their width is fitted anew
     once such a cause is in: the old one would be made up for by a friction that is not there.
@@ -83,8 +111,8 @@ def find_causes(
     if after is None:
         step, found, p_values, shown = stand(problem, state, whitening), [], [], []
     else:
-        problem, step, found = after.problem, after.step, list(after.found)
-        p_values, shown = [after.p_value], after.shown
+        step = with_causes(problem, state, [f.effect for f in after.found], whitening)
+        found, p_values, shown = list(after.found), [after.p_value], after.shown
     null = Null(problem, spectrum, whitening, generator)
     screened, groups = None, None
     failed: dict[Name, float] = {}  # share of its joints' squares that a candidate scored when it last failed
@@ -113,6 +141,7 @@ def find_causes(
             known, problem, screened = problem, friction_width(problem, step.state, whitening), None
             groups = None if problem is not known or "response" in ways else groups
             step = step if problem is known else stand(problem, with_width(problem, step.state), whitening)
+        del before, contenders, chosen  # their rows and columns are large
     begun = solved(problem, with_width(problem, state), step.state.theta[: len(state.theta)])
     return Search(problem, begun, step, found, p_values[0], p_values[-1], shown)
 
@@ -237,7 +266,10 @@ def _found(
     """The accepted cause with its gain, and with what explains the same misfit as well or nearly so."""
     alike = rivals(step, contenders, best)
     drop = step.verdicts.cost - best.verdicts.cost
+    open_to = ambiguous(step, best, alike, screened)
     wins = shares_of_wins(np.stack([c.verdicts.blocks for c in [best, *alike]]), generator)
+    # laws that hold this one, and need not: where they win, it has won
+    outer = [best.name.effect in type(c.effect).contains and c.name.at == best.name.at for c in alike]
     return Found(
         name=best.name,
         effect=best.effect,
@@ -245,11 +277,17 @@ def _found(
         heldout=(step.verdicts.heldout, best.verdicts.heldout),
         cost=(step.verdicts.cost, best.verdicts.cost),
         t=t_value(step.verdicts.blocks, best.verdicts.blocks),
-        confidence=float(wins[0]) * (1 - p),
-        ambiguous=ambiguous(step, best, alike, screened),
+        confidence=float(wins[0] + wins[1:][outer].sum()) * (1 - p),
+        ambiguous=open_to,
         joints=best.joints,
         alike=tuple(c.name for c in alike if step.verdicts.cost - c.verdicts.cost > SHARE_ALIKE * drop),
+        doubtful=any(c.name.at == best.name.at and _better_if_possible(c, best) for c in alike),
+        instead=tuple(Rival(c.name, c.effect, c.joints) for c in alike if c.name in open_to),
     )
+
+
+def _better_if_possible(other: Contender, best: Contender) -> bool:
+    return not physical_sign(other.effect) and other.verdicts.heldout < best.verdicts.heldout
 
 
 def eliminate(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> list[Found]:

@@ -269,6 +269,7 @@ class Effect(eqx.Module):
     dissipative: ClassVar[bool] = False  # whether amplitudes below zero would feed energy to the robot
     speed_law: ClassVar[bool] = False  # whether it is a law of dry friction over the speed, one of several alike
     beside_rest: ClassVar[bool] = True  # whether it can be told from a rest that stays; no law of what any rest does
+    fades: ClassVar[bool] = False  # whether it goes by the time since the start: another recording has it no more
     one_rotor: ClassVar[
         tuple[str, ...]
     ] = ()  # of a rotor that turns two joints: inertia, then what tells it from links

@@ -181,6 +181,7 @@ class FrictionDrift(JointEffect):
 
     name, title = "friction_drift", "friction that falls as the joint warms up"
     beside_rest = False  # a rest that changes in the course of a recording looks like it
+    fades = True
     equation = "(force s(v) + damping v) exp(-t/time)"
     separated_by = "the same motion of {at} at the start and again after the robot has warmed up"
     force: Scalar = amplitude("N m")

@@ -34,6 +34,8 @@ SMALL = 160  # columns of a normal matrix
 PANEL = 16  # columns that a QR factorisation takes together
 AT_ONCE = 512  # samples of a product on a CPU, by machine code
 TOGETHER = 1024  # samples of a product on a GPU
+WORTH_WRITING = 1 << 16  # samples from which rows of a large tree are written out by kernels of their own
+TUNING = 1  # of the products of a normal matrix; those of a factor wait for triangular solves
 DEVICE_BYTES = 2e9  # of the blocks of a chunk on a GPU
 
 
@@ -72,14 +74,14 @@ def normal_matrix(
     rows = _rows(model, q, v, a, tau, weight, extra)
     beside = (0 if extra is None else np.shape(extra)[-1]) + 1
     columns, on_gpu = 10 * len(model.joints) + beside, usable(*rows) and len(rows.q) > 0
-    kept = _kept(model) if on_gpu else None
+    kept = _kept(model, len(rows.q)) if on_gpu else None
     groups = _groups(model, columns) if not on_gpu else _kept_groups(model, kept, beside)
     columns = columns if kept is None else sum(map(len, kept)) + beside
     library: Any = np if on_host(model, rows) else jnp
     start = tuple(library.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
     parts = _by_machine_code(model, groups, rows) if on_host(model, rows) else None
     if on_gpu:
-        parts = _by_kernels(model, kept, start, rows)
+        parts = _by_kernels(_with_products, model, kept, start, rows)
     # a small matrix is added to from the innermost cache; a large one costs more to add to than its rows to make
     chunk = 32 if on_host() and columns <= SMALL else chunk_size()
     parts = _fold(_add_products, chunk, start, model, rows) if parts is None else parts
@@ -104,7 +106,8 @@ def triangular_factor(
 
     Rank, conditioning and least squares follow from R as from A, without the squared condition number of
     `normal_matrix`, whose arguments these are. One small QR factorisation a chunk, on top of the R so far (TSQR;
-    Demmel, Grigori, Hoemmen and Langou, 2012). Without `tau` its column is left out.
+    Demmel, Grigori, Hoemmen and Langou, 2012); on a GPU from products, twice (`_with_factor`). Without `tau` its column
+    is left out.
 
     >>> import numpy as np, figaroh_jax as fj
     >>> robot = fj.load_urdf(fj.DEMO)
@@ -118,6 +121,8 @@ def triangular_factor(
     if on_host(model, rows, start) and (own := _factor_by_machine_code(model, columns, rows)) is not None:
         whole = np.concatenate([np.asarray(start), own])
         return _upright(jnp.asarray(np.linalg.qr(whole, mode="r")))
+    if usable(*rows) and len(rows.q) > 0:
+        return _upright(_joined(start, _factor_by_kernels(model, columns, rows)))
     return _upright(_fold(_add_rows, 2 * chunk_size(), start, model, rows))
 
 
@@ -232,10 +237,13 @@ def _kept_groups(model: RobotModel, kept: Kept | None, beside: int) -> list[_Gro
     return groups
 
 
-def _kept(model: RobotModel) -> Kept | None:
-    """Columns that are computed on a GPU, where the robot is known and its kernels leave much out; None for all."""
+def _kept(model: RobotModel, samples: int) -> Kept | None:
+    """Columns that are computed on a GPU, where the robot is known and its kernels leave much out; None for all.
+
+    Of a large tree few samples are taken by the one kernel that loops, which is compiled in a third of the time.
+    """
     codes = known_codes(_row_form(0, None), model)
-    if traced(model) or (looped(model) and not orderly(model.joints, codes)):
+    if traced(model) or (looped(model) and (samples < WORTH_WRITING or not orderly(model.joints, codes))):
         return None
     return kept_columns(model.joints, codes)
 
@@ -275,8 +283,13 @@ def _add_products(model: RobotModel, totals: tuple[Array, ...], rows: _Rows) -> 
     return tuple(new)
 
 
-def _by_kernels(model: RobotModel, kept: Kept | None, start: tuple[Array, ...], rows: _Rows) -> tuple[Array, ...]:
-    """The products of each coordinate on a GPU, from rows that a kernel writes as they are multiplied."""
+Add = Callable[[Array, Array], Array]  # of a sum or factor so far (c, k, k) and more rows of each coordinate
+
+
+def _by_kernels(
+    add: Add, model: RobotModel, kept: Kept | None, start: tuple[Array, ...], rows: _Rows
+) -> tuple[Array, ...]:
+    """The products, or factors, of each coordinate on a GPU, from rows that a kernel writes as they are multiplied."""
     samples, nv = len(rows.q), model.nv
     # no empty array of so many rows: XLA takes seconds to make its program, and as long to read it again
     given = [jnp.asarray(x).reshape(samples, nv, -1) for x in (rows.extra, rows.tau) if x is not None]
@@ -286,21 +299,23 @@ def _by_kernels(model: RobotModel, kept: Kept | None, start: tuple[Array, ...], 
     if whole > samples:
         modes = ("edge", "edge", "edge", "constant", "edge")
         arrays = [jnp.pad(x, ((0, whole - samples), (0, 0)), mode=m) for x, m in zip(arrays, modes, strict=True)]
-    told = kept, known_codes(_row_form(0, kept), model), min(whole, _rows_at_once(model))
+    told = add, kept, known_codes(_row_form(0, kept), model), min(whole, _rows_at_once(model))
     if traced(model, start, arrays):
         return _sums_of_rows(*told, model, start, *arrays)
     return (_kept_sums(*told) if kept_here(*arrays) else partial(_program_of_sums, *told))(model, start, *arrays)
 
 
 @lru_cache(maxsize=64)
-def _kept_sums(kept: Kept | None, codes: bytes, chunk: int) -> Program:
+def _kept_sums(add: Add, kept: Kept | None, codes: bytes, chunk: int) -> Program:
     def sums_of_rows(model: RobotModel, start: tuple[Array, ...], *arrays: Array) -> tuple[Array, ...]:
-        return _sums_of_rows(kept, codes, chunk, model, start, *arrays)
+        return _sums_of_rows(add, kept, codes, chunk, model, start, *arrays)
 
-    return Program(sums_of_rows, key=f"{kept} {chunk} {codes.hex()}")
+    key = f"{add.__name__} {kept} {chunk} {codes.hex()}"
+    return Program(sums_of_rows, key=key, tuning=TUNING if add is _with_products else 0)
 
 
 def _sums_of_rows(
+    add: Add,
     kept: Kept | None,
     codes: bytes,
     chunk: int,
@@ -315,13 +330,12 @@ def _sums_of_rows(
 
     def step(total: tuple[Array, ...], arrays: list[Array]) -> tuple[tuple[Array, ...], None]:
         rows = straight_answers(form, model, *arrays, codes=codes)
-        products = piece_products if piece else row_products
-        return tuple(x + products(one) for x, one in zip(total, rows, strict=True)), None
+        return tuple(add(x, one) for x, one in zip(total, rows, strict=True)), None
 
     return jax.lax.scan(step, start, chunks)[0] if len(arrays[0]) else start
 
 
-_program_of_sums = jax.jit(_sums_of_rows, static_argnums=(0, 1, 2))
+_program_of_sums = jax.jit(_sums_of_rows, static_argnums=(0, 1, 2, 3))
 
 
 @lru_cache(maxsize=16)
@@ -342,6 +356,78 @@ def _plain_rows(
         parts.append(jnp.concatenate([blocks[np.array(index, int)], beside[row]]))
     groups = [jnp.stack([parts[row] * root[:, row] for row in group]) for group in row_groups(model, kept)]
     return [jnp.moveaxis(x.reshape(*x.shape[:2], -1, piece), 2, 1) for x in groups] if piece else groups
+
+
+def _with_products(total: Float[Array, "c k k"], rows: Float[Array, "c *pieces k samples"]) -> Float[Array, "c k k"]:
+    return total + _products(rows)
+
+
+def _with_factor(total: Float[Array, "c k k"], rows: Float[Array, "c *pieces k samples"]) -> Float[Array, "c k k"]:
+    """R of [R so far; rows], samples last, by Cholesky factors of the products, twice (CholeskyQR2).
+
+    The first factor makes the columns nearly orthogonal, and products of what it leaves do not lose what is small:
+    shifted by a little where columns depend on others (Fukaya, Kannan, Nakatsukasa, Yamamoto and Yanagisawa, 2020).
+    """
+    before = jnp.swapaxes(total, 1, 2)  # rows so far, as the others
+    first = _shifted_factor(row_products(before) + _products(rows), SHIFTS[0])
+    before, rows = _divided(before, first), _divided(rows, first)
+    second = _shifted_factor(row_products(before) + _products(rows), SHIFTS[1])
+    return jnp.matmul(second, first, precision=jax.lax.Precision.HIGHEST)
+
+
+SHIFTS = (4e-15, 4e-16)  # times the number of columns, of products of columns of length one
+
+
+def _shifted_factor(products: Float[Array, "c k k"], shift: float) -> Float[Array, "c k k"]:
+    """R of R'R = products, and a little more on the diagonal."""
+    length = jnp.sqrt(jnp.maximum(jnp.diagonal(products, axis1=1, axis2=2), 1e-200))
+    count = products.shape[1]
+    unit = products / (length[:, :, None] * length[:, None, :]) + shift * count * jnp.eye(count)
+    return jnp.swapaxes(jnp.linalg.cholesky(unit), 1, 2) * length[:, None, :]
+
+
+def _divided(rows: Float[Array, "c *pieces k samples"], factor: Float[Array, "c k k"]) -> Array:
+    """R'^-1 rows: the columns divided by R."""
+    wide = jnp.broadcast_to(factor[:, None] if rows.ndim > 3 else factor, (*rows.shape[:-1], rows.shape[-2]))
+    return jax.lax.linalg.triangular_solve(wide, rows, left_side=True, lower=False, transpose_a=True)
+
+
+def _factor_by_kernels(model: RobotModel, columns: int, rows: _Rows) -> Float[Array, "rows columns"]:
+    """Rows with the same products as those of the regressor: a triangular factor of each coordinate's own columns."""
+    kept, beside = _kept(model, len(rows.q)), columns - 10 * len(model.joints)
+    if not beside:  # kernels write at least one column beside those of the links
+        return _factor_by_kernels(model, columns + 1, rows._replace(tau=jnp.zeros_like(rows.v)))[:, :-1]
+    groups = _kept_groups(model, kept, beside)
+    start = tuple(jnp.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
+    parts = _by_kernels(_with_factor, model, kept, start, rows)
+    few = columns if kept is None else sum(map(len, kept)) + beside
+    links = None if kept is None else regrouping(model, kept)
+    return _spread(few, links, tuple(g.columns for g in groups), parts)
+
+
+@partial(jax.jit, static_argnums=0)
+def _spread(
+    columns: int, links: Float[Array, "kept links"] | None, places: tuple[Array, ...], parts: tuple[Array, ...]
+) -> Float[Array, "rows _"]:
+    """Each factor in its own columns of all, one below the other; of all links from those that were kept."""
+    rows = []
+    for place, own in zip(places, parts, strict=True):
+        one, row = np.arange(own.shape[0])[:, None, None], np.arange(own.shape[1])[:, None]
+        rows.append(jnp.zeros((*own.shape[:2], columns)).at[one, row, place[:, None]].set(own).reshape(-1, columns))
+    whole = jnp.concatenate(rows)
+    if links is None:
+        return whole
+    ours = jnp.matmul(whole[:, : len(links)], links, precision=jax.lax.Precision.HIGHEST)
+    return jnp.concatenate([ours, whole[:, len(links) :]], axis=1)
+
+
+@jax.jit
+def _joined(one: Float[Array, "m columns"], other: Float[Array, "n columns"]) -> Float[Array, "columns columns"]:
+    return jnp.linalg.qr(jnp.concatenate([one, other]), mode="r")
+
+
+def _products(rows: Float[Array, "c *pieces k samples"]) -> Float[Array, "c k k"]:
+    return piece_products(rows) if rows.ndim > 3 else row_products(rows)
 
 
 def piece_products(rows: Float[Array, "c pieces k samples"]) -> Float[Array, "c k k"]:

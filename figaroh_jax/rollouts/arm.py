@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -21,15 +22,16 @@ from .faults import Fault, faults, without
 from .fit import Fit, System, fit, refitted_without
 from .parameters import put, values
 from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_of_entry, outputs, tried_now
-from .search import Model, Named, Search, Tried, judged_by_colour, sized, t_of
+from .search import Model, Named, Search, Tried, judged_by_colour, sized, t_of, t_of_places, t_of_recordings
 from .sensitivity import predicted
-from .setting import Setting, Structure, begins_of, begun, by_recording, free_entries, level_of, thinned  # fmt: skip
+from .setting import Setting, Structure, begins_of, begun, by_recording, evened, free_entries, level_of, thinned
 from .thresholds import (
     CONFIDENT,
     COST_OF_A_MISSED,
     FITTED_FOR_HELD,
     GAIN,
     GAIN_BESIDE_REST,
+    MOST_OF_IT,
     NEAR,
     NO_CHOICE,
     NO_WORSE,
@@ -46,6 +48,7 @@ __all__ = ["search_arm"]
 _AGAIN = 6  # iterations from the numbers of the model file
 _TOP, _CHECKS = 3, 4  # candidates told as the nearest; those whose held-out squares are looked at in a round
 _FIRST = 4  # iterations from each start of the baseline
+_EVENED = 3  # fits of all that was recorded, each with weights by what the one before has left
 
 
 def search_arm(
@@ -53,7 +56,37 @@ def search_arm(
 ) -> Search:
     """Causes of an arm whose drives act at one joint each and whose joints are all measured."""
     found = _searched(here, progress, forbid)
-    return judged_by_colour(here, found, lambda again: _searched(again, lambda phase, share: None, forbid))
+    return judged_by_colour(here, found, lambda again: _by_colour(again, found, forbid))
+
+
+def _by_colour(here: Setting, white: Search, forbid: Sequence[str]) -> Search:
+    """The search with coloured noise; where it ends in another valley, the first causes of the search before it."""
+    new = _searched(here, lambda phase, share: None, forbid)
+    if new.verdict in ("nothing", "named") or new.beside is not None or new.origin is None:
+        return new
+    begin = _standing(here, new.origin, new.first, here.baseline)
+    for last in white.fits:
+        free = [int(k) for k in last.free if k >= 0]
+        found = [n for n in white.named or white.proxy if set(n.candidate.entries) <= set(free)]
+        if set(free) - set(here.baseline) - {k for n in found for k in n.candidate.entries}:
+            continue
+        plain = len(last.theta) == len(here.known.table)
+        loop, table = (here.loop, here.known.table) if plain else white.structure[:2]
+        structure = Structure(loop, table, here.cut(loop))
+        one = fit(*structure, last.theta[None], [free], last.start[None], width=max(here.width, len(free)), lanes=1,
+                  iterations=LATE)[0]  # fmt: skip
+        now = _standing(here, structure, one, free)
+        if not now.excess.max() < 1.0:
+            continue
+        found, now, slight = _still_needed(here, found, now, begin)
+        found, now = _alike(here, found, now) if slight is None else (found, now)
+        held = [_rms(here, begin.held), _rms(here, now.held)]
+        label = ", ".join(str(Name(n.candidate.effect, n.candidate.at)) for n in found)
+        steps = [("baseline", _level(here, new.first)), (label, _level(here, now.model.fit))]
+        told = Search("nothing", found, now.model.structure, new.first, now.model.fit, new.p_value, [], [], steps, held,
+                      [now.model.fit], new.origin, here)  # fmt: skip
+        return _judged(here, told, now, slight)
+    return new
 
 
 def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Sequence[str]) -> Search:
@@ -86,19 +119,23 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
         if now.excess.max() < 1.0:
             break
     progress("judging", 0.9)
-    found, now = _still_needed(here, found, now, begin)
-    found, now = _alike(here, found, now)
+    found, now, slight = _still_needed(here, found, now, begin)
+    found, now = _alike(here, found, now) if slight is None else (found, now)
+    even = by_recording(whole) and bool(found) and now.excess.max() >= 1.0
     if whole is not here:
         progress("fitting all that was recorded", 0.95)
-        here, (begin, now) = whole, (_on_all(whole, one.model) for one in (begin, now))
+        begin, now, here = _on_all(whole, begin.model), _on_all(whole, now.model), whole
         first = begin.model.fit
         steps.append(("all that was recorded", _level(here, now.model.fit)))
         held = [_rms(here, begin.held), *held[1:-1], *([_rms(here, now.held)] if found else [])]
+    if even:
+        now = _alike_by_recording(here, now)
+        steps.append(("recordings that tell alike", _level(here, now.model.fit)))
     result = Search(
         "nothing", found, now.model.structure, first, now.model.fit, p_value, [], nearest, steps, held, fits,
         begin.model.structure, here, wrong,
     )  # fmt: skip
-    return _judged(here, result, now)
+    return _judged(here, result, now, slight)
 
 
 def _started(here: Setting, first: Fit) -> Fit:
@@ -110,11 +147,26 @@ def _started(here: Setting, first: Fit) -> Fit:
 def _on_all(here: Setting, model: Model) -> Standing:
     """A model of some windows fitted to all of them."""
     structure = model.structure._replace(data=here.cut(model.structure.loop))
-    if not np.isfinite(model.fit.cost):
-        return _standing(here, structure, model.fit, model.free)
-    new = fit(*structure, model.fit.theta[None], [model.free], width=max(here.width, len(model.free)), lanes=1,
-              iterations=LATE, rough=ROUGH)[0]  # fmt: skip
+    new = _from(here, structure, model.fit, model.free) if np.isfinite(model.fit.cost) else model.fit
     return _standing(here, structure, new, model.free)
+
+
+def _alike_by_recording(here: Setting, now: Standing) -> Standing:
+    """The numbers where more than noise is left: each recording tells as much of a joint, not the fastest the most."""
+    structure, last, free = now.model.structure, now.model.fit, now.model.free
+    for _ in range(_EVENED):
+        some = evened(here, structure, last)
+        last = _from(some, structure._replace(data=some.cut(structure.loop)), last, free)
+    last = _from(here, structure, last, free, 0)
+    beyond = excess_of(here, structure, last)
+    return Standing(Model(structure, last, free, float(beyond.max())), outputs(here, last.sums.cost), now.held, beyond)
+
+
+def _from(here: Setting, structure: Structure, last: Fit, free: Sequence[int], most: int = LATE) -> Fit:
+    """The fit of these numbers from another of the same structure; the states at the starts too, where it had them."""
+    start = last.start[None] if last.start.shape[1] == len(here.stretches) else None
+    return fit(*structure, last.theta[None], [free], start, width=max(here.width, len(free)), lanes=1, iterations=most,
+               rough=ROUGH)[0]  # fmt: skip
 
 
 def _replaced(old: Named, new: Named | Tried) -> bool:
@@ -152,9 +204,17 @@ def _begun(here: Setting) -> Fit:
     return fit(*structure, best.theta[None], [here.baseline], best.start[None], width=here.width, lanes=1)[0]
 
 
-def _judged(here: Setting, result: Search, now: Standing) -> Search:
-    """`named` where every joint's rest is noise; `named+rest` where the names hold without each of three recordings."""
+def _judged(here: Setting, result: Search, now: Standing, slight: _Slight | None = None) -> Search:
+    """`named` where every joint's rest is noise; `named+rest` where the names hold without each of three recordings.
+
+    Also where a cause that is too slight to be told from the error of another's law explains the rest.
+    """
     found = result.named
+    if slight is not None:
+        one, why = slight.cause.candidate, "too little beside what others explain: their law may be off by as much"
+        result.verdict, result.beside = "named+rest", slight.fit
+        result.nearest = [(Name(one.effect, one.at), max(slight.cause.gain, 0.0), why)]
+        return result
     if now.excess.max() < 1.0:
         result.verdict = "named" if found else "nothing"
     elif found and by_recording(here) and found[0].t > T_BESIDE_REST:
@@ -260,9 +320,8 @@ def _worthy(here: Setting, now: Standing, one: Tried) -> bool:
         return bool(gain > GAIN)
     usual, rest = one.candidate.kind.usual, by_recording(here)
     needed = T_BESIDE_REST if rest and not (usual and gain > GAIN_BESIDE_REST) else CONFIDENT
-    return bool(
-        gain > (GAIN_BESIDE_REST if rest and not usual else GAIN) and t_of(before, after) > FITTED_FOR_HELD * needed
-    )
+    t = max(t_of(before, after), t_of_places(before, after) if one.candidate.kind.limit else 0.0)
+    return bool(gain > (GAIN_BESIDE_REST if rest and not usual else GAIN) and t > FITTED_FOR_HELD * needed)
 
 
 def _ordered(now: Standing, ones: Sequence[Tried]) -> list[Tried]:
@@ -370,7 +429,11 @@ def _check(here: Setting, now: Standing, new: Standing, one: Tried) -> tuple[boo
     t, noise = t_of(before, after), float(new.excess[mine].max()) < 1.0
     if noise and float(now.excess[mine].max()) >= 1.0:  # all that is seen is explained, be it in a few places only
         t = max(t, float(np.sqrt(max(before.sum() - after.sum(), 0.0))) / 2)
+    if gain > MOST_OF_IT or one.candidate.kind.limit:  # a limit is met in a few places
+        t = max(t, t_of_places(before, after))
     rest = by_recording(here) and not noise
+    if rest:  # blocks of a recording gain or lose together
+        t = min(t, t_of_recordings(before, after, np.array([x.run for x in here.stretches])))
     usual = one.candidate.kind.usual
     sure = CONFIDENT if float(now.excess[mine].max()) >= 1.0 else T_WITHOUT_REST
     needed = T_BESIDE_REST if rest and not (usual and gain > GAIN_BESIDE_REST) else sure
@@ -386,7 +449,6 @@ def _spare(here: Setting, new: Standing, chosen: Sequence[Tried], begin: Standin
     With the model at the `begin` also one that is worth next to nothing of what the others have explained there since:
     where their laws are off by as little, it makes up for that.
     """
-    structure, last = new.model.structure, new.model.fit
     for one in sorted(chosen, key=lambda one: _gained(new, one), reverse=True):
         if one.candidate.kind.elastic:
             continue
@@ -394,40 +456,60 @@ def _spare(here: Setting, new: Standing, chosen: Sequence[Tried], begin: Standin
         mine = slice(None) if j < 0 else slice(j, j + 1)
         if _costs(here, new, entries) > COST_OF_A_MISSED * new.squares[..., mine].sum():
             continue
-        theta = last.theta.copy()
-        theta[entries] = values(structure.loop, structure.table)[entries]
-        free = [k for k in new.model.free if k not in entries or k in here.baseline]
-        other = fit(*structure, theta[None], [free], last.start[None], width=max(here.width, len(free)), lanes=1,
-                    iterations=LATE, rough=ROUGH)[0]  # fmt: skip
+        other, _ = _without(here, new, entries)
         if not np.isfinite(other.cost):
             continue
-        before, after = outputs(here, other.sums.cost)[..., mine].sum(-1), new.squares[..., mine].sum(-1)
-        worth = before.sum() - after.sum()
-        slight = 0.0 if begin is None else SLIGHT * (begin.squares[..., mine].sum() - before.sum())
-        if worth < max(SMALL * before.sum(), slight) or t_of(before, after) < CONFIDENT:
+        left = outputs(here, other.sums.cost)[..., mine]
+        before, after = left.sum(-1), new.squares[..., mine].sum(-1)
+        if before.sum() - after.sum() < SMALL * before.sum() or t_of(before, after) < CONFIDENT:
+            return one
+        if begin is not None and _is_slight(begin.squares[..., mine], left, new.squares[..., mine]):
             return one
     return None
 
 
-def _still_needed(here: Setting, found: list[Named], now: Standing, begin: Standing) -> tuple[list[Named], Standing]:
-    """The causes without those that a later one made needless, where noise is all that is left with and without."""
+def _is_slight(begin: np.ndarray, left: np.ndarray, after: np.ndarray) -> bool:
+    """Whether a cause lowers what is `left` without it by too little beside what others explain, at each joint."""
+    begin, left, after = (x.sum((0, 1)) for x in (begin, left, after))
+    return bool((left - after < np.maximum(SLIGHT * (begin - left), SMALL * left)).all())
+
+
+def _without(here: Setting, now: Standing, entries: Sequence[int]) -> tuple[Fit, list[int]]:
+    """The fit without numbers, and what is free in it."""
+    structure, last = now.model.structure, now.model.fit
+    theta = last.theta.copy()
+    theta[list(entries)] = values(structure.loop, structure.table)[list(entries)]
+    free = [k for k in now.model.free if k not in entries or k in here.baseline]
+    return fit(*structure, theta[None], [free], last.start[None], width=max(here.width, len(free)), lanes=1,
+               iterations=LATE, rough=ROUGH)[0], free  # fmt: skip
+
+
+class _Slight(NamedTuple):
+    """A cause that explains what others leave, and may be no more than the error of their laws; the fit with it."""
+
+    cause: Named
+    fit: Fit
+
+
+def _still_needed(
+    here: Setting, found: list[Named], now: Standing, begin: Standing
+) -> tuple[list[Named], Standing, _Slight | None]:
+    """The causes without those that a later one made needless, where noise is all that is left.
+
+    One without which more than noise is left, but too little to tell it from the error of another's law, is told apart.
+    """
     while len(found) > 1 and now.excess.max() < 1.0:
-        structure, one = now.model.structure, now.model.fit
         own = [Tried(n.candidate, now.model, now.squares) for n in found]
         spare = _spare(here, now, own, begin)
         if spare is None:
             break
-        entries = list(spare.candidate.entries)
-        free = [k for k in now.model.free if k not in entries or k in here.baseline]
-        theta = one.theta.copy()
-        theta[entries] = values(structure.loop, structure.table)[entries]
-        other = fit(*structure, theta[None], [free], one.start[None], width=max(here.width, len(free)), lanes=1,
-                    iterations=LATE)[0]  # fmt: skip
-        new = _standing(here, structure, other, free)
+        new = _standing(here, now.model.structure, *_without(here, now, spare.candidate.entries))
+        rest = [n for n in found if n.candidate is not spare.candidate]
         if not new.excess.max() < 1.0:
-            break
-        found, now = [n for n in found if n.candidate is not spare.candidate], new
-    return found, now
+            (gone,) = (n for n in found if n.candidate is spare.candidate)
+            return rest, new, _Slight(gone, now.model.fit)
+        found, now = rest, new
+    return found, now, None
 
 
 def _alike(here: Setting, found: list[Named], now: Standing) -> tuple[list[Named], Standing]:
@@ -479,7 +561,7 @@ def _name(
             continue
         if t_of(other.sse[..., mine].sum(-1), one.sse[..., mine].sum(-1)) < UNTOLD and sized(here, other):
             alike.append(Name(other.candidate.effect, other.candidate.at))
-    before, after = (_rms(here, x[..., mine]) for x in (now.held, new.held))
+    before, after = (_rms(here, x, j) for x in (now.held, new.held))
     return Named(one.candidate, check[2], check[1], tuple(alike), before, after)
 
 
@@ -487,7 +569,8 @@ def _level(here: Setting, one: Fit) -> float:
     return level_of(one, np.asarray(here.data.weight))
 
 
-def _rms(here: Setting, squares: np.ndarray) -> float:
-    """Whitened squares by joints as an RMS over the rows of all of them: rad, or m."""
-    count = (np.asarray(here.data.weight) > 0).sum() / here.loop.robot.nv * squares.shape[-1]
-    return float(np.sqrt(max(squares.sum(), 0.0) / max(count, 1) * np.mean(here.spread**2)))
+def _rms(here: Setting, squares: np.ndarray, joint: int = -1) -> float:
+    """Whitened squares (blocks, windows, joints) as an RMS over the rows of a joint, or of all: rad, or m."""
+    mine = squares[..., slice(None) if joint < 0 else [joint]]
+    count = (np.asarray(here.data.weight) > 0).sum() / here.loop.robot.nv * mine.shape[-1]
+    return float(np.sqrt(max(mine.sum(), 0.0) / max(count, 1) * np.mean(here.spread**2)))

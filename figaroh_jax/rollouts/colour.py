@@ -32,11 +32,13 @@ class Colour(NamedTuple):
 
 
 def colour_of(
-    error: Float[np.ndarray, "rows ny windows"], counted: Bool[np.ndarray, "rows ny windows"], most: float = COLOUR
+    error: Float[np.ndarray, "rows ny windows"],
+    counted: Bool[np.ndarray, "rows ny windows"],
+    most: tuple[float, float] = (COLOUR, BURST),
 ) -> Colour | None:
     """The colour of residuals in units of `data.noise_of`, or None where one of them is no such noise.
 
-    `most` are the sigmas by which octaves with levels of their own may be likelier.
+    `most` are the sigmas by which octaves with levels of their own may be likelier, and power may come in bursts.
     """
     found = [_colour(list(_stretches(error[:, y], counted[:, y])), most) for y in range(error.shape[1])]
     if any(one is None for one in found):
@@ -67,7 +69,7 @@ def _stretches(error: np.ndarray, counted: np.ndarray) -> Iterator[np.ndarray]:
                 yield error[first:last, w]
 
 
-def _colour(stretches: list[np.ndarray], most: float) -> tuple[float, float] | None:
+def _colour(stretches: list[np.ndarray], most: tuple[float, float]) -> tuple[float, float] | None:
     """The pole and the level of the noise of one encoder, or None where its residual is no such noise."""
     if not stretches:
         return None
@@ -85,7 +87,7 @@ def _colour(stretches: list[np.ndarray], most: float) -> tuple[float, float] | N
     if corner < LOWEST_CORNER or loud > 1 + LOUDER * np.sqrt(6 / rows):
         return None
     ratio = power / (level * _shape(frequency, pole))
-    if _beyond_bands(frequency, ratio) > most or _in_bursts(stretches, pole) > BURST:
+    if _beyond_bands(frequency, ratio) > most[0] or _in_bursts(stretches, pole) > most[1]:
         return None
     return pole, float(np.sqrt(level))
 

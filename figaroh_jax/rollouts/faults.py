@@ -22,6 +22,7 @@ __all__ = ["Fault", "faults", "without"]
 _SLOW, _LONG, _REACH = 0.02, 0.6, 2.0  # rad/s of a joint that stands, s, multiples of what friction holds
 _BLOCK, _JUMP, _ALIKE = 2.0, 2.0, 0.5  # s of one lag, periods of a jump, share by which joints may differ
 _MOST_LATE, _SHIFTED, _FEW = 0.3, 0.15, 3  # s, share of the power that a shift leaves, blocks on either side of a jump
+_NEAR = 5  # blocks on either side that tell the size of a jump
 _WRONG, _HOLDS = 6.0, 1.2  # multiples of the usual error and of the friction, of a joint that stands
 _MOVING = 0.1  # rad/s
 _OFF, _SEVERAL = 3.0, 3  # multiples of the usual error, joints that are off by so much at once
@@ -188,8 +189,12 @@ def _jump(run: Run, read: np.ndarray) -> tuple[float, float] | None:
             best = float(left), k, float(after - before)
     if best is None or abs(best[2]) < _JUMP:
         return None
-    _, k, step = best
-    each = [_step(lag[place[:k], j], lag[place[k:], j]) for j in range(lag.shape[1])]
+    k = best[1]
+    last, first = place[max(k - _NEAR, 0) : k], place[k : k + _NEAR]  # a model's own lag drifts, a clock's jumps
+    step = float(np.median(middle[first]) - np.median(middle[last]))
+    if abs(step) < _JUMP:
+        return None
+    each = [_step(lag[last, j], lag[first, j]) for j in range(lag.shape[1])]
     each = np.array([x for x in each if np.isfinite(x)])
     if len(each) < 2 or np.mean(np.abs(each - step) <= _ALIKE * abs(step)) < 0.75:
         return None

@@ -193,72 +193,6 @@ class Step:
         soft = get("weight") * (_HARD if self.p.hard else get("friction_share")) + 0.0 * v
         return motor - passive, level, pull, soft, damping
 
-    def settled(self, M: dict, r: list, rows: list, a: list, slip: list) -> tuple[list, list]:
-        """Accelerations under friction, and which joints slip (-1, 1) or hold (0)."""
-        n = self.n
-        level, pull, soft = ([row[k] for row in rows] for k in (1, 2, 3))
-
-        def acting(a: Sequence[Any]) -> list:
-            raw = [(pull[j] - a[j]) / soft[j] for j in range(n)]
-            return [jnp.where(raw[j] >= level[j], 1.0, jnp.where(raw[j] <= -level[j], -1.0, 0.0)) for j in range(n)]
-
-        def full_of(slip: Sequence[Any]) -> list:
-            more = [jnp.where(slip[j] == 0.0, 1.0 / soft[j], 0.0) for j in range(n)]
-            right = [r[j] + jnp.where(slip[j] == 0.0, pull[j] / soft[j], slip[j] * level[j]) for j in range(n)]
-            return _solved(M, more, right)
-
-        def same_of(one: Sequence[Any], two: Sequence[Any]) -> Any:
-            same = one[0] == two[0]
-            for x, y in zip(one[1:], two[1:], strict=True):
-                same = same & (x == y)
-            return same
-
-        full = full_of(slip)
-        done = same_of(acting(full), slip)
-        a = [jnp.where(done, x, y) for x, y in zip(full, a, strict=True)]
-        first = acting(a)
-        slip = [jnp.where(done, x, y) for x, y in zip(slip, first, strict=True)]
-
-        def unfinished(state: tuple) -> Any:
-            return (jnp.max(jnp.where(state[2], 0, 1)) > 0) & (state[3] < _TURNS)
-
-        def newton(state: tuple) -> tuple:
-            a, slip, done, turn = state
-            full = full_of(slip)
-            new = acting(full)
-            same = same_of(new, slip)
-            way = [x - y for x, y in zip(full, a, strict=True)]
-            moved = _times(M, way)
-            begin = _sum([w * (m - x) for w, m, x in zip(way, _times(M, a), r, strict=True)])
-            curve = _sum([w * m for w, m in zip(way, moved, strict=True)])
-
-            def slope(s: Any) -> Any:
-                at = [x + s * w for x, w in zip(a, way, strict=True)]
-                force = [jnp.clip((pull[j] - at[j]) / soft[j], -level[j], level[j]) for j in range(n)]
-                return begin + s * curve - _sum([w * f for w, f in zip(way, force, strict=True)])
-
-            def narrower(_: Any, bracket: tuple) -> tuple:
-                low, high, below, above = bracket
-                s = low - below * (high - low) / jnp.where(above > below, above - below, 1.0)
-                at = slope(s)
-                left = at <= 0
-                below, above = jnp.where(left, at, 0.5 * below), jnp.where(left, 0.5 * above, at)
-                return jnp.where(left, s, low), jnp.where(left, high, s), below, above
-
-            zero = 0.0 * a[0]
-            low, high, below, above = lax.fori_loop(
-                0, _SEARCH, narrower, (zero, zero + 1.0, slope(zero), slope(zero + 1.0))
-            )
-            s = low - below * (high - low) / jnp.where(above > below, above - below, 1.0)
-            s = jnp.where(same | (slope(zero + 1.0) <= 0), 1.0, s)
-            after = [jnp.where(done, x, x + s * w) for x, w in zip(a, way, strict=True)]
-            fresh = acting(after)
-            slip = [jnp.where(done | same, x, y) for x, y in zip(slip, fresh, strict=True)]
-            return after, slip, done | same, turn + 1
-
-        a, slip, done, _ = lax.while_loop(unfinished, newton, (a, slip, done, jnp.int32(0)))
-        return [jnp.where(done, x, jnp.nan) for x in a], slip
-
     def bias(self, q: list, v: list) -> list:
         """Torques of gravity and rates."""
         return self.inverse(q, v, [0.0] * self.n)
@@ -272,9 +206,87 @@ class Step:
             M[j, j] = M[j, j] + self.get("armature", j)
         rows = [self.joint(j, q[j], v[j], u[j], bias[j]) for j in range(n)]
         right = [rows[j][0] - bias[j] for j in range(n)]
-        a, slip = self.settled(M, right, rows, a, slip)
+        a, slip = _Friction(M, right, rows).settled(a, slip)
         whole = _solved(M, [self.p.dt * row[4] for row in rows], _times(M, a))
         return a, whole, slip
+
+
+class _Friction:
+    """Dry friction of one step: who slips, and the accelerations under it, by Newton's method with a search."""
+
+    def __init__(self, M: dict, right: list, rows: list):
+        self.M, self.right, self.n = M, right, len(right)
+        self.level, self.pull = ([row[k] for row in rows] for k in (1, 2))
+        self.stiff = [1.0 / row[3] for row in rows]  # once: a division takes as long as thirty products
+
+    def settled(self, a: list, slip: list) -> tuple[list, list]:
+        """Accelerations under friction, and which joints slip (-1, 1) or hold (0), from those of the step before."""
+        full = self.under(slip)
+        done = _same(self.acting(full), slip)
+        a = [jnp.where(done, x, y) for x, y in zip(full, a, strict=True)]
+        slip = [jnp.where(done, x, y) for x, y in zip(slip, self.acting(a), strict=True)]
+
+        def unfinished(state: tuple) -> Any:
+            return (jnp.max(jnp.where(state[2], 0, 1)) > 0) & (state[3] < _TURNS)
+
+        a, slip, done, _ = lax.while_loop(unfinished, self.newton, (a, slip, done, jnp.int32(0)))
+        return [jnp.where(done, x, jnp.nan) for x in a], slip
+
+    def acting(self, a: Sequence[Any]) -> list:
+        """Which joints slip at these accelerations."""
+        raw = [(self.pull[j] - a[j]) * self.stiff[j] for j in range(self.n)]
+        level = self.level
+        return [jnp.where(raw[j] >= level[j], 1.0, jnp.where(raw[j] <= -level[j], -1.0, 0.0)) for j in range(self.n)]
+
+    def under(self, slip: Sequence[Any]) -> list:
+        """Accelerations where these joints slip and the others hold."""
+        pull, stiff, level = self.pull, self.stiff, self.level
+        more = [jnp.where(slip[j] == 0.0, stiff[j], 0.0) for j in range(self.n)]
+        held = [jnp.where(slip[j] == 0.0, pull[j] * stiff[j], slip[j] * level[j]) for j in range(self.n)]
+        return _solved(self.M, more, [r + h for r, h in zip(self.right, held, strict=True)])
+
+    def newton(self, state: tuple) -> tuple:
+        """One step of the lanes that are not done, each as far as its energy falls."""
+        a, slip, done, turn = state
+        full = self.under(slip)
+        same = _same(self.acting(full), slip)
+        way = [x - y for x, y in zip(full, a, strict=True)]
+        s = self.lowest(a, way, same)
+        after = [jnp.where(done, x, x + s * w) for x, w in zip(a, way, strict=True)]
+        slip = [jnp.where(done | same, x, y) for x, y in zip(slip, self.acting(after), strict=True)]
+        return after, slip, done | same, turn + 1
+
+    def lowest(self, a: list, way: list, same: Any) -> Any:
+        """The share of a step at which its energy is lowest: the root of its slope, by the Illinois rule."""
+        moved = _times(self.M, way)
+        begin = _sum([w * (m - x) for w, m, x in zip(way, _times(self.M, a), self.right, strict=True)])
+        curve = _sum([w * m for w, m in zip(way, moved, strict=True)])
+
+        def slope(s: Any) -> Any:
+            at = [(self.pull[j] - (a[j] + s * way[j])) * self.stiff[j] for j in range(self.n)]
+            force = [jnp.clip(x, -level, level) for x, level in zip(at, self.level, strict=True)]
+            return begin + s * curve - _sum([w * f for w, f in zip(way, force, strict=True)])
+
+        def narrower(_: Any, bracket: tuple) -> tuple:
+            low, high, below, above = bracket
+            s = low - below * (high - low) / jnp.where(above > below, above - below, 1.0)
+            at = slope(s)
+            left = at <= 0
+            below, above = jnp.where(left, at, 0.5 * below), jnp.where(left, 0.5 * above, at)
+            return jnp.where(left, s, low), jnp.where(left, high, s), below, above
+
+        zero = 0.0 * a[0]
+        first = (zero, zero + 1.0, slope(zero), slope(zero + 1.0))
+        low, high, below, above = lax.fori_loop(0, _SEARCH, narrower, first)
+        s = low - below * (high - low) / jnp.where(above > below, above - below, 1.0)
+        return jnp.where(same | (slope(zero + 1.0) <= 0), 1.0, s)
+
+
+def _same(one: Sequence[Any], two: Sequence[Any]) -> Any:
+    same = one[0] == two[0]
+    for x, y in zip(one[1:], two[1:], strict=True):
+        same = same & (x == y)
+    return same
 
 
 def _infinite(x: Any) -> bool:
@@ -381,26 +393,36 @@ def _launched(program: _Program, own: Array, seen: Array, start: Array, interpre
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    n, steps, windows = len(program.drives), seen.shape[0], seen.shape[2]
+    n, windows = len(program.drives), seen.shape[2]
     rounds = -(-windows // LANES)
     missing = rounds * LANES - windows
     if missing:
         seen, start = (jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, missing)], mode="edge") for x in (seen, start))
-    drives = [d for d in program.drives if d >= 0]
-    given = len([k for k in program.numbers.place if k >= 0])
+    anywhere, given = pl.BlockSpec(memory_space=pl.ANY), any(k >= 0 for k in program.numbers.place)
+    found = pl.pallas_call(
+        _kernel(program, seen.shape[0], seen.dtype),
+        out_shape=[jax.ShapeDtypeStruct((seen.shape[0], n, rounds * LANES), seen.dtype)] * len(Rolled._fields),
+        grid=(rounds,),
+        in_specs=[anywhere] * 4,
+        out_specs=[anywhere] * len(Rolled._fields),
+        compiler_params=None if interpret else triton.CompilerParams(num_warps=1, num_stages=1),
+        interpret=interpret,
+        name="rolled",
+    )(own if given else jnp.zeros(1), seen, start, jnp.ones(1, jnp.int32))
+    return [x[..., :windows] for x in found]
+
+
+def _kernel(program: _Program, steps: int, dtype: Any) -> Callable[..., None]:
+    """All steps of `LANES` windows: reads numbers, commands (steps, drives, windows) and starts (2 nv, windows)."""
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton
+
+    n, drives = len(program.drives), [d for d in program.drives if d >= 0]
+    given = sum(k >= 0 for k in program.numbers.place)
 
     def kernel(own_ref: Any, seen_ref: Any, start_ref: Any, once_ref: Any, *outs: Any) -> None:
         at = pl.program_id(0) * LANES + lax.iota(jnp.int32, LANES)
-        once, zero = once_ref[0], jnp.zeros(LANES, seen.dtype)
-
-        def apart(access: Callable[[list], list], begin: list) -> list:
-            """As in `compiled.kernels`: a loop of one round, through which Triton does not look."""
-
-            def step(carry: tuple) -> tuple:
-                return carry[0] + 1, access(carry[1])
-
-            return lax.while_loop(lambda carry: carry[0] * 2 < once, step, (jnp.int32(0), begin))[1]
-
+        apart, zero = _apart(once_ref[0]), jnp.zeros(LANES, dtype)
         places = [jnp.full(LANES, k, jnp.int32) for k in range(given)]
         values = apart(lambda _: [triton.load(own_ref.at[k]) for k in places], [zero] * given)
         both = apart(lambda _: [triton.load(start_ref.at[j, at]) for j in range(2 * n)], [zero] * (2 * n))
@@ -427,15 +449,16 @@ def _launched(program: _Program, own: Array, seen: Array, start: Array, interpre
 
         lax.fori_loop(0, steps, one, (both[:n], both[n:], [zero] * n, [zero] * n))
 
-    anywhere = pl.BlockSpec(memory_space=pl.ANY)
-    found = pl.pallas_call(
-        kernel,
-        out_shape=[jax.ShapeDtypeStruct((steps, n, rounds * LANES), seen.dtype)] * len(Rolled._fields),
-        grid=(rounds,),
-        in_specs=[anywhere] * 4,
-        out_specs=[anywhere] * len(Rolled._fields),
-        compiler_params=None if interpret else triton.CompilerParams(num_warps=1, num_stages=1),
-        interpret=interpret,
-        name="rolled",
-    )(own if given else jnp.zeros(1), seen, start, jnp.ones(1, jnp.int32))
-    return [x[..., :windows] for x in found]
+    return kernel
+
+
+def _apart(once: Any) -> Callable[[Callable[[list], list], list], list]:
+    """As in `compiled.kernels`: a loop of one round, through which Triton does not look."""
+
+    def apart(access: Callable[[list], list], begin: list) -> list:
+        def step(carry: tuple) -> tuple:
+            return carry[0] + 1, access(carry[1])
+
+        return lax.while_loop(lambda carry: carry[0] * 2 < once, step, (jnp.int32(0), begin))[1]
+
+    return apart

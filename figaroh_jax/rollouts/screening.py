@@ -116,7 +116,10 @@ def tried_now(
         enough = [one for one in ranked if j < 0 or one.promise > least or one.candidate.kind.usual]
         usual = [one for one in enough if one.candidate.kind.usual][:1]  # may come before what promises more
         rest = [one for one in enough if all(one is not x for x in usual)]
-        hopeful[j] = [*usual, *rest][: _TOP if j >= 0 else 1]
+        chosen = [*usual, *rest][: _TOP if j >= 0 else 1]
+        hopeful[j] = chosen + [
+            one for one in ranked if _asked_by(one.candidate, chosen) and all(one is not x for x in chosen)
+        ]
     found = _fitted(here, now, hopeful)
     for j in (-1, *open_joints) if -1 not in same else open_joints:
         known[j] = _Seen(sizes[j], [one for one in found if joint_of(here, one.candidate) == j], [])
@@ -209,6 +212,11 @@ def _rows(here: Setting, joint: int) -> int:
     return int((np.asarray(here.data.weight)[:, column :: len(here.loop.measured)] > 0).sum())
 
 
+def _asked_by(one: Candidate, others: Sequence[_Ranked]) -> bool:
+    """Whether another is more of it, or may stand for it: then it must have been fitted too."""
+    return any(one.effect in (x.candidate.kind.adds_to, x.candidate.kind.rival_of) for x in others)
+
+
 def _no_more(one: _Ranked, ranked: Sequence[_Ranked]) -> bool:
     """Whether a candidate promises hardly more than one that it contains."""
     kind = one.candidate.kind
@@ -230,7 +238,10 @@ def _fitted(here: Setting, now: Standing, hopeful: dict[int, list[_Ranked]]) -> 
         ordered = sorted(ones, key=lambda x: x[0])
         ordered = [x for k, x in enumerate(ordered) if all(x[1].candidate is not y[1].candidate for y in ordered[:k])]
         near = [x for x in ordered if before - x[0] > MAY_WIN * (before - ordered[0][0])]
-        leaders[j] = [(x[1], x[2]) for x in near[:_RACE]]
+        first = near[:_RACE]
+        first += [x for x in ordered if all(x is not y for y in first) and x[0] < before
+                  and _asked_by(x[1].candidate, [y[1] for y in near[:_RACE]])]  # fmt: skip
+        leaders[j] = [(x[1], x[2]) for x in first]
     found = []
     for one in _all_in_lanes(here, now, leaders, LATE, now.model.fit.cost):
         c, beyond = one.ranked.candidate, excess_of(here, one.ranked.structure, one.fit)
@@ -267,11 +278,14 @@ def _all_in_lanes(
 ) -> list[_OneOf]:
     """Every candidate of the lists fitted, the first of each joint together, then the second ones, and so on.
 
-    A spring changes the structure, a payload shows at several joints, a limit may hold up the steps of the others:
-    these are fitted by themselves.
+    A spring changes the structure, a payload shows at several joints, a limit may hold up the steps of the others, and
+    a joint that is off by more than all others together decides which steps are taken: these are fitted by themselves.
     """
-    single = [(j, *one) for j, ones in lists.items() for one in ones if _fitted_alone(one[0].candidate)]
-    plain = {j: [one for one in ones if not _fitted_alone(one[0].candidate)] for j, ones in lists.items() if j >= 0}
+    own = now.squares.sum((0, 1))
+    large = [j for j in lists if j >= 0 and own[j] > 0.5 * own.sum()]
+    apart = {j: [one for one in ones if j in large or _fitted_alone(one[0].candidate)] for j, ones in lists.items()}
+    single = [(j, *one) for j, ones in apart.items() for one in ones]
+    plain = {j: [x for x in ones if all(x is not y for y in apart[j])] for j, ones in lists.items() if j >= 0}
     lanes = [[(j, *ones[m]) for j, ones in plain.items() if m < len(ones)]
              for m in range(max((len(ones) for ones in plain.values()), default=0))]  # fmt: skip
     found, queue = [], [*lanes, *([one] for one in single)]

@@ -34,9 +34,11 @@ from .thresholds import (
     CONFIDENT,
     GAIN,
     GAIN_BESIDE_REST,
+    LEAST_OF_A_RECORDING,
     NEAR,
     NO_WORSE,
     OF_ITS_SIZE,
+    SLIGHT,
     T_BESIDE_REST,
     T_WITHOUT_REST,
     UNTOLD,
@@ -54,6 +56,8 @@ __all__ = [
     "settled",
     "sized",
     "t_of",
+    "t_of_places",
+    "t_of_recordings",
 ]
 
 _SHORT = 6  # candidates that are fitted where a linear screening can order them
@@ -94,6 +98,7 @@ class Search:
     origin: Structure | None = None  # of the baseline
     setting: Setting | None = None  # where rows were left out: without them
     faults: list[Fault] = field(default_factory=list)  # why they were
+    beside: Fit | None = None  # where a cause that is too slight to be named is left out: with it noise alone is left
 
 
 def judged_by_colour(here: Setting, found: Search, seek: Callable[[Setting], Search]) -> Search:
@@ -107,9 +112,14 @@ def judged_by_colour(here: Setting, found: Search, seek: Callable[[Setting], Sea
     new = seek(again)
     levels = np.concatenate([one / white for one, white in zip(again.noise, sound.noise, strict=True)])
     counted = np.asarray(new.structure.data.weight) > 0
-    left = residuals(new.structure, new.last) * levels[:, None]
-    if new.verdict not in ("nothing", "named") or colour_of(left, counted) is None:
+    left = residuals(new.structure, new.beside or new.last)
+    if new.verdict not in ("nothing", "named") and new.beside is None:
         return found
+    if colour_of(left * levels[:, None], counted) is None:
+        begun = residuals(new.origin or new.structure, new.first)
+        if new.verdict == "nothing" or (left**2).sum() > SLIGHT * (begun**2).sum():
+            return found
+        new.verdict = "named+rest"  # all that is left, noise too, may be the error of the law that was found
     new.setting, new.faults = again, found.faults
     if [n.candidate for n in new.named] == [n.candidate for n in found.named or found.proxy]:  # in plain squares
         old = found.named or found.proxy
@@ -336,6 +346,26 @@ def t_of(worse: np.ndarray, better: np.ndarray) -> float:
     gain = (worse - better).ravel()
     gain = gain[(worse.ravel() != 0) | (better.ravel() != 0)]
     return float(gain.mean() / (gain.std(ddof=1) / np.sqrt(len(gain)) + 1e-300)) if len(gain) > 2 else 0.0
+
+
+def t_of_places(worse: np.ndarray, better: np.ndarray) -> float:
+    """t of the logarithms of the blocks' gains: a limit that is met in a few places is not one large gain by chance."""
+    told = (worse.ravel() != 0) | (better.ravel() != 0)
+    floor = better.ravel()[told].mean()
+    logs = np.log((worse.ravel()[told] + floor) / (better.ravel()[told] + floor))
+    return float(logs.mean() / (logs.std(ddof=1) / np.sqrt(len(logs)) + 1e-300)) if len(logs) > 2 else 0.0
+
+
+def t_of_recordings(worse: np.ndarray, better: np.ndarray, runs: np.ndarray) -> float:
+    """t of the logarithms of the recordings' gains, (blocks, windows) with the run (windows,) of each: all count alike.
+
+    Blocks of one recording gain or lose together; a recording in which nothing moves tells nothing.
+    """
+    sums = np.stack([np.bincount(runs, x.sum(0)) / np.maximum(np.bincount(runs), 1) for x in (worse, better)])
+    sums = sums[:, np.bincount(runs) > 0]
+    floor = LEAST_OF_A_RECORDING * sums[1].mean()
+    logs = np.log((sums[0] + floor) / (sums[1] + floor))
+    return float(logs.mean() / (logs.std(ddof=1) / np.sqrt(len(logs)) + 1e-300)) if len(logs) > 2 else 0.0
 
 
 def _best(

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -25,6 +26,7 @@ __all__ = [
     "begun",
     "by_recording",
     "coloured",
+    "evened",
     "excess",
     "free_entries",
     "largest_forces",
@@ -58,6 +60,7 @@ class Setting:
     stretches: tuple[Stretch, ...]
     block: float
     pole: np.ndarray | None = None  # of coloured noise, of which `noise` drives the low pass
+    even: np.ndarray | None = None  # (runs, ny) by which rows weigh more or less than by their noise: `evened`
 
     @property
     def spread(self) -> np.ndarray:
@@ -67,7 +70,16 @@ class Setting:
 
     def cut(self, loop: Loop) -> Windows:
         """The recordings in windows, for a loop of these joints."""
-        return windows(loop, self.runs, self.stretches, self.noise, self.block, pole=self.pole)
+        data = windows(loop, self.runs, self.stretches, self.noise, self.block, pole=self.pole)
+        if self.even is None:
+            return data
+        share = self.even[[one.run for one in self.stretches]].T
+        return eqx.tree_at(lambda d: d.weight, data, np.asarray(data.weight) * share)
+
+    def plain(self) -> Setting:
+        """The same with every row weighed by its noise alone."""
+        some = replace(self, even=None)
+        return self if self.even is None else replace(some, data=some.cut(self.loop))
 
     @property
     def bounds(self) -> np.ndarray:
@@ -130,6 +142,27 @@ def thinned(here: Setting) -> Setting:
     some = replace(here, stretches=tuple(kept))
     data = some.cut(here.loop)
     return replace(some, data=data, folds=_folds(data, kept))
+
+
+def evened(here: Setting, structure: Structure, found: Fit) -> Setting:
+    """The setting in which each recording tells as much of each joint, where a fit leaves more than noise of it.
+
+    What a model lacks differs by recording and joint, as fast motions show more of it than slow ones: least squares
+    weigh each by the variance of what is left there (A. C. Aitken, Proceedings of the Royal Society of Edinburgh 55,
+    1935), all together as before.
+    """
+    plain = here.plain()
+    data = structure._replace(data=plain.cut(structure.loop))
+    left, counted = residuals(data, found), np.asarray(data.data.weight) > 0
+    run = np.array([one.run for one in here.stretches])
+    size = np.ones((run.max() + 1, left.shape[1]))
+    for k in np.unique(run):
+        count = counted[..., run == k].sum((0, 2))
+        size[k] = np.sqrt((left[..., run == k] ** 2).sum((0, 2)) / np.maximum(count, 1))
+    size = np.maximum(size, 1.0)
+    mean = np.sqrt((left**2).sum() / max(counted.sum(), 1))
+    some = replace(plain, even=mean / size)
+    return replace(some, data=some.cut(here.loop))
 
 
 def _folds(data: Windows, stretches: Sequence[Stretch]) -> np.ndarray:

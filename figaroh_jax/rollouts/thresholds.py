@@ -16,6 +16,8 @@ T_BESIDE_REST = 3.0  # t, where more than noise stays beside it
 GAIN_BESIDE_REST = 0.25  # less may stand in for the rest; not of what every joint has
 SMALL = 0.002  # gain below which a cause found with others is not missed
 SLIGHT = 1e-3  # of the squares that others explain at its joint: less makes up for a law that is not theirs
+MOST_OF_IT = 0.9  # gain on held-out data from which places count alike, however large the squares of a few are
+LEAST_OF_A_RECORDING = 0.1  # of the mean squares of recordings: gains are told beside so much
 COST_OF_A_MISSED = 0.1  # of the squares, by which a cause that is surely missed would make them larger
 FITTED_FOR_HELD = 0.7  # of the t that a name needs: what it must have on the rows that it was fitted to
 OF_ITS_SIZE = 0.5  # standard deviation of a size that is known, of numbers that cannot be negative
@@ -41,8 +43,11 @@ SLOW_ROWS = 25
 
 # Whether it is coloured noise (`colour`)
 COLOUR = 4.0  # sigmas by which octaves with levels of their own are likelier than a low pass
-TO_TRY = 8.0  # the same of what a fit that takes it for white noise leaves: such a fit bends to it
 BURST = 5.0  # sigmas by which the power of groups of `BURST_ROWS` rows varies more than noise's
+TO_TRY = (
+    8.0,
+    float("inf"),
+)  # both of what a fit that takes it for white noise leaves: bent to it, short of what is rare
 BURST_ROWS = 25
 LOUDER = 4.0  # sigmas of the power over that which the record's fourth differences tell, as `POWER`
 LOWEST_CORNER = 0.02  # of the sampling rate: a corner below that is not seen in the data
