@@ -349,7 +349,9 @@ def _judged(
     against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
     for one, rest in zip(found, rests, strict=True):
         if rest and one.doubtful and not against[one.name]:
-            against[one.name] = "a law of impossible sign explains the same misfit: it may be the unexplained residual"
+            against[one.name] = (
+                "a law of impossible sign explains the same misfit: this may be part of the unexplained residual"
+            )
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
     here, joint, by_speed = _as_predicts_best([here] if same else [here, before], named)

@@ -291,7 +291,9 @@ def as_data(model: ExtendedModel, data: Any) -> tuple[Data, ...]:
     if isinstance(data, Data):
         return (data,)
     if not isinstance(data, Sequence) or not len(data):
-        raise InputError(f"data is {type(data).__name__}: recordings, postures, or what has a method `residual(model)`")
+        raise InputError(
+            f"data is {type(data).__name__}: expected recordings, postures or an object with a method `residual(model)`"
+        )
     for kind, make in ((Recording, torque_data), (PoseRecording, pose_data)):
         if all(isinstance(one, kind) for one in data):
             made = make(model, data)
