@@ -401,12 +401,24 @@ def _factor_by_kernels(model: RobotModel, columns: int, rows: _Rows) -> Float[Ar
     start = tuple(jnp.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
     parts = _by_kernels(_with_factor, model, kept, start, rows)
     few = columns if kept is None else sum(map(len, kept)) + beside
-    both = [pair for g, own in zip(groups, parts, strict=True) for pair in zip(g.columns, own, strict=True)]
-    whole = jnp.concatenate([jnp.zeros((len(own), few)).at[:, place].set(own) for place, own in both])
-    if kept is None:
+    links = None if kept is None else regrouping(model, kept)
+    return _spread(few, links, tuple(g.columns for g in groups), parts)
+
+
+@partial(jax.jit, static_argnums=0)
+def _spread(
+    columns: int, links: Float[Array, "kept links"] | None, places: tuple[Array, ...], parts: tuple[Array, ...]
+) -> Float[Array, "rows _"]:
+    """Each factor in its own columns of all, one below the other; of all links from those that were kept."""
+    rows = []
+    for place, own in zip(places, parts, strict=True):
+        one, row = np.arange(own.shape[0])[:, None, None], np.arange(own.shape[1])[:, None]
+        rows.append(jnp.zeros((*own.shape[:2], columns)).at[one, row, place[:, None]].set(own).reshape(-1, columns))
+    whole = jnp.concatenate(rows)
+    if links is None:
         return whole
-    links = jnp.matmul(whole[:, : few - beside], regrouping(model, kept), precision=jax.lax.Precision.HIGHEST)
-    return jnp.concatenate([links, whole[:, few - beside :]], axis=1)
+    ours = jnp.matmul(whole[:, : len(links)], links, precision=jax.lax.Precision.HIGHEST)
+    return jnp.concatenate([ours, whole[:, len(links) :]], axis=1)
 
 
 @jax.jit
