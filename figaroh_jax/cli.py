@@ -32,7 +32,7 @@ _THREADS = {
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
 }
 _TASKS = {  # commands that take a task file
-    "diagnose": "the main job, on a task file of yours",
+    "diagnose": "the main job, on your own task file",
     "identify": "fit the dynamics: links, friction, intervals",
     "calibrate": "fit the kinematics from measured poses or points",
     "excite": "design the most informative motion within limits",
@@ -246,8 +246,8 @@ def _one_line(text: str) -> str:
 def _parser() -> argparse.ArgumentParser:
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--out", type=Path, metavar="DIR", help="run directory; an earlier run there is replaced")
-    common.add_argument("--json", action="store_true", help="print the answer as JSON in place of the summary")
-    common.add_argument("--verbose", action="store_true", help="show the notes of the summary, which else are counted")
+    common.add_argument("--json", action="store_true", help="print the answer as JSON instead of the summary")
+    common.add_argument("--verbose", action="store_true", help="show the notes in full instead of their number")
     common.add_argument("--quiet", action="store_true", help="no progress on standard error")
     common.add_argument("--traceback", action="store_true", help="show where an error was raised")
     common.add_argument(
@@ -269,10 +269,10 @@ def _parser() -> argparse.ArgumentParser:
         if name == "calibrate":
             command.add_argument("--level", help="frames, joint_offset or full, in place of what predicts best")
             command.add_argument("--no-priors", dest="priors", action="store_false", help="plain least squares")
-    again = commands.add_parser("rerun", parents=[common], help="run the command that made a run directory once more")
+    again = commands.add_parser("rerun", parents=[common], help="repeat the command that made a run directory")
     again.add_argument("run", type=Path, metavar="DIR")
     _add_tools(commands)
-    export = commands.add_parser("export", parents=[common], help="a rollout's model in the words of a simulator")
+    export = commands.add_parser("export", parents=[common], help="write a rollout's model for a simulator")
     export.add_argument("task", type=Path, metavar="MODEL_DIR", help="`model` of a run directory")
     export.add_argument("--for", dest="simulator", required=True, metavar="NAME", help="mujoco, newton, isaaclab, ...")
     demo = commands.add_parser("demo", parents=[common], help="the main job on an embedded recording, no file needed")
@@ -283,7 +283,7 @@ def _parser() -> argparse.ArgumentParser:
 def _add_tools(commands: Any) -> None:
     """Commands before and after a run."""
     tool = argparse.ArgumentParser(add_help=False)
-    tool.add_argument("--json", action="store_true", help="print JSON in place of the table")
+    tool.add_argument("--json", action="store_true", help="print JSON instead of the table")
     tool.add_argument("--traceback", action="store_true", help="show where an error was raised")
     new = commands.add_parser("new", parents=[tool], help="draft a task file from a model and recordings")
     new.add_argument("model", type=Path, metavar="MODEL")

@@ -53,7 +53,7 @@ def as_written(what: object) -> Iterator[None]:
         raise
     except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
         said = f"{type(error).__name__}: {str(error)[:200]}"
-        raise InputError(f"{what}: is not as this library writes it; was it changed or damaged? ({said})") from error
+        raise InputError(f"{what}: is not what figaroh-jax writes; was it changed or damaged? ({said})") from error
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -139,3 +139,77 @@ def test_everything_can_be_free_at_once(robot: fj.RobotModel, tracked: tuple[fj.
         told["gravity z"] == float(moved.robot.gravity[2]) and told["joint_offset elbow"] == y[at["joint_offset elbow"]]
     )
     assert np.abs(fj.residual(moved, devices)).max() > 0
+
+
+@pytest.fixture(scope="module")
+def rubbing(robot: fj.RobotModel) -> fj.ExtendedModel:
+    return fj.extend(robot, place(robot, "viscous_friction", "elbow"), place(robot, "coulomb_friction", "elbow"))
+
+
+def moved_arm(rubbing: fj.ExtendedModel, more: float = 0.0, inertia: float = 1.0, noise: float = 0.0) -> fj.TorqueData:
+    """A recording of an arm with 2 N m s/rad and 1 N m of friction at the elbow, or `more`."""
+    robot = eqx.tree_at(lambda m: m.inertia, rubbing.robot, np.asarray(rubbing.robot.inertia) * inertia)
+    friction = (
+        place(robot, "viscous_friction", "elbow", damping=2 + more),
+        place(robot, "coulomb_friction", "elbow", force=1 + more),
+    )
+    torque = np.array(fj.extend(robot, *friction).inverse_dynamics(Q, V, A))
+    torque += noise * np.random.default_rng(0).normal(size=torque.shape)
+    return fj.torque_data(rubbing, fj.recording(q=Q, tau=torque, rate=250), fj.Preprocess(cutoff=10, rate=20))
+
+
+def test_one_fit_estimates_inertias_friction_placements_offsets_frames_and_gravity(
+    robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...], rubbing: fj.ExtendedModel
+):
+    """Torque and postures in one fit: what each shows alone comes back, what neither shows is its prior's."""
+    torque = moved_arm(rubbing, inertia=1.02, noise=0.05)
+    torque = eqx.tree_at(lambda d: d.weight, torque, torque.weight / 0.05)
+    postures = tuple(eqx.tree_at(lambda d: d.weight, one, one.weight / 1e-5) for one in tracked)
+    free = {"inertia": ["forearm", "hand"], "friction": True, "joint_offset": ["shoulder", "elbow"], "frames": True}
+    free |= {"link_geometry": ["wrist"], "gravity": ["gravity z"]}
+    prior = {"inertia": 0.1, "link_geometry": 1e-3, "gravity": 0.5}
+    found = fj.fit(rubbing, [torque, *postures], free, prior=prior)
+    assert found.result == optimistix.RESULTS.successful and int(found.rank) == len(found.values)
+    truth = {"viscous_friction elbow damping": 2.0, "coulomb_friction elbow force": 1.0, "joint_offset shoulder": 0.02}
+    for name, value in truth.items():
+        assert abs(found.parameters[name].value - value) < 4 * found.parameters[name].std
+    assert found.parameters["joint_offset shoulder"].std < 1e-3 and found.parameters["gravity z"].std < 0.5
+    assert float(found.cost) < 0.6 * len(found.rows)  # half the squares of noise with one sigma
+
+
+def test_fits_of_many_runs_and_of_robots_of_one_structure_are_mapped(rubbing: fj.ExtendedModel):
+    """One jitted call of `jax.vmap` gives what a loop gives."""
+    runs = [moved_arm(rubbing, 0.1 * k) for k in range(3)]
+    robots = [
+        eqx.tree_at(lambda m: m.robot.inertia, rubbing, np.asarray(rubbing.robot.inertia) * (1 + 0.01 * k))
+        for k in range(3)
+    ]
+    data, models = (jax.tree.map(lambda *x: jnp.stack(x), *many) for many in (runs, robots))
+
+    def friction(model: fj.ExtendedModel, run: fj.TorqueData) -> jax.Array:
+        return jnp.asarray(fj.fit(model, run, "friction").values)
+
+    mapped = jax.jit(jax.vmap(friction, in_axes=(None, 0)))(rubbing, data)
+    np.testing.assert_allclose(mapped, [[2 + 0.1 * k, 1 + 0.1 * k] for k in range(3)], rtol=0, atol=5e-2)
+    both = jax.jit(jax.vmap(friction))(models, data)
+    single = [friction(model, run) for model, run in zip(robots, runs, strict=True)]
+    np.testing.assert_allclose(both, single, rtol=1e-8, atol=0)
+
+
+def test_plain_gradients_by_all_of_the_data_are_those_of_refits(
+    robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...], rubbing: fj.ExtendedModel
+):
+    """No leaf is a whole number: `jax.grad` takes the data as they are."""
+    run, (postures, *_) = moved_arm(rubbing), tracked
+
+    def damping(data: fj.TorqueData) -> jax.Array:
+        return jnp.asarray(fj.fit(rubbing, data, "friction").values)[0]
+
+    def offset(data: fj.PoseData) -> jax.Array:
+        return jnp.asarray(fj.fit(robot, data, {**JOINTS, "frames": True}).values)[0]
+
+    for fitted, data, leaf in ((damping, run, lambda d: d.torque), (offset, postures, lambda d: d.position)):
+        way = np.cos(np.arange(np.size(leaf(data)))).reshape(np.shape(leaf(data)))
+        sides = [fitted(eqx.tree_at(leaf, data, np.asarray(leaf(data)) + s * 1e-4 * way)) for s in (1, -1)]
+        slope = (np.asarray(leaf(jax.grad(fitted)(data))) * way).sum()
+        np.testing.assert_allclose(slope, (sides[0] - sides[1]) / 2e-4, rtol=1e-5, atol=0)

@@ -71,3 +71,12 @@ def test_values_are_as_unsure_as_parts_of_the_data_disagree():
     found = np.sqrt(np.diag(with_parts(problem, joint, np.ones((1, 2))).fitted.covariance))
     np.testing.assert_allclose(found[:2], jackknife[:2], rtol=1e-6)
     assert found[2] == deviation[2] > jackknife[2]
+
+
+def test_a_value_that_no_row_shows_is_as_unsure_as_can_be():
+    """... and no NaN: its scores are zero, which says nothing of how sure it is."""
+    rows: Any = SimpleNamespace(size=100)
+    covariance, inverse = np.array([[0.04, 0.0], [0.0, 0.0]]), np.diag([0.01, 1e24])
+    found = fits._widened(covariance, inverse, rows, np.ones((1, 100)), 2)
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), [0.2, 1e12], rtol=0.02)
+    assert np.isfinite(found).all() and found[0, 1] == 0

@@ -11,17 +11,44 @@ import numpy as np
 import pinocchio as pin
 import poses
 import pytest
+from jaxtyping import Array, Float
 
 from figaroh_jax.estimation import posefit, starts
 from figaroh_jax.estimation.posehost import HostRows, written_out
 from figaroh_jax.estimation.posesolver import solve
 from figaroh_jax.formats.urdf import load_urdf
-from figaroh_jax.recordings.devices import Camera, Device, Distance, Planes, Points, Poses, Sockets, own_device
+from figaroh_jax.recordings.devices import ORIENTATION, Device, Distance, Planes, Points, Poses, Sockets, own_device
+from figaroh_jax.rigid import lie
 from figaroh_jax.rigid.chain import chain_between
-from figaroh_jax.rigid.model import RobotModel
+from figaroh_jax.rigid.model import Leaf, RobotModel
 
 N = 4
 BOTH = ("base_frame", "tool_frame")
+
+
+class Camera(Poses):
+    """Corners of a board in the image of a camera: `datum` is (corners, 2), in pixels; the tool carries the camera
+    (the device's frame is the board's) or, with `mount` "world", the board (the device's frame is the camera's).
+
+    Rows are pixels over the focal length, an angle in rad.
+    """
+
+    board: Float[Leaf, "corners 3"] = eqx.field(kw_only=True)  # m, in the board's frame
+    intrinsics: Float[Leaf, "3 3"] = eqx.field(kw_only=True)
+    mount: str = eqx.field(static=True, default="hand")
+
+    def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, " rows"]:
+        """Predicted minus measured corners over the focal length (2 corners,): angles in rad; `datum` in pixels."""
+        seen = self.device_T_base(unknown) @ pose @ self.tool_T_marker(unknown)
+        camera_T_board = lie.inverse_pose(seen) if self.mount == "hand" else seen
+        points = self.board @ camera_T_board[:3, :3].T + camera_T_board[:3, 3]
+        focal = jnp.array([self.intrinsics[0, 0], self.intrinsics[1, 1]])
+        measured = (datum - self.intrinsics[:2, 2]) / focal
+        return (points[:, :2] / points[:, 2:] - measured).reshape(-1)
+
+    def channels(self) -> tuple[int, ...]:
+        """Angles alone."""
+        return (ORIENTATION,) * (2 * len(self.board))
 
 
 @pytest.fixture(scope="module")

@@ -19,11 +19,13 @@ from synthetic import DT, made_signals, swing
 from figaroh_jax.diagnosis.comparison import Verdicts
 from figaroh_jax.diagnosis.contenders import Contender
 from figaroh_jax.diagnosis.design import units
+from figaroh_jax.diagnosis.diagnosis import _possible
 from figaroh_jax.diagnosis.flexible import WIDTHS, friction_width
-from figaroh_jax.diagnosis.gates import exists, physical_sign, possible
+from figaroh_jax.diagnosis.gates import ambiguous, exists, physical_sign, rivals
 from figaroh_jax.diagnosis.layout import held_rows, layout
 from figaroh_jax.diagnosis.naming import beyond_simpler
 from figaroh_jax.diagnosis.problem import Problem
+from figaroh_jax.diagnosis.search import Found, Rival
 from figaroh_jax.diagnosis.shifts import shifted, torque_change
 from figaroh_jax.diagnosis.state import baseline, batched, extended_state, plain_rows, solved, whitened
 from figaroh_jax.effects.base import Motion, place
@@ -191,9 +193,15 @@ def test_a_sign_that_physics_forbids_gives_way_to_a_law_that_does_as_well(model:
     wrong = contender("stribeck_friction", law, "turn", force=-0.1, speed=0.2)
     other = contender("power_law_friction", law, "slide", strength=0.3, exponent=0.4)
     right = contender("power_law_friction", law, "turn", more=0.1 * told, strength=0.3, exponent=0.4)
-    step = cast(Any, SimpleNamespace(verdicts=said(0 * speed)))
-    assert possible(step, [wrong, other, right], wrong) is (wrong if told else right)
-    assert possible(step, [right, wrong, other], right) is right
+    step, screened = (cast(Any, x) for x in (SimpleNamespace(verdicts=said(0 * speed)), SimpleNamespace(groups=[])))
+    open_to = ambiguous(step, wrong, rivals(step, [wrong, other, right], wrong), screened)
+    instead = tuple(Rival(c.name, c.effect, c.joints) for c in (other, right) if c.name in open_to)
+    found = cast(
+        Any, Found(wrong.name, wrong.effect, 0.0, (1.0, 0.0), (1.0, 0.0), 9.0, 1.0, open_to, (0,), (), instead)
+    )
+    kept = _possible([found], cast(Any, SimpleNamespace(causes=[wrong.effect])))
+    assert kept[0].name == (wrong if told else right).name
+    assert _possible([found], cast(Any, SimpleNamespace(causes=[right.effect])))[0] is found
 
 
 def test_an_effect_exists_within_its_bounds_only(model: RobotModel) -> None:

@@ -231,6 +231,10 @@ def _searched(
         found, joint = _told_apart(here, *_fitted_together(here, search.found, forbid, tolerance))
         left, p_left, beyond, line, more = _left(here, search, found, joint, forbid, tolerance, generator)
         strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
+        if not strict and (kept := _possible(found, joint)) != found:
+            found, joint = kept, _together(here, kept)
+            left, p_left, beyond, line, more = _left(here, search, found, joint, forbid, tolerance, generator)
+            strict = left.there or beyond > NO_REST
         return _Searched(before, here, search, found, joint, left, line, strict, more, p_left < REST_P)
 
     like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
@@ -302,6 +306,21 @@ def _told_apart(here: _Setting, found: list[Found], joint: Joint) -> tuple[list[
     return found, joint
 
 
+def _possible(found: list[Found], joint: Joint) -> list[Found]:
+    """The causes, each whose sign physics forbids as the best at its place that does as well, where there is one.
+
+    Beside a rest it stays: it takes what another law would be named for.
+    """
+    out = []
+    for one, effect in zip(found, joint.causes, strict=True):
+        there = [o for o in one.instead if o.name.at == one.name.at and physical_sign(o.effect)]
+        if there and not physical_sign(effect):
+            known = tuple(n for n in one.ambiguous if n != there[0].name)
+            one = replace(one, name=there[0].name, effect=there[0].effect, joints=there[0].joints, ambiguous=known)
+        out.append(one)
+    return out
+
+
 def _simple(here: _Setting, found: list[Found], joint: Joint, forbid: Sequence[str], tolerance: float) -> list[Found]:
     """The causes, each as the simpler effect that it contains where it adds to that no more than is tolerable."""
     problem, state, out = here.problem, joint.step.state, []
@@ -347,9 +366,6 @@ def _judged(
     rests = beside_rest(each, [f.joints for f in found], strict, beyond, tolerance)
     asked = (tolerance, certain, fading)
     against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
-    for one, rest in zip(found, rests, strict=True):
-        if rest and one.doubtful and not against[one.name]:
-            against[one.name] = "a law of impossible sign explains the same misfit: it may be the unexplained residual"
     named = [f for f in found if not against[f.name]]
     same = before.problem is here.problem
     here, joint, by_speed = _as_predicts_best([here] if same else [here, before], named)

@@ -14,7 +14,7 @@ from .screening import Screen
 from .step import Step
 from .thresholds import GAIN, OVERLAP_SAME, SIZE_REGION, T_ALIKE, T_APART, T_BETTER
 
-__all__ = ["ambiguous", "exists", "gains", "passes", "physical_sign", "possible", "rivals", "simpler"]
+__all__ = ["ambiguous", "exists", "gains", "passes", "physical_sign", "rivals", "simpler"]
 
 
 def exists(problem: Problem, effect: Effect) -> bool:
@@ -88,14 +88,6 @@ def simpler(step: Step, contenders: list[Contender], one: Contender) -> list[Con
     inside = [c for c in contenders if c.name.effect in kind.contains and c.name.at == one.name.at]
     like = [c for c in rivals(step, contenders, one) if c.name.effect in kind.resembles and physical_sign(c.effect)]
     return [c for c in (*inside, *like) if _member(step, one, c)]
-
-
-def possible(step: Step, contenders: list[Contender], one: Contender) -> Contender:
-    """The cause, or where its sign is one that physics forbids, the best at its place that does as well."""
-    if physical_sign(one.effect):
-        return one
-    there = [c for c in rivals(step, contenders, one) if c.name.at == one.name.at and physical_sign(c.effect)]
-    return next((c for c in there if _member(step, one, c)), one)
 
 
 def rivals(step: Step, contenders: list[Contender], one: Contender) -> list[Contender]:

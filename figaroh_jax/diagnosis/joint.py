@@ -170,8 +170,10 @@ def _widened(
     """
     level = max(1.0, float((residual**2).sum()) / max(rows.size - count, rows.size / 2))
     least = np.sqrt(level * np.maximum(np.diag(inverse), 0.0))
-    wider = np.maximum(least / np.maximum(np.sqrt(np.maximum(np.diag(covariance), 0.0)), 1e-300), 1.0)
-    return covariance * np.outer(wider, wider)
+    own = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    shown = own > KEPT * least  # of the others no row says anything
+    wider = np.where(shown, np.maximum(least / np.where(shown, own, 1.0), 1.0), 0.0)
+    return covariance * np.outer(wider, wider) + np.diag(np.where(shown, 0.0, least**2))
 
 
 def _scatter(

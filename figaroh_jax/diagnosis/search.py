@@ -19,7 +19,7 @@ from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
 from .flexible import friction_width
-from .gates import ambiguous, exists, gains, passes, physical_sign, possible, rivals, simpler
+from .gates import ambiguous, exists, gains, passes, rivals, simpler
 from .problem import Problem
 from .screening import DRAWS, Null, Screen, Shown, catalogue, family_p, place_p, screen
 from .state import State, solved, with_width
@@ -65,7 +65,6 @@ class Found:
     joints: tuple[int, ...] = ()  # by whose rows it is judged
     alike: tuple[Name, ...] = ()  # what else explains much of the same misfit, though not as well
     instead: tuple[Rival, ...] = ()  # of the `ambiguous` those that were fitted in its place
-    doubtful: bool = False  # whether it came in for a law at its place whose sign physics forbids
 
 
 class Search(NamedTuple):
@@ -254,7 +253,7 @@ def _best(problem: Problem, step: Step, contenders: list[Contender], before: lis
     for one in passing:
         instead = simpler(step, passing, one)
         if not instead:
-            return possible(step, passing, one)
+            return one
         if type(one.effect).resembles:
             return instead[0]
     return None
@@ -281,13 +280,8 @@ def _found(
         ambiguous=open_to,
         joints=best.joints,
         alike=tuple(c.name for c in alike if step.verdicts.cost - c.verdicts.cost > SHARE_ALIKE * drop),
-        doubtful=any(c.name.at == best.name.at and _better_if_possible(c, best) for c in alike),
         instead=tuple(Rival(c.name, c.effect, c.joints) for c in alike if c.name in open_to),
     )
-
-
-def _better_if_possible(other: Contender, best: Contender) -> bool:
-    return not physical_sign(other.effect) and other.verdicts.heldout < best.verdicts.heldout
 
 
 def eliminate(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> list[Found]:

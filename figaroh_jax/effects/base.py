@@ -431,6 +431,11 @@ def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **par
     >>> float(friction.damping)
     1.5
     """
+    if not (isinstance(effect, type) and issubclass(effect, Effect)):
+        told = f"'{effect}'" if isinstance(effect, str) else f"a {type(effect).__name__}"
+        raise InputError(
+            f"place takes an effect, then the model: fj.place(fj.CATALOGUE[name], model, at); got {told} first"
+        )
     wanted = {"joint": 1, "pair": 2, "link": 1, "robot": 0}[effect.acts_on]
     at = [at] if isinstance(at, str) else [*(at or ())]
     if len(at) != wanted:

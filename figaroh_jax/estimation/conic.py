@@ -110,8 +110,12 @@ def _check(status: str) -> None:
     if status in ("Solved", "AlmostSolved"):
         return
     if "PrimalInfeasible" in status:
-        raise InputError("no parameters satisfy all constraints together: bounds, equalities and bodies contradict")
-    raise NotConverged(f"the constrained fit did not converge (Clarabel: {status}); there may be hardly any motion")
+        raise InputError(
+            "no parameters satisfy all constraints together: bounds, equalities and consistency contradict"
+        )
+    raise NotConverged(
+        f"the constrained fit did not converge (Clarabel: {status}); the recordings may contain hardly any motion"
+    )
 
 
 def _scale(factor: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " columns"]:

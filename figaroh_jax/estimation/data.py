@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int, Shaped
+from jaxtyping import Array, Float, Shaped
 
 from ..compiled.precision import in_float64
 from ..effects.extended import ExtendedModel, changed_robot, extend, opened, read_position, read_sensors
@@ -70,8 +70,9 @@ class TorqueData(eqx.Module):
     torque: Float[Leaf, "n M nv"]  # rows of the measured torque, N m or N
     weight: Float[Leaf, "n M nv"]  # 1 / sigma; 0: not measured, gated, padding
     dt: Float[Leaf, ""] | float  # s
-    source: Int[Leaf, "n L"] | None = None  # sample at each place of the extended record; None: samples are rows
-    kept: Int[Leaf, "n M"] | None = None  # place of each row
+    # whole numbers as floats: `jax.grad` by the data takes no others
+    source: Float[Leaf, "n L"] | None = None  # sample at each place of the extended record; None: samples are rows
+    kept: Float[Leaf, "n M"] | None = None  # place of each row
     response: Shaped[Leaf, " F"] | None = None  # of the row filter
     carried: Float[Leaf, "n links 10"] | None = None  # known payloads
     together: int = eqx.field(static=True, default=0)  # rows of a block, half a second or more; 0: a recording is one
@@ -97,7 +98,8 @@ class TorqueData(eqx.Module):
         return read_sensors(model, time, q, v, a, jnp.asarray(self.dt))
 
     def _rows(self, torque: Array, source: Array, kept: Array) -> Array:
-        return jnp.asarray(filtered(torque.T, source, kept, jnp.asarray(self.response))).T
+        places = source.astype(int), kept.astype(int)
+        return jnp.asarray(filtered(torque.T, *places, jnp.asarray(self.response))).T
 
 
 def _traceable(x: Any) -> Any:
@@ -236,8 +238,8 @@ def torque_data(
         np.swapaxes(np.stack(rows), 1, 2),
         np.asarray(records.weight) / np.asarray(noise),
         np.float64(records.dt),
-        records.source,
-        records.kept,
+        np.asarray(records.source, float),
+        np.asarray(records.kept, float),
         np.asarray(records.low_pass),
         records.carried,
         max(1, round(float(records.rate) * max(BLOCK, BLOCK_PERIODS / float(records.cutoff)))),
@@ -289,7 +291,9 @@ def as_data(model: ExtendedModel, data: Any) -> tuple[Data, ...]:
     if isinstance(data, Data):
         return (data,)
     if not isinstance(data, Sequence) or not len(data):
-        raise InputError(f"data is {type(data).__name__}: recordings, postures, or what has a method `residual(model)`")
+        raise InputError(
+            f"data is {type(data).__name__}: expected recordings, postures or an object with a method `residual(model)`"
+        )
     for kind, make in ((Recording, torque_data), (PoseRecording, pose_data)):
         if all(isinstance(one, kind) for one in data):
             made = make(model, data)

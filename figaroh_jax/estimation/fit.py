@@ -206,7 +206,9 @@ def _precision(free: Free, model: ExtendedModel, prior: Mapping[str, Any]) -> Fl
             out.append(np.zeros(len(part.index)))
         elif kind == "inertia" and np.ndim(sigma) == 0:
             if traced(model.robot.inertia):
-                raise InputError("prior: a relative sigma of `inertia` needs a model that no transformation holds")
+                raise InputError(
+                    "prior: a relative sigma of `inertia` needs a model that is not traced by jit, grad or vmap"
+                )
             out.append(rigid_prior(model.robot, float(sigma))[1][np.array(part.index)])
         else:
             whole = np.broadcast_to(np.asarray(sigma, float), part.shape).reshape(-1)
@@ -273,7 +275,7 @@ def _limits(free: Free, bounds: Mapping[str, tuple[float, float]]) -> tuple[np.n
         if not mine.any():
             raise InputError(f"bounds: nothing free is called '{key}'; free are {', '.join(free.names[:12])}")
         if not low <= 0.0 <= high:
-            raise InputError(f"bounds: '{key}' {low, high} does not hold 0, the model that is given")
+            raise InputError(f"bounds: '{key}' {low, high} excludes 0, the given model")
         lower[mine], upper[mine] = low, high
     return lower / free.sizes, upper / free.sizes
 

@@ -119,7 +119,7 @@ def learn(
         scale = np.full(robot.nv, np.inf)
         scale[rows] = list(measured.values())
         if not (scale[rows] > 0).all():
-            raise InputError("measured: one sigma of each joint is above zero")
+            raise InputError("measured: each joint needs one sigma above zero")
     prior = np.zeros((base.rank, base.rank))
     if trust is not None:
         precision = np.append(rigid_prior(robot, trust)[1], np.full(len(names) - own, UNKNOWN_DRIVE))

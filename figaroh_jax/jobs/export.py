@@ -46,7 +46,7 @@ def _write_files(out: Path, files: Mapping[str, str]) -> None:
         path = out / name
         with refusals(out):
             if os.path.lexists(path) and not (path.is_file() and path.read_bytes() == text.encode()):
-                raise InputError(f"--out {out}: {name} is there and says something else; name another folder")
+                raise InputError(f"--out {out}: {name} exists with other content; name another folder")
     with refusals(out):
         out.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():

@@ -147,7 +147,7 @@ def _unit_without_joint(look: Look) -> Iterator[Finding]:
         yield Finding(
             False,
             f"units: {{position: deg}}, but no joint moves by more than {look.span[~straight].max() / DEGREE:.3g}"
-            " degrees: it looks like rad; leave units: {position: deg} out",
+            " degrees: it looks like rad; leave out units: {position: deg}",
         )
 
 

@@ -131,7 +131,7 @@ def write_file(path: Path, text: str, option: str, own: str | None = None) -> No
             raise InputError(f"{shown}: is there and was not written by this command; name another file")
         _whole_file(place, data, replace=there)
     except FileExistsError:
-        raise InputError(f"{shown}: was made by somebody else meanwhile; name another file") from None
+        raise InputError(f"{shown}: was created by another program meanwhile; name another file") from None
     except (OSError, RuntimeError) as error:
         said = _reason(error) if isinstance(error, OSError) else "its links form a loop"
         raise InputError(f"{shown}: {said}") from error

@@ -106,7 +106,7 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
     p_value = 1.0 if not np.isfinite(first.cost) else float(max(ndtr(-4 * begin.excess.max()), 1e-12))
     while np.isfinite(first.cost):
         number = len(steps)
-        progress(f"looking for causes, round {number}", min(0.1 + 0.12 * number, 0.9))
+        progress(f"searching for causes, round {number}", min(0.1 + 0.12 * number, 0.9))
         new, now, nearest = _round(here, now, found, forbid, nearest, known)
         found = [n for n in found if not any(_replaced(n, one) for one in new)] + new
         if not new:
@@ -130,7 +130,7 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
         held = [_rms(here, begin.held), *held[1:-1], *([_rms(here, now.held)] if found else [])]
     if even:
         now = _alike_by_recording(here, now)
-        steps.append(("recordings that tell alike", _level(here, now.model.fit)))
+        steps.append(("recordings that are equally informative", _level(here, now.model.fit)))
     result = Search(
         "nothing", found, now.model.structure, first, now.model.fit, p_value, [], nearest, steps, held, fits,
         begin.model.structure, here, wrong,
@@ -211,7 +211,7 @@ def _judged(here: Setting, result: Search, now: Standing, slight: _Slight | None
     """
     found = result.named
     if slight is not None:
-        one, why = slight.cause.candidate, "too little beside what others explain: their law may be off by as much"
+        one, why = slight.cause.candidate, "too little beside what others explain: their laws may be off by as much"
         result.verdict, result.beside = "named+rest", slight.fit
         result.nearest = [(Name(one.effect, one.at), max(slight.cause.gain, 0.0), why)]
         return result
@@ -299,7 +299,7 @@ def _round(
     if not kept:
         nearest = [
             (Name(one.candidate.effect, one.candidate.at), max(float((total - one.sse.sum()) / total), 0.0),
-             "gains too little on data that it was not fitted to")
+             "improves held-out data too little")
             for one in close
         ]  # fmt: skip
     return kept, now, nearest

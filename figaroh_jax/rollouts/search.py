@@ -160,7 +160,7 @@ def _searched(
     stood, found, p_value, steps, nearest = [now], [], 1.0, [("baseline", level_of(first, weight))], []
     most = _MOST if by_recording(here) else _MOST_ONE
     while len(found) < most:
-        progress(f"looking for cause {len(found) + 1}", min(0.2 + 0.15 * len(found), 0.9))
+        progress(f"searching for cause {len(found) + 1}", min(0.2 + 0.15 * len(found), 0.9))
         tried = _tried(here, now, [n.candidate for n in found], forbid)
         best, p = _best(here, now, tried, nearest)
         p_value = p if not found else p_value
@@ -389,7 +389,7 @@ def _best(
     worth = [GAIN_BESIDE_REST if r and not t.candidate.kind.usual else GAIN for r, t in zip(beside, tried, strict=True)]
     passing = [k for k in range(len(tried)) if gains[k] > worth[k] and ts[k] > needs[k] and sized(here, tried[k])]
     for k in np.argsort(gains)[::-1][:3]:
-        why = "no better than another" if k in passing else "gains too little on data that it was not fitted to"
+        why = "no better than another" if k in passing else "improves held-out data too little"
         nearest.append((Name(tried[k].candidate.effect, tried[k].candidate.at), float(max(gains[k], 0.0)), why))
     if not passing:
         return None, p

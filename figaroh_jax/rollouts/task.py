@@ -246,7 +246,7 @@ def diverged(here: Setting, first: Fit) -> str:
         stamp = run.time[min(row, len(run.time) - 1)]
         place = f" at joint {joint}, in row {row} (from 0, {stamp:.4g} s) of {run.name}"
     return (
-        f"the simulation diverges{place} with the model's own gains: they contradict its inertia and time step; check"
+        f"the simulation diverges{place} with the model's own gains: they do not suit its inertia and time step; check"
         " kp, kd (their units and signs) and armature"
     )
 
