@@ -56,7 +56,7 @@ def test_residual_is_the_low_passed_torque_of_the_model_less_the_measured(robot:
     rows = np.asarray(fj.residual(model, data)).reshape(-1, 4)
     torque = np.asarray(model.inverse_dynamics(data.position[0], data.velocity[0], data.acceleration[0]))
     assert data.source is not None and data.kept is not None
-    inside = np.asarray(data.source[0])[np.asarray(data.kept[0])]
+    inside = np.asarray(data.source[0], int)[np.asarray(data.kept[0], int)]
     # a smooth motion far below the cutoff passes the filter as it is
     expected = (torque[inside] - np.cos(data.position[0])[inside]) / np.array([1.0, 2.0, 3.0, 4.0])
     np.testing.assert_allclose(rows[4:-4], expected[4:-4], rtol=0, atol=2e-3 * np.abs(expected).max())

@@ -252,7 +252,8 @@ def _rows(model: ExtendedModel, data: TorqueData) -> tuple[Array, Array, Array]:
     X = jnp.stack([_columns(model, terms, data, k) for k in range(n)])
     if data.source is not None and data.kept is not None:
         assert data.response is not None
-        rows = [filtered(jnp.moveaxis(X[k], 0, -1), data.source[k], data.kept[k], data.response) for k in range(n)]
+        source, kept = data.source.astype(int), data.kept.astype(int)
+        rows = [filtered(jnp.moveaxis(X[k], 0, -1), source[k], kept[k], data.response) for k in range(n)]
         X = jnp.stack([jnp.moveaxis(jnp.asarray(one), -1, 0) for one in rows])
     y = jnp.asarray(data.torque)
     if data.carried is not None:
