@@ -35,7 +35,6 @@ PANEL = 16  # columns that a QR factorisation takes together
 AT_ONCE = 512  # samples of a product on a CPU, by machine code
 TOGETHER = 1024  # samples of a product on a GPU
 WORTH_WRITING = 1 << 16  # samples from which rows of a large tree are written out by kernels of their own
-TUNING = 1  # of the products of a normal matrix; those of a factor wait for triangular solves
 DEVICE_BYTES = 2e9  # of the blocks of a chunk on a GPU
 
 
@@ -311,7 +310,7 @@ def _kept_sums(add: Add, kept: Kept | None, codes: bytes, chunk: int) -> Program
         return _sums_of_rows(add, kept, codes, chunk, model, start, *arrays)
 
     key = f"{add.__name__} {kept} {chunk} {codes.hex()}"
-    return Program(sums_of_rows, key=key, tuning=TUNING if add is _with_products else 0)
+    return Program(sums_of_rows, key=key, tuning=None if add is _with_products else 0)  # solves decide, not products
 
 
 def _sums_of_rows(

@@ -506,6 +506,10 @@ def _still_needed(
         new = _standing(here, now.model.structure, *_without(here, now, spare.candidate.entries))
         rest = [n for n in found if n.candidate is not spare.candidate]
         if not new.excess.max() < 1.0:
+            j = joint_of(here, spare.candidate)
+            mine = slice(None) if j < 0 else slice(j, j + 1)
+            if not _is_slight(begin.squares[..., mine], new.squares[..., mine], now.squares[..., mine]):
+                break  # needed, be it in a few places only
             (gone,) = (n for n in found if n.candidate is spare.candidate)
             return rest, new, _Slight(gone, now.model.fit)
         found, now = rest, new
