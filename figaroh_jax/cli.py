@@ -38,7 +38,7 @@ _TASKS = {  # commands that take a task file
     "excite": "design the most informative motion within limits",
 }
 _TRIM_THRESHOLD, _MMAP_MAX, _ARENA_MAX = -1, -4, -8  # of glibc's mallopt
-_NEW_OBJECTS = 1_000_000  # between two searches of Python for circles of objects that nobody holds
+_NEW_OBJECTS = 400_000  # between two searches of Python for circles of objects that nobody holds
 _READING = 0.03  # of a command's work, for the progress bar
 _OTHERS = ("verify", "compare", "list", "new", "migrate", "view")  # commands before and after a run
 _DESCRIPTION = "Name what a robot's simulation gets wrong, extend the model with it and measure the gain."
