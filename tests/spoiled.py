@@ -224,7 +224,7 @@ _CLOCK = r"clock looks wrong|right rate|1?\.?\d* Hz in place of"
 _DEG = r"\{position: deg"
 KINDS: dict[str, tuple[Spoil, str]] = {
     "degrees read as rad": (_with("q", np.rad2deg), _DEG),
-    "rad read as degrees": (_units(position="deg"), r"leave units|velocity.*degrees|in rad"),
+    "rad read as degrees": (_units(position="deg"), r"leave out units|velocity.*degrees|in rad"),
     "mm on a revolute arm": (_units(position="mm"), r"every joint of the robot turns"),
     "torque columns swapped": (_swapped("tau"), r"torque columns stand in another order"),
     "position columns swapped": (_swapped("q"), r"position.*swapped|velocity of .* does not follow|limits"),
