@@ -82,7 +82,7 @@ def slopes(
         return jnp.concatenate([jnp.sum(B * x[:, None, :3], 2), -2 * cross(momentum, x[:, :3])], 1)
 
     def matrix(lower: Array, upper: Array) -> Array:
-        found = below[..., None] * lower + above.T[..., None] * upper
+        found = jnp.asarray(below)[..., None] * lower + jnp.asarray(above.T)[..., None] * upper
         return found[np.argsort(column)][:, np.argsort(column)]
 
     def rigid(one: Array) -> Array:
