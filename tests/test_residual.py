@@ -206,7 +206,8 @@ def test_a_recording_whose_samples_single_precision_cannot_count_is_refused(
     robot: fj.RobotModel, monkeypatch: pytest.MonkeyPatch
 ):
     """The places of rows are floats: above 2^24 two of them would be one without x64."""
-    assert PLACES + 1 != np.float32(PLACES + 1) and np.float32(PLACES - 1) != np.float32(PLACES)
+    first, last = (float(np.float32(PLACES + k)) for k in (-1, 1))
+    assert first == PLACES - 1 and last != PLACES + 1
     monkeypatch.setattr("figaroh_jax.estimation.data.PLACES", 400)
     with pytest.raises(fj.InputError, match="more than 400 cannot be counted .* split it into shorter"):
         fj.torque_data(robot, run())
