@@ -267,6 +267,7 @@ class Effect(eqx.Module):
     excludes: ClassVar[tuple[str, ...]] = ()  # not looked for any more once this one has been accepted
     # what physics asks of it; for a single parameter see the bounds of `amplitude` and `shape`
     dissipative: ClassVar[bool] = False  # whether amplitudes below zero would feed energy to the robot
+    rubs: ClassVar[bool] = False  # whether it is friction though not `dissipative`, a correction of another law say
     speed_law: ClassVar[bool] = False  # whether it is a law of dry friction over the speed, one of several alike
     beside_rest: ClassVar[bool] = True  # whether it can be told from a rest that stays; no law of what any rest does
     fades: ClassVar[bool] = False  # whether it goes by the time since the start: another recording has it no more
