@@ -107,7 +107,7 @@ def without_spikes(
     return replace(
         recording,
         trusted=trusted,
-        notes=(*recording.notes, f"{note} lies beyond {cut:g} robust standard deviations and is left out"),
+        notes=(*recording.notes, f"{note} is beyond {cut:g} robust standard deviations and is left out"),
     )
 
 
@@ -124,7 +124,9 @@ def without_untrusted(recording: Recording) -> tuple[Recording, list[Float[np.nd
         raise InputError(f"{recording.file}: `trusted` has shape {trusted.shape}, but torque {torque.shape}")
     if not trusted.any(axis=0).all():
         name = recording.joints[int(np.argmin(trusted.any(axis=0)))]
-        raise InputError(f"{recording.file}: no torque of {name} is trusted; leave it out by identify.joints instead")
+        raise InputError(
+            f"{recording.file}: no torque of {name} is trusted; leave the joint out with identify.joints instead"
+        )
     columns = [
         np.interp(recording.time, recording.time[good], x[good]) for x, good in zip(torque.T, trusted.T, strict=True)
     ]
