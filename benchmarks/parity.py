@@ -339,7 +339,7 @@ def _errors_of_links(links: list[list[float]], answers: list[dict[str, Any]]) ->
     true = {f"{name}{k}": x for k, ten in enumerate(links, 1) for name, x in zip(names, ten, strict=True)}
     both = [{p["expression"]: p for p in a["base_parameters"] if p["status"] == "identified"} for a in answers]
     for text in both[0].keys() & both[1].keys():
-        terms = re.findall(r"([+-]?) ?([\d.e-]+ )?([A-Za-z_.]+\d[\w]*)", text)
+        terms = re.findall(r"([+-]?) ?(\d[\d.e-]* )?([A-Za-z_.]+\d[\w]*)", text)
         if all(name in true for _, _, name in terms):
             value = sum((-1 if sign == "-" else 1) * float(factor or 1) * true[name] for sign, factor, name in terms)
             yield [(abs(own[text]["value"] - value), own[text]["std"]) for own in both]
