@@ -16,7 +16,7 @@ from .thresholds import SAME_MOTION
 __all__ = ["checked_repeats", "describe_folds", "held_rows", "layout"]
 
 BLOCK, SHORT_BLOCK, SHORT = 1.0, 0.3, 9.99  # s: of a block, of a block in recordings shorter than the third
-FOLDS, SLICE = 5, 2.0  # where the excitations are few: folds, and seconds that one takes in turn
+FOLDS, SLICE = 5, 1.0  # where the excitations are few: folds, and seconds that one takes in turn
 QUARTERS = 4
 SLICED, QUARTERED = True, False
 FEWEST_EXCITATIONS = 3
