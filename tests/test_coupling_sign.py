@@ -32,7 +32,8 @@ def test_of_two_mirrored_signs_the_one_with_positive_parts_comes_first(sign: flo
     a, v, turns, across = rng.standard_normal((4, 2, ROWS))
     grid = [np.stack([s * a, s * v, x]) for s, x in ((1.0, turns), (-1.0, across))]
     own = grid[0 if sign > 0 else 1]
-    y = np.tensordot([0.5, 0.8, 0.3], own, 1) - 0.4 * grid[1 if sign > 0 else 0][2] + 0.1 * rng.standard_normal((2, ROWS))
+    noise = 0.1 * rng.standard_normal((2, ROWS))
+    y = np.tensordot([0.5, 0.8, 0.3], own, 1) - 0.4 * grid[1 if sign > 0 else 0][2] + noise
     rows = _rows(y)
     X = np.zeros((2, ROWS, 1))
     X[:, :, 0] = 1.0

@@ -159,8 +159,8 @@ def _exact_columns(
 def _as_one_rotor(step: Step, base: Ground, group: Group, order: np.ndarray) -> np.ndarray:
     """The grid points of a coupling, first that which explains most with no part below zero.
 
-    One rotor that turns the sum of two joints, or their difference, has inertia, damping and friction of that sign. Of
-    the inertia and the damping the two signs are mirror images, so that the free fit of the wrong one may be the better.
+    One rotor that turns the sum of two joints, or their difference, has inertia, damping and friction of that sign.
+    Inertia and damping of the two signs are mirror images, so that a free fit of the wrong one may be the better.
     """
     joints, gains = group.columns.joints, []
     for point in order:

@@ -58,7 +58,17 @@ from .search import Begun, Found, Search, chance_beside, eliminate, find_causes,
 from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import Step, stand, with_causes
-from .thresholds import ALL_BUT, ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, NO_REST, REST_P, STANDSTILL, WEIGHT_ROUNDS, WHITE_GAIN
+from .thresholds import (
+    ALL_BUT,
+    ALPHA_OF_A_NAME,
+    FEW_CAUSES,
+    FOR_SURE,
+    NO_REST,
+    REST_P,
+    STANDSTILL,
+    WEIGHT_ROUNDS,
+    WHITE_GAIN,
+)
 from .weights import relative_speed, weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
