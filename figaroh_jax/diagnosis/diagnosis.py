@@ -38,7 +38,7 @@ from .floor import noise_floor, noise_rms
 from .gaining import Fall, Gaining, beside_all, predicts_all_better, predicts_better, without_losses
 from .gates import physical_sign
 from .holdout import fold_squares, part_error, residual_rms, traces
-from .joint import Joint, opened, polished, sized, with_misfit, with_parts
+from .joint import Joint, least_sure, opened, polished, sized, with_misfit, with_parts
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import beside_rest, beyond_simpler, reason_against, standings
 from .problem import Problem
@@ -46,6 +46,7 @@ from .rest import (
     Significance,
     excess,
     lines,
+    more_than_noise,
     parts_of,
     predictable,
     relative_rest,
@@ -377,23 +378,15 @@ def _judged(
     asked = (tolerance, certain, fading)
     against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
     named = [f for f in found if not against[f.name]]
-    same = before.problem is here.problem
-    here, joint, by_speed = _as_predicts_best([here] if same else [here, before], named)
-    count = len(named)
-    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, borne_out)
-    gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
+    settings = [here] if before.problem is here.problem else [here, before]
+    here, gaining, by_speed, reasons = _answered(searched, settings, named, borne_out, forbid)
     named, joint, problem = gaining.named, gaining.joint, here.problem
-    if named:
-        gaining = gaining._replace(joint=_as_weighed_otherwise(here, searched.here.problem, joint))
-    against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
+    against |= reasons
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
     shown = left.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
-    sticks = shown and (
-        _sticks(here, joint, tolerance)
-        or _sticks(seen := searched.here, by_speed if count == len(named) else _together(seen, named), tolerance)
-    )
+    sticks = shown and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
     rest = shown and not sticks
     text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
     told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
@@ -402,6 +395,40 @@ def _judged(
     quiet = not rest and not named and searched.search.p_value < alpha
     why = tolerated(float(relative.max()), tolerance, sticks) if quiet else ""
     return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text, why), sticks, here)
+
+
+def _answered(
+    searched: _Searched,
+    settings: Sequence[_Setting],
+    named: list[Found],
+    borne_out: Callable[[Name], bool],
+    forbid: Sequence[str],
+) -> tuple[_Setting, Gaining, Joint, dict[Name, str]]:
+    """The causes that lower the error on data held out and whose size the answer's own intervals tell from zero.
+
+    With the setting of the answer's fit, their fit with the weights that found them, and why the others went.
+    """
+    against: dict[Name, str] = {}
+    while True:
+        here, joint, by_speed = _as_predicts_best(settings, named)
+        count = len(named)
+        gaining = without_losses(here.problem, here.start, here.whitening, named, joint, searched.strict, borne_out)
+        against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
+        named = gaining.named
+        if named:
+            gaining = gaining._replace(joint=_as_weighed_otherwise(here, searched.here.problem, gaining.joint))
+        least = least_sure(named, gaining.joint)
+        if least is None:
+            by_speed = by_speed if count == len(named) else _together(searched.here, named)
+            return here, gaining._replace(named=opened(named, gaining.joint, forbid)), by_speed, against
+        against[named[least].name] = f"its size is not surely above zero: {_told_size(gaining.joint, least, here)}"
+        named = [f for f in named if f is not named[least]]
+
+
+def _told_size(joint: Joint, which: int, here: _Setting) -> str:
+    """A cause's parameters with their deviations, in words."""
+    each = estimates(joint.causes[which], joint.fitted, joint.fitted.places[which], here.problem.model)
+    return ", ".join(f"{name} {e.value:.3g} +- {1.96 * e.std:.2g} {e.unit}".rstrip() for name, e in each.items())
 
 
 def _sticks(here: _Setting, joint: Joint, tolerance: float) -> bool:
@@ -488,7 +515,10 @@ def _left(
     joints, tolerable = problem.model.joint_names, size <= tolerance
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
-    return left._replace(there=left.there or (wrong and not tolerable)), p_left, now[0], line, flexible[2]
+    there = left.there or (wrong and not tolerable)
+    if not there and not tolerable:
+        there = more_than_noise(problem, joint.step.linear.residual, spectrum, whitening, generator) < REST_P
+    return left._replace(there=there), p_left, now[0], line, flexible[2]
 
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:
