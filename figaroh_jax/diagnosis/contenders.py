@@ -162,20 +162,21 @@ def _as_one_rotor(step: Step, base: Ground, group: Group, order: np.ndarray) -> 
     One rotor that turns the sum of two joints, or their difference, has inertia, damping and friction of that sign.
     Inertia and damping of the two signs are mirror images, so that a free fit of the wrong one may be the better.
     """
-    joints, gains = group.columns.joints, []
+    rows, joints, gains = step.rows, list(group.columns.joints), []
     for point in order:
         Z = group.columns.Z[point]
-        full = np.zeros((*step.rows.y.shape, len(Z)))
-        full[list(joints)] = np.moveaxis(Z, 0, 2)
-        free = judge_grown(step.rows, base, joints, Z).theta[-len(Z) :]
-        gains.append(_drop_of_none_below_zero(_information(step.rows, base, full), free))
+        cross = np.sum(
+            [rows.X[joint].T @ own.T for joint, own in zip(joints, np.swapaxes(Z, 0, 1), strict=True)], axis=0
+        )
+        G = np.tensordot(Z, Z, ((1, 2), (1, 2))) - cross.T @ base.inverse[-1] @ cross
+        gains.append(_drop_of_none_below_zero(G, np.tensordot(Z, base.verdicts.residual[joints], 2)))
     return order[np.argsort(-np.array(gains), kind="stable")]
 
 
-def _drop_of_none_below_zero(G: Float[np.ndarray, "k k"], free: Float[np.ndarray, " k"]) -> float:
-    """Squares that k columns explain with coefficients of zero or more: G is their precision, `free` their free fit."""
-    pull, best = G @ free, 0.0
-    for some in product((False, True), repeat=len(free)):
+def _drop_of_none_below_zero(G: Float[np.ndarray, "k k"], pull: Float[np.ndarray, " k"]) -> float:
+    """Squares that k columns explain with coefficients of zero or more: the least of x'Gx - 2 pull'x, negative."""
+    best = 0.0
+    for some in product((False, True), repeat=len(pull)):
         at = np.flatnonzero(some)
         own = np.linalg.lstsq(G[np.ix_(at, at)], pull[at], rcond=None)[0] if len(at) else np.zeros(0)
         if (own >= 0).all():
