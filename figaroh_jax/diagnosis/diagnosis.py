@@ -409,9 +409,9 @@ def _answered(
     With the setting of the answer's fit, their fit with the weights that found them, and why the others went.
     """
     against: dict[Name, str] = {}
+    here, joint, by_speed = _as_predicts_best(settings, named)
+    first = named
     while True:
-        here, joint, by_speed = _as_predicts_best(settings, named)
-        count = len(named)
         gaining = without_losses(here.problem, here.start, here.whitening, named, joint, searched.strict, borne_out)
         against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
         named = gaining.named
@@ -419,10 +419,11 @@ def _answered(
             gaining = gaining._replace(joint=_as_weighed_otherwise(here, searched.here.problem, gaining.joint))
         least = least_sure(named, gaining.joint)
         if least is None:
-            by_speed = by_speed if count == len(named) else _together(searched.here, named)
+            by_speed = by_speed if len(first) == len(named) else _together(searched.here, named)
             return here, gaining._replace(named=opened(named, gaining.joint, forbid)), by_speed, against
         against[named[least].name] = f"its size is not surely above zero: {_told_size(gaining.joint, least, here)}"
         named = [f for f in named if f is not named[least]]
+        joint = _together(here, named)
 
 
 def _told_size(joint: Joint, which: int, here: _Setting) -> str:
@@ -464,9 +465,9 @@ def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple
         residual = residual_rms(best.problem, joint.step.state)
         level = np.broadcast_to(1 / np.maximum(residual, 1e-12 * residual.max()), best.whitening.shape)
         white = best._replace(whitening=level, white=True)
-        tried.append((white, _together(white, named)))
-        if part_error(white.problem, tried[-1][1].step) < (1 - WHITE_GAIN) * min(errors):
-            best, joint = tried[-1]
+        step = stand(white.problem, joint.step.state, level)  # the laws' shapes as they are
+        if part_error(white.problem, step) < (1 - WHITE_GAIN) * min(errors):
+            best, joint = white, _together(white, named)
     for one, other in tried if best.problem.held.any() else ():
         if predicts_all_better(best.problem, joint.step, other.step):
             best, joint = one, other
