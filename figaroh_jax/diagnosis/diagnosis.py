@@ -55,7 +55,7 @@ from .rest import (
     verdict,
     wrong_law,
 )
-from .search import Begun, Found, Search, chance_beside, eliminate, find_causes, judged_without
+from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without
 from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import Step, stand, with_causes
@@ -310,8 +310,7 @@ def _told_apart(here: _Setting, found: list[Found], joint: Joint) -> tuple[list[
             effects = [other.effect if at == k else effect for at, effect in enumerate(joint.causes)]
             full = with_causes(problem, start, effects, whitening)
             if predicts_better(problem, joint.step, full, sorted({*one.joints} & {*other.joints})):
-                known = tuple(n for n in (one.name, *one.ambiguous) if n != other.name)
-                own = replace(one, name=other.name, effect=other.effect, joints=other.joints, ambiguous=known)
+                own = one.as_another(other, (one.name, *one.ambiguous))
                 found = [own if f is found[k] else f for f in found]
                 joint = polished(problem, start, [f.effect for f in found], whitening)
     return found, joint
@@ -326,8 +325,7 @@ def _possible(found: list[Found], joint: Joint) -> list[Found]:
     for one, effect in zip(found, joint.causes, strict=True):
         there = [o for o in one.instead if o.name.at == one.name.at and physical_sign(o.effect)]
         if there and not physical_sign(effect):
-            known = tuple(n for n in one.ambiguous if n != there[0].name)
-            one = replace(one, name=there[0].name, effect=there[0].effect, joints=there[0].joints, ambiguous=known)
+            one = one.as_another(there[0], one.ambiguous)
         out.append(one)
     return out
 
@@ -338,10 +336,10 @@ def _simple(here: _Setting, found: list[Found], joint: Joint, forbid: Sequence[s
     for one, effect, at in zip(found, joint.causes, amplitude_places(state, joint.causes, problem.model), strict=True):
         inside = next((n for n in type(effect).contains if n not in forbid), None)
         if inside and beyond_simpler(problem, state, effect, at) < tolerance:
-            place_of = one.name.at
-            alike = tuple(Name(n, place_of) for n in related(inside, "indistinguishable_from") if n not in forbid)
-            simpler = place(find(inside), problem.model, place_of)
-            one = replace(one, name=Name(inside, place_of), effect=simpler, ambiguous=alike)
+            where = one.name.at
+            alike = [Name(n, where) for n in related(inside, "indistinguishable_from") if n not in forbid]
+            simpler = Rival(Name(inside, where), place(find(inside), problem.model, where), one.joints)
+            one = one.as_another(simpler, alike)
         out.append(one)
     return out
 
