@@ -395,7 +395,8 @@ class _Lanes:
     Triton spends its time on how each access goes with every other operation that it can reach from there, cubic in
     their number. So in a long kernel accesses stand in loops of one round (`once`, unknown to the compiler), through
     which it does not look: what goes in is written, what comes out is read. Nor does a constant stand in them: there is
-    one of each in a kernel, and from it all is reached that uses the same. So places go in, too, and change in a round.
+    one of each in a kernel, and from it all is reached that uses the same. So places go in, too, and are doubled in a
+    round, for what stays as it is would be taken out.
     """
 
     def __init__(self, triton: Any, layout: _Layout, columns: Columns, once: Any) -> None:
@@ -430,7 +431,7 @@ class _Lanes:
         def put(there: list[Any], mask: Array | None, values: list[Array]) -> list[Array]:
             for x, value in zip(there, values, strict=True):
                 self.triton.store(x, value, mask=mask)
-            return _changed(values)
+            return [*values[1:], -values[0]]  # others, or the loop would be seen through
 
         places, numbers = zip(*entries, strict=True)
         self._apart([self.layout.write(x) for x in places], put, [_in_lanes(x, self.dtype) for x in numbers])
@@ -453,12 +454,13 @@ class _Lanes:
                 if flat and x.first != last[x.kind]:
                     at[x.kind], last[x.kind] = at[x.kind] + known[x.first - last[x.kind]], x.first
                 there.append(x.ref.at[at[x.kind] if flat else x.at(index)])
-            return rounds + 1, index + 1, [x + 1 for x in begin], _changed(given), access(there, mask, values)
+            rounds, index, begin, given = jax.tree.map(lambda x: x + x, (rounds, index, begin, given))
+            return rounds, index, begin, given, access(there, mask, values)
 
         begin, given = [self._first(x) for x in first.values()], [jnp.int32(n) for n in numbers]
-        # twice: a plain count would become a loop through which the compiler does look
-        carry = (jnp.int32(0), self.index, begin, given, start)
-        return lax.while_loop(lambda carry: carry[0] * 2 < self.once, step, carry)[4]
+        # by doubling: a plain count would become a loop through which the compiler does look
+        carry = (jnp.int32(1), self.index, begin, given, start)
+        return lax.while_loop(lambda carry: carry[0] < 2 * self.once, step, carry)[4]
 
     def _first(self, place: _Place) -> Int[Array, " lanes"]:
         """Where the samples of this block find a number."""
@@ -477,11 +479,6 @@ def _steps(places: Sequence[_Place]) -> Iterable[int]:
         if x.first != last.get(x.kind, x.first):
             yield x.first - last[x.kind]
         last[x.kind] = x.first
-
-
-def _changed(values: list[Array]) -> list[Array]:
-    """Others, or a loop of one round would be seen through."""
-    return [*values[1:], -values[0]] if values else []
 
 
 def _in_lanes(number: Number, dtype: Any) -> Array:
