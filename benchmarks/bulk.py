@@ -54,8 +54,8 @@ def studies(seed: int) -> list[Study]:
         for r in REAL
     ]
     made = {
-        "closed_loop": ("closed_loop", 40, (), _due_closed_loop, 8),
-        "inverse_hidden": ("inverse", 0, ("0.05-", "0.15-", "0.02-"), _due_inverse, 5),
+        "closed_loop": ("closed_loop", 40, (), _due_closed_loop, 3),
+        "inverse_hidden": ("inverse", 0, ("0.05-", "0.15-", "0.02-"), _due_inverse, 3),
         **{f"inverse_clean_{k}": ("inverse", 50, ("/clean",), _due_inverse, 2) for k in range(4)},
         "kinematic": ("kinematic", 60, (), _due_kinematic, 2),
     }
@@ -81,18 +81,18 @@ def _due_real(case: dict[str, Any], forbidden: bool) -> float | None:
         return None
     if not forbidden:
         return heavy
-    return 2.0 + heavy if case["size"] > 0.15 else 3.0 + heavy
+    return 0.5 + heavy if case["size"] > 0.15 else 0.7 + heavy
 
 
 def _due_closed_loop(case: dict[str, Any], forbidden: bool) -> float | None:
     if not case["truth"]:
-        return None if forbidden else 1.0
-    return 8.0 if forbidden else 1.1
+        return None if forbidden else 1.1
+    return 1.2 if forbidden else 1.0
 
 
 def _due_inverse(case: dict[str, Any], forbidden: bool) -> float | None:
     if case["family"] == "clean":
-        return None if forbidden else 4.0
+        return None if forbidden else 5.0
     if 0.03 < case["size"] < 0.1:
         return None if forbidden else 3.8
     if forbidden:  # of the large ones: whether they are told apart from what is left of the catalogue

@@ -8,8 +8,8 @@
 `make` writes folders that hold everything: twelve public sets ($FIGAROH_JAX_DATA: seven of torque, five of postures),
 four identifications, 64 hidden effects (`hidden_effects.py`: sixteen effects, TX40 with the first seed and Panda with
 the second, with and without repeats), and 18 made identifications that are judged on recordings kept out. `run` starts
-a process for each case and version and goes on where it was stopped. `table` prints what differs, and of what is hidden
-who finds it.
+a process for each case and version and goes on where it was stopped. `table` prints what differs, of what is hidden who
+finds it, and whose sizes lie nearer to the truth.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import io
 import json
 import multiprocessing
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -26,6 +27,8 @@ import sys
 import tarfile
 import tempfile
 import time
+import zlib
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
@@ -43,12 +46,12 @@ BYTES = (0, 8, 16, 24)
 DIFFERENCES = {"q": 3, "tau": 1}  # that leave the smallest numbers
 
 
-def make(folder: Path, seeds: list[int]) -> None:
+def make(folder: Path, seeds: list[int], jobs: int, only_made: bool) -> None:
     """Write all cases and `cases.json`."""
     sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(ROOT / "tests")]
     folder.mkdir(parents=True, exist_ok=True)
-    cases = [*_torques(folder), *_postures(folder), *_identifications(folder), *_hidden(folder, seeds)]
-    cases += _fresh(folder, seeds)
+    cases = [] if only_made else [*_torques(folder), *_postures(folder), *_identifications(folder)]
+    cases += [*_hidden(folder, seeds, jobs), *_fresh(folder, seeds)]
     (folder / "cases.json").write_text(json.dumps(cases, indent=1))
     print(f"{len(cases)} cases, {sum(f.stat().st_size for f in folder.rglob('*') if f.is_file()) / 1e6:.0f} MB")
 
@@ -113,12 +116,12 @@ def _identifications(folder: Path) -> Iterator[dict[str, Any]]:
         yield {"name": f"{name} identify", "task": f"{here.name}/task.yaml", "command": "identify"}
 
 
-def _hidden(folder: Path, seeds: list[int]) -> Iterator[dict[str, Any]]:
+def _hidden(folder: Path, seeds: list[int], jobs: int) -> Iterator[dict[str, Any]]:
     import hidden_effects
 
     effects = list(hidden_effects.EFFECTS[:16])  # those that the first version knew
     wishes = [(r, s, effect) for r, s in zip(("tx40", "panda"), seeds, strict=True) for effect in effects]
-    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
         for made in pool.map(_one_hidden, [folder] * len(wishes), *zip(*wishes, strict=True)):
             yield from made
 
@@ -137,7 +140,7 @@ def _one_hidden(folder: Path, robot: str, seed: int, effect: str) -> list[dict[s
         name = label.replace(" ", "_").replace("(", "").replace(")", "").replace(",", "")
         case.write(folder / name)
         _smaller(folder / name)
-        truth = [{"effect": one.effect, "at": list(one.at)} for one in case.truth]
+        truth = [{"effect": one.effect, "at": list(one.at), "parameters": one.parameters} for one in case.truth]
         made.append({"name": label, "task": f"{name}/task.yaml", "command": "diagnose", "truth": truth})
     return made
 
@@ -157,7 +160,7 @@ def _fresh(folder: Path, seeds: list[int]) -> Iterator[dict[str, Any]]:
             task["data"][-2:] = [one | {"role": "holdout"} for one in task["data"][-2:]]
             (folder / name / "task.yaml").write_text(json.dumps(task))
             title = f"fresh {robot} {k}{' '.join(name for name, _ in effects)} identify"
-            yield {"name": title, "task": f"{name}/task.yaml", "command": "identify"}
+            yield {"name": title, "task": f"{name}/task.yaml", "command": "identify", "links": case.links}
 
 
 def _smaller(folder: Path) -> None:
@@ -222,15 +225,27 @@ def unpack(file: Path, folder: Path) -> None:
             np.savez_compressed(one, **kept)
 
 
-def run(folder: Path, out: Path, sides: dict[str, Path], jobs: int, only: list[str]) -> None:
-    """Every case by every version, `jobs` processes at a time."""
-    cases = json.loads((folder / "cases.json").read_text())
-    wanted = [c for c in cases if not only or any(word in c["name"] for word in only)]
+def run(folder: Path, out: Path, sides: dict[str, Path], args: argparse.Namespace) -> None:
+    """Every case by every version, `jobs` processes at a time; none is begun after `limit` seconds."""
+    cases, begin = json.loads((folder / "cases.json").read_text()), time.monotonic()
+    wanted = [c for c in cases if not args.only or _has(c, args.only)]
+    wanted.sort(key=lambda c: (not _has(c, args.first), zlib.crc32(c["name"].encode())))  # a fair part, if cut
     todo = [(c, s) for c in wanted for s in sides if not _kept(out, c, s).is_file()]
     print(f"{len(todo)} runs to make", flush=True)
-    with ThreadPoolExecutor(jobs) as pool:
-        for k, line in enumerate(pool.map(lambda one: _called(folder, out, one[0], one[1], sides[one[1]]), todo), 1):
+
+    def one(case: dict[str, Any], side: str) -> str:
+        late = time.monotonic() - begin > args.limit
+        return f"{side} {case['name']}: left out, too late" if late else _called(folder, out, case, side, sides[side])
+
+    with ThreadPoolExecutor(args.jobs) as pool:
+        for k, line in enumerate(pool.map(lambda each: one(*each), todo), 1):
             print(f"[{k}/{len(todo)}] {line}", flush=True)
+
+
+def _has(case: dict[str, Any], words: list[str]) -> bool:
+    """Whether a word is part of the case's name; `public` means what is not made."""
+    made = "truth" in case or case["name"].startswith("fresh")
+    return any(not made if word == "public" else word in case["name"] for word in words)
 
 
 def _kept(out: Path, case: dict[str, Any], side: str) -> Path:
@@ -273,30 +288,73 @@ def _cpu(used: resource.struct_rusage) -> float:
 
 
 def table(folder: Path, out: Path) -> None:
-    """Case by case, the two versions that `out` holds."""
+    """Case by case, the two versions that `out` holds; then counts, and how near the sizes lie to what is hidden."""
     sides = sorted(p.name for p in out.iterdir() if p.is_dir() and p.name != "cache")
-    counts: dict[str, int] = {}
-    found = {side: 0 for side in sides}
-    named = {side: 0 for side in sides}
+    counts: Counter[str] = Counter()
+    found: dict[str, Counter[str]] = {side: Counter() for side in sides}
+    errors: dict[str, list[list[tuple[float, float]]]] = {"hidden effects": [], "base parameters": []}
     for case in json.loads((folder / "cases.json").read_text()):
         if not all(_kept(out, case, side).is_file() for side in sides):
+            counts["not run"] += 1
             continue
         both = [json.loads(_kept(out, case, side).read_text()) for side in sides]
         answers = [one["answer"] for one in both]
         word = _compared(*answers) if all(answers) else f"exit {[one['exit'] for one in both]}"
-        kind = word.split(",")[0].split(":")[0]
-        counts[kind] = counts.get(kind, 0) + 1
+        counts[word.split(",")[0].split(":")[0]] += 1
         right = ""
         if "truth" in case and all(answers):
             hits = {s: _right(case["truth"], a) for s, a in zip(sides, answers, strict=True)}
             for side, hit in hits.items():
-                found[side] += hit == "right"
-                named[side] += hit == "wrong"
+                found[side][hit] += 1
             right = f"  [{' | '.join(f'{s}: {h}' for s, h in hits.items())}]"
+            errors["hidden effects"] += _errors(case["truth"], answers)
+        if "links" in case and all(answers):
+            errors["base parameters"] += _errors_of_links(case["links"], answers)
         print(f"{case['name']}: {word}{right}")
     print(", ".join(f"{count} {kind}" for kind, count in sorted(counts.items())))
     for side in sides:
-        print(f"{side}: {found[side]} hidden effects right, {named[side]} wrong")
+        print(f"{side}: {', '.join(f'{n} {hit}' for hit, n in found[side].most_common())} of hidden effects")
+    for what, each in errors.items():
+        if each:
+            _told(what, sides, each)
+
+
+def _told(what: str, sides: list[str], errors: list[list[tuple[float, float]]]) -> None:
+    """How near the numbers of both versions lie to the truth, and how often inside of their intervals."""
+    (a, sa), (b, sb) = np.moveaxis(np.array(errors), 0, -1)
+    inside = [f"{side} {(e <= 1.96 * s).sum()}" for side, e, s in zip(sides, (a, b), (sa, sb), strict=True)]
+    moved = np.abs(a - b) > 1e-3 * sa
+    ratio = np.sum((b / sa) ** 2) / np.sum((a / sa) ** 2)
+    print(
+        f"sizes of {what} that both give: {len(a)}, in the 95 % interval {', '.join(inside)}; of {moved.sum()} that"
+        f" moved {(b < a)[moved].sum()} are nearer to the truth in {sides[1]}; error in {sides[0]}'s sigma: squares"
+        f" {ratio:.3f} times, median {np.median(a / sa):.3f} -> {np.median(b / sa):.3f}; median sigma"
+        f" {np.median(sb / sa):.3f} times"
+    )
+
+
+def _errors_of_links(links: list[list[float]], answers: list[dict[str, Any]]) -> Iterator[list[tuple[float, float]]]:
+    """The same of the base parameters that are sums of links' alone and that both versions identify."""
+    names = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
+    true = {f"{name}{k}": x for k, ten in enumerate(links, 1) for name, x in zip(names, ten, strict=True)}
+    both = [{p["expression"]: p for p in a["base_parameters"] if p["status"] == "identified"} for a in answers]
+    for text in both[0].keys() & both[1].keys():
+        terms = re.findall(r"([+-]?) ?([\d.e-]+ )?([A-Za-z_.]+\d[\w]*)", text)
+        if all(name in true for _, _, name in terms):
+            value = sum((-1 if sign == "-" else 1) * float(factor or 1) * true[name] for sign, factor, name in terms)
+            yield [(abs(own[text]["value"] - value), own[text]["std"]) for own in both]
+
+
+def _errors(truth: list[dict[str, Any]], answers: list[dict[str, Any]]) -> Iterator[list[tuple[float, float]]]:
+    """Distance to the truth and sigma, by both versions, of every parameter of a hidden effect that both name."""
+    for hidden in truth:
+        causes = [
+            [c for c in a["causes"] if (c["effect"], c["at"]) == (hidden["effect"], hidden["at"])] for a in answers
+        ]
+        for name, true in hidden.get("parameters", {}).items():
+            own = [each[0]["parameters"].get(name) for each in causes if each]
+            if len(own) == len(answers) and all(p and p["std"] for p in own):
+                yield [(abs(p["value"] - true), p["std"]) for p in own]
 
 
 def _names(answer: dict[str, Any]) -> list[str]:
@@ -367,15 +425,20 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--seeds", type=int, nargs=2, default=[31, 32])
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--only", nargs="+", default=[], metavar="WORD")
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="WORD", help="of the names; `public`: what is not made"
+    )
+    parser.add_argument("--first", nargs="+", default=[], metavar="WORD", help="run these before the others")
+    parser.add_argument("--limit", type=float, default=float("inf"), help="seconds after which no run begins")
+    parser.add_argument("--only-made", action="store_true", help="make no case of the public recordings")
     args = parser.parse_intermixed_args()  # versions may stand behind options
     if args.step == "make":
-        make(args.cases, args.seeds)
+        make(args.cases, args.seeds, args.jobs, args.only_made)
     elif args.step in ("pack", "unpack"):
         pack(args.cases, args.out) if args.step == "pack" else unpack(args.out, args.cases)
     elif args.step == "run":
         sides = {name: Path(folder).resolve() for name, folder in (one.split("=", 1) for one in args.sides)}
-        run(args.cases, args.out.resolve(), sides, args.jobs, args.only)
+        run(args.cases, args.out.resolve(), sides, args)
     else:
         table(args.cases, args.out)
 

@@ -36,7 +36,12 @@ def widened(monkeypatch: pytest.MonkeyPatch, *others: Any) -> np.ndarray:
 def test_a_value_that_moves_with_the_weights_is_as_unsure_as_it_moves(monkeypatch: pytest.MonkeyPatch):
     found = widened(monkeypatch, stood([1.3, 2.0], [0.1, 0.2]), stood([1.0, 2.0], [0.15, 0.2]))
     np.testing.assert_allclose(np.sqrt(np.diag(found)), [np.hypot(0.1, 0.3 / np.sqrt(2)), 0.2], rtol=1e-12)
-    assert found[0, 1] == pytest.approx(SHARE * np.sqrt(found[0, 0] * found[1, 1]))
+    assert found[0, 1] == pytest.approx(SHARE * 0.1 * 0.2)  # the move is of the first value alone
+
+
+def test_values_that_move_together_are_unsure_together(monkeypatch: pytest.MonkeyPatch):
+    found = widened(monkeypatch, stood([1.5, 3.0], [0.1, 0.2]))
+    np.testing.assert_allclose(found[0, 1], SHARE * 0.1 * 0.2 + 0.5 * 1.0, rtol=1e-12)
 
 
 def test_a_fit_that_says_little_of_a_value_moves_its_deviation_little(monkeypatch: pytest.MonkeyPatch):

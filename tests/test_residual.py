@@ -12,6 +12,7 @@ import pytest
 
 import figaroh_jax as fj
 from figaroh_jax.compiled.precision import Float32Boundary
+from figaroh_jax.estimation.data import PLACES
 from figaroh_jax.recordings.devices import Planes, Sockets
 
 T = np.arange(500)[:, None] / 250.0
@@ -199,3 +200,14 @@ def test_an_effect_takes_a_number_that_is_traced(robot: fj.RobotModel, wide: boo
     single = [float(cost(float(size))) for size in sizes]
     np.testing.assert_allclose(many, single, rtol=1e-12 if wide else 1e-6, atol=0)
     assert slope == pytest.approx(single[2] - single[0], rel=1e-5)  # of a parabola
+
+
+def test_a_recording_whose_samples_single_precision_cannot_count_is_refused(
+    robot: fj.RobotModel, monkeypatch: pytest.MonkeyPatch
+):
+    """The places of rows are floats: above 2^24 two of them would be one without x64."""
+    first, last = (float(np.float32(PLACES + k)) for k in (-1, 1))
+    assert first == PLACES - 1 and last != PLACES + 1
+    monkeypatch.setattr("figaroh_jax.estimation.data.PLACES", 400)
+    with pytest.raises(fj.InputError, match="more than 400 cannot be counted .* split it into shorter"):
+        fj.torque_data(robot, run())

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from figaroh_jax.diagnosis import rest as rests
 from figaroh_jax.diagnosis.estimates import Fitted
-from figaroh_jax.diagnosis.joint import has_size
+from figaroh_jax.diagnosis.joint import Joint, has_size, least_sure
 from figaroh_jax.diagnosis.naming import Standing, _turns_against_itself, beside_rest, reason_against
 from figaroh_jax.diagnosis.rest import significance, tolerated, verdict, wrong_law
 from figaroh_jax.effects.catalogue import find
@@ -36,6 +37,63 @@ def test_two_amplitudes_are_judged_together() -> None:
     # chi-square of two: 5.99 at 95 %
     assert not sized("position_dependent_friction", [1.0, 1.0], cosine=1.7, sine=1.7)
     assert sized("position_dependent_friction", [1.0, 1.0], cosine=1.8, sine=1.8)
+
+
+def least_of(*causes: tuple[str, list[float], float, dict[str, float]]) -> int | None:
+    """Which of some causes (name, deviations, correlation of the first two parameters, values) is least sure."""
+    effects, blocks, places, first = [], [], [], 0
+    for name, deviation, correlation, values in causes:
+        effects.append(find(name)(np.array([0]), **{key: np.float64(value) for key, value in values.items()}))
+        count = len(deviation)
+        share = np.eye(count)
+        if count > 1:
+            share[0, 1] = share[1, 0] = correlation
+        blocks.append(share * np.outer(deviation, deviation))
+        places.append(tuple(range(first, first + count)))
+        first += count
+    covariance = np.zeros((first, first))
+    for place, block in zip(places, blocks, strict=True):
+        covariance[np.ix_(place, place)] = block
+    none: Any = [None] * len(causes)
+    return least_sure(none, Joint(none, effects, Fitted(np.zeros(first), covariance, tuple(places))))
+
+
+def test_a_cause_whose_told_interval_holds_zero_is_the_first_to_go() -> None:
+    ratio, gain, offset = (("load_dependent_friction", "ratio"), ("torque_gain", "gain"), ("torque_offset", "offset"))
+    poor = (ratio[0], [0.0726], 0.0, {ratio[1]: 0.1211})
+    poorer = (gain[0], [0.043], 0.0, {gain[1]: 0.0678})
+    good = (offset[0], [1.0], 0.0, {offset[1]: 2.0})
+    assert least_of(good) is None
+    assert least_of(good, poor) == 1
+    assert least_of(poorer, good, poor) == 0  # 1.58 deviations, 1.67
+    assert least_of(("torque_delay", [0.002], 0.0, {"delay": 0.003})) == 0  # a size that is no amplitude
+    assert least_of(("torque_delay", [0.001], 0.0, {"delay": 0.003})) is None
+
+
+def test_a_law_of_the_speed_is_judged_at_its_shape() -> None:
+    """Strength and exponent trade with each other: given the exponent, its deviation is a 25th."""
+    law = {"strength": -4.0, "exponent": 1.15}
+    assert least_of(("power_law_friction", [22.0, 0.68], 0.9992, law)) is None  # -4.0 +- .88 at that exponent
+    assert least_of(("power_law_friction", [22.0, 0.68], 0.99, law)) == 0  # -4.0 +- 3.1
+
+
+def test_more_power_than_noise_can_have_is_a_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two joints of 400 independent rows: deviations of their power are sqrt(2 / 400) (chi-square)."""
+    nothing, shape = cast(Any, None), (2, 400)
+
+    def drawn(problem: Any, spectrum: Any, whitening: Any, draws: int, generator: np.random.Generator) -> np.ndarray:
+        return generator.standard_normal((draws, *shape))
+
+    monkeypatch.setattr(rests, "draw_noise", drawn)
+    rng, left = np.random.default_rng(3), np.ones(shape)
+
+    def p(share: float) -> float:
+        size = np.array([1.0, np.sqrt(1 + share * np.sqrt(2 / 400))])  # so many deviations at the second joint
+        return rests.more_than_noise(nothing, left * size[:, None], nothing, nothing, rng)
+
+    assert p(0.0) > 0.4
+    assert 0.02 < p(2.0) < 0.15
+    assert p(4.0) < 0.01
 
 
 def test_a_law_is_wrong_where_it_leaves_a_rest_at_its_own_place() -> None:

@@ -38,7 +38,7 @@ from .floor import noise_floor, noise_rms
 from .gaining import Fall, Gaining, beside_all, predicts_better, without_losses
 from .gates import physical_sign
 from .holdout import fold_squares, part_error, residual_rms, traces
-from .joint import Joint, opened, polished, sized, with_misfit, with_parts
+from .joint import Joint, least_sure, opened, polished, sized, with_misfit, with_parts
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import beside_rest, beyond_simpler, reason_against, standings
 from .problem import Problem
@@ -46,6 +46,7 @@ from .rest import (
     Significance,
     excess,
     lines,
+    more_than_noise,
     parts_of,
     predictable,
     relative_rest,
@@ -54,7 +55,7 @@ from .rest import (
     verdict,
     wrong_law,
 )
-from .search import Begun, Found, Search, chance_beside, eliminate, find_causes, judged_without
+from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without
 from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import Step, stand, with_causes
@@ -299,8 +300,7 @@ def _told_apart(here: _Setting, found: list[Found], joint: Joint) -> tuple[list[
             effects = [other.effect if at == k else effect for at, effect in enumerate(joint.causes)]
             full = with_causes(problem, start, effects, whitening)
             if predicts_better(problem, joint.step, full, sorted({*one.joints} & {*other.joints})):
-                known = tuple(n for n in (one.name, *one.ambiguous) if n != other.name)
-                own = replace(one, name=other.name, effect=other.effect, joints=other.joints, ambiguous=known)
+                own = one.as_another(other, (one.name, *one.ambiguous))
                 found = [own if f is found[k] else f for f in found]
                 joint = polished(problem, start, [f.effect for f in found], whitening)
     return found, joint
@@ -315,8 +315,7 @@ def _possible(found: list[Found], joint: Joint) -> list[Found]:
     for one, effect in zip(found, joint.causes, strict=True):
         there = [o for o in one.instead if o.name.at == one.name.at and physical_sign(o.effect)]
         if there and not physical_sign(effect):
-            known = tuple(n for n in one.ambiguous if n != there[0].name)
-            one = replace(one, name=there[0].name, effect=there[0].effect, joints=there[0].joints, ambiguous=known)
+            one = one.as_another(there[0], one.ambiguous)
         out.append(one)
     return out
 
@@ -327,10 +326,10 @@ def _simple(here: _Setting, found: list[Found], joint: Joint, forbid: Sequence[s
     for one, effect, at in zip(found, joint.causes, amplitude_places(state, joint.causes, problem.model), strict=True):
         inside = next((n for n in type(effect).contains if n not in forbid), None)
         if inside and beyond_simpler(problem, state, effect, at) < tolerance:
-            place_of = one.name.at
-            alike = tuple(Name(n, place_of) for n in related(inside, "indistinguishable_from") if n not in forbid)
-            simpler = place(find(inside), problem.model, place_of)
-            one = replace(one, name=Name(inside, place_of), effect=simpler, ambiguous=alike)
+            where = one.name.at
+            alike = [Name(n, where) for n in related(inside, "indistinguishable_from") if n not in forbid]
+            simpler = Rival(Name(inside, where), place(find(inside), problem.model, where), one.joints)
+            one = one.as_another(simpler, alike)
         out.append(one)
     return out
 
@@ -367,23 +366,15 @@ def _judged(
     asked = (tolerance, certain, fading)
     against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
     named = [f for f in found if not against[f.name]]
-    same = before.problem is here.problem
-    here, joint, by_speed = _as_predicts_best([here] if same else [here, before], named)
-    count = len(named)
-    gaining = without_losses(here.problem, here.start, here.whitening, named, joint, strict, borne_out)
-    gaining = gaining._replace(named=opened(gaining.named, gaining.joint, forbid))
+    settings = [here] if before.problem is here.problem else [here, before]
+    here, gaining, by_speed, reasons = _answered(searched, settings, named, borne_out, forbid)
     named, joint, problem = gaining.named, gaining.joint, here.problem
-    if named:
-        gaining = gaining._replace(joint=_as_weighed_otherwise(here, searched.here.problem, joint))
-    against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
+    against |= reasons
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
     shown = left.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
-    sticks = shown and (
-        _sticks(here, joint, tolerance)
-        or _sticks(seen := searched.here, by_speed if count == len(named) else _together(seen, named), tolerance)
-    )
+    sticks = shown and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
     rest = shown and not sticks
     text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
     parts = parts_of(problem, joint.step, whitening, line, names)
@@ -391,6 +382,40 @@ def _judged(
     quiet = not rest and not named and searched.search.p_value < alpha
     why = tolerated(float(relative.max()), tolerance, sticks) if quiet else ""
     return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text, why), sticks, here)
+
+
+def _answered(
+    searched: _Searched,
+    settings: Sequence[_Setting],
+    named: list[Found],
+    borne_out: Callable[[Name], bool],
+    forbid: Sequence[str],
+) -> tuple[_Setting, Gaining, Joint, dict[Name, str]]:
+    """The causes that lower the error on data held out and whose size the answer's own intervals tell from zero.
+
+    With the setting of the answer's fit, their fit with the weights that found them, and why the others went.
+    """
+    against: dict[Name, str] = {}
+    while True:
+        here, joint, by_speed = _as_predicts_best(settings, named)
+        count = len(named)
+        gaining = without_losses(here.problem, here.start, here.whitening, named, joint, searched.strict, borne_out)
+        against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
+        named = gaining.named
+        if named:
+            gaining = gaining._replace(joint=_as_weighed_otherwise(here, searched.here.problem, gaining.joint))
+        least = least_sure(named, gaining.joint)
+        if least is None:
+            by_speed = by_speed if count == len(named) else _together(searched.here, named)
+            return here, gaining._replace(named=opened(named, gaining.joint, forbid)), by_speed, against
+        against[named[least].name] = f"its size is not surely above zero: {_told_size(gaining.joint, least, here)}"
+        named = [f for f in named if f is not named[least]]
+
+
+def _told_size(joint: Joint, which: int, here: _Setting) -> str:
+    """A cause's parameters with their deviations, in words."""
+    each = estimates(joint.causes[which], joint.fitted, joint.fitted.places[which], here.problem.model)
+    return ", ".join(f"{name} {e.value:.3g} +- {1.96 * e.std:.2g} {e.unit}".rstrip() for name, e in each.items())
 
 
 def _sticks(here: _Setting, joint: Joint, tolerance: float) -> bool:
@@ -462,7 +487,10 @@ def _left(
     joints, tolerable = problem.model.joint_names, size <= tolerance
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
-    return left._replace(there=left.there or (wrong and not tolerable)), p_left, now[0], line, flexible[2]
+    there = left.there or (wrong and not tolerable)
+    if not there and not tolerable:
+        there = more_than_noise(problem, joint.step.linear.residual, spectrum, whitening, generator) < REST_P
+    return left._replace(there=there), p_left, now[0], line, flexible[2]
 
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:

@@ -22,7 +22,18 @@ from .state import State, assembled, solved
 from .step import Step, stand
 from .thresholds import SIZE_REGION
 
-__all__ = ["Joint", "has_size", "joint_fit", "moved", "opened", "polished", "sized", "with_misfit", "with_parts"]
+__all__ = [
+    "Joint",
+    "has_size",
+    "joint_fit",
+    "least_sure",
+    "moved",
+    "opened",
+    "polished",
+    "sized",
+    "with_misfit",
+    "with_parts",
+]
 
 KEPT = 1e-12
 AS_SURE = 2.0  # times the deviation of a fit up to which another one counts in full
@@ -75,16 +86,16 @@ def with_misfit(
     `weights` are those of the rows, with a whitening.
     """
     fitted = joint.fitted
-    variance, moves = np.diag(fitted.covariance), np.zeros_like(fitted.value)
+    variance, moves = np.diag(fitted.covariance), np.zeros_like(fitted.covariance)
     for weight, whitening in weights:
         other = problem.weighted(weight)
         base = solved(other, start, joint.step.state.theta[: len(start.theta)])
         one = _together(other, base, joint.causes, whitening).fitted
         share = AS_SURE**2 * variance / np.maximum(np.diag(one.covariance), 1e-300)
-        more = np.minimum(share, 1.0) * (one.value - fitted.value) ** 2
-        moves += np.where(np.isfinite(more), more, 0.0)  # a fit without rows of a joint says nothing of it
-    mean = moves / max(len(weights), 1)
-    return joint._replace(fitted=_wider(fitted, 1 + mean / np.maximum(variance, 1e-300)))
+        move = np.sqrt(np.minimum(share, 1.0)) * (one.value - fitted.value)
+        move = np.where(np.isfinite(move), move, 0.0)  # a fit without rows of a joint says nothing of it
+        moves += np.outer(move, move)
+    return joint._replace(fitted=replace(fitted, covariance=fitted.covariance + moves / max(len(weights), 1)))
 
 
 def with_parts(problem: Problem, joint: Joint, whitening: Float[np.ndarray, "F nv"]) -> Joint:
@@ -249,14 +260,47 @@ def has_size(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
 
     Amplitudes that a simpler effect has too do not count: a spring without stiffness is an offset.
     """
-    from scipy.special import chdtri  # scipy is slow to import
+    own = _amplitudes(effect)
+    return not own or kind(effect) != "columns" or _beyond_zero(effect, fitted, place, own) > 1
 
+
+def least_sure(found: list[Found], joint: Joint) -> int | None:
+    """Which of the causes is least surely there by the intervals that are told, of those that are not; else None.
+
+    Of a law of the speed whose shape is open the amplitude is judged at that shape: the same friction comes of many
+    pairs of strength and exponent, none of them surely, and of no strength at none.
+    """
+    shares = []
+    for effect, place in zip(joint.causes, joint.fitted.places, strict=True):
+        names = [n for n, p in effect.parameters().items() if p.linear] if kind(effect) == "columns" else []
+        own = _amplitudes(effect) if names else list(range(len(place)))
+        given = range(len(names), len(place)) if names and effect.speed_law else ()
+        shares.append(_beyond_zero(effect, joint.fitted, place, own, given) if own else np.inf)
+    least = int(np.argmin(shares)) if shares else 0
+    return least if shares and shares[least] <= 1 else None
+
+
+def _amplitudes(effect: Effect) -> list[int]:
+    """Which of an effect's amplitudes no simpler effect has."""
     names = [n for n, p in effect.parameters().items() if p.linear]
     simpler = {name for inside in type(effect).contains for name in find(inside).parameters()}
-    own = [k for k, name in enumerate(names) if name not in simpler]
-    if not own or kind(effect) != "columns":
-        return True
-    at = np.array(place)[own]
+    return [k for k, name in enumerate(names) if name not in simpler]
+
+
+def _beyond_zero(
+    effect: Effect, fitted: Fitted, place: tuple[int, ...], own: Sequence[int], given: Sequence[int] = ()
+) -> float:
+    """How far some of an effect's parameters are from zero, where those `given` are as fitted: 1 on the border of their
+    95 % region."""
+    from scipy.special import chdtri  # scipy is slow to import
+
+    names = [n for n, p in effect.parameters().items() if p.linear and kind(effect) == "columns"]
+    names += shapes(type(effect))
+    at, known = np.array(place)[list(own)], np.array(place)[list(given)].astype(int)
     value = np.array([float(getattr(effect, names[k])) for k in own])
-    covariance = fitted.covariance[np.ix_(at, at)]
-    return bool(value @ np.linalg.pinv(covariance, hermitian=True) @ value > chdtri(len(own), 1 - SIZE_REGION))
+    covariance, across = fitted.covariance[np.ix_(at, at)], fitted.covariance[np.ix_(at, known)]
+    if len(known):
+        within = np.linalg.pinv(fitted.covariance[np.ix_(known, known)], hermitian=True)
+        covariance = covariance - across @ within @ across.T
+    size = value @ np.linalg.pinv(covariance, hermitian=True) @ value
+    return float(size / chdtri(len(own), 1 - SIZE_REGION))

@@ -17,7 +17,7 @@ from .comparison import ground, judge_grown, t_value
 from .flexible import dependences, families
 from .holdout import residual_rms
 from .problem import Problem
-from .screening import noise_squares
+from .screening import CHUNK, draw_noise, noise_squares
 from .state import State
 from .step import Step
 from .thresholds import (
@@ -41,6 +41,7 @@ __all__ = [
     "Significance",
     "excess",
     "lines",
+    "more_than_noise",
     "parts_of",
     "predictable",
     "relative_rest",
@@ -50,6 +51,7 @@ __all__ = [
     "wrong_law",
 ]
 
+POWER_DRAWS = 200  # of noise, whose power is compared with what is left
 
 _Share = tuple[float, Dependence, tuple[float, float] | None, str | None]  # share, kind, band in Hz, file
 
@@ -89,6 +91,26 @@ def excess(
     from scipy.special import ndtr  # scipy is slow to import
 
     return float(products.sum() / share.sum()), float(ndtr(-z)), products.sum(1) / share
+
+
+def more_than_noise(
+    problem: Problem,
+    residual: Float[np.ndarray, "nv T"],
+    spectrum: Spectrum,
+    whitening: Float[np.ndarray, "F nv"],
+    generator: np.random.Generator,
+) -> float:
+    """p-value of the power of the joint that has most of it, in standard deviations of what noise has there.
+
+    Noise is drawn with all that its spectrum may be. What no function of the motion predicts is a misfit too, if it is
+    larger than the noise can be.
+    """
+    noise = np.concatenate(
+        [(draw_noise(problem, spectrum, whitening, CHUNK, generator) ** 2).sum(2) for _ in range(POWER_DRAWS // CHUNK)]
+    )
+    mean, deviation = noise.mean(0), np.maximum(noise.std(0), 1e-12 * noise.mean(0) + 1e-300)
+    own = (((residual**2).sum(1) - mean) / deviation).max()
+    return float(1 + np.sum(((noise - mean) / deviation).max(1) >= own)) / (len(noise) + 1)
 
 
 def significance(

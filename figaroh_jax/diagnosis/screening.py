@@ -25,7 +25,19 @@ from .evidence import Score, block_scores, largest, other_scores, projection, pu
 from .problem import Problem, without_factor
 from .state import State
 
-__all__ = ["Group", "Null", "Screen", "Shown", "catalogue", "family_p", "noise_squares", "place_p", "screen"]
+__all__ = [
+    "CHUNK",
+    "Group",
+    "Null",
+    "Screen",
+    "Shown",
+    "catalogue",
+    "draw_noise",
+    "family_p",
+    "noise_squares",
+    "place_p",
+    "screen",
+]
 
 DRAWS, CHUNK = 400, 50  # draws, and how many are made at once
 LOCAL_DRAWS = 4000  # where each place is asked for itself, and counted as one of many

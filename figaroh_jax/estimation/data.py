@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Data", "PoseData", "TorqueData", "as_data", "pose_data", "residual", "torque_data"]
 
+PLACES = 2**24  # of an extended record: whole numbers are exact so far in float32, which data may become without x64
+
 
 @runtime_checkable
 class Data(Protocol):
@@ -70,7 +72,7 @@ class TorqueData(eqx.Module):
     torque: Float[Leaf, "n M nv"]  # rows of the measured torque, N m or N
     weight: Float[Leaf, "n M nv"]  # 1 / sigma; 0: not measured, gated, padding
     dt: Float[Leaf, ""] | float  # s
-    # whole numbers as floats: `jax.grad` by the data takes no others
+    # whole numbers as floats, none above `PLACES`: `jax.grad` by the data takes no others
     source: Float[Leaf, "n L"] | None = None  # sample at each place of the extended record; None: samples are rows
     kept: Float[Leaf, "n M"] | None = None  # place of each row
     response: Shaped[Leaf, " F"] | None = None  # of the row filter
@@ -204,7 +206,8 @@ def torque_data(
 
     They are brought to even samples, position low-passed and differentiated, and rows of torque as `preprocess`
     says (`Preprocess(cutoff=...)`, Hz). `noise` is one sigma of the rows (N m or N; one, or one for each joint): rows
-    count in its units. Recordings with role "holdout" are left out. Raises `InputError` where they do not fit.
+    count in its units. Recordings with role "holdout" are left out. Raises `InputError` where they do not fit, and for
+    one of more than `PLACES` samples.
 
     >>> import numpy as np, figaroh_jax as fj
     >>> model = fj.load_urdf(fj.DEMO)
@@ -225,6 +228,12 @@ def torque_data(
         raise InputError(f"{lacking.file} has no torque" if lacking else "no recording to fit: all have role holdout")
     signals = prepare_all(tuple(fitted), preprocess or Preprocess(), slowed=False, model=robot)
     records = stack(signals, robot)
+    places = records.source.shape[1]
+    if places > PLACES:
+        raise InputError(
+            f"the longest recording takes {places} samples, extended at both ends: more than {PLACES} cannot be counted"
+            " in single precision; split it into shorter recordings"
+        )
     flat = np.moveaxis(np.asarray(records.torque), 2, 1)
     rows = [
         filtered(x, s, k, np.asarray(records.low_pass))
