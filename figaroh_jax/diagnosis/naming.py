@@ -38,6 +38,7 @@ from .thresholds import (
     MASS,
     MODULATION,
     MODULATION_HELD_OUT,
+    MODULATION_ROBOT,
     SHARE_NAMED,
     T_NAMED,
 )
@@ -80,7 +81,7 @@ def reason_against(
     `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not; `fading`
     are those that were surely there and are gone in recordings kept out.
     """
-    least = GAIN_NAMED_ROBOT if one.whole else GAIN_NAMED
+    least, most = (GAIN_NAMED_ROBOT, MODULATION_ROBOT) if one.whole else (GAIN_NAMED, MODULATION)
     varies = "its amplitude varies with position, speed, load or time (that would add"
     checks = [
         (one.physical, "its fitted sign is physically impossible"),
@@ -98,7 +99,7 @@ def reason_against(
                 f"its gain on held-out data is not significant: t = {one.t:.1f}, {one.t_needed:.1f} needed",
             ),
             (one.gain >= least, f"it removes {one.gain:.0%} of the held-out error where it acts, {least:.0%} needed"),
-            (one.modulation <= MODULATION, f"{varies} {one.modulation:.2f} of its gain)"),
+            (one.modulation <= most, f"{varies} {one.modulation:.2f} of its gain)"),
             (one.share >= SHARE_NAMED, f"its torque is {one.share:.1%} of the joint's, {SHARE_NAMED:.0%} needed"),
             (not one.cancels, "it cancels most of the joint's torque, as no gain beside another cause does"),
             (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion explain as much"),
@@ -239,26 +240,29 @@ def _share_of_torque(problem: Problem, state: State, torque: np.ndarray, effect:
 def _modulation(
     grown: _Grown, effect: Effect, torque: np.ndarray, without: Verdicts, joints: tuple[int, ...], whole: bool
 ) -> tuple[float, float]:
-    """What an amplitude that varies gains more, in the fit and on held-out data, over what the cause gains."""
+    """What an amplitude that varies gains more, in the fit and on held-out data, over what the cause gains.
+
+    Of a joint's law it is asked of its position, speed, load and time one by one, and the largest counts: all together
+    they fit chance, and what they then predict of other data says nothing.
+    """
     step = grown.step
-    columns = _varied_robot(grown, effect, torque) if whole else _varied_joint(grown, torque, joints)
-    base, more = grown.base, columns
+    base, touched = grown.base, list(range(len(step.rows.y))) if whole else list(joints)
     if kind(effect) == "response":  # it has no amplitude: its tangent must be free before
         (name,) = effect.parameters()
-        tangent = torque_slope(grown.problem, step.state, effect, name, grown.whitening)
-        free = judge_grown(step.rows, base, range(len(tangent)), tangent[None])
-        varied = judge_grown(step.rows, base, range(len(tangent)), np.concatenate([tangent[None], more]))
+        beside = torque_slope(grown.problem, step.state, effect, name, grown.whitening)[None, touched]
+        free = judge_grown(step.rows, base, touched, beside)
     else:
-        free = step.verdicts
-        touched = list(range(len(step.rows.y))) if whole else list(joints)
-        varied = judge_grown(step.rows, base, touched, more)
+        free, beside = step.verdicts, np.zeros((0, len(touched), step.rows.y.shape[1]))
     drop, held = without.cost - free.cost, without.own(step.rows, joints).sum() - free.own(step.rows, joints).sum()
-    more_drop = free.cost - varied.cost
-    more_held = free.own(step.rows, joints).sum() - varied.own(step.rows, joints).sum()
-    return float(more_drop / max(drop, 1e-9)), float(more_held / max(held, 1e-9))
+    more_drop, more_held = [], []
+    for columns in [_varied_robot(grown, effect, torque)] if whole else _varied_joint(grown, torque, joints):
+        varied = judge_grown(step.rows, base, touched, np.concatenate([beside, columns]))
+        more_drop.append(free.cost - varied.cost)
+        more_held.append(float((free.own(step.rows, joints) - varied.own(step.rows, joints)).sum()))
+    return float(max(more_drop) / max(drop, 1e-9)), float(max(more_held) / max(held, 1e-9))
 
 
-def _varied_joint(grown: _Grown, torque: np.ndarray, joints: tuple[int, ...]) -> Float[np.ndarray, "8 rows T"]:
+def _varied_joint(grown: _Grown, torque: np.ndarray, joints: tuple[int, ...]) -> Float[np.ndarray, "4 2 rows T"]:
     """The cause's torque times x and 2 x^2 - 1, x each joint's position, speed, load and time from -1 to 1."""
     problem, motion, records = grown.problem, grown.step.state.motion, grown.problem.records
     n, samples, _, _ = records.shape
@@ -268,8 +272,8 @@ def _varied_joint(grown: _Grown, torque: np.ndarray, joints: tuple[int, ...]) ->
         varying = [_unit(x) for x in (q[:, joint], np.abs(v[:, joint]), load[:, joint], np.asarray(motion.time))]
         columns = np.stack([torque[:, joint] * f for x in varying for f in (x, 2 * x**2 - 1)])
         rows = filter_rows(records, columns.reshape(-1, n, samples), grown.response[:, joint][None], fitted=True)
-        out.append((rows * np.asarray(problem.records.weight)[:, :, joint]).reshape(len(columns), -1))
-    return np.stack(out, axis=1)
+        out.append((rows * np.asarray(problem.records.weight)[:, :, joint]).reshape(len(varying), 2, -1))
+    return np.stack(out, axis=2)
 
 
 def _varied_robot(grown: _Grown, effect: Effect, torque: np.ndarray) -> Float[np.ndarray, "k nv T"]:

@@ -173,7 +173,7 @@ def _places(model: RobotModel, terms: tuple[Effect, ...]) -> tuple[Int[np.ndarra
 
     Those of the links are first, block by block, then those of `term_rows`.
     """
-    blocks, beside = coordinate_blocks(model)[0], term_places(model, terms)
+    blocks, beside = coordinate_blocks(model.joints)[0], term_places(model, terms)
     links = 10 * len(model.joints)
     out = np.full((model.nv, links + max(beside[:, 1], default=-1) + 1), -1)
     for k in range(10):
@@ -296,7 +296,7 @@ _own_term_rows = program(term_rows, CPU_OPTIONS, kept=True)
 def _summed_by_code(states: States, frames: Sequence[OwnFrame], folds: int) -> _Sums | None:
     """Sums of all pieces on one CPU, the rows by machine code; None where there is none for one of the pieces."""
     nv, (places, _) = states.model.nv, _places(states.model, states.terms)
-    first = 10 * len(coordinate_blocks(states.model)[0])
+    first = 10 * len(coordinate_blocks(states.model.joints)[0])
     index = [places[j, frame.kept] for j, frame in enumerate(frames)]
     parts = [(k[k < first], k[k >= first] - first) for k in index]
     products = tuple(np.zeros((folds, len(k) + 1, len(k) + 1)) for k in index)
