@@ -343,7 +343,9 @@ def refitted_without(
     left = _left_out(folds)
     many, width = len(left), max(len(one.free) for one in found)
     if native(loop, table, data).usable and all((mine.all(0) == mine.any(0)).all() for mine in left):
-        answers = np.stack([_squares_without(loop, table, data, one, [np.any(mine, 0) for mine in left]) for one in found])
+        answers = np.stack(
+            [_squares_without(loop, table, data, one, [np.any(mine, 0) for mine in left]) for one in found]
+        )
         return answers if outputs else answers.sum(-1)
     theta, start = (np.repeat(np.stack([getattr(one, name) for one in found]), many, 0) for name in ("theta", "start"))
     free = [one.free for one in found for _ in left]
