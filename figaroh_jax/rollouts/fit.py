@@ -401,7 +401,7 @@ def spread_of_recordings(loop: Loop, table: Table, data: Windows, found: Fit, fo
     left, free, theta = _left_out(folds), found.free[found.free >= 0], []
     for out in left:
         some = eqx.tree_at(lambda d: d.weight, data, np.where(np.any(out, 0), 0.0, np.asarray(data.weight)))
-        theta += fit(loop, table, some, found.theta[None], [free], found.start[None], width=len(found.free), lanes=1,
+        theta += fit(loop, table, some, found.theta[None], [free.tolist()], found.start[None], width=len(free), lanes=1,
                      iterations=_STEPS, rough=_SETTLED)  # fmt: skip
     own, many = np.stack([one.theta for one in theta])[:, np.maximum(found.free, 0)], len(left)
     wide = np.sqrt((many - 1) / many * ((own - own.mean(0)) ** 2).sum(0)) * stdtrit(many - 1, 0.975) / ndtri(0.975)
