@@ -11,7 +11,7 @@ import pytest
 from figaroh_jax.diagnosis import rest as rests
 from figaroh_jax.diagnosis.estimates import Fitted
 from figaroh_jax.diagnosis.joint import Joint, has_size, least_sure
-from figaroh_jax.diagnosis.naming import Standing, _turns_against_itself, beside_rest, reason_against
+from figaroh_jax.diagnosis.naming import Standing, _turns_against_itself, beside_rest, of_its_own, reason_against
 from figaroh_jax.diagnosis.rest import significance, tolerated, verdict, wrong_law
 from figaroh_jax.effects.catalogue import find
 from figaroh_jax.results import Name
@@ -87,13 +87,31 @@ def test_more_power_than_noise_can_have_is_a_rest(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(rests, "draw_noise", drawn)
     rng, left = np.random.default_rng(3), np.ones(shape)
 
-    def p(share: float) -> float:
+    def beyond(share: float) -> np.ndarray:
         size = np.array([1.0, np.sqrt(1 + share * np.sqrt(2 / 400))])  # so many deviations at the second joint
-        return rests.more_than_noise(nothing, left * size[:, None], nothing, nothing, rng)
+        return rests.beyond_noise(nothing, left * size[:, None], nothing, nothing, rng)
 
-    assert p(0.0) > 0.4
-    assert 0.02 < p(2.0) < 0.15
-    assert p(4.0) < 0.01
+    assert not beyond(0.0).any()
+    assert not beyond(2.0).any()
+    np.testing.assert_allclose(beyond(4.0), [0.0, 4 * np.sqrt(2 * 400)], rtol=0, atol=8)  # mean of 200 draws: +- 2
+
+
+@pytest.mark.parametrize(
+    ("beyond", "joints", "share"),
+    [
+        ([0, 0, 50, 0, 0, 0], [2], 0.5),
+        ([0, 9, 50, 0, 0, 0], [2], 0.5),  # one of five others
+        ([9, 9, 50, 9, 0, 0], [2], 0.0),  # most others have a misfit: this joint may have one too
+        ([0, 0, 50, 0, 0, 0], [1], 0.0),
+        ([0, 20, 30, 0, 0, 0], [1, 2], 0.5),
+        ([0, 20, 30, 0, 0, 0], [0, 1, 2, 3, 4, 5], 0.5),
+        ([9, 20, 30, 0, 0, 0], [0, 1, 2, 3, 4, 5], 0.0),
+    ],
+)
+def test_what_stays_at_a_causes_joints_is_its_own_where_others_are_explained(
+    beyond: list[float], joints: list[int], share: float
+) -> None:
+    assert of_its_own(np.array(beyond, float), joints, 100.0) == pytest.approx(share)
 
 
 def test_a_law_is_wrong_where_it_leaves_a_rest_at_its_own_place() -> None:
@@ -126,6 +144,7 @@ RIGHT = Standing(
         ({"share": 0.015}, "needed"),
         ({"modulation": 0.5}, "varies"),
         ({"modulation_held_out": 0.25}, "varies"),
+        ({"leaves": 0.06}, "another law acts there"),
         ({"share": 3.0, "cancels": True}, "cancels"),
         ({"physical": False}, "physically impossible"),
         ({"beside_rest": False}, "named only where nothing else"),

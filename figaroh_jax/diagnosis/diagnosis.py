@@ -40,13 +40,13 @@ from .gates import physical_sign
 from .holdout import fold_squares, part_error, residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_misfit, with_parts
 from .layout import checked_repeats, describe_folds, held_rows, layout
-from .naming import beside_rest, beyond_simpler, reason_against, standings
+from .naming import beside_rest, beyond_simpler, of_its_own, reason_against, standings
 from .problem import Problem
 from .rest import (
     Significance,
+    beyond_noise,
     excess,
     lines,
-    more_than_noise,
     parts_of,
     predictable,
     relative_rest,
@@ -127,6 +127,17 @@ class _Setting(NamedTuple):
     white: bool  # whether the rows are weighted by their joint's residual, not by the noise's spectrum
 
 
+class _Left(NamedTuple):
+    """What all causes together leave, and whether it is more than noise."""
+
+    rest: Significance
+    p_value: float  # of the whole catalogue on it
+    excess: float  # over the noise
+    line: tuple[float, float, int]  # the strongest in its spectrum
+    more: float  # squares by which smooth functions find more in it than chance gives
+    beyond: Float[np.ndarray, " nv"]  # squares of each joint beyond those of noise, where they surely are
+
+
 class _Searched(NamedTuple):
     """What a search has found, all of it in one fit, and what that leaves."""
 
@@ -135,11 +146,8 @@ class _Searched(NamedTuple):
     search: Search
     found: list[Found]
     joint: Joint
-    left: Significance
-    line: tuple[float, float, int]
+    left: _Left
     strict: bool  # whether a rest stays, beside which a cause must show more to be named
-    more: float  # squares by which smooth functions find more in it than chance gives
-    doubted: bool  # whether the catalogue still scores more than noise, though nothing in it passes
     fading: tuple[Name, ...] = ()  # causes that were there and are gone in recordings kept out
 
 
@@ -230,13 +238,13 @@ def _searched(
         here = before._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
         found, joint = _told_apart(here, *_fitted_together(here, search.found, forbid, tolerance))
-        left, p_left, beyond, line, more = _left(here, search, found, joint, forbid, tolerance, generator)
-        strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
+        left = _left(here, search, found, joint, forbid, tolerance, generator)
+        strict = left.rest.there or left.excess > NO_REST or len(found) > FEW_CAUSES
         if not strict and (kept := _possible(found, joint)) != found:
             found, joint = kept, _together(here, kept)
-            left, p_left, beyond, line, more = _left(here, search, found, joint, forbid, tolerance, generator)
-            strict = left.there or beyond > NO_REST
-        return _Searched(before, here, search, found, joint, left, line, strict, more, p_left < REST_P)
+            left = _left(here, search, found, joint, forbid, tolerance, generator)
+            strict = left.rest.there or left.excess > NO_REST
+        return _Searched(before, here, search, found, joint, left, strict)
 
     like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
 
@@ -343,11 +351,16 @@ def _judged(
 
     What is not named is no part of the answer's model: the others are fitted anew without it.
     """
-    before, here, _, found, joint, left, line, strict, more, doubted, fading = searched
+    before, here, _, found, joint, left, strict, fading = searched
     problem, whitening = here.problem, here.whitening
     each = standings(problem, here.start, found, joint, whitening)
     each = [
-        replace(one, complete=more <= ALL_BUT * (f.cost[0] - f.cost[1])) for one, f in zip(each, found, strict=True)
+        replace(
+            one,
+            complete=left.more <= ALL_BUT * (f.cost[0] - f.cost[1]),
+            leaves=of_its_own(left.beyond, f.joints, one.taken),
+        )
+        for one, f in zip(each, found, strict=True)
     ]
     noise = noise_rms(problem, here.spectrum)
     claims = {one.name: one.gain for one in each}
@@ -375,11 +388,12 @@ def _judged(
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
-    shown = left.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
+    doubted = left.p_value < REST_P  # the catalogue still scores more than noise, though nothing in it passes
+    shown = left.rest.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
     sticks = shown and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
     rest = shown and not sticks
-    text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
-    parts = parts_of(problem, joint.step, whitening, line, names)
+    text = left.rest.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
+    parts = parts_of(problem, joint.step, whitening, left.line, names)
     nearest = tuple(sorted(nearest, key=lambda one: -one.share))
     quiet = not rest and not named and searched.search.p_value < alpha
     why = tolerated(float(relative.max()), tolerance, sticks) if quiet else ""
@@ -472,9 +486,8 @@ def _left(
     forbid: Sequence[str],
     tolerance: float,
     generator: np.random.Generator,
-) -> tuple[Significance, float, float, tuple[float, float, int], float]:
-    """Whether all causes together leave more than noise, the p-value of the catalogue on it, its excess over
-    the noise, the strongest line in it, and the squares that smooth functions find in it beyond chance."""
+) -> _Left:
+    """What all causes together leave."""
     problem, start, spectrum, whitening, _ = here
     first = stand(problem, start, whitening)
     before, *_ = excess(problem, first.rows, first.linear.residual, spectrum, whitening)
@@ -489,10 +502,9 @@ def _left(
     joints, tolerable = problem.model.joint_names, size <= tolerance
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
-    there = left.there or (wrong and not tolerable)
-    if not there and not tolerable:
-        there = more_than_noise(problem, joint.step.linear.residual, spectrum, whitening, generator) < REST_P
-    return left._replace(there=there), p_left, now[0], line, flexible[2]
+    beyond = beyond_noise(problem, joint.step.linear.residual, spectrum, whitening, generator)
+    there = left.there or ((wrong or bool(beyond.any())) and not tolerable)
+    return _Left(left._replace(there=there), p_left, now[0], line, flexible[2], beyond)
 
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:

@@ -35,6 +35,7 @@ from .thresholds import (
     BESIDE_SMOOTH,
     GAIN_NAMED,
     GAIN_NAMED_ROBOT,
+    LAW_LEAVES,
     MASS,
     MODULATION,
     MODULATION_HELD_OUT,
@@ -42,7 +43,7 @@ from .thresholds import (
     T_NAMED,
 )
 
-__all__ = ["Standing", "beside_rest", "beyond_simpler", "cause_torque", "reason_against", "standings"]
+__all__ = ["Standing", "beside_rest", "beyond_simpler", "cause_torque", "of_its_own", "reason_against", "standings"]
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,8 @@ class Standing:
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
     cancels: bool = False  # whether it is a share of all torque, and larger than it: a reading of less than half
     complete: bool = False  # whether smooth functions find next to nothing in what it leaves
+    taken: float = 0.0  # held-out squares of its joints that it removes
+    leaves: float = 0.0  # squares beyond noise at its joints over these, where most other joints have none
 
 
 def reason_against(
@@ -90,6 +93,11 @@ def reason_against(
             f"its torque is {one.share:.2%} of the joint's, below the tolerance of {tolerance:.2%}",
         ),
         (one.modulation_held_out <= MODULATION_HELD_OUT, f"{varies} {one.modulation_held_out:.2f} of its gain)"),
+        (
+            one.leaves <= LAW_LEAVES,
+            f"where it acts {one.leaves:.2f} of what it removes stays beyond the noise, and most joints where it does"
+            " not act are explained: another law acts there",
+        ),
     ]
     if rest or not (one.beside_rest or one.complete):  # what any rest looks like is taken on less only if it is all
         checks += [
@@ -113,6 +121,19 @@ def reason_against(
             (not one.massless, "its mass is not surely above zero: a link other than believed explains as much"),
         ]
     return next((reason for passed, reason in checks if not passed), "")
+
+
+def of_its_own(beyond: Float[np.ndarray, " nv"], joints: Sequence[int], taken: float) -> float:
+    """Squares `beyond` the noise at a cause's joints over the held-out squares that it has `taken` there; zero where
+    they may be another misfit's.
+
+    Whether a joint is likely to have a misfit of its own beside the cause is told by the others: where most of them (of
+    all joints, if it acts on all) are explained down to the noise, what stays where it acts is what its law lacks.
+    """
+    acts = np.isin(np.arange(len(beyond)), list(joints))
+    others = beyond if acts.all() else beyond[~acts]
+    alone = bool(np.mean(others > 0) < 0.5)
+    return float(beyond[acts].sum() / max(taken, 1e-300)) if alone else 0.0
 
 
 def beside_rest(
@@ -163,6 +184,7 @@ def standings(
                 physical=physical_sign(effect) and not (coupled and _turns_against_itself(effect, joint.fitted, at)),
                 beside_rest=effect.beside_rest,
                 gain=1 - float(better.sum() / max(worse.sum(), 1e-300)),
+                taken=max(float((worse - better).sum()), 0.0),
                 t=t_value(worse, better),
                 t_needed=t_needed(len(worse), T_NAMED),
                 share=share,
