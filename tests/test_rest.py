@@ -144,6 +144,9 @@ RIGHT = Standing(
         ({"share": 0.015}, "needed"),
         ({"modulation": 0.5}, "varies"),
         ({"modulation_held_out": 0.25}, "varies"),
+        ({"modulation_held_out": 0.1, "modulation_t": 3.0}, "varies"),  # less than .2, but surely
+        ({"modulation_held_out": 0.1, "modulation_t": 2.0}, ""),
+        ({"modulation_held_out": 0.04, "modulation_t": 9.0}, ""),
         ({"leaves": 0.06}, "another law acts there"),
         ({"share": 3.0, "cancels": True}, "cancels"),
         ({"physical": False}, "physically impossible"),

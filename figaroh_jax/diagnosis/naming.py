@@ -59,6 +59,7 @@ class Standing:
     share: float  # RMS torque over that of the joint, where it is largest
     modulation: float = 0.0  # squares that an amplitude which varies gains, over those of the cause
     modulation_held_out: float = 0.0
+    modulation_t: float = 0.0  # how surely left-out squares fall by it (Student t of the blocks)
     beside_smooth: float = 1.0  # gain of a cause of the whole robot beside smooth functions, or in their place
     inertia_alone: bool = False  # a coupling of inertia, without friction of its own
     massless: bool = False  # a body whose mass is not surely there
@@ -92,7 +93,10 @@ def reason_against(
             one.share >= tolerance,
             f"its torque is {one.share:.2%} of the joint's, below the tolerance of {tolerance:.2%}",
         ),
-        (one.modulation_held_out <= MODULATION_HELD_OUT, f"{varies} {one.modulation_held_out:.2f} of its gain)"),
+        (
+            one.modulation_held_out <= (LAW_LEAVES if one.modulation_t > one.t_needed else MODULATION_HELD_OUT),
+            f"{varies} {one.modulation_held_out:.2f} of its gain)",
+        ),
         (
             one.leaves <= LAW_LEAVES,
             f"where it acts {one.leaves:.2f} of what it removes stays beyond the noise, and most joints where it does"
@@ -191,6 +195,7 @@ def standings(
                 cancels=bool(type(effect).follows_total) and not whole and share > 1,
                 modulation=modulation[0],
                 modulation_held_out=modulation[1],
+                modulation_t=modulation[2],
                 beside_smooth=_beside_smooth(grown, bare, effect, place, one.joints) if whole else 1.0,
                 inertia_alone=coupled and _inertia_alone(effect, joint.fitted, at),
                 massless=effect.body and _deviations(effect, joint.fitted, at)["mass"] < MASS,
@@ -260,8 +265,8 @@ def _share_of_torque(problem: Problem, state: State, torque: np.ndarray, effect:
 
 def _modulation(
     grown: _Grown, effect: Effect, torque: np.ndarray, without: Verdicts, joints: tuple[int, ...], whole: bool
-) -> tuple[float, float]:
-    """What an amplitude that varies gains more, in the fit and on held-out data, over what the cause gains."""
+) -> tuple[float, float, float]:
+    """What an amplitude that varies gains more, in the fit and on held-out data, over what the cause gains; t of it."""
     step = grown.step
     columns = _varied_robot(grown, effect, torque) if whole else _varied_joint(grown, torque, joints)
     base, more = grown.base, columns
@@ -274,10 +279,10 @@ def _modulation(
         free = step.verdicts
         touched = list(range(len(step.rows.y))) if whole else list(joints)
         varied = judge_grown(step.rows, base, touched, more)
-    drop, held = without.cost - free.cost, without.own(step.rows, joints).sum() - free.own(step.rows, joints).sum()
-    more_drop = free.cost - varied.cost
-    more_held = free.own(step.rows, joints).sum() - varied.own(step.rows, joints).sum()
-    return float(more_drop / max(drop, 1e-9)), float(more_held / max(held, 1e-9))
+    bare, fixed, loose = (v.own(step.rows, joints) for v in (without, free, varied))
+    drop, held = without.cost - free.cost, bare.sum() - fixed.sum()
+    more_drop, more_held = free.cost - varied.cost, fixed.sum() - loose.sum()
+    return float(more_drop / max(drop, 1e-9)), float(more_held / max(held, 1e-9)), t_value(fixed, loose)
 
 
 def _varied_joint(grown: _Grown, torque: np.ndarray, joints: tuple[int, ...]) -> Float[np.ndarray, "8 rows T"]:

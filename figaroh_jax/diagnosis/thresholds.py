@@ -52,9 +52,7 @@ BY_CHANCE_UNSHOWN = 0.001  # the same where slices of the recordings that are fi
 RISES = 0.1  # p-value of a rise of the error of all rows kept out: below, the robot is predicted worse
 KEPT_OF_CLAIM = 1 / 3  # of what a cause takes in slices: what must be left of it in such a fall
 STANDS = SPEED_EDGES[1]  # of a joint's top speed: below, it stands, and its rows say nothing of a law of the motion
-LAW_LEAVES = (
-    0.05  # of the squares that a cause removes: what may stay of them at its joints where others have noise alone
-)
+LAW_LEAVES = 0.05  # of the squares that a cause removes: what its law may surely lack (own rest, varying amplitude)
 ALL_BUT = 0.1  # of the squares that a cause has removed: what smooth functions may still find where it is all there is
 SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
 MASS = 3.0  # standard deviations of a body's mass: below, what moves is the link that carries it
