@@ -97,21 +97,23 @@ def test_more_power_than_noise_can_have_is_a_rest(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize(
-    ("beyond", "joints", "share"),
+    ("beyond", "baseline", "joints", "share"),
     [
-        ([0, 0, 50, 0, 0, 0], [2], 0.5),
-        ([0, 9, 50, 0, 0, 0], [2], 0.5),  # one of five others
-        ([9, 9, 50, 9, 0, 0], [2], 0.0),  # most others have a misfit: this joint may have one too
-        ([0, 0, 50, 0, 0, 0], [1], 0.0),
-        ([0, 20, 30, 0, 0, 0], [1, 2], 0.5),
-        ([0, 20, 30, 0, 0, 0], [0, 1, 2, 3, 4, 5], 0.5),
-        ([9, 20, 30, 0, 0, 0], [0, 1, 2, 3, 4, 5], 0.0),
+        ([0, 0, 50, 0, 0, 0], [0, 0, 150, 0, 0, 0], [2], 0.5),
+        ([0, 9, 50, 0, 0, 0], [0, 9, 150, 0, 0, 0], [2], 0.5),  # one of five others
+        ([9, 9, 50, 9, 0, 0], [9, 9, 150, 9, 0, 0], [2], 0.0),  # most others have a misfit: this joint may have one too
+        ([0, 0, 50, 0, 0, 0], [9, 9, 150, 9, 0, 0], [2], 0.0),  # ... that other causes have taken
+        ([0, 0, 50, 0, 0, 0], [0, 0, 150, 0, 0, 0], [1], 0.0),
+        ([0, 20, 30, 0, 0, 0], [0, 90, 90, 0, 0, 0], [1, 2], 0.5),
+        ([0, 20, 30, 0, 0, 0], [0, 90, 90, 0, 0, 0], [0, 1, 2, 3, 4, 5], 0.5),
+        ([0, 20, 30, 0, 0, 0], [9, 90, 90, 0, 0, 0], [0, 1, 2, 3, 4, 5], 0.0),
     ],
 )
-def test_what_stays_at_a_causes_joints_is_its_own_where_others_are_explained(
-    beyond: list[float], joints: list[int], share: float
+def test_what_stays_at_a_causes_joints_is_its_own_where_others_have_no_misfit(
+    beyond: list[float], baseline: list[float], joints: list[int], share: float
 ) -> None:
-    assert of_its_own(np.array(beyond, float), joints, 100.0) == pytest.approx(share)
+    found = of_its_own(np.array(beyond, float), np.array(baseline, float), joints, 100.0)
+    assert found == pytest.approx(share)
 
 
 def test_a_law_is_wrong_where_it_leaves_a_rest_at_its_own_place() -> None:

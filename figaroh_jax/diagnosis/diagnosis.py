@@ -136,6 +136,7 @@ class _Left(NamedTuple):
     line: tuple[float, float, int]  # the strongest in its spectrum
     more: float  # squares by which smooth functions find more in it than chance gives
     beyond: Float[np.ndarray, " nv"]  # squares of each joint beyond those of noise, where they surely are
+    baseline: Float[np.ndarray, " nv"]  # the same without any cause
 
 
 class _Searched(NamedTuple):
@@ -358,7 +359,7 @@ def _judged(
         replace(
             one,
             complete=left.more <= ALL_BUT * (f.cost[0] - f.cost[1]),
-            leaves=of_its_own(left.beyond, f.joints, one.taken),
+            leaves=of_its_own(left.beyond, left.baseline, f.joints, one.taken),
         )
         for one, f in zip(each, found, strict=True)
     ]
@@ -502,9 +503,11 @@ def _left(
     joints, tolerable = problem.model.joint_names, size <= tolerance
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
-    beyond = beyond_noise(problem, joint.step.linear.residual, spectrum, whitening, generator)
+    beyond, baseline = (
+        beyond_noise(problem, step.linear.residual, spectrum, whitening, generator) for step in (joint.step, first)
+    )
     there = left.there or ((wrong or bool(beyond.any())) and not tolerable)
-    return _Left(left._replace(there=there), p_left, now[0], line, flexible[2], beyond)
+    return _Left(left._replace(there=there), p_left, now[0], line, flexible[2], beyond, baseline)
 
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:

@@ -99,8 +99,8 @@ def reason_against(
         ),
         (
             one.leaves <= LAW_LEAVES,
-            f"where it acts {one.leaves:.2f} of what it removes stays beyond the noise, and most joints where it does"
-            " not act are explained: another law acts there",
+            f"where it acts {one.leaves:.2f} of what it removes stays beyond the noise, though most other joints have"
+            " no misfit: another law acts there",
         ),
     ]
     if rest or not (one.beside_rest or one.complete):  # what any rest looks like is taken on less only if it is all
@@ -127,15 +127,17 @@ def reason_against(
     return next((reason for passed, reason in checks if not passed), "")
 
 
-def of_its_own(beyond: Float[np.ndarray, " nv"], joints: Sequence[int], taken: float) -> float:
+def of_its_own(
+    beyond: Float[np.ndarray, " nv"], baseline: Float[np.ndarray, " nv"], joints: Sequence[int], taken: float
+) -> float:
     """Squares `beyond` the noise at a cause's joints over the held-out squares that it has `taken` there; zero where
     they may be another misfit's.
 
-    Whether a joint is likely to have a misfit of its own beside the cause is told by the others: where most of them (of
-    all joints, if it acts on all) are explained down to the noise, what stays where it acts is what its law lacks.
+    Whether a joint is likely to have a misfit of its own beside the cause is told by the others: where the `baseline`
+    leaves most of them (of all joints, if it acts on all) noise alone, what stays where it acts is what its law lacks.
     """
     acts = np.isin(np.arange(len(beyond)), list(joints))
-    others = beyond if acts.all() else beyond[~acts]
+    others = baseline if acts.all() else baseline[~acts]
     alone = bool(np.mean(others > 0) < 0.5)
     return float(beyond[acts].sum() / max(taken, 1e-300)) if alone else 0.0
 
