@@ -19,6 +19,7 @@ import io
 import json
 import multiprocessing
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -159,7 +160,7 @@ def _fresh(folder: Path, seeds: list[int]) -> Iterator[dict[str, Any]]:
             task["data"][-2:] = [one | {"role": "holdout"} for one in task["data"][-2:]]
             (folder / name / "task.yaml").write_text(json.dumps(task))
             title = f"fresh {robot} {k}{' '.join(name for name, _ in effects)} identify"
-            yield {"name": title, "task": f"{name}/task.yaml", "command": "identify"}
+            yield {"name": title, "task": f"{name}/task.yaml", "command": "identify", "links": case.links}
 
 
 def _smaller(folder: Path) -> None:
@@ -291,7 +292,7 @@ def table(folder: Path, out: Path) -> None:
     sides = sorted(p.name for p in out.iterdir() if p.is_dir() and p.name != "cache")
     counts: Counter[str] = Counter()
     found: dict[str, Counter[str]] = {side: Counter() for side in sides}
-    errors: list[list[tuple[float, float]]] = []
+    errors: dict[str, list[list[tuple[float, float]]]] = {"hidden effects": [], "base parameters": []}
     for case in json.loads((folder / "cases.json").read_text()):
         if not all(_kept(out, case, side).is_file() for side in sides):
             counts["not run"] += 1
@@ -306,21 +307,42 @@ def table(folder: Path, out: Path) -> None:
             for side, hit in hits.items():
                 found[side][hit] += 1
             right = f"  [{' | '.join(f'{s}: {h}' for s, h in hits.items())}]"
-            errors += _errors(case["truth"], answers)
+            errors["hidden effects"] += _errors(case["truth"], answers)
+        if "links" in case and all(answers):
+            errors["base parameters"] += _errors_of_links(case["links"], answers)
         print(f"{case['name']}: {word}{right}")
     print(", ".join(f"{count} {kind}" for kind, count in sorted(counts.items())))
-    for k, side in enumerate(sides):
-        print(f"{side}, hidden effects: {', '.join(f'{n} {hit}' for hit, n in found[side].most_common())}")
-        if errors:
-            inside = sum(one[k][0] <= 1.96 * one[k][1] for one in errors)
-            print(f"{side}: the 95 % interval holds the true size in {inside} of {len(errors)}")
-    if errors:
-        (a, sa), (b, _) = np.moveaxis(np.array(errors), 0, -1)
-        moved, ratio = np.abs(a - b) > 1e-3 * sa, np.sum((b / sa) ** 2) / np.sum((a / sa) ** 2)
-        print(
-            f"sizes that both found: {len(a)}, {(b < a)[moved].sum()} of {moved.sum()} that moved are nearer to the"
-            f" truth in {sides[1]}; squared errors, in {sides[0]}'s sigma, {ratio:.3f} times"
-        )
+    for side in sides:
+        print(f"{side}: {', '.join(f'{n} {hit}' for hit, n in found[side].most_common())} of hidden effects")
+    for what, each in errors.items():
+        if each:
+            _told(what, sides, each)
+
+
+def _told(what: str, sides: list[str], errors: list[list[tuple[float, float]]]) -> None:
+    """How near the numbers of both versions lie to the truth, and how often inside of their intervals."""
+    (a, sa), (b, sb) = np.moveaxis(np.array(errors), 0, -1)
+    inside = [f"{side} {(e <= 1.96 * s).sum()}" for side, e, s in zip(sides, (a, b), (sa, sb), strict=True)]
+    moved = np.abs(a - b) > 1e-3 * sa
+    ratio = np.sum((b / sa) ** 2) / np.sum((a / sa) ** 2)
+    print(
+        f"sizes of {what} that both give: {len(a)}, in the 95 % interval {', '.join(inside)}; of {moved.sum()} that"
+        f" moved {(b < a)[moved].sum()} are nearer to the truth in {sides[1]}; error in {sides[0]}'s sigma: squares"
+        f" {ratio:.3f} times, median {np.median(a / sa):.3f} -> {np.median(b / sa):.3f}; median sigma"
+        f" {np.median(sb / sa):.3f} times"
+    )
+
+
+def _errors_of_links(links: list[list[float]], answers: list[dict[str, Any]]) -> Iterator[list[tuple[float, float]]]:
+    """The same of the base parameters that are sums of links' alone and that both versions identify."""
+    names = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
+    true = {f"{name}{k}": x for k, ten in enumerate(links, 1) for name, x in zip(names, ten, strict=True)}
+    both = [{p["expression"]: p for p in a["base_parameters"] if p["status"] == "identified"} for a in answers]
+    for text in both[0].keys() & both[1].keys():
+        terms = re.findall(r"([+-]?) ?(\d[\d.e-]* )?([A-Za-z_.]+\d[\w]*)", text)
+        if all(name in true for _, _, name in terms):
+            value = sum((-1 if sign == "-" else 1) * float(factor or 1) * true[name] for sign, factor, name in terms)
+            yield [(abs(own[text]["value"] - value), own[text]["std"]) for own in both]
 
 
 def _errors(truth: list[dict[str, Any]], answers: list[dict[str, Any]]) -> Iterator[list[tuple[float, float]]]:

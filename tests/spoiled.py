@@ -220,13 +220,13 @@ def _back(base: Base, arrays: Arrays, entry: Entry) -> None:
     arrays["t"][40] = arrays["t"][38]
 
 
-_CLOCK = r"clock looks wrong|right rate|1?\.?\d* Hz in place of"
+_CLOCK = r"clock looks wrong|right rate|1?\.?\d* Hz instead of"
 _DEG = r"\{position: deg"
 KINDS: dict[str, tuple[Spoil, str]] = {
     "degrees read as rad": (_with("q", np.rad2deg), _DEG),
-    "rad read as degrees": (_units(position="deg"), r"leave out units|velocity.*degrees|in rad"),
+    "rad read as degrees": (_units(position="deg"), r"remove units|velocity.*degrees|in rad"),
     "mm on a revolute arm": (_units(position="mm"), r"every joint of the robot turns"),
-    "torque columns swapped": (_swapped("tau"), r"torque columns stand in another order"),
+    "torque columns swapped": (_swapped("tau"), r"torque columns are in a different order"),
     "position columns swapped": (_swapped("q"), r"position.*swapped|velocity of .* does not follow|limits"),
     "all columns of two joints swapped": (_swapped("q", "dq", "tau"), r"swapped|limits|order"),
     "sign of one torque": (_joint("tau", np.negative), r"torque of .* has the opposite sign"),

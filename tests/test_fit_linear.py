@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -121,3 +122,25 @@ def test_optimistix_calibrates_real_robots_as_published(bench: Any, name: str, l
         assert bench.millimetres(one) == pytest.approx(error, abs=1e-3)
     both = [float(one.cost) for one in found.values()]
     assert both[0] == pytest.approx(both[1], rel=1e-8)
+
+
+@pytest.mark.slow
+def test_gradients_by_the_data_of_a_real_robot_are_those_of_refits(bench: Any, data_dir: Path, tmp_path: Path):
+    """Friction of the TX40's twelve terms: derivatives of a fit by torques, weights and positions as they were read."""
+    import bootstrap
+
+    model, data = bootstrap.problem(tmp_path)
+
+    def damping(data: fj.TorqueData) -> jax.Array:
+        return jnp.asarray(fj.fit(model, data, "friction").values)[0]
+
+    slopes = jax.grad(damping)(data)
+    assert all(np.isfinite(np.asarray(one)).all() for one in jax.tree.leaves(slopes))
+    for leaf in (lambda d: d.torque, lambda d: d.weight, lambda d: d.position):
+        value = np.asarray(leaf(data))
+        way = np.cos(0.01 * np.arange(value.size)).reshape(value.shape) * (value != 0)
+        h = 1e-4 * np.abs(value).max()
+        ahead, behind = (damping(eqx.tree_at(leaf, data, value + s * h * way)) for s in (1, -1))
+        np.testing.assert_allclose(
+            (np.asarray(leaf(slopes)) * way).sum(), (ahead - behind) / (2 * h), rtol=1e-3, atol=0
+        )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from figaroh_jax.diagnosis import gaining
-from figaroh_jax.diagnosis.gaining import Fall, beside_all, predicts_better, without_losses
+from figaroh_jax.diagnosis.gaining import Fall, beside_all, predicts_all_better, predicts_better, without_losses
 from figaroh_jax.diagnosis.holdout import Held
 
 BLOCKS = 12
@@ -204,6 +204,19 @@ def test_of_two_laws_the_one_that_surely_predicts_their_joints_better_is_preferr
     assert not predicts_better(problem, other, one, [0])
     even = first * (1 + 0.3 * rng.standard_normal(first.shape))
     assert not predicts_better(problem, one, cast(Any, even), [0, 1])
+
+
+def test_a_fit_of_another_weight_is_taken_where_all_rows_kept_out_surely_prefer_it(monkeypatch: pytest.MonkeyPatch):
+    """By the robot's error in N m: a small joint that is worse does not keep a large one's gain."""
+    rng = np.random.default_rng(5)
+    first = squares(rng, 100.0, 4.0)
+    second = first * np.array([0.8, 1.5]) * (1 + 0.1 * rng.standard_normal(first.shape))
+    monkeypatch.setattr(gaining, "weighted_squares", lambda problem, before, after: in_turn(before, after))
+    problem, one, other = (cast(Any, x) for x in (None, first, second))
+    assert predicts_all_better(problem, one, other)
+    assert not predicts_all_better(problem, other, one)
+    even = first * (1 + 0.3 * rng.standard_normal(first.shape))
+    assert not predicts_all_better(problem, one, cast(Any, even))
 
 
 def stood_by(

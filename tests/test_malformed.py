@@ -318,7 +318,7 @@ refused = {
     "tau holds complex": lambda: fj.recording(q=x, tau=c, rate=100),
     "time holds complex": lambda: fj.recording(q=x, tau=x, time=c[:, 0]),
     "position holds complex": lambda: fj.postures(q=x, position=c[:, :3], base_frame="base", tool_frame="hand"),
-    "stamps that look like ns": lambda: fj.recording(q=x, tau=x, time=np.arange(20) * 1e7),
+    "the stamps look like ns": lambda: fj.recording(q=x, tau=x, time=np.arange(20) * 1e7),
     "not an array of numbers": lambda: fj.recording(q=[[0.1], [0.1, 0.2]], tau=x, rate=100),
     "q holds text": lambda: fj.mass_matrix(m, [["1", "2", "3", "4"]]),
     "q holds objects": lambda: fj.mass_matrix(m, [[None] * 4]),

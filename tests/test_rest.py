@@ -144,11 +144,13 @@ RIGHT = Standing(
         ({"gain": 0.2}, "held-out error"),
         ({"t": 2.0}, "not significant"),
         ({"share": 0.015}, "needed"),
-        ({"modulation": 0.5}, "varies"),
+        ({"modulation": 0.2}, "varies"),
+        ({"whole": True, "gain": 0.05, "modulation": 0.2}, ""),
+        ({"whole": True, "gain": 0.05, "modulation": 0.4}, "varies"),
         ({"modulation_held_out": 0.25}, "varies"),
-        ({"modulation_held_out": 0.1, "modulation_t": 3.0}, "varies"),  # less than .2, but surely
-        ({"modulation_held_out": 0.1, "modulation_t": 2.0}, ""),
-        ({"modulation_held_out": 0.04, "modulation_t": 9.0}, ""),
+        ({"modulation_held_out": 0.1, "varies": True}, "varies"),  # less than .2, but surely
+        ({"modulation_held_out": 0.1}, ""),
+        ({"modulation_held_out": 0.04, "varies": True}, ""),
         ({"leaves": 0.06}, "another law acts there"),
         ({"share": 3.0, "cancels": True}, "cancels"),
         ({"physical": False}, "physically impossible"),

@@ -19,9 +19,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from . import executable_cache
 
@@ -307,12 +308,17 @@ def launch(
     if not samples:
         empty = [jnp.zeros(one.shape, one.dtype) for one in answers]
         return empty if many else empty[0]
-    pieces = len([x for group in columns for x in group]) + _numbers(shape) > FEW
+    long = len([x for group in columns for x in group]) + _numbers(shape) > FEW
+    # each array in one row, so that a place in it is one number (of 32 bits)
+    flat = bool(piece) or (long and max(prod(x.shape) for x in [*arrays, *answers]) < 1 << 31)
+    if flat:
+        answers = [jax.ShapeDtypeStruct((prod(x.shape),), x.dtype) for x in answers]
 
     def kernel(*refs: Any) -> None:
         (table, once, *given), outs = refs[: 2 + len(arrays)], refs[-len(answers) :]
-        out, seen = list(outs) if many else outs[0], once[0] if pieces else None
-        lanes = _Lanes(triton, given, out, samples, last, seen, columns, numbers, piece)
+        widths = [x.shape[1] for x in arrays]
+        layout = _Layout(given, list(outs), widths, numbers, samples, last, piece, many, flat)
+        lanes = _Lanes(triton, layout, columns, once[0] if long else None)
         program(
             lambda k: table[k],
             [*(partial(lanes.read, k) for k in range(len(arrays))), lanes.back],
@@ -320,7 +326,7 @@ def launch(
         )
 
     anywhere, before = pl.BlockSpec(memory_space=pl.ANY), jax.tree.leaves(into)
-    before = [x.reshape(-1) for x in before] if piece else before
+    before, inputs = ([x.reshape(-1) if flat else x for x in some] for some in (before, arrays))
     found = pl.pallas_call(
         kernel,
         out_shape=answers,
@@ -331,10 +337,56 @@ def launch(
         compiler_params=None if interpret else triton.CompilerParams(num_warps=1, num_stages=1),
         interpret=interpret,
         name=program.__name__,
-    )(constants, jnp.ones(1, jnp.int32), *arrays, *before)
+    )(constants, jnp.ones(1, jnp.int32), *inputs, *before)
     if piece:
-        return [x.reshape(n, samples // piece, k, piece) for x, (n, k) in zip(found, numbers, strict=True)]
-    return list(found) if many else found[0]
+        shapes = [(n, samples // piece, k, piece) for n, k in numbers]
+    found = [x.reshape(one) for x, one in zip(found, shapes, strict=True)]
+    return found if many else found[0]
+
+
+class _Place(NamedTuple):
+    """Where samples find a number: in an array, at an index beside that of the sample; or, where the array is one row,
+    from `first` on, each sample `apart` from the one before; in pieces of `piece` samples, the pieces `apart`.
+    """
+
+    ref: Any
+    at: Callable[[Array], tuple[Any, ...]]
+    first: int = 0
+    kind: tuple[int, int] = (0, 0)  # apart, piece
+
+
+class _Layout(NamedTuple):
+    """Arrays (samples, widths) and answers of `launch`; `flat` where each is one row."""
+
+    given: Sequence[Any]
+    outs: Sequence[Any]
+    widths: Sequence[int]
+    shapes: Sequence[tuple[int, ...]]
+    samples: int
+    last: bool
+    piece: int
+    many: bool
+    flat: bool
+
+    def read(self, array: int, column: int) -> _Place:
+        """A column of an array."""
+        return _Place(self.given[array], lambda index: (index, column), column, (self.widths[array], 0))
+
+    def write(self, place: tuple[int, ...]) -> _Place:
+        """A number of an answer."""
+        array, place = (place[0], place[1:]) if self.many else (0, place)
+        out, shape, samples = self.outs[array], self.shapes[array], self.samples
+        if self.piece:
+            row, column = place
+            first, kind = row * samples * shape[1] + column * self.piece, (shape[1] * self.piece, self.piece)
+            return _Place(out, lambda index: (index,), first, kind)
+        number = int(np.ravel_multi_index(place, shape))
+        if self.last:
+            return _Place(out, lambda index: (*place, index), number * samples, (1, 0))
+        return _Place(out, lambda index: (index, *place), number, (prod(shape), 0))
+
+
+Access = Callable[[list[Any], Array | None, list[Array]], list[Array]]  # of places, which lanes, values: new values
 
 
 class _Lanes:
@@ -342,29 +394,18 @@ class _Lanes:
 
     Triton spends its time on how each access goes with every other operation that it can reach from there, cubic in
     their number. So in a long kernel accesses stand in loops of one round (`once`, unknown to the compiler), through
-    which it does not look: what goes in is written, what comes out is read.
+    which it does not look: what goes in is written, what comes out is read. Nor does a constant stand in them: there is
+    one of each in a kernel, and from it all is reached that uses the same. So places go in, too, and are doubled in a
+    round, for what stays as it is would be taken out.
     """
 
-    def __init__(
-        self,
-        triton: Any,
-        given: Sequence[Any],
-        out: Any,
-        samples: int,
-        last: bool,
-        once: Any,
-        columns: Columns,
-        shape: list[tuple[int, ...]],
-        piece: int,
-    ) -> None:
+    def __init__(self, triton: Any, layout: _Layout, columns: Columns, once: Any) -> None:
         from jax.experimental import pallas as pl
 
-        self.triton, self.given, self.out, self.samples, self.last = triton, given, out, samples, last
-        self.shape, self.piece = shape, piece
-        self.offsets: dict[int, tuple[Array, Array]] = {}
-        self.dtype = (out[0] if isinstance(out, list) else out).dtype
-        self.once, self.columns = once, columns
-        self.index = pl.program_id(0) * LANES + lax.iota(jnp.int32, LANES)
+        self.triton, self.layout, self.columns, self.once = triton, layout, columns, once
+        self.dtype, self.samples = layout.outs[0].dtype, layout.samples
+        self.block, self.lane = pl.program_id(0), lax.iota(jnp.int32, LANES)
+        self.index = self.block * LANES + self.lane
         self.seen: dict[tuple[int, int], Number] = {}
 
     def read(self, array: int, column: int) -> Number:
@@ -372,67 +413,72 @@ class _Lanes:
             group = [(array, column)]
             if self.once is not None:
                 group = next(g for g in self.columns if (array, column) in g)
-            start = [jnp.zeros(LANES, self.dtype)] * len(group)
-            loaded = self._apart(lambda index, _: [self._fetched(index, *one) for one in group], start)
-            self.seen.update({one: Number(x) for one, x in zip(group, loaded, strict=True)})
+            loaded = self._loaded([self.layout.read(*one) for one in group])
+            self.seen.update(zip(group, loaded, strict=True))
         return self.seen[array, column]
 
     def back(self, places: Sequence[tuple[int, ...]]) -> list[Number]:
         """What programs before this one wrote."""
+        return self._loaded([self.layout.write(place) for place in places])
 
-        def read(index: Array, _: list[Array]) -> list[Array]:
-            mask = self._mask(index)
-            other = None if mask is None else 0.0
-            return [self.triton.load(self._at(place, index), mask=mask, other=other) for place in places]
+    def _loaded(self, places: Sequence[_Place]) -> list[Number]:
+        def load(there: list[Any], mask: Array | None, _: list[Array]) -> list[Array]:
+            return [self.triton.load(x, mask=mask, other=None if mask is None else 0.0) for x in there]
 
-        return [Number(x) for x in self._apart(read, [jnp.zeros(LANES, self.dtype)] * len(places))]
-
-    def _at(self, place: tuple[int, ...], index: Array) -> Any:
-        if self.piece:
-            array, row, column = place
-            columns = self.shape[array][1]
-            return self.out[array].at[
-                self._offset(columns, index) + (row * self.samples * columns + column * self.piece)
-            ]
-        out, place = (self.out[place[0]], place[1:]) if isinstance(self.out, list) else (self.out, place)
-        return out.at[(*place, index) if self.last else (index, *place)]
-
-    def _offset(self, columns: int, index: Array) -> Array:
-        """Where the samples stand in a flat array (pieces, columns, samples of a piece), before its first column."""
-        known = self.offsets.get(columns)
-        if known is None or known[0] is not index:
-            piece = lax.shift_right_logical(index, jnp.int32(self.piece.bit_length() - 1))
-            offset = piece * jnp.int32(columns * self.piece) + lax.bitwise_and(index, jnp.int32(self.piece - 1))
-            known = self.offsets[columns] = index, offset
-        return known[1]
+        return [Number(x) for x in self._apart(places, load, [jnp.zeros(LANES, self.dtype)] * len(places))]
 
     def write(self, entries: Iterable[tuple[tuple[int, ...], Number]]) -> None:
+        def put(there: list[Any], mask: Array | None, values: list[Array]) -> list[Array]:
+            for x, value in zip(there, values, strict=True):
+                self.triton.store(x, value, mask=mask)
+            return [*values[1:], -values[0]]  # others, or the loop would be seen through
+
         places, numbers = zip(*entries, strict=True)
+        self._apart([self.layout.write(x) for x in places], put, [_in_lanes(x, self.dtype) for x in numbers])
 
-        def put(index: Array, values: list[Array]) -> list[Array]:
-            for place, value in zip(places, values, strict=True):
-                self.triton.store(self._at(place, index), value, mask=self._mask(index))
-            return [*values[1:], -values[0]]  # changed, or the loop would be seen through
-
-        self._apart(put, [_in_lanes(number, self.dtype) for number in numbers])
-
-    def _fetched(self, index: Array, array: int, column: int) -> Array:
-        mask = self._mask(index)
-        return self.triton.load(self.given[array].at[index, column], mask=mask, other=None if mask is None else 0.0)
-
-    def _mask(self, index: Array) -> Array | None:
-        return index < self.samples if self.samples % LANES else None
-
-    def _apart(self, access: Callable[[Array, list[Array]], list[Array]], start: list[Array]) -> list[Array]:
+    def _apart(self, places: Sequence[_Place], access: Access, start: list[Array]) -> list[Array]:
+        flat, ends = self.layout.flat, [self.samples] if self.samples % LANES else []
         if self.once is None:
-            return access(self.index, start)
+            there = [x.ref.at[self._first(x) if flat else x.at(self.index)] for x in places]
+            return access(there, self.index < self.samples if ends else None, start)
+        first = {x.kind: x for x in reversed(places)} if flat else {}
+        numbers = list(dict.fromkeys([*_steps(places), *ends] if flat else ends))
 
-        def step(carry: tuple[Array, Array, list[Array]]) -> tuple[Array, Array, list[Array]]:
-            rounds, index, values = carry
-            return rounds + 1, index + 1, access(index, values)
+        def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+            rounds, index, begin, given, values = carry
+            known = {n: lax.broadcast(x, (LANES,)) for n, x in zip(numbers, given, strict=True)}
+            mask = index < known[self.samples] if ends else None
+            at, there = dict(zip(first, begin, strict=True)), []
+            last = {kind: x.first for kind, x in first.items()}
+            for x in places:
+                if flat and x.first != last[x.kind]:
+                    at[x.kind], last[x.kind] = at[x.kind] + known[x.first - last[x.kind]], x.first
+                there.append(x.ref.at[at[x.kind] if flat else x.at(index)])
+            rounds, index, begin, given = jax.tree.map(lambda x: x + x, (rounds, index, begin, given))
+            return rounds, index, begin, given, access(there, mask, values)
 
-        # twice: a plain count would become a loop through which the compiler does look
-        return lax.while_loop(lambda carry: carry[0] * 2 < self.once, step, (jnp.int32(0), self.index, start))[2]
+        begin, given = [self._first(x) for x in first.values()], [jnp.int32(n) for n in numbers]
+        # by doubling: a plain count would become a loop through which the compiler does look
+        carry = (jnp.int32(1), self.index, begin, given, start)
+        return lax.while_loop(lambda carry: carry[0] < 2 * self.once, step, carry)[4]
+
+    def _first(self, place: _Place) -> Int[Array, " lanes"]:
+        """Where the samples of this block find a number."""
+        apart, piece = place.kind
+        if not piece:
+            return (self.index if apart == 1 else self.index * apart) + place.first
+        pieces, blocks = jnp.int32((piece // LANES).bit_length() - 1), jnp.int32(piece // LANES - 1)
+        first = lax.shift_right_logical(self.block, pieces) * apart + lax.bitwise_and(self.block, blocks) * LANES
+        return self.lane + (first + place.first)
+
+
+def _steps(places: Sequence[_Place]) -> Iterable[int]:
+    """From each place to the next of its kind, without those of length zero."""
+    last: dict[tuple[int, int], int] = {}
+    for x in places:
+        if x.first != last.get(x.kind, x.first):
+            yield x.first - last[x.kind]
+        last[x.kind] = x.first
 
 
 def _in_lanes(number: Number, dtype: Any) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import jax
 import numpy as np
@@ -116,6 +117,8 @@ def contend(
         one = _position_contender(problem, step, base, ready, group, fitted.get(group.name))
         fitted[group.name] = one.effect
         return one
+    if group.effect.one_rotor:
+        order = _as_one_rotor(step, base, group, order)
     effect, Z = _exact_columns(problem, step, ready, group, order)
     free = None
     if effect.body:
@@ -151,6 +154,34 @@ def _exact_columns(
     effects = jax.tree.map(lambda x: x[starts], group.effect)
     effect, Z = refit(effects, step.state.motion, problem.records, ready, group.effect)
     return effect, Z.reshape(*Z.shape[:2], -1)
+
+
+def _as_one_rotor(step: Step, base: Ground, group: Group, order: np.ndarray) -> np.ndarray:
+    """The grid points of a coupling, first that which explains most with no part below zero.
+
+    One rotor that turns the sum of two joints, or their difference, has inertia, damping and friction of that sign.
+    Inertia and damping of the two signs are mirror images, so that a free fit of the wrong one may be the better.
+    """
+    rows, joints, gains = step.rows, list(group.columns.joints), []
+    for point in order:
+        Z = group.columns.Z[point]
+        cross = np.sum(
+            [rows.X[joint].T @ own.T for joint, own in zip(joints, np.swapaxes(Z, 0, 1), strict=True)], axis=0
+        )
+        G = np.tensordot(Z, Z, ((1, 2), (1, 2))) - cross.T @ base.inverse[-1] @ cross
+        gains.append(_drop_of_none_below_zero(G, np.tensordot(Z, base.verdicts.residual[joints], 2)))
+    return order[np.argsort(-np.array(gains), kind="stable")]
+
+
+def _drop_of_none_below_zero(G: Float[np.ndarray, "k k"], pull: Float[np.ndarray, " k"]) -> float:
+    """Squares that k columns explain with coefficients of zero or more: the least of x'Gx - 2 pull'x, negative."""
+    best = 0.0
+    for some in product((False, True), repeat=len(pull)):
+        at = np.flatnonzero(some)
+        own = np.linalg.lstsq(G[np.ix_(at, at)], pull[at], rcond=None)[0] if len(at) else np.zeros(0)
+        if (own >= 0).all():
+            best = max(best, float(own @ pull[at]))
+    return best
 
 
 def _judged_beside(

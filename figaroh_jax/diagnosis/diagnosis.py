@@ -35,7 +35,7 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .gaining import Fall, Gaining, beside_all, predicts_better, without_losses
+from .gaining import Fall, Gaining, beside_all, predicts_all_better, predicts_better, without_losses
 from .gates import physical_sign
 from .holdout import fold_squares, part_error, residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_misfit, with_parts
@@ -55,11 +55,21 @@ from .rest import (
     verdict,
     wrong_law,
 )
-from .search import Begun, Found, Search, chance_beside, eliminate, find_causes, judged_without
+from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without
 from .standstill import only_sticks
 from .state import State, baseline, with_width
 from .step import Step, stand, with_causes
-from .thresholds import ALL_BUT, ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, NO_REST, REST_P, STANDSTILL, WEIGHT_ROUNDS
+from .thresholds import (
+    ALL_BUT,
+    ALPHA_OF_A_NAME,
+    FEW_CAUSES,
+    FOR_SURE,
+    NO_REST,
+    REST_P,
+    STANDSTILL,
+    WEIGHT_ROUNDS,
+    WHITE_GAIN,
+)
 from .weights import relative_speed, weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -309,8 +319,7 @@ def _told_apart(here: _Setting, found: list[Found], joint: Joint) -> tuple[list[
             effects = [other.effect if at == k else effect for at, effect in enumerate(joint.causes)]
             full = with_causes(problem, start, effects, whitening)
             if predicts_better(problem, joint.step, full, sorted({*one.joints} & {*other.joints})):
-                known = tuple(n for n in (one.name, *one.ambiguous) if n != other.name)
-                own = replace(one, name=other.name, effect=other.effect, joints=other.joints, ambiguous=known)
+                own = one.as_another(other, (one.name, *one.ambiguous))
                 found = [own if f is found[k] else f for f in found]
                 joint = polished(problem, start, [f.effect for f in found], whitening)
     return found, joint
@@ -325,8 +334,7 @@ def _possible(found: list[Found], joint: Joint) -> list[Found]:
     for one, effect in zip(found, joint.causes, strict=True):
         there = [o for o in one.instead if o.name.at == one.name.at and physical_sign(o.effect)]
         if there and not physical_sign(effect):
-            known = tuple(n for n in one.ambiguous if n != there[0].name)
-            one = replace(one, name=there[0].name, effect=there[0].effect, joints=there[0].joints, ambiguous=known)
+            one = one.as_another(there[0], one.ambiguous)
         out.append(one)
     return out
 
@@ -337,10 +345,10 @@ def _simple(here: _Setting, found: list[Found], joint: Joint, forbid: Sequence[s
     for one, effect, at in zip(found, joint.causes, amplitude_places(state, joint.causes, problem.model), strict=True):
         inside = next((n for n in type(effect).contains if n not in forbid), None)
         if inside and beyond_simpler(problem, state, effect, at) < tolerance:
-            place_of = one.name.at
-            alike = tuple(Name(n, place_of) for n in related(inside, "indistinguishable_from") if n not in forbid)
-            simpler = place(find(inside), problem.model, place_of)
-            one = replace(one, name=Name(inside, place_of), effect=simpler, ambiguous=alike)
+            where = one.name.at
+            alike = [Name(n, where) for n in related(inside, "indistinguishable_from") if n not in forbid]
+            simpler = Rival(Name(inside, where), place(find(inside), problem.model, where), one.joints)
+            one = one.as_another(simpler, alike)
         out.append(one)
     return out
 
@@ -394,7 +402,8 @@ def _judged(
     sticks = shown and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
     rest = shown and not sticks
     text = left.rest.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
-    parts = parts_of(problem, joint.step, whitening, left.line, names)
+    told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
+    parts = parts_of(problem, told, whitening, left.line, names)
     nearest = tuple(sorted(nearest, key=lambda one: -one.share))
     quiet = not rest and not named and searched.search.p_value < alpha
     why = tolerated(float(relative.max()), tolerance, sticks) if quiet else ""
@@ -413,9 +422,9 @@ def _answered(
     With the setting of the answer's fit, their fit with the weights that found them, and why the others went.
     """
     against: dict[Name, str] = {}
+    here, joint, by_speed = _as_predicts_best(settings, named)
+    first = named
     while True:
-        here, joint, by_speed = _as_predicts_best(settings, named)
-        count = len(named)
         gaining = without_losses(here.problem, here.start, here.whitening, named, joint, searched.strict, borne_out)
         against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
         named = gaining.named
@@ -423,10 +432,11 @@ def _answered(
             gaining = gaining._replace(joint=_as_weighed_otherwise(here, searched.here.problem, gaining.joint))
         least = least_sure(named, gaining.joint)
         if least is None:
-            by_speed = by_speed if count == len(named) else _together(searched.here, named)
+            by_speed = by_speed if len(first) == len(named) else _together(searched.here, named)
             return here, gaining._replace(named=opened(named, gaining.joint, forbid)), by_speed, against
         against[named[least].name] = f"its size is not surely above zero: {_told_size(gaining.joint, least, here)}"
         named = [f for f in named if f is not named[least]]
+        joint = _together(here, named)
 
 
 def _told_size(joint: Joint, which: int, here: _Setting) -> str:
@@ -453,19 +463,34 @@ def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple
     them.
 
     Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows, and
-    the width of friction beside all causes need not be that beside the named ones.
+    the width of friction beside all causes need not be that beside the named ones. Where the noise is far below what
+    the model leaves, its spectrum is a poor weight: each joint's residual alone may do better. Another fit than that
+    which parts prefer is taken where recordings kept out surely prefer it.
     """
-    best, first = None, None
-    for here in settings:
-        weights = [np.asarray(here.problem.records.weight), np.asarray(here.problem.records.judged)]
-        for weight in weights[: 1 if np.array_equal(weights[0], weights[1]) else 2]:
-            one = here._replace(problem=here.problem.weighted(weight))
-            joint = _together(one, named)
-            error = part_error(one.problem, joint.step)
-            best = (error, one, joint) if best is None or error < best[0] else best
-            first = first or joint
-    assert best is not None and first is not None
-    return *best[1:], first
+    tried = [
+        (one, _together(one, named))
+        for here in settings
+        for one in (here._replace(problem=here.problem.weighted(weight)) for weight in _weights(here.problem))
+    ]
+    errors = [part_error(one.problem, joint.step) for one, joint in tried]
+    best, joint = tried[int(np.argmin(errors))]
+    if not best.white:
+        residual = residual_rms(best.problem, joint.step.state)
+        level = np.broadcast_to(1 / np.maximum(residual, 1e-12 * residual.max()), best.whitening.shape)
+        white = best._replace(whitening=level, white=True)
+        step = stand(white.problem, joint.step.state, level)  # the laws' shapes as they are
+        if part_error(white.problem, step) < (1 - WHITE_GAIN) * min(errors):
+            best, joint = white, _together(white, named)
+    for one, other in tried if best.problem.held.any() else ():
+        if predicts_all_better(best.problem, joint.step, other.step):
+            best, joint = one, other
+    return best, joint, tried[0][1]
+
+
+def _weights(problem: Problem) -> list[Float[np.ndarray, "n M nv"]]:
+    """Weights of the rows by their speed, and all alike."""
+    by_speed, alike = np.asarray(problem.records.weight), np.asarray(problem.records.judged)
+    return [by_speed] if np.array_equal(by_speed, alike) else [by_speed, alike]
 
 
 def _as_weighed_otherwise(here: _Setting, by_speed: Problem, joint: Joint) -> Joint:

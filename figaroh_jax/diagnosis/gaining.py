@@ -19,7 +19,7 @@ from .state import State
 from .step import Step
 from .thresholds import BY_CHANCE, BY_CHANCE_BESIDE, BY_CHANCE_UNSHOWN, KEPT_OF_CLAIM, RISES
 
-__all__ = ["Fall", "Gaining", "beside_all", "fall", "predicts_better", "without_losses"]
+__all__ = ["Fall", "Gaining", "beside_all", "fall", "predicts_all_better", "predicts_better", "without_losses"]
 
 EXACT, DRAWS = 12, 4000  # blocks up to which every choice of signs is made; choices beyond
 
@@ -170,6 +170,13 @@ def predicts_better(problem: Problem, before: Step, after: Step, joints: Sequenc
     drop, had = (worse.squares - better.squares)[1][:, places], worse.squares[1][:, places].sum(0)
     gain = (drop / np.maximum(had, 1e-300)).sum(1)
     return bool(gain.sum() > 0 and _by_chance(gain) < BY_CHANCE)
+
+
+def predicts_all_better(problem: Problem, before: Step, after: Step) -> bool:
+    """Whether data kept out surely prefer one fit to another on all their rows, by the robot's error (N m or N)."""
+    worse, better = weighted_squares(problem, before, after)
+    drop = (worse.squares - better.squares)[0].sum(1)
+    return bool(drop.sum() > 0 and _by_chance(drop) < BY_CHANCE)
 
 
 def _told(

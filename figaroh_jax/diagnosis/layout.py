@@ -16,7 +16,7 @@ from .thresholds import SAME_MOTION
 __all__ = ["checked_repeats", "describe_folds", "held_rows", "layout"]
 
 BLOCK, SHORT_BLOCK, SHORT = 1.0, 0.3, 9.99  # s: of a block, of a block in recordings shorter than the third
-FOLDS, SLICE = 5, 2.0  # where the excitations are few: folds, and seconds that one takes in turn
+FOLDS = 5  # where the excitations are few: blocks go to them in turn
 QUARTERS = 4
 SLICED, QUARTERED = True, False
 FEWEST_EXCITATIONS = 3
@@ -120,19 +120,24 @@ def _blocks(signals: Sequence[Signals], records: Records) -> Int[np.ndarray, " T
     block, start = np.full((n, count), -1), 0
     for one, at in zip((s for s in signals if s.role == "fit"), records.spans, strict=False):
         seconds = np.arange(at.rows) / float(records.rate)
-        length = one.time[-1] - one.time[0]
-        width = BLOCK if length > SHORT else SHORT_BLOCK
+        width = _width(one)
         number = np.minimum(seconds / width, max(1, round(seconds[-1] / width)) - 1).astype(int)
         block[at.slot, at.row : at.row + at.rows] = start + number
         start += number[-1] + 1
     return block.reshape(-1)
 
 
+def _width(one: Signals) -> float:
+    """Seconds of a block: a recording is to have many."""
+    return BLOCK if one.time[-1] - one.time[0] > SHORT else SHORT_BLOCK
+
+
 def _folds(signals: Sequence[Signals], records: Records, sliced: bool) -> Int[np.ndarray, " T"]:
-    """One excitation each; where they are few, `sliced` in turn, or quarters that follow one another.
+    """One excitation each; where they are few, slices of a block's length in turn, or quarters that follow one another.
 
     A model that is fitted around a slice is asked to interpolate, one fitted beside a quarter to extrapolate: causes
-    are told apart better by the first, what they gain is told more honestly by the second.
+    are told apart better by the first, what they gain is told more honestly by the second. Longer slices hold events
+    whole (a joint that starts once): a cause that shows there most is then asked to predict them without them.
     """
     n, _, count, _ = records.shape
     fitted = [s for s in signals if s.role == "fit"]
@@ -142,7 +147,7 @@ def _folds(signals: Sequence[Signals], records: Records, sliced: bool) -> Int[np
     for k, (one, at) in enumerate(zip(fitted, records.spans, strict=False)):
         late = align(fitted[first.setdefault(labels[k], k)], one) if one.repeat else 0
         row = np.maximum(np.arange(at.rows) - late, 0)  # repeats share their slices
-        slices = row / float(records.rate) // SLICE % FOLDS
+        slices = row / float(records.rate) // _width(one) % FOLDS
         quarter = labels[k] * QUARTERS + np.minimum(row * QUARTERS // max(one.rows.kept, 1), QUARTERS - 1)
         fold[at.slot, at.row : at.row + at.rows] = labels[k] if enough else slices if sliced else quarter
     used = np.unique(fold[fold >= 0])

@@ -39,6 +39,7 @@ from .thresholds import (
     MASS,
     MODULATION,
     MODULATION_HELD_OUT,
+    MODULATION_ROBOT,
     SHARE_NAMED,
     T_NAMED,
 )
@@ -59,7 +60,7 @@ class Standing:
     share: float  # RMS torque over that of the joint, where it is largest
     modulation: float = 0.0  # squares that an amplitude which varies gains, over those of the cause
     modulation_held_out: float = 0.0
-    modulation_t: float = 0.0  # how surely left-out squares fall by it (Student t of the blocks)
+    varies: bool = False  # whether left-out squares surely fall by it
     beside_smooth: float = 1.0  # gain of a cause of the whole robot beside smooth functions, or in their place
     inertia_alone: bool = False  # a coupling of inertia, without friction of its own
     massless: bool = False  # a body whose mass is not surely there
@@ -84,7 +85,7 @@ def reason_against(
     `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not; `fading`
     are those that were surely there and are gone in recordings kept out.
     """
-    least = GAIN_NAMED_ROBOT if one.whole else GAIN_NAMED
+    least, most = (GAIN_NAMED_ROBOT, MODULATION_ROBOT) if one.whole else (GAIN_NAMED, MODULATION)
     varies = "its amplitude varies with position, speed, load or time (that would add"
     checks = [
         (one.physical, "its fitted sign is physically impossible"),
@@ -94,7 +95,7 @@ def reason_against(
             f"its torque is {one.share:.2%} of the joint's, below the tolerance of {tolerance:.2%}",
         ),
         (
-            one.modulation_held_out <= (LAW_LEAVES if one.modulation_t > one.t_needed else MODULATION_HELD_OUT),
+            one.modulation_held_out <= (LAW_LEAVES if one.varies else MODULATION_HELD_OUT),
             f"{varies} {one.modulation_held_out:.2f} of its gain)",
         ),
         (
@@ -110,7 +111,7 @@ def reason_against(
                 f"its gain on held-out data is not significant: t = {one.t:.1f}, {one.t_needed:.1f} needed",
             ),
             (one.gain >= least, f"it removes {one.gain:.0%} of the held-out error where it acts, {least:.0%} needed"),
-            (one.modulation <= MODULATION, f"{varies} {one.modulation:.2f} of its gain)"),
+            (one.modulation <= most, f"{varies} {one.modulation:.2f} of its gain)"),
             (one.share >= SHARE_NAMED, f"its torque is {one.share:.1%} of the joint's, {SHARE_NAMED:.0%} needed"),
             (not one.cancels, "it cancels most of the joint's torque, as no gain beside another cause does"),
             (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion explain as much"),
@@ -197,7 +198,7 @@ def standings(
                 cancels=bool(type(effect).follows_total) and not whole and share > 1,
                 modulation=modulation[0],
                 modulation_held_out=modulation[1],
-                modulation_t=modulation[2],
+                varies=modulation[2],
                 beside_smooth=_beside_smooth(grown, bare, effect, place, one.joints) if whole else 1.0,
                 inertia_alone=coupled and _inertia_alone(effect, joint.fitted, at),
                 massless=effect.body and _deviations(effect, joint.fitted, at)["mass"] < MASS,
@@ -267,27 +268,34 @@ def _share_of_torque(problem: Problem, state: State, torque: np.ndarray, effect:
 
 def _modulation(
     grown: _Grown, effect: Effect, torque: np.ndarray, without: Verdicts, joints: tuple[int, ...], whole: bool
-) -> tuple[float, float, float]:
-    """What an amplitude that varies gains more, in the fit and on held-out data, over what the cause gains; t of it."""
+) -> tuple[float, float, bool]:
+    """What an amplitude that varies gains more, in the fit and on held-out data, over what the cause gains; whether
+    held-out data surely want it.
+
+    Of a joint's law it is asked of its position, speed, load and time one by one, and the largest counts: all together
+    they fit chance, and what they then predict of other data says nothing. Chance makes the best of four surer than one.
+    """
     step = grown.step
-    columns = _varied_robot(grown, effect, torque) if whole else _varied_joint(grown, torque, joints)
-    base, more = grown.base, columns
+    base, touched = grown.base, list(range(len(step.rows.y))) if whole else list(joints)
     if kind(effect) == "response":  # it has no amplitude: its tangent must be free before
         (name,) = effect.parameters()
-        tangent = torque_slope(grown.problem, step.state, effect, name, grown.whitening)
-        free = judge_grown(step.rows, base, range(len(tangent)), tangent[None])
-        varied = judge_grown(step.rows, base, range(len(tangent)), np.concatenate([tangent[None], more]))
+        beside = torque_slope(grown.problem, step.state, effect, name, grown.whitening)[None, touched]
+        free = judge_grown(step.rows, base, touched, beside)
     else:
-        free = step.verdicts
-        touched = list(range(len(step.rows.y))) if whole else list(joints)
-        varied = judge_grown(step.rows, base, touched, more)
-    bare, fixed, loose = (v.own(step.rows, joints) for v in (without, free, varied))
-    drop, held = without.cost - free.cost, bare.sum() - fixed.sum()
-    more_drop, more_held = free.cost - varied.cost, fixed.sum() - loose.sum()
-    return float(more_drop / max(drop, 1e-9)), float(more_held / max(held, 1e-9)), t_value(fixed, loose)
+        free, beside = step.verdicts, np.zeros((0, len(touched), step.rows.y.shape[1]))
+    bare, fixed = (v.own(step.rows, joints) for v in (without, free))
+    drop, held, more_drop, more = without.cost - free.cost, bare.sum() - fixed.sum(), [], []
+    for columns in [_varied_robot(grown, effect, torque)] if whole else _varied_joint(grown, torque, joints):
+        varied = judge_grown(step.rows, base, touched, np.concatenate([beside, columns]))
+        loose = varied.own(step.rows, joints)
+        more_drop.append(free.cost - varied.cost)
+        more.append((float((fixed - loose).sum()), t_value(fixed, loose)))
+    gained, t = max(more)
+    surely = t > t_needed(len(fixed), T_NAMED, len(more))
+    return float(max(more_drop) / max(drop, 1e-9)), float(gained / max(held, 1e-9)), surely
 
 
-def _varied_joint(grown: _Grown, torque: np.ndarray, joints: tuple[int, ...]) -> Float[np.ndarray, "8 rows T"]:
+def _varied_joint(grown: _Grown, torque: np.ndarray, joints: tuple[int, ...]) -> Float[np.ndarray, "4 2 rows T"]:
     """The cause's torque times x and 2 x^2 - 1, x each joint's position, speed, load and time from -1 to 1."""
     problem, motion, records = grown.problem, grown.step.state.motion, grown.problem.records
     n, samples, _, _ = records.shape
@@ -297,8 +305,8 @@ def _varied_joint(grown: _Grown, torque: np.ndarray, joints: tuple[int, ...]) ->
         varying = [_unit(x) for x in (q[:, joint], np.abs(v[:, joint]), load[:, joint], np.asarray(motion.time))]
         columns = np.stack([torque[:, joint] * f for x in varying for f in (x, 2 * x**2 - 1)])
         rows = filter_rows(records, columns.reshape(-1, n, samples), grown.response[:, joint][None], fitted=True)
-        out.append((rows * np.asarray(problem.records.weight)[:, :, joint]).reshape(len(columns), -1))
-    return np.stack(out, axis=1)
+        out.append((rows * np.asarray(problem.records.weight)[:, :, joint]).reshape(len(varying), 2, -1))
+    return np.stack(out, axis=2)
 
 
 def _varied_robot(grown: _Grown, effect: Effect, torque: np.ndarray) -> Float[np.ndarray, "k nv T"]:

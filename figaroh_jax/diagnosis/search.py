@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -65,6 +65,11 @@ class Found:
     joints: tuple[int, ...] = ()  # by whose rows it is judged
     alike: tuple[Name, ...] = ()  # what else explains much of the same misfit, though not as well
     instead: tuple[Rival, ...] = ()  # of the `ambiguous` those that were fitted in its place
+
+    def as_another(self, other: Rival, alike: Iterable[Name]) -> Found:
+        """The same cause by another's name, effect and joints; `alike` is what then cannot be told from it."""
+        known = tuple(name for name in alike if name != other.name)
+        return replace(self, name=other.name, effect=other.effect, joints=other.joints, ambiguous=known)
 
 
 class Search(NamedTuple):

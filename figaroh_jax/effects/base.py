@@ -267,6 +267,7 @@ class Effect(eqx.Module):
     excludes: ClassVar[tuple[str, ...]] = ()  # not looked for any more once this one has been accepted
     # what physics asks of it; for a single parameter see the bounds of `amplitude` and `shape`
     dissipative: ClassVar[bool] = False  # whether amplitudes below zero would feed energy to the robot
+    rubs: ClassVar[bool] = False  # whether it is friction though not `dissipative`, a correction of another law say
     speed_law: ClassVar[bool] = False  # whether it is a law of dry friction over the speed, one of several alike
     beside_rest: ClassVar[bool] = True  # whether it can be told from a rest that stays; no law of what any rest does
     fades: ClassVar[bool] = False  # whether it goes by the time since the start: another recording has it no more
@@ -391,13 +392,10 @@ class JointEffect(Effect):
     ...     force: float = fj.amplitude("N m")
     ...     speed: float = fj.shape("rad/s", (0.01, 0.03, 0.1))  # where a search begins
     ...     def torque(self, motion):
-    ...         growth = jnp.log1p(abs(self.here(motion.velocity)) / self.speed)
-    ...         return self.force * self.here(motion.direction) * growth
-    >>> robot, q, v = fj.load_urdf(fj.DEMO), jnp.zeros(4), jnp.array([0.0, 0.0, 1.0, 0.0])
-    >>> more = fj.extend(robot, fj.place(Grease, robot, [robot.joint_names[2]], force=0.5, speed=0.1))
-    >>> added = more.inverse_dynamics(q, v, q) - fj.inverse_dynamics(robot, q, v, q)  # 0.5 log(1 + 1 / 0.1)
-    >>> [round(float(x), 3) for x in added]
-    [0.0, 0.0, 1.199, 0.0]
+    ...         v = self.here(motion.velocity)
+    ...         return self.force * self.here(motion.direction) * jnp.log1p(abs(v) / self.speed)
+    >>> float(fj.place(Grease, fj.load_urdf(fj.DEMO), ["elbow"], force=0.5, speed=0.1).speed)
+    0.1
     """
 
     acts_on = "joint"

@@ -77,6 +77,7 @@ class AsymmetricCoulombFriction(JointEffect):
     """Dry friction of another level in each direction; the part that differs."""
 
     name, title = "asymmetric_coulomb_friction", "direction-dependent Coulomb friction"
+    rubs = True
     indistinguishable_from = ("torque_offset",)
     equation = "difference |s(v)|"
     separated_by = "a dwell of {at} with the brake on, and motion in both directions"
@@ -92,6 +93,7 @@ class AsymmetricViscousFriction(JointEffect):
     """Viscous friction of another slope in each direction; the part that differs."""
 
     name, title = "asymmetric_viscous_friction", "direction-dependent viscous friction"
+    rubs = True
     equation = "difference |v|"
     separated_by = "sweeps of {at} in both directions over its whole range of speed"
     difference: Scalar = amplitude("N m s/rad")
@@ -123,7 +125,7 @@ class PowerLawFriction(JointEffect):
     """Friction that grows with a power of the speed (lubricant, temperature)."""
 
     name, title = "power_law_friction", "power-law friction"
-    speed_law = True
+    rubs = speed_law = True
     equation = "strength |v|^exponent s(v)"
     separated_by = "constant-speed sweeps of {at} from 0.05 rad/s to its maximum speed"
     strength: Scalar = amplitude("N m (s/rad)^exponent")
@@ -164,6 +166,7 @@ class PositionDependentFriction(JointEffect):
     """Dry friction that changes over a turn (a bent shaft, a seal, a worn gear)."""
 
     name, title = "position_dependent_friction", "position-dependent friction"
+    rubs = True
     equation = "s(v) (cosine cos q + sine sin q)"
     separated_by = "the same motion of {at} in other postures of the other joints"
     cosine: Scalar = amplitude("N m")
@@ -180,6 +183,7 @@ class FrictionDrift(JointEffect):
     """Friction above its later level that falls off as the joint warms up."""
 
     name, title = "friction_drift", "friction that falls as the joint warms up"
+    rubs = True
     beside_rest = False  # a rest that changes in the course of a recording looks like it
     fades = True
     equation = "(force s(v) + damping v) exp(-t/time)"
@@ -197,6 +201,7 @@ class FrictionDrift(JointEffect):
 class Bristle(JointEffect):
     """Dry friction with a state: a bristle that bends before it slides, in units of its sliding deflection."""
 
+    rubs = True
     force: Scalar = amplitude("N m", lower=0.0)
     # teeth and bearings yield by a hundredth of a radian before they slide; a cable that is dragged along, by tenths
     distance: Scalar = shape("rad", (0.0003, 0.001, 0.003, 0.01, 0.03, 0.08), (2e-5, 0.1))

@@ -138,7 +138,14 @@ def random_states(
 
 
 def motion_at(model: RobotModel, time: Any, q: Any, v: Any, a: Any, dt: Any, width: Any) -> Motion:
-    """The motion (rad, rad/s, rad/s^2; m if sliding) at instants `dt` s apart, without load; `width` as in `Motion`."""
+    """The motion (rad, rad/s, rad/s^2; m if sliding) at instants `dt` s apart, without load; `width` as in `Motion`.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> q, v, a = fj.columns.random_states(robot, 5)
+    >>> fj.columns.motion_at(robot, np.zeros(5), q, v, a, 0.0, np.zeros(4)).velocity.shape
+    (5, 4)
+    """
     zero = jnp.zeros(jnp.shape(v))
     return Motion(model, jnp.asarray(time), jnp.asarray(q), jnp.asarray(v), jnp.asarray(a), zero, zero, dt, width)
 
@@ -152,7 +159,15 @@ def state_columns(
     v: Float[ArrayLike, "samples nv"],
     a: Float[ArrayLike, "samples nv"],
 ) -> Float[np.ndarray, "samples nv columns"]:
-    """Columns at given states, unfiltered; `widths` as in `Regression.pieces`."""
+    """Columns at given states, unfiltered; `widths` as in `Regression.pieces`.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> q, v, a = fj.columns.random_states(robot, 5)
+    >>> W = fj.columns.state_columns(robot, (), np.zeros(4), (), q, v, a)
+    >>> bool(np.allclose(W @ np.asarray(robot.inertia).ravel(), fj.inverse_dynamics(robot, q, v, a), atol=1e-3))
+    True
+    """
     motion = motion_at(model, jnp.zeros(jnp.shape(v)[0]), q, v, a, 0.0, width)
     return columns_of(NativeBackend(model), terms, motion, widths)
 

@@ -76,7 +76,12 @@ def identify_fleet(
 
 
 def check_fleet(robots: Sequence[RobotModel], q: Any, v: Any, a: Any, tau: Any) -> None:
-    """Raise `InputError` where the robots have different joints or the arrays do not fit them."""
+    """Raise `InputError` where the robots have different joints or the arrays do not fit them.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot, x = fj.load_urdf(fj.DEMO), np.zeros((2, 100, 4))
+    >>> fj.fleets.check_fleet([robot, robot], x, x, x, x)
+    """
     if not robots:
         raise InputError("a fleet needs at least one robot")
     first = robots[0]
@@ -105,7 +110,12 @@ def fleet_of(base: BaseParameters, found: Any) -> Fleet:
 
 
 def own_arrays(robot: RobotModel) -> tuple[Any, ...]:
-    """What may differ from robot to robot."""
+    """What may differ from robot to robot.
+
+    >>> import figaroh_jax as fj
+    >>> fj.fleets.own_arrays(fj.load_urdf(fj.DEMO))[2].shape  # inertial parameters
+    (4, 10)
+    """
     return robot.placement, robot.axis, robot.inertia, robot.ratio, robot.offset, robot.gravity
 
 

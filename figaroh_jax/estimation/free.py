@@ -225,7 +225,7 @@ def _open_parts(kind: str, data: Sequence[Data]) -> Iterator[Part]:
 def _effect_parts(model: ExtendedModel, friction: bool) -> Iterator[Part]:
     robot = model.robot
     for k, effect in enumerate(model.effects):
-        if friction and not (effect.dissipative or effect.speed_law or "friction" in effect.name):
+        if friction and not (effect.dissipative or effect.rubs):
             continue
         known = robot.link_names if effect.acts_on == "link" else robot.dof_names
         places = [known[int(i)] for i in effect.at]

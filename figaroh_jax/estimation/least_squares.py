@@ -149,6 +149,15 @@ def solve(
     `kept` are the columns that are fitted, normally the base parameters (default: all); the others stay zero. `weight`
     are the joints' weights. `regression` and `used` are needed by the methods that look at single rows. Where columns
     are dependent the parameters are the smallest, in units of the columns' lengths.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> q, v, a = fj.columns.random_states(robot, 300)
+    >>> states = fj.states.States(robot, lambda: [(q, v, a, np.asarray(fj.inverse_dynamics(robot, q, v, a)))], ())
+    >>> data = fj.regression.condense(states, states.used)
+    >>> found = fj.least_squares.solve(data, kept=states.structural.independent)
+    >>> bool(found.rms.max() < 1e-6)  # N m
+    True
     """
     method = method or OrdinaryLeastSquares()
     columns = np.arange(len(data.names)) if kept is None else np.asarray(kept, int)
@@ -169,7 +178,16 @@ def solve(
 
 
 def joint_weights(data: Condensed, theta: Float[np.ndarray, " columns"]) -> Float[np.ndarray, " nv"]:
-    """Inverse of the mean squared residual of each joint; a joint without rows weighs nothing."""
+    """Inverse of the mean squared residual of each joint; a joint without rows weighs nothing.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> q, v, a = fj.columns.random_states(robot, 300)
+    >>> states = fj.states.States(robot, lambda: [(q, v, a, np.asarray(fj.inverse_dynamics(robot, q, v, a)))], ())
+    >>> data = fj.regression.condense(states, states.used)
+    >>> fj.least_squares.joint_weights(data, np.zeros(40)).shape
+    (4,)
+    """
     squares, rows = data.squares(theta), data.rows
     torque = data.squares(np.zeros_like(theta))
     floor = LEAST**2 * torque + np.finfo(float).tiny
@@ -179,7 +197,14 @@ def joint_weights(data: Condensed, theta: Float[np.ndarray, " columns"]) -> Floa
 def with_prior(
     factor: Float[np.ndarray, "n k"], mean: Float[np.ndarray, " columns"], precision: Float[np.ndarray, " columns"]
 ) -> Float[np.ndarray, "n k"]:
-    """Factor of the squares plus `precision` times the squared difference to `mean`."""
+    """Factor of the squares plus `precision` times the squared difference to `mean`.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> factor = np.array([[2.0, 6.0], [0.0, 0.0]])  # 2 x = 6
+    >>> both = fj.least_squares.with_prior(factor, np.array([1.0]), np.array([4.0]))
+    >>> round(float(both[0, 1] / both[0, 0]), 3)  # halfway between 3 and 1
+    2.0
+    """
     root = np.sqrt(np.asarray(precision))
     rows = np.column_stack([np.diag(root), root * np.asarray(mean)])
     return np.asarray(np.linalg.qr(np.concatenate([factor, rows]), mode="r"))

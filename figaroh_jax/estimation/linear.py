@@ -106,8 +106,7 @@ def linear_limits(model: ExtendedModel, basis: Basis) -> tuple[Float[np.ndarray,
     """
     lower = [-np.inf] * (10 * len(model.robot.joints))
     for effect in model.effects:
-        least = {"rotor_inertia": 0.0, "viscous_friction": 0.0, "coulomb_friction": 0.0}.get(effect.name, -np.inf)
-        lower += [max(p.lower, least) for p in effect.parameters().values() if p.linear]
+        lower += [p.lower for p in effect.parameters().values() if p.linear]
     low = np.array(lower)[list(basis.kept)]
     return low, np.full(len(low), np.inf)
 

@@ -95,6 +95,10 @@ def segments_of(robot: RobotModel) -> tuple[tuple[str, ...], tuple[int, ...]]:
     """Names of the segments, the links with a mass, and the segment of each link.
 
     Massless links between the axes of one anatomical joint have no size: theirs is that of the next link with a mass.
+
+    >>> import figaroh_jax as fj
+    >>> fj.markers.segments_of(fj.load_urdf(fj.DEMO))[0]
+    ('turret', 'upper_arm', 'forearm', 'hand')
     """
     mass = np.asarray(robot.inertia)[:, 0]
     names = tuple(joint.link for joint, m in zip(robot.joints, mass, strict=True) if m > 0)
@@ -111,6 +115,13 @@ def scaled(robot: RobotModel, segment: Sequence[int], scale: Any) -> RobotModel:
     """The robot whose segments are `scale` times as long: the joints and frames that a link carries move with it.
 
     Inertial parameters stay; `identification.people.anthropometric` gives those of the new sizes.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> names, segment = fj.markers.segments_of(robot)
+    >>> twice = fj.markers.scaled(robot, segment, 2.0 * np.ones(len(names)))
+    >>> bool(np.allclose(twice.placement[-1][:3, 3], 2 * np.asarray(robot.placement[-1][:3, 3])))
+    True
     """
     one = jnp.concatenate([jnp.asarray(scale), jnp.ones(1)])[np.asarray(segment)]
     carried = jnp.concatenate([one, jnp.ones(1)])
@@ -134,6 +145,15 @@ def marker_data(
     NaN where a marker was not seen; `sigma` (m) is the deviation of a marker from its place on the bone, soft tissue
     included. `start`: positions to search from (default: neutral). Raises `InputError` for unknown links and labels,
     wrong shapes, and a motion of which a frame shows fewer than six coordinates.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot, zero = fj.load_urdf(fj.DEMO), np.zeros((2, 4))
+    >>> places = {"tip": ("hand", (0.0, 0.0, 0.1)), "side": ("hand", (0.1, 0.0, 0.0))}
+    >>> poses = np.asarray(fj.frame_placement(robot, zero, "hand"))
+    >>> seen = {label: poses[:, :3, :3] @ np.array(at) + poses[:, :3, 3] for label, (_, at) in places.items()}
+    >>> data = fj.markers.marker_data(robot, places, seen, start=zero)
+    >>> data.seen.shape
+    (2, 2, 3)
     """
     names, segment = segments_of(robot)
     for label, (link, place) in markers.items():
@@ -247,6 +267,15 @@ def joint_positions(robot: RobotModel, data: MarkerData, turns: int = 15) -> _Mo
     """Positions of every frame by inverse kinematics (rad, m), and the markers' residuals.
 
     Damped Gauss-Newton steps from `data.start`, all frames at once; a position that no marker shows stays there.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> robot, q = fj.load_urdf(fj.DEMO), np.array([[0.1, 0.2, -0.3, 0.1]])
+    >>> places = {"tip": ("hand", (0.0, 0.0, 0.1)), "side": ("hand", (0.1, 0.0, 0.0))}
+    >>> pose = np.asarray(fj.frame_placement(robot, q, "hand"))
+    >>> seen = {label: pose[:, :3, :3] @ np.array(at) + pose[:, :3, 3] for label, (_, at) in places.items()}
+    >>> found = fj.markers.joint_positions(robot, fj.markers.marker_data(robot, places, seen))
+    >>> bool(np.abs(found.residual).max() < 1e-3)  # m
+    True
     """
     answers = []
     for first in range(0, len(np.asarray(data.seen)), _BLOCK):

@@ -154,7 +154,12 @@ def _rows_of(array: np.memmap, start: int, samples: int) -> np.ndarray:
 
 
 def check_piece(model: RobotModel, part: Sequence[Any], number: int, *, values: bool = True) -> None:
-    """Refuse a piece of states with arrays of wrong shapes or, with `values`, a number that is not finite."""
+    """Refuse a piece of states with arrays of wrong shapes or, with `values`, a number that is not finite.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> x = np.zeros((100, 4))
+    >>> fj.states.check_piece(fj.load_urdf(fj.DEMO), (x, x, x, x), 0)
+    """
     samples = len(part[0])
     shapes = [(samples, model.nq), *[(samples, model.nv)] * 3]
     for name, x, shape in zip(("q", "v", "a", "tau"), part, shapes, strict=True):

@@ -193,7 +193,7 @@ def _warnings(extended: ExtendedModel, in_urdf: Sequence[Carried], in_mjcf: Sequ
 def load_model(directory: str | Path) -> ExtendedModel:
     """The extended model that `write_model` wrote, the same to rounding: joints in their order, every effect.
 
-    Effects of your own must have been registered (`effects.register`) before. Raises `InputError` for a folder that
+    Effects of your own must have been registered (`register`) before. Raises `InputError` for a folder that
     holds no such model, and for effects, joints or links that are not known.
 
     >>> import tempfile, figaroh_jax as fj

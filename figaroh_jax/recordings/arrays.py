@@ -229,7 +229,7 @@ def _check_pace(stamps: np.ndarray, source: Memory) -> None:
     if step > _SLOWEST:
         unit = next((unit for unit, factor in SECONDS.items() if step * factor <= 0.1), "ns")
         raise InputError(
-            f"{source}: one sample in {step:.4g} s is too few for a motion; stamps that look like {unit}:"
+            f"{source}: one sample every {step:.4g} s is too few for a motion; the stamps look like {unit}: add"
             f' units={{"time": "{unit}"}}'
         )
 

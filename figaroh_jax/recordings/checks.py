@@ -118,13 +118,13 @@ def _clock(look: Look) -> Iterator[Finding]:
     _, _, speed, _ = _limits(look.model)
     top = np.abs(np.diff(look.position, axis=0)).max(axis=0) / step
     slow = bool((top < 0.02 * np.where(np.isfinite(speed), speed, 3.0)).all())
-    advice = f"stamps that look like {unit}: add units: {{time: {unit}}}"
+    advice = f"the stamps look like {unit}: add units: {{time: {unit}}}"
     if look.entry is not None and look.entry.time is None:
-        advice = f"rate: {1 / step:g} Hz looks like a period in place of a frequency"
+        advice = f"rate: {1 / step:g} Hz looks like a period instead of a frequency"
     whole = bool(np.all(time == np.round(time)))
     yield Finding(
         slow and (whole or step > 0.5),
-        f"{look.entry.time if look.entry and look.entry.time else 'time'}: one sample in {step:.4g} s over"
+        f"{look.entry.time if look.entry and look.entry.time else 'time'}: one sample every {step:.4g} s over"
         f" {time[-1] - time[0]:.4g} s; {advice}",
     )
 
@@ -147,7 +147,7 @@ def _unit_without_joint(look: Look) -> Iterator[Finding]:
         yield Finding(
             False,
             f"units: {{position: deg}}, but no joint moves by more than {look.span[~straight].max() / DEGREE:.3g}"
-            " degrees: it looks like rad; leave out units: {position: deg}",
+            " degrees: it looks like rad; remove units: {position: deg}",
         )
 
 
@@ -236,7 +236,7 @@ def _jumps(look: Look) -> Iterator[Finding]:
         yield Finding(
             bool(beyond),
             f"position of {look.joints[j]} jumps by {steps[k - 1, j]:.4g} {unit_of(look, j)} in row {k} (from 0)"
-            f"{and_more(rows)}: a wild sample or lost rows; delete these rows, or keep them out by preprocess.window",
+            f"{and_more(rows)}: a wild sample or lost rows; delete these rows, or exclude them with preprocess.window",
         )
 
 
@@ -275,7 +275,7 @@ def _held_samples(look: Look) -> Iterator[Finding]:
     rate = (len(position) - 1) / (look.recording.time[-1] - look.recording.time[0])
     yield Finding(
         False,
-        f"every row appears {times:.0f} times: the recording was held at about {rate / times:.4g} Hz, the stamps"
+        f"every row appears {times:.0f} times: values were sampled at about {rate / times:.4g} Hz and held, the stamps"
         f" say {rate:.4g} Hz; keep one row of each",
     )
 
@@ -326,7 +326,8 @@ def _velocity_said(look: Look, slope: np.ndarray, like: np.ndarray, at: np.ndarr
     flipped = [name for name, r in zip(names, like, strict=True) if r < -LIKE]
     if flipped:
         yield Finding(
-            False, f"velocity of {', '.join(flipped)} has the opposite sign of the position's rate: one is negated"
+            False,
+            f"velocity of {', '.join(flipped)} has the opposite sign of the position's rate: one of them is negated",
         )
     foreign = [name for name, r in zip(names, like, strict=True) if abs(r) < UNLIKE]
     if foreign:
@@ -341,11 +342,11 @@ def _velocity_said(look: Look, slope: np.ndarray, like: np.ndarray, at: np.ndarr
     time = look.recording.time
     rate = (len(time) - 1) / (time[-1] - time[0])
     if abs(factor * DEGREE - 1) < 0.2:
-        text = "it looks like degrees: add units: {velocity: deg/s}, or units: {position: deg} where both are"
+        text = "it looks like degrees: add units: {velocity: deg/s}, or units: {position: deg} if both are"
     elif abs(factor / DEGREE - 1) < 0.2:
         text = "the position looks like degrees: add units: {position: deg, velocity: rad/s}"
     else:
-        text = f"the clock looks wrong: a rate of {rate * factor:.4g} Hz in place of {rate:.4g} Hz would fit"
+        text = f"the clock looks wrong: a rate of {rate * factor:.4g} Hz instead of {rate:.4g} Hz would fit"
     hard = factor > 300 or factor < 1 / 300
     yield Finding(bool(hard), f"velocity is {factor:.4g} times the position's rate; {text}")
 
@@ -422,7 +423,8 @@ def _clipped(look: Look) -> Iterator[Finding]:
                 yield Finding(
                     False,
                     f"torque of {look.joints[j]} stays at {end:.4g} {effort_unit(look, j)} for {at.mean():.1%} of the"
-                    " samples: the drive was at its limit, or the log clips; leave such motions out, or record slower",
+                    " samples: the drive was at its limit, or the log clips; leave such motions out, or move more"
+                    " slowly",
                 )
 
 

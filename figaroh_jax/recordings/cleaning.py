@@ -107,7 +107,7 @@ def without_spikes(
     return replace(
         recording,
         trusted=trusted,
-        notes=(*recording.notes, f"{note} lies beyond {cut:g} robust standard deviations and is left out"),
+        notes=(*recording.notes, f"{note} is beyond {cut:g} robust standard deviations and is left out"),
     )
 
 
@@ -116,6 +116,14 @@ def without_untrusted(recording: Recording) -> tuple[Recording, list[Float[np.nd
 
     A low pass would spread such torque over its neighbours. Raises `InputError` for a mask of another shape, and where
     a joint has nothing left.
+
+    >>> import dataclasses, numpy as np, figaroh_jax as fj
+    >>> torque = np.arange(10.0)[:, None] * np.ones(2)
+    >>> torque[4, 1], trusted = 99.0, np.arange(20).reshape(10, 2) != 9
+    >>> run = dataclasses.replace(fj.recording(q=torque, tau=torque, rate=10), trusted=trusted)
+    >>> found, times = fj.cleaning.without_untrusted(run)
+    >>> float(found.torque[4, 1]), times[1].tolist()
+    (4.0, [0.4])
     """
     torque, trusted = recording.torque, recording.trusted
     if torque is None or trusted is None:
@@ -124,7 +132,9 @@ def without_untrusted(recording: Recording) -> tuple[Recording, list[Float[np.nd
         raise InputError(f"{recording.file}: `trusted` has shape {trusted.shape}, but torque {torque.shape}")
     if not trusted.any(axis=0).all():
         name = recording.joints[int(np.argmin(trusted.any(axis=0)))]
-        raise InputError(f"{recording.file}: no torque of {name} is trusted; leave it out by identify.joints instead")
+        raise InputError(
+            f"{recording.file}: no torque of {name} is trusted; leave the joint out with identify.joints instead"
+        )
     columns = [
         np.interp(recording.time, recording.time[good], x[good]) for x, good in zip(torque.T, trusted.T, strict=True)
     ]
@@ -135,7 +145,12 @@ def without_untrusted(recording: Recording) -> tuple[Recording, list[Float[np.nd
 def near(
     rows: Float[np.ndarray, " rows"], masked: Sequence[Float[np.ndarray, "_"]], reach: float
 ) -> Bool[np.ndarray, "rows nv"] | Bool[np.ndarray, ""]:
-    """Which rows (times, s) lie within `reach` (s) of a time that is masked, joint by joint; none for no mask."""
+    """Which rows (times, s) lie within `reach` (s) of a time that is masked, joint by joint; none for no mask.
+
+    >>> import numpy as np, figaroh_jax as fj
+    >>> fj.cleaning.near(np.array([0.0, 0.1, 0.2]), [np.array([0.12])], 0.05).tolist()
+    [[False], [True], [False]]
+    """
     if not masked:
         return np.array(False)
     out = np.zeros((len(rows), len(masked)), bool)

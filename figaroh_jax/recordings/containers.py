@@ -230,7 +230,7 @@ def read_lerobot(folder: Path, source: Source) -> Table:
         feature, k = parts[name]
         values = whole.read(feature)
         if values.ndim != 2 or k >= values.shape[1]:
-            raise InputError(f"{folder}: '{feature}' has shape {values.shape}; meta/info.json names more columns")
+            raise InputError(f"{folder}: '{feature}' has shape {values.shape}, but meta/info.json names more columns")
         return values[:, k]
 
     return Table(folder, (*whole.names, *(name for name in parts if name not in whole.names)), read)

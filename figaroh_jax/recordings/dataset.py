@@ -96,8 +96,8 @@ def read_recordings(
     lacking = next((r for r in recordings if r.role == "fit" and r.torque is None), None)
     if lacking is not None:
         raise InputError(
-            f"{lacking.file}: a fit recording needs `torque` (only `role: holdout` may lack it), or all recordings a "
-            "`command` in its place"
+            f"{lacking.file}: a fit recording needs `torque` (only `role: holdout` may lack it), or every recording"
+            " a `command` instead"
         )
     return recordings
 

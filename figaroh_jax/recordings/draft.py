@@ -284,7 +284,7 @@ def _order(robot: RobotModel, reads: Sequence[Columns], motions: Sequence[Sample
         own, best = shares[cycle, cycle], shares[cycle, order[cycle]]
         if (best > CONFIRMED).all() and np.sum(np.log((1.02 - own) / (1.02 - best))) > np.log(6.0):
             text = ", ".join(f"{names[j]} goes with the torque given for {names[order[j]]}" for j in cycle)
-            raise InputError(f"{reads[0].file}: torque and position columns stand in different orders: {text}")
+            raise InputError(f"{reads[0].file}: torque and position columns are in different orders: {text}")
 
 
 def _cycles(order: list[int]) -> Iterator[list[int]]:

@@ -80,9 +80,9 @@ def _against_model(recording: PoseRecording, model: RobotModel, unit: str, measu
         yield _odd(own, [(text, overlay(other)) for text, other in _readings(q, model, unit)])
     elif not 0.5 < own.scale < 2.0:
         thousand = 500 < own.scale < 2000
-        advice = "they look like mm: add units: {measurement: mm}" if thousand else "which unit are they in?"
+        advice = "they look like mm: add units: {measurement: mm}" if thousand else "what unit are they in?"
         if 500 < 1 / own.scale < 2000 and measured == "mm":
-            advice = "they look like m: leave units: {measurement: mm} out"
+            advice = "they look like m: remove units: {measurement: mm}"
         yield Finding(True, f"the measured points spread {own.scale:.4g} times as far as the model's; {advice}")
     if recording.kind == "pose" and own.left <= OFF:
         yield from _orientations(recording, model, seen)
@@ -124,7 +124,7 @@ def _readings(q: np.ndarray, model: RobotModel, unit: str) -> Iterator[tuple[str
     if unit == "rad":
         yield "they would in degrees: add units: {position: deg}", q * np.where(turns, DEGREE, 1e-3)
     else:
-        yield f"they would in rad: leave units: {{position: {unit}}} out", q * np.where(turns, 1 / DEGREE, 1e3)
+        yield f"they would in rad: remove units: {{position: {unit}}}", q * np.where(turns, 1 / DEGREE, 1e3)
     for i in range(len(names)):
         sign = np.ones(len(names))
         sign[i] = -1.0
@@ -152,7 +152,7 @@ def _orientations(recording: PoseRecording, model: RobotModel, seen: np.ndarray)
     first = Rotation.from_quat(np.roll(numbers, -1, axis=1)).as_matrix()  # w x y z read as x y z w
     advice = "another order of columns, or another frame?"
     if np.median(np.abs(_angles(first) - own)) < 0.15:
-        advice = "they look like w x y z; the columns are to be named in the order x y z qx qy qz qw"
+        advice = "they look like w x y z; name the columns in the order x y z qx qy qz qw"
     yield Finding(False, f"the measured orientations do not turn as the model's do; {advice}")
 
 

@@ -60,8 +60,8 @@ def torque_findings(look: Look, motion: Sampled) -> Iterator[Finding]:
     if error < 0.15 and abs(np.log(stretch)) > max(np.log(1.5), 3 * error):
         yield Finding(
             False,
-            f"the clock looks wrong: inertial torque fits one {stretch:.2g} times as fast, {motion.rate * stretch:.4g}"
-            f" Hz in place of {motion.rate:.4g} Hz (+-{100 * error:.0f} %)",
+            f"the clock looks wrong: the inertial torque fits a clock {stretch:.2g} times as fast,"
+            f" {motion.rate * stretch:.4g} Hz instead of {motion.rate:.4g} Hz (+-{100 * error:.0f} %)",
         )
 
 
@@ -123,7 +123,7 @@ def _other_reading(look: Look, motion: Sampled) -> Finding | None:
             best, text = gain, said
     if best < np.log(5.0):
         return None
-    return Finding(False, f"torque does not belong to the motion as read; {text}")
+    return Finding(False, f"torque does not match the motion as read; {text}")
 
 
 def _belongs(fit: _Fit, heavy: np.ndarray) -> bool:
@@ -150,7 +150,7 @@ def _readings(look: Look, motion: Sampled, nominal: np.ndarray) -> Iterator[tupl
         text = "it would with positions in degrees: add units: {position: deg}"
         yield text, motion.scaled(np.where(turns, DEGREE, 1e-3))
     else:
-        text = f"it would with positions in rad: leave units: {{position: {look.unit}}} out"
+        text = f"it would with positions in rad: remove units: {{position: {look.unit}}}"
         yield text, motion.scaled(np.where(turns, 1 / DEGREE, 1e3))
     if n > 1:
         yield (
@@ -162,7 +162,7 @@ def _readings(look: Look, motion: Sampled, nominal: np.ndarray) -> Iterator[tupl
     order = _assigned(matrix_of_likeness(motion, nominal, torque))
     if order is not None:
         text = ", ".join(f"{joints[j]} takes the column given for {joints[c]}" for j, c in enumerate(order) if c != j)
-        yield f"the torque columns stand in another order: {text}", replace(motion, torque=torque[:, order])
+        yield f"the torque columns are in a different order: {text}", replace(motion, torque=torque[:, order])
     yield from _swapped(joints, motion, torque, turns)
     for j in np.flatnonzero(turns):
         for quarter in (1, 2, -1):

@@ -23,7 +23,7 @@ from ..compiled.machine_code import machine_code
 from ..compiled.precision import in_float64
 from ..errors import InputError, check_real
 from .kinematics import check_shapes
-from .model import RobotModel
+from .model import Joint, RobotModel
 from .regressor import BLOCK_FORM, coordinate_blocks, coordinate_rows, dense_rows
 from .regrouped import Kept, kept_columns, orderly, regrouping
 from .scalar_forms import looped, row_groups, weighted_rows
@@ -74,19 +74,22 @@ def normal_matrix(
     beside = (0 if extra is None else np.shape(extra)[-1]) + 1
     columns, on_gpu = 10 * len(model.joints) + beside, usable(*rows) and len(rows.q) > 0
     kept = _kept(model, len(rows.q)) if on_gpu else None
-    groups = _groups(model, columns) if not on_gpu else _kept_groups(model, kept, beside)
+    groups = _groups(model, columns) if not on_gpu else _kept_groups(model.joints, kept, beside)
     columns = columns if kept is None else sum(map(len, kept)) + beside
-    library: Any = np if on_host(model, rows) else jnp
-    start = tuple(library.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
     parts = _by_machine_code(model, groups, rows) if on_host(model, rows) else None
     if on_gpu:
-        parts = _by_kernels(_with_products, model, kept, start, rows)
-    # a small matrix is added to from the innermost cache; a large one costs more to add to than its rows to make
-    chunk = 32 if on_host() and columns <= SMALL else chunk_size()
-    parts = _fold(_add_products, chunk, start, model, rows) if parts is None else parts
-    index = np.concatenate([_flat(group, columns).ravel() for group in groups])
-    new = _scattered(columns, index, parts)
-    new = new if kept is None else _regrouped(regrouping(model, kept), new)
+        parts = _by_kernels(_with_products, model, kept, rows)
+    if parts is None:
+        library: Any = np if on_host(model, rows) else jnp
+        start = tuple(library.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
+        # a small matrix is added to from the innermost cache; a large one costs more to add to than its rows to make
+        chunk = 32 if on_host() and columns <= SMALL else chunk_size()
+        parts = _fold(_add_products, chunk, start, model, rows)
+    if kept is not None and on_gpu and kept_here(*parts) and not traced(model, parts):
+        new = NormalMatrix(*_kept_whole(model.joints, kept, beside)(regrouping(model, kept), parts))
+    else:
+        new = _scattered(columns, np.concatenate([_flat(group, columns).ravel() for group in groups]), parts)
+        new = new if kept is None else _regrouped(regrouping(model, kept), new)
     return new if total is None else NormalMatrix(*(x + y for x, y in zip(total, new, strict=True)))
 
 
@@ -206,10 +209,10 @@ class _Group(NamedTuple):
 
 
 def _groups(model: RobotModel, columns: int) -> list[_Group]:
-    blocks, _ = coordinate_blocks(model)
+    blocks, _ = coordinate_blocks(model.joints)
     members = [np.flatnonzero(blocks[:, 0] == coordinate) for coordinate in range(model.nv)]
     groups = []
-    for which in row_groups(model):
+    for which in row_groups(model.joints):
         index = np.stack([members[k] for k in which])
         # the columns of mass and first moments of all links before those of their inertia, as the kernel gives them
         first = 10 * blocks[index, 1][..., None]
@@ -221,12 +224,13 @@ def _groups(model: RobotModel, columns: int) -> list[_Group]:
     return groups
 
 
-def _kept_groups(model: RobotModel, kept: Kept | None, beside: int) -> list[_Group]:
+@lru_cache(maxsize=64)
+def _kept_groups(joints: tuple[Joint, ...], kept: Kept | None, beside: int) -> list[_Group]:
     """As kernels of a GPU write them: the kept columns in the order of the regressor, then those beside."""
-    blocks, _ = coordinate_blocks(model)
-    ends = np.cumsum([0, *([10] * len(model.joints) if kept is None else map(len, kept))]).tolist()
+    blocks, _ = coordinate_blocks(joints)
+    ends = np.cumsum([0, *([10] * len(joints) if kept is None else map(len, kept))]).tolist()
     groups = []
-    for which in row_groups(model, kept):
+    for which in row_groups(joints, kept):
         index = np.stack([np.flatnonzero(blocks[:, 0] == k) for k in which])
         own = [
             np.concatenate([*(np.arange(ends[link], ends[link + 1]) for link in links), ends[-1] + np.arange(beside)])
@@ -269,6 +273,16 @@ def _scattered(columns: int, index: Array, parts: tuple[Array, ...]) -> NormalMa
     return NormalMatrix(whole[:-1, :-1], whole[:-1, -1], whole[-1, -1])
 
 
+@lru_cache(maxsize=64)
+def _kept_whole(joints: tuple[Joint, ...], kept: Kept, beside: int) -> Program:
+    def whole_matrix(links: Float[Array, "kept links"], parts: tuple[Array, ...]) -> tuple[Array, ...]:
+        columns = sum(map(len, kept)) + beside
+        index = np.concatenate([_flat(group, columns).ravel() for group in _kept_groups(joints, kept, beside)])
+        return tuple(_regrouped(links, _scattered(columns, index, parts)))
+
+    return Program(whole_matrix, key=f"{joints} {kept} {beside}", tuning=0)  # two small products: not worth a search
+
+
 def _add_products(model: RobotModel, totals: tuple[Array, ...], rows: _Rows) -> tuple[Array, ...]:
     samples = rows.q.shape[-1]
     pieces = coordinate_rows(model, rows.q, rows.v, rows.a)
@@ -285,9 +299,7 @@ def _add_products(model: RobotModel, totals: tuple[Array, ...], rows: _Rows) -> 
 Add = Callable[[Array, Array], Array]  # of a sum or factor so far (c, k, k) and more rows of each coordinate
 
 
-def _by_kernels(
-    add: Add, model: RobotModel, kept: Kept | None, start: tuple[Array, ...], rows: _Rows
-) -> tuple[Array, ...]:
+def _by_kernels(add: Add, model: RobotModel, kept: Kept | None, rows: _Rows) -> tuple[Array, ...]:
     """The products, or factors, of each coordinate on a GPU, from rows that a kernel writes as they are multiplied."""
     samples, nv = len(rows.q), model.nv
     # no empty array of so many rows: XLA takes seconds to make its program, and as long to read it again
@@ -299,18 +311,18 @@ def _by_kernels(
         modes = ("edge", "edge", "edge", "constant", "edge")
         arrays = [jnp.pad(x, ((0, whole - samples), (0, 0)), mode=m) for x, m in zip(arrays, modes, strict=True)]
     told = add, kept, known_codes(_row_form(0, kept), model), min(whole, _rows_at_once(model))
-    if traced(model, start, arrays):
-        return _sums_of_rows(*told, model, start, *arrays)
-    return (_kept_sums(*told) if kept_here(*arrays) else partial(_program_of_sums, *told))(model, start, *arrays)
+    if traced(model, arrays):
+        return _sums_of_rows(*told, model, *arrays)
+    return (_kept_sums(*told) if kept_here(*arrays) else partial(_program_of_sums, *told))(model, *arrays)
 
 
 @lru_cache(maxsize=64)
 def _kept_sums(add: Add, kept: Kept | None, codes: bytes, chunk: int) -> Program:
-    def sums_of_rows(model: RobotModel, start: tuple[Array, ...], *arrays: Array) -> tuple[Array, ...]:
-        return _sums_of_rows(add, kept, codes, chunk, model, start, *arrays)
+    def sums_of_rows(model: RobotModel, *arrays: Array) -> tuple[Array, ...]:
+        return _sums_of_rows(add, kept, codes, chunk, model, *arrays)
 
     key = f"{add.__name__} {kept} {chunk} {codes.hex()}"
-    return Program(sums_of_rows, key=key, tuning=None if add is _with_products else 0)  # solves decide, not products
+    return Program(sums_of_rows, key=key, tuning=0)  # the first way is as quick as the best
 
 
 def _sums_of_rows(
@@ -319,12 +331,14 @@ def _sums_of_rows(
     codes: bytes,
     chunk: int,
     model: RobotModel,
-    start: tuple[Array, ...],
     *arrays: Float[Array, "samples _"],
 ) -> tuple[Array, ...]:
     # XLA would copy the rows of several coordinates, the samples last, before it multiplies them in pieces
     piece = 0 if kept is None else min(TOGETHER, chunk & -chunk)
-    form = _row_form(arrays[4].shape[1] // model.nv, kept, piece)
+    beside = arrays[4].shape[1] // model.nv
+    form = _row_form(beside, kept, piece)
+    groups = _kept_groups(model.joints, kept, beside)
+    start = tuple(jnp.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
     chunks = [x.reshape(-1, chunk, x.shape[1]) for x in arrays]
 
     def step(total: tuple[Array, ...], arrays: list[Array]) -> tuple[tuple[Array, ...], None]:
@@ -346,14 +360,14 @@ def _plain_rows(
     side: int, kept: Kept | None, piece: int, model: RobotModel, q: Any, v: Any, a: Any, root: Any, given: Any
 ) -> list[Array]:
     blocks, samples = jnp.concatenate(coordinate_rows(model, q.T, v.T, a.T), axis=1).reshape(-1, len(q)), len(q)
-    order = coordinate_blocks(model)[0]
+    order = coordinate_blocks(model.joints)[0]
     beside = given.T.reshape(model.nv, side, samples)
     parts = []
     for row in range(model.nv):
         own = ((k, order[k, 1]) for k in np.flatnonzero(order[:, 0] == row).tolist())
         index = [10 * k + c for k, link in own for c in (range(10) if kept is None else kept[link])]
         parts.append(jnp.concatenate([blocks[np.array(index, int)], beside[row]]))
-    groups = [jnp.stack([parts[row] * root[:, row] for row in group]) for group in row_groups(model, kept)]
+    groups = [jnp.stack([parts[row] * root[:, row] for row in group]) for group in row_groups(model.joints, kept)]
     return [jnp.moveaxis(x.reshape(*x.shape[:2], -1, piece), 2, 1) for x in groups] if piece else groups
 
 
@@ -396,9 +410,8 @@ def _factor_by_kernels(model: RobotModel, columns: int, rows: _Rows) -> Float[Ar
     kept, beside = _kept(model, len(rows.q)), columns - 10 * len(model.joints)
     if not beside:  # kernels write at least one column beside those of the links
         return _factor_by_kernels(model, columns + 1, rows._replace(tau=jnp.zeros_like(rows.v)))[:, :-1]
-    groups = _kept_groups(model, kept, beside)
-    start = tuple(jnp.zeros((len(g.blocks), g.columns.shape[1], g.columns.shape[1])) for g in groups)
-    parts = _by_kernels(_with_factor, model, kept, start, rows)
+    groups = _kept_groups(model.joints, kept, beside)
+    parts = _by_kernels(_with_factor, model, kept, rows)
     few = columns if kept is None else sum(map(len, kept)) + beside
     links = None if kept is None else regrouping(model, kept)
     return _spread(few, links, tuple(g.columns for g in groups), parts)
@@ -443,7 +456,7 @@ def row_products(rows: Float[Array, "c k samples"]) -> Float[Array, "c k k"]:
 
 def _rows_at_once(model: RobotModel) -> int:
     """Samples to a chunk on a GPU, whose products are the quicker the more rows they sum."""
-    blocks, _ = coordinate_blocks(model)
+    blocks, _ = coordinate_blocks(model.joints)
     return 1 << min(20, int(np.log2(DEVICE_BYTES / 80 / len(blocks))))
 
 

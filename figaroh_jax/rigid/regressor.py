@@ -125,13 +125,9 @@ def packed_regressor(
     return over_samples(packed_rows, model, q, v, a, last=True, width=width, straight=_PACKED)
 
 
-def coordinate_blocks(model: RobotModel) -> tuple[Int[np.ndarray, "blocks 2"], Int[np.ndarray, " pairs"]]:
-    """Coordinate and link of each block of W that can differ from zero, and the block to which each pair adds."""
-    return _coordinate_blocks(model.joints)
-
-
 @lru_cache(maxsize=256)
-def _coordinate_blocks(joints: tuple[Joint, ...]) -> tuple[np.ndarray, np.ndarray]:
+def coordinate_blocks(joints: tuple[Joint, ...]) -> tuple[Int[np.ndarray, "blocks 2"], Int[np.ndarray, " pairs"]]:
+    """Coordinate and link of each block of W that can differ from zero, and the block to which each pair adds."""
     moved = _pairs(joints)
     where = np.stack([dofs(joints).column[moved[:, 0]], moved[:, 1]], 1)
     blocks, place = np.unique(where, axis=0, return_inverse=True)
@@ -141,7 +137,7 @@ def _coordinate_blocks(joints: tuple[Joint, ...]) -> tuple[np.ndarray, np.ndarra
 @lru_cache(maxsize=256)
 def _runs(joints: tuple[Joint, ...]) -> list[tuple[tuple[int, slice], slice]]:
     """Blocks of W that stand side by side in one row: coordinate and links, and where they are among the blocks."""
-    blocks, _ = _coordinate_blocks(joints)
+    blocks, _ = coordinate_blocks(joints)
     starts = np.flatnonzero((np.diff(blocks, axis=0, prepend=-2) != [0, 1]).any(1))
     runs = []
     for start, end in zip(starts, [*starts[1:], len(blocks)], strict=True):
@@ -155,7 +151,7 @@ def coordinate_rows(
 ) -> tuple[Float[Array, "blocks 4 samples"], Float[Array, "blocks 6 samples"]]:
     """Kernel: the blocks of `coordinate_blocks` as `packed_rows` gives them, the samples last."""
     moments, inertias = packed_rows(model, q, v, a, scale=model.ratio)
-    blocks, place = coordinate_blocks(model)
+    blocks, place = coordinate_blocks(model.joints)
     if len(blocks) == len(place):
         order = np.argsort(place)
         return take(moments, order), take(inertias, order)
@@ -186,7 +182,7 @@ def dense_rows(
     model: RobotModel, q: Float[Array, "nq samples"], v: Float[Array, "nv samples"], a: Float[Array, "nv samples"]
 ) -> Float[Array, "nv columns samples"]:
     """Kernel of `joint_torque_regressor`: the samples last."""
-    rows, (blocks, _) = jnp.concatenate(coordinate_rows(model, q, v, a), axis=1), coordinate_blocks(model)
+    rows, (blocks, _) = jnp.concatenate(coordinate_rows(model, q, v, a), axis=1), coordinate_blocks(model.joints)
     source = np.full((model.nv, len(model.joints)), len(rows))  # zeros, where no block is
     source[tuple(blocks.T)] = np.arange(len(rows))
     filled = jnp.concatenate([rows, jnp.zeros_like(rows[:1])])
@@ -218,7 +214,7 @@ def packed_rows(
     return sum(moments[1:], moments[0]), sum(inertias[1:], inertias[0])
 
 
-BLOCK_FORM = straight(BLOCKS, coordinate_rows, lambda model: 10 * len(coordinate_blocks(model)[0]))
+BLOCK_FORM = straight(BLOCKS, coordinate_rows, lambda model: 10 * len(coordinate_blocks(model.joints)[0]))
 BLOCK_FORM = BLOCK_FORM._replace(looped=looped_blocks)
 _DENSE = straight(DENSE, dense_rows, lambda model: 10 * len(pairs(model)))
 _PACKED = straight(PACKED, packed_rows, lambda model: 10 * len(pairs(model)))

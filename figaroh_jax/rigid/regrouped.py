@@ -9,6 +9,8 @@ they are zero, or Ibb is -Icc.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from jaxtyping import Float
 
@@ -24,6 +26,7 @@ ORDERLY = 3  # numbers of a joint's rotation, on average, that may be other than
 _INERTIA = {0: (6, 9), 1: (4, 9), 2: (4, 6)}  # Ibb and Icc beside axis k
 
 
+@lru_cache(maxsize=64)
 def kept_columns(joints: tuple[Joint, ...], codes: bytes) -> Kept:
     """Columns that are computed where so much is known of the robot (`scalars.known`): all, of an unknown axis."""
     return tuple(tuple(c for c in ALL if c not in _left_out(joints, codes, i)) for i in range(len(joints)))
@@ -58,9 +61,15 @@ def _left_out(joints: tuple[Joint, ...], codes: bytes, i: int) -> tuple[int, ...
 
 def regrouping(model: RobotModel, kept: Kept) -> Float[np.ndarray, "kept columns"]:
     """All columns of the regressor are those that are kept times this; of a model whose numbers are at hand."""
+    return _regrouping(model.joints, np.asarray(model.placement, float).tobytes(), kept)
+
+
+@lru_cache(maxsize=64)
+def _regrouping(joints: tuple[Joint, ...], placement: bytes, kept: Kept) -> Float[np.ndarray, "kept columns"]:
+    placements = np.frombuffer(placement).reshape(len(joints), 4, 4)
     ends = np.cumsum([0, *map(len, kept)])
     whole = np.zeros((ends[-1], 10 * len(kept)))
-    for i, joint in enumerate(model.joints):
+    for i, joint in enumerate(joints):
         own = 10 * i + np.arange(10)
         whole[ends[i] + np.arange(len(kept[i])), own[list(kept[i])]] = 1.0
         gone = sorted(set(ALL) - set(kept[i]))
@@ -71,7 +80,7 @@ def regrouping(model: RobotModel, kept: Kept) -> Float[np.ndarray, "kept columns
                 beside = _INERTIA[turning[0]][1]
                 moved = moved + np.eye(10)[beside]
             if joint.parent >= 0:
-                above = transform(moved, np.asarray(model.placement[i], float))
+                above = transform(moved, placements[i])
                 whole[:, own[column]] = whole[:, 10 * joint.parent + np.arange(10)] @ above
             if beside is not None:
                 whole[:, own[column]] -= whole[:, own[beside]]

@@ -152,13 +152,9 @@ def _weighted_rows(side: int, kept: Kept | None, model: RobotModel, codes: bytes
     return [of_links(links) for links in pieces]
 
 
-def row_groups(model: RobotModel, kept: Kept | None = None) -> list[np.ndarray]:
-    """Coordinates that move equally many links, of which equally many columns are `kept` (all, where not told)."""
-    return _row_groups(model.joints, kept)
-
-
 @lru_cache(maxsize=64)
-def _row_groups(joints: tuple[Joint, ...], kept: Kept | None) -> list[np.ndarray]:
+def row_groups(joints: tuple[Joint, ...], kept: Kept | None = None) -> list[np.ndarray]:
+    """Coordinates that move equally many links, of which equally many columns are `kept` (all, where not told)."""
     rows = sorted_rows(joints, True)
     width = np.full(len(joints), 10) if kept is None else np.array([len(columns) for columns in kept])
     counts = np.stack([np.bincount(rows[:, 0]), np.bincount(rows[:, 0], width[rows[:, 1]]).astype(int)], 1)
@@ -169,7 +165,7 @@ def _row_groups(joints: tuple[Joint, ...], kept: Kept | None) -> list[np.ndarray
 def _row_places(joints: tuple[Joint, ...], kept: Kept | None) -> list[tuple[int, int, tuple[int, int], int]]:
     """Of each coordinate and link: group, place in the group, both, and where its columns begin in the row."""
     rows, out = sorted_rows(joints, True), []
-    for group, members in enumerate(_row_groups(joints, kept)):
+    for group, members in enumerate(row_groups(joints, kept)):
         for member, row in enumerate(members.tolist()):
             at = 0
             for link in rows[rows[:, 0] == row, 1].tolist():
@@ -179,7 +175,7 @@ def _row_places(joints: tuple[Joint, ...], kept: Kept | None) -> list[tuple[int,
 
 
 def _row_lengths(side: int, kept: Kept | None, model: RobotModel) -> list[tuple[int, ...]]:
-    links, rows = sorted_rows(model.joints, True), row_groups(model, kept)
+    links, rows = sorted_rows(model.joints, True), row_groups(model.joints, kept)
     own = (links[links[:, 0] == group[0], 1] for group in rows)
     width = [sum(10 if kept is None else len(kept[link]) for link in one.tolist()) for one in own]
     return [(len(group), columns + side) for group, columns in zip(rows, width, strict=True)]
@@ -220,7 +216,7 @@ def _looped_weighted_rows(side: int, model: RobotModel, *arrays: Array) -> list[
     if not looped(model):
         return None
     lengths, (group, start) = _row_lengths(side, None, model), np.zeros((2, model.nv), int)
-    for k, members in enumerate(row_groups(model)):
+    for k, members in enumerate(row_groups(model.joints)):
         group[members], start[members] = k, lengths[k][1] * np.arange(len(members))
     column = model.dofs.column
     rows = Rows(tuple(n * length for n, length in lengths), group[column], start[column])

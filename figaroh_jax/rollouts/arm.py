@@ -127,7 +127,6 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
         begin, now, here = _on_all(whole, begin.model), _on_all(whole, now.model), whole
         first = begin.model.fit
         steps.append(("all that was recorded", _level(here, now.model.fit)))
-        held = [_rms(here, begin.held), *held[1:-1], *([_rms(here, now.held)] if found else [])]
     if even:
         now = _alike_by_recording(here, now)
         steps.append(("recordings that are equally informative", _level(here, now.model.fit)))
@@ -145,10 +144,10 @@ def _started(here: Setting, first: Fit) -> Fit:
 
 
 def _on_all(here: Setting, model: Model) -> Standing:
-    """A model of some windows fitted to all of them."""
+    """A model of some windows fitted to all of them; what is held out was asked of the windows of the search."""
     structure = model.structure._replace(data=here.cut(model.structure.loop))
     new = _from(here, structure, model.fit, model.free) if np.isfinite(model.fit.cost) else model.fit
-    return _standing(here, structure, new, model.free)
+    return _standing(here, structure, new, model.free, held=False)
 
 
 def _alike_by_recording(here: Setting, now: Standing) -> Standing:
@@ -254,15 +253,18 @@ def _simulated(here: Setting, first: Fit) -> list[np.ndarray] | None:
     return found
 
 
-def _standing(here: Setting, structure: Structure, one: Fit, free: Sequence[int]) -> Standing:
-    """A fit with what it leaves, on the rows it was fitted to and without them."""
+def _standing(here: Setting, structure: Structure, one: Fit, free: Sequence[int], *, held: bool = True) -> Standing:
+    """A fit with what it leaves, on the rows it was fitted to and, where it is asked, without them (else the same)."""
     if not np.isfinite(one.cost):
         nothing = np.zeros((1, 1, 1))
         return Standing(Model(structure, one, tuple(free), np.inf), nothing, nothing, np.full(1, np.inf))
     beyond = excess_of(here, structure, one)
     model = Model(structure, one, tuple(free), float(beyond.max()))
-    held = refitted_without(*structure, [one], here.folds, lanes=1, outputs=True)[0]
-    return Standing(model, outputs(here, one.sums.cost), outputs(here, held), beyond)
+    fitted = outputs(here, one.sums.cost)
+    if not held:
+        return Standing(model, fitted, fitted, beyond)
+    without = refitted_without(*structure, [one], here.folds, lanes=1, outputs=True)[0]
+    return Standing(model, fitted, outputs(here, without), beyond)
 
 
 def _round(

@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-__all__ = ["Rows", "Solution", "corrected", "inverse", "row_force", "solve_rows", "solved", "times"]
+__all__ = ["Rows", "Solution", "corrected", "inverse", "product", "row_force", "solve_rows", "solved",
+           "stiffened", "times"]  # fmt: skip
 
 _MOST = 60  # Newton steps; 1 to 4 are used
 _FAR = 1e300
@@ -96,14 +97,23 @@ def inverse(matrix: Array) -> Array:
     return -jax.lax.fori_loop(0, len(matrix), sweep, matrix)
 
 
+def product(one: Array, two: Array) -> Array:
+    """Products of matrices (n, n, samples), as sums."""
+    return jnp.sum(one[:, :, None] * two[None], 1)
+
+
+def stiffened(masses: Array, rows: Rows, found: Solution) -> Array:
+    """Inverse of the masses with the stiffness of the constraints that act, (n, n, samples); a constant."""
+    slope = _slope(rows, found.slip, found.low, found.high)
+    return jax.lax.stop_gradient(inverse(masses + jnp.eye(len(found.a))[..., None] * slope[:, None]))
+
+
 def corrected(masses: Array, rows: Rows, found: Solution, gap: Array) -> Array:
     """The solution's acceleration after one Newton step: its value is the same, its derivatives are exact.
 
     `gap` is M a - r at the solution's `a` held fixed, differentiable in everything else.
     """
-    slope = jax.lax.stop_gradient(_slope(rows, found.slip, found.low, found.high))
-    matrix = masses + jnp.eye(len(found.a))[..., None] * slope[:, None]
-    return found.a - times(jax.lax.stop_gradient(inverse(matrix)), gap - row_force(rows, found, found.a))
+    return found.a - times(stiffened(masses, rows, found), gap - row_force(rows, found, found.a))
 
 
 def solve_rows(masses: Array, right: Array, rows: Rows, warm: Array) -> Solution:

@@ -23,7 +23,7 @@ from ..rigid.dynamics import joint_masses, joint_torques
 from ..rigid.manifold import integrate
 from ..rigid.model import RobotModel
 from ..rigid.spatial import cross, quaternion_rotation, rotate, rotate_back
-from .friction import Rows, Solution, corrected, inverse, solve_rows, solved, times
+from .friction import Rows, Solution, corrected, inverse, product, row_force, solve_rows, solved, stiffened, times
 
 __all__ = [
     "Activation",
@@ -263,7 +263,7 @@ class _Smooth(NamedTuple):
 
     torque: Array  # (nv, samples) of drives and passive elements
     bias: Array  # gravity and velocity torques of the rigid body
-    damping: Array  # (nv, nv, samples) minus the torque's derivative by v, as implicitfast takes it
+    slope: Array  # (nu, samples) of each drive's force by its rate, as implicitfast takes it; else zero
     activation: Array  # at the end of the step
     rows: Rows
     shift: Array  # what turns accelerations of free joints into those of MuJoCo's axes
@@ -276,14 +276,25 @@ def _smooth(loop: Loop, state: State, u: Array, weight: Array) -> _Smooth:
     control, rate = _control(loop, act, u)
     drive = _drive(loop, angle, v, control)
     bias = _bias(loop, q, v)
-    damping = jnp.eye(loop.robot.nv)[..., None] * jnp.asarray(loop.joints.damping)[:, None, None]
-    if loop.integrator == "implicitfast":
-        way = jnp.asarray(loop.drives.transmission)
-        pairs = way[:, :, None, None] * way[:, None, :, None]
-        damping = damping - (pairs * drive.slope[:, None, None]).sum(0)
+    slope = drive.slope if loop.integrator == "implicitfast" else jnp.zeros_like(drive.slope)
     torque = drive.torque + _passive(loop, angle, v)
     rows = _rows(loop, angle, v, drive.torque, bias, weight)
-    return _Smooth(torque, bias, damping, _next_activation(loop, act, rate), rows, _shift(loop, v), rate)
+    return _Smooth(torque, bias, slope, _next_activation(loop, act, rate), rows, _shift(loop, v), rate)
+
+
+def _resistance(loop: Loop, slope: Array) -> Array:
+    """Minus the torque's derivative by v as the integrator takes it, (nv, nv, samples): joints' damping and drives."""
+    damping = jnp.eye(loop.robot.nv)[..., None] * jnp.asarray(loop.joints.damping)[:, None, None]
+    way = jnp.asarray(loop.drives.transmission)
+    pairs = way[:, :, None, None] * way[:, None, :, None]
+    return damping - (pairs * slope[:, None, None]).sum(0)
+
+
+def _resisted(loop: Loop, slope: Array, a: Array) -> Array:
+    """`_resistance` times an acceleration, without the matrix: its derivatives are vectors then."""
+    way = jnp.asarray(loop.drives.transmission)
+    rate = times(way[..., None], a)
+    return jnp.asarray(loop.joints.damping)[:, None] * a - times(way.T[..., None], slope * rate)
 
 
 def _rows(loop: Loop, angle: Array, v: Array, motor: Array, bias: Array, weight: Array) -> Rows:
@@ -373,7 +384,7 @@ def advance(loop: Loop, state: State, u: Array, weight: Array, warm: Array) -> t
         return _runge_kutta(loop, state, u, weight, warm, None)
     smooth, masses, solution = _accelerate(loop, state, u, weight, warm)
     force = times(masses, solution.a + smooth.shift)
-    a = solved(masses + loop.dt * smooth.damping, force)
+    a = solved(masses + loop.dt * _resistance(loop, smooth.slope), force)
     return _moved(loop, state, a, smooth.activation), Step(solution, a)
 
 
@@ -387,12 +398,13 @@ def integrated(loop: Loop, state: State, u: Array, weight: Array, step: Step) ->
     smooth = _smooth(loop, state, u, weight)
     found, whole = jax.lax.stop_gradient((step.solution, step.a))
     masses = jax.lax.stop_gradient(_masses(loop, state.q))
-    implicit = masses + loop.dt * jax.lax.stop_gradient(smooth.damping)
+    implicit = inverse(masses + loop.dt * jax.lax.stop_gradient(_resistance(loop, smooth.slope)))
     first, second = _inertial(loop, state, smooth.bias, found.a, whole - smooth.shift)
-    a = corrected(masses, smooth.rows, found, first + smooth.bias - smooth.torque)
-    gap = second + loop.dt * times(smooth.damping, whole) - first
-    gap = gap - times(masses, a - found.a)
-    return _moved(loop, state, whole - times(inverse(implicit), gap), smooth.activation)
+    off = first + smooth.bias - smooth.torque - row_force(smooth.rows, found, found.a)
+    gap = second + loop.dt * _resisted(loop, smooth.slope, whole) - first
+    through = product(product(implicit, masses), stiffened(masses, smooth.rows, found))
+    a = whole - times(implicit, gap) - times(through, off)
+    return _moved(loop, state, a, smooth.activation)
 
 
 def _inertial(loop: Loop, state: State, bias: Array, *accelerations: Array) -> list[Array]:

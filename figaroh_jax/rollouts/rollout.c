@@ -906,10 +906,13 @@ INLINE void window_of(const Given *g, const int n, const int carried, const int 
     for (int k = 0; k < 2 * n; k++) S[k * width + g->columns + k] = 1;
   }
   int lost = 0;
+  long end = g->rows; /* of what counts: shorter windows are padded */
+  for (int none = 1; want && none && end > 0; end -= none)
+    for (long y = 0; y < wide; y++) none &= g->weight[((end - 1) * wide + y) * g->windows + window] == 0;
   for (long b = 0; b < blocks; b++) {
     memset(cost, 0, sizeof cost);
     if (want) memset(gradient, 0, sizeof gradient), memset(matrix, 0, sizeof matrix);
-    for (long row = b * g->block; row < (b + 1) * g->block; row++) {
+    for (long row = b * g->block; row < (b + 1) * g->block && row < end; row++) {
       for (int j = 0; j < n; j++) lost |= !(fabs(w->v[j]) < 1e12);
       if (want && !lost) collected(g, w, n, window, row, width, S, cost, gradient, matrix, kept, &waiting, &before);
       if (!want)

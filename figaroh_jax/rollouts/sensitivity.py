@@ -19,6 +19,7 @@ from jaxtyping import Array
 from ..compiled.batching import program, traced
 from ..rigid.dynamics import joint_masses, joint_torques
 from ..rigid.model import RobotModel
+from ..rigid.slopes import Slopes, slopes, within_reach
 from . import lanes
 from .friction import Solution
 from .loop import Linear, Loop, State, Step, advance, integrated, mobility, observe
@@ -345,24 +346,11 @@ class _RigidBody:
 
     def __init__(self, loop: Loop, table: Table, theta: Array, free: Array, state: State, step: Any):
         q, v = state.q, state.v
-        now, samples = put(loop, table, theta), q.shape[1]
-        robot, n = now.robot, loop.robot.nv
+        robot = put(loop, table, theta).robot
         a = jnp.stack([jnp.zeros_like(v), step.solution.a, step.a])
-        three = lambda x: jnp.concatenate([x] * 3, 1)  # noqa: E731
-        wide = jnp.concatenate(list(a), 1)
-        torque, by_q = jax.linearize(lambda q: joint_torques(robot, q, three(v), wide), three(q))
-        _, by_v = jax.linearize(lambda v: joint_torques(robot, q, v, jnp.zeros_like(v)), v)
-        each = jnp.eye(n)[:, :, None]
-        columns = jax.vmap(by_q)(jnp.broadcast_to(each, (n, n, 3 * samples)))  # (direction, torque, samples)
         self.table, self.theta = table, theta
-        self.linear = Linear(
-            q=q, v=v, a=a,
-            torque=jnp.stack(jnp.split(torque, 3, axis=1)),
-            by_q=jnp.stack(jnp.split(columns.swapaxes(0, 1), 3, axis=2)),
-            by_v=jax.vmap(by_v)(jnp.broadcast_to(each, (n, n, samples))).swapaxes(0, 1),
-            mass=joint_masses(robot, q),
-            more=jnp.zeros_like(a),
-        )  # fmt: skip
+        found = slopes(robot, q, v, a) if within_reach(robot) else _by_directions(robot, q, v, a)
+        self.linear = Linear(q=q, v=v, a=a, more=jnp.zeros_like(a), **found._asdict())
         self.which = [k for k, entry in enumerate(table) if entry.name in _OF_BODY]
         if self.which:
             mine = jnp.any(jnp.isin(free, jnp.array(self.which)))
@@ -392,6 +380,23 @@ class _RigidBody:
             change = (theta - self.theta)[np.array(self.which)]
             linear = eqx.tree_at(lambda x: x.more, linear, jnp.einsum("k,kans->ans", change, self.columns))
         return eqx.tree_at(lambda m: m.linear, loop, linear, is_leaf=lambda x: x is None)
+
+
+def _by_directions(robot: RobotModel, q: Array, v: Array, a: Array) -> Slopes:
+    """`slopes` of any tree whose positions are as many as its rates, one direction after the other."""
+    n, samples = v.shape
+    three = lambda x: jnp.concatenate([x] * 3, 1)  # noqa: E731
+    wide = jnp.concatenate(list(a), 1)
+    torque, by_q = jax.linearize(lambda q: joint_torques(robot, q, three(v), wide), three(q))
+    _, by_v = jax.linearize(lambda v: joint_torques(robot, q, v, jnp.zeros_like(v)), v)
+    each = jnp.eye(n)[:, :, None]
+    columns = jax.vmap(by_q)(jnp.broadcast_to(each, (n, n, 3 * samples)))  # (direction, torque, samples)
+    return Slopes(
+        jnp.stack(jnp.split(torque, 3, axis=1)),
+        jnp.stack(jnp.split(columns.swapaxes(0, 1), 3, axis=2)),
+        jax.vmap(by_v)(jnp.broadcast_to(each, (n, n, samples))).swapaxes(0, 1),
+        joint_masses(robot, q),
+    )
 
 
 _PULLS = ("gravity_x", "gravity_y")

@@ -41,6 +41,7 @@ __all__ = [
 _PAIR = 2  # starts of the baseline that are followed to the end
 _ROUGH = 1e-3  # share of the squares that a step of such a start must promise
 _ENOUGH = 6000  # rows of an arm's recordings that a search is made on; the more are asked at the end
+_SHORTEST = 100  # rows of a window that is shortened for that
 _EARLY = 4  # iterations of a race among all starts
 
 
@@ -128,7 +129,10 @@ def setting(
 
 
 def thinned(here: Setting) -> Setting:
-    """Where there is more than a search needs, some windows of each recording, evenly spread; else the same."""
+    """Where there is more than a search needs, some windows of each recording, evenly spread; else the same.
+
+    Where one window of each recording is still more, all are shortened alike.
+    """
     total = sum(one.rows for one in here.stretches)
     if total <= _ENOUGH:
         return here
@@ -137,8 +141,8 @@ def thinned(here: Setting) -> Setting:
         mine = [one for one in here.stretches if one.run == run]
         many = int(np.ceil(len(mine) * _ENOUGH / total))
         kept += [mine[k] for k in np.unique(np.round((np.arange(many) + 0.5) * len(mine) / many - 0.5).astype(int))]
-    if len(kept) == len(here.stretches):
-        return here
+    share = min(_ENOUGH / sum(one.rows for one in kept), 1.0)
+    kept = [one._replace(rows=max(int(one.rows * share), min(one.rows, _SHORTEST))) for one in kept]
     some = replace(here, stretches=tuple(kept))
     data = some.cut(here.loop)
     return replace(some, data=data, folds=_folds(data, kept))

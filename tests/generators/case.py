@@ -33,6 +33,7 @@ class Case:
     seed: int
     induced: dict[str, float] = field(default_factory=dict)  # effect: RMS of its torque over the joint's RMS torque
     baseline: dict[str, bool] = field(default_factory=dict)  # what the task declares beside friction
+    links: tuple[tuple[float, ...], ...] = ()  # the true ten parameters of each, with what is hidden in them
 
     def write(self, folder: Path | str, forbid: Sequence[str] = (), cutoff: float = 15, rate: float = 50) -> Path:
         """Write recordings, nominal URDF and `task.yaml` into `folder`; return the path of the task."""

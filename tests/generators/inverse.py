@@ -95,7 +95,10 @@ def make_case(
     truth = tuple(Truth(h.effect, h.at, h.parameters(h.scale)) for h in hidden)
     induced = {h.effect: _size(made, model, fit, time, h) for h in hidden} if noise == 0 else {}
     trust = 0.02 if trusted else 0.10
-    return Case(robot, made.urdf, made.joints, recordings, truth, trust, seed, induced)
+    for h in hidden:
+        model = h.change(model, h.scale) if h.change else model
+    links = tuple(tuple(robots.ten(model, j).tolist()) for j in range(model.nv))
+    return Case(robot, made.urdf, made.joints, recordings, truth, trust, seed, induced, links=links)
 
 
 def observable(truth: Truth) -> set[tuple[str, tuple[str, ...]]]:
