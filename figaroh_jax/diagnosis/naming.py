@@ -273,7 +273,7 @@ def _modulation(
     held-out data surely want it.
 
     Of a joint's law it is asked of its position, speed, load and time one by one, and the largest counts: all together
-    they fit chance, and what they then predict of other data says nothing. Chance makes the best of four surer than one.
+    they fit chance, and what they then predict of other data says nothing. The best of four is surer by chance alone.
     """
     step = grown.step
     base, touched = grown.base, list(range(len(step.rows.y))) if whole else list(joints)
