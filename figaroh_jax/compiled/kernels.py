@@ -34,6 +34,7 @@ __all__ = [
     "Read",
     "Straight",
     "Write",
+    "in_a_round",
     "kept_here",
     "known_codes",
     "lanes_of",
@@ -389,15 +390,28 @@ class _Layout(NamedTuple):
 Access = Callable[[list[Any], Array | None, list[Array]], list[Array]]  # of places, which lanes, values: new values
 
 
-class _Lanes:
-    """The samples of one block: where their numbers are read and written.
+def in_a_round(
+    once: Any, whole: Any, access: Callable[[Any, list[Array]], list[Array]], start: list[Array]
+) -> list[Array]:
+    """What an access makes of whole numbers (a tree) and values, in a loop of one round (`once` is 1, which is read).
 
     Triton spends its time on how each access goes with every other operation that it can reach from there, cubic in
-    their number. So in a long kernel accesses stand in loops of one round (`once`, unknown to the compiler), through
-    which it does not look: what goes in is written, what comes out is read. Nor does a constant stand in them: there is
-    one of each in a kernel, and from it all is reached that uses the same. So places go in, too, and are doubled in a
-    round, for what stays as it is would be taken out.
+    their number. It does not look through such a loop: what goes in is written, what comes out is read. Nor may a
+    constant stand in it: there is one of each in a kernel, and from it all is reached that uses the same. So whole
+    numbers go in, too, and are doubled in a round, for what stays as it is would be taken out.
     """
+
+    def step(carry: tuple[Any, Any, list[Array]]) -> tuple[Any, Any, list[Array]]:
+        rounds, given, values = carry
+        found = access(given, values)
+        return *jax.tree.map(lambda x: x + x, (rounds, given)), found
+
+    # by doubling: a plain count would become a loop through which the compiler does look
+    return lax.while_loop(lambda carry: carry[0] < 2 * once, step, (jnp.int32(1), whole, start))[2]
+
+
+class _Lanes:
+    """The samples of one block: where their numbers are read and written; in a long kernel by `in_a_round`."""
 
     def __init__(self, triton: Any, layout: _Layout, columns: Columns, once: Any) -> None:
         from jax.experimental import pallas as pl
@@ -444,8 +458,8 @@ class _Lanes:
         first = {x.kind: x for x in reversed(places)} if flat else {}
         numbers = list(dict.fromkeys([*_steps(places), *ends] if flat else ends))
 
-        def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-            rounds, index, begin, given, values = carry
+        def walked(whole: Any, values: list[Array]) -> list[Array]:
+            index, begin, given = whole
             known = {n: lax.broadcast(x, (LANES,)) for n, x in zip(numbers, given, strict=True)}
             mask = index < known[self.samples] if ends else None
             at, there = dict(zip(first, begin, strict=True)), []
@@ -454,13 +468,10 @@ class _Lanes:
                 if flat and x.first != last[x.kind]:
                     at[x.kind], last[x.kind] = at[x.kind] + known[x.first - last[x.kind]], x.first
                 there.append(x.ref.at[at[x.kind] if flat else x.at(index)])
-            rounds, index, begin, given = jax.tree.map(lambda x: x + x, (rounds, index, begin, given))
-            return rounds, index, begin, given, access(there, mask, values)
+            return access(there, mask, values)
 
         begin, given = [self._first(x) for x in first.values()], [jnp.int32(n) for n in numbers]
-        # by doubling: a plain count would become a loop through which the compiler does look
-        carry = (jnp.int32(1), self.index, begin, given, start)
-        return lax.while_loop(lambda carry: carry[0] < 2 * self.once, step, carry)[4]
+        return in_a_round(self.once, (self.index, begin, given), walked, start)
 
     def _first(self, place: _Place) -> Int[Array, " lanes"]:
         """Where the samples of this block find a number."""

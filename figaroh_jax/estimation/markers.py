@@ -199,6 +199,7 @@ def segment_sizes(
     Gauss-Newton on the same misfit as `fit(robot, data, ["segments", "markers"])`, whose rows it takes apart: a frame's
     positions never enter a matrix with those of another. `spread` is one sigma of a scale about one, `misplaced` (m) of
     each coordinate of a marker about its place. A few dozen frames of a motion of all joints are enough.
+    An example: `docs/people.md`.
     """
     count, labels = len(data.names), len(data.labels)
     precision = np.concatenate([np.full(count, spread**-2.0), np.full(3 * labels, misplaced**-2.0)])

@@ -43,6 +43,7 @@ def simulated_instruments(
     `control(time, q, v)` gives the torque (N m or N) of the recording's own controller and references, in JAX; the
     states of `rows` are one record at even steps of `dt` s that begins at `position` and `velocity`. Raises
     `InputError` where the simulated motion is not finite: the robot is none that can exist, or is not stabilised.
+    An example: `examples/noisy_encoder.py`.
     """
     lengths = [len(part[0]) for part in rows.source()]
     found = simulate(_robot(rows, theta), control, position, velocity, dt, sum(lengths))
@@ -72,6 +73,7 @@ def solve_by_simulation(
 
     Starts from least squares weighted by joint; what no motion shows keeps the model's own values in the simulation.
     Arguments as `simulated_instruments`. `converged` tells whether the parameters settled within `turns`.
+    An example: `examples/noisy_encoder.py`.
     """
     data = condense(rows, rows.used)
     found = solve(data, WeightedByJoint(), kept=base.independent)

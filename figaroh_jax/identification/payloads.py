@@ -105,7 +105,7 @@ def drive_gains(
     sigma of each joint's, by default its RMS), the other columns none: total least squares on what is left of the
     readings beside those, scaled by the payload's column (Gautier and Briot, 2014). `recordings` are
     (q, v, a, u, load), load None without a payload. Raises `InputError` where no payload was carried, or the gains
-    stay undetermined.
+    stay undetermined. An example: `examples/payload_and_gains.py`.
     """
     rank, nv = base.rank, model.nv
     factor, square, loaded = np.zeros((0, rank + 1 + nv)), np.zeros(nv), False

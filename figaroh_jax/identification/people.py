@@ -164,6 +164,7 @@ def anthropometric(
     is scaled first. Long segments have the table's centre of mass and radii of gyration on the line to the next joint;
     of head, hands, feet and trunk, whose ends no joint marks, the model's own are scaled. A link is told by its name
     (`left_upperleg`, `thigh`, ...). Raises `InputError` for a link with a mass that no segment of the table is.
+    An example: `docs/people.md`.
     """
     if not mass > 0:
         raise InputError(f"anthropometric: the body mass is {mass} kg; more than zero is expected")
@@ -204,6 +205,7 @@ def capture(
     A plate is its pose in the world and what it exerts on the person: force (N) and torque about its origin (N m), in
     its own axes. Everything passes one zero-phase Butterworth filter of fourth order (`cutoff`, Hz); velocities and
     accelerations are differences along the configuration manifold. Raises `InputError` for wrong shapes and stamps.
+    An example: `docs/people.md`.
     """
     from scipy.signal import butter, sosfiltfilt
 
@@ -237,7 +239,7 @@ def identify_segments(
     by its own noise, of the plates' zeros in each recording, and of the prior over segments that are bodies (a
     semidefinite programme). The residual is correlated in time, for markers slide
     with the skin and filters smooth: rows count as the number of independent ones that its correlation leaves
-    (`effective` overrides it). Raises `InputError` where nothing was captured.
+    (`effective` overrides it). Raises `InputError` where nothing was captured. An example: `docs/people.md`.
     """
     if not captures:
         raise InputError("identify_segments: no recording; give one `capture` or more")
@@ -317,6 +319,7 @@ def name_payload(
     At each place a load of ten parameters, believed to be up to `heaviest` kg within 0.3 m of the joint, is fitted to
     the residual; the place that explains most is named. `places`: names of links (default: all segments). The standard
     deviation of the mass holds the noise of these recordings and what the person's own parameters may be off.
+    An example: `docs/people.md`.
     """
     model, results, costs = person.model, {}, {}
     size = np.array([heaviest / 2, *[heaviest * 0.15] * 3, *[heaviest * 0.05] * 6])
@@ -347,7 +350,10 @@ def name_payload(
 
 
 def predicted(model: RobotModel, one: Capture) -> Float[np.ndarray, "samples 6"]:
-    """Wrench of the plates at and in the root's frame, N and N m, that the model needs for the motion of a capture."""
+    """Wrench of the plates at and in the root's frame, N and N m, that the model needs for the motion of a capture.
+
+    An example: `docs/people.md`.
+    """
     return _rows(model, one) @ np.ravel(np.asarray(model.inertia))
 
 

@@ -45,7 +45,7 @@ def standing(
     the world. `support` is how far the sole reaches before and behind, and to either side of, the plate's frame (m):
     the centre of pressure of the body's weight stays in it where torques keep the model's limits. Hold both legs'
     joints and make the support larger for a person on two feet. Raises `InputError` for a robot that is not free, an
-    unknown link, and joints of several axes.
+    unknown link, and joints of several axes. An example: `examples/person_on_a_plate.py`.
     """
     if robot.joints[0].kind != "free" or any(j.kind not in ("revolute", "prismatic") for j in robot.joints[1:]):
         raise InputError("standing: one free root and joints of one axis; load the model with root='free_flyer'")
@@ -93,7 +93,7 @@ def balanced(
     A motion begins at rest, so this is where one may begin (`excite(start=...)`). `near` (rad; default: all zero) is
     measured in shares of the joints' ranges; `hold` names joints that stay as they are there, `room` is the share of
     each range that is left free at either end. Raises `InputError` for a model that is not of `standing`, and where no
-    posture within the limits is in balance.
+    posture within the limits is in balance. An example: `examples/person_on_a_plate.py`.
     """
     if person.dof_names[:6] != PLATE:
         raise InputError(f"balanced: '{person.name}' does not stand on a plate; `standing` makes a model that does")

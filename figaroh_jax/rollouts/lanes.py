@@ -10,7 +10,7 @@ step has solved, all steps are linearised at once (`sensitivity`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,7 +21,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array
 
-from ..compiled.kernels import Number, usable
+from ..compiled.kernels import Number, in_a_round, usable
 from ..rigid.scalar_programs import mass_entries, torques
 from ..rigid.scalars import Robot, constants, known
 from .loop import Loop, mobility
@@ -399,33 +399,43 @@ def _launched(program: _Program, own: Array, seen: Array, start: Array, interpre
     if missing:
         seen, start = (jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, missing)], mode="edge") for x in (seen, start))
     anywhere, given = pl.BlockSpec(memory_space=pl.ANY), any(k >= 0 for k in program.numbers.place)
+    steps, width = seen.shape[0], rounds * LANES
     found = pl.pallas_call(
-        _kernel(program, seen.shape[0], seen.dtype),
-        out_shape=[jax.ShapeDtypeStruct((seen.shape[0], n, rounds * LANES), seen.dtype)] * len(Rolled._fields),
+        _kernel(program, steps, seen.shape[1], width, seen.dtype),
+        out_shape=[jax.ShapeDtypeStruct((steps * n * width,), seen.dtype)] * len(Rolled._fields),
         grid=(rounds,),
         in_specs=[anywhere] * 4,
         out_specs=[anywhere] * len(Rolled._fields),
         compiler_params=None if interpret else triton.CompilerParams(num_warps=1, num_stages=1),
         interpret=interpret,
         name="rolled",
-    )(own if given else jnp.zeros(1), seen, start, jnp.ones(1, jnp.int32))
-    return [x[..., :windows] for x in found]
+    )(own if given else jnp.zeros(1), seen.ravel(), start.ravel(), jnp.ones(1, jnp.int32))
+    return [x.reshape(steps, n, width)[..., :windows] for x in found]
 
 
-def _kernel(program: _Program, steps: int, dtype: Any) -> Callable[..., None]:
-    """All steps of `LANES` windows: reads numbers, commands (steps, drives, windows) and starts (2 nv, windows)."""
+def _kernel(program: _Program, steps: int, commands: int, width: int, dtype: Any) -> Callable[..., None]:
+    """All steps of `LANES` windows of `width`, of numbers, commands (steps, drives, windows), starts (2 nv, windows).
+
+    Each array is one row; a place in it is the one before and a number more.
+    """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    n, drives = len(program.drives), [d for d in program.drives if d >= 0]
-    given = sum(k >= 0 for k in program.numbers.place)
+    n, given = len(program.drives), sum(k >= 0 for k in program.numbers.place)
+    long = jnp.int64 if steps * max(n, commands) * width >= 1 << 31 else jnp.int32
 
     def kernel(own_ref: Any, seen_ref: Any, start_ref: Any, once_ref: Any, *outs: Any) -> None:
-        at = pl.program_id(0) * LANES + lax.iota(jnp.int32, LANES)
-        apart, zero = _apart(once_ref[0]), jnp.zeros(LANES, dtype)
-        places = [jnp.full(LANES, k, jnp.int32) for k in range(given)]
-        values = apart(lambda _: [triton.load(own_ref.at[k]) for k in places], [zero] * given)
-        both = apart(lambda _: [triton.load(start_ref.at[j, at]) for j in range(2 * n)], [zero] * (2 * n))
+        at = (pl.program_id(0) * LANES + lax.iota(jnp.int32, LANES)).astype(long)
+        zero = jnp.zeros(LANES, dtype)
+
+        def read(ref: Any, first: Any, by: int, count: int) -> list:
+            def loaded(place: Any, _: list) -> list:
+                return [triton.load(ref.at[x]) for x in _along(place, count)]
+
+            return in_a_round(once_ref[0], (first, jnp.asarray(by, long)), loaded, [zero] * count) if count else []
+
+        values = read(own_ref, jnp.zeros(LANES, long), 1, given)
+        both = read(start_ref, at, width, 2 * n)
 
         def number(k: int) -> Any:
             place = program.numbers.place[k]
@@ -433,16 +443,19 @@ def _kernel(program: _Program, steps: int, dtype: Any) -> Callable[..., None]:
 
         def one(k: Any, carry: tuple) -> tuple:
             q, v, a, slip = carry
-            loaded = apart(lambda _: [triton.load(seen_ref.at[k, d, at]) for d in drives], [zero] * len(drives))
-            u = [loaded[drives.index(d)] if d >= 0 else zero for d in program.drives]
+            k = k.astype(long)
+            loaded = read(seen_ref, at + k * (commands * width), width, commands)
+            u = [loaded[d] if d >= 0 else zero for d in program.drives]
             a, whole, slip = Step(program, number).solved(q, v, u, a, slip)
 
-            def kept(values: list) -> list:
-                for c, x in enumerate(values):
-                    triton.store(outs[c // n].at[k, c % n, at], x)
+            def kept(place: Any, values: list) -> list:
+                for c, x in enumerate(_along(place, n)):
+                    for number, out in enumerate(outs):
+                        triton.store(out.at[x], values[number * n + c])
                 return [*values[1:], -values[0]]
 
-            apart(kept, [*q, *v, *a, *whole, *slip])
+            place = at + k * (n * width), jnp.asarray(width, long)
+            in_a_round(once_ref[0], place, kept, [*q, *v, *a, *whole, *slip])
             v = [x + program.dt * y for x, y in zip(v, whole, strict=True)]
             q = [x + program.dt * y for x, y in zip(q, v, strict=True)]
             return q, v, a, slip
@@ -452,13 +465,9 @@ def _kernel(program: _Program, steps: int, dtype: Any) -> Callable[..., None]:
     return kernel
 
 
-def _apart(once: Any) -> Callable[[Callable[[list], list], list], list]:
-    """As in `compiled.kernels`: a loop of one round, through which Triton does not look."""
-
-    def apart(access: Callable[[list], list], begin: list) -> list:
-        def step(carry: tuple) -> tuple:
-            return carry[0] + 1, access(carry[1])
-
-        return lax.while_loop(lambda carry: carry[0] * 2 < once, step, (jnp.int32(0), begin))[1]
-
-    return apart
+def _along(place: Any, count: int) -> Iterator[Any]:
+    """A place, and those that lie behind it, each as far from the one before."""
+    first, more = place
+    for k in range(count):
+        yield first
+        first = first + more if k < count - 1 else first
