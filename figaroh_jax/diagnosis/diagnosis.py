@@ -16,10 +16,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..effects.base import Effect, place
+from ..effects.base import place
 from ..effects.catalogue import CATALOGUE, find, related
 from ..effects.plausibility import implausible
-from ..errors import InputError
 from ..estimation.noise import Spectrum
 from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
@@ -57,7 +56,7 @@ from .rest import (
 )
 from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without
 from .standstill import only_sticks
-from .state import State, baseline, with_width
+from .state import State, baseline, stated_effects, with_width
 from .step import Step, stand, with_causes
 from .thresholds import (
     ALL_BUT,
@@ -209,7 +208,7 @@ def _begun(backend: Backend, signals: Sequence[Signals], known: Baseline | None,
     records = without_reversals(stack(signals, backend.robot, joined=True))
     held = held_rows(signals, records)
     problem = Problem(backend, records, layout(signals, records), trust, np.zeros(backend.robot.nv), held)
-    return problem, baseline(problem, *_baseline_effects(backend.robot, known))
+    return problem, baseline(problem, *stated_effects(backend.robot, known))
 
 
 def _setting(problem: Problem, start: State, forbid: Sequence[str], progress: Callable[[str, float], None]) -> _Setting:
@@ -528,11 +527,11 @@ def _left(
     joints, tolerable = problem.model.joint_names, size <= tolerance
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
-    beyond, baseline = (
+    beyond, alone = (
         beyond_noise(problem, step.linear.residual, spectrum, whitening, generator) for step in (joint.step, first)
     )
     there = left.there or ((wrong or bool(beyond.any())) and not tolerable)
-    return _Left(left._replace(there=there), p_left, now[0], line, flexible[2], beyond, baseline)
+    return _Left(left._replace(there=there), p_left, now[0], line, flexible[2], beyond, alone)
 
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:
@@ -572,25 +571,6 @@ def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judg
         notes=(*_notes(signals, here, last), *([_AT_REST] if judged.sticks else [])),
         prismatic=prismatic(model),
     )
-
-
-def _baseline_effects(model: RobotModel, known: Baseline | None) -> tuple[list[str], list[Effect]]:
-    """Names of the effects that every joint has in the baseline, and the ones that stand at given joints."""
-    if known is None:
-        return ["viscous_friction", "coulomb_friction"], []
-    switches = {
-        "viscous_friction": known.viscous,
-        "coulomb_friction": known.coulomb,
-        "rotor_inertia": known.rotor,
-        "torque_offset": known.offset,
-    }
-    given = []
-    for entry in known.effects:
-        effect = find(entry.effect)
-        if not any(p.linear for p in effect.parameters().values()):
-            raise InputError(f"baseline.effects: '{entry.effect}' cannot be fitted as part of the baseline")
-        given.append(place(effect, model, entry.at))
-    return [name for name, on in switches.items() if on], given
 
 
 _AT_REST = (
