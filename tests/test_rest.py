@@ -148,9 +148,9 @@ RIGHT = Standing(
         ({"whole": True, "gain": 0.05, "modulation": 0.2}, ""),
         ({"whole": True, "gain": 0.05, "modulation": 0.4}, "varies"),
         ({"modulation_held_out": 0.25}, "varies"),
-        ({"modulation_held_out": 0.1, "varies": True}, "varies"),  # less than .2, but surely
-        ({"modulation_held_out": 0.1}, ""),
-        ({"modulation_held_out": 0.04, "varies": True}, ""),
+        ({"modulation_held_out": 0.12, "varies": True}, "varies"),  # less than .2, but surely
+        ({"modulation_held_out": 0.12}, ""),
+        ({"modulation_held_out": 0.08, "varies": True}, ""),
         ({"leaves": 0.06}, "another law acts there"),
         ({"share": 3.0, "cancels": True}, "cancels"),
         ({"physical": False}, "physically impossible"),

@@ -32,6 +32,7 @@ from .shifts import torque_change
 from .state import State, batched
 from .step import Step, stand
 from .thresholds import (
+    ALL_BUT,
     BESIDE_SMOOTH,
     GAIN_NAMED,
     GAIN_NAMED_ROBOT,
@@ -95,7 +96,7 @@ def reason_against(
             f"its torque is {one.share:.2%} of the joint's, below the tolerance of {tolerance:.2%}",
         ),
         (
-            one.modulation_held_out <= (LAW_LEAVES if one.varies else MODULATION_HELD_OUT),
+            one.modulation_held_out <= (ALL_BUT if one.varies else MODULATION_HELD_OUT),
             f"{varies} {one.modulation_held_out:.2f} of its gain)",
         ),
         (
