@@ -39,6 +39,16 @@ def test_two_amplitudes_are_judged_together() -> None:
     assert sized("position_dependent_friction", [1.0, 1.0], cosine=1.8, sine=1.8)
 
 
+def test_friction_that_fades_more_slowly_than_it_is_seen_is_judged_at_its_time() -> None:
+    """Over less than its time a larger and slower change is the same: .5 +- 1, +- .14 at that time."""
+    drift = find("friction_drift")(np.array([0]), force=np.float64(0.5), damping=np.float64(0.0), time=np.float64(15.0))
+    deviation, share = np.array([1.0, 0.2, 20.0]), np.eye(3)
+    share[0, 2] = share[2, 0] = 0.99
+    assert has_size(drift, Fitted(np.zeros(3), share * np.outer(deviation, deviation), ()), (0, 1, 2))
+    share[0, 2] = share[2, 0] = 0.9  # .5 +- .44
+    assert not has_size(drift, Fitted(np.zeros(3), share * np.outer(deviation, deviation), ()), (0, 1, 2))
+
+
 def least_of(*causes: tuple[str, list[float], float, dict[str, float]]) -> int | None:
     """Which of some causes (name, deviations, correlation of the first two parameters, values) is least sure."""
     effects, blocks, places, first = [], [], [], 0
