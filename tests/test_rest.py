@@ -41,7 +41,8 @@ def test_two_amplitudes_are_judged_together() -> None:
 
 def test_friction_that_fades_more_slowly_than_it_is_seen_is_judged_at_its_time() -> None:
     """Over less than its time a larger and slower change is the same: .5 +- 1, +- .14 at that time."""
-    drift = find("friction_drift")(np.array([0]), force=np.float64(0.5), damping=np.float64(0.0), time=np.float64(15.0))
+    values = {"force": np.float64(0.5), "damping": np.float64(0.0), "time": np.float64(15.0)}
+    drift = find("friction_drift")(np.array([0]), **values)
     deviation, share = np.array([1.0, 0.2, 20.0]), np.eye(3)
     share[0, 2] = share[2, 0] = 0.99
     assert has_size(drift, Fitted(np.zeros(3), share * np.outer(deviation, deviation), ()), (0, 1, 2))
