@@ -55,7 +55,7 @@ from .rest import (
     wrong_law,
 )
 from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without
-from .standstill import only_sticks
+from .standstill import only_sticks, resting
 from .state import State, baseline, stated_effects, with_width
 from .step import Step, stand, with_causes
 from .thresholds import (
@@ -144,7 +144,9 @@ class _Left(NamedTuple):
     excess: float  # over the noise
     line: tuple[float, float, int]  # the strongest in its spectrum
     more: float  # squares by which smooth functions find more in it than chance gives
-    beyond: Float[np.ndarray, " nv"]  # squares of each joint beyond those of noise, where they surely are
+    beyond: Float[
+        np.ndarray, " nv"
+    ]  # squares of each joint while it moves beyond those of noise, where they surely are
     baseline: Float[np.ndarray, " nv"]  # the same without any cause
 
 
@@ -527,10 +529,13 @@ def _left(
     joints, tolerable = problem.model.joint_names, size <= tolerance
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
+    loud = beyond_noise(problem, joint.step.linear.residual, spectrum, whitening, generator)
+    there = left.there or ((wrong or bool(loud.any())) and not tolerable)
+    moves = np.moveaxis(~resting(problem), 2, 0).reshape(joint.step.rows.y.shape)
     beyond, alone = (
-        beyond_noise(problem, step.linear.residual, spectrum, whitening, generator) for step in (joint.step, first)
+        beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)
+        for step in (joint.step, first)
     )
-    there = left.there or ((wrong or bool(beyond.any())) and not tolerable)
     return _Left(left._replace(there=there), p_left, now[0], line, flexible[2], beyond, alone)
 
 
