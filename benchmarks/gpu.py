@@ -1,7 +1,7 @@
 """Throughput on an accelerator, and that it gives the numbers of the CPU.
 
-    PYTHONPATH=. python benchmarks/gpu.py ROBOT.urdf ... [--tree N] [--only WORD ...] [--gpus 0 1] [--at-once N]
-        [--out FILE]
+    PYTHONPATH=. python benchmarks/gpu.py ROBOT.urdf ... [--tree N] [--ways] [--only WORD ...] [--gpus 0 1]
+        [--at-once N] [--out FILE]
 
 Inverse and forward dynamics, mass matrix and regressor (dense, packed; normal matrix and triangular factor, both with
 torque) in float64, and the kernels in float32 too. Each function of each robot is a process of its own, begun in the
@@ -12,7 +12,9 @@ A process puts the states on the device, traces and compiles (told apart), compa
 a process that sees the CPU alone, and calls until half a second has passed: the best call counts ("in a program"). Two
 more call the public function as it is ("called"), for the time of the first call without kept programs and with those
 that the one before kept. The robot is known when the function is compiled; "argument" says where it is an argument of
-the program. `--tree N` adds a random tree of N joints, turning and sliding, its axes and placements at any angle.
+the program. `--ways` are other ways to the triangular factor: columns divided by an inverse in place of a solve, three
+turns of that, rows of the dense regressor by QR. `--tree N` adds a random tree of N joints, turning and sliding, its
+axes and placements at any angle.
 """
 
 from __future__ import annotations
@@ -51,9 +53,7 @@ CASES = {
     "forward dynamics float32": (1 << 21, 1 << 17),
     "inverse dynamics argument": (1 << 22, 1 << 20),
 }
-
-
-SUMS = ("normal matrix", "triangular factor")  # over all samples: they are told weights, too
+WAYS = {f"triangular factor, {way}": CASES["triangular factor"] for way in ("inverse", "three turns", "QR")}
 _PUBLIC = (
     "inverse dynamics",
     "forward dynamics",
@@ -63,13 +63,18 @@ _PUBLIC = (
     "normal matrix",
     "triangular factor",
 )
-STAGES = {"in a program": tuple(CASES), "called, none kept": _PUBLIC, "called, kept": _PUBLIC}
+STAGES = {
+    "in a program": (*CASES, *WAYS),
+    "called, none kept": _PUBLIC,
+    "called, kept": _PUBLIC,
+}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("robots", type=Path, nargs="*", metavar="ROBOT.urdf")
     parser.add_argument("--tree", type=int, help="joints of a random tree that is timed too")
+    parser.add_argument("--ways", action="store_true", help="other ways to the triangular factor, alone")
     parser.add_argument("--only", nargs="+", default=[""], help="functions, or words that their names hold")
     parser.add_argument("--gpus", nargs="+", default=["0"], help="as CUDA_VISIBLE_DEVICES tells them")
     parser.add_argument("--at-once", type=int, default=8, help="processes that compile beside each other")
@@ -87,7 +92,7 @@ def main() -> None:
             options.robots.append(_tree(options.tree, Path(folder) / f"tree{options.tree}.urdf"))
         jobs = [
             (robot, name, next(gpus))
-            for name in CASES
+            for name in (WAYS if options.ways else CASES)
             for robot in options.robots
             if name in options.only or any(word in name for word in options.only if word not in CASES)
         ]
@@ -173,7 +178,7 @@ def _child(robot: Path, name: str, folder: str, stage: str, samples: int) -> Non
         return
     if stage.startswith("called"):
         keep_programs()
-    samples = samples or CASES[name][model.nv > 10]
+    samples = samples or (CASES | WAYS)[name][model.nv > 10]
     jax.block_until_ready(jax.device_put(np.zeros(8)) + 1.0)  # the device is there and has run something
     if stage.startswith("called"):
         print(json.dumps(_called(model, name, samples)))
@@ -191,7 +196,7 @@ def _child(robot: Path, name: str, folder: str, stage: str, samples: int) -> Non
         found = jax.block_until_ready(function(*state))
         first = time.perf_counter() - begin + traced + compiled
         row = {"samples": samples, "first": first, "traced": traced, "compiled": compiled}
-        if name in SUMS:  # the same program, of which the first samples alone count
+        if _sums(name):  # the same program, of which the first samples alone count
             found = function(*state[:-1], state[-1].at[CHECKED:].set(0.0))
         sample = _first_samples(found, name)
         del found
@@ -225,6 +230,11 @@ def _difference(found: Any, reference: Path) -> float:
     return float(np.abs(found - cpu).max() / np.abs(cpu).max())
 
 
+def _sums(name: str) -> bool:
+    """Whether it is over all samples: then it is told weights, too."""
+    return name.startswith(("normal matrix", "triangular factor"))
+
+
 def _function(model: Any, name: str) -> Callable[..., Any]:
     """The function of (q, v, a), for accelerations of (q, v, tau), for sums of (q, v, a, weight)."""
     import figaroh_jax as fj
@@ -251,23 +261,54 @@ def _function(model: Any, name: str) -> Callable[..., Any]:
     if name == "inverse dynamics argument":
         nothing = dynamics._TORQUES.nothing_known(model)
         return lambda *x: straight_answers(dynamics._TORQUES, model, *x, codes=nothing)
-    return partial(known[name], model)
+    public, _, way = name.partition(", ")
+    if way:
+        _take(way)
+    return partial(known[public], model)
+
+
+def _take(way: str) -> None:
+    """Another way to the triangular factor on a GPU than the library's."""
+    import jax
+    import jax.numpy as jnp
+
+    from figaroh_jax.rigid import normal_equations as own
+
+    if way == "QR":
+        own.usable = lambda *arrays: False
+        return
+
+    def inverse(rows: Any, factor: Any) -> Any:
+        unit = jnp.broadcast_to(jnp.eye(factor.shape[-1]), factor.shape)
+        divided = jax.lax.linalg.triangular_solve(factor, unit, left_side=True, lower=False, transpose_a=True)
+        letters = "ckl,cpls->cpks" if rows.ndim > 3 else "ckl,cls->cks"
+        return jnp.einsum(letters, divided, rows, precision=jax.lax.Precision.HIGHEST)
+
+    def turns(total: Any, rows: Any) -> Any:
+        before, factor = jnp.swapaxes(total, 1, 2), None
+        for turn in range(3 if way == "three turns" else 2):
+            new = own._shifted_factor(own.row_products(before) + own._products(rows), own.SHIFTS[min(turn, 1)])
+            before, rows = inverse(before, new), inverse(rows, new)
+            factor = new if factor is None else jnp.matmul(new, factor, precision=jax.lax.Precision.HIGHEST)
+        return factor
+
+    own._with_factor = turns
 
 
 def _states(model: Any, name: str, samples: int, lengths_alone: bool = False) -> list[np.ndarray]:
     """q, v, a (and weights) of which the first thousand are the same for all numbers; in the function's precision."""
     dtype = np.float32 if "float32" in name else np.float64
     if lengths_alone:
-        return [np.broadcast_to(dtype(0), (samples, model.nv))] * (4 if name in SUMS else 3)
+        return [np.broadcast_to(dtype(0), (samples, model.nv))] * (4 if _sums(name) else 3)
     random = np.random.default_rng(0)
     checked = [random.uniform(-1.5, 1.5, (CHECKED, model.nv)) for _ in range(3)]
     rest = [random.random((max(0, samples - CHECKED), model.nv), np.float32) * 3.0 - 1.5 for _ in range(3)]
     states = [np.concatenate([x, y]).astype(dtype)[:samples] for x, y in zip(checked, rest, strict=True)]
-    return [*states, np.ones((samples, model.nv))] if name in SUMS else states
+    return [*states, np.ones((samples, model.nv))] if _sums(name) else states
 
 
 def _first_samples(found: Any, name: str) -> np.ndarray:
-    if name in SUMS:
+    if _sums(name):
         return _answer(found, name)
     return _answer(found[..., :CHECKED] if name.startswith("packed") else found[:CHECKED], name)
 
@@ -276,7 +317,7 @@ def _answer(found: Any, name: str) -> np.ndarray:
     """All numbers; of a factor those of its products, since what no sample moves may stand in it anyhow."""
     import jax
 
-    if name == "triangular factor":
+    if name.startswith("triangular factor"):
         found = np.asarray(found).T @ np.asarray(found)
     return np.concatenate([np.ravel(np.asarray(x, np.float64)) for x in jax.tree.leaves(found)])
 

@@ -214,7 +214,10 @@ def so101_sage(
         print(f"  chi2/N {level:10.2f} after {label}")
     for entry in dict.fromkeys(found.last.free[found.last.free >= 0]):
         one = found.structure.table[entry]
-        print(f"  {one.name:>14} {SO101[one.at[0]] if one.at[0] < 6 else 'spring':<14} {found.last.theta[entry]:.5g}")
+        column = int(np.flatnonzero(found.last.free == entry)[0])
+        half = "" if found.spread is None else f" +- {1.96 * found.spread[column]:.2g}"
+        where = SO101[one.at[0]] if one.at[0] < 6 else "spring"
+        print(f"  {one.name:>14} {where:<14} {found.last.theta[entry]:.5g}{half}")
     models = {
         "as stated": here.loop,
         "gains and damping": put(here.loop, here.known.table, found.first.theta),

@@ -38,6 +38,7 @@ def test_the_example_in_a_docstring_runs_and_is_short(name: str):
     found = inspect.unwrap(found) if inspect.isfunction(found) else found
     (test,) = doctest.DocTestFinder(recurse=False).find(found, name, globs={})
     assert 0 < sum(one.source.count("\n") for one in test.examples) <= 10
+    assert "from figaroh_jax" not in test.docstring  # public names alone
     failed = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test).failed
     for known, old in zip((registry.CATALOGUE, registry.POSES), before, strict=True):
         known.clear()  # what an example registers goes with it

@@ -107,6 +107,17 @@ def test_what_the_metric_does_not_see_leaves_the_mass_finite() -> None:
     assert 0 < found[0] < 1e8 and np.isfinite(found).all()
 
 
+@pytest.mark.parametrize("seed", range(40))
+def test_parameters_far_from_any_body_end_at_one(seed: int) -> None:
+    """Sizes without a scale in common, of which the metric sees some."""
+    rng = np.random.default_rng(seed)
+    free = rng.normal(size=10) * 10.0 ** rng.uniform(-4, 4, 10)
+    seen = np.diag(10.0 ** rng.uniform(0, 7, 10) * rng.integers(0, 2, 10))
+    found = physical_body(free, seen)
+    values = np.linalg.eigvalsh(np.asarray(pseudo_inertia(found)))
+    assert np.isfinite(found).all() and found[0] > 0 and values[0] > -1e-9 * values[-1]
+
+
 def test_rigid_prior_is_trust_times_each_links_own_scale(tmp_path: Path) -> None:
     parts = [robots.link("base"), robots.link("a", 2.0, com="0.3 0 0.4", rpy="0 0 0"), '<link name="b"/>']
     joints = [robots.joint("turn", "base", "a"), robots.joint("slide", "a", "b", "prismatic")]

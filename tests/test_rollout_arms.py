@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
+import equinox as eqx
 import jax
 import mujoco
 import numpy as np
 import pytest
 from generators import servo_arm, servo_arm6
 
+from figaroh_jax.rollouts import fit as fit_module, sensitivity
 from figaroh_jax.rollouts.alone import alone, carried_by, separable
 from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.data import Run, Stretch, windows
 from figaroh_jax.rollouts.faults import faults, without
-from figaroh_jax.rollouts.fit import System, fit, standard_errors
+from figaroh_jax.rollouts.fit import System, fit, spread_of_recordings, standard_errors
 from figaroh_jax.rollouts.parameters import Entry, values
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.search import t_of, t_of_places
@@ -211,3 +214,31 @@ def test_recordings_that_tell_alike_weigh_by_what_is_left_of_them(tmp_path: Path
     np.testing.assert_allclose(each, plain.sum() / 3, rtol=1e-9)
     assert even.plain().even is None
     np.testing.assert_array_equal(even.plain().data.weight, here.data.weight)
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_recordings_that_tell_numbers_differently_widen_their_intervals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plain: bool
+):
+    """Four recordings of arms whose friction differs by far more than noise tells: half of the interval is theirs."""
+    if plain:  # a machine without a compiler
+        for module in (fit_module, sensitivity):
+            monkeypatch.setattr(module, "native", lambda *_: SimpleNamespace(usable=False))
+    (tmp_path / "arm.xml").write_text(servo_arm.model_text())
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    t, u = servo_arm.command()
+    u, runs, levels = u[:500, None], [], np.array([0.2, 0.25, 0.35, 0.4])
+    for k, level in enumerate(levels):
+        other = eqx.tree_at(lambda m: m.joints.friction, loop, np.array([level]))
+        read = np.asarray(rollout(other, u, np.zeros(1)).reading)
+        noisy = read + np.random.default_rng(k).normal(0, 2e-4, read.shape)
+        runs.append(Run(f"run {k}", t[:500], u, noisy, None))
+    here = setting(loop, runs, baseline=("friction_loss",))
+    found = begun(here)
+    spread = spread_of_recordings(loop, here.known.table, here.data, found, here.folds)
+    (column,) = np.flatnonzero(found.free >= 0)
+    without = [(levels.sum() - one) / 3 for one in levels]  # were all recordings to tell as much
+    expected = np.sqrt(3 / 4 * np.var(without) * 4) * 3.182 / 1.96
+    assert found.theta[found.free[column]] == pytest.approx(levels.mean(), abs=0.02)
+    assert spread[column] == pytest.approx(expected, rel=0.2)
+    assert spread[column] > 100 * standard_errors(found, here.data)[column]

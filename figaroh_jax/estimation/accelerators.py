@@ -77,12 +77,10 @@ class BatchFit(NamedTuple):
 def coordinates(structure: Float[np.ndarray, "samples nv columns"], base: BaseParameters) -> Coordinates:
     """Coordinates in which the columns at the random states `structure` are orthonormal.
 
-    >>> import numpy as np, figaroh_jax as fj
-    >>> from figaroh_jax.estimation.base_parameters import base_parameters
+    >>> import figaroh_jax as fj
     >>> robot = fj.load_urdf(fj.DEMO)
-    >>> W, names = fj.columns.structural_columns(robot, ()), fj.columns.column_names(robot, ())
-    >>> base = base_parameters(W.reshape(-1, len(names)), names)
-    >>> fj.accelerators.coordinates(W, base).into.shape == (len(names), base.rank)
+    >>> base = fj.states.States(robot, lambda: [], ()).structural
+    >>> fj.accelerators.coordinates(fj.columns.structural_columns(robot, ()), base).into.shape == (40, base.rank)
     True
     """
     kept = structure[:, :, base.independent].reshape(-1, base.rank)
@@ -146,14 +144,13 @@ def fit_states(
     residual of each joint as its weight. To be called where 64-bit JAX is on.
 
     >>> import jax, figaroh_jax as fj
-    >>> from figaroh_jax.estimation.base_parameters import base_parameters
-    >>> robot, names = fj.load_urdf(fj.DEMO), fj.columns.column_names(fj.load_urdf(fj.DEMO), ())
-    >>> W = fj.columns.structural_columns(robot, ())
-    >>> into = fj.accelerators.coordinates(W, base_parameters(W.reshape(-1, len(names)), names)).into
+    >>> robot = fj.load_urdf(fj.DEMO)
+    >>> base = fj.states.States(robot, lambda: [], ()).structural
+    >>> into = fj.accelerators.coordinates(fj.columns.structural_columns(robot, ()), base).into
     >>> with jax.enable_x64(True):
     ...     q, v, a = map(jax.numpy.asarray, fj.columns.random_states(robot, 300))
     ...     found = fj.accelerators.fit_states(robot, (), into, q, v, a, fj.inverse_dynamics(robot, q, v, a))
-    >>> bool(found.rms.max() < 1e-6)  # N m
+    ...     bool(found.rms.max() < 1e-6)  # N m
     True
     """
     Z, y = conditioned_rows(model, terms, jnp.zeros(model.nv), into, q, v, a, tau)

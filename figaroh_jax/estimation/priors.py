@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 from jaxtyping import Float
 
 from ..rigid.inertia import to_com
 from ..rigid.model import RobotModel
-from .conic import Body, Constraints, constrained
+from .conic import Body, Constraints, NotConverged, constrained
+from .consistency import inconsistencies
 
 __all__ = ["body_precision", "physical_body", "rigid_prior"]
 
 UNSEEN = 1e-12  # of the largest information: what a direction without any counts for
-LIGHT, SHORT = 0.05, 0.05  # kg, m: the least scale of a body
+LIGHT, SHORT, LONG = 0.05, 0.05, 1.0  # kg, m, m: scales of a body, the first two at the least
 
 
 def rigid_prior(model: RobotModel, trust: float) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
@@ -39,10 +42,16 @@ def physical_body(free: Float[np.ndarray, "10"], information: Float[np.ndarray, 
     values, vectors = np.linalg.eigh((information + information.T) / 2)
     root = np.sqrt(np.maximum(values, UNSEEN * values[-1]))[:, None] * vectors.T
     mass = max(abs(float(free[0])), LIGHT)
-    length = max(SHORT, float(np.linalg.norm(free[1:4])) / mass)
-    body = Body("body", range(10), mass, length)
-    scale = mass * length ** np.array([0.0, *[1.0] * 3, *[2.0] * 6])
-    return constrained(np.column_stack([root, root @ free]), Constraints([body]), scale)
+    length = min(max(SHORT, float(np.linalg.norm(free[1:4])) / mass), LONG)
+    # parameters far from any body are not always found in a metric: then those nearest in units of their own
+    for rows, kg, m in ((root, mass, length), (np.eye(10), float(np.abs(free).max()), 1.0)):
+        body = Body("body", range(10), kg, m)
+        scale = kg * m ** np.array([0.0, *[1.0] * 3, *[2.0] * 6])
+        with suppress(NotConverged):
+            found = constrained(np.column_stack([rows, rows @ free]), Constraints([body]), scale)
+            if not inconsistencies(found[None], [body.name]):
+                return found
+    raise NotConverged(f"no body lies near the parameters {free}")
 
 
 def body_precision(ten: Float[np.ndarray, "10"]) -> Float[np.ndarray, "10"]:

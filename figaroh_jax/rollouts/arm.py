@@ -19,7 +19,7 @@ from ..results import Name
 from .alike import instead, names, rivals
 from .causes import Candidate
 from .faults import Fault, faults, without
-from .fit import Fit, System, fit, refitted_without
+from .fit import Fit, System, fit, refitted_without, spread_of_recordings
 from .parameters import put, values
 from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_of_entry, outputs, tried_now
 from .search import Model, Named, Search, Tried, judged_by_colour, sized, t_of, t_of_places, t_of_recordings
@@ -127,12 +127,13 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
         begin, now, here = _on_all(whole, begin.model), _on_all(whole, now.model), whole
         first = begin.model.fit
         steps.append(("all that was recorded", _level(here, now.model.fit)))
+    spread = None
     if even:
-        now = _alike_by_recording(here, now)
+        now, spread = _alike_by_recording(here, now)
         steps.append(("recordings that are equally informative", _level(here, now.model.fit)))
     result = Search(
         "nothing", found, now.model.structure, first, now.model.fit, p_value, [], nearest, steps, held, fits,
-        begin.model.structure, here, wrong,
+        begin.model.structure, here, wrong, spread,
     )  # fmt: skip
     return _judged(here, result, now, slight)
 
@@ -150,15 +151,21 @@ def _on_all(here: Setting, model: Model) -> Standing:
     return _standing(here, structure, new, model.free, held=False)
 
 
-def _alike_by_recording(here: Setting, now: Standing) -> Standing:
-    """The numbers where more than noise is left: each recording tells as much of a joint, not the fastest the most."""
-    structure, last, free = now.model.structure, now.model.fit, now.model.free
+def _alike_by_recording(here: Setting, now: Standing) -> tuple[Standing, np.ndarray]:
+    """The numbers where more than noise is left: each recording tells as much of a joint, not the fastest the most.
+
+    With them how differently recordings tell each, (columns of the fit,).
+    """
+    structure, last, free, even = now.model.structure, now.model.fit, now.model.free, now.model.structure
     for _ in range(_EVENED):
         some = evened(here, structure, last)
-        last = _from(some, structure._replace(data=some.cut(structure.loop)), last, free)
+        even = structure._replace(data=some.cut(structure.loop))
+        last = _from(some, even, last, free)
+    spread = spread_of_recordings(*even, last, here.folds)
     last = _from(here, structure, last, free, 0)
     beyond = excess_of(here, structure, last)
-    return Standing(Model(structure, last, free, float(beyond.max())), outputs(here, last.sums.cost), now.held, beyond)
+    model = Model(structure, last, free, float(beyond.max()))
+    return Standing(model, outputs(here, last.sums.cost), now.held, beyond), spread
 
 
 def _from(here: Setting, structure: Structure, last: Fit, free: Sequence[int], most: int = LATE) -> Fit:

@@ -18,13 +18,14 @@ from .native import native
 from .parameters import BOUNDS, Table
 from .sensitivity import Sums, Windows, linear_sums
 
-__all__ = ["Fit", "fit", "held_out", "refitted_without", "standard_errors", "start_of"]
+__all__ = ["Fit", "fit", "held_out", "refitted_without", "spread_of_recordings", "standard_errors", "start_of"]
 
 _ITERATIONS = 40
 _PAIR = 2
 _FEW = 12  # windows up to which starts and numbers always move together
 _MOSTLY = 0.5  # share of a step's gain from which the starts move alone, every other time
 _GROUPS, _REFITS = 6, 10  # of recordings that are left out, steps of each fit without one
+_STEPS = 4  # of each fit without some recordings that tells how they differ
 _SETTLED, _RESTING = 1e-5, 10.0  # predicted share of the squares at which a fit without some recordings ends
 _OF_GAIN, _OF_REST = 0.02, 0.003  # shares of what a fit has gained and of what is left, where only its gain is asked
 _CLOSE = 0.02  # predicted decrease of the sum of whitened squares at which a fit ends
@@ -109,14 +110,14 @@ class _Lanes:
             cost, gradient, matrix = (np.asarray(x) for x in found)
         return [Sums(cost[k], gradient[k], matrix[k]) for k in range(len(which))]
 
-    def several(self, now: list[Sums], steps: int) -> list[Sums]:
+    def several(self, now: list[Sums], steps: int, settled: float = _SETTLED) -> list[Sums]:
         """The sums of every lane after some damped steps of what it keeps; starts without their first rows stay."""
         count = len(self.theta)
         cost = np.array([self.cost(self.kept(now[k], k), self.start[k]) for k in range(count)])
         damping, active = np.full(count, 1e-3), np.arange(count)
         for _ in range(steps):
             made = {k: self.step(self.kept(now[k], k), k, damping[k]) for k in active}
-            least = _SETTLED * cost * np.clip(cost / self.rows, 1.0, _RESTING)  # a large rest tells less of a number
+            least = settled * cost * np.clip(cost / self.rows, 1.0, _RESTING)  # a large rest tells less of a number
             active = np.array([k for k in active if made[k].gain > least[k]], int)
             if not len(active):
                 break
@@ -339,11 +340,12 @@ def refitted_without(
     Recordings that hold much of what tells a number leave a direction open that one linear step follows out of sight.
     A few damped steps do not. `folds` are recordings, left out in groups, six at the most.
     """
-    groups = np.searchsorted(np.unique(folds), folds) % _GROUPS
-    left = [groups == k for k in range(groups.max() + 1)]
+    left = _left_out(folds)
     many, width = len(left), max(len(one.free) for one in found)
     if native(loop, table, data).usable and all((mine.all(0) == mine.any(0)).all() for mine in left):
-        answers = np.stack([_squares_without(loop, table, data, one, [mine.any(0) for mine in left]) for one in found])
+        answers = np.stack(
+            [_squares_without(loop, table, data, one, [np.any(mine, 0) for mine in left]) for one in found]
+        )
         return answers if outputs else answers.sum(-1)
     theta, start = (np.repeat(np.stack([getattr(one, name) for one in found]), many, 0) for name in ("theta", "start"))
     free = [one.free for one in found for _ in left]
@@ -355,18 +357,55 @@ def refitted_without(
     return answers if outputs else answers.sum(-1)
 
 
+def _left_out(folds: np.ndarray) -> list[np.ndarray]:
+    """Groups of folds, six at the most, each (blocks, windows)."""
+    groups = np.searchsorted(np.unique(folds), folds) % _GROUPS
+    return [groups == k for k in range(groups.max() + 1)]
+
+
 def _squares_without(loop: Loop, table: Table, data: Windows, one: Fit, left: Sequence[np.ndarray]) -> np.ndarray:
     """Squares (blocks, windows, ny) of each group of windows by a fit of the others, which alone are simulated."""
     answer = np.zeros(one.sums.cost.shape)
     for out in left:
-        some = [jax.tree.map(lambda x: np.asarray(x)[..., which], data) for which in (~out, out)]  # noqa: B023
-        none = np.zeros((len(answer), int((~out).sum())), bool)
-        begin = one.theta[None], [one.free], one.start[None][..., ~out]
-        lane = _Lanes(loop, table, some[0], *begin, len(one.free), 1, [none])
-        lane.several([Sums(*(x[:, ~out] for x in one.sums))], _REFITS)  # pyright: ignore[reportArgumentType]
-        code = native(loop, table, some[1])
-        answer[:, out] = code.sums(lane.theta[0], np.zeros(0, int), one.start[:, out]).cost
+        theta = _of_others(loop, table, data, one, out, _REFITS, _SETTLED)
+        code = native(loop, table, jax.tree.map(lambda x: np.asarray(x)[..., out], data))  # noqa: B023
+        answer[:, out] = code.sums(theta, np.zeros(0, int), one.start[:, out]).cost
     return answer
+
+
+def _of_others(
+    loop: Loop, table: Table, data: Windows, one: Fit, out: np.ndarray, steps: int, settled: float
+) -> np.ndarray:
+    """The numbers after some steps of a fit of all windows but those that are `out`, (entries,)."""
+    some = jax.tree.map(lambda x: np.asarray(x)[..., ~out], data)
+    none = np.zeros((len(one.sums.cost), int((~out).sum())), bool)
+    begin = one.theta[None], [one.free], one.start[None][..., ~out]
+    lane = _Lanes(loop, table, some, *begin, len(one.free), 1, [none])
+    lane.several([Sums(*(x[:, ~out] for x in one.sums))], steps, settled)  # pyright: ignore[reportArgumentType]
+    return lane.theta[0]
+
+
+def spread_of_recordings(loop: Loop, table: Table, data: Windows, found: Fit, folds: np.ndarray) -> np.ndarray:
+    """How differently recordings tell each free entry, (columns,): half of its 95 % interval over 1.96.
+
+    Where more than noise is left, and in each recording in its own way, the noise tells no error. The numbers are
+    fitted without some recordings (`folds` (blocks, windows) numbers them) and told by the spread of these: a
+    jackknife of groups (J. W. Tukey, Annals of Mathematical Statistics 29, 1958) with Student's t.
+    """
+    from scipy.special import ndtri, stdtrit  # scipy is slow to import
+
+    left, settled = _left_out(folds), _SETTLED / 100
+    many = len(left)
+    if native(loop, table, data).usable:
+        theta = np.stack([_of_others(loop, table, data, found, np.any(out, 0), _STEPS, settled) for out in left])
+    else:  # one program for all of them
+        begin = [found.theta] * many, [found.free] * many, [found.start] * many
+        fits = _Lanes(loop, table, data, *begin, len(found.free), 1, left)
+        fits.several([found.sums] * many, _STEPS, settled)
+        theta = fits.theta
+    own = theta[:, np.maximum(found.free, 0)]
+    wide = np.sqrt((many - 1) / many * ((own - own.mean(0)) ** 2).sum(0)) * stdtrit(many - 1, 0.975) / ndtri(0.975)
+    return np.where(found.free >= 0, wide, np.nan)
 
 
 def held_out(found: Fit, data: Windows, folds: np.ndarray) -> np.ndarray:

@@ -679,23 +679,19 @@ INLINE void linearised(const Given *g, Work *w, const int n, const int carried, 
     }
     by_q[j * n + j] += dq, by_v[j * n + j] += dv;
   }
-  for (int i = 0; i < n; i++) /* W = L^-1 M K^-1 */
-    for (int j = 0; j < n; j++) {
-      own[i * n + j] = 0;
-      for (int k = 0; k < n; k++) own[i * n + j] += w->L[i * n + k] * w->M[k * n + j];
-    }
+  memset(own, 0, sizeof(double) * n * n), memset(W, 0, sizeof(double) * n * n); /* W: L M K transposed, all symmetric */
   for (int i = 0; i < n; i++)
-    for (int j = 0; j < n; j++) {
-      W[i * n + j] = 0;
-      for (int k = 0; k < n; k++) W[i * n + j] += own[i * n + k] * w->K[k * n + j];
-    }
-  memset(by, 0, sizeof(double) * total * n);
-  for (int j = 0; j < n; j++)
     for (int k = 0; k < n; k++)
-      for (int c = 0; c < n; c++) {
-        BY(c) -= W[j * n + k] * by_q[k * n + c] + w->L[j * n + k] * second[k * n + c];
-        BY(n + c) -= W[j * n + k] * by_v[k * n + c];
-      }
+      for (int j = 0; j < n; j++) own[i * n + j] += w->M[i * n + k] * w->L[k * n + j];
+  for (int i = 0; i < n; i++)
+    for (int k = 0; k < n; k++)
+      for (int j = 0; j < n; j++) W[i * n + j] += w->K[i * n + k] * own[k * n + j];
+  memset(by, 0, sizeof(double) * total * n);
+  for (int c = 0; c < n; c++)
+    for (int k = 0; k < n; k++) {
+      const double f1 = by_q[k * n + c], f2 = second[k * n + c], f3 = by_v[k * n + c];
+      for (int j = 0; j < n; j++) BY(c) -= W[k * n + j] * f1 + w->L[k * n + j] * f2, BY(n + c) -= W[k * n + j] * f3;
+    }
   for (long p = 0; p < g->many; p++) {
     const long c = two + g->column[p], at = g->place[p], kind = g->kind[p];
     double one[MOST], more[MOST];
@@ -727,8 +723,8 @@ INLINE void linearised(const Given *g, Work *w, const int n, const int carried, 
         if (w->side[1][j].on) f -= (w->side[1][j].pull + w->a[j]) / w->side[1][j].soft;
         one[j] += f * mobile[p * n + j];
       }
-      for (int j = 0; j < n; j++)
-        for (int k = 0; k < n; k++) BY(c) -= W[j * n + k] * one[k] + w->L[j * n + k] * more[k];
+      for (int k = 0; k < n; k++)
+        for (int j = 0; j < n; j++) BY(c) -= W[k * n + j] * one[k] + w->L[k * n + j] * more[k];
       continue;
     }
     if (kind >= OF_DRIVE) {
@@ -747,7 +743,7 @@ INLINE void linearised(const Given *g, Work *w, const int n, const int carried, 
       for (int k = 0; k < n; k++) {
         if (way[k] == 0) continue;
         const double t1 = -way[k] * f * load[k] * w->within[k], t2 = g->implicit ? -g->dt * way[k] * turn * bend : 0;
-        for (int j = 0; j < n; j++) BY(c) -= W[j * n + k] * t1 + w->L[j * n + k] * t2;
+        for (int j = 0; j < n; j++) BY(c) -= W[k * n + j] * t1 + w->L[k * n + j] * t2;
       }
       continue;
     }
@@ -773,7 +769,7 @@ INLINE void linearised(const Given *g, Work *w, const int n, const int carried, 
         default: break;
       }
     }
-    for (int j = 0; j < n; j++) BY(c) -= W[j * n + at] * t1 + w->L[j * n + at] * t2;
+    for (int j = 0; j < n; j++) BY(c) -= W[at * n + j] * t1 + w->L[at * n + j] * t2;
   }
 }
 

@@ -98,6 +98,7 @@ class Search:
     origin: Structure | None = None  # of the baseline
     setting: Setting | None = None  # where rows were left out: without them
     faults: list[Fault] = field(default_factory=list)  # why they were
+    spread: np.ndarray | None = None  # (columns of `last`,) by recordings: half of each 95 % interval over 1.96
     beside: Fit | None = None  # where a cause that is too slight to be named is left out: with it noise alone is left
 
 

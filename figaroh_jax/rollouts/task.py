@@ -294,6 +294,8 @@ def _cause(one: Named, found: Search, here: Setting) -> Cause:
     weight = np.asarray(structure.data.weight)
     level = max(1.0, fitted.squares / (weight > 0).sum())
     errors = standard_errors(fitted, structure.data, level)
+    if found.spread is not None:
+        errors = np.fmax(errors, found.spread)
     parameters = {}
     for name, entry in zip(one.candidate.reported, one.candidate.entries, strict=True):
         column = int(np.flatnonzero(fitted.free == entry)[0])
