@@ -328,8 +328,8 @@ def _told(what: str, sides: list[str], errors: list[list[tuple[float, float]]]) 
     print(
         f"sizes of {what} that both give: {len(a)}, in the 95 % interval {', '.join(inside)}; of {moved.sum()} that"
         f" moved {(b < a)[moved].sum()} are nearer to the truth in {sides[1]}; error in {sides[0]}'s sigma: squares"
-        f" {ratio:.3f} times, median {np.median(a / sa):.3f} -> {np.median(b / sa):.3f}; median sigma"
-        f" {np.median(sb / sa):.3f} times"
+        f" {ratio:.3f} times, median {np.median(a / sa):.3f} -> {np.median(b / sa):.3f}; in their own: mean square"
+        f" {np.mean((a / sa) ** 2):.2f} -> {np.mean((b / sb) ** 2):.2f}; median sigma {np.median(sb / sa):.3f} times"
     )
 
 

@@ -13,6 +13,7 @@ REVERSAL = 0.25  # periods of the cutoff around a change of the velocity's sign 
 REVERSALS_AT_MOST = 1 / 3  # of a joint's rows; a joint that mostly stands still keeps them
 SPEED_EDGES = (0.0, 0.015, 0.03, 0.05, 0.08, 0.12, 0.2, 0.35, 1.0)  # of a joint's top speed: the bins
 FAST = 0.12  # of a joint's top speed, from which its residual is the measure of slower rows
+LOW_SPEEDS = (0.04, 0.08, 0.16)  # of a joint's top speed: widths of friction that slow rows may follow
 LEAST_FACTOR = 1.3  # of the mean square: a bin that is worse by less is as good as the fast ones
 ROWS_OF_A_BIN = 15.0  # rows at which a bin's own factor and none are believed alike
 WEIGHT_ROUNDS = 2  # of weights and spectrum in turn
