@@ -35,7 +35,7 @@ __all__ = [
     "with_parts",
 ]
 
-KEPT = 1e-12
+KEPT = 1e-12  # of the diagonal: a ridge for numbers that no row shows
 AS_SURE = 2.0  # times the deviation of a fit up to which another one counts in full
 LATE = 4  # turns: most fits have settled by then
 BACK = 0.5  # of its last move: what a shape goes back by where steps overshoot

@@ -46,7 +46,7 @@ __all__ = [
     "with_term",
 ]
 
-FRICTION_PRECISION = 1e-6
+FRICTION_PRECISION = 1e-6  # 1/(N m)^2: friction is as good as free
 
 
 @dataclass(frozen=True)
