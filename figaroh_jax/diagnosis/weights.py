@@ -18,7 +18,16 @@ from .holdout import fold_error, residual_rms
 from .problem import Problem
 from .state import State, whitened
 from .step import stand
-from .thresholds import FAST, LEAST_FACTOR, REVERSAL, REVERSALS_AT_MOST, ROWS_OF_A_BIN, SPEED_EDGES, WHITE_GAIN
+from .thresholds import (
+    FAST,
+    LEAST_FACTOR,
+    LOW_SPEEDS,
+    REVERSAL,
+    REVERSALS_AT_MOST,
+    ROWS_OF_A_BIN,
+    SPEED_EDGES,
+    WHITE_GAIN,
+)
 
 __all__ = ["relative_speed", "speed_factors", "weighted_by_speed", "white_where_better", "without_reversals"]
 
@@ -55,7 +64,8 @@ def speed_factors(problem: Problem, state: State, whitening: Float[np.ndarray, "
     """Mean square of what a rich model leaves in each bin of |v| / max |v|, over that of the fast rows; never rising.
 
     The model is the baseline with smooth functions of the joint's position, speed and load, and of its friction over
-    position and speed; it serves the weights alone. Bins of few rows are drawn towards 1.
+    position and speed, low speeds apart: what a law of the velocity could predict there is no scatter. It serves the
+    weights alone. Bins of few rows are drawn towards 1.
     """
     rows = whitened(problem, state, whitening)
     weight, speed = (
@@ -63,11 +73,21 @@ def speed_factors(problem: Problem, state: State, whitening: Float[np.ndarray, "
     )
     functions, out = smooth_functions(state.motion), []
     for joint in range(len(rows.y)):
-        smooth = _whitened_rows(problem, state, functions[joint], whitening, joint)
+        own = np.concatenate([functions[joint], _friction_of_low_speed(problem, state, joint)])
+        smooth = _whitened_rows(problem, state, own, whitening, joint)
         residual = _left(rows, state, joint, smooth) / np.maximum(weight[joint], 1e-12)
         used = weight[joint] > 0
         out.append(_bin_factors(residual[used], speed[joint][used]))
     return np.array(out)
+
+
+def _friction_of_low_speed(problem: Problem, state: State, joint: int) -> Float[np.ndarray, "k nN"]:
+    """Friction that falls, or rises, within some share of the joint's top speed: a law of the velocity, no scatter."""
+    fitted = np.asarray(problem.records.fitted)[..., joint] > 0
+    speed = np.abs(np.asarray(problem.records.velocity)[..., joint])
+    top = float(np.take_along_axis(speed, problem.records.row_samples(), axis=1)[fitted].max(initial=1e-12))
+    v, s = np.asarray(state.motion.velocity)[:, joint], np.asarray(state.motion.direction)[:, joint]
+    return np.stack([s * np.exp(-((v / (width * top)) ** 2)) for width in LOW_SPEEDS])
 
 
 def white_where_better(
