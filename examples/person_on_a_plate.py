@@ -7,13 +7,15 @@ import numpy as np
 
 import figaroh_jax as fj
 
-DATA = Path(os.environ.get("FIGAROH_JAX_DATA", "shared/data"))
+DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 MOVING = ["middle_lumbar_X", "middle_lumbar_Z"]
 MOVING += [f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder_Z", "shoulder_X", "elbow_Z")]
 
 
 def main() -> None:
     """Legs as one with the pelvis, everything else within the limits of the joints."""
+    if not DATA.is_dir():
+        return print(f"skipped: no model in {DATA}; FIGAROH_JAX_DATA names the folder")
     robot = fj.load_urdf(DATA / "human_model" / "human.urdf", joints=MOVING, root="free_flyer")
     upright = np.zeros(robot.nq)
     upright[:7] = [0.0, 0.0, 0.95, np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]  # the model's y is up

@@ -33,7 +33,7 @@ from .step import with_causes
 __all__ = ["next_experiment"]
 
 SPEEDS = (0.02, 0.05, 0.1, 0.2, 0.3)  # rad/s or m/s, of slow sweeps
-FASTER, SLOWER = 1.5, 0.5
+FASTER, SLOWER = 1.5, 0.5  # times the speed of the recordings' motion
 ROUNDED = 0.2  # s: how long a sweep takes to turn
 MASS, ARM = 0.1, 0.1  # of the robot's; m from the last joint: of a known load
 ENOUGH = 3.0  # standard deviations that an experiment must add

@@ -14,7 +14,7 @@ from .screening import Shown
 __all__ = ["explain"]
 
 VISIBLE = 4.0  # noise sigmas at which an effect is seen
-CUT = 1e-9
+CUT = 1e-9  # of the largest eigenvalue: below, a direction is rounding
 
 
 def explain(

@@ -18,9 +18,9 @@ from .state import FRICTION_PRECISION, State, whitened
 
 __all__ = ["dependences", "families", "flexible_p", "friction_width", "smooth_functions"]
 
-DEGREES = 6
+DEGREES = 6  # of the polynomials in a joint's position; of the cosines over time one less
 WIDTHS = (0.0, 0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # rad/s or m/s
-WIDTH_GAIN = 10.0
+WIDTH_GAIN = 10.0  # whitened squares that a smooth reversal must take away
 
 
 def flexible_p(

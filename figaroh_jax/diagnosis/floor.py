@@ -19,7 +19,7 @@ from .thresholds import LOWEST_FREQUENCY, LOWEST_RESOLVED
 
 __all__ = ["kept_columns", "noise_floor", "noise_rms"]
 
-ROUNDS = 2
+ROUNDS = 2  # of the rich model's fit and the spectrum in turn
 RICHNESS = 10  # groups of columns in the rich model
 RICH_CUT = 1e-9  # of the unit-diagonal Gram of the rich model
 COLUMN_CUT = 1e-8  # of the longest column: below, a column of the rigid body is what rounding leaves of zero

@@ -17,9 +17,9 @@ __all__ = ["checked_repeats", "describe_folds", "held_rows", "layout"]
 
 BLOCK, SHORT_BLOCK, SHORT = 1.0, 0.3, 9.99  # s: of a block, of a block in recordings shorter than the third
 FOLDS = 5  # where the excitations are few: blocks go to them in turn
-QUARTERS = 4
+QUARTERS = 4  # of an excitation, for folds of few
 SLICED, QUARTERED = True, False
-FEWEST_EXCITATIONS = 3
+FEWEST_EXCITATIONS = 3  # from which each is left out as a whole
 
 
 def layout(signals: Sequence[Signals], records: Records) -> Layout:

@@ -26,7 +26,7 @@ SETTLED = 1e-7  # of the first value: a step that promises less is not taken
 CLOSE = 1e-4  # the same for the size of a shift, which is fitted exactly later
 STEP = 1e-5  # of its bracket: over which the profile of a shift is differentiated
 FAR = 10.0  # times what its next step promises: what a start may lie above the best to be followed
-RIDGE = 1e-9
+RIDGE = 1e-9  # of normal equations with a unit diagonal
 
 
 class Whitened(NamedTuple):

@@ -57,12 +57,12 @@ __all__ = ["Fit", "identify", "identify_task"]
 Fit = Literal["physical", "log_cholesky", "unconstrained"]
 # A direction is loosened as far as the noise of the data moves it by no more than so many stated standard deviations.
 # Of .5, 1, 2, 3 this one, chosen by the cross-validated error of the Panda and TIAGo; see `benchmarks/README.md`.
-MOVED = 2.0
+MOVED = 2.0  # standard deviations that noise may move a loosened direction by
 SHOWN = 0.01  # information of the data in a direction below which it stays as stated; 1 is the prior's own (a root)
 TRUSTS = (1.0, 3.0, 10.0, 100.0)  # multiples of the stated trust that cross-validation chooses from
 MOST_UNSEEN = 2.0  # relative sigma of a link beyond which nothing is let go that no torque shows
 CLEARLY = 0.05  # of the squares left out: what letting go of all that no torque shows must gain
-DRIVE_PRECISION = 1e-6
+DRIVE_PRECISION = 1e-6  # of friction and rotors: as good as free
 DEAD = 0.5  # share of samples at one single value: such a torque is not measured
 
 
