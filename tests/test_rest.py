@@ -11,7 +11,7 @@ import pytest
 from figaroh_jax.diagnosis import rest as rests
 from figaroh_jax.diagnosis.estimates import Fitted
 from figaroh_jax.diagnosis.joint import Joint, has_size, least_sure
-from figaroh_jax.diagnosis.naming import Standing, _turns_against_itself, beside_rest, reason_against
+from figaroh_jax.diagnosis.naming import Standing, _turns_against_itself, beside_rest, of_its_own, reason_against
 from figaroh_jax.diagnosis.rest import significance, tolerated, verdict, wrong_law
 from figaroh_jax.effects.catalogue import find
 from figaroh_jax.results import Name
@@ -37,6 +37,17 @@ def test_two_amplitudes_are_judged_together() -> None:
     # chi-square of two: 5.99 at 95 %
     assert not sized("position_dependent_friction", [1.0, 1.0], cosine=1.7, sine=1.7)
     assert sized("position_dependent_friction", [1.0, 1.0], cosine=1.8, sine=1.8)
+
+
+def test_friction_that_fades_more_slowly_than_it_is_seen_is_judged_at_its_time() -> None:
+    """Over less than its time a larger and slower change is the same: .5 +- 1, +- .14 at that time."""
+    values = {"force": np.float64(0.5), "damping": np.float64(0.0), "time": np.float64(15.0)}
+    drift = find("friction_drift")(np.array([0]), **values)
+    deviation, share = np.array([1.0, 0.2, 20.0]), np.eye(3)
+    share[0, 2] = share[2, 0] = 0.99
+    assert has_size(drift, Fitted(np.zeros(3), share * np.outer(deviation, deviation), ()), (0, 1, 2))
+    share[0, 2] = share[2, 0] = 0.9  # .5 +- .44
+    assert not has_size(drift, Fitted(np.zeros(3), share * np.outer(deviation, deviation), ()), (0, 1, 2))
 
 
 def least_of(*causes: tuple[str, list[float], float, dict[str, float]]) -> int | None:
@@ -87,13 +98,33 @@ def test_more_power_than_noise_can_have_is_a_rest(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(rests, "draw_noise", drawn)
     rng, left = np.random.default_rng(3), np.ones(shape)
 
-    def p(share: float) -> float:
+    def beyond(share: float) -> np.ndarray:
         size = np.array([1.0, np.sqrt(1 + share * np.sqrt(2 / 400))])  # so many deviations at the second joint
-        return rests.more_than_noise(nothing, left * size[:, None], nothing, nothing, rng)
+        return rests.beyond_noise(nothing, left * size[:, None], nothing, nothing, rng)
 
-    assert p(0.0) > 0.4
-    assert 0.02 < p(2.0) < 0.15
-    assert p(4.0) < 0.01
+    assert not beyond(0.0).any()
+    assert not beyond(2.0).any()
+    np.testing.assert_allclose(beyond(4.0), [0.0, 4 * np.sqrt(2 * 400)], rtol=0, atol=8)  # mean of 200 draws: +- 2
+
+
+@pytest.mark.parametrize(
+    ("beyond", "baseline", "joints", "share"),
+    [
+        ([0, 0, 50, 0, 0, 0], [0, 0, 150, 0, 0, 0], [2], 0.5),
+        ([0, 9, 50, 0, 0, 0], [0, 9, 150, 0, 0, 0], [2], 0.5),  # one of five others
+        ([9, 9, 50, 9, 0, 0], [9, 9, 150, 9, 0, 0], [2], 0.0),  # most others have a misfit: this joint may have one too
+        ([0, 0, 50, 0, 0, 0], [9, 9, 150, 9, 0, 0], [2], 0.0),  # ... that other causes have taken
+        ([0, 0, 50, 0, 0, 0], [0, 0, 150, 0, 0, 0], [1], 0.0),
+        ([0, 20, 30, 0, 0, 0], [0, 90, 90, 0, 0, 0], [1, 2], 0.5),
+        ([0, 20, 30, 0, 0, 0], [0, 90, 90, 0, 0, 0], [0, 1, 2, 3, 4, 5], 0.5),
+        ([0, 20, 30, 0, 0, 0], [9, 90, 90, 0, 0, 0], [0, 1, 2, 3, 4, 5], 0.0),
+    ],
+)
+def test_what_stays_at_a_causes_joints_is_its_own_where_others_have_no_misfit(
+    beyond: list[float], baseline: list[float], joints: list[int], share: float
+) -> None:
+    found = of_its_own(np.array(beyond, float), np.array(baseline, float), joints, 100.0)
+    assert found == pytest.approx(share)
 
 
 def test_a_law_is_wrong_where_it_leaves_a_rest_at_its_own_place() -> None:
@@ -128,6 +159,10 @@ RIGHT = Standing(
         ({"whole": True, "gain": 0.05, "modulation": 0.2}, ""),
         ({"whole": True, "gain": 0.05, "modulation": 0.4}, "varies"),
         ({"modulation_held_out": 0.25}, "varies"),
+        ({"modulation_held_out": 0.12, "varies": True}, "varies"),  # less than .2, but surely
+        ({"modulation_held_out": 0.12}, ""),
+        ({"modulation_held_out": 0.08, "varies": True}, ""),
+        ({"leaves": 0.06}, "another law acts there"),
         ({"share": 3.0, "cancels": True}, "cancels"),
         ({"physical": False}, "physically impossible"),
         ({"beside_rest": False}, "named only where nothing else"),

@@ -231,11 +231,12 @@ def t_value(worse: Float[np.ndarray, " blocks"], better: Float[np.ndarray, " blo
     return float(gain.mean() / spread) if spread > 0 else 0.0
 
 
-def t_needed(blocks: int, t: float) -> float:
-    """The Student t of so many blocks' differences that chance exceeds as often as it exceeds `t` of very many."""
+def t_needed(blocks: int, t: float, tried: int = 1) -> float:
+    """The Student t of so many blocks' differences that chance exceeds as often as it exceeds `t` of very many; the
+    largest of as many as were `tried` no more often."""
     from scipy.special import ndtr, stdtrit  # scipy is slow to import
 
-    return float(stdtrit(max(blocks - 1, 1), ndtr(t)))
+    return float(stdtrit(max(blocks - 1, 1), 1 - ndtr(-t) / tried))
 
 
 def overlap(current: Verdicts, one: Verdicts, other: Verdicts) -> float:

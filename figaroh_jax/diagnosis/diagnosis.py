@@ -16,10 +16,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..effects.base import Effect, place
+from ..effects.base import place
 from ..effects.catalogue import CATALOGUE, find, related
 from ..effects.plausibility import implausible
-from ..errors import InputError
 from ..estimation.noise import Spectrum
 from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
@@ -40,13 +39,13 @@ from .gates import physical_sign
 from .holdout import fold_squares, part_error, residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_misfit, with_parts
 from .layout import checked_repeats, describe_folds, held_rows, layout
-from .naming import beside_rest, beyond_simpler, reason_against, standings
+from .naming import beside_rest, beyond_simpler, of_its_own, reason_against, standings
 from .problem import Problem
 from .rest import (
     Significance,
+    beyond_noise,
     excess,
     lines,
-    more_than_noise,
     parts_of,
     predictable,
     relative_rest,
@@ -56,8 +55,8 @@ from .rest import (
     wrong_law,
 )
 from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without
-from .standstill import only_sticks
-from .state import State, baseline, with_width
+from .standstill import only_sticks, resting
+from .state import State, baseline, stated_effects, with_width
 from .step import Step, stand, with_causes
 from .thresholds import (
     ALL_BUT,
@@ -137,6 +136,20 @@ class _Setting(NamedTuple):
     white: bool  # whether the rows are weighted by their joint's residual, not by the noise's spectrum
 
 
+class _Left(NamedTuple):
+    """What all causes together leave, and whether it is more than noise."""
+
+    rest: Significance
+    p_value: float  # of the whole catalogue on it
+    excess: float  # over the noise
+    line: tuple[float, float, int]  # the strongest in its spectrum
+    more: float  # squares by which smooth functions find more in it than chance gives
+    beyond: Float[
+        np.ndarray, " nv"
+    ]  # squares of each joint while it moves beyond those of noise, where they surely are
+    baseline: Float[np.ndarray, " nv"]  # the same without any cause
+
+
 class _Searched(NamedTuple):
     """What a search has found, all of it in one fit, and what that leaves."""
 
@@ -145,11 +158,8 @@ class _Searched(NamedTuple):
     search: Search
     found: list[Found]
     joint: Joint
-    left: Significance
-    line: tuple[float, float, int]
+    left: _Left
     strict: bool  # whether a rest stays, beside which a cause must show more to be named
-    more: float  # squares by which smooth functions find more in it than chance gives
-    doubted: bool  # whether the catalogue still scores more than noise, though nothing in it passes
     fading: tuple[Name, ...] = ()  # causes that were there and are gone in recordings kept out
 
 
@@ -200,7 +210,7 @@ def _begun(backend: Backend, signals: Sequence[Signals], known: Baseline | None,
     records = without_reversals(stack(signals, backend.robot, joined=True))
     held = held_rows(signals, records)
     problem = Problem(backend, records, layout(signals, records), trust, np.zeros(backend.robot.nv), held)
-    return problem, baseline(problem, *_baseline_effects(backend.robot, known))
+    return problem, baseline(problem, *stated_effects(backend.robot, known))
 
 
 def _setting(problem: Problem, start: State, forbid: Sequence[str], progress: Callable[[str, float], None]) -> _Setting:
@@ -240,13 +250,13 @@ def _searched(
         here = before._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
         found, joint = _told_apart(here, *_fitted_together(here, search.found, forbid, tolerance))
-        left, p_left, beyond, line, more = _left(here, search, found, joint, forbid, tolerance, generator)
-        strict = left.there or beyond > NO_REST or len(found) > FEW_CAUSES
+        left = _left(here, search, found, joint, forbid, tolerance, generator)
+        strict = left.rest.there or left.excess > NO_REST or len(found) > FEW_CAUSES
         if not strict and (kept := _possible(found, joint)) != found:
             found, joint = kept, _together(here, kept)
-            left, p_left, beyond, line, more = _left(here, search, found, joint, forbid, tolerance, generator)
-            strict = left.there or beyond > NO_REST
-        return _Searched(before, here, search, found, joint, left, line, strict, more, p_left < REST_P)
+            left = _left(here, search, found, joint, forbid, tolerance, generator)
+            strict = left.rest.there or left.excess > NO_REST
+        return _Searched(before, here, search, found, joint, left, strict)
 
     like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
 
@@ -351,11 +361,16 @@ def _judged(
 
     What is not named is no part of the answer's model: the others are fitted anew without it.
     """
-    before, here, _, found, joint, left, line, strict, more, doubted, fading = searched
+    before, here, _, found, joint, left, strict, fading = searched
     problem, whitening = here.problem, here.whitening
     each = standings(problem, here.start, found, joint, whitening)
     each = [
-        replace(one, complete=more <= ALL_BUT * (f.cost[0] - f.cost[1])) for one, f in zip(each, found, strict=True)
+        replace(
+            one,
+            complete=left.more <= ALL_BUT * (f.cost[0] - f.cost[1]),
+            leaves=of_its_own(left.beyond, left.baseline, f.joints, one.taken),
+        )
+        for one, f in zip(each, found, strict=True)
     ]
     noise = noise_rms(problem, here.spectrum)
     claims = {one.name: one.gain for one in each}
@@ -383,12 +398,13 @@ def _judged(
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
-    shown = left.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
+    doubted = left.p_value < REST_P  # the catalogue still scores more than noise, though nothing in it passes
+    shown = left.rest.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
     sticks = shown and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
     rest = shown and not sticks
-    text = left.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
+    text = left.rest.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
     told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
-    parts = parts_of(problem, told, whitening, line, names)
+    parts = parts_of(problem, told, whitening, left.line, names)
     nearest = tuple(sorted(nearest, key=lambda one: -one.share))
     quiet = not rest and not named and searched.search.p_value < alpha
     why = tolerated(float(relative.max()), tolerance, sticks) if quiet else ""
@@ -497,9 +513,8 @@ def _left(
     forbid: Sequence[str],
     tolerance: float,
     generator: np.random.Generator,
-) -> tuple[Significance, float, float, tuple[float, float, int], float]:
-    """Whether all causes together leave more than noise, the p-value of the catalogue on it, its excess over
-    the noise, the strongest line in it, and the squares that smooth functions find in it beyond chance."""
+) -> _Left:
+    """What all causes together leave."""
     problem, start, spectrum, whitening, _ = here
     first = stand(problem, start, whitening)
     before, *_ = excess(problem, first.rows, first.linear.residual, spectrum, whitening)
@@ -514,10 +529,14 @@ def _left(
     joints, tolerable = problem.model.joint_names, size <= tolerance
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
-    there = left.there or (wrong and not tolerable)
-    if not there and not tolerable:
-        there = more_than_noise(problem, joint.step.linear.residual, spectrum, whitening, generator) < REST_P
-    return left._replace(there=there), p_left, now[0], line, flexible[2]
+    loud = beyond_noise(problem, joint.step.linear.residual, spectrum, whitening, generator)
+    there = left.there or ((wrong or bool(loud.any())) and not tolerable)
+    moves = np.moveaxis(~resting(problem), 2, 0).reshape(joint.step.rows.y.shape)
+    beyond, alone = (
+        beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)
+        for step in (joint.step, first)
+    )
+    return _Left(left._replace(there=there), p_left, now[0], line, flexible[2], beyond, alone)
 
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:
@@ -557,19 +576,6 @@ def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judg
         notes=(*_notes(signals, here, last), *([_AT_REST] if judged.sticks else [])),
         prismatic=prismatic(model),
     )
-
-
-def _baseline_effects(model: RobotModel, known: Baseline | None) -> tuple[list[str], list[Effect]]:
-    """Names of the effects that every joint has in the baseline, and the ones that stand at given joints."""
-    if known is None:
-        return ["viscous_friction", "coulomb_friction"], []
-    given = []
-    for entry in known.effects:
-        effect = find(entry.effect)
-        if not any(p.linear for p in effect.parameters().values()):
-            raise InputError(f"baseline.effects: '{entry.effect}' cannot be fitted as part of the baseline")
-        given.append(place(effect, model, entry.at))
-    return known.everywhere(), given
 
 
 _AT_REST = (

@@ -258,23 +258,24 @@ def _open(one: Found, effect: Effect, forbid: Sequence[str]) -> tuple[Name, ...]
 def has_size(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
     """Whether the effect's size is surely not zero: its amplitudes' 95 % region excludes it.
 
-    Amplitudes that a simpler effect has too do not count: a spring without stiffness is an offset.
+    Amplitudes that a simpler effect has too do not count: a spring without stiffness is an offset. Of friction that
+    fades they are judged at its time: where that is longer than the recordings, a larger and slower change is the same.
     """
     own = _amplitudes(effect)
-    return not own or kind(effect) != "columns" or _beyond_zero(effect, fitted, place, own) > 1
+    given = _shape_places(effect, place) if effect.fades else ()
+    return not own or kind(effect) != "columns" or _beyond_zero(effect, fitted, place, own, given) > 1
 
 
 def least_sure(found: list[Found], joint: Joint) -> int | None:
     """Which of the causes is least surely there by the intervals that are told, of those that are not; else None.
 
     Of a law of the speed whose shape is open the amplitude is judged at that shape: the same friction comes of many
-    pairs of strength and exponent, none of them surely, and of no strength at none.
+    pairs of strength and exponent, none of them surely, and of no strength at none. So it is with friction that fades.
     """
     shares = []
     for effect, place in zip(joint.causes, joint.fitted.places, strict=True):
-        names = [n for n, p in effect.parameters().items() if p.linear] if kind(effect) == "columns" else []
-        own = _amplitudes(effect) if names else list(range(len(place)))
-        given = range(len(names), len(place)) if names and effect.speed_law else ()
+        own = _amplitudes(effect) if kind(effect) == "columns" else list(range(len(place)))
+        given = _shape_places(effect, place) if effect.speed_law or effect.fades else ()
         shares.append(_beyond_zero(effect, joint.fitted, place, own, given) if own else np.inf)
     least = int(np.argmin(shares)) if shares else 0
     return least if shares and shares[least] <= 1 else None
@@ -285,6 +286,11 @@ def _amplitudes(effect: Effect) -> list[int]:
     names = [n for n, p in effect.parameters().items() if p.linear]
     simpler = {name for inside in type(effect).contains for name in find(inside).parameters()}
     return [k for k, name in enumerate(names) if name not in simpler]
+
+
+def _shape_places(effect: Effect, place: tuple[int, ...]) -> Sequence[int]:
+    """Which of an effect's parameters are its shape."""
+    return range(len(place) - len(shapes(type(effect))), len(place))
 
 
 def _beyond_zero(

@@ -32,9 +32,11 @@ from .shifts import torque_change
 from .state import State, batched
 from .step import Step, stand
 from .thresholds import (
+    ALL_BUT,
     BESIDE_SMOOTH,
     GAIN_NAMED,
     GAIN_NAMED_ROBOT,
+    LAW_LEAVES,
     MASS,
     MODULATION,
     MODULATION_HELD_OUT,
@@ -43,7 +45,7 @@ from .thresholds import (
     T_NAMED,
 )
 
-__all__ = ["Standing", "beside_rest", "beyond_simpler", "cause_torque", "reason_against", "standings"]
+__all__ = ["Standing", "beside_rest", "beyond_simpler", "cause_torque", "of_its_own", "reason_against", "standings"]
 
 
 @dataclass(frozen=True)
@@ -59,12 +61,15 @@ class Standing:
     share: float  # RMS torque over that of the joint, where it is largest
     modulation: float = 0.0  # squares that an amplitude which varies gains, over those of the cause
     modulation_held_out: float = 0.0
+    varies: bool = False  # whether left-out squares surely fall by it
     beside_smooth: float = 1.0  # gain of a cause of the whole robot beside smooth functions, or in their place
     inertia_alone: bool = False  # a coupling of inertia, without friction of its own
     massless: bool = False  # a body whose mass is not surely there
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
     cancels: bool = False  # whether it is a share of all torque, and larger than it: a reading of less than half
     complete: bool = False  # whether smooth functions find next to nothing in what it leaves
+    taken: float = 0.0  # held-out squares of its joints that it removes
+    leaves: float = 0.0  # squares beyond noise at its joints over these, where most other joints have none
 
 
 def reason_against(
@@ -90,7 +95,15 @@ def reason_against(
             one.share >= tolerance,
             f"its torque is {one.share:.2%} of the joint's, below the tolerance of {tolerance:.2%}",
         ),
-        (one.modulation_held_out <= MODULATION_HELD_OUT, f"{varies} {one.modulation_held_out:.2f} of its gain)"),
+        (
+            one.modulation_held_out <= (ALL_BUT if one.varies else MODULATION_HELD_OUT),
+            f"{varies} {one.modulation_held_out:.2f} of its gain)",
+        ),
+        (
+            one.leaves <= LAW_LEAVES,
+            f"where it acts {one.leaves:.2f} of what it removes stays beyond the noise, though most other joints have"
+            " no misfit: another law acts there",
+        ),
     ]
     if rest or not (one.beside_rest or one.complete):  # what any rest looks like is taken on less only if it is all
         checks += [
@@ -114,6 +127,21 @@ def reason_against(
             (not one.massless, "its mass is not surely above zero: a link other than believed explains as much"),
         ]
     return next((reason for passed, reason in checks if not passed), "")
+
+
+def of_its_own(
+    beyond: Float[np.ndarray, " nv"], baseline: Float[np.ndarray, " nv"], joints: Sequence[int], taken: float
+) -> float:
+    """Squares `beyond` the noise at a cause's joints over the held-out squares that it has `taken` there; zero where
+    they may be another misfit's.
+
+    Whether a joint is likely to have a misfit of its own beside the cause is told by the others: where the `baseline`
+    leaves most of them (of all joints, if it acts on all) noise alone, what stays where it acts is what its law lacks.
+    """
+    acts = np.isin(np.arange(len(beyond)), list(joints))
+    others = baseline if acts.all() else baseline[~acts]
+    alone = bool(np.mean(others > 0) < 0.5)
+    return float(beyond[acts].sum() / max(taken, 1e-300)) if alone else 0.0
 
 
 def beside_rest(
@@ -164,12 +192,14 @@ def standings(
                 physical=physical_sign(effect) and not (coupled and _turns_against_itself(effect, joint.fitted, at)),
                 beside_rest=effect.beside_rest,
                 gain=1 - float(better.sum() / max(worse.sum(), 1e-300)),
+                taken=max(float((worse - better).sum()), 0.0),
                 t=t_value(worse, better),
                 t_needed=t_needed(len(worse), T_NAMED),
                 share=share,
                 cancels=bool(type(effect).follows_total) and not whole and share > 1,
                 modulation=modulation[0],
                 modulation_held_out=modulation[1],
+                varies=modulation[2],
                 beside_smooth=_beside_smooth(grown, bare, effect, place, one.joints) if whole else 1.0,
                 inertia_alone=coupled and _inertia_alone(effect, joint.fitted, at),
                 massless=effect.body and _deviations(effect, joint.fitted, at)["mass"] < MASS,
@@ -239,11 +269,12 @@ def _share_of_torque(problem: Problem, state: State, torque: np.ndarray, effect:
 
 def _modulation(
     grown: _Grown, effect: Effect, torque: np.ndarray, without: Verdicts, joints: tuple[int, ...], whole: bool
-) -> tuple[float, float]:
-    """What an amplitude that varies gains more, in the fit and on held-out data, over what the cause gains.
+) -> tuple[float, float, bool]:
+    """What an amplitude that varies gains more, in the fit and on held-out data, over what the cause gains; whether
+    held-out data surely want it.
 
     Of a joint's law it is asked of its position, speed, load and time one by one, and the largest counts: all together
-    they fit chance, and what they then predict of other data says nothing.
+    they fit chance, and what they then predict of other data says nothing. The best of four is surer by chance alone.
     """
     step = grown.step
     base, touched = grown.base, list(range(len(step.rows.y))) if whole else list(joints)
@@ -253,13 +284,16 @@ def _modulation(
         free = judge_grown(step.rows, base, touched, beside)
     else:
         free, beside = step.verdicts, np.zeros((0, len(touched), step.rows.y.shape[1]))
-    drop, held = without.cost - free.cost, without.own(step.rows, joints).sum() - free.own(step.rows, joints).sum()
-    more_drop, more_held = [], []
+    bare, fixed = (v.own(step.rows, joints) for v in (without, free))
+    drop, held, more_drop, more = without.cost - free.cost, bare.sum() - fixed.sum(), [], []
     for columns in [_varied_robot(grown, effect, torque)] if whole else _varied_joint(grown, torque, joints):
         varied = judge_grown(step.rows, base, touched, np.concatenate([beside, columns]))
+        loose = varied.own(step.rows, joints)
         more_drop.append(free.cost - varied.cost)
-        more_held.append(float((free.own(step.rows, joints) - varied.own(step.rows, joints)).sum()))
-    return float(max(more_drop) / max(drop, 1e-9)), float(max(more_held) / max(held, 1e-9))
+        more.append((float((fixed - loose).sum()), t_value(fixed, loose)))
+    gained, t = max(more)
+    surely = t > t_needed(len(fixed), T_NAMED, len(more))
+    return float(max(more_drop) / max(drop, 1e-9)), float(gained / max(held, 1e-9)), surely
 
 
 def _varied_joint(grown: _Grown, torque: np.ndarray, joints: tuple[int, ...]) -> Float[np.ndarray, "4 2 rows T"]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..estimation import noise
 from ..estimation.noise import Spectrum
@@ -39,9 +39,9 @@ from .weights import relative_speed
 
 __all__ = [
     "Significance",
+    "beyond_noise",
     "excess",
     "lines",
-    "more_than_noise",
     "parts_of",
     "predictable",
     "relative_rest",
@@ -93,24 +93,30 @@ def excess(
     return float(products.sum() / share.sum()), float(ndtr(-z)), products.sum(1) / share
 
 
-def more_than_noise(
+def beyond_noise(
     problem: Problem,
     residual: Float[np.ndarray, "nv T"],
     spectrum: Spectrum,
     whitening: Float[np.ndarray, "F nv"],
     generator: np.random.Generator,
-) -> float:
-    """p-value of the power of the joint that has most of it, in standard deviations of what noise has there.
+    rows: Bool[np.ndarray, "nv T"] | None = None,
+) -> Float[np.ndarray, " nv"]:
+    """Squares that each joint's residual has beyond those of noise, where chance gives no joint so many; else zero.
 
-    Noise is drawn with all that its spectrum may be. What no function of the motion predicts is a misfit too, if it is
+    Of some rows of each joint, or of all.
+
+    Noise is drawn with all that its spectrum may be, and a joint's power counted in deviations of what noise has there:
+    one draw in a hundred has a joint with as much. What no function of the motion predicts is a misfit too, if it is
     larger than the noise can be.
     """
-    noise = np.concatenate(
-        [(draw_noise(problem, spectrum, whitening, CHUNK, generator) ** 2).sum(2) for _ in range(POWER_DRAWS // CHUNK)]
-    )
+    counted = np.ones(residual.shape, bool) if rows is None else rows
+    parts = (draw_noise(problem, spectrum, whitening, CHUNK, generator) for _ in range(POWER_DRAWS // CHUNK))
+    noise = np.concatenate([(part**2 * counted).sum(2) for part in parts])
     mean, deviation = noise.mean(0), np.maximum(noise.std(0), 1e-12 * noise.mean(0) + 1e-300)
-    own = (((residual**2).sum(1) - mean) / deviation).max()
-    return float(1 + np.sum(((noise - mean) / deviation).max(1) >= own)) / (len(noise) + 1)
+    largest = ((noise - mean) / deviation).max(1)
+    own = (residual**2 * counted).sum(1) - mean
+    p = (1 + np.sum(largest[:, None] >= own / deviation, axis=0)) / (len(noise) + 1)
+    return np.where(p < REST_P, np.maximum(own, 0.0), 0.0)
 
 
 def significance(

@@ -8,22 +8,26 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from ..effects.base import Effect, Motion
+from ..effects.base import Effect, Motion, place
 from ..effects.catalogue import find
+from ..errors import InputError
 from ..estimation.priors import body_precision, rigid_prior
 from ..estimation.rows import Prior, Rows, instruments
 from ..recordings.stacked import filtered_rows
-from ..rigid.model import Leaf, dofs
+from ..rigid.model import Leaf, RobotModel, dofs
 from ..simulators.native import NativeBackend
 from .design import Units, batch_size, flattened, kind, local, sensor_response, shapes, units, units_and_slopes
 from .problem import Layout, Part, Problem, family_of
 from .shifts import shifted
+
+if TYPE_CHECKING:
+    from ..formats.config import Baseline
 
 __all__ = [
     "State",
@@ -35,6 +39,7 @@ __all__ = [
     "on_motion",
     "plain_rows",
     "solved",
+    "stated_effects",
     "unit_slopes",
     "unit_torques",
     "whitened",
@@ -140,6 +145,19 @@ def extended_state(problem: Problem, state: State, effect: Effect) -> State:
         return grown
     moved = _rigid(problem, link_motion(problem, grown))
     return replace(grown, parts=(moved, *state.parts[1:]))
+
+
+def stated_effects(model: RobotModel, known: Baseline | None) -> tuple[list[str], list[Effect]]:
+    """Names of the effects that every joint has in the baseline, and the ones that stand at given joints."""
+    if known is None:
+        return ["viscous_friction", "coulomb_friction"], []
+    given = []
+    for entry in known.effects:
+        effect = find(entry.effect)
+        if not any(p.linear for p in effect.parameters().values()):
+            raise InputError(f"baseline.effects: '{entry.effect}' cannot be fitted as part of the baseline")
+        given.append(place(effect, model, entry.at))
+    return known.everywhere(), given
 
 
 def assembled(
