@@ -16,6 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from ..compiled.memory import give_back_holes
 from ..effects.base import place
 from ..effects.catalogue import CATALOGUE, find, related
 from ..effects.plausibility import implausible
@@ -120,7 +121,9 @@ def diagnose(
         signals, slowed, begun = _signals(backend, recordings, preprocess, known, trust)
         here = _setting(*begun, forbid, progress)
         generator = np.random.default_rng(seed)
+        give_back_holes()
         searched = _searched(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
+        give_back_holes()
         judged = _judged(searched, [s.name for s in signals], forbid, tolerance, alpha)
         progress("measuring the gain", 0.9)
         return replace(_answer(searched.here, signals, searched.search, judged), slowed=slowed)
@@ -277,6 +280,7 @@ def _searched(
     fading = [f for f in search.found[taken:] if f.effect.fades and _borne_out(here, kept, f)]
     begun = Begun(kept + fading, search.p_value, search.shown)
     del search
+    give_back_holes()
     search = find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun)
     return ended(here, search)._replace(fading=tuple(f.name for f in fading))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -25,7 +26,7 @@ _PAIR = 2
 _FEW = 12  # windows up to which starts and numbers always move together
 _MOSTLY = 0.5  # share of a step's gain from which the starts move alone, every other time
 _GROUPS, _REFITS = 6, 10  # of recordings that are left out, steps of each fit without one
-_STEPS = 4  # of each fit without some recordings that tells how they differ
+_STEPS = 12  # of each fit without some recordings that tells how numbers differ
 _SETTLED, _RESTING = 1e-5, 10.0  # predicted share of the squares at which a fit without some recordings ends
 _OF_GAIN, _OF_REST = 0.02, 0.003  # shares of what a fit has gained and of what is left, where only its gain is asked
 _CLOSE = 0.02  # predicted decrease of the sum of whitened squares at which a fit ends
@@ -110,14 +111,14 @@ class _Lanes:
             cost, gradient, matrix = (np.asarray(x) for x in found)
         return [Sums(cost[k], gradient[k], matrix[k]) for k in range(len(which))]
 
-    def several(self, now: list[Sums], steps: int, settled: float = _SETTLED) -> list[Sums]:
+    def several(self, now: list[Sums], steps: int) -> list[Sums]:
         """The sums of every lane after some damped steps of what it keeps; starts without their first rows stay."""
         count = len(self.theta)
         cost = np.array([self.cost(self.kept(now[k], k), self.start[k]) for k in range(count)])
         damping, active = np.full(count, 1e-3), np.arange(count)
         for _ in range(steps):
             made = {k: self.step(self.kept(now[k], k), k, damping[k]) for k in active}
-            least = settled * cost * np.clip(cost / self.rows, 1.0, _RESTING)  # a large rest tells less of a number
+            least = _SETTLED * cost * np.clip(cost / self.rows, 1.0, _RESTING)  # a large rest tells less of a number
             active = np.array([k for k in active if made[k].gain > least[k]], int)
             if not len(active):
                 break
@@ -187,6 +188,8 @@ class _Lanes:
                     done[k] = cost[k] - new < 1e-7 * cost[k]
                     cost[k] = new
                 else:
+                    if self.start.shape[2] > _FEW:
+                        self.held_back(now[k], sums, step.start, k)
                     damping[k], worse[k] = max(damping[k] * 6 * 2 ** worse[k], 1e-6), worse[k] + 1
                     done[k] = damping[k] > 1e8
         return [Fit(self.theta[k], self.free[k], self.start[k], cost[k], now[k], bool(done[k])) for k in everyone]
@@ -199,14 +202,23 @@ class _Lanes:
         gain = system.decrease(np.zeros(system.m), change.T)
         return _Step(self.theta[lane], self.start[lane] + change.T, gain)
 
-    def better(self, old: Sums, new: Sums, start: np.ndarray, lane: int) -> Sums:
-        """The better sums of each window, whose start moves where they are the new ones."""
+    def held_back(self, old: Sums, new: Sums, start: np.ndarray, lane: int) -> None:
+        """The starts of the windows that a refused step made worse are damped more."""
+        good = self.improved(old, new, start, lane)
+        self.inner[lane] = np.where(good, self.inner[lane], np.clip(self.inner[lane] * 30, 1e-2, 1e8))
+
+    def improved(self, old: Sums, new: Sums, start: np.ndarray, lane: int) -> np.ndarray:
+        """Whether each window's cost is lower, (windows,)."""
         precise, truth = np.asarray(self.data.precision), np.asarray(self.data.start)
         costs = [
             sums.cost.sum((0, 2)) + ((x - truth) ** 2 * precise**2).sum(0)
             for sums, x in ((old, self.start[lane]), (new, start))
         ]
-        good = np.isfinite(new.matrix).all((0, 2, 3)) & (costs[1] < costs[0])
+        return np.isfinite(new.matrix).all((0, 2, 3)) & (costs[1] < costs[0])
+
+    def better(self, old: Sums, new: Sums, start: np.ndarray, lane: int) -> Sums:
+        """The better sums of each window, whose start moves where they are the new ones."""
+        good = self.improved(old, new, start, lane)
         self.start[lane] = np.where(good, start, self.start[lane])
         self.inner[lane] = np.where(good, self.inner[lane] / 5, np.clip(self.inner[lane] * 6, 1e-3, 1e8))
         wide = lambda x: good.reshape(1, -1, *(1,) * (x.ndim - 2))  # noqa: E731
@@ -367,22 +379,14 @@ def _squares_without(loop: Loop, table: Table, data: Windows, one: Fit, left: Se
     """Squares (blocks, windows, ny) of each group of windows by a fit of the others, which alone are simulated."""
     answer = np.zeros(one.sums.cost.shape)
     for out in left:
-        theta = _of_others(loop, table, data, one, out, _REFITS, _SETTLED)
-        code = native(loop, table, jax.tree.map(lambda x: np.asarray(x)[..., out], data))  # noqa: B023
-        answer[:, out] = code.sums(theta, np.zeros(0, int), one.start[:, out]).cost
+        some = [jax.tree.map(lambda x: np.asarray(x)[..., which], data) for which in (~out, out)]  # noqa: B023
+        none = np.zeros((len(answer), int((~out).sum())), bool)
+        begin = one.theta[None], [one.free], one.start[None][..., ~out]
+        lane = _Lanes(loop, table, some[0], *begin, len(one.free), 1, [none])
+        lane.several([Sums(*(x[:, ~out] for x in one.sums))], _REFITS)  # pyright: ignore[reportArgumentType]
+        code = native(loop, table, some[1])
+        answer[:, out] = code.sums(lane.theta[0], np.zeros(0, int), one.start[:, out]).cost
     return answer
-
-
-def _of_others(
-    loop: Loop, table: Table, data: Windows, one: Fit, out: np.ndarray, steps: int, settled: float
-) -> np.ndarray:
-    """The numbers after some steps of a fit of all windows but those that are `out`, (entries,)."""
-    some = jax.tree.map(lambda x: np.asarray(x)[..., ~out], data)
-    none = np.zeros((len(one.sums.cost), int((~out).sum())), bool)
-    begin = one.theta[None], [one.free], one.start[None][..., ~out]
-    lane = _Lanes(loop, table, some, *begin, len(one.free), 1, [none])
-    lane.several([Sums(*(x[:, ~out] for x in one.sums))], steps, settled)  # pyright: ignore[reportArgumentType]
-    return lane.theta[0]
 
 
 def spread_of_recordings(loop: Loop, table: Table, data: Windows, found: Fit, folds: np.ndarray) -> np.ndarray:
@@ -394,16 +398,12 @@ def spread_of_recordings(loop: Loop, table: Table, data: Windows, found: Fit, fo
     """
     from scipy.special import ndtri, stdtrit  # scipy is slow to import
 
-    left, settled = _left_out(folds), _SETTLED / 100
-    many = len(left)
-    if native(loop, table, data).usable:
-        theta = np.stack([_of_others(loop, table, data, found, np.any(out, 0), _STEPS, settled) for out in left])
-    else:  # one program for all of them
-        begin = [found.theta] * many, [found.free] * many, [found.start] * many
-        fits = _Lanes(loop, table, data, *begin, len(found.free), 1, left)
-        fits.several([found.sums] * many, _STEPS, settled)
-        theta = fits.theta
-    own = theta[:, np.maximum(found.free, 0)]
+    left, free, theta = _left_out(folds), found.free[found.free >= 0], []
+    for out in left:
+        some = eqx.tree_at(lambda d: d.weight, data, np.where(np.any(out, 0), 0.0, np.asarray(data.weight)))
+        theta += fit(loop, table, some, found.theta[None], [free.tolist()], found.start[None], width=len(free), lanes=1,
+                     iterations=_STEPS, rough=_SETTLED)  # fmt: skip
+    own, many = np.stack([one.theta for one in theta])[:, np.maximum(found.free, 0)], len(left)
     wide = np.sqrt((many - 1) / many * ((own - own.mean(0)) ** 2).sum(0)) * stdtrit(many - 1, 0.975) / ndtri(0.975)
     return np.where(found.free >= 0, wide, np.nan)
 
