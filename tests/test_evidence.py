@@ -86,6 +86,18 @@ def test_a_candidate_inside_the_model_scores_nothing() -> None:
     assert found.rank[0] == 0
 
 
+def test_columns_that_are_rounding_of_zero_count_as_no_direction() -> None:
+    rows, columns = random_rows(), random_columns(2)
+    rounding = 1e-14 * np.random.default_rng(7).normal(size=(2, 3, NV, COUNT))
+    wider = Columns((0, 1), np.concatenate([columns.Z[:, :1], rounding, columns.Z[:, 1:]], axis=1))
+    linear, stock = fit(rows, PRIOR), bank(rows, [wider])
+    (found,) = evidence.scores(linear, stock, evidence.projection(linear, stock))
+    _, before = least_squares(rows.y, rows.X, PRIOR)
+    drops = [before - least_squares(rows.y, rows.X, PRIOR, spread(columns, g))[1] for g in range(2)]
+    np.testing.assert_array_equal(found.rank, 2)
+    np.testing.assert_allclose(found.Q, drops, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("k", [1, 3])
 def test_score_is_chi_square_when_there_is_only_noise(k: int) -> None:
     rng, rows, columns = np.random.default_rng(3), random_rows(), random_columns(k, grid=1)

@@ -8,6 +8,7 @@ where they write nothing get memory back that the same program wrote, whose zero
 
 from __future__ import annotations
 
+import ctypes
 import mmap
 import weakref
 from collections import deque
@@ -17,8 +18,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["recycled"]
+__all__ = ["give_back_holes", "recycled"]
 
+HOLES = 200_000_000  # bytes that the C library holds for nobody, from which on they are given back
 LEAST, MOST, LATEST = 1 << 20, 1 << 31, 2  # bytes of an answer; answers whose memory is kept
 _FREE = getattr(mmap, "MADV_FREE", None)
 _shelf: deque[tuple[tuple[Any, int], mmap.mmap]] = deque()
@@ -73,3 +75,28 @@ def _advise(block: mmap.mmap, advice: int) -> bool:
     except OSError:
         return False
     return True
+
+
+class _Heap(ctypes.Structure):
+    """What glibc tells of its memory (`mallinfo2`), bytes."""
+
+    _fields_ = tuple(
+        (name, ctypes.c_size_t)
+        for name in ("arena", "_1", "_2", "_3", "mapped", "_4", "_5", "used", "free", "at_the_end")
+    )
+
+
+def give_back_holes() -> None:
+    """Have the system take pages that the C library holds for nobody, where there are many: glibc alone.
+
+    What large arrays leave is too small for the next ones, or elsewhere than they fit. It costs half a second for a
+    gigabyte, so between phases alone.
+    """
+    try:
+        library = ctypes.CDLL(None)
+        tell, trim = library.mallinfo2, library.malloc_trim
+    except (OSError, AttributeError):
+        return
+    tell.restype = _Heap
+    if tell().free > HOLES:
+        trim(0)

@@ -26,6 +26,7 @@ __all__ = [
 
 _FEW = 4  # columns of a candidate at a point
 CUT = 1e-7  # eigenvalues of the unit-diagonal variance below it: a direction that the baseline has absorbed
+COLUMN_CUT = 1e-8  # of a candidate's longest column: below, a column is what rounding leaves of zero
 
 
 class Score(NamedTuple):
@@ -142,7 +143,8 @@ def _whitener(
     V: Float[np.ndarray, "grid k k"], raw: Float[np.ndarray, "grid k k"]
 ) -> tuple[Float[np.ndarray, "grid k k"], Int[np.ndarray, " grid"]]:
     scale = np.sqrt(np.maximum(np.diagonal(raw, axis1=1, axis2=2), 1e-300))
-    unit = V / (scale[:, :, None] * scale[:, None, :])
+    seen = scale > COLUMN_CUT * scale.max(1, keepdims=True)
+    unit = V * (seen[:, :, None] & seen[:, None, :]) / (scale[:, :, None] * scale[:, None, :])
     values, vectors = np.linalg.eigh((unit + np.swapaxes(unit, 1, 2)) / 2)
     keep = values > CUT
     inverse = np.where(keep, 1 / np.sqrt(np.where(keep, values, 1.0)), 0.0)

@@ -358,17 +358,22 @@ def _with_smooth(grown: _Grown, step: Step) -> Hypothesis:
     problem, whitening, rows = grown.problem, grown.whitening, step.rows
     n, samples, _, nv = problem.records.shape
     response = whitening * step.state.response(problem.records.omega)[:, None]
-    blocks = []
+    own = []
     for joint, functions in enumerate(smooth_functions(step.state.motion)):
-        own = filter_rows(problem.records, functions.reshape(-1, n, samples), response[:, joint][None], fitted=True)
-        own = (own * np.asarray(problem.records.weight)[:, :, joint]).reshape(len(functions), -1)
-        full = np.zeros((nv, own.shape[1], len(own)))
-        full[joint] = own.T
-        blocks.append(full)
+        filtered = filter_rows(
+            problem.records, functions.reshape(-1, n, samples), response[:, joint][None], fitted=True
+        )
+        own.append((filtered * np.asarray(problem.records.weight)[:, :, joint]).reshape(len(functions), -1))
     prior = step.state.prior
-    size = np.concatenate([np.full(b.shape[2], s) for b, s in zip(blocks, grown.size, strict=True)])
+    size = np.concatenate([np.full(len(x), s) for x, s in zip(own, grown.size, strict=True)])
     more = Prior(prior.extended(len(size)).mean, np.append(prior.precision, size**-2.0))
-    return Hypothesis(np.concatenate([rows.X, *blocks], axis=2), more)
+    first = rows.X.shape[2]
+    X = np.zeros((nv, rows.X.shape[1], first + len(size)))
+    X[:, :, :first] = rows.X
+    for joint, one in enumerate(own):
+        X[joint, :, first : first + len(one)] = one.T
+        first += len(one)
+    return Hypothesis(X, more)
 
 
 def _inertia_alone(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..compiled.memory import give_back_holes
 from ..effects.base import Effect
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Prior
@@ -141,11 +142,13 @@ def find_causes(
         if len(found) > 1 and any(type(f.effect).follows_total for f in found):
             step, screened = _refreshed(problem, state, step, found, whitening), None
         ways = {kind(best.effect) for best in chosen}
+        # their rows and columns are large; there is a best one, since some were chosen
+        del before, contenders, chosen, best  # pyright: ignore[reportPossiblyUnboundVariable]
         if ways != {"columns"}:
+            give_back_holes()
             known, problem, screened = problem, friction_width(problem, step.state, whitening), None
             groups = None if problem is not known or "response" in ways else groups
             step = step if problem is known else stand(problem, with_width(problem, step.state), whitening)
-        del before, contenders, chosen  # their rows and columns are large
     begun = solved(problem, with_width(problem, state), step.state.theta[: len(state.theta)])
     return Search(problem, begun, step, found, p_values[0], p_values[-1], shown)
 

@@ -322,7 +322,10 @@ def _kept_sums(add: Add, kept: Kept | None, codes: bytes, chunk: int) -> Program
         return _sums_of_rows(add, kept, codes, chunk, model, *arrays)
 
     key = f"{add.__name__} {kept} {chunk} {codes.hex()}"
-    return Program(sums_of_rows, key=key, tuning=0)  # the first way is as quick as the best
+    # the best ways to products save half of a call's time; of few samples they are not worth the seconds of a search,
+    # and for factors solves decide
+    searched = add is _with_products and chunk >= WORTH_WRITING
+    return Program(sums_of_rows, key=key, tuning=None if searched else 0)
 
 
 def _sums_of_rows(
