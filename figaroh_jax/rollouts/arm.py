@@ -140,12 +140,11 @@ def _alike_by_recording(here: Setting, now: Standing) -> tuple[Standing, np.ndar
 
     With them how differently recordings tell each, (columns of the fit,).
     """
-    structure, last, free, even = now.model.structure, now.model.fit, now.model.free, now.model.structure
+    structure, last, free = now.model.structure, now.model.fit, now.model.free
     for _ in range(_EVENED):
         some = evened(here, structure, last)
-        even = structure._replace(data=some.cut(structure.loop))
-        last = _from(some, even, last, free)
-    spread = spread_of_recordings(*even, last, here.folds)
+        last = _from(some, structure._replace(data=some.cut(structure.loop)), last, free)
+    spread = spread_of_recordings(structure.table, last, here.folds)
     last = _from(here, structure, last, free, 0)
     beyond = excess_of(here, structure, last)
     model = Model(structure, last, free, float(beyond.max()))
