@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from figaroh_jax.diagnosis import gaining
-from figaroh_jax.diagnosis.gaining import Fall, beside_all, predicts_all_better, predicts_better, without_losses
+from figaroh_jax.diagnosis.gaining import Fall, beside_all, kept_squares, predicts_better, surely_less, without_losses
 from figaroh_jax.diagnosis.holdout import Held
 
 BLOCKS = 12
@@ -211,12 +211,13 @@ def test_a_fit_of_another_weight_is_taken_where_all_rows_kept_out_surely_prefer_
     rng = np.random.default_rng(5)
     first = squares(rng, 100.0, 4.0)
     second = first * np.array([0.8, 1.5]) * (1 + 0.1 * rng.standard_normal(first.shape))
-    monkeypatch.setattr(gaining, "weighted_squares", lambda problem, before, after: in_turn(before, after))
-    problem, one, other = (cast(Any, x) for x in (None, first, second))
-    assert predicts_all_better(problem, one, other)
-    assert not predicts_all_better(problem, other, one)
     even = first * (1 + 0.3 * rng.standard_normal(first.shape))
-    assert not predicts_all_better(problem, one, cast(Any, even))
+    monkeypatch.setattr(gaining, "weighted_squares", lambda problem, before, after: in_turn(before, after))
+    one, other, third = (kept_squares(cast(Any, None), cast(Any, x)) for x in (first, second, even))
+    np.testing.assert_allclose(one, first[0].sum(1))
+    assert surely_less(one, other)
+    assert not surely_less(other, one)
+    assert not surely_less(one, third)
 
 
 def stood_by(

@@ -35,7 +35,7 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
 from .floor import noise_floor, noise_rms
-from .gaining import Fall, Gaining, beside_all, predicts_all_better, predicts_better, without_losses
+from .gaining import Fall, Gaining, beside_all, kept_squares, predicts_better, surely_less, without_losses
 from .gates import physical_sign
 from .holdout import fold_squares, part_error, residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_misfit, with_parts
@@ -472,24 +472,30 @@ def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple
     the model leaves, its spectrum is a poor weight: each joint's residual alone may do better. Another fit than that
     which parts prefer is taken where recordings kept out surely prefer it.
     """
-    tried = [
-        (one, _together(one, named))
-        for here in settings
-        for one in (here._replace(problem=here.problem.weighted(weight)) for weight in _weights(here.problem))
-    ]
-    errors = [part_error(one.problem, joint.step) for one, joint in tried]
-    best, joint = tried[int(np.argmin(errors))]
-    if not best.white:
-        residual = residual_rms(best.problem, joint.step.state)
-        level = np.broadcast_to(1 / np.maximum(residual, 1e-12 * residual.max()), best.whitening.shape)
-        white = best._replace(whitening=level, white=True)
+    best, first, kept = None, None, []  # one fit at a time: rows and columns are large
+    held = bool(settings[0].problem.held.any())
+    for here in settings:
+        for weight in _weights(here.problem):
+            one = here._replace(problem=here.problem.weighted(weight))
+            joint = _together(one, named)
+            error, first = part_error(one.problem, joint.step), first or joint
+            if held:
+                kept.append((one, kept_squares(one.problem, joint.step)))
+            best = (error, one, joint) if best is None or error < best[0] else best
+    assert best is not None and first is not None
+    error, chosen, joint = best
+    if not chosen.white:
+        residual = residual_rms(chosen.problem, joint.step.state)
+        level = np.broadcast_to(1 / np.maximum(residual, 1e-12 * residual.max()), chosen.whitening.shape)
+        white = chosen._replace(whitening=level, white=True)
         step = stand(white.problem, joint.step.state, level)  # the laws' shapes as they are
-        if part_error(white.problem, step) < (1 - WHITE_GAIN) * min(errors):
-            best, joint = white, _together(white, named)
-    for one, other in tried if best.problem.held.any() else ():
-        if predicts_all_better(best.problem, joint.step, other.step):
-            best, joint = one, other
-    return best, joint, tried[0][1]
+        if part_error(white.problem, step) < (1 - WHITE_GAIN) * error:
+            chosen, joint = white, _together(white, named)
+    squares = kept_squares(chosen.problem, joint.step) if held else np.zeros(0)
+    for one, own in kept:
+        if surely_less(squares, own):
+            chosen, joint, squares = one, _together(one, named), own
+    return chosen, joint, first
 
 
 def _weights(problem: Problem) -> list[Float[np.ndarray, "n M nv"]]:

@@ -19,7 +19,7 @@ from .state import State
 from .step import Step
 from .thresholds import BY_CHANCE, BY_CHANCE_BESIDE, BY_CHANCE_UNSHOWN, KEPT_OF_CLAIM, RISES
 
-__all__ = ["Fall", "Gaining", "beside_all", "fall", "predicts_all_better", "predicts_better", "without_losses"]
+__all__ = ["Fall", "Gaining", "beside_all", "fall", "kept_squares", "predicts_better", "surely_less", "without_losses"]
 
 EXACT, DRAWS = 12, 4000  # blocks up to which every choice of signs is made; choices beyond
 
@@ -172,10 +172,14 @@ def predicts_better(problem: Problem, before: Step, after: Step, joints: Sequenc
     return bool(gain.sum() > 0 and _by_chance(gain) < BY_CHANCE)
 
 
-def predicts_all_better(problem: Problem, before: Step, after: Step) -> bool:
-    """Whether data kept out surely prefer one fit to another on all their rows, by the robot's error (N m or N)."""
-    worse, better = weighted_squares(problem, before, after)
-    drop = (worse.squares - better.squares)[0].sum(1)
+def kept_squares(problem: Problem, step: Step) -> Float[np.ndarray, " blocks"]:
+    """Squares of the robot's error (N m or N) on all rows of data kept out of a fit, block by block."""
+    return weighted_squares(problem, step, step)[0].squares[0].sum(1)
+
+
+def surely_less(worse: Float[np.ndarray, " blocks"], better: Float[np.ndarray, " blocks"]) -> bool:
+    """Whether squares fall from one fit to another by more than chance makes of the blocks' differences."""
+    drop = worse - better
     return bool(drop.sum() > 0 and _by_chance(drop) < BY_CHANCE)
 
 

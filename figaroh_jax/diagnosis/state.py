@@ -151,19 +151,13 @@ def stated_effects(model: RobotModel, known: Baseline | None) -> tuple[list[str]
     """Names of the effects that every joint has in the baseline, and the ones that stand at given joints."""
     if known is None:
         return ["viscous_friction", "coulomb_friction"], []
-    switches = {
-        "viscous_friction": known.viscous,
-        "coulomb_friction": known.coulomb,
-        "rotor_inertia": known.rotor,
-        "torque_offset": known.offset,
-    }
     given = []
     for entry in known.effects:
         effect = find(entry.effect)
         if not any(p.linear for p in effect.parameters().values()):
             raise InputError(f"baseline.effects: '{entry.effect}' cannot be fitted as part of the baseline")
         given.append(place(effect, model, entry.at))
-    return [name for name, on in switches.items() if on], given
+    return known.everywhere(), given
 
 
 def assembled(

@@ -54,16 +54,10 @@ def friction_terms(model: RobotModel, known: Baseline) -> tuple[Effect, ...]:
     >>> [term.name for term in terms]
     ['viscous_friction', 'coulomb_friction', 'torque_offset']
     """
-    switches = {
-        "viscous_friction": known.viscous,
-        "coulomb_friction": known.coulomb,
-        "rotor_inertia": known.rotor,
-        "torque_offset": known.offset,
-    }
     driven = [k for k, joint in enumerate(_joints(model)) if joint.kind != "free"]
     joints = np.array(driven)[:, None]
     terms: list[Effect] = []
-    for name in (name for name, on in switches.items() if on and driven):
+    for name in known.everywhere() if driven else ():
         effect = find(name)
         terms.append(effect(joints, **{p: np.zeros(len(driven)) for p in effect.parameters()}))
     for entry in known.effects:

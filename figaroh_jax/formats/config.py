@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
@@ -91,6 +91,17 @@ class Baseline(Keys):
     rotor: bool = False
     offset: bool = False
     effects: tuple[BaselineEffect, ...] = ()
+
+    SWITCHES: ClassVar[dict[str, str]] = {
+        "viscous": "viscous_friction",
+        "coulomb": "coulomb_friction",
+        "rotor": "rotor_inertia",
+        "offset": "torque_offset",
+    }
+
+    def everywhere(self) -> list[str]:
+        """Names of the effects that every joint has."""
+        return [name for key, name in self.SWITCHES.items() if getattr(self, key)]
 
 
 class JointDrive(Keys):

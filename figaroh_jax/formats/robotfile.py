@@ -139,10 +139,8 @@ def stated_baseline(task: Task) -> tuple[Baseline, tuple[str, ...]]:
     from .config import BaselineEffect, robot_options
 
     known, file = task.baseline, task.robot.model
-    switches = {"viscous_friction": "viscous", "coulomb_friction": "coulomb"}
-    switches |= {"rotor_inertia": "rotor", "torque_offset": "offset"}
-    fitted = {name for name, key in switches.items() if getattr(known, key)} | {entry.effect for entry in known.effects}
-    refused = {name for name, key in switches.items() if key in known.model_fields_set} - fitted
+    fitted = {*known.everywhere(), *(entry.effect for entry in known.effects)}
+    refused = {name for key, name in known.SWITCHES.items() if key in known.model_fields_set} - fitted
     extended, notes = load_extended(file, **robot_options(task.robot))
     added: dict[tuple[str, tuple[str, ...]], BaselineEffect] = {}
     places: dict[tuple[str, bool], list[str]] = {}
