@@ -2,7 +2,7 @@
 
     JAX_PLATFORMS=cpu PYTHONPATH=. python benchmarks/gpu_compile.py ROBOT.urdf [--only WORD ...] [--samples N]
 
-Needs the packages `jax-cuda13-plugin` and `jax-cuda13-pjrt` of this JAX's version and `ptxas`, without CUDA's libraries.
+Needs `jax-cuda13-plugin` and `jax-cuda13-pjrt` of this JAX's version and `ptxas`, but none of CUDA's libraries.
 The program is made for an H100 that is told to XLA; `perf record` beside it says where the seconds go.
 """
 
