@@ -188,7 +188,7 @@ class _Lanes:
                     done[k] = cost[k] - new < 1e-7 * cost[k]
                     cost[k] = new
                 else:
-                    if self.start.shape[2] > _FEW:
+                    if rough > 0 and self.start.shape[2] > _FEW:  # beside a rest a start may move far
                         self.held_back(now[k], sums, step.start, k)
                     damping[k], worse[k] = max(damping[k] * 6 * 2 ** worse[k], 1e-6), worse[k] + 1
                     done[k] = damping[k] > 1e8
