@@ -24,12 +24,12 @@ MODELS = {
     "friction .35, light rotors (Isaac Lab)": (48.0, 0.6, 0.35, 0.05, 0.0),
     "causes named by this library": (*FITTED, (0.028, 0.028, 0.028, 0.0081, 0.028, 0.028), 0.0),
 }
-# half of each 95 % interval of the last model's gain, damping and friction, by fits without some recordings each;
+# half of each 95 % interval of the last model's gain, damping and friction, by a jackknife of its recordings;
 # the flexing wrist's rotor has .0059 kg m2, the others are as stated
 HALVES = (
-    (55, 0.71, 1.5, 0.50, 8.7, 5.7),
-    (3.2, 0.51, 0.29, 0.084, 0.34, 0.48),
-    (0.60, 0.036, 0.094, 0.014, 0.19, float("nan")),
+    (110, 0.71, 1.5, 0.62, 8.5, 6.4),
+    (6.5, 0.55, 0.83, 0.13, 0.34, 0.57),
+    (1.2, 0.034, 0.1, 0.016, 0.097, float("nan")),
 )
 
 
