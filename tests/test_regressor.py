@@ -190,6 +190,7 @@ def compilations(caplog: pytest.LogCaptureFixture) -> int:
     return sum("Finished XLA compilation" in record.getMessage() for record in caplog.records)
 
 
+@pytest.mark.skipif(jax.default_backend() == "gpu", reason="its kernels leave out zeros: others, another one")
 def test_changed_masses_lengths_and_sample_counts_compile_no_kernel(
     arm: RobotModel, caplog: pytest.LogCaptureFixture
 ) -> None:
