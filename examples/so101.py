@@ -12,25 +12,18 @@ import figaroh_jax as fj
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "so101_sage"
 PERIOD, ROWS, STEPS = 0.02006, 1500, 4  # s, rows of each motion, steps to a row
 ARM = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
-FITTED = (  # gain, damping, friction
-    (40.6, 12.3, 11.7, 10.2, 35.1, 25.1),
-    (2.45, 0.827, 0.713, 0.606, 2.02, 1.99),
-    (0.424, 0.396, 0.467, 0.142, 0.377, 0.0),
-)
-# N m/rad, N m s/rad (gain and joint together), N m, kg m2, s
+# N m/rad, N m s/rad (gain and joint together), N m, kg m2, s; the last one's intervals: docs/so101.md
 MODELS = {
     "as MuJoCo Menagerie says": (998.2, 3.33, 0.052, 0.028, 0.0),
     "no friction, heavy rotors (Playground)": (17.8, 0.6, 1e-4, 0.15, 0.0),
     "friction .35, light rotors (Isaac Lab)": (48.0, 0.6, 0.35, 0.05, 0.0),
-    "causes named by this library": (*FITTED, (0.028, 0.028, 0.028, 0.0081, 0.028, 0.028), 0.0),
+    "causes named by this library": (
+        (40.6, 12.3, 11.7, 10.2, 35.1, 25.1),
+        (2.45, 0.827, 0.713, 0.606, 2.02, 1.99),
+        (0.424, 0.396, 0.467, 0.142, 0.377, 0.0),
+        *((0.028, 0.028, 0.028, 0.0081, 0.028, 0.028), 0.0),
+    ),
 }
-# half of each 95 % interval of the last model's gain, damping and friction, by a jackknife of its recordings;
-# the flexing wrist's rotor has .0059 kg m2, the others are as stated
-HALVES = (
-    (110, 0.71, 1.5, 0.62, 8.5, 6.4),
-    (6.5, 0.55, 0.83, 0.13, 0.34, 0.57),
-    (1.2, 0.034, 0.1, 0.016, 0.097, float("nan")),
-)
 
 
 def arm(gain: Any, damping: Any, friction: Any, armature: Any, delay: Any) -> Any:
@@ -61,10 +54,6 @@ def main() -> None:
             read = np.asarray(fj.rollout(loop, np.repeat(command, STEPS, axis=0), position[0]).reading)[::STEPS]
             errors.append(1e3 * np.sqrt(np.mean((read - position)[:, :5] ** 2, axis=0)))
         print(f"{label:<40} {np.mean(errors):5.1f} mrad; by joint {np.round(np.mean(errors, axis=0), 1)}")
-    print("\nwhat the recordings tell of gain (N m/rad), damping (N m s/rad) and friction (N m):")
-    for k, name in enumerate(ARM[:5]):
-        told = [(numbers[k], half[k]) for numbers, half in zip(FITTED, HALVES, strict=True)]
-        print(f"{name:<14} " + ", ".join(f"{value:.3g} +- {half:.2g}" for value, half in told))
 
 
 if __name__ == "__main__":
