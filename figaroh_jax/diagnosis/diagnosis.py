@@ -147,9 +147,7 @@ class _Left(NamedTuple):
     excess: float  # over the noise
     line: tuple[float, float, int]  # the strongest in its spectrum
     more: float  # squares by which smooth functions find more in it than chance gives
-    beyond: Float[
-        np.ndarray, " nv"
-    ]  # squares of each joint while it moves beyond those of noise, where they surely are
+    beyond: Float[np.ndarray, " nv"]  # each joint's squares, moving, beyond those of noise, where they surely are
     baseline: Float[np.ndarray, " nv"]  # the same without any cause
 
 
