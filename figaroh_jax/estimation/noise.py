@@ -143,7 +143,7 @@ def _penalised(
 def white(
     variance: Float[np.ndarray, " nv"], nyquist: float, degrees: Float[np.ndarray, " nv"] | float = np.inf
 ) -> Spectrum:
-    """The same power at all frequencies: a scale per joint and nothing else, known from so many `degrees` of freedom."""
+    """The same power at all frequencies: a scale per joint and nothing else, known by so many `degrees`."""
     coefficients, covariance = np.zeros((6, len(variance))), np.zeros((len(variance), 6, 6))
     coefficients[0], covariance[:, 0, 0] = np.log(variance), 2 / np.asarray(degrees)
     return Spectrum(coefficients, covariance, nyquist)
