@@ -434,11 +434,12 @@ def _answered(
         named = gaining.named
         if named:
             gaining = gaining._replace(joint=_as_weighed_otherwise(here, searched.here.problem, gaining.joint))
-        least = least_sure(named, gaining.joint)
+        by_speed = by_speed if len(first) == len(named) else _together(searched.here, named)
+        first, moving = named, _as_weighed_in_motion(searched.here, by_speed) if named else by_speed
+        least = least_sure(named, moving)
         if least is None:
-            by_speed = by_speed if len(first) == len(named) else _together(searched.here, named)
             return here, gaining._replace(named=opened(named, gaining.joint, forbid)), by_speed, against
-        against[named[least].name] = f"its size is not surely above zero: {_told_size(gaining.joint, least, here)}"
+        against[named[least].name] = f"its size is not surely above zero: {_told_size(moving, least, here)}"
         named = [f for f in named if f is not named[least]]
         joint = _together(here, named)
 
@@ -512,6 +513,21 @@ def _as_weighed_otherwise(here: _Setting, by_speed: Problem, joint: Joint) -> Jo
     weights = [(w, here.whitening) for w in slow if not np.array_equal(w, own)]
     joint = with_parts(problem, joint, here.whitening)
     return with_misfit(problem, here.start, joint, [*weights, (own, white)])
+
+
+def _as_weighed_in_motion(here: _Setting, by_speed: Joint) -> Joint:
+    """The fit by whose weights causes are found, with what its intervals owe to its parts, to slow rows and to the
+    spectrum.
+
+    Whether a cause has a size is asked of this one: a fit that is asked for rows at rest, where no law of the velocity
+    holds, gives part of a law of the motion away, and which fit predicts best changes from one recording to the next.
+    """
+    problem = here.problem
+    white = np.ones_like(here.whitening) / np.maximum(residual_rms(problem, by_speed.step.state), 1e-300)
+    own = np.asarray(problem.records.weight)
+    moving = own * (relative_speed(problem) >= STANDSTILL)
+    joint = with_parts(problem, by_speed, here.whitening)
+    return with_misfit(problem, here.start, joint, [(moving, here.whitening), (own, white)])
 
 
 def _left(
