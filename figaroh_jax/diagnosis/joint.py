@@ -118,7 +118,7 @@ def _at_shapes(causes: Sequence[Effect], fitted: Fitted) -> Float[np.ndarray, "P
     for effect, place in zip(causes, fitted.places, strict=True):
         known = list(place[len(place) - len(shapes(type(effect))) :])
         own = list(place[: len(place) - len(known)])
-        if known and own:
+        if known and own and np.isfinite(fitted.covariance[np.ix_(place, place)]).all():  # else no row says anything
             out[np.ix_(own, own)] = _given(fitted.covariance, own, known)
     return out
 
