@@ -50,6 +50,7 @@ from .rest import (
     parts_of,
     predictable,
     relative_rest,
+    repeating,
     significance,
     tolerated,
     verdict,
@@ -146,7 +147,7 @@ class _Left(NamedTuple):
     p_value: float  # of the whole catalogue on it
     excess: float  # over the noise
     line: tuple[float, float, int]  # the strongest in its spectrum
-    more: float  # squares by which smooth functions find more in it than chance gives
+    more: Float[np.ndarray, " nv"]  # squares by which smooth functions of each joint find more in it than chance gives
     beyond: Float[np.ndarray, " nv"]  # each joint's squares, moving, beyond those of noise, where they surely are
     baseline: Float[np.ndarray, " nv"]  # the same without any cause
 
@@ -369,7 +370,7 @@ def _judged(
     each = [
         replace(
             one,
-            complete=left.more <= ALL_BUT * (f.cost[0] - f.cost[1]),
+            complete=bool(left.more[list(f.joints)].max() <= ALL_BUT * (f.cost[0] - f.cost[1])),
             leaves=of_its_own(left.beyond, left.baseline, f.joints, one.taken),
         )
         for one, f in zip(each, found, strict=True)
@@ -544,7 +545,10 @@ def _left(
         beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)
         for step in (joint.step, first)
     )
-    return _Left(left._replace(there=there), p_left, now[0], line, flexible[2], beyond, alone)
+    # what a wrong law leaves shows in all rows too, and is there again in a repeat: what noisy positions make is not
+    beyond = np.minimum(beyond, loud)
+    beyond = np.minimum(beyond, repeating(problem, joint.step.rows, joint.step.linear.residual, moves))
+    return _Left(left._replace(there=there), p_left, now[0], line, flexible.each, beyond, alone)
 
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:
