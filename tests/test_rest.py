@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -10,10 +11,12 @@ import pytest
 
 from figaroh_jax.diagnosis import rest as rests
 from figaroh_jax.diagnosis.estimates import Fitted
+from figaroh_jax.diagnosis.flexible import Smooth
 from figaroh_jax.diagnosis.joint import Joint, has_size, least_sure
 from figaroh_jax.diagnosis.naming import Standing, _turns_against_itself, beside_rest, of_its_own, reason_against
-from figaroh_jax.diagnosis.rest import significance, tolerated, verdict, wrong_law
+from figaroh_jax.diagnosis.rest import repeating, significance, tolerated, verdict, wrong_law
 from figaroh_jax.effects.catalogue import find
+from figaroh_jax.estimation.rows import Rows
 from figaroh_jax.results import Name
 
 
@@ -128,12 +131,30 @@ def test_what_stays_at_a_causes_joints_is_its_own_where_others_have_no_misfit(
 
 
 def test_a_law_is_wrong_where_it_leaves_a_rest_at_its_own_place() -> None:
-    rest = (0.001, Name("friction", ("elbow",)), 50.0)
+    rest = Smooth(0.001, Name("friction", ("elbow",)), 50.0, np.array([0.0, 50.0]))
     assert wrong_law(("elbow",), 1000.0, rest)
     assert wrong_law((), 1000.0, rest)  # the whole robot
     assert not wrong_law(("elbow",), 10_000.0, rest)  # a small share of what was removed
     assert not wrong_law(("wrist",), 1000.0, rest)
-    assert not wrong_law(("elbow",), 1000.0, (0.02, *rest[1:]))
+    assert not wrong_law(("elbow",), 1000.0, rest._replace(p=0.02))
+
+
+def test_what_repeats_have_in_common_is_no_noise() -> None:
+    """Two repeats of 4000 rows that share a wave; a third of the rows counts; the second joint has noise alone."""
+    rng, n = np.random.default_rng(5), 4000
+    wave = np.sin(np.arange(n) / 7.0)
+    residual = rng.standard_normal((2, 2 * n))
+    residual[0] += np.tile(wave, 2)
+    partner = np.concatenate([np.arange(n) + n, np.arange(n)])[None]
+    rows = Rows(*[np.zeros((2, 0, 0))] * 3, np.ones((2, 2 * n)), partner, np.zeros(2 * n, int), np.zeros(2 * n, int))
+    counted = np.tile(np.arange(2 * n) % 3 == 0, (2, 1))
+    problem = cast(Any, SimpleNamespace(layout=SimpleNamespace(repeats=True)))
+    shared, none = repeating(problem, rows, residual, counted)
+    told = (np.tile(wave, 2)[counted[0]] ** 2).sum()
+    assert shared == pytest.approx(told, rel=0.15)  # five deviations of the products' noise
+    assert none < 0.15 * told
+    problem.layout.repeats = False
+    assert np.isinf(repeating(problem, rows, residual, counted)).all()
 
 
 def test_verdicts_follow_causes_and_rest() -> None:
@@ -196,6 +217,8 @@ def test_recordings_kept_out_may_show_what_few_blocks_of_the_others_cannot(
         ({"modulation": 0.5}, ""),  # by chance, of a small cause
         ({"modulation_held_out": 0.3}, "varies"),
         ({"share": 2.0, "cancels": True}, ""),
+        ({"outdone": True}, "predicts better, though it is none itself"),
+        ({"whole": True, "massless": True}, "mass is not surely"),
     ],
 )
 def test_without_a_rest_a_cause_need_only_be_there(changes: dict[str, float], word: str) -> None:
@@ -235,7 +258,7 @@ def test_a_law_like_a_rest_is_taken_on_less_where_it_leaves_nothing() -> None:
 
 
 def test_a_rest_without_repeats_counts_where_smooth_functions_predict_it() -> None:
-    flexible, line = (0.001, Name("position", ("elbow",)), 50.0), (1.0, 0.0, 0)
+    flexible, line = Smooth(0.001, Name("position", ("elbow",)), 50.0, np.array([0.0, 50.0])), (1.0, 0.0, 0)
     now, joints = (0.2, 1.0, np.array([0.1, 0.3])), ("shoulder", "elbow")
 
     def there(p_repeat: float = 1.0, predicted: bool = True, tolerable: bool = False) -> bool:
