@@ -101,13 +101,18 @@ def test_more_power_than_noise_can_have_is_a_rest(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(rests, "draw_noise", drawn)
     rng, left = np.random.default_rng(3), np.ones(shape)
 
-    def beyond(share: float) -> np.ndarray:
+    def against(share: float) -> tuple[np.ndarray, np.ndarray]:
         size = np.array([1.0, np.sqrt(1 + share * np.sqrt(2 / 400))])  # so many deviations at the second joint
         return rests.beyond_noise(nothing, left * size[:, None], nothing, nothing, rng)
 
-    assert not beyond(0.0).any()
-    assert not beyond(2.0).any()
-    np.testing.assert_allclose(beyond(4.0), [0.0, 4 * np.sqrt(2 * 400)], rtol=0, atol=8)  # mean of 200 draws: +- 2
+    for share in (-2.0, 0.0, 2.0):
+        beyond, quiet = against(share)
+        assert not beyond.any() and not quiet.any()
+    beyond, quiet = against(4.0)
+    np.testing.assert_allclose(beyond, [0.0, 4 * np.sqrt(2 * 400)], rtol=0, atol=8)  # mean of 200 draws: +- 2
+    assert not quiet.any()
+    beyond, quiet = against(-4.5)  # noise never has so little: what was taken for noise is something else
+    assert not beyond.any() and quiet.tolist() == [False, True]
 
 
 @pytest.mark.parametrize(

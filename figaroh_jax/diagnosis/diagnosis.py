@@ -390,6 +390,9 @@ def _judged(
         return bool(searched.here.problem.held.any()) and beside(name).certainly(claims[name])
 
     beyond = relative_rest(problem, joint.step.state, noise)
+    doubted = left.p_value < REST_P  # the catalogue still scores more than noise, though nothing in it passes
+    if found and doubted and float(beyond.max()) > tolerance:  # a rest of the answer is one for its names
+        strict = strict or not _sticks(here, joint, tolerance)
     rests = beside_rest(each, [f.joints for f in found], strict, beyond, tolerance)
     asked = (tolerance, certain, fading)
     against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
@@ -401,7 +404,6 @@ def _judged(
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
-    doubted = left.p_value < REST_P  # the catalogue still scores more than noise, though nothing in it passes
     shown = left.rest.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
     sticks = shown and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
     rest = shown and not sticks
@@ -530,7 +532,8 @@ def _left(
     now = excess(problem, joint.step.rows, joint.step.linear.residual, spectrum, whitening)
     flexible = flexible_p(problem, joint.step.state, joint.step.rows, spectrum, whitening, generator)
     line = lines(problem, joint.step.linear.residual)
-    size = float(relative_rest(problem, joint.step.state, noise_rms(problem, spectrum)).max())
+    noise = noise_rms(problem, spectrum)
+    size = float(relative_rest(problem, joint.step.state, noise).max())
     predicted = predictable(problem, joint.step, whitening)
     p_left = search.p_left
     if len(found) < len(search.found):  # it was asked beside causes that have gone
@@ -538,11 +541,13 @@ def _left(
     joints, tolerable = problem.model.joint_names, size <= tolerance
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
-    loud = beyond_noise(problem, joint.step.linear.residual, spectrum, whitening, generator)
+    loud, quiet = beyond_noise(problem, joint.step.linear.residual, spectrum, whitening, generator)
     there = left.there or ((wrong or bool(loud.any())) and not tolerable)
+    if not problem.layout.repeats and not found:  # what is left is then no noise, nor is it known how much of it is
+        there = there or bool((quiet & (relative_rest(problem, joint.step.state, 0 * noise) > tolerance)).any())
     moves = np.moveaxis(~resting(problem), 2, 0).reshape(joint.step.rows.y.shape)
     beyond, alone = (
-        beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)
+        beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)[0]
         for step in (joint.step, first)
     )
     # what a wrong law leaves shows in all rows too, and is there again in a repeat: what noisy positions make is not

@@ -101,23 +101,27 @@ def beyond_noise(
     whitening: Float[np.ndarray, "F nv"],
     generator: np.random.Generator,
     rows: Bool[np.ndarray, "nv T"] | None = None,
-) -> Float[np.ndarray, " nv"]:
-    """Squares that each joint's residual has beyond those of noise, where chance gives no joint so many; else zero.
+) -> tuple[Float[np.ndarray, " nv"], Bool[np.ndarray, " nv"]]:
+    """Squares that each joint's residual has beyond those of noise, where chance gives no joint so many, else zero; and
+    whether it has fewer than chance gives any joint.
 
     Of some rows of each joint, or of all.
 
     Noise is drawn with all that its spectrum may be, and a joint's power counted in deviations of what noise has there:
     one draw in a hundred has a joint with as much. What no function of the motion predicts is a misfit too, if it is
-    larger than the noise can be.
+    larger than the noise can be. Less power than the noise has is no noise either: its spectrum is estimated from what
+    a rich model leaves, and what the motion's own frequencies leave passes for more noise than there is.
     """
     counted = np.ones(residual.shape, bool) if rows is None else rows
     parts = (draw_noise(problem, spectrum, whitening, CHUNK, generator) for _ in range(POWER_DRAWS // CHUNK))
     noise = np.concatenate([(part**2 * counted).sum(2) for part in parts])
     mean, deviation = noise.mean(0), np.maximum(noise.std(0), 1e-12 * noise.mean(0) + 1e-300)
-    largest = ((noise - mean) / deviation).max(1)
-    own = (residual**2 * counted).sum(1) - mean
-    p = (1 + np.sum(largest[:, None] >= own / deviation, axis=0)) / (len(noise) + 1)
-    return np.where(p < REST_P, np.maximum(own, 0.0), 0.0)
+    drawn, own = (noise - mean) / deviation, (residual**2 * counted).sum(1) - mean
+    p, q = (
+        (1 + np.sum(most[:, None] >= side * own / deviation, axis=0)) / (len(noise) + 1)
+        for side, most in ((1, drawn.max(1)), (-1, -drawn.min(1)))
+    )
+    return np.where(p < REST_P, np.maximum(own, 0.0), 0.0), q < REST_P
 
 
 def repeating(
