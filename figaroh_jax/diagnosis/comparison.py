@@ -23,7 +23,9 @@ __all__ = [
     "judge",
     "judge_grown",
     "last_coefficient",
+    "left_out",
     "overlap",
+    "prefix_sums",
     "shares_of_wins",
     "sums_of",
     "told",
@@ -133,6 +135,17 @@ def grown_sums(rows: Rows, known: FoldSums, X: Float[np.ndarray, "nv T P"]) -> F
     return FoldSums(gram, moment, known.square)
 
 
+def prefix_sums(rows: Rows, gram: Float[np.ndarray, "folds P P"]) -> FoldSums:
+    """The sums of the first columns of some rows, their products being known."""
+    count = gram.shape[1]
+    moment, square = np.zeros(gram.shape[:2]), np.zeros(len(gram))
+    for fold, own in _stretches(rows):
+        for columns, target in zip(rows.X[:, own, :count], rows.y[:, own], strict=True):
+            moment[fold] += columns.T @ target
+            square[fold] += target @ target
+    return FoldSums(gram, moment, square)
+
+
 def fewer_sums(known: FoldSums, without: Sequence[int]) -> FoldSums:
     """The sums of the columns that are left without some."""
     gram = np.delete(np.delete(known.gram, without, axis=1), without, axis=2)
@@ -152,6 +165,12 @@ def coefficients(sums: FoldSums, prior: Prior) -> Float[np.ndarray, " P"]:
     """The fit to all rows."""
     gram, moment, square = (part.sum(0) for part in sums)
     return _solve(gram, moment, square, prior)[0]
+
+
+def left_out(sums: FoldSums, prior: Prior) -> Float[np.ndarray, "folds P"]:
+    """The fits to all rows but those of each fold."""
+    gram, moment, square = (part.sum(0) for part in sums)
+    return np.array([_solve(gram - g, moment - m, square - s, prior)[0] for g, m, s in zip(*sums, strict=True)])
 
 
 def last_coefficient(sums: FoldSums, prior: Prior) -> tuple[Float[np.ndarray, " P"], float]:

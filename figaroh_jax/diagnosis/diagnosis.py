@@ -425,7 +425,8 @@ def _answered(
     With the setting of the answer's fit, their fit with the weights that found them, and why the others went.
     """
     against: dict[Name, str] = {}
-    here, joint, by_speed = _as_predicts_best(settings, named)
+    known = searched.joint if [f.name for f in named] == [f.name for f in searched.found] else None
+    here, joint, by_speed = _as_predicts_best(settings, named, known)
     first = named
     while True:
         gaining = without_losses(here.problem, here.start, here.whitening, named, joint, searched.strict, borne_out)
@@ -461,21 +462,24 @@ def _together(here: _Setting, found: list[Found]) -> Joint:
     return polished(here.problem, here.start, [one.effect for one in found], here.whitening)
 
 
-def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple[_Setting, Joint, Joint]:
+def _as_predicts_best(
+    settings: Sequence[_Setting], named: list[Found], known: Joint | None
+) -> tuple[_Setting, Joint, Joint]:
     """The named causes in one fit as predicts parts left out best, by their error in N m; and as the first setting has
     them.
 
     Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows, and
     the width of friction beside all causes need not be that beside the named ones. Where the noise is far below what
     the model leaves, its spectrum is a poor weight: each joint's residual alone may do better. Another fit than that
-    which parts prefer is taken where recordings kept out surely prefer it.
+    which parts prefer is taken where recordings kept out surely prefer it. `known` is the fit of the first setting with
+    its own weights, where it has been made.
     """
     best, first, kept = None, None, []  # one fit at a time: rows and columns are large
     held = bool(settings[0].problem.held.any())
     for here in settings:
         for weight in _weights(here.problem):
             one = here._replace(problem=here.problem.weighted(weight))
-            joint = _together(one, named)
+            joint = known if known and first is None else _together(one, named)
             error, first = part_error(one.problem, joint.step), first or joint
             if held:
                 kept.append((one, kept_squares(one.problem, joint.step)))
