@@ -268,7 +268,7 @@ class Effect(eqx.Module):
     follows_total: ClassVar[bool] = False  # whether it depends on all torque together, as a drive or a sensor does
     inertial: ClassVar[bool] = False  # whether its amplitudes are ten parameters of its link: the regressor's columns
     body: ClassVar[bool] = False  # whether these are a body's that exists: mass > 0, pseudo-inertia >= 0
-    levels: ClassVar[tuple[str, ...]] = ("torque", "pose")  # of diagnoses that look for it
+    levels: ClassVar[tuple[str, ...]] = ("torque", "pose", "rollout")  # of diagnoses that look for it
     correction: ClassVar[float] = 1.0  # its linear parameters behind one of what a calibration of postures reports
     searched: ClassVar[bool] = True  # whether a diagnosis looks for it, that is, whether it is in the catalogue
     # relations to other effects, by name; the last two hold both ways, whichever class states them (`related`)
@@ -329,6 +329,10 @@ class Effect(eqx.Module):
     def step(self, velocity: Float[Array, " nv"], dt: Float[Array, ""]) -> Effect:
         """The effect with its state after `dt` seconds at a velocity, for effects that have a state (`memory`)."""
         return self
+
+    def begin(self, velocity: Float[Array, " nv"]) -> Float[Array, ""]:
+        """The state where a simulation begins at a velocity: the sign of its joint's, sliding; yours may be another."""
+        return jnp.sign(velocity[self.at[0]])
 
     def torque_response(self, omega: Float[Array, " freqs"]) -> Complex[Array, " freqs"]:
         """Factor of the torque sensor at the angular frequencies `omega` (rad/s)."""
