@@ -3,6 +3,7 @@
     python benchmarks/arm_cases.py --seeds 1 2 [--effects payload none] [--sizes 0 1 2] [--noise white|coloured|counts]
     python benchmarks/arm_cases.py --seeds 1 --pairs
     python benchmarks/arm_cases.py --seeds 1 --forbid
+    python benchmarks/arm_cases.py --seeds 1 --own            # a detent, an effect that a user registers
 
 Each arm is made by MuJoCo C (`tests/generators/servo_arm6.py`, no code shared with the library) and diagnosed with a
 model whose armature, damping and frictionloss are 1.6 times too large, on two recordings of 12 s. The joint follows
@@ -17,12 +18,15 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from generators import servo_arm6  # noqa: E402
 
+import figaroh_jax as fj  # noqa: E402
 from figaroh_jax.rollouts.arm import search_arm  # noqa: E402
 from figaroh_jax.rollouts.data import Run, Stretch  # noqa: E402
 from figaroh_jax.rollouts.reading import load_loop  # noqa: E402
@@ -30,6 +34,20 @@ from figaroh_jax.rollouts.search import Named, search  # noqa: E402
 from figaroh_jax.rollouts.setting import setting  # noqa: E402
 
 LINKS = 5  # the last link carries the payload
+
+
+class Detent(fj.JointEffect):
+    """A ball that drops into a notch of the joint and has to be pushed out of it."""
+
+    name, title, equation = "detent", "a detent", "strength x exp(-x^2 / 2), x = (q - notch) / 0.1 rad"
+    separated_by = "slow passes of {at} through the notch in both directions"
+    strength: float = fj.amplitude("N m")
+    notch: float = fj.shape("rad", tuple(np.linspace(-0.3, 1.2, 16)))
+
+    def torque(self, motion: fj.Motion) -> Any:
+        """strength x exp(-x^2 / 2), N m."""
+        x = (self.here(motion.position) - self.notch) / 0.1
+        return self.strength * x * jnp.exp(-(x**2) / 2)
 
 
 def run(
@@ -86,10 +104,13 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--noise", choices=["white", "coloured", "counts"], default="white")
     parser.add_argument("--pairs", action="store_true", help="two effects at a time, of the middle size")
+    parser.add_argument("--own", action="store_true", help="an effect that is no one of the library's, registered here")
     parser.add_argument("--forbid", action="store_true", help="leave the true effect out of the catalogue")
     parser.add_argument("--whole", action="store_true", help="search with the whole arm in place of joint by joint")
     args = parser.parse_args()
     count: dict[str, int] = {}
+    if args.own:
+        fj.register(Detent)
     for seed in args.seeds:
         for hidden in _cases(args, np.random.default_rng([seed, 3])):
             given = {"whole": args.whole, "known": True, "forbid": args.forbid}
@@ -106,6 +127,8 @@ def _cases(args: argparse.Namespace, rng: np.random.Generator) -> list[list[tupl
         joint = 5 if effect == "payload" else int(rng.integers(0, 4 if sprung else 5))
         return effect, joint, servo_arm6.EFFECTS[effect][size]
 
+    if args.own:
+        return [[("detent", int(rng.integers(0, 5)), servo_arm6.DETENT[size])] for size in args.sizes]
     effects = list(servo_arm6.EFFECTS)
     if args.pairs:
         pairs = [rng.choice(len(effects), 2, replace=False) for _ in range(3)]

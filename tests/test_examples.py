@@ -10,7 +10,7 @@ import pytest
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 # these have tests of their own, or make what the package ships
-ELSEWHERE = {"make_demo", "own_device", "own_effect"}
+ELSEWHERE = {"make_demo", "own_device", "own_effect", "own_rollout_effect"}
 SLOW = {
     "any_optimiser",
     "calibrate_tracker",

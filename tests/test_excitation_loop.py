@@ -36,10 +36,12 @@ URDF = "".join(
 )
 
 
-def _measured(q: np.ndarray, v: np.ndarray, a: np.ndarray, seed: int, noise: np.ndarray = NOISE) -> np.ndarray:
-    """Torques of MuJoCo C with the rotor and damping, and noise."""
+def measured(
+    q: np.ndarray, v: np.ndarray, a: np.ndarray, seed: int, noise: np.ndarray = NOISE, rotor: float = ROTOR
+) -> np.ndarray:
+    """Torques of MuJoCo C with a rotor at the elbow and damping, and noise."""
     model = mujoco.MjModel.from_xml_string(URDF)
-    model.dof_armature[1], model.dof_damping[:] = ROTOR, DAMPING
+    model.dof_armature[1], model.dof_damping[:] = rotor, DAMPING
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONTACT)
     data, out = mujoco.MjData(model), []
     for state in zip(q, v, a, strict=True):
@@ -78,7 +80,7 @@ def test_the_motion_designed_for_an_open_pair_brings_the_right_name(tmp_path: Pa
     t = np.arange(0, 10, 0.005)
     for seed in range(3):
         states = _slow(seed, t)
-        np.savez(tmp_path / f"slow{seed}.npz", t=t, q=states[0], tau=_measured(*states, seed, 2 * NOISE))
+        np.savez(tmp_path / f"slow{seed}.npz", t=t, q=states[0], tau=measured(*states, seed, 2 * NOISE))
     first = _task(tmp_path, "first.yaml", [f"slow{k}" for k in range(3)])
     run = tmp_path / "first"
     assert main(["diagnose", str(first), "--out", str(run), "--quiet"]) == 0
@@ -95,7 +97,7 @@ def test_the_motion_designed_for_an_open_pair_brings_the_right_name(tmp_path: Pa
         time, *states = (motion[name][::5] for name in ("t", "q", "v", "a"))
     for seed in range(3):
         np.savez(
-            tmp_path / f"told{seed}.npz", t=time, q=states[0], tau=_measured(states[0], states[1], states[2], 10 + seed)
+            tmp_path / f"told{seed}.npz", t=time, q=states[0], tau=measured(states[0], states[1], states[2], 10 + seed)
         )
     second = _task(tmp_path, "second.yaml", [f"told{k}" for k in range(3)])
     assert main(["diagnose", str(second), "--out", str(tmp_path / "second"), "--quiet"]) == 0

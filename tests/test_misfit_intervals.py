@@ -10,27 +10,39 @@ import pytest
 
 from figaroh_jax.diagnosis import joint as fits
 from figaroh_jax.diagnosis.estimates import Fitted
-from figaroh_jax.diagnosis.joint import AS_SURE, Joint, with_misfit, with_parts
+from figaroh_jax.diagnosis.joint import AS_SURE, Joint, least_sure, with_misfit, with_parts
+from figaroh_jax.effects.base import Effect
+from figaroh_jax.effects.catalogue import find
 from figaroh_jax.estimation.rows import Prior, Rows
 
 SHARE = 0.25  # correlation of the two values
 
 
-def stood(value: list[float], deviation: list[float]) -> Any:
+def law() -> Effect:
+    return find("power_law_friction")(np.array([0]), **{"strength": np.float64(1.0), "exponent": np.float64(2.0)})
+
+
+def stood(value: list[float], deviation: list[float], at_shape: float = 1.0) -> Any:
+    """A power law's strength and exponent, with its strength at the exponent that stands."""
     covariance = np.outer(deviation, deviation) * (np.eye(2) + SHARE * (1 - np.eye(2)))
-    step = SimpleNamespace(state=SimpleNamespace(theta=np.zeros(2)))
-    return SimpleNamespace(step=step, causes=[], fitted=Fitted(np.array(value), covariance, ((0, 1),)))
+    step = SimpleNamespace(state=SimpleNamespace(theta=np.array([at_shape])))
+    return SimpleNamespace(step=step, causes=[law()], fitted=Fitted(np.array(value), covariance, ((0, 1),)))
 
 
-def widened(monkeypatch: pytest.MonkeyPatch, *others: Any) -> np.ndarray:
-    """Covariance of the fit of values (1, 2) with deviations (.1, .2), beside others by other weights."""
+def fitted_beside(monkeypatch: pytest.MonkeyPatch, *others: Any) -> Fitted:
+    """The fit of values (1, 2) with deviations (.1, .2), beside others by other weights."""
     own, left = stood([1.0, 2.0], [0.1, 0.2]), list(others)
     monkeypatch.setattr(fits, "solved", lambda problem, start, theta: start)
     monkeypatch.setattr(fits, "_together", lambda problem, base, causes, whitening: left.pop(0))
     problem: Any = SimpleNamespace(weighted=lambda weight: problem)
     start, nothing = cast(Any, SimpleNamespace(theta=np.zeros(2))), np.zeros(1)
     joint = Joint(own.step, own.causes, own.fitted)
-    return with_misfit(problem, start, joint, [(nothing, nothing)] * len(others)).fitted.covariance
+    return with_misfit(problem, start, joint, [(nothing, nothing)] * len(others)).fitted
+
+
+def widened(monkeypatch: pytest.MonkeyPatch, *others: Any) -> np.ndarray:
+    """Covariance of that fit."""
+    return fitted_beside(monkeypatch, *others).covariance
 
 
 def test_a_value_that_moves_with_the_weights_is_as_unsure_as_it_moves(monkeypatch: pytest.MonkeyPatch):
@@ -52,6 +64,18 @@ def test_a_fit_that_says_little_of_a_value_moves_its_deviation_little(monkeypatc
 def test_rows_that_say_nothing_of_a_value_leave_its_deviation(monkeypatch: pytest.MonkeyPatch):
     found = widened(monkeypatch, stood([np.nan, 2.0], [np.inf, 0.2]))
     np.testing.assert_allclose(np.sqrt(np.diag(found)), [0.1, 0.2], rtol=1e-12)
+
+
+def test_an_amplitude_is_known_at_its_shape_as_far_as_it_moves_there(monkeypatch: pytest.MonkeyPatch):
+    """Strength and exponent that trade with each other: at the exponent that is told the strength stays."""
+    found = fitted_beside(monkeypatch, stood([3.0, 1.0], [0.1, 0.2], at_shape=1.05)).at_shapes
+    assert found is not None
+    given = 0.1**2 * (1 - SHARE**2)  # of two Gaussians of that correlation, one known
+    np.testing.assert_allclose(found[0, 0], given + 0.05**2, rtol=1e-9)
+    told = Fitted(np.array([1.0, 2.0]), np.diag([9.0, 9.0]), ((0, 1),), found)
+    none: Any = None
+    assert least_sure([none], Joint(none, [law()], told)) is None
+    assert least_sure([none], Joint(none, [law()], Fitted(told.value, told.covariance, told.places))) == 0
 
 
 def test_values_are_as_unsure_as_parts_of_the_data_disagree():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 
 import numpy as np
+import pytest
 from scipy.signal import lfilter
 
 from figaroh_jax.estimation import noise
@@ -126,6 +127,18 @@ def test_white_noise_rarely_shows_a_line() -> None:
     # 0.6 and 0.06 are expected; the tail is right within a factor of two
     assert (p < 1e-3).sum() <= 8, np.sort(p)[:10]
     assert (p < 1e-4).sum() <= 4, np.sort(p)[:10]
+
+
+@pytest.mark.parametrize("parts", [(1.0, 0.0), (1.0, 0.0, 0.0), (1.0, 0.2, 1.0)])
+def test_recordings_left_out_of_the_fit_or_shorter_than_others_show_no_line(parts: tuple[float, ...]) -> None:
+    """One recording and one that is kept out are not two: their mean scatters as one does."""
+    rng, here = np.random.default_rng(secrets.randbits(64)), np.linspace(0, 1, 1500, endpoint=False)
+    used = np.stack([here < part for part in parts])[:, :, None]
+    p = np.array(
+        [noise.spectral_line(rng.standard_normal((len(parts), 1500, 2)) * used, RATE, CUTOFF)[0] for _ in range(600)]
+    )
+    assert (p < 1e-2).sum() <= 16, np.sort(p)[:20]  # 6 are expected
+    assert (p < 1e-3).sum() <= 8, np.sort(p)[:10]
 
 
 def test_too_short_a_series_has_no_line() -> None:

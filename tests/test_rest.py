@@ -11,7 +11,14 @@ import pytest
 from figaroh_jax.diagnosis import rest as rests
 from figaroh_jax.diagnosis.estimates import Fitted
 from figaroh_jax.diagnosis.joint import Joint, has_size, least_sure
-from figaroh_jax.diagnosis.naming import Standing, _turns_against_itself, beside_rest, of_its_own, reason_against
+from figaroh_jax.diagnosis.naming import (
+    Standing,
+    _turns_against_itself,
+    beside_rest,
+    of_its_own,
+    reason_against,
+    stands_alone,
+)
 from figaroh_jax.diagnosis.rest import significance, tolerated, verdict, wrong_law
 from figaroh_jax.effects.catalogue import find
 from figaroh_jax.results import Name
@@ -108,23 +115,23 @@ def test_more_power_than_noise_can_have_is_a_rest(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize(
-    ("beyond", "baseline", "joints", "share"),
+    ("misfit", "joints", "alone"),
     [
-        ([0, 0, 50, 0, 0, 0], [0, 0, 150, 0, 0, 0], [2], 0.5),
-        ([0, 9, 50, 0, 0, 0], [0, 9, 150, 0, 0, 0], [2], 0.5),  # one of five others
-        ([9, 9, 50, 9, 0, 0], [9, 9, 150, 9, 0, 0], [2], 0.0),  # most others have a misfit: this joint may have one too
-        ([0, 0, 50, 0, 0, 0], [9, 9, 150, 9, 0, 0], [2], 0.0),  # ... that other causes have taken
-        ([0, 0, 50, 0, 0, 0], [0, 0, 150, 0, 0, 0], [1], 0.0),
-        ([0, 20, 30, 0, 0, 0], [0, 90, 90, 0, 0, 0], [1, 2], 0.5),
-        ([0, 20, 30, 0, 0, 0], [0, 90, 90, 0, 0, 0], [0, 1, 2, 3, 4, 5], 0.5),
-        ([0, 20, 30, 0, 0, 0], [9, 90, 90, 0, 0, 0], [0, 1, 2, 3, 4, 5], 0.0),
+        ([0, 0, 1, 0, 0, 0], [2], True),
+        ([0, 1, 1, 0, 0, 0], [2], True),  # one of five others
+        ([1, 1, 1, 1, 0, 0], [2], False),  # most others have a misfit: this joint may have one too
+        ([0, 1, 1, 0, 0, 0], [1, 2], True),
+        ([0, 1, 1, 0, 0, 0], [0, 1, 2, 3, 4, 5], True),
+        ([1, 1, 1, 0, 0, 0], [0, 1, 2, 3, 4, 5], False),
+        ([1], [0], False),
     ],
 )
-def test_what_stays_at_a_causes_joints_is_its_own_where_others_have_no_misfit(
-    beyond: list[float], baseline: list[float], joints: list[int], share: float
-) -> None:
-    found = of_its_own(np.array(beyond, float), np.array(baseline, float), joints, 100.0)
-    assert found == pytest.approx(share)
+def test_a_cause_stands_alone_where_others_have_no_misfit(misfit: list[int], joints: list[int], alone: bool) -> None:
+    assert stands_alone(np.array(misfit, bool), joints) is alone
+
+
+def test_what_stays_at_a_causes_joints_is_told_by_what_it_removes() -> None:
+    assert of_its_own(np.array([0.0, 20.0, 30.0, 9.0]), [1, 2], 100.0) == pytest.approx(0.5)
 
 
 def test_a_law_is_wrong_where_it_leaves_a_rest_at_its_own_place() -> None:
@@ -163,6 +170,9 @@ RIGHT = Standing(
         ({"modulation_held_out": 0.12}, ""),
         ({"modulation_held_out": 0.08, "varies": True}, ""),
         ({"leaves": 0.06}, "another law acts there"),
+        ({"leaves": 0.06, "alone": False}, ""),
+        ({"modulation_held_out": 0.12, "varies": True, "alone": False}, ""),
+        ({"modulation_held_out": 0.12, "varies": True, "alone": False, "whole": True}, "varies"),
         ({"share": 3.0, "cancels": True}, "cancels"),
         ({"physical": False}, "physically impossible"),
         ({"beside_rest": False}, "named only where nothing else"),

@@ -72,8 +72,8 @@ def test_a_fit_finds_what_mujoco_hid_and_its_derivative_is_that_of_differences(c
 
 def test_what_a_rollout_has_no_form_for_is_refused(case):
     model, data = case
-    odd = fj.extend(model, fj.place(fj.CATALOGUE["torque_ripple"], model.robot, ["j"]))
-    with pytest.raises(fj.InputError, match="no form for 'torque_ripple'"):
+    odd = fj.extend(model, fj.place(fj.CATALOGUE["friction_drift"], model.robot, ["j"]))
+    with pytest.raises(fj.InputError, match="no form for 'friction_drift': its torque follows the time"):
         fj.residual(odd, data)
     with pytest.raises(fj.InputError, match="no number 'delays'; did you mean 'delay'"):
         fj.rollout_data(data.loop, [], drives=["delays"])

@@ -36,7 +36,7 @@ from .kernels import Number, Program, Straight
 from .memory import recycled
 from .store import Store
 
-__all__ = ["FARTHEST", "FEWEST", "code_of_few", "library", "machine_code", "own_room"]
+__all__ = ["FARTHEST", "FEWEST", "code_of_few", "is_gnu", "library", "machine_code", "own_room"]
 
 FEWEST = 8  # samples: no vector is longer
 FROM = 512  # samples; below, handing them over costs as much as it saves
@@ -323,6 +323,12 @@ def _built(source: str, *flags: str) -> bytes | None:
             return out.read_bytes()
         except (OSError, subprocess.SubprocessError):
             return None
+
+
+def is_gnu() -> bool:
+    """Whether the compiler takes a level of optimisation at each function; clang knows none."""
+    compiler = _compiler()
+    return compiler is not None and "clang" not in os.path.realpath(compiler[0])
 
 
 def library(source: str, *flags: str) -> ctypes.CDLL | None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..compiled.memory import give_back_holes
 from ..effects.base import place
@@ -40,7 +40,7 @@ from .gates import physical_sign
 from .holdout import fold_squares, part_error, residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_misfit, with_parts
 from .layout import checked_repeats, describe_folds, held_rows, layout
-from .naming import beside_rest, beyond_simpler, of_its_own, reason_against, standings
+from .naming import beside_rest, beyond_simpler, of_its_own, reason_against, standings, stands_alone
 from .problem import Problem
 from .rest import (
     Significance,
@@ -148,7 +148,7 @@ class _Left(NamedTuple):
     line: tuple[float, float, int]  # the strongest in its spectrum
     more: float  # squares by which smooth functions find more in it than chance gives
     beyond: Float[np.ndarray, " nv"]  # each joint's squares, moving, beyond those of noise, where they surely are
-    baseline: Float[np.ndarray, " nv"]  # the same without any cause
+    misfit: Bool[np.ndarray, " nv"]  # whether, without any cause, they are, or are more than is tolerable
 
 
 class _Searched(NamedTuple):
@@ -370,7 +370,8 @@ def _judged(
         replace(
             one,
             complete=left.more <= ALL_BUT * (f.cost[0] - f.cost[1]),
-            leaves=of_its_own(left.beyond, left.baseline, f.joints, one.taken),
+            leaves=of_its_own(left.beyond, f.joints, one.taken),
+            alone=stands_alone(left.misfit, f.joints),
         )
         for one, f in zip(each, found, strict=True)
     ]
@@ -425,7 +426,8 @@ def _answered(
     With the setting of the answer's fit, their fit with the weights that found them, and why the others went.
     """
     against: dict[Name, str] = {}
-    here, joint, by_speed = _as_predicts_best(settings, named)
+    known = searched.joint if [f.name for f in named] == [f.name for f in searched.found] else None
+    here, joint, by_speed = _as_predicts_best(settings, named, known)
     first = named
     while True:
         gaining = without_losses(here.problem, here.start, here.whitening, named, joint, searched.strict, borne_out)
@@ -433,11 +435,12 @@ def _answered(
         named = gaining.named
         if named:
             gaining = gaining._replace(joint=_as_weighed_otherwise(here, searched.here.problem, gaining.joint))
-        least = least_sure(named, gaining.joint)
+        by_speed = by_speed if len(first) == len(named) else _together(searched.here, named)
+        first, moving = named, _as_weighed_in_motion(searched.here, by_speed) if named else by_speed
+        least = least_sure(named, moving)
         if least is None:
-            by_speed = by_speed if len(first) == len(named) else _together(searched.here, named)
             return here, gaining._replace(named=opened(named, gaining.joint, forbid)), by_speed, against
-        against[named[least].name] = f"its size is not surely above zero: {_told_size(gaining.joint, least, here)}"
+        against[named[least].name] = f"its size is not surely above zero: {_told_size(moving, least, here)}"
         named = [f for f in named if f is not named[least]]
         joint = _together(here, named)
 
@@ -461,21 +464,24 @@ def _together(here: _Setting, found: list[Found]) -> Joint:
     return polished(here.problem, here.start, [one.effect for one in found], here.whitening)
 
 
-def _as_predicts_best(settings: Sequence[_Setting], named: list[Found]) -> tuple[_Setting, Joint, Joint]:
+def _as_predicts_best(
+    settings: Sequence[_Setting], named: list[Found], known: Joint | None
+) -> tuple[_Setting, Joint, Joint]:
     """The named causes in one fit as predicts parts left out best, by their error in N m; and as the first setting has
     them.
 
     Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows, and
     the width of friction beside all causes need not be that beside the named ones. Where the noise is far below what
     the model leaves, its spectrum is a poor weight: each joint's residual alone may do better. Another fit than that
-    which parts prefer is taken where recordings kept out surely prefer it.
+    which parts prefer is taken where recordings kept out surely prefer it. `known` is the fit of the first setting with
+    its own weights, where it has been made.
     """
     best, first, kept = None, None, []  # one fit at a time: rows and columns are large
     held = bool(settings[0].problem.held.any())
     for here in settings:
         for weight in _weights(here.problem):
             one = here._replace(problem=here.problem.weighted(weight))
-            joint = _together(one, named)
+            joint = known if known and first is None else _together(one, named)
             error, first = part_error(one.problem, joint.step), first or joint
             if held:
                 kept.append((one, kept_squares(one.problem, joint.step)))
@@ -513,6 +519,21 @@ def _as_weighed_otherwise(here: _Setting, by_speed: Problem, joint: Joint) -> Jo
     return with_misfit(problem, here.start, joint, [*weights, (own, white)])
 
 
+def _as_weighed_in_motion(here: _Setting, by_speed: Joint) -> Joint:
+    """The fit by whose weights causes are found, with what its intervals owe to its parts, to slow rows and to the
+    spectrum.
+
+    Whether a cause has a size is asked of this one: a fit that is asked for rows at rest, where no law of the velocity
+    holds, gives part of a law of the motion away, and which fit predicts best changes from one recording to the next.
+    """
+    problem = here.problem
+    white = np.ones_like(here.whitening) / np.maximum(residual_rms(problem, by_speed.step.state), 1e-300)
+    own = np.asarray(problem.records.weight)
+    moving = own * (relative_speed(problem) >= STANDSTILL)
+    joint = with_parts(problem, by_speed, here.whitening)
+    return with_misfit(problem, here.start, joint, [(moving, here.whitening), (own, white)])
+
+
 def _left(
     here: _Setting,
     search: Search,
@@ -529,7 +550,8 @@ def _left(
     now = excess(problem, joint.step.rows, joint.step.linear.residual, spectrum, whitening)
     flexible = flexible_p(problem, joint.step.state, joint.step.rows, spectrum, whitening, generator)
     line = lines(problem, joint.step.linear.residual)
-    size = float(relative_rest(problem, joint.step.state, noise_rms(problem, spectrum)).max())
+    noise = noise_rms(problem, spectrum)
+    size = float(relative_rest(problem, joint.step.state, noise).max())
     predicted = predictable(problem, joint.step, whitening)
     p_left = search.p_left
     if len(found) < len(search.found):  # it was asked beside causes that have gone
@@ -544,7 +566,8 @@ def _left(
         beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)
         for step in (joint.step, first)
     )
-    return _Left(left._replace(there=there), p_left, now[0], line, flexible[2], beyond, alone)
+    misfit = (alone > 0) | (relative_rest(problem, first.state, noise) > tolerance)
+    return _Left(left._replace(there=there), p_left, now[0], line, flexible[2], beyond, misfit)
 
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:

@@ -28,6 +28,7 @@ class Fitted(eqx.Module):
     value: Float[np.ndarray, " parameters"]
     covariance: Float[np.ndarray, "parameters parameters"]
     places: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # of each cause's fields among the parameters
+    at_shapes: Float[np.ndarray, "parameters parameters"] | None = None  # the covariance at each cause's shapes as told
 
 
 def with_amplitudes(state: State, causes: list[Effect], model: RobotModel) -> list[Effect]:

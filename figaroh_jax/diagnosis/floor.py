@@ -49,6 +49,12 @@ def noise_floor(
     return spectrum, response  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
 
 
+def _passed(problem: Problem) -> float:
+    """Share of white noise's power that the row filter passes: so many of the rows are independent."""
+    frequency = np.linspace(0, float(problem.records.rate) / 2, 400)
+    return float(np.interp(frequency, np.asarray(problem.records.omega) / (2 * np.pi), problem.gain).mean())
+
+
 def noise_rms(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, " nv"]:
     """RMS of noise with the spectrum in the rows of each joint, N m or N."""
     frequency = np.linspace(0.05, float(problem.records.rate) / 2, 400)
@@ -114,8 +120,10 @@ def _from_rich_model(
     y = rows.y.reshape(-1)
     residual = (y - basis @ (basis.T @ y)).reshape(rows.y.shape) * scale[:, None]
     if not long:
-        degrees = count - (basis.reshape(len(rows.y), -1, basis.shape[1]) ** 2).sum((1, 2))
-        return noise.white((residual**2).sum(1) / np.maximum(degrees, count / 4), float(problem.records.rate) / 2)
+        independent = count * _passed(problem)
+        degrees = independent - (basis.reshape(len(rows.y), -1, basis.shape[1]) ** 2).sum((1, 2))
+        degrees = np.maximum(degrees, independent / 4)
+        return noise.white((residual**2).sum(1) / degrees, float(problem.records.rate) / 2, degrees)
     n, _, length, nv = problem.records.shape
     return _fit(problem, residual, np.moveaxis(basis.reshape(nv, n, length, -1), 0, 2))
 

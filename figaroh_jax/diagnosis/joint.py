@@ -83,19 +83,51 @@ def with_misfit(
     asks for that). What it leaves beyond pulls them by what the rows weigh, the same way in every block, so that no
     scatter of blocks shows it: which weights are right nobody knows, so the mean square of the moves is added to the
     variance. A fit whose own deviation is more than `AS_SURE` times as large says less of that, and counts less.
-    `weights` are those of the rows, with a whitening.
+    `weights` are those of the rows, with a whitening. Amplitudes at the shapes that are told move by less: beside
+    them shapes are not asked for.
     """
-    fitted = joint.fitted
-    variance, moves = np.diag(fitted.covariance), np.zeros_like(fitted.covariance)
+    fitted, theta = joint.fitted, joint.step.state.theta
+    moves, shaped = np.zeros_like(fitted.covariance), _at_shapes(joint.causes, fitted)
+    amplitudes = np.zeros_like(shaped)
     for weight, whitening in weights:
         other = problem.weighted(weight)
-        base = solved(other, start, joint.step.state.theta[: len(start.theta)])
-        one = _together(other, base, joint.causes, whitening).fitted
-        share = AS_SURE**2 * variance / np.maximum(np.diag(one.covariance), 1e-300)
-        move = np.sqrt(np.minimum(share, 1.0)) * (one.value - fitted.value)
-        move = np.where(np.isfinite(move), move, 0.0)  # a fit without rows of a joint says nothing of it
-        moves += np.outer(move, move)
-    return joint._replace(fitted=replace(fitted, covariance=fitted.covariance + moves / max(len(weights), 1)))
+        base = solved(other, start, theta[: len(start.theta)])
+        one = _together(other, base, joint.causes, whitening)
+        moves += _moves(fitted.covariance, one.fitted.covariance, one.fitted.value - fitted.value)
+        alone = np.append(one.step.state.theta - theta, np.zeros(len(fitted.value) - len(theta)))
+        amplitudes += _moves(shaped, _at_shapes(joint.causes, one.fitted), alone)
+    count = max(len(weights), 1)
+    return joint._replace(
+        fitted=replace(fitted, covariance=fitted.covariance + moves / count, at_shapes=shaped + amplitudes / count)
+    )
+
+
+def _moves(
+    own: Float[np.ndarray, "P P"], other: Float[np.ndarray, "P P"], move: Float[np.ndarray, " P"]
+) -> Float[np.ndarray, "P P"]:
+    """Squares of what another fit moves, as far as it is as sure."""
+    share = AS_SURE**2 * np.diag(own) / np.maximum(np.diag(other), 1e-300)
+    move = np.sqrt(np.clip(share, 0.0, 1.0)) * move
+    move = np.where(np.isfinite(move), move, 0.0)  # a fit without rows of a joint says nothing of it
+    return np.outer(move, move)
+
+
+def _at_shapes(causes: Sequence[Effect], fitted: Fitted) -> Float[np.ndarray, "P P"]:
+    """Covariance of the parameters, those of each cause's amplitudes at its shapes as fitted."""
+    out = fitted.covariance.copy()
+    for effect, place in zip(causes, fitted.places, strict=True):
+        known = list(place[len(place) - len(shapes(type(effect))) :])
+        own = list(place[: len(place) - len(known)])
+        if known and own and np.isfinite(fitted.covariance[np.ix_(place, place)]).all():  # else no row says anything
+            out[np.ix_(own, own)] = _given(fitted.covariance, own, known)
+    return out
+
+
+def _given(covariance: Float[np.ndarray, "P P"], at: Sequence[int], known: Sequence[int]) -> Float[np.ndarray, "k k"]:
+    """Covariance of some parameters where others are known."""
+    across = covariance[np.ix_(at, known)]
+    within = np.linalg.pinv(covariance[np.ix_(known, known)], hermitian=True)
+    return covariance[np.ix_(at, at)] - across @ within @ across.T
 
 
 def with_parts(problem: Problem, joint: Joint, whitening: Float[np.ndarray, "F nv"]) -> Joint:
@@ -304,9 +336,9 @@ def _beyond_zero(
     names += shapes(type(effect))
     at, known = np.array(place)[list(own)], np.array(place)[list(given)].astype(int)
     value = np.array([float(getattr(effect, names[k])) for k in own])
-    covariance, across = fitted.covariance[np.ix_(at, at)], fitted.covariance[np.ix_(at, known)]
+    covariance = fitted.covariance[np.ix_(at, at)]
     if len(known):
-        within = np.linalg.pinv(fitted.covariance[np.ix_(known, known)], hermitian=True)
-        covariance = covariance - across @ within @ across.T
+        shaped = fitted.at_shapes
+        covariance = _given(fitted.covariance, list(at), list(known)) if shaped is None else shaped[np.ix_(at, at)]
     size = value @ np.linalg.pinv(covariance, hermitian=True) @ value
     return float(size / chdtri(len(own), 1 - SIZE_REGION))

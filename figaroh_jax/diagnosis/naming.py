@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..effects.base import Effect
 from ..effects.catalogue import find
@@ -45,7 +45,16 @@ from .thresholds import (
     T_NAMED,
 )
 
-__all__ = ["Standing", "beside_rest", "beyond_simpler", "cause_torque", "of_its_own", "reason_against", "standings"]
+__all__ = [
+    "Standing",
+    "beside_rest",
+    "beyond_simpler",
+    "cause_torque",
+    "of_its_own",
+    "reason_against",
+    "standings",
+    "stands_alone",
+]
 
 
 @dataclass(frozen=True)
@@ -69,7 +78,8 @@ class Standing:
     cancels: bool = False  # whether it is a share of all torque, and larger than it: a reading of less than half
     complete: bool = False  # whether smooth functions find next to nothing in what it leaves
     taken: float = 0.0  # held-out squares of its joints that it removes
-    leaves: float = 0.0  # squares beyond noise at its joints over these, where most other joints have none
+    leaves: float = 0.0  # squares beyond noise at its joints over these
+    alone: bool = True  # whether its joints are likely to have no other misfit (`stands_alone`)
 
 
 def reason_against(
@@ -87,6 +97,7 @@ def reason_against(
     are those that were surely there and are gone in recordings kept out.
     """
     least, most = (GAIN_NAMED_ROBOT, MODULATION_ROBOT) if one.whole else (GAIN_NAMED, MODULATION)
+    strict_law = one.whole or one.alone  # what else is wrong at a joint makes its law's amplitude vary
     varies = "its amplitude varies with position, speed, load or time (that would add"
     checks = [
         (one.physical, "its fitted sign is physically impossible"),
@@ -96,11 +107,11 @@ def reason_against(
             f"its torque is {one.share:.2%} of the joint's, below the tolerance of {tolerance:.2%}",
         ),
         (
-            one.modulation_held_out <= (ALL_BUT if one.varies else MODULATION_HELD_OUT),
+            one.modulation_held_out <= (ALL_BUT if one.varies and strict_law else MODULATION_HELD_OUT),
             f"{varies} {one.modulation_held_out:.2f} of its gain)",
         ),
         (
-            one.leaves <= LAW_LEAVES,
+            one.leaves <= LAW_LEAVES or not one.alone,
             f"where it acts {one.leaves:.2f} of what it removes stays beyond the noise, though most other joints have"
             " no misfit: another law acts there",
         ),
@@ -129,19 +140,20 @@ def reason_against(
     return next((reason for passed, reason in checks if not passed), "")
 
 
-def of_its_own(
-    beyond: Float[np.ndarray, " nv"], baseline: Float[np.ndarray, " nv"], joints: Sequence[int], taken: float
-) -> float:
-    """Squares `beyond` the noise at a cause's joints over the held-out squares that it has `taken` there; zero where
-    they may be another misfit's.
+def stands_alone(misfit: Bool[np.ndarray, " nv"], joints: Sequence[int]) -> bool:
+    """Whether a cause that acts at the `joints` is likely to be the only thing wrong there.
 
-    Whether a joint is likely to have a misfit of its own beside the cause is told by the others: where the `baseline`
-    leaves most of them (of all joints, if it acts on all) noise alone, what stays where it acts is what its law lacks.
+    That is told by the other joints (by all, if it acts on all): where most have a `misfit` in the baseline, so may
+    these have one beside it.
     """
-    acts = np.isin(np.arange(len(beyond)), list(joints))
-    others = baseline if acts.all() else baseline[~acts]
-    alone = bool(np.mean(others > 0) < 0.5)
-    return float(beyond[acts].sum() / max(taken, 1e-300)) if alone else 0.0
+    acts = np.isin(np.arange(len(misfit)), list(joints))
+    return bool(np.mean(misfit if acts.all() else misfit[~acts]) < 0.5)
+
+
+def of_its_own(beyond: Float[np.ndarray, " nv"], joints: Sequence[int], taken: float) -> float:
+    """Squares `beyond` the noise at a cause's joints over the held-out squares that it has `taken` there: what its law
+    lacks, where it stands alone."""
+    return float(beyond[list(joints)].sum() / max(taken, 1e-300))
 
 
 def beside_rest(

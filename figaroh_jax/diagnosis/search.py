@@ -132,6 +132,7 @@ def find_causes(
             break
         progress("comparing causes on held-out data", len(found) / MOST_CAUSES)
         contenders = _contenders(problem, step, screened, whitening, failed, fitted)
+        contenders = [c for c in contenders if not _told_already(c, found)]
         chosen = _chosen(problem, step, contenders, found)
         if not chosen:
             break
@@ -226,6 +227,14 @@ def _contenders(
     return sorted(out, key=lambda c: c.verdicts.heldout)
 
 
+def _told_already(one: Contender, found: list[Found]) -> bool:
+    """Whether a cause is one found before, at another place from which the data could not tell it.
+
+    Beside that one it would take what little they differ by, and in the end its place.
+    """
+    return any(one.name in f.ambiguous and one.name.effect == f.name.effect for f in found)
+
+
 def _chosen(problem: Problem, step: Step, contenders: list[Contender], before: list[Found]) -> list[Contender]:
     """The best cause, and the best of other joints that explain another misfit."""
     first = _best(problem, step, contenders, before)
@@ -293,17 +302,33 @@ def _found(
 
 
 def eliminate(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> list[Found]:
-    """The causes without those that no longer predict anything once the others are in (earliest first)."""
+    """The causes without those that no longer predict anything once the others are in, the least of them first.
+
+    One that came in last may make an earlier one needless and be the lesser of the two: which of them goes must not
+    hang on their order.
+    """
     if len(found) < 2:
         return found
     full = with_causes(problem, start, [f.effect for f in found], whitening)
-    for one in list(found[:-1]):
-        without = judged_without(problem, start, full, found, one, whitening)
-        worse, better = (v.own(full.rows, one.joints) for v in (without, full.verdicts))
-        if 1 - better.sum() / worse.sum() < GAIN or t_value(worse, better) < T_BETTER:
-            found = [f for f in found if f is not one]
-            full = with_causes(problem, start, [f.effect for f in found], whitening)
+    asked = list(found)
+    while len(found) > 1:
+        needs = [(_needed(problem, start, full, found, one, whitening), k) for k, one in enumerate(asked)]
+        needless = sorted(n for n in needs if n[0] < 1)
+        if not needless:
+            break
+        asked = [asked[k] for _, k in needless]
+        found, asked = [f for f in found if f is not asked[0]], asked[1:]
+        full = with_causes(problem, start, [f.effect for f in found], whitening)
     return found
+
+
+def _needed(
+    problem: Problem, start: State, full: Step, found: list[Found], one: Found, whitening: Float[np.ndarray, "F nv"]
+) -> float:
+    """How much of a cause's gain is left beside all others, by what the gates ask for: below 1 it is not enough."""
+    without = judged_without(problem, start, full, found, one, whitening)
+    worse, better = (v.own(full.rows, one.joints) for v in (without, full.verdicts))
+    return min((1 - float(better.sum() / worse.sum())) / GAIN, t_value(worse, better) / T_BETTER)
 
 
 def judged_without(

@@ -23,7 +23,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -44,6 +44,7 @@ __all__ = [
     "Parameter",
     "Place",
     "amplitude",
+    "changed",
     "fixed",
     "joint_unit",
     "movable",
@@ -51,6 +52,8 @@ __all__ = [
     "shape",
     "smooth_sign",
 ]
+
+T = TypeVar("T")
 
 # a number; with leading axes where one object holds an effect at many places
 Scalar = Float[Leaf, "..."] | float
@@ -143,6 +146,15 @@ class Motion(eqx.Module):
     ) -> Float[Array, " samples"]:
         """Smooth sign of another velocity, e.g. that of a motor between two joints."""
         return smooth_sign(velocity, acceleration, self.dt, width)
+
+
+def changed(module: T, **fields: Any) -> T:
+    """A module with other fields, as `dataclasses.replace` makes it: equinox's own checks take half a millisecond."""
+    other, own = object.__new__(type(module)), vars(module)
+    names = type(module).__dataclass_fields__  # pyright: ignore[reportAttributeAccessIssue]
+    for name, value in ({name: own[name] for name in names if name in own} | fields).items():
+        object.__setattr__(other, name, value)
+    return other
 
 
 def amplitude(unit: str, lower: float = -np.inf, upper: float = np.inf) -> Any:
@@ -256,7 +268,7 @@ class Effect(eqx.Module):
     follows_total: ClassVar[bool] = False  # whether it depends on all torque together, as a drive or a sensor does
     inertial: ClassVar[bool] = False  # whether its amplitudes are ten parameters of its link: the regressor's columns
     body: ClassVar[bool] = False  # whether these are a body's that exists: mass > 0, pseudo-inertia >= 0
-    levels: ClassVar[tuple[str, ...]] = ("torque", "pose")  # of diagnoses that look for it
+    levels: ClassVar[tuple[str, ...]] = ("torque", "pose", "rollout")  # of diagnoses that look for it
     correction: ClassVar[float] = 1.0  # its linear parameters behind one of what a calibration of postures reports
     searched: ClassVar[bool] = True  # whether a diagnosis looks for it, that is, whether it is in the catalogue
     # relations to other effects, by name; the last two hold both ways, whichever class states them (`related`)
@@ -317,6 +329,10 @@ class Effect(eqx.Module):
     def step(self, velocity: Float[Array, " nv"], dt: Float[Array, ""]) -> Effect:
         """The effect with its state after `dt` seconds at a velocity, for effects that have a state (`memory`)."""
         return self
+
+    def begin(self, velocity: Float[Array, " nv"]) -> Float[Array, ""]:
+        """The state where a simulation begins at a velocity: the sign of its joint's, sliding; yours may be another."""
+        return jnp.sign(velocity[self.at[0]])
 
     def torque_response(self, omega: Float[Array, " freqs"]) -> Complex[Array, " freqs"]:
         """Factor of the torque sensor at the angular frequencies `omega` (rad/s)."""

@@ -15,4 +15,6 @@ from . import (
 )
 from .registry import CATALOGUE, find, register, related
 
-__all__ = ["CATALOGUE", "find", "register", "related"]
+__all__ = ["CATALOGUE", "LIBRARY", "find", "register", "related"]
+
+LIBRARY = frozenset(CATALOGUE)  # before any of a user's: in rollouts these have names and numbers of their own

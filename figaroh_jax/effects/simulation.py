@@ -25,7 +25,7 @@ from ..rigid.model import RobotModel
 from .base import Effect, Motion
 from .extended import ExtendedModel, changed_robot, opened, read_position, read_torque, require_single_axes, with_torque
 
-__all__ = ["Command", "Simulation", "simulate"]
+__all__ = ["Command", "Reversal", "Simulation", "simulate"]
 
 Command = Callable[[Float[Array, ""], Float[Array, " nv"], Float[Array, " nv"]], Float[Array, " nv"]]
 
@@ -103,7 +103,7 @@ def _simulate(
         a = (after - v) / dt
         return (q + dt * after, after, a, memory), (q, v, a, tau)
 
-    start = (q, v, jnp.zeros_like(v), [jnp.sign(v[e.at[0]]) for e in extended.effects if e.has("step")])
+    start = (q, v, jnp.zeros_like(v), [e.begin(v) for e in extended.effects if e.has("step")])
     _, (qs, vs, accelerations, taus) = jax.lax.scan(advance, start, (time, record))
     load = jnp.zeros_like(qs) if not _reads(extended) else inverse_dynamics(robot, qs, vs, accelerations)
     motion = Motion(robot, time, qs, vs, accelerations, load, taus, dt, jnp.asarray(extended.width))
@@ -136,7 +136,7 @@ def _step(
     def excess(a: Array) -> tuple[Array, tuple[Array, _Friction]]:
         # one evaluation of both instants compiles in half the time of two
         instants = [q, q], [v, v + dt * a], [last, a]
-        motion = _Reversal.at(extended, robot, time, *(jnp.stack(x) for x in instants))
+        motion = Reversal.at(extended, robot, time, *(jnp.stack(x) for x in instants))
         friction, smooth = _apart(extended, motion)
         torque = smooth[1] + friction.drive - tau
         return torque, (torque, friction)
@@ -150,7 +150,7 @@ def _step(
     return free - mobility @ f
 
 
-class _Reversal(Motion):
+class Reversal(Motion):
     """One instant whose dry frictions are told their directions, so that they can be taken apart."""
 
     joint: Float[Array, ""]  # direction of the joints: 1, -1 or 0
@@ -164,12 +164,12 @@ class _Reversal(Motion):
         return self.motor * jnp.ones_like(velocity)
 
     @classmethod
-    def at(cls, extended: ExtendedModel, robot: RobotModel, time: Array, q: Array, v: Array, a: Array) -> _Reversal:
+    def at(cls, extended: ExtendedModel, robot: RobotModel, time: Array, q: Array, v: Array, a: Array) -> Reversal:
         load, zero = inverse_dynamics(robot, q, v, a), jnp.zeros(())
         time = jnp.broadcast_to(time, q.shape[:1])
         return cls(robot, time, q, v, a, load, load, 0.0, jnp.asarray(extended.width), zero, zero)
 
-    def told(self, joint: Float[Array, ""], motor: Float[Array, ""]) -> _Reversal:
+    def told(self, joint: Float[Array, ""], motor: Float[Array, ""]) -> Reversal:
         return dataclasses.replace(self, joint=joint, motor=motor)
 
 
@@ -182,7 +182,7 @@ class _Friction(NamedTuple):
     drive: Float[Array, " nv"]  # torque of frictions that push, i.e. whose level is negative
 
 
-def _apart(extended: ExtendedModel, motion: _Reversal) -> tuple[_Friction, Float[Array, "samples nv"]]:
+def _apart(extended: ExtendedModel, motion: Reversal) -> tuple[_Friction, Float[Array, "samples nv"]]:
     """Dry frictions at the first instant, and the torque of all the rest at every instant.
 
     A friction is half the jump of the torque from one direction to the other, the rest the mean of both.

@@ -140,11 +140,13 @@ def _penalised(
     return likely, coefficients, np.broadcast_to(inverse, (observed.shape[1], *inverse.shape))
 
 
-def white(variance: Float[np.ndarray, " nv"], nyquist: float) -> Spectrum:
-    """The same power at all frequencies: a scale per joint and nothing else."""
-    coefficients = np.zeros((6, len(variance)))
-    coefficients[0] = np.log(variance)
-    return Spectrum(coefficients, np.zeros((len(variance), 6, 6)), nyquist)
+def white(
+    variance: Float[np.ndarray, " nv"], nyquist: float, degrees: Float[np.ndarray, " nv"] | float = np.inf
+) -> Spectrum:
+    """The same power at all frequencies: a scale per joint and nothing else, known by so many `degrees`."""
+    coefficients, covariance = np.zeros((6, len(variance))), np.zeros((len(variance), 6, 6))
+    coefficients[0], covariance[:, 0, 0] = np.log(variance), 2 / np.asarray(degrees)
+    return Spectrum(coefficients, covariance, nyquist)
 
 
 def whitening(
@@ -155,7 +157,7 @@ def whitening(
     The floor is 5 % of the median filtered power between 1 Hz and the cutoff, so that the band which the row filter
     has emptied is not blown up.
     """
-    if not spectrum.covariance.any():
+    if not spectrum.coefficients[1:].any():  # white
         return np.broadcast_to(
             1 / np.sqrt(spectrum.power(frequency[:1])), (len(frequency), spectrum.coefficients.shape[1])
         )
@@ -173,15 +175,21 @@ def leverage(basis: Float[np.ndarray, "samples nv columns"]) -> Float[np.ndarray
 def spectral_line(
     residual: Float[np.ndarray, "recordings samples nv"], rate: float, cutoff: float
 ) -> tuple[float, float, int]:
-    """p-value, frequency (Hz) and joint of the strongest line in time, over a running median of 41 bins."""
-    powers = [periodogram(rows, rate) for rows in residual]
-    frequency, power = powers[0][0], np.mean([p for _, p in powers], axis=0)
+    """p-value, frequency (Hz) and joint of the strongest line in time, over a running median of 41 bins.
+
+    A recording that is kept out of the fit, whose rows are zero, tells nothing; of recordings that differ in length or
+    power as many count as independent as their mean has degrees of freedom.
+    """
+    told = [rows for rows in residual if rows.any()]
+    frequency = np.fft.rfftfreq(residual.shape[1], 1 / rate)[1:]
     used = (frequency > LOWEST) & (frequency < min(0.9 * cutoff, 0.6 * rate / 2))
-    if used.sum() < 41:
+    if used.sum() < 41 or not told:
         return 1.0, 0.0, 0
+    power = np.mean([periodogram(rows, rate)[1] for rows in told], axis=0)
+    each = np.stack([(rows**2).sum(0) for rows in told])
+    shape = max(1.0, float((each.sum(0) ** 2 / np.maximum((each**2).sum(0), 1e-300)).min()))
     padded = np.pad(power, ((20, 20), (0, 0)), mode="reflect")
     level = np.median(np.lib.stride_tricks.sliding_window_view(padded, 41, axis=0), axis=-1)
-    shape = float(len(powers))
     ratio = np.where(used[:, None], power / np.maximum(level, 1e-300), 0)
     row, joint = np.unravel_index(np.argmax(ratio), ratio.shape)
     from scipy.special import fdtrc, gammaincinv  # scipy is slow to import

@@ -8,6 +8,7 @@ the arm, and a wrong model of one joint does not reach the fits of the others.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -16,6 +17,7 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from ..compiled.batching import program
+from ..effects.base import Place
 from ..rigid.dynamics import joint_masses, joint_torques
 from ..rigid.model import Joint, RobotModel
 from .data import Run, regular
@@ -66,6 +68,7 @@ def alone(loop: Loop, runs: Sequence[Run], carried: Sequence[np.ndarray], joint:
         robot=_one_joint(loop.robot, joint), drives=own, joints=joints, start=np.asarray(loop.start)[[joint]],
         dt=loop.dt, integrator=loop.integrator, law=loop.law,
         limited=loop.limited, measured=(0,), summed=(-1,), carried=one,
+        effects=tuple(replace(e, at=Place((0,))) for e in loop.effects if tuple(e.places.tolist()) == (joint,)),
     )  # fmt: skip
     mine = tuple(
         run._replace(

@@ -138,17 +138,28 @@ def _on_all(here: Setting, model: Model) -> Standing:
 def _alike_by_recording(here: Setting, now: Standing) -> tuple[Standing, np.ndarray]:
     """The numbers where more than noise is left: each recording tells as much of a joint, not the fastest the most.
 
-    With them how differently recordings tell each, (columns of the fit,).
+    With them how differently recordings, and quarters of each recording's time, tell each, (columns of the fit,): a
+    friction that falls as all the recordings go on shows in the latter alone.
     """
     structure, last, free = now.model.structure, now.model.fit, now.model.free
     for _ in range(_EVENED):
         some = evened(here, structure, last)
         last = _from(some, structure._replace(data=some.cut(structure.loop)), last, free)
-    spread = spread_of_recordings(structure.table, last, here.folds)
+    spread = np.hypot(
+        *(spread_of_recordings(structure.table, last, folds) for folds in (here.folds, _quarters(here, structure)))
+    )
     last = _from(here, structure, last, free, 0)
     beyond = excess_of(here, structure, last)
     model = Model(structure, last, free, float(beyond.max()))
     return Standing(model, outputs(here, last.sums.cost), now.held, beyond), spread
+
+
+def _quarters(here: Setting, structure: Structure) -> np.ndarray:
+    """Which quarter of its recording each block and window is in, (blocks, windows)."""
+    blocks = np.arange(structure.data.reading.shape[0] // structure.data.block)[:, None] * structure.data.block
+    first = np.array([one.first for one in here.stretches])
+    length = np.array([len(here.runs[one.run].time) for one in here.stretches])
+    return np.clip((first + blocks) * 4 // length, 0, 3)
 
 
 def _from(here: Setting, structure: Structure, last: Fit, free: Sequence[int], most: int = LATE) -> Fit:

@@ -8,6 +8,9 @@
     rest.step(data, command)  # in place of data.ctrl[:] = command; mujoco.mj_step(model, data)
     rest.reading(data)  # what the encoders show
 
+An effect of your own is in `loop.json` with its equation and numbers; say its torque as a function of NumPy's numbers,
+`Rest(model, "loop.json", own={"detent": lambda q, v, strength, notch: ...})`: N m or N against the motion at its joint.
+
 Friction that follows the speed (Stribeck) or the load, play of a spring, constant torques, dead bands, limited
 voltages and what is late at such drives, and offsets of encoders. It needs NumPy and MuJoCo alone.
 """
@@ -15,6 +18,7 @@ voltages and what is late at such drives, and offsets of encoders. It needs NumP
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +30,9 @@ __all__ = ["Rest"]
 class Rest:
     """Moves a model of `robot.xml` with everything that `loop.json` says; one for each simulation."""
 
-    def __init__(self, model: Any, file: str | Path = "loop.json"):
+    def __init__(
+        self, model: Any, file: str | Path = "loop.json", own: Mapping[str, Callable[..., float]] | None = None
+    ):
         content = json.loads(Path(file).read_text(encoding="utf-8"))
         joints, drives = list(content["joints"].items()), list(content["drives"].items())
         self.model, self.late = model, []
@@ -36,6 +42,15 @@ class Rest:
         self.joints = {name: np.array([one[name] for _, one in joints]) for name in joints[0][1]} if joints else {}
         words = ("kp", "length", "constant", "delay", "dead_band")
         self.drives = {name: np.array([float(one[name]) for _, one in drives]) for name in words}
+        self.own = []
+        for one in content.get("effects", ()):
+            if one["effect"] not in (own or {}) or len(one["at"]) != 1:
+                raise ValueError(
+                    f"{one['effect']} ({one['equation']}) at {', '.join(one['at'])} is an effect that MuJoCo has no"
+                    f" words for: give its torque, Rest(..., own={{'{one['effect']}': lambda q, v, ...: ...}})"
+                )
+            place = model.joint(one["at"][0])
+            self.own.append((place.qposadr[0], place.dofadr[0], (own or {})[one["effect"]], one["parameters"]))
         self.volts = np.array([np.inf if one["voltage"] is None else one["voltage"] for _, one in drives])
         self.bent = (self.drives["dead_band"] > 0) | np.isfinite(self.volts)
         stateful = [name for (name, one), bent in zip(drives, self.bent, strict=True) if bent and _has_state(one)]
@@ -43,9 +58,9 @@ class Rest:
             raise ValueError(
                 f"drive {stateful[0]} has a state of its own: its dead band or voltage cannot be said here"
             )
-        own = self.drives["delay"] * self.bent  # MuJoCo's own delay would be behind what is added here
+        late = self.drives["delay"] * self.bent  # MuJoCo's own delay would be behind what is added here
         model.actuator_delay[self.drive[self.bent]] = 0.0
-        self.delay = own / model.opt.timestep
+        self.delay = late / model.opt.timestep
 
     def step(self, data: Any, command: Any) -> None:
         """One step of the model; `command` (drives,) in the order of `loop.json`."""
@@ -78,6 +93,8 @@ class Rest:
             data.qpos[self.place] - model.qpos_spring[self.place]
         )
         data.qfrc_applied[at] = own - j["stiffness"] * stretch - j["offset"]
+        for place, column, torque, numbers in self.own:
+            data.qfrc_applied[column] -= torque(data.qpos[place], data.qvel[column], **numbers)
         if not (j["stribeck_force"].any() or j["load_ratio"].any()):
             return
         if changed and j["load_ratio"].any():

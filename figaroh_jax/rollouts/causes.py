@@ -8,9 +8,11 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
+from ..effects.base import Effect
 from ..effects.catalogue import find
 from ..rigid.model import Frame, Joint, RobotModel
 from .loop import Joints, Loop
+from .own import amplitudes, is_own, registered, starts_of
 from .parameters import Entry, Table
 
 __all__ = ["BASELINE", "KINDS", "Candidate", "Catalogue", "Kind", "catalogue", "elastic_loop", "springs"]
@@ -43,6 +45,7 @@ class Kind(NamedTuple):
     telling: int | None = None  # number that tells it from what it contains
     looks_like: str = ""  # what looks the same, in words
     experiment: str = "steps of {at} of two sizes, and slow sweeps"  # that tells it from others
+    shapes: tuple[int, ...] = ()  # numbers of a user's effect that show nothing without a size: each start is asked
 
     def holds(self, other: str) -> bool:
         """Whether it can imitate another effect."""
@@ -61,7 +64,12 @@ class Candidate(NamedTuple):
     @property
     def kind(self) -> Kind:
         """What sets its effect apart."""
-        return KINDS.get(self.effect, Kind())
+        theirs = registered().get(self.effect)
+        return KINDS.get(self.effect, Kind()) if theirs is None else _kind_of(theirs)
+
+    def own(self, known: Catalogue) -> bool:
+        """Whether it is an effect of a user's, which machine code does not know."""
+        return is_own(known.table[self.entries[0]].name) if self.entries[0] < len(known.table) else False
 
 
 class Catalogue(NamedTuple):
@@ -106,6 +114,14 @@ KINDS = {
 _HERE = float("nan")
 
 
+def _kind_of(effect: type[Effect]) -> Kind:
+    """What a user's effect says of itself."""
+    count = len(amplitudes(effect))
+    plain = Kind(contains=effect.contains, signed=not effect.dissipative)
+    told = effect.separated_by or plain.experiment
+    return plain._replace(experiment=told, shapes=tuple(range(count, len(effect.parameters()))))
+
+
 def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbid: Sequence[str] = ()) -> Catalogue:
     """The candidates of a loop; `forces` (nu,) are the largest that its drives gave in the recordings."""
     table, candidates = [], []
@@ -125,6 +141,12 @@ def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbi
     for i, joint in enumerate(robot.joints if loop.carried is None else ()):
         table.append(Entry("payload", (i,)))
         candidates.append(("payload", (("payload", i),), ((0.0,),), ("mass",), joint.link))
+    for k, effect in enumerate(loop.effects):
+        ordered = sorted(effect.parameters(), key=lambda name: name not in amplitudes(type(effect)))  # noqa: B023
+        table += [Entry(f"{effect.name}.{name}", (k,)) for name in ordered]
+        if effect.name in registered() and len(effect.places) == 1:
+            own = tuple((f"{effect.name}.{name}", k) for name in ordered)
+            candidates.append((effect.name, own, starts_of(type(effect)), tuple(ordered), names[effect.places[0]]))
     index = {(e.name, e.at[0]): k for k, e in enumerate(table)}
     built = [
         Candidate(effect, (name,), tuple(index[e] for e in entries), starts, reported)
@@ -207,6 +229,7 @@ def elastic_loop(loop: Loop, coordinate: int, stiffness: float, damping: float, 
         measured=loop.measured,
         summed=summed,
         carried=loop.carried,
+        effects=loop.effects,
     )
 
 

@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
+from ..effects.base import Effect
 from ..errors import InputError, nearest
 from ..formats.xmlfile import read_xml
 from .loop import Loop
+from .own import amplitudes
 from .parameters import UNITS
 
 __all__ = ["SIMULATORS", "described", "described_text", "for_simulator", "with_drives"]
@@ -48,7 +50,19 @@ def described(loop: Loop) -> dict[str, Any]:
             "time_constant": float(np.asarray(loop.drives.time_constant)[k]),
             "activation": loop.drives.activation[k],
         }
-    return {"joints": joints, "drives": drives, "dt": float(loop.dt), "integrator": loop.integrator, "law": loop.law}
+    content = {
+        "joints": joints, "drives": drives, "dt": float(loop.dt), "integrator": loop.integrator, "law": loop.law,
+    }  # fmt: skip
+    own = [_effect(loop, e) for e in loop.effects if any(float(getattr(e, name)) for name in amplitudes(type(e)))]
+    return content | ({"effects": own} if own else {})
+
+
+def _effect(loop: Loop, effect: Effect) -> dict[str, Any]:
+    """An effect that acts by its own torque, as `Rest` of `callback.py` takes it."""
+    numbers = {name: float(getattr(effect, name)) for name in effect.parameters()}
+    at = [loop.robot.dof_names[k] for k in effect.places] if effect.acts_on in ("joint", "pair") else []
+    units = {name: parameter.unit for name, parameter in effect.parameters().items()}
+    return {"effect": effect.name, "equation": effect.equation, "at": at, "parameters": numbers, "units": units}
 
 
 def _finite(value: Any) -> float | None:
@@ -172,4 +186,10 @@ def for_simulator(content: dict[str, Any], name: str) -> dict[str, Any]:
                 elif value != 0 and number not in (*_NEUTRAL, "time_constant", "constant"):
                     unit = UNITS["force_limit" if number == "force" else number]
                     unsaid.append({"at": place, "number": number, "value": value, "unit": unit})
+    for one in content.get("effects", ()):
+        place = ", ".join(one["at"]) or "the robot"
+        unsaid += [
+            {"at": place, "number": f"{one['effect']}.{number}", "value": value, "unit": one["units"][number]}
+            for number, value in one["parameters"].items()
+        ]
     return {"simulator": name, "meaning": meaning, "values": values, "unsaid": unsaid}

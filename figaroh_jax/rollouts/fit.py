@@ -24,6 +24,7 @@ _ITERATIONS = 40
 _PAIR = 2
 _FEW = 12  # windows up to which starts and numbers always move together
 _MOSTLY = 0.5  # share of a step's gain from which the starts move alone, every other time
+_COLUMNS = 16  # free numbers, a multiple of which a program differentiates
 _GROUPS, _REFITS = 6, 10  # of recordings that are left out, steps of each fit without one
 _SETTLED, _RESTING = 1e-5, 10.0  # predicted share of the squares at which a fit without some recordings ends
 _OF_GAIN, _OF_REST = 0.02, 0.003  # shares of what a fit has gained and of what is left, where only its gain is asked
@@ -98,8 +99,10 @@ class _Lanes:
 
     def sums(self, which: np.ndarray, theta: np.ndarray, start: np.ndarray) -> list[Sums]:
         if self.code.usable:
-            lanes = zip(which, theta, start, strict=True)
-            return [Sums(*self.code.sums(one, self.free[k], x)) for k, one, x in lanes]  # pyright: ignore[reportArgumentType]
+            plain = [self.code.knows_one(one, self.free[k]) for k, one in zip(which, theta, strict=True)]
+            lanes = zip(which, theta, start, plain, strict=True)
+            return [Sums(*self.code.sums(one, self.free[k], x)) if known else self.by_program(k, one, x)  # pyright: ignore[reportArgumentType]
+                    for k, one, x, known in lanes]  # fmt: skip
         lanes = _PAIR if len(which) <= _PAIR < self.lanes else self.lanes  # few are left of many: a smaller program
         padded = np.resize(which, lanes)
         index = np.maximum(self.free[padded], 0)
@@ -108,6 +111,18 @@ class _Lanes:
             found = linear_sums(self.loop, self.table, theta[at], index, self.data, start[at])
             cost, gradient, matrix = (np.asarray(x) for x in found)
         return [Sums(cost[k], gradient[k], matrix[k]) for k in range(len(which))]
+
+    def by_program(self, lane: Any, theta: np.ndarray, start: np.ndarray) -> Sums:
+        """The sums of one lane in which effects act that machine code does not know; few sizes, each compiled once."""
+        count, states = self.free.shape[1], len(start)
+        wide = -(-count // _COLUMNS) * _COLUMNS
+        index = np.zeros(wide, int)
+        index[:count] = np.maximum(self.free[lane], 0)
+        keep = np.r_[:count, wide : wide + states]
+        with jax.enable_x64(True):
+            found = linear_sums(self.loop, self.table, theta[None], index[None], self.data, start[None])
+            cost, gradient, matrix = (np.asarray(x)[0] for x in found)
+        return Sums(cost, gradient[..., keep], matrix[..., keep[:, None], keep])  # pyright: ignore[reportArgumentType]
 
     def several(self, now: list[Sums], steps: int) -> list[Sums]:
         """The sums of every lane after some damped steps of what it keeps; starts without their first rows stay."""
@@ -352,7 +367,12 @@ def refitted_without(
     """
     left = _left_out(folds)
     many, width = len(left), max(len(one.free) for one in found)
-    if native(loop, table, data).usable and all((mine.all(0) == mine.any(0)).all() for mine in left):
+    code = native(loop, table, data)
+    if (
+        code.usable
+        and code.knows([one.theta for one in found], [one.free for one in found])
+        and all((mine.all(0) == mine.any(0)).all() for mine in left)
+    ):
         answers = np.stack(
             [_squares_without(loop, table, data, one, [np.any(mine, 0) for mine in left]) for one in found]
         )

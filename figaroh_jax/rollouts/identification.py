@@ -16,6 +16,7 @@ from ..results import Trace
 from .data import Run, Stretch, noise_of, windows
 from .fit import Fit, System, fit, standard_errors
 from .loop import Loop
+from .own import is_own
 from .parameters import BOUNDS, OF_DRIVES, UNITS, put
 from .sensitivity import predicted
 from .setting import Setting, Structure, begun, coloured, residuals
@@ -139,6 +140,8 @@ def _result(
 def _expression(here: Setting, entry: int) -> str:
     one = here.known.table[entry]
     names, place = here.loop.robot.dof_names, one.at[0]
+    if is_own(one.name):
+        return f"{one.name} {', '.join(names[k] for k in here.loop.effects[place].places)}"
     if one.name in OF_DRIVES:
         place = int(np.abs(np.asarray(here.loop.drives.transmission)[place]).argmax())
     return f"{one.name} {here.loop.robot.link_names[place] if one.name == 'payload' else names[place]}"

@@ -11,6 +11,7 @@ as its soft constraints, solved exactly (`friction`), then the integrator. Equal
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -19,10 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..effects.base import Effect
 from ..rigid.dynamics import joint_masses, joint_torques
 from ..rigid.manifold import integrate
 from ..rigid.model import RobotModel
 from ..rigid.spatial import cross, quaternion_rotation, rotate, rotate_back
+from . import own
 from .friction import Rows, Solution, corrected, inverse, product, row_force, solve_rows, solved, stiffened, times
 
 __all__ = [
@@ -147,6 +150,20 @@ class Loop(eqx.Module):
     summed: tuple[int, ...] = eqx.field(static=True)  # a second coordinate added to each (-1: none)
     carried: Carried | None = None  # in place of the robot's rigid body
     linear: Linear | None = None  # in place of the robot's rigid body, for derivatives
+    effects: tuple[Effect, ...] = ()  # that act by their own torque beside the joints' numbers (`own`)
+
+    def with_effects(self, *effects: Effect) -> Loop:
+        """The loop with these effects in place of those it had: yours, or any of the catalogue with a `torque`.
+
+        What has no sign of the velocity acts from the beginning of each step on; dry friction holds the joint.
+
+        >>> import figaroh_jax as fj
+        >>> loop, _ = fj.load_loop(fj.DEMO, {"elbow": {"kind": "position", "kp": 20.0, "kd": 0.5}}, joints=["elbow"])
+        >>> ripple = fj.place(fj.CATALOGUE["torque_ripple"], loop.robot, ["elbow"], sine=0.2, order=6.0)
+        >>> loop.with_effects(ripple).effects[0].name
+        'torque_ripple'
+        """
+        return dataclasses.replace(self, effects=own.placed(self.robot, effects))
 
     @property
     def columns(self) -> np.ndarray:
@@ -163,7 +180,7 @@ class State(NamedTuple):
 
     q: Array
     v: Array
-    act: Array
+    act: Array  # activations of the drives, then the states of effects that have one
 
 
 class Step(NamedTuple):
@@ -273,13 +290,19 @@ class _Smooth(NamedTuple):
 def _smooth(loop: Loop, state: State, u: Array, weight: Array) -> _Smooth:
     q, v, act = state
     angle = _angles(loop, q)
+    act, memory = jnp.split(act, [len(u)])
     control, rate = _control(loop, act, u)
     drive = _drive(loop, angle, v, control)
     bias = _bias(loop, q, v)
     slope = drive.slope if loop.integrator == "implicitfast" else jnp.zeros_like(drive.slope)
     torque = drive.torque + _passive(loop, angle, v)
-    rows = _rows(loop, angle, v, drive.torque, bias, weight)
-    return _Smooth(torque, bias, slope, _next_activation(loop, act, rate), rows, _shift(loop, v), rate)
+    level = jnp.zeros_like(v)
+    if loop.effects:
+        more = own.acting(loop.effects, loop.robot, q, v, bias, drive.torque, memory)
+        torque, level = torque - more.torque, more.level
+    rows = _rows(loop, angle, v, drive.torque, bias, weight, level)
+    rate = jnp.concatenate([rate, jnp.zeros_like(memory)])
+    return _Smooth(torque, bias, slope, _next_activation(loop, act, rate[: len(u)]), rows, _shift(loop, v), rate)
 
 
 def _resistance(loop: Loop, slope: Array) -> Array:
@@ -297,12 +320,12 @@ def _resisted(loop: Loop, slope: Array, a: Array) -> Array:
     return jnp.asarray(loop.joints.damping)[:, None] * a - times(way.T[..., None], slope * rate)
 
 
-def _rows(loop: Loop, angle: Array, v: Array, motor: Array, bias: Array, weight: Array) -> Rows:
-    """Dry friction and limits of each coordinate as soft constraints of its acceleration."""
+def _rows(loop: Loop, angle: Array, v: Array, motor: Array, bias: Array, weight: Array, more: Array) -> Rows:
+    """Dry friction (`more` of it by effects) and limits of each coordinate, as soft constraints of its acceleration."""
     j = loop.joints
     peak, speed, ratio = (jnp.asarray(x)[:, None] for x in (j.stribeck_force, j.stribeck_speed, j.load_ratio))
     level = jnp.asarray(j.friction)[:, None] + peak * jnp.exp(-((v / speed) ** 2)) + ratio * jnp.abs(motor + bias)
-    level = jnp.maximum(level, 0.0)
+    level = jnp.maximum(level + more, 0.0)
     if loop.law == "hard":
         pull, soft = -v / loop.dt, _HARD * weight * jnp.ones_like(v)
     else:
@@ -426,7 +449,7 @@ def _moved(loop: Loop, state: State, a: Array, activation: Array) -> State:
     """Semi-implicit: the new velocity carries the position; `a` is in MuJoCo's axes at free joints."""
     v = state.v + loop.dt * a
     if loop.robot.nq == loop.robot.nv:
-        return State(state.q + loop.dt * v, v, activation)
+        return State(state.q + loop.dt * v, v, _remembered(loop, state, v, activation))
     q = state.q
     for joint, at in zip(loop.robot.joints, loop.robot.dofs.positions, strict=True):
         k = joint.coordinate
@@ -443,7 +466,15 @@ def _moved(loop: Loop, state: State, a: Array, activation: Array) -> State:
     for joint in loop.robot.joints:
         if joint.kind == "free":
             still = still.at[joint.coordinate : joint.coordinate + 6].set(0.0)
-    return State(integrate(loop.robot, q.T, loop.dt * still.T).T, v, activation)
+    return State(integrate(loop.robot, q.T, loop.dt * still.T).T, v, _remembered(loop, state, v, activation))
+
+
+def _remembered(loop: Loop, state: State, v: Array, activation: Array) -> Array:
+    """Activations at the end of a step, and behind them the states of effects."""
+    if not loop.effects:
+        return activation
+    memory = state.act[len(loop.drives.names) :]
+    return jnp.concatenate([activation, own.after(loop.effects, memory, v, loop.dt)])
 
 
 def _runge_kutta(
@@ -467,7 +498,9 @@ def _runge_kutta(
         rates.append(State(now.v, a, smooth.rate))
     weights = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
     mean = jax.tree.map(lambda *parts: sum(w * r for w, r in zip(weights, parts, strict=True)), *rates)
-    after = State(state.q + loop.dt * mean.q, state.v + loop.dt * mean.v, _next_activation(loop, state.act, mean.act))
+    v, drives = state.v + loop.dt * mean.v, len(loop.drives.names)
+    active = _next_activation(loop, state.act[:drives], mean.act[:drives])
+    after = State(state.q + loop.dt * mean.q, v, _remembered(loop, state, v, active))
     return after, Step(jax.tree.map(lambda *x: jnp.stack(x), *solutions), solutions[-1].a)
 
 

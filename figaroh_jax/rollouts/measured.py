@@ -17,6 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from ..effects.base import Effect
 from ..effects.extended import ExtendedModel, changed_robot
 from ..errors import InputError, nearest
 from ..recordings.dataset import Recording
@@ -24,6 +25,7 @@ from ..rigid.model import Leaf, RobotModel
 from .alone import alone, carried_by, separable
 from .data import Run, Stretch, noise_of, regular, windows
 from .loop import Loop, State, advance, integrated, mobility
+from .own import placed
 from .parameters import UNITS, Entry, current, put, values
 from .sensitivity import Windows, began, carrying, read_of
 from .simulation import delayed
@@ -172,12 +174,13 @@ def _with_model(loop: Loop, model: ExtendedModel) -> Loop:
     """The loop with the model's robot, and its effects in place of what acts at the loop's joints."""
     robot: RobotModel = changed_robot(model)
     leaves: dict[str, Array] = {leaf: jnp.zeros(robot.nv) for fields in EFFECTS.values() for leaf in fields.values()}
+    acts: list[Effect] = []
     for effect in model.effects:
         fields = {"offset": "offset"} if effect.name == "torque_offset" else EFFECTS.get(effect.name)
         if fields is None:
-            if effect.has("change"):
-                continue
-            raise InputError(f"a rollout has no form for '{effect.name}'; it simulates {', '.join(EFFECTS)}")
+            if not effect.has("change"):
+                acts.append(effect)
+            continue
         for name, leaf in fields.items():
             leaves[leaf] = leaves[leaf].at[effect.places[0]].add(getattr(effect, name))
     if "stribeck_friction" not in {effect.name for effect in model.effects}:
@@ -188,7 +191,8 @@ def _with_model(loop: Loop, model: ExtendedModel) -> Loop:
         loop.joints,
         [*(leaves[name] for name in names), jnp.zeros(robot.nv)],
     )
-    return eqx.tree_at(lambda m: (m.robot, m.joints), loop, (robot, joints))
+    own = placed(loop.robot, acts) if acts else ()
+    return replace(eqx.tree_at(lambda m: (m.robot, m.joints), loop, (robot, joints)), effects=own)
 
 
 def _simulated(loop: Loop, data: Windows, start: Array) -> Array:

@@ -18,8 +18,9 @@ import jax
 import numpy as np
 
 from ..compiled.batching import on_host
-from ..compiled.machine_code import library
+from ..compiled.machine_code import is_gnu, library
 from .loop import Loop
+from .own import is_own, silent
 from .parameters import TEN, Table, unit_payload
 
 if TYPE_CHECKING:
@@ -75,6 +76,20 @@ class native:  # noqa: N801  (used as a function that keeps what it has prepared
             weighed = any(entry.name == "payload" for entry in table) and loop.carried is None
             self.unit_payload = _unit_payloads(loop) if weighed else np.zeros((0, 10))
 
+    def knows(self, thetas: Sequence[np.ndarray], frees: Sequence[np.ndarray] = ()) -> bool:
+        """Whether it gives these lanes: no effect of a user's acts in any of them, and no number of one is free."""
+        return self.usable and all(self.knows_one(x) for x in thetas) and not any(self._theirs(x) for x in frees)
+
+    def knows_one(self, theta: np.ndarray, free: np.ndarray | None = None) -> bool:
+        """The same of one lane."""
+        if not self.usable or (free is not None and self._theirs(free)):
+            return False
+        own = {(one.name, one.at[0]): float(theta[k]) for k, one in enumerate(self.table) if is_own(one.name)}
+        return silent(self.loop.effects, own)
+
+    def _theirs(self, free: np.ndarray) -> bool:
+        return bool(self.loop.effects) and any(k >= 0 and is_own(self.table[int(k)].name) for k in free)
+
     def sums(self, theta: np.ndarray, free: np.ndarray, start: np.ndarray) -> Answers:
         """Sums of one lane: `free` (columns,) entries that are differentiated, -1 for a column of zeros."""
         kept = np.flatnonzero(np.asarray(free) >= 0)
@@ -127,6 +142,8 @@ class native:  # noqa: N801  (used as a function that keeps what it has prepared
         own = {name: x.copy() for name, x in self.numbers.items()}
         for entry, value in zip(self.table, theta, strict=True):
             at = list(entry.at)
+            if is_own(entry.name):
+                continue
             if entry.name in _PLAIN:
                 own["joint"][_PLAIN.index(entry.name), at] = value
             elif entry.name in _DRIVE:
@@ -190,7 +207,7 @@ def _fits(loop: Loop, table: Table, data: Windows) -> bool:
         return False
     places = {"reading": loop.measured}
     told = all(set(entry.at) <= set(places.get(entry.name, entry.at)) for entry in table)
-    return told and all(entry.name in _KINDS for entry in table)
+    return told and all(entry.name in _KINDS or is_own(entry.name) for entry in table)
 
 
 def _numbers(loop: Loop) -> dict[str, np.ndarray]:
@@ -235,14 +252,15 @@ def _fixed(loop: Loop, data: Windows) -> dict[str, np.ndarray]:
     return found | {name: f(x) for name, x in more.items() if x is not None}
 
 
-_FLAGS = ("-O3", *(("-mprefer-vector-width=256",) if platform.machine() in ("x86_64", "AMD64") else ()))  # 8 % faster
+_NARROW = ("-mprefer-vector-width=256",) if platform.machine() in ("x86_64", "AMD64") else ()  # 8 % faster
 
 
 @lru_cache
 def _code(size: int, one: bool) -> Any:
     """The compiled function, or None."""
     source = (Path(__file__).parent / "rollout.c").read_text()
-    found = library(source, f"-DSIZE={size}", f"-DONE={int(one)}", *_FLAGS)
+    level = "-O3" if size or not is_gnu() else "-O1"  # functions that take the time say -O3: a third of the compilation
+    found = library(source, f"-DSIZE={size}", f"-DONE={int(one)}", level, *_NARROW)
     if found is None:
         return None
     function = found["rolled"]

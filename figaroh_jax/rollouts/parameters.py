@@ -6,6 +6,8 @@ drive or a link, or several of them that share one number.
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from . import own
 from .loop import Loop
 
 __all__ = ["BOUNDS", "OF_DRIVES", "TEN", "UNITS", "Entry", "Table", "current", "put", "unit_payload", "values"]
@@ -23,7 +26,10 @@ OF_DRIVES = (*_DRIVES, "force_limit", "kp", "kd")  # places that are drives
 
 
 class Entry(NamedTuple):
-    """One number: `name` is a field of `Joints` or `Drives`, or kp, kd, force_limit, payload, or one of `TEN`."""
+    """One number: `name` is a field of `Joints` or `Drives`, or kp, kd, force_limit, payload, or one of `TEN`.
+
+    Or that of a number of an effect, "effect.parameter"; its place is one of the loop's `effects`.
+    """
 
     name: str
     at: tuple[int, ...]  # coordinates, drives (names of `Drives`, kp, kd, force_limit) or links (payload, `TEN`)
@@ -34,17 +40,31 @@ Table = tuple[Entry, ...]
 TEN = ("mass", "mass_x", "mass_y", "mass_z",
        "inertia_xx", "inertia_xy", "inertia_yy", "inertia_xz", "inertia_yz", "inertia_zz")  # fmt: skip
 
-UNITS = {
+
+class _Known(dict[str, Any]):
+    """What is known of numbers by their names; of effects' numbers their class says it."""
+
+    def __init__(self, known: dict[str, Any], of_effect: Callable[[str], Any]):
+        super().__init__(known)
+        self.of_effect = of_effect
+
+    def __missing__(self, name: str) -> Any:
+        if not own.is_own(name):
+            raise KeyError(name)
+        return self.of_effect(name)
+
+
+UNITS = _Known({
     "armature": "kg m2", "damping": "N m s/rad", "friction": "N m", "stribeck_force": "N m", "stribeck_speed": "rad/s",
     "load_ratio": "", "stiffness": "N m/rad", "rest": "rad", "play": "rad", "offset": "N m", "ripple_sine": "N m",
     "ripple_cosine": "N m", "ripple_order": "1/rad", "reading": "rad", "scale": "", "delay": "s", "dead_band": "rad",
     "voltage": "N m", "force_limit": "N m", "time_constant": "s", "payload": "kg", "kp": "N m/rad", "kd": "N m s/rad",
     "gravity_x": "m/s2", "gravity_y": "m/s2", "mass": "kg", **dict.fromkeys(TEN[1:4], "kg m"),
     **dict.fromkeys(TEN[4:], "kg m2"),
-}  # fmt: skip
+}, own.unit_of)  # fmt: skip
 
 _ANY = (-np.inf, np.inf)
-BOUNDS = {  # what such a number can be
+BOUNDS = _Known({  # what such a number can be
     "armature": (1e-6, 1e3), "damping": (0.0, 1e4), "friction": (0.0, 1e4), "stribeck_force": (0.0, 1e4),
     "stribeck_speed": (0.005, 3.0), "load_ratio": (0.0, 0.95), "stiffness": (0.0, 1e7), "play": (0.0, 0.5),
     "ripple_order": (0.5, 40.0), "scale": (1e-3, 1e3), "delay": (0.0, 0.15), "dead_band": (0.0, 0.5),
@@ -52,7 +72,7 @@ BOUNDS = {  # what such a number can be
     "kp": (1e-6, 1e6), "kd": (0.0, 1e5), "reading": (-0.5, 0.5), "offset": _ANY, "rest": _ANY, "ripple_sine": _ANY,
     "ripple_cosine": _ANY, "gravity_x": (-9.0, 9.0), "gravity_y": (-9.0, 9.0),
     **dict.fromkeys(TEN, _ANY),
-}  # fmt: skip
+}, own.bounds_of)  # fmt: skip
 
 
 def values(loop: Loop, table: Table) -> np.ndarray:
@@ -66,6 +86,8 @@ def current(loop: Loop, table: Table) -> Array:
 
 
 def _get(loop: Loop, name: str, xp: Any = np) -> Any:
+    if own.is_own(name):
+        return own.read_number(loop.effects, name, xp)
     drives = loop.drives
     special = {
         "kp": lambda: xp.asarray(drives.gain)[:, 0],
@@ -92,13 +114,15 @@ def put(loop: Loop, table: Table, theta: Array | np.ndarray) -> Loop:
 
 
 def _put(loop: Loop, name: str, at: np.ndarray, new: Array | np.ndarray) -> Loop:
+    if own.is_own(name):
+        return dataclasses.replace(loop, effects=own.with_numbers(loop.effects, name, at, new))
     if name == "payload" and loop.carried is not None:
         whole = jnp.asarray(loop.carried.payload).at[at].set(new)
         return eqx.tree_at(lambda m: m.carried.payload, loop, whole)
     if name == "payload":
-        own = jnp.asarray(loop.robot.inertia)
-        chosen = np.eye(len(own))[at]  # no scatter: XLA mixes up one that adds to the array it is computed from
-        return eqx.tree_at(lambda m: m.robot.inertia, loop, own + chosen.T @ (new[:, None] * unit_payload(loop, at)))
+        ten = jnp.asarray(loop.robot.inertia)
+        chosen = np.eye(len(ten))[at]  # no scatter: XLA mixes up one that adds to the array it is computed from
+        return eqx.tree_at(lambda m: m.robot.inertia, loop, ten + chosen.T @ (new[:, None] * unit_payload(loop, at)))
     if name in TEN:
         return eqx.tree_at(
             lambda m: m.robot.inertia, loop, jnp.asarray(loop.robot.inertia).at[at, TEN.index(name)].add(new)

@@ -20,7 +20,7 @@
 #else
 #define ALIKE APART
 #endif
-#define APART static __attribute__((noinline))
+#define APART static __attribute__((noinline, optimize("O3"))) /* where the time goes */
 
 enum joint_number {
   ARMATURE, DAMPING, FRICTION, PEAK, SPEED, RATIO, STIFFNESS, REST, PLAY, OFFSET, SINE, COSINE, ORDER, READING,

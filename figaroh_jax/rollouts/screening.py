@@ -16,6 +16,7 @@ import numpy as np
 from .causes import Candidate, elastic_loop, springs
 from .fit import Fit, fit
 from .loop import Loop
+from .own import is_own
 from .parameters import OF_DRIVES, Entry
 from .search import Model, Tried, scored, settled
 from .sensitivity import Windows
@@ -269,7 +270,7 @@ class _OneOf(NamedTuple):
 def _from_starts(one: _Ranked) -> list[tuple[_Ranked, np.ndarray]]:
     """A candidate with the numbers from which its fit starts, once for each start."""
     c = one.candidate
-    return [(one, x) for x in ([one.theta] if c.kind.elastic or not c.starts or c.kind.limit else
+    return [(one, x) for x in ([one.theta] if c.kind.elastic or not c.starts or c.kind.limit or c.kind.shapes else
                                [start_values(one.theta, c, start) for start in c.starts])]  # fmt: skip
 
 
@@ -380,6 +381,9 @@ def joint_of_entry(here: Setting, entry: int) -> int:
     if one is None or len(one.at) != 1 or one.name == "payload":
         return -1
     (place,) = one.at
+    if is_own(one.name):
+        at = here.loop.effects[place].places
+        return int(at[0]) if len(at) == 1 else -1
     if one.name in OF_DRIVES:
         return int(np.argmax(np.abs(np.asarray(here.loop.drives.transmission)[place])))
     return place

@@ -196,9 +196,10 @@ def _tried(here: Setting, now: Model, named: Sequence[Candidate], forbid: Sequen
     left = [c for c in left if len(now.free) + len(c.entries) <= here.width]
     if here.loop.robot.nv > 1 or here.loop.carried is not None:
         left = _screened(here, now, left) if left else []
+    best = _best_starts(here, now, left)
     thetas, free, owner = [], [], []
     for c in left:
-        for start in c.starts:
+        for start in best.get(c.entries, c.starts):
             thetas.append(start_values(now.fit.theta, c, start))
             free.append(free_entries(now.free, c.entries))
             owner.append(c)
@@ -210,6 +211,15 @@ def _tried(here: Setting, now: Model, named: Sequence[Candidate], forbid: Sequen
     if here.loop.robot.nv == 1 and rigid and first and all(one.state.excess >= 1.0 for one in found):
         found += _elastic(here, now, forbid)
     return found
+
+
+def _best_starts(
+    here: Setting, now: Model, left: Sequence[Candidate]
+) -> dict[tuple[int, ...], list[tuple[float, ...]]]:
+    """Of users' effects whose parameters are not all linear, the start from which a linear step promises most."""
+    mine = [c for c in left if c.kind.shapes]
+    found = scored(here, now, mine) if mine else {}
+    return {mine[k].entries: [tuple(theta[list(mine[k].entries)])] for k, (_, theta) in found.items()}
 
 
 def _raced(
@@ -255,13 +265,15 @@ def scored(here: Setting, now: Model, left: Sequence[Candidate]) -> dict[int, tu
     """The cost that one linear step of each candidate leaves, and from which numbers; those that diverge are left out.
 
     Several candidates share one linearisation; a limit of a drive changes the model before it can be differentiated:
-    each is linearised at one start of its own.
+    each is linearised at one start of its own. Users' effects stand by themselves, for no machine code knows them.
     """
     many = max(int(np.sqrt(_SUMS / now.fit.sums.cost[..., 0].size)) - len(now.free) - len(now.fit.start), _LEAST_ROOM)
     room = max(here.width - len(now.free), min(many, _ROOM))
     limits = [k for k, c in enumerate(left) if c.kind.limit]
+    theirs = {c.effect: [k for k, x in enumerate(left) if x.effect == c.effect] for c in left if c.own(here.known)}
+    apart = {*limits, *(k for pack in theirs.values() for k in pack)}
     packs, filled = [], 0
-    for k in [k for k in range(len(left)) if k not in limits]:
+    for k in [k for k in range(len(left)) if k not in apart]:
         if not packs or filled + len(left[k].entries) > room:
             packs.append([])
             filled = 0
@@ -274,6 +286,12 @@ def scored(here: Setting, now: Model, left: Sequence[Candidate]) -> dict[int, tu
             for k in pack:
                 if shape := left[k].kind.falls_off:
                     theta[left[k].entries[shape]] = left[k].starts[variant][shape]
+            lanes.append((theta, pack))
+    for pack in theirs.values():  # every start of all that share a name, at all places at once
+        for variant in range(max(len(left[k].starts) for k in pack)):
+            theta = now.fit.theta.copy()
+            for k in pack:
+                theta[list(left[k].entries)] = left[k].starts[variant % len(left[k].starts)]
             lanes.append((theta, pack))
     for k in limits:
         lanes += [(start_values(now.fit.theta, left[k], start), [k]) for start in left[k].starts]

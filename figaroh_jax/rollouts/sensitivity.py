@@ -20,7 +20,7 @@ from ..compiled.batching import program, traced
 from ..rigid.dynamics import joint_masses, joint_torques
 from ..rigid.model import RobotModel
 from ..rigid.slopes import Slopes, slopes, within_reach
-from . import lanes
+from . import lanes, own
 from .friction import Solution
 from .loop import Linear, Loop, State, Step, advance, integrated, mobility, observe
 from .native import native
@@ -60,9 +60,9 @@ class Sums(NamedTuple):
 
 
 def state_size(loop: Loop) -> int:
-    """Numbers of the state that is carried: positions, velocities and activations."""
-    active = any(kind != "none" for kind in loop.drives.activation)
-    return 2 * loop.robot.nv + (len(loop.drives.names) if active else 0)
+    """Numbers of the state that is carried: positions, velocities, activations, and the states of effects."""
+    active, more = any(kind != "none" for kind in loop.drives.activation), own.memories(loop.effects)
+    return 2 * loop.robot.nv + (len(loop.drives.names) + more if active or more else 0)
 
 
 def began(loop: Loop, data: Windows, start: Array) -> State:
@@ -72,7 +72,8 @@ def began(loop: Loop, data: Windows, start: Array) -> State:
     kinds = np.array(loop.drives.activation)[:, None]
     first = jnp.asarray(data.command)[data.lead]
     length = jnp.asarray(loop.drives.transmission) @ q
-    return State(q, v, jnp.where(kinds == "integrator", length, jnp.where(kinds == "none", 0.0, first)))
+    active = jnp.where(kinds == "integrator", length, jnp.where(kinds == "none", 0.0, first))
+    return State(q, v, jnp.concatenate([active, own.begun_memory(loop.effects, v)]) if loop.effects else active)
 
 
 def _seen(loop: Loop, data: Windows, block: Array) -> Array:
@@ -156,7 +157,7 @@ _sums_program = program(_linear_sums, static_argnums=1)
 def predicted(loop: Loop, table: Table, theta: Any, data: Windows, start: Any) -> Any:
     """Readings (lanes, rows, ny, windows) of the parameters (lanes, entries) and starts (lanes, 2 nv, windows)."""
     code = None if traced(loop, theta, data, start) else native(loop, table, data)
-    if code is None or not code.usable:
+    if code is None or not code.usable or not code.knows(theta):
         return _predicted_program(loop, table, theta, data, start)
     return np.stack([code.read(np.asarray(one), np.asarray(x)) for one, x in zip(theta, start, strict=True)])
 
@@ -171,7 +172,7 @@ def linear_sums(loop: Loop, table: Table, theta: Any, free: Any, data: Windows, 
     code = None if traced(loop, theta, free, data, start) else native(loop, table, data)
     if code is not None and not code.usable and lanes.fits(loop, table, data):
         return by_kernel(loop, table, np.asarray(theta), np.maximum(np.asarray(free), 0), data, start)
-    if code is None or not code.usable:
+    if code is None or not code.usable or not code.knows(theta, free):
         at = np.maximum(free, 0) if isinstance(free, np.ndarray) else free
         return _sums_program(loop, table, theta, at, data, start)
     each = zip(theta, free, start, strict=True)
@@ -204,7 +205,7 @@ def _lane(
     if size > 2 * n:  # activations start with the command; an integrator's with the position
         kinds = np.array(loop.drives.activation) == "integrator"
         begin = jnp.where(kinds[:, None], jnp.asarray(loop.drives.transmission), 0.0)
-        spread = spread.at[2 * n :, len(free) : len(free) + n].set(begin[..., None])
+        spread = spread.at[2 * n : 2 * n + len(kinds), len(free) : len(free) + n].set(begin[..., None])
     look = _looking(loop, size, rates)
     direct = _direct(loop, table, look.shape[0])[:, free]
     wide, columns = look.shape[0], spread.shape[1]

@@ -15,6 +15,7 @@ from .colour import colour_of, filtered
 from .data import Run, Stretch, noise_of, windows
 from .fit import Fit, fit
 from .loop import Loop
+from .own import everywhere
 from .parameters import BOUNDS, Table, values
 from .sensitivity import Windows, predicted
 from .thresholds import POWER, SLOW, SLOW_ROWS, TO_TRY
@@ -109,6 +110,7 @@ def setting(
     rates: bool = True,
 ) -> Setting:
     """Data, catalogue and baseline; `more` are (effect, joint) that it has beside `baseline` at every joint."""
+    loop = replace(loop, effects=everywhere(loop.robot, loop.effects, forbid))
     fitted = [r for r in runs if not r.holdout]
     noise = [np.sqrt(np.mean([noise_of(r.position) ** 2 for r in fitted], axis=0))]
     if rates and all(r.velocity is not None for r in fitted):
@@ -254,7 +256,18 @@ def begun(here: Setting) -> Fit:
 
 
 def begins_of(here: Setting, theta: np.ndarray) -> np.ndarray:
-    """Where the baseline's fit starts: at the model; where the gains are free, also stiffer and heavier."""
+    """Where the baseline's fit starts: at the model; where the gains are free, also stiffer and heavier.
+
+    A user's effect whose parameters are not all linear starts from each point of their grids.
+    """
+    known = catalogue(here.loop, np.ones(len(here.loop.drives.names))).candidates if here.loop.effects else ()
+    own = {k: one for c in known for k, one in _grids(c).items() if k in here.baseline}
+    if own:
+        many = max(len(one) for one in own.values())
+        begins = np.repeat(theta[None], many, 0)
+        for k, one in own.items():
+            begins[:, k] = np.resize(one, many)
+        return begins
     gains = [k for k in here.baseline if here.known.table[k].name == "scale"]
     if not gains:
         return theta[None]
@@ -265,6 +278,11 @@ def begins_of(here: Setting, theta: np.ndarray) -> np.ndarray:
         begins[-1][gains] *= stiff
         begins[-1][rotors] = np.maximum(begins[-1][rotors], 1e-3) * heavy
     return np.array(begins)
+
+
+def _grids(c: Candidate) -> dict[int, list[float]]:
+    """The starting values of each number of a candidate that shows nothing without a size."""
+    return {c.entries[i]: [start[i] for start in c.starts] for i in c.kind.shapes}
 
 
 def free_entries(fitted: Sequence[int], extra: Sequence[int]) -> list[int]:

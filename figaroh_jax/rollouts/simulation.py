@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from ..compiled.batching import traced
 from ..errors import InputError
 from ..rigid.kinematics import check_shapes
+from . import own
 from .loop import Loop, State, advance, integrated, mobility, observe
 
 __all__ = ["Rollout", "delayed", "held", "rollout"]
@@ -81,7 +82,8 @@ def _rollout(loop: Loop, u: Array, q: Array, v: Array) -> Rollout:
         step = jax.lax.stop_gradient(advance(loop, state, control, weight, warm)[1])
         return (integrated(loop, state, control, weight, step), step.a), state
 
-    start = State(q[:, None], v[:, None], jnp.zeros((u.shape[1], 1)))
+    active = jnp.concatenate([jnp.zeros((u.shape[1], 1)), own.begun_memory(loop.effects, v[:, None])])
+    start = State(q[:, None], v[:, None], active)
     _, states = jax.lax.scan(one, (start, jnp.zeros_like(v)[:, None]), seen)
     time = loop.dt * jnp.arange(len(u))
     reading = jax.vmap(lambda q, v, act: observe(loop, State(q, v, act)))(*states)

@@ -25,6 +25,7 @@ from .causes import BASELINE
 from .data import Run, Stretch, noise_of, regular, windows
 from .fit import Fit, standard_errors
 from .loop import Loop
+from .own import amplitudes
 from .parameters import UNITS, put
 from .reading import load_loop
 from .rest import nearest_of, parts_of, relative_rest
@@ -374,4 +375,5 @@ def extended_of(loop: Loop) -> ExtendedModel:
                 own.append(place(find(effect), robot, [name], **numbers))
             elif effect == "joint_spring" and numbers["offset"]:
                 own.append(place(find("torque_offset"), robot, [name], offset=numbers["offset"]))
+    own += [e for e in loop.effects if any(float(getattr(e, name)) for name in amplitudes(type(e)))]
     return extend(robot, *own)

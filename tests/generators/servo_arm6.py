@@ -23,6 +23,7 @@ EFFECTS = {  # three sizes each
     "voltage_saturation": (0.8, 0.6, 0.4),  # share of the largest torque
     "dead_band": (0.003, 0.008, 0.02),  # rad
 }
+DETENT = (0.1, 0.25, 0.6)  # N m: no effect of the library's
 DT, EVERY, SECONDS, NOISE = 0.002, 5, 12.0, 2e-4
 KP, KV = (60.0, 60.0, 50.0, 20.0, 15.0, 8.0), (1.0, 1.0, 0.8, 0.3, 0.2, 0.1)
 MASS, LENGTH = (1.0, 0.8, 0.6, 0.35, 0.25, 0.12), (0.06, 0.25, 0.22, 0.08, 0.08, 0.05)
@@ -32,6 +33,7 @@ ARMATURE, DAMPING, FRICTION = (
     (0.4, 0.4, 0.3, 0.1, 0.08, 0.04),
     (0.3, 0.3, 0.2, 0.08, 0.06, 0.03),
 )
+MIDDLE = (0.0, 0.9, 0.5, 0.3, 0.0, 0.0)  # rad, about which the joints are moved
 NAMES = ("pan", "lift", "elbow", "flex", "roll", "jaw")
 
 
@@ -63,8 +65,7 @@ def command(seed: int, number: int) -> np.ndarray:
     slow = 0.35 * np.sin(2 * np.pi * rng.uniform(0.1, 0.3, 6) * t + rng.uniform(0, 6, 6))
     fast = 0.12 * np.sin(2 * np.pi * (0.3 * t + 0.5 * rng.uniform(1.5, 3.0, 6) / SECONDS * t**2) + rng.uniform(0, 6, 6))
     steps = np.repeat(rng.uniform(-0.12, 0.12, (round(SECONDS / 0.5) + 1, 6)), round(0.5 / DT), 0)[: len(t)]
-    middle = np.array([0.0, 0.9, 0.5, 0.3, 0.0, 0.0])
-    return middle + (slow + fast + steps) * np.clip(t / 1.0, 0, 1)
+    return np.array(MIDDLE) + (slow + fast + steps) * np.clip(t / 1.0, 0, 1)
 
 
 def record(
@@ -102,6 +103,10 @@ def record(
             mujoco.mj_forward(model, data)
             load = abs(data.qfrc_actuator[dofs[j]] + data.qfrc_bias[dofs[j]])
             model.dof_frictionloss[dofs[j]] = 0.5 * FRICTION[j] + ratio * load
+        if "detent" in what:  # a ball that drops into a notch .2 rad wide, in the middle of the joint's motion
+            j, size = what["detent"]
+            x = (now[j] - MIDDLE[j]) / 0.1
+            data.qfrc_applied[dofs[j]] = -size * x * np.exp(-(x**2) / 2)
         if sprung >= 0:
             at = model.joint("spring").dofadr[0]
             stiffness = what["joint_elasticity"][1] if "joint_elasticity" in what else 300.0
