@@ -321,8 +321,8 @@ def _told_apart(here: _Setting, found: list[Found], joint: Joint) -> tuple[list[
             if not physical_sign(other.effect) or other.name in [f.name for f in found]:
                 continue
             effects = [other.effect if at == k else effect for at, effect in enumerate(joint.causes)]
-            full = with_causes(problem, start, effects, whitening)
-            if predicts_better(problem, joint.step, full, sorted({*one.joints} & {*other.joints})):
+            both = sorted({*one.joints} & {*other.joints})
+            if predicts_better(problem, joint.step, with_causes(problem, start, effects, whitening), both):
                 own = one.as_another(other, (one.name, *one.ambiguous))
                 found = [own if f is found[k] else f for f in found]
                 joint = polished(problem, start, [f.effect for f in found], whitening)

@@ -76,11 +76,10 @@ class Found:
 
 
 class Search(NamedTuple):
-    """How a search ended: the problem and the baseline as it sees them, its last step, the causes in order."""
+    """How a search ended: the problem and the baseline as it sees them, the causes in order."""
 
     problem: Problem
     start: State  # with the coefficients that it has beside all causes
-    step: Step
     found: list[Found]
     p_value: float  # of the whole catalogue before anything was found
     p_left: float  # of the same once the causes were in
@@ -153,7 +152,7 @@ def find_causes(
             groups = None if problem is not known or "response" in ways else groups
             step = step if problem is known else stand(problem, with_width(problem, step.state), whitening)
     begun = solved(problem, with_width(problem, state), step.state.theta[: len(state.theta)])
-    return Search(problem, begun, step, found, p_values[0], p_values[-1], shown)
+    return Search(problem, begun, found, p_values[0], p_values[-1], shown)
 
 
 def chance_beside(
