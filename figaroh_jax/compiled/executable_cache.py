@@ -17,11 +17,11 @@ import pickle
 import platform
 from collections.abc import Callable, Iterable
 from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jaxlib.version
 import numpy as np
 
 from .store import Store, cache_home
@@ -155,7 +155,7 @@ def surroundings() -> str:
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     processor = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
-    versions = (jax.__version__, version("jaxlib"), platform.machine(), platform.processor())
+    versions = (jax.__version__, jaxlib.version.__version__, platform.machine(), platform.processor())
     quick = jax.config.values.get("jax_disable_most_optimizations")
     return repr((source.hexdigest(), versions, processor, os.environ.get("XLA_FLAGS"), quick))
 

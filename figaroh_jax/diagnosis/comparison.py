@@ -23,7 +23,9 @@ __all__ = [
     "judge",
     "judge_grown",
     "last_coefficient",
+    "left_out",
     "overlap",
+    "prefix_sums",
     "shares_of_wins",
     "sums_of",
     "told",
@@ -94,9 +96,30 @@ def fold_sums(rows: Rows, X: Float[np.ndarray, "nv T P"], y: Float[np.ndarray, "
 
 def _stretches(rows: Rows) -> list[tuple[int, slice]]:
     """The rows of each fold as stretches that follow one another, with its number; rows of no fold are in none."""
+    return [(fold, own) for fold, own in _runs(rows) if fold >= 0]
+
+
+def _runs(rows: Rows) -> list[tuple[int, slice]]:
+    """As `_stretches`, with those of no fold as fold -1."""
     firsts = np.append(0, np.flatnonzero(np.diff(rows.fold)) + 1)
     ends = np.append(firsts[1:], len(rows.fold))
-    return [(int(rows.fold[a]), slice(int(a), int(b))) for a, b in zip(firsts, ends, strict=True) if rows.fold[a] >= 0]
+    return [(int(rows.fold[a]), slice(int(a), int(b))) for a, b in zip(firsts, ends, strict=True)]
+
+
+def _predicted(
+    rows: Rows, X: Float[np.ndarray, "nv T P"], each: Float[np.ndarray, "folds+1 P"]
+) -> Float[np.ndarray, "nv T 2"]:
+    """What the coefficients of `each` fold's fit make of its rows (nothing of those in no fold), and the last of all.
+
+    Both at once: the columns are read from memory once.
+    """
+    out = np.zeros((*X.shape[:2], 2))
+    for fold, own in _runs(rows):
+        if fold < 0:
+            out[:, own, 1] = X[:, own] @ each[-1]
+        else:
+            np.matmul(X[:, own], each[[fold, -1]].T, out=out[:, own])
+    return out
 
 
 def grown_sums(rows: Rows, known: FoldSums, X: Float[np.ndarray, "nv T P"]) -> FoldSums:
@@ -110,6 +133,17 @@ def grown_sums(rows: Rows, known: FoldSums, X: Float[np.ndarray, "nv T P"]) -> F
             moment[fold, P:] += columns[:, P:].T @ target
     gram[:, P:, :P] = np.swapaxes(gram[:, :P, P:], 1, 2)
     return FoldSums(gram, moment, known.square)
+
+
+def prefix_sums(rows: Rows, gram: Float[np.ndarray, "folds P P"]) -> FoldSums:
+    """The sums of the first columns of some rows, their products being known."""
+    count = gram.shape[1]
+    moment, square = np.zeros(gram.shape[:2]), np.zeros(len(gram))
+    for fold, own in _stretches(rows):
+        for columns, target in zip(rows.X[:, own, :count], rows.y[:, own], strict=True):
+            moment[fold] += columns.T @ target
+            square[fold] += target @ target
+    return FoldSums(gram, moment, square)
 
 
 def fewer_sums(known: FoldSums, without: Sequence[int]) -> FoldSums:
@@ -131,6 +165,12 @@ def coefficients(sums: FoldSums, prior: Prior) -> Float[np.ndarray, " P"]:
     """The fit to all rows."""
     gram, moment, square = (part.sum(0) for part in sums)
     return _solve(gram, moment, square, prior)[0]
+
+
+def left_out(sums: FoldSums, prior: Prior) -> Float[np.ndarray, "folds P"]:
+    """The fits to all rows but those of each fold."""
+    gram, moment, square = (part.sum(0) for part in sums)
+    return np.array([_solve(gram - g, moment - m, square - s, prior)[0] for g, m, s in zip(*sums, strict=True)])
 
 
 def last_coefficient(sums: FoldSums, prior: Prior) -> tuple[Float[np.ndarray, " P"], float]:
@@ -164,11 +204,10 @@ def judge(rows: Rows, hypothesis: Hypothesis, known: FoldSums | None = None, wit
     solved.append(_solve(G, b, yy, prior))
     each, costs = np.zeros((len(solved), X.shape[2])), np.array([cost for _, cost in solved])
     each[:, kept] = [solution for solution, _ in solved]
-    error = np.array(y)
-    for fold, own in _stretches(rows):
-        error[:, own] -= X[:, own] @ each[fold]
-    squares, theta = _block_squares(rows, error), each[-1]
-    return Verdicts(float(costs[-1]), theta, each[:-1], squares, costs[:-1], y - X @ theta, error)
+    predicted = _predicted(rows, X, each)
+    error, residual = y - predicted[..., 0], y - predicted[..., 1]
+    squares = _block_squares(rows, error)
+    return Verdicts(float(costs[-1]), each[-1], each[:-1], squares, costs[:-1], residual, error)
 
 
 def ground(verdicts: Verdicts, prior: Prior, sums: FoldSums) -> Ground:
@@ -205,11 +244,11 @@ def judge_grown(rows: Rows, base: Ground, joints: Sequence[int], more: Float[np.
     drop = (left * t).sum((1, 2))
     change = -np.matmul(across, t)
     theta = np.concatenate([known + change, t], axis=1)[..., 0]
-    error, residual = np.array(was.error), was.residual - rows.X @ change[folds, :, 0]
-    residual[list(joints)] -= np.tensordot(t[folds, :, 0], more, 1)
-    for fold, here in _stretches(rows):
-        error[:, here] -= rows.X[:, here] @ change[fold, :, 0]
-        error[list(joints), here] -= np.tensordot(t[fold, :, 0], more[:, :, here], 1)
+    predicted, own_joints = _predicted(rows, rows.X, change[..., 0]), list(joints)
+    error, residual = was.error - predicted[..., 0], was.residual - predicted[..., 1]
+    residual[own_joints] -= np.tensordot(t[folds, :, 0], more, 1)
+    each = np.where(rows.fold >= 0, t[rows.fold, :, 0].T, 0.0)
+    error[own_joints] -= np.einsum("kt,krt->rt", each, more)
     squares, costs = _block_squares(rows, error), was.without - drop[:folds]
     return Verdicts(was.cost - float(drop[folds]), theta[folds], theta[:folds], squares, costs, residual, error)
 

@@ -194,7 +194,9 @@ def _imagined(problem: Problem, ideas: Sequence[_Idea]) -> Problem:
     )
     same = np.zeros(n * count, int)
     alone = Layout(np.zeros((0, n * count), int), np.ones((weight.shape[2], n * count)), same, same, same, False)
-    return replace(problem, records=changed, layout=alone, held=np.zeros_like(weight))
+    imagined = replace(problem, records=changed, layout=alone, held=np.zeros_like(weight))
+    imagined.__dict__["families"] = problem.families  # no candidate is looked for in it
+    return imagined
 
 
 def _longest(records: Records) -> int:

@@ -12,7 +12,7 @@ from ..effects.base import Effect
 from ..recordings.signals import Signals
 from ..recordings.stacked import open_rows
 from ..results import Trace
-from .comparison import Hypothesis, judge
+from .comparison import left_out
 from .design import kind, sensor_response
 from .estimates import amplitude_places
 from .problem import Problem
@@ -123,8 +123,7 @@ def _error(problem: Problem, step: Step) -> Float[np.ndarray, "n M nv"]:
     if problem.held.any():
         error = problem.torque - predicted(problem, state)
     else:
-        parts = judge(step.rows._replace(fold=part), Hypothesis(step.rows.X, state.prior)).folds
-        error = _left_out(problem, state, parts, part)
+        error = _left_out(problem, state, _without_parts(problem, step), part)
     return error * _kept_out(problem)
 
 
@@ -221,9 +220,13 @@ def fold_squares(
 
 def part_error(problem: Problem, step: Step) -> float:
     """As `fold_error`, of the parts by which the gain is told where no recording is kept out."""
-    part = problem.layout.part
-    folds = judge(step.rows._replace(fold=part), Hypothesis(step.rows.X, step.state.prior)).folds
-    return fold_error(problem, step.state, folds, part)
+    return fold_error(problem, step.state, _without_parts(problem, step), problem.layout.part)
+
+
+def _without_parts(problem: Problem, step: Step) -> Float[np.ndarray, "parts P"]:
+    """Coefficients of a step without each part."""
+    rows = step.rows._replace(fold=problem.layout.part)
+    return left_out(problem.filtered.sums(rows), step.state.prior)
 
 
 def _left_out(

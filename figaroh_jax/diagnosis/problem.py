@@ -19,10 +19,12 @@ from jaxtyping import Complex, Float, Int
 from ..effects.base import Effect, Motion
 from ..effects.catalogue import CATALOGUE
 from ..estimation.priors import rigid_prior
+from ..estimation.rows import Rows
 from ..recordings.stacked import Records, filter_rows, open_rows
 from ..rigid.model import RobotModel
 from ..rigid.regressor import packed_regressor, pairs
 from ..simulators.contract import Backend
+from .comparison import FoldSums, fold_sums, grown_sums, prefix_sums
 from .design import SHORT, Units, candidates, flattened, kind, shapes, units
 from .shifts import links_torque, rigid_torque
 from .thresholds import TRUSTED
@@ -35,6 +37,7 @@ __all__ = ["Layout", "Part", "Problem", "family_of", "without_factor"]
 _OF_THE_MOTION = ("torque", "gain", "motion", "families", "fixed", "plain", "_terms")
 KEPT = 110 << 20  # bytes of filtered columns that are held: two responses of an arm in 18 recordings of half a minute
 AT_ONCE = 36  # effects with a shape that are evaluated at once along long recordings
+MOST_SUMS = 12  # models whose normal equations are held
 MOST_TERMS = 48  # terms of models whose columns are held
 TURNED = 128  # samples that are turned at once: they stay in the processor's cache
 
@@ -156,10 +159,33 @@ def _of_blocks(blocks: Float[np.ndarray, "pairs 10 nN"], where: Int[np.ndarray, 
     return _Columns(flat if used.all() else flat[used], joint[used], column[used])
 
 
+class _Made(NamedTuple):
+    """Of which filtered columns rows were made, with what weights, and their products fold by fold."""
+
+    blocks: list[ref[np.ndarray]]
+    weight: ref[Any]
+    factor: Float[np.ndarray, " nv"]
+    fold: ref[np.ndarray]
+    gram: Float[np.ndarray, "folds P P"]
+
+    def shared(self, other: _Made) -> int:
+        """How many of the first columns are the same, and weighted alike, as those of another."""
+        if self.weight() is not other.weight() or self.fold() is not other.fold():
+            return 0
+        count = 0
+        for own, its in zip(self.blocks, other.blocks, strict=False):
+            if own() is None or own() is not its():
+                break
+            count += own().shape[2]  # pyright: ignore[reportOptionalMemberAccess]
+        return count if np.array_equal(self.factor, other.factor) else 0
+
+
 class Filtered:
     """Parts of regressors through the row filter and a response, kept while they are used: most stay the same."""
 
     def __init__(self) -> None:
+        self._last: tuple[ref[np.ndarray], list[ref[np.ndarray]], ref[Any], np.ndarray] | None = None
+        self._sums: list[_Made] = []  # the last few
         # filtered columns by the addresses of the series and of the filter, as long as these live, and by the response
         self._kept: OrderedDict[tuple[int, int, bytes], tuple[ref[Any], ref[Any], np.ndarray]] = OrderedDict()
 
@@ -175,7 +201,21 @@ class Filtered:
         for block in blocks:
             np.multiply(block, weight, out=X[:, :, first : first + block.shape[2]])
             first += block.shape[2]
+        self._last = ref(X), [ref(block) for block in blocks], ref(records.weight), factor
         return X
+
+    def sums(self, rows: Rows) -> FoldSums:
+        """`fold_sums` of rows just made; products of columns that the rows of an earlier model began with are known."""
+        if self._last is None or self._last[0]() is not rows.X:
+            return fold_sums(rows, rows.X)
+        made = _Made(*self._last[1:], ref(rows.fold), np.zeros(0))
+        count, known = max(((one.shared(made), k) for k, one in enumerate(self._sums)), default=(0, 0))
+        if count:
+            sums = grown_sums(rows, prefix_sums(rows, self._sums[known].gram[:, :count, :count]), rows.X)
+        else:
+            sums = fold_sums(rows, rows.X)
+        self._sums = [made._replace(gram=sums.gram), *self._sums[: MOST_SUMS - 1]]
+        return sums
 
     def _block(self, records: Records, part: Part, response: np.ndarray, code: bytes) -> Float[np.ndarray, "nv T k"]:
         source = np.asarray(records.source)

@@ -131,7 +131,7 @@ def refit(
     fields = np.concatenate([np.reshape(x, (len(start), -1)) for x in jax.tree.leaves(effects)], axis=1)
     once = np.unique(fields, axis=0, return_index=True)[1]
     few, low, width = jax.tree.map(lambda x: np.asarray(x)[once], effects), low[once], width[once]
-    device_effects, device_motion = jax.device_put((few, motion))
+    device_effects, device_motion = jax.device_put(few), _on_device(motion)
     known: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # shape and columns of each start as last evaluated
 
     def function(u: Float[np.ndarray, "starts p"], some: Int[np.ndarray, " some"]) -> tuple[np.ndarray, np.ndarray]:
@@ -146,6 +146,15 @@ def refit(
         function(shares, np.array([best]))
     one = jax.tree.map(lambda x: np.asarray(x)[best], few)
     return with_shape(one, names, list(values[best])), known[best][1]
+
+
+_ON_DEVICE: list[tuple[Motion, Any]] = []  # the last one: all refits of a step share their motion
+
+
+def _on_device(motion: Motion) -> Any:
+    if not any(known is motion for known, _ in _ON_DEVICE):
+        _ON_DEVICE[:] = [(motion, jax.device_put(motion))]
+    return _ON_DEVICE[0][1]
 
 
 def shift_profile(change: Float[np.ndarray, "sizes nv T"], whitened: Whitened) -> Float[np.ndarray, " sizes"]:

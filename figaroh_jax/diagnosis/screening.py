@@ -108,10 +108,11 @@ def catalogue(
     batches = {n: b for family in problem.families.values() for n, b in family.items()}
     old = {group.name: group for group in before or ()}
     fresh = _fresh_columns(problem, state, whitening, wanted, everything=before is None)
-    groups = []
+    groups, joints, links = [], problem.model.joint_names, problem.model.link_names
     for name in (n for n in wanted if n in batches):
+        own = links if batches[name].acts_on == "link" else joints
         for place, at in enumerate(np.asarray(batches[name].at)[:, 0].tolist()):
-            title = Name(name, place_names(problem.model, batches[name], tuple(at)))
+            title = Name(name, tuple(own[i] for i in at))
             if (name, tuple(at)) in taken:
                 continue
             known = old.get(title)

@@ -6,7 +6,6 @@ JAX evaluates inverse dynamics, many samples in one program; the equations of th
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..effects.base import Effect, Motion
+from ..effects.base import Effect, Motion, changed
 from ..recordings.stacked import Records
 from ..rigid.dynamics import torques_on_host
 from ..rigid.model import Leaf, RobotModel
@@ -197,7 +196,7 @@ def _errors(
     """What each sensor reads beside the truth, under the motion's load or each under its own."""
     out = []
     for one in range(len(effects.at)):
-        here = motion if loads is None else replace(motion, load=loads[one])
+        here = motion if loads is None else changed(motion, load=loads[one])
         effect = jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects)
         # as it is written, on NumPy's arrays; a bound method would be a module of its own
         out.append(np.asarray(type(effect).position_error(effect, here)))
@@ -216,7 +215,7 @@ def _moved(effects: Effect, motion: Motion, errors: Float[np.ndarray, "effects n
         moved[one, :, joint] -= delta.reshape(len(errors), -1)
         true.append(moved)
     position, velocity, acceleration = true
-    return replace(motion, position=position, velocity=velocity, acceleration=acceleration)
+    return changed(motion, position=position, velocity=velocity, acceleration=acceleration)
 
 
 def difference(signal: Float[np.ndarray, "*n N"], dt: float) -> Float[np.ndarray, "*n N"]:
@@ -295,6 +294,6 @@ def _unit_errors(effects: Effect, motion: Motion) -> Float[np.ndarray, "effects 
     for one in range(len(effects.at)):
         effect = jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects)
         for unit in np.eye(len(names)):
-            units = replace(effect, **dict(zip(names, unit, strict=True)))
+            units = changed(effect, **dict(zip(names, unit, strict=True)))
             out.append(np.asarray(type(effect).position_error(units, motion)))
     return np.reshape(out, (len(effects.at), len(names), -1))

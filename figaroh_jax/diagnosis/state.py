@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from ..effects.base import Effect, Motion, place
+from ..effects.base import Effect, Motion, changed, place
 from ..effects.catalogue import find
 from ..errors import InputError
 from ..estimation.priors import body_precision, rigid_prior
@@ -65,8 +65,8 @@ class State:
     def motion(self) -> Motion:
         """The motion as measured, with load, total torque and inertia of `theta`."""
         load, *others = self.shares(self.theta)
-        model = replace(self.measured.model, inertia=self.theta[: self.rigid.width].reshape(-1, 10))
-        return replace(self.measured, load=load, total=sum(others, load), model=model)
+        model = changed(self.measured.model, inertia=self.theta[: self.rigid.width].reshape(-1, 10))
+        return changed(self.measured, load=load, total=sum(others, load), model=model)
 
     @property
     def rigid(self) -> Part:
@@ -226,7 +226,7 @@ def link_motion(problem: Problem, state: State) -> Motion:
         if kind(effect) == "position":
             moved = shifted(batched(effect), motion, problem.records)
             position, velocity, acceleration = moved.position[0], moved.velocity[0], moved.acceleration[0]
-            motion = replace(moved, position=position, velocity=velocity, acceleration=acceleration)
+            motion = changed(moved, position=position, velocity=velocity, acceleration=acceleration)
     return motion
 
 

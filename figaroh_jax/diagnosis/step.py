@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ..effects.base import Effect
 from ..estimation.rows import Linear, Prior, Rows, fit
 from .believed import believed, let_go
-from .comparison import FoldSums, Hypothesis, Verdicts, coefficients, fold_sums, grown_sums, judge
+from .comparison import FoldSums, Hypothesis, Verdicts, coefficients, grown_sums, judge
 from .design import kind
 from .problem import Problem
 from .state import State, assembled, extended_state, solved, whitened
@@ -56,7 +56,7 @@ def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], 
     if before is not None and len(before.state.sensors) == len(state.sensors):
         folded = grown_sums(rows, before.folded, rows.X)
     else:
-        folded = fold_sums(rows, rows.X)
+        folded = problem.filtered.sums(rows)
     state = replace(state, prior=believed(problem, state.prior, folded))
     solution = solved(problem, state, coefficients(folded, state.prior))
     return Step(solution, rows, folded, let_go(problem, state.prior))
@@ -68,6 +68,7 @@ def with_cause(problem: Problem, step: Step, effect: Effect, whitening: Float[np
     if kind(effect) != "position":
         return grown
     base = solved(problem, step.state, grown.state.theta)
+    del grown  # its rows and columns are large
     return stand(problem, extended_state(problem, base, effect), whitening)
 
 

@@ -57,11 +57,17 @@ def _hashed(path: Path) -> dict[str, Any]:
     return {"file": str(path), "bytes": path.stat().st_size, "sha256": digest}
 
 
+def _version(package: metadata.Distribution) -> str:
+    """As `package.version`, which parses a package's whole description (.05 CPU s for these)."""
+    head = (package.read_text("METADATA") or "").partition("\n\n")[0]
+    return next((line[8:].strip() for line in head.splitlines() if line.startswith("Version:")), package.version)
+
+
 def _versions() -> dict[str, str]:
     found = {}
     for name in _PACKAGES:
         try:
-            found[name] = metadata.version(name)
+            found[name] = _version(metadata.distribution(name))
         except metadata.PackageNotFoundError:
             continue
     return found
