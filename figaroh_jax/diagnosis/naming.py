@@ -77,7 +77,8 @@ class Standing:
     massless: bool = False  # a body whose mass is not surely there
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
     cancels: bool = False  # whether it is a share of all torque, and larger than it: a reading of less than half
-    complete: bool = False  # whether smooth functions find next to nothing in what it leaves
+    complete: bool = False  # whether smooth functions find next to nothing in what it leaves at its joints
+    outdone: bool = False  # whether what could be named in its place surely predicts better
     taken: float = 0.0  # held-out squares of its joints that it removes
     leaves: float = 0.0  # squares beyond noise at its joints over these
     alone: bool = True  # whether its joints are likely to have no other misfit (`stands_alone`)
@@ -112,6 +113,8 @@ def reason_against(
             one.modulation_held_out <= (ALL_BUT if one.varies and strict_law else MODULATION_HELD_OUT),
             f"{varies} {one.modulation_held_out:.2f} of its gain)",
         ),
+        (not one.outdone, "another cause that explains the same misfit predicts better, though it is none itself"),
+        (not one.massless, "its mass is not surely above zero: a link other than believed explains as much"),
         (
             one.leaves <= LAW_LEAVES or not one.alone,
             f"where it acts {one.leaves:.2f} of what it removes stays beyond the noise, though most other joints have"
@@ -137,7 +140,6 @@ def reason_against(
                 not one.inertia_alone,
                 "a coupling without friction of its own cannot be distinguished from rotor or link inertia",
             ),
-            (not one.massless, "its mass is not surely above zero: a link other than believed explains as much"),
             (
                 margin >= MARGIN,
                 f"it is borderline: t, gain and a steady amplitude together are {margin:.1f} times what each alone"
@@ -229,6 +231,7 @@ def standings(
                 varies=modulation[2],
                 beside_smooth=_beside_smooth(grown, bare, effect, place, one.joints) if whole else 1.0,
                 inertia_alone=coupled and _inertia_alone(effect, joint.fitted, at),
+                outdone=one.outdone,
                 massless=effect.body and _deviations(effect, joint.fitted, at)["mass"] < MASS,
             )
         )
