@@ -5,26 +5,29 @@
 `sets` calibrates the recordings of $FIGAROH_JAX_DATA with everything chosen inside five folds (MUKCa: on tool positions
 that were not fitted) and prints error and names. `speed` solves one problem, UR10e poses with its identifiable
 parameters, with both (Pinocchio in a Python loop for SciPy), in interleaved rounds, for 50 to 10 000 POSTURES or those
-told. `figaroh` does the same with
-FIGAROH 1.0.2 on its own sets, in the environment that `regressor.py` makes. CPU seconds; cold is that of a fresh
-process from its first line to the answer, without any cache, which tells peak memory too.
+told. `figaroh` does the same with FIGAROH 1.0.2 on its own sets, in the environment that `regressor.py` makes. CPU
+seconds; cold is that of a fresh process from its first line to the answer, imports among them, with Python's bytecode
+but without any cache of programs; it tells peak memory too.
 """
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pinocchio_calibration import Peer  # beside this file
 
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.recordings.poses import PoseRecording
@@ -119,44 +122,6 @@ def run_sets() -> None:
             print(f"    {note}" * bool(note), end="\n" * bool(note))
 
 
-class Peer:
-    """The same problem for SciPy: a Pinocchio loop and finite differences."""
-
-    def __init__(self, path: Path, frame: str, joint: np.ndarray, twists: np.ndarray) -> None:
-        import pinocchio  # pyright: ignore[reportMissingImports]
-
-        pin: Any = pinocchio
-        self.pin, self.robot, self.joint, self.twists = pin, pin.buildModelFromUrdf(str(path)), joint, twists
-        self.nominal = [pin.SE3(placement) for placement in self.robot.jointPlacements]
-        self.tool = self.robot.getFrameId(frame)
-
-    def poses(self, q: np.ndarray, x: np.ndarray, base, marker) -> list:
-        """Poses of the marker in the device's frame, with the columns' coefficients `x`."""
-        total = np.zeros((6, 6))
-        np.add.at(total, self.joint, x[:, None] * self.twists)
-        for k, twist in enumerate(total):
-            E = self.pin.SE3(self.pin.exp3(twist[3:]), twist[:3])
-            self.robot.jointPlacements[k + 1] = self.nominal[k + 1] * E
-        data, found = self.robot.createData(), []
-        for row in q:
-            self.pin.framesForwardKinematics(self.robot, data, row)
-            found.append(base * data.oMf[self.tool] * marker)
-        return found
-
-    def solve(self, q: np.ndarray, seen: list, near: list, picked: np.ndarray) -> float:
-        """Cost of the least squares over both frames and the columns `picked`."""
-        from scipy.optimize import least_squares
-
-        def residual(y: np.ndarray) -> np.ndarray:
-            x = np.zeros(len(self.joint))
-            x[picked] = 1e-3 * y[12:]
-            marks = [m * self.pin.exp6(1e-2 * d) for m, d in zip(near, (y[:6], y[6:12]), strict=True)]
-            found = self.poses(q, x, *marks)
-            return 1e4 * np.concatenate([self.pin.log6(s.actInv(p)).vector for s, p in zip(seen, found, strict=True)])
-
-        return least_squares(residual, np.zeros(12 + len(picked)), method="lm").cost
-
-
 def run_speed(postures: Sequence[int] = (50, 500, 4000, 10000)) -> None:
     from figaroh_jax.calibration.candidates import geometry_columns
     from figaroh_jax.estimation.posegroups import postures_of
@@ -209,11 +174,14 @@ def _compare(N: int, model, frames: tuple[str, str], columns, peer: Peer) -> Non
     near = [exp(np.concatenate([0.3 * rng.normal(size=3), rng.normal(size=3)])) for _ in range(2)]
     seen = [pose * exp(1e-4 * rng.normal(size=6)) for pose in peer.poses(q, x, *near)]
     poses = np.array([pose.homogeneous for pose in seen])
-    with tempfile.TemporaryDirectory() as folder:
-        np.savez(Path(folder) / "poses.npz", q=q, poses=poses)
-        cold = _fresh("child", str(Path(folder) / "poses.npz"))
     ours = Ours(model, [recording(q, "pose", poses, *frames)])
     found, picked = ours.solve(), np.flatnonzero(ours.free[: len(columns)])
+    with tempfile.TemporaryDirectory() as folder:
+        file, told = Path(folder) / "poses.npz", {"urdf": str(_ur10e()[0]), "frame": frames[1], "q": q, "poses": poses}
+        told |= {"joint": peer.joint, "twists": peer.twists, "picked": picked}
+        np.savez(file, near=np.array([pose.homogeneous for pose in near]), **told)
+        cold = _fresh("child", str(file))
+        cold_peer = _fresh(str(file), script=Path(__file__).with_name("pinocchio_calibration.py"))
     warm, theirs, cost = [], [], 0.0
     for _ in range(3 if N <= 500 else 1):
         start = time.process_time()
@@ -225,17 +193,28 @@ def _compare(N: int, model, frames: tuple[str, str], columns, peer: Peer) -> Non
         theirs.append(time.process_time() - between)
     print(
         f"N {N}: {ours.rank} parameters; SciPy + Pinocchio {min(theirs):.2f}-{max(theirs):.2f} s; ours warm"
-        f" {min(warm):.4f}-{max(warm):.4f} s, cold {cold['cpu']:.1f} s, peak {cold['peak_mb']:.0f} MB; ratio"
-        f" {np.median(theirs) / np.median(warm):.0f}; cost {found.cost:.2f} and {cost:.2f}",
+        f" {min(warm):.4f}-{max(warm):.4f} s, cold {cold['cpu']:.2f} s, peak {cold['peak_mb']:.0f} MB; ratio"
+        f" {np.median(theirs) / np.median(warm):.0f}; SciPy + Pinocchio cold {cold_peer['cpu']:.2f} s, ratio"
+        f" {cold_peer['cpu'] / cold['cpu']:.2f}; cost {found.cost:.2f} and {cost:.2f}",
         flush=True,
     )
 
 
-def _fresh(*arguments: str) -> dict[str, Any]:
-    """The answer of this file in a new process."""
-    environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
-    answer = subprocess.run([sys.executable, __file__, *arguments], check=True, capture_output=True, env=environment)
-    return json.loads(answer.stdout)
+def _fresh(*arguments: str, script: Path = Path(__file__)) -> dict[str, Any]:
+    """The answer of a script in a new process, the second one: Python's bytecode is there, as when installed."""
+    environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false", "PYTHONPYCACHEPREFIX": _bytecode()}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    command = [sys.executable, str(script), *arguments]
+    answers = [subprocess.run(command, check=True, capture_output=True, env=environment) for _ in range(2)]
+    return json.loads(answers[-1].stdout)
+
+
+@lru_cache(maxsize=1)
+def _bytecode() -> str:
+    """A folder for the bytecode of fresh processes, as long as this one lives."""
+    folder = tempfile.mkdtemp()
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def solve_child(file: str) -> None:

@@ -42,7 +42,7 @@ FROM_HOST = 16  # so many times fewer samples where they travel
 NOISE = 0.05  # N m
 DRIVES = ("viscous_friction", "coulomb_friction", "rotor_inertia", "torque_offset")
 DRIVE = 0.7  # hidden value of every drive parameter
-SIZES = {"arm": (1 << 21, 1 << 29), "humanoid": (1 << 18, 1 << 27)}  # samples of a piece, and in all
+SIZES = {"arm": (1 << 21, 1 << 29), "humanoid": (1 << 18, 1 << 28)}  # samples of a piece, and in all
 
 
 def main() -> None:

@@ -292,7 +292,7 @@ def table(folder: Path, out: Path) -> None:
     sides = sorted(p.name for p in out.iterdir() if p.is_dir() and p.name != "cache")
     counts: Counter[str] = Counter()
     found: dict[str, Counter[str]] = {side: Counter() for side in sides}
-    errors: dict[str, list[list[tuple[float, float]]]] = {"hidden effects": [], "base parameters": []}
+    errors: dict[str, list[list[tuple[float, float, float]]]] = {"hidden effects": [], "base parameters": []}
     for case in json.loads((folder / "cases.json").read_text()):
         if not all(_kept(out, case, side).is_file() for side in sides):
             counts["not run"] += 1
@@ -319,9 +319,9 @@ def table(folder: Path, out: Path) -> None:
             _told(what, sides, each)
 
 
-def _told(what: str, sides: list[str], errors: list[list[tuple[float, float]]]) -> None:
+def _told(what: str, sides: list[str], errors: list[list[tuple[float, float, float]]]) -> None:
     """How near the numbers of both versions lie to the truth, and how often inside of their intervals."""
-    (a, sa), (b, sb) = np.moveaxis(np.array(errors), 0, -1)
+    (a, sa, size), (b, sb, _) = np.moveaxis(np.array(errors), 0, -1)
     inside = [f"{side} {(e <= 1.96 * s).sum()}" for side, e, s in zip(sides, (a, b), (sa, sb), strict=True)]
     moved = np.abs(a - b) > 1e-3 * sa
     ratio = np.sum((b / sa) ** 2) / np.sum((a / sa) ** 2)
@@ -331,9 +331,20 @@ def _told(what: str, sides: list[str], errors: list[list[tuple[float, float]]]) 
         f" {ratio:.3f} times, median {np.median(a / sa):.3f} -> {np.median(b / sa):.3f}; in their own: mean square"
         f" {np.mean((a / sa) ** 2):.2f} -> {np.mean((b / sb) ** 2):.2f}; median sigma {np.median(sb / sa):.3f} times"
     )
+    times, share, seen = np.log(np.maximum(b, 1e-300) / np.maximum(a, 1e-300)), (a / size, b / size), size > 0
+    middle, spread = times.mean(), 1.96 * times.std(ddof=1) / np.sqrt(len(times))
+    low, mean, high = np.exp([middle - spread, middle, middle + spread])
+    parts = [f"{np.median(e[seen]):.4f}" for e in share]
+    near = [f"{(e[seen] <= 0.05).sum()} and {(e[seen] <= 0.15).sum()}" for e in share]
+    print(
+        f"  in their own units: error {mean:.3f} times in the geometric mean [{low:.3f}, {high:.3f}]; over the truth:"
+        f" median {' -> '.join(parts)}; of {seen.sum()} within 5 and 15 % {' -> '.join(near)}"
+    )
 
 
-def _errors_of_links(links: list[list[float]], answers: list[dict[str, Any]]) -> Iterator[list[tuple[float, float]]]:
+def _errors_of_links(
+    links: list[list[float]], answers: list[dict[str, Any]]
+) -> Iterator[list[tuple[float, float, float]]]:
     """The same of the base parameters that are sums of links' alone and that both versions identify."""
     names = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
     true = {f"{name}{k}": x for k, ten in enumerate(links, 1) for name, x in zip(names, ten, strict=True)}
@@ -342,11 +353,11 @@ def _errors_of_links(links: list[list[float]], answers: list[dict[str, Any]]) ->
         terms = re.findall(r"([+-]?) ?(\d[\d.e-]* )?([A-Za-z_.]+\d[\w]*)", text)
         if all(name in true for _, _, name in terms):
             value = sum((-1 if sign == "-" else 1) * float(factor or 1) * true[name] for sign, factor, name in terms)
-            yield [(abs(own[text]["value"] - value), own[text]["std"]) for own in both]
+            yield [(abs(own[text]["value"] - value), own[text]["std"], abs(value)) for own in both]
 
 
-def _errors(truth: list[dict[str, Any]], answers: list[dict[str, Any]]) -> Iterator[list[tuple[float, float]]]:
-    """Distance to the truth and sigma, by both versions, of every parameter of a hidden effect that both name."""
+def _errors(truth: list[dict[str, Any]], answers: list[dict[str, Any]]) -> Iterator[list[tuple[float, float, float]]]:
+    """Distance to the truth, sigma and truth, by both versions, of every number of a hidden effect that both name."""
     for hidden in truth:
         causes = [
             [c for c in a["causes"] if (c["effect"], c["at"]) == (hidden["effect"], hidden["at"])] for a in answers
@@ -354,7 +365,7 @@ def _errors(truth: list[dict[str, Any]], answers: list[dict[str, Any]]) -> Itera
         for name, true in hidden.get("parameters", {}).items():
             own = [each[0]["parameters"].get(name) for each in causes if each]
             if len(own) == len(answers) and all(p and p["std"] for p in own):
-                yield [(abs(p["value"] - true), p["std"]) for p in own]
+                yield [(abs(p["value"] - true), p["std"], abs(true)) for p in own]
 
 
 def _names(answer: dict[str, Any]) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from figaroh_jax.diagnosis import rest as rests
 from figaroh_jax.diagnosis.estimates import Fitted
+from figaroh_jax.diagnosis.flexible import Smooth
 from figaroh_jax.diagnosis.joint import Joint, has_size, least_sure
 from figaroh_jax.diagnosis.naming import (
     Standing,
@@ -19,8 +21,9 @@ from figaroh_jax.diagnosis.naming import (
     reason_against,
     stands_alone,
 )
-from figaroh_jax.diagnosis.rest import significance, tolerated, verdict, wrong_law
+from figaroh_jax.diagnosis.rest import repeating, significance, tolerated, verdict, wrong_law
 from figaroh_jax.effects.catalogue import find
+from figaroh_jax.estimation.rows import Rows
 from figaroh_jax.results import Name
 
 
@@ -105,13 +108,18 @@ def test_more_power_than_noise_can_have_is_a_rest(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(rests, "draw_noise", drawn)
     rng, left = np.random.default_rng(3), np.ones(shape)
 
-    def beyond(share: float) -> np.ndarray:
+    def against(share: float) -> tuple[np.ndarray, np.ndarray]:
         size = np.array([1.0, np.sqrt(1 + share * np.sqrt(2 / 400))])  # so many deviations at the second joint
         return rests.beyond_noise(nothing, left * size[:, None], nothing, nothing, rng)
 
-    assert not beyond(0.0).any()
-    assert not beyond(2.0).any()
-    np.testing.assert_allclose(beyond(4.0), [0.0, 4 * np.sqrt(2 * 400)], rtol=0, atol=8)  # mean of 200 draws: +- 2
+    for share in (-2.0, 0.0, 2.0):
+        beyond, quiet = against(share)
+        assert not beyond.any() and not quiet.any()
+    beyond, quiet = against(4.0)
+    np.testing.assert_allclose(beyond, [0.0, 4 * np.sqrt(2 * 400)], rtol=0, atol=8)  # mean of 200 draws: +- 2
+    assert not quiet.any()
+    beyond, quiet = against(-4.5)  # noise never has so little: what was taken for noise is something else
+    assert not beyond.any() and quiet.tolist() == [False, True]
 
 
 @pytest.mark.parametrize(
@@ -135,12 +143,31 @@ def test_what_stays_at_a_causes_joints_is_told_by_what_it_removes() -> None:
 
 
 def test_a_law_is_wrong_where_it_leaves_a_rest_at_its_own_place() -> None:
-    rest = (0.001, Name("friction", ("elbow",)), 50.0)
+    rest = Smooth(0.001, Name("friction", ("elbow",)), 50.0, np.array([0.0, 50.0]))
     assert wrong_law(("elbow",), 1000.0, rest)
     assert wrong_law((), 1000.0, rest)  # the whole robot
     assert not wrong_law(("elbow",), 10_000.0, rest)  # a small share of what was removed
     assert not wrong_law(("wrist",), 1000.0, rest)
-    assert not wrong_law(("elbow",), 1000.0, (0.02, *rest[1:]))
+    assert not wrong_law(("elbow",), 1000.0, rest._replace(p=0.02))
+
+
+def test_what_repeats_have_in_common_is_no_noise() -> None:
+    """Two repeats of 4000 rows that share a wave; a third of the rows counts; the second joint has noise alone."""
+    rng, n = np.random.default_rng(5), 4000
+    wave = np.sin(np.arange(n) / 7.0)
+    residual = rng.standard_normal((2, 2 * n))
+    residual[0] += np.tile(wave, 2)
+    partner = np.concatenate([np.arange(n) + n, np.arange(n)])[None]
+    empty = np.zeros((2, 0, 0))
+    rows = Rows(empty, empty, empty, np.ones((2, 2 * n)), partner, np.zeros(2 * n, int), np.zeros(2 * n, int))
+    counted = np.tile(np.arange(2 * n) % 3 == 0, (2, 1))
+    problem = cast(Any, SimpleNamespace(layout=SimpleNamespace(repeats=True)))
+    shared, none = repeating(problem, rows, residual, counted)
+    told = (np.tile(wave, 2)[counted[0]] ** 2).sum()
+    assert shared == pytest.approx(told, rel=0.15)  # five deviations of the products' noise
+    assert none < 0.15 * told
+    problem.layout.repeats = False
+    assert np.isinf(repeating(problem, rows, residual, counted)).all()
 
 
 def test_verdicts_follow_causes_and_rest() -> None:
@@ -163,7 +190,11 @@ RIGHT = Standing(
         ({"t": 2.0}, "not significant"),
         ({"share": 0.015}, "needed"),
         ({"modulation": 0.2}, "varies"),
-        ({"whole": True, "gain": 0.05, "modulation": 0.2}, ""),
+        ({"whole": True, "gain": 0.1, "modulation": 0.2}, ""),
+        ({"whole": True, "gain": 0.05, "modulation": 0.2}, "borderline"),  # 1.67, 1.25 and 1.5 times what is needed
+        ({"gain": 0.26, "t": 2.5, "modulation": 0.14}, "borderline"),  # each of them by little
+        ({"gain": 0.26, "t": 2.5}, ""),  # but as steady as can be
+        ({"gain": 0.26, "t": 20.0, "modulation": 0.14}, ""),
         ({"whole": True, "gain": 0.05, "modulation": 0.4}, "varies"),
         ({"modulation_held_out": 0.25}, "varies"),
         ({"modulation_held_out": 0.12, "varies": True}, "varies"),  # less than .2, but surely
@@ -206,6 +237,8 @@ def test_recordings_kept_out_may_show_what_few_blocks_of_the_others_cannot(
         ({"modulation": 0.5}, ""),  # by chance, of a small cause
         ({"modulation_held_out": 0.3}, "varies"),
         ({"share": 2.0, "cancels": True}, ""),
+        ({"outdone": True}, "predicts better, though it is none itself"),
+        ({"whole": True, "massless": True}, "mass is not surely"),
     ],
 )
 def test_without_a_rest_a_cause_need_only_be_there(changes: dict[str, float], word: str) -> None:
@@ -245,7 +278,7 @@ def test_a_law_like_a_rest_is_taken_on_less_where_it_leaves_nothing() -> None:
 
 
 def test_a_rest_without_repeats_counts_where_smooth_functions_predict_it() -> None:
-    flexible, line = (0.001, Name("position", ("elbow",)), 50.0), (1.0, 0.0, 0)
+    flexible, line = Smooth(0.001, Name("position", ("elbow",)), 50.0, np.array([0.0, 50.0])), (1.0, 0.0, 0)
     now, joints = (0.2, 1.0, np.array([0.1, 0.3])), ("shoulder", "elbow")
 
     def there(p_repeat: float = 1.0, predicted: bool = True, tolerable: bool = False) -> bool:

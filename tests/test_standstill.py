@@ -15,7 +15,7 @@ from figaroh_jax.diagnosis.holdout import predicted
 from figaroh_jax.diagnosis.layout import held_rows, layout
 from figaroh_jax.diagnosis.problem import Problem
 from figaroh_jax.diagnosis.rest import relative_rest
-from figaroh_jax.diagnosis.standstill import beyond_sliding, only_sticks, resting
+from figaroh_jax.diagnosis.standstill import beyond_sliding, only_sticks, resting, stands
 from figaroh_jax.diagnosis.state import State, assembled, baseline, solved
 from figaroh_jax.recordings.stacked import stack
 from figaroh_jax.rigid.model import RobotModel
@@ -49,14 +49,22 @@ def spring(v: np.ndarray, top: np.ndarray, rng: np.random.Generator) -> np.ndarr
     return 0.3 * SLIDING * np.sin(np.arange(len(v)) / 97.0)[:, None]
 
 
-def recorded(model: RobotModel, more: Law, width: float = 0.0) -> tuple[Problem, State]:
+def halting(time: np.ndarray) -> np.ndarray:
+    """Two joints whose velocity is the third power of a sine: at each reversal they stand still for a while."""
+    phase = np.stack([1.3 * time, 1.9 * time + 0.8], axis=1)
+    return np.array([0.9, 0.7]) * (np.cos(phase) ** 3 / 3 - np.cos(phase))
+
+
+def recorded(
+    model: RobotModel, more: Law, width: float = 0.0, motion: Callable[[np.ndarray], np.ndarray] = halting
+) -> tuple[Problem, State]:
     """Torque of Pinocchio with sliding friction and something more, and the model without that; its friction reverses
     over twice the `width`, in top speeds."""
-    plain = made_signals(30.0, swing)
+    plain = made_signals(30.0, motion)
     v, rng = plain.velocity, np.random.default_rng(5)
     rigid = reference.inverse_dynamics(model, plain.position, v, plain.acceleration)
     torque = rigid + SLIDING * np.sign(v) + more(v, np.abs(v).max(0), rng)
-    signals = made_signals(30.0, swing, torque + NOISE * rng.standard_normal(torque.shape))
+    signals = made_signals(30.0, motion, torque + NOISE * rng.standard_normal(torque.shape))
     records = stack([signals], model)
     turned = width * np.abs(v).max(0)
     problem = Problem(
@@ -78,6 +86,17 @@ def test_only_a_stick_is_no_error_of_the_model(model: RobotModel, more: Law, sti
     relative = relative_rest(problem, state, noise)
     assert relative.max() > TOLERANCE  # something is left, in all three
     assert only_sticks(problem, state, noise, relative, TOLERANCE) == sticks
+
+
+def test_a_joint_that_passes_without_stopping_does_not_stick(model: RobotModel) -> None:
+    """The same misfit around rest of joints that turn at once, of which nothing can hold one: a law is missing."""
+    for motion, still in ((halting, True), (swing, False)):
+        problem, state = recorded(model, stick, motion=motion)
+        noise = np.full(2, NOISE)
+        relative = relative_rest(problem, state, noise)
+        assert relative.max() > TOLERANCE
+        assert np.all(stands(problem) == still)
+        assert only_sticks(problem, state, noise, relative, TOLERANCE) == still
 
 
 def test_friction_up_to_its_limit_is_no_law_where_the_model_has_less(model: RobotModel) -> None:

@@ -50,6 +50,7 @@ from .rest import (
     parts_of,
     predictable,
     relative_rest,
+    repeating,
     significance,
     tolerated,
     verdict,
@@ -146,7 +147,7 @@ class _Left(NamedTuple):
     p_value: float  # of the whole catalogue on it
     excess: float  # over the noise
     line: tuple[float, float, int]  # the strongest in its spectrum
-    more: float  # squares by which smooth functions find more in it than chance gives
+    more: Float[np.ndarray, " nv"]  # squares by which smooth functions of each joint find more in it than chance gives
     beyond: Float[np.ndarray, " nv"]  # each joint's squares, moving, beyond those of noise, where they surely are
     misfit: Bool[np.ndarray, " nv"]  # whether, without any cause, they are, or are more than is tolerable
 
@@ -320,8 +321,8 @@ def _told_apart(here: _Setting, found: list[Found], joint: Joint) -> tuple[list[
             if not physical_sign(other.effect) or other.name in [f.name for f in found]:
                 continue
             effects = [other.effect if at == k else effect for at, effect in enumerate(joint.causes)]
-            full = with_causes(problem, start, effects, whitening)
-            if predicts_better(problem, joint.step, full, sorted({*one.joints} & {*other.joints})):
+            both = sorted({*one.joints} & {*other.joints})
+            if predicts_better(problem, joint.step, with_causes(problem, start, effects, whitening), both):
                 own = one.as_another(other, (one.name, *one.ambiguous))
                 found = [own if f is found[k] else f for f in found]
                 joint = polished(problem, start, [f.effect for f in found], whitening)
@@ -369,7 +370,7 @@ def _judged(
     each = [
         replace(
             one,
-            complete=left.more <= ALL_BUT * (f.cost[0] - f.cost[1]),
+            complete=bool(left.more[list(f.joints)].max() <= ALL_BUT * (f.cost[0] - f.cost[1])),
             leaves=of_its_own(left.beyond, f.joints, one.taken),
             alone=stands_alone(left.misfit, f.joints),
         )
@@ -390,6 +391,9 @@ def _judged(
         return bool(searched.here.problem.held.any()) and beside(name).certainly(claims[name])
 
     beyond = relative_rest(problem, joint.step.state, noise)
+    doubted = left.p_value < REST_P  # the catalogue still scores more than noise, though nothing in it passes
+    if found and doubted and float(beyond.max()) > tolerance:  # a rest of the answer is one for its names
+        strict = strict or not _sticks(here, joint, tolerance)
     rests = beside_rest(each, [f.joints for f in found], strict, beyond, tolerance)
     asked = (tolerance, certain, fading)
     against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
@@ -401,7 +405,6 @@ def _judged(
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
-    doubted = left.p_value < REST_P  # the catalogue still scores more than noise, though nothing in it passes
     shown = left.rest.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
     sticks = shown and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
     rest = shown and not sticks
@@ -559,15 +562,20 @@ def _left(
     joints, tolerable = problem.model.joint_names, size <= tolerance
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
-    loud = beyond_noise(problem, joint.step.linear.residual, spectrum, whitening, generator)
+    loud, quiet = beyond_noise(problem, joint.step.linear.residual, spectrum, whitening, generator)
     there = left.there or ((wrong or bool(loud.any())) and not tolerable)
+    if not problem.layout.repeats and not found:  # what is left is then no noise, nor is it known how much of it is
+        there = there or bool((quiet & (relative_rest(problem, joint.step.state, 0 * noise) > tolerance)).any())
     moves = np.moveaxis(~resting(problem), 2, 0).reshape(joint.step.rows.y.shape)
     beyond, alone = (
-        beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)
+        beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)[0]
         for step in (joint.step, first)
     )
+    # what a wrong law leaves shows in all rows too, and is there again in a repeat: what noisy positions make is not
+    beyond = np.minimum(beyond, loud)
+    beyond = np.minimum(beyond, repeating(problem, joint.step.rows, joint.step.linear.residual, moves))
     misfit = (alone > 0) | (relative_rest(problem, first.state, noise) > tolerance)
-    return _Left(left._replace(there=there), p_left, now[0], line, flexible[2], beyond, misfit)
+    return _Left(left._replace(there=there), p_left, now[0], line, flexible.each, beyond, misfit)
 
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -16,11 +18,20 @@ from .problem import Problem
 from .screening import Group, Null, family_p, screen
 from .state import FRICTION_PRECISION, State, whitened
 
-__all__ = ["dependences", "families", "flexible_p", "friction_width", "smooth_functions"]
+__all__ = ["Smooth", "dependences", "families", "flexible_p", "friction_width", "smooth_functions"]
 
 DEGREES = 6  # of the polynomials in a joint's position; of the cosines over time one less
 WIDTHS = (0.0, 0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # rad/s or m/s
 WIDTH_GAIN = 10.0  # whitened squares that a smooth reversal must take away
+
+
+class Smooth(NamedTuple):
+    """What smooth functions find in what a fit leaves; squares are those of whitened rows beyond what chance gives."""
+
+    p: float  # of all families
+    strongest: Name
+    score: float  # squares of the strongest
+    each: Float[np.ndarray, " nv"]  # squares of the best family of each joint
 
 
 def flexible_p(
@@ -30,9 +41,8 @@ def flexible_p(
     spectrum: Spectrum,
     whitening: Float[np.ndarray, "F nv"],
     generator: np.random.Generator,
-) -> tuple[float, Name, float]:
-    """p-value of the smooth families of each joint (`families`), the strongest of them, and by how much its score
-    exceeds what chance gives (squares of the whitened rows).
+) -> Smooth:
+    """What the smooth families of each joint (`families`) say of what a fit leaves.
 
     They test and describe; they are never named as a cause.
     """
@@ -41,8 +51,12 @@ def flexible_p(
     found = screen(rows, linear, groups)
     p = family_p(rows, linear, found, Null(problem, spectrum, whitening, generator), generator)
     best = int(np.argmax([result.z.max() for result in found.scores]))
+    more = np.zeros(problem.model.nv)
+    for group, score in zip(found.groups, found.scores, strict=True):
+        (joint,) = group.columns.joints
+        more[joint] = max(more[joint], float(score.Q.max() - score.rank.max()))
     score = found.scores[best]
-    return p, found.groups[best].name, float(score.Q.max() - score.rank.max())
+    return Smooth(p, found.groups[best].name, float(score.Q.max() - score.rank.max()), more)
 
 
 def friction_width(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> Problem:

@@ -37,6 +37,7 @@ from .thresholds import (
     GAIN_NAMED,
     GAIN_NAMED_ROBOT,
     LAW_LEAVES,
+    MARGIN,
     MASS,
     MODULATION,
     MODULATION_HELD_OUT,
@@ -76,7 +77,8 @@ class Standing:
     massless: bool = False  # a body whose mass is not surely there
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
     cancels: bool = False  # whether it is a share of all torque, and larger than it: a reading of less than half
-    complete: bool = False  # whether smooth functions find next to nothing in what it leaves
+    complete: bool = False  # whether smooth functions find next to nothing in what it leaves at its joints
+    outdone: bool = False  # whether what could be named in its place surely predicts better
     taken: float = 0.0  # held-out squares of its joints that it removes
     leaves: float = 0.0  # squares beyond noise at its joints over these
     alone: bool = True  # whether its joints are likely to have no other misfit (`stands_alone`)
@@ -97,6 +99,7 @@ def reason_against(
     are those that were surely there and are gone in recordings kept out.
     """
     least, most = (GAIN_NAMED_ROBOT, MODULATION_ROBOT) if one.whole else (GAIN_NAMED, MODULATION)
+    margin = _together_beyond(max(one.t / one.t_needed, 1.0), one.gain / least, most / max(one.modulation, 1e-9))
     strict_law = one.whole or one.alone  # what else is wrong at a joint makes its law's amplitude vary
     varies = "its amplitude varies with position, speed, load or time (that would add"
     checks = [
@@ -110,6 +113,8 @@ def reason_against(
             one.modulation_held_out <= (ALL_BUT if one.varies and strict_law else MODULATION_HELD_OUT),
             f"{varies} {one.modulation_held_out:.2f} of its gain)",
         ),
+        (not one.outdone, "another cause that explains the same misfit predicts better, though it is none itself"),
+        (not one.massless, "its mass is not surely above zero: a link other than believed explains as much"),
         (
             one.leaves <= LAW_LEAVES or not one.alone,
             f"where it acts {one.leaves:.2f} of what it removes stays beyond the noise, though most other joints have"
@@ -135,9 +140,21 @@ def reason_against(
                 not one.inertia_alone,
                 "a coupling without friction of its own cannot be distinguished from rotor or link inertia",
             ),
-            (not one.massless, "its mass is not surely above zero: a link other than believed explains as much"),
+            (
+                margin >= MARGIN,
+                f"it is borderline: t, gain and a steady amplitude together are {margin:.1f} times what each alone"
+                f" needs, {MARGIN:.0f} needed",
+            ),
         ]
     return next((reason for passed, reason in checks if not passed), "")
+
+
+def _together_beyond(*ratios: float) -> float:
+    """How far a cause is beyond what its tests need, together.
+
+    One that passes each of them by little passes some of them by chance, and not with the next recording.
+    """
+    return float(np.prod(np.clip(ratios, 0.0, MARGIN)))
 
 
 def stands_alone(misfit: Bool[np.ndarray, " nv"], joints: Sequence[int]) -> bool:
@@ -214,6 +231,7 @@ def standings(
                 varies=modulation[2],
                 beside_smooth=_beside_smooth(grown, bare, effect, place, one.joints) if whole else 1.0,
                 inertia_alone=coupled and _inertia_alone(effect, joint.fitted, at),
+                outdone=one.outdone,
                 massless=effect.body and _deviations(effect, joint.fitted, at)["mass"] < MASS,
             )
         )

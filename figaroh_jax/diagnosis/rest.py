@@ -12,9 +12,9 @@ from ..estimation import noise
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Rows
 from ..recordings.stacked import filter_rows
-from ..results import Dependence, Name, Part, Verdict
+from ..results import Dependence, Part, Verdict
 from .comparison import ground, judge_grown, t_value
-from .flexible import dependences, families
+from .flexible import Smooth, dependences, families
 from .holdout import residual_rms
 from .problem import Problem
 from .screening import CHUNK, draw_noise, noise_squares
@@ -45,6 +45,7 @@ __all__ = [
     "parts_of",
     "predictable",
     "relative_rest",
+    "repeating",
     "significance",
     "tolerated",
     "verdict",
@@ -100,30 +101,46 @@ def beyond_noise(
     whitening: Float[np.ndarray, "F nv"],
     generator: np.random.Generator,
     rows: Bool[np.ndarray, "nv T"] | None = None,
-) -> Float[np.ndarray, " nv"]:
-    """Squares that each joint's residual has beyond those of noise, where chance gives no joint so many; else zero.
+) -> tuple[Float[np.ndarray, " nv"], Bool[np.ndarray, " nv"]]:
+    """Squares that each joint's residual has beyond those of noise, where chance gives no joint so many, else zero; and
+    whether it has fewer than chance gives any joint.
 
     Of some rows of each joint, or of all.
 
     Noise is drawn with all that its spectrum may be, and a joint's power counted in deviations of what noise has there:
     one draw in a hundred has a joint with as much. What no function of the motion predicts is a misfit too, if it is
-    larger than the noise can be.
+    larger than the noise can be. Less power than the noise has is no noise either: its spectrum is estimated from what
+    a rich model leaves, and what the motion's own frequencies leave passes for more noise than there is.
     """
     counted = np.ones(residual.shape, bool) if rows is None else rows
     parts = (draw_noise(problem, spectrum, whitening, CHUNK, generator) for _ in range(POWER_DRAWS // CHUNK))
     noise = np.concatenate([(part**2 * counted).sum(2) for part in parts])
     mean, deviation = noise.mean(0), np.maximum(noise.std(0), 1e-12 * noise.mean(0) + 1e-300)
-    largest = ((noise - mean) / deviation).max(1)
-    own = (residual**2 * counted).sum(1) - mean
-    p = (1 + np.sum(largest[:, None] >= own / deviation, axis=0)) / (len(noise) + 1)
-    return np.where(p < REST_P, np.maximum(own, 0.0), 0.0)
+    drawn, own = (noise - mean) / deviation, (residual**2 * counted).sum(1) - mean
+    p, q = (
+        (1 + np.sum(most[:, None] >= side * own / deviation, axis=0)) / (len(noise) + 1)
+        for side, most in ((1, drawn.max(1)), (-1, -drawn.min(1)))
+    )
+    return np.where(p < REST_P, np.maximum(own, 0.0), 0.0), q < REST_P
+
+
+def repeating(
+    problem: Problem, rows: Rows, residual: Float[np.ndarray, "nv T"], counted: Bool[np.ndarray, "nv T"]
+) -> Float[np.ndarray, " nv"]:
+    """Squares of each joint's residual, in some of its rows, that repeats of the motion have in common: no noise and
+    no error of what a law is evaluated at. Infinite where no recording repeats another."""
+    if not problem.layout.repeats:
+        return np.full(len(residual), np.inf)
+    other = np.stack([rows.instrument(residual[j], j) for j in range(len(residual))])
+    paired = (rows.paired * counted).sum(1) / np.maximum(counted.sum(1), 1)
+    return np.maximum((residual * other * counted).sum(1), 0.0) / np.maximum(paired, 1e-12)
 
 
 def significance(
     now: tuple[float, float, Float[np.ndarray, " nv"]],
     first: float,
     p_catalogue: float,
-    flexible: tuple[float, Name, float],
+    flexible: Smooth,
     line: tuple[float, float, int],
     joints: tuple[str, ...],
     predicted: bool,
@@ -139,15 +156,15 @@ def significance(
     largest = float(np.max(own))
     repeated = p_repeat < 1
     repeats = p_repeat < REST_P and size > max(REPEATED, REPEATED_SHARE * first)
-    p = min(flexible[0], p_catalogue) if repeated else flexible[0]
+    p = min(flexible.p, p_catalogue) if repeated else flexible.p
     scored = p < REST_P and largest > max(FITTED if repeated else UNREPEATED, FITTED_SHARE * first)
     vibrates = line[0] < LINE_P
     worst, text = int(np.argmax(own)), ""
     there = bool((repeats or (scored and (repeated or predicted))) and not tolerable)
     if there:
         text = f"mostly at {joints[worst]} ({own[worst]:.2g} times the noise power)"
-        if flexible[0] < REST_P:
-            text += f"; strongest dependence: {flexible[1].effect} at {flexible[1].at[0]}"
+        if flexible.p < REST_P:
+            text += f"; strongest dependence: {flexible.strongest.effect} at {flexible.strongest.at[0]}"
     if vibrates:
         text += f"{'; ' if text else ''}a spectral line at {line[1]:.3g} Hz at {joints[line[2]]}"
     return Significance(there or vibrates, text)
@@ -245,13 +262,13 @@ def _share_of_line(problem: Problem, step: Step, line: tuple[float, float, int])
     return float(power[near].sum() / max(power.sum(), 1e-300))
 
 
-def wrong_law(at: tuple[str, ...], drop: float, flexible: tuple[float, Name, float]) -> bool:
+def wrong_law(at: tuple[str, ...], drop: float, flexible: Smooth) -> bool:
     """Whether a cause that acts at the joints `at` leaves a rest of its own there, beside the squares it removed.
 
     The right law leaves noise; one that only resembles it leaves a share of what it stands for.
     """
-    p, (_, places), score = flexible
-    return p < REST_P and (not at or places[0] in at) and score > OWN_SHARE * drop
+    places = flexible.strongest.at
+    return flexible.p < REST_P and (not at or places[0] in at) and flexible.score > OWN_SHARE * drop
 
 
 def tolerated(largest: float, tolerance: float, sticks: bool) -> str:

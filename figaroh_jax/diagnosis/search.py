@@ -20,12 +20,12 @@ from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
 from .flexible import friction_width
-from .gates import ambiguous, exists, gains, passes, rivals, simpler
+from .gates import ambiguous, exists, gains, passes, physical_sign, rivals, simpler
 from .problem import Problem
 from .screening import DRAWS, Null, Screen, Shown, catalogue, family_p, place_p, screen
 from .state import State, solved, with_width
 from .step import Step, stand, with_cause, with_causes
-from .thresholds import GAIN, MOST_CAUSES, OVERLAP_ELSEWHERE, SHARE_AGAIN, SHARE_ALIKE, SMALLEST, T_BETTER
+from .thresholds import GAIN, MOST_CAUSES, OUTDONE, OVERLAP_ELSEWHERE, SHARE_AGAIN, SHARE_ALIKE, SMALLEST, T_BETTER
 
 __all__ = [
     "Begun",
@@ -66,19 +66,20 @@ class Found:
     joints: tuple[int, ...] = ()  # by whose rows it is judged
     alike: tuple[Name, ...] = ()  # what else explains much of the same misfit, though not as well
     instead: tuple[Rival, ...] = ()  # of the `ambiguous` those that were fitted in its place
+    outdone: bool = False  # whether what could be named in its place predicts better in nearly all draws of the blocks
 
     def as_another(self, other: Rival, alike: Iterable[Name]) -> Found:
         """The same cause by another's name, effect and joints; `alike` is what then cannot be told from it."""
         known = tuple(name for name in alike if name != other.name)
-        return replace(self, name=other.name, effect=other.effect, joints=other.joints, ambiguous=known)
+        own = {"name": other.name, "effect": other.effect, "joints": other.joints}
+        return replace(self, **own, ambiguous=known, outdone=False)
 
 
 class Search(NamedTuple):
-    """How a search ended: the problem and the baseline as it sees them, its last step, the causes in order."""
+    """How a search ended: the problem and the baseline as it sees them, the causes in order."""
 
     problem: Problem
     start: State  # with the coefficients that it has beside all causes
-    step: Step
     found: list[Found]
     p_value: float  # of the whole catalogue before anything was found
     p_left: float  # of the same once the causes were in
@@ -138,7 +139,7 @@ def find_causes(
             break
         before = step
         for best in chosen[: MOST_CAUSES - len(found)]:
-            found.append(_found(before, contenders, best, screened, p_values[-1], generator))
+            found.append(_found(problem, before, contenders, best, screened, p_values[-1], generator))
             step = with_cause(problem, step, best.effect, whitening)
         if len(found) > 1 and any(type(f.effect).follows_total for f in found):
             step, screened = _refreshed(problem, state, step, found, whitening), None
@@ -151,7 +152,7 @@ def find_causes(
             groups = None if problem is not known or "response" in ways else groups
             step = step if problem is known else stand(problem, with_width(problem, step.state), whitening)
     begun = solved(problem, with_width(problem, state), step.state.theta[: len(state.theta)])
-    return Search(problem, begun, step, found, p_values[0], p_values[-1], shown)
+    return Search(problem, begun, found, p_values[0], p_values[-1], shown)
 
 
 def chance_beside(
@@ -277,7 +278,13 @@ def _best(problem: Problem, step: Step, contenders: list[Contender], before: lis
 
 
 def _found(
-    step: Step, contenders: list[Contender], best: Contender, screened: Screen, p: float, generator: np.random.Generator
+    problem: Problem,
+    step: Step,
+    contenders: list[Contender],
+    best: Contender,
+    screened: Screen,
+    p: float,
+    generator: np.random.Generator,
 ) -> Found:
     """The accepted cause with its gain, and with what explains the same misfit as well or nearly so."""
     alike = rivals(step, contenders, best)
@@ -285,7 +292,10 @@ def _found(
     open_to = ambiguous(step, best, alike, screened)
     wins = shares_of_wins(np.stack([c.verdicts.blocks for c in [best, *alike]]), generator)
     # laws that hold this one, and need not: where they win, it has won
-    outer = [best.name.effect in type(c.effect).contains and c.name.at == best.name.at for c in alike]
+    outer = np.array([best.name.effect in type(c.effect).contains and c.name.at == best.name.at for c in alike], bool)
+    own = float(wins[0] + wins[1:][outer].sum())
+    # where the links are not well known, those that they can stand for are no names
+    apart = np.array([problem.trust <= c.effect.needs_trust and physical_sign(c.effect) for c in alike], bool)
     return Found(
         name=best.name,
         effect=best.effect,
@@ -293,11 +303,12 @@ def _found(
         heldout=(step.verdicts.heldout, best.verdicts.heldout),
         cost=(step.verdicts.cost, best.verdicts.cost),
         t=t_value(step.verdicts.blocks, best.verdicts.blocks),
-        confidence=float(wins[0] + wins[1:][outer].sum()) * (1 - p),
+        confidence=own * (1 - p),
         ambiguous=open_to,
         joints=best.joints,
         alike=tuple(c.name for c in alike if step.verdicts.cost - c.verdicts.cost > SHARE_ALIKE * drop),
         instead=tuple(Rival(c.name, c.effect, c.joints) for c in alike if c.name in open_to),
+        outdone=own < OUTDONE * (own + wins[1:][apart & ~outer].sum()),
     )
 
 

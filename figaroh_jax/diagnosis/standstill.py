@@ -18,8 +18,9 @@ from .state import State
 from .thresholds import CARRIED, LAW_AT_REST, LAW_WIDTHS, LEAST_MOVING, STANDSTILL
 from .weights import relative_speed
 
-__all__ = ["beyond_sliding", "only_sticks", "resting"]
+__all__ = ["beyond_sliding", "only_sticks", "resting", "stands"]
 
+PASSED = 1 / 8  # of the band of slow rows
 TURNED = 0.1  # of the way to its limit: below, what friction a joint needs to slide is taken from the samples around
 
 
@@ -58,6 +59,8 @@ def only_sticks(
     looked_at = np.flatnonzero(relative > tolerance)
     if not len(looked_at) or np.any(moving[looked_at] > tolerance * torque[looked_at]):
         return False
+    if not np.any(stands(problem)[looked_at]):  # a robot whose joints stick does so at some joint for long
+        return False
     seen = (judged & ~still).sum((0, 1)) >= LEAST_MOVING * judged.sum((0, 1))
     held = _rms(left, still) <= 2 * np.sqrt((_friction(state) ** 2).mean(0))  # from one limit to the other
     if not np.all((seen & held)[looked_at]):
@@ -65,6 +68,17 @@ def only_sticks(
     beyond = np.sqrt(np.maximum(_rms(beyond_sliding(problem, state, left), still) ** 2 - noise**2, 0.0))
     slides = [joint for joint in looked_at.tolist() if beyond[joint] > tolerance * torque[joint]]
     return not any(_law_of_velocity(problem, state, left, still, joint) for joint in slides)
+
+
+def stands(problem: Problem) -> Bool[np.ndarray, " nv"]:
+    """Whether each joint stands still at times: it is as long at rest, within an eighth of the band of slow rows, as it
+    would be on its way through if it passed without stopping.
+
+    A joint that turns at constant acceleration is an eighth of its slow rows within an eighth of the band.
+    """
+    speed, judged = relative_speed(problem), np.asarray(problem.records.judged) > 0
+    slow = ((speed < STANDSTILL) & judged).sum((0, 1))
+    return ((speed < STANDSTILL * PASSED) & judged).sum((0, 1)) > 2 * PASSED * slow
 
 
 def beyond_sliding(problem: Problem, state: State, left: Float[np.ndarray, "n M nv"]) -> Float[np.ndarray, "n M nv"]:

@@ -68,6 +68,7 @@ def with_cause(problem: Problem, step: Step, effect: Effect, whitening: Float[np
     if kind(effect) != "position":
         return grown
     base = solved(problem, step.state, grown.state.theta)
+    del grown  # its rows and columns are large
     return stand(problem, extended_state(problem, base, effect), whitening)
 
 

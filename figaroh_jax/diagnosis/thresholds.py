@@ -34,6 +34,7 @@ T_BETTER = 1.64  # t of the blocks: that the cause predicts better
 T_ALIKE = 1.7  # t below which two causes predict alike
 OVERLAP_SAME = 0.5  # overlap from which two causes explain the same misfit
 T_APART = 3.0  # t from which data tell effects apart that are the same while the joint moves
+OUTDONE = 0.05  # of the draws of the blocks: in fewer, a cause predicts best of those that could be named in its place
 SHARE_ALIKE = 0.5  # share of the best's drop from which another cause explains much of the same
 SMALLEST = 0.0005  # share of the first cause's drop below which a later one may be what the first left over
 MOST_CAUSES = 16
@@ -57,6 +58,7 @@ STANDS = SPEED_EDGES[1]  # of a joint's top speed: below, it stands, and its row
 LAW_LEAVES = 0.05  # of the squares that a cause removes: what may surely stay at its joints where no other has a misfit
 ALL_BUT = 0.1  # of the squares that a cause removes: what smooth functions may still find where it is all there is, and
 # what an amplitude that varies may surely gain
+MARGIN = 4.0  # times what is needed, of t, gain and modulation together (each of them as much at the most)
 SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
 MASS = 3.0  # standard deviations of a body's mass: below, what moves is the link that carries it
 BESIDE_SMOOTH = 0.05  # gain of a cause of the whole robot beside smooth functions at every joint, or in their place

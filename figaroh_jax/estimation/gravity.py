@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..compiled.batching import traced
 from ..rigid.chain import joint_axis
-from ..rigid.kinematics import ancestors, forward_kinematics
+from ..rigid.kinematics import ancestors, forward_kinematics, poses_on_host
 from ..rigid.model import RobotModel
 
 __all__ = ["gravity_moments", "without_far_masses"]
@@ -42,7 +42,7 @@ def gravity_moments(
     $M_j = \sum_{i \text{ above } j} (c_i - o_j) \times m_i g$ over the links that joint j moves.
     """
     lib: Any = jnp if traced(model, q) else np
-    poses = lib.asarray(forward_kinematics(model, q))
+    poses: Any = poses_on_host(model, np.asarray(q, float)) if lib is np else forward_kinematics(model, q)
     R, o = poses[..., :3, :3], poses[..., :3, 3]
     inertia, gravity = lib.asarray(model.inertia), lib.asarray(model.gravity)
     mass, first = inertia[:, 0], inertia[:, 1:4]

@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..recordings.devices import Device, Planes, Points, Poses, Sockets
 from ..recordings.poses import PoseRecording
 from ..rigid.chain import chain_between
-from ..rigid.kinematics import forward_kinematics
+from ..rigid.kinematics import poses_on_host
 from ..rigid.model import RobotModel
 from . import posefit, starts
 from .gravity import gravity_moments
@@ -170,7 +170,7 @@ def _group(
 
 def _nominal(model: RobotModel, base: str, tool: str, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotation and origin of the tool frame in the base frame, without errors."""
-    poses = np.asarray(forward_kinematics(model, q))
+    poses = poses_on_host(model, np.asarray(q, float))
     world = np.concatenate([np.broadcast_to(np.eye(4), (len(q), 1, 4, 4)), poses], axis=1)
     start, end = (
         world[:, model.frames[k].parent + 1] @ np.asarray(model.frame_placement)[k]

@@ -242,7 +242,8 @@ def _solved(matrix: Float[Any, "n n"], right: Float[Any, " n"]) -> Float[Any, " 
     """By Cholesky's factor; NaN where there is none."""
     if _library(right) is jnp:
         return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), right)
-    from scipy.linalg.lapack import dposv  # pyright: ignore[reportAttributeAccessIssue]  (scipy is slow to import)
-
-    _, found, failed = dposv(matrix, right, lower=1)
-    return np.full_like(right, np.nan) if failed else found
+    try:
+        np.linalg.cholesky(matrix)  # SciPy, whose factor could be used again, takes longer to import than a fit takes
+    except np.linalg.LinAlgError:
+        return np.full_like(right, np.nan)
+    return np.linalg.solve(matrix, right)

@@ -46,6 +46,7 @@ __all__ = [
 ]
 
 _UNROLLED = 8  # levels: a short chain compiles to straight code as fast as to a loop, and runs faster
+_FEW = 1 << 17  # poses that NumPy makes on the host in less time than a program takes to compile
 _ORIGIN = np.array([1.0, 0.0, 0.0, 0.0])[:, None, None]  # picks the origin among the columns of a pose
 
 
@@ -321,11 +322,12 @@ def forward_kinematics(model: RobotModel, q: Float[ArrayLike, "*batch nq"]) -> F
 def poses_on_host(model: RobotModel, q: Float[np.ndarray, "samples nq"]) -> Float[np.ndarray, "samples nj 4 4"]:
     """`forward_kinematics` of few arrays of the host in NumPy, where joints turn or slide about one axis.
 
-    A program for them takes half a second to compile.
+    A program for them takes half a second to compile; where there are more than `_FEW` poses it is worth it.
     """
     numbers, parents = _numbers(model.joints), [joint.parent for joint in model.joints]
     kinds = {joint.kind for joint in model.joints}
-    if kinds - {"revolute", "prismatic"} or any(parent >= k for k, parent in enumerate(parents)):
+    ordered = all(parent < k for k, parent in enumerate(parents))
+    if kinds - {"revolute", "prismatic"} or not ordered or len(parents) * len(q) > _FEW:
         return np.asarray(forward_kinematics(model, q))
     check_shapes(model, q=q)
     sliding = {int(joint): int(column) for joint, _, _, column in numbers.slides}

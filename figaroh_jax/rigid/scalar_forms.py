@@ -250,9 +250,11 @@ MOST = 24  # blocks of the regressor, ten numbers each, that one kernel writes: 
 
 
 def _masses(model: RobotModel, codes: bytes) -> list[Program]:
+    place = {(row, column): k for k, (row, column) in enumerate(_entries(model.joints).tolist())}
+
     def mass_matrix(load: Load, reads: list[Read], write: Write) -> None:
-        def put(row: int, column: int, number: Number) -> None:
-            write([((min(row, column), max(row, column)), number)])
+        def put(entries: dict[tuple[int, int], Number]) -> None:
+            write([((place[row, column],), number) for (row, column), number in entries.items()])
 
         mass_entries(Robot(model.joints, codes, load), reads[0], put)
 
@@ -267,20 +269,21 @@ def _accelerations(model: RobotModel, codes: bytes) -> list[Program]:
     return [forward_dynamics]
 
 
-def _whole_masses(model: RobotModel, upper: Array) -> Array:
-    """From the entries on and above the diagonal that are not zero for every posture."""
-    place = np.arange(model.nv)
-    upper = jnp.where((place[:, None] <= place)[..., None] & ~_empty(model.joints)[..., None], upper, 0.0)
-    return upper + jnp.swapaxes(jnp.where((place[:, None] < place)[..., None], upper, 0.0), 0, 1)
+def _whole_masses(model: RobotModel, entries: Array) -> Array:
+    """From the entries on and below the diagonal that are not zero for every posture."""
+    (row, column), nv = _entries(model.joints).T, model.nv
+    source = np.full((nv, nv), len(row))  # zeros, where no entry is
+    source[row, column] = source[column, row] = np.arange(len(row))
+    return jnp.concatenate([entries, jnp.zeros_like(entries[:1])])[source]
 
 
 @lru_cache(maxsize=64)
-def _empty(joints: tuple[Joint, ...]) -> np.ndarray:
-    """Entries of the mass matrix whose coordinates move no link in common: zero for every posture."""
+def _entries(joints: tuple[Joint, ...]) -> np.ndarray:
+    """Row and column, not above it, of entries of the mass matrix whose coordinates move a link in common."""
     places = dofs(joints)
     moved = np.zeros((int(places.column.max(initial=-1)) + 1, len(joints)))
     np.add.at(moved, places.column, ancestors(joints)[places.joint])
-    return moved @ moved.T == 0
+    return np.argwhere(np.tril(moved @ moved.T) > 0)
 
 
 def _rows(model: RobotModel, coordinates: bool) -> np.ndarray:
@@ -333,7 +336,7 @@ def _column_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
 
 
 def _mass_places(model: RobotModel, place: tuple[int, ...]) -> list[int]:
-    row, column = place
+    row, column = _entries(model.joints)[place[0]].tolist()
     return sorted({model.nv * row + column, model.nv * column + row})
 
 
@@ -366,7 +369,14 @@ COLUMNS = _Form(
     answer=lambda model: (10 * len(model.joints), model.nv),
     places=_column_places,
 )
-MASSES = _Form("masses", _masses, lambda model: (model.nv, model.nv), _whole_masses, places=_mass_places)
+MASSES = _Form(
+    "mass entries",
+    _masses,
+    lambda model: (len(_entries(model.joints)),),
+    _whole_masses,
+    answer=lambda model: (model.nv, model.nv),
+    places=_mass_places,
+)
 
 
 def _in_order(shape: Callable[[RobotModel], tuple[int, ...]], model: RobotModel, place: tuple[int, ...]) -> list[int]:

@@ -276,6 +276,9 @@ def ten_columns(twist: Twist, motion: Motion, spin: Matrix, wanted: Sequence[int
 _ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))  # of the inertia, in Pinocchio's order
 
 
+Entries = dict[tuple[int, int], Number]  # of the mass matrix, by row and column
+
+
 class Body(NamedTuple):
     """Of all that a joint carries, about its origin, in its axes: mass, first moments and moments of inertia."""
 
@@ -284,18 +287,23 @@ class Body(NamedTuple):
     inertia: Matrix
 
 
-def mass_entries(robot: Robot, q: Read, put: Callable[[int, int, Number], None]) -> None:
-    """Composite bodies (Featherstone 2008, section 6.2): `put(row, column, number)` for rows not above the column.
+def mass_entries(robot: Robot, q: Read, put: Callable[[Entries], None]) -> None:
+    """Composite bodies (Featherstone 2008, section 6.2): `put` entries whose row is not above the column.
 
-    Entries that are zero by structure are not put. Joints that share a coordinate add up when the last is there.
+    Each degree of freedom's are put as soon as they are there, so that few are held at a time; those of joints that
+    share a coordinate add up and are put last. Entries that are zero by structure are not put.
     """
     poses: dict[int, Pose] = {}
     total: dict[tuple[int, int], Number] = {}
     column, carried_by = robot.dofs.column, robot.joints
+    alone = np.bincount(column)[column] == 1
 
-    def enter(k: int, above: int, value: Number, ratio: Number) -> None:
+    def enter(k: int, above: int, value: Number, ratio: Number, ready: Entries) -> None:
         place = (max(int(column[k]), int(column[above])), min(int(column[k]), int(column[above])))
         value = value * ratio
+        if alone[k] and alone[above]:
+            ready[place] = value
+            return
         if column[k] == column[above] and k != above:
             value = value + value
         total[place] = total[place] + value if place in total else value
@@ -313,13 +321,15 @@ def mass_entries(robot: Robot, q: Read, put: Callable[[int, int, Number], None])
     def project(i: int, body: Body) -> None:
         ratio = robot.of_joint(i, "ratio")[0]
         for k in robot.own(i):
+            ready: Entries = {}
             axis = robot.of_dof(k, "axis")
             if robot.dofs.turns[k]:
                 force, torque = cross(axis, body.h), turned(body.inertia, axis)
             else:
                 force, torque = scaled(axis, body.m), cross(body.h, axis)
             for n in range(robot.own(i)[0], k + 1):
-                enter(k, n, dot(robot.of_dof(n, "axis"), torque if robot.dofs.turns[n] else force), ratio * ratio)
+                moment = torque if robot.dofs.turns[n] else force
+                enter(k, n, dot(robot.of_dof(n, "axis"), moment), ratio * ratio, ready)
             j = i
             while carried_by[j].parent >= 0:
                 pose, j = poses[j], carried_by[j].parent
@@ -327,12 +337,15 @@ def mass_entries(robot: Robot, q: Read, put: Callable[[int, int, Number], None])
                 torque = add(pose.turn(torque), cross(pose.origin, force))
                 both = ratio * robot.of_joint(j, "ratio")[0]
                 for n in robot.own(j):
-                    enter(k, n, dot(robot.of_dof(n, "axis"), torque if robot.dofs.turns[n] else force), both)
+                    moment = torque if robot.dofs.turns[n] else force
+                    enter(k, n, dot(robot.of_dof(n, "axis"), moment), both, ready)
+            if ready:
+                put(ready)
 
     for i in robot.children(-1):
         visit(i)
-    for (row, col), value in total.items():
-        put(row, col, value)
+    if total:
+        put(total)
 
 
 def accelerations(robot: Robot, q: Read, v: Read, tau: Read, put: Callable[[int, Number], None]) -> None:
@@ -344,7 +357,7 @@ def accelerations(robot: Robot, q: Read, v: Read, tau: Read, put: Callable[[int,
     M: dict[tuple[int, int], Number] = {}
     torques(robot, q, v, lambda k: ZERO, lambda row, bias: rest.update({row: bias}))
     rest = {row: tau(row) - bias for row, bias in rest.items()}
-    mass_entries(robot, q, lambda row, column, number: M.update({(row, column): number}))
+    mass_entries(robot, q, M.update)
     order = sorted(rest)
     above = {k: [i for i in order[:n] if (k, i) in M] for n, k in enumerate(order)}
     inverse: dict[int, Number] = {}

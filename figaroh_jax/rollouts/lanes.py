@@ -145,9 +145,9 @@ class Step:
 
     def masses(self, q: list) -> dict[tuple[int, int], Any]:
         """Lower entries that are not zero by structure."""
-        out: dict[tuple[int, int], Any] = {}
-        mass_entries(self.body, lambda k: Number(q[k]), lambda i, j, number: out.update({(i, j): number.x}))
-        return out
+        found: dict[tuple[int, int], Number] = {}
+        mass_entries(self.body, lambda k: Number(q[k]), found.update)
+        return {place: number.x for place, number in found.items()}
 
     def joint(self, j: int, q: Any, v: Any, u: Any, bias: Any) -> tuple[Any, ...]:
         """Torque of drive and passive elements, friction's level, pull and softness, and the step's damping."""
