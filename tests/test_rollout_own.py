@@ -231,6 +231,30 @@ def test_a_baseline_names_what_a_rollout_can_fit(tmp_path: Path, capsys: pytest.
     assert "asymmetric_coulomb_friction.difference lift" in told
 
 
+def test_a_base_that_is_not_level_is_identified(tmp_path: Path):
+    """Gravity along x by the base that leans, of a servo in MuJoCo C."""
+    (tmp_path / "servo.xml").write_text(SERVO)
+    model = mujoco.MjModel.from_xml_string(SERVO)
+    model.opt.gravity[:] = [0.6, 0.0, -9.81]
+    data, u = mujoco.MjData(model), command(3000)
+    q = np.zeros(len(u))
+    for k, row in enumerate(u):
+        q[k], data.ctrl[0] = data.qpos[0], row
+        mujoco.mj_step(model, data)
+    noise = 2e-4 * np.random.default_rng(3).standard_normal(len(u))
+    np.savez(tmp_path / "run.npz", t=0.002 * np.arange(len(u)), u=u, q=q + noise)
+    (tmp_path / "task.yaml").write_text(
+        "robot: {model: servo.xml}\nbaseline: {effects: [{effect: gravity_tilt}]}\n"
+        "data:\n  - {file: run.npz, time: t, command: u, position: q}\n"
+    )
+    assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    told = {one["expression"]: one for one in result["base_parameters"]}
+    x, y = told["gravity_x"], told["gravity_y"]
+    assert x["status"] == "identified" and abs(x["value"] - 0.6) < 3 * x["std"] < 0.05 and x["unit"] == "m/s2"
+    assert y["status"] == "unidentifiable"  # along the axis of the joint
+
+
 def test_the_example_names_its_effect():
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     example = ROOT / "examples" / "own_rollout_effect.py"

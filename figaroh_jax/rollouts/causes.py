@@ -124,8 +124,13 @@ def _kind_of(effect: type[Effect]) -> Kind:
     return plain._replace(experiment=told, shapes=tuple(range(count, len(effect.parameters()))))
 
 
-def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbid: Sequence[str] = ()) -> Catalogue:
-    """The candidates of a loop; `forces` (nu,) are the largest that its drives gave in the recordings."""
+def catalogue(
+    loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbid: Sequence[str] = (), tilt: bool = False
+) -> Catalogue:
+    """The candidates of a loop; `forces` (nu,) are the largest that its drives gave in the recordings.
+
+    `tilt`: with a base that is not level, which no search looks for.
+    """
     table, candidates = [], []
     robot = loop.robot
     names = robot.dof_names
@@ -150,9 +155,13 @@ def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbi
         if effect.name not in known and effect.acts_on == "joint":
             own = tuple((f"{effect.name}.{name}", k) for name in ordered)
             candidates.append((effect.name, own, starts_of(type(effect)), tuple(ordered), names[effect.places[0]]))
+    if tilt:
+        table += [Entry("gravity_x", (0,)), Entry("gravity_y", (0,))]
+        both = (("gravity_x", 0), ("gravity_y", 0))
+        candidates.append(("gravity_tilt", both, ((_HERE, _HERE),), ("x", "y"), None))
     index = {(e.name, e.at[0]): k for k, e in enumerate(table)}
     built = [
-        Candidate(effect, (name,), tuple(index[e] for e in entries), starts, reported)
+        Candidate(effect, () if name is None else (name,), tuple(index[e] for e in entries), starts, reported)
         for effect, entries, starts, reported, name in candidates
         if effect not in forbid
     ]

@@ -140,6 +140,8 @@ def _result(
 def _expression(here: Setting, entry: int) -> str:
     one = here.known.table[entry]
     names, place = here.loop.robot.dof_names, one.at[0]
+    if one.name in ("gravity_x", "gravity_y"):
+        return one.name
     if is_own(one.name):
         return f"{one.name} {', '.join(names[k] for k in here.loop.effects[place].places)}"
     if one.name in OF_DRIVES:

@@ -378,7 +378,7 @@ def joint_of(here: Setting, c: Candidate) -> int:
 def joint_of_entry(here: Setting, entry: int) -> int:
     """The joint whose encoder shows a number of the table; -1: those of several."""
     one = here.known.table[entry] if entry < len(here.known.table) else None
-    if one is None or len(one.at) != 1 or one.name == "payload":
+    if one is None or len(one.at) != 1 or one.name in ("payload", "gravity_x", "gravity_y"):
         return -1
     (place,) = one.at
     if is_own(one.name):

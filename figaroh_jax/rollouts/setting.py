@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from ..effects.base import Effect, place
-from ..effects.catalogue import CATALOGUE, find
+from ..effects.catalogue import CATALOGUE
 from ..errors import InputError, nearest
 from .causes import Candidate, Catalogue, catalogue
 from .colour import colour_of, filtered
@@ -105,14 +105,14 @@ def setting(
     runs: Sequence[Run],
     *,
     baseline: Sequence[str] = ("rotor_inertia", "joint_damping", "friction_loss"),
-    more: Sequence[tuple[str, str]] = (),
+    more: Sequence[tuple[str, ...]] = (),
     gains_known: bool = True,
     forbid: Sequence[str] = (),
     block: float = 0.3,
     stretches: Sequence[Stretch] = (),
     rates: bool = True,
 ) -> Setting:
-    """Data, catalogue and baseline; `more` are (effect, joint) that it has beside `baseline` at every joint."""
+    """Data, catalogue and baseline; `more` are (effect, place) that it has beside `baseline` at every joint."""
     loop = replace(loop, effects=everywhere(loop.robot, _with_wanted(loop, more), forbid))
     fitted = [r for r in runs if not r.holdout]
     noise = [np.sqrt(np.mean([noise_of(r.position) ** 2 for r in fitted], axis=0))]
@@ -120,18 +120,19 @@ def setting(
         noise.append(np.sqrt(np.mean([noise_of(r.velocity) ** 2 for r in fitted if r.velocity is not None], axis=0)))
     stretches = tuple(stretches) or tuple(Stretch(k, 0, len(r.time)) for k, r in enumerate(fitted))
     data = windows(loop, fitted, stretches, noise, block)
-    known = catalogue(loop, largest_forces(loop, fitted), gains_known=gains_known, forbid=forbid)
+    forces, tilt = largest_forces(loop, fitted), any(one[0] == "gravity_tilt" for one in more)
+    known = catalogue(loop, forces, gains_known=gains_known, forbid=forbid, tilt=tilt)
     names = loop.robot.dof_names
     wanted = [(effect, name) for effect in baseline for name in names] + list(more)
-    all_of = catalogue(loop, largest_forces(loop, fitted), gains_known=False).candidates
+    all_of = catalogue(loop, forces, gains_known=False, tilt=tilt).candidates
     told = {(c.effect, *c.at) for c in all_of}
-    for effect, name in more:
-        if (effect, name) not in told:
+    for effect, *at in more:
+        if (effect, *at) not in told:
             raise InputError(
-                f"baseline: effects: a rollout has no number for '{effect}' at '{name}'"
+                f"baseline: effects: a rollout has no number for '{effect}' at '{', '.join(at)}'"
                 f"{nearest(effect, {one[0] for one in told})}; it has {', '.join(sorted({one[0] for one in told}))}"
             )
-    free = [k for c in all_of if (c.effect, c.at[0]) in wanted for k in c.entries]
+    free = [k for c in all_of if (c.effect, *c.at) in wanted for k in c.entries]
     keep = tuple(c for c in known.candidates if not set(c.entries) <= set(free))
     count = loop.robot.nv
     return Setting(
@@ -140,11 +141,12 @@ def setting(
     )  # fmt: skip
 
 
-def _with_wanted(loop: Loop, more: Sequence[tuple[str, str]]) -> tuple[Effect, ...]:
+def _with_wanted(loop: Loop, more: Sequence[tuple[str, ...]]) -> tuple[Effect, ...]:
     """The effects of a loop, and those of the baseline for which it has no number of its own but their torque."""
     own = {c.effect for c in catalogue(loop, np.ones(len(loop.drives.names)), gains_known=False).candidates}
     names = loop.robot.dof_names
-    new = [(find(effect), name) for effect, name in more if effect not in own and effect in CATALOGUE and name in names]
+    asked = [(one[0], one[1]) for one in more if len(one) == 2 and one[0] not in own and one[1] in names]
+    new = [(CATALOGUE[effect], name) for effect, name in asked if effect in CATALOGUE]
     new = [
         place(effect, loop.robot, [name]) for effect, name in new if effect.acts_on == "joint" and effect.has("torque")
     ]

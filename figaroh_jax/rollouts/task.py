@@ -140,7 +140,8 @@ def diagnosis_setting(task: Task, loop: Loop, runs: Sequence[Run]) -> Setting:
     known, given = task.baseline, task.baseline.model_fields_set
     rotor = known.rotor if "rotor" in given else bool(np.asarray(loop.joints.armature).any())
     names = [n for n, on in zip(BASELINE, (rotor, known.viscous, known.coulomb), strict=True) if on]
-    more = [(_SAME.get(entry.effect, entry.effect), name) for entry in known.effects for name in entry.at]
+    at = [(_SAME.get(entry.effect, entry.effect), entry.at) for entry in known.effects]
+    more = [one for effect, names in at for one in ([(effect, name) for name in names] or [(effect,)])]
     return setting(
         loop, runs, baseline=names, more=more, gains_known=task.actuator.gains == "known", forbid=task.diagnose.forbid,
         stretches=_cut(task, loop, runs),
