@@ -118,7 +118,8 @@ def _other_reading(look: Look, motion: Sampled) -> Finding | None:
     best, text = -np.inf, ""
     readings = list(_readings(look, motion, given.nominal))
     signals = zip(*((one.position, one.velocity, one.acceleration) for _, one in readings), strict=True)
-    together = Sampled(*(np.concatenate(each) for each in signals), None, motion.rate)  # one call for all
+    position, velocity, acceleration = (np.concatenate(each) for each in signals)
+    together = Sampled(position, velocity, acceleration, None, motion.rate)  # one call for all
     nominal = np.split(rigid_torque(look.model, together), len(readings))
     for (said, other), own in zip(readings, nominal, strict=True):
         fit = _fit(look.model, other, own)
