@@ -4,6 +4,7 @@
     python benchmarks/arm_cases.py --seeds 1 --pairs
     python benchmarks/arm_cases.py --seeds 1 --forbid
     python benchmarks/arm_cases.py --seeds 1 --own            # a detent, an effect that a user registers
+    python benchmarks/arm_cases.py --seeds 1 --registered     # it is looked for, but not there
 
 Each arm is made by MuJoCo C (`tests/generators/servo_arm6.py`, no code shared with the library) and diagnosed with a
 model whose armature, damping and frictionloss are 1.6 times too large, on two recordings of 12 s. The joint follows
@@ -105,11 +106,12 @@ def main() -> None:
     parser.add_argument("--noise", choices=["white", "coloured", "counts"], default="white")
     parser.add_argument("--pairs", action="store_true", help="two effects at a time, of the middle size")
     parser.add_argument("--own", action="store_true", help="an effect that is no one of the library's, registered here")
+    parser.add_argument("--registered", action="store_true", help="that effect is registered, but not hidden")
     parser.add_argument("--forbid", action="store_true", help="leave the true effect out of the catalogue")
     parser.add_argument("--whole", action="store_true", help="search with the whole arm in place of joint by joint")
     args = parser.parse_args()
     count: dict[str, int] = {}
-    if args.own:
+    if args.own or args.registered:
         fj.register(Detent)
     for seed in args.seeds:
         for hidden in _cases(args, np.random.default_rng([seed, 3])):

@@ -2,7 +2,7 @@
 
     python benchmarks/rollouts.py servo_miuzei      # a hobby servo with a weight: train, test and all other runs
     python benchmarks/rollouts.py dfki_double_pendulum --window 0.3
-    python benchmarks/rollouts.py so101_sage [--third K] [--again]   # a 6-joint servo arm; K: that third is left out
+    python benchmarks/rollouts.py so101_sage [--third K] [--again] [--uncut]  # a 6-joint servo arm
     python benchmarks/rollouts.py so101_speed                   # CPU seconds of sensitivities: arm and joints
 
 Data under the folder that FIGAROH_JAX_DATA names. It prints the RMS of the position error, rad, after each cause, on
@@ -183,11 +183,21 @@ def so101_loop(**values: float) -> Loop:
 
 
 def so101_sage(
-    motions: list[str], third: int | None, most: float, unseen: float, forbid: list[str], again: bool = False
+    motions: list[str],
+    third: int | None,
+    most: float,
+    unseen: float,
+    forbid: list[str],
+    again: bool = False,
+    uncut: bool = False,
 ) -> None:
-    """Gains and viscous friction of every servo are fitted; what else the arm shows is sought."""
+    """Gains and viscous friction of every servo are fitted; what else the arm shows is sought.
+
+    `uncut`: with the rows that touch the table, of the late clock and of the held wrist, which are cut by hand else.
+    """
     loop = so101_loop()
-    runs = [r for k, r in enumerate(so101_runs({k: TRAIN[k] for k in motions})) if third is None or k % 3 != third]
+    cuts = {k: WHOLE if uncut else TRAIN[k] for k in motions}
+    runs = [r for k, r in enumerate(so101_runs(cuts)) if third is None or k % 3 != third]
     runs = [_shorter(r, most) for r in runs]
     cut = [
         Stretch(k, f, min(750, len(r.time) - f)) for k, r in enumerate(runs) for f in range(0, len(r.time) - 100, 750)
@@ -206,6 +216,8 @@ def so101_sage(
     print(
         f"verdict {found.verdict}, {time.process_time() - start:.0f} CPU s, {seconds:.0f} s of {len(runs)} recordings"
     )
+    for fault in found.faults:
+        print(f"  {fault.text(here.loop, here.runs)}")
     for n in found.named or found.proxy:
         alike = f", alike {', '.join(str(a) for a in n.alike)}" if n.alike else ""
         gain = f"{1e3 * n.before:.2f} -> {1e3 * n.after:.2f} mrad"
@@ -313,6 +325,7 @@ if __name__ == "__main__":
     parser.add_argument("--motions", nargs="+", choices=list(TRAIN), default=list(TRAIN), help="of the arm, fitted")
     parser.add_argument("--unseen", type=float, default=999.0, help="s of each of the arm's motions that are predicted")
     parser.add_argument("--forbid", nargs="*", default=[], help="effects that the arm's search leaves out")
+    parser.add_argument("--uncut", action="store_true", help="the arm's recordings with their faulty rows")
     parser.add_argument("--again", action="store_true", help="the arm's search a second time, everything compiled")
     args = parser.parse_args()
     if args.data == "so101_speed":
@@ -320,7 +333,7 @@ if __name__ == "__main__":
     elif args.data == "so101_faults":
         so101_faults()
     elif args.data == "so101_sage":
-        so101_sage(args.motions, args.third, args.most, args.unseen, args.forbid, args.again)
+        so101_sage(args.motions, args.third, args.most, args.unseen, args.forbid, args.again, args.uncut)
     elif args.data == "servo_miuzei":
         servo_miuzei(args.law)
     else:

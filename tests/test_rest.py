@@ -205,7 +205,11 @@ RIGHT = Standing(
         ({"t": 2.0}, "not significant"),
         ({"share": 0.015}, "needed"),
         ({"modulation": 0.2}, "varies"),
-        ({"whole": True, "gain": 0.05, "modulation": 0.2}, ""),
+        ({"whole": True, "gain": 0.1, "modulation": 0.2}, ""),
+        ({"whole": True, "gain": 0.05, "modulation": 0.2}, "borderline"),  # 1.67, 1.25 and 1.5 times what is needed
+        ({"gain": 0.26, "t": 2.5, "modulation": 0.14}, "borderline"),  # each of them by little
+        ({"gain": 0.26, "t": 2.5}, ""),  # but as steady as can be
+        ({"gain": 0.26, "t": 20.0, "modulation": 0.14}, ""),
         ({"whole": True, "gain": 0.05, "modulation": 0.4}, "varies"),
         ({"modulation_held_out": 0.25}, "varies"),
         ({"modulation_held_out": 0.12, "varies": True}, "varies"),  # less than .2, but surely

@@ -212,6 +212,25 @@ def test_what_a_step_does_not_know_is_refused(tmp_path: Path):
             loop.with_effects(fj.place(fj.CATALOGUE[name], loop.robot, ["lift"]))
 
 
+def test_a_baseline_names_what_a_rollout_can_fit(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """An effect of the catalogue acts by its torque where the loop has no number for it; what has none is refused."""
+    (tmp_path / "servo.xml").write_text(SERVO)
+    u = command(1500)
+    noise = 2e-4 * np.random.default_rng(3).standard_normal(len(u))
+    np.savez(tmp_path / "run.npz", t=0.002 * np.arange(len(u)), u=u, q=simulated_by_mujoco(u, 0.0, 0.0) + noise)
+    text = (
+        "robot: {model: servo.xml}\nbaseline: {effects: [{effect: EFFECT, at: [lift]}]}\n"
+        "data:\n  - {file: run.npz, time: t, command: u, position: q}\n"
+    )
+    (tmp_path / "task.yaml").write_text(text.replace("EFFECT", "joint_elasticity"))
+    assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    assert "a rollout has no number for 'joint_elasticity' at 'lift'" in capsys.readouterr().err
+    (tmp_path / "task.yaml").write_text(text.replace("EFFECT", "asymmetric_coulomb_friction"))
+    assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    told = [one["expression"] for one in json.loads((tmp_path / "out" / "result.json").read_text())["base_parameters"]]
+    assert "asymmetric_coulomb_friction.difference lift" in told
+
+
 def test_the_example_names_its_effect():
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     example = ROOT / "examples" / "own_rollout_effect.py"

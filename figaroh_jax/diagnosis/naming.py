@@ -37,6 +37,7 @@ from .thresholds import (
     GAIN_NAMED,
     GAIN_NAMED_ROBOT,
     LAW_LEAVES,
+    MARGIN,
     MASS,
     MODULATION,
     MODULATION_HELD_OUT,
@@ -99,6 +100,7 @@ def reason_against(
     are those that were surely there and are gone in recordings kept out.
     """
     least, most = (GAIN_NAMED_ROBOT, MODULATION_ROBOT) if one.whole else (GAIN_NAMED, MODULATION)
+    margin = _together_beyond(max(one.t / one.t_needed, 1.0), one.gain / least, most / max(one.modulation, 1e-9))
     strict_law = one.whole or one.alone  # what else is wrong at a joint makes its law's amplitude vary
     varies = "its amplitude varies with position, speed, load or time (that would add"
     checks = [
@@ -140,8 +142,21 @@ def reason_against(
                 not one.inertia_alone,
                 "a coupling without friction of its own cannot be distinguished from rotor or link inertia",
             ),
+            (
+                margin >= MARGIN,
+                f"it is borderline: t, gain and a steady amplitude together are {margin:.1f} times what each alone"
+                f" needs, {MARGIN:.0f} needed",
+            ),
         ]
     return next((reason for passed, reason in checks if not passed), "")
+
+
+def _together_beyond(*ratios: float) -> float:
+    """How far a cause is beyond what its tests need, together.
+
+    One that passes each of them by little passes some of them by chance, and not with the next recording.
+    """
+    return float(np.prod(np.clip(ratios, 0.0, MARGIN)))
 
 
 def stands_alone(misfit: Bool[np.ndarray, " nv"], joints: Sequence[int]) -> bool:

@@ -58,6 +58,7 @@ STANDS = SPEED_EDGES[1]  # of a joint's top speed: below, it stands, and its row
 LAW_LEAVES = 0.05  # of the squares that a cause removes: what may surely stay at its joints where no other has a misfit
 ALL_BUT = 0.1  # of the squares that a cause removes: what smooth functions may still find where it is all there is, and
 # what an amplitude that varies may surely gain
+MARGIN = 4.0  # times what is needed, of t, gain and modulation together (each of them as much at the most)
 SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
 MASS = 3.0  # standard deviations of a body's mass: below, what moves is the link that carries it
 BESIDE_SMOOTH = 0.05  # gain of a cause of the whole robot beside smooth functions at every joint, or in their place

@@ -14,7 +14,7 @@ from jaxtyping import Float
 __all__ = ["motion_band", "smoothed"]
 
 ORDER = 3  # of the differences that smoothing holds small: gain 1 / (1 + (f / band)^(2 ORDER))
-STEPS = 2.0 ** (-np.arange(7) / 2)  # bands tried, as shares of the cutoff
+STEPS = 2.0 ** (-np.arange(13) / 2)  # bands tried, as shares of the cutoff
 WINDOW = 14.0  # Kaiser: what the motion leaks stays 100 dB below it
 CHANCE = 12.0  # times its mean: power that noise reaches at one frequency in a hundred thousand
 WORTH = 0.5  # share of the error in the acceleration at the cutoff below which a smaller band is taken

@@ -12,7 +12,7 @@ from ..effects.base import Effect
 from ..effects.catalogue import find
 from ..rigid.model import Frame, Joint, RobotModel
 from .loop import Joints, Loop
-from .own import amplitudes, is_own, registered, starts_of
+from .own import amplitudes, is_own, starts_of
 from .parameters import Entry, Table
 
 __all__ = ["BASELINE", "KINDS", "Candidate", "Catalogue", "Kind", "catalogue", "elastic_loop", "springs"]
@@ -64,8 +64,9 @@ class Candidate(NamedTuple):
     @property
     def kind(self) -> Kind:
         """What sets its effect apart."""
-        theirs = registered().get(self.effect)
-        return KINDS.get(self.effect, Kind()) if theirs is None else _kind_of(theirs)
+        if self.effect in KINDS or self.effect in _PLAIN:
+            return KINDS.get(self.effect, Kind())
+        return _kind_of(find(self.effect))
 
     def own(self, known: Catalogue) -> bool:
         """Whether it is an effect of a user's, which machine code does not know."""
@@ -111,6 +112,7 @@ KINDS = {
     ),
     "backlash": Kind(elastic=True, signed=False, contains=("joint_elasticity",), telling=2),
 }
+_PLAIN = ("dead_band",)  # of which nothing is to be said
 _HERE = float("nan")
 
 
@@ -141,10 +143,11 @@ def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbi
     for i, joint in enumerate(robot.joints if loop.carried is None else ()):
         table.append(Entry("payload", (i,)))
         candidates.append(("payload", (("payload", i),), ((0.0,),), ("mass",), joint.link))
+    known = {one[0] for one in candidates}
     for k, effect in enumerate(loop.effects):
         ordered = sorted(effect.parameters(), key=lambda name: name not in amplitudes(type(effect)))  # noqa: B023
         table += [Entry(f"{effect.name}.{name}", (k,)) for name in ordered]
-        if effect.name in registered() and len(effect.places) == 1:
+        if effect.name not in known and effect.acts_on == "joint":
             own = tuple((f"{effect.name}.{name}", k) for name in ordered)
             candidates.append((effect.name, own, starts_of(type(effect)), tuple(ordered), names[effect.places[0]]))
     index = {(e.name, e.at[0]): k for k, e in enumerate(table)}

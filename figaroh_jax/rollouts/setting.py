@@ -10,12 +10,15 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from ..effects.base import Effect, place
+from ..effects.catalogue import CATALOGUE, find
+from ..errors import InputError, nearest
 from .causes import Candidate, Catalogue, catalogue
 from .colour import colour_of, filtered
 from .data import Run, Stretch, noise_of, windows
 from .fit import Fit, fit
 from .loop import Loop
-from .own import everywhere
+from .own import everywhere, placed
 from .parameters import BOUNDS, Table, values
 from .sensitivity import Windows, predicted
 from .thresholds import POWER, SLOW, SLOW_ROWS, TO_TRY
@@ -110,7 +113,7 @@ def setting(
     rates: bool = True,
 ) -> Setting:
     """Data, catalogue and baseline; `more` are (effect, joint) that it has beside `baseline` at every joint."""
-    loop = replace(loop, effects=everywhere(loop.robot, loop.effects, forbid))
+    loop = replace(loop, effects=everywhere(loop.robot, _with_wanted(loop, more), forbid))
     fitted = [r for r in runs if not r.holdout]
     noise = [np.sqrt(np.mean([noise_of(r.position) ** 2 for r in fitted], axis=0))]
     if rates and all(r.velocity is not None for r in fitted):
@@ -121,6 +124,13 @@ def setting(
     names = loop.robot.dof_names
     wanted = [(effect, name) for effect in baseline for name in names] + list(more)
     all_of = catalogue(loop, largest_forces(loop, fitted), gains_known=False).candidates
+    told = {(c.effect, *c.at) for c in all_of}
+    for effect, name in more:
+        if (effect, name) not in told:
+            raise InputError(
+                f"baseline: effects: a rollout has no number for '{effect}' at '{name}'"
+                f"{nearest(effect, {one[0] for one in told})}; it has {', '.join(sorted({one[0] for one in told}))}"
+            )
     free = [k for c in all_of if (c.effect, c.at[0]) in wanted for k in c.entries]
     keep = tuple(c for c in known.candidates if not set(c.entries) <= set(free))
     count = loop.robot.nv
@@ -128,6 +138,18 @@ def setting(
         loop, tuple(fitted), data, tuple(noise), Catalogue(known.table, keep), tuple(free),
         _folds(data, stretches), 8 if count == 1 else 1, len(free) + (5 if count == 1 else 8), stretches, block,
     )  # fmt: skip
+
+
+def _with_wanted(loop: Loop, more: Sequence[tuple[str, str]]) -> tuple[Effect, ...]:
+    """The effects of a loop, and those of the baseline for which it has no number of its own but their torque."""
+    own = {c.effect for c in catalogue(loop, np.ones(len(loop.drives.names)), gains_known=False).candidates}
+    names = loop.robot.dof_names
+    new = [(find(effect), name) for effect, name in more if effect not in own and effect in CATALOGUE and name in names]
+    new = [
+        place(effect, loop.robot, [name]) for effect, name in new if effect.acts_on == "joint" and effect.has("torque")
+    ]
+    there = {(e.name, *np.asarray(e.places).tolist()) for e in loop.effects}
+    return (*loop.effects, *placed(loop.robot, [e for e in new if (e.name, *e.places.tolist()) not in there]))
 
 
 def thinned(here: Setting) -> Setting:

@@ -56,6 +56,7 @@ EFFECTS = {  # parameters of effects and the fields of `Joints` that hold them
     "load_dependent_friction": {"ratio": "load_ratio"},
     "joint_spring": {"stiffness": "stiffness", "offset": "offset"},
 }
+_SAME = {"viscous_friction": "joint_damping", "coulomb_friction": "friction_loss"}  # as they are called here
 _WINDOW, _OPEN = 15.0, 1.0  # s
 _FAR = 1e3  # rad or m: a simulation that gets there has diverged
 _TURN = 12.0  # a command that many times beyond what the joint did is in other units
@@ -139,7 +140,7 @@ def diagnosis_setting(task: Task, loop: Loop, runs: Sequence[Run]) -> Setting:
     known, given = task.baseline, task.baseline.model_fields_set
     rotor = known.rotor if "rotor" in given else bool(np.asarray(loop.joints.armature).any())
     names = [n for n, on in zip(BASELINE, (rotor, known.viscous, known.coulomb), strict=True) if on]
-    more = [(entry.effect, entry.at[0]) for entry in known.effects if entry.at]
+    more = [(_SAME.get(entry.effect, entry.effect), name) for entry in known.effects for name in entry.at]
     return setting(
         loop, runs, baseline=names, more=more, gains_known=task.actuator.gains == "known", forbid=task.diagnose.forbid,
         stretches=_cut(task, loop, runs),
