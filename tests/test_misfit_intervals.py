@@ -10,7 +10,7 @@ import pytest
 
 from figaroh_jax.diagnosis import joint as fits
 from figaroh_jax.diagnosis.estimates import Fitted
-from figaroh_jax.diagnosis.joint import AS_SURE, Joint, least_sure, with_misfit, with_parts
+from figaroh_jax.diagnosis.joint import AS_SURE, Joint, least_sure, with_misfit, with_parts, with_rest
 from figaroh_jax.effects.base import Effect
 from figaroh_jax.effects.catalogue import find
 from figaroh_jax.estimation.rows import Prior, Rows
@@ -100,6 +100,25 @@ def test_values_are_as_unsure_as_parts_of_the_data_disagree():
     found = np.sqrt(np.diag(with_parts(problem, joint, np.ones((1, 2))).fitted.covariance))
     np.testing.assert_allclose(found[:2], jackknife[:2], rtol=1e-6)
     assert found[2] == deviation[2] > jackknife[2]
+
+
+def test_values_are_as_unsure_as_what_is_left_at_their_joint(monkeypatch: pytest.MonkeyPatch):
+    """A misfit of ten functions of equal size, of which one is the cause's: it moves by what one of them has."""
+    rng = np.random.default_rng(8)
+    functions, base = np.linalg.qr(rng.normal(size=(400, 11)))[0].T, rng.normal(size=(400, 1))
+    X = np.stack([np.column_stack([base, functions[:1].T]), np.zeros((400, 2))])  # the second joint has none of it
+    signs = rng.choice([-1.0, 1.0], 11)
+    y = X[0] @ np.array([2.0, 5.0]) + 0.3 * signs @ functions
+    theta, (squares,) = np.linalg.lstsq(X[0], y, rcond=None)[:2]
+    step: Any = SimpleNamespace(
+        rows=SimpleNamespace(X=X), state=SimpleNamespace(prior=Prior(np.zeros(2), np.full(2, 1e-9)))
+    )
+    monkeypatch.setattr(fits, "torque_slopes", lambda *args: [])
+    none: Any = None
+    joint = Joint(step, [none], Fitted(theta, np.diag([1e-8, 1e-8]), ((1,),)))
+    told = with_rest(none, joint, np.ones((1, 2)), [(0,)], np.array([squares, 1e6])).fitted.covariance
+    assert np.sqrt(told[1, 1]) == pytest.approx(abs(theta[1] - 5.0), rel=0.1)
+    assert told[0, 0] == 1e-8  # no cause's
 
 
 def test_a_value_that_no_row_shows_is_as_unsure_as_can_be():

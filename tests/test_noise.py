@@ -141,6 +141,14 @@ def test_recordings_left_out_of_the_fit_or_shorter_than_others_show_no_line(part
     assert (p < 1e-3).sum() <= 8, np.sort(p)[:10]
 
 
+def test_the_slope_of_coloured_noise_is_no_line() -> None:
+    rng, rate = np.random.default_rng(secrets.randbits(64)), 50.0
+    slow = [np.asarray(lfilter([1.0], [1.0, -0.95], rng.standard_normal((2, 600, 2)), axis=1)) for _ in range(600)]
+    p = np.array([noise.spectral_line(rows[:, 200:], rate, 15.0)[0] for rows in slow])
+    assert (p < 1e-2).sum() <= 16, np.sort(p)[:20]  # 6 are expected
+    assert (p < 1e-3).sum() <= 8, np.sort(p)[:10]
+
+
 def test_too_short_a_series_has_no_line() -> None:
     assert noise.spectral_line(np.ones((1, 60, 1)), RATE, CUTOFF) == (1.0, 0.0, 0)
 

@@ -15,6 +15,7 @@ from figaroh_jax.diagnosis.flexible import Smooth
 from figaroh_jax.diagnosis.joint import Joint, has_size, least_sure
 from figaroh_jax.diagnosis.naming import (
     Standing,
+    _spoils,
     _turns_against_itself,
     beside_rest,
     of_its_own,
@@ -170,6 +171,20 @@ def test_what_repeats_have_in_common_is_no_noise() -> None:
     assert np.isinf(repeating(problem, rows, residual, counted)).all()
 
 
+@pytest.mark.parametrize(("rise", "spoils"), [(0.0, False), (0.3, True), (-0.3, False)])
+def test_a_law_of_the_whole_robot_that_predicts_one_joint_worse_is_none(rise: float, spoils: bool) -> None:
+    """Three joints, 40 blocks: the first falls by a half, the last rises by a share of what it had."""
+    rng = np.random.default_rng(11)
+    before = rng.uniform(0.8, 1.2, (3, 40))
+    after = before * np.array([[0.5], [1.0], [1.0 + rise]]) + 0.1 * rng.standard_normal((3, 40))
+
+    def verdicts(squares: np.ndarray) -> Any:
+        return SimpleNamespace(own=lambda rows, joints: squares[list(joints)].sum(0))
+
+    full = cast(Any, SimpleNamespace(rows=SimpleNamespace(y=np.zeros((3, 1))), verdicts=verdicts(after)))
+    assert _spoils(verdicts(before), full) == spoils
+
+
 def test_verdicts_follow_causes_and_rest() -> None:
     assert verdict(False, False) == "nothing"
     assert verdict(False, True) == "unknown"
@@ -238,6 +253,7 @@ def test_recordings_kept_out_may_show_what_few_blocks_of_the_others_cannot(
         ({"modulation_held_out": 0.3}, "varies"),
         ({"share": 2.0, "cancels": True}, ""),
         ({"outdone": True}, "predicts better, though it is none itself"),
+        ({"whole": True, "spoils": True}, "predicts a joint worse"),
         ({"whole": True, "massless": True}, "mass is not surely"),
     ],
 )

@@ -38,7 +38,7 @@ from .floor import noise_floor, noise_rms
 from .gaining import Fall, Gaining, beside_all, kept_squares, predicts_better, surely_less, without_losses
 from .gates import physical_sign
 from .holdout import fold_squares, part_error, residual_rms, traces
-from .joint import Joint, least_sure, opened, polished, sized, with_misfit, with_parts
+from .joint import Joint, least_sure, opened, polished, sized, with_misfit, with_parts, with_rest
 from .layout import checked_repeats, describe_folds, held_rows, layout
 from .naming import beside_rest, beyond_simpler, of_its_own, reason_against, standings, stands_alone
 from .problem import Problem
@@ -56,6 +56,7 @@ from .rest import (
     verdict,
     wrong_law,
 )
+from .screening import noise_squares
 from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without
 from .standstill import only_sticks, resting
 from .state import State, baseline, stated_effects, with_width
@@ -410,6 +411,11 @@ def _judged(
     rest = shown and not sticks
     text = left.rest.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
     told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
+    if rest and named:
+        squares = (joint.step.linear.residual**2).sum(1)
+        left_over = squares - noise_squares(problem, here.spectrum, here.whitening)
+        joint = with_rest(problem, joint, here.whitening, [f.joints for f in named], left_over)
+        gaining = gaining._replace(joint=joint)
     parts = parts_of(problem, told, whitening, left.line, names)
     nearest = tuple(sorted(nearest, key=lambda one: -one.share))
     quiet = not rest and not named and searched.search.p_value < alpha

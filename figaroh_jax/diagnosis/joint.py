@@ -33,9 +33,11 @@ __all__ = [
     "sized",
     "with_misfit",
     "with_parts",
+    "with_rest",
 ]
 
 KEPT = 1e-12  # of the diagonal: a ridge for numbers that no row shows
+PIECES = 10.0  # functions of a joint's motion that what is left at it goes into
 AS_SURE = 2.0  # times the deviation of a fit up to which another one counts in full
 LATE = 4  # turns: most fits have settled by then
 BACK = 0.5  # of its last move: what a shape goes back by where steps overshoot
@@ -155,6 +157,32 @@ def with_parts(problem: Problem, joint: Joint, whitening: Float[np.ndarray, "F n
     return joint._replace(fitted=_wider(fitted, variance / np.maximum(np.diag(fitted.covariance), 1e-300)))
 
 
+def with_rest(
+    problem: Problem,
+    joint: Joint,
+    whitening: Float[np.ndarray, "F nv"],
+    places: Sequence[Sequence[int]],
+    rest: Float[np.ndarray, " nv"],
+) -> Joint:
+    """The fit with what its intervals owe to a rest that no cause explains.
+
+    What is wrong at a joint beside a cause looks in part like that cause, the same in every part of the data. How much
+    cannot be seen, but what is left there can: smooth misfits of a joint go into some `PIECES` functions of its motion,
+    and the law of the cause is one function more, which has taken as many squares as any of them. `rest` are the
+    squares of each joint's rows beyond those of noise, `places` the joints where each cause acts.
+    """
+    step, fitted = joint.step, joint.fitted
+    slopes = [slope for e in joint.causes for slope in torque_slopes(problem, step.state, e, whitening)]
+    J = np.concatenate([step.rows.X, *(slope[..., None] for slope in slopes)], axis=2)
+    gram = np.tensordot(J, J, ((0, 1), (0, 1)))
+    inverse = _inverse(gram + np.diag(np.append(step.state.prior.precision, np.zeros(len(slopes)))))
+    covariance = fitted.covariance.copy()
+    for place, joints in zip(fitted.places, places, strict=True):
+        at = np.ix_(place, place)
+        covariance[at] += max(float(rest[list(joints)].mean()), 0.0) / PIECES * inverse[at]
+    return joint._replace(fitted=replace(fitted, covariance=covariance))
+
+
 def _wider(fitted: Fitted, times: Float[np.ndarray, " parameters"]) -> Fitted:
     """The values with variances so many times as large, but no smaller ones."""
     wider = np.sqrt(np.maximum(times, 1.0))
@@ -192,7 +220,7 @@ def joint_fit(problem: Problem, step: Step, causes: list[Effect], whitening: Flo
     cross = np.stack([np.tensordot(slope, rows.X, 2) for slope in slopes]) if each else np.zeros((0, rows.X.shape[2]))
     flat = slopes.reshape(len(slopes), rows.y.size)
     A = np.block([[step.folded.gram.sum(0), cross.T], [cross, flat @ flat.T]]) + np.diag(precision)
-    inverse = np.linalg.inv(A + KEPT * np.diag(np.maximum(np.diag(A), KEPT)))
+    inverse = _inverse(A)
     residual = rows.y - rows.X @ state.theta
     pull = np.append(state.prior.precision * (state.prior.mean - state.theta), np.zeros(len(slopes)))
     move = inverse @ (np.append(np.tensordot(residual, rows.X, 2), flat @ residual.reshape(-1)) + pull)
@@ -200,6 +228,10 @@ def joint_fit(problem: Problem, step: Step, causes: list[Effect], whitening: Flo
     covariance = inverse @ (_scatter(rows, slopes, residual) + np.diag(precision)) @ inverse
     covariance = _widened(covariance, inverse, rows, residual, len(A))
     return Fitted(np.append(state.theta, values) + move, covariance, _places(problem, state, causes))
+
+
+def _inverse(A: Float[np.ndarray, "P P"]) -> Float[np.ndarray, "P P"]:
+    return np.linalg.inv(A + KEPT * np.diag(np.maximum(np.diag(A), KEPT)))
 
 
 def _widened(

@@ -78,6 +78,7 @@ class Standing:
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
     cancels: bool = False  # whether it is a share of all torque, and larger than it: a reading of less than half
     complete: bool = False  # whether smooth functions find next to nothing in what it leaves at its joints
+    spoils: bool = False  # whether, of the whole robot, it surely predicts some joint worse
     outdone: bool = False  # whether what could be named in its place surely predicts better
     taken: float = 0.0  # held-out squares of its joints that it removes
     leaves: float = 0.0  # squares beyond noise at its joints over these
@@ -113,6 +114,7 @@ def reason_against(
             one.modulation_held_out <= (ALL_BUT if one.varies and strict_law else MODULATION_HELD_OUT),
             f"{varies} {one.modulation_held_out:.2f} of its gain)",
         ),
+        (not one.spoils, "it predicts a joint worse, which a right law of the whole robot does not"),
         (not one.outdone, "another cause that explains the same misfit predicts better, though it is none itself"),
         (not one.massless, "its mass is not surely above zero: a link other than believed explains as much"),
         (
@@ -231,6 +233,7 @@ def standings(
                 varies=modulation[2],
                 beside_smooth=_beside_smooth(grown, bare, effect, place, one.joints) if whole else 1.0,
                 inertia_alone=coupled and _inertia_alone(effect, joint.fitted, at),
+                spoils=whole and kind(effect) == "columns" and _spoils(without, full),
                 outdone=one.outdone,
                 massless=effect.body and _deviations(effect, joint.fitted, at)["mass"] < MASS,
             )
@@ -410,6 +413,15 @@ def _inertia_alone(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bo
     """Whether neither friction of a coupling is surely there (two standard deviations)."""
     deviations = _deviations(effect, fitted, place)
     return all(abs(deviations[n]) < 2 for n in effect.one_rotor[1:])
+
+
+def _spoils(without: Verdicts, full: Step) -> bool:
+    """Whether left-out data of some joint are surely predicted worse with a cause than without it, of all joints.
+
+    What stands in for a law of the whole robot buys the joints where it fits with those where it does not.
+    """
+    each = [[v.own(full.rows, (joint,)) for v in (without, full.verdicts)] for joint in range(len(full.rows.y))]
+    return any(t_value(better, worse) > t_needed(len(worse), T_NAMED, len(each)) for worse, better in each)
 
 
 def _turns_against_itself(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:

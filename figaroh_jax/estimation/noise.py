@@ -175,22 +175,25 @@ def leverage(basis: Float[np.ndarray, "samples nv columns"]) -> Float[np.ndarray
 def spectral_line(
     residual: Float[np.ndarray, "recordings samples nv"], rate: float, cutoff: float
 ) -> tuple[float, float, int]:
-    """p-value, frequency (Hz) and joint of the strongest line in time, over a running median of 41 bins.
+    """p-value, frequency (Hz) and joint of the strongest line in time.
 
-    A recording that is kept out of the fit, whose rows are zero, tells nothing; of recordings that differ in length or
-    power as many count as independent as their mean has degrees of freedom.
+    Over a running median of 41 bins of what a smooth spectrum leaves: coloured noise is steep. A recording that is kept
+    out of the fit, whose rows are zero, tells nothing; of recordings that differ in length or power as many count as
+    independent as their mean has degrees of freedom.
     """
     told = [rows for rows in residual if rows.any()]
     frequency = np.fft.rfftfreq(residual.shape[1], 1 / rate)[1:]
     used = (frequency > LOWEST) & (frequency < min(0.9 * cutoff, 0.6 * rate / 2))
     if used.sum() < 41 or not told:
         return 1.0, 0.0, 0
-    power = np.mean([periodogram(rows, rate)[1] for rows in told], axis=0)
+    frequency, power = frequency[used], np.mean([periodogram(rows, rate)[1] for rows in told], axis=0)[used]
     each = np.stack([(rows**2).sum(0) for rows in told])
     shape = max(1.0, float((each.sum(0) ** 2 / np.maximum((each**2).sum(0), 1e-300)).min()))
+    basis, heard = _basis(frequency, rate / 2), np.log(np.maximum(power, 1e-300))
+    power = np.exp(heard - basis @ np.linalg.lstsq(basis, heard, rcond=None)[0])  # a slope is no line
     padded = np.pad(power, ((20, 20), (0, 0)), mode="reflect")
     level = np.median(np.lib.stride_tricks.sliding_window_view(padded, 41, axis=0), axis=-1)
-    ratio = np.where(used[:, None], power / np.maximum(level, 1e-300), 0)
+    ratio = np.where(each.sum(0) > 0, power / np.maximum(level, 1e-300), 0)
     row, joint = np.unravel_index(np.argmax(ratio), ratio.shape)
     from scipy.special import fdtrc, gammaincinv  # scipy is slow to import
 

@@ -413,13 +413,13 @@ def _clipped(look: Look) -> Iterator[Finding]:
     if torque is None:
         return
     for j in np.flatnonzero(look.span > STILL).tolist():
-        column, levels = torque[:, j], np.unique(torque[:, j])
-        if len(levels) < 30:
-            continue  # steps of the sensor, not a limit
+        column = torque[:, j]
         for end in (column.max(), column.min()):
             at = column == end
+            if end == 0 or at.mean() <= 0.01 or len(np.unique(column)) < 30:
+                continue  # few levels are steps of the sensor, not a limit
             runs = _runs(at)
-            if end != 0 and at.mean() > 0.01 and (runs >= 5).sum() and runs.max() < len(at) / 2:
+            if (runs >= 5).sum() and runs.max() < len(at) / 2:
                 yield Finding(
                     False,
                     f"torque of {look.joints[j]} stays at {end:.4g} {effort_unit(look, j)} for {at.mean():.1%} of the"

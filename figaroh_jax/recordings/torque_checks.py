@@ -65,9 +65,10 @@ def torque_findings(look: Look, motion: Sampled) -> Iterator[Finding]:
         )
 
 
-def _fit(model: RobotModel, motion: Sampled) -> _Fit:
+def _fit(model: RobotModel, motion: Sampled, nominal: Float[np.ndarray, "rows nv"] | None = None) -> _Fit:
+    """`nominal` is the model's torque along the motion, where that is known."""
     assert motion.torque is not None
-    nominal, torque = rigid_torque(model, motion), motion.torque
+    nominal, torque = rigid_torque(model, motion) if nominal is None else nominal, motion.torque
     columns = zip(nominal.T, torque.T, motion.velocity.T, motion.acceleration.T, strict=True)
     own = [likeness(*each) for each in columns]
     return _Fit(own, nominal, _heavy(own, torque))
@@ -115,8 +116,13 @@ def _other_reading(look: Look, motion: Sampled) -> Finding | None:
     assert motion.torque is not None
     given = _fit(look.model, motion)
     best, text = -np.inf, ""
-    for said, other in _readings(look, motion, given.nominal):
-        fit = _fit(look.model, other)
+    readings = list(_readings(look, motion, given.nominal))
+    signals = zip(*((one.position, one.velocity, one.acceleration) for _, one in readings), strict=True)
+    position, velocity, acceleration = (np.concatenate(each) for each in signals)
+    together = Sampled(position, velocity, acceleration, None, motion.rate)  # one call for all
+    nominal = np.split(rigid_torque(look.model, together), len(readings))
+    for (said, other), own in zip(readings, nominal, strict=True):
+        fit = _fit(look.model, other, own)
         heavy = given.heavy | fit.heavy
         gain = _misfit(given.own, heavy) - _misfit(fit.own, heavy)
         if gain > best + 0.3 and _belongs(fit, heavy):  # the simpler reading, which comes first, wins a draw
