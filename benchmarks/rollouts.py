@@ -23,6 +23,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+import figaroh_jax as fj
 from figaroh_jax.rollouts.alone import alone, carried_by
 from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.data import Run, Stretch, windows
@@ -241,11 +242,37 @@ def so101_sage(
         show_motions(label, model, [_shorter(r, unseen) for r in so101_runs(TEST)])
 
 
-def so101_faults() -> None:
-    """What is told of whole recordings, three with known faults among them, with a roughly fitted arm."""
+def _rough_arm() -> Loop:
+    """The arm roughly fitted, as it is where faults are looked for."""
     loop = so101_loop(kp=12.0)
     friction, damping = np.array([0.1, 0.3, 0.4, 0.14, 0.1, 0.1]), np.array([0.6, 0.3, 0.3, 0.3, 0.6, 0.6])
-    loop = eqx.tree_at(lambda m: (m.joints.friction, m.joints.damping), loop, (friction, damping))
+    return eqx.tree_at(lambda m: (m.joints.friction, m.joints.damping), loop, (friction, damping))
+
+
+def so101_contact() -> None:
+    """Where the arm rests: how much higher its end stands than the roughly fitted model's, free and on the table."""
+    loop, still = _rough_arm(), []
+    table = {"hold_under_gravity": ((14.0, 24.0), (24.5, 34.0), (36.5, 46.0)),
+             "large_amplitude": ((30.5, 35.0), (53.0, 59.0), (101.0, 110.0))}  # fmt: skip
+    for run in so101_runs(dict.fromkeys([*TRAIN, *TEST], WHOLE)):
+        read = simulated(loop, run)
+        both = np.stack([run.position, read])
+        seen, model = np.asarray(fj.frame_placement(loop.robot, both, "gripperframe"))[..., 2, 3]
+        higher, rate = 1e3 * (seen - model), np.abs(np.gradient(run.position, PERIOD, axis=0))
+        slow = np.stack([np.convolve(x, np.ones(30) / 30, "same") for x in rate.T], 1)[:, 1:5].max(1) < 0.02
+        touches = np.zeros(len(slow), bool)
+        for first, last in table.get(run.name, ()):
+            part = (run.time >= first) & (run.time <= last)
+            touches |= (run.time >= first - 2.0) & (run.time <= last + 2.0)
+            print(f"{run.name}, on the table {first:g} to {last:g} s: {np.median(higher[part]):.1f} mm higher")
+        still.append(np.abs(higher[slow & ~touches & (run.time < 108)]))
+    levels = np.quantile(np.concatenate(still), [0.5, 0.9, 1.0])
+    print(f"at rest elsewhere, either way: median {levels[0]:.1f}, 90 % {levels[1]:.1f}, largest {levels[2]:.1f} mm")
+
+
+def so101_faults() -> None:
+    """What is told of whole recordings, three with known faults among them, with a roughly fitted arm."""
+    loop = _rough_arm()
     whole = ("hold_under_gravity", "large_amplitude", "chirp_sweep", "single_joint_wrist_roll")
     first = {"multisine": ((0.0, 60.0),), "step_response": ((0.0, 60.0),)}
     runs = so101_runs(dict.fromkeys(whole, WHOLE) | first)
@@ -315,7 +342,8 @@ def show(found: Search, causes: list[str]) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "data", choices=["servo_miuzei", "dfki_double_pendulum", "so101_sage", "so101_speed", "so101_faults"]
+        "data",
+        choices=["servo_miuzei", "dfki_double_pendulum", "so101_sage", "so101_speed", "so101_faults", "so101_contact"],
     )
     parser.add_argument("--window", type=float, default=0.3, help="s, of the double pendulum")
     parser.add_argument("--law", choices=["hard", "soft"], default="hard")
@@ -330,6 +358,8 @@ if __name__ == "__main__":
     args = parser.parse_args()
     if args.data == "so101_speed":
         so101_speed()
+    elif args.data == "so101_contact":
+        so101_contact()
     elif args.data == "so101_faults":
         so101_faults()
     elif args.data == "so101_sage":
