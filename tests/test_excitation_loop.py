@@ -37,11 +37,19 @@ URDF = "".join(
 
 
 def measured(
-    q: np.ndarray, v: np.ndarray, a: np.ndarray, seed: int, noise: np.ndarray = NOISE, rotor: float = ROTOR
+    q: np.ndarray,
+    v: np.ndarray,
+    a: np.ndarray,
+    seed: int,
+    noise: np.ndarray = NOISE,
+    rotor: float = ROTOR,
+    forearm: float = 1.0,
 ) -> np.ndarray:
-    """Torques of MuJoCo C with a rotor at the elbow and damping, and noise."""
+    """Torques of MuJoCo C with a rotor at the elbow, damping, a share of the forearm's inertia, and noise."""
     model = mujoco.MjModel.from_xml_string(URDF)
     model.dof_armature[1], model.dof_damping[:] = rotor, DAMPING
+    model.body_mass[-1] *= forearm
+    model.body_inertia[-1] *= forearm
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONTACT)
     data, out = mujoco.MjData(model), []
     for state in zip(q, v, a, strict=True):

@@ -169,6 +169,32 @@ def test_rows_of_a_state_that_has_grown_are_those_computed_from_scratch(model: R
     np.testing.assert_allclose(whitened(lighter, grown, weights).X, 0.5 * short.X, rtol=0, atol=1e-12)
 
 
+def test_products_of_known_columns_are_those_of_the_rows_at_hand(model: RobotModel) -> None:
+    """Whatever was made before: as many columns, more, other weights, other folds, another torque sensor."""
+    problem = problem_of(model, made_signals(6.0), made_signals(5.0))
+    begun, white = baseline(problem, ["viscous_friction"]), np.ones((len(problem.records.omega), model.nv))
+    more = [
+        extended_state(problem, begun, place(find(name), model, [model.joint_names[1]]))
+        for name in ("joint_spring", "rotor_inertia")
+    ]
+    late = extended_state(problem, more[0], place(find("torque_delay"), model, delay=0.01))
+    half = problem.weighted(np.asarray(problem.records.weight) * np.linspace(0.5, 1.0, model.nv))
+    cases = [(problem, begun, white), *((problem, one, white) for one in more), (half, more[0], white)]
+    cases += [(problem, late, white), (problem, more[1], 2 * white), (problem, more[0], white)]
+    for here, state, response in cases:
+        for fold in (here.layout.fold, here.layout.part):
+            rows = whitened(here, state, response)._replace(fold=fold)
+            tall = [np.concatenate(rows.X[:, fold == k]) for k in range(fold.max() + 1)]
+            target = [np.concatenate(rows.y[:, fold == k]) for k in range(fold.max() + 1)]
+            gram, moment, square = here.filtered.sums(rows)
+            size = max(np.abs(x.T @ x).max() for x in tall)
+            np.testing.assert_allclose(gram, [x.T @ x for x in tall], rtol=0, atol=1e-12 * size)
+            np.testing.assert_allclose(
+                moment, [x.T @ y for x, y in zip(tall, target, strict=True)], rtol=1e-9, atol=1e-9
+            )
+            np.testing.assert_allclose(square, [y @ y for y in target], rtol=1e-12)
+
+
 def test_a_robot_near_its_nominal_values_is_fitted_without_rest(model: RobotModel) -> None:
     signals = made_signals(12.0)
     mean, precision = rigid_prior(model, 0.01)

@@ -46,3 +46,21 @@ def test_a_rotor_in_short_recordings_is_named_without_a_rest(tmp_path: Path) -> 
     assert (found.verdict, cause.name.effect, cause.name.at) == ("named", "rotor_inertia", ("elbow",))
     told = cause.parameters["inertia"]
     assert abs(told.value - 0.025) < 4 * told.std and told.std < 0.005
+
+
+def test_a_link_of_negative_mass_is_never_named(tmp_path: Path) -> None:
+    """Torques of a forearm that weighs less than nothing: no physical body does that, and no name says it."""
+    rng, time = np.random.default_rng(300), np.arange(0, 10, 1 / RATE)
+    task = _task(tmp_path, 300, rotor=0.0)
+    for run in range(3):
+        with np.load(tmp_path / f"{run}.npz") as read:
+            q, whole = read["q"], read["tau"]
+        assert len(time) == len(q)
+        v = np.gradient(q, 1 / RATE, axis=0)
+        a = np.gradient(v, 1 / RATE, axis=0)
+        bare = measured(q, v, a, 0, 0 * NOISE, rotor=0.0, forearm=1e-6)
+        held = measured(q, v, a, 0, 0 * NOISE, rotor=0.0)
+        noise = rng.normal(size=q.shape) * NOISE * 0.1
+        np.savez(tmp_path / f"{run}.npz", t=time, q=q, tau=whole - 1.6 * (held - bare) + noise)
+    found = fj.diagnose_task(fj.load_task(str(task)))
+    assert found.verdict == "unknown", (found.verdict, found.causes)

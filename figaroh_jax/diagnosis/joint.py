@@ -67,9 +67,7 @@ def polished(problem: Problem, start: State, causes: list[Effect], whitening: Fl
         goal = replace(joint.fitted, value=joint.fitted.value - (1 - share) * move)
         causes = [moved(e, goal, at) for e, at in zip(joint.causes, goal.places, strict=True)]
         base = solved(problem, start, joint.step.state.theta[: len(start.theta)])
-        before, last = move, joint.fitted
-        del joint  # its rows and columns are large
-        joint = _together(problem, base, causes, whitening)
+        before, last, joint = move, joint.fitted, _together(problem, base, causes, whitening)
         if np.all(np.abs(joint.fitted.value - last.value) <= SETTLED * np.sqrt(np.diag(joint.fitted.covariance))):
             break
     return joint

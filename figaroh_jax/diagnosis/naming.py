@@ -44,6 +44,7 @@ from .thresholds import (
     MODULATION_ROBOT,
     SHARE_NAMED,
     T_NAMED,
+    WEIGHTLESS,
 )
 
 __all__ = [
@@ -220,7 +221,9 @@ def standings(
             Standing(
                 name=one.name,
                 whole=whole,
-                physical=physical_sign(effect) and not (coupled and _turns_against_itself(effect, joint.fitted, at)),
+                physical=physical_sign(effect)
+                and not (coupled and _turns_against_itself(effect, joint.fitted, at))
+                and not (effect.acts_on == "link" and _weighs_less_than_nothing(problem, effect, joint.fitted, at)),
                 beside_rest=effect.beside_rest,
                 gain=1 - float(better.sum() / max(worse.sum(), 1e-300)),
                 taken=max(float((worse - better).sum()), 0.0),
@@ -239,6 +242,13 @@ def standings(
             )
         )
     return out
+
+
+def _weighs_less_than_nothing(problem: Problem, effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
+    """Whether a link, with what its cause adds, would surely have a negative mass."""
+    change = float(getattr(effect, "mass", 0.0))
+    whole = float(np.asarray(problem.model.inertia)[int(effect.at[0]), 0]) + change
+    return whole < 0 and -whole * abs(_deviations(effect, fitted, place)["mass"]) > WEIGHTLESS * abs(change)
 
 
 class _Grown(NamedTuple):
