@@ -24,10 +24,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pinocchio_calibration import Peer  # beside this file
+
+if TYPE_CHECKING:
+    from pinocchio_calibration import Peer
 
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.recordings.poses import PoseRecording
@@ -130,6 +132,8 @@ def run_speed(postures: Sequence[int] = (50, 500, 4000, 10000)) -> None:
     columns = geometry_columns(model, range(6))
     (zero,) = postures_of(model, [recording(np.zeros((1, 6)), "pose", np.eye(4)[None], *frames)])
     twists = np.array([column.pieces[0][1](zero)[:, 0] for column in columns])
+    from pinocchio_calibration import Peer  # beside this file, which others load without its folder
+
     peer = Peer(path, frames[1], np.array([column.pieces[0][0] for column in columns]), twists)
     for N in postures:
         _compare(N, model, frames, columns, peer)
