@@ -28,6 +28,7 @@ SETS = {  # the relative error that causes leave at most, with what it was when 
     "kuka": 0.0320,  # .0284
     "dfki_simple_pendulum": 0.470,  # .4651
 }
+EXPLAINED = {"kuka": (0.58, 0.999, 0.96, 0.986, 0.37)}  # R2 of each of the first joints, kept out, at least
 
 
 @pytest.mark.slow
@@ -47,3 +48,8 @@ def test_the_error_on_recordings_kept_out_is_no_larger_than_that_of_identify(
     assert found.holdout.after <= found.holdout.before
     assert found.holdout.after <= identified
     assert found.holdout.after <= SETS[name]
+    kept = [trace for trace in found.traces if trace.role == "holdout" and trace.measured is not None]
+    measured, after = (np.concatenate([getattr(trace, key) for trace in kept]) for key in ("measured", "after"))
+    explained = 1 - ((measured - after) ** 2).sum(0) / ((measured - measured.mean(0)) ** 2).sum(0)
+    goals = EXPLAINED.get(name, ())
+    assert np.all(explained[: len(goals)] >= goals), explained

@@ -96,11 +96,11 @@ def condense_on_devices(
     """`condense(states, states.used)`, the samples of every piece spread over `devices` (default: all of this host).
 
     Each device forms the rows of its own samples, `chunk` at a time, and sums their products; the sums of the devices
-    are added at the end, on the host. Pieces of one length share a program. While accelerators work, a thread reads
-    the source's next piece and brings it to them. A single CPU takes machine code for the rows of long pieces, where
-    there is some. A direction in which the rows are less than 3e-7 of the strongest one's is taken as not shown. Folds
-    are whole chunks in turn. Raises `InputError` where a piece has a wrong shape or holds a number that is not finite.
-    An accelerator is busy with pieces of 1e5 samples and more.
+    are added at the end, on the host. Pieces of one length share a program; the source is read while the devices work.
+    A single CPU takes machine code for the rows of long pieces, where there is some. A direction in which the rows are
+    less than 3e-7 of the strongest one's is taken as not shown. Folds are whole chunks in turn. Raises `InputError`
+    where a piece has a wrong shape or holds a number that is not finite. An accelerator is busy with pieces of 1e5
+    samples and more.
 
     Where `jax.distributed` runs, each process takes the pieces that its own source gives, however many, on the devices
     of its host; the sums of all are added once at the end, and every process gets the same answer.
@@ -205,19 +205,20 @@ def _summed(states: States, frames: Sequence[OwnFrame], mesh: Mesh, folds: int, 
     totals, fixed = zip(*(jax.device_put(start, device) for device in devices), strict=True)
     numbers = _places(model, terms)[1] + sum(2 * g.places.size for g in groups)
     codes = block_codes(model) if devices[0].platform == "gpu" else None
-    pieces, on_cpu = _pieces(states, mesh, numbers, folds, chunk), devices[0].platform == "cpu"
     chunks, before, lengths = 0, None, set()
     with ThreadPoolExecutor(mesh.size) as threads:  # a call ends only when its device has taken nearly all the work
-        # a CPU's arrays may be those of the source itself, which could overwrite them
-        for samples, chunk, shares in pieces if on_cpu else _one_ahead(pieces):
-            add = in_float64(_program(chunk, folds, codes, on_cpu))
-            share = len(shares[0][0])
-            firsts = [np.int32(chunks + share // chunk * k) for k in range(mesh.size)]
-            there = [np.int32(np.clip(samples - k * share, 0, share)) for k in range(mesh.size)]
-            beside = map if samples not in lengths else threads.map  # compiled one after the other
-            totals = tuple(beside(add, totals, fixed, shares, there, firsts))
-            lengths.add(samples)
-            chunks += -(-samples // chunk)
+        for number, part in enumerate(states.source()):
+            check_piece(model, part, number, values=False)
+            chunk = chunk or _chunk(mesh, numbers, len(part[0]) // folds)
+            add = in_float64(_program(chunk, folds, codes, devices[0].platform == "cpu"))
+            own = -(-len(part[0]) // (chunk * mesh.size))
+            firsts = [np.int32(chunks + own * k) for k in range(mesh.size)]
+            share = own * chunk
+            there = [np.int32(np.clip(len(part[0]) - k * share, 0, share)) for k in range(mesh.size)]
+            beside = map if len(part[0]) not in lengths else threads.map  # compiled one after the other
+            totals = tuple(beside(add, totals, fixed, _shares(part, chunk, mesh), there, firsts))
+            lengths.add(len(part[0]))
+            chunks += -(-len(part[0]) // chunk)
             jax.block_until_ready(before)  # one piece ahead: no more wait in memory
             before = [total.rows for total in totals]
     sums = jax.tree.map(lambda *own: sum(own), *jax.device_get(totals))
@@ -244,52 +245,17 @@ def _chunk(mesh: Mesh, rows: int, most: int) -> int:
     return 1 << max(8, min(int(np.log2(memory / 8 / rows)), int(np.ceil(np.log2(max(1, most / mesh.size))))))
 
 
-Piece = tuple[int, int, list[tuple[Array, ...]]]  # its samples, those of a chunk, and each device's share
-
-
-def _pieces(states: States, mesh: Mesh, numbers: int, folds: int, chunk: int | None) -> Iterator[Piece]:
-    """The source's pieces on the devices."""
-    with ThreadPoolExecutor(mesh.size) as threads:
-        for number, part in enumerate(states.source()):
-            check_piece(states.model, part, number, values=False)
-            chunk = chunk or _chunk(mesh, numbers, len(part[0]) // folds)
-            yield len(part[0]), chunk, _shares(part, chunk, mesh, threads)
-
-
-def _one_ahead(pieces: Iterator[Piece]) -> Iterator[Piece]:
-    """The same; while one is used, a thread reads the next and brings it to the devices."""
-
-    def following() -> Piece | None:
-        with jax.enable_x64(True):  # each thread has its own
-            piece = next(pieces, None)
-            return piece if piece is None else jax.block_until_ready(piece)
-
-    with ThreadPoolExecutor(1) as reader:
-        ahead = reader.submit(following)
-        while (piece := ahead.result()) is not None:
-            ahead = reader.submit(following)
-            yield piece
-
-
-def _shares(part: Sequence[Any], chunk: int, mesh: Mesh, threads: ThreadPoolExecutor) -> list[tuple[Array, ...]]:
-    """Each device's share of the arrays of a piece, filled up to whole chunks; from the host by a thread for each."""
-    missing = -len(part[0]) % (chunk * mesh.size)
-    devices = list(mesh.devices.flat)
+def _shares(part: Sequence[Any], chunk: int, mesh: Mesh) -> list[tuple[Array, ...]]:
+    """Each device's share of the arrays of a piece, filled up to whole chunks."""
+    samples = len(part[0])
+    missing = -samples % (chunk * mesh.size)
+    sharding = NamedSharding(mesh, PartitionSpec("samples"))
     arrays = [x if isinstance(x, jax.Array) else np.asarray(x, float) for x in part]
     if missing:
         arrays = [np.concatenate([x, np.repeat(np.asarray(x[-1:]), missing, axis=0)]) for x in arrays]
-    if not any(isinstance(x, jax.Array) for x in arrays):
-        share = len(arrays[0]) // mesh.size
-
-        def put(k: int) -> tuple[Array, ...]:
-            with jax.enable_x64(True):
-                return tuple(jax.device_put(x[k * share : (k + 1) * share], devices[k]) for x in arrays)
-
-        return list(threads.map(put, range(mesh.size)))
-    sharding = NamedSharding(mesh, PartitionSpec("samples"))
     spread = (jax.device_put(x, sharding) for x in arrays)
     own = [{share.device: share.data for share in x.addressable_shards} for x in spread]
-    return [tuple(x[device] for x in own) for device in devices]
+    return [tuple(x[device] for x in own) for device in mesh.devices.flat]
 
 
 @lru_cache(maxsize=16)
