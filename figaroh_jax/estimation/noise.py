@@ -179,7 +179,7 @@ def spectral_line(
 
     Over a running median of 41 bins of what a smooth spectrum leaves: coloured noise is steep. A recording that is kept
     out of the fit, whose rows are zero, tells nothing; of recordings that differ in length or power as many count as
-    independent as their mean has degrees of freedom.
+    the loudest goes into their sum: it alone makes the tail.
     """
     told = [rows for rows in residual if rows.any()]
     frequency = np.fft.rfftfreq(residual.shape[1], 1 / rate)[1:]
@@ -188,7 +188,7 @@ def spectral_line(
         return 1.0, 0.0, 0
     frequency, power = frequency[used], np.mean([periodogram(rows, rate)[1] for rows in told], axis=0)[used]
     each = np.stack([(rows**2).sum(0) for rows in told])
-    shape = max(1.0, float((each.sum(0) ** 2 / np.maximum((each**2).sum(0), 1e-300)).min()))
+    shape = max(1.0, float((each.sum(0) / np.maximum(each.max(0), 1e-300)).min()))
     basis, heard = _basis(frequency, rate / 2), np.log(np.maximum(power, 1e-300))
     power = np.exp(heard - basis @ np.linalg.lstsq(basis, heard, rcond=None)[0])  # a slope is no line
     padded = np.pad(power, ((20, 20), (0, 0)), mode="reflect")
