@@ -189,9 +189,8 @@ def test_products_of_known_columns_are_those_of_the_rows_at_hand(model: RobotMod
             gram, moment, square = here.filtered.sums(rows)
             size = max(np.abs(x.T @ x).max() for x in tall)
             np.testing.assert_allclose(gram, [x.T @ x for x in tall], rtol=0, atol=1e-12 * size)
-            np.testing.assert_allclose(
-                moment, [x.T @ y for x, y in zip(tall, target, strict=True)], rtol=1e-9, atol=1e-9
-            )
+            expected = np.array([x.T @ y for x, y in zip(tall, target, strict=True)])
+            np.testing.assert_allclose(moment, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
             np.testing.assert_allclose(square, [y @ y for y in target], rtol=1e-12)
 
 

@@ -158,18 +158,22 @@ class Reversal(Motion):
 
     @property
     def direction(self) -> Float[Array, "samples nv"]:
+        """The direction of every joint that was told."""
         return self.joint * jnp.ones_like(self.velocity)
 
     def reversal(self, velocity: Array, acceleration: Array, width: Array) -> Array:
+        """The direction of the motors that was told, whatever the velocity."""
         return self.motor * jnp.ones_like(velocity)
 
     @classmethod
     def at(cls, extended: ExtendedModel, robot: RobotModel, time: Array, q: Array, v: Array, a: Array) -> Reversal:
+        """States (samples, nq) and (samples, nv) of a robot at `time` (s), with no direction told."""
         load, zero = inverse_dynamics(robot, q, v, a), jnp.zeros(())
         time = jnp.broadcast_to(time, q.shape[:1])
         return cls(robot, time, q, v, a, load, load, 0.0, jnp.asarray(extended.width), zero, zero)
 
     def told(self, joint: Float[Array, ""], motor: Float[Array, ""]) -> Reversal:
+        """The same instant with these directions of joints and motors."""
         return dataclasses.replace(self, joint=joint, motor=motor)
 
 

@@ -188,12 +188,13 @@ def spectral_line(
         return 1.0, 0.0, 0
     frequency, power = frequency[used], np.mean([periodogram(rows, rate)[1] for rows in told], axis=0)[used]
     each = np.stack([(rows**2).sum(0) for rows in told])
-    shape = max(1.0, float((each.sum(0) / np.maximum(each.max(0), 1e-300)).min()))
-    basis, heard = _basis(frequency, rate / 2), np.log(np.maximum(power, 1e-300))
-    power = np.exp(heard - basis @ np.linalg.lstsq(basis, heard, rcond=None)[0])  # a slope is no line
+    heard = each.sum(0) > 0  # by joint: one without rows has no line
+    shape = float((each[:, heard].sum(0) / each[:, heard].max(0)).min())
+    basis, log = _basis(frequency, rate / 2), np.log(np.maximum(power, 1e-300))
+    power = np.exp(log - basis @ np.linalg.lstsq(basis, log, rcond=None)[0])  # a slope is no line
     padded = np.pad(power, ((20, 20), (0, 0)), mode="reflect")
     level = np.median(np.lib.stride_tricks.sliding_window_view(padded, 41, axis=0), axis=-1)
-    ratio = np.where(each.sum(0) > 0, power / np.maximum(level, 1e-300), 0)
+    ratio = np.where(heard, power / np.maximum(level, 1e-300), 0)
     row, joint = np.unravel_index(np.argmax(ratio), ratio.shape)
     from scipy.special import fdtrc, gammaincinv  # scipy is slow to import
 
