@@ -521,7 +521,8 @@ def _as_rows_count(here: _Setting, joint: Joint, named: list[Found]) -> tuple[_S
     error, best = part_error(here.problem, joint.step), here
     for times in FEWER:
         one = here._replace(whitening=here.whitening / np.sqrt(times))
-        own = part_error(one.problem, stand(one.problem, joint.step.state, one.whitening))  # the laws' shapes as they are
+        step = stand(one.problem, joint.step.state, one.whitening)  # the laws' shapes as they are
+        own = part_error(one.problem, step)
         if own >= error:
             break
         error, best = own, one
