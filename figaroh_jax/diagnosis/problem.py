@@ -36,7 +36,7 @@ __all__ = ["Layout", "Part", "Problem", "family_of", "without_factor"]
 # cached, and the same for all weights of the rows
 _OF_THE_MOTION = ("torque", "gain", "motion", "families", "fixed", "plain", "_terms")
 KEPT = 110 << 20  # bytes of filtered columns that are held: two responses of an arm in 18 recordings of half a minute
-AT_ONCE = 36  # effects with a shape that are evaluated at once along long recordings
+AT_ONCE = 6  # effects with a shape that are evaluated at once along long recordings
 MOST_SUMS = 12  # models whose normal equations are held
 MOST_TERMS = 48  # terms of models whose columns are held
 TURNED = 128  # samples that are turned at once: they stay in the processor's cache
