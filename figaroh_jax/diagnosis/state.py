@@ -64,9 +64,9 @@ class State:
     @cached_property
     def motion(self) -> Motion:
         """The motion as measured, with load, total torque and inertia of `theta`."""
-        load, *others = self.shares(self.theta)
+        load = self._load(self.theta)
         model = changed(self.measured.model, inertia=self.theta[: self.rigid.width].reshape(-1, 10))
-        return changed(self.measured, load=load, total=sum(others, load), model=model)
+        return changed(self.measured, load=load, total=self._total(load, self.theta), model=model)
 
     @property
     def rigid(self) -> Part:
@@ -85,15 +85,28 @@ class State:
 
     def torque(self, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "nN nv"]:
         """Torque at the samples with the coefficients `theta`, N m or N."""
-        return sum(self.shares(theta), np.zeros((self.rigid.samples, self.rigid.nv)))
+        return self._total(self._load(theta), theta)
+
+    def _load(self, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "nN nv"]:
+        """Torque of the rigid body with what it carries."""
+        torque = self.rigid.torque(theta[: self.rigid.width])
+        return torque if self.carried is None else torque + self.known
+
+    def _total(self, load: Float[np.ndarray, "nN nv"], theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "nN nv"]:
+        """The load with the torque of each term."""
+        total = load.copy()
+        for part, own in zip(self.parts[1:], self._of_terms(theta), strict=True):
+            part.add(own, total)
+        return total
+
+    def _of_terms(self, theta: Float[np.ndarray, " P"]) -> list[Float[np.ndarray, " k"]]:
+        """The coefficients of each term."""
+        return np.split(theta, np.cumsum([part.width for part in self.parts])[:-1])[1:]
 
     def shares(self, theta: Float[np.ndarray, " P"]) -> Iterator[Float[np.ndarray, "nN nv"]]:
-        """Torque of the rigid body with what it carries, then of each term."""
-        first = 0
-        for part in self.parts:
-            torque = part.torque(theta[first : first + part.width])
-            yield torque if first or self.carried is None else torque + self.known
-            first += part.width
+        """Torque of each term."""
+        for part, own in zip(self.parts[1:], self._of_terms(theta), strict=True):
+            yield part.torque(own)
 
     def response(self, omega: Float[Leaf, " F"]) -> Complex[np.ndarray, " F"] | Float[np.ndarray, " F"]:
         """Response of the torque sensor of all sensor effects together."""

@@ -54,7 +54,7 @@ def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], 
     """
     rows = whitened(problem, state, whitening)
     if before is not None and len(before.state.sensors) == len(state.sensors):
-        folded = grown_sums(rows, before.folded, rows.X)
+        folded = grown_sums(rows, before.folded, rows.X[:, :, before.folded.moment.shape[1] :])
     else:
         folded = problem.filtered.sums(rows)
     state = replace(state, prior=believed(problem, state.prior, folded))
