@@ -240,9 +240,9 @@ def _beside(
     blocks: Sequence[Float[np.ndarray, "nv T _"]], weight: Float[np.ndarray, "nv T 1"]
 ) -> Float[np.ndarray, "nv T P"]:
     """The blocks side by side, each row times its weight, a few rows at a time while they are in the cache."""
-    ends = np.cumsum([block.shape[2] for block in blocks])
-    X = np.empty((*weight.shape[:2], ends[-1]))
-    for start in range(0, X.shape[1], ROWS):
+    ends, (joints, rows, _) = np.cumsum([block.shape[2] for block in blocks]), weight.shape
+    X = np.empty((joints, rows, ends[-1]))
+    for start in range(0, rows, ROWS):
         few = slice(start, start + ROWS)
         for block, end in zip(blocks, ends, strict=True):
             X[:, few, end - block.shape[2] : end] = block[:, few]

@@ -142,8 +142,8 @@ def _compliances(
     effects: Effect, motion: Motion, records: Records, load: Float[np.ndarray, "nN nv"]
 ) -> list[_Compliance]:
     """What a small change of its joint's motion changes of each sensor's reading."""
-    loads = np.repeat(load[None], len(effects.at), axis=0)
-    unit = (_errors(effects, motion, loads + 1) - _errors(effects, motion, loads)).mean(1)
+    more, here = (_errors(effects, changed(motion, load=own)) for own in (load + 1, load))
+    unit = (more - here).mean(1)
     joints = np.asarray(effects.at)[:, 0]
     few, (once, place) = _Few.of(motion, records), np.unique(joints, return_inverse=True)
     slopes = few.slopes(motion.model, once, lambda q, v, a: links_torque(motion.model, q, v, a, records))
@@ -225,13 +225,13 @@ def _torques(
 ) -> Float[np.ndarray, "effects nN nv"]:
     """The links' torque along the motion less each error (`_moved`), one after another: a joint of it is all that
     changes."""
-    moved = [signal.copy() for signal in _state(motion)]
-    out, deltas = np.empty((len(errors), *moved[0].shape)), _with_rates(errors, records)
+    moved = q, v, a = [signal.copy() for signal in _state(motion)]
+    out, deltas = np.empty((len(errors), *q.shape)), _with_rates(errors, records)
     for one, joint in enumerate(np.asarray(effects.at)[:, 0].tolist()):
         read = [signal[:, joint].copy() for signal in moved]
         for signal, delta in zip(moved, deltas, strict=True):
             signal[:, joint] -= delta[one]
-        out[one] = links_torque(motion.model, *moved, records)
+        out[one] = links_torque(motion.model, q, v, a, records)
         for signal, own in zip(moved, read, strict=True):
             signal[:, joint] = own
     return out
