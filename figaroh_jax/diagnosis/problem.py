@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
 from itertools import pairwise
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 from weakref import ref
 
 import equinox as eqx
@@ -24,7 +24,7 @@ from ..recordings.stacked import Records, filter_rows, open_rows
 from ..rigid.model import RobotModel
 from ..rigid.regressor import packed_regressor, pairs
 from ..simulators.contract import Backend
-from .comparison import FoldSums, fold_sums, grown_sums, prefix_sums
+from .comparison import FoldSums, Verdicts, fold_sums, grown_sums, prefix_sums
 from .design import SHORT, Units, candidates, flattened, kind, shapes, units
 from .shifts import links_torque, rigid_torque
 from .thresholds import TRUSTED
@@ -38,6 +38,7 @@ _OF_THE_MOTION = ("torque", "gain", "motion", "families", "fixed", "plain", "_te
 KEPT = 110 << 20  # bytes of filtered columns that are held: two responses of an arm in 18 recordings of half a minute
 AT_ONCE = 6  # effects with a shape that are evaluated at once along long recordings
 MOST_SUMS = 12  # models whose normal equations are held
+MOST_BEGUN, MOST_JUDGED = 4, 16
 MOST_TERMS = 48  # terms of models whose columns are held
 ROWS = 512  # that are put side by side and weighted at once
 TURNED = 128  # samples that are turned at once: they stay in the processor's cache
@@ -267,6 +268,30 @@ def _through(records: Records, part: Part, response: np.ndarray) -> Float[np.nda
     return block
 
 
+class Known(Generic[T]):
+    """The last few answers, each known by the objects that it was asked about."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._answers: OrderedDict[tuple[int, ...], tuple[tuple[object, ...], T]] = OrderedDict()
+
+    def get(self, *about: object) -> T | None:
+        """The answer about these very objects."""
+        known = self._answers.get(tuple(map(id, about)))
+        return None if known is None else known[1]
+
+    def put(self, answer: T, *about: object) -> T:
+        """Keep an answer, and the objects with it: their addresses are then no others'."""
+        self._answers[tuple(map(id, about))] = about, answer
+        while len(self._answers) > self._most:
+            self._answers.popitem(last=False)
+        return answer
+
+    def clear(self) -> None:
+        """Forget all answers."""
+        self._answers.clear()
+
+
 class Layout(eqx.Module):
     """Which rows repeat, belong together or are left out together; T = recordings x rows."""
 
@@ -293,6 +318,9 @@ class Problem:
     held: Float[np.ndarray, "n M nv"]  # 1: a row of a holdout recording with torque
     bounded: bool = False  # whether the links stay within what is believed of them (`believed`)
     filtered: Filtered = field(default_factory=Filtered, compare=False, repr=False)
+    # states with the first causes of a fit, and what was said of a fit without one of them
+    begun: Known[Any] = field(default_factory=lambda: Known(MOST_BEGUN), init=False, compare=False, repr=False)
+    judged: Known[Verdicts] = field(default_factory=lambda: Known(MOST_JUDGED), init=False, compare=False, repr=False)
 
     @property
     def model(self) -> RobotModel:

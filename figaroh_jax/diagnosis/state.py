@@ -43,6 +43,7 @@ __all__ = [
     "unit_slopes",
     "unit_torques",
     "whitened",
+    "with_size",
     "with_term",
 ]
 
@@ -177,20 +178,25 @@ def assembled(
     problem: Problem,
     start: State,
     causes: Sequence[Effect],
-    before: Callable[[State, Effect], State] = lambda state, effect: state,
+    grow: Callable[[State, Sequence[Effect]], State] | None = None,
 ) -> State:
-    """The state with all causes at their sizes, in their order; `before` is asked for the state that one comes into.
+    """The state with all causes at their sizes, in their order; `grow` adds the last of the causes so far, if not
+    `with_size`.
 
     A cause that follows all torque together is evaluated behind the others, whatever its place among them.
     """
     order = sorted(range(len(causes)), key=lambda k: type(causes[k]).follows_total)
-    state = start
-    for effect in (causes[k] for k in order):
-        state = before(state, effect)
-        grown = extended_state(problem, state, effect)
-        linear = [n for n, p in effect.parameters().items() if p.linear and kind(effect) == "columns"]
-        state = solved(problem, grown, np.append(state.theta, [float(getattr(effect, n)) for n in linear]))
+    state, ordered = start, [causes[k] for k in order]
+    for count, effect in enumerate(ordered, 1):
+        state = grow(state, ordered[:count]) if grow else with_size(problem, state, effect)
     return _rearranged(state, [k for k in order if kind(causes[k]) == "columns"])
+
+
+def with_size(problem: Problem, state: State, effect: Effect) -> State:
+    """The state with one more cause at its size."""
+    linear = [n for n, p in effect.parameters().items() if p.linear and kind(effect) == "columns"]
+    theta = np.append(state.theta, [float(getattr(effect, n)) for n in linear])
+    return solved(problem, extended_state(problem, state, effect), theta)
 
 
 def _rearranged(state: State, order: list[int]) -> State:
