@@ -49,12 +49,6 @@ def noise_floor(
     return spectrum, response  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
 
 
-def _passed(problem: Problem) -> float:
-    """Share of white noise's power that the row filter passes: so many of the rows are independent."""
-    frequency = np.linspace(0, float(problem.records.rate) / 2, 400)
-    return float(np.interp(frequency, np.asarray(problem.records.omega) / (2 * np.pi), problem.gain).mean())
-
-
 def noise_rms(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, " nv"]:
     """RMS of noise with the spectrum in the rows of each joint, N m or N."""
     frequency = np.linspace(0.05, float(problem.records.rate) / 2, 400)
@@ -120,7 +114,7 @@ def _from_rich_model(
     y = rows.y.reshape(-1)
     residual = (y - basis @ (basis.T @ y)).reshape(rows.y.shape) * scale[:, None]
     if not long:
-        independent = count * _passed(problem)
+        independent = count * problem.passed
         degrees = independent - (basis.reshape(len(rows.y), -1, basis.shape[1]) ** 2).sum((1, 2))
         degrees = np.maximum(degrees, independent / 4)
         return noise.white((residual**2).sum(1) / degrees, float(problem.records.rate) / 2, degrees)

@@ -15,7 +15,7 @@ from ..recordings.stacked import open_rows
 from .holdout import predicted
 from .problem import Problem
 from .state import State
-from .thresholds import CARRIED, LAW_AT_REST, LAW_WIDTHS, LEAST_MOVING, STANDSTILL
+from .thresholds import CARRIED, ENOUGH_MOVING, LAW_AT_REST, LAW_WIDTHS, LEAST_MOVING, STANDSTILL
 from .weights import relative_speed
 
 __all__ = ["beyond_sliding", "only_sticks", "resting", "stands"]
@@ -61,7 +61,8 @@ def only_sticks(
         return False
     if not np.any(stands(problem)[looked_at]):  # a robot whose joints stick does so at some joint for long
         return False
-    seen = (judged & ~still).sum((0, 1)) >= LEAST_MOVING * judged.sum((0, 1))
+    rows = (judged & ~still).sum((0, 1))
+    seen = rows >= np.minimum(LEAST_MOVING * judged.sum((0, 1)), ENOUGH_MOVING / problem.passed)
     held = _rms(left, still) <= 2 * np.sqrt((_friction(state) ** 2).mean(0))  # from one limit to the other
     if not np.all((seen & held)[looked_at]):
         return False

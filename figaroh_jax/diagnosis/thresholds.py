@@ -84,5 +84,6 @@ OWN_SHARE = 0.03  # of what a cause has removed: a rest at its own place that sp
 STANDSTILL = 0.08  # of a joint's top speed: rows at and around rest
 CARRIED = 1.0  # periods of the cutoff to which the row filter carries a stick
 LEAST_MOVING = 0.25  # of a joint's rows that must be far from rest, or they say nothing of how it moves
+ENOUGH_MOVING = 40  # independent rows far from rest that say enough, however long the joint stands
 LAW_WIDTHS = (0.04, 0.08)  # of a joint's top speed: friction of low speed that is looked for at rest
 LAW_AT_REST = 0.3  # of the squares at rest that it predicts: from there a law is missing, it is no stick

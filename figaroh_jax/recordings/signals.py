@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
-from .bandwidth import motion_band, smoothed
+from .bandwidth import encoder_step, motion_band, smoothed
 from .cleaning import near, without_untrusted
 from .dataset import Recording
 from .groupmotion import continued, group_rates, normalised
@@ -144,7 +144,7 @@ def prepare(
     if grouped is not None:
         position = continued(grouped, position, str(recording.file))
     _refuse_endless(recording, time, rates)
-    known = {} if resampled is None else resampled
+    known, raw = {} if resampled is None else resampled, position
     if key not in known:
         grid = even_grid(time, position, *([] if torque is None else [torque]))
         known[key] = grid.rate, grid.gaps, *_resample(grid, rates, shift)
@@ -160,7 +160,9 @@ def prepare(
             f" after {trim} s are cut at both ends, at least {FEWEST_ROWS} are needed"
         )
     if grouped is None:
-        position = (_motion if slowed else low_pass)(columns[0], dt, rates.cutoff)
+        position = (
+            _motion(columns[0], dt, rates.cutoff, raw, rate) if slowed else low_pass(columns[0], dt, rates.cutoff)
+        )
         moves = np.ptp(position, axis=0) > STILL * (1 + np.abs(position).max(axis=0))
         position[:, ~moves] = position[0, ~moves]  # dry friction would see the sign of rounding
         velocity, acceleration = (differentiate(position, dt, order=order) * moves for order in (1, 2))
@@ -204,11 +206,16 @@ def _refuse_endless(recording: Recording, time: Float[np.ndarray, " samples"], r
     )
 
 
-def _motion(position: Float[np.ndarray, "samples nv"], dt: float, cutoff: float) -> Float[np.ndarray, "samples nv"]:
-    """The position of each joint without what lies above its cutoff, or above its motion where that is slower."""
+def _motion(
+    position: Float[np.ndarray, "samples nv"], dt: float, cutoff: float, raw: Float[np.ndarray, "read nv"], rate: float
+) -> Float[np.ndarray, "samples nv"]:
+    """The position of each joint without what lies above its cutoff, or above its motion where that is slower.
+
+    `raw` are the samples as they were read, at `rate` (Hz): they show the steps of the encoder.
+    """
     out = low_pass(position, dt, cutoff)
     for joint, column in enumerate(position.T):
-        band = motion_band(column, dt, cutoff)
+        band = motion_band(column, dt, cutoff, encoder_step(raw[:, joint]), rate)
         if band < cutoff:
             out[:, joint] = smoothed(column, dt, band)
     return out
