@@ -190,7 +190,8 @@ def make(folder: Path, seed: int, hidden: str, strange: bool = False) -> tuple[C
         load = ", load: {frame: fore, mass: 0.7, com: [0.3, 0, 0.05]}" if beside.payload else ""
         role = "holdout" if last else "fit"
         lines.append(f"  - {{{keys}, role: {role}{label}{load}}}\n")
-    rows = f", rate: {min(told.rows, 0.45 * told.rate)}" if told.rows else ""
+    most = (0.45 if beside.two_rates else 0.9) * told.rate
+    rows = f", rate: {min(told.rows, most)}" if told.rows else ""
     head = "robot: {model: robot.urdf, trust: 0.03}\ndata:\n"
     gears = f"transmission: {{torque: {[MOTOR] * model.nv}}}\n" if beside.adc else ""
     text = f"{head}{''.join(lines)}{gears}preprocess: {{cutoff: {told.cutoff}{rows}}}\n"

@@ -23,7 +23,7 @@ from .bandwidth import encoder_step, motion_band, smoothed
 from .cleaning import near, without_untrusted
 from .dataset import Recording
 from .groupmotion import continued, group_rates, normalised
-from .resampling import Grid, band_limited, differentiate, even_grid, sampling_rate, to_recording_times
+from .resampling import Grid, band_limited, differentiate, even_grid, sampling_rate, to_recording_times, unrounded
 from .rowfilter import RowFilter, fast_length, filter_rows, frequencies, low_pass, row_filter
 
 if TYPE_CHECKING:
@@ -229,7 +229,7 @@ def choose_rates(recordings: Sequence[Recording], preprocess: Preprocess) -> Rat
     times the cutoff, because differences and friction signs need the finer samples, and is 13.2 times the cutoff for
     long data that it would else sample more than 16 times as fast.
     """
-    raw, file = min((sampling_rate(recording.time), str(recording.file)) for recording in recordings)
+    raw, file = min((sampling_rate(unrounded(recording.time)), str(recording.file)) for recording in recordings)
     cutoff = preprocess.cutoff or min(DEFAULT_CUTOFF, 0.2 * raw)
     if cutoff >= raw / 2:
         raise InputError(
@@ -251,7 +251,7 @@ def choose_rates(recordings: Sequence[Recording], preprocess: Preprocess) -> Rat
 
 def _window(recording: Recording, window: tuple[float, float] | None):
     """The part of a recording that is kept."""
-    time, position, torque = recording.time, recording.position, recording.torque
+    time, position, torque = unrounded(recording.time), recording.position, recording.torque
     if window is None:
         return time, position, torque
     keep = (time >= window[0]) & (time <= window[1])
