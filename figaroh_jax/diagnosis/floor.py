@@ -17,7 +17,7 @@ from .screening import Group, catalogue, screen
 from .state import State, plain_rows, solved, whitened
 from .thresholds import LOWEST_FREQUENCY, LOWEST_RESOLVED
 
-__all__ = ["kept_columns", "noise_floor", "noise_rms"]
+__all__ = ["kept_columns", "noise_floor", "noise_rms", "sober_spectrum"]
 
 ROUNDS = 2  # of the rich model's fit and the spectrum in turn
 RICHNESS = 10  # groups of columns in the rich model
@@ -47,6 +47,19 @@ def noise_floor(
         spectrum = _from_repeats(problem, rows, state)
         response = _whitening(problem, spectrum)
     return spectrum, response  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
+
+
+def sober_spectrum(problem: Problem, state: State, forbid: Collection[str] = ()) -> Spectrum:
+    """Spectrum of what the state and the one best candidate of the catalogue leave.
+
+    A rich model takes noise in at the frequencies of the motion, the more the less of the data is independent: slow
+    noise in the band of a slow motion looks smaller than it is. One candidate takes little, and all of its own misfit.
+    """
+    rows = plain_rows(problem, state)
+    count = max(1, rows.size // len(rows.y))
+    rough = rows.y - rows.X @ _weighted(rows, state.prior, np.sqrt((rows.y**2).mean(1)))
+    scale = np.sqrt((rough**2).sum(1) / count)
+    return _from_rich_model(problem, state, scale, forbid, count, richness=1)
 
 
 def noise_rms(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, " nv"]:
@@ -82,7 +95,12 @@ def _mean_of_partners(rows: Rows, residual: Float[np.ndarray, "nv T"]) -> Float[
 
 
 def _from_rich_model(
-    problem: Problem, state: State, scale: Float[np.ndarray, " nv"], forbid: Collection[str], count: int
+    problem: Problem,
+    state: State,
+    scale: Float[np.ndarray, " nv"],
+    forbid: Collection[str],
+    count: int,
+    richness: int = RICHNESS,
 ) -> Spectrum:
     """Residual of the baseline with the groups of the catalogue, and smooth families, that a forward selection takes.
 
@@ -93,11 +111,11 @@ def _from_rich_model(
     rows = whitened(problem, state, response)
     state = solved(problem, state, fit(rows, state.prior).theta)
     groups = catalogue(problem, state, rows, response, forbid)
-    long = count >= ENOUGH
-    if long:
+    long = count >= ENOUGH or richness == 1
+    if long and richness > 1:
         groups += families(problem, state, response, still=True)
     blocks, prior, found = [rows.X], state.prior, None
-    for _ in range(RICHNESS):
+    for _ in range(richness):
         found = screen(rows, fit(rows, prior), groups, found)
         scores = found.scores
         if not scores:
