@@ -103,9 +103,10 @@ class Strange:
 
 def draw_strange(rng: np.random.Generator) -> Strange:
     """Each of them in a fifth of the cases."""
-    chance = dict(zip(Strange.__dataclass_fields__, rng.random(10) < 0.2, strict=True))
-    share = {name: float(chance[name]) * float(rng.uniform(0.003, 0.03)) for name in ("lost", "stale")}
-    return Strange(**{name: bool(yes) for name, yes in chance.items() if name not in share}, **share)
+    names = list(Strange.__dataclass_fields__)
+    yes = dict(zip(names, (rng.random(len(names)) < 0.2).tolist(), strict=True))
+    lost, stale = (float(yes.pop(name)) * float(rng.uniform(0.003, 0.03)) for name in ("lost", "stale"))
+    return replace(Strange(**yes), lost=lost, stale=stale)
 
 
 def motion(rng: np.random.Generator, told: Conditions) -> np.ndarray:
@@ -159,7 +160,7 @@ def make(folder: Path, seed: int, hidden: str, strange: bool = False) -> tuple[C
     if strange:
         beside = draw_strange(other)
         if beside.whole_ms:
-            told = replace(told, rate={50: 60.0, 100: 120.0, 250: 240.0, 1000: 333.0}[told.rate], jitter=False)
+            told = replace(told, rate={50: 60.0, 100: 120.0, 250: 240.0, 1000: 333.0}[int(told.rate)], jitter=False)
             told = replace(told, cutoff=min(told.cutoff, 0.25 * told.rate), rows=0.0)
     model = _robot(folder, beside)
     model.dof_armature[1] = ROTOR if hidden == "rotor" else 0.0
@@ -231,7 +232,7 @@ def _write(folder: Path, run: int, arrays: dict[str, np.ndarray], beside: Strang
     kept = rng.random(len(t)) >= beside.lost
     arrays = {name: x[kept] for name, x in arrays.items()}
     if not beside.text:
-        np.savez(folder / f"{run}.npz", **arrays)
+        np.savez(folder / f"{run}.npz", allow_pickle=False, **arrays)
         told = "".join(f", {key}: {unit}" for key, unit in units.items())
         units_key = f", units: {{{told[2:]}}}" if units else ""
         return f"file: {run}.npz, time: t, position: q, torque: tau{units_key}"
@@ -270,11 +271,10 @@ def graded(seed: int, hidden: str, strange: bool = False) -> dict[str, Any]:
     """The answer to one case, as it is printed and kept."""
     with tempfile.TemporaryDirectory() as scratch:
         told, beside = make(Path(scratch), seed, hidden, strange)
-        begun = time.process_time()
+        begun, found, text = time.process_time(), None, ""
         try:
             found = fj.diagnose_task(fj.load_task(f"{scratch}/task.yaml"))
         except fj.InputError as refused:
-            found = None
             text = str(refused).replace(scratch, "")
     drawn = asdict(told) | {name: value for name, value in asdict(beside).items() if value}
     out: dict[str, Any] = {"seed": seed, "hidden": hidden, "drawn": drawn, "cpu": time.process_time() - begun}

@@ -58,8 +58,8 @@ class Reader:
         out = []
         for _ in range(READINGS):
             read = [
-                _read(*each, torque[at.slot, at.sample : at.sample + at.samples], generator)
-                for *each, at in zip(self.recordings, self.signals, problem.records.spans, strict=True)
+                _read(recording, signals, torque[at.slot, at.sample : at.sample + at.samples], generator)
+                for recording, signals, at in zip(self.recordings, self.signals, problem.records.spans, strict=True)
             ]
             records = stack(prepare_all(read, self.preprocess, slowed=self.slowed), problem.model, joined=True)
             if records.spans != problem.records.spans:
