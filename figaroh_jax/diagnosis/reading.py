@@ -21,8 +21,9 @@ from ..recordings.bandwidth import encoder_step
 from ..recordings.dataset import Recording
 from ..recordings.signals import Signals, prepare_all
 from ..recordings.stacked import stack
-from .holdout import predicted, residual_rms
+from .holdout import predicted
 from .problem import Problem
+from .standstill import held, resting, stands
 from .state import State, on_motion
 from .thresholds import CARRIED, ENOUGH_MOVING, LEAST_MOVING
 
@@ -83,19 +84,20 @@ def only_read(
     """Whether what the state leaves beyond the `noise` (N m or N) is no more than readings of a right model leave, and
     no larger than tolerable in the rows where readings leave little.
 
-    `relative` is what it leaves of all rows over each joint's torque: a joint below the tolerance is not looked at.
+    `relative` is what it leaves of all rows over each joint's torque: a joint below the tolerance is not looked at. Of
+    a joint that stands still at times the rows at rest only have to stay within what its dry friction can hold.
     """
     judged = np.asarray(problem.records.judged) > 0
     left, torque = problem.torque - predicted(problem, state), _rms(problem.torque, judged)
-    squares = (errors**2).mean(0)
-    made = (squares * judged).sum((0, 1)) / np.maximum(judged.sum((0, 1)), 1)
-    beyond = residual_rms(problem, state) ** 2 - noise**2
+    still = judged & resting(problem) & stands(problem)
+    used, squares = judged & ~still, (errors**2).mean(0)
     reach = int(np.ceil(CARRIED / float(problem.records.cutoff) * float(problem.records.rate)))
     spread = np.stack([_largest_near(one, reach) for one in np.moveaxis(squares, 2, 0)], axis=2)
-    quiet = judged & (spread < (QUIET * noise) ** 2)
-    rest = np.sqrt(np.maximum(_rms(left, quiet) ** 2 - noise**2, 0.0))
+    quiet = used & (spread < (QUIET * noise) ** 2)
+    beyond, rest = (_rms(left, rows) ** 2 - noise**2 for rows in (used, quiet))
     enough = np.minimum(LEAST_MOVING * judged.sum((0, 1)), ENOUGH_MOVING / problem.passed)
-    told = (beyond <= AS_MUCH * made) & (quiet.sum((0, 1)) >= enough) & (rest <= tolerance * torque)
+    told = (beyond <= AS_MUCH * _rms(np.sqrt(squares), used) ** 2) & (quiet.sum((0, 1)) >= enough)
+    told &= (rest <= (tolerance * torque) ** 2) & held(state, left, still)
     large = relative > tolerance
     return bool(large.any() and told[large].all())
 

@@ -296,7 +296,7 @@ def wrong_law(at: tuple[str, ...], drop: float, flexible: Smooth) -> bool:
     return flexible.p < REST_P and (not at or places[0] in at) and flexible.score > OWN_SHARE * drop
 
 
-def tolerated(largest: float, tolerance: float, sticks: bool, read: bool) -> str:
+def tolerated(largest: float, tolerance: float, sticks: bool, read: bool = False) -> str:
     """Why a misfit that noise does not explain is no rest, in words; `largest` is that of any joint over its torque."""
     if read:
         return "the steps of the encoders and the time between samples leave as much of a model that is right"
