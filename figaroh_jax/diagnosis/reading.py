@@ -19,6 +19,7 @@ from jaxtyping import Float
 from ..formats.recording_keys import Preprocess
 from ..recordings.bandwidth import encoder_step
 from ..recordings.dataset import Recording
+from ..recordings.resampling import unrounded
 from ..recordings.signals import Signals, prepare_all
 from ..recordings.stacked import stack
 from .holdout import predicted
@@ -82,7 +83,8 @@ def only_read(
     errors: Float[np.ndarray, "readings n M nv"],
 ) -> bool:
     """Whether what the state leaves beyond the `noise` (N m or N) is no more than readings of a right model leave, and
-    no larger than tolerable in the rows where readings leave little.
+    no larger than tolerable in the rows where readings leave little; or is what they leave, row by row, but for what is
+    tolerable.
 
     `relative` is what it leaves of all rows over each joint's torque: a joint below the tolerance is not looked at. Of
     a joint that stands still at times the rows at rest only have to stay within what its dry friction can hold.
@@ -97,7 +99,9 @@ def only_read(
     beyond, rest = (_rms(left, rows) ** 2 - noise**2 for rows in (used, quiet))
     enough = np.minimum(LEAST_MOVING * judged.sum((0, 1)), ENOUGH_MOVING / problem.passed)
     told = (beyond <= AS_MUCH * _rms(np.sqrt(squares), used) ** 2) & (quiet.sum((0, 1)) >= enough)
-    told &= (rest <= (tolerance * torque) ** 2) & held(state, left, still)
+    told &= rest <= (tolerance * torque) ** 2
+    told |= _rms(left - errors.mean(0), used) ** 2 - noise**2 <= (tolerance * torque) ** 2
+    told &= held(state, left, still)
     large = relative > tolerance
     return bool(large.any() and told[large].all())
 
@@ -108,7 +112,7 @@ def _read(
     """The recording with the prepared motion, read by its encoders once more, and a torque along it."""
     from scipy.interpolate import CubicSpline  # scipy is slow to import
 
-    at = np.clip(recording.time, signals.time[0], signals.time[-1])
+    at = np.clip(unrounded(recording.time), signals.time[0], signals.time[-1])
     true, read = CubicSpline(signals.time, signals.position)(at), np.array(recording.position)
     for joint, own in enumerate(true.T):
         step = encoder_step(read[:, joint])
@@ -119,8 +123,22 @@ def _read(
         elif len(own) > 2:  # white: what the neighbours do not tell
             second = error[2:] - 2 * error[1:-1] + error[:-2]
             read[:, joint] = own + generator.standard_normal(len(own)) * np.median(np.abs(second)) / 0.6745 / 6**0.5
-    given = np.stack([np.interp(at, signals.time, column) for column in torque.T], axis=1)
+    given = np.stack([_at(at, signals.time, *columns) for columns in zip(torque.T, signals.velocity.T, strict=True)], 1)
     return replace(recording, position=read, torque=None if recording.torque is None else given, trusted=None)
+
+
+def _at(
+    at: Float[np.ndarray, " samples"],
+    time: Float[np.ndarray, " n"],
+    torque: Float[np.ndarray, " n"],
+    velocity: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, " samples"]:
+    """The torque at some instants; it jumps where the velocity changes its sign."""
+    out, after = np.interp(at, time, torque), np.clip(np.searchsorted(time, at), 1, len(time) - 1)
+    v, w = velocity[after - 1], velocity[after]
+    turns = v * w < 0
+    gone = (at - time[after - 1]) / (time[after] - time[after - 1]) > v / np.where(turns, v - w, 1.0)
+    return np.where(turns, np.where(gone, torque[after], torque[after - 1]), out)
 
 
 def _largest_near(rows: Float[np.ndarray, "n M"], reach: int) -> Float[np.ndarray, "n M"]:
