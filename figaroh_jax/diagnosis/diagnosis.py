@@ -34,7 +34,7 @@ from .estimates import amplitude_places, estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
-from .floor import noise_floor, noise_rms, sober_spectrum
+from .floor import foretold, noise_floor, noise_rms, sober_spectrum, told_too_large
 from .gaining import Fall, Gaining, beside_all, kept_squares, predicts_better, surely_less, without_losses
 from .gates import physical_sign
 from .holdout import fold_squares, part_error, residual_rms, traces
@@ -71,6 +71,7 @@ from .thresholds import (
     NO_REST,
     REST_P,
     STANDSTILL,
+    SURE_DROP,
     WEIGHT_ROUNDS,
     WHITE_GAIN,
 )
@@ -410,6 +411,14 @@ def _judged(
     asked = (tolerance, certain, fading)
     against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
     named = [f for f in found if not against[f.name]]
+    if named and not problem.layout.repeats and max(f.cost[0] - f.cost[1] for f in named) < SURE_DROP:
+        sober, bare = sober_spectrum(problem, joint.step.state, forbid), stand(problem, here.start, whitening)
+        chance = chance_beside(problem, bare, sober, whitening, forbid, generator)
+        if chance >= REST_P:
+            against |= {
+                f.name: f"noise as slow as the motion scores as much by chance (p = {chance:.2g})" for f in named
+            }
+            named = []
     settings = [here] if before.problem is here.problem else [here, before]
     here, gaining, by_speed, reasons = _answered(searched, settings, named, borne_out, forbid)
     named, joint, problem = gaining.named, gaining.joint, here.problem
@@ -418,6 +427,9 @@ def _judged(
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
     shown = left.rest.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
+    if shown and not named and not left.rest.there and not doubted and not problem.layout.repeats:
+        sober = sober_spectrum(problem, joint.step.state, forbid)
+        shown = chance_beside(problem, joint.step, sober, here.whitening, forbid, generator) < REST_P
     sticks = shown and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
     rest, read = shown and not sticks, False
     if rest and not named and left.line[0] >= LINE_P:  # a line is none of what reading a motion leaves
@@ -584,10 +596,13 @@ def _left(
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
     loud, quiet = beyond_noise(problem, joint.step.linear.residual, spectrum, whitening, generator)
-    there = left.there or ((wrong or bool(loud.any())) and not tolerable)
+    there = left.there or (wrong and not tolerable)
+    if loud.any() and not there and not tolerable:  # without repeats a rich model's residual is the noise
+        there = problem.layout.repeats or bool((foretold(problem, joint.step.state, forbid) & (loud > 0)).any())
     if quiet.any() and not there and not problem.layout.repeats and not found:
-        fitted = joint.step.rows, joint.step.linear
-        quiet = beyond_noise(problem, fitted[1].residual, spectrum, whitening, generator, fitted=fitted)[1]
+        fitted, large = (joint.step.rows, joint.step.linear), told_too_large(problem, spectrum, generator)
+        fair = spectrum.louder(1 / np.maximum(large, 1.0))
+        quiet = beyond_noise(problem, fitted[1].residual, fair, whitening, generator, fitted=fitted)[1]
     if not problem.layout.repeats and not found:  # what is left is then no noise, nor is it known how much of it is
         there = there or bool((quiet & (relative_rest(problem, joint.step.state, 0 * noise) > tolerance)).any())
     moves = np.moveaxis(~resting(problem), 2, 0).reshape(joint.step.rows.y.shape)

@@ -88,11 +88,11 @@ def excess(
     other = np.stack([rows.instrument(residual[j], j) for j in range(len(residual))])
     products = residual * other
     blocks = np.bincount(rows.block[rows.block >= 0], products.sum(0)[rows.block >= 0])
-    z = blocks.sum() / np.sqrt((blocks**2).sum() + 1e-300)
+    t, used = blocks.sum() / np.sqrt((blocks**2).sum() + 1e-300), np.count_nonzero(blocks)
     share = rows.paired.mean(1) * level
-    from scipy.special import ndtr  # scipy is slow to import
+    from scipy.special import stdtr  # scipy is slow to import
 
-    return float(products.sum() / share.sum()), float(ndtr(-z)), products.sum(1) / share
+    return float(products.sum() / share.sum()), float(stdtr(max(used - 1, 1), -t)), products.sum(1) / share
 
 
 def beyond_noise(

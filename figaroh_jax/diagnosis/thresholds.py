@@ -41,6 +41,7 @@ MOST_CAUSES = 16
 SHARE_AGAIN = 1.2  # times its share of its joints' squares when it failed: from here a candidate is tried again
 OVERLAP_ELSEWHERE = 0.2  # overlap up to which causes at other joints are taken in at once
 SIZE_REGION = 0.95  # of the region of a cause's amplitudes that must not hold zero
+SURE_DROP = 300.0  # squares that a cause removes from which no slow noise is asked whether it does as much
 ALPHA_OF_A_NAME = 0.2  # of alpha: what a name needs, for p is not uniform under coloured noise
 
 # Naming beside a rest (`naming`)
