@@ -1,7 +1,7 @@
 """Recordings as strangers make them (`benchmarks/conditions.py`, torques of MuJoCo C): each read something else before.
 
-What was wrong stands beside each: what reads a motion (steps of an encoder, stamps without decimals, samples between which
-dry friction turns) and slow noise in the band of a slow motion are no misfit of the model.
+What was wrong stands beside each. What reads a motion (steps of an encoder, stamps without decimals, samples between
+which dry friction turns) and slow noise in the band of a slow motion are no misfit of the model.
 """
 
 from __future__ import annotations
