@@ -115,14 +115,12 @@ def _read(
     at = np.clip(unrounded(recording.time), signals.time[0], signals.time[-1])
     true, read = CubicSpline(signals.time, signals.position)(at), np.array(recording.position)
     for joint, own in enumerate(true.T):
-        step = encoder_step(read[:, joint])
-        place = generator.random()
-        error = read[:, joint] - own
-        if step:
-            read[:, joint] = step * (np.round(own / step + place) - place)
-        elif len(own) > 2:  # white: what the neighbours do not tell
-            second = error[2:] - 2 * error[1:-1] + error[:-2]
-            read[:, joint] = own + generator.standard_normal(len(own)) * np.median(np.abs(second)) / 0.6745 / 6**0.5
+        step, place = encoder_step(read[:, joint]), generator.random()
+        error, sigma = read[:, joint] - own, 0.0
+        if len(own) > 2:  # white: what the neighbours do not tell
+            sigma = float(np.median(np.abs(error[2:] - 2 * error[1:-1] + error[:-2]))) / 0.6745 / 6**0.5
+        drawn = own + generator.standard_normal(len(own)) * sigma * (sigma > step)
+        read[:, joint] = step * (np.round(drawn / step + place) - place) if step else drawn
     given = np.stack([_at(at, signals.time, *columns) for columns in zip(torque.T, signals.velocity.T, strict=True)], 1)
     return replace(recording, position=read, torque=None if recording.torque is None else given, trusted=None)
 

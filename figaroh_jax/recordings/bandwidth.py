@@ -19,6 +19,8 @@ WINDOW = 14.0  # Kaiser: what the motion leaks stays 100 dB below it
 CHANCE = 12.0  # times its mean: power that noise reaches at one frequency in a hundred thousand
 WORTH = 0.5  # share of the error in the acceleration at the cutoff below which a smaller band is taken
 FEWEST = 200  # samples from which a spectrum tells motion and noise apart
+FELT = 0.1  # of the noise's power: steps of less are lost in it
+FEW_VALUES = 20  # of a position: fewer are steps
 LINE = 3  # bins to either side to which the window spreads a line
 READINGS = 4  # of a motion by an encoder, each with its steps at another place
 
@@ -41,7 +43,7 @@ def motion_band(
         return cutoff
     low = (frequency > 0) & (frequency < 2 * cutoff)
     noise = np.full(int(low.sum()), float(power[high].mean()))
-    if step > 0:
+    if step**2 / 12 > FELT * noise[0] * (rate or 1 / dt) * dt:
         noise = np.maximum(noise, _stepping(position, dt, cutoff, step, rate or 1 / dt, frequency, power)[low])
     weight, motion = frequency[low] ** 4, np.where(power[low] > CHANCE * noise, power[low] - noise, 0.0)
     gain = 1 / (1 + (frequency[low] / (cutoff * STEPS[:, None])) ** (2 * ORDER))
@@ -53,13 +55,14 @@ def motion_band(
 def encoder_step(position: Float[np.ndarray, " samples"]) -> float:
     """Step of the encoder that a position was read from (its unit); zero where the samples do not show one.
 
-    The median distance between neighbours among the values that occur. Where most values occur once the motion passes
-    a step or more from sample to sample: the error is then white, and seen as noise.
+    The small distances between neighbours among the values that occur, where nearly all are whole multiples of them.
     """
-    values = np.unique(position)
-    if len(values) < 3 or 2 * len(values) > len(position):
-        return 0.0
-    return float(np.median(np.diff(values)))
+    gaps = np.diff(np.unique(position))
+    if len(gaps) < FEW_VALUES:
+        return float(gaps.min()) if len(gaps) else 0.0
+    step = float(np.median(gaps[gaps <= 1.5 * np.quantile(gaps, 0.1)]))
+    off = np.abs(gaps / step - np.rint(gaps / step))
+    return step if np.mean(off < 0.1) > 0.9 else 0.0
 
 
 def _stepping(
