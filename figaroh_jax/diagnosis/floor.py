@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from ..estimation import noise
 from ..estimation.noise import Spectrum
-from ..estimation.rows import Prior, Rows, fit
+from ..estimation.rows import Prior, Rows, fit, tall
 from .comparison import ground, judge_grown, t_value
 from .evidence import Score
 from .flexible import families
@@ -171,9 +171,9 @@ def _rich(
     groups = catalogue(problem, state, rows, response, forbid)
     if smooth:
         groups += families(problem, state, response, still=True)
-    blocks, prior, found = [rows.X], state.prior, None
+    blocks, prior, found, gram = [], state.prior, None, tall(rows.X).T @ tall(rows.X)
     for _ in range(richness):
-        found = screen(rows, fit(rows, prior), groups, found)
+        found = screen(rows, fit(rows, prior, gram), groups, found)
         scores = found.scores
         if not scores:
             break
@@ -182,10 +182,20 @@ def _rich(
         if scores[best].z.max() < _largest_by_chance(scores):
             break  # the best of so many that noise alone would have: without it, the residual would be less than noise
         point = int(np.argmax(scores[best].Q))
-        blocks.append(_full(rows, groups[best], point) @ kept_columns(scores[best].root[point]))
-        X = np.concatenate(blocks, axis=2)
-        rows, prior = rows._replace(X=X, Xi=X), prior.extended(blocks[-1].shape[2])
-    return rows, blocks[1:]
+        more = _full(rows, groups[best], point) @ kept_columns(scores[best].root[point])
+        X = np.concatenate([rows.X, more], axis=2)
+        gram = _grown_gram(gram, tall(X), tall(more))
+        rows, prior = rows._replace(X=X, Xi=X), prior.extended(more.shape[2])
+        blocks.append(more)
+    return rows, blocks
+
+
+def _grown_gram(
+    gram: Float[np.ndarray, "P0 P0"], X: Float[np.ndarray, "nvT P"], more: Float[np.ndarray, "nvT k"]
+) -> Float[np.ndarray, "P P"]:
+    """X'X, of which that of the columns before the last, `more`, is known."""
+    cross, before = X.T @ more, len(gram)
+    return np.block([[gram, cross[:before]], [cross[:before].T, cross[before:]]])
 
 
 def _largest_by_chance(scores: Sequence[Score]) -> float:
