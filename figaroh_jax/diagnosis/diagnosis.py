@@ -421,8 +421,9 @@ def _judged(
             }
             named = []
     settings = [here] if before.problem is here.problem else [here, before]
-    like_a_rest = {one.name: one.gain for one in each if not one.beside_rest} if problem.held.any() else {}
-    here, gaining, by_speed, reasons = _answered(searched, settings, named, borne_out, forbid, like_a_rest)
+    asked_more = [one.name for one in each if one.whole or not one.beside_rest] if problem.held.any() else []
+    must_keep = {name: claims[name] for name in asked_more}
+    here, gaining, by_speed, reasons = _answered(searched, settings, named, borne_out, forbid, must_keep)
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= reasons
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
