@@ -65,6 +65,7 @@ from .thresholds import (
     ALL_BUT,
     ALPHA_OF_A_NAME,
     FEW_CAUSES,
+    FEWER,
     FOR_SURE,
     NO_REST,
     REST_P,
@@ -508,7 +509,24 @@ def _as_predicts_best(
     for one, own in kept:
         if surely_less(squares, own):
             chosen, joint, squares = one, _together(one, named), own
-    return chosen, joint, first
+    return *_as_rows_count(chosen, joint, named), first
+
+
+def _as_rows_count(here: _Setting, joint: Joint, named: list[Found]) -> tuple[_Setting, Joint]:
+    """The fit in which rows count beside what is believed of the links as parts left out ask for.
+
+    Whitened rows count as independent ones. What a model leaves goes on from one to the next, so that many say what one
+    does, and the links follow it further than they are believed to move.
+    """
+    error, best = part_error(here.problem, joint.step), here
+    for times in FEWER:
+        one = here._replace(whitening=here.whitening / np.sqrt(times))
+        step = stand(one.problem, joint.step.state, one.whitening)  # the laws' shapes as they are
+        own = part_error(one.problem, step)
+        if own >= error:
+            break
+        error, best = own, one
+    return (here, joint) if best is here else (best, _together(best, named))
 
 
 def _weights(problem: Problem) -> list[Float[np.ndarray, "n M nv"]]:

@@ -22,6 +22,7 @@ WEIGHT_ROUNDS = 2  # of weights and spectrum in turn
 LOWEST_RESOLVED = 2.0  # periods in a recording: below that frequency the spectrum of the noise is held constant
 LOWEST_FREQUENCY = 0.02  # Hz, the same for long recordings
 WHITE_GAIN = 0.02  # relative fall of the folds' error in N m from which rows are weighted by their residual alone
+FEWER = (2.0, 4.0, 8.0, 16.0)  # rows of the answer's fit that may count as one beside what is believed of the links
 SAME_MOTION = 0.05  # of a joint's range (standard deviation): repeats that differ by more are none
 
 # The search (`contenders`, `gates`, `search`)
