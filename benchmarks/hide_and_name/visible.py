@@ -4,7 +4,8 @@ No code of the library and no answer of a tool goes in. Columns: ten parameters 
 prior about the nominal ones that the task states), viscous and Coulomb friction of each joint, along the motion. Rows
 are Fourier coefficients of each recording up to the task's cutoff, each over the standard deviation that the sensors'
 noise has there: that of the torque by its colour, that of the encoder through the robot's mean mass matrix. D is the
-length of what is left, in these: the t-value that the effect's size has for one who knows all else of it.
+length of what is left, in these: the t-value that the effect's size has for one who knows all else of it. The misfit
+is what is left in the joints' own unit, over their RMS torque: below the task's tolerance `nothing` is right.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from generators.motion import Motion
 Array = np.ndarray
 RATE = sensors.RATE
 SEEN = 5.0  # least D of an effect that the data hold; below it, no search among many could tell it from chance
+TOLERANCE = 0.01  # of a joint's RMS torque: the tasks', which state none
 WEAK = 1e-12  # precision of what nothing is known of
 POSITION = 2e-5  # rad, the encoder's noise
 
@@ -29,6 +31,7 @@ class Seen(NamedTuple):
 
     left: float  # share of its weighted power
     sigmas: float  # D: square root of what is left, in noise sigmas
+    misfit: float  # RMS of what is left over that of the joint's torque, where it is largest
 
 
 class Noise(NamedTuple):
@@ -42,25 +45,27 @@ class Noise(NamedTuple):
 def seen(drawn: inverse.Drawn, repeats: int, noise: Noise, cutoff: float) -> Seen:
     """Of all hidden effects together."""
     robot, model, fit = drawn.robot, drawn.model, drawn.fit
-    pairs = [sum(scene.induced(robot, model, m, drawn.time, h)[0] for h in drawn.hidden) for m in fit]
+    pairs: list[Array] = [sum(scene.induced(robot, model, m, drawn.time, h)[0] for h in drawn.hidden) for m in fit]  # type: ignore[misc]
     without = [scene.induced(robot, model, m, drawn.time, drawn.hidden[0])[1] for m in fit]
     rms = np.sqrt(np.mean(np.concatenate(without) ** 2, 0))
     deviation = _deviation(robot, fit, rms, noise, len(_thin(pairs[0])), cutoff)
-    gram = np.diag(_precision(robot, 0.02 if drawn.trusted else 0.10))
-    take, square = np.zeros(len(gram)), 0.0
-    for motion, added in zip(fit, pairs, strict=True):
-        z = _rows(_thin(added)[:, :, None], deviation)[:, 0]
-        X = _rows(_columns(robot, motion, drawn.time), deviation)
-        gram += repeats * X.T @ X
-        take += repeats * X.T @ z
-        square += repeats * float(z @ z)
-    left = max(square - float(take @ np.linalg.solve(gram, take)), 0.0)
-    return Seen(left / square, float(np.sqrt(left)))
+    z = [_rows(_thin(added)[:, :, None], deviation)[:, 0] for added in pairs]
+    X = [_rows(_columns(robot, motion, drawn.time), deviation) for motion in fit]
+    take, square = (repeats * sum(x.T @ y for x, y in zip(a, z, strict=True)) for a in (X, z))
+    gram = repeats * sum(x.T @ x for x in X) + np.diag(_precision(robot, 0.02 if drawn.trusted else 0.10))
+    taken = np.linalg.solve(gram, take)
+    left = max(float(square - take @ taken), 0.0)
+    each = [(y - x @ taken).reshape(-1, len(rms)) for x, y in zip(X, z, strict=True)]
+    back = np.concatenate([deviation, deviation[1:]])  # to N m: of the real, then of the imaginary parts
+    power = np.mean([((one * back) ** 2 * np.where(np.arange(len(one)) > 0, 2, 1)[:, None]).sum(0) for one in each], 0)
+    misfit = np.sqrt(power) / len(_thin(pairs[0])) / rms
+    return Seen(left / float(square), float(np.sqrt(left)), float(misfit.max()))
 
 
 def told(one: Seen) -> dict[str, Any]:
     """As it stands in `cases.json`."""
-    return {"left": one.left, "sigmas": one.sigmas, "visible": one.sigmas >= SEEN}
+    shown = one.sigmas >= SEEN and one.misfit >= TOLERANCE
+    return {"left": one.left, "sigmas": one.sigmas, "misfit": one.misfit, "visible": shown}
 
 
 def _thin(x: Array) -> Array:
@@ -86,7 +91,9 @@ def _rows(x: Array, deviation: Array) -> Array:
     return np.concatenate([f.real, f.imag[1:]]).reshape(-1, x.shape[2])
 
 
-def _deviation(robot: robots.Robot, fit: Sequence[Motion], rms: Array, noise: Noise, samples: int, cutoff: float) -> Array:
+def _deviation(
+    robot: robots.Robot, fit: Sequence[Motion], rms: Array, noise: Noise, samples: int, cutoff: float
+) -> Array:
     """(frequencies, joints) of the real and of the imaginary part of the noise's Fourier coefficients."""
     frequency = np.fft.rfftfreq(samples, 1 / RATE)
     density = 0.02**2 + 0.01**2 * _density(noise.colour, frequency, samples) if noise.colour != "white" else 0.02**2

@@ -233,9 +233,7 @@ def _steady_load(motion: Motion, records: Records) -> Float[np.ndarray, "nN nv"]
     return load if band >= float(records.cutoff) else _low(records, load, band)
 
 
-def _low(
-    records: Records, signal: Float[np.ndarray, "nN cols"], cutoff: float
-) -> Float[np.ndarray, "nN cols"]:
+def _low(records: Records, signal: Float[np.ndarray, "nN cols"], cutoff: float) -> Float[np.ndarray, "nN cols"]:
     """Each recording low-passed as positions are; `cutoff` in Hz."""
     out = signal.reshape(*records.shape[:2], -1).copy()
     for at in records.spans:

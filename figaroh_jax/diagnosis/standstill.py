@@ -18,7 +18,7 @@ from .state import State
 from .thresholds import CARRIED, LAW_AT_REST, LAW_WIDTHS, LEAST_MOVING, STANDSTILL
 from .weights import relative_speed
 
-__all__ = ["beyond_sliding", "only_sticks", "resting", "stands"]
+__all__ = ["beyond_sliding", "left_moving", "only_sticks", "resting", "stands"]
 
 PASSED = 1 / 8  # of the band of slow rows
 TURNED = 0.1  # of the way to its limit: below, what friction a joint needs to slide is taken from the samples around
@@ -40,6 +40,12 @@ def resting(problem: Problem) -> Bool[np.ndarray, "n M nv"]:
     return near
 
 
+def left_moving(problem: Problem, state: State, noise: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
+    """RMS of what the state leaves beyond the `noise` of the rows in which each joint moves, N m or N."""
+    left, judged = problem.torque - predicted(problem, state), np.asarray(problem.records.judged) > 0
+    return np.sqrt(np.maximum(_rms(left, judged & ~resting(problem)) ** 2 - noise**2, 0.0))
+
+
 def only_sticks(
     problem: Problem,
     state: State,
@@ -55,7 +61,7 @@ def only_sticks(
     left, judged = problem.torque - predicted(problem, state), np.asarray(problem.records.judged) > 0
     still = resting(problem) & judged
     torque = _rms(problem.torque, judged)
-    moving = np.sqrt(np.maximum(_rms(left, judged & ~still) ** 2 - noise**2, 0.0))
+    moving = left_moving(problem, state, noise)
     looked_at = np.flatnonzero(relative > tolerance)
     if not len(looked_at) or np.any(moving[looked_at] > tolerance * torque[looked_at]):
         return False

@@ -83,8 +83,15 @@ def make_case(
     instead of 5 %; `motion` goes to `motion.excitation` (amplitude, speed, harmonics).
     """
     drawn = draw_case(effects, robot, trajectories, seed, holdout=holdout, trusted=trusted, duration=duration, **motion)
+    return record_case(drawn, repeats, noise, colour=colour, encoder_step=encoder_step)
+
+
+def record_case(
+    drawn: Drawn, repeats: int = 2, noise: float = 1.0, *, colour: str = "ar20", encoder_step: float = 1e-5
+) -> Case:
+    """The recordings of what was drawn, once: its random numbers go on from there."""
     made, model, hidden = drawn.robot, drawn.model, drawn.hidden
-    runs = _runs(made, model, drawn.motions, trajectories, repeats, drawn.time, hidden, drawn.rng)
+    runs = _runs(made, model, drawn.motions, len(drawn.fit), repeats, drawn.time, hidden, drawn.rng)
     recordings = noisy(runs, drawn.rng, noise, colour, encoder_step)
     truth = tuple(Truth(h.effect, h.at, h.parameters(h.scale)) for h in hidden)
     induced = {h.effect: _size(made, model, drawn.fit, drawn.time, h) for h in hidden} if noise == 0 else {}
@@ -92,7 +99,7 @@ def make_case(
     for h in hidden:
         model = h.change(model, h.scale) if h.change else model
     links = tuple(tuple(robots.ten(model, j).tolist()) for j in range(model.nv))
-    return Case(robot, made.urdf, made.joints, recordings, truth, trust, seed, induced, links=links)
+    return Case(made.name, made.urdf, made.joints, recordings, truth, trust, drawn.seed, induced, links=links)
 
 
 class Drawn(NamedTuple):
@@ -105,6 +112,7 @@ class Drawn(NamedTuple):
     time: np.ndarray
     hidden: list[Hidden]
     trusted: bool  # whether the inertials are well known
+    seed: int
     rng: np.random.Generator  # of the recordings
 
 
@@ -128,7 +136,7 @@ def draw_case(
     time = scene.grid(duration)
     fit = motions[:trajectories]
     hidden = [hide(made, model, fit, time, streams[2], *item) for item in wanted]
-    return Drawn(made, model, motions, fit, time, hidden, trusted, streams[3])
+    return Drawn(made, model, motions, fit, time, hidden, trusted, seed, streams[3])
 
 
 def observable(truth: Truth) -> set[tuple[str, tuple[str, ...]]]:
