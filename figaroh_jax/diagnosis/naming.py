@@ -259,7 +259,9 @@ def standings(
                 varies=modulation[2],
                 beside_smooth=_beside_smooth(grown, bare, effect, place, one.joints) if whole else 1.0,
                 inertia_alone=coupled and _inertia_alone(effect, joint.fitted, at),
-                spoils=whole and kind(effect) == "columns" and _spoils(problem, without, full),
+                spoils=whole
+                and kind(effect) == "columns"
+                and _spoils(*(_by_joint(problem, v, full) for v in (without, full.verdicts))),
                 everywhere=not whole and any(name.effect in EVERYWHERE for name in one.ambiguous),
                 outdone=one.outdone,
                 massless=effect.body and _deviations(effect, joint.fitted, at)["mass"] < MASS,
@@ -449,24 +451,26 @@ def _inertia_alone(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bo
     return all(abs(deviations[n]) < 2 for n in effect.one_rotor[1:])
 
 
-def _spoils(problem: Problem, without: Verdicts, full: Step) -> bool:
+def _spoils(before: Float[np.ndarray, "ways nv blocks"], after: Float[np.ndarray, "ways nv blocks"]) -> bool:
     """Whether left-out data of some joint are surely predicted worse with a cause than without it, of all joints.
 
     What stands in for a law of the whole robot buys the joints where it fits with those where it does not. It must cost
-    a joint while it moves, and by a share of what it gains: what a stick is fitted with changes with any cause.
+    a joint in each way of counting its rows, by a share of what it gains: what a stick is fitted with changes with any
+    cause. Squares of each joint's blocks, of all rows first.
     """
-    before, after = without.heldout, full.verdicts.heldout
+    least = max(BUYS * float((before[0] - after[0]).sum()), 0.0)
+    needed = t_needed(before.shape[2], T_NAMED, before.shape[1])
+    return any(
+        all(t_value(now, was) > needed and (now - was).sum() > least for was, now in zip(*joint, strict=True))
+        for joint in zip(before.swapaxes(0, 1), after.swapaxes(0, 1), strict=True)
+    )
+
+
+def _by_joint(problem: Problem, verdicts: Verdicts, full: Step) -> Float[np.ndarray, "2 nv blocks"]:
+    """Squares of each joint's blocks: of all rows, and of those in which it moves."""
     moves = np.moveaxis(~resting(problem), 2, 0).reshape(full.rows.y.shape)
-    for joint in range(len(full.rows.y)):
-        for rows in (np.ones_like(moves), moves):
-            errors = (v._replace(error=v.error * rows).own(full.rows, (joint,)) for v in (without, full.verdicts))
-            worse, better = errors
-            surely = t_value(better, worse) > t_needed(len(worse), T_NAMED, len(full.rows.y))
-            if not surely or (better - worse).sum() <= BUYS * (before - after):
-                break
-        else:
-            return True
-    return False
+    ways = (verdicts, verdicts._replace(error=verdicts.error * moves))
+    return np.array([[v.own(full.rows, (joint,)) for joint in range(len(moves))] for v in ways])
 
 
 def _turns_against_itself(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
