@@ -58,7 +58,7 @@ from .rest import (
 )
 from .screening import noise_squares
 from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without
-from .standstill import left_moving, only_sticks, resting
+from .standstill import left_moving, left_weighed, only_sticks, resting
 from .state import State, baseline, stated_effects, with_width
 from .step import Step, stand, with_causes
 from .thresholds import (
@@ -400,7 +400,8 @@ def _judged(
     doubted = left.p_value < REST_P  # the catalogue still scores more than noise, though nothing in it passes
     if found and doubted and float(beyond.max()) > tolerance:  # a rest of the answer is one for its names
         strict = strict or not _sticks(here, joint, tolerance)
-    rests = beside_rest(each, [f.joints for f in found], strict, beyond, tolerance)
+    weighed = left_weighed(problem, joint.step.state, noise)  # rows at reversals say nothing of a law
+    rests = beside_rest(each, [f.joints for f in found], strict, np.minimum(beyond, weighed), tolerance)
     asked = (tolerance, certain, fading)
     against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
     named = [f for f in found if not against[f.name]]
@@ -605,8 +606,7 @@ def _left(
     beyond = np.minimum(beyond, repeating(problem, joint.step.rows, joint.step.linear.residual, moves))
     misfit = (alone > 0) | (relative_rest(problem, first.state, noise) > tolerance)
     followed = flexible.each * (predicted and flexible.p < REST_P)
-    torque = np.sqrt(np.mean((problem.torque * problem.records.judged) ** 2, axis=(0, 1)))
-    moved = (alone > 0) | (left_moving(problem, first.state, noise) > tolerance * torque)
+    moved = (alone > 0) | (left_moving(problem, first.state, noise) > tolerance)
     return _Left(left._replace(there=there), p_left, now[0], line, flexible.each, beyond, misfit, followed, moved)
 
 
