@@ -7,7 +7,7 @@ another, until nothing is gained. What is left decides between `named`, `named+r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -406,7 +406,8 @@ def _judged(
     against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
     named = [f for f in found if not against[f.name]]
     settings = [here] if before.problem is here.problem else [here, before]
-    here, gaining, by_speed, reasons = _answered(searched, settings, named, borne_out, forbid)
+    like_a_rest = {one.name: one.gain for one in each if not one.beside_rest} if problem.held.any() else {}
+    here, gaining, by_speed, reasons = _answered(searched, settings, named, borne_out, forbid, like_a_rest)
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= reasons
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
@@ -436,6 +437,7 @@ def _answered(
     named: list[Found],
     borne_out: Callable[[Name], bool],
     forbid: Sequence[str],
+    claims: Mapping[Name, float],
 ) -> tuple[_Setting, Gaining, Joint, dict[Name, str]]:
     """The causes that lower the error on data held out and whose size the answer's own intervals tell from zero.
 
@@ -446,7 +448,8 @@ def _answered(
     here, joint, by_speed = _as_predicts_best(settings, named, known)
     first = named
     while True:
-        gaining = without_losses(here.problem, here.start, here.whitening, named, joint, searched.strict, borne_out)
+        fit = (here.problem, here.start, here.whitening, named, joint)
+        gaining = without_losses(*fit, searched.strict, borne_out, claims)
         against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
         named = gaining.named
         if named:

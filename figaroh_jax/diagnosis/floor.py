@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ..estimation import noise
 from ..estimation.noise import Spectrum
-from ..estimation.rows import Prior, Rows, fit
+from ..estimation.rows import Prior, Rows, fit, tall
 from .evidence import Score
 from .flexible import families
 from .problem import Problem
@@ -102,9 +102,9 @@ def _from_rich_model(
     long = count >= ENOUGH
     if long:
         groups += families(problem, state, response, still=True)
-    blocks, prior, found = [rows.X], state.prior, None
+    prior, found, gram = state.prior, None, tall(rows.X).T @ tall(rows.X)
     for _ in range(RICHNESS):
-        found = screen(rows, fit(rows, prior), groups, found)
+        found = screen(rows, fit(rows, prior, gram), groups, found)
         scores = found.scores
         if not scores:
             break
@@ -113,9 +113,10 @@ def _from_rich_model(
         if scores[best].z.max() < _largest_by_chance(scores):
             break  # the best of so many that noise alone would have: without it, the residual would be less than noise
         point = int(np.argmax(scores[best].Q))
-        blocks.append(_full(rows, groups[best], point) @ kept_columns(scores[best].root[point]))
-        X = np.concatenate(blocks, axis=2)
-        rows, prior = rows._replace(X=X, Xi=X), prior.extended(blocks[-1].shape[2])
+        more = _full(rows, groups[best], point) @ kept_columns(scores[best].root[point])
+        X = np.concatenate([rows.X, more], axis=2)
+        gram = _grown_gram(gram, tall(X), tall(more))
+        rows, prior = rows._replace(X=X, Xi=X), prior.extended(more.shape[2])
     basis = _orthonormal(rows)
     y = rows.y.reshape(-1)
     residual = (y - basis @ (basis.T @ y)).reshape(rows.y.shape) * scale[:, None]
@@ -126,6 +127,14 @@ def _from_rich_model(
         return noise.white((residual**2).sum(1) / degrees, float(problem.records.rate) / 2, degrees)
     n, _, length, nv = problem.records.shape
     return _fit(problem, residual, np.moveaxis(basis.reshape(nv, n, length, -1), 0, 2))
+
+
+def _grown_gram(
+    gram: Float[np.ndarray, "P0 P0"], X: Float[np.ndarray, "nvT P"], more: Float[np.ndarray, "nvT k"]
+) -> Float[np.ndarray, "P P"]:
+    """X'X, of which that of the columns before the last, `more`, is known."""
+    cross, before = X.T @ more, len(gram)
+    return np.block([[gram, cross[:before]], [cross[:before].T, cross[before:]]])
 
 
 def _largest_by_chance(scores: Sequence[Score]) -> float:

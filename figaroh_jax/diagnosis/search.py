@@ -333,7 +333,7 @@ def eliminate(problem: Problem, start: State, found: list[Found], whitening: Flo
     """
     if len(found) < 2:
         return found
-    full = with_causes(problem, start, [f.effect for f in found], whitening)
+    full = with_causes(problem, start, [f.effect for f in found], whitening, keep=True)
     asked = list(found)
     while len(found) > 1:
         needs = [(_needed(problem, start, full, found, one, whitening), k) for k, one in enumerate(asked)]
@@ -342,7 +342,8 @@ def eliminate(problem: Problem, start: State, found: list[Found], whitening: Flo
             break
         asked = [asked[k] for _, k in needless]
         found, asked = [f for f in found if f is not asked[0]], asked[1:]
-        full = with_causes(problem, start, [f.effect for f in found], whitening)
+        full = with_causes(problem, start, [f.effect for f in found], whitening, keep=True)
+    problem.begun.clear()  # their columns are large
     return found
 
 
@@ -360,7 +361,9 @@ def judged_without(
 ) -> Verdicts:
     """What the data say of all causes but one."""
     if kind(one.effect) != "columns":
-        return stood_without(problem, start, found, one, whitening).verdicts
+        about = start, whitening, *(f.effect for f in found if f is not one)
+        known = problem.judged.get(*about)
+        return known or problem.judged.put(stood_without(problem, start, found, one, whitening).verdicts, *about)
     place = amplitude_places(full.state, [f.effect for f in found], problem.model)[found.index(one)]
     prior, kept = full.state.prior, np.delete(np.arange(len(full.state.theta)), place)
     fewer = believed(problem, Prior(prior.mean[kept], prior.precision[kept]), fewer_sums(full.folded, place))

@@ -125,9 +125,8 @@ def beyond_sliding(problem: Problem, state: State, left: Float[np.ndarray, "n M 
 
 def _friction(state: State) -> Float[np.ndarray, "nN nv"]:
     """What all friction of the state takes of each joint, N m or N."""
-    _, *shares = state.shares(state.theta)
     friction = np.zeros((state.rigid.samples, state.rigid.nv))
-    for share, term in zip(shares, state.terms, strict=True):
+    for share, term in zip(state.shares(state.theta), state.terms, strict=True):
         friction = friction + share * term.dissipative
     return friction
 
