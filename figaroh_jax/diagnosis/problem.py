@@ -34,7 +34,7 @@ T = TypeVar("T")
 __all__ = ["Layout", "Part", "Problem", "family_of", "without_factor"]
 
 # cached, and the same for all weights of the rows
-_OF_THE_MOTION = ("torque", "gain", "motion", "families", "fixed", "plain", "_terms")
+_OF_THE_MOTION = ("torque", "gain", "passed", "motion", "families", "fixed", "plain", "_terms")
 KEPT = 110 << 20  # bytes of filtered columns that are held: two responses of an arm in 18 recordings of half a minute
 AT_ONCE = 6  # effects with a shape that are evaluated at once along long recordings
 MOST_SUMS = 12  # models whose normal equations are held
@@ -342,6 +342,12 @@ class Problem:
     def gain(self) -> Float[np.ndarray, " F"]:
         """Power gain of the row filter."""
         return np.asarray(self.records.low_pass) ** 2
+
+    @cached_property
+    def passed(self) -> float:
+        """Share of white noise's power that the row filter passes: so many of the rows are independent."""
+        frequency = np.linspace(0, float(self.records.rate) / 2, 400)
+        return float(np.interp(frequency, np.asarray(self.records.omega) / (2 * np.pi), self.gain).mean())
 
     @cached_property
     def motion(self) -> Motion:

@@ -19,6 +19,7 @@ from .comparison import Hypothesis, Verdicts, fewer_sums, ground, judge, overlap
 from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
+from .evidence import block_scores
 from .flexible import friction_width
 from .gates import ambiguous, exists, gains, passes, physical_sign, rivals, simpler
 from .problem import Problem
@@ -190,13 +191,17 @@ def _chance(
     Once causes are in, each place is asked for itself too: what one joint leaves must not hide another's.
     """
 
+    if not screened.scores:
+        return 1.0
+    parts = block_scores(step.rows, step.linear, screened.stock, screened.H)
+
     def drawn(draws: int) -> float:
-        return family_p(step.rows, step.linear, screened, null, generator, draws)
+        return family_p(step.rows, step.linear, screened, null, generator, draws, parts)
 
     p = drawn(DRAWS if first else LATER)
     if alpha < p < NEAR * alpha:
         p = drawn(CLOSER)
-    return p if first or p <= alpha else min(p, place_p(step.rows, step.linear, screened, generator))
+    return p if first or p <= alpha else min(p, place_p(screened, parts, generator))
 
 
 def _contenders(

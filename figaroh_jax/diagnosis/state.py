@@ -84,20 +84,22 @@ class State:
         torques = [self.rigid.torque(ten.reshape(-1), rows) for ten, rows in zip(self.carried, each, strict=True)]
         return np.concatenate(torques)
 
-    def torque(self, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "nN nv"]:
-        """Torque at the samples with the coefficients `theta`, N m or N."""
-        return self._total(self._load(theta), theta)
+    def torque(self, theta: Float[np.ndarray, " P"], rows: slice = slice(None)) -> Float[np.ndarray, "rows nv"]:
+        """Torque at some samples with the coefficients `theta`, N m or N."""
+        return self._total(self._load(theta, rows), theta, rows)
 
-    def _load(self, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "nN nv"]:
+    def _load(self, theta: Float[np.ndarray, " P"], rows: slice = slice(None)) -> Float[np.ndarray, "rows nv"]:
         """Torque of the rigid body with what it carries."""
-        torque = self.rigid.torque(theta[: self.rigid.width])
-        return torque if self.carried is None else torque + self.known
+        torque = self.rigid.torque(theta[: self.rigid.width], rows)
+        return torque if self.carried is None else torque + self.known[rows]
 
-    def _total(self, load: Float[np.ndarray, "nN nv"], theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "nN nv"]:
+    def _total(
+        self, load: Float[np.ndarray, "rows nv"], theta: Float[np.ndarray, " P"], rows: slice = slice(None)
+    ) -> Float[np.ndarray, "rows nv"]:
         """The load with the torque of each term."""
         total = load.copy()
         for part, own in zip(self.parts[1:], self._of_terms(theta), strict=True):
-            part.add(own, total)
+            part.add(own, total, rows)
         return total
 
     def _of_terms(self, theta: Float[np.ndarray, " P"]) -> list[Float[np.ndarray, " k"]]:
