@@ -223,6 +223,7 @@ def _faulty(found: Search, here: Setting) -> list[Cause]:
     for one in found.faults:
         at = () if one.kind == "clock_error" else tuple(names[j] for j in one.joints)
         size = ("delay", "s") if one.kind == "clock_error" else ("torque", "N m")
+        size = size if one.table is None else ("force", "N")
         parameters = {
             "first": Estimate(one.first, 0.5, "s"),
             "last": Estimate(one.last, 0.5, "s"),
