@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..effects.base import Effect, Motion, Place, fixed
-from ..effects.catalogue import CATALOGUE, LIBRARY
+from ..effects.catalogue import ROLLOUTS
 from ..effects.registry import find
 from ..effects.simulation import Reversal
 from ..errors import InputError
@@ -55,9 +55,8 @@ class Acting(NamedTuple):
 
 
 def registered() -> dict[str, type[Effect]]:
-    """Effects of users that a search of rollouts looks for, by name: at a joint, with a torque, no library's own."""
-    own = {name: effect for name, effect in CATALOGUE.items() if name not in LIBRARY}
-    return {n: e for n, e in own.items() if e.acts_on == "joint" and e.has("torque") and "rollout" in e.levels}
+    """Effects that a search of rollouts looks for by their torque at a joint, by name: users', as a rule."""
+    return {name: effect for name, effect in ROLLOUTS.items() if not effect.in_rollouts.numbers}
 
 
 def placed(robot: RobotModel, effects: Sequence[Effect]) -> tuple[Effect, ...]:
@@ -162,7 +161,7 @@ def is_own(name: str) -> bool:
 
 def _parameter(name: str) -> Any:
     effect, parameter = name.split(".")
-    return find(effect).parameters()[parameter]
+    return (ROLLOUTS.get(effect) or find(effect)).parameters()[parameter]
 
 
 def bounds_of(name: str) -> tuple[float, float]:

@@ -145,6 +145,9 @@ def _limits_and_springs(
     mine = [c for c in left if joint_of(here, c) == joint]
     leader = max(plain, key=lambda one: one.promise, default=None)
     chosen = [c for c in mine if c.kind.limit or (leader is not None and c is leader.candidate)]
+    if leader is not None and leader.candidate.kind.shapes:  # from the start that was the best one
+        best = leader.candidate._replace(starts=(tuple(leader.theta[list(leader.candidate.entries)]),))
+        chosen = [best if c is leader.candidate else c for c in chosen]
     scores = {chosen[k].effect: (part.fit.cost - x, theta) for k, (x, theta) in scored(here, part, chosen).items()}
     if leader is not None and scores.get(leader.candidate.effect, (0.0, None))[0] > 0:
         share = leader.promise / scores[leader.candidate.effect][0]  # as much more as the same cause promises in all

@@ -120,11 +120,11 @@ def setting(
         noise.append(np.sqrt(np.mean([noise_of(r.velocity) ** 2 for r in fitted if r.velocity is not None], axis=0)))
     stretches = tuple(stretches) or tuple(Stretch(k, 0, len(r.time)) for k, r in enumerate(fitted))
     data = windows(loop, fitted, stretches, noise, block)
-    forces, tilt = largest_forces(loop, fitted), any(one[0] == "gravity_tilt" for one in more)
-    known = catalogue(loop, forces, gains_known=gains_known, forbid=forbid, tilt=tilt)
+    forces = largest_forces(loop, fitted)
+    known = catalogue(loop, forces, gains_known=gains_known, forbid=forbid)
     names = loop.robot.dof_names
     wanted = [(effect, name) for effect in baseline for name in names] + list(more)
-    all_of = catalogue(loop, forces, gains_known=False, tilt=tilt).candidates
+    all_of = catalogue(loop, forces, gains_known=False).candidates
     told = {(c.effect, *c.at) for c in all_of}
     for effect, *at in more:
         if (effect, *at) not in told:
