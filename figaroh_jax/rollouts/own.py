@@ -34,6 +34,7 @@ __all__ = [
     "bounds_of",
     "everywhere",
     "is_own",
+    "left_out",
     "memories",
     "placed",
     "read_number",
@@ -65,14 +66,18 @@ def placed(robot: RobotModel, effects: Sequence[Effect]) -> tuple[Effect, ...]:
     for effect in map(fixed, effects):
         if not effect.has("torque") or not isinstance(effect.at, Place):
             raise InputError(f"a rollout has no form for '{effect.name}': it needs a `torque` at a known place")
-        for what, moved in _follows(robot, effect).items():
-            if moved:
-                raise InputError(
-                    f"a rollout has no form for '{effect.name}': its torque follows the {what}, which a step does not"
-                    " know at its beginning"
-                )
+        if what := _unknown_to_a_step(robot, effect):
+            raise InputError(
+                f"a rollout has no form for '{effect.name}': its torque follows the {what}, which a step does not know"
+                " at its beginning"
+            )
         found.append(_with(effect, {name: getattr(effect, name) for name in effect.parameters()}))
     return tuple(found)
+
+
+def _unknown_to_a_step(robot: RobotModel, effect: Effect) -> str:
+    """What its torque follows that a step does not know at its beginning: the acceleration, the time, or nothing."""
+    return " and the ".join(what for what, moved in _follows(robot, effect).items() if moved)
 
 
 def _follows(robot: RobotModel, effect: Effect) -> dict[str, bool]:
@@ -211,11 +216,20 @@ def everywhere(robot: RobotModel, effects: Sequence[Effect], forbid: Sequence[st
         new = [effect(Place((j,))) for j in range(robot.nv) if (name, j) not in there]
         if name in forbid or not new:
             continue
-        try:
-            found += [placed(robot, new[:1])[0], *placed(robot, new[1:])]
-        except InputError:  # one that needs the acceleration or the time: no search of rollouts can look for it
-            continue
+        if not _unknown_to_a_step(robot, new[0]):  # `left_out` tells it
+            found += placed(robot, new)
     return tuple(found)
+
+
+def left_out(robot: RobotModel, forbid: Sequence[str] = ()) -> tuple[str, ...]:
+    """Of each registered effect that no search of rollouts can look for, why."""
+    whats = {name: _unknown_to_a_step(robot, effect(Place((0,)))) for name, effect in registered().items()
+             if name not in forbid}  # fmt: skip
+    return tuple(
+        f"'{name}' is registered, but not looked for in rollouts: its torque follows the {what}, which a step does not"
+        " know at its beginning"
+        for name, what in whats.items() if what
+    )  # fmt: skip
 
 
 def starts_of(effect: type[Effect]) -> tuple[tuple[float, ...], ...]:

@@ -32,7 +32,18 @@ from .setting import (  # fmt: skip
 )
 from .thresholds import EXPLAINED, HOPEFUL, MAY_WIN, RICHER, UNCHANGED, USUAL
 
-__all__ = ["LATE", "ROUGH", "Known", "Standing", "excess_of", "joint_of", "joint_of_entry", "outputs", "tried_now"]
+__all__ = [
+    "LATE",
+    "ROUGH",
+    "Known",
+    "Standing",
+    "excess_of",
+    "joint_of",
+    "joint_of_entry",
+    "outputs",
+    "sprung_now",
+    "tried_now",
+]
 
 LATE, ROUGH = 30, 1e-4  # iterations; share of the squares that a step must promise
 _EARLY = 3  # iterations of each candidate
@@ -351,6 +362,23 @@ def _sprung(here: Setting, now: Standing, joint: int, forbid: Sequence[str]) -> 
             theta = np.concatenate([now.model.fit.theta, [torque / share, 0.002 * torque / share, play]])
             score = settled(here, small, theta, free_entries(now.model.free, c.entries), start)
             found.append(_Ranked(part.fit.cost - score, structure, c, theta))
+    return found
+
+
+def sprung_now(here: Setting, now: Standing, forbid: Sequence[str]) -> list[Tried]:
+    """A spring at each joint of a rigid arm, fitted to the end where it may explain more than any other joint's."""
+    if now.model.structure.loop.robot.nv != here.loop.robot.nv:
+        return []
+    ranked = [max(_sprung(here, now, j, forbid), key=lambda one: one.promise, default=None)
+              for j in range(here.loop.robot.nv)]  # fmt: skip
+    found = []
+    for one in sorted((x for x in ranked if x is not None), key=lambda x: -x.promise)[:_RACE]:
+        free, start = free_entries(now.model.free, one.candidate.entries), _start_of(now, one.structure)
+        last = fit(*one.structure, one.theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
+                   iterations=LATE)[0]  # fmt: skip
+        if np.isfinite(last.cost):
+            state = Model(one.structure, last, tuple(free), float(excess_of(here, one.structure, last).max()))
+            found.append(Tried(one.candidate, state, outputs(here, last.sums.cost)))
     return found
 
 

@@ -165,6 +165,8 @@ def _searched(
         progress(f"searching for cause {len(found) + 1}", min(0.2 + 0.15 * len(found), 0.9))
         tried = _tried(here, now, [n.candidate for n in found], forbid)
         best, p = _best(here, now, tried, nearest)
+        if best is not None and now.excess < 1.0 and now.structure.loop.robot.nv == here.loop.robot.nv == 1:
+            best, p = _best(here, now, [*tried, *_elastic(here, now, forbid)], nearest)  # not looked for in noise
         p_value = p if not found else p_value
         if best is None:
             break

@@ -25,7 +25,7 @@ from .causes import BASELINE
 from .data import Run, Stretch, noise_of, regular, windows
 from .fit import Fit, standard_errors
 from .loop import Loop
-from .own import amplitudes
+from .own import amplitudes, left_out
 from .parameters import UNITS, put
 from .reading import load_loop
 from .rest import nearest_of, parts_of, relative_rest
@@ -75,6 +75,7 @@ def diagnose_rollout_task(
     progress("reading", 0.0)
     loop, runs, notes = read_rollouts(task)
     here = diagnosis_setting(task, loop, runs)
+    notes = (*notes, *left_out(loop.robot, task.diagnose.forbid))
     with jax.enable_x64(True):
         seek = search_arm if separable(loop) else search
         found = seek(here, progress, forbid=task.diagnose.forbid)
