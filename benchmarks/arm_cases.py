@@ -114,7 +114,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument(
-        "--effects", nargs="+", choices=["none", *servo_arm6.EFFECTS, *servo_arm6.MORE], default=["none", *servo_arm6.EFFECTS]
+        "--effects",
+        nargs="+",
+        choices=["none", *servo_arm6.EFFECTS, *servo_arm6.MORE],
+        default=["none", *servo_arm6.EFFECTS],
     )
     parser.add_argument("--sizes", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--noise", choices=["white", "coloured", "counts"], default="white")
@@ -141,7 +144,7 @@ def _cases(args: argparse.Namespace, rng: np.random.Generator) -> list[list[tupl
     def one(effect: str, size: int) -> tuple[str, int, float]:
         sprung = effect in ("joint_elasticity", "backlash")  # the wrist's roll is too light for a spring at 2 ms
         joint = 5 if effect == "payload" else int(rng.integers(0, 4 if sprung else 5))
-        if effect in ("torque_ripple", "coupled_transmission"):  # the roll and the jaw do not move far enough, or alone
+        if effect in ("torque_ripple", "coupled_transmission"):  # the roll and the jaw do not move far enough
             joint = int(rng.integers(0, 4))
         return effect, joint, (servo_arm6.EFFECTS | servo_arm6.MORE)[effect][size]
 

@@ -55,6 +55,10 @@ class CoupledTransmission(Effect):
     name, title, acts_on = "coupled_transmission", "transmission coupling", "pair"
     equation = "row i: inertia a_j + damping v_j + friction s(v_i + sign v_j); row j: i and j swapped, friction by sign"
     separated_by = "{at} alone, together and against each other"
+    in_rollouts = InRollouts(
+        (("inertia", "pair_inertia"), ("damping", "pair_damping"), ("friction", "pair_friction")),
+        lambda scale: ((0.0, 0.0, 0.0),), "pair", several=True, together=3,
+    )  # fmt: skip
     one_rotor = ("inertia", "damping", "friction")
     inertia: Scalar = amplitude("kg m2")
     damping: Scalar = amplitude("N m s/rad")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -13,17 +14,19 @@ from ..effects.base import Effect
 from ..effects.catalogue import ROLLOUTS, find
 from ..effects.loops import InRollouts, Scale
 from ..rigid.model import Frame, Joint, RobotModel
-from .loop import Joints, Loop
+from .loop import Joints, Loop, Pairs
 from .own import amplitudes, is_own, starts_of
 from .parameters import Entry, Table
 
-__all__ = ["BASELINE", "Candidate", "Catalogue", "catalogue", "elastic_loop", "kind_of", "springs"]
+__all__ = ["BASELINE", "Candidate", "Catalogue", "catalogue", "elastic_loop", "kind_of", "springs", "with_pairs"]
 
 _JOINT_ENTRIES = (
     "armature", "damping", "friction", "stribeck_force", "stribeck_speed", "load_ratio", "stiffness",
     "offset", "ripple_sine", "ripple_cosine", "ripple_order", "reading",
 )  # fmt: skip
+_PAIR_ENTRIES = ("pair_inertia", "pair_damping", "pair_friction")
 _DRIVE_ENTRIES = ("scale", "delay", "dead_band", "voltage", "force_limit")
+_MOST_PAIRS = 64
 BASELINE = ("rotor_inertia", "joint_damping", "friction_loss")
 
 
@@ -96,6 +99,9 @@ def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbi
     if _stands(loop):
         table += [Entry("gravity_x", (0,)), Entry("gravity_y", (0,))]
         candidates += _wanted(kinds, "robot", (), 0, Scale(0.0, 0.0))
+    for k, (i, j, _) in enumerate(loop.pairs.at if loop.pairs is not None else ()):
+        table += [Entry(number, (k,)) for number in _PAIR_ENTRIES]
+        candidates += _wanted(kinds, "pair", (names[i], names[j]), k, Scale(0.0, 0.0))
     for k, effect in enumerate(loop.effects):
         ordered = sorted(effect.parameters(), key=lambda name: name not in amplitudes(type(effect)))  # noqa: B023
         table += [Entry(f"{effect.name}.{name}", (k,)) for name in ordered]
@@ -131,6 +137,20 @@ def _wanted(
         for called, kind in kinds.items()
         if kind.place == place and kind.numbers and not any(number in without for _, number in kind.numbers)
     ]  # fmt: skip
+
+
+def with_pairs(loop: Loop) -> Loop:
+    """The loop with couplings of no size of every joint with the one before it: motors of their sum and difference."""
+    joints = loop.robot.joints
+    if loop.pairs is not None or loop.carried is not None or any(j.kind not in ("revolute", "prismatic") for j in joints):
+        return loop
+    near = [(joints[j.parent], j) for j in joints if j.parent >= 0 and not j.follows]
+    pairs = [(a.coordinate, b.coordinate) for a, b in near if a.kind == b.kind and not a.follows]
+    at = tuple((*pair, sign) for pair in pairs for sign in (1, -1))
+    if not 0 < len(at) <= _MOST_PAIRS:
+        return loop
+    zero = np.zeros(len(at))
+    return replace(loop, pairs=Pairs(zero, zero, zero, at))
 
 
 def _stands(loop: Loop) -> bool:
@@ -181,6 +201,7 @@ def elastic_loop(loop: Loop, coordinate: int, stiffness: float, damping: float, 
         measured=loop.measured,
         summed=summed,
         carried=loop.carried,
+        pairs=loop.pairs,
         effects=loop.effects,
     )
 

@@ -17,7 +17,7 @@ from .causes import Candidate, elastic_loop, springs
 from .fit import Fit, fit
 from .loop import Loop
 from .own import is_own
-from .parameters import OF_DRIVES, Entry
+from .parameters import OF_DRIVES, OF_SEVERAL, Entry
 from .search import Model, Tried, scored, settled
 from .sensitivity import Windows
 from .setting import (  # fmt: skip
@@ -129,6 +129,8 @@ def tried_now(
         usual = [one for one in enough if one.candidate.kind.usual][:1]  # may come before what promises more
         rest = [one for one in enough if all(one is not x for x in usual)]
         chosen = [*usual, *rest][: _TOP if j >= 0 else 1]
+        if j < 0:  # a motor that turns with the sum of two joints, and one that turns with their difference
+            chosen = [one for one in rest if one.candidate[:2] == chosen[0].candidate[:2]] if chosen else []
         hopeful[j] = chosen + [
             one for one in ranked if _asked_by(one.candidate, chosen) and all(one is not x for x in chosen)
         ]
@@ -409,7 +411,7 @@ def joint_of(here: Setting, c: Candidate) -> int:
 def joint_of_entry(here: Setting, entry: int) -> int:
     """The joint whose encoder shows a number of the table; -1: those of several."""
     one = here.known.table[entry] if entry < len(here.known.table) else None
-    if one is None or len(one.at) != 1 or one.name in ("payload", "gravity_x", "gravity_y"):
+    if one is None or len(one.at) != 1 or one.name in OF_SEVERAL:
         return -1
     (place,) = one.at
     if is_own(one.name):

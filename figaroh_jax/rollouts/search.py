@@ -294,7 +294,8 @@ def scored(here: Setting, now: Model, left: Sequence[Candidate]) -> dict[int, tu
                 if shape := left[k].kind.falls_off:
                     theta[left[k].entries[shape]] = left[k].starts[variant][shape]
             lanes.append((theta, pack))
-    for pack in ([k for k in pack if k not in nowhere] for pack in theirs.values()):  # every start of all that share a name, at all places at once
+    for one in theirs.values():  # every start of all that share a name, at all places at once
+        pack = [k for k in one if k not in nowhere]
         for variant in range(max((len(left[k].starts) for k in pack), default=0)):
             theta = now.fit.theta.copy()
             for k in pack:

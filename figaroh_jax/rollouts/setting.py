@@ -13,7 +13,7 @@ import numpy as np
 from ..effects.base import Effect, place
 from ..effects.catalogue import CATALOGUE
 from ..errors import InputError, nearest
-from .causes import Candidate, Catalogue, catalogue
+from .causes import Candidate, Catalogue, catalogue, with_pairs
 from .colour import colour_of, filtered
 from .data import Run, Stretch, noise_of, windows
 from .fit import Fit, fit
@@ -113,7 +113,7 @@ def setting(
     rates: bool = True,
 ) -> Setting:
     """Data, catalogue and baseline; `more` are (effect, place) that it has beside `baseline` at every joint."""
-    loop = replace(loop, effects=everywhere(loop.robot, _with_wanted(loop, more), forbid))
+    loop = replace(with_pairs(loop), effects=everywhere(loop.robot, _with_wanted(loop, more), forbid))
     fitted = [r for r in runs if not r.holdout]
     noise = [np.sqrt(np.mean([noise_of(r.position) ** 2 for r in fitted], axis=0))]
     if rates and all(r.velocity is not None for r in fitted):
@@ -127,6 +127,11 @@ def setting(
     all_of = catalogue(loop, forces, gains_known=False).candidates
     told = {(c.effect, *c.at) for c in all_of}
     for effect, *at in more:
+        if effect == "coupled_transmission":
+            raise InputError(
+                "baseline: effects: a rollout finds a 'coupled_transmission' by `diagnose`, with the sign of its second"
+                " joint; it is not fitted before"
+            )
         if (effect, *at) not in told:
             raise InputError(
                 f"baseline: effects: a rollout has no number for '{effect}' at '{', '.join(at)}'"

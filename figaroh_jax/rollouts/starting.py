@@ -24,6 +24,7 @@ from .setting import Setting, Structure, residuals
 __all__ = ["shown", "suggested"]
 
 _FEW = 3  # starts of each candidate
+_LOST = 1e12  # sigmas
 
 
 def shown(here: Setting, c: Candidate, theta: np.ndarray) -> bool:
@@ -36,11 +37,13 @@ def shown(here: Setting, c: Candidate, theta: np.ndarray) -> bool:
 
 
 def suggested(here: Setting, structure: Structure, now: Fit, wanted: Sequence[Candidate]) -> list[Candidate]:
-    """The candidates with the starts that explain most of what is left, `_FEW` of each; none where no motion shows it."""
+    """The candidates with the starts that explain most of what is left, `_FEW` of each; none that no motion shows."""
     many = [c for c in wanted if c.kind.shapes and len(c.starts) > _FEW and not _class_of(c).has("step")]
     if not many or here.loop.carried is not None:
         return list(wanted)
     left, weight = residuals(structure, now), np.asarray(structure.data.weight)
+    if not (np.abs(left) < _LOST).all():  # the loop diverges
+        return list(wanted)
     motion, servos = _motion(here, left[:, 0].shape), _servos(here.loop)
     low, high = _range(here)
     found = []

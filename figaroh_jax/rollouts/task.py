@@ -308,6 +308,9 @@ def _cause(one: Named, found: Search, here: Setting) -> Cause:
             name, value, error, unit = "rest", -value / stiffness, error / abs(stiffness), "rad"
         value -= one.candidate.kind.neutral
         parameters[name] = Estimate(value, error, unit)
+    first = structure.table[one.candidate.entries[0]]
+    if first.name == "pair_inertia" and here.loop.pairs is not None:
+        parameters["sign"] = Estimate(float(here.loop.pairs.at[first.at[0]][2]), 0.0, "")
     if one.candidate.effect == "gravity_tilt":  # as angles
         x, y = (parameters[name] for name in ("x", "y"))
         parameters = {
@@ -381,5 +384,10 @@ def extended_of(loop: Loop) -> ExtendedModel:
                 continue  # the spring holds it
             if any(numbers[name] for name in amplitudes(find(effect)) if name != "offset" or effect == "torque_offset"):
                 own.append(place(find(effect), robot, [name], **numbers))
+    for k, (i, j, sign) in enumerate(loop.pairs.at if loop.pairs is not None else ()):
+        numbers = {field: float(np.asarray(getattr(loop.pairs, field))[k]) for field in ("inertia", "damping", "friction")}
+        if any(numbers.values()):
+            pair = [robot.dof_names[i], robot.dof_names[j]]
+            own.append(place(find("coupled_transmission"), robot, pair, **numbers, sign=float(sign)))
     own += [e for e in loop.effects if any(float(getattr(e, name)) for name in amplitudes(type(e)))]
     return extend(robot, *own)
