@@ -142,7 +142,11 @@ def _wanted(
 def with_pairs(loop: Loop) -> Loop:
     """The loop with couplings of no size of every joint with the one before it: motors of their sum and difference."""
     joints = loop.robot.joints
-    if loop.pairs is not None or loop.carried is not None or any(j.kind not in ("revolute", "prismatic") for j in joints):
+    if (
+        loop.pairs is not None
+        or loop.carried is not None
+        or any(j.kind not in ("revolute", "prismatic") for j in joints)
+    ):
         return loop
     near = [(joints[j.parent], j) for j in joints if j.parent >= 0 and not j.follows]
     pairs = [(a.coordinate, b.coordinate) for a, b in near if a.kind == b.kind and not a.follows]

@@ -103,8 +103,8 @@ class Joints(eqx.Module):
 class Pairs(eqx.Module):
     """Couplings of two coordinates by a motor that turns with the sum or the difference of both; arrays (pairs,).
 
-    Inertia and damping are what the motion of one does at the other; what they do at its own is the joint's armature and
-    damping. The dry friction holds the motor.
+    Inertia and damping are what the motion of one does at the other; what they do at its own is the joint's armature
+    and damping. The dry friction holds the motor.
     """
 
     inertia: Any  # kg m2
@@ -395,7 +395,8 @@ def _with_pairs(loop: Loop, rows: Rows, v: Array, weight: Array) -> Rows:
         pull, share = -jnp.asarray(j.friction_rate)[first, None] * rate, jnp.asarray(j.friction_share)[first, None]
     far, one = jnp.full_like(rate, -jnp.inf), jnp.ones_like(rate)
     more = (level, pull, share * weight * one, far, one, far, one)
-    return Rows(*(jnp.concatenate(both) for both in zip(rows[:7], more, strict=True)), way)
+    parts = [jnp.concatenate(both) for both in zip(rows[:7], more, strict=True)]
+    return Rows(*parts[:7], way=way)  # pyright: ignore[reportArgumentType]
 
 
 def _limit(loop: Loop, distance: Array, rate: Array, weight: Array) -> tuple[Array, Array]:

@@ -45,8 +45,8 @@ _LONGS = ("n", "nu", "links", "ny", "rates", "carried", "hard", "limited", "impl
           "substeps", "block", "many", "columns", "pairs")  # fmt: skip
 _ARRAYS = (
     "measured", "summed", "parent", "coordinate", "slides", "placement", "axis", "inertia", "gravity", "start", "joint",
-    "drive", "way", "payload", "resting", "kind", "place", "column", "ten", "pair", "joined", "command", "reading", "weight", "load",
-    "begin", "pole", "cost", "gradient", "matrix", "read",
+    "drive", "way", "payload", "resting", "kind", "place", "column", "ten", "pair", "joined", "command", "reading",
+    "weight", "load", "begin", "pole", "cost", "gradient", "matrix", "read",
 )  # fmt: skip
 _MOST, _MOST_COLUMNS, _MOST_PAIRS = 32, 500, 64
 
@@ -232,9 +232,9 @@ def _numbers(loop: Loop) -> dict[str, np.ndarray]:
         "drive": np.array(own).reshape(-1, nu),
         "inertia": np.array(loop.robot.inertia, float),
         "gravity": np.array(loop.robot.gravity, float),
-        "pair": np.zeros((3, 0)) if loop.pairs is None else np.stack(
-            [f(getattr(loop.pairs, name)) for name in ("inertia", "damping", "friction")]
-        ),
+        "pair": np.zeros((3, 0))
+        if loop.pairs is None
+        else np.stack([f(getattr(loop.pairs, name)) for name in ("inertia", "damping", "friction")]),
         "payload": np.zeros(1) if carried is None else np.array(carried.payload, float),
     }
 

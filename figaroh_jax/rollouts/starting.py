@@ -133,7 +133,8 @@ def _servos(loop: Loop) -> np.ndarray:
     joints = loop.joints
     spring = -(way**2 * (np.asarray(loop.drives.scale) * bias[:, 1])[:, None]).sum(0) + np.asarray(joints.stiffness)
     damper = -(way**2 * bias[:, 2][:, None]).sum(0) + np.asarray(joints.damping)
-    return np.stack([masses + np.asarray(joints.armature), damper, spring], 1)
+    rotors = masses + np.asarray(joints.armature)
+    return np.stack([rotors, np.maximum(damper, 0.0), np.maximum(spring, 0.0)], 1)  # a loop that diverges tells nothing
 
 
 def _masses(robot: RobotModel, q: np.ndarray) -> np.ndarray:

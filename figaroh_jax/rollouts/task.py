@@ -385,7 +385,9 @@ def extended_of(loop: Loop) -> ExtendedModel:
             if any(numbers[name] for name in amplitudes(find(effect)) if name != "offset" or effect == "torque_offset"):
                 own.append(place(find(effect), robot, [name], **numbers))
     for k, (i, j, sign) in enumerate(loop.pairs.at if loop.pairs is not None else ()):
-        numbers = {field: float(np.asarray(getattr(loop.pairs, field))[k]) for field in ("inertia", "damping", "friction")}
+        numbers = {
+            field: float(np.asarray(getattr(loop.pairs, field))[k]) for field in ("inertia", "damping", "friction")
+        }
         if any(numbers.values()):
             pair = [robot.dof_names[i], robot.dof_names[j]]
             own.append(place(find("coupled_transmission"), robot, pair, **numbers, sign=float(sign)))
