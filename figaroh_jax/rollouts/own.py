@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..effects.base import Effect, Motion, Place, fixed
-from ..effects.catalogue import ROLLOUTS
+from ..effects.catalogue import CATALOGUE, ROLLOUTS
 from ..effects.registry import find
 from ..effects.simulation import Reversal
 from ..errors import InputError
@@ -57,7 +57,8 @@ class Acting(NamedTuple):
 
 def registered() -> dict[str, type[Effect]]:
     """Effects that a search of rollouts looks for by their torque at a joint, by name: users', as a rule."""
-    return {name: effect for name, effect in ROLLOUTS.items() if not effect.in_rollouts.numbers}
+    own = {name: effect for name, effect in ROLLOUTS.items() if not effect.in_rollouts.numbers}
+    return {name: e for name, e in own.items() if "torque" not in e.levels or CATALOGUE.get(name) is e}
 
 
 def placed(robot: RobotModel, effects: Sequence[Effect]) -> tuple[Effect, ...]:
