@@ -209,6 +209,8 @@ RIGHT = Standing(
         ({"whole": True, "gain": 0.05, "modulation": 0.2}, "borderline"),  # 1.67, 1.25 and 1.5 times what is needed
         ({"gain": 0.26, "t": 2.5, "modulation": 0.14}, "borderline"),  # each of them by little
         ({"gain": 0.26, "t": 2.5}, ""),  # but as steady as can be
+        ({"gain": 0.34, "t": 3.8, "modulation": 0.11, "modulation_held_out": 0.1}, "borderline"),
+        ({"gain": 0.34, "t": 3.8, "modulation": 0.11, "modulation_held_out": 0.0}, ""),  # half of that is chance
         ({"gain": 0.26, "t": 20.0, "modulation": 0.14}, ""),
         ({"whole": True, "gain": 0.05, "modulation": 0.4}, "varies"),
         ({"modulation_held_out": 0.25}, "varies"),
@@ -232,7 +234,17 @@ def test_beside_a_rest_a_cause_is_named_by_what_it_alone_explains(changes: dict[
     assert word in reason and bool(word) == bool(reason)
 
 
-@pytest.mark.parametrize(("changes", "named"), [({"t": 1.5}, True), ({"t": 1.5, "gain": 0.1}, False)])
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"t": 1.5}, True),
+        ({"t": 1.5, "gain": 0.1}, False),
+        ({"gain": 0.26, "t": 2.5, "modulation": 0.14, "modulation_held_out": 0.14}, True),
+        ({"modulation": 0.18, "modulation_held_out": 0.18}, True),
+        ({"modulation": 0.22, "modulation_held_out": 0.18}, False),
+        ({"outdone": True}, False),
+    ],
+)
 def test_recordings_kept_out_may_show_what_few_blocks_of_the_others_cannot(
     changes: dict[str, float], named: bool
 ) -> None:

@@ -97,11 +97,13 @@ def reason_against(
 
     Beside a `rest` it must explain much of its joints' error, and surely; without one it must only be there, with one
     amplitude: one that would rather vary predicts better on data that were not fitted, whether or not a rest shows.
-    `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not; `fading`
-    are those that were surely there and are gone in recordings kept out.
+    `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not or where it is
+    borderline; `fading` are those that were surely there and are gone in recordings kept out.
     """
     least, most = (GAIN_NAMED_ROBOT, MODULATION_ROBOT) if one.whole else (GAIN_NAMED, MODULATION)
-    margin = _together_beyond(max(one.t / one.t_needed, 1.0), one.gain / least, most / max(one.modulation, 1e-9))
+    shown = certain(one.name)
+    varying = one.modulation if one.whole else _without_chance(one.modulation, one.modulation_held_out)
+    margin = _together_beyond(max(one.t / one.t_needed, 1.0), one.gain / least, most / max(varying, 1e-9))
     strict_law = one.whole or one.alone  # what else is wrong at a joint makes its law's amplitude vary
     varies = "its amplitude varies with position, speed, load or time (that would add"
     checks = [
@@ -127,11 +129,14 @@ def reason_against(
     if rest or not (one.beside_rest or one.complete):  # what any rest looks like is taken on less only if it is all
         checks += [
             (
-                one.t >= one.t_needed or certain(one.name),
+                one.t >= one.t_needed or shown,
                 f"its gain on held-out data is not significant: t = {one.t:.1f}, {one.t_needed:.1f} needed",
             ),
             (one.gain >= least, f"it removes {one.gain:.0%} of the held-out error where it acts, {least:.0%} needed"),
-            (one.modulation <= most, f"{varies} {one.modulation:.2f} of its gain)"),
+            (
+                one.modulation <= (max(most, MODULATION_HELD_OUT) if shown else most),
+                f"{varies} {one.modulation:.2f} of its gain)",
+            ),
             (one.share >= SHARE_NAMED, f"its torque is {one.share:.1%} of the joint's, {SHARE_NAMED:.0%} needed"),
             (not one.cancels, "it cancels most of the joint's torque, as no gain beside another cause does"),
             (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion explain as much"),
@@ -144,12 +149,17 @@ def reason_against(
                 "a coupling without friction of its own cannot be distinguished from rotor or link inertia",
             ),
             (
-                margin >= MARGIN,
+                margin >= MARGIN or shown,
                 f"it is borderline: t, gain and a steady amplitude together are {margin:.1f} times what each alone"
                 f" needs, {MARGIN:.0f} needed",
             ),
         ]
     return next((reason for passed, reason in checks if not passed), "")
+
+
+def _without_chance(fitted: float, held_out: float) -> float:
+    """What an amplitude that varies gains: by chance it gains more in the fit, and as much less on data left out."""
+    return max((fitted + held_out) / 2, 0.0)
 
 
 def _together_beyond(*ratios: float) -> float:

@@ -19,6 +19,7 @@ from .comparison import Hypothesis, Verdicts, fewer_sums, ground, judge, overlap
 from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
+from .evidence import block_scores
 from .flexible import friction_width
 from .gates import ambiguous, exists, gains, passes, physical_sign, rivals, simpler
 from .problem import Problem
@@ -190,13 +191,17 @@ def _chance(
     Once causes are in, each place is asked for itself too: what one joint leaves must not hide another's.
     """
 
+    if not screened.scores:
+        return 1.0
+    parts = block_scores(step.rows, step.linear, screened.stock, screened.H)
+
     def drawn(draws: int) -> float:
-        return family_p(step.rows, step.linear, screened, null, generator, draws)
+        return family_p(step.rows, step.linear, screened, null, generator, draws, parts)
 
     p = drawn(DRAWS if first else LATER)
     if alpha < p < NEAR * alpha:
         p = drawn(CLOSER)
-    return p if first or p <= alpha else min(p, place_p(step.rows, step.linear, screened, generator))
+    return p if first or p <= alpha else min(p, place_p(screened, parts, generator))
 
 
 def _contenders(
@@ -320,7 +325,7 @@ def eliminate(problem: Problem, start: State, found: list[Found], whitening: Flo
     """
     if len(found) < 2:
         return found
-    full = with_causes(problem, start, [f.effect for f in found], whitening)
+    full = with_causes(problem, start, [f.effect for f in found], whitening, keep=True)
     asked = list(found)
     while len(found) > 1:
         needs = [(_needed(problem, start, full, found, one, whitening), k) for k, one in enumerate(asked)]
@@ -329,7 +334,8 @@ def eliminate(problem: Problem, start: State, found: list[Found], whitening: Flo
             break
         asked = [asked[k] for _, k in needless]
         found, asked = [f for f in found if f is not asked[0]], asked[1:]
-        full = with_causes(problem, start, [f.effect for f in found], whitening)
+        full = with_causes(problem, start, [f.effect for f in found], whitening, keep=True)
+    problem.begun.clear()  # their columns are large
     return found
 
 
@@ -347,7 +353,9 @@ def judged_without(
 ) -> Verdicts:
     """What the data say of all causes but one."""
     if kind(one.effect) != "columns":
-        return stood_without(problem, start, found, one, whitening).verdicts
+        about = start, whitening, *(f.effect for f in found if f is not one)
+        known = problem.judged.get(*about)
+        return known or problem.judged.put(stood_without(problem, start, found, one, whitening).verdicts, *about)
     place = amplitude_places(full.state, [f.effect for f in found], problem.model)[found.index(one)]
     prior, kept = full.state.prior, np.delete(np.arange(len(full.state.theta)), place)
     fewer = believed(problem, Prior(prior.mean[kept], prior.precision[kept]), fewer_sums(full.folded, place))

@@ -70,22 +70,28 @@ def shifted(
 
     Position, velocity and acceleration of the answer have a leading axis of effects.
     """
+    return _moved(effects, motion, _shifts(effects, motion, records, turns, as_read), records)
+
+
+def _shifts(
+    effects: Effect, motion: Motion, records: Records, turns: int, as_read: Float[np.ndarray, "nN nv"] | None
+) -> Float[np.ndarray, "effects nN"]:
+    """By how much each sensor's joint stands elsewhere than was read."""
     shift = _errors(effects, motion)
     if not turns:
-        return _moved(effects, motion, shift, records)
+        return shift
     if as_read is None:
         as_read = links_torque(motion.model, motion.position, motion.velocity, motion.acceleration, records)
     compliances, shift = _compliances(effects, motion, records, as_read), np.zeros_like(shift)
     for turn in range(turns):
         if turn:
-            true = _moved(effects, motion, shift, records)
-            loads = links_torque(motion.model, true.position, true.velocity, true.acceleration, records)
+            loads = _torques(effects, motion, shift, records)
         else:  # the motion as it was read
             loads = np.broadcast_to(as_read, (len(shift), *as_read.shape))
         missing = (_errors(effects, motion, loads) - shift).reshape(-1, *records.position.shape[:2])
         change = [own.solve(one) for own, one in zip(compliances, missing, strict=True)]
         shift = shift + np.reshape(change, shift.shape)
-    return _moved(effects, motion, shift, records)
+    return shift
 
 
 class _Compliance(NamedTuple):
@@ -136,8 +142,8 @@ def _compliances(
     effects: Effect, motion: Motion, records: Records, load: Float[np.ndarray, "nN nv"]
 ) -> list[_Compliance]:
     """What a small change of its joint's motion changes of each sensor's reading."""
-    loads = np.repeat(load[None], len(effects.at), axis=0)
-    unit = (_errors(effects, motion, loads + 1) - _errors(effects, motion, loads)).mean(1)
+    more, here = (_errors(effects, changed(motion, load=own)) for own in (load + 1, load))
+    unit = (more - here).mean(1)
     joints = np.asarray(effects.at)[:, 0]
     few, (once, place) = _Few.of(motion, records), np.unique(joints, return_inverse=True)
     slopes = few.slopes(motion.model, once, lambda q, v, a: links_torque(motion.model, q, v, a, records))
@@ -168,8 +174,7 @@ class _Few(NamedTuple):
     def of(cls, motion: Motion, records: Records) -> _Few:
         n, samples, _, nv = records.shape
         at = np.append(np.arange(0, samples - 1, EVERY), samples - 1)
-        state = (motion.position, motion.velocity, motion.acceleration)
-        return cls(at, samples, tuple(np.asarray(x).reshape(n, samples, nv)[:, at].reshape(-1, nv) for x in state))
+        return cls(at, samples, tuple(x.reshape(n, samples, nv)[:, at].reshape(-1, nv) for x in _state(motion)))
 
     def slopes(
         self, model: RobotModel, joints: Int[np.ndarray, " joints"], torque: Callable[..., np.ndarray]
@@ -205,17 +210,44 @@ def _errors(
 
 def _moved(effects: Effect, motion: Motion, errors: Float[np.ndarray, "effects nN"], records: Records) -> Motion:
     """The motion less each error of the joint of each effect."""
-    errors = errors.reshape(-1, *records.position.shape[:2])
-    rates = difference(errors, float(records.dt))
-    change = [errors, rates, difference(rates, float(records.dt))]
     one, joint = np.arange(len(errors)), np.asarray(effects.at)[:, 0]
     true = []
-    for signal, delta in zip((motion.position, motion.velocity, motion.acceleration), change, strict=True):
-        moved = np.repeat(np.asarray(signal)[None], len(errors), axis=0)
-        moved[one, :, joint] -= delta.reshape(len(errors), -1)
+    for signal, delta in zip(_state(motion), _with_rates(errors, records), strict=True):
+        moved = np.repeat(signal[None], len(errors), axis=0)
+        moved[one, :, joint] -= delta
         true.append(moved)
     position, velocity, acceleration = true
     return changed(motion, position=position, velocity=velocity, acceleration=acceleration)
+
+
+def _torques(
+    effects: Effect, motion: Motion, errors: Float[np.ndarray, "effects nN"], records: Records
+) -> Float[np.ndarray, "effects nN nv"]:
+    """The links' torque along the motion less each error (`_moved`), one after another: a joint of it is all that
+    changes."""
+    moved = q, v, a = [signal.copy() for signal in _state(motion)]
+    out, deltas = np.empty((len(errors), *q.shape)), _with_rates(errors, records)
+    for one, joint in enumerate(np.asarray(effects.at)[:, 0].tolist()):
+        read = [signal[:, joint].copy() for signal in moved]
+        for signal, delta in zip(moved, deltas, strict=True):
+            signal[:, joint] -= delta[one]
+        out[one] = links_torque(motion.model, q, v, a, records)
+        for signal, own in zip(moved, read, strict=True):
+            signal[:, joint] = own
+    return out
+
+
+def _state(motion: Motion) -> tuple[Float[np.ndarray, "nN nv"], ...]:
+    """Position, velocity and acceleration."""
+    return tuple(np.asarray(x) for x in (motion.position, motion.velocity, motion.acceleration))
+
+
+def _with_rates(errors: Float[np.ndarray, "effects nN"], records: Records) -> list[Float[np.ndarray, "effects nN"]]:
+    """Errors of the position with those of the velocity and of the acceleration."""
+    each = [errors.reshape(-1, *records.position.shape[:2])]
+    for _ in range(2):
+        each.append(difference(each[-1], float(records.dt)))
+    return [one.reshape(len(errors), -1) for one in each]
 
 
 def difference(signal: Float[np.ndarray, "*n N"], dt: float) -> Float[np.ndarray, "*n N"]:
@@ -246,8 +278,8 @@ def torque_change(
     out, few = np.empty((len(effects.at), *as_read.shape)), max(1, AT_ONCE // as_read.size)
     for part in (slice(start, start + few) for start in range(0, len(out), few)):
         some = jax.tree.map(lambda x, part=part: np.asarray(x)[part], effects)
-        true = shifted(some, motion, records, turns, as_read)
-        out[part] = links_torque(motion.model, true.position, true.velocity, true.acceleration, records) - as_read
+        out[part] = _torques(some, motion, _shifts(some, motion, records, turns, as_read), records)
+        out[part] -= as_read
     return out
 
 

@@ -19,11 +19,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
-from .bandwidth import motion_band, smoothed
+from .bandwidth import encoder_step, motion_band, smoothed
 from .cleaning import near, without_untrusted
 from .dataset import Recording
 from .groupmotion import continued, group_rates, normalised
-from .resampling import Grid, band_limited, differentiate, even_grid, sampling_rate, to_recording_times
+from .resampling import Grid, band_limited, differentiate, even_grid, sampling_rate, to_recording_times, unrounded
 from .rowfilter import RowFilter, fast_length, filter_rows, frequencies, low_pass, row_filter
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def prepare(
     if grouped is not None:
         position = continued(grouped, position, str(recording.file))
     _refuse_endless(recording, time, rates)
-    known = {} if resampled is None else resampled
+    known, raw = {} if resampled is None else resampled, position
     if key not in known:
         grid = even_grid(time, position, *([] if torque is None else [torque]))
         known[key] = grid.rate, grid.gaps, *_resample(grid, rates, shift)
@@ -160,7 +160,9 @@ def prepare(
             f" after {trim} s are cut at both ends, at least {FEWEST_ROWS} are needed"
         )
     if grouped is None:
-        position = (_motion if slowed else low_pass)(columns[0], dt, rates.cutoff)
+        position = (
+            _motion(columns[0], dt, rates.cutoff, raw, rate) if slowed else low_pass(columns[0], dt, rates.cutoff)
+        )
         moves = np.ptp(position, axis=0) > STILL * (1 + np.abs(position).max(axis=0))
         position[:, ~moves] = position[0, ~moves]  # dry friction would see the sign of rounding
         velocity, acceleration = (differentiate(position, dt, order=order) * moves for order in (1, 2))
@@ -204,11 +206,16 @@ def _refuse_endless(recording: Recording, time: Float[np.ndarray, " samples"], r
     )
 
 
-def _motion(position: Float[np.ndarray, "samples nv"], dt: float, cutoff: float) -> Float[np.ndarray, "samples nv"]:
-    """The position of each joint without what lies above its cutoff, or above its motion where that is slower."""
+def _motion(
+    position: Float[np.ndarray, "samples nv"], dt: float, cutoff: float, raw: Float[np.ndarray, "read nv"], rate: float
+) -> Float[np.ndarray, "samples nv"]:
+    """The position of each joint without what lies above its cutoff, or above its motion where that is slower.
+
+    `raw` are the samples as they were read, at `rate` (Hz): they show the steps of the encoder.
+    """
     out = low_pass(position, dt, cutoff)
     for joint, column in enumerate(position.T):
-        band = motion_band(column, dt, cutoff)
+        band = motion_band(column, dt, cutoff, encoder_step(raw[:, joint]), rate)
         if band < cutoff:
             out[:, joint] = smoothed(column, dt, band)
     return out
@@ -222,7 +229,7 @@ def choose_rates(recordings: Sequence[Recording], preprocess: Preprocess) -> Rat
     times the cutoff, because differences and friction signs need the finer samples, and is 13.2 times the cutoff for
     long data that it would else sample more than 16 times as fast.
     """
-    raw, file = min((sampling_rate(recording.time), str(recording.file)) for recording in recordings)
+    raw, file = min((sampling_rate(unrounded(recording.time)), str(recording.file)) for recording in recordings)
     cutoff = preprocess.cutoff or min(DEFAULT_CUTOFF, 0.2 * raw)
     if cutoff >= raw / 2:
         raise InputError(
@@ -244,7 +251,7 @@ def choose_rates(recordings: Sequence[Recording], preprocess: Preprocess) -> Rat
 
 def _window(recording: Recording, window: tuple[float, float] | None):
     """The part of a recording that is kept."""
-    time, position, torque = recording.time, recording.position, recording.torque
+    time, position, torque = unrounded(recording.time), recording.position, recording.torque
     if window is None:
         return time, position, torque
     keep = (time >= window[0]) & (time <= window[1])
