@@ -32,6 +32,11 @@ from figaroh_jax.rollouts.task import extended_of
 mujoco: Any = engine
 
 
+def both(sign: int) -> Pairs:
+    """The motor of the tendon."""
+    return Pairs(np.array([0.012]), np.array([0.1]), np.array([0.15]), ((0, 1, sign),))
+
+
 def moved(text: str, u: np.ndarray) -> np.ndarray:
     model = mujoco.MjModel.from_xml_string(text)
     data, q = mujoco.MjData(model), np.zeros_like(u)
@@ -62,7 +67,7 @@ def test_a_motor_of_two_joints_moves_them_as_a_tendon_of_mujoco(
     whole = {name: [x + more for x in own[name]] for name, more in (("damping", 0.1), ("armature", 0.012))}
     (tmp_path / "arm.xml").write_text(PAIR.format(tendon="", **whole))
     loop, _ = fj.load_loop(tmp_path / "arm.xml")
-    loop = dataclasses.replace(loop, pairs=Pairs(*(np.array([x]) for x in (0.012, 0.1, 0.15)), ((0, 1, sign),)))
+    loop = dataclasses.replace(loop, pairs=both(sign))
     t = 0.002 * np.arange(800)[:, None]
     u = np.array([0.4, -0.3]) + 0.3 * np.sin(t * [5.0, 7.3] + [1.0, 2.0])
     q = moved(PAIR.format(tendon=tendon, **own), u)
@@ -97,7 +102,7 @@ def test_what_was_found_moves_mujoco_as_it_moves_us(tmp_path: Path):
     """A tendon and gravity in `robot.xml`, ripple by the callback."""
     (tmp_path / "arm.xml").write_text(PAIR.format(tendon="", damping=(0.4, 0.3), armature=(0.042, 0.032)))
     loop, _ = fj.load_loop(tmp_path / "arm.xml")
-    loop = dataclasses.replace(loop, pairs=Pairs(*(np.array([x]) for x in (0.012, 0.1, 0.15)), ((0, 1, -1),)))
+    loop = dataclasses.replace(loop, pairs=both(-1))
     table = tuple(Entry(name, (0,)) for name in ("ripple_sine", "ripple_cosine", "ripple_order", "gravity_x"))
     with jax.enable_x64(True):
         loop = put(loop, table, np.array([0.2, -0.1, 9.0, 0.7]))
