@@ -40,7 +40,7 @@ from .gates import physical_sign
 from .holdout import fold_squares, part_error, residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_misfit, with_parts, with_rest
 from .layout import checked_repeats, describe_folds, held_rows, layout
-from .naming import beside_rest, beyond_simpler, of_its_own, reason_against, standings, stands_alone
+from .naming import beside_rest, beyond_simpler, of_its_own, reason_against, standings, stands_alone, strong
 from .problem import Problem
 from .reading import Reader, only_read
 from .rest import (
@@ -59,7 +59,7 @@ from .rest import (
 )
 from .screening import noise_squares
 from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without
-from .standstill import only_sticks, resting
+from .standstill import left_moving, left_weighed, only_sticks, resting
 from .state import State, baseline, stated_effects, with_width
 from .step import Step, stand, with_causes
 from .thresholds import (
@@ -156,6 +156,8 @@ class _Left(NamedTuple):
     more: Float[np.ndarray, " nv"]  # squares by which smooth functions of each joint find more in it than chance gives
     beyond: Float[np.ndarray, " nv"]  # each joint's squares, moving, beyond those of noise, where they surely are
     misfit: Bool[np.ndarray, " nv"]  # whether, without any cause, they are, or are more than is tolerable
+    followed: Float[np.ndarray, " nv"]  # `more` where such functions surely predict what was not fitted, else zero
+    moved: Bool[np.ndarray, " nv"]  # `misfit` of the rows in which the joint moves
 
 
 class _Searched(NamedTuple):
@@ -384,6 +386,8 @@ def _judged(
             complete=bool(left.more[list(f.joints)].max() <= ALL_BUT * (f.cost[0] - f.cost[1])),
             leaves=of_its_own(left.beyond, f.joints, one.taken),
             alone=stands_alone(left.misfit, f.joints),
+            followed=of_its_own(left.followed, f.joints, one.taken),
+            unmoved=stands_alone(left.moved, f.joints),
         )
         for one, f in zip(each, found, strict=True)
     ]
@@ -408,7 +412,8 @@ def _judged(
         doubted = chance_beside(problem, joint.step, sober, whitening, forbid, generator) < REST_P
     if found and doubted and float(beyond.max()) > tolerance:  # a rest of the answer is one for its names
         strict = strict or not _sticks(here, joint, tolerance)
-    rests = beside_rest(each, [f.joints for f in found], strict, beyond, tolerance)
+    weighed = left_weighed(problem, joint.step.state, noise)  # rows at reversals say nothing of a law
+    rests = beside_rest(each, [f.joints for f in found], strict, np.minimum(beyond, weighed), tolerance)
     asked = (tolerance, certain, fading)
     against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
     named = [f for f in found if not against[f.name]]
@@ -433,7 +438,8 @@ def _judged(
     if shown and not named and not left.rest.there and not doubted and not problem.layout.repeats:
         sober = sober_spectrum(problem, joint.step.state, forbid)
         shown = chance_beside(problem, joint.step, sober, here.whitening, forbid, generator) < REST_P
-    sticks = shown and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
+    law = any(strong(one) and against[one.name] for one in each)  # it moves, whatever it is
+    sticks = shown and not law and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
     rest, read = shown and not sticks, False
     if rest and not named and left.line[0] >= LINE_P:  # a line is none of what reading a motion leaves
         errors = reader.errors(problem, joint.step.state, generator)
@@ -636,7 +642,9 @@ def _left(
     beyond = np.minimum(beyond, loud)
     beyond = np.minimum(beyond, repeating(problem, joint.step.rows, joint.step.linear.residual, moves))
     misfit = (alone > 0) | (relative_rest(problem, first.state, noise) > tolerance)
-    return _Left(left._replace(there=there), p_left, now[0], line, flexible.each, beyond, misfit)
+    followed = flexible.each * (predicted and flexible.p < REST_P)
+    moved = (alone > 0) | (left_moving(problem, first.state, noise) > tolerance)
+    return _Left(left._replace(there=there), p_left, now[0], line, flexible.each, beyond, misfit, followed, moved)
 
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:

@@ -135,7 +135,7 @@ def find_causes(
         progress("comparing causes on held-out data", len(found) / MOST_CAUSES)
         contenders = _contenders(problem, step, screened, whitening, failed, fitted)
         contenders = [c for c in contenders if not _told_already(c, found)]
-        chosen = _chosen(problem, step, contenders, found)
+        chosen = _chosen(problem, step, contenders, found, alpha / len(groups))
         if not chosen:
             break
         before = step
@@ -241,19 +241,32 @@ def _told_already(one: Contender, found: list[Found]) -> bool:
     return any(one.name in f.ambiguous and one.name.effect == f.name.effect for f in found)
 
 
-def _chosen(problem: Problem, step: Step, contenders: list[Contender], before: list[Found]) -> list[Contender]:
-    """The best cause, and the best of other joints that explain another misfit."""
+def _chosen(
+    problem: Problem, step: Step, contenders: list[Contender], before: list[Found], chance: float
+) -> list[Contender]:
+    """The best cause, and the best of other joints that explain another misfit.
+
+    The p-value of the step is that of the first. Each of the others must lower the squares by more than a candidate
+    does by `chance`, or it waits for a step of its own.
+    """
     first = _best(problem, step, contenders, before)
     if first is None:
         return []
     chosen = [first]
     while first.effect.acts_on in ("joint", "pair") and kind(first.effect) == "columns":
-        free = [c for c in contenders if all(_apart(step, c, one) for one in chosen)]
+        free = [c for c in contenders if all(_apart(step, c, one) for one in chosen) and _shows(step, c, chance)]
         other = _best(problem, step, free, before)
         if other is None:
             break
         chosen.append(other)
     return chosen
+
+
+def _shows(step: Step, one: Contender, chance: float) -> bool:
+    """Whether it lowers the squares by more than so many numbers do of noise with that chance."""
+    from scipy.special import chdtri  # scipy is slow to import
+
+    return step.verdicts.cost - one.verdicts.cost > chdtri(len(one.effect.parameters()), chance)
 
 
 def _apart(step: Step, one: Contender, other: Contender) -> bool:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..effects.base import Effect, Motion, changed
+from ..recordings.rowfilter import low_pass
 from ..recordings.stacked import Records
 from ..rigid.dynamics import torques_on_host
 from ..rigid.model import Leaf, RobotModel
@@ -26,6 +27,9 @@ ENDS, TINY = 6, 1e-6  # samples whose derivatives are held; what makes them zero
 EVERY = 4  # samples between which derivatives of the torque are straight
 ROUNDING = 1e-9  # of the largest derivative of the torque
 STEP = 1e-4  # of central differences, rad, rad/s or rad/s2 (m for rad)
+OF_THE_MOTION, BAND = 0.97, 4.0  # share of the velocities' power below a frequency; times that one, the load's band
+IN_DOUBT = 0.02  # of a load's RMS: what the model does not know of it
+DOUBTS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # times that: over which the step of an abrupt sensor is averaged
 
 
 def rigid_torque(
@@ -77,7 +81,7 @@ def _shifts(
     effects: Effect, motion: Motion, records: Records, turns: int, as_read: Float[np.ndarray, "nN nv"] | None
 ) -> Float[np.ndarray, "effects nN"]:
     """By how much each sensor's joint stands elsewhere than was read."""
-    shift = _errors(effects, motion)
+    shift = _errors(effects, motion, records)
     if not turns:
         return shift
     if as_read is None:
@@ -88,7 +92,7 @@ def _shifts(
             loads = _torques(effects, motion, shift, records)
         else:  # the motion as it was read
             loads = np.broadcast_to(as_read, (len(shift), *as_read.shape))
-        missing = (_errors(effects, motion, loads) - shift).reshape(-1, *records.position.shape[:2])
+        missing = (_errors(effects, motion, records, loads) - shift).reshape(-1, *records.position.shape[:2])
         change = [own.solve(one) for own, one in zip(compliances, missing, strict=True)]
         shift = shift + np.reshape(change, shift.shape)
     return shift
@@ -142,7 +146,7 @@ def _compliances(
     effects: Effect, motion: Motion, records: Records, load: Float[np.ndarray, "nN nv"]
 ) -> list[_Compliance]:
     """What a small change of its joint's motion changes of each sensor's reading."""
-    more, here = (_errors(effects, changed(motion, load=own)) for own in (load + 1, load))
+    more, here = (_errors(effects, changed(motion, load=own), records) for own in (load + 1, load))
     unit = (more - here).mean(1)
     joints = np.asarray(effects.at)[:, 0]
     few, (once, place) = _Few.of(motion, records), np.unique(joints, return_inverse=True)
@@ -196,16 +200,51 @@ class _Few(NamedTuple):
 
 
 def _errors(
-    effects: Effect, motion: Motion, loads: Float[np.ndarray, "effects nN nv"] | None = None
+    effects: Effect, motion: Motion, records: Records, loads: Float[np.ndarray, "effects nN nv"] | None = None
 ) -> Float[np.ndarray, "effects nN"]:
     """What each sensor reads beside the truth, under the motion's load or each under its own."""
     out = []
     for one in range(len(effects.at)):
         here = motion if loads is None else changed(motion, load=loads[one])
         effect = jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects)
-        # as it is written, on NumPy's arrays; a bound method would be a module of its own
-        out.append(np.asarray(type(effect).position_error(effect, here)))
+        out.append(_read_beside(effect, here, records))
     return np.stack(out)
+
+
+def _read_beside(effect: Effect, motion: Motion, records: Records) -> Float[np.ndarray, " nN"]:
+    """What one sensor reads beside the truth along a motion, as much of it as the positions have been let through.
+
+    A play makes the position step, and the inertial torque of that step, which no link feels, would decide on which
+    side the load is: an abrupt sensor is given the load in the band of the motion. How well that is known says how
+    well the time of a step is: it is averaged over what the load may be.
+    """
+    # as it is written, on NumPy's arrays; a bound method would be a module of its own
+    if not effect.abrupt:
+        return np.asarray(type(effect).position_error(effect, motion))
+    load = _steady_load(motion, records)
+    doubt = IN_DOUBT * np.sqrt(np.mean(load**2, 0))
+    each = [type(effect).position_error(effect, changed(motion, load=load + k * doubt)) for k in DOUBTS]
+    return _low(records, np.mean(each, axis=0)[:, None], float(records.cutoff))[:, 0]
+
+
+def _steady_load(motion: Motion, records: Records) -> Float[np.ndarray, "nN nv"]:
+    """The load without what lies above the band of the motion."""
+    n, samples, _, nv = records.shape
+    velocity = np.asarray(motion.velocity).reshape(n, samples, nv)
+    power = (np.abs(np.fft.rfft(velocity, axis=1)) ** 2).sum((0, 2))
+    most = int(np.searchsorted(np.cumsum(power), OF_THE_MOTION * power.sum()))
+    band = max(BAND * most / (samples * float(records.dt)), 2 / (samples * float(records.dt)))
+    load = np.asarray(motion.load)
+    return load if band >= float(records.cutoff) else _low(records, load, band)
+
+
+def _low(records: Records, signal: Float[np.ndarray, "nN cols"], cutoff: float) -> Float[np.ndarray, "nN cols"]:
+    """Each recording low-passed as positions are; `cutoff` in Hz."""
+    out = signal.reshape(*records.shape[:2], -1).copy()
+    for at in records.spans:
+        own = slice(at.sample, at.sample + at.samples)
+        out[at.slot, own] = low_pass(out[at.slot, own], float(records.dt), cutoff)
+    return out.reshape(signal.shape)
 
 
 def _moved(effects: Effect, motion: Motion, errors: Float[np.ndarray, "effects nN"], records: Records) -> Motion:
@@ -290,7 +329,7 @@ def shift_torques(effects: Effect, motion: Motion, records: Records) -> Float[np
     velocity and the acceleration of the joint: the same for all sensors.
     """
     names = [name for name, p in effects.parameters().items() if p.linear]
-    errors = _unit_errors(effects, motion).reshape(len(effects.at), len(names), *records.position.shape[:2])
+    errors = _unit_errors(effects, motion, records).reshape(len(effects.at), len(names), *records.position.shape[:2])
     rates = difference(errors, float(records.dt))
     pushes = difference(rates, float(records.dt))
     loads = _load_slopes(motion, records)
@@ -320,12 +359,12 @@ def _load_slopes(motion: Motion, records: Records) -> Float[np.ndarray, "3 nv nv
     return _SLOPES[0][2]
 
 
-def _unit_errors(effects: Effect, motion: Motion) -> Float[np.ndarray, "effects k nN"]:
+def _unit_errors(effects: Effect, motion: Motion, records: Records) -> Float[np.ndarray, "effects k nN"]:
     """What each sensor reads beside the truth with a unit of each of its amplitudes."""
     names, out = [name for name, p in effects.parameters().items() if p.linear], []
     for one in range(len(effects.at)):
         effect = jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects)
         for unit in np.eye(len(names)):
             units = changed(effect, **dict(zip(names, unit, strict=True)))
-            out.append(np.asarray(type(effect).position_error(units, motion)))
+            out.append(_read_beside(units, motion, records))
     return np.reshape(out, (len(effects.at), len(names), -1))

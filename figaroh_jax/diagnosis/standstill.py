@@ -18,7 +18,7 @@ from .state import State
 from .thresholds import CARRIED, ENOUGH_MOVING, LAW_AT_REST, LAW_WIDTHS, LEAST_MOVING, STANDSTILL
 from .weights import relative_speed
 
-__all__ = ["beyond_sliding", "held", "only_sticks", "resting", "stands"]
+__all__ = ["beyond_sliding", "held", "left_moving", "left_weighed", "only_sticks", "resting", "stands"]
 
 PASSED = 1 / 8  # of the band of slow rows
 TURNED = 0.1  # of the way to its limit: below, what friction a joint needs to slide is taken from the samples around
@@ -40,6 +40,26 @@ def resting(problem: Problem) -> Bool[np.ndarray, "n M nv"]:
     return near
 
 
+def left_moving(problem: Problem, state: State, noise: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
+    """RMS of what the state leaves beyond the `noise` (N m or N) of the rows in which each joint moves, relative to the
+    RMS torque of the joint."""
+    return _left_of(problem, state, noise, ~resting(problem))
+
+
+def left_weighed(problem: Problem, state: State, noise: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
+    """The same of the rows of each joint that have a weight: none at reversals."""
+    return _left_of(problem, state, noise, np.asarray(problem.records.weight) > 0)
+
+
+def _left_of(
+    problem: Problem, state: State, noise: Float[np.ndarray, " nv"], rows: Bool[np.ndarray, "n M nv"]
+) -> Float[np.ndarray, " nv"]:
+    left, judged = problem.torque - predicted(problem, state), np.asarray(problem.records.judged) > 0
+    torque = _rms(problem.torque, judged)
+    beyond = np.sqrt(np.maximum(_rms(left, judged & rows) ** 2 - noise**2, 0.0))
+    return beyond / np.maximum(torque, 1e-9 * max(float(torque.max()), 1e-300))
+
+
 def only_sticks(
     problem: Problem,
     state: State,
@@ -55,9 +75,9 @@ def only_sticks(
     left, judged = problem.torque - predicted(problem, state), np.asarray(problem.records.judged) > 0
     still = resting(problem) & judged
     torque = _rms(problem.torque, judged)
-    moving = np.sqrt(np.maximum(_rms(left, judged & ~still) ** 2 - noise**2, 0.0))
+    moving = left_moving(problem, state, noise)
     looked_at = np.flatnonzero(relative > tolerance)
-    if not len(looked_at) or np.any(moving[looked_at] > tolerance * torque[looked_at]):
+    if not len(looked_at) or np.any(moving[looked_at] > tolerance):
         return False
     if not np.any(stands(problem)[looked_at]):  # a robot whose joints stick does so at some joint for long
         return False

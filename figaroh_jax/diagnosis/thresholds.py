@@ -57,6 +57,7 @@ BY_CHANCE_UNSHOWN = 0.001  # the same where slices of the recordings that are fi
 RISES = 0.1  # p-value of a rise of the error of all rows kept out: below, the robot is predicted worse
 KEPT_OF_CLAIM = 1 / 3  # of what a cause takes in slices: what must be left of it in such a fall
 STANDS = SPEED_EDGES[1]  # of a joint's top speed: below, it stands, and its rows say nothing of a law of the motion
+BUYS = 0.01  # of the squares that a law of the whole robot removes: what it may surely cost a joint that moves
 LAW_LEAVES = 0.05  # of the squares that a cause removes: what may surely stay at its joints where no other has a misfit
 ALL_BUT = 0.1  # of the squares that a cause removes: what smooth functions may still find where it is all there is, and
 # what an amplitude that varies may surely gain

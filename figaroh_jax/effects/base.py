@@ -285,6 +285,7 @@ class Effect(eqx.Module):
     speed_law: ClassVar[bool] = False  # whether it is a law of dry friction over the speed, one of several alike
     beside_rest: ClassVar[bool] = True  # whether it can be told from a rest that stays; no law of what any rest does
     fades: ClassVar[bool] = False  # whether it goes by the time since the start: another recording has it no more
+    abrupt: ClassVar[bool] = False  # whether its `position_error` steps where the load changes its side
     one_rotor: ClassVar[
         tuple[str, ...]
     ] = ()  # of a rotor that turns two joints: inertia, then what tells it from links

@@ -172,7 +172,7 @@ class JointElasticity(JointEffect):
 class Backlash(JointEffect):
     """Play in the gear: the motor stands ahead of the link by half of it, on the side to which it pushes."""
 
-    name, title = "backlash", "backlash"
+    name, title, abrupt = "backlash", "backlash", True
     correction = 2.0  # a calibration reports half of the play
     equation = "q_measured = q + width/2 sign(tau_load)"
     separated_by = "slow reversals of the load of {at}, with a second encoder on the link"
