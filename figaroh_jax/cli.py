@@ -25,8 +25,10 @@ from .errors import InputError
 
 __all__ = ["main"]
 
-# The matrices are small: more threads wait for each other, at three times the CPU seconds. What the user sets stays.
-_THREADS = {
+# The matrices are small: more threads wait for each other, at three times the CPU seconds. A GPU, whose memory another
+# program may hold, takes twice as long as the CPU beside it. What the user sets stays.
+_MACHINE = {
+    "JAX_PLATFORMS": "cpu",
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
@@ -118,7 +120,7 @@ def _drop_standard_output() -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    for name, value in _THREADS.items():
+    for name, value in _MACHINE.items():
         os.environ.setdefault(name, value)
     _keep_freed_memory()
     gc.set_threshold(_NEW_OBJECTS)  # what imports make lives on: with Python's 700 the searches take .2 s of a run

@@ -7,7 +7,7 @@ import secrets
 import numpy as np
 import pytest
 
-from figaroh_jax.recordings.bandwidth import motion_band, smoothed
+from figaroh_jax.recordings.bandwidth import encoder_step, motion_band, smoothed
 from figaroh_jax.recordings.resampling import differentiate
 
 DT, CUTOFF, SECONDS = 1 / 200, 15.0, 10.0
@@ -75,3 +75,27 @@ def test_smoothing_has_the_gain_of_its_penalty_and_no_phase(frequency: float) ->
 def test_smoothing_leaves_a_parabola_alone_up_to_its_ends() -> None:
     parabola = 0.3 + 0.2 * TIME - 0.05 * TIME**2
     np.testing.assert_allclose(smoothed(parabola, DT, 3.0), parabola, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("rate", [250.0, 1000.0])
+def test_the_steps_of_a_slow_joint_are_not_taken_for_motion(rate: float) -> None:
+    """Near its turns a joint makes a slow, loud sawtooth of its encoder's steps, whose lines stand above the rest."""
+    seed, time = secrets.randbits(32), np.arange(0, 8, 1 / rate)
+    rng, off = np.random.default_rng(seed), []
+    for _ in range(8):
+        wave = rng.uniform(0.5, 2.0, 6)
+        angle, speed = wave * time[:, None] + rng.uniform(0, 6, 6), rng.uniform(0.05, 0.3, 6)
+        step = 2 * np.pi / 4096
+        read = np.round((speed / wave * np.sin(angle)).sum(1) / step) * step
+        assert abs(encoder_step(read) / step - 1) < 1e-6 or encoder_step(read) == 0, seed
+        band = motion_band(read, 1 / rate, 0.25 * rate, encoder_step(read), rate)
+        known = differentiate(smoothed(read, 1 / rate, band)[:, None], 1 / rate, order=2)[:, 0]
+        off.append(np.std((known + (speed * wave * np.sin(angle)).sum(1))[int(rate) : -int(rate)]))
+    assert max(off) < 0.3, (seed, off)  # rad/s^2; 10 to 300 at the cutoff
+
+
+def test_a_step_is_read_from_the_values_that_occur() -> None:
+    slow = np.sin(np.arange(0, 4, 1e-3))
+    assert encoder_step(np.round(slow / 0.01) * 0.01) == pytest.approx(0.01)
+    assert encoder_step(np.round(np.round(slow / 0.0015339) * 0.0015339, 4)) == pytest.approx(0.0015, abs=1e-4)
+    assert encoder_step(slow) == 0.0 == encoder_step(np.zeros(100))

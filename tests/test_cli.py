@@ -6,6 +6,7 @@ The diagnosis itself is made up here; `make demo` runs the real one.
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -211,3 +212,13 @@ def test_compiled_programs_are_kept_in_the_users_cache_folder(tmp_path: Path):
 def test_the_package_runs_as_a_module():
     run = subprocess.run([sys.executable, "-m", "figaroh_jax", "--version"], capture_output=True, text=True)
     assert (run.returncode, run.stdout[:12], run.stderr) == (0, "figaroh-jax ", "")
+
+
+@pytest.mark.parametrize(("told", "expected"), [(None, "cpu"), ("cuda,cpu", "cuda,cpu")])
+def test_the_command_computes_on_the_cpu_unless_told_otherwise(told: str | None, expected: str, tmp_path: Path):
+    environment = {name: value for name, value in os.environ.items() if name != "JAX_PLATFORMS"}
+    environment |= {} if told is None else {"JAX_PLATFORMS": told}
+    code = "import os, sys; from figaroh_jax import cli; cli.main(sys.argv[1:]); print(os.environ['JAX_PLATFORMS'])"
+    program = [sys.executable, "-c", code, "list", str(tmp_path)]
+    process = subprocess.run(program, capture_output=True, text=True, env=environment, check=True)
+    assert process.stdout.splitlines()[-1] == expected

@@ -70,7 +70,7 @@ def test_held_out_blocks_are_those_of_a_loop_of_refits(rows: Rows, fixed: bool) 
 def test_sums_grown_by_columns_are_the_sums_of_all_columns(rows: Rows) -> None:
     more = np.random.default_rng(2).normal(size=(NV, COUNT, 2)) * (rows.block >= 0)[:, None]
     both = np.concatenate([rows.X, more], axis=2)
-    grown, whole = grown_sums(rows, fold_sums(rows, rows.X), both), fold_sums(rows, both)
+    grown, whole = grown_sums(rows, fold_sums(rows, rows.X), more), fold_sums(rows, both)
     for one, other in zip(grown, whole, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
 

@@ -185,3 +185,32 @@ def test_measured_postures_are_told_what_to_write(made, tmp_path: Path):
     shown = shown.replace("MODEL", str(urdf)).replace("BASE", "base").replace("TOOL", "tool0")
     (tmp_path / "task.yaml").write_text(shown)
     assert load_task(tmp_path / "task.yaml").data[0].measurement is not None
+
+
+def test_a_clock_of_another_name_and_rows_that_were_written_twice(made, tmp_path: Path):
+    urdf, joints, (run, *_) = made
+    columns = {"Zeit [ms]": np.round(1e3 * run["time"])}
+    columns |= {f"angle {joint} [rad]": run["position"][:, j] for j, joint in enumerate(joints)}
+    columns |= {f"Moment {joint} [Nm]": run["torque"][:, j] for j, joint in enumerate(joints)}
+    twice = {name: np.repeat(values, 1 + (np.arange(len(values)) % 300 == 7)) for name, values in columns.items()}
+    draft = draft_task(urdf, [table(tmp_path / "run.csv", twice)])
+    task, _, (recording,) = read_back(draft.text, tmp_path)
+    assert (task.data[0].time, task.data[0].units.time) == ("Zeit [ms]", "ms")
+    np.testing.assert_allclose(recording.position, run["position"], rtol=0, atol=1e-9)
+
+
+def test_a_clock_that_stops_is_told_by_its_row(made, tmp_path: Path):
+    urdf, _, (run, *_) = made
+    time = np.array(run["time"])
+    time[40] = time[39]
+    np.savez(tmp_path / "run.npz", t=time, q=run["position"], tau=run["torque"])
+    with pytest.raises(InputError, match=r"'t' is no clock of the positions: in row 40 \(from 0\)"):
+        draft_task(urdf, [tmp_path / "run.npz"])
+
+
+def test_parts_of_a_time_are_told_what_to_write(made, tmp_path: Path):
+    urdf, _, (run, *_) = made
+    stamps = {"secs": np.floor(run["time"]), "nsecs": np.round(1e9 * (run["time"] % 1))}
+    np.savez(tmp_path / "run.npz", q=run["position"], tau=run["torque"], **stamps)
+    with pytest.raises(Undecided, match="secs, nsecs are parts of a time"):
+        draft_task(urdf, [tmp_path / "run.npz"])

@@ -220,8 +220,26 @@ def test_a_fit_of_another_weight_is_taken_where_all_rows_kept_out_surely_prefer_
     assert not surely_less(one, third)
 
 
+@pytest.mark.parametrize(("claim", "kept"), [(None, True), (0.1, True), (0.5, False)])
+def test_what_any_rest_looks_like_must_keep_a_part_of_what_it_takes_in_slices(
+    claim: float | None, kept: bool, monkeypatch: pytest.MonkeyPatch
+):
+    base = squares(np.random.default_rng(3), 4.0)
+
+    def by_gain(problem: Any, start: Any, whitening: Any, causes: Sequence[str], later: Sequence[bool]) -> Any:
+        return list(range(len(causes))), in_turn(base, *[0.95 * base for _ in causes]), base.sum(1)
+
+    claims = {} if claim is None else {"a": claim}
+    assert stood_by(monkeypatch, by_gain, "a", claims=claims).worse == ([] if kept else ["a"])
+
+
 def stood_by(
-    monkeypatch: pytest.MonkeyPatch, by_gain: Any, causes: str, strict: bool = True, borne_out: str = ""
+    monkeypatch: pytest.MonkeyPatch,
+    by_gain: Any,
+    causes: str,
+    strict: bool = True,
+    borne_out: str = "",
+    claims: dict[str, float] | None = None,
 ) -> gaining.Gaining:
     """What stays of causes with such squares on the data held out, some of them `borne_out` beside all else."""
 
@@ -233,4 +251,4 @@ def stood_by(
     found: Any = [SimpleNamespace(name=c, effect=c, joints=(0,)) for c in causes]
     problem: Any = SimpleNamespace(model=SimpleNamespace(joint_names=("one",)))
     start, whitening, sure = cast(Any, None), np.zeros((1, 1)), cast(Any, borne_out.__contains__)
-    return without_losses(problem, start, whitening, found, joint(causes), strict, sure)
+    return without_losses(problem, start, whitening, found, joint(causes), strict, sure, cast(Any, claims or {}))

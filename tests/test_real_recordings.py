@@ -24,9 +24,10 @@ from benchmarks.hide_in_real.generate import twin_of  # noqa: E402
 SETS = {  # the relative error that causes leave at most, with what it was when this was written
     "ur10e": 0.050,  # .0467
     "panda": 0.0118,  # .0114
-    "tiago": 0.1300,  # .1290
+    "tiago": 0.1295,  # .1283
     "kuka": 0.0320,  # .0284
     "dfki_simple_pendulum": 0.470,  # .4651
+    "dfki_double_pendulum": 0.283,  # .2792
 }
 EXPLAINED = {"kuka": (0.58, 0.999, 0.96, 0.986, 0.37)}  # R2 of each of the first joints, kept out, at least
 

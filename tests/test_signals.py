@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from pathlib import Path
 
 import jax
@@ -14,7 +15,7 @@ from figaroh_jax.errors import InputError
 from figaroh_jax.formats.config import Preprocess
 from figaroh_jax.recordings import resampling, signals
 from figaroh_jax.recordings.dataset import Recording
-from figaroh_jax.recordings.resampling import differentiate, to_recording_times
+from figaroh_jax.recordings.resampling import differentiate, to_recording_times, unrounded
 from figaroh_jax.recordings.rowfilter import filter_rows, frequencies, low_pass, row_filter
 
 JOINTS = ("a", "b", "c")
@@ -280,3 +281,34 @@ def test_an_interpolation_in_blocks_is_the_same_to_the_last_bit(monkeypatch: pyt
     monkeypatch.setattr(resampling, "_AT_ONCE", 1000)
     pieces = resampling.band_limited(x, at, start=0.0, rate=100.0, passed=20.0, stopped=60.0)
     np.testing.assert_array_equal(pieces, whole)
+
+
+@pytest.mark.parametrize("rate", [60.0, 240.0, 333.0])
+@pytest.mark.parametrize("lost", [0.0, 0.03])
+def test_stamps_in_whole_milliseconds_are_those_of_the_even_clock_behind_them(rate: float, lost: float):
+    seed = secrets.randbits(32)
+    true = 3.7 + np.arange(0, 8, 1 / rate)
+    true = true[np.random.default_rng(seed).random(len(true)) >= lost]
+    found = unrounded(np.round(true, 3))
+    assert np.abs(found - true).max() < 5e-5, seed  # .5 ms before
+
+
+def test_stamps_of_a_clock_that_shakes_are_left_alone():
+    rng = np.random.default_rng(0)
+    even = np.arange(0, 8, 0.01)
+    for shaken in (even + rng.uniform(-1e-3, 1e-3, 800), np.round(even + rng.uniform(-4e-3, 4e-3, 800), 3), even):
+        assert unrounded(shaken) is shaken
+
+
+def test_samples_that_repeat_the_one_before_are_those_of_a_logger_and_not_of_the_robot():
+    rng = np.random.default_rng(secrets.randbits(32))
+    t = np.arange(3000) / 250
+    q, tau = motion(t), motion(t) + 1e-4 * rng.standard_normal((3000, 3))
+    again = np.flatnonzero(rng.random(3000) < 0.02)[1:]
+    for x in (q, tau):
+        x[again] = x[again - 1]
+    prepared = signals.prepare(recording(t, q, tau), Preprocess(cutoff=10))
+    read = prepared.position[prepared.rows.index] - motion(prepared.rows.row_times)
+    assert np.abs(read).max() < 1e-4 and prepared.notes == ()  # rad; .008 with the samples as they are
+    q[1000:1200], tau[1000:1200] = q[1000], tau[1000]  # a robot that stands
+    assert np.shape(signals.prepare(recording(t, q, tau), Preprocess(cutoff=10)).time) == prepared.time.shape

@@ -112,20 +112,23 @@ def _made(folder: Path, seed: int, wish: Wish) -> dict[str, Any] | None:
 
 
 def _dynamic(folder: Path, wish: Wish, seed: int) -> dict[str, Any]:
-    from generators import make_case
+    from generators.inverse import draw_case, record_case
     from generators.sensors import COLOURS
 
     from .stiction import make_stiction_case
+    from .visible import Noise, seen, told
 
     repeats, trajectories = LAYOUTS[wish.layout]
     effects = [] if wish.family == "clean" else [(wish.family, wish.size)]
-    where: dict[str, Any] = {"robot": wish.robot, "repeats": repeats, "trajectories": trajectories, "seed": seed}
+    drawn = noise = None
     if wish.kind == "closed_loop":
-        made = make_stiction_case(effects, **where)
+        made = make_stiction_case(effects, wish.robot, repeats, trajectories, seed)
     else:
         rng = np.random.default_rng(seed)
-        noise = {"noise": float(rng.choice([0.5, 1.0, 2.0])), "encoder_step": float(rng.choice([1e-5, 1e-4]))}
-        made = make_case(effects, colour=str(rng.choice(COLOURS)), **noise, **where)
+        scale, step = float(rng.choice([0.5, 1.0, 2.0])), float(rng.choice([1e-5, 1e-4]))
+        noise = Noise(scale, str(rng.choice(COLOURS)), step)
+        drawn = draw_case(effects, wish.robot, trajectories, seed)
+        made = record_case(drawn, repeats, noise.scale, colour=noise.colour, encoder_step=noise.step)
     place = folder / wish.name
     task = json.loads(made.write(place).read_text())
     (place / "task.yaml").unlink()
@@ -136,7 +139,8 @@ def _dynamic(folder: Path, wish: Wish, seed: int) -> dict[str, Any]:
         np.savez_compressed(file, **packed)  # pyright: ignore[reportArgumentType]
     names = {t.effect: [list(t.at), t.parameters] for t in made.truth}
     truth = [{"effect": e, "at": at, "also": _also(wish.robot, at), "parameters": p} for e, (at, p) in names.items()]
-    return _case(wish, task, [t | {"names": _same(t["effect"])} for t in truth])
+    shown = told(seen(drawn, repeats, noise, task["preprocess"]["cutoff"])) if drawn and noise and drawn.hidden else {}
+    return _case(wish, task, [t | {"names": _same(t["effect"])} for t in truth]) | shown
 
 
 def _same(effect: str) -> list[str]:

@@ -10,6 +10,7 @@ from typing import Any
 from ..blackbox import Case, Job, commit, grade, read
 
 HIDDEN = ("right", "more", "set", "wrong", "nothing", "unknown", "failed")
+SEEN = 5.0  # D from which an effect is more than the noise (`visible`)
 NONE = ("nothing", "unknown", "wrong", "failed")
 
 
@@ -42,6 +43,7 @@ def _rows(case: Case, out: Path, modes: Iterable[str]) -> list[dict[str, Any]]:
             {"case": case["name"], "group": case["group"], "size": case["size"], "family": case["family"]}
             | {"study": study if study in ("left out", "hidden", "clean") else "foreign", "grade": mark}
             | {"new": graded.new, "false": graded.false, "size_errors": graded.sizes, "inside": graded.inside}
+            | {key: case.get(key) for key in ("left", "sigmas", "misfit", "visible")}
             | {"p_value": answer["p_value"] if answer else None, "cpu_s": ran["cpu_s"]}
         )
     return found
@@ -62,13 +64,38 @@ def _extra(rows: list[dict[str, Any]], title: str) -> list[str]:
     """Coverage of the intervals of named causes; p-values of clean cases."""
     if title == "hidden":
         inside = [x for r in rows for x in r["inside"]]
-        return [f"90 % intervals of named causes hold {sum(inside)} of {len(inside)} parameters"] if inside else []
+        return (
+            [*_by_sight(rows)] + [f"90 % intervals of named causes hold {sum(inside)} of {len(inside)} parameters"]
+            if inside
+            else []
+        )
+    if title != "clean":
+        return _by_sight(rows)
     p = [r["p_value"] for r in rows if r["p_value"] is not None]
-    return [f"p < .05 in {sum(x < 0.05 for x in p)} of {len(p)}"] if p and title == "clean" else []
+    return [f"p < .05 in {sum(x < 0.05 for x in p)} of {len(p)}"] if p else []
+
+
+def _by_sight(rows: list[dict[str, Any]]) -> list[str]:
+    """Hidden effects by what the data hold of them, which `visible` says without any tool's answer."""
+    groups = {
+        "in the data": lambda r: r["visible"],
+        "below the tolerance": lambda r: not r["visible"] and r["sigmas"] >= SEEN,
+        "within the noise": lambda r: r["sigmas"] < SEEN,
+    }
+    asked = [r for r in rows if r["visible"] is not None]
+    out = []
+    for title, belongs in groups.items():
+        for size in sorted({r["size"] for r in asked}):
+            own = [r["grade"] for r in asked if r["size"] == size and belongs(r)]
+            if own:
+                counts = ", ".join(f"{own.count(g)} {g}" for g in HIDDEN if g in own)
+                out.append(f"{title}, {100 * size:g} %: {len(own)} cases: {counts}")
+    return out
 
 
 def _told(row: dict[str, Any]) -> str:
     new = "; ".join(f"{effect} ({', '.join(at)})" for effect, at in row["new"])
     size = ", ".join(f"{e:.2f}" for e in row["size_errors"])
+    sight = f"   D {row['sigmas']:.1f}, misfit {row['misfit']:.2%}" if row["sigmas"] is not None else ""
     text = f"{row['case']:<64} {row['study']:<9} {row['grade']:<8} named: {new or '-'}"
-    return text + (f"   size off by {size}" if size else "")
+    return text + (f"   size off by {size}" if size else "") + sight

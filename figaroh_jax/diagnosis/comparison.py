@@ -122,15 +122,16 @@ def _predicted(
     return out
 
 
-def grown_sums(rows: Rows, known: FoldSums, X: Float[np.ndarray, "nv T P"]) -> FoldSums:
-    """The sums of columns whose first ones are known."""
-    P, folds = known.gram.shape[1], len(known.gram)
-    gram, moment = np.zeros((folds, X.shape[2], X.shape[2])), np.zeros((folds, X.shape[2]))
+def grown_sums(rows: Rows, known: FoldSums, more: Float[np.ndarray, "nv T k"]) -> FoldSums:
+    """The sums of the rows' first columns, which are `known`, with those of columns more."""
+    (folds, P), k = known.moment.shape, more.shape[2]
+    gram, moment = np.zeros((folds, P + k, P + k)), np.zeros((folds, P + k))
     gram[:, :P, :P], moment[:, :P] = known.gram, known.moment
     for fold, own in _stretches(rows):
-        for columns, target in zip(X[:, own], rows.y[:, own], strict=True):
-            gram[fold, :, P:] += columns.T @ columns[:, P:]
-            moment[fold, P:] += columns[:, P:].T @ target
+        for columns, others, target in zip(rows.X[:, own, :P], more[:, own], rows.y[:, own], strict=True):
+            gram[fold, :P, P:] += columns.T @ others
+            gram[fold, P:, P:] += others.T @ others
+            moment[fold, P:] += others.T @ target
     gram[:, P:, :P] = np.swapaxes(gram[:, :P, P:], 1, 2)
     return FoldSums(gram, moment, known.square)
 

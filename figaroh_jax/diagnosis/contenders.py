@@ -193,7 +193,7 @@ def _judged_beside(
     more = np.zeros((*step.rows.y.shape, len(Z)))
     more[list(joints)] = np.moveaxis(Z, 0, 2)
     X = np.concatenate([step.rows.X, more], axis=2)
-    sums, loose = grown_sums(step.rows, step.folded, X), step.loose.extended(len(Z))
+    sums, loose = grown_sums(step.rows, step.folded, more), step.loose.extended(len(Z))
     held, free = (judge(step.rows, Hypothesis(X, p), sums) for p in (believed(problem, loose, sums), loose))
     return held, free
 
@@ -287,8 +287,8 @@ def _response_contender(
     for _ in range(RESPONSE_TURNS):
         here = stand(problem, extended_state(problem, step.state, effect), whitening)
         slope = torque_slope(problem, here.state, effect, name, whitening)
-        X = np.concatenate([here.rows.X, slope[..., None]], axis=2)
-        theta, variance = last_coefficient(grown_sums(here.rows, here.folded, X), here.state.prior.extended(1))
+        sums = grown_sums(here.rows, here.folded, slope[..., None])
+        theta, variance = last_coefficient(sums, here.state.prior.extended(1))
         size = float(getattr(effect, name))
         value = float(np.clip(size + theta[-1], parameter.lower, parameter.upper))
         if abs(value - size) < max(NEAR_ENOUGH * np.sqrt(variance), 1e-7):

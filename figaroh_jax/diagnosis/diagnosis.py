@@ -7,7 +7,7 @@ another, until nothing is gained. What is left decides between `named`, `named+r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -34,14 +34,15 @@ from .estimates import amplitude_places, estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p, friction_width
-from .floor import noise_floor, noise_rms
+from .floor import foretold, noise_floor, noise_rms, sober_spectrum, told_too_large
 from .gaining import Fall, Gaining, beside_all, kept_squares, predicts_better, surely_less, without_losses
 from .gates import physical_sign
 from .holdout import fold_squares, part_error, residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_misfit, with_parts, with_rest
 from .layout import checked_repeats, describe_folds, held_rows, layout
-from .naming import beside_rest, beyond_simpler, of_its_own, reason_against, standings, stands_alone
+from .naming import beside_rest, beyond_simpler, of_its_own, reason_against, standings, stands_alone, strong
 from .problem import Problem
+from .reading import Reader, only_read
 from .rest import (
     Significance,
     beyond_noise,
@@ -58,17 +59,20 @@ from .rest import (
 )
 from .screening import noise_squares
 from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without
-from .standstill import only_sticks, resting
+from .standstill import left_moving, left_weighed, only_sticks, resting
 from .state import State, baseline, stated_effects, with_width
 from .step import Step, stand, with_causes
 from .thresholds import (
     ALL_BUT,
     ALPHA_OF_A_NAME,
     FEW_CAUSES,
+    FEWER,
     FOR_SURE,
+    LINE_P,
     NO_REST,
     REST_P,
     STANDSTILL,
+    SURE_DROP,
     WEIGHT_ROUNDS,
     WHITE_GAIN,
 )
@@ -126,7 +130,8 @@ def diagnose(
         give_back_holes()
         searched = _searched(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
         give_back_holes()
-        judged = _judged(searched, [s.name for s in signals], forbid, tolerance, alpha)
+        ordered = sorted(recordings, key=lambda r: r.role == "holdout")
+        judged = _judged(searched, Reader(ordered, signals, preprocess, slowed), forbid, tolerance, alpha, generator)
         progress("measuring the gain", 0.9)
         return replace(_answer(searched.here, signals, searched.search, judged), slowed=slowed)
 
@@ -151,6 +156,8 @@ class _Left(NamedTuple):
     more: Float[np.ndarray, " nv"]  # squares by which smooth functions of each joint find more in it than chance gives
     beyond: Float[np.ndarray, " nv"]  # each joint's squares, moving, beyond those of noise, where they surely are
     misfit: Bool[np.ndarray, " nv"]  # whether, without any cause, they are, or are more than is tolerable
+    followed: Float[np.ndarray, " nv"]  # `more` where such functions surely predict what was not fitted, else zero
+    moved: Bool[np.ndarray, " nv"]  # `misfit` of the rows in which the joint moves
 
 
 class _Searched(NamedTuple):
@@ -359,7 +366,12 @@ def _simple(here: _Setting, found: list[Found], joint: Joint, forbid: Sequence[s
 
 
 def _judged(
-    searched: _Searched, names: Sequence[str], forbid: Sequence[str], tolerance: float, alpha: float
+    searched: _Searched,
+    reader: Reader,
+    forbid: Sequence[str],
+    tolerance: float,
+    alpha: float,
+    generator: np.random.Generator,
 ) -> _Judged:
     """The verdict by what is left beside all causes; of these, the ones that stand beside it are named.
 
@@ -374,6 +386,8 @@ def _judged(
             complete=bool(left.more[list(f.joints)].max() <= ALL_BUT * (f.cost[0] - f.cost[1])),
             leaves=of_its_own(left.beyond, f.joints, one.taken),
             alone=stands_alone(left.misfit, f.joints),
+            followed=of_its_own(left.followed, f.joints, one.taken),
+            unmoved=stands_alone(left.moved, f.joints),
         )
         for one, f in zip(each, found, strict=True)
     ]
@@ -393,22 +407,44 @@ def _judged(
 
     beyond = relative_rest(problem, joint.step.state, noise)
     doubted = left.p_value < REST_P  # the catalogue still scores more than noise, though nothing in it passes
+    if doubted and not left.rest.there and not problem.layout.repeats:
+        sober = sober_spectrum(problem, joint.step.state, forbid)
+        doubted = chance_beside(problem, joint.step, sober, whitening, forbid, generator) < REST_P
     if found and doubted and float(beyond.max()) > tolerance:  # a rest of the answer is one for its names
         strict = strict or not _sticks(here, joint, tolerance)
-    rests = beside_rest(each, [f.joints for f in found], strict, beyond, tolerance)
+    weighed = left_weighed(problem, joint.step.state, noise)  # rows at reversals say nothing of a law
+    rests = beside_rest(each, [f.joints for f in found], strict, np.minimum(beyond, weighed), tolerance)
     asked = (tolerance, certain, fading)
     against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
     named = [f for f in found if not against[f.name]]
+    if named and not problem.layout.repeats and max(f.cost[0] - f.cost[1] for f in named) < SURE_DROP:
+        sober, bare = sober_spectrum(problem, joint.step.state, forbid), stand(problem, here.start, whitening)
+        chance = chance_beside(problem, bare, sober, whitening, forbid, generator)
+        if chance >= REST_P:
+            against |= {
+                f.name: f"noise as slow as the motion scores as much by chance (p = {chance:.2g})" for f in named
+            }
+            named = []
     settings = [here] if before.problem is here.problem else [here, before]
-    here, gaining, by_speed, reasons = _answered(searched, settings, named, borne_out, forbid)
+    asked_more = [one.name for one in each if one.whole or not one.beside_rest] if problem.held.any() else []
+    must_keep = {name: claims[name] for name in asked_more}
+    here, gaining, by_speed, reasons = _answered(searched, settings, named, borne_out, forbid, must_keep)
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= reasons
     nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
     shown = left.rest.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
-    sticks = shown and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
-    rest = shown and not sticks
+    if shown and not named and not left.rest.there and not doubted and not problem.layout.repeats:
+        sober = sober_spectrum(problem, joint.step.state, forbid)
+        shown = chance_beside(problem, joint.step, sober, here.whitening, forbid, generator) < REST_P
+    law = any(strong(one) and against[one.name] for one in each)  # it moves, whatever it is
+    sticks = shown and not law and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
+    rest, read = shown and not sticks, False
+    if rest and not named and left.line[0] >= LINE_P:  # a line is none of what reading a motion leaves
+        errors = reader.errors(problem, joint.step.state, generator)
+        read = errors is not None and only_read(problem, joint.step.state, noise, relative, tolerance, errors)
+        rest = not read
     text = left.rest.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
     told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
     if rest and named:
@@ -416,10 +452,10 @@ def _judged(
         left_over = squares - noise_squares(problem, here.spectrum, here.whitening)
         joint = with_rest(problem, joint, here.whitening, [f.joints for f in named], left_over)
         gaining = gaining._replace(joint=joint)
-    parts = parts_of(problem, told, whitening, left.line, names)
+    parts = parts_of(problem, told, whitening, left.line, [s.name for s in reader.signals])
     nearest = tuple(sorted(nearest, key=lambda one: -one.share))
     quiet = not rest and not named and searched.search.p_value < alpha
-    why = tolerated(float(relative.max()), tolerance, sticks) if quiet else ""
+    why = tolerated(float(relative.max()), tolerance, sticks, read) if quiet or read else ""
     return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text, why), sticks, here)
 
 
@@ -429,6 +465,7 @@ def _answered(
     named: list[Found],
     borne_out: Callable[[Name], bool],
     forbid: Sequence[str],
+    claims: Mapping[Name, float],
 ) -> tuple[_Setting, Gaining, Joint, dict[Name, str]]:
     """The causes that lower the error on data held out and whose size the answer's own intervals tell from zero.
 
@@ -439,7 +476,8 @@ def _answered(
     here, joint, by_speed = _as_predicts_best(settings, named, known)
     first = named
     while True:
-        gaining = without_losses(here.problem, here.start, here.whitening, named, joint, searched.strict, borne_out)
+        fit = (here.problem, here.start, here.whitening, named, joint)
+        gaining = without_losses(*fit, searched.strict, borne_out, claims)
         against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
         named = gaining.named
         if named:
@@ -508,7 +546,24 @@ def _as_predicts_best(
     for one, own in kept:
         if surely_less(squares, own):
             chosen, joint, squares = one, _together(one, named), own
-    return chosen, joint, first
+    return *_as_rows_count(chosen, joint, named), first
+
+
+def _as_rows_count(here: _Setting, joint: Joint, named: list[Found]) -> tuple[_Setting, Joint]:
+    """The fit in which rows count beside what is believed of the links as parts left out ask for.
+
+    Whitened rows count as independent ones. What a model leaves goes on from one to the next, so that many say what one
+    does, and the links follow it further than they are believed to move.
+    """
+    error, best = part_error(here.problem, joint.step), here
+    for times in FEWER:
+        one = here._replace(whitening=here.whitening / np.sqrt(times))
+        step = stand(one.problem, joint.step.state, one.whitening)  # the laws' shapes as they are
+        own = part_error(one.problem, step)
+        if own >= error:
+            break
+        error, best = own, one
+    return (here, joint) if best is here else (best, _together(best, named))
 
 
 def _weights(problem: Problem) -> list[Float[np.ndarray, "n M nv"]]:
@@ -569,7 +624,13 @@ def _left(
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
     loud, quiet = beyond_noise(problem, joint.step.linear.residual, spectrum, whitening, generator)
-    there = left.there or ((wrong or bool(loud.any())) and not tolerable)
+    there = left.there or (wrong and not tolerable)
+    if loud.any() and not there and not tolerable:  # without repeats a rich model's residual is the noise
+        there = problem.layout.repeats or bool((foretold(problem, joint.step.state, forbid) & (loud > 0)).any())
+    if quiet.any() and not there and not problem.layout.repeats and not found:
+        fitted, large = (joint.step.rows, joint.step.linear), told_too_large(problem, spectrum, generator)
+        fair = spectrum.louder(1 / np.maximum(large, 1.0))
+        quiet = beyond_noise(problem, fitted[1].residual, fair, whitening, generator, fitted=fitted)[1]
     if not problem.layout.repeats and not found:  # what is left is then no noise, nor is it known how much of it is
         there = there or bool((quiet & (relative_rest(problem, joint.step.state, 0 * noise) > tolerance)).any())
     moves = np.moveaxis(~resting(problem), 2, 0).reshape(joint.step.rows.y.shape)
@@ -581,7 +642,9 @@ def _left(
     beyond = np.minimum(beyond, loud)
     beyond = np.minimum(beyond, repeating(problem, joint.step.rows, joint.step.linear.residual, moves))
     misfit = (alone > 0) | (relative_rest(problem, first.state, noise) > tolerance)
-    return _Left(left._replace(there=there), p_left, now[0], line, flexible.each, beyond, misfit)
+    followed = flexible.each * (predicted and flexible.p < REST_P)
+    moved = (alone > 0) | (left_moving(problem, first.state, noise) > tolerance)
+    return _Left(left._replace(there=there), p_left, now[0], line, flexible.each, beyond, misfit, followed, moved)
 
 
 def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:

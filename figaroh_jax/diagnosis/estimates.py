@@ -108,10 +108,9 @@ def _without(state: State, effect: Effect) -> Motion:
     """The motion with the total torque that the effect follows: that of the model without it."""
     motion = state.motion
     if effect.follows_torque:
-        shares = list(state.shares(state.theta))[1:]
         own = [
             s
-            for s, t in zip(shares, state.terms, strict=True)
+            for s, t in zip(state.shares(state.theta), state.terms, strict=True)
             if t.name == effect.name and np.array_equal(t.places.reshape(-1), effect.places.reshape(-1))
         ]
         motion = eqx.tree_at(lambda m: m.total, motion, motion.total - sum(own, np.zeros_like(motion.total)))

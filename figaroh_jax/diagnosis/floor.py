@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..estimation import noise
 from ..estimation.noise import Spectrum
-from ..estimation.rows import Prior, Rows, fit
+from ..estimation.rows import Prior, Rows, fit, tall
+from .comparison import ground, judge_grown, t_value
 from .evidence import Score
 from .flexible import families
 from .problem import Problem
-from .screening import Group, catalogue, screen
+from .screening import Group, catalogue, draw_noise, screen
 from .state import State, plain_rows, solved, whitened
-from .thresholds import LOWEST_FREQUENCY, LOWEST_RESOLVED
+from .step import stand
+from .thresholds import LOWEST_FREQUENCY, LOWEST_RESOLVED, T_REST
 
-__all__ = ["kept_columns", "noise_floor", "noise_rms"]
+__all__ = ["foretold", "kept_columns", "noise_floor", "noise_rms", "sober_spectrum", "told_too_large"]
 
 ROUNDS = 2  # of the rich model's fit and the spectrum in turn
 RICHNESS = 10  # groups of columns in the rich model
@@ -34,10 +36,7 @@ def noise_floor(
     From the differences of repeats where there are some; the baseline is fitted in between, so that its weights are
     right. Else from the residual of a rich model, white where the data are short.
     """
-    rows = plain_rows(problem, state)
-    count = max(1, rows.size // len(rows.y))
-    rough = rows.y - rows.X @ _weighted(rows, state.prior, np.sqrt((rows.y**2).mean(1)))
-    scale = np.sqrt((rough**2).sum(1) / count)
+    rows, scale, count = _alike(problem, state)
     if not problem.layout.repeats:
         spectrum = _from_rich_model(problem, state, scale, forbid, count)
         return spectrum, _whitening(problem, spectrum)
@@ -49,10 +48,54 @@ def noise_floor(
     return spectrum, response  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
 
 
-def _passed(problem: Problem) -> float:
-    """Share of white noise's power that the row filter passes: so many of the rows are independent."""
-    frequency = np.linspace(0, float(problem.records.rate) / 2, 400)
-    return float(np.interp(frequency, np.asarray(problem.records.omega) / (2 * np.pi), problem.gain).mean())
+def sober_spectrum(problem: Problem, state: State, forbid: Collection[str] = ()) -> Spectrum:
+    """Spectrum of what the state and the one best candidate of the catalogue leave.
+
+    A rich model takes noise in at the frequencies of the motion, the more the less of the data is independent: slow
+    noise in the band of a slow motion looks smaller than it is. One candidate takes little, and all of its own misfit.
+    """
+    rows, scale, count = _alike(problem, state)
+    return _from_rich_model(problem, state, scale, forbid, count, richness=1)
+
+
+def foretold(problem: Problem, state: State, forbid: Collection[str] = ()) -> Bool[np.ndarray, " nv"]:
+    """Whether what the rich model takes of each joint's residual predicts parts that it was not fitted to.
+
+    A misfit is there in all parts; noise that a rich model has taken in is in none but its own.
+    """
+    _, scale, count = _alike(problem, state)
+    response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
+    _, blocks = _rich(problem, state, response, forbid, count >= ENOUGH, RICHNESS)
+    step, out = stand(problem, state, response), np.zeros(len(scale), bool)
+    base = ground(step.verdicts, step.state.prior, step.folded)
+    for joint in range(len(scale)):
+        columns = np.concatenate([block[joint].T for block in blocks] or [np.zeros((0, 0))])
+        columns = columns[np.abs(columns).max(1, initial=0.0) > 0] if len(columns) else columns
+        if len(columns):
+            own = judge_grown(step.rows, base, (joint,), columns[:, None])
+            worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, own))
+            out[joint] = t_value(worse, better) > T_REST
+    return out
+
+
+def told_too_large(
+    problem: Problem, spectrum: Spectrum, generator: np.random.Generator, draws: int = 8
+) -> Float[np.ndarray, " nv"]:
+    """By how much the power that is told of noise with the spectrum is larger than it is: rows left out within a
+    recording carry power to where the row filter lets none pass."""
+    n, _, count, nv = problem.records.shape
+    flat = np.ones((len(np.asarray(problem.records.omega)), nv))
+    drawn = draw_noise(problem, spectrum, flat, draws, generator)
+    told = [noise_rms(problem, _fit(problem, one.astype(float), None)) ** 2 for one in drawn]
+    return np.mean(told, axis=0) / noise_rms(problem, spectrum) ** 2
+
+
+def _alike(problem: Problem, state: State) -> tuple[Rows, Float[np.ndarray, " nv"], int]:
+    """Rows as they are, the RMS of what a fit with the joints weighted alike leaves of them, and rows a joint."""
+    rows = plain_rows(problem, state)
+    count = max(1, rows.size // len(rows.y))
+    rough = rows.y - rows.X @ _weighted(rows, state.prior, np.sqrt((rows.y**2).mean(1)))
+    return rows, np.sqrt((rough**2).sum(1) / count), count
 
 
 def noise_rms(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, " nv"]:
@@ -88,44 +131,71 @@ def _mean_of_partners(rows: Rows, residual: Float[np.ndarray, "nv T"]) -> Float[
 
 
 def _from_rich_model(
-    problem: Problem, state: State, scale: Float[np.ndarray, " nv"], forbid: Collection[str], count: int
+    problem: Problem,
+    state: State,
+    scale: Float[np.ndarray, " nv"],
+    forbid: Collection[str],
+    count: int,
+    richness: int = RICHNESS,
 ) -> Spectrum:
     """Residual of the baseline with the groups of the catalogue, and smooth families, that a forward selection takes.
 
     Where the data are long, smooth families stand in for what the catalogue does not hold: what the model misses of a
     misfit passes for noise.
     """
-    response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
-    rows = whitened(problem, state, response)
-    state = solved(problem, state, fit(rows, state.prior).theta)
-    groups = catalogue(problem, state, rows, response, forbid)
-    long = count >= ENOUGH
-    if long:
-        groups += families(problem, state, response, still=True)
-    blocks, prior, found = [rows.X], state.prior, None
-    for _ in range(RICHNESS):
-        found = screen(rows, fit(rows, prior), groups, found)
-        scores = found.scores
-        if not scores:
-            break
-        # families have many columns: only z weighs them fairly
-        best = int(np.argmax([(result.z if long else result.Q).max() for result in scores]))
-        if scores[best].z.max() < _largest_by_chance(scores):
-            break  # the best of so many that noise alone would have: without it, the residual would be less than noise
-        point = int(np.argmax(scores[best].Q))
-        blocks.append(_full(rows, groups[best], point) @ kept_columns(scores[best].root[point]))
-        X = np.concatenate(blocks, axis=2)
-        rows, prior = rows._replace(X=X, Xi=X), prior.extended(blocks[-1].shape[2])
+    response, long = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale, count >= ENOUGH or richness == 1
+    rows, _ = _rich(problem, state, response, forbid, count >= ENOUGH and richness > 1, richness)
     basis = _orthonormal(rows)
     y = rows.y.reshape(-1)
     residual = (y - basis @ (basis.T @ y)).reshape(rows.y.shape) * scale[:, None]
     if not long:
-        independent = count * _passed(problem)
+        independent = count * problem.passed
         degrees = independent - (basis.reshape(len(rows.y), -1, basis.shape[1]) ** 2).sum((1, 2))
         degrees = np.maximum(degrees, independent / 4)
         return noise.white((residual**2).sum(1) / degrees, float(problem.records.rate) / 2, degrees)
     n, _, length, nv = problem.records.shape
     return _fit(problem, residual, np.moveaxis(basis.reshape(nv, n, length, -1), 0, 2))
+
+
+def _rich(
+    problem: Problem,
+    state: State,
+    response: Float[np.ndarray, "F nv"],
+    forbid: Collection[str],
+    smooth: bool,
+    richness: int,
+) -> tuple[Rows, list[Float[np.ndarray, "nv T k"]]]:
+    """Rows of the state with the columns that a forward selection takes, and these; `smooth` families among them."""
+    rows = whitened(problem, state, response)
+    state = solved(problem, state, fit(rows, state.prior).theta)
+    groups = catalogue(problem, state, rows, response, forbid)
+    if smooth:
+        groups += families(problem, state, response, still=True)
+    blocks, prior, found, gram = [], state.prior, None, tall(rows.X).T @ tall(rows.X)
+    for _ in range(richness):
+        found = screen(rows, fit(rows, prior, gram), groups, found)
+        scores = found.scores
+        if not scores:
+            break
+        # families have many columns: only z weighs them fairly
+        best = int(np.argmax([(result.z if smooth else result.Q).max() for result in scores]))
+        if scores[best].z.max() < _largest_by_chance(scores):
+            break  # the best of so many that noise alone would have: without it, the residual would be less than noise
+        point = int(np.argmax(scores[best].Q))
+        more = _full(rows, groups[best], point) @ kept_columns(scores[best].root[point])
+        X = np.concatenate([rows.X, more], axis=2)
+        gram = _grown_gram(gram, tall(X), tall(more))
+        rows, prior = rows._replace(X=X, Xi=X), prior.extended(more.shape[2])
+        blocks.append(more)
+    return rows, blocks
+
+
+def _grown_gram(
+    gram: Float[np.ndarray, "P0 P0"], X: Float[np.ndarray, "nvT P"], more: Float[np.ndarray, "nvT k"]
+) -> Float[np.ndarray, "P P"]:
+    """X'X, of which that of the columns before the last, `more`, is known."""
+    cross, before = X.T @ more, len(gram)
+    return np.block([[gram, cross[:before]], [cross[:before].T, cross[before:]]])
 
 
 def _largest_by_chance(scores: Sequence[Score]) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -111,13 +111,17 @@ def without_losses(
     joint: Joint,
     strict: bool,
     borne_out: Callable[[Name], bool] = lambda name: False,
+    claims: Mapping[Name, float] | None = None,
 ) -> Gaining:
     """The causes without those that do not lower the error on the data held out, the worst first (`Fall`).
 
     Each is judged as it comes in: by what it gains alone, or else after all the others, for some show only beside
     another, or beside what has no name (`borne_out`). All together never raise the error of the robot on all rows held
-    out, be it by chance: what is handed over predicts no worse than the model without causes.
+    out, be it by chance: what is handed over predicts no worse than the model without causes. `claims` are the shares
+    that causes take in slices of which recordings kept out must surely show a part: any rest looks like these, or they
+    act on the whole robot, alike in every motion.
     """
+    claims = claims or {}
     worse: list[Name] = []
     later: list[Name] = []  # come in behind the others
     passed: set[Name] = set()  # in some order of these causes
@@ -125,7 +129,7 @@ def without_losses(
         order, squares, power = _by_gain(problem, start, whitening, joint.causes, [f.name in later for f in named])
         falls = [fall(a, b, named[k].joints) for k, (a, b) in zip(order, pairwise(squares), strict=True)]
         pairs = [(named[k].name, k, one) for k, one in zip(order, falls, strict=True)]
-        passed |= {name for name, _, one in pairs if one.gains}
+        passed |= {n for n, _, one in pairs if (one.surely(claims[n]) if n in claims else one.gains)}
         passed |= {name for name, _, one in pairs if name not in passed and strict and one.own > 0 and borne_out(name)}
         failing = [(one.own, k) for name, k, one in pairs if name not in passed or one.own <= 0]
         if not failing and squares[-1].squares[0].sum() > squares[0].squares[0].sum():

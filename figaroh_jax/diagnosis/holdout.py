@@ -232,8 +232,16 @@ def _without_parts(problem: Problem, step: Step) -> Float[np.ndarray, "parts P"]
 def _left_out(
     problem: Problem, state: State, folds: Float[np.ndarray, "folds P"], fold: Int[np.ndarray, " T"]
 ) -> Float[np.ndarray, "n M nv"]:
+    """What the fit without each fold leaves of it. A slot's torque is computed for the folds that have rows in it."""
     response, error = state.response(problem.records.omega), problem.torque
-    fold = fold.reshape(error.shape[:2])
-    for k, theta in enumerate(folds):
-        error = error - open_rows(problem.records, state.torque(theta), response) * (fold == k)[..., None]
+    (n, samples, _, nv), fold = problem.records.shape, fold.reshape(error.shape[:2])
+    inside = [np.unique(own[own >= 0]).tolist() for own in fold]
+    for turn in range(max(map(len, inside))):
+        torque, now = np.zeros((n * samples, nv)), [own[turn] if turn < len(own) else -1 for own in inside]
+        for slot, k in enumerate(now):
+            if k >= 0:
+                here = slice(slot * samples, (slot + 1) * samples)
+                torque[here] = state.torque(folds[k], here if n > 1 else slice(None))
+        told = (fold >= 0) & (fold == np.array(now)[:, None])
+        error = error - open_rows(problem.records, torque, response) * told[..., None]
     return error

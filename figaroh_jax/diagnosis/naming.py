@@ -29,11 +29,13 @@ from .joint import Joint
 from .problem import Problem
 from .search import Found, judged_without, stood_without
 from .shifts import torque_change
+from .standstill import resting
 from .state import State, batched
 from .step import Step, stand
 from .thresholds import (
     ALL_BUT,
     BESIDE_SMOOTH,
+    BUYS,
     GAIN_NAMED,
     GAIN_NAMED_ROBOT,
     LAW_LEAVES,
@@ -42,6 +44,7 @@ from .thresholds import (
     MODULATION,
     MODULATION_HELD_OUT,
     MODULATION_ROBOT,
+    OWN_SHARE,
     SHARE_NAMED,
     T_NAMED,
     WEIGHTLESS,
@@ -56,7 +59,11 @@ __all__ = [
     "reason_against",
     "standings",
     "stands_alone",
+    "strong",
 ]
+
+
+EVERYWHERE = ("gravity_tilt", "external_wrench")  # laws that act at all joints, at all times
 
 
 @dataclass(frozen=True)
@@ -83,6 +90,9 @@ class Standing:
     outdone: bool = False  # whether what could be named in its place surely predicts better
     taken: float = 0.0  # held-out squares of its joints that it removes
     leaves: float = 0.0  # squares beyond noise at its joints over these
+    followed: float = 0.0  # squares that smooth functions surely find in what it leaves at its joints, over these
+    unmoved: bool = True  # whether no misfit of joints that move but its own is likely
+    everywhere: bool = False  # whether a law that acts at all joints at all times may stand in its place
     alone: bool = True  # whether its joints are likely to have no other misfit (`stands_alone`)
 
 
@@ -97,11 +107,13 @@ def reason_against(
 
     Beside a `rest` it must explain much of its joints' error, and surely; without one it must only be there, with one
     amplitude: one that would rather vary predicts better on data that were not fitted, whether or not a rest shows.
-    `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not; `fading`
-    are those that were surely there and are gone in recordings kept out.
+    `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not or where it is
+    borderline; `fading` are those that were surely there and are gone in recordings kept out.
     """
     least, most = (GAIN_NAMED_ROBOT, MODULATION_ROBOT) if one.whole else (GAIN_NAMED, MODULATION)
-    margin = _together_beyond(max(one.t / one.t_needed, 1.0), one.gain / least, most / max(one.modulation, 1e-9))
+    shown = certain(one.name)
+    varying = one.modulation if one.whole else _without_chance(one.modulation, one.modulation_held_out)
+    margin = _together_beyond(max(one.t / one.t_needed, 1.0), one.gain / least, most / max(varying, 1e-9))
     strict_law = one.whole or one.alone  # what else is wrong at a joint makes its law's amplitude vary
     varies = "its amplitude varies with position, speed, load or time (that would add"
     checks = [
@@ -123,16 +135,25 @@ def reason_against(
             f"where it acts {one.leaves:.2f} of what it removes stays beyond the noise, though most other joints have"
             " no misfit: another law acts there",
         ),
+        (
+            one.followed <= OWN_SHARE or not one.unmoved,
+            f"where it acts the motion predicts {one.followed:.2f} of what it removes once more, though most other"
+            " joints have no misfit while they move: another law acts there",
+        ),
     ]
     if rest or not (one.beside_rest or one.complete):  # what any rest looks like is taken on less only if it is all
         checks += [
             (
-                one.t >= one.t_needed or certain(one.name),
+                one.t >= one.t_needed or shown,
                 f"its gain on held-out data is not significant: t = {one.t:.1f}, {one.t_needed:.1f} needed",
             ),
             (one.gain >= least, f"it removes {one.gain:.0%} of the held-out error where it acts, {least:.0%} needed"),
-            (one.modulation <= most, f"{varies} {one.modulation:.2f} of its gain)"),
+            (
+                one.modulation <= (max(most, MODULATION_HELD_OUT) if shown else most),
+                f"{varies} {one.modulation:.2f} of its gain)",
+            ),
             (one.share >= SHARE_NAMED, f"its torque is {one.share:.1%} of the joint's, {SHARE_NAMED:.0%} needed"),
+            (not one.everywhere, "a law of the whole robot explains as much where it acts, and more is left"),
             (not one.cancels, "it cancels most of the joint's torque, as no gain beside another cause does"),
             (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion explain as much"),
             (
@@ -144,12 +165,24 @@ def reason_against(
                 "a coupling without friction of its own cannot be distinguished from rotor or link inertia",
             ),
             (
-                margin >= MARGIN,
+                margin >= MARGIN or shown,
                 f"it is borderline: t, gain and a steady amplitude together are {margin:.1f} times what each alone"
                 f" needs, {MARGIN:.0f} needed",
             ),
         ]
     return next((reason for passed, reason in checks if not passed), "")
+
+
+def strong(one: Standing) -> bool:
+    """Whether it surely explains much of what its joints leave, as a law that exists would, whatever speaks against its
+    name: then what is left is more than sticks, which no law explains."""
+    much = one.gain >= GAIN_NAMED and one.share >= SHARE_NAMED and one.t >= one.t_needed
+    return much and one.physical and one.beside_rest and not one.whole
+
+
+def _without_chance(fitted: float, held_out: float) -> float:
+    """What an amplitude that varies gains: by chance it gains more in the fit, and as much less on data left out."""
+    return max((fitted + held_out) / 2, 0.0)
 
 
 def _together_beyond(*ratios: float) -> float:
@@ -236,7 +269,10 @@ def standings(
                 varies=modulation[2],
                 beside_smooth=_beside_smooth(grown, bare, effect, place, one.joints) if whole else 1.0,
                 inertia_alone=coupled and _inertia_alone(effect, joint.fitted, at),
-                spoils=whole and kind(effect) == "columns" and _spoils(without, full),
+                spoils=whole
+                and kind(effect) == "columns"
+                and _spoils(*(_by_joint(problem, v, full) for v in (without, full.verdicts))),
+                everywhere=not whole and any(name.effect in EVERYWHERE for name in one.ambiguous),
                 outdone=one.outdone,
                 massless=effect.body and _deviations(effect, joint.fitted, at)["mass"] < MASS,
             )
@@ -425,13 +461,26 @@ def _inertia_alone(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bo
     return all(abs(deviations[n]) < 2 for n in effect.one_rotor[1:])
 
 
-def _spoils(without: Verdicts, full: Step) -> bool:
+def _spoils(before: Float[np.ndarray, "ways nv blocks"], after: Float[np.ndarray, "ways nv blocks"]) -> bool:
     """Whether left-out data of some joint are surely predicted worse with a cause than without it, of all joints.
 
-    What stands in for a law of the whole robot buys the joints where it fits with those where it does not.
+    What stands in for a law of the whole robot buys the joints where it fits with those where it does not. It must cost
+    a joint in each way of counting its rows, by a share of what it gains: what a stick is fitted with changes with any
+    cause. Squares of each joint's blocks, of all rows first.
     """
-    each = [[v.own(full.rows, (joint,)) for v in (without, full.verdicts)] for joint in range(len(full.rows.y))]
-    return any(t_value(better, worse) > t_needed(len(worse), T_NAMED, len(each)) for worse, better in each)
+    least = max(BUYS * float((before[0] - after[0]).sum()), 0.0)
+    needed = t_needed(before.shape[2], T_NAMED, before.shape[1])
+    return any(
+        all(t_value(now, was) > needed and (now - was).sum() > least for was, now in zip(*joint, strict=True))
+        for joint in zip(before.swapaxes(0, 1), after.swapaxes(0, 1), strict=True)
+    )
+
+
+def _by_joint(problem: Problem, verdicts: Verdicts, full: Step) -> Float[np.ndarray, "2 nv blocks"]:
+    """Squares of each joint's blocks: of all rows, and of those in which it moves."""
+    moves = np.moveaxis(~resting(problem), 2, 0).reshape(full.rows.y.shape)
+    ways = (verdicts, verdicts._replace(error=verdicts.error * moves))
+    return np.array([[v.own(full.rows, (joint,)) for joint in range(len(moves))] for v in ways])
 
 
 def _turns_against_itself(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
 from itertools import pairwise
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 from weakref import ref
 
 import equinox as eqx
@@ -24,7 +24,7 @@ from ..recordings.stacked import Records, filter_rows, open_rows
 from ..rigid.model import RobotModel
 from ..rigid.regressor import packed_regressor, pairs
 from ..simulators.contract import Backend
-from .comparison import FoldSums, fold_sums, grown_sums, prefix_sums
+from .comparison import FoldSums, Verdicts, fold_sums, grown_sums, prefix_sums
 from .design import SHORT, Units, candidates, flattened, kind, shapes, units
 from .shifts import links_torque, rigid_torque
 from .thresholds import TRUSTED
@@ -34,11 +34,13 @@ T = TypeVar("T")
 __all__ = ["Layout", "Part", "Problem", "family_of", "without_factor"]
 
 # cached, and the same for all weights of the rows
-_OF_THE_MOTION = ("torque", "gain", "motion", "families", "fixed", "plain", "_terms")
+_OF_THE_MOTION = ("torque", "gain", "passed", "motion", "families", "fixed", "plain", "_terms")
 KEPT = 110 << 20  # bytes of filtered columns that are held: two responses of an arm in 18 recordings of half a minute
-AT_ONCE = 36  # effects with a shape that are evaluated at once along long recordings
+AT_ONCE = 6  # effects with a shape that are evaluated at once along long recordings
 MOST_SUMS = 12  # models whose normal equations are held
+MOST_BEGUN, MOST_JUDGED = 4, 16
 MOST_TERMS = 48  # terms of models whose columns are held
+ROWS = 512  # that are put side by side and weighted at once
 TURNED = 128  # samples that are turned at once: they stay in the processor's cache
 
 
@@ -68,8 +70,7 @@ class Part:
 
     @cached_property
     def _columns(self) -> _Columns:
-        made, self._quick = self._make(), None
-        return made
+        return self._make()
 
     @property
     def series(self) -> Float[np.ndarray, "series nN"]:
@@ -118,28 +119,32 @@ class Part:
 
     def torque(self, theta: Float[np.ndarray, " k"], rows: slice = slice(None)) -> Float[np.ndarray, "rows nv"]:
         """Torque (samples, nv) of the coefficients `theta`, N m or N; `rows` are samples."""
-        whole = rows == slice(None)
-        if whole and self._last and np.array_equal(self._last[0][0], theta):
-            return self._last[0][1]
-        if whole and self._quick is not None:
-            return self._held(theta, self._quick(theta))
-        series = self.series if whole else self.series[:, rows]
-        out = np.zeros((self.nv, series.shape[1]))
+        if rows != slice(None):
+            return self._of_columns(theta, rows)
+        if not self._last or not np.array_equal(self._last[0][0], theta):
+            torque = self._of_columns(theta, rows) if self._quick is None else self._quick(theta)
+            torque.setflags(write=False)
+            self._last[:] = [(theta.copy(), torque)]  # states that grow out of one another ask for it again
+        return self._last[0][1]
+
+    def _of_columns(self, theta: Float[np.ndarray, " k"], rows: slice) -> Float[np.ndarray, "rows nv"]:
+        torque = np.zeros((len(range(self.samples)[rows]), self.nv))
+        self.add(theta, torque, rows)
+        return torque
+
+    def add(
+        self, theta: Float[np.ndarray, " k"], torque: Float[np.ndarray, "rows nv"], rows: slice = slice(None)
+    ) -> None:
+        """Add the torque of the coefficients to a `torque`, at the joints that have any of it."""
+        series = self.series[:, rows]
         for joint, own in self._stretches:
-            np.dot(theta[self.column[own]], series[own], out=out[joint])
-        return self._held(theta, out.T) if whole else out.T
+            torque[:, joint] += theta[self.column[own]] @ series[own]
 
     @cached_property
     def _stretches(self) -> list[tuple[int, slice]]:
         """The joints that have any of `series`, and where these stand."""
         ends = np.searchsorted(self.joint, np.arange(self.nv + 1)).tolist()
         return [(joint, slice(a, b)) for joint, (a, b) in enumerate(pairwise(ends)) if b > a]
-
-    def _held(self, theta: Float[np.ndarray, " k"], torque: Float[np.ndarray, "nN nv"]) -> Float[np.ndarray, "nN nv"]:
-        """The torque, which states that grow out of one another ask for again."""
-        torque.setflags(write=False)
-        self._last[:] = [(theta.copy(), torque)]
-        return torque
 
     def dense(self, columns: range) -> Float[np.ndarray, "k nv nN"]:
         """Some of the columns in the rows of all joints."""
@@ -195,12 +200,10 @@ class Filtered:
         """Masked rows of the parts side by side."""
         response, factor = without_factor(response)
         code = blake2b(np.ascontiguousarray(response).tobytes(), digest_size=16).digest()
+        code += np.asarray(records.weight).any((1, 2)).tobytes()
         blocks = [self._block(records, part, response, code) for part in parts]
         weight = (np.moveaxis(np.asarray(records.weight), 2, 0) * factor[:, None, None]).reshape(len(factor), -1, 1)
-        X, first = np.empty((*blocks[0].shape[:2], sum(part.width for part in parts))), 0
-        for block in blocks:
-            np.multiply(block, weight, out=X[:, :, first : first + block.shape[2]])
-            first += block.shape[2]
+        X = _beside(blocks, weight)
         self._last = ref(X), [ref(block) for block in blocks], ref(records.weight), factor
         return X
 
@@ -211,7 +214,8 @@ class Filtered:
         made = _Made(*self._last[1:], ref(rows.fold), np.zeros(0))
         count, known = max(((one.shared(made), k) for k, one in enumerate(self._sums)), default=(0, 0))
         if count:
-            sums = grown_sums(rows, prefix_sums(rows, self._sums[known].gram[:, :count, :count]), rows.X)
+            first = prefix_sums(rows, self._sums[known].gram[:, :count, :count])
+            sums = grown_sums(rows, first, rows.X[:, :, count:])
         else:
             sums = fold_sums(rows, rows.X)
         self._sums = [made._replace(gram=sums.gram), *self._sums[: MOST_SUMS - 1]]
@@ -219,8 +223,7 @@ class Filtered:
 
     def _block(self, records: Records, part: Part, response: np.ndarray, code: bytes) -> Float[np.ndarray, "nv T k"]:
         source = np.asarray(records.source)
-        used = np.asarray(records.weight).any((1, 2))
-        key = (id(part.series), id(source), code + used.tobytes())
+        key = (id(part.series), id(source), code)
         known = self._kept.pop(key, None)
         if known is not None and known[0]() is part.series and known[1]() is source:
             self._kept[key] = known
@@ -232,6 +235,20 @@ class Filtered:
         while len(self._kept) > 1 and sum(own.nbytes for _, _, own in self._kept.values()) > KEPT:
             self._kept.popitem(last=False)
         return block
+
+
+def _beside(
+    blocks: Sequence[Float[np.ndarray, "nv T _"]], weight: Float[np.ndarray, "nv T 1"]
+) -> Float[np.ndarray, "nv T P"]:
+    """The blocks side by side, each row times its weight, a few rows at a time while they are in the cache."""
+    ends, (joints, rows, _) = np.cumsum([block.shape[2] for block in blocks]), weight.shape
+    X = np.empty((joints, rows, ends[-1]))
+    for start in range(0, rows, ROWS):
+        few = slice(start, start + ROWS)
+        for block, end in zip(blocks, ends, strict=True):
+            X[:, few, end - block.shape[2] : end] = block[:, few]
+        X[:, few] *= weight[:, few]
+    return X
 
 
 def without_factor(response: np.ndarray) -> tuple[np.ndarray, Float[np.ndarray, " nv"]]:
@@ -249,6 +266,30 @@ def _through(records: Records, part: Part, response: np.ndarray) -> Float[np.nda
     block = np.zeros((nv, n * count, part.width))
     block[part.joint, :, part.column] = rows.reshape(len(rows), n * count)
     return block
+
+
+class Known(Generic[T]):
+    """The last few answers, each known by the objects that it was asked about."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._answers: OrderedDict[tuple[int, ...], tuple[tuple[object, ...], T]] = OrderedDict()
+
+    def get(self, *about: object) -> T | None:
+        """The answer about these very objects."""
+        known = self._answers.get(tuple(map(id, about)))
+        return None if known is None else known[1]
+
+    def put(self, answer: T, *about: object) -> T:
+        """Keep an answer, and the objects with it: their addresses are then no others'."""
+        self._answers[tuple(map(id, about))] = about, answer
+        while len(self._answers) > self._most:
+            self._answers.popitem(last=False)
+        return answer
+
+    def clear(self) -> None:
+        """Forget all answers."""
+        self._answers.clear()
 
 
 class Layout(eqx.Module):
@@ -277,6 +318,9 @@ class Problem:
     held: Float[np.ndarray, "n M nv"]  # 1: a row of a holdout recording with torque
     bounded: bool = False  # whether the links stay within what is believed of them (`believed`)
     filtered: Filtered = field(default_factory=Filtered, compare=False, repr=False)
+    # states with the first causes of a fit, and what was said of a fit without one of them
+    begun: Known[Any] = field(default_factory=lambda: Known(MOST_BEGUN), init=False, compare=False, repr=False)
+    judged: Known[Verdicts] = field(default_factory=lambda: Known(MOST_JUDGED), init=False, compare=False, repr=False)
 
     @property
     def model(self) -> RobotModel:
@@ -298,6 +342,12 @@ class Problem:
     def gain(self) -> Float[np.ndarray, " F"]:
         """Power gain of the row filter."""
         return np.asarray(self.records.low_pass) ** 2
+
+    @cached_property
+    def passed(self) -> float:
+        """Share of white noise's power that the row filter passes: so many of the rows are independent."""
+        frequency = np.linspace(0, float(self.records.rate) / 2, 400)
+        return float(np.interp(frequency, np.asarray(self.records.omega) / (2 * np.pi), self.gain).mean())
 
     @cached_property
     def motion(self) -> Motion:

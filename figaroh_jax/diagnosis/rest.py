@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from ..estimation import noise
 from ..estimation.noise import Spectrum
-from ..estimation.rows import Rows
+from ..estimation.rows import Linear, Rows, tall
 from ..recordings.stacked import filter_rows
 from ..results import Dependence, Part, Verdict
 from .comparison import ground, judge_grown, t_value
@@ -52,6 +52,7 @@ __all__ = [
     "wrong_law",
 ]
 
+SURE = 0.6  # of the cutoff: below, the row filter passes noise as it is
 POWER_DRAWS = 200  # of noise, whose power is compared with what is left
 
 _Share = tuple[float, Dependence, tuple[float, float] | None, str | None]  # share, kind, band in Hz, file
@@ -87,11 +88,11 @@ def excess(
     other = np.stack([rows.instrument(residual[j], j) for j in range(len(residual))])
     products = residual * other
     blocks = np.bincount(rows.block[rows.block >= 0], products.sum(0)[rows.block >= 0])
-    z = blocks.sum() / np.sqrt((blocks**2).sum() + 1e-300)
+    t, used = blocks.sum() / np.sqrt((blocks**2).sum() + 1e-300), np.count_nonzero(blocks)
     share = rows.paired.mean(1) * level
-    from scipy.special import ndtr  # scipy is slow to import
+    from scipy.special import stdtr  # scipy is slow to import
 
-    return float(products.sum() / share.sum()), float(ndtr(-z)), products.sum(1) / share
+    return float(products.sum() / share.sum()), float(stdtr(max(used - 1, 1), -t)), products.sum(1) / share
 
 
 def beyond_noise(
@@ -101,11 +102,14 @@ def beyond_noise(
     whitening: Float[np.ndarray, "F nv"],
     generator: np.random.Generator,
     rows: Bool[np.ndarray, "nv T"] | None = None,
+    fitted: tuple[Rows, Linear] | None = None,
 ) -> tuple[Float[np.ndarray, " nv"], Bool[np.ndarray, " nv"]]:
     """Squares that each joint's residual has beyond those of noise, where chance gives no joint so many, else zero; and
     whether it has fewer than chance gives any joint.
 
-    Of some rows of each joint, or of all.
+    Of some rows of each joint, or of all. With a `fitted` model, of what it leaves of the noise (of slow noise it takes
+    much), and only below `SURE` of the cutoff: above, the power of the noise is what a smooth curve says of a band that
+    the row filter empties.
 
     Noise is drawn with all that its spectrum may be, and a joint's power counted in deviations of what noise has there:
     one draw in a hundred has a joint with as much. What no function of the motion predicts is a misfit too, if it is
@@ -114,7 +118,13 @@ def beyond_noise(
     """
     counted = np.ones(residual.shape, bool) if rows is None else rows
     parts = (draw_noise(problem, spectrum, whitening, CHUNK, generator) for _ in range(POWER_DRAWS // CHUNK))
-    noise = np.concatenate([(part**2 * counted).sum(2) for part in parts])
+    left = parts
+    if fitted is not None:
+        left, residual = (
+            (_surely_passed(problem, _left_of(part, *fitted)) for part in parts),
+            _surely_passed(problem, residual),
+        )
+    noise = np.concatenate([(part**2 * counted).sum(2) for part in left])
     mean, deviation = noise.mean(0), np.maximum(noise.std(0), 1e-12 * noise.mean(0) + 1e-300)
     drawn, own = (noise - mean) / deviation, (residual**2 * counted).sum(1) - mean
     p, q = (
@@ -122,6 +132,21 @@ def beyond_noise(
         for side, most in ((1, drawn.max(1)), (-1, -drawn.min(1)))
     )
     return np.where(p < REST_P, np.maximum(own, 0.0), 0.0), q < REST_P
+
+
+def _surely_passed(problem: Problem, rows: Float[np.ndarray, "*draws T"]) -> Float[np.ndarray, "*draws T"]:
+    """The part of whitened rows below `SURE` of the cutoff."""
+    records = problem.records
+    n, _, count, _ = records.shape
+    spectrum = np.fft.rfft(rows.reshape(*rows.shape[:-1], n, count), axis=-1)
+    spectrum[..., np.fft.rfftfreq(count, 1 / float(records.rate)) > SURE * float(records.cutoff)] = 0.0
+    return np.fft.irfft(spectrum, count, axis=-1).reshape(rows.shape)
+
+
+def _left_of(noise: Float[np.ndarray, "draws nv T"], rows: Rows, linear: Linear) -> Float[np.ndarray, "draws nv T"]:
+    """What a fit leaves of rows of noise."""
+    theta = (noise * rows.paired).reshape(len(noise), -1) @ tall(rows.Xi) @ linear.inverse.T
+    return noise - np.moveaxis(rows.X @ theta.T, 2, 0)
 
 
 def repeating(
@@ -271,8 +296,10 @@ def wrong_law(at: tuple[str, ...], drop: float, flexible: Smooth) -> bool:
     return flexible.p < REST_P and (not at or places[0] in at) and flexible.score > OWN_SHARE * drop
 
 
-def tolerated(largest: float, tolerance: float, sticks: bool) -> str:
+def tolerated(largest: float, tolerance: float, sticks: bool, read: bool = False) -> str:
     """Why a misfit that noise does not explain is no rest, in words; `largest` is that of any joint over its torque."""
+    if read:
+        return "the steps of the encoders and the time between samples leave as much of a model that is right"
     if sticks:
         return "it stands where joints are at rest, as dry friction allows"
     if largest <= tolerance:

@@ -225,17 +225,23 @@ class Null:
 
 
 def family_p(
-    rows: Rows, linear: Linear, found: Screen, null: Null, generator: np.random.Generator, draws: int = DRAWS
+    rows: Rows,
+    linear: Linear,
+    found: Screen,
+    null: Null,
+    generator: np.random.Generator,
+    draws: int = DRAWS,
+    parts: Float[np.ndarray, "blocks columns"] | None = None,
 ) -> float:
     """Chance that noise alone gives some candidate of the whole catalogue a score as large as the largest.
 
     The larger of two nulls: noise drawn from the spectrum (its coefficients redrawn each time), and fair signs of
-    whole blocks of the residual, the prior's rows among the blocks.
+    whole blocks of the residual, the prior's rows among the blocks. `parts` are the `block_scores` where known.
     """
     if not found.scores:
         return 1.0  # every candidate is forbidden, or stands in the model already
     highest = max(float(result.z.max()) for result in found.scores)
-    parts = block_scores(rows, linear, found.stock, found.H)
+    parts = block_scores(rows, linear, found.stock, found.H) if parts is None else parts
     signs = generator.choice([-1.0, 1.0], (draws, len(parts)))
     above = np.sum(largest(found.stock.span, found.scores, signs @ parts) >= highest)
     drawn = 0
@@ -248,13 +254,16 @@ def family_p(
 
 
 def place_p(
-    rows: Rows, linear: Linear, found: Screen, generator: np.random.Generator, draws: int = LOCAL_DRAWS
+    found: Screen,
+    parts: Float[np.ndarray, "blocks columns"],
+    generator: np.random.Generator,
+    draws: int = LOCAL_DRAWS,
 ) -> float:
     """As `family_p` by fair signs of blocks, each place for itself, times the places: the chance at the surest of them.
 
     A joint with a large misfit has large scores under any signs, beside which what another joint shows would drown.
+    `parts` are the `block_scores`.
     """
-    parts = block_scores(rows, linear, found.stock, found.H)
     signs = generator.choice([-1.0, 1.0], (draws, len(parts)))
     places: dict[tuple[int, ...], list[int]] = {}
     for index, group in enumerate(found.groups):

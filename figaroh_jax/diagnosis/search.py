@@ -19,6 +19,7 @@ from .comparison import Hypothesis, Verdicts, fewer_sums, ground, judge, overlap
 from .contenders import Contender, acting, contend, for_refit, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
+from .evidence import block_scores
 from .flexible import friction_width
 from .gates import ambiguous, exists, gains, passes, physical_sign, rivals, simpler
 from .problem import Problem
@@ -134,7 +135,7 @@ def find_causes(
         progress("comparing causes on held-out data", len(found) / MOST_CAUSES)
         contenders = _contenders(problem, step, screened, whitening, failed, fitted)
         contenders = [c for c in contenders if not _told_already(c, found)]
-        chosen = _chosen(problem, step, contenders, found)
+        chosen = _chosen(problem, step, contenders, found, alpha / len(groups))
         if not chosen:
             break
         before = step
@@ -190,13 +191,17 @@ def _chance(
     Once causes are in, each place is asked for itself too: what one joint leaves must not hide another's.
     """
 
+    if not screened.scores:
+        return 1.0
+    parts = block_scores(step.rows, step.linear, screened.stock, screened.H)
+
     def drawn(draws: int) -> float:
-        return family_p(step.rows, step.linear, screened, null, generator, draws)
+        return family_p(step.rows, step.linear, screened, null, generator, draws, parts)
 
     p = drawn(DRAWS if first else LATER)
     if alpha < p < NEAR * alpha:
         p = drawn(CLOSER)
-    return p if first or p <= alpha else min(p, place_p(step.rows, step.linear, screened, generator))
+    return p if first or p <= alpha else min(p, place_p(screened, parts, generator))
 
 
 def _contenders(
@@ -236,19 +241,32 @@ def _told_already(one: Contender, found: list[Found]) -> bool:
     return any(one.name in f.ambiguous and one.name.effect == f.name.effect for f in found)
 
 
-def _chosen(problem: Problem, step: Step, contenders: list[Contender], before: list[Found]) -> list[Contender]:
-    """The best cause, and the best of other joints that explain another misfit."""
+def _chosen(
+    problem: Problem, step: Step, contenders: list[Contender], before: list[Found], chance: float
+) -> list[Contender]:
+    """The best cause, and the best of other joints that explain another misfit.
+
+    The p-value of the step is that of the first. Each of the others must lower the squares by more than a candidate
+    does by `chance`, or it waits for a step of its own.
+    """
     first = _best(problem, step, contenders, before)
     if first is None:
         return []
     chosen = [first]
     while first.effect.acts_on in ("joint", "pair") and kind(first.effect) == "columns":
-        free = [c for c in contenders if all(_apart(step, c, one) for one in chosen)]
+        free = [c for c in contenders if all(_apart(step, c, one) for one in chosen) and _shows(step, c, chance)]
         other = _best(problem, step, free, before)
         if other is None:
             break
         chosen.append(other)
     return chosen
+
+
+def _shows(step: Step, one: Contender, chance: float) -> bool:
+    """Whether it lowers the squares by more than so many numbers do of noise with that chance."""
+    from scipy.special import chdtri  # scipy is slow to import
+
+    return step.verdicts.cost - one.verdicts.cost > chdtri(len(one.effect.parameters()), chance)
 
 
 def _apart(step: Step, one: Contender, other: Contender) -> bool:
@@ -320,7 +338,7 @@ def eliminate(problem: Problem, start: State, found: list[Found], whitening: Flo
     """
     if len(found) < 2:
         return found
-    full = with_causes(problem, start, [f.effect for f in found], whitening)
+    full = with_causes(problem, start, [f.effect for f in found], whitening, keep=True)
     asked = list(found)
     while len(found) > 1:
         needs = [(_needed(problem, start, full, found, one, whitening), k) for k, one in enumerate(asked)]
@@ -329,7 +347,8 @@ def eliminate(problem: Problem, start: State, found: list[Found], whitening: Flo
             break
         asked = [asked[k] for _, k in needless]
         found, asked = [f for f in found if f is not asked[0]], asked[1:]
-        full = with_causes(problem, start, [f.effect for f in found], whitening)
+        full = with_causes(problem, start, [f.effect for f in found], whitening, keep=True)
+    problem.begun.clear()  # their columns are large
     return found
 
 
@@ -347,7 +366,9 @@ def judged_without(
 ) -> Verdicts:
     """What the data say of all causes but one."""
     if kind(one.effect) != "columns":
-        return stood_without(problem, start, found, one, whitening).verdicts
+        about = start, whitening, *(f.effect for f in found if f is not one)
+        known = problem.judged.get(*about)
+        return known or problem.judged.put(stood_without(problem, start, found, one, whitening).verdicts, *about)
     place = amplitude_places(full.state, [f.effect for f in found], problem.model)[found.index(one)]
     prior, kept = full.state.prior, np.delete(np.arange(len(full.state.theta)), place)
     fewer = believed(problem, Prior(prior.mean[kept], prior.precision[kept]), fewer_sums(full.folded, place))

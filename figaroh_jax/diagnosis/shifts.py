@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..effects.base import Effect, Motion, changed
+from ..recordings.rowfilter import low_pass
 from ..recordings.stacked import Records
 from ..rigid.dynamics import torques_on_host
 from ..rigid.model import Leaf, RobotModel
@@ -26,6 +27,9 @@ ENDS, TINY = 6, 1e-6  # samples whose derivatives are held; what makes them zero
 EVERY = 4  # samples between which derivatives of the torque are straight
 ROUNDING = 1e-9  # of the largest derivative of the torque
 STEP = 1e-4  # of central differences, rad, rad/s or rad/s2 (m for rad)
+OF_THE_MOTION, BAND = 0.97, 4.0  # share of the velocities' power below a frequency; times that one, the load's band
+IN_DOUBT = 0.02  # of a load's RMS: what the model does not know of it
+DOUBTS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # times that: over which the step of an abrupt sensor is averaged
 
 
 def rigid_torque(
@@ -70,22 +74,28 @@ def shifted(
 
     Position, velocity and acceleration of the answer have a leading axis of effects.
     """
-    shift = _errors(effects, motion)
+    return _moved(effects, motion, _shifts(effects, motion, records, turns, as_read), records)
+
+
+def _shifts(
+    effects: Effect, motion: Motion, records: Records, turns: int, as_read: Float[np.ndarray, "nN nv"] | None
+) -> Float[np.ndarray, "effects nN"]:
+    """By how much each sensor's joint stands elsewhere than was read."""
+    shift = _errors(effects, motion, records)
     if not turns:
-        return _moved(effects, motion, shift, records)
+        return shift
     if as_read is None:
         as_read = links_torque(motion.model, motion.position, motion.velocity, motion.acceleration, records)
     compliances, shift = _compliances(effects, motion, records, as_read), np.zeros_like(shift)
     for turn in range(turns):
         if turn:
-            true = _moved(effects, motion, shift, records)
-            loads = links_torque(motion.model, true.position, true.velocity, true.acceleration, records)
+            loads = _torques(effects, motion, shift, records)
         else:  # the motion as it was read
             loads = np.broadcast_to(as_read, (len(shift), *as_read.shape))
-        missing = (_errors(effects, motion, loads) - shift).reshape(-1, *records.position.shape[:2])
+        missing = (_errors(effects, motion, records, loads) - shift).reshape(-1, *records.position.shape[:2])
         change = [own.solve(one) for own, one in zip(compliances, missing, strict=True)]
         shift = shift + np.reshape(change, shift.shape)
-    return _moved(effects, motion, shift, records)
+    return shift
 
 
 class _Compliance(NamedTuple):
@@ -136,8 +146,8 @@ def _compliances(
     effects: Effect, motion: Motion, records: Records, load: Float[np.ndarray, "nN nv"]
 ) -> list[_Compliance]:
     """What a small change of its joint's motion changes of each sensor's reading."""
-    loads = np.repeat(load[None], len(effects.at), axis=0)
-    unit = (_errors(effects, motion, loads + 1) - _errors(effects, motion, loads)).mean(1)
+    more, here = (_errors(effects, changed(motion, load=own), records) for own in (load + 1, load))
+    unit = (more - here).mean(1)
     joints = np.asarray(effects.at)[:, 0]
     few, (once, place) = _Few.of(motion, records), np.unique(joints, return_inverse=True)
     slopes = few.slopes(motion.model, once, lambda q, v, a: links_torque(motion.model, q, v, a, records))
@@ -168,8 +178,7 @@ class _Few(NamedTuple):
     def of(cls, motion: Motion, records: Records) -> _Few:
         n, samples, _, nv = records.shape
         at = np.append(np.arange(0, samples - 1, EVERY), samples - 1)
-        state = (motion.position, motion.velocity, motion.acceleration)
-        return cls(at, samples, tuple(np.asarray(x).reshape(n, samples, nv)[:, at].reshape(-1, nv) for x in state))
+        return cls(at, samples, tuple(x.reshape(n, samples, nv)[:, at].reshape(-1, nv) for x in _state(motion)))
 
     def slopes(
         self, model: RobotModel, joints: Int[np.ndarray, " joints"], torque: Callable[..., np.ndarray]
@@ -191,31 +200,93 @@ class _Few(NamedTuple):
 
 
 def _errors(
-    effects: Effect, motion: Motion, loads: Float[np.ndarray, "effects nN nv"] | None = None
+    effects: Effect, motion: Motion, records: Records, loads: Float[np.ndarray, "effects nN nv"] | None = None
 ) -> Float[np.ndarray, "effects nN"]:
     """What each sensor reads beside the truth, under the motion's load or each under its own."""
     out = []
     for one in range(len(effects.at)):
         here = motion if loads is None else changed(motion, load=loads[one])
         effect = jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects)
-        # as it is written, on NumPy's arrays; a bound method would be a module of its own
-        out.append(np.asarray(type(effect).position_error(effect, here)))
+        out.append(_read_beside(effect, here, records))
     return np.stack(out)
+
+
+def _read_beside(effect: Effect, motion: Motion, records: Records) -> Float[np.ndarray, " nN"]:
+    """What one sensor reads beside the truth along a motion, as much of it as the positions have been let through.
+
+    A play makes the position step, and the inertial torque of that step, which no link feels, would decide on which
+    side the load is: an abrupt sensor is given the load in the band of the motion. How well that is known says how
+    well the time of a step is: it is averaged over what the load may be.
+    """
+    # as it is written, on NumPy's arrays; a bound method would be a module of its own
+    if not effect.abrupt:
+        return np.asarray(type(effect).position_error(effect, motion))
+    load = _steady_load(motion, records)
+    doubt = IN_DOUBT * np.sqrt(np.mean(load**2, 0))
+    each = [type(effect).position_error(effect, changed(motion, load=load + k * doubt)) for k in DOUBTS]
+    return _low(records, np.mean(each, axis=0)[:, None], float(records.cutoff))[:, 0]
+
+
+def _steady_load(motion: Motion, records: Records) -> Float[np.ndarray, "nN nv"]:
+    """The load without what lies above the band of the motion."""
+    n, samples, _, nv = records.shape
+    velocity = np.asarray(motion.velocity).reshape(n, samples, nv)
+    power = (np.abs(np.fft.rfft(velocity, axis=1)) ** 2).sum((0, 2))
+    most = int(np.searchsorted(np.cumsum(power), OF_THE_MOTION * power.sum()))
+    band = max(BAND * most / (samples * float(records.dt)), 2 / (samples * float(records.dt)))
+    load = np.asarray(motion.load)
+    return load if band >= float(records.cutoff) else _low(records, load, band)
+
+
+def _low(records: Records, signal: Float[np.ndarray, "nN cols"], cutoff: float) -> Float[np.ndarray, "nN cols"]:
+    """Each recording low-passed as positions are; `cutoff` in Hz."""
+    out = signal.reshape(*records.shape[:2], -1).copy()
+    for at in records.spans:
+        own = slice(at.sample, at.sample + at.samples)
+        out[at.slot, own] = low_pass(out[at.slot, own], float(records.dt), cutoff)
+    return out.reshape(signal.shape)
 
 
 def _moved(effects: Effect, motion: Motion, errors: Float[np.ndarray, "effects nN"], records: Records) -> Motion:
     """The motion less each error of the joint of each effect."""
-    errors = errors.reshape(-1, *records.position.shape[:2])
-    rates = difference(errors, float(records.dt))
-    change = [errors, rates, difference(rates, float(records.dt))]
     one, joint = np.arange(len(errors)), np.asarray(effects.at)[:, 0]
     true = []
-    for signal, delta in zip((motion.position, motion.velocity, motion.acceleration), change, strict=True):
-        moved = np.repeat(np.asarray(signal)[None], len(errors), axis=0)
-        moved[one, :, joint] -= delta.reshape(len(errors), -1)
+    for signal, delta in zip(_state(motion), _with_rates(errors, records), strict=True):
+        moved = np.repeat(signal[None], len(errors), axis=0)
+        moved[one, :, joint] -= delta
         true.append(moved)
     position, velocity, acceleration = true
     return changed(motion, position=position, velocity=velocity, acceleration=acceleration)
+
+
+def _torques(
+    effects: Effect, motion: Motion, errors: Float[np.ndarray, "effects nN"], records: Records
+) -> Float[np.ndarray, "effects nN nv"]:
+    """The links' torque along the motion less each error (`_moved`), one after another: a joint of it is all that
+    changes."""
+    moved = q, v, a = [signal.copy() for signal in _state(motion)]
+    out, deltas = np.empty((len(errors), *q.shape)), _with_rates(errors, records)
+    for one, joint in enumerate(np.asarray(effects.at)[:, 0].tolist()):
+        read = [signal[:, joint].copy() for signal in moved]
+        for signal, delta in zip(moved, deltas, strict=True):
+            signal[:, joint] -= delta[one]
+        out[one] = links_torque(motion.model, q, v, a, records)
+        for signal, own in zip(moved, read, strict=True):
+            signal[:, joint] = own
+    return out
+
+
+def _state(motion: Motion) -> tuple[Float[np.ndarray, "nN nv"], ...]:
+    """Position, velocity and acceleration."""
+    return tuple(np.asarray(x) for x in (motion.position, motion.velocity, motion.acceleration))
+
+
+def _with_rates(errors: Float[np.ndarray, "effects nN"], records: Records) -> list[Float[np.ndarray, "effects nN"]]:
+    """Errors of the position with those of the velocity and of the acceleration."""
+    each = [errors.reshape(-1, *records.position.shape[:2])]
+    for _ in range(2):
+        each.append(difference(each[-1], float(records.dt)))
+    return [one.reshape(len(errors), -1) for one in each]
 
 
 def difference(signal: Float[np.ndarray, "*n N"], dt: float) -> Float[np.ndarray, "*n N"]:
@@ -246,8 +317,8 @@ def torque_change(
     out, few = np.empty((len(effects.at), *as_read.shape)), max(1, AT_ONCE // as_read.size)
     for part in (slice(start, start + few) for start in range(0, len(out), few)):
         some = jax.tree.map(lambda x, part=part: np.asarray(x)[part], effects)
-        true = shifted(some, motion, records, turns, as_read)
-        out[part] = links_torque(motion.model, true.position, true.velocity, true.acceleration, records) - as_read
+        out[part] = _torques(some, motion, _shifts(some, motion, records, turns, as_read), records)
+        out[part] -= as_read
     return out
 
 
@@ -258,7 +329,7 @@ def shift_torques(effects: Effect, motion: Motion, records: Records) -> Float[np
     velocity and the acceleration of the joint: the same for all sensors.
     """
     names = [name for name, p in effects.parameters().items() if p.linear]
-    errors = _unit_errors(effects, motion).reshape(len(effects.at), len(names), *records.position.shape[:2])
+    errors = _unit_errors(effects, motion, records).reshape(len(effects.at), len(names), *records.position.shape[:2])
     rates = difference(errors, float(records.dt))
     pushes = difference(rates, float(records.dt))
     loads = _load_slopes(motion, records)
@@ -288,12 +359,12 @@ def _load_slopes(motion: Motion, records: Records) -> Float[np.ndarray, "3 nv nv
     return _SLOPES[0][2]
 
 
-def _unit_errors(effects: Effect, motion: Motion) -> Float[np.ndarray, "effects k nN"]:
+def _unit_errors(effects: Effect, motion: Motion, records: Records) -> Float[np.ndarray, "effects k nN"]:
     """What each sensor reads beside the truth with a unit of each of its amplitudes."""
     names, out = [name for name, p in effects.parameters().items() if p.linear], []
     for one in range(len(effects.at)):
         effect = jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects)
         for unit in np.eye(len(names)):
             units = changed(effect, **dict(zip(names, unit, strict=True)))
-            out.append(np.asarray(type(effect).position_error(units, motion)))
+            out.append(_read_beside(units, motion, records))
     return np.reshape(out, (len(effects.at), len(names), -1))

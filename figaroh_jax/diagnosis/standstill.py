@@ -15,10 +15,10 @@ from ..recordings.stacked import open_rows
 from .holdout import predicted
 from .problem import Problem
 from .state import State
-from .thresholds import CARRIED, LAW_AT_REST, LAW_WIDTHS, LEAST_MOVING, STANDSTILL
+from .thresholds import CARRIED, ENOUGH_MOVING, LAW_AT_REST, LAW_WIDTHS, LEAST_MOVING, STANDSTILL
 from .weights import relative_speed
 
-__all__ = ["beyond_sliding", "only_sticks", "resting", "stands"]
+__all__ = ["beyond_sliding", "held", "left_moving", "left_weighed", "only_sticks", "resting", "stands"]
 
 PASSED = 1 / 8  # of the band of slow rows
 TURNED = 0.1  # of the way to its limit: below, what friction a joint needs to slide is taken from the samples around
@@ -40,6 +40,26 @@ def resting(problem: Problem) -> Bool[np.ndarray, "n M nv"]:
     return near
 
 
+def left_moving(problem: Problem, state: State, noise: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
+    """RMS of what the state leaves beyond the `noise` (N m or N) of the rows in which each joint moves, relative to the
+    RMS torque of the joint."""
+    return _left_of(problem, state, noise, ~resting(problem))
+
+
+def left_weighed(problem: Problem, state: State, noise: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
+    """The same of the rows of each joint that have a weight: none at reversals."""
+    return _left_of(problem, state, noise, np.asarray(problem.records.weight) > 0)
+
+
+def _left_of(
+    problem: Problem, state: State, noise: Float[np.ndarray, " nv"], rows: Bool[np.ndarray, "n M nv"]
+) -> Float[np.ndarray, " nv"]:
+    left, judged = problem.torque - predicted(problem, state), np.asarray(problem.records.judged) > 0
+    torque = _rms(problem.torque, judged)
+    beyond = np.sqrt(np.maximum(_rms(left, judged & rows) ** 2 - noise**2, 0.0))
+    return beyond / np.maximum(torque, 1e-9 * max(float(torque.max()), 1e-300))
+
+
 def only_sticks(
     problem: Problem,
     state: State,
@@ -55,19 +75,25 @@ def only_sticks(
     left, judged = problem.torque - predicted(problem, state), np.asarray(problem.records.judged) > 0
     still = resting(problem) & judged
     torque = _rms(problem.torque, judged)
-    moving = np.sqrt(np.maximum(_rms(left, judged & ~still) ** 2 - noise**2, 0.0))
+    moving = left_moving(problem, state, noise)
     looked_at = np.flatnonzero(relative > tolerance)
-    if not len(looked_at) or np.any(moving[looked_at] > tolerance * torque[looked_at]):
+    if not len(looked_at) or np.any(moving[looked_at] > tolerance):
         return False
     if not np.any(stands(problem)[looked_at]):  # a robot whose joints stick does so at some joint for long
         return False
-    seen = (judged & ~still).sum((0, 1)) >= LEAST_MOVING * judged.sum((0, 1))
-    held = _rms(left, still) <= 2 * np.sqrt((_friction(state) ** 2).mean(0))  # from one limit to the other
-    if not np.all((seen & held)[looked_at]):
+    rows = (judged & ~still).sum((0, 1))
+    seen = rows >= np.minimum(LEAST_MOVING * judged.sum((0, 1)), ENOUGH_MOVING / problem.passed)
+    if not np.all((seen & held(state, left, still))[looked_at]):
         return False
     beyond = np.sqrt(np.maximum(_rms(beyond_sliding(problem, state, left), still) ** 2 - noise**2, 0.0))
     slides = [joint for joint in looked_at.tolist() if beyond[joint] > tolerance * torque[joint]]
     return not any(_law_of_velocity(problem, state, left, still, joint) for joint in slides)
+
+
+def held(state: State, left: Float[np.ndarray, "n M nv"], still: Bool[np.ndarray, "n M nv"]) -> Bool[np.ndarray, " nv"]:
+    """Whether what the state has `left` of each joint's rows at rest is no more than its dry friction from one limit to
+    the other."""
+    return _rms(left, still) <= 2 * np.sqrt((_friction(state) ** 2).mean(0))
 
 
 def stands(problem: Problem) -> Bool[np.ndarray, " nv"]:
@@ -105,9 +131,8 @@ def beyond_sliding(problem: Problem, state: State, left: Float[np.ndarray, "n M 
 
 def _friction(state: State) -> Float[np.ndarray, "nN nv"]:
     """What all friction of the state takes of each joint, N m or N."""
-    _, *shares = state.shares(state.theta)
     friction = np.zeros((state.rigid.samples, state.rigid.nv))
-    for share, term in zip(shares, state.terms, strict=True):
+    for share, term in zip(state.shares(state.theta), state.terms, strict=True):
         friction = friction + share * term.dissipative
     return friction
 

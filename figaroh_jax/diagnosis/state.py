@@ -43,6 +43,7 @@ __all__ = [
     "unit_slopes",
     "unit_torques",
     "whitened",
+    "with_size",
     "with_term",
 ]
 
@@ -64,9 +65,9 @@ class State:
     @cached_property
     def motion(self) -> Motion:
         """The motion as measured, with load, total torque and inertia of `theta`."""
-        load, *others = self.shares(self.theta)
+        load = self._load(self.theta)
         model = changed(self.measured.model, inertia=self.theta[: self.rigid.width].reshape(-1, 10))
-        return changed(self.measured, load=load, total=sum(others, load), model=model)
+        return changed(self.measured, load=load, total=self._total(load, self.theta), model=model)
 
     @property
     def rigid(self) -> Part:
@@ -83,17 +84,32 @@ class State:
         torques = [self.rigid.torque(ten.reshape(-1), rows) for ten, rows in zip(self.carried, each, strict=True)]
         return np.concatenate(torques)
 
-    def torque(self, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, "nN nv"]:
-        """Torque at the samples with the coefficients `theta`, N m or N."""
-        return sum(self.shares(theta), np.zeros((self.rigid.samples, self.rigid.nv)))
+    def torque(self, theta: Float[np.ndarray, " P"], rows: slice = slice(None)) -> Float[np.ndarray, "rows nv"]:
+        """Torque at some samples with the coefficients `theta`, N m or N."""
+        return self._total(self._load(theta, rows), theta, rows)
+
+    def _load(self, theta: Float[np.ndarray, " P"], rows: slice = slice(None)) -> Float[np.ndarray, "rows nv"]:
+        """Torque of the rigid body with what it carries."""
+        torque = self.rigid.torque(theta[: self.rigid.width], rows)
+        return torque if self.carried is None else torque + self.known[rows]
+
+    def _total(
+        self, load: Float[np.ndarray, "rows nv"], theta: Float[np.ndarray, " P"], rows: slice = slice(None)
+    ) -> Float[np.ndarray, "rows nv"]:
+        """The load with the torque of each term."""
+        total = load.copy()
+        for part, own in zip(self.parts[1:], self._of_terms(theta), strict=True):
+            part.add(own, total, rows)
+        return total
+
+    def _of_terms(self, theta: Float[np.ndarray, " P"]) -> list[Float[np.ndarray, " k"]]:
+        """The coefficients of each term."""
+        return np.split(theta, np.cumsum([part.width for part in self.parts])[:-1])[1:]
 
     def shares(self, theta: Float[np.ndarray, " P"]) -> Iterator[Float[np.ndarray, "nN nv"]]:
-        """Torque of the rigid body with what it carries, then of each term."""
-        first = 0
-        for part in self.parts:
-            torque = part.torque(theta[first : first + part.width])
-            yield torque if first or self.carried is None else torque + self.known
-            first += part.width
+        """Torque of each term."""
+        for part, own in zip(self.parts[1:], self._of_terms(theta), strict=True):
+            yield part.torque(own)
 
     def response(self, omega: Float[Leaf, " F"]) -> Complex[np.ndarray, " F"] | Float[np.ndarray, " F"]:
         """Response of the torque sensor of all sensor effects together."""
@@ -164,20 +180,25 @@ def assembled(
     problem: Problem,
     start: State,
     causes: Sequence[Effect],
-    before: Callable[[State, Effect], State] = lambda state, effect: state,
+    grow: Callable[[State, Sequence[Effect]], State] | None = None,
 ) -> State:
-    """The state with all causes at their sizes, in their order; `before` is asked for the state that one comes into.
+    """The state with all causes at their sizes, in their order; `grow` adds the last of the causes so far, if not
+    `with_size`.
 
     A cause that follows all torque together is evaluated behind the others, whatever its place among them.
     """
     order = sorted(range(len(causes)), key=lambda k: type(causes[k]).follows_total)
-    state = start
-    for effect in (causes[k] for k in order):
-        state = before(state, effect)
-        grown = extended_state(problem, state, effect)
-        linear = [n for n, p in effect.parameters().items() if p.linear and kind(effect) == "columns"]
-        state = solved(problem, grown, np.append(state.theta, [float(getattr(effect, n)) for n in linear]))
+    state, ordered = start, [causes[k] for k in order]
+    for count, effect in enumerate(ordered, 1):
+        state = grow(state, ordered[:count]) if grow else with_size(problem, state, effect)
     return _rearranged(state, [k for k in order if kind(causes[k]) == "columns"])
+
+
+def with_size(problem: Problem, state: State, effect: Effect) -> State:
+    """The state with one more cause at its size."""
+    linear = [n for n, p in effect.parameters().items() if p.linear and kind(effect) == "columns"]
+    theta = np.append(state.theta, [float(getattr(effect, n)) for n in linear])
+    return solved(problem, extended_state(problem, state, effect), theta)
 
 
 def _rearranged(state: State, order: list[int]) -> State:

@@ -15,7 +15,7 @@ from .believed import believed, let_go
 from .comparison import FoldSums, Hypothesis, Verdicts, coefficients, grown_sums, judge
 from .design import kind
 from .problem import Problem
-from .state import State, assembled, extended_state, solved, whitened
+from .state import State, assembled, extended_state, solved, whitened, with_size
 
 __all__ = ["Step", "stand", "with_cause", "with_causes"]
 
@@ -54,7 +54,7 @@ def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], 
     """
     rows = whitened(problem, state, whitening)
     if before is not None and len(before.state.sensors) == len(state.sensors):
-        folded = grown_sums(rows, before.folded, rows.X)
+        folded = grown_sums(rows, before.folded, rows.X[:, :, before.folded.moment.shape[1] :])
     else:
         folded = problem.filtered.sums(rows)
     state = replace(state, prior=believed(problem, state.prior, folded))
@@ -72,14 +72,24 @@ def with_cause(problem: Problem, step: Step, effect: Effect, whitening: Float[np
     return stand(problem, extended_state(problem, base, effect), whitening)
 
 
-def with_causes(problem: Problem, start: State, causes: Sequence[Effect], whitening: Float[np.ndarray, "F nv"]) -> Step:
+def with_causes(
+    problem: Problem, start: State, causes: Sequence[Effect], whitening: Float[np.ndarray, "F nv"], keep: bool = False
+) -> Step:
     """All causes in at once, each at its size where it comes in.
 
     What follows the torque (a late sensor, friction by load) sees that of the coefficients of `start` and of the causes
-    before it; what follows all torque together (a drive at its limit), that of all causes.
+    before it; what follows all torque together (a drive at its limit), that of all causes. `keep`: other fits will have
+    the same first causes, up to some sensor.
     """
 
-    def solved_first(state: State, effect: Effect) -> State:
-        return state if kind(effect) == "columns" else stand(problem, state, whitening).state
+    def grow(state: State, first: Sequence[Effect]) -> State:
+        if kind(first[-1]) == "columns":
+            return with_size(problem, state, first[-1])
+        known = problem.begun.get(start, whitening, *first)
+        if known is None:
+            known = with_size(problem, stand(problem, state, whitening).state, first[-1])
+            if keep:
+                problem.begun.put(known, start, whitening, *first)
+        return known
 
-    return stand(problem, assembled(problem, start, causes, solved_first), whitening)
+    return stand(problem, assembled(problem, start, causes, grow), whitening)

@@ -22,6 +22,7 @@ WEIGHT_ROUNDS = 2  # of weights and spectrum in turn
 LOWEST_RESOLVED = 2.0  # periods in a recording: below that frequency the spectrum of the noise is held constant
 LOWEST_FREQUENCY = 0.02  # Hz, the same for long recordings
 WHITE_GAIN = 0.02  # relative fall of the folds' error in N m from which rows are weighted by their residual alone
+FEWER = (2.0, 4.0, 8.0, 16.0)  # rows of the answer's fit that may count as one beside what is believed of the links
 SAME_MOTION = 0.05  # of a joint's range (standard deviation): repeats that differ by more are none
 
 # The search (`contenders`, `gates`, `search`)
@@ -41,6 +42,7 @@ MOST_CAUSES = 16
 SHARE_AGAIN = 1.2  # times its share of its joints' squares when it failed: from here a candidate is tried again
 OVERLAP_ELSEWHERE = 0.2  # overlap up to which causes at other joints are taken in at once
 SIZE_REGION = 0.95  # of the region of a cause's amplitudes that must not hold zero
+SURE_DROP = 300.0  # squares that a cause removes from which no slow noise is asked whether it does as much
 ALPHA_OF_A_NAME = 0.2  # of alpha: what a name needs, for p is not uniform under coloured noise
 
 # Naming beside a rest (`naming`)
@@ -55,6 +57,7 @@ BY_CHANCE_UNSHOWN = 0.001  # the same where slices of the recordings that are fi
 RISES = 0.1  # p-value of a rise of the error of all rows kept out: below, the robot is predicted worse
 KEPT_OF_CLAIM = 1 / 3  # of what a cause takes in slices: what must be left of it in such a fall
 STANDS = SPEED_EDGES[1]  # of a joint's top speed: below, it stands, and its rows say nothing of a law of the motion
+BUYS = 0.01  # of the squares that a law of the whole robot removes: what it may surely cost a joint that moves
 LAW_LEAVES = 0.05  # of the squares that a cause removes: what may surely stay at its joints where no other has a misfit
 ALL_BUT = 0.1  # of the squares that a cause removes: what smooth functions may still find where it is all there is, and
 # what an amplitude that varies may surely gain
@@ -84,5 +87,6 @@ OWN_SHARE = 0.03  # of what a cause has removed: a rest at its own place that sp
 STANDSTILL = 0.08  # of a joint's top speed: rows at and around rest
 CARRIED = 1.0  # periods of the cutoff to which the row filter carries a stick
 LEAST_MOVING = 0.25  # of a joint's rows that must be far from rest, or they say nothing of how it moves
+ENOUGH_MOVING = 40  # independent rows far from rest that say enough, however long the joint stands
 LAW_WIDTHS = (0.04, 0.08)  # of a joint's top speed: friction of low speed that is looked for at rest
 LAW_AT_REST = 0.3  # of the squares at rest that it predicts: from there a law is missing, it is no stick

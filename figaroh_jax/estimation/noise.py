@@ -55,6 +55,12 @@ class Spectrum(NamedTuple):
         basis = _basis(np.clip(frequency, self.known, self.nyquist), self.nyquist)
         return np.exp(basis @ (self.coefficients + off))
 
+    def louder(self, times: Float[np.ndarray, " nv"]) -> Spectrum:
+        """The same spectrum of so many times the power at each joint."""
+        coefficients = self.coefficients.copy()
+        coefficients[0] += np.log(times)
+        return self._replace(coefficients=coefficients)
+
 
 def periodogram(
     rows: Float[np.ndarray, "samples *series"], rate: float, level: bool = False

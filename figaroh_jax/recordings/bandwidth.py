@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["motion_band", "smoothed"]
+__all__ = ["encoder_step", "motion_band", "smoothed"]
 
 ORDER = 3  # of the differences that smoothing holds small: gain 1 / (1 + (f / band)^(2 ORDER))
 STEPS = 2.0 ** (-np.arange(13) / 2)  # bands tried, as shares of the cutoff
@@ -19,26 +19,77 @@ WINDOW = 14.0  # Kaiser: what the motion leaks stays 100 dB below it
 CHANCE = 12.0  # times its mean: power that noise reaches at one frequency in a hundred thousand
 WORTH = 0.5  # share of the error in the acceleration at the cutoff below which a smaller band is taken
 FEWEST = 200  # samples from which a spectrum tells motion and noise apart
+FELT = 0.1  # of the noise's power: steps of less are lost in it
+FEW_VALUES = 20  # of a position: fewer are steps
+LINE = 3  # bins to either side to which the window spreads a line
+READINGS = 4  # of a motion by an encoder, each with its steps at another place
 
 
-def motion_band(position: Float[np.ndarray, " samples"], dt: float, cutoff: float) -> float:
+def motion_band(
+    position: Float[np.ndarray, " samples"], dt: float, cutoff: float, step: float = 0.0, rate: float | None = None
+) -> float:
     """Frequency (Hz, at most `cutoff`) up to which a position (rad or m, every `dt` s) holds more motion than noise.
 
-    The noise is taken as white in the position, at its level between one and two and a half times the cutoff.
+    The noise is taken as white in the position, at its level between one and two and a half times the cutoff, but
+    nowhere as less than what the `step` of an encoder makes of such a motion (`_stepping`). `rate` (Hz) is that of the
+    recording, where it is not 1/dt: above 0.4 of it the samples hold nothing.
     """
     if len(position) < FEWEST:
         return cutoff
     frequency, power = _position_spectrum(position, dt)
-    high = (frequency > cutoff) & (frequency < 2.5 * cutoff)
+    top = 2.5 * cutoff if rate is None else min(2.5 * cutoff, max(0.4 * rate, 1.1 * cutoff))
+    high = (frequency > cutoff) & (frequency < top)
     if not high.any():
         return cutoff
-    noise = float(power[high].mean())
     low = (frequency > 0) & (frequency < 2 * cutoff)
+    noise = np.full(int(low.sum()), float(power[high].mean()))
+    if step**2 / 12 > FELT * noise[0] * (rate or 1 / dt) * dt:
+        noise = np.maximum(noise, _stepping(position, dt, cutoff, step, rate or 1 / dt, frequency, power)[low])
     weight, motion = frequency[low] ** 4, np.where(power[low] > CHANCE * noise, power[low] - noise, 0.0)
     gain = 1 / (1 + (frequency[low] / (cutoff * STEPS[:, None])) ** (2 * ORDER))
     error = ((1 - gain) ** 2 * motion + gain**2 * noise) @ weight
     best = int(np.argmin(error))
     return float(cutoff * STEPS[best]) if error[best] < WORTH * error[0] else cutoff
+
+
+def encoder_step(position: Float[np.ndarray, " samples"]) -> float:
+    """Step of the encoder that a position was read from (its unit); zero where the samples do not show one.
+
+    The small distances between neighbours among the values that occur, where nearly all are whole multiples of them.
+    """
+    gaps = np.diff(np.unique(position))
+    if len(gaps) < FEW_VALUES:
+        return float(gaps.min()) if len(gaps) else 0.0
+    step = float(np.median(gaps[gaps <= 1.5 * np.quantile(gaps, 0.1)]))
+    off = np.abs(gaps / step - np.rint(gaps / step))
+    return step if np.mean(off < 0.1) > 0.9 else 0.0
+
+
+def _stepping(
+    position: np.ndarray, dt: float, cutoff: float, step: float, rate: float, frequency: np.ndarray, power: np.ndarray
+) -> Float[np.ndarray, " freqs"]:
+    """Power at each frequency of the error that an encoder's `step` makes of the position's own motion.
+
+    Slow motion makes a sawtooth of |v| / step Hz, whose lines stand far below the encoder's Nyquist frequency and far
+    above its mean error. So the motion, smoothed until no more than twice the variance of the steps (step^2 / 12) is
+    taken off, is read once more, at several places of its steps. The power of the errors is averaged over them and over
+    a fifth of the frequency, and is nowhere less than that of a line close by.
+    """
+    above = 2 * np.cumsum(power[::-1])[::-1] / len(position)
+    first = int(np.argmax(above <= 2 * step**2 / 12))
+    smooth = smoothed(position, dt, min(max(frequency[first], cutoff * STEPS[-1]), cutoff))
+    time = np.arange(len(smooth)) * dt
+    read = np.interp(np.arange(0, time[-1], 1 / rate), time, smooth)
+    window = np.kaiser(len(read), WINDOW)
+    offset = np.arange(READINGS)[:, None] / READINGS
+    error = step * (np.round(read / step + offset) - offset) - read
+    each = (np.abs(np.fft.rfft((error - error.mean(1, keepdims=True)) * window)) ** 2).mean(0) / (window**2).sum()
+    seen = np.interp(frequency, np.fft.rfftfreq(len(read), 1 / rate), each / (rate * dt), right=0.0)
+    whole, place = np.append(0.0, np.cumsum(seen)), np.arange(len(seen))
+    reach = np.maximum(place // 10, LINE)
+    begin, end = np.maximum(place - reach, 0), np.minimum(place + reach + 1, len(seen))
+    line = np.lib.stride_tricks.sliding_window_view(np.pad(seen, LINE), 2 * LINE + 1).max(1)
+    return np.maximum((whole[end] - whole[begin]) / (end - begin), line)
 
 
 def smoothed(position: Float[np.ndarray, " samples"], dt: float, band: float) -> Float[np.ndarray, " samples"]:

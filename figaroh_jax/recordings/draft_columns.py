@@ -37,9 +37,10 @@ _WORDS = {
     },
     "velocity": {"dq", "qd", "vel", "velocity", "velocities", "speed", "qdot", "v"},
     "current": {"i", "current", "currents", "cur", "amp", "amps", "percent", "load"},
-    "torque": {"tau", "torque", "torques", "effort", "efforts", "eff", "trq", "force", "j"},
+    "torque": {"tau", "torque", "torques", "effort", "efforts", "eff", "trq", "moment", "moments", "force", "j"},
     "position": {"q", "pos", "position", "positions", "angle", "angles", "theta", "state"},
 }
+_FEW_STEPS, _ALIKE = 20, 0.9  # rows of a clock, and the share of its steps that are alike
 _TIMES = ("t", "time", "timestamp", "timestamps", "stamp", "stamps", "sec", "seconds", "clock", "header.stamp")
 _CLOCKS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SLOW, _FAST = 15.0, 14000.0  # Hz; their ratio is below a thousand, so that one unit of time alone fits
@@ -220,12 +221,41 @@ def _time(table: Table) -> str:
     if not found and "received" in table.names:  # when a bag got a message that has no stamp of its own
         return "received"
     found = found or [n for n in table.names if set(_words(n)) & {*_TIMES} and not set(_words(n)) & {"des", "cmd"}]
+    if not found and len(rising := _rising(table)) == 1:
+        return rising[0]
     if len(found) != 1:
+        halves = [n for n in table.names if set(_words(n)) & _HALVES]
+        if halves and not found:
+            raise Undecided(
+                "rate",
+                f"{table.file}: {', '.join(halves)} are parts of a time; write their sum into one column 'time', in s"
+                " from the recording's beginning, or give --rate HZ",
+            )
         what = f"several columns look like one: {', '.join(found)}" if found else "no column looks like one"
         raise Undecided(
             "rate", f"{table.file}: which column is the time? {what}; give --rate HZ, or rename it to 'time'"
         )
     return found[0]
+
+
+_HALVES = {"secs", "nsec", "nsecs", "nanosec", "nanosecs", "usec", "usecs"}
+
+
+def _rising(table: Table) -> list[str]:
+    """Columns that run as a clock does, whatever they are called: up from row to row, mostly by the same step."""
+    out = []
+    for name in table.names:
+        try:
+            values = np.asarray(table.read(name), float)
+        except (InputError, TypeError, ValueError):
+            continue
+        steps = np.diff(values) if values.ndim == 1 else np.zeros(0)
+        if len(steps) < _FEW_STEPS or not (steps >= 0).all() or not (steps > 0).mean() > _ALIKE:
+            continue
+        step = float(np.median(steps))
+        if np.mean(np.abs(steps - step) <= 0.5 * step) > _ALIKE:
+            out.append(name)
+    return out
 
 
 def _stamps(
@@ -236,8 +266,15 @@ def _stamps(
         assert rate is not None
         return np.arange(samples) / rate, entry | {"rate": rate}
     time = table.vector(clock, "time")
-    if len(time) != samples or not (np.diff(time) > 0).all():
-        raise InputError(f"{table.file}: '{clock}' is not the positions' clock: it does not increase, or is shorter")
+    if len(time) != samples:
+        raise InputError(f"{table.file}: '{clock}' is not the positions' clock: it has {len(time)} rows of {samples}")
+    back = np.flatnonzero(~(np.diff(time) > 0))
+    if len(back):
+        row = back[0] + 1
+        raise InputError(
+            f"{table.file}: '{clock}' is no clock of the positions: in row {row} (from 0) it is {time[row]:.9g} after"
+            f" {time[row - 1]:.9g}, and the stamps must increase"
+        )
     step = float(np.median(np.diff(time)))
     unit = next((u for u, s in _CLOCKS.items() if _SLOW <= 1 / (step * s) <= _FAST), None)
     if unit is None:

@@ -12,10 +12,23 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["Grid", "band_limited", "differentiate", "even_grid", "sampling_rate", "stencil", "to_recording_times"]
+__all__ = [
+    "Grid",
+    "band_limited",
+    "differentiate",
+    "even_grid",
+    "sampling_rate",
+    "stencil",
+    "to_recording_times",
+    "unrounded",
+]
 
 EVEN = 0.02  # stamps within this share of a step of a straight line count as even
 GAP_STEPS = 5
+STAMP = 1e-7  # s: stamps are not told apart below it
+FEW_STAMPS = 20  # from which rounding is told from chance
+ON_LATTICE = 0.01  # of the lattice of stamps: where they stand on it
+ROUNDED = 0.75  # of the lattice: how far from it the clock may be (half, and what the line's own fit is off)
 _SAME = 9  # decimals, in samples: instants that lie so close between samples have one kernel
 _AT_ONCE = 1 << 22  # weights of an interpolation that are held at once
 STOP_BAND = 100.0  # dB
@@ -36,6 +49,31 @@ def sampling_rate(time: Float[np.ndarray, " samples"]) -> float:
     """Rate in Hz: of the mean step where the stamps are even, else of the median step."""
     steps = np.diff(time)
     return float(1 / (steps.mean() if _is_even(time) else np.median(steps)))
+
+
+def unrounded(time: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+    """Stamps (s) of an even clock whose logger has rounded them, as that clock had them; all others as they are.
+
+    Whole milliseconds of 240 Hz are 4, 4, 4, 4, 4, 5, ...: taken at their word, they shake the position by its
+    velocity times half a millisecond. They count as rounded where all stand on a lattice, off which one even clock lies
+    nowhere by more than rounding. Samples may be missing.
+    """
+    steps = np.diff(time)
+    if len(time) < FEW_STAMPS or _is_even(time) or not (steps > 0).all():
+        return time
+    lattice = float(steps.min())
+    different = np.unique(np.round(steps / STAMP)) * STAMP
+    if len(different) > 1:
+        lattice = min(lattice, float(np.diff(different).min()))
+    ticks = (time - time[0]) / lattice
+    if np.abs(ticks - np.rint(ticks)).max() > ON_LATTICE:
+        return time
+    for step in (np.median(steps), steps.mean()):
+        count = np.append(0.0, np.cumsum(np.maximum(np.rint(steps / step), 1)))
+        period, start = np.polyfit(count, time, 1)
+        if np.abs(time - (start + period * count)).max() < ROUNDED * lattice:
+            return start + period * count
+    return time
 
 
 def _is_even(time: Float[np.ndarray, " samples"]) -> bool:

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..errors import InputError
-from .bandwidth import motion_band, smoothed
+from .bandwidth import encoder_step, motion_band, smoothed
 from .cleaning import near, without_untrusted
 from .dataset import Recording
 from .groupmotion import continued, group_rates, normalised
-from .resampling import Grid, band_limited, differentiate, even_grid, sampling_rate, to_recording_times
+from .resampling import Grid, band_limited, differentiate, even_grid, sampling_rate, to_recording_times, unrounded
 from .rowfilter import RowFilter, fast_length, filter_rows, frequencies, low_pass, row_filter
 
 if TYPE_CHECKING:
@@ -51,6 +51,8 @@ MOST_WORKING, LONG = 16.0, 40_000  # the same at the most, where all recordings 
 ROWS = 3.3  # output rate over cutoff
 MOST_NUMBERS = 1 << 25  # of one signal at the working rate: 256 MiB, hours of a robot
 FEWEST_ROWS = 10
+STALE = 0.1  # of the samples: more that repeat the one before are those of a robot that stands
+MOST_STALE = 3  # of them in a row
 STILL = 1e-12  # of rad or m: what a joint that stands still moves by rounding
 
 
@@ -144,7 +146,7 @@ def prepare(
     if grouped is not None:
         position = continued(grouped, position, str(recording.file))
     _refuse_endless(recording, time, rates)
-    known = {} if resampled is None else resampled
+    known, raw = {} if resampled is None else resampled, position
     if key not in known:
         grid = even_grid(time, position, *([] if torque is None else [torque]))
         known[key] = grid.rate, grid.gaps, *_resample(grid, rates, shift)
@@ -160,7 +162,9 @@ def prepare(
             f" after {trim} s are cut at both ends, at least {FEWEST_ROWS} are needed"
         )
     if grouped is None:
-        position = (_motion if slowed else low_pass)(columns[0], dt, rates.cutoff)
+        position = (
+            _motion(columns[0], dt, rates.cutoff, raw, rate) if slowed else low_pass(columns[0], dt, rates.cutoff)
+        )
         moves = np.ptp(position, axis=0) > STILL * (1 + np.abs(position).max(axis=0))
         position[:, ~moves] = position[0, ~moves]  # dry friction would see the sign of rounding
         velocity, acceleration = (differentiate(position, dt, order=order) * moves for order in (1, 2))
@@ -204,11 +208,16 @@ def _refuse_endless(recording: Recording, time: Float[np.ndarray, " samples"], r
     )
 
 
-def _motion(position: Float[np.ndarray, "samples nv"], dt: float, cutoff: float) -> Float[np.ndarray, "samples nv"]:
-    """The position of each joint without what lies above its cutoff, or above its motion where that is slower."""
+def _motion(
+    position: Float[np.ndarray, "samples nv"], dt: float, cutoff: float, raw: Float[np.ndarray, "read nv"], rate: float
+) -> Float[np.ndarray, "samples nv"]:
+    """The position of each joint without what lies above its cutoff, or above its motion where that is slower.
+
+    `raw` are the samples as they were read, at `rate` (Hz): they show the steps of the encoder.
+    """
     out = low_pass(position, dt, cutoff)
     for joint, column in enumerate(position.T):
-        band = motion_band(column, dt, cutoff)
+        band = motion_band(column, dt, cutoff, encoder_step(raw[:, joint]), rate)
         if band < cutoff:
             out[:, joint] = smoothed(column, dt, band)
     return out
@@ -222,7 +231,7 @@ def choose_rates(recordings: Sequence[Recording], preprocess: Preprocess) -> Rat
     times the cutoff, because differences and friction signs need the finer samples, and is 13.2 times the cutoff for
     long data that it would else sample more than 16 times as fast.
     """
-    raw, file = min((sampling_rate(recording.time), str(recording.file)) for recording in recordings)
+    raw, file = min((sampling_rate(unrounded(recording.time)), str(recording.file)) for recording in recordings)
     cutoff = preprocess.cutoff or min(DEFAULT_CUTOFF, 0.2 * raw)
     if cutoff >= raw / 2:
         raise InputError(
@@ -244,7 +253,10 @@ def choose_rates(recordings: Sequence[Recording], preprocess: Preprocess) -> Rat
 
 def _window(recording: Recording, window: tuple[float, float] | None):
     """The part of a recording that is kept."""
-    time, position, torque = recording.time, recording.position, recording.torque
+    time, position, torque = unrounded(recording.time), recording.position, recording.torque
+    if torque is not None:
+        new = _new_samples(position, torque)
+        time, position, torque = time[new], position[new], torque[new]
     if window is None:
         return time, position, torque
     keep = (time >= window[0]) & (time <= window[1])
@@ -254,6 +266,21 @@ def _window(recording: Recording, window: tuple[float, float] | None):
             f" which lasts from {time[0]:g} to {time[-1]:g} s"
         )
     return time[keep], position[keep], None if torque is None else torque[keep]
+
+
+def _new_samples(
+    position: Float[np.ndarray, "samples nv"], torque: Float[np.ndarray, "samples nv"]
+) -> Bool[np.ndarray, " samples"] | slice:
+    """The samples that are not, number by number, what stood there a sample before, where such ones are few.
+
+    A logger that is faster than its robot, or has missed a message, writes the last one again under a new stamp: the
+    position stands still for a sample and then leaps.
+    """
+    again = np.append(False, ((np.diff(position, axis=0) == 0) & (np.diff(torque, axis=0) == 0)).all(axis=1))
+    begin, end = (np.flatnonzero(np.diff(np.append(np.append(0, again), 0)) == step) for step in (1, -1))
+    for first, after in zip(begin, end, strict=True):
+        again[first:after] &= after - first <= MOST_STALE  # longer, it stands
+    return ~again if 0 < again.mean() < STALE else slice(None)
 
 
 def _resample(grid: Grid, rates: Rates, shift: float):

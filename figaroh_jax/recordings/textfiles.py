@@ -1,6 +1,7 @@
 """Text tables: any delimiter, header rows, units and comments above the numbers, decimal commas, ISO times.
 
-The file is read in blocks of whole lines, so that only the numbers are ever held, and progress is told.
+The file is read in blocks of whole lines, so that only the numbers are ever held, and progress is told. A row that was
+written twice, stamp and all, is read once.
 """
 
 from __future__ import annotations
@@ -173,7 +174,17 @@ def _read(file: Path, layout: _Layout) -> tuple[Float[np.ndarray, "rows columns"
             told(f"reading {file.name}", share)
     if not row:
         raise InputError(f"{file} is not a table of numbers with a header line: there is no row below its header")
-    return np.concatenate(parts), texts
+    return _without_repeats(np.concatenate(parts), texts), texts
+
+
+def _without_repeats(
+    numbers: Float[np.ndarray, "rows columns"], texts: dict[int, list[str]]
+) -> Float[np.ndarray, "some columns"]:
+    """The rows without those that were written twice, where a column that else rises shows that they were."""
+    again = np.append(False, (numbers[1:] == numbers[:-1]).all(axis=1))
+    if texts or not again.any() or not (np.diff(numbers[~again], axis=0) > 0).all(axis=0).any():
+        return numbers
+    return numbers[~again]
 
 
 def _fast(block: str, layout: _Layout) -> np.ndarray | None:

@@ -81,8 +81,13 @@ def torques_on_host(
         check_shapes(model, q=q, v=v, a=a)
         rows = two_axes(q, v, a, host=True)
         if (code := machine_code(_TORQUES, model, *rows)) is not None:
-            return code(own_room, *rows).reshape(*q.shape[:-1], model.nv)
+            return code(_heap_room, *rows).reshape(*q.shape[:-1], model.nv)
     return np.asarray(inverse_dynamics(model, q, v, a))
+
+
+def _heap_room(shape: tuple[int, ...], fill: float | None) -> np.ndarray:
+    """Memory that the process has already: answers of many sizes follow one another, and new pages cost as much."""
+    return np.empty(shape) if fill is None else np.zeros(shape)
 
 
 def joint_torques(

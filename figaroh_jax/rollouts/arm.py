@@ -21,7 +21,7 @@ from .faults import Fault, faults, without
 from .fit import Fit, fit, spread_of_recordings
 from .gates import Slight, checked, gained, in_order, needless, replaced, rms_of, standing, still_needed, worthy
 from .parameters import put, values
-from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_of_entry, outputs, tried_now
+from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_of_entry, outputs, sprung_now, tried_now
 from .search import Model, Named, Search, Tried, judged_by_colour, sized, t_of
 from .sensitivity import predicted
 from .setting import Setting, Structure, begins_of, begun, by_recording, evened, free_entries, level_of, thinned
@@ -296,6 +296,8 @@ def _round(
         if chosen[0].candidate.kind.usual:  # what every joint has is found at all of them at once
             chosen = [one for one in firsts if one.candidate.kind.usual]
         new = _named(here, now, lists, chosen, found)
+        if new is not None and now.excess.max() < 1.0:
+            new = _beside_springs(here, now, lists, new, found, forbid)
         if new is not None:
             kept, now = new
             break
@@ -311,6 +313,21 @@ def _round(
             for one in close
         ]  # fmt: skip
     return kept, now, nearest
+
+
+def _beside_springs(
+    here: Setting, now: Standing, lists: dict[int, list[Tried]], new: tuple[list[Named], Standing],
+    found: Sequence[Named], forbid: Sequence[str],
+) -> tuple[list[Named], Standing] | None:  # fmt: skip
+    """What is to be named though noise alone is left: springs, which are not looked for there, may explain more."""
+    named, model = new
+    springs = sorted(sprung_now(here, now, forbid), key=lambda one: one.state.fit.squares)
+    squares = model.model.fit.squares
+    if springs and springs[0].state.fit.squares < squares - NO_CHOICE:
+        return _named(here, now, lists, springs[:1], found)
+    alike = [one.candidate for one in springs if one.state.fit.squares < squares + NO_CHOICE]
+    told = tuple(Name(c.effect, c.at) for c in alike)
+    return [n._replace(alike=tuple(dict.fromkeys([*n.alike, *told]))) for n in named], model
 
 
 def _named(

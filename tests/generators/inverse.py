@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -82,6 +82,52 @@ def make_case(
     `sensors.COLOURS`; `holdout` adds one more trajectory with that role; `trusted` makes the true inertials 1 % off
     instead of 5 %; `motion` goes to `motion.excitation` (amplitude, speed, harmonics).
     """
+    drawn = draw_case(effects, robot, trajectories, seed, holdout=holdout, trusted=trusted, duration=duration, **motion)
+    return record_case(drawn, repeats, noise, colour=colour, encoder_step=encoder_step)
+
+
+def record_case(
+    drawn: Drawn, repeats: int = 2, noise: float = 1.0, *, colour: str = "ar20", encoder_step: float = 1e-5
+) -> Case:
+    """The recordings of what was drawn, once: its random numbers go on from there."""
+    made, model, hidden = drawn.robot, drawn.model, drawn.hidden
+    runs = _runs(made, model, drawn.motions, len(drawn.fit), repeats, drawn.time, hidden, drawn.rng)
+    recordings = noisy(runs, drawn.rng, noise, colour, encoder_step)
+    truth = tuple(Truth(h.effect, h.at, h.parameters(h.scale)) for h in hidden)
+    induced = {h.effect: _size(made, model, drawn.fit, drawn.time, h) for h in hidden} if noise == 0 else {}
+    trust = 0.02 if drawn.trusted else 0.10
+    for h in hidden:
+        model = h.change(model, h.scale) if h.change else model
+    links = tuple(tuple(robots.ten(model, j).tolist()) for j in range(model.nv))
+    return Case(made.name, made.urdf, made.joints, recordings, truth, trust, drawn.seed, induced, links=links)
+
+
+class Drawn(NamedTuple):
+    """What a case is made of, before anything is recorded."""
+
+    robot: robots.Robot
+    model: pin.Model  # as it really is, without the effects
+    motions: list[Motion]
+    fit: list[Motion]  # those that are not held out
+    time: np.ndarray
+    hidden: list[Hidden]
+    trusted: bool  # whether the inertials are well known
+    seed: int
+    rng: np.random.Generator  # of the recordings
+
+
+def draw_case(
+    effects: Sequence[Wanted] = (),
+    robot: str = "tx40",
+    trajectories: int = 3,
+    seed: int = 0,
+    *,
+    holdout: bool = False,
+    trusted: bool | None = None,
+    duration: float = PERIOD,
+    **motion: Any,
+) -> Drawn:
+    """What `make_case` records."""
     wanted, trusted = choose(effects, trusted)
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
     made = robots.load(robot)
@@ -90,15 +136,7 @@ def make_case(
     time = scene.grid(duration)
     fit = motions[:trajectories]
     hidden = [hide(made, model, fit, time, streams[2], *item) for item in wanted]
-    runs = _runs(made, model, motions, trajectories, repeats, time, hidden, streams[3])
-    recordings = noisy(runs, streams[3], noise, colour, encoder_step)
-    truth = tuple(Truth(h.effect, h.at, h.parameters(h.scale)) for h in hidden)
-    induced = {h.effect: _size(made, model, fit, time, h) for h in hidden} if noise == 0 else {}
-    trust = 0.02 if trusted else 0.10
-    for h in hidden:
-        model = h.change(model, h.scale) if h.change else model
-    links = tuple(tuple(robots.ten(model, j).tolist()) for j in range(model.nv))
-    return Case(robot, made.urdf, made.joints, recordings, truth, trust, seed, induced, links=links)
+    return Drawn(made, model, motions, fit, time, hidden, trusted, seed, streams[3])
 
 
 def observable(truth: Truth) -> set[tuple[str, tuple[str, ...]]]:
