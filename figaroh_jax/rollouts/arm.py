@@ -107,8 +107,9 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
     found, now, slight = still_needed(here, found, now, begin)
     found, now = _alike(here, found, now) if slight is None else (found, now)
     even = by_recording(whole) and bool(found) and now.excess.max() >= 1.0
-    progress("looking for a table", 0.92)
-    whole, resting = _off_the_table(whole, now.model) if now.excess.max() >= 1.0 and found else (whole, [])
+    if even:  # beside a rest alone: noise leaves nothing to a table
+        progress("looking for a table", 0.92)
+    whole, resting = _off_the_table(whole, now.model) if even else (whole, [])
     wrong = [x for x in wrong if not any(_same_place(x, y) for y in resting)]
     if whole is not here:
         progress("fitting all that was recorded", 0.95)
