@@ -70,9 +70,8 @@ def run(
     found = (search if whole else search_arm)(here, forbid=left_out)
     names = {(n.candidate.effect, *n.candidate.at) for n in found.named}
     alike = {(a.effect, *a.at) for n in found.named for a in n.alike}
-    truth = {(effect, "payload" if effect == "payload" else servo_arm6.NAMES[j]) for effect, j, _ in hidden}
-    told = {(e, "payload" if e == "payload" else place) for e, place in names}
-    also = {(e, "payload" if e == "payload" else place) for e, place in alike}
+    truth = {(effect, *_place(effect, j)) for effect, j, _ in hidden}
+    told, also = ({_any_link(name) for name in some} for some in (names, alike))
     if left_out:
         word = "right" if found.verdict == "unknown" else "wrong" if names else "missed"
     elif not hidden:
@@ -83,24 +82,42 @@ def run(
         word = "missed" if found.verdict == "nothing" else "unknown"
     else:
         word = "part" if told < truth else "wrong"
-    names_text = "+".join(f"{e}({p})" for e, p in sorted(names)) or "-"
-    names_text += "".join(f" alike {e}({p})" for e, p in sorted(alike))
-    proxy = "+".join(f"{n.candidate.effect}({n.candidate.at[0]})" for n in found.proxy) or "-"
+    names_text = "+".join(_text(name) for name in sorted(names)) or "-"
+    names_text += "".join(f" alike {_text(name)}" for name in sorted(alike))
+    proxy = "+".join(f"{n.candidate.effect}({', '.join(n.candidate.at)})" for n in found.proxy) or "-"
     levels = " -> ".join(f"{x:.3f}" for _, x in found.table)
     return word, f"{found.verdict} {names_text}, chi2/N {levels}, proxy {proxy}", time.process_time() - start
 
 
-def _true(named: Named, truth: set[tuple[str, str]]) -> bool:
+def _place(effect: str, joint: int) -> tuple[str, ...]:
+    """Where a hidden effect is to be named."""
+    own = {"payload": ("payload",), "gravity_tilt": (), "coupled_transmission": servo_arm6.NAMES[joint : joint + 2]}
+    return tuple(own.get(effect, (servo_arm6.NAMES[joint],)))
+
+
+def _any_link(name: tuple[str, ...]) -> tuple[str, ...]:
+    """A payload may be named at any link: the arm's last ones move alike."""
+    return ("payload", "payload") if name[0] == "payload" else name
+
+
+def _text(name: tuple[str, ...]) -> str:
+    return f"{name[0]}({', '.join(name[1:])})"
+
+
+def _true(named: Named, truth: set[tuple[str, ...]]) -> bool:
     """Whether a name, or one that it is told to be alike, is hidden."""
     told = [(named.candidate.effect, *named.candidate.at), *((a.effect, *a.at) for a in named.alike)]
-    return any((e, "payload" if e == "payload" else place) in truth for e, place in told)
+    return any(_any_link(name) in truth for name in told)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument(
-        "--effects", nargs="+", choices=["none", *servo_arm6.EFFECTS], default=["none", *servo_arm6.EFFECTS]
+        "--effects",
+        nargs="+",
+        choices=["none", *servo_arm6.EFFECTS, *servo_arm6.MORE],
+        default=["none", *servo_arm6.EFFECTS],
     )
     parser.add_argument("--sizes", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--noise", choices=["white", "coloured", "counts"], default="white")
@@ -127,7 +144,9 @@ def _cases(args: argparse.Namespace, rng: np.random.Generator) -> list[list[tupl
     def one(effect: str, size: int) -> tuple[str, int, float]:
         sprung = effect in ("joint_elasticity", "backlash")  # the wrist's roll is too light for a spring at 2 ms
         joint = 5 if effect == "payload" else int(rng.integers(0, 4 if sprung else 5))
-        return effect, joint, servo_arm6.EFFECTS[effect][size]
+        if effect in ("torque_ripple", "coupled_transmission"):  # the roll and the jaw do not move far enough
+            joint = int(rng.integers(0, 4))
+        return effect, joint, (servo_arm6.EFFECTS | servo_arm6.MORE)[effect][size]
 
     if args.own:
         return [[("detent", int(rng.integers(0, 5)), servo_arm6.DETENT[size])] for size in args.sizes]

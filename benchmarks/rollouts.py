@@ -3,6 +3,7 @@
     python benchmarks/rollouts.py servo_miuzei      # a hobby servo with a weight: train, test and all other runs
     python benchmarks/rollouts.py dfki_double_pendulum --window 0.3
     python benchmarks/rollouts.py so101_sage [--third K] [--again] [--uncut]  # a 6-joint servo arm
+    python benchmarks/rollouts.py so101_thirds [--processes 4]  # all of it, and without each third of the recordings
     python benchmarks/rollouts.py so101_speed                   # CPU seconds of sensitivities: arm and joints
 
 Data under the folder that FIGAROH_JAX_DATA names. It prints the RMS of the position error, rad, after each cause, on
@@ -12,18 +13,20 @@ runs that were fitted and on runs that were not, each simulated from its first m
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import json
 import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 
-import figaroh_jax as fj
 from figaroh_jax.rollouts.alone import alone, carried_by
 from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.data import Run, Stretch, windows
@@ -35,6 +38,7 @@ from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.search import Search, search
 from figaroh_jax.rollouts.sensitivity import linear_sums
 from figaroh_jax.rollouts.setting import Setting, setting
+from figaroh_jax.rollouts.table import on_table
 from figaroh_jax.rollouts.task import simulated
 
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", "/data"))
@@ -191,8 +195,8 @@ def so101_sage(
     forbid: list[str],
     again: bool = False,
     uncut: bool = False,
-) -> None:
-    """Gains and viscous friction of every servo are fitted; what else the arm shows is sought.
+) -> tuple[Search, float]:
+    """Gains and viscous friction of every servo are fitted; what else it shows is sought: with the unseen RMS, mrad.
 
     `uncut`: with the rows that touch the table, of the late clock and of the held wrist, which are cut by hand else.
     """
@@ -238,8 +242,66 @@ def so101_sage(
         "friction 1e-4, armature .15": so101_loop(friction=1e-4, armature=0.15),
         "friction .35, kp 48, armature .05": so101_loop(friction=0.35, kp=48.0, armature=0.05),
     }
-    for label, model in models.items():
-        show_motions(label, model, [_shorter(r, unseen) for r in so101_runs(TEST)])
+    rms = {
+        label: show_motions(label, model, [_shorter(r, unseen) for r in so101_runs(TEST)])
+        for label, model in models.items()
+    }
+    return found, rms["with the causes"]
+
+
+class Part(NamedTuple):
+    """What the arm's recordings say, all of them or without a third."""
+
+    verdict: str
+    names: list[str]  # in the order in which they were found
+    sizes: dict[str, tuple[float, float]]  # of the numbers of the named causes: value, half of the 95 % interval
+    unseen: float  # mrad
+    seconds: float  # CPU
+
+
+def so101_part(third: int | None, folder: str | None) -> Part:
+    """The arm's whole recordings without a third of them; everything that is found goes to a file of its own."""
+    name = "whole" if third is None else f"without_{third + 1}"
+    out = contextlib.nullcontext() if folder is None else (Path(folder) / f"so101_{name}.txt").open("w", buffering=1)
+    with out as file, contextlib.redirect_stdout(file or sys.stdout):
+        start = time.process_time()
+        found, unseen = so101_sage(list(TRAIN), third, 999.0, 999.0, [])
+        seconds = time.process_time() - start
+    last, sizes, names = found.last, {}, []
+    for one in found.named or found.proxy:
+        place = one.candidate.at[0] if one.candidate.at else "all"
+        alike = f" (or {', '.join(a.effect for a in one.alike)})" if one.alike else ""
+        names.append(f"{one.candidate.effect} {place}{alike}")
+        for entry in one.candidate.entries:
+            column = int(np.flatnonzero(last.free == entry)[0])
+            half = float("nan") if found.spread is None else 1.96 * found.spread[column]
+            sizes[f"{found.structure.table[entry].name} {place}"] = float(last.theta[entry]), float(half)
+    return Part(found.verdict, names, sizes, unseen, seconds)
+
+
+def so101_thirds(processes: int, folder: str | None) -> None:
+    """All recordings whole, and without each third of them: what is named each time, and whether the sizes agree."""
+    thirds = (None, 0, 1, 2)
+    if processes > 1:
+        from concurrent.futures import ProcessPoolExecutor
+        from multiprocessing import get_context
+
+        with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+            parts = list(pool.map(so101_part, thirds, [folder] * 4))
+    else:
+        parts = [so101_part(third, folder) for third in thirds]
+    labels = ("the whole set", "without the first third", "without the second", "without the third")
+    for label, one in zip(labels, parts, strict=True):
+        print(f"{label}: {one.verdict}, unseen {one.unseen:.2f} mrad, {one.seconds:.0f} CPU s; {'; '.join(one.names)}")
+    whole = parts[0].sizes
+    for name in dict.fromkeys(k for one in parts for k in one.sizes):
+        told = [f"{x[0]:.4g} +- {x[1]:.2g}" if (x := one.sizes.get(name)) else "-" for one in parts]
+        beyond = [
+            abs(one.sizes[name][0] - whole[name][0]) > whole[name][1]
+            for one in parts[1:]
+            if name in one.sizes and name in whole
+        ]
+        print(f"  {name:<28} {' | '.join(told)}{'; beyond the interval of all' if any(beyond) else ''}")
 
 
 def _rough_arm() -> Loop:
@@ -249,25 +311,40 @@ def _rough_arm() -> Loop:
     return eqx.tree_at(lambda m: (m.joints.friction, m.joints.damping), loop, (friction, damping))
 
 
+FREE = {
+    **{name: WHOLE for name in [*TRAIN, *TEST] if name not in ("large_amplitude", "hold_under_gravity")},
+    "large_amplitude": ((0.0, 30.0), (60.0, 100.0)), "hold_under_gravity": ((0.0, 24.0),),
+}  # fmt: skip
+
+
 def so101_contact() -> None:
-    """Where the arm rests: how much higher its end stands than the roughly fitted model's, free and on the table."""
-    loop, still = _rough_arm(), []
-    table = {"hold_under_gravity": ((14.0, 24.0), (24.5, 34.0), (36.5, 46.0)),
-             "large_amplitude": ((30.5, 35.0), (53.0, 59.0), (101.0, 110.0))}  # fmt: skip
-    for run in so101_runs(dict.fromkeys([*TRAIN, *TEST], WHOLE)):
-        read = simulated(loop, run)
-        both = np.stack([run.position, read])
-        seen, model = np.asarray(fj.frame_placement(loop.robot, both, "gripperframe"))[..., 2, 3]
-        higher, rate = 1e3 * (seen - model), np.abs(np.gradient(run.position, PERIOD, axis=0))
-        slow = np.stack([np.convolve(x, np.ones(30) / 30, "same") for x in rate.T], 1)[:, 1:5].max(1) < 0.02
-        touches = np.zeros(len(slow), bool)
-        for first, last in table.get(run.name, ()):
-            part = (run.time >= first) & (run.time <= last)
-            touches |= (run.time >= first - 2.0) & (run.time <= last + 2.0)
-            print(f"{run.name}, on the table {first:g} to {last:g} s: {np.median(higher[part]):.1f} mm higher")
-        still.append(np.abs(higher[slow & ~touches & (run.time < 108)]))
-    levels = np.quantile(np.concatenate(still), [0.5, 0.9, 1.0])
-    print(f"at rest elsewhere, either way: median {levels[0]:.1f}, 90 % {levels[1]:.1f}, largest {levels[2]:.1f} mm")
+    """Where the arm's end rests on the table: all recordings, and those that are free with models that are wrong."""
+    loop = _rough_arm()
+    scaled = lambda of, share: eqx.tree_at(of, loop, share * np.asarray(of(loop)))  # noqa: E731
+    friction, gain = (lambda m: m.joints.friction), (lambda m: m.drives.scale)
+    heavy = np.where(np.arange(len(loop.robot.joints)) == 4, 2.0, 1.0)[:, None]
+    wrong = {
+        "roughly fitted": loop,
+        "as stated": so101_loop(),
+        "half the friction": scaled(friction, 0.5),
+        "half as much more": scaled(friction, 1.5),
+        "no friction": scaled(friction, 0.02),
+        "gains of .7": scaled(gain, 0.7),
+        "gains of 1.4": scaled(gain, 1.4),
+        "a gripper without mass": scaled(lambda m: m.robot.inertia, np.where(heavy > 1, 0.01, 1.0)),
+        "a gripper of twice the mass": scaled(lambda m: m.robot.inertia, heavy),
+    }
+    cases = [("all recordings", loop, dict.fromkeys([*TRAIN, *TEST], WHOLE)), *((k, m, FREE) for k, m in wrong.items())]
+    for label, model, which in cases:
+        start, runs = time.process_time(), so101_runs(which)
+        table = on_table(model, runs)
+        label = label if which is not FREE else f"free motions, {label}"
+        told = [] if table is None else [(x, table.height) for x in table.stretches]
+        print(
+            f"{label}: {len(told) or 'no'} contacts with a table, {time.process_time() - start:.1f} CPU s", flush=True
+        )
+        for x, height in told:
+            print(f"  {runs[x.run].name}, {x.first:.1f} to {x.last:.1f} s: {x.force:.2g} N, {1e3 * height:.0f} mm")
 
 
 def so101_faults() -> None:
@@ -309,13 +386,14 @@ def _sums_seconds(loop: Loop, here: Setting, theta: np.ndarray, free: np.ndarray
     return min(found[1:])
 
 
-def show_motions(label: str, model: Loop, runs: list[Run]) -> None:
-    """RMS by motion and joint, mrad, each simulated from its first position and its command alone."""
+def show_motions(label: str, model: Loop, runs: list[Run]) -> float:
+    """RMS by motion and joint, mrad, each simulated from its first position and its command alone; their mean."""
     rms = np.array(
         [1e3 * np.sqrt(np.mean((simulated(model, r)[:, :5] - r.position[:, :5]) ** 2, axis=0)) for r in runs]
     )
     each = ", ".join(f"{r.name} {x.mean():.2f}" for r, x in zip(runs, rms, strict=True))
     print(f"{label:<34} unseen {rms.mean():6.2f} mrad, by joint {np.round(rms.mean(0), 1)}; {each}", flush=True)
+    return float(rms.mean())
 
 
 def _shorter(run: Run, most: float) -> Run:
@@ -343,7 +421,15 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "data",
-        choices=["servo_miuzei", "dfki_double_pendulum", "so101_sage", "so101_speed", "so101_faults", "so101_contact"],
+        choices=[
+            "servo_miuzei",
+            "dfki_double_pendulum",
+            "so101_sage",
+            "so101_thirds",
+            "so101_speed",
+            "so101_faults",
+            "so101_contact",
+        ],
     )
     parser.add_argument("--window", type=float, default=0.3, help="s, of the double pendulum")
     parser.add_argument("--law", choices=["hard", "soft"], default="hard")
@@ -355,8 +441,12 @@ if __name__ == "__main__":
     parser.add_argument("--forbid", nargs="*", default=[], help="effects that the arm's search leaves out")
     parser.add_argument("--uncut", action="store_true", help="the arm's recordings with their faulty rows")
     parser.add_argument("--again", action="store_true", help="the arm's search a second time, everything compiled")
+    parser.add_argument("--processes", type=int, default=4, help="of so101_thirds, one thread each")
+    parser.add_argument("--out", help="folder for all that so101_thirds finds")
     args = parser.parse_args()
-    if args.data == "so101_speed":
+    if args.data == "so101_thirds":
+        so101_thirds(args.processes, args.out)
+    elif args.data == "so101_speed":
         so101_speed()
     elif args.data == "so101_contact":
         so101_contact()

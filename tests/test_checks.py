@@ -56,6 +56,19 @@ def test_right_recordings_pass_in_silence(seed: int, tmp_path: Path):
     assert said(Base("run", robot, arrays, entry), None, tmp_path) == ("silent", "")
 
 
+def test_an_absolute_value_is_refused_as_a_torque(tmp_path: Path):
+    """The size of the torques of an arm of three joints; the same without the rows near zero may be gravity's."""
+    case = make_case(robot="small", repeats=1, trajectories=1, seed=2)
+    (tmp_path / "robot.urdf").write_text(case.urdf)
+    run = case.recordings[0]
+    entry = {"time": "t", "position": "q", "torque": "tau"}
+    robot: dict[str, Any] = {"model": str(tmp_path / "robot.urdf"), "joints": list(case.joints)}
+    for more, refused in ((0.0, True), (20.0, False)):
+        arrays = {"t": run["time"], "q": run["position"], "tau": np.abs(run["torque"]) + more}
+        what, text = said(Base("run", robot, arrays, entry), None, tmp_path)
+        assert (what == "refused" and "never changes its sign" in text) == refused, text
+
+
 def test_millimetres_on_an_arm_without_slides_are_refused(tmp_path: Path):
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(_URDF)

@@ -21,7 +21,7 @@ from figaroh_jax.formats import reference
 from figaroh_jax.formats.config import Limits, Task
 from figaroh_jax.formats.taskfile import CONTRACT_EFFECTS
 from figaroh_jax.reporting.rollout_effects import NOT_LOOKED_FOR, ROLLOUT_EFFECTS
-from figaroh_jax.rollouts.causes import BASELINE, catalogue
+from figaroh_jax.rollouts.causes import BASELINE, catalogue, with_pairs
 from figaroh_jax.rollouts.reading import load_loop
 
 OWN = {name: effect for name, effect in CATALOGUE.items() if effect.__module__.startswith("figaroh_jax.effects.")}
@@ -57,8 +57,8 @@ def test_the_page_of_effects_has_the_row_of_each_effect_of_rollouts(name: str) -
 
 def test_the_effects_of_rollouts_are_those_that_a_search_looks_for() -> None:
     """The search's candidates, the structures that it tries, and names of the contract that nothing is behind."""
-    loop, _ = load_loop(DEMO, {"elbow": {"kind": "position", "kp": 20.0, "kd": 0.5}}, joints=["elbow"])
-    looked_for = {one.effect for one in catalogue(loop, np.ones(1), gains_known=False).candidates}
+    loop, _ = load_loop(DEMO, {"elbow": {"kind": "position", "kp": 20.0, "kd": 0.5}})
+    looked_for = {one.effect for one in catalogue(with_pairs(loop), np.ones(1), gains_known=False).candidates}
     assert {*ROLLOUT_EFFECTS} - {*NOT_LOOKED_FOR} == looked_for | {*BASELINE, "joint_elasticity", "backlash"}
     known = {*OWN, *KINEMATIC, *ROLLOUT_EFFECTS, "outlier"}
     assert known >= {*CONTRACT_EFFECTS}, {*CONTRACT_EFFECTS} - known

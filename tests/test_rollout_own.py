@@ -25,6 +25,7 @@ from figaroh_jax.effects import registry
 from figaroh_jax.jobs.export import export_loop
 from figaroh_jax.rollouts.data import Run, Stretch, windows
 from figaroh_jax.rollouts.loop import Loop
+from figaroh_jax.rollouts.own import everywhere, left_out
 from figaroh_jax.rollouts.parameters import Entry
 from figaroh_jax.rollouts.sensitivity import linear_sums, predicted
 
@@ -106,6 +107,25 @@ def simulated_by_mujoco(u: np.ndarray, grip: float = GRIP, force: float = FORCE)
     return q
 
 
+def recorded(folder: Path, q: np.ndarray, effect: str) -> Path:
+    """A task with the servo's positions, noise added, and an effect in its baseline."""
+    noise = 2e-4 * np.random.default_rng(3).standard_normal(len(q))
+    np.savez(folder / "run.npz", t=0.002 * np.arange(len(q)), u=command(len(q)), q=q + noise)
+    (folder / "task.yaml").write_text(
+        f"robot: {{model: servo.xml}}\nbaseline: {{effects: [{effect}]}}\n"
+        "data:\n  - {file: run.npz, time: t, command: u, position: q}\n"
+    )
+    return folder / "task.yaml"
+
+
+def identified(folder: Path, q: np.ndarray, effect: str) -> dict[str, Any]:
+    """The numbers that `identify` tells, by what they are."""
+    task = recorded(folder, q, effect)
+    assert main(["identify", str(task), "--out", str(folder / "out"), "--quiet"]) == 0
+    result = json.loads((folder / "out" / "result.json").read_text())
+    return {one["expression"]: one for one in result["base_parameters"]}
+
+
 def test_effects_act_as_in_mujoco_c(tmp_path: Path):
     """A torque, a dry friction and a state, 1500 steps."""
     u = command(1500)
@@ -144,8 +164,8 @@ def known() -> Iterator[type[fj.Effect]]:
     """The notch, registered for one test alone."""
     fj.register(Notch)
     yield Notch
-    registry.CATALOGUE.pop(Notch.name)
-    registry.POSES.pop(Notch.name, None)
+    for one in (registry.CATALOGUE, registry.POSES, registry.ROLLOUTS):
+        one.pop(Notch.name, None)
 
 
 def test_a_registered_effect_is_identified_and_exported(
@@ -155,16 +175,8 @@ def test_a_registered_effect_is_identified_and_exported(
     u = command(3000)
     q = simulated_by_mujoco(u, 0.0, 0.0)
     (tmp_path / "servo.xml").write_text(SERVO.replace('frictionloss="0.15"', 'frictionloss="0.3"'))
-    noise = 2e-4 * np.random.default_rng(3).standard_normal(len(q))
-    np.savez(tmp_path / "run.npz", t=0.002 * np.arange(len(q)), u=u, q=q + noise)
-    (tmp_path / "task.yaml").write_text(
-        "robot: {model: servo.xml}\nbaseline: {effects: [{effect: test_notch, at: [lift]}]}\n"
-        "data:\n  - {file: run.npz, time: t, command: u, position: q}\n"
-    )
-    assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    told = identified(tmp_path, q, "{effect: test_notch, at: [lift]}")
     capsys.readouterr()
-    result = json.loads((tmp_path / "out" / "result.json").read_text())
-    told = {one["expression"]: one for one in result["base_parameters"]}
     for name, truth in (("strength", STRENGTH), ("place", NOTCH)):
         one = told[f"test_notch.{name} lift"]
         assert one["status"] == "identified" and one["unit"] == known.units()[name]
@@ -204,6 +216,31 @@ def test_effects_of_a_model_act_in_data_of_rollouts(tmp_path: Path):
     assert values["strength"] == pytest.approx(STRENGTH, rel=1e-3) and values["place"] == pytest.approx(NOTCH, abs=1e-4)
 
 
+class Twitch(fj.JointEffect):
+    """A torque that follows the time."""
+
+    name, title, equation = "test_twitch", "a twitch", "size sin t"
+    size: float = fj.amplitude("N m")
+
+    def torque(self, motion: fj.Motion) -> Any:
+        return self.size * jnp.sin(motion.time)
+
+
+def test_a_registered_effect_that_no_step_can_simulate_is_told(tmp_path: Path):
+    """It stays out of the search, and the answer's notes say why."""
+    (tmp_path / "servo.xml").write_text(SERVO)
+    loop, _ = fj.load_loop(tmp_path / "servo.xml")
+    fj.register(Twitch)
+    try:
+        assert not any(e.name == Twitch.name for e in everywhere(loop.robot, ()))
+        (note,) = left_out(loop.robot)
+        assert left_out(loop.robot, (Twitch.name,)) == ()
+    finally:
+        for known in (registry.CATALOGUE, registry.POSES, registry.ROLLOUTS):
+            known.pop(Twitch.name, None)
+    assert note.startswith("'test_twitch' is registered, but not looked for in rollouts: its torque follows the time")
+
+
 def test_what_a_step_does_not_know_is_refused(tmp_path: Path):
     (tmp_path / "servo.xml").write_text(SERVO)
     loop, _ = fj.load_loop(tmp_path / "servo.xml")
@@ -216,18 +253,11 @@ def test_a_baseline_names_what_a_rollout_can_fit(tmp_path: Path, capsys: pytest.
     """An effect of the catalogue acts by its torque where the loop has no number for it; what has none is refused."""
     (tmp_path / "servo.xml").write_text(SERVO)
     u = command(1500)
-    noise = 2e-4 * np.random.default_rng(3).standard_normal(len(u))
-    np.savez(tmp_path / "run.npz", t=0.002 * np.arange(len(u)), u=u, q=simulated_by_mujoco(u, 0.0, 0.0) + noise)
-    text = (
-        "robot: {model: servo.xml}\nbaseline: {effects: [{effect: EFFECT, at: [lift]}]}\n"
-        "data:\n  - {file: run.npz, time: t, command: u, position: q}\n"
-    )
-    (tmp_path / "task.yaml").write_text(text.replace("EFFECT", "joint_elasticity"))
-    assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    q = simulated_by_mujoco(u, 0.0, 0.0)
+    task = recorded(tmp_path, q, "{effect: joint_elasticity, at: [lift]}")
+    assert main(["identify", str(task), "--out", str(tmp_path / "out"), "--quiet"]) == 2
     assert "a rollout has no number for 'joint_elasticity' at 'lift'" in capsys.readouterr().err
-    (tmp_path / "task.yaml").write_text(text.replace("EFFECT", "asymmetric_coulomb_friction"))
-    assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "out"), "--quiet"]) == 0
-    told = [one["expression"] for one in json.loads((tmp_path / "out" / "result.json").read_text())["base_parameters"]]
+    told = identified(tmp_path, q, "{effect: asymmetric_coulomb_friction, at: [lift]}")
     assert "asymmetric_coulomb_friction.difference lift" in told
 
 
@@ -241,15 +271,7 @@ def test_a_base_that_is_not_level_is_identified(tmp_path: Path):
     for k, row in enumerate(u):
         q[k], data.ctrl[0] = data.qpos[0], row
         mujoco.mj_step(model, data)
-    noise = 2e-4 * np.random.default_rng(3).standard_normal(len(u))
-    np.savez(tmp_path / "run.npz", t=0.002 * np.arange(len(u)), u=u, q=q + noise)
-    (tmp_path / "task.yaml").write_text(
-        "robot: {model: servo.xml}\nbaseline: {effects: [{effect: gravity_tilt}]}\n"
-        "data:\n  - {file: run.npz, time: t, command: u, position: q}\n"
-    )
-    assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "out"), "--quiet"]) == 0
-    result = json.loads((tmp_path / "out" / "result.json").read_text())
-    told = {one["expression"]: one for one in result["base_parameters"]}
+    told = identified(tmp_path, q, "{effect: gravity_tilt}")
     x, y = told["gravity_x"], told["gravity_y"]
     assert x["status"] == "identified" and abs(x["value"] - 0.6) < 3 * x["std"] < 0.05 and x["unit"] == "m/s2"
     assert y["status"] == "unidentifiable"  # along the axis of the joint

@@ -298,3 +298,17 @@ def test_stamps_of_a_clock_that_shakes_are_left_alone():
     even = np.arange(0, 8, 0.01)
     for shaken in (even + rng.uniform(-1e-3, 1e-3, 800), np.round(even + rng.uniform(-4e-3, 4e-3, 800), 3), even):
         assert unrounded(shaken) is shaken
+
+
+def test_samples_that_repeat_the_one_before_are_those_of_a_logger_and_not_of_the_robot():
+    rng = np.random.default_rng(secrets.randbits(32))
+    t = np.arange(3000) / 250
+    q, tau = motion(t), motion(t) + 1e-4 * rng.standard_normal((3000, 3))
+    again = np.flatnonzero(rng.random(3000) < 0.02)[1:]
+    for x in (q, tau):
+        x[again] = x[again - 1]
+    prepared = signals.prepare(recording(t, q, tau), Preprocess(cutoff=10))
+    read = prepared.position[prepared.rows.index] - motion(prepared.rows.row_times)
+    assert np.abs(read).max() < 1e-4 and prepared.notes == ()  # rad; .008 with the samples as they are
+    q[1000:1200], tau[1000:1200] = q[1000], tau[1000]  # a robot that stands
+    assert np.shape(signals.prepare(recording(t, q, tau), Preprocess(cutoff=10)).time) == prepared.time.shape

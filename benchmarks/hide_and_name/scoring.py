@@ -69,8 +69,10 @@ def _extra(rows: list[dict[str, Any]], title: str) -> list[str]:
             if inside
             else []
         )
+    if title != "clean":
+        return _by_sight(rows)
     p = [r["p_value"] for r in rows if r["p_value"] is not None]
-    return [f"p < .05 in {sum(x < 0.05 for x in p)} of {len(p)}"] if p and title == "clean" else []
+    return [f"p < .05 in {sum(x < 0.05 for x in p)} of {len(p)}"] if p else []
 
 
 def _by_sight(rows: list[dict[str, Any]]) -> list[str]:

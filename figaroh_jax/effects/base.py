@@ -35,6 +35,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from ..errors import InputError
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.model import Leaf, RobotModel
+from .loops import InRollouts
 
 __all__ = [
     "Effect",
@@ -269,6 +270,7 @@ class Effect(eqx.Module):
     inertial: ClassVar[bool] = False  # whether its amplitudes are ten parameters of its link: the regressor's columns
     body: ClassVar[bool] = False  # whether these are a body's that exists: mass > 0, pseudo-inertia >= 0
     levels: ClassVar[tuple[str, ...]] = ("torque", "pose", "rollout")  # of diagnoses that look for it
+    in_rollouts: ClassVar[InRollouts] = InRollouts()  # how it stands in a rollout
     correction: ClassVar[float] = 1.0  # its linear parameters behind one of what a calibration of postures reports
     searched: ClassVar[bool] = True  # whether a diagnosis looks for it, that is, whether it is in the catalogue
     # relations to other effects, by name; the last two hold both ways, whichever class states them (`related`)

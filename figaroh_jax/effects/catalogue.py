@@ -7,14 +7,13 @@ adds one of yours.
 from __future__ import annotations
 
 from . import (
+    drives as drives,
     environment as environment,
     friction as friction,
     inertia as inertia,
     sensors as sensors,
     transmission as transmission,
 )
-from .registry import CATALOGUE, find, register, related
+from .registry import CATALOGUE, ROLLOUTS, find, register, related
 
-__all__ = ["CATALOGUE", "LIBRARY", "find", "register", "related"]
-
-LIBRARY = frozenset(CATALOGUE)  # before any of a user's: in rollouts these have names and numbers of their own
+__all__ = ["CATALOGUE", "ROLLOUTS", "find", "register", "related"]

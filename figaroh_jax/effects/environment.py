@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from ..rigid.kinematics import axis_twists, gather, movers, pose_columns, poses_on_host
 from ..rigid.model import RobotModel
 from .base import Effect, Motion, Scalar, amplitude, shape
+from .loops import HERE, InRollouts
 from .registry import register
 
 __all__ = ["Contact", "ExternalWrench", "GravityTilt", "PointEffect"]
@@ -22,6 +23,9 @@ class GravityTilt(Effect):
     name, title, acts_on = "gravity_tilt", "base tilt", "robot"
     equation = "tau(gravity + (x, y, 0)) - tau(gravity)"
     separated_by = "a full turn of the first joint with the arm stretched, or a level on the base"
+    in_rollouts = InRollouts(
+        (("x", "gravity_x"), ("y", "gravity_y")), lambda scale: ((HERE, HERE),), "robot", several=True, together=2,
+    )  # fmt: skip
     x: Scalar = amplitude("m/s2")
     y: Scalar = amplitude("m/s2")
 

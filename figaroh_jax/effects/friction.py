@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .base import JointEffect, Motion, Native, Scalar, amplitude, shape
+from .loops import HERE, InRollouts
 from .registry import register
 
 __all__ = [
@@ -42,6 +43,10 @@ class ViscousFriction(JointEffect):
     dissipative = True
     equation = "damping v"
     separated_by = "constant-speed sweeps of {at} at five or more speeds up to its maximum"
+    in_rollouts = InRollouts(
+        (("damping", "damping"),), lambda scale: ((HERE,),), called="joint_damping", usual=True, signed=False,
+        looks_like="a wrong velocity gain of the drive looks the same",
+    )  # fmt: skip
     damping: Scalar = amplitude("N m s/rad")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
@@ -61,6 +66,10 @@ class CoulombFriction(JointEffect):
     dissipative = True
     equation = "force s(v)"
     separated_by = "reversals of {at} at several accelerations"
+    in_rollouts = InRollouts(
+        (("force", "friction"),), lambda scale: ((HERE,), (scale.friction,)), called="friction_loss", usual=True,
+        signed=False,
+    )  # fmt: skip
     force: Scalar = amplitude("N m")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
@@ -77,6 +86,7 @@ class AsymmetricCoulombFriction(JointEffect):
     """Dry friction of another level in each direction; the part that differs."""
 
     name, title = "asymmetric_coulomb_friction", "direction-dependent Coulomb friction"
+    levels = ("torque", "pose")  # in rollouts it acts where a model has it, but is not looked for
     rubs = True
     indistinguishable_from = ("torque_offset",)
     equation = "difference |s(v)|"
@@ -93,6 +103,7 @@ class AsymmetricViscousFriction(JointEffect):
     """Viscous friction of another slope in each direction; the part that differs."""
 
     name, title = "asymmetric_viscous_friction", "direction-dependent viscous friction"
+    levels = ("torque", "pose")  # in rollouts it acts where a model has it, but is not looked for
     rubs = True
     equation = "difference |v|"
     separated_by = "sweeps of {at} in both directions over its whole range of speed"
@@ -111,6 +122,12 @@ class StribeckFriction(JointEffect):
     dissipative = speed_law = True
     equation = "force exp(-(|v|/speed)^2) s(v)"
     separated_by = "slow constant-velocity sweeps of {at} at five or more speeds below 0.3 rad/s"
+    in_rollouts = InRollouts(
+        (("force", "stribeck_force"), ("speed", "stribeck_speed")),
+        lambda scale: tuple((0.07 * scale.friction, speed) for speed in (0.1, 0.25, 0.6)),
+        signed=True, adds_to="friction_loss", falls_off=1,
+        experiment="slow constant-velocity sweeps of {at} below 0.3 rad/s",
+    )  # fmt: skip
     force: Scalar = amplitude("N m")
     speed: Scalar = shape("rad/s", (0.03, 0.06, 0.1, 0.15, 0.25, 0.4), (0.012, 0.64))
 
@@ -125,6 +142,7 @@ class PowerLawFriction(JointEffect):
     """Friction that grows with a power of the speed (lubricant, temperature)."""
 
     name, title = "power_law_friction", "power-law friction"
+    levels = ("torque", "pose")  # in rollouts it acts where a model has it, but is not looked for
     rubs = speed_law = True
     equation = "strength |v|^exponent s(v)"
     separated_by = "constant-speed sweeps of {at} from 0.05 rad/s to its maximum speed"
@@ -154,6 +172,10 @@ class LoadDependentFriction(JointEffect):
     follows_torque = dissipative = True
     equation = "ratio |tau_load| s(v)"
     separated_by = "the same motion of {at} with and without a payload"
+    in_rollouts = InRollouts(
+        (("ratio", "load_ratio"),), lambda scale: ((0.05,),), signed=True, rival_of="friction_loss", rival_start=0.2,
+        experiment="the same motion of {at} with and without a known payload",
+    )  # fmt: skip
     ratio: Scalar = amplitude("")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
@@ -166,6 +188,7 @@ class PositionDependentFriction(JointEffect):
     """Dry friction that changes over a turn (a bent shaft, a seal, a worn gear)."""
 
     name, title = "position_dependent_friction", "position-dependent friction"
+    levels = ("torque", "pose")  # in rollouts it acts where a model has it, but is not looked for
     rubs = True
     equation = "s(v) (cosine cos q + sine sin q)"
     separated_by = "the same motion of {at} in other postures of the other joints"
@@ -183,6 +206,7 @@ class FrictionDrift(JointEffect):
     """Friction above its later level that falls off as the joint warms up."""
 
     name, title = "friction_drift", "friction that falls as the joint warms up"
+    levels = ("torque", "pose")  # in rollouts it acts where a model has it, but is not looked for
     rubs = True
     beside_rest = False  # a rest that changes in the course of a recording looks like it
     fades = True
@@ -245,6 +269,7 @@ class Presliding(Bristle):
     """Dry friction that builds up over a small distance after each reversal (Dahl 1968, exponent 1)."""
 
     name, title = "presliding", "presliding friction"
+    levels = ("torque", "pose")  # in rollouts it acts where a model has it, but is not looked for
     beside_rest = False  # most of any rest stands at reversals, where it acts
     equation = "force (z - s(v)), z' = v/distance (1 - z s(v))"
     separated_by = "reversals of {at} at several accelerations: presliding is late in position, a delay in time"

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from ..rigid.model import RobotModel
 from .base import Effect, Scalar, amplitude
+from .loops import InRollouts
 from .registry import register
 
 __all__ = ["LinkEffect", "LinkInertia", "Payload"]
@@ -58,6 +59,10 @@ class Payload(LinkEffect):
     body = True
     equation = "W_k dpi_k, dpi_k a physical body: pseudo-inertia >= 0, mass > 0"
     separated_by = "the same motion with and without what is fixed to {at}"
+    in_rollouts = InRollouts(
+        (("mass", "payload"),), lambda scale: ((0.0,),), "link", several=True,
+        experiment="the same motion with {at} carrying a known mass, or without what is fixed to it",
+    )  # fmt: skip
 
     def physical(self) -> dict[str, Scalar]:
         """Mass (kg) and centre of mass in the frame of the link's joint (m); not finite for a mass of zero."""

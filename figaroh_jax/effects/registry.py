@@ -5,10 +5,11 @@ from __future__ import annotations
 from ..errors import InputError, nearest
 from .base import Effect
 
-__all__ = ["CATALOGUE", "POSES", "find", "register", "related"]
+__all__ = ["CATALOGUE", "POSES", "ROLLOUTS", "find", "register", "related"]
 
 CATALOGUE: dict[str, type[Effect]] = {}  # that a diagnosis of torques looks for
 POSES: dict[str, type[Effect]] = {}  # that a calibration and a diagnosis of postures look for
+ROLLOUTS: dict[str, type[Effect]] = {}  # that a diagnosis of rollouts looks for, as they are called there
 _OTHERS: dict[str, type[Effect]] = {}  # known by name, but nothing that a diagnosis looks for
 
 
@@ -17,7 +18,7 @@ def register(effect: type[Effect]) -> type[Effect]:
 
     Where another one can imitate it exactly (a power law a square law), `contained_in` names that one, and the simpler
     is preferred. Its `levels` say which diagnoses look for it: of torques, and of postures where it has an error of the
-    position that is linear in a parameter, or a twist.
+    position that is linear in a parameter, or a twist, and of rollouts where it acts at a joint by a torque.
 
     >>> import figaroh_jax as fj
     >>> @fj.register
@@ -29,13 +30,16 @@ def register(effect: type[Effect]) -> type[Effect]:
     >>> fj.CATALOGUE["drag"] is Drag
     True
     """
-    if (CATALOGUE | _OTHERS | POSES).get(effect.name, effect).__qualname__ != effect.__qualname__:
+    if (CATALOGUE | _OTHERS | POSES | ROLLOUTS).get(effect.name, effect).__qualname__ != effect.__qualname__:
         raise InputError(f"an effect called '{effect.name}' is registered already")
     if "torque" in effect.levels:
         (CATALOGUE if effect.searched else _OTHERS)[effect.name] = effect
     linear = effect.has("position_error") and any(p.linear for p in effect.parameters().values())
     if "pose" in effect.levels and effect.searched and (effect.has("twist") or linear):
         POSES[effect.name] = effect
+    acts = bool(effect.in_rollouts.numbers) or (effect.acts_on == "joint" and effect.has("torque") and effect.searched)
+    if "rollout" in effect.levels and acts:
+        ROLLOUTS[effect.in_rollouts.called or effect.name] = effect
     for name in effect.contained_in:
         outer = find(name)
         outer.contains = tuple(dict.fromkeys((*outer.contains, effect.name)))

@@ -11,6 +11,7 @@ from jaxtyping import Array, Complex, Float
 
 from ..rigid.model import Leaf
 from .base import Effect, JointEffect, Motion, Native, Scalar, amplitude, shape
+from .loops import InRollouts
 from .registry import register
 
 __all__ = [
@@ -33,6 +34,7 @@ class TorqueOffset(JointEffect):
     name, title = "torque_offset", "torque offset"
     equation = "offset"
     separated_by = "a dwell of {at} with the brake on or the motor unloaded"
+    in_rollouts = InRollouts((("offset", "offset"),), lambda scale: ((0.0,),), constant=True)
     offset: Scalar = amplitude("N m")
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
@@ -49,6 +51,7 @@ class TorqueGain(JointEffect):
     """A wrong torque constant or gear ratio: the reading is off by a factor."""
 
     name, title = "torque_gain", "torque gain error"
+    levels = ("torque", "pose")  # in rollouts it acts where a model has it, but is not looked for
     follows_torque = follows_total = True
     equation = "gain tau_hat"
     separated_by = "the same motion of {at} with and without a payload of known mass"
@@ -148,7 +151,8 @@ class EncoderOffset(JointEffect):
     """A zero of the encoder that is not the model's."""
 
     name, title = "encoder_offset", "encoder zero offset"
-    levels = ("torque",)  # to a calibration it is a `joint_offset`
+    levels = ("torque", "rollout")  # to a calibration it is a `joint_offset`
+    in_rollouts = InRollouts((("offset", "reading"),), lambda scale: ((0.0,),), constant=True)
     equation = "q_measured = q + offset"
     separated_by = "kinematic calibration, or a reference mark of {at}: torque hardly distinguishes it from inertia"
     offset: Scalar = amplitude("rad", lower=-0.2, upper=0.2)

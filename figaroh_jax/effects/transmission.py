@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from ..rigid.model import Leaf
 from .base import Effect, JointEffect, Motion, Native, Scalar, amplitude, shape
+from .loops import HERE, InRollouts
 from .registry import register
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
 ]
 
 
+_ORDERS = tuple(3.0 + 0.8 * k for k in range(30))  # 1/rad
 _CROSSING = 0.01  # s that the motor takes to cross the play of its gear
 
 
@@ -34,6 +36,7 @@ class RotorInertia(JointEffect):
     name, title = "rotor_inertia", "rotor inertia"
     equation = "inertia a"
     separated_by = "fast motion of {at} in several postures of the joints beyond it"
+    in_rollouts = InRollouts((("inertia", "armature"),), lambda scale: ((HERE,),), usual=True, signed=False)
     inertia: Scalar = amplitude("kg m2", lower=0.0)
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
@@ -52,6 +55,10 @@ class CoupledTransmission(Effect):
     name, title, acts_on = "coupled_transmission", "transmission coupling", "pair"
     equation = "row i: inertia a_j + damping v_j + friction s(v_i + sign v_j); row j: i and j swapped, friction by sign"
     separated_by = "{at} alone, together and against each other"
+    in_rollouts = InRollouts(
+        (("inertia", "pair_inertia"), ("damping", "pair_damping"), ("friction", "pair_friction")),
+        lambda scale: ((0.0, 0.0, 0.0),), "pair", several=True, together=3,
+    )  # fmt: skip
     one_rotor = ("inertia", "damping", "friction")
     inertia: Scalar = amplitude("kg m2")
     damping: Scalar = amplitude("N m s/rad")
@@ -90,9 +97,13 @@ class TorqueRipple(JointEffect):
     name, title = "torque_ripple", "torque ripple"
     equation = "sine sin(order q) + cosine cos(order q)"
     separated_by = "sweeps of {at} at two constant speeds: the order stays, the frequency moves"
+    in_rollouts = InRollouts(
+        (("sine", "ripple_sine"), ("cosine", "ripple_cosine"), ("order", "ripple_order")),
+        lambda scale: tuple((0.0, 0.0, order) for order in _ORDERS), together=2, shapes=(2,),
+    )  # fmt: skip
     sine: Scalar = amplitude("N m")
     cosine: Scalar = amplitude("N m")
-    order: Scalar = shape("1/rad", tuple(3.0 + 0.8 * k for k in range(30)), (2.9, 26.6))
+    order: Scalar = shape("1/rad", _ORDERS, (2.9, 26.6))
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
         """sine sin(order q) + cosine cos(order q), N m or N."""
@@ -113,6 +124,10 @@ class JointSpring(JointEffect):
     contains = ("torque_offset",)
     equation = "stiffness (q - rest)"
     separated_by = "motion of {at} over a larger range, or with the base turned"
+    in_rollouts = InRollouts(
+        (("stiffness", "stiffness"), ("offset", "offset")), lambda scale: ((0.002 * scale.torque, 0.0),), constant=True,
+        signed=True,
+    )  # fmt: skip
     stiffness: Scalar = amplitude("N m/rad", lower=0.0)
     offset: Scalar = amplitude("N m")  # -stiffness rest: linear, where the rest position is not
 
@@ -142,6 +157,10 @@ class JointElasticity(JointEffect):
     name, title = "joint_elasticity", "joint elasticity"
     equation = "q_measured = q + compliance tau_load"
     separated_by = "a chirp of {at} above a third of its resonance, or a sensor on the link side"
+    in_rollouts = InRollouts(
+        (("stiffness", "stiffness"), ("damping", "damping")), place="spring", elastic=True, signed=False,
+        experiment="a chirp of {at} above a third of its resonance, and an encoder on the link",
+    )  # fmt: skip
     compliance: Scalar = shape("rad/(N m)", (2e-5, 1e-4, 4e-4, 1.5e-3, 5e-3), (1e-7, 1e-2))
 
     def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:
@@ -158,6 +177,11 @@ class Backlash(JointEffect):
     equation = "q_measured = q + width/2 sign(tau_load)"
     separated_by = "slow reversals of the load of {at}, with a second encoder on the link"
     separated_by_postures = "postures of {at} near the vertical, on both sides of it"
+    in_rollouts = InRollouts(
+        (("stiffness", "stiffness"), ("damping", "damping"), ("width", "play")), place="spring", elastic=True,
+        signed=True, contains=("joint_elasticity",), telling=2,
+        experiment="steps of {at} of two sizes, and slow sweeps",
+    )  # fmt: skip
     width: Scalar = amplitude("rad", lower=0.0, upper=0.05)
 
     def position_error(self, motion: Motion) -> Float[Leaf, "samples *joints"]:

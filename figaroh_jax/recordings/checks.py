@@ -373,6 +373,17 @@ def _speeds(look: Look) -> Iterator[Finding]:
 # Torque
 
 
+def _absolute(torque: Float[np.ndarray, "samples nv"]) -> bool:
+    """Whether torques of several moving joints have lost their sign: never below zero, but down to zero.
+
+    Gravity alone may hold a sign, but keeps a torque away from zero.
+    """
+    low, high = torque.min(axis=0), torque.max(axis=0)
+    alive = high > 0
+    near = alive & (low <= 0.005 * high) & (np.mean(torque <= 0.02 * high, axis=0) > 0.01)
+    return bool(alive.sum() > 2 and (low >= 0).all() and 2 * near.sum() > alive.sum())
+
+
 def _torque_values(look: Look) -> Iterator[Finding]:
     """Torques that no drive gives, and torques that were not measured."""
     torque = look.recording.torque
@@ -381,6 +392,13 @@ def _torque_values(look: Look) -> Iterator[Finding]:
     if not np.ptp(torque, axis=0).any():
         what = "zero" if not torque.any() else "constant"
         yield Finding(True, f"torque is {what} at every joint: it was not measured; name the column that holds it")
+        return
+    if _absolute(torque):
+        yield Finding(
+            True,
+            "torque never changes its sign at any joint and falls to zero at most of them: an absolute value, as of a"
+            " current without direction, is no torque; leave it out (a diagnosis of command and position needs none)",
+        )
         return
     dead = np.ptp(torque, axis=0) == 0
     if dead.any():

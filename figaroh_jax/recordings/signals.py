@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..errors import InputError
 from .bandwidth import encoder_step, motion_band, smoothed
@@ -51,6 +51,8 @@ MOST_WORKING, LONG = 16.0, 40_000  # the same at the most, where all recordings 
 ROWS = 3.3  # output rate over cutoff
 MOST_NUMBERS = 1 << 25  # of one signal at the working rate: 256 MiB, hours of a robot
 FEWEST_ROWS = 10
+STALE = 0.1  # of the samples: more that repeat the one before are those of a robot that stands
+MOST_STALE = 3  # of them in a row
 STILL = 1e-12  # of rad or m: what a joint that stands still moves by rounding
 
 
@@ -252,6 +254,9 @@ def choose_rates(recordings: Sequence[Recording], preprocess: Preprocess) -> Rat
 def _window(recording: Recording, window: tuple[float, float] | None):
     """The part of a recording that is kept."""
     time, position, torque = unrounded(recording.time), recording.position, recording.torque
+    if torque is not None:
+        new = _new_samples(position, torque)
+        time, position, torque = time[new], position[new], torque[new]
     if window is None:
         return time, position, torque
     keep = (time >= window[0]) & (time <= window[1])
@@ -261,6 +266,21 @@ def _window(recording: Recording, window: tuple[float, float] | None):
             f" which lasts from {time[0]:g} to {time[-1]:g} s"
         )
     return time[keep], position[keep], None if torque is None else torque[keep]
+
+
+def _new_samples(
+    position: Float[np.ndarray, "samples nv"], torque: Float[np.ndarray, "samples nv"]
+) -> Bool[np.ndarray, " samples"] | slice:
+    """The samples that are not, number by number, what stood there a sample before, where such ones are few.
+
+    A logger that is faster than its robot, or has missed a message, writes the last one again under a new stamp: the
+    position stands still for a sample and then leaps.
+    """
+    again = np.append(False, ((np.diff(position, axis=0) == 0) & (np.diff(torque, axis=0) == 0)).all(axis=1))
+    begin, end = (np.flatnonzero(np.diff(np.append(np.append(0, again), 0)) == step) for step in (1, -1))
+    for first, after in zip(begin, end, strict=True):
+        again[first:after] &= after - first <= MOST_STALE  # longer, it stands
+    return ~again if 0 < again.mean() < STALE else slice(None)
 
 
 def _resample(grid: Grid, rates: Rates, shift: float):

@@ -5,7 +5,10 @@ The search itself is `rollouts.causes`; a test compares the names.
 
 from __future__ import annotations
 
+import inspect
 from typing import NamedTuple
+
+from ..effects.catalogue import ROLLOUTS
 
 __all__ = ["NOT_LOOKED_FOR", "ROLLOUT_EFFECTS", "RolloutEffect"]
 
@@ -23,6 +26,16 @@ class RolloutEffect(NamedTuple):
     hidden_by: str
     excite: str
     said_by: str  # in the files of simulators
+
+
+def _said(name: str, number: str, size: float, hidden_by: str, excite: str, said_by: str) -> RolloutEffect:
+    """An effect whose class says what it is."""
+    effect = ROLLOUTS[name]
+    meaning = inspect.cleandoc(effect.__doc__ or "").split("\n\n")[0].replace("\n", " ")
+    units = effect.units()
+    return RolloutEffect(
+        effect.title, meaning, effect.equation, effect.acts_on, units, number, size, hidden_by, excite, said_by
+    )  # fmt: skip
 
 
 _NONE = "no simulator's file: `model/loop.json` holds it, and `fj.rollout` simulates it"
@@ -70,39 +83,42 @@ ROLLOUT_EFFECTS = {
         "{at} at several gains of its drive",
         "MuJoCo (a drive's constant bias)",
     ),
+    "torque_ripple": _said(
+        "torque_ripple", "", 0.0, "motion that covers less than one and a half periods of it",
+        "sweeps of {at} over its whole range at two constant speeds", _NONE,
+    ),
+    "coupled_transmission": _said(
+        "coupled_transmission", "", 0.0, "motion in which one of the two joints stands still",
+        "{at} alone, together and against each other", "MuJoCo (a fixed tendon's armature, damping, frictionloss)",
+    ),
+    "gravity_tilt": _said(
+        "gravity_tilt", "", 0.0, "encoder offsets, where few joints carry a load",
+        "a full turn of the first joint with the arm stretched, or a level on the base", "MuJoCo (option gravity)",
+    ),
     "encoder_offset": RolloutEffect(
         "encoder offset", "The encoder reads the position plus a constant.",
         "q_measured = q + offset", "joint",
         {"offset": "rad"}, "reading", 0.05, "a constant torque at a position servo",
         "a reference mark of {at}, or gravity in several postures", _NONE,
     ),
-    "actuator_gain": RolloutEffect(
-        "drive gain", "The drive gives more or less torque than its gains say; considered only with `gains: free`.",
-        "(1 + gain) kp (u - q) - kd v", "joint", {"gain": "1"}, "scale", 0.6,
-        "all masses and frictions at once: gains and inertias scale together",
+    "actuator_gain": _said(
+        "actuator_gain", "scale", 0.6, "all masses and frictions at once: gains and inertias scale together",
         "the same motion with {at} carrying a known mass", "MuJoCo (gainprm, biasprm)",
     ),
-    "command_delay": RolloutEffect(
-        "command delay", "The drive sees the command late.", "u(t - delay)", "joint", {"delay": "s"},
-        "delay", 0.04,
-        "positions that are stamped early", "steps of {at} that are small enough not to saturate its drive", _NONE,
+    "command_delay": _said(
+        "command_delay", "delay", 0.04, "positions that are stamped early",
+        "steps of {at} that are small enough not to saturate its drive", _NONE,
     ),
-    "actuator_saturation": RolloutEffect(
-        "torque limit", "The drive's torque is limited.", "clip(tau, -limit, limit)", "joint",
-        {"limit": "N m"}, "force_limit", 5.0, "gentle motion, which never asks for as much",
+    "actuator_saturation": _said(
+        "actuator_saturation", "force_limit", 5.0, "gentle motion, which never asks for as much",
         "steps of {at} of two sizes", "MuJoCo (forcerange), URDF (effort)",
     ),
-    "voltage_saturation": RolloutEffect(
-        "voltage limit",
-        "The torque is limited before the motor's back-EMF is taken off, so that fast motion gets less.",
-        "clip(kp (u - q), -limit, limit) - kd v", "joint", {"limit": "N m"}, "voltage", 5.0,
-        "gentle motion, and a limit of the torque where the joint is slow",
+    "voltage_saturation": _said(
+        "voltage_saturation", "voltage", 5.0, "gentle motion, and a limit of the torque where the joint is slow",
         "large steps of {at} in both directions", _NONE,
     ),
-    "dead_band": RolloutEffect(
-        "drive dead band", "The drive ignores errors within a band, and subtracts the band from larger ones.",
-        "kp (e - clip(e, -band, band)), e = u - q", "joint", {"band": "rad"}, "dead_band", 0.05, "dry friction",
-        "slow ramps of {at} of a few times the band", _NONE,
+    "dead_band": _said(
+        "dead_band", "dead_band", 0.05, "dry friction", "slow ramps of {at} of a few times the band", _NONE
     ),
     "payload": RolloutEffect(
         "payload", "A body that the robot carries and the model lacks, or the other way round.",

@@ -21,10 +21,11 @@ from .faults import Fault, faults, without
 from .fit import Fit, fit, spread_of_recordings
 from .gates import Slight, checked, gained, in_order, needless, replaced, rms_of, standing, still_needed, worthy
 from .parameters import put, values
-from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_of_entry, outputs, tried_now
+from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_of_entry, outputs, sprung_now, tried_now
 from .search import Model, Named, Search, Tried, judged_by_colour, sized, t_of
 from .sensitivity import predicted
 from .setting import Setting, Structure, begins_of, begun, by_recording, evened, free_entries, level_of, thinned
+from .table import on_table
 from .thresholds import NEAR, NO_CHOICE, T_BESIDE_REST, UNTOLD
 
 __all__ = ["search_arm"]
@@ -106,6 +107,10 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
     found, now, slight = still_needed(here, found, now, begin)
     found, now = _alike(here, found, now) if slight is None else (found, now)
     even = by_recording(whole) and bool(found) and now.excess.max() >= 1.0
+    if even:  # beside a rest alone: noise leaves nothing to a table
+        progress("looking for a table", 0.92)
+    whole, resting = _off_the_table(whole, now.model) if even else (whole, [])
+    wrong = [x for x in wrong if not any(_same_place(x, y) for y in resting)]
     if whole is not here:
         progress("fitting all that was recorded", 0.95)
         begin, now, here = _on_all(whole, begin.model), _on_all(whole, now.model), whole
@@ -113,11 +118,11 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
         steps.append(("all that was recorded", _level(here, now.model.fit)))
     spread = None
     if even:
-        now, spread = _alike_by_recording(here, now)
+        now, spread = alike_by_recording(here, now)
         steps.append(("recordings that are equally informative", _level(here, now.model.fit)))
     result = Search(
         "nothing", found, now.model.structure, first, now.model.fit, p_value, [], nearest, steps, held, fits,
-        begin.model.structure, here, wrong, spread,
+        begin.model.structure, here, [*wrong, *resting], spread,
     )  # fmt: skip
     return _judged(here, result, now, slight)
 
@@ -135,7 +140,7 @@ def _on_all(here: Setting, model: Model) -> Standing:
     return standing(here, structure, new, model.free, held=False)
 
 
-def _alike_by_recording(here: Setting, now: Standing) -> tuple[Standing, np.ndarray]:
+def alike_by_recording(here: Setting, now: Standing) -> tuple[Standing, np.ndarray]:
     """The numbers where more than noise is left: each recording tells as much of a joint, not the fastest the most.
 
     With them how differently recordings, and quarters of each recording's time, tell each, (columns of the fit,): a
@@ -231,6 +236,27 @@ def _sound(here: Setting, first: Fit) -> tuple[Setting, list[Fault]]:
     return replace(here, data=here.cut(here.loop)), found
 
 
+def _off_the_table(here: Setting, model: Model) -> tuple[Setting, list[Fault]]:
+    """The setting without the rows in which the arm's end rests on something, and where that is.
+
+    It is told by a model with friction alone: without, all that friction holds looks as if something held it.
+    """
+    structure = model.structure
+    table = on_table(put(structure.loop, structure.table, model.fit.theta), here.runs)
+    if table is None:
+        return here, []
+    found = [
+        Fault("contact", x.run, x.first, x.last, x.joints, x.force, table.height) for x in table.stretches
+    ]  # fmt: skip
+    here = replace(here, runs=without(here.runs, found))
+    return replace(here, data=here.cut(here.loop)), found
+
+
+def _same_place(one: Fault, other: Fault) -> bool:
+    """Whether both tell of the same rows that something holds the arm."""
+    return one.kind == other.kind and one.run == other.run and one.first <= other.last and other.first <= one.last
+
+
 def _simulated(here: Setting, first: Fit) -> list[np.ndarray] | None:
     """What the encoders of a baseline read, (rows, joints) of each recording, or None where it diverges."""
     with jax.enable_x64(True):
@@ -271,6 +297,8 @@ def _round(
         if chosen[0].candidate.kind.usual:  # what every joint has is found at all of them at once
             chosen = [one for one in firsts if one.candidate.kind.usual]
         new = _named(here, now, lists, chosen, found)
+        if new is not None and now.excess.max() < 1.0:
+            new = _beside_springs(here, now, lists, new, found, forbid)
         if new is not None:
             kept, now = new
             break
@@ -286,6 +314,21 @@ def _round(
             for one in close
         ]  # fmt: skip
     return kept, now, nearest
+
+
+def _beside_springs(
+    here: Setting, now: Standing, lists: dict[int, list[Tried]], new: tuple[list[Named], Standing],
+    found: Sequence[Named], forbid: Sequence[str],
+) -> tuple[list[Named], Standing] | None:  # fmt: skip
+    """What is to be named though noise alone is left: springs, which are not looked for there, may explain more."""
+    named, model = new
+    springs = sorted(sprung_now(here, now, forbid), key=lambda one: one.state.fit.squares)
+    squares = model.model.fit.squares
+    if springs and springs[0].state.fit.squares < squares - NO_CHOICE:
+        return _named(here, now, lists, springs[:1], found)
+    alike = [one.candidate for one in springs if one.state.fit.squares < squares + NO_CHOICE]
+    told = tuple(Name(c.effect, c.at) for c in alike)
+    return [n._replace(alike=tuple(dict.fromkeys([*n.alike, *told]))) for n in named], model
 
 
 def _named(

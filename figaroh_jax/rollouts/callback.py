@@ -11,7 +11,7 @@
 An effect of your own is in `loop.json` with its equation and numbers; say its torque as a function of NumPy's numbers,
 `Rest(model, "loop.json", own={"detent": lambda q, v, strength, notch: ...})`: N m or N against the motion at its joint.
 
-Friction that follows the speed (Stribeck) or the load, play of a spring, constant torques, dead bands, limited
+Friction that follows the speed (Stribeck) or the load, play of a spring, ripple, constant torques, dead bands, limited
 voltages and what is late at such drives, and offsets of encoders. It needs NumPy and MuJoCo alone.
 """
 
@@ -92,7 +92,9 @@ class Rest:
         own = model.jnt_stiffness[joint].reshape(len(at), -1)[:, 0] * (
             data.qpos[self.place] - model.qpos_spring[self.place]
         )
-        data.qfrc_applied[at] = own - j["stiffness"] * stretch - j["offset"]
+        turn = j["ripple_order"] * data.qpos[self.place]
+        ripple = j["ripple_sine"] * np.sin(turn) + j["ripple_cosine"] * np.cos(turn)
+        data.qfrc_applied[at] = own - j["stiffness"] * stretch - j["offset"] - ripple
         for place, column, torque, numbers in self.own:
             data.qfrc_applied[column] -= torque(data.qpos[place], data.qvel[column], **numbers)
         if not (j["stribeck_force"].any() or j["load_ratio"].any()):

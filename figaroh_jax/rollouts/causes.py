@@ -3,53 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from ..effects.base import Effect
-from ..effects.catalogue import find
+from ..effects.catalogue import ROLLOUTS, find
+from ..effects.loops import InRollouts, Scale
 from ..rigid.model import Frame, Joint, RobotModel
-from .loop import Joints, Loop
+from .loop import Joints, Loop, Pairs
 from .own import amplitudes, is_own, starts_of
 from .parameters import Entry, Table
 
-__all__ = ["BASELINE", "KINDS", "Candidate", "Catalogue", "Kind", "catalogue", "elastic_loop", "springs"]
+__all__ = ["BASELINE", "Candidate", "Catalogue", "catalogue", "elastic_loop", "kind_of", "springs", "with_pairs"]
 
 _JOINT_ENTRIES = (
     "armature", "damping", "friction", "stribeck_force", "stribeck_speed", "load_ratio", "stiffness",
-    "offset", "reading",
+    "offset", "ripple_sine", "ripple_cosine", "ripple_order", "reading",
 )  # fmt: skip
+_PAIR_ENTRIES = ("pair_inertia", "pair_damping", "pair_friction")
 _DRIVE_ENTRIES = ("scale", "delay", "dead_band", "voltage", "force_limit")
-BASELINE = {"rotor_inertia": "armature", "joint_damping": "damping", "friction_loss": "friction"}
+_MOST_PAIRS = 64
+BASELINE = ("rotor_inertia", "joint_damping", "friction_loss")
 
 
-class Kind(NamedTuple):
-    """What sets an effect apart from others; the search asks this and never a name."""
-
-    usual: bool = False  # every joint has it
-    adds_to: str = ""  # the effect of which it is more: found beside it, not without it
-    rival_of: str = ""  # the effect that it may stand for: asked where that is named, whatever else is left
-    rival_start: float = 0.0  # its size where that is asked
-    contains: tuple[str, ...] = ()  # what it can imitate exactly: the simpler one is preferred
-    limit: bool = False  # it changes the model before that can be differentiated
-    elastic: bool = False  # another structure: a spring between motor and link
-    constant: bool = False  # it shows at a joint that stands: one such makes up for another there
-    several: bool = False  # it shows at several joints
-    signed: bool = True  # its size may be of either sign
-    neutral: float = 0.0  # its size where it is none
-    falls_off: int | None = (
-        None  # number that is a speed: it shows nothing without a size, and no end beyond all motion
+@lru_cache(maxsize=512)
+def kind_of(effect: type[Effect]) -> InRollouts:
+    """What an effect says of itself, the library's or a user's: `in_rollouts`, and what its class says otherwise."""
+    own, parameters = effect.in_rollouts, effect.parameters()
+    plain = own._replace(
+        contains=tuple(dict.fromkeys((*effect.contains, *own.contains))),
+        experiment=own.experiment or effect.separated_by or "steps of {at} of two sizes, and slow sweeps",
     )
-    telling: int | None = None  # number that tells it from what it contains
-    looks_like: str = ""  # what looks the same, in words
-    experiment: str = "steps of {at} of two sizes, and slow sweeps"  # that tells it from others
-    shapes: tuple[int, ...] = ()  # numbers of a user's effect that show nothing without a size: each start is asked
-
-    def holds(self, other: str) -> bool:
-        """Whether it can imitate another effect."""
-        return other in self.contains
+    if own.numbers:
+        return plain._replace(signed=own.signed is not False)
+    count = len(amplitudes(effect))
+    signed = not effect.dissipative if own.signed is None else own.signed
+    together = count if signed else 1
+    return plain._replace(signed=signed, together=together, shapes=tuple(range(count, len(parameters))))
 
 
 class Candidate(NamedTuple):
@@ -62,11 +56,9 @@ class Candidate(NamedTuple):
     reported: tuple[str, ...]  # names of the entries in the answer
 
     @property
-    def kind(self) -> Kind:
+    def kind(self) -> InRollouts:
         """What sets its effect apart."""
-        if self.effect in KINDS or self.effect in _PLAIN:
-            return KINDS.get(self.effect, Kind())
-        return _kind_of(find(self.effect))
+        return kind_of(ROLLOUTS.get(self.effect) or find(self.effect))
 
     def own(self, known: Catalogue) -> bool:
         """Whether it is an effect of a user's, which machine code does not know."""
@@ -84,88 +76,91 @@ class Catalogue(NamedTuple):
         return next(k for k, e in enumerate(self.table) if e.name == name and place in e.at)
 
 
-_KNOWN_MASS = "the same motion with {at} carrying a known mass"
-KINDS = {
-    **dict.fromkeys(BASELINE, Kind(usual=True, signed=False)),
-    "joint_damping": Kind(usual=True, signed=False, looks_like="a wrong velocity gain of the drive looks the same"),
-    "stribeck_friction": Kind(
-        adds_to="friction_loss", falls_off=1, experiment="slow constant-velocity sweeps of {at} below 0.3 rad/s"
-    ),
-    "load_dependent_friction": Kind(
-        rival_of="friction_loss", rival_start=0.2, experiment="the same motion of {at} with and without a known payload"
-    ),
-    "joint_spring": Kind(constant=True, contains=find("joint_spring").contains),
-    "torque_offset": Kind(constant=True),
-    "encoder_offset": Kind(constant=True),
-    "actuator_gain": Kind(neutral=1.0, experiment=f"{_KNOWN_MASS}: else gains and inertias scale together"),
-    "command_delay": Kind(
-        looks_like="positions that are stamped late by as much look the same",
-        experiment="steps of {at} small enough not to saturate its drive",
-    ),
-    "actuator_saturation": Kind(limit=True, signed=False),
-    "voltage_saturation": Kind(limit=True, signed=False),
-    "payload": Kind(several=True, experiment=f"{_KNOWN_MASS}, or without what is fixed to it"),
-    "joint_elasticity": Kind(
-        elastic=True,
-        signed=False,
-        experiment="a chirp of {at} above a third of its resonance, and an encoder on the link",
-    ),
-    "backlash": Kind(elastic=True, signed=False, contains=("joint_elasticity",), telling=2),
-}
-_PLAIN = ("dead_band",)  # of which nothing is to be said
-_HERE = float("nan")
-
-
-def _kind_of(effect: type[Effect]) -> Kind:
-    """What a user's effect says of itself."""
-    count = len(amplitudes(effect))
-    plain = Kind(contains=effect.contains, signed=not effect.dissipative)
-    told = effect.separated_by or plain.experiment
-    return plain._replace(experiment=told, shapes=tuple(range(count, len(effect.parameters()))))
-
-
-def catalogue(
-    loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbid: Sequence[str] = (), tilt: bool = False
-) -> Catalogue:
-    """The candidates of a loop; `forces` (nu,) are the largest that its drives gave in the recordings.
-
-    `tilt`: with a base that is not level, which no search looks for.
-    """
-    table, candidates = [], []
-    robot = loop.robot
-    names = robot.dof_names
+def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbid: Sequence[str] = ()) -> Catalogue:
+    """The candidates of a loop; `forces` (nu,) are the largest that its drives gave in the recordings."""
+    robot, names = loop.robot, loop.robot.dof_names
+    table, candidates = list[Entry](), list[_Wanted]()
+    kinds = {called: kind_of(effect) for called, effect in ROLLOUTS.items() if called not in forbid}
     levers = np.asarray(loop.joints.friction)
     for j, name in enumerate(names):
         read = j in loop.measured
         table += [Entry(number, (j,)) for number in _JOINT_ENTRIES if read or number != "reading"]
         torque = _largest(loop, forces, j)
-        own = _of_joint(j, max(float(levers[j]), 0.02 * torque), torque)
-        candidates += [(*one, name) for one in own if read or one[0] != "encoder_offset"]
+        scale = Scale(max(float(levers[j]), 0.02 * torque), torque)
+        candidates += _wanted(kinds, "joint", (name,), j, scale, () if read else ("reading",))
     for k in range(len(loop.drives.names)):
         table += [Entry(number, (k,)) for number in _DRIVE_ENTRIES]
         name = names[int(np.argmax(np.abs(np.asarray(loop.drives.transmission)[k])))]
-        candidates += [(*one, name) for one in _of_drive(k, float(forces[k]), gains_known)]
+        own = {called: kind for called, kind in kinds.items() if not (kind.gains_free and gains_known)}
+        candidates += _wanted(own, "drive", (name,), k, Scale(0.0, float(forces[k])))
     for i, joint in enumerate(robot.joints if loop.carried is None else ()):
         table.append(Entry("payload", (i,)))
-        candidates.append(("payload", (("payload", i),), ((0.0,),), ("mass",), joint.link))
-    known = {one[0] for one in candidates}
+        candidates += _wanted(kinds, "link", (joint.link,), i, Scale(0.0, 0.0))
+    if _stands(loop):
+        table += [Entry("gravity_x", (0,)), Entry("gravity_y", (0,))]
+        candidates += _wanted(kinds, "robot", (), 0, Scale(0.0, 0.0))
+    for k, (i, j, _) in enumerate(loop.pairs.at if loop.pairs is not None else ()):
+        table += [Entry(number, (k,)) for number in _PAIR_ENTRIES]
+        candidates += _wanted(kinds, "pair", (names[i], names[j]), k, Scale(0.0, 0.0))
     for k, effect in enumerate(loop.effects):
         ordered = sorted(effect.parameters(), key=lambda name: name not in amplitudes(type(effect)))  # noqa: B023
         table += [Entry(f"{effect.name}.{name}", (k,)) for name in ordered]
-        if effect.name not in known and effect.acts_on == "joint":
+        mine = kind_of(type(effect))
+        if effect.acts_on == "joint" and effect.name not in forbid and not mine.numbers:
             own = tuple((f"{effect.name}.{name}", k) for name in ordered)
-            candidates.append((effect.name, own, starts_of(type(effect)), tuple(ordered), names[effect.places[0]]))
-    if tilt:
-        table += [Entry("gravity_x", (0,)), Entry("gravity_y", (0,))]
-        both = (("gravity_x", 0), ("gravity_y", 0))
-        candidates.append(("gravity_tilt", both, ((_HERE, _HERE),), ("x", "y"), None))
+            candidates.append(
+                _Wanted(effect.name, (names[effect.places[0]],), own, starts_of(type(effect)), tuple(ordered))
+            )
     index = {(e.name, e.at[0]): k for k, e in enumerate(table)}
     built = [
-        Candidate(effect, () if name is None else (name,), tuple(index[e] for e in entries), starts, reported)
-        for effect, entries, starts, reported, name in candidates
-        if effect not in forbid
+        Candidate(one.effect, one.at, tuple(index[e] for e in one.entries), one.starts, one.reported)
+        for one in candidates
     ]
     return Catalogue(tuple(table), tuple(built))
+
+
+class _Wanted(NamedTuple):
+    effect: str
+    at: tuple[str, ...]
+    entries: tuple[tuple[str, int], ...]
+    starts: tuple[tuple[float, ...], ...]
+    reported: tuple[str, ...]
+
+
+def _wanted(
+    kinds: dict[str, InRollouts], place: str, at: tuple[str, ...], k: int, scale: Scale, without: Sequence[str] = ()
+) -> list[_Wanted]:
+    """The effects that change numbers of one joint, drive, link or of the robot."""
+    return [
+        _Wanted(called, at, tuple((number, k) for _, number in kind.numbers), kind.starts(scale),
+                tuple(name for name, _ in kind.numbers))
+        for called, kind in kinds.items()
+        if kind.place == place and kind.numbers and not any(number in without for _, number in kind.numbers)
+    ]  # fmt: skip
+
+
+def with_pairs(loop: Loop) -> Loop:
+    """The loop with couplings of no size of every joint with the one before it: motors of their sum and difference."""
+    joints = loop.robot.joints
+    if (
+        loop.pairs is not None
+        or loop.carried is not None
+        or any(j.kind not in ("revolute", "prismatic") for j in joints)
+    ):
+        return loop
+    near = [(joints[j.parent], j) for j in joints if j.parent >= 0 and not j.follows]
+    pairs = [(a.coordinate, b.coordinate) for a, b in near if a.kind == b.kind and not a.follows]
+    at = tuple((*pair, sign) for pair in pairs for sign in (1, -1))
+    if not 0 < len(at) <= _MOST_PAIRS:
+        return loop
+    zero = np.zeros(len(at))
+    return replace(loop, pairs=Pairs(zero, zero, zero, at))
+
+
+def _stands(loop: Loop) -> bool:
+    """Whether the base stands still and gravity acts: then it may not be level."""
+    still = all(joint.kind in ("revolute", "prismatic") for joint in loop.robot.joints)
+    return still and loop.carried is None and bool(np.asarray(loop.robot.gravity).any())
 
 
 def _largest(loop: Loop, forces: np.ndarray, joint: int) -> float:
@@ -173,45 +168,14 @@ def _largest(loop: Loop, forces: np.ndarray, joint: int) -> float:
     return float(max((way * forces).max(initial=0.0), 1e-6))
 
 
-def _of_joint(j: int, friction: float, torque: float) -> list[tuple]:
-    h = _HERE
-    return [
-        ("joint_damping", (("damping", j),), ((h,),), ("damping",)),
-        ("friction_loss", (("friction", j),), ((h,), (friction,)), ("force",)),
-        ("rotor_inertia", (("armature", j),), ((h,),), ("inertia",)),
-        (
-            "stribeck_friction",
-            (("stribeck_force", j), ("stribeck_speed", j)),
-            tuple((0.07 * friction, speed) for speed in (0.1, 0.25, 0.6)),
-            ("force", "speed"),
-        ),
-        ("load_dependent_friction", (("load_ratio", j),), ((0.05,),), ("ratio",)),
-        ("joint_spring", (("stiffness", j), ("offset", j)), ((0.002 * torque, 0.0),), ("stiffness", "offset")),
-        ("torque_offset", (("offset", j),), ((0.0,),), ("offset",)),
-        ("encoder_offset", (("reading", j),), ((0.0,),), ("offset",)),
-    ]
-
-
-def _of_drive(k: int, force: float, gains_known: bool) -> list[tuple]:
-    limits = tuple((share * force,) for share in (0.9, 0.6, 0.3))
-    gain = [] if gains_known else [("actuator_gain", (("scale", k),), ((_HERE,),), ("gain",))]
-    return [
-        *gain,
-        ("command_delay", (("delay", k),), ((0.002,), (0.012,), (0.04,)), ("delay",)),
-        ("actuator_saturation", (("force_limit", k),), limits, ("limit",)),
-        ("voltage_saturation", (("voltage", k),), limits, ("limit",)),
-        ("dead_band", (("dead_band", k),), ((0.002,), (0.02,)), ("band",)),
-    ]
-
-
 def springs(joint: str, first: int, forbid: Sequence[str] = ()) -> list[Candidate]:
     """A spring, and a spring with play, between motor and link of a joint; their numbers stand from `first` on."""
-    reported = {"joint_elasticity": ("stiffness", "damping"), "backlash": ("stiffness", "damping", "width")}
+    kinds = {called: kind_of(effect) for called, effect in ROLLOUTS.items() if called not in forbid}
     return [
-        Candidate(effect, (joint,), tuple(range(first, first + len(names))), (), names)
-        for effect, names in reported.items()
-        if effect not in forbid
-    ]
+        Candidate(called, (joint,), tuple(range(first, first + len(kind.numbers))), (),
+                  tuple(name for name, _ in kind.numbers))
+        for called, kind in kinds.items() if kind.place == "spring"
+    ]  # fmt: skip
 
 
 def elastic_loop(loop: Loop, coordinate: int, stiffness: float, damping: float, *, link_side: bool = False) -> Loop:
@@ -241,6 +205,7 @@ def elastic_loop(loop: Loop, coordinate: int, stiffness: float, damping: float, 
         measured=loop.measured,
         summed=summed,
         carried=loop.carried,
+        pairs=loop.pairs,
         effects=loop.effects,
     )
 

@@ -23,7 +23,7 @@ __all__ = ["SIMULATORS", "described", "described_text", "for_simulator", "with_d
 
 _NEUTRAL = {"stribeck_speed": None, "ripple_order": None, "friction_rate": None, "friction_share": None, "rest": None}
 _JOINT = ("armature", "damping", "friction", "stribeck_force", "stribeck_speed", "load_ratio", "stiffness", "rest",
-          "play", "offset", "reading")  # fmt: skip
+          "play", "offset", "ripple_sine", "ripple_cosine", "ripple_order", "reading")  # fmt: skip
 
 
 def described(loop: Loop) -> dict[str, Any]:
@@ -53,6 +53,9 @@ def described(loop: Loop) -> dict[str, Any]:
     content = {
         "joints": joints, "drives": drives, "dt": float(loop.dt), "integrator": loop.integrator, "law": loop.law,
     }  # fmt: skip
+    pairs = [_pair(loop, k) for k in range(0 if loop.pairs is None else len(loop.pairs.at))]
+    if pairs := [one for one in pairs if any(one["parameters"].values())]:
+        content["pairs"] = pairs
     own = [_effect(loop, e) for e in loop.effects if any(float(getattr(e, name)) for name in amplitudes(type(e)))]
     return content | ({"effects": own} if own else {})
 
@@ -63,6 +66,14 @@ def _effect(loop: Loop, effect: Effect) -> dict[str, Any]:
     at = [loop.robot.dof_names[k] for k in effect.places] if effect.acts_on in ("joint", "pair") else []
     units = {name: parameter.unit for name, parameter in effect.parameters().items()}
     return {"effect": effect.name, "equation": effect.equation, "at": at, "parameters": numbers, "units": units}
+
+
+def _pair(loop: Loop, k: int) -> dict[str, Any]:
+    """A motor that turns with two joints: of `robot.xml` a fixed tendon."""
+    assert loop.pairs is not None
+    i, j, sign = loop.pairs.at[k]
+    numbers = {name: float(np.asarray(getattr(loop.pairs, name))[k]) for name in ("inertia", "damping", "friction")}
+    return {"at": [loop.robot.dof_names[i], loop.robot.dof_names[j]], "sign": sign, "parameters": numbers}
 
 
 def _finite(value: Any) -> float | None:
@@ -186,6 +197,15 @@ def for_simulator(content: dict[str, Any], name: str) -> dict[str, Any]:
                 elif value != 0 and number not in (*_NEUTRAL, "time_constant", "constant"):
                     unit = UNITS["force_limit" if number == "force" else number]
                     unsaid.append({"at": place, "number": number, "value": value, "unit": unit})
+    for one in content.get("pairs", ()):
+        place = f"{one['at'][0]} {'+' if one['sign'] > 0 else '-'} {one['at'][1]}"
+        for number, value in one["parameters"].items():
+            if name == "mujoco":
+                word = {"inertia": "armature", "damping": "damping", "friction": "frictionloss"}[number]
+                values.append({"at": place, "number": f"pair_{number}", "word": f"tendon {word}", "value": value})
+            elif value:
+                unit = UNITS[f"pair_{number}"]
+                unsaid.append({"at": place, "number": f"pair_{number}", "value": value, "unit": unit})
     for one in content.get("effects", ()):
         place = ", ".join(one["at"]) or "the robot"
         unsaid += [

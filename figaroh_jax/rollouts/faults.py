@@ -37,7 +37,8 @@ class Fault(NamedTuple):
     first: float  # s
     last: float  # s
     joints: tuple[int, ...]
-    size: float  # N m beyond what friction holds (of several joints: of the drive at most); s of a clock
+    size: float  # N m beyond what friction holds (of several joints: of the drive at most); s of a clock; N of a table
+    table: float | None = None  # m, height over the base of the plane that the arm's end rests on
 
     def text(self, loop: Loop, runs: Sequence[Run]) -> str:
         """One line for people."""
@@ -45,6 +46,11 @@ class Fault(NamedTuple):
         if self.kind == "clock_error":
             return f"clock_error: {where}: all joints follow {1e3 * self.size:.0f} ms later than before, stamps regular"
         at = ", ".join(names[j] for j in self.joints)
+        if self.table is not None:
+            return (
+                f"contact: {where}: the arm's end rests on a plane {1e3 * self.table:.0f} mm above the base's origin,"
+                f" which pushes it up by {self.size:.2g} N (seen at {at})"
+            )
         if len(self.joints) > 1:
             return (
                 f"contact: {where}: {at} stand off the model's motion at once, the drives push by {self.size:.2g} N m"

@@ -15,7 +15,7 @@ import numpy as np
 
 from .loop import Loop
 from .native import native
-from .parameters import BOUNDS, Table
+from .parameters import BOUNDS, Table, uncoupled
 from .sensitivity import Sums, Windows, linear_sums
 
 __all__ = ["Fit", "fit", "held_out", "refitted_without", "spread_of_recordings", "standard_errors", "start_of"]
@@ -108,7 +108,8 @@ class _Lanes:
         index = np.maximum(self.free[padded], 0)
         at = np.resize(np.arange(len(which)), lanes)
         with jax.enable_x64(True):
-            found = linear_sums(self.loop, self.table, theta[at], index, self.data, start[at])
+            loop = uncoupled(self.loop, self.table, theta, self.free[which])
+            found = linear_sums(loop, self.table, theta[at], index, self.data, start[at])
             cost, gradient, matrix = (np.asarray(x) for x in found)
         return [Sums(cost[k], gradient[k], matrix[k]) for k in range(len(which))]
 
@@ -120,7 +121,8 @@ class _Lanes:
         index[:count] = np.maximum(self.free[lane], 0)
         keep = np.r_[:count, wide : wide + states]
         with jax.enable_x64(True):
-            found = linear_sums(self.loop, self.table, theta[None], index[None], self.data, start[None])
+            loop = uncoupled(self.loop, self.table, theta, self.free[lane])
+            found = linear_sums(loop, self.table, theta[None], index[None], self.data, start[None])
             cost, gradient, matrix = (np.asarray(x)[0] for x in found)
         return Sums(cost, gradient[..., keep], matrix[..., keep[:, None], keep])  # pyright: ignore[reportArgumentType]
 

@@ -25,7 +25,7 @@ _FAR = 1e300
 
 
 class Rows(NamedTuple):
-    """The constraints of each coordinate; arrays (nv, samples)."""
+    """The constraints of each coordinate; arrays (nv, samples), with those of sums of coordinates behind them."""
 
     level: Array  # F >= 0
     pull: Array  # acceleration that friction asks for
@@ -34,6 +34,7 @@ class Rows(NamedTuple):
     low_soft: Array
     high: Array  # the same of the upper limit, in the opposite direction
     high_soft: Array
+    way: Array | None = None  # (rows, nv): behind the coordinates' own, rows of sums of them
 
 
 class Solution(NamedTuple):
@@ -45,7 +46,30 @@ class Solution(NamedTuple):
     high: Array
 
 
+def _apart(rows: Rows, a: Array) -> Array:
+    """The acceleration of each row."""
+    return a if rows.way is None else jnp.concatenate([a, times(rows.way[..., None], a)])
+
+
+def _summed(rows: Rows, force: Array) -> Array:
+    """Forces of the rows as those on the coordinates."""
+    if rows.way is None:
+        return force
+    n = rows.way.shape[1]
+    return force[:n] + times(rows.way.T[..., None], force[n:])
+
+
+def _stiff(rows: Rows, slope: Array) -> Array:
+    """Slopes of the rows as a matrix of the coordinates, (nv, nv, samples)."""
+    if rows.way is None:
+        return jnp.eye(len(slope))[..., None] * slope[:, None]
+    n = rows.way.shape[1]
+    pairs = rows.way[:, :, None, None] * rows.way[:, None, :, None]
+    return jnp.eye(n)[..., None] * slope[:n, None] + (pairs * slope[n:, None, None]).sum(0)
+
+
 def _acting(rows: Rows, a: Array) -> tuple[Array, Array, Array]:
+    a = _apart(rows, a)
     raw = (rows.pull - a) / rows.soft
     slip = jnp.where(raw >= rows.level, 1.0, jnp.where(raw <= -rows.level, -1.0, 0.0))
     return slip, jnp.where(a < rows.low, 1.0, 0.0), jnp.where(-a < rows.high, 1.0, 0.0)
@@ -53,10 +77,11 @@ def _acting(rows: Rows, a: Array) -> tuple[Array, Array, Array]:
 
 def row_force(rows: Rows, acting: Solution, a: Array) -> Array:
     """Force on each coordinate at the acceleration `a`, the acting ones given (linear in `a`)."""
+    a = _apart(rows, a)
     friction = jnp.where(acting.slip == 0, (rows.pull - a) / rows.soft, acting.slip * rows.level)
     low = jnp.where(acting.low > 0, (jnp.where(acting.low > 0, rows.low, 0.0) - a) / rows.low_soft, 0.0)
     high = jnp.where(acting.high > 0, (jnp.where(acting.high > 0, rows.high, 0.0) + a) / rows.high_soft, 0.0)
-    return friction + low - high
+    return _summed(rows, friction + low - high)
 
 
 def _slope(rows: Rows, slip: Array, low: Array, high: Array) -> Array:
@@ -105,7 +130,7 @@ def product(one: Array, two: Array) -> Array:
 def stiffened(masses: Array, rows: Rows, found: Solution) -> Array:
     """Inverse of the masses with the stiffness of the constraints that act, (n, n, samples); a constant."""
     slope = _slope(rows, found.slip, found.low, found.high)
-    return jax.lax.stop_gradient(inverse(masses + jnp.eye(len(found.a))[..., None] * slope[:, None]))
+    return jax.lax.stop_gradient(inverse(masses + _stiff(rows, slope)))
 
 
 def corrected(masses: Array, rows: Rows, found: Solution, gap: Array) -> Array:
@@ -129,7 +154,7 @@ def solve_rows(masses: Array, right: Array, rows: Rows, warm: Array) -> Solution
         found, done, count = state
         slope = _slope(rows, found.slip, found.low, found.high)
         gap = times(masses, found.a) - right - row_force(rows, found, found.a)
-        way = -solved(masses + jnp.eye(len(right))[..., None] * slope[:, None], gap)
+        way = -solved(masses + _stiff(rows, slope), gap)
         full = _acting(rows, found.a + way)
         same = jnp.stack([(x == y).all(0) for x, y in zip(full, found[1:], strict=True)]).all(0)
         step = jnp.where(same, 1.0, _line_search(masses, right, rows, found.a, way))
@@ -144,8 +169,9 @@ def solve_rows(masses: Array, right: Array, rows: Rows, warm: Array) -> Solution
 def _line_search(masses: Array, right: Array, rows: Rows, a: Array, way: Array) -> Array:
     """Step length at which the cost along `way` is least: its slope is piecewise linear and grows."""
     edges = (rows.pull - rows.soft * rows.level, rows.pull + rows.soft * rows.level, rows.low, -rows.high)
-    moving = jnp.where(way == 0, 1.0, way)
-    at = jnp.concatenate([jnp.where(jnp.isfinite(x) & (way != 0), (x - a) / moving, 0.0) for x in edges])
+    now, apart = _apart(rows, a), _apart(rows, way)
+    moving = jnp.where(apart == 0, 1.0, apart)
+    at = jnp.concatenate([jnp.where(jnp.isfinite(x) & (apart != 0), (x - now) / moving, 0.0) for x in edges])
     at = jnp.concatenate([jnp.clip(at, 0.0, None), jnp.zeros((1, at.shape[1]))])
     at = jnp.concatenate([at, at.max(0, keepdims=True) + 1.0])
     start = jnp.sum(way * (times(masses, a) - right), 0)

@@ -142,6 +142,8 @@ def _expression(here: Setting, entry: int) -> str:
     names, place = here.loop.robot.dof_names, one.at[0]
     if one.name in ("gravity_x", "gravity_y"):
         return one.name
+    if one.name.startswith("pair_") and here.loop.pairs is not None:
+        return f"{one.name} {', '.join(names[k] for k in here.loop.pairs.at[place][:2])}"
     if is_own(one.name):
         return f"{one.name} {', '.join(names[k] for k in here.loop.effects[place].places)}"
     if one.name in OF_DRIVES:

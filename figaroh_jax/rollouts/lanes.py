@@ -71,7 +71,7 @@ def known_to_it(loop: Loop, table: Table) -> bool:
     plain &= all(k < 0 for k in loop.summed)
     plain &= len(robot.joints) == robot.nv <= _MOST and all(kind == "none" for kind in loop.drives.activation)
     plain &= loop.integrator != "rk4" and not loop.limited and loop.carried is None and loop.linear is None
-    plain &= not loop.effects
+    plain &= not loop.effects and loop.pairs is None
     single = bool(((way != 0).sum(1) <= 1).all() and ((way != 0).sum(0) <= 1).all())
     names = {*_JOINT[:13], *_DRIVE, "force_limit", "kp", "kd", "delay", "reading"}
     return plain and single and all(entry.name in names for entry in table)

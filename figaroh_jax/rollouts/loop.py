@@ -36,6 +36,7 @@ __all__ = [
     "Joints",
     "Linear",
     "Loop",
+    "Pairs",
     "State",
     "Step",
     "advance",
@@ -99,6 +100,33 @@ class Joints(eqx.Module):
     reading: Any  # rad, what the encoder reads beside the position
 
 
+class Pairs(eqx.Module):
+    """Couplings of two coordinates by a motor that turns with the sum or the difference of both; arrays (pairs,).
+
+    Inertia and damping are what the motion of one does at the other; what they do at its own is the joint's armature
+    and damping. The dry friction holds the motor.
+    """
+
+    inertia: Any  # kg m2
+    damping: Any  # N m s/rad
+    friction: Any  # N m
+    at: tuple[tuple[int, int, int], ...] = eqx.field(static=True)  # both coordinates, sign of the second
+
+    def rows(self, n: int) -> np.ndarray:
+        """How each motor turns with the coordinates, (pairs, n)."""
+        found = np.zeros((len(self.at), n))
+        for k, (i, j, sign) in enumerate(self.at):
+            found[k, i], found[k, j] = 1.0, sign
+        return found
+
+    def across(self, size: Any, n: int) -> Array:
+        """What `size` (pairs,) of one coordinate's motion is at the other, (n, n)."""
+        each = np.zeros((len(self.at), n, n))
+        for k, (i, j, sign) in enumerate(self.at):
+            each[k, i, j] = each[k, j, i] = sign
+        return jnp.einsum("k,kij->ij", jnp.asarray(size), each)
+
+
 class Carried(eqx.Module):
     """What the rest of a robot does to one joint while the other joints move as they were measured; arrays (samples,).
 
@@ -150,6 +178,7 @@ class Loop(eqx.Module):
     summed: tuple[int, ...] = eqx.field(static=True)  # a second coordinate added to each (-1: none)
     carried: Carried | None = None  # in place of the robot's rigid body
     linear: Linear | None = None  # in place of the robot's rigid body, for derivatives
+    pairs: Pairs | None = None
     effects: tuple[Effect, ...] = ()  # that act by their own torque beside the joints' numbers (`own`)
 
     def with_effects(self, *effects: Effect) -> Loop:
@@ -191,10 +220,14 @@ class Step(NamedTuple):
 
 
 def mobility(loop: Loop) -> Array:
-    """Diagonal of the inverse inertia at the start (MuJoCo's dof_invweight0), (nv, 1); mean over ball and free axes."""
+    """Diagonal of the inverse inertia at the start (MuJoCo's dof_invweight0), (nv, 1); mean over ball and free axes.
+
+    Behind it that of each pair's motor (tendon_invweight0).
+    """
     matrix = _masses(loop, jnp.asarray(loop.start, jnp.float64)[:, None])[..., 0]
     n = loop.robot.nv
-    diagonal = jnp.diagonal(solved(matrix[..., None] * jnp.ones(n), jnp.eye(n)) if n < 3 else jnp.linalg.inv(matrix))
+    whole = solved(matrix[..., None] * jnp.ones(n), jnp.eye(n)) if n < 3 else jnp.linalg.inv(matrix)
+    diagonal = jnp.diagonal(whole)
     if loop.carried is not None:
         return (loop.carried.share * diagonal)[:, None]
     for joint in loop.robot.joints:
@@ -202,6 +235,9 @@ def mobility(loop: Loop) -> Array:
         parts = {"free": (at, slice(at.stop, at.stop + 3)), "spherical": (at,)}.get(joint.kind, ())
         for part in parts:
             diagonal = diagonal.at[part].set(diagonal[part].mean())
+    if loop.pairs is not None:
+        rows = loop.pairs.rows(n)
+        diagonal = jnp.concatenate([diagonal, jnp.einsum("ki,ij,kj->k", rows, whole, rows)])
     return diagonal[:, None]
 
 
@@ -269,6 +305,8 @@ def _passive(loop: Loop, angle: Array, v: Array) -> Array:
     stretch = stretch - jnp.clip(stretch, -j["play"] / 2, j["play"] / 2)
     turn = j["ripple_order"] * angle
     ripple = j["ripple_sine"] * jnp.sin(turn) + j["ripple_cosine"] * jnp.cos(turn)
+    if loop.pairs is not None:
+        ripple = ripple + times(loop.pairs.across(loop.pairs.damping, len(v))[..., None], v)
     return -(j["damping"] * v + j["stiffness"] * stretch + j["offset"] + ripple)
 
 
@@ -310,6 +348,8 @@ def _resistance(loop: Loop, slope: Array) -> Array:
     damping = jnp.eye(loop.robot.nv)[..., None] * jnp.asarray(loop.joints.damping)[:, None, None]
     way = jnp.asarray(loop.drives.transmission)
     pairs = way[:, :, None, None] * way[:, None, :, None]
+    if loop.pairs is not None:
+        damping = damping + loop.pairs.across(loop.pairs.damping, loop.robot.nv)[..., None]
     return damping - (pairs * slope[:, None, None]).sum(0)
 
 
@@ -317,12 +357,15 @@ def _resisted(loop: Loop, slope: Array, a: Array) -> Array:
     """`_resistance` times an acceleration, without the matrix: its derivatives are vectors then."""
     way = jnp.asarray(loop.drives.transmission)
     rate = times(way[..., None], a)
-    return jnp.asarray(loop.joints.damping)[:, None] * a - times(way.T[..., None], slope * rate)
+    own = jnp.asarray(loop.joints.damping)[:, None] * a
+    if loop.pairs is not None:
+        own = own + times(loop.pairs.across(loop.pairs.damping, len(a))[..., None], a)
+    return own - times(way.T[..., None], slope * rate)
 
 
 def _rows(loop: Loop, angle: Array, v: Array, motor: Array, bias: Array, weight: Array, more: Array) -> Rows:
     """Dry friction (`more` of it by effects) and limits of each coordinate, as soft constraints of its acceleration."""
-    j = loop.joints
+    j, weight, motors = loop.joints, weight[: len(v)], weight[len(v) :]
     peak, speed, ratio = (jnp.asarray(x)[:, None] for x in (j.stribeck_force, j.stribeck_speed, j.load_ratio))
     level = jnp.asarray(j.friction)[:, None] + peak * jnp.exp(-((v / speed) ** 2)) + ratio * jnp.abs(motor + bias)
     level = jnp.maximum(level + more, 0.0)
@@ -333,11 +376,27 @@ def _rows(loop: Loop, angle: Array, v: Array, motor: Array, bias: Array, weight:
         soft = jnp.asarray(j.friction_share)[:, None] * weight * jnp.ones_like(v)
     if not loop.limited:
         far, one = jnp.full_like(v, -jnp.inf), jnp.ones_like(v)
-        return Rows(level, pull, soft, far, one, far, one)
+        return _with_pairs(loop, Rows(level, pull, soft, far, one, far, one), v, motors)
     below, above = (jnp.asarray(j.limit)[:, k, None] for k in (0, 1))
     low = _limit(loop, angle - below, v, weight)
     high = _limit(loop, above - angle, -v, weight)
-    return Rows(level, pull, soft, *low, *high)
+    return _with_pairs(loop, Rows(level, pull, soft, *low, *high), v, motors)
+
+
+def _with_pairs(loop: Loop, rows: Rows, v: Array, weight: Array) -> Rows:
+    """With the dry friction of the motors that turn with two coordinates."""
+    if loop.pairs is None:
+        return rows
+    way, j = jnp.asarray(loop.pairs.rows(len(v))), loop.joints
+    first, rate = np.array([at[0] for at in loop.pairs.at], int), times(way[..., None], v)
+    level = jnp.maximum(jnp.asarray(loop.pairs.friction), 0.0)[:, None] * jnp.ones_like(rate)
+    pull, share = -rate / loop.dt, _HARD
+    if loop.law != "hard":
+        pull, share = -jnp.asarray(j.friction_rate)[first, None] * rate, jnp.asarray(j.friction_share)[first, None]
+    far, one = jnp.full_like(rate, -jnp.inf), jnp.ones_like(rate)
+    more = (level, pull, share * weight * one, far, one, far, one)
+    parts = [jnp.concatenate(both) for both in zip(rows[:7], more, strict=True)]
+    return Rows(*parts[:7], way=way)  # pyright: ignore[reportArgumentType]
 
 
 def _limit(loop: Loop, distance: Array, rate: Array, weight: Array) -> tuple[Array, Array]:
@@ -383,6 +442,8 @@ def _bias(loop: Loop, q: Array, v: Array) -> Array:
 
 def _masses(loop: Loop, q: Array) -> Array:
     armature = jnp.eye(loop.robot.nv)[..., None] * jnp.asarray(loop.joints.armature)[:, None, None]
+    if loop.pairs is not None:
+        armature = armature + loop.pairs.across(loop.pairs.inertia, loop.robot.nv)[..., None]
     if loop.linear is not None:
         return loop.linear.mass + armature
     if loop.carried is None:
@@ -432,16 +493,21 @@ def integrated(loop: Loop, state: State, u: Array, weight: Array, step: Step) ->
 
 def _inertial(loop: Loop, state: State, bias: Array, *accelerations: Array) -> list[Array]:
     """M a of the rigid body with armature for each of the accelerations, by one inverse dynamics of all of them."""
-    armature = jnp.asarray(loop.joints.armature)[:, None]
+    own = jnp.asarray(loop.joints.armature)[:, None]
+    across = None if loop.pairs is None else loop.pairs.across(loop.pairs.inertia, loop.robot.nv)[..., None]
+
+    def rotors(a: Array) -> Array:
+        return own * a if across is None else own * a + times(across, a)
+
     if (one := loop.linear) is not None:
         torques = [one.at(k, state.q, state.v) + times(one.mass, a - one.a[k]) for k, a in enumerate(accelerations, 1)]
-        return [torque + armature * a - bias for torque, a in zip(torques, accelerations, strict=True)]
+        return [torque + rotors(a) - bias for torque, a in zip(torques, accelerations, strict=True)]
     if loop.carried is not None:
-        return [loop.carried.mass * a.sum(0) + armature * a for a in accelerations]
+        return [loop.carried.mass * a.sum(0) + rotors(a) for a in accelerations]
     count = len(accelerations)
     a = jnp.concatenate(accelerations, 1)
     q, v = (jnp.concatenate([x] * count, 1) for x in (state.q, state.v))
-    torque = joint_torques(loop.robot, q, v, a) + armature * a
+    torque = joint_torques(loop.robot, q, v, a) + rotors(a)
     return [part - bias for part in jnp.split(torque, count, axis=1)]
 
 

@@ -176,7 +176,7 @@ def _with_model(loop: Loop, model: ExtendedModel) -> Loop:
     leaves: dict[str, Array] = {leaf: jnp.zeros(robot.nv) for fields in EFFECTS.values() for leaf in fields.values()}
     acts: list[Effect] = []
     for effect in model.effects:
-        fields = {"offset": "offset"} if effect.name == "torque_offset" else EFFECTS.get(effect.name)
+        fields = EFFECTS.get(effect.name)
         if fields is None:
             if not effect.has("change"):
                 acts.append(effect)

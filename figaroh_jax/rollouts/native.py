@@ -37,16 +37,18 @@ _DRIVE = ("scale", "delay", "dead_band", "voltage")
 _KINDS = {name: k for k, name in enumerate(_PLAIN)} | {name: 100 + k for k, name in enumerate(_DRIVE)}
 _KINDS |= {"force_limit": 110, "kp": 111, "kd": 112, "gravity_x": 201, "gravity_y": 201, "payload": 200}
 _KINDS |= dict.fromkeys(TEN, 200)
+_PAIR = ("pair_inertia", "pair_damping", "pair_friction")
+_KINDS |= {name: 120 + k for k, name in enumerate(_PAIR)}
 _CARRIED_PAYLOAD = 202
 _GAIN, _BIAS, _COMMAND, _FORCE = 4, 7, 10, 12  # rows of a drive's numbers
 _LONGS = ("n", "nu", "links", "ny", "rates", "carried", "hard", "limited", "implicit", "windows", "rows", "lead",
-          "substeps", "block", "many", "columns")  # fmt: skip
+          "substeps", "block", "many", "columns", "pairs")  # fmt: skip
 _ARRAYS = (
     "measured", "summed", "parent", "coordinate", "slides", "placement", "axis", "inertia", "gravity", "start", "joint",
-    "drive", "way", "payload", "resting", "kind", "place", "column", "ten", "command", "reading", "weight", "load",
-    "begin", "pole", "cost", "gradient", "matrix", "read",
+    "drive", "way", "payload", "resting", "kind", "place", "column", "ten", "pair", "joined", "command", "reading",
+    "weight", "load", "begin", "pole", "cost", "gradient", "matrix", "read",
 )  # fmt: skip
-_MOST, _MOST_COLUMNS = 32, 500
+_MOST, _MOST_COLUMNS, _MOST_PAIRS = 32, 500, 64
 
 
 class _Given(ctypes.Structure):
@@ -128,6 +130,7 @@ class native:  # noqa: N801  (used as a function that keeps what it has prepared
             "hard": loop.law == "hard", "limited": loop.limited, "implicit": loop.integrator == "implicitfast",
             "windows": start.shape[1], "rows": data.reading.shape[0] // data.block * data.block, "lead": data.lead,
             "substeps": data.substeps, "block": data.block, "many": len(arrays["kind"]), "columns": len(free),
+            "pairs": arrays["pair"].shape[1],
         }  # fmt: skip
         for name, value in longs.items():
             setattr(given, name, int(value))
@@ -154,6 +157,8 @@ class native:  # noqa: N801  (used as a function that keeps what it has prepared
                 own["drive"][_GAIN, at], own["drive"][_BIAS + 1, at] = value, -value
             elif entry.name == "kd":
                 own["drive"][_BIAS + 2, at] = -value
+            elif entry.name in _PAIR:
+                own["pair"][_PAIR.index(entry.name), at] = value
             elif entry.name == "payload" and self.loop.carried is not None:
                 own["payload"][at] = value
             elif entry.name == "payload":
@@ -206,6 +211,8 @@ def _fits(loop: Loop, table: Table, data: Windows) -> bool:
     if loop.carried is not None and (robot.nv > 2 or data.carried is None):
         return False
     places = {"reading": loop.measured}
+    if loop.pairs is not None and (len(loop.pairs.at) > _MOST_PAIRS or robot.nv < 2):
+        return False
     told = all(set(entry.at) <= set(places.get(entry.name, entry.at)) for entry in table)
     return told and all(entry.name in _KINDS or is_own(entry.name) for entry in table)
 
@@ -225,6 +232,9 @@ def _numbers(loop: Loop) -> dict[str, np.ndarray]:
         "drive": np.array(own).reshape(-1, nu),
         "inertia": np.array(loop.robot.inertia, float),
         "gravity": np.array(loop.robot.gravity, float),
+        "pair": np.zeros((3, 0))
+        if loop.pairs is None
+        else np.stack([f(getattr(loop.pairs, name)) for name in ("inertia", "damping", "friction")]),
         "payload": np.zeros(1) if carried is None else np.array(carried.payload, float),
     }
 
@@ -237,6 +247,7 @@ def _fixed(loop: Loop, data: Windows) -> dict[str, np.ndarray]:
         "summed": loop.summed,
         "parent": [joint.parent for joint in robot.joints],
         "coordinate": [joint.coordinate for joint in robot.joints],
+        "joined": [] if loop.pairs is None else np.array(loop.pairs.at).ravel(),
         "slides": [joint.kind == "prismatic" for joint in robot.joints],
     }
     carried = loop.carried

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..effects.base import Effect, Motion, Place, fixed
-from ..effects.catalogue import CATALOGUE, LIBRARY
+from ..effects.catalogue import CATALOGUE, ROLLOUTS
 from ..effects.registry import find
 from ..effects.simulation import Reversal
 from ..errors import InputError
@@ -34,6 +34,7 @@ __all__ = [
     "bounds_of",
     "everywhere",
     "is_own",
+    "left_out",
     "memories",
     "placed",
     "read_number",
@@ -55,9 +56,9 @@ class Acting(NamedTuple):
 
 
 def registered() -> dict[str, type[Effect]]:
-    """Effects of users that a search of rollouts looks for, by name: at a joint, with a torque, no library's own."""
-    own = {name: effect for name, effect in CATALOGUE.items() if name not in LIBRARY}
-    return {n: e for n, e in own.items() if e.acts_on == "joint" and e.has("torque") and "rollout" in e.levels}
+    """Effects that a search of rollouts looks for by their torque at a joint, by name: users', as a rule."""
+    own = {name: effect for name, effect in ROLLOUTS.items() if not effect.in_rollouts.numbers}
+    return {name: e for name, e in own.items() if "torque" not in e.levels or CATALOGUE.get(name) is e}
 
 
 def placed(robot: RobotModel, effects: Sequence[Effect]) -> tuple[Effect, ...]:
@@ -66,14 +67,18 @@ def placed(robot: RobotModel, effects: Sequence[Effect]) -> tuple[Effect, ...]:
     for effect in map(fixed, effects):
         if not effect.has("torque") or not isinstance(effect.at, Place):
             raise InputError(f"a rollout has no form for '{effect.name}': it needs a `torque` at a known place")
-        for what, moved in _follows(robot, effect).items():
-            if moved:
-                raise InputError(
-                    f"a rollout has no form for '{effect.name}': its torque follows the {what}, which a step does not"
-                    " know at its beginning"
-                )
+        if what := _unknown_to_a_step(robot, effect):
+            raise InputError(
+                f"a rollout has no form for '{effect.name}': its torque follows the {what}, which a step does not know"
+                " at its beginning"
+            )
         found.append(_with(effect, {name: getattr(effect, name) for name in effect.parameters()}))
     return tuple(found)
+
+
+def _unknown_to_a_step(robot: RobotModel, effect: Effect) -> str:
+    """What its torque follows that a step does not know at its beginning: the acceleration, the time, or nothing."""
+    return " and the ".join(what for what, moved in _follows(robot, effect).items() if moved)
 
 
 def _follows(robot: RobotModel, effect: Effect) -> dict[str, bool]:
@@ -162,7 +167,7 @@ def is_own(name: str) -> bool:
 
 def _parameter(name: str) -> Any:
     effect, parameter = name.split(".")
-    return find(effect).parameters()[parameter]
+    return (ROLLOUTS.get(effect) or find(effect)).parameters()[parameter]
 
 
 def bounds_of(name: str) -> tuple[float, float]:
@@ -212,11 +217,20 @@ def everywhere(robot: RobotModel, effects: Sequence[Effect], forbid: Sequence[st
         new = [effect(Place((j,))) for j in range(robot.nv) if (name, j) not in there]
         if name in forbid or not new:
             continue
-        try:
-            found += [placed(robot, new[:1])[0], *placed(robot, new[1:])]
-        except InputError:  # one that needs the acceleration or the time: no search of rollouts can look for it
-            continue
+        if not _unknown_to_a_step(robot, new[0]):  # `left_out` tells it
+            found += placed(robot, new)
     return tuple(found)
+
+
+def left_out(robot: RobotModel, forbid: Sequence[str] = ()) -> tuple[str, ...]:
+    """Of each registered effect that no search of rollouts can look for, why."""
+    whats = {name: _unknown_to_a_step(robot, effect(Place((0,)))) for name, effect in registered().items()
+             if name not in forbid}  # fmt: skip
+    return tuple(
+        f"'{name}' is registered, but not looked for in rollouts: its torque follows the {what}, which a step does not"
+        " know at its beginning"
+        for name, what in whats.items() if what
+    )  # fmt: skip
 
 
 def starts_of(effect: type[Effect]) -> tuple[tuple[float, ...], ...]:

@@ -19,10 +19,25 @@ from jaxtyping import Array
 from . import own
 from .loop import Loop
 
-__all__ = ["BOUNDS", "OF_DRIVES", "TEN", "UNITS", "Entry", "Table", "current", "put", "unit_payload", "values"]
+__all__ = [
+    "BOUNDS",
+    "OF_DRIVES",
+    "OF_SEVERAL",
+    "TEN",
+    "UNITS",
+    "Entry",
+    "Table",
+    "current",
+    "put",
+    "uncoupled",
+    "unit_payload",
+    "values",
+]
 
+_PAIRS = {"pair_inertia": "inertia", "pair_damping": "damping", "pair_friction": "friction"}  # fields of `Pairs`
 _DRIVES = ("scale", "delay", "dead_band", "voltage", "time_constant")  # fields of `Drives`
 OF_DRIVES = (*_DRIVES, "force_limit", "kp", "kd")  # places that are drives
+OF_SEVERAL = ("payload", "gravity_x", "gravity_y", *_PAIRS)  # numbers that several joints show
 
 
 class Entry(NamedTuple):
@@ -32,7 +47,7 @@ class Entry(NamedTuple):
     """
 
     name: str
-    at: tuple[int, ...]  # coordinates, drives (names of `Drives`, kp, kd, force_limit) or links (payload, `TEN`)
+    at: tuple[int, ...]  # coordinates, drives (names of `Drives`, kp, kd, force_limit), links (payload, `TEN`), pairs
 
 
 Table = tuple[Entry, ...]
@@ -59,7 +74,8 @@ UNITS = _Known({
     "load_ratio": "", "stiffness": "N m/rad", "rest": "rad", "play": "rad", "offset": "N m", "ripple_sine": "N m",
     "ripple_cosine": "N m", "ripple_order": "1/rad", "reading": "rad", "scale": "", "delay": "s", "dead_band": "rad",
     "voltage": "N m", "force_limit": "N m", "time_constant": "s", "payload": "kg", "kp": "N m/rad", "kd": "N m s/rad",
-    "gravity_x": "m/s2", "gravity_y": "m/s2", "mass": "kg", **dict.fromkeys(TEN[1:4], "kg m"),
+    "gravity_x": "m/s2", "gravity_y": "m/s2", "pair_inertia": "kg m2", "pair_damping": "N m s/rad",
+    "pair_friction": "N m", "mass": "kg", **dict.fromkeys(TEN[1:4], "kg m"),
     **dict.fromkeys(TEN[4:], "kg m2"),
 }, own.unit_of)  # fmt: skip
 
@@ -70,7 +86,7 @@ BOUNDS = _Known({  # what such a number can be
     "ripple_order": (0.5, 40.0), "scale": (1e-3, 1e3), "delay": (0.0, 0.15), "dead_band": (0.0, 0.5),
     "voltage": (1e-4, 1e6), "force_limit": (1e-4, 1e6), "time_constant": (1e-4, 2.0), "payload": (-50.0, 50.0),
     "kp": (1e-6, 1e6), "kd": (0.0, 1e5), "reading": (-0.5, 0.5), "offset": _ANY, "rest": _ANY, "ripple_sine": _ANY,
-    "ripple_cosine": _ANY, "gravity_x": (-9.0, 9.0), "gravity_y": (-9.0, 9.0),
+    "ripple_cosine": _ANY, "gravity_x": (-9.0, 9.0), "gravity_y": (-9.0, 9.0), **dict.fromkeys(_PAIRS, (0.0, 1e4)),
     **dict.fromkeys(TEN, _ANY),
 }, own.bounds_of)  # fmt: skip
 
@@ -88,6 +104,8 @@ def current(loop: Loop, table: Table) -> Array:
 def _get(loop: Loop, name: str, xp: Any = np) -> Any:
     if own.is_own(name):
         return own.read_number(loop.effects, name, xp)
+    if name in _PAIRS:
+        return xp.asarray(getattr(loop.pairs, _PAIRS[name]))
     drives = loop.drives
     special = {
         "kp": lambda: xp.asarray(drives.gain)[:, 0],
@@ -116,6 +134,11 @@ def put(loop: Loop, table: Table, theta: Array | np.ndarray) -> Loop:
 def _put(loop: Loop, name: str, at: np.ndarray, new: Array | np.ndarray) -> Loop:
     if own.is_own(name):
         return dataclasses.replace(loop, effects=own.with_numbers(loop.effects, name, at, new))
+    if name in _PAIRS and loop.pairs is None:  # taken away where none of them acts: `uncoupled`
+        return loop
+    if name in _PAIRS:
+        old = jnp.asarray(getattr(loop.pairs, _PAIRS[name]))
+        return eqx.tree_at(lambda m: getattr(m.pairs, _PAIRS[name]), loop, old.at[at].set(new))
     if name == "payload" and loop.carried is not None:
         whole = jnp.asarray(loop.carried.payload).at[at].set(new)
         return eqx.tree_at(lambda m: m.carried.payload, loop, whole)
@@ -142,6 +165,18 @@ def _put(loop: Loop, name: str, at: np.ndarray, new: Array | np.ndarray) -> Loop
     group = "drives" if name in _DRIVES else "joints"
     old = jnp.asarray(getattr(getattr(loop, group), name))
     return eqx.tree_at(lambda m: getattr(getattr(m, group), name), loop, old.at[at].set(new))
+
+
+def uncoupled(loop: Loop, table: Table, thetas: Any, frees: Any) -> Loop:
+    """The loop without its couplings where none acts and no number of one is free: each costs a row at every step."""
+    mine = [k for k, entry in enumerate(table) if entry.name in _PAIRS]
+    if loop.pairs is None or np.asarray(thetas)[..., mine].any() or np.isin(frees, mine).any():
+        return loop
+    told = {(entry.name, at) for entry in table for at in entry.at}
+    if any(np.asarray(getattr(loop.pairs, field))[k] and (name, k) not in told
+           for name, field in _PAIRS.items() for k in range(len(loop.pairs.at))):  # fmt: skip
+        return loop
+    return dataclasses.replace(loop, pairs=None)
 
 
 def unit_payload(loop: Loop, at: np.ndarray) -> Array:

@@ -12,6 +12,7 @@
 
 #define MOST 32 /* coordinates, drives */
 #define ROWS 64 /* numbers that are read at an instant: positions and rates */
+#define PAIRS 64 /* couplings of two coordinates that act */
 #define TURNS 60 /* Newton steps of the constraints; 1 to 4 are used */
 #define INLINE static inline __attribute__((always_inline))
 #define WIDE static __attribute__((noinline, optimize("O3"))) /* loops over columns, in vectors */
@@ -27,10 +28,11 @@ enum joint_number {
   RATE, SHARE, LEAST, LARGEST, LOWER, UPPER, MARGIN, TIME, DAMPED, LOWEST, HIGHEST, WIDTH, MIDDLE, POWER
 };
 enum drive_number { SCALE, DELAY, DEAD, VOLTAGE, GAIN0, GAIN1, GAIN2, BIAS0, BIAS1, BIAS2, FROM, TO, WEAKEST, STRONGEST };
-enum unknown { OF_DRIVE = 100, LIMIT = 110, KP, KD, BODY = 200, PULL, CARRIED_BODY };
+enum pair_number { TOGETHER, DRAG, RUB }; /* inertia, damping, dry friction of a motor that turns with both */
+enum unknown { OF_DRIVE = 100, LIMIT = 110, KP, KD, PAIR = 120, BODY = 200, PULL, CARRIED_BODY };
 
 typedef struct {
-  long n, nu, links, ny, rates, carried, hard, limited, implicit, windows, rows, lead, substeps, block, many, columns;
+  long n, nu, links, ny, rates, carried, hard, limited, implicit, windows, rows, lead, substeps, block, many, columns, pairs;
   double dt;
   const long *measured, *summed;             /* (ny) */
   const long *parent, *coordinate, *slides;  /* (n) of each tree joint */
@@ -40,6 +42,8 @@ typedef struct {
   const double *payload, *resting;           /* (links), (2): mass and share of a carried joint */
   const long *kind, *place, *column;         /* (many) of the unknowns */
   const double *ten;                         /* (many, 10), of unknowns of the rigid body */
+  const double *pair;                        /* (3, pairs) */
+  const long *joined;                        /* (pairs, 3): two coordinates, and the sign of the second */
   const double *command, *reading, *weight, *load, *begin; /* (lead + rows, nu, windows) ... (2 n, windows) */
   const double *pole;                        /* (wide, windows) of the noise, or none where it is white */
   double *cost, *gradient, *matrix, *read;   /* sums, or what is read alone where `cost` is none */
@@ -67,6 +71,9 @@ typedef struct {
   double u[MOST], faster[MOST], by_length[MOST], by_rate[MOST], by_u[MOST], slope[MOST], length[MOST], rate[MOST];
   double part[MOST], often; /* of a delay in steps */
   int whole[MOST];
+  int pairs, one[PAIRS], two[PAIRS], held[PAIRS]; /* couplings that act; held: 0, or the sign of the friction that slips */
+  long which[PAIRS];
+  double way[PAIRS], pair_level[PAIRS], pair_pull[PAIRS], pair_soft[PAIRS], pair_weight[PAIRS];
   double by_scale[MOST], by_gain[MOST], by_band[MOST];
   int volt[MOST], limit[MOST], inside[MOST];
   double mass, base, steep, at;                               /* of a carried joint */
@@ -269,6 +276,7 @@ APART void unit_torques(const Given *g, const Work *w, const int n, const long k
 
 #define JN(name) (g->joint[(name) * n + j])
 #define DN(name) (g->drive[(name) * g->nu + d])
+#define PN(name) (g->pair[(name) * g->pairs + w->which[k]])
 
 /* softness of the constraints, and the logarithm's derivative by each unknown */
 APART void mobility(const Given *g, Work *w, const int n, double *by) {
@@ -282,14 +290,29 @@ APART void mobility(const Given *g, Work *w, const int n, double *by) {
     masses(g, w, n, M);
   }
   for (int j = 0; j < n; j++) M[j * n + j] += JN(ARMATURE);
+  for (int k = 0; k < w->pairs; k++) {
+    const int i = w->one[k], j = w->two[k];
+    M[i * n + j] += w->way[k] * PN(TOGETHER), M[j * n + i] += w->way[k] * PN(TOGETHER);
+  }
   inverted(M, n);
+  double turn[PAIRS][MOST];
   for (int j = 0; j < n; j++) w->weight[j] = M[j * n + j] * (g->carried ? g->resting[1] : 1);
-  memset(by, 0, sizeof(double) * n * g->many);
+  for (int k = 0; k < w->pairs; k++) {
+    for (int j = 0; j < n; j++) turn[k][j] = M[w->one[k] * n + j] + w->way[k] * M[w->two[k] * n + j];
+    w->pair_weight[k] = turn[k][w->one[k]] + w->way[k] * turn[k][w->two[k]];
+  }
+  memset(by, 0, sizeof(double) * (n + w->pairs) * g->many);
+  double *by_pair = by + n * g->many;
   for (long k = 0; k < g->many; k++) {
-    if (g->kind[k] == ARMATURE)
-      for (int j = 0; j < n; j++) by[k * n + j] = -M[j * n + g->place[k]] * M[j * n + g->place[k]] / M[j * n + j];
-    if (g->kind[k] != BODY) continue;
     double dM[MOST * MOST];
+    if (g->kind[k] == ARMATURE || g->kind[k] == PAIR + TOGETHER) {
+      const int same = g->kind[k] == ARMATURE, i = same ? (int)g->place[k] : (int)g->joined[3 * g->place[k]];
+      const int other = same ? i : (int)g->joined[3 * g->place[k] + 1];
+      const double size = same ? 1 : 2.0 * (double)g->joined[3 * g->place[k] + 2];
+      for (int j = 0; j < n; j++) by[k * n + j] = -size * M[j * n + i] * M[j * n + other] / M[j * n + j];
+      for (int p = 0; p < w->pairs; p++) by_pair[k * w->pairs + p] = -size * turn[p][i] * turn[p][other] / w->pair_weight[p];
+    }
+    if (g->kind[k] != BODY) continue;
     for (int c = 0; c < n; c++) {
       double A[MOST][6];
       for (int i = 0; i < n; i++) {
@@ -305,6 +328,12 @@ APART void mobility(const Given *g, Work *w, const int n, double *by) {
       for (int c = 0; c < n; c++)
         for (int r = 0; r < n; r++) x -= M[j * n + c] * dM[c * n + r] * M[r * n + j];
       by[k * n + j] = x / M[j * n + j];
+    }
+    for (int p = 0; p < w->pairs; p++) {
+      double x = 0;
+      for (int c = 0; c < n; c++)
+        for (int r = 0; r < n; r++) x -= turn[p][c] * dM[c * n + r] * turn[p][r];
+      by_pair[k * w->pairs + p] = x / w->pair_weight[p];
     }
   }
 }
@@ -396,6 +425,14 @@ ALIKE void resisted(const Given *g, Work *w, const int n) {
     limited(g, n, j, q - JN(LOWER), v, w->weight[j], &w->side[0][j]);
     limited(g, n, j, JN(UPPER) - q, -v, w->weight[j], &w->side[1][j]);
   }
+  for (int k = 0; k < w->pairs; k++) {
+    const int i = w->one[k], j = w->two[k];
+    const double s = w->way[k], rate = w->v[i] + s * w->v[j];
+    w->torque[i] -= PN(DRAG) * s * w->v[j], w->torque[j] -= PN(DRAG) * s * w->v[i];
+    w->pair_level[k] = PN(RUB) > 0 ? PN(RUB) : 0;
+    w->pair_pull[k] = g->hard ? -rate / g->dt : -g->joint[RATE * n + i] * rate;
+    w->pair_soft[k] = w->pair_weight[k] * (g->hard ? 1e-9 : g->joint[SHARE * n + i]);
+  }
 }
 
 INLINE void acting(const Given *g, Work *w, const int n, const double *a) {
@@ -405,6 +442,14 @@ INLINE void acting(const Given *g, Work *w, const int n, const double *a) {
     w->side[0][j].on = g->limited && a[j] < w->side[0][j].pull;
     w->side[1][j].on = g->limited && -a[j] < w->side[1][j].pull;
   }
+  for (int k = 0; k < w->pairs; k++) {
+    const double raw = (w->pair_pull[k] - a[w->one[k]] - w->way[k] * a[w->two[k]]) / w->pair_soft[k];
+    w->held[k] = raw >= w->pair_level[k] ? 1 : raw <= -w->pair_level[k] ? -1 : 0;
+  }
+}
+INLINE double pair_force(const Work *w, const int k, const double *a) {
+  if (w->held[k]) return w->held[k] * w->pair_level[k];
+  return (w->pair_pull[k] - a[w->one[k]] - w->way[k] * a[w->two[k]]) / w->pair_soft[k];
 }
 INLINE double force_at(const Work *w, const int j, double a) {
   double f = w->slip[j] ? w->slip[j] * w->level[j] : (w->pull[j] - a) / w->soft[j];
@@ -425,10 +470,11 @@ APART double along(const Given *g, Work *w, const int n, const double *a, const 
   for (int j = 0; j < n; j++) at[j] = a[j] + s * way[j];
   acting(g, w, n, at);
   for (int j = 0; j < n; j++) x -= way[j] * force_at(w, j, at[j]);
+  for (int k = 0; k < w->pairs; k++) x -= (way[w->one[k]] + w->way[k] * way[w->two[k]]) * pair_force(w, k, at);
   return x;
 }
 APART double step_length(const Given *g, Work *w, const int n, const double *r, const double *way) {
-  double at[4 * MOST + 2], start = 0, curve = 0, far = 0, low = 0, high = INFINITY;
+  double at[4 * MOST + 2 * PAIRS + 2], start = 0, curve = 0, far = 0, low = 0, high = INFINITY;
   int many = 0;
   for (int j = 0; j < n; j++) {
     double x = 0, y = 0;
@@ -439,6 +485,14 @@ APART double step_length(const Given *g, Work *w, const int n, const double *r, 
     const double edge[4] = {w->pull[j] - reach, w->pull[j] + reach, w->side[0][j].pull, -w->side[1][j].pull};
     for (int k = 0; k < (g->limited ? 4 : 2); k++) {
       const double s = (edge[k] - w->a[j]) / way[j];
+      if (isfinite(s) && s > 0) at[many++] = s, far = s > far ? s : far;
+    }
+  }
+  for (int k = 0; k < w->pairs; k++) {
+    const double rise = way[w->one[k]] + w->way[k] * way[w->two[k]], here = w->a[w->one[k]] + w->way[k] * w->a[w->two[k]];
+    if (rise == 0) continue;
+    for (int side = -1; side < 2; side += 2) {
+      const double s = (w->pair_pull[k] + side * w->pair_soft[k] * w->pair_level[k] - here) / rise;
       if (isfinite(s) && s > 0) at[many++] = s, far = s > far ? s : far;
     }
   }
@@ -456,6 +510,12 @@ APART double step_length(const Given *g, Work *w, const int n, const double *r, 
 INLINE void with_stiffness(const Work *w, const int n, double *K) {
   memcpy(K, w->M, sizeof(double) * n * n);
   for (int j = 0; j < n; j++) K[j * n + j] += stiffness(w, j);
+  for (int k = 0; k < w->pairs; k++) {
+    if (w->held[k]) continue;
+    const int i = w->one[k], j = w->two[k];
+    const double c = 1 / w->pair_soft[k], s = w->way[k];
+    K[i * n + i] += c, K[j * n + j] += c, K[i * n + j] += s * c, K[j * n + i] += s * c;
+  }
   inverted(K, n);
 }
 
@@ -485,12 +545,16 @@ INLINE void settled(const Given *g, Work *w, const int n) {
   for (int turn = 0; turn < TURNS; turn++) {
     if (turn == 1) acting(g, w, n, w->a);
     double way[MOST], gap[MOST], full[MOST];
-    int slip[MOST], low[MOST], high[MOST], same = 1;
+    int slip[MOST], low[MOST], high[MOST], held[PAIRS], same = 1;
     with_stiffness(w, n, w->K);
     for (int j = 0; j < n; j++) {
       gap[j] = -r[j] - force_at(w, j, w->a[j]);
       for (int k = 0; k < n; k++) gap[j] += w->M[j * n + k] * w->a[k];
       slip[j] = w->slip[j], low[j] = w->side[0][j].on, high[j] = w->side[1][j].on;
+    }
+    for (int k = 0; k < w->pairs; k++) {
+      const double f = pair_force(w, k, w->a);
+      gap[w->one[k]] -= f, gap[w->two[k]] -= w->way[k] * f, held[k] = w->held[k];
     }
     for (int j = 0; j < n; j++) {
       way[j] = 0;
@@ -499,6 +563,7 @@ INLINE void settled(const Given *g, Work *w, const int n) {
     }
     acting(g, w, n, full);
     for (int j = 0; j < n; j++) same &= slip[j] == w->slip[j] && low[j] == w->side[0][j].on && high[j] == w->side[1][j].on;
+    for (int k = 0; k < w->pairs; k++) same &= held[k] == w->held[k];
     if (same) {
       memcpy(w->a, full, sizeof(double) * n);
       return;
@@ -530,12 +595,20 @@ INLINE void stepped(const Given *g, Work *w, const int n, const int carried, con
     masses(g, w, n, w->M);
   }
   for (int j = 0; j < n; j++) w->M[j * n + j] += JN(ARMATURE);
+  for (int k = 0; k < w->pairs; k++) {
+    const int i = w->one[k], j = w->two[k];
+    w->M[i * n + j] += w->way[k] * PN(TOGETHER), w->M[j * n + i] += w->way[k] * PN(TOGETHER);
+  }
   driven(g, w, n, want);
   resisted(g, w, n);
   settled(g, w, n);
   int damped = 0;
   memset(w->D, 0, sizeof(double) * n * n);
   for (int j = 0; j < n; j++) w->D[j * n + j] = JN(DAMPING), damped |= JN(DAMPING) != 0;
+  for (int k = 0; k < w->pairs; k++) {
+    const int i = w->one[k], j = w->two[k];
+    w->D[i * n + j] += w->way[k] * PN(DRAG), w->D[j * n + i] += w->way[k] * PN(DRAG), damped |= PN(DRAG) != 0;
+  }
   for (long d = 0; g->implicit && d < g->nu; d++) {
     const double *way = g->way + d * n;
     if (w->slope[d] == 0) continue;
@@ -679,6 +752,11 @@ INLINE void linearised(const Given *g, Work *w, const int n, const int carried, 
     }
     by_q[j * n + j] += dq, by_v[j * n + j] += dv;
   }
+  for (int k = 0; k < w->pairs; k++) {
+    const int i = w->one[k], j = w->two[k];
+    const double s = w->way[k], c = w->held[k] ? 0 : (g->hard ? 1 / g->dt : g->joint[RATE * n + i]) / w->pair_soft[k];
+    by_v[i * n + i] += c, by_v[j * n + j] += c, by_v[i * n + j] += s * (c + PN(DRAG)), by_v[j * n + i] += s * (c + PN(DRAG));
+  }
   memset(own, 0, sizeof(double) * n * n), memset(W, 0, sizeof(double) * n * n); /* W: L M K transposed, all symmetric */
   for (int i = 0; i < n; i++)
     for (int k = 0; k < n; k++)
@@ -696,11 +774,22 @@ INLINE void linearised(const Given *g, Work *w, const int n, const int carried, 
     const long c = two + g->column[p], at = g->place[p], kind = g->kind[p];
     double one[MOST], more[MOST];
     int all = 0;
-    if (kind == ARMATURE || kind >= BODY) {
+    if (kind == ARMATURE || kind >= BODY || (kind >= PAIR && kind <= PAIR + RUB)) {
       memset(one, 0, sizeof(double) * n), memset(more, 0, sizeof(double) * n);
       all = 1;
     }
     if (kind == ARMATURE) one[at] = w->a[at], more[at] = x[at];
+    if (kind >= PAIR && kind <= PAIR + RUB) {
+      int k = 0;
+      while (w->which[k] != at) k++;
+      const int i = w->one[k], j = w->two[k];
+      const double s = w->way[k];
+      if (kind == PAIR + TOGETHER) one[i] = s * w->a[j], one[j] = s * w->a[i], more[i] = s * x[j], more[j] = s * x[i];
+      if (kind == PAIR + DRAG) {
+        one[i] = s * w->v[j], one[j] = s * w->v[i], more[i] = g->dt * s * w->moved[j], more[j] = g->dt * s * w->moved[i];
+      }
+      if (kind == PAIR + RUB) one[i] = -w->held[k], one[j] = -s * w->held[k];
+    }
     if (kind == CARRIED_BODY) {
       double q = -w->at, a = 0, s = 0;
       for (int k = 0; k < n; k++) q += w->q[k], a += w->a[k], s += x[k];
@@ -722,6 +811,11 @@ INLINE void linearised(const Given *g, Work *w, const int n, const int carried, 
         if (w->side[0][j].on) f += (w->side[0][j].pull - w->a[j]) / w->side[0][j].soft;
         if (w->side[1][j].on) f -= (w->side[1][j].pull + w->a[j]) / w->side[1][j].soft;
         one[j] += f * mobile[p * n + j];
+      }
+      for (int k = 0; k < w->pairs; k++) {
+        const double f = w->held[k] ? 0 : (w->pair_pull[k] - w->a[w->one[k]] - w->way[k] * w->a[w->two[k]]) / w->pair_soft[k];
+        const double rise = f * mobile[n * g->many + p * w->pairs + k];
+        one[w->one[k]] += rise, one[w->two[k]] += w->way[k] * rise;
       }
       for (int k = 0; k < n; k++)
         for (int j = 0; j < n; j++) BY(c) -= W[k * n + j] * one[k] + w->L[k * n + j] * more[k];
@@ -936,7 +1030,14 @@ INLINE void window_of(const Given *g, const int n, const int carried, const int 
 INLINE void all_windows(const Given *g, const int n, const int carried, const int want) {
   Work w; /* no static one: its address would be asked for at each use */
   memset(&w, 0, sizeof w);
-  double mobile[n * g->many + 1];
+  for (long k = 0; k < g->pairs && w.pairs < PAIRS; k++) {
+    int acts = g->pair[TOGETHER * g->pairs + k] != 0 || g->pair[DRAG * g->pairs + k] != 0 || g->pair[RUB * g->pairs + k] != 0;
+    for (long p = 0; p < g->many; p++) acts |= g->kind[p] >= PAIR && g->kind[p] <= PAIR + RUB && g->place[p] == k;
+    if (!acts) continue;
+    w.one[w.pairs] = (int)g->joined[3 * k], w.two[w.pairs] = (int)g->joined[3 * k + 1];
+    w.way[w.pairs] = (double)g->joined[3 * k + 2], w.which[w.pairs++] = k;
+  }
+  double mobile[(n + w.pairs) * g->many + 1];
   mobility(g, &w, n, mobile);
   w.often = 1 / g->dt;
   for (long d = 0; d < g->nu; d++) {

@@ -17,7 +17,7 @@ from .causes import Candidate, elastic_loop, springs
 from .fit import Fit, fit
 from .loop import Loop
 from .own import is_own
-from .parameters import OF_DRIVES, Entry
+from .parameters import OF_DRIVES, OF_SEVERAL, Entry
 from .search import Model, Tried, scored, settled
 from .sensitivity import Windows
 from .setting import (  # fmt: skip
@@ -32,7 +32,18 @@ from .setting import (  # fmt: skip
 )
 from .thresholds import EXPLAINED, HOPEFUL, MAY_WIN, RICHER, UNCHANGED, USUAL
 
-__all__ = ["LATE", "ROUGH", "Known", "Standing", "excess_of", "joint_of", "joint_of_entry", "outputs", "tried_now"]
+__all__ = [
+    "LATE",
+    "ROUGH",
+    "Known",
+    "Standing",
+    "excess_of",
+    "joint_of",
+    "joint_of_entry",
+    "outputs",
+    "sprung_now",
+    "tried_now",
+]
 
 LATE, ROUGH = 30, 1e-4  # iterations; share of the squares that a step must promise
 _EARLY = 3  # iterations of each candidate
@@ -118,6 +129,8 @@ def tried_now(
         usual = [one for one in enough if one.candidate.kind.usual][:1]  # may come before what promises more
         rest = [one for one in enough if all(one is not x for x in usual)]
         chosen = [*usual, *rest][: _TOP if j >= 0 else 1]
+        if j < 0:  # a motor that turns with the sum of two joints, and one that turns with their difference
+            chosen = [one for one in rest if one.candidate[:2] == chosen[0].candidate[:2]] if chosen else []
         hopeful[j] = chosen + [
             one for one in ranked if _asked_by(one.candidate, chosen) and all(one is not x for x in chosen)
         ]
@@ -145,6 +158,9 @@ def _limits_and_springs(
     mine = [c for c in left if joint_of(here, c) == joint]
     leader = max(plain, key=lambda one: one.promise, default=None)
     chosen = [c for c in mine if c.kind.limit or (leader is not None and c is leader.candidate)]
+    if leader is not None and leader.candidate.kind.shapes:  # from the start that was the best one
+        best = leader.candidate._replace(starts=(tuple(leader.theta[list(leader.candidate.entries)]),))
+        chosen = [best if c is leader.candidate else c for c in chosen]
     scores = {chosen[k].effect: (part.fit.cost - x, theta) for k, (x, theta) in scored(here, part, chosen).items()}
     if leader is not None and scores.get(leader.candidate.effect, (0.0, None))[0] > 0:
         share = leader.promise / scores[leader.candidate.effect][0]  # as much more as the same cause promises in all
@@ -351,6 +367,23 @@ def _sprung(here: Setting, now: Standing, joint: int, forbid: Sequence[str]) -> 
     return found
 
 
+def sprung_now(here: Setting, now: Standing, forbid: Sequence[str]) -> list[Tried]:
+    """A spring at each joint of a rigid arm, fitted to the end where it may explain more than any other joint's."""
+    if now.model.structure.loop.robot.nv != here.loop.robot.nv:
+        return []
+    ranked = [max(_sprung(here, now, j, forbid), key=lambda one: one.promise, default=None)
+              for j in range(here.loop.robot.nv)]  # fmt: skip
+    found = []
+    for one in sorted((x for x in ranked if x is not None), key=lambda x: -x.promise)[:_RACE]:
+        free, start = free_entries(now.model.free, one.candidate.entries), _start_of(now, one.structure)
+        last = fit(*one.structure, one.theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
+                   iterations=LATE)[0]  # fmt: skip
+        if np.isfinite(last.cost):
+            state = Model(one.structure, last, tuple(free), float(excess_of(here, one.structure, last).max()))
+            found.append(Tried(one.candidate, state, outputs(here, last.sums.cost)))
+    return found
+
+
 def outputs(here: Setting, squares: Any) -> np.ndarray:
     """Squares by outputs as squares by joints of the robot: rates go with their positions."""
     places, count = list(here.loop.measured), len(here.loop.measured)
@@ -378,7 +411,7 @@ def joint_of(here: Setting, c: Candidate) -> int:
 def joint_of_entry(here: Setting, entry: int) -> int:
     """The joint whose encoder shows a number of the table; -1: those of several."""
     one = here.known.table[entry] if entry < len(here.known.table) else None
-    if one is None or len(one.at) != 1 or one.name in ("payload", "gravity_x", "gravity_y"):
+    if one is None or len(one.at) != 1 or one.name in OF_SEVERAL:
         return -1
     (place,) = one.at
     if is_own(one.name):

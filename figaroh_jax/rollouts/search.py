@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import gammainccinv, ndtr
 
 from ..results import Name, Verdict
 from .causes import Candidate, elastic_loop, springs
@@ -29,6 +29,7 @@ from .setting import (
     start_values,
     whitened,
 )
+from .starting import shown, suggested
 from .thresholds import (
     CLEAR_OF_NOTHING,
     CONFIDENT,
@@ -164,6 +165,8 @@ def _searched(
         progress(f"searching for cause {len(found) + 1}", min(0.2 + 0.15 * len(found), 0.9))
         tried = _tried(here, now, [n.candidate for n in found], forbid)
         best, p = _best(here, now, tried, nearest)
+        if best is not None and now.excess < 1.0 and now.structure.loop.robot.nv == here.loop.robot.nv == 1:
+            best, p = _best(here, now, [*tried, *_elastic(here, now, forbid)], nearest)  # not looked for in noise
         p_value = p if not found else p_value
         if best is None:
             break
@@ -265,12 +268,16 @@ def scored(here: Setting, now: Model, left: Sequence[Candidate]) -> dict[int, tu
     """The cost that one linear step of each candidate leaves, and from which numbers; those that diverge are left out.
 
     Several candidates share one linearisation; a limit of a drive changes the model before it can be differentiated:
-    each is linearised at one start of its own. Users' effects stand by themselves, for no machine code knows them.
+    each is linearised at one start of its own. Users' effects stand by themselves, for no machine code knows them, and
+    so does what is asked at several starts.
     """
     many = max(int(np.sqrt(_SUMS / now.fit.sums.cost[..., 0].size)) - len(now.free) - len(now.fit.start), _LEAST_ROOM)
     room = max(here.width - len(now.free), min(many, _ROOM))
     limits = [k for k, c in enumerate(left) if c.kind.limit]
-    theirs = {c.effect: [k for k, x in enumerate(left) if x.effect == c.effect] for c in left if c.own(here.known)}
+    left = suggested(here, now.structure, now.fit, left)
+    theirs = {c.effect: [k for k, x in enumerate(left) if x.effect == c.effect] for c in left if c.kind.shapes}
+    theirs |= {c.effect: [k for k, x in enumerate(left) if x.effect == c.effect] for c in left if c.own(here.known)}
+    nowhere = {k for k, c in enumerate(left) if c.kind.shapes and not c.starts}
     apart = {*limits, *(k for pack in theirs.values() for k in pack)}
     packs, filled = [], 0
     for k in [k for k in range(len(left)) if k not in apart]:
@@ -287,8 +294,9 @@ def scored(here: Setting, now: Model, left: Sequence[Candidate]) -> dict[int, tu
                 if shape := left[k].kind.falls_off:
                     theta[left[k].entries[shape]] = left[k].starts[variant][shape]
             lanes.append((theta, pack))
-    for pack in theirs.values():  # every start of all that share a name, at all places at once
-        for variant in range(max(len(left[k].starts) for k in pack)):
+    for one in theirs.values():  # every start of all that share a name, at all places at once
+        pack = [k for k in one if k not in nowhere]
+        for variant in range(max((len(left[k].starts) for k in pack), default=0)):
             theta = now.fit.theta.copy()
             for k in pack:
                 theta[list(left[k].entries)] = left[k].starts[variant % len(left[k].starts)]
@@ -480,9 +488,28 @@ def sized(here: Setting, one: Tried) -> bool:
         speed = one.candidate.entries[kind.falls_off]
         if found.theta[speed] > _top_speed(here, one.state.structure.table[speed].at[0]):
             return False
+    if not shown(here, one.candidate, found.theta):
+        return False
     if not kind.signed:
         return bool(np.isfinite(error) and error < OF_ITS_SIZE * abs(value) + 1e-12)
+    if kind.together > 1:
+        return _clear_together(one)
     return bool(np.isfinite(error) and abs(value - kind.neutral) > CLEAR_OF_NOTHING * error)
+
+
+def _clear_together(one: Tried) -> bool:
+    """Whether two numbers are a size together, such as sine and cosine: as sure as one number is to be."""
+    found = one.state.fit
+    entries = [k for k in one.candidate.entries[: one.candidate.kind.together] if k in found.free]
+    at = [int(np.flatnonzero(found.free == k)[0]) for k in entries]
+    covariance = System(found.sums, one.state.structure.data, found.start).covariance(found.free < 0)[np.ix_(at, at)]
+    told = np.isfinite(np.diag(covariance))
+    size = found.theta[entries][told]
+    if not told.any():
+        return False
+    wald = float(size @ np.linalg.pinv(covariance[np.ix_(told, told)], hermitian=True) @ size)
+    chance = 2 * ndtr(-CLEAR_OF_NOTHING)
+    return wald > (CLEAR_OF_NOTHING**2 if told.sum() == 1 else 2 * gammainccinv(told.sum() / 2, chance))
 
 
 def _top_speed(here: Setting, coordinate: int) -> float:

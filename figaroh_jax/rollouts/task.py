@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..effects.base import Effect, place
-from ..effects.catalogue import find
+from ..effects.catalogue import ROLLOUTS, find
 from ..effects.extended import ExtendedModel, extend
 from ..effects.plausibility import implausible
 from ..errors import InputError
@@ -25,7 +25,7 @@ from .causes import BASELINE
 from .data import Run, Stretch, noise_of, regular, windows
 from .fit import Fit, standard_errors
 from .loop import Loop
-from .own import amplitudes
+from .own import amplitudes, left_out
 from .parameters import UNITS, put
 from .reading import load_loop
 from .rest import nearest_of, parts_of, relative_rest
@@ -49,16 +49,14 @@ __all__ = [
 ]
 
 EFFECTS = {  # parameters of effects and the fields of `Joints` that hold them
-    "rotor_inertia": {"inertia": "armature"},
-    "viscous_friction": {"damping": "damping"},
-    "coulomb_friction": {"force": "friction"},
-    "stribeck_friction": {"force": "stribeck_force", "speed": "stribeck_speed"},
-    "load_dependent_friction": {"ratio": "load_ratio"},
-    "joint_spring": {"stiffness": "stiffness", "offset": "offset"},
+    effect.name: {told: number for told, number in effect.in_rollouts.numbers}
+    for effect in ROLLOUTS.values()
+    if effect.in_rollouts.numbers and effect.in_rollouts.place == "joint" and effect.has("torque")
 }
-_SAME = {"viscous_friction": "joint_damping", "coulomb_friction": "friction_loss"}  # as they are called here
+_SAME = {effect.name: called for called, effect in ROLLOUTS.items() if called != effect.name}
 _WINDOW, _OPEN = 15.0, 1.0  # s
 _FAR = 1e3  # rad or m: a simulation that gets there has diverged
+_G = 9.81  # m/s2, as `GravityTilt.physical`
 _TURN = 12.0  # a command that many times beyond what the joint did is in other units
 
 
@@ -77,6 +75,7 @@ def diagnose_rollout_task(
     progress("reading", 0.0)
     loop, runs, notes = read_rollouts(task)
     here = diagnosis_setting(task, loop, runs)
+    notes = (*notes, *left_out(loop.robot, task.diagnose.forbid))
     with jax.enable_x64(True):
         seek = search_arm if separable(loop) else search
         found = seek(here, progress, forbid=task.diagnose.forbid)
@@ -223,6 +222,7 @@ def _faulty(found: Search, here: Setting) -> list[Cause]:
     for one in found.faults:
         at = () if one.kind == "clock_error" else tuple(names[j] for j in one.joints)
         size = ("delay", "s") if one.kind == "clock_error" else ("torque", "N m")
+        size = size if one.table is None else ("force", "N")
         parameters = {
             "first": Estimate(one.first, 0.5, "s"),
             "last": Estimate(one.last, 0.5, "s"),
@@ -309,6 +309,14 @@ def _cause(one: Named, found: Search, here: Setting) -> Cause:
             name, value, error, unit = "rest", -value / stiffness, error / abs(stiffness), "rad"
         value -= one.candidate.kind.neutral
         parameters[name] = Estimate(value, error, unit)
+    first = structure.table[one.candidate.entries[0]]
+    if first.name == "pair_inertia" and here.loop.pairs is not None:
+        parameters["sign"] = Estimate(float(here.loop.pairs.at[first.at[0]][2]), 0.0, "")
+    if one.candidate.effect == "gravity_tilt":  # as angles
+        x, y = (parameters[name] for name in ("x", "y"))
+        parameters = {
+            "about_x": Estimate(-y.value / _G, y.std / _G, "rad"), "about_y": Estimate(x.value / _G, x.std / _G, "rad")
+        }  # fmt: skip
     at = one.candidate.at
     sure = 1.0 / (1 + len(one.alike)) * (0.98 if found.verdict == "named" else 0.8)
     gain = Gain(one.before, one.after, "rad")
@@ -321,7 +329,7 @@ def _experiment(found: Search) -> Experiment | None:
             other = one.alike[0].effect if one.alike else "what is not in the catalogue"
             text = one.candidate.kind.experiment
             pair = ((one.candidate.effect, other),)
-            return Experiment(text.format(at=one.candidate.at[0]), pair if one.alike else ())
+            return Experiment(text.format(at=", ".join(one.candidate.at)), pair if one.alike else ())
     return None
 
 
@@ -373,9 +381,16 @@ def extended_of(loop: Loop) -> ExtendedModel:
             numbers = {field: float(np.asarray(getattr(loop.joints, leaf))[k]) for field, leaf in fields.items()}
             if effect == "joint_spring":
                 numbers["offset"] -= numbers["stiffness"] * float(np.asarray(loop.joints.rest)[k])
-            if next(iter(numbers.values())):
+            if effect == "torque_offset" and np.asarray(loop.joints.stiffness)[k]:
+                continue  # the spring holds it
+            if any(numbers[name] for name in amplitudes(find(effect)) if name != "offset" or effect == "torque_offset"):
                 own.append(place(find(effect), robot, [name], **numbers))
-            elif effect == "joint_spring" and numbers["offset"]:
-                own.append(place(find("torque_offset"), robot, [name], offset=numbers["offset"]))
+    for k, (i, j, sign) in enumerate(loop.pairs.at if loop.pairs is not None else ()):
+        numbers = {
+            field: float(np.asarray(getattr(loop.pairs, field))[k]) for field in ("inertia", "damping", "friction")
+        }
+        if any(numbers.values()):
+            pair = [robot.dof_names[i], robot.dof_names[j]]
+            own.append(place(find("coupled_transmission"), robot, pair, **numbers, sign=float(sign)))
     own += [e for e in loop.effects if any(float(getattr(e, name)) for name in amplitudes(type(e)))]
     return extend(robot, *own)

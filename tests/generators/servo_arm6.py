@@ -23,6 +23,12 @@ EFFECTS = {  # three sizes each
     "voltage_saturation": (0.8, 0.6, 0.4),  # share of the largest torque
     "dead_band": (0.003, 0.008, 0.02),  # rad
 }
+MORE = {  # effects of torque level that act on joints; three sizes each
+    "torque_ripple": (0.05, 0.12, 0.3),  # N m, 13.7 times a turn and .9 rad late
+    "gravity_tilt": (0.01, 0.03, 0.08),  # rad, about x; half of it about y
+    "coupled_transmission": (0.3, 0.6, 1.0),  # of a joint's armature, damping and friction, by a tendon to the next one
+}
+ORDER, PHASE = 13.7, 0.9
 DETENT = (0.1, 0.25, 0.6)  # N m: no effect of the library's
 DT, EVERY, SECONDS, NOISE = 0.002, 5, 12.0, 2e-4
 KP, KV = (60.0, 60.0, 50.0, 20.0, 15.0, 8.0), (1.0, 1.0, 0.8, 0.3, 0.2, 0.1)
@@ -37,7 +43,9 @@ MIDDLE = (0.0, 0.9, 0.5, 0.3, 0.0, 0.0)  # rad, about which the joints are moved
 NAMES = ("pan", "lift", "elbow", "flex", "roll", "jaw")
 
 
-def model_text(scale: float = 1.0, payload: float = 0.0, spring: int = -1) -> str:
+def model_text(
+    scale: float = 1.0, payload: float = 0.0, spring: int = -1, tilt: float = 0.0, coupled: tuple[int, float] = (0, 0.0)
+) -> str:
     """The arm as an MJCF file; `spring`: a hinge between motor and link of that joint."""
     body, drives = "", ""
     for k, name in enumerate(NAMES):
@@ -54,8 +62,12 @@ def model_text(scale: float = 1.0, payload: float = 0.0, spring: int = -1) -> st
             body += f'<body pos="{place}">{own}{link}'
         drives += f'<position name="{name}" joint="{name}" kp="{KP[k]}" kv="{KV[k]}"/>'
     ends = "</body>" * (6 + (spring >= 0))
-    return (f'<mujoco><compiler angle="radian"/><option timestep="{DT}" integrator="implicitfast"><flag contact="disable"/></option>'
-            f"<worldbody>{body}{ends}</worldbody><actuator>{drives}</actuator></mujoco>")  # fmt: skip
+    j, share = coupled
+    tendon = "" if share == 0 else (f'<tendon><fixed armature="{share * ARMATURE[j]:.6g}" damping="{share * DAMPING[j]:.6g}" frictionloss="{share * FRICTION[j]:.6g}">'
+        f'<joint joint="{NAMES[j]}" coef="1"/><joint joint="{NAMES[j + 1]}" coef="1"/></fixed></tendon>')  # fmt: skip
+    pull = f"{9.81 * np.sin(tilt / 2):.9g} {-9.81 * np.sin(tilt):.9g} -9.81"
+    return (f'<mujoco><compiler angle="radian"/><option timestep="{DT}" integrator="implicitfast" gravity="{pull}"><flag contact="disable"/></option>'
+            f"<worldbody>{body}{ends}</worldbody>{tendon}<actuator>{drives}</actuator></mujoco>")  # fmt: skip
 
 
 def command(seed: int, number: int) -> np.ndarray:
@@ -76,7 +88,11 @@ def record(
 
     what = {name: (joint, size) for name, joint, size in hidden}
     sprung = next((what[k][0] for k in ("joint_elasticity", "backlash") if k in what), -1)
-    model = mujoco.MjModel.from_xml_string(model_text(payload=what.get("payload", (5, 0.0))[1], spring=sprung))
+    text = model_text(
+        payload=what.get("payload", (5, 0.0))[1], spring=sprung, tilt=what.get("gravity_tilt", (0, 0.0))[1],
+        coupled=what.get("coupled_transmission", (0, 0.0)),
+    )  # fmt: skip
+    model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     dofs = [model.joint(name).dofadr[0] for name in NAMES]
     u = command(seed, number)
@@ -107,6 +123,9 @@ def record(
             j, size = what["detent"]
             x = (now[j] - MIDDLE[j]) / 0.1
             data.qfrc_applied[dofs[j]] = -size * x * np.exp(-(x**2) / 2)
+        if "torque_ripple" in what:
+            j, size = what["torque_ripple"]
+            data.qfrc_applied[dofs[j]] = -size * np.sin(ORDER * now[j] + PHASE)
         if sprung >= 0:
             at = model.joint("spring").dofadr[0]
             stiffness = what["joint_elasticity"][1] if "joint_elasticity" in what else 300.0
