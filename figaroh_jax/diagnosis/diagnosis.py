@@ -397,6 +397,9 @@ def _answered(
         fit = (here.problem, here.start, here.whitening, named, joint)
         gaining = without_losses(*fit, searched.strict, borne_out, claims)
         against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
+        if named and not gaining.named:  # the fit was chosen beside causes that have gone
+            here, joint, _ = _as_predicts_best(settings, [], None)
+            gaining = without_losses(here.problem, here.start, here.whitening, [], joint, searched.strict)
         named = gaining.named
         if named:
             gaining = gaining._replace(joint=as_weighed_otherwise(here, searched.here.problem, gaining.joint))
