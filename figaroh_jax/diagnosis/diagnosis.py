@@ -398,7 +398,7 @@ def _answered(
         gaining = without_losses(*fit, searched.strict, borne_out, claims)
         against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
         if named and not gaining.named:  # the fit was chosen beside causes that have gone
-            here, joint, _ = _as_predicts_best(settings, [], None)
+            here, joint, _ = as_predicts_best(settings, [], None)
             gaining = without_losses(here.problem, here.start, here.whitening, [], joint, searched.strict)
         named = gaining.named
         if named:
