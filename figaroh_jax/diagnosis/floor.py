@@ -95,7 +95,7 @@ def told_too_large(
 
 def _resolved(problem: Problem) -> bool:
     """Whether any recording has rows enough for a spectrum."""
-    fitted = problem.records.fitted.any(2)
+    fitted = np.any(problem.records.fitted, axis=2)
     return any(fitted[at.slot, at.row : at.row + at.rows].sum() >= FEWEST for at in problem.records.spans)
 
 
