@@ -114,10 +114,10 @@ def irb120(cases: Path, out: Path, sides: dict[str, Path], orders: int = 16) -> 
 
 def slowed(cases: Path) -> None:
     import figaroh_jax as fj
-    from figaroh_jax.diagnosis import diagnosis
+    from figaroh_jax.diagnosis import diagnosis, setting
 
     seen: list[np.ndarray] = []
-    squares, kept = diagnosis._baseline_squares, diagnosis._signals
+    squares, kept = setting._baseline_squares, diagnosis.prepared_signals
 
     def noted(*given: Any) -> np.ndarray:
         seen.append(squares(*given))
@@ -129,7 +129,7 @@ def slowed(cases: Path) -> None:
     def ended(*given: Any) -> Any:
         raise Chosen(kept(*given)[1])
 
-    diagnosis._baseline_squares, diagnosis._signals = noted, ended
+    setting._baseline_squares, diagnosis.prepared_signals = noted, ended
     for file in sorted(cases.glob("*/task.yaml")):
         seen.clear()
         try:

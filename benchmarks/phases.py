@@ -21,7 +21,7 @@ from typing import Any
 
 PHASES = {  # functions of the package, by what they are told as
     "reading": ["recordings.dataset.read_recordings", "recordings.checks.check_recordings"],
-    "signals, whether slowed": ["diagnosis.diagnosis._signals"],
+    "signals, whether slowed": ["diagnosis.setting.prepared_signals"],
     "noise": ["diagnosis.floor.noise_floor"],
     "weights and width of friction": [
         "diagnosis.flexible.friction_width",
@@ -39,7 +39,7 @@ PHASES = {  # functions of the package, by what they are told as
     "fits of all causes": ["diagnosis.joint.polished"],
     "each cause left out": ["diagnosis.search.eliminate", "diagnosis.naming.standings"],
     "what is left": ["diagnosis.diagnosis._left", "diagnosis.rest.parts_of"],
-    "data kept out": ["diagnosis.gaining.without_losses", "diagnosis.diagnosis._as_predicts_best"],
+    "data kept out": ["diagnosis.gaining.without_losses", "diagnosis.answer_fit.as_predicts_best"],
     "next experiment": ["diagnosis.experiment.next_experiment"],
     "the rest of the diagnosis": ["diagnosis.diagnosis.diagnose"],
 }

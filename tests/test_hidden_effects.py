@@ -112,7 +112,7 @@ def test_a_payload_on_links_that_are_trusted_is_named_and_not_taken_in_by_them()
 @needs_robots
 def test_a_cause_at_one_joint_does_not_decide_whether_positions_are_slowed():
     """The motion of all joints is far below the cutoff, whether or not the largest reads its torque 5 % low."""
-    from figaroh_jax.diagnosis import diagnosis
+    from figaroh_jax.diagnosis import setting
 
     for seed in (7301, 7302):
         for effects in ([], [("torque_gain", 0.05, ("panda_joint2",))]):
@@ -121,7 +121,7 @@ def test_a_cause_at_one_joint_does_not_decide_whether_positions_are_slowed():
                 task = config.load_task(case.write(Path(folder)))
                 model = load_robot(task)
                 given = read_recordings(task, model), task.preprocess, None, task.robot.trust
-                assert diagnosis._signals(as_backend(model), *given)[1], (seed, effects)
+                assert setting.prepared_signals(as_backend(model), *given)[1], (seed, effects)
 
 
 @pytest.mark.slow

@@ -22,12 +22,14 @@ from figaroh_jax.diagnosis.design import units
 from figaroh_jax.diagnosis.diagnosis import _possible
 from figaroh_jax.diagnosis.flexible import WIDTHS, friction_width
 from figaroh_jax.diagnosis.gates import ambiguous, exists, physical_sign, rivals
+from figaroh_jax.diagnosis.holdout import fold_squares
 from figaroh_jax.diagnosis.layout import held_rows, layout
 from figaroh_jax.diagnosis.naming import beyond_simpler
 from figaroh_jax.diagnosis.problem import Problem
 from figaroh_jax.diagnosis.search import Found, Rival
 from figaroh_jax.diagnosis.shifts import shifted, torque_change
 from figaroh_jax.diagnosis.state import baseline, batched, extended_state, plain_rows, solved, whitened
+from figaroh_jax.diagnosis.step import with_causes
 from figaroh_jax.effects.base import Motion, place
 from figaroh_jax.effects.catalogue import find
 from figaroh_jax.errors import InputError
@@ -372,3 +374,51 @@ def test_what_a_spring_adds_to_a_constant_is_how_its_torque_varies(model: RobotM
     size = np.sqrt((problem.torque[..., joint][judged] ** 2).mean())
     assert beyond_simpler(problem, state, spring, at) == pytest.approx(varies / size, rel=1e-3)
     assert beyond_simpler(problem, state, place(find("torque_offset"), model, [model.joint_names[joint]]), at[1:]) == 1
+
+
+def test_fits_that_share_their_first_causes_are_those_made_alone(model: RobotModel) -> None:
+    """`keep` spares what fits without one cause have in common, and changes none of them."""
+    signals = made_signals(8.0), made_signals(6.0, begin=10.0)
+    at = model.joint_names
+    causes = [
+        place(find("rotor_inertia"), model, at[:1], inertia=0.1),
+        place(find("torque_delay"), model, [], delay=0.004),
+        place(find("joint_elasticity"), model, at[1:2], compliance=1e-4),
+        place(find("joint_spring"), model, at[:1], stiffness=2.0),
+        place(find("joint_elasticity"), model, at[:1], compliance=2e-4),
+    ]
+    shared, alone = problem_of(model, *signals), problem_of(model, *signals)
+    white = np.ones((len(shared.records.omega), model.nv))
+    names = ["viscous_friction", "coulomb_friction"]
+    first, second = baseline(shared, names), baseline(alone, names)
+    with_causes(shared, first, causes, white, keep=True)
+    assert shared.begun.get(first, white, *causes[:3]) is not None
+    assert shared.begun.get(second, white, *causes[:3]) is None
+    for one in [None, *causes]:
+        few = [cause for cause in causes if cause is not one]
+        found, expected = with_causes(shared, first, few, white), with_causes(alone, second, few, white)
+        np.testing.assert_allclose(found.state.theta, expected.state.theta, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.rows.X, expected.rows.X, rtol=0, atol=1e-12)
+    shared.begun.clear()
+    assert shared.begun.get(first, white, *causes[:3]) is None
+
+
+def test_parts_left_out_of_several_recordings_are_predicted_by_their_own_coefficients(model: RobotModel) -> None:
+    """Beside the regressor's rows times each fold's coefficients; a recording has rows of several folds, or of one."""
+    problem = problem_of(model, made_signals(8.0), made_signals(5.0, begin=10.0), made_signals(3.0, begin=20.0))
+    state = baseline(problem, ["viscous_friction"])
+    rows, rng = plain_rows(problem, state), np.random.default_rng(11)
+    n, _, count, nv = problem.records.shape
+    fold = np.full((n, count), -1)
+    fold[0] = np.arange(count) * 3 // count
+    fold[1], fold[2, : count // 3] = 3, 1
+    fold[2, count // 3 : count // 2] = 4
+    folds = state.theta + rng.normal(size=(5, len(state.theta)))
+    predicted = np.zeros((nv, n * count))
+    for row, own in enumerate(fold.reshape(-1)):
+        if own >= 0:
+            predicted[:, row] = rows.X[:, row] @ folds[own]
+    judged = np.moveaxis(np.asarray(problem.records.judged), 2, 0).reshape(nv, -1)
+    expected = ((rows.y - predicted) ** 2 * judged).sum(1)
+    found = fold_squares(problem, state, folds, fold.reshape(-1))
+    np.testing.assert_allclose(found, expected, rtol=1e-10)

@@ -20,28 +20,26 @@ from ..compiled.memory import give_back_holes
 from ..effects.base import place
 from ..effects.catalogue import CATALOGUE, find, related
 from ..effects.plausibility import implausible
-from ..estimation.noise import Spectrum
 from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
-from ..recordings.signals import Resampled, Signals, prepare_all
-from ..recordings.stacked import stack
+from ..recordings.signals import Signals
 from ..results import Cause, Diagnosis, Name, Nearest, Rest, Verdict
 from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
 from ..simulators.native import as_backend
 from ..simulators.registry import backend as make_backend
+from .answer_fit import as_predicts_best, as_weighed_in_motion, as_weighed_otherwise, together
 from .estimates import amplitude_places, estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
-from .flexible import flexible_p, friction_width
-from .floor import foretold, noise_floor, noise_rms, sober_spectrum, told_too_large
-from .gaining import Fall, Gaining, beside_all, kept_squares, predicts_better, surely_less, without_losses
+from .flexible import flexible_p
+from .floor import foretold, noise_rms, sober_spectrum, told_too_large
+from .gaining import Fall, Gaining, beside_all, predicts_better, without_losses
 from .gates import physical_sign
-from .holdout import fold_squares, part_error, residual_rms, traces
-from .joint import Joint, least_sure, opened, polished, sized, with_misfit, with_parts, with_rest
-from .layout import checked_repeats, describe_folds, held_rows, layout
+from .holdout import residual_rms, traces
+from .joint import Joint, least_sure, opened, polished, sized, with_rest
+from .layout import describe_folds
 from .naming import beside_rest, beyond_simpler, of_its_own, reason_against, standings, stands_alone, strong
-from .problem import Problem
 from .reading import Reader, only_read
 from .rest import (
     Significance,
@@ -59,24 +57,10 @@ from .rest import (
 )
 from .screening import noise_squares
 from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without
+from .setting import Setting, prepared_signals, setting_of
 from .standstill import left_moving, left_weighed, only_sticks, resting
-from .state import State, baseline, stated_effects, with_width
 from .step import Step, stand, with_causes
-from .thresholds import (
-    ALL_BUT,
-    ALPHA_OF_A_NAME,
-    FEW_CAUSES,
-    FEWER,
-    FOR_SURE,
-    LINE_P,
-    NO_REST,
-    REST_P,
-    STANDSTILL,
-    SURE_DROP,
-    WEIGHT_ROUNDS,
-    WHITE_GAIN,
-)
-from .weights import relative_speed, weighted_by_speed, white_where_better, without_reversals
+from .thresholds import ALL_BUT, ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, LINE_P, NO_REST, REST_P, SURE_DROP
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess, Task
@@ -124,8 +108,8 @@ def diagnose(
     with jax.enable_x64(True):
         progress("preparing signals", 0.03)
         backend = as_backend(model)
-        signals, slowed, begun = _signals(backend, recordings, preprocess, known, trust)
-        here = _setting(*begun, forbid, progress)
+        signals, slowed, begun = prepared_signals(backend, recordings, preprocess, known, trust)
+        here = setting_of(*begun, forbid, progress)
         generator = np.random.default_rng(seed)
         give_back_holes()
         searched = _searched(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
@@ -134,16 +118,6 @@ def diagnose(
         judged = _judged(searched, Reader(ordered, signals, preprocess, slowed), forbid, tolerance, alpha, generator)
         progress("measuring the gain", 0.9)
         return replace(_answer(searched.here, signals, searched.search, judged), slowed=slowed)
-
-
-class _Setting(NamedTuple):
-    """What is known before any cause is looked for: data, baseline, noise and what makes it white."""
-
-    problem: Problem
-    start: State
-    spectrum: Spectrum
-    whitening: Float[np.ndarray, "F nv"]
-    white: bool  # whether the rows are weighted by their joint's residual, not by the noise's spectrum
 
 
 class _Left(NamedTuple):
@@ -163,8 +137,8 @@ class _Left(NamedTuple):
 class _Searched(NamedTuple):
     """What a search has found, all of it in one fit, and what that leaves."""
 
-    before: _Setting  # as it was set out with
-    here: _Setting  # with the width of friction that the causes leave
+    before: Setting  # as it was set out with
+    here: Setting  # with the width of friction that the causes leave
     search: Search
     found: list[Found]
     joint: Joint
@@ -180,67 +154,11 @@ class _Judged(NamedTuple):
     causes: Gaining
     rest: Rest
     sticks: bool  # whether what is left is that of joints at rest
-    here: _Setting  # with the weights of the answer's fit
-
-
-def _signals(
-    backend: Backend, recordings: Sequence[Recording], preprocess: Preprocess, known: Baseline | None, trust: float
-) -> tuple[list[Signals], bool, tuple[Problem, State]]:
-    """The recordings prepared, holdout recordings behind the others, whether their positions are slowed, the baseline.
-
-    Each position is taken down to the band of its own motion only where the baseline then predicts left-out parts
-    better: coarse encoders need it, and it takes the abrupt parts of a fine one away. Every joint counts alike, by the
-    ratio of its errors, so that one with a cause in it does not decide for all.
-    """
-    resampled: Resampled = {}
-    prepared = (prepare_all(recordings, preprocess, slowed=slowed, resampled=resampled) for slowed in (False, True))
-    plain, slow = both = [sorted(checked_repeats(each), key=lambda s: s.role == "holdout") for each in prepared]
-    if all(np.array_equal(a.position, b.position) for a, b in zip(plain, slow, strict=True)):
-        return plain, False, _begun(backend, plain, known, trust)
-    first, second = (_begun(backend, signals, known, trust) for signals in both)
-    slower = np.mean(np.log(_baseline_squares(*second) / _baseline_squares(*first))) < 0
-    return (slow, True, second) if slower else (plain, False, first)
-
-
-def _baseline_squares(problem: Problem, start: State) -> Float[np.ndarray, " nv"]:
-    """Squares of each joint's error on parts left out of the baseline's fit, in which a joint weighs by what it leaves.
-
-    None is less than 1e-12 of their sum: a joint without error decides nothing.
-    """
-    torque = np.sqrt(((problem.torque * problem.records.judged) ** 2).mean((0, 1)))
-    white = np.ones((len(problem.records.omega), 1)) / np.maximum(torque, 1e-9 * torque.max())
-    residual = residual_rms(problem, stand(problem, start, white).state)
-    step = stand(problem, start, white * torque / np.maximum(residual, 1e-9 * residual.max()))
-    squares = fold_squares(problem, step.state, step.verdicts.folds, problem.layout.fold)
-    return np.maximum(squares, max(1e-12 * squares.sum(), 1e-300))
-
-
-def _begun(backend: Backend, signals: Sequence[Signals], known: Baseline | None, trust: float) -> tuple[Problem, State]:
-    """The recordings on one clock, and the baseline."""
-    records = without_reversals(stack(signals, backend.robot, joined=True))
-    held = held_rows(signals, records)
-    problem = Problem(backend, records, layout(signals, records), trust, np.zeros(backend.robot.nv), held)
-    return problem, baseline(problem, *stated_effects(backend.robot, known))
-
-
-def _setting(problem: Problem, start: State, forbid: Sequence[str], progress: Callable[[str, float], None]) -> _Setting:
-    """The recordings on one clock, the baseline, and the noise; holdout recordings stand behind the others."""
-    progress("estimating the noise", 0.08)
-    spectrum, whitening = noise_floor(problem, start, forbid)
-    problem = friction_width(problem, start, whitening)
-    start = with_width(problem, start)
-    for _ in range(WEIGHT_ROUNDS):
-        weighted = weighted_by_speed(problem, start, whitening)
-        if weighted is problem:
-            break
-        problem = weighted
-        spectrum, whitening = noise_floor(problem, start, forbid)
-    whitening, white = white_where_better(problem, start, whitening)
-    return _Setting(problem.within_trust(), start, spectrum, whitening, white)
+    here: Setting  # with the weights of the answer's fit
 
 
 def _searched(
-    here: _Setting,
+    here: Setting,
     forbid: Sequence[str],
     alpha: float,
     tolerance: float,
@@ -256,14 +174,14 @@ def _searched(
     found, that is known before they are in one fit.
     """
 
-    def ended(before: _Setting, search: Search) -> _Searched:
+    def ended(before: Setting, search: Search) -> _Searched:
         here = before._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
         found, joint = _told_apart(here, *_fitted_together(here, search.found, forbid, tolerance))
         left = _left(here, search, found, joint, forbid, tolerance, generator)
         strict = left.rest.there or left.excess > NO_REST or len(found) > FEW_CAUSES
         if not strict and (kept := _possible(found, joint)) != found:
-            found, joint = kept, _together(here, kept)
+            found, joint = kept, together(here, kept)
             left = _left(here, search, found, joint, forbid, tolerance, generator)
             strict = left.rest.there or left.excess > NO_REST
         return _Searched(before, here, search, found, joint, left, strict)
@@ -292,7 +210,7 @@ def _searched(
     return ended(here, search)._replace(fading=tuple(f.name for f in fading))
 
 
-def _borne_out(here: _Setting, before: list[Found], one: Found) -> bool:
+def _borne_out(here: Setting, before: list[Found], one: Found) -> bool:
     """Whether recordings kept out surely show a cause beside those that were found before it."""
     problem, start, whitening, found = here.problem, here.start, here.whitening, [*before, one]
     if not problem.held.any():
@@ -304,21 +222,21 @@ def _borne_out(here: _Setting, before: list[Found], one: Found) -> bool:
 
 
 def _fitted_together(
-    here: _Setting, found: list[Found], forbid: Sequence[str], tolerance: float
+    here: Setting, found: list[Found], forbid: Sequence[str], tolerance: float
 ) -> tuple[list[Found], Joint]:
     """The causes that the others do not make needless and that surely have a size, all in one fit."""
     found = eliminate(here.problem, here.start, found, here.whitening)
-    joint = _together(here, found)
+    joint = together(here, found)
     kept = _simple(here, found, joint, forbid, tolerance)
     if kept != found:
-        joint = _together(here, kept)
+        joint = together(here, kept)
     found, kept = kept, sized(kept, joint, forbid)
     if len(kept) < len(found):
-        joint = _together(here, kept)
+        joint = together(here, kept)
     return kept, joint
 
 
-def _told_apart(here: _Setting, found: list[Found], joint: Joint) -> tuple[list[Found], Joint]:
+def _told_apart(here: Setting, found: list[Found], joint: Joint) -> tuple[list[Found], Joint]:
     """The causes, each as that of those which slices cannot tell from it that recordings kept out surely prefer.
 
     They are asked at the joints where both act: elsewhere only one of them says anything.
@@ -351,7 +269,7 @@ def _possible(found: list[Found], joint: Joint) -> list[Found]:
     return out
 
 
-def _simple(here: _Setting, found: list[Found], joint: Joint, forbid: Sequence[str], tolerance: float) -> list[Found]:
+def _simple(here: Setting, found: list[Found], joint: Joint, forbid: Sequence[str], tolerance: float) -> list[Found]:
     """The causes, each as the simpler effect that it contains where it adds to that no more than is tolerable."""
     problem, state, out = here.problem, joint.step.state, []
     for one, effect, at in zip(found, joint.causes, amplitude_places(state, joint.causes, problem.model), strict=True):
@@ -461,44 +379,47 @@ def _judged(
 
 def _answered(
     searched: _Searched,
-    settings: Sequence[_Setting],
+    settings: Sequence[Setting],
     named: list[Found],
     borne_out: Callable[[Name], bool],
     forbid: Sequence[str],
     claims: Mapping[Name, float],
-) -> tuple[_Setting, Gaining, Joint, dict[Name, str]]:
+) -> tuple[Setting, Gaining, Joint, dict[Name, str]]:
     """The causes that lower the error on data held out and whose size the answer's own intervals tell from zero.
 
     With the setting of the answer's fit, their fit with the weights that found them, and why the others went.
     """
     against: dict[Name, str] = {}
     known = searched.joint if [f.name for f in named] == [f.name for f in searched.found] else None
-    here, joint, by_speed = _as_predicts_best(settings, named, known)
+    here, joint, by_speed = as_predicts_best(settings, named, known)
     first = named
     while True:
         fit = (here.problem, here.start, here.whitening, named, joint)
         gaining = without_losses(*fit, searched.strict, borne_out, claims)
         against |= dict.fromkeys(gaining.worse, "the error on held-out data does not fall with it")
+        if named and not gaining.named:  # the fit was chosen beside causes that have gone
+            here, joint, _ = as_predicts_best(settings, [], None)
+            gaining = without_losses(here.problem, here.start, here.whitening, [], joint, searched.strict)
         named = gaining.named
         if named:
-            gaining = gaining._replace(joint=_as_weighed_otherwise(here, searched.here.problem, gaining.joint))
-        by_speed = by_speed if len(first) == len(named) else _together(searched.here, named)
-        first, moving = named, _as_weighed_in_motion(searched.here, by_speed) if named else by_speed
+            gaining = gaining._replace(joint=as_weighed_otherwise(here, searched.here.problem, gaining.joint))
+        by_speed = by_speed if len(first) == len(named) else together(searched.here, named)
+        first, moving = named, as_weighed_in_motion(searched.here, by_speed) if named else by_speed
         least = least_sure(named, moving)
         if least is None:
             return here, gaining._replace(named=opened(named, gaining.joint, forbid)), by_speed, against
         against[named[least].name] = f"its size is not surely above zero: {_told_size(moving, least, here)}"
         named = [f for f in named if f is not named[least]]
-        joint = _together(here, named)
+        joint = together(here, named)
 
 
-def _told_size(joint: Joint, which: int, here: _Setting) -> str:
+def _told_size(joint: Joint, which: int, here: Setting) -> str:
     """A cause's parameters with their deviations, in words."""
     each = estimates(joint.causes[which], joint.fitted, joint.fitted.places[which], here.problem.model)
     return ", ".join(f"{name} {e.value:.3g} +- {1.96 * e.std:.2g} {e.unit}".rstrip() for name, e in each.items())
 
 
-def _sticks(here: _Setting, joint: Joint, tolerance: float) -> bool:
+def _sticks(here: Setting, joint: Joint, tolerance: float) -> bool:
     """Whether what is left beside the causes of a fit is that of joints at rest.
 
     A fit that is also asked for slow rows gives part of their sticks to the friction of the joints that move.
@@ -507,99 +428,8 @@ def _sticks(here: _Setting, joint: Joint, tolerance: float) -> bool:
     return only_sticks(here.problem, state, noise, relative_rest(here.problem, state, noise), tolerance)
 
 
-def _together(here: _Setting, found: list[Found]) -> Joint:
-    return polished(here.problem, here.start, [one.effect for one in found], here.whitening)
-
-
-def _as_predicts_best(
-    settings: Sequence[_Setting], named: list[Found], known: Joint | None
-) -> tuple[_Setting, Joint, Joint]:
-    """The named causes in one fit as predicts parts left out best, by their error in N m; and as the first setting has
-    them.
-
-    Weights by speed find causes and name them; the model that is handed over is also asked to predict slow rows, and
-    the width of friction beside all causes need not be that beside the named ones. Where the noise is far below what
-    the model leaves, its spectrum is a poor weight: each joint's residual alone may do better. Another fit than that
-    which parts prefer is taken where recordings kept out surely prefer it. `known` is the fit of the first setting with
-    its own weights, where it has been made.
-    """
-    best, first, kept = None, None, []  # one fit at a time: rows and columns are large
-    held = bool(settings[0].problem.held.any())
-    for here in settings:
-        for weight in _weights(here.problem):
-            one = here._replace(problem=here.problem.weighted(weight))
-            joint = known if known and first is None else _together(one, named)
-            error, first = part_error(one.problem, joint.step), first or joint
-            if held:
-                kept.append((one, kept_squares(one.problem, joint.step)))
-            best = (error, one, joint) if best is None or error < best[0] else best
-    assert best is not None and first is not None
-    error, chosen, joint = best
-    if not chosen.white:
-        residual = residual_rms(chosen.problem, joint.step.state)
-        level = np.broadcast_to(1 / np.maximum(residual, 1e-12 * residual.max()), chosen.whitening.shape)
-        white = chosen._replace(whitening=level, white=True)
-        step = stand(white.problem, joint.step.state, level)  # the laws' shapes as they are
-        if part_error(white.problem, step) < (1 - WHITE_GAIN) * error:
-            chosen, joint = white, _together(white, named)
-    squares = kept_squares(chosen.problem, joint.step) if held else np.zeros(0)
-    for one, own in kept:
-        if surely_less(squares, own):
-            chosen, joint, squares = one, _together(one, named), own
-    return *_as_rows_count(chosen, joint, named), first
-
-
-def _as_rows_count(here: _Setting, joint: Joint, named: list[Found]) -> tuple[_Setting, Joint]:
-    """The fit in which rows count beside what is believed of the links as parts left out ask for.
-
-    Whitened rows count as independent ones. What a model leaves goes on from one to the next, so that many say what one
-    does, and the links follow it further than they are believed to move.
-    """
-    error, best = part_error(here.problem, joint.step), here
-    for times in FEWER:
-        one = here._replace(whitening=here.whitening / np.sqrt(times))
-        step = stand(one.problem, joint.step.state, one.whitening)  # the laws' shapes as they are
-        own = part_error(one.problem, step)
-        if own >= error:
-            break
-        error, best = own, one
-    return (here, joint) if best is here else (best, _together(best, named))
-
-
-def _weights(problem: Problem) -> list[Float[np.ndarray, "n M nv"]]:
-    """Weights of the rows by their speed, and all alike."""
-    by_speed, alike = np.asarray(problem.records.weight), np.asarray(problem.records.judged)
-    return [by_speed] if np.array_equal(by_speed, alike) else [by_speed, alike]
-
-
-def _as_weighed_otherwise(here: _Setting, by_speed: Problem, joint: Joint) -> Joint:
-    """The answer's fit with what its intervals owe to its parts, to weights of slow rows and to the spectrum."""
-    problem, judged = here.problem, np.asarray(here.problem.records.judged)
-    slow = [judged, np.asarray(by_speed.records.weight), judged * (relative_speed(problem) >= STANDSTILL)]
-    white = np.ones_like(here.whitening) / np.maximum(residual_rms(problem, joint.step.state), 1e-300)
-    own = np.asarray(problem.records.weight)
-    weights = [(w, here.whitening) for w in slow if not np.array_equal(w, own)]
-    joint = with_parts(problem, joint, here.whitening)
-    return with_misfit(problem, here.start, joint, [*weights, (own, white)])
-
-
-def _as_weighed_in_motion(here: _Setting, by_speed: Joint) -> Joint:
-    """The fit by whose weights causes are found, with what its intervals owe to its parts, to slow rows and to the
-    spectrum.
-
-    Whether a cause has a size is asked of this one: a fit that is asked for rows at rest, where no law of the velocity
-    holds, gives part of a law of the motion away, and which fit predicts best changes from one recording to the next.
-    """
-    problem = here.problem
-    white = np.ones_like(here.whitening) / np.maximum(residual_rms(problem, by_speed.step.state), 1e-300)
-    own = np.asarray(problem.records.weight)
-    moving = own * (relative_speed(problem) >= STANDSTILL)
-    joint = with_parts(problem, by_speed, here.whitening)
-    return with_misfit(problem, here.start, joint, [(moving, here.whitening), (own, white)])
-
-
 def _left(
-    here: _Setting,
+    here: Setting,
     search: Search,
     found: list[Found],
     joint: Joint,
@@ -647,7 +477,7 @@ def _left(
     return _Left(left._replace(there=there), p_left, now[0], line, flexible.each, beyond, misfit, followed, moved)
 
 
-def _answer(searched: _Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:
+def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:
     here, seen = judged.here, stand(searched.problem, searched.start, searched.whitening)
     named, joint, order, gains, holdout, _ = judged.causes
     problem, model, last = here.problem, here.problem.model, joint.step
@@ -698,7 +528,7 @@ def _scheme(signals: Sequence[Signals]) -> str:
     return describe_folds(signals)
 
 
-def _notes(signals: Sequence[Signals], here: _Setting, last: Step) -> tuple[str, ...]:
+def _notes(signals: Sequence[Signals], here: Setting, last: Step) -> tuple[str, ...]:
     notes = [note for s in signals for note in s.notes]
     if not here.problem.layout.repeats:
         notes.append(

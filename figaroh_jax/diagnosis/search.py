@@ -142,11 +142,12 @@ def find_causes(
         for best in chosen[: MOST_CAUSES - len(found)]:
             found.append(_found(problem, before, contenders, best, screened, p_values[-1], generator))
             step = with_cause(problem, step, best.effect, whitening)
-        if len(found) > 1 and any(type(f.effect).follows_total for f in found):
-            step, screened = _refreshed(problem, state, step, found, whitening), None
         ways = {kind(best.effect) for best in chosen}
         # their rows and columns are large; there is a best one, since some were chosen
         del before, contenders, chosen, best  # pyright: ignore[reportPossiblyUnboundVariable]
+        if len(found) > 1 and any(type(f.effect).follows_total for f in found):
+            screened = None
+            step = _refreshed(problem, state, step, found, whitening)
         if ways != {"columns"}:
             give_back_holes()
             known, problem, screened = problem, friction_width(problem, step.state, whitening), None

@@ -125,7 +125,7 @@ def on_host(
     def run(signal: np.ndarray, response: np.ndarray) -> np.ndarray:
         spectrum = np.fft.rfft(extended(signal), axis=-1)
         shape = np.broadcast_shapes(spectrum.shape, response.shape)  # memory that is new takes longer than the product
-        factor = response.astype(complex) if response.ndim == 1 else response
+        factor = np.asarray(response, complex)  # as it is, its numbers would be converted for each series
         spectrum = np.multiply(spectrum, factor, out=spectrum if shape == spectrum.shape else None)
         return wanted(np.fft.irfft(_folded(spectrum, step, count), count, axis=-1))
 

@@ -103,15 +103,16 @@ def filter_rows(
     factor = np.asarray(records.low_pass) if response is None else np.asarray(records.low_pass) * response
     count = int(np.prod(series))
     flat, out = torque.reshape(count, *torque.shape[-2:]), np.empty((count, *records.kept.shape))
-    shared = factor.ndim == 1 or factor.size == factor.shape[-1]
-    each = None if shared else np.broadcast_to(factor, (*series, factor.shape[-1])).reshape(count, factor.shape[-1])
+    factors = factor.reshape(-1, factor.shape[-1])
+    which = np.broadcast_to(np.arange(len(factors)).reshape(factor.shape[:-1]), series).reshape(count)
     used = np.any(records.weight, axis=(1, 2)) if fitted else np.ones(len(records.kept), bool)
     out[:, ~used] = 0.0
     few = max(1, AT_ONCE // records.source.shape[1])
-    parts = [slice(start, start + few) for start in range(0, count, few)]
-    for k, run in enumerate(_filters(records.source, records.kept)):
-        for part in parts if used[k] else ():
-            out[part, k] = run(flat[part, k], factor.reshape(-1) if each is None else each[part])
+    filters = [(k, run) for k, run in enumerate(_filters(records.source, records.kept)) if used[k]]
+    for part in (slice(start, start + few) for start in range(0, count, few)):
+        own = factors[which[part] if len(factors) > 1 else 0].astype(complex)
+        for k, run in filters:
+            out[part, k] = run(flat[part, k], own)
     return out.reshape(*series, *records.kept.shape)
 
 

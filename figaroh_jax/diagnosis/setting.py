@@ -1,0 +1,97 @@
+"""What a diagnosis knows before it looks for any cause: recordings, baseline, the noise and what makes it white."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..estimation.noise import Spectrum
+from ..recordings.dataset import Recording
+from ..recordings.signals import Resampled, Signals, prepare_all
+from ..recordings.stacked import stack
+from ..simulators.contract import Backend
+from .flexible import friction_width
+from .floor import noise_floor
+from .holdout import fold_squares, residual_rms
+from .layout import checked_repeats, held_rows, layout
+from .problem import Problem
+from .state import State, baseline, stated_effects, with_width
+from .step import stand
+from .thresholds import WEIGHT_ROUNDS
+from .weights import weighted_by_speed, white_where_better, without_reversals
+
+if TYPE_CHECKING:
+    from ..formats.config import Baseline, Preprocess
+
+__all__ = ["Setting", "prepared_signals", "setting_of"]
+
+
+class Setting(NamedTuple):
+    """What is known before any cause is looked for: data, baseline, noise and what makes it white."""
+
+    problem: Problem
+    start: State
+    spectrum: Spectrum
+    whitening: Float[np.ndarray, "F nv"]
+    white: bool  # whether the rows are weighted by their joint's residual, not by the noise's spectrum
+
+
+def prepared_signals(
+    backend: Backend, recordings: Sequence[Recording], preprocess: Preprocess, known: Baseline | None, trust: float
+) -> tuple[list[Signals], bool, tuple[Problem, State]]:
+    """The recordings prepared, holdout recordings behind the others, whether their positions are slowed, the baseline.
+
+    Each position is taken down to the band of its own motion only where the baseline then predicts left-out parts
+    better: coarse encoders need it, and it takes the abrupt parts of a fine one away. Every joint counts alike, by the
+    ratio of its errors, so that one with a cause in it does not decide for all.
+    """
+    resampled: Resampled = {}
+    prepared = (prepare_all(recordings, preprocess, slowed=slowed, resampled=resampled) for slowed in (False, True))
+    plain, slow = both = [sorted(checked_repeats(each), key=lambda s: s.role == "holdout") for each in prepared]
+    if all(np.array_equal(a.position, b.position) for a, b in zip(plain, slow, strict=True)):
+        return plain, False, _begun(backend, plain, known, trust)
+    first, second = (_begun(backend, signals, known, trust) for signals in both)
+    slower = np.mean(np.log(_baseline_squares(*second) / _baseline_squares(*first))) < 0
+    return (slow, True, second) if slower else (plain, False, first)
+
+
+def _baseline_squares(problem: Problem, start: State) -> Float[np.ndarray, " nv"]:
+    """Squares of each joint's error on parts left out of the baseline's fit, in which a joint weighs by what it leaves.
+
+    None is less than 1e-12 of their sum: a joint without error decides nothing.
+    """
+    torque = np.sqrt(((problem.torque * problem.records.judged) ** 2).mean((0, 1)))
+    white = np.ones((len(problem.records.omega), 1)) / np.maximum(torque, 1e-9 * torque.max())
+    residual = residual_rms(problem, stand(problem, start, white).state)
+    step = stand(problem, start, white * torque / np.maximum(residual, 1e-9 * residual.max()))
+    squares = fold_squares(problem, step.state, step.verdicts.folds, problem.layout.fold)
+    return np.maximum(squares, max(1e-12 * squares.sum(), 1e-300))
+
+
+def _begun(backend: Backend, signals: Sequence[Signals], known: Baseline | None, trust: float) -> tuple[Problem, State]:
+    """The recordings on one clock, and the baseline."""
+    records = without_reversals(stack(signals, backend.robot, joined=True))
+    held = held_rows(signals, records)
+    problem = Problem(backend, records, layout(signals, records), trust, np.zeros(backend.robot.nv), held)
+    return problem, baseline(problem, *stated_effects(backend.robot, known))
+
+
+def setting_of(
+    problem: Problem, start: State, forbid: Sequence[str], progress: Callable[[str, float], None]
+) -> Setting:
+    """The recordings on one clock, the baseline, and the noise; holdout recordings stand behind the others."""
+    progress("estimating the noise", 0.08)
+    spectrum, whitening = noise_floor(problem, start, forbid)
+    problem = friction_width(problem, start, whitening)
+    start = with_width(problem, start)
+    for _ in range(WEIGHT_ROUNDS):
+        weighted = weighted_by_speed(problem, start, whitening)
+        if weighted is problem:
+            break
+        problem = weighted
+        spectrum, whitening = noise_floor(problem, start, forbid)
+    whitening, white = white_where_better(problem, start, whitening)
+    return Setting(problem.within_trust(), start, spectrum, whitening, white)
