@@ -124,6 +124,20 @@ def test_more_power_than_noise_can_have_is_a_rest(monkeypatch: pytest.MonkeyPatc
     assert not beyond.any() and quiet.tolist() == [False, True]
 
 
+def test_a_joint_without_rows_leaves_the_others_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draws in single precision of a joint that never moves: 0 / 0 made a rest of any power at every joint."""
+    nothing, shape = cast(Any, None), (2, 400)
+
+    def drawn(problem: Any, spectrum: Any, whitening: Any, draws: int, generator: np.random.Generator) -> np.ndarray:
+        return generator.standard_normal((draws, *shape), np.float32)
+
+    monkeypatch.setattr(rests, "draw_noise", drawn)
+    moves = np.ones(shape, bool)
+    moves[1] = False
+    found = rests.beyond_noise(nothing, 1.01 * np.ones(shape), nothing, nothing, np.random.default_rng(3), moves)
+    assert not np.any(found)
+
+
 @pytest.mark.parametrize(
     ("misfit", "joints", "alone"),
     [

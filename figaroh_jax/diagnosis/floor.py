@@ -25,6 +25,7 @@ ROUNDS = 2  # of the rich model's fit and the spectrum in turn
 RICHNESS = 10  # groups of columns in the rich model
 RICH_CUT = 1e-9  # of the unit-diagonal Gram of the rich model
 COLUMN_CUT = 1e-8  # of the longest column: below, a column of the rigid body is what rounding leaves of zero
+FEWEST = 20  # rows of a recording whose spectrum is taken
 ENOUGH = 1500  # rows a joint without which misfit takes spectra and smooth families: then the noise is white
 
 
@@ -84,10 +85,18 @@ def told_too_large(
     """By how much the power that is told of noise with the spectrum is larger than it is: rows left out within a
     recording carry power to where the row filter lets none pass."""
     n, _, count, nv = problem.records.shape
+    if not _resolved(problem):
+        return np.ones(nv)
     flat = np.ones((len(np.asarray(problem.records.omega)), nv))
     drawn = draw_noise(problem, spectrum, flat, draws, generator)
     told = [noise_rms(problem, _fit(problem, one.astype(float), None)) ** 2 for one in drawn]
     return np.mean(told, axis=0) / noise_rms(problem, spectrum) ** 2
+
+
+def _resolved(problem: Problem) -> bool:
+    """Whether any recording has rows enough for a spectrum."""
+    fitted = np.any(problem.records.fitted, axis=2)
+    return any(fitted[at.slot, at.row : at.row + at.rows].sum() >= FEWEST for at in problem.records.spans)
 
 
 def _alike(problem: Problem, state: State) -> tuple[Rows, Float[np.ndarray, " nv"], int]:
@@ -143,7 +152,8 @@ def _from_rich_model(
     Where the data are long, smooth families stand in for what the catalogue does not hold: what the model misses of a
     misfit passes for noise.
     """
-    response, long = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale, count >= ENOUGH or richness == 1
+    response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
+    long = count >= ENOUGH or (richness == 1 and _resolved(problem))
     rows, _ = _rich(problem, state, response, forbid, count >= ENOUGH and richness > 1, richness)
     basis = _orthonormal(rows)
     y = rows.y.reshape(-1)
@@ -245,7 +255,7 @@ def _fit(problem: Problem, rows: Float[np.ndarray, "nv T"], taken: np.ndarray | 
         here = slice(at.row, at.row + at.rows)
         series = rows.reshape(nv, n, count)[:, at.slot, here].T
         used = np.flatnonzero(np.abs(series).max(1) > 0)
-        if len(used) < 20:
+        if len(used) < FEWEST:
             continue
         inside = slice(used[0], used[-1] + 1)
         own, p = noise.periodogram(series[inside], rate, level=True)

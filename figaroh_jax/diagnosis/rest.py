@@ -124,7 +124,7 @@ def beyond_noise(
             (_surely_passed(problem, _left_of(part, *fitted)) for part in parts),
             _surely_passed(problem, residual),
         )
-    noise = np.concatenate([(part**2 * counted).sum(2) for part in left])
+    noise = np.concatenate([(part**2 * counted).sum(2) for part in left]).astype(float)
     mean, deviation = noise.mean(0), np.maximum(noise.std(0), 1e-12 * noise.mean(0) + 1e-300)
     drawn, own = (noise - mean) / deviation, (residual**2 * counted).sum(1) - mean
     p, q = (
