@@ -269,14 +269,15 @@ def _window(recording: Recording, window: tuple[float, float] | None):
 
 
 def _new_samples(
-    position: Float[np.ndarray, "samples nv"], torque: Float[np.ndarray, "samples nv"]
+    position: Float[np.ndarray, "samples nq"], torque: Float[np.ndarray, "samples nv"]
 ) -> Bool[np.ndarray, " samples"] | slice:
     """The samples that are not, number by number, what stood there a sample before, where such ones are few.
 
     A logger that is faster than its robot, or has missed a message, writes the last one again under a new stamp: the
     position stands still for a sample and then leaps.
     """
-    again = np.append(False, ((np.diff(position, axis=0) == 0) & (np.diff(torque, axis=0) == 0)).all(axis=1))
+    same = [(np.diff(x, axis=0) == 0).all(axis=1) for x in (position, torque)]
+    again = np.append(False, same[0] & same[1])
     begin, end = (np.flatnonzero(np.diff(np.append(np.append(0, again), 0)) == step) for step in (1, -1))
     for first, after in zip(begin, end, strict=True):
         again[first:after] &= after - first <= MOST_STALE  # longer, it stands
