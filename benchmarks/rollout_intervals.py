@@ -66,7 +66,7 @@ def errors(kind: str, seed: int, many: int) -> np.ndarray:
         Stretch(k, f, min(400, len(r.time) - f)) for k, r in enumerate(runs) for f in range(0, len(r.time) - 50, 400)
     ]
     here = setting(loop, runs, baseline=("friction_loss", "joint_damping", "rotor_inertia"), stretches=cut)
-    structure = Structure(loop, here.known.table, here.data)
+    structure = Structure(here.loop, here.known.table, here.data)
     now = standing(here, structure, begun(here), here.baseline, held=False)
     now, spread = alike_by_recording(here, now)
     truth = {"friction": servo_arm6.FRICTION, "damping": servo_arm6.DAMPING, "armature": servo_arm6.ARMATURE}
