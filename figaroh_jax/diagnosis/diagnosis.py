@@ -33,7 +33,7 @@ from .estimates import amplitude_places, estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p
-from .floor import foretold, noise_rms, sober_spectrum, told_too_large
+from .floor import foretold, noise_rms, short, sober_spectrum, told_too_large
 from .gaining import Fall, Gaining, beside_all, predicts_better, without_losses
 from .gates import physical_sign
 from .holdout import residual_rms, traces
@@ -325,7 +325,7 @@ def _judged(
 
     beyond = relative_rest(problem, joint.step.state, noise)
     doubted = left.p_value < REST_P  # the catalogue still scores more than noise, though nothing in it passes
-    if doubted and not left.rest.there and not problem.layout.repeats:
+    if doubted and not left.rest.there and short(problem, joint.step.state):
         sober = sober_spectrum(problem, joint.step.state, forbid)
         doubted = chance_beside(problem, joint.step, sober, whitening, forbid, generator) < REST_P
     if found and doubted and float(beyond.max()) > tolerance:  # a rest of the answer is one for its names
@@ -353,7 +353,7 @@ def _judged(
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
     shown = left.rest.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
-    if shown and not named and not left.rest.there and not doubted and not problem.layout.repeats:
+    if shown and not named and not left.rest.there and not doubted and short(problem, joint.step.state):
         sober = sober_spectrum(problem, joint.step.state, forbid)
         shown = chance_beside(problem, joint.step, sober, here.whitening, forbid, generator) < REST_P
     law = any(strong(one) and against[one.name] for one in each)  # it moves, whatever it is
@@ -455,9 +455,10 @@ def _left(
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
     loud, quiet = beyond_noise(problem, joint.step.linear.residual, spectrum, whitening, generator)
     there = left.there or (wrong and not tolerable)
-    if loud.any() and not there and not tolerable:  # without repeats a rich model's residual is the noise
-        there = problem.layout.repeats or bool((foretold(problem, joint.step.state, forbid) & (loud > 0)).any())
-    if quiet.any() and not there and not problem.layout.repeats and not found:
+    few = short(problem, joint.step.state)
+    if loud.any() and not there and not tolerable:  # of few rows a rich model's residual is less than the noise
+        there = not few or bool((foretold(problem, joint.step.state, forbid) & (loud > 0)).any())
+    if quiet.any() and not there and few and not found:
         fitted, large = (joint.step.rows, joint.step.linear), told_too_large(problem, spectrum, generator)
         fair = spectrum.louder(1 / np.maximum(large, 1.0))
         quiet = beyond_noise(problem, fitted[1].residual, fair, whitening, generator, fitted=fitted)[1]

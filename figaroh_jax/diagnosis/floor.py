@@ -19,7 +19,7 @@ from .state import State, plain_rows, solved, whitened
 from .step import stand
 from .thresholds import LOWEST_FREQUENCY, LOWEST_RESOLVED, T_REST
 
-__all__ = ["foretold", "kept_columns", "noise_floor", "noise_rms", "sober_spectrum", "told_too_large"]
+__all__ = ["foretold", "kept_columns", "noise_floor", "noise_rms", "short", "sober_spectrum", "told_too_large"]
 
 ROUNDS = 2  # of the rich model's fit and the spectrum in turn
 RICHNESS = 10  # groups of columns in the rich model
@@ -57,6 +57,11 @@ def sober_spectrum(problem: Problem, state: State, forbid: Collection[str] = ())
     """
     rows, scale, count = _alike(problem, state)
     return _from_rich_model(problem, state, scale, forbid, count, richness=1)
+
+
+def short(problem: Problem, state: State) -> bool:
+    """Whether the data have no repeats and too few rows to tell slow noise by its spectrum from a misfit."""
+    return not problem.layout.repeats and _alike(problem, state)[2] < ENOUGH
 
 
 def foretold(problem: Problem, state: State, forbid: Collection[str] = ()) -> Bool[np.ndarray, " nv"]:
