@@ -304,9 +304,8 @@ def test_samples_that_repeat_the_one_before_are_those_of_a_logger_and_not_of_the
     rng = np.random.default_rng(secrets.randbits(32))
     t = np.arange(3000) / 250
     q, tau = motion(t), motion(t) + 1e-4 * rng.standard_normal((3000, 3))
-    again = np.flatnonzero(rng.random(3000) < 0.02)[1:]
-    for x in (q, tau):
-        x[again] = x[again - 1]
+    for late in np.flatnonzero(rng.random(3000) < 0.02)[1:]:  # in turn: two in a row are one message
+        q[late], tau[late] = q[late - 1], tau[late - 1]
     prepared = signals.prepare(recording(t, q, tau), Preprocess(cutoff=10))
     read = prepared.position[prepared.rows.index] - motion(prepared.rows.row_times)
     assert np.abs(read).max() < 1e-4 and prepared.notes == ()  # rad; .008 with the samples as they are
