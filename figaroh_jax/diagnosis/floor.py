@@ -61,7 +61,7 @@ def sober_spectrum(problem: Problem, state: State, forbid: Collection[str] = ())
 
 def short(problem: Problem, state: State) -> bool:
     """Whether the data have no repeats and too few rows to tell slow noise by its spectrum from a misfit."""
-    return not problem.layout.repeats and _alike(problem, state)[2] < ENOUGH
+    return not problem.layout.repeats and _rows_a_joint(plain_rows(problem, state)) < ENOUGH
 
 
 def foretold(problem: Problem, state: State, forbid: Collection[str] = ()) -> Bool[np.ndarray, " nv"]:
@@ -107,9 +107,13 @@ def _resolved(problem: Problem) -> bool:
 def _alike(problem: Problem, state: State) -> tuple[Rows, Float[np.ndarray, " nv"], int]:
     """Rows as they are, the RMS of what a fit with the joints weighted alike leaves of them, and rows a joint."""
     rows = plain_rows(problem, state)
-    count = max(1, rows.size // len(rows.y))
+    count = _rows_a_joint(rows)
     rough = rows.y - rows.X @ _weighted(rows, state.prior, np.sqrt((rows.y**2).mean(1)))
     return rows, np.sqrt((rough**2).sum(1) / count), count
+
+
+def _rows_a_joint(rows: Rows) -> int:
+    return max(1, rows.size // len(rows.y))
 
 
 def noise_rms(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, " nv"]:
