@@ -6,6 +6,9 @@ which dry friction turns) and slow noise in the band of a slow motion are no mis
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -14,6 +17,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import figaroh_jax as fj
 from benchmarks.conditions import Strange, draw, graded, motion, moved
 
 
@@ -46,3 +50,21 @@ def test_the_motion_is_the_integral_of_its_velocity(pause: float) -> None:
     np.testing.assert_allclose(np.gradient(q, 1e-4, axis=0)[inner], v[inner], rtol=0, atol=1e-6)
     np.testing.assert_allclose(np.gradient(v, 1e-4, axis=0)[inner], a[inner], rtol=0, atol=1e-2)
     assert Strange() == Strange(lost=0.0)
+
+
+@pytest.mark.slow
+def test_a_ripple_that_the_catalogue_lacks_is_told_without_repeats(tmp_path: Path, data_dir: Path) -> None:
+    """What 15 % of a joint's torque leaves of long data is not taken for slow noise (read `nothing` before)."""
+    only = ["--seed", "247155", "--kinds", "inverse", "--clean", "0", "--only", "torque_ripple-0.15-tx40"]
+    root = Path(__file__).resolve().parents[1]
+    program = [sys.executable, "-m", "benchmarks.hide_and_name", "generate", "--cases", str(tmp_path), *only]
+    subprocess.run(program, cwd=root, env=os.environ | {"PYTHONPATH": str(root)}, check=True, capture_output=True)
+    (told,) = tmp_path.glob("inverse/*/case.json")
+    case = json.loads(told.read_text())
+    task = case["task"] | {"diagnose": {"forbid": case["forbid"]}}
+    task["robot"]["model"] = str(tmp_path / case["model"])
+    for recording in task["data"]:
+        recording["file"] = str(tmp_path / recording["file"])
+    (tmp_path / "task.yaml").write_text(json.dumps(task))
+    found = fj.diagnose_task(fj.load_task(tmp_path / "task.yaml"))
+    assert (found.verdict, found.causes) == ("unknown", ())
