@@ -25,6 +25,7 @@ from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_
 from .search import Model, Named, Search, Tried, judged_by_colour, sized, t_of
 from .sensitivity import predicted
 from .setting import Setting, Structure, begins_of, begun, by_recording, evened, free_entries, level_of, thinned
+from .shared import at_all_joints
 from .table import on_table
 from .thresholds import NEAR, NO_CHOICE, T_BESIDE_REST, UNTOLD
 
@@ -74,7 +75,10 @@ def _by_colour(here: Setting, white: Search, forbid: Sequence[str]) -> Search:
     return new
 
 
-def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Sequence[str]) -> Search:
+def _searched(
+    here: Setting, progress: Callable[[str, float], None], forbid: Sequence[str], *, told: bool = False
+) -> Search:
+    """The search in rows that count; `told`: those in which the end rests on a table are left out already."""
     progress("fitting the baseline", 0.05)
     whole, here = here, thinned(here)
     first, wrong = _begun(here), list[Fault]()
@@ -93,9 +97,11 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
         number = len(steps)
         progress(f"searching for causes, round {number}", min(0.1 + 0.12 * number, 0.9))
         new, now, nearest = _round(here, now, found, forbid, nearest, known)
-        found = [n for n in found if not any(replaced(n, one) for one in new)] + new
+        if not new and now.excess.max() >= 1.0:
+            new, now = at_all_joints(here, now, found)
         if not new:
             break
+        found = [n for n in found if not any(replaced(n, one) for one in new)] + new
         steps.append(
             (", ".join(str(Name(n.candidate.effect, n.candidate.at)) for n in new), _level(here, now.model.fit))
         )
@@ -107,10 +113,17 @@ def _searched(here: Setting, progress: Callable[[str, float], None], forbid: Seq
     found, now, slight = still_needed(here, found, now, begin)
     found, now = _alike(here, found, now) if slight is None else (found, now)
     even = by_recording(whole) and bool(found) and now.excess.max() >= 1.0
-    if even:  # beside a rest alone: noise leaves nothing to a table
+    rest = now.excess.max() >= 1.0 and not found and whole.pole is None
+    look = not told and (even or (rest and _has_friction(now.model)))
+    if look:  # beside a rest alone: noise leaves nothing to a table
         progress("looking for a table", 0.92)
-    whole, resting = _off_the_table(whole, now.model) if even else (whole, [])
+    whole, resting = _off_the_table(whole, now.model) if look else (whole, [])
     wrong = [x for x in wrong if not any(_same_place(x, y) for y in resting)]
+    if resting and not even:  # with these rows nothing was named: once more without
+        again = _searched(whole, progress, forbid, told=True)
+        new = [x for x in again.faults if not any(_same_place(x, y) for y in [*wrong, *resting])]
+        again.faults, again.setting = [*wrong, *resting, *new], again.setting or whole
+        return again
     if whole is not here:
         progress("fitting all that was recorded", 0.95)
         begin, now, here = _on_all(whole, begin.model), _on_all(whole, now.model), whole
@@ -151,7 +164,8 @@ def alike_by_recording(here: Setting, now: Standing) -> tuple[Standing, np.ndarr
         some = evened(here, structure, last)
         last = _from(some, structure._replace(data=some.cut(structure.loop)), last, free)
     spread = np.hypot(
-        *(spread_of_recordings(structure.table, last, folds) for folds in (here.folds, _quarters(here, structure)))
+        spread_of_recordings(structure.table, last, here.folds),
+        spread_of_recordings(structure.table, last, _quarters(here, structure), alike=True),
     )
     last = _from(here, structure, last, free, 0)
     beyond = excess_of(here, structure, last)
@@ -250,6 +264,12 @@ def _off_the_table(here: Setting, model: Model) -> tuple[Setting, list[Fault]]:
     ]  # fmt: skip
     here = replace(here, runs=without(here.runs, found))
     return replace(here, data=here.cut(here.loop)), found
+
+
+def _has_friction(model: Model) -> bool:
+    """Whether dry friction stands at every joint: all that it holds looks as if something held it, else."""
+    joints = put(model.structure.loop, model.structure.table, model.fit.theta).joints
+    return bool((np.asarray(joints.friction) > 0).all())
 
 
 def _same_place(one: Fault, other: Fault) -> bool:

@@ -409,29 +409,53 @@ def _squares_without(loop: Loop, table: Table, data: Windows, one: Fit, left: Se
     return answer
 
 
-def spread_of_recordings(table: Table, found: Fit, folds: np.ndarray) -> np.ndarray:
+def spread_of_recordings(table: Table, found: Fit, folds: np.ndarray, *, alike: bool = False) -> np.ndarray:
     """How differently recordings tell each free entry, (columns,): half of its 95 % interval over 1.96.
 
     Where more than noise is left, and in each recording in its own way, the noise tells no error. A Gauss-Newton step
-    leads to the numbers without some recordings (`folds` (blocks, windows) numbers them), whose spread tells it: a
-    jackknife of groups (J. W. Tukey, Annals of Mathematical Statistics 29, 1958) with Student's t. The starts of the
-    windows stay, and so do numbers on their bounds.
+    leads to the numbers without each recording (`folds` (blocks, windows) numbers them), whose spread tells it: a
+    jackknife (J. W. Tukey, Annals of Mathematical Statistics 29, 1958) with Student's t. Its degrees of freedom follow
+    from how much each recording tells of the number, unless all are to count `alike`. The starts of the windows stay,
+    and so do numbers on their bounds.
     """
     from scipy.special import ndtri, stdtrit  # scipy is slow to import
 
-    count, left = len(found.free), _left_out(folds)
+    count, left = len(found.free), [folds == k for k in np.unique(folds)]
     low, high = np.array([BOUNDS[entry.name] for entry in table])[np.maximum(found.free, 0)].T
     value = found.theta[np.maximum(found.free, 0)]
     gradient, matrix = found.sums.gradient[..., :count], found.sums.matrix[..., :count, :count]
     keep = (found.free >= 0) & (value > low) & (value < high) & (np.diag(matrix.sum((0, 1))) > 0)
-    away = np.zeros((len(left), count))
+    away, told = np.zeros((len(left), count)), np.ones((len(left), count))
+    whole = np.linalg.pinv(matrix.sum((0, 1))[np.ix_(keep, keep)], rcond=1e-12, hermitian=True)
     for k, out in enumerate(left):
         H, g = matrix[~out].sum(0)[np.ix_(keep, keep)], gradient[~out].sum(0)[keep]
         size = np.sqrt(np.maximum(np.diag(H), 1e-300))
         away[k, keep] = np.linalg.lstsq(H / np.outer(size, size), g / size, rcond=1e-12)[0] / size
+        told[k, keep] = np.einsum("ij,jk,ik->i", whole, matrix[out].sum(0)[np.ix_(keep, keep)], whole)
     many = len(left)
-    wide = np.sqrt((many - 1) / many * ((away - away.mean(0)) ** 2).sum(0)) * stdtrit(many - 1, 0.975) / ndtri(0.975)
-    return np.where(keep, wide, np.nan)
+    bias, freedom = (1.0, many - 1.0) if alike else _of_jackknife(told)
+    square = (many - 1) / many * ((away - away.mean(0)) ** 2).sum(0) / bias
+    return np.where(keep, np.sqrt(square) * stdtrit(freedom, 0.975) / ndtri(0.975), np.nan)
+
+
+def _of_jackknife(told: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """By how much a jackknife's variance is too large, and its degrees of freedom, (columns,).
+
+    `told` (groups, columns) is what each group tells of a number, which differs between groups with one variance: a
+    mean with these weights. The jackknife of it is a quadratic form, matched by its mean and variance to a chi-squared
+    (R. M. Bell and D. F. McCaffrey, Survey Methodology 28, 2002).
+    """
+    many, count = told.shape
+    bias, freedom = np.ones(count), np.ones(count)
+    for k, own in enumerate(told.T):
+        share = np.clip(own, 0.0, None)
+        share = share / max(share.sum(), 1e-300)
+        steps = (share / np.maximum(1 - share, 1e-6))[:, None] * (share - np.eye(many))
+        steps = steps - steps.mean(0)
+        form = (many - 1) / many * steps.T @ steps
+        bias[k] = np.trace(form) / max(share @ share, 1e-300)
+        freedom[k] = np.trace(form) ** 2 / max((form**2).sum(), 1e-300)
+    return bias, np.clip(freedom, 1.0, many - 1.0)
 
 
 def held_out(found: Fit, data: Windows, folds: np.ndarray) -> np.ndarray:

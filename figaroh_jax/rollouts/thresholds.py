@@ -18,6 +18,7 @@ SMALL = 0.002  # gain below which a cause found with others is not missed
 SLIGHT = 1e-3  # of the squares that others explain at its joint: less makes up for a law that is not theirs
 MOST_OF_IT = 0.9  # gain on held-out data from which places count alike, however large the squares of a few are
 LEAST_OF_A_RECORDING = 0.1  # of the mean squares of recordings: gains are told beside so much
+FEWEST_JOINTS = 3  # that must bear out together a cause of which none shows enough by itself
 COST_OF_A_MISSED = 0.1  # of the squares, by which a cause that is surely missed would make them larger
 FITTED_FOR_HELD = 0.7  # of the t that a name needs: what it must have on the rows that it was fitted to
 OF_ITS_SIZE = 0.5  # standard deviation of a size that is known, of numbers that cannot be negative
