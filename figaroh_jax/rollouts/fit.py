@@ -28,6 +28,7 @@ _COLUMNS = 16  # free numbers, a multiple of which a program differentiates
 _GROUPS, _REFITS = 6, 10  # of recordings that are left out, steps of each fit without one
 _SETTLED, _RESTING = 1e-5, 10.0  # predicted share of the squares at which a fit without some recordings ends
 _OF_GAIN, _OF_REST = 0.02, 0.003  # shares of what a fit has gained and of what is left, where only its gain is asked
+_LEAST_FREEDOM = 2.0  # of an interval told by recordings
 _CLOSE = 0.02  # predicted decrease of the sum of whitened squares at which a fit ends
 
 
@@ -433,29 +434,28 @@ def spread_of_recordings(table: Table, found: Fit, folds: np.ndarray, *, alike: 
         away[k, keep] = np.linalg.lstsq(H / np.outer(size, size), g / size, rcond=1e-12)[0] / size
         told[k, keep] = np.einsum("ij,jk,ik->i", whole, matrix[out].sum(0)[np.ix_(keep, keep)], whole)
     many = len(left)
-    bias, freedom = (1.0, many - 1.0) if alike else _of_jackknife(told)
-    square = (many - 1) / many * ((away - away.mean(0)) ** 2).sum(0) / bias
+    freedom = many - 1.0 if alike else _freedom(told)
+    square = (many - 1) / many * ((away - away.mean(0)) ** 2).sum(0)
     return np.where(keep, np.sqrt(square) * stdtrit(freedom, 0.975) / ndtri(0.975), np.nan)
 
 
-def _of_jackknife(told: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """By how much a jackknife's variance is too large, and its degrees of freedom, (columns,).
+def _freedom(told: np.ndarray) -> np.ndarray:
+    """Degrees of freedom of a jackknife, (columns,): fewer than its groups where few of them tell most of a number.
 
-    `told` (groups, columns) is what each group tells of a number, which differs between groups with one variance: a
-    mean with these weights. The jackknife of it is a quadratic form, matched by its mean and variance to a chi-squared
-    (R. M. Bell and D. F. McCaffrey, Survey Methodology 28, 2002).
+    `told` (groups, columns) is what each group tells of a number that is its own in each group: they are the weights of
+    a mean. Its jackknife is a quadratic form, matched by mean and variance to a chi-squared (R. M. Bell and
+    D. F. McCaffrey, Survey Methodology 28, 2002); two at the least, for a t of fewer has no variance.
     """
     many, count = told.shape
-    bias, freedom = np.ones(count), np.ones(count)
+    found = np.ones(count)
     for k, own in enumerate(told.T):
         share = np.clip(own, 0.0, None)
         share = share / max(share.sum(), 1e-300)
         steps = (share / np.maximum(1 - share, 1e-6))[:, None] * (share - np.eye(many))
         steps = steps - steps.mean(0)
-        form = (many - 1) / many * steps.T @ steps
-        bias[k] = np.trace(form) / max(share @ share, 1e-300)
-        freedom[k] = np.trace(form) ** 2 / max((form**2).sum(), 1e-300)
-    return bias, np.clip(freedom, 1.0, many - 1.0)
+        form = steps.T @ steps
+        found[k] = np.trace(form) ** 2 / max((form**2).sum(), 1e-300)
+    return np.clip(found, min(_LEAST_FREEDOM, many - 1.0), many - 1.0)
 
 
 def held_out(found: Fit, data: Windows, folds: np.ndarray) -> np.ndarray:
