@@ -11,12 +11,13 @@ import mujoco
 import numpy as np
 import pytest
 from generators import servo_arm, servo_arm6
+from scipy import stats
 
 from figaroh_jax.rollouts.alone import alone, carried_by, separable
 from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.data import Run, Stretch, windows
 from figaroh_jax.rollouts.faults import faults, without
-from figaroh_jax.rollouts.fit import System, fit, spread_of_recordings, standard_errors
+from figaroh_jax.rollouts.fit import System, _freedom, fit, spread_of_recordings, standard_errors  # pyright: ignore[reportPrivateUsage]
 from figaroh_jax.rollouts.parameters import Entry, values
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.search import t_of, t_of_places
@@ -234,3 +235,20 @@ def test_recordings_that_tell_numbers_differently_widen_their_intervals(tmp_path
     assert found.theta[found.free[column]] == pytest.approx(levels.mean(), abs=0.02)
     assert spread[column] == pytest.approx(expected, rel=0.2)
     assert spread[column] > 100 * standard_errors(found, here.data)[column]
+
+
+def test_intervals_hold_where_a_few_recordings_tell_most_of_a_number():
+    """Means of six groups that differ, 5000 times: right as often as said where all tell alike, no less else."""
+    rng, found = np.random.default_rng(5), []
+    for share in (np.full(6, 1 / 6), np.array([5, 1, 1, 1, 1, 1]) / 10):
+        own = rng.normal(size=(5000, 6))
+        mean = own @ share
+        away = (mean[:, None] - own) * share / (1 - share)
+        error = np.sqrt(5 / 6 * ((away - away.mean(1, keepdims=True)) ** 2).sum(1))
+        free = float(_freedom(share[:, None])[0])
+        found.append((free, np.mean(np.abs(mean) > stats.t.ppf(0.975, free) * error)))
+    (alike, missed), (few, seldom) = found
+    assert alike == pytest.approx(5)
+    assert 0.04 < missed < 0.06
+    assert 2 <= few < 3
+    assert seldom < 0.05

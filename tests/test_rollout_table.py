@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from generators import servo_arm6
 
-from figaroh_jax.rollouts.data import Run
+from figaroh_jax.rollouts.arm import search_arm
+from figaroh_jax.rollouts.data import Run, Stretch
 from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.reading import load_loop
+from figaroh_jax.rollouts.setting import setting
 from figaroh_jax.rollouts.table import on_table
 
 END = "</body></body></body></body></body></body>"
@@ -86,3 +88,18 @@ def test_no_table_where_there_is_none_however_wrong_the_model(small: Loop):
         lambda m: eqx.tree_at(lambda x: x.drives.scale, m, 1.3 * np.asarray(m.drives.scale)),
     ]
     assert [on_table(change(small), runs) for change in changes] == [None] * len(changes)
+
+
+def test_a_recording_whose_only_fault_is_the_table_says_contact_and_nothing_else(small: Loop):
+    """One recording, two seconds on a plane, friction in the model: no name, no second contact where none is."""
+    run, touches = record(-0.1365, 0)
+    times = run.time[touches]
+    cut = [Stretch(0, first, 400) for first in range(0, len(run.time), 400)]
+    loop = eqx.tree_at(lambda m: m.joints.friction, small, 1.2 * np.asarray(small.joints.friction))
+    found = search_arm(setting(loop, [run], stretches=cut))
+    assert (found.verdict, found.named, found.proxy) == ("nothing", [], [])
+    (fault,) = found.faults
+    assert fault.kind == "contact"
+    assert fault.table == pytest.approx(-0.1365, abs=0.012)
+    assert fault.first == pytest.approx(times[0], abs=0.5)
+    assert fault.last == pytest.approx(times[-1], abs=0.5)

@@ -444,7 +444,8 @@ def _freedom(told: np.ndarray) -> np.ndarray:
 
     `told` (groups, columns) is what each group tells of a number that is its own in each group: they are the weights of
     a mean. Its jackknife is a quadratic form, matched by mean and variance to a chi-squared (R. M. Bell and
-    D. F. McCaffrey, Survey Methodology 28, 2002); two at the least, for a t of fewer has no variance.
+    D. F. McCaffrey, Survey Methodology 28, 2002); two at the least, for a t of fewer has no variance. Given the weights
+    that is on the safe side; but weights by what is left of each recording (`evened`) are drawn with the recordings.
     """
     many, count = told.shape
     found = np.ones(count)
