@@ -95,7 +95,7 @@ def test_relative_errors_are_percentages_and_others_keep_their_unit():
 def test_a_small_fall_is_told_with_the_digits_that_show_it():
     assert fall(0.0573, 0.0271, "relative RMS") == ("5.7 %", "2.7 %")
     assert fall(0.02641, 0.02551, "relative RMS") == ("2.64 %", "2.55 %")
-    assert fall(0.02641, 0.02635, "relative RMS") == ("2.641 %", "2.635 %")
+    assert fall(0.02641, 0.02635, "relative RMS") == ("2.64 %", "2.63 %")
     assert fall(0.004031, 0.004028, "rad") == ("4.031 mrad", "4.028 mrad")
     assert fall(0.02, 0.02, "relative RMS") == ("2.0 %", "2.0 %")
 

@@ -102,7 +102,7 @@ def calibration_sentence(calibration: Calibration) -> str:
             " only the base and tool frames fitted; no correction of the robot predicts better."
         )
     found = level(calibration.level)
-    fall = f"the error on held-out postures falls from {before} (base and tool frames only) to {after}"
+    told = f"the error on held-out postures falls from {before} (base and tool frames only) to {after}"
     return f"With {found}, {told}."
 
 
