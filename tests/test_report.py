@@ -22,7 +22,7 @@ from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.reporting import report
 from figaroh_jax.reporting.picture import robot_picture
 from figaroh_jax.reporting.provenance import provenance
-from figaroh_jax.reporting.wording import error, interval, phrase, sentence
+from figaroh_jax.reporting.wording import error, fall, interval, phrase, sentence
 from figaroh_jax.results import Diagnosis, Estimate, Gain, Name, Nearest, Part, Rest
 
 LAPTOP, PHONE = (1280, 800), (390, 844)
@@ -90,6 +90,14 @@ def test_relative_errors_are_percentages_and_others_keep_their_unit():
     assert error(0.00213, "relative RMS") == "0.21 %"
     assert error(1.5, "N m") == "1.5 N m"
     assert error(float("nan"), "relative RMS") == "unknown"
+
+
+def test_a_small_fall_is_told_with_the_digits_that_show_it():
+    assert fall(0.0573, 0.0271, "relative RMS") == ("5.7 %", "2.7 %")
+    assert fall(0.02641, 0.02551, "relative RMS") == ("2.64 %", "2.55 %")
+    assert fall(0.02641, 0.02635, "relative RMS") == ("2.64 %", "2.63 %")
+    assert fall(0.004031, 0.004028, "rad") == ("4.031 mrad", "4.028 mrad")
+    assert fall(0.02, 0.02, "relative RMS") == ("2.0 %", "2.0 %")
 
 
 def test_effect_outside_the_catalogue_still_reads_as_words():

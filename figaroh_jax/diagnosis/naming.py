@@ -7,8 +7,9 @@ vary with position, speed, load or time stands for another law.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -96,6 +97,9 @@ class Standing:
     alone: bool = True  # whether its joints are likely to have no other misfit (`stands_alone`)
 
 
+_VARIES = "its amplitude varies with position, speed, load or time (that would add"
+
+
 def reason_against(
     one: Standing,
     rest: bool,
@@ -110,67 +114,73 @@ def reason_against(
     `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not or where it is
     borderline; `fading` are those that were surely there and are gone in recordings kept out.
     """
+    checks = _of_all(one, tolerance)
+    if rest or not (one.beside_rest or one.complete):  # what any rest looks like is taken on less only if it is all
+        checks = chain(checks, _of_those_beside_rest(one, rest, certain, fading))
+    return next((reason for passed, reason in checks if not passed), "")
+
+
+def _of_all(one: Standing, tolerance: float) -> Iterator[tuple[bool, str]]:
+    """What every cause is asked, with why it is not named where it fails."""
+    strict_law = one.whole or one.alone  # what else is wrong at a joint makes its law's amplitude vary
+    yield (one.physical, "its fitted sign is physically impossible")
+    yield (one.gain > 0, f"it does not improve the prediction of held-out data (gain {one.gain:.2g})")
+    yield (
+        one.share >= tolerance,
+        f"its torque is {one.share:.2%} of the joint's, below the tolerance of {tolerance:.2%}",
+    )
+    yield (
+        one.modulation_held_out <= (ALL_BUT if one.varies and strict_law else MODULATION_HELD_OUT),
+        f"{_VARIES} {one.modulation_held_out:.2f} of its gain)",
+    )
+    yield (not one.spoils, "it predicts a joint worse, which a right law of the whole robot does not")
+    yield (not one.outdone, "another cause that explains the same misfit predicts better, though it is none itself")
+    yield (not one.massless, "its mass is not surely above zero: a link other than believed explains as much")
+    yield (
+        one.leaves <= LAW_LEAVES or not one.alone,
+        f"where it acts {one.leaves:.2f} of what it removes stays beyond the noise, though most other joints have"
+        " no misfit: another law acts there",
+    )
+    yield (
+        one.followed <= OWN_SHARE or not one.unmoved,
+        f"where it acts the motion predicts {one.followed:.2f} of what it removes once more, though most other"
+        " joints have no misfit while they move: another law acts there",
+    )
+
+
+def _of_those_beside_rest(
+    one: Standing, rest: bool, certain: Callable[[Name], bool], fading: Collection[Name]
+) -> Iterator[tuple[bool, str]]:
+    """What a cause beside a rest is asked more. `certain` costs a fit: it is asked where the answer hangs on it."""
     least, most = (GAIN_NAMED_ROBOT, MODULATION_ROBOT) if one.whole else (GAIN_NAMED, MODULATION)
-    shown = certain(one.name)
     varying = one.modulation if one.whole else _without_chance(one.modulation, one.modulation_held_out)
     margin = _together_beyond(max(one.t / one.t_needed, 1.0), one.gain / least, most / max(varying, 1e-9))
-    strict_law = one.whole or one.alone  # what else is wrong at a joint makes its law's amplitude vary
-    varies = "its amplitude varies with position, speed, load or time (that would add"
-    checks = [
-        (one.physical, "its fitted sign is physically impossible"),
-        (one.gain > 0, f"it does not improve the prediction of held-out data (gain {one.gain:.2g})"),
-        (
-            one.share >= tolerance,
-            f"its torque is {one.share:.2%} of the joint's, below the tolerance of {tolerance:.2%}",
-        ),
-        (
-            one.modulation_held_out <= (ALL_BUT if one.varies and strict_law else MODULATION_HELD_OUT),
-            f"{varies} {one.modulation_held_out:.2f} of its gain)",
-        ),
-        (not one.spoils, "it predicts a joint worse, which a right law of the whole robot does not"),
-        (not one.outdone, "another cause that explains the same misfit predicts better, though it is none itself"),
-        (not one.massless, "its mass is not surely above zero: a link other than believed explains as much"),
-        (
-            one.leaves <= LAW_LEAVES or not one.alone,
-            f"where it acts {one.leaves:.2f} of what it removes stays beyond the noise, though most other joints have"
-            " no misfit: another law acts there",
-        ),
-        (
-            one.followed <= OWN_SHARE or not one.unmoved,
-            f"where it acts the motion predicts {one.followed:.2f} of what it removes once more, though most other"
-            " joints have no misfit while they move: another law acts there",
-        ),
-    ]
-    if rest or not (one.beside_rest or one.complete):  # what any rest looks like is taken on less only if it is all
-        checks += [
-            (
-                one.t >= one.t_needed or shown,
-                f"its gain on held-out data is not significant: t = {one.t:.1f}, {one.t_needed:.1f} needed",
-            ),
-            (one.gain >= least, f"it removes {one.gain:.0%} of the held-out error where it acts, {least:.0%} needed"),
-            (
-                one.modulation <= (max(most, MODULATION_HELD_OUT) if shown else most),
-                f"{varies} {one.modulation:.2f} of its gain)",
-            ),
-            (one.share >= SHARE_NAMED, f"its torque is {one.share:.1%} of the joint's, {SHARE_NAMED:.0%} needed"),
-            (not one.everywhere, "a law of the whole robot explains as much where it acts, and more is left"),
-            (not one.cancels, "it cancels most of the joint's torque, as no gain beside another cause does"),
-            (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion explain as much"),
-            (
-                one.beside_rest or not rest or one.name in fading,
-                "the unexplained residual may imitate it: it is named only where nothing else is left",
-            ),
-            (
-                not one.inertia_alone,
-                "a coupling without friction of its own cannot be distinguished from rotor or link inertia",
-            ),
-            (
-                margin >= MARGIN or shown,
-                f"it is borderline: t, gain and a steady amplitude together are {margin:.1f} times what each alone"
-                f" needs, {MARGIN:.0f} needed",
-            ),
-        ]
-    return next((reason for passed, reason in checks if not passed), "")
+    yield (
+        one.t >= one.t_needed or certain(one.name),
+        f"its gain on held-out data is not significant: t = {one.t:.1f}, {one.t_needed:.1f} needed",
+    )
+    yield (one.gain >= least, f"it removes {one.gain:.0%} of the held-out error where it acts, {least:.0%} needed")
+    yield (
+        one.modulation <= most or (one.modulation <= MODULATION_HELD_OUT and certain(one.name)),
+        f"{_VARIES} {one.modulation:.2f} of its gain)",
+    )
+    yield (one.share >= SHARE_NAMED, f"its torque is {one.share:.1%} of the joint's, {SHARE_NAMED:.0%} needed")
+    yield (not one.everywhere, "a law of the whole robot explains as much where it acts, and more is left")
+    yield (not one.cancels, "it cancels most of the joint's torque, as no gain beside another cause does")
+    yield (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion explain as much")
+    yield (
+        one.beside_rest or not rest or one.name in fading,
+        "the unexplained residual may imitate it: it is named only where nothing else is left",
+    )
+    yield (
+        not one.inertia_alone,
+        "a coupling without friction of its own cannot be distinguished from rotor or link inertia",
+    )
+    yield (
+        margin >= MARGIN or certain(one.name),
+        f"it is borderline: t, gain and a steady amplitude together are {margin:.1f} times what each alone"
+        f" needs, {MARGIN:.0f} needed",
+    )
 
 
 def strong(one: Standing) -> bool:

@@ -157,22 +157,22 @@ def stack(signals: Sequence[Signals], model: RobotModel | None = None, joined: b
     carried = None if model is None else _carried(model, signals)
     slots = [[k] for k in range(len(signals))]
     if joined and carried is None:
-        slots = _slots(signals, samples, fast_length(samples + 2 * pad) - 2 * pad)
+        slots = _slots(signals, samples, _length(samples + 2 * pad, first.rows.step) - 2 * pad)
         longer = [_slots(signals, round(x * samples)) for x in LONGER] if len(slots) > FEW_SLOTS else []
         slots = min([slots, *longer], key=partial(_padded_size, signals))
     samples, count = (max(sum(sizes[k] for k in m) for m in slots) for sizes in _sizes(signals))
-    length = fast_length(max(samples + 2 * pad, *(_with_ends(signals, m) for m in slots)))
+    length = _length(max(samples + 2 * pad, *(_with_ends(signals, m) for m in slots)), first.rows.step)
     spans, kept, source = [_NOWHERE] * len(signals), [], []
     for slot, members in enumerate(slots):
-        sample = row = place = 0
+        sample = row = 0
         rows, index = [], []
-        for k in members:
+        starts = [*_starts(signals, members, pad), length]
+        for k, place, end in zip(members, starts, starts[1:], strict=False):
             one = signals[k]
             spans[k] = Span(slot, sample, one.time.size, row, one.rows.kept)
-            room = length - place if k == members[-1] else one.time.size + 2 * pad
-            index.append(_extended(one, pad, room) + sample)
+            index.append(_extended(one, pad, end - place) + sample)
             rows.append(one.rows.index + pad + place)
-            sample, row, place = sample + one.time.size, row + one.rows.kept, place + room
+            sample, row = sample + one.time.size, row + one.rows.kept
         kept.append(np.concatenate(rows))
         source.append(np.concatenate(index))
 
@@ -210,13 +210,14 @@ def _slots(signals: Sequence[Signals], samples: int, room: float = np.inf) -> li
     A slot has `samples`, of which each further recording needs twice what the filter reaches more; `room` is what all
     have together. Slots stand in the order of their first recordings.
     """
-    pad = reach(signals[0].dt, signals[0].cutoff)
+    pad, step = reach(signals[0].dt, signals[0].cutoff), signals[0].rows.step
     slots: list[list[int]] = []
     for k in sorted(range(len(signals)), key=lambda k: -signals[k].time.size):
         for members in slots:
             taken = sum(signals[m].time.size for m in members) + signals[k].time.size
             alike = signals[members[0]].role == signals[k].role
-            if alike and taken <= min(samples, room - 2 * pad * len(members)) and _apart(signals, [*members, k]):
+            ends = (2 * pad + step - 1) * len(members)
+            if alike and taken <= min(samples, room - ends) and _apart(signals, [*members, k]):
                 members.append(k)
                 break
         else:
@@ -229,16 +230,34 @@ def _sizes(signals: Sequence[Signals]) -> tuple[list[int], list[int]]:
     return [s.time.size for s in signals], [s.rows.kept for s in signals]
 
 
+def _length(least: int, step: int) -> int:
+    """A length that a real FFT is quick at, of which every `step`th number can be transformed back alone."""
+    return step * fast_length(-(-least // step))
+
+
+def _starts(signals: Sequence[Signals], members: Sequence[int], pad: int) -> list[int]:
+    """Where the recordings of a slot begin in its extended record.
+
+    Their rows stand a whole number of steps apart: then only these are transformed back (`rowfilter.on_host`).
+    """
+    first, starts = signals[members[0]].rows, [0]
+    for before, k in pairwise(members):
+        least = starts[-1] + signals[before].time.size + 2 * pad
+        starts.append(least + (first.first - signals[k].rows.first - least) % first.step)
+    return starts
+
+
 def _with_ends(signals: Sequence[Signals], members: Sequence[int]) -> int:
-    """Samples of a slot with what the filter reaches on both sides of each recording in it."""
+    """Places of a slot: its recordings with what the filter reaches on both sides of each."""
     pad = reach(signals[0].dt, signals[0].cutoff)
-    return sum(signals[k].time.size + 2 * pad for k in members)
+    return _starts(signals, members, pad)[-1] + signals[members[-1]].time.size + 2 * pad
 
 
 def _padded_size(signals: Sequence[Signals], slots: list[list[int]]) -> int:
     """Samples of all slots, and of what is transformed of them."""
     samples = max(sum(signals[k].time.size for k in members) for members in slots)
-    return len(slots) * (samples + fast_length(max(_with_ends(signals, members) for members in slots)))
+    longest = max(_with_ends(signals, members) for members in slots)
+    return len(slots) * (samples + _length(longest, signals[0].rows.step))
 
 
 def _apart(signals: Sequence[Signals], members: list[int]) -> bool:

@@ -158,6 +158,7 @@ def page_template(name: str, folder: Path | None = None) -> Any:
         "aside": wording.aside,
         "equation": wording.effect_equation,
         "error": lambda value, unit: _glued(wording.error(value, unit)),
+        "fall": lambda gain: " → ".join(map(_glued, wording.fall(gain.before, gain.after, gain.unit))),
         "fixed": lambda value, decimals=0: f"{value:.{decimals}f}" if math.isfinite(value) else "–",
         "first_upper": lambda words: words[:1].upper() + words[1:],
         "interval": lambda estimate: _glued(wording.interval(estimate)),

@@ -138,8 +138,8 @@ def _cause(number: int, cause: Cause) -> RenderableType:
         Text.assemble(
             f"\n{number}. ",
             (wording.phrase(cause.name), "bold"),
-            f"  [{cause.name.effect}]  error {wording.error(gain.before, gain.unit)} → ",
-            f"{wording.error(gain.after, gain.unit)}, confidence {cause.confidence:.2f}",
+            f"  [{cause.name.effect}]  error {' → '.join(wording.fall(gain.before, gain.after, gain.unit))}, ",
+            f"confidence {cause.confidence:.2f}",
         )
     ]
     lines += [Text(line) for line in _aligned(cause.parameters)]

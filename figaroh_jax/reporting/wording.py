@@ -102,8 +102,8 @@ def calibration_sentence(calibration: Calibration) -> str:
             " only the base and tool frames fitted; no correction of the robot predicts better."
         )
     found = level(calibration.level)
-    fall = f"the error on held-out postures falls from {before} (base and tool frames only) to {after}"
-    return f"With {found}, {fall}."
+    told = f"the error on held-out postures falls from {before} (base and tool frames only) to {after}"
+    return f"With {found}, {told}."
 
 
 def distances(calibration: Calibration) -> str:
@@ -211,16 +211,25 @@ def _value_and_half(value: float, half: float, decimals: int) -> str:
     return _minus(f"{value:.{decimals}f} ± {half:.{decimals}f}")
 
 
-def error(value: float, of: str) -> str:
-    """An error in words: a relative one in percent, a small angle or length in mrad or mm, any other with its unit."""
+def error(value: float, of: str, more: int = 0) -> str:
+    """An error in words: a relative one in percent, a small angle or length in mrad or mm, any other with its unit.
+
+    `more`: how many digits beyond those that a reader needs of one error alone.
+    """
     if not math.isfinite(value):
         return "unknown"
     if of in ("rad", "m") and abs(value) < 0.1:
-        return f"{number(1e3 * value, 3)} m{of}"
+        return f"{number(1e3 * value, 3 + more)} m{of}"
     if not of.startswith("relative"):
-        return _with_unit(number(value), of)
+        return _with_unit(number(value, 4 + more), of)
     percent = 100.0 * value
-    return f"{percent:.1f} %" if abs(percent) >= 1.0 else f"{number(percent, 2)} %"
+    return f"{percent:.{1 + more}f} %" if abs(percent) >= 1.0 else f"{number(percent, 2 + more)} %"
+
+
+def fall(before: float, after: float, of: str) -> tuple[str, str]:
+    """Two errors in words, with as many digits as show that they differ, two more at the most."""
+    told = [(error(before, of, more), error(after, of, more)) for more in range(3)]
+    return next((pair for pair in told if pair[0] != pair[1]), told[0])
 
 
 def number(value: float, digits: int = 4) -> str:
@@ -244,7 +253,7 @@ def unit(text: str) -> str:
 
 def _fall(diagnosis: Diagnosis) -> str:
     gain = diagnosis.holdout
-    before, after = error(gain.before, gain.unit), error(gain.after, gain.unit)
+    before, after = fall(gain.before, gain.after, gain.unit)
     return f"its error on held-out data falls from {before} to {after}"
 
 

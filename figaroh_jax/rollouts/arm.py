@@ -304,6 +304,10 @@ def _round(
         lists.setdefault(joint_of(here, one.candidate), []).append(one)
     if not lists:
         return [], now, nearest
+    springs = _springs_first(here, now, tried, found, forbid)
+    sprung = _spring_alone(here, now, tried, springs, found)
+    if sprung is not None:
+        return *sprung, nearest
     ordered = {
         j: [one for one in in_order(now, ones) if one.candidate not in known[j].refused and worthy(here, now, one)]
         for j, ones in lists.items()
@@ -317,10 +321,8 @@ def _round(
         if chosen[0].candidate.kind.usual:  # what every joint has is found at all of them at once
             chosen = [one for one in firsts if one.candidate.kind.usual]
         new = _named(here, now, lists, chosen, found)
-        if new is not None and now.excess.max() < 1.0:
-            new = _beside_springs(here, now, lists, new, found, forbid)
         if new is not None:
-            kept, now = new
+            kept, now = _beside_springs(new, springs)
             break
         for one in chosen:
             known[joint_of(here, one.candidate)].refused.append(one.candidate)
@@ -336,17 +338,41 @@ def _round(
     return kept, now, nearest
 
 
-def _beside_springs(
-    here: Setting, now: Standing, lists: dict[int, list[Tried]], new: tuple[list[Named], Standing],
-    found: Sequence[Named], forbid: Sequence[str],
-) -> tuple[list[Named], Standing] | None:  # fmt: skip
-    """What is to be named though noise alone is left: springs, which are not looked for there, may explain more."""
+def _springs_first(
+    here: Setting, now: Standing, tried: Sequence[Tried], found: Sequence[Named], forbid: Sequence[str]
+) -> list[Tried]:
+    """A spring at every joint before the first cause, unless something is missing that every joint has.
+
+    A spring acts at the joints beside its own too, and one linear step tells little of it: ranked by that, a payload or
+    a neighbour's spring comes first and stays.
+    """
+    if found or any(one.candidate.kind.usual for one in tried):
+        return []
+    return sprung_now(here, now, forbid)
+
+
+def _spring_alone(
+    here: Setting, now: Standing, tried: Sequence[Tried], springs: Sequence[Tried], found: Sequence[Named]
+) -> tuple[list[Named], Standing] | None:
+    """A spring, or play, with which noise alone is left, and which no other cause comes near."""
+    clean = [one for one in springs if one.state.excess < 1.0]
+    if not clean:
+        return None
+    best = in_order(now, clean)[:1]
+    others = [one.state.fit.squares for one in tried if not one.candidate.kind.elastic]
+    if not best or not best[0].state.fit.squares < min(others, default=np.inf) - NO_CHOICE:
+        return None
+    j = joint_of(here, best[0].candidate)
+    return _named(here, now, {j: [one for one in clean if joint_of(here, one.candidate) == j]}, best, found)
+
+
+def _beside_springs(new: tuple[list[Named], Standing], springs: Sequence[Tried]) -> tuple[list[Named], Standing]:
+    """What is named with the springs that leave noise alone as well."""
     named, model = new
-    springs = sorted(sprung_now(here, now, forbid), key=lambda one: one.state.fit.squares)
-    squares = model.model.fit.squares
-    if springs and springs[0].state.fit.squares < squares - NO_CHOICE:
-        return _named(here, now, lists, springs[:1], found)
-    alike = [one.candidate for one in springs if one.state.fit.squares < squares + NO_CHOICE]
+    if not model.excess.max() < 1.0:
+        return new
+    alike = [one.candidate for one in springs
+             if one.state.excess < 1.0 and one.state.fit.squares < model.model.fit.squares + NO_CHOICE]  # fmt: skip
     told = tuple(Name(c.effect, c.at) for c in alike)
     return [n._replace(alike=tuple(dict.fromkeys([*n.alike, *told]))) for n in named], model
 
@@ -459,7 +485,12 @@ def _name(
     for other in lists.get(j, []):
         contained = other.candidate.kind.holds(one.candidate.effect)
         comparable = other.state.excess < 1.0 or one.state.excess >= 1.0
-        if other is one or contained or not comparable or most - gained(now, other) > NEAR * most:
+        if (
+            other.candidate[:2] == one.candidate[:2]
+            or contained
+            or not comparable
+            or most - gained(now, other) > NEAR * most
+        ):
             continue
         if t_of(other.sse[..., mine].sum(-1), one.sse[..., mine].sum(-1)) < UNTOLD and sized(here, other):
             alike.append(Name(other.candidate.effect, other.candidate.at))

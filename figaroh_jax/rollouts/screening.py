@@ -30,7 +30,7 @@ from .setting import (  # fmt: skip
     start_values,
     whitened,
 )
-from .thresholds import EXPLAINED, HOPEFUL, MAY_WIN, RICHER, UNCHANGED, USUAL
+from .thresholds import EXPLAINED, GAIN, HOPEFUL, MAY_WIN, RICHER, UNCHANGED, USUAL
 
 __all__ = [
     "LATE",
@@ -186,8 +186,7 @@ def _looser(here: Setting, now: Standing, joint: int, forbid: Sequence[str]) -> 
         return []
     part, _, _ = _part(now, joint)
     (c,), found = wanted, []
-    forces = np.abs(np.asarray(here.loop.drives.transmission))[:, joint] * largest_forces(here.loop, here.runs)
-    twist = float(forces.max(initial=0.0) / max(model.fit.theta[first], 1e-9))
+    twist = _torque(here, joint) / max(float(model.fit.theta[first]), 1e-9)
     for share in _PLAYS:
         theta = model.fit.theta.copy()
         theta[c.entries[c.kind.telling or 0]] = share * twist
@@ -345,9 +344,7 @@ def _start_of(now: Standing, structure: Structure) -> np.ndarray:
 def _sprung(here: Setting, now: Standing, joint: int, forbid: Sequence[str]) -> list[_Ranked]:
     """A spring, and a spring with play, between motor and link of a joint."""
     wanted = springs(here.loop.robot.dof_names[joint], len(here.known.table), forbid)
-    forces = largest_forces(here.loop, here.runs)
-    way = np.abs(np.asarray(here.loop.drives.transmission))[:, joint]
-    torque = float(max((way * forces).max(initial=0.0), 1e-6))
+    torque = _torque(here, joint)
     if not wanted or not np.isfinite(torque):
         return []
     loop = elastic_loop(here.loop, joint, 10.0 * torque, 0.01 * torque)
@@ -368,20 +365,72 @@ def _sprung(here: Setting, now: Standing, joint: int, forbid: Sequence[str]) -> 
 
 
 def sprung_now(here: Setting, now: Standing, forbid: Sequence[str]) -> list[Tried]:
-    """A spring at each joint of a rigid arm, fitted to the end where it may explain more than any other joint's."""
+    """A spring at each joint of a rigid arm, with and without play: a few steps of each, those that may win to the end.
+
+    A joint's own encoder does not judge it: a spring shows at the joints beside it too.
+    """
     if now.model.structure.loop.robot.nv != here.loop.robot.nv:
         return []
     ranked = [max(_sprung(here, now, j, forbid), key=lambda one: one.promise, default=None)
               for j in range(here.loop.robot.nv)]  # fmt: skip
+    early = [one for one in ranked if one is not None]
+    early = [(one, _spring_fitted(here, now, one, one.theta, _start_of(now, one.structure), _EARLY)) for one in early]
+    gains = [now.model.fit.cost - last.cost for _, last in early]
+    least = max(MAY_WIN * max(gains, default=0.0), GAIN * now.model.fit.squares)
     found = []
-    for one in sorted((x for x in ranked if x is not None), key=lambda x: -x.promise)[:_RACE]:
-        free, start = free_entries(now.model.free, one.candidate.entries), _start_of(now, one.structure)
-        last = fit(*one.structure, one.theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
-                   iterations=LATE)[0]  # fmt: skip
-        if np.isfinite(last.cost):
-            state = Model(one.structure, last, tuple(free), float(excess_of(here, one.structure, last).max()))
-            found.append(Tried(one.candidate, state, outputs(here, last.sums.cost)))
+    for (one, begun), gain in zip(early, gains, strict=True):
+        if gain > least:
+            found += _with_and_without_play(here, now, one, begun, forbid)
     return found
+
+
+def _spring_fitted(
+    here: Setting, now: Standing, one: _Ranked, theta: np.ndarray, start: np.ndarray, most: int
+) -> Fit:  # fmt: skip
+    free = free_entries(now.model.free, one.candidate.entries)
+    return fit(*one.structure, theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
+               iterations=most)[0]  # fmt: skip
+
+
+def _with_and_without_play(
+    here: Setting, now: Standing, one: _Ranked, begun: Fit, forbid: Sequence[str]
+) -> list[Tried]:
+    """The spring of a joint fitted to the end, and what contains it or is contained in it from there."""
+    last = _spring_fitted(here, now, one, begun.theta, begun.start, LATE)
+    if not np.isfinite(last.cost):
+        return []
+    found = [_tried_spring(here, now, one, last)]
+    first = len(here.known.table)
+    for other in springs(one.candidate.at[0], first, forbid):
+        if other.effect == one.candidate.effect:
+            continue
+        play = first + 2
+        plays = [0.0]
+        if other.kind.telling is not None:
+            twist = float(_torque(here, joint_of(here, other)) / max(last.theta[first], 1e-9))
+            plays = [share * twist for share in _PLAYS]
+        fits = []
+        for width in plays:
+            theta = last.theta.copy()
+            theta[play] = width
+            fits.append(_spring_fitted(here, now, one._replace(candidate=other), theta, last.start, _EARLY))
+        best = min(fits, key=lambda x: x.cost)
+        best = _spring_fitted(here, now, one._replace(candidate=other), best.theta, best.start, LATE)
+        if np.isfinite(best.cost):
+            found.append(_tried_spring(here, now, one._replace(candidate=other), best))
+    return found
+
+
+def _tried_spring(here: Setting, now: Standing, one: _Ranked, last: Fit) -> Tried:
+    free = tuple(free_entries(now.model.free, one.candidate.entries))
+    state = Model(one.structure, last, free, float(excess_of(here, one.structure, last).max()))
+    return Tried(one.candidate, state, outputs(here, last.sums.cost))
+
+
+def _torque(here: Setting, joint: int) -> float:
+    """The largest torque that the drives of a joint gave, N m or N."""
+    way = np.abs(np.asarray(here.loop.drives.transmission))[:, joint]
+    return float(max((way * largest_forces(here.loop, here.runs)).max(initial=0.0), 1e-6))
 
 
 def outputs(here: Setting, squares: Any) -> np.ndarray:
