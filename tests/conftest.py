@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 # Most of the seconds are the compiler's: here and in the commands that the tests start it does not optimise (a third
@@ -23,6 +24,20 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", str(ROOT / ".cache" / "jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+@pytest.fixture(autouse=True)
+def own_effects() -> Iterator[None]:
+    """Effects that a test registers are known to it alone: no later test of the same process meets them."""
+    from figaroh_jax.effects import registry
+
+    tables = (registry.CATALOGUE, registry.POSES, registry.ROLLOUTS, registry._OTHERS)  # pyright: ignore[reportPrivateUsage]
+    before = [dict(known) for known in tables]
+    yield
+    for known, old in zip(tables, before, strict=True):
+        if known != old:
+            known.clear()
+            known.update(old)
 
 
 @pytest.fixture(scope="session")

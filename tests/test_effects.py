@@ -405,20 +405,17 @@ def test_a_registered_effect_is_found_and_a_taken_name_refused(model: RobotModel
         def torque(self, motion: Motion) -> jax.Array:
             return jnp.asarray(self.pull * jnp.sin(self.here(motion.position) - self.home))
 
-    try:
-        register(Magnet)
-        magnet = place(find("magnet"), model, ["turn"], pull=2.0, home=0.5)
-        motion = moving(model)
-        torque = 2.0 * np.sin(np.asarray(motion.position)[:, 0] - 0.5)
-        np.testing.assert_allclose(magnet.torque(motion), torque, rtol=0, atol=1e-14)
+    register(Magnet)
+    magnet = place(find("magnet"), model, ["turn"], pull=2.0, home=0.5)
+    motion = moving(model)
+    torque = 2.0 * np.sin(np.asarray(motion.position)[:, 0] - 0.5)
+    np.testing.assert_allclose(magnet.torque(motion), torque, rtol=0, atol=1e-14)
 
-        class Other(Magnet):
-            name = "magnet"
+    class Other(Magnet):
+        name = "magnet"
 
-        with pytest.raises(InputError, match="registered already"):
-            register(Other)
-    finally:
-        CATALOGUE.pop("magnet", None)
+    with pytest.raises(InputError, match="registered already"):
+        register(Other)
 
 
 def test_relations_hold_both_ways_whichever_class_states_them():
@@ -442,14 +439,11 @@ def test_an_effect_of_ones_own_states_its_relations_and_its_sign():
         indistinguishable_from = ("power_law_friction", "of another package")
         force: jax.Array | np.ndarray | float = amplitude("N m")
 
-    try:
-        register(Seal)
-        assert related("stribeck_friction", "excludes") == ("seal",)
-        assert related("seal", "indistinguishable_from") == ("power_law_friction",)
-        assert Seal.parameters()["force"].lower == 0.0
-    finally:
-        CATALOGUE.pop("seal", None)
     assert related("stribeck_friction", "excludes") == ()
+    register(Seal)
+    assert related("stribeck_friction", "excludes") == ("seal",)
+    assert related("seal", "indistinguishable_from") == ("power_law_friction",)
+    assert Seal.parameters()["force"].lower == 0.0
 
 
 @pytest.mark.parametrize(

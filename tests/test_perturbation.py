@@ -13,7 +13,7 @@ import reference
 import robots
 
 from figaroh_jax.effects.base import JointEffect, Scalar, amplitude
-from figaroh_jax.effects.catalogue import CATALOGUE as TORQUES, register
+from figaroh_jax.effects.catalogue import register
 from figaroh_jax.effects.kinematic import CATALOGUE, Postures, axis_twist, columns_of
 from figaroh_jax.estimation.perturbation import Perturbation, apply
 from figaroh_jax.rigid.chain import chain_between, chain_pose
@@ -70,17 +70,13 @@ def test_an_effect_of_ones_own_that_errs_in_position_is_one_of_postures(tmp_path
     model, q = robots.load(robots.ARM, tmp_path), rng.uniform(-1.0, 1.0, (5, 2))
     none = np.zeros((5, 2))
     postures = Postures(q, q, none, np.zeros((5, 2, 3)), none, np.arange(5.0), 4.0)
-    try:
-        register(Wear)
-        (column,) = columns_of(CATALOGUE["wear"], model, (1,))
-        ((joint, field),) = column.pieces
-        assert (joint, column.parameter, column.unit) == (1, "depth", "m")  # the joint slides
-        # the joint stands behind its reading by the error
-        turn = axis_twist(model, 1)[:, None] * -np.exp(-(q[:, 1] ** 2))
-        np.testing.assert_allclose(field(postures), turn, rtol=0, atol=1e-15)
-    finally:
-        for names in (TORQUES, CATALOGUE):
-            names.pop("wear", None)
+    register(Wear)
+    (column,) = columns_of(CATALOGUE["wear"], model, (1,))
+    ((joint, field),) = column.pieces
+    assert (joint, column.parameter, column.unit) == (1, "depth", "m")  # the joint slides
+    # the joint stands behind its reading by the error
+    turn = axis_twist(model, 1)[:, None] * -np.exp(-(q[:, 1] ** 2))
+    np.testing.assert_allclose(field(postures), turn, rtol=0, atol=1e-15)
 
 
 def test_derivative_by_an_offset_is_the_column_of_the_calibration(tmp_path: Path):

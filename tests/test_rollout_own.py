@@ -8,7 +8,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ import pytest
 
 import figaroh_jax as fj
 from figaroh_jax.cli import main
-from figaroh_jax.effects import registry
 from figaroh_jax.jobs.export import export_loop
 from figaroh_jax.rollouts.data import Run, Stretch, windows
 from figaroh_jax.rollouts.loop import Loop
@@ -160,12 +158,9 @@ def test_sums_by_numbers_of_effects_are_those_of_finite_differences(tmp_path: Pa
 
 
 @pytest.fixture
-def known() -> Iterator[type[fj.Effect]]:
+def known() -> type[fj.Effect]:
     """The notch, registered for one test alone."""
-    fj.register(Notch)
-    yield Notch
-    for one in (registry.CATALOGUE, registry.POSES, registry.ROLLOUTS):
-        one.pop(Notch.name, None)
+    return fj.register(Notch)
 
 
 def test_a_registered_effect_is_identified_and_exported(
@@ -231,13 +226,9 @@ def test_a_registered_effect_that_no_step_can_simulate_is_told(tmp_path: Path):
     (tmp_path / "servo.xml").write_text(SERVO)
     loop, _ = fj.load_loop(tmp_path / "servo.xml")
     fj.register(Twitch)
-    try:
-        assert not any(e.name == Twitch.name for e in everywhere(loop.robot, ()))
-        (note,) = left_out(loop.robot)
-        assert left_out(loop.robot, (Twitch.name,)) == ()
-    finally:
-        for known in (registry.CATALOGUE, registry.POSES, registry.ROLLOUTS):
-            known.pop(Twitch.name, None)
+    assert not any(e.name == Twitch.name for e in everywhere(loop.robot, ()))
+    (note,) = left_out(loop.robot)
+    assert left_out(loop.robot, (Twitch.name,)) == ()
     assert note.startswith("'test_twitch' is registered, but not looked for in rollouts: its torque follows the time")
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from test_excitation import ARM, a_motion
 
 from figaroh_jax.effects.base import JointEffect, Motion, Scalar, amplitude
-from figaroh_jax.effects.catalogue import CATALOGUE, register
+from figaroh_jax.effects.catalogue import register
 from figaroh_jax.errors import InputError
 from figaroh_jax.estimation.priors import rigid_prior
 from figaroh_jax.excitation import information as info
@@ -88,14 +88,11 @@ def test_an_effect_of_ones_own_takes_part_and_its_repeats_are_those_of_rows_repe
         def torque(self, motion: Motion) -> Float[Array, " samples"]:
             return self.strength * jnp.sin(3.0 * self.here(motion.position))
 
-    try:
-        learned = info.learn(arm, noise=0.02)
-        states = np.stack([np.asarray(x) for x in a_motion(arm).states(20.0)])
-        pair = (("detent", ("bend",), {"strength": 0.25}), ("rotor_inertia", ("bend",), {"inertia": 0.02}))
-        given = causes(learned, [pair], states, 0.1)
-        forth, back = separated(given, gram_of(learned, given.sampler, states, given.columns), learned.prior)
-    finally:
-        CATALOGUE.pop("detent")
+    learned = info.learn(arm, noise=0.02)
+    states = np.stack([np.asarray(x) for x in a_motion(arm).states(20.0)])
+    pair = (("detent", ("bend",), {"strength": 0.25}), ("rotor_inertia", ("bend",), {"inertia": 0.02}))
+    given = causes(learned, [pair], states, 0.1)
+    forth, back = separated(given, gram_of(learned, given.sampler, states, given.columns), learned.prior)
     q, v, a = states
     friction = np.zeros((len(q), 2, 4))
     for joint in range(2):
