@@ -25,13 +25,15 @@ from figaroh_jax.diagnosis.floor import sober_spectrum
 from figaroh_jax.diagnosis.gaining import foretells
 from figaroh_jax.diagnosis.gates import ambiguous, exists, physical_sign, rivals
 from figaroh_jax.diagnosis.holdout import fold_squares
+from figaroh_jax.diagnosis.joint import polished
 from figaroh_jax.diagnosis.layout import held_rows, layout
-from figaroh_jax.diagnosis.naming import beyond_simpler
+from figaroh_jax.diagnosis.naming import beyond_simpler, standings
 from figaroh_jax.diagnosis.problem import Problem
 from figaroh_jax.diagnosis.search import Found, Rival
 from figaroh_jax.diagnosis.shifts import shifted, torque_change
 from figaroh_jax.diagnosis.state import baseline, batched, extended_state, plain_rows, solved, whitened
 from figaroh_jax.diagnosis.step import with_causes
+from figaroh_jax.diagnosis.thresholds import MODULATION
 from figaroh_jax.effects.base import Motion, place
 from figaroh_jax.effects.catalogue import find
 from figaroh_jax.errors import InputError
@@ -458,3 +460,24 @@ def test_slow_noise_of_a_recording_kept_out_does_not_bear_out_what_was_fitted_to
             sure[key] += foretells(other, bare, full, sober)
     assert sure["alone"] <= 3, sure
     assert sure["there"] > 50, sure
+
+
+@pytest.mark.parametrize(("drifts", "varies"), [("the dry friction", False), ("the law", True)])
+def test_an_amplitude_varies_where_what_a_law_adds_does_and_not_where_the_friction_beside_it_does(
+    model: RobotModel, drifts: str, varies: bool
+) -> None:
+    """Most of |v|^.5 is dry and viscous friction: times the time, it took the drift of these for its own."""
+    signals = made_signals(20.0)
+    v, time = signals.velocity[:, 0], signals.time
+    warm = 1 + 0.3 * (time / time[-1] - 0.5)
+    law = 8.0 * np.abs(v) ** 0.5 * np.sign(v)
+    torque = np.random.default_rng(3).normal(scale=0.05, size=signals.velocity.shape)
+    torque[:, 0] += 2 * v + (law + 6.0 * warm * np.sign(v) if drifts == "the dry friction" else law * warm)
+    torque += rigid_torque(model, signals)
+    problem = problem_of(model, dataclasses.replace(signals, torque=torque))
+    state, white = baseline(problem, ["viscous_friction", "coulomb_friction"]), np.ones((len(problem.records.omega), 2))
+    power = place(find("power_law_friction"), model, model.joint_names[:1], strength=8.0, exponent=0.5)
+    name = Name("power_law_friction", (model.joint_names[0],))
+    found = [Found(name, power, 0.0, (1.0, 0.0), (1.0, 0.0), 9.0, 1.0, (), (0,))]
+    (one,) = standings(problem, state, found, polished(problem, state, [power], white), white)
+    assert (one.modulation > MODULATION) is varies, one

@@ -258,7 +258,8 @@ def standings(
         worse, better = (v.own(full.rows, one.joints) for v in (without, full.verdicts))
         whole = effect.acts_on not in ("joint", "pair")
         torque = cause_torque(problem, full.state, effect, place)
-        modulation = _modulation(grown, effect, torque, without, one.joints, whole)
+        varying = torque if whole or kind(effect) != "columns" else _taken(full.state, without)
+        modulation = _modulation(grown, effect, varying, without, one.joints, whole)
         share = _share_of_torque(problem, full.state, torque, effect)
         out.append(
             Standing(
@@ -309,6 +310,15 @@ class _Grown(NamedTuple):
     @property
     def response(self) -> np.ndarray:
         return self.whitening * self.step.state.response(self.problem.records.omega)[:, None]
+
+
+def _taken(state: State, without: Verdicts) -> Float[np.ndarray, "nN nv"]:
+    """What a cause changes of the torque at all samples, N m or N: its own less what all else takes when it is gone.
+
+    Most of a friction that rises with a power of the speed is what dry and viscous friction are too: how those vary is
+    nothing that speaks against it.
+    """
+    return state.torque(state.theta) - state.torque(without.theta)
 
 
 def cause_torque(problem: Problem, state: State, effect: Effect, place: list[int]) -> Float[np.ndarray, "nN nv"]:
