@@ -125,7 +125,7 @@ def main() -> None:
     parser.add_argument("--own", action="store_true", help="an effect that is no one of the library's, registered here")
     parser.add_argument("--registered", action="store_true", help="that effect is registered, but not hidden")
     parser.add_argument("--forbid", action="store_true", help="leave the true effect out of the catalogue")
-    parser.add_argument("--whole", action="store_true", help="search with the whole arm in place of joint by joint")
+    parser.add_argument("--whole", action="store_true", help="one cause after another, as for other robots")
     args = parser.parse_args()
     count: dict[str, int] = {}
     if args.own or args.registered:

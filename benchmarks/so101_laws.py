@@ -4,7 +4,7 @@
     python benchmarks/so101_laws.py shoulder_lift --seconds 60
 
 Data under the folder that FIGAROH_JAX_DATA names (so101_sage). Gain, damping, rotor and friction of the joint are
-fitted to nine motions and judged on five that were not fitted; the other joints keep the numbers below. The level of
+fitted to nine motions and judged on four that were not fitted; the other joints keep the numbers below. The level of
 friction is set before every step:
 
     constant   F                      load     r |motor + gravity|      both      F + r |motor + gravity|

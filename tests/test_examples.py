@@ -80,5 +80,6 @@ def test_an_example_runs(
     if name == "friction_by_gradient":
         pytest.importorskip("optax")
     monkeypatch.setenv("FIGAROH_JAX_DATA", str(data_dir))
+    monkeypatch.setattr("sys.argv", [f"{name}.py"])  # not those of pytest
     runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
     assert SAYS[name] in capsys.readouterr().out

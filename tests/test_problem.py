@@ -21,6 +21,8 @@ from figaroh_jax.diagnosis.contenders import Contender
 from figaroh_jax.diagnosis.design import units
 from figaroh_jax.diagnosis.diagnosis import _possible
 from figaroh_jax.diagnosis.flexible import WIDTHS, friction_width
+from figaroh_jax.diagnosis.floor import sober_spectrum
+from figaroh_jax.diagnosis.gaining import foretells
 from figaroh_jax.diagnosis.gates import ambiguous, exists, physical_sign, rivals
 from figaroh_jax.diagnosis.holdout import fold_squares
 from figaroh_jax.diagnosis.layout import held_rows, layout
@@ -422,3 +424,37 @@ def test_parts_left_out_of_several_recordings_are_predicted_by_their_own_coeffic
     expected = ((rows.y - predicted) ** 2 * judged).sum(1)
     found = fold_squares(problem, state, folds, fold.reshape(-1))
     np.testing.assert_allclose(found, expected, rtol=1e-10)
+
+
+def test_slow_noise_of_a_recording_kept_out_does_not_bear_out_what_was_fitted_to_another(model: RobotModel) -> None:
+    """It does as often as the level of .01 says, though the drift is as slow as the recording; what is there does."""
+    rng = np.random.default_rng(7)
+
+    def drift(count: int) -> np.ndarray:
+        """A part of a much longer drift, with a power of f^-2, of unit variance at both joints."""
+        f = np.maximum(np.fft.rfftfreq(8 * count), 1 / count)[:, None]
+        out = np.fft.irfft(np.fft.rfft(rng.standard_normal((8 * count, 2)), axis=0) / f, 8 * count, axis=0)[:count]
+        return out / out.std(0)
+
+    signals = made_signals(12.0), made_signals(8.0, begin=20.0, role="holdout")
+    made = (dataclasses.replace(s, torque=drift(len(s.time))) for s in signals)
+    problem = problem_of(model, *made)
+    state, white = baseline(problem, ["viscous_friction"]), np.ones((len(problem.records.omega), model.nv))
+    offset = place(find("torque_offset"), model, [model.joint_names[0]])
+    bare, full = (with_causes(problem, state, causes, white) for causes in ([], [offset]))
+    told, taken = (
+        step.state.torque(step.state.theta).reshape(problem.records.torque.shape)[1, : len(signals[1].time)]
+        for step in (bare, full)
+    )
+    taken = taken - told
+    sober = sober_spectrum(problem, state)
+    sure = {"alone": 0, "there": 0}
+    for _ in range(60):
+        for key, more in (("alone", 0.0), ("there", 4 * taken / np.abs(taken).max())):
+            whole = np.array(problem.records.torque)
+            whole[1, : len(told)] = told + drift(len(told)) + more
+            records = eqx.tree_at(lambda r: r.torque, problem.records, whole)
+            other = Problem(problem.backend, records, problem.layout, TRUST, problem.width, problem.held)
+            sure[key] += foretells(other, bare, full, sober)
+    assert sure["alone"] <= 3, sure
+    assert sure["there"] > 50, sure

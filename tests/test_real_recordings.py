@@ -29,6 +29,7 @@ SETS = {  # the relative error that causes leave at most, with what it was when 
     "dfki_simple_pendulum": 0.470,  # .4651
     "dfki_double_pendulum": 0.283,  # .2792
 }
+VERDICTS = {"panda": "unknown"}  # 16 % of a torque are left, and what is refused predicts what was kept out
 EXPLAINED = {"kuka": (0.58, 0.999, 0.96, 0.986, 0.37)}  # R2 of each of the first joints, kept out, at least
 
 
@@ -46,6 +47,7 @@ def test_the_error_on_recordings_kept_out_is_no_larger_than_that_of_identify(
     rms = [np.asarray(kept.rms) for kept in plain.holdout.values()]
     torque = [np.asarray(kept.rms) / np.asarray(kept.relative) for kept in plain.holdout.values()]
     identified = np.sqrt(sum((r**2).sum() for r in rms) / sum((t**2).sum() for t in torque))
+    assert found.verdict == VERDICTS.get(name, found.verdict)
     assert found.holdout.after <= found.holdout.before
     assert found.holdout.after <= identified
     assert found.holdout.after <= SETS[name]

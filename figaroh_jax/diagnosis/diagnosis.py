@@ -34,7 +34,7 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p
 from .floor import foretold, noise_rms, short, sober_spectrum, told_too_large
-from .gaining import Fall, Gaining, beside_all, predicts_better, without_losses
+from .gaining import Fall, Gaining, beside_all, foretells, predicts_better, without_losses
 from .gates import physical_sign
 from .holdout import residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_rest
@@ -327,7 +327,8 @@ def _judged(
     doubted = left.p_value < REST_P  # the catalogue still scores more than noise, though nothing in it passes
     if doubted and not left.rest.there and short(problem, joint.step.state):
         sober = sober_spectrum(problem, joint.step.state, forbid)
-        doubted = chance_beside(problem, joint.step, sober, whitening, forbid, generator) < REST_P
+        doubted = foretells(problem, stand(problem, here.start, whitening), joint.step, sober)
+        doubted = doubted or chance_beside(problem, joint.step, sober, whitening, forbid, generator) < REST_P
     if found and doubted and float(beyond.max()) > tolerance:  # a rest of the answer is one for its names
         strict = strict or not _sticks(here, joint, tolerance)
     weighed = left_weighed(problem, joint.step.state, noise)  # rows at reversals say nothing of a law

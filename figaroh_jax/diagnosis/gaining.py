@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect
+from ..estimation.noise import Spectrum, whitening
 from ..results import Gain, Name
-from .holdout import Held, held_squares, weighted_squares
+from .holdout import Held, held_squares, weighted_squares, whitened_wanted
 from .joint import Joint, polished
 from .problem import Problem
 from .search import Found, stood_without
@@ -19,7 +20,17 @@ from .state import State
 from .step import Step
 from .thresholds import BY_CHANCE, BY_CHANCE_BESIDE, BY_CHANCE_UNSHOWN, KEPT_OF_CLAIM, RISES
 
-__all__ = ["Fall", "Gaining", "beside_all", "fall", "kept_squares", "predicts_better", "surely_less", "without_losses"]
+__all__ = [
+    "Fall",
+    "Gaining",
+    "beside_all",
+    "fall",
+    "foretells",
+    "kept_squares",
+    "predicts_better",
+    "surely_less",
+    "without_losses",
+]
 
 EXACT, DRAWS = 12, 4000  # blocks up to which every choice of signs is made; choices beyond
 
@@ -174,6 +185,16 @@ def predicts_better(problem: Problem, before: Step, after: Step, joints: Sequenc
     drop, had = (worse.squares - better.squares)[1][:, places], worse.squares[1][:, places].sum(0)
     gain = (drop / np.maximum(had, 1e-300)).sum(1)
     return bool(gain.sum() > 0 and _by_chance(gain) < BY_CHANCE)
+
+
+def foretells(problem: Problem, bare: Step, full: Step, spectrum: Spectrum) -> bool:
+    """Whether recordings kept out surely want what one fit has beyond another: noise of one recording, however slow,
+    says nothing of another. `spectrum` is that of the noise."""
+    if not problem.held.any():
+        return False
+    frequency = np.asarray(problem.records.omega) / (2 * np.pi)
+    response = whitening(spectrum, frequency, problem.gain, float(problem.records.cutoff))
+    return _by_chance(whitened_wanted(problem, bare, full, response)) < BY_CHANCE_BESIDE
 
 
 def kept_squares(problem: Problem, step: Step) -> Float[np.ndarray, " blocks"]:

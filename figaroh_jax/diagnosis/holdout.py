@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from ..effects.base import Effect
 from ..recordings.signals import Signals
-from ..recordings.stacked import open_rows
+from ..recordings.stacked import filter_rows, open_rows
 from ..results import Trace
 from .comparison import left_out
 from .design import kind, sensor_response
@@ -32,6 +32,7 @@ __all__ = [
     "residual_rms",
     "traces",
     "weighted_squares",
+    "whitened_wanted",
 ]
 
 BLOCK, FEWEST = 1.0, 8  # s; blocks of a recording
@@ -69,6 +70,28 @@ def weighted_squares(problem: Problem, bare: Step, full: Step) -> tuple[Held, He
     """As `held_squares` of a fit without and with a cause; the rows that say how a joint moves by their weights."""
     before, after, weight = _error(problem, bare), _error(problem, full), _by_speed(problem)
     return _held(problem, before, before, weight), _held(problem, before, after, weight)
+
+
+def whitened_wanted(
+    problem: Problem, bare: Step, full: Step, whitening: Float[np.ndarray, "F nv"]
+) -> Float[np.ndarray, " blocks"]:
+    """Error of recordings kept out times what a fit takes of it, in whitened rows weighed by speed, block by block.
+
+    Noise that is slower than a block makes blocks alike; whitened, they are as many witnesses.
+    """
+    records = problem.records
+    n, samples, _, nv = records.shape
+
+    def rows(torque: Float[np.ndarray, "nN nv"], response: np.ndarray) -> Float[np.ndarray, "n M nv"]:
+        return np.moveaxis(filter_rows(records, torque.T.reshape(nv, n, samples), response.T), 0, 2)
+
+    measured = rows(records.flat(records.torque), whitening)
+    before, after = (
+        measured - rows(step.state.torque(step.state.theta), whitening * step.state.response(records.omega)[:, None])
+        for step in (bare, full)
+    )
+    wanted, block = (before * (before - after) * _by_speed(problem) * problem.held).sum(2), _blocks(problem)
+    return np.bincount(block[block >= 0], wanted[block >= 0])
 
 
 def _held(

@@ -56,7 +56,7 @@ __all__ = ["Fit", "identify", "identify_task"]
 
 Fit = Literal["physical", "log_cholesky", "unconstrained"]
 # A direction is loosened as far as the noise of the data moves it by no more than so many stated standard deviations.
-# Of .5, 1, 2, 3 this one, chosen by the cross-validated error of the Panda and TIAGo; see `benchmarks/README.md`.
+# Of .5, 1, 2, 3 this one, chosen by the cross-validated error of the Panda and TIAGo; see `benchmarks/FINDINGS.md`.
 MOVED = 2.0  # standard deviations that noise may move a loosened direction by
 SHOWN = 0.01  # information of the data in a direction below which it stays as stated; 1 is the prior's own (a root)
 TRUSTS = (1.0, 3.0, 10.0, 100.0)  # multiples of the stated trust that cross-validation chooses from
