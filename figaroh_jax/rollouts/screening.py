@@ -47,6 +47,7 @@ __all__ = [
 
 LATE, ROUGH = 30, 1e-4  # iterations; share of the squares that a step must promise
 _EARLY = 3  # iterations of each candidate
+_SPRUNG = 10  # of a spring by itself: far from its stiffness the first ones are refused
 _MOST = 6  # causes of a joint
 _TOP, _RACE = 3, 2  # candidates of a joint that are fitted, and that are fitted to the end
 _PART = 3  # of the windows, one in so many shows whether a limit or a spring is worth a fit
@@ -374,7 +375,7 @@ def sprung_now(here: Setting, now: Standing, forbid: Sequence[str]) -> list[Trie
     ranked = [max(_sprung(here, now, j, forbid), key=lambda one: one.promise, default=None)
               for j in range(here.loop.robot.nv)]  # fmt: skip
     early = [one for one in ranked if one is not None]
-    early = [(one, _spring_fitted(here, now, one, one.theta, _start_of(now, one.structure), _EARLY)) for one in early]
+    early = [(one, _spring_fitted(here, now, one, one.theta, _start_of(now, one.structure), _SPRUNG)) for one in early]
     gains = [now.model.fit.cost - last.cost for _, last in early]
     least = max(MAY_WIN * max(gains, default=0.0), GAIN * now.model.fit.squares)
     found = []
