@@ -258,7 +258,7 @@ def standings(
         worse, better = (v.own(full.rows, one.joints) for v in (without, full.verdicts))
         whole = effect.acts_on not in ("joint", "pair")
         torque = cause_torque(problem, full.state, effect, place)
-        varying = torque if whole or kind(effect) != "columns" else _taken(full.state, without)
+        varying = _taken(full.state, without) if effect.speed_law else torque
         modulation = _modulation(grown, effect, varying, without, one.joints, whole)
         share = _share_of_torque(problem, full.state, torque, effect)
         out.append(
