@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -39,7 +38,7 @@ from .gates import physical_sign
 from .holdout import residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_rest
 from .layout import describe_folds
-from .naming import beside_rest, beyond_simpler, of_its_own, reason_against, standings, stands_alone, strong
+from .naming import Standing, beside_rest, beyond_simpler, of_its_own, reason_against, standings, stands_alone, strong
 from .reading import Reader, only_read
 from .rest import (
     Significance,
@@ -295,62 +294,23 @@ def _judged(
 
     What is not named is no part of the answer's model: the others are fitted anew without it.
     """
-    before, here, _, found, joint, left, strict, fading = searched
+    before, here, _, found, joint, left, *_ = searched
     problem, whitening = here.problem, here.whitening
-    each = standings(problem, here.start, found, joint, whitening)
-    each = [
-        replace(
-            one,
-            complete=bool(left.more[list(f.joints)].max() <= ALL_BUT * (f.cost[0] - f.cost[1])),
-            leaves=of_its_own(left.beyond, f.joints, one.taken),
-            alone=stands_alone(left.misfit, f.joints),
-            followed=of_its_own(left.followed, f.joints, one.taken),
-            unmoved=stands_alone(left.moved, f.joints),
-        )
-        for one, f in zip(each, found, strict=True)
-    ]
-    noise = noise_rms(problem, here.spectrum)
-    claims = {one.name: one.gain for one in each}
-
-    @cache
-    def beside(name: Name) -> Fall:
-        one = next(f for f in found if f.name == name)
-        return beside_all(searched.here.problem, searched.here.start, whitening, found, searched.joint.step, one)
-
-    def borne_out(name: Name) -> bool:
-        return beside(name).surely(claims[name])
-
-    def certain(name: Name) -> bool:
-        return bool(searched.here.problem.held.any()) and beside(name).certainly(claims[name])
-
-    beyond = relative_rest(problem, joint.step.state, noise)
-    doubted = left.p_value < REST_P  # the catalogue still scores more than noise, though nothing in it passes
-    if doubted and not left.rest.there and short(problem, joint.step.state):
-        sober = sober_spectrum(problem, joint.step.state, forbid)
-        doubted = foretells(problem, stand(problem, here.start, whitening), joint.step, sober)
-        doubted = doubted or chance_beside(problem, joint.step, sober, whitening, forbid, generator) < REST_P
-    if found and doubted and float(beyond.max()) > tolerance:  # a rest of the answer is one for its names
-        strict = strict or not _sticks(here, joint, tolerance)
-    weighed = left_weighed(problem, joint.step.state, noise)  # rows at reversals say nothing of a law
-    rests = beside_rest(each, [f.joints for f in found], strict, np.minimum(beyond, weighed), tolerance)
-    asked = (tolerance, certain, fading)
-    against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
+    each = _standings(searched)
+    kept_out = _KeptOut(searched, {one.name: one.gain for one in each})
+    doubted = _doubted(searched, forbid, generator)
+    against = _reasons(searched, each, kept_out, doubted, tolerance)
     named = [f for f in found if not against[f.name]]
-    if named and not problem.layout.repeats and max(f.cost[0] - f.cost[1] for f in named) < SURE_DROP:
-        sober, bare = sober_spectrum(problem, joint.step.state, forbid), stand(problem, here.start, whitening)
-        chance = chance_beside(problem, bare, sober, whitening, forbid, generator)
-        if chance >= REST_P:
-            against |= {
-                f.name: f"noise as slow as the motion scores as much by chance (p = {chance:.2g})" for f in named
-            }
-            named = []
+    if named and (chance := _as_slow_noise(searched, named, forbid, generator)) is not None:
+        against |= {f.name: f"noise as slow as the motion scores as much by chance (p = {chance:.2g})" for f in named}
+        named = []
     settings = [here] if before.problem is here.problem else [here, before]
     asked_more = [one.name for one in each if one.whole or not one.beside_rest] if problem.held.any() else []
-    must_keep = {name: claims[name] for name in asked_more}
-    here, gaining, by_speed, reasons = _answered(searched, settings, named, borne_out, forbid, must_keep)
+    must_keep = {name: kept_out.claims[name] for name in asked_more}
+    here, gaining, by_speed, reasons = _answered(searched, settings, named, kept_out.borne_out, forbid, must_keep)
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= reasons
-    nearest = tuple(Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name])
+    nearest = [Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name]]
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
     shown = left.rest.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
@@ -372,10 +332,97 @@ def _judged(
         joint = with_rest(problem, joint, here.whitening, [f.joints for f in named], left_over)
         gaining = gaining._replace(joint=joint)
     parts = parts_of(problem, told, whitening, left.line, [s.name for s in reader.signals])
-    nearest = tuple(sorted(nearest, key=lambda one: -one.share))
+    nearest.sort(key=lambda one: -one.share)
     quiet = not rest and not named and searched.search.p_value < alpha
     why = tolerated(float(relative.max()), tolerance, sticks, read) if quiet or read else ""
-    return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, nearest, text, why), sticks, here)
+    return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, tuple(nearest), text, why), sticks, here)
+
+
+class _KeptOut:
+    """What recordings kept out say of single causes beside all that was found; each answer costs a fit, made once."""
+
+    def __init__(self, searched: _Searched, claims: Mapping[Name, float]) -> None:
+        self.searched, self.claims = searched, claims
+        self.falls: dict[Name, Fall] = {}
+
+    def borne_out(self, name: Name) -> bool:
+        """Whether they surely show the cause, which may have no name alone."""
+        return self.fall(name).surely(self.claims[name])
+
+    def certain(self, name: Name) -> bool:
+        """Whether they show it beyond doubt; never where nothing is kept out."""
+        return bool(self.searched.here.problem.held.any()) and self.fall(name).certainly(self.claims[name])
+
+    def fall(self, name: Name) -> Fall:
+        if name not in self.falls:
+            here, found, step = self.searched.here, self.searched.found, self.searched.joint.step
+            one = next(f for f in found if f.name == name)
+            self.falls[name] = beside_all(here.problem, here.start, here.whitening, found, step, one)
+        return self.falls[name]
+
+
+def _standings(searched: _Searched) -> list[Standing]:
+    """What the data say of each cause, with what is left at its joints."""
+    _, here, _, found, joint, left, *_ = searched
+    each = standings(here.problem, here.start, found, joint, here.whitening)
+    return [
+        replace(
+            one,
+            complete=bool(left.more[list(f.joints)].max() <= ALL_BUT * (f.cost[0] - f.cost[1])),
+            leaves=of_its_own(left.beyond, f.joints, one.taken),
+            alone=stands_alone(left.misfit, f.joints),
+            followed=of_its_own(left.followed, f.joints, one.taken),
+            unmoved=stands_alone(left.moved, f.joints),
+        )
+        for one, f in zip(each, found, strict=True)
+    ]
+
+
+def _doubted(searched: _Searched, forbid: Sequence[str], generator: np.random.Generator) -> bool:
+    """Whether the catalogue still scores more than noise on what is left, though nothing in it passes."""
+    here, step, left = searched.here, searched.joint.step, searched.left
+    problem, whitening = here.problem, here.whitening
+    doubted = left.p_value < REST_P
+    if not doubted or left.rest.there or not short(problem, step.state):
+        return doubted
+    sober = sober_spectrum(problem, step.state, forbid)
+    if foretells(problem, stand(problem, here.start, whitening), step, sober):
+        return True
+    return chance_beside(problem, step, sober, whitening, forbid, generator) < REST_P
+
+
+def _reasons(
+    searched: _Searched, each: Sequence[Standing], kept_out: _KeptOut, doubted: bool, tolerance: float
+) -> dict[Name, str]:
+    """Why each cause that was found is not named; empty where it is."""
+    here, found, joint, strict = searched.here, searched.found, searched.joint, searched.strict
+    noise = noise_rms(here.problem, here.spectrum)
+    beyond = relative_rest(here.problem, joint.step.state, noise)
+    if found and doubted and float(beyond.max()) > tolerance:  # a rest of the answer is one for its names
+        strict = strict or not _sticks(here, joint, tolerance)
+    weighed = left_weighed(here.problem, joint.step.state, noise)  # rows at reversals say nothing of a law
+    rests = beside_rest(each, [f.joints for f in found], strict, np.minimum(beyond, weighed), tolerance)
+    asked = (tolerance, kept_out.certain, searched.fading)
+    return {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
+
+
+def _as_slow_noise(
+    searched: _Searched, named: list[Found], forbid: Sequence[str], generator: np.random.Generator
+) -> float | None:
+    """How often noise as slow as the motion scores as much as the catalogue does, where the named causes may be that.
+
+    None where they are not: repeats tell noise apart, much is removed, such noise seldom does as much, or recordings
+    kept out surely want the causes, for the noise of one recording says nothing of another.
+    """
+    here, joint = searched.here, searched.joint
+    problem, whitening = here.problem, here.whitening
+    if problem.layout.repeats or max(f.cost[0] - f.cost[1] for f in named) >= SURE_DROP:
+        return None
+    sober, bare = sober_spectrum(problem, joint.step.state, forbid), stand(problem, here.start, whitening)
+    chance = chance_beside(problem, bare, sober, whitening, forbid, generator)
+    if chance < REST_P or foretells(problem, bare, together(here, named).step, sober):
+        return None
+    return chance
 
 
 def _answered(
