@@ -8,7 +8,7 @@ vary with position, speed, load or time stands for another law.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import NamedTuple
 
@@ -37,6 +37,7 @@ from .thresholds import (
     ALL_BUT,
     BESIDE_SMOOTH,
     BUYS,
+    COUPLED,
     GAIN_NAMED,
     GAIN_NAMED_ROBOT,
     LAW_LEAVES,
@@ -82,7 +83,7 @@ class Standing:
     modulation_held_out: float = 0.0
     varies: bool = False  # whether left-out squares surely fall by it
     beside_smooth: float = 1.0  # gain of a cause of the whole robot beside smooth functions, or in their place
-    inertia_alone: bool = False  # a coupling of inertia, without friction of its own
+    one_part: bool = False  # a coupling of which no more than one part is surely there
     massless: bool = False  # a body whose mass is not surely there
     beside_rest: bool = True  # whether its law can be told from a rest (`Effect.beside_rest`)
     cancels: bool = False  # whether it is a share of all torque, and larger than it: a reading of less than half
@@ -95,6 +96,7 @@ class Standing:
     unmoved: bool = True  # whether no misfit of joints that move but its own is likely
     everywhere: bool = False  # whether a law that acts at all joints at all times may stand in its place
     alone: bool = True  # whether its joints are likely to have no other misfit (`stands_alone`)
+    contested: bool = False  # whether another law of the whole robot, one that cannot be, surely takes much beside it
 
 
 _VARIES = "its amplitude varies with position, speed, load or time (that would add"
@@ -173,8 +175,13 @@ def _of_those_beside_rest(
         "the unexplained residual may imitate it: it is named only where nothing else is left",
     )
     yield (
-        not one.inertia_alone,
-        "a coupling without friction of its own cannot be distinguished from rotor or link inertia",
+        not one.one_part,
+        "of its inertia, damping and friction no more than one is surely there, as where it stands for another law",
+    )
+    yield (
+        not one.contested,
+        "another law of the whole robot takes much beside it, with a sign that is physically impossible: what both"
+        " stand for is neither",
     )
     yield (
         margin >= MARGIN or certain(one.name),
@@ -186,8 +193,12 @@ def _of_those_beside_rest(
 def strong(one: Standing) -> bool:
     """Whether it surely explains much of what its joints leave, as a law that exists would, whatever speaks against its
     name: then what is left is more than sticks, which no law explains."""
-    much = one.gain >= GAIN_NAMED and one.share >= SHARE_NAMED and one.t >= one.t_needed
-    return much and one.physical and one.beside_rest and not one.whole
+    return _much(one) and one.physical and one.beside_rest and not one.whole
+
+
+def _much(one: Standing) -> bool:
+    """Whether it surely takes much of what its joints leave, with much torque."""
+    return one.gain >= GAIN_NAMED and one.share >= SHARE_NAMED and one.t >= one.t_needed
 
 
 def _without_chance(fitted: float, held_out: float) -> float:
@@ -279,7 +290,7 @@ def standings(
                 modulation_held_out=modulation[1],
                 varies=modulation[2],
                 beside_smooth=_beside_smooth(grown, bare, effect, place, one.joints) if whole else 1.0,
-                inertia_alone=coupled and _inertia_alone(effect, joint.fitted, at),
+                one_part=coupled and _one_part(effect, joint.fitted, at),
                 spoils=whole
                 and kind(effect) == "columns"
                 and _spoils(*(_by_joint(problem, v, full) for v in (without, full.verdicts))),
@@ -288,7 +299,8 @@ def standings(
                 massless=effect.body and _deviations(effect, joint.fitted, at)["mass"] < MASS,
             )
         )
-    return out
+    impossible = [one.whole and not one.physical and _much(one) for one in out]
+    return [replace(one, contested=one.whole and one.physical and any(impossible)) for one in out]
 
 
 def _weighs_less_than_nothing(problem: Problem, effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
@@ -475,10 +487,14 @@ def _with_smooth(grown: _Grown, step: Step) -> Hypothesis:
     return Hypothesis(X, more)
 
 
-def _inertia_alone(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
-    """Whether neither friction of a coupling is surely there (two standard deviations)."""
+def _one_part(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
+    """Whether no more than one of a coupling's parts is surely there (two standard deviations).
+
+    A rotor that turns with two joints has inertia and friction. Inertia alone is that of a link or of a rotor at one of
+    them; damping alone is what a late torque looks like.
+    """
     deviations = _deviations(effect, fitted, place)
-    return all(abs(deviations[n]) < 2 for n in effect.one_rotor[1:])
+    return sum(abs(deviations[n]) >= COUPLED for n in effect.one_rotor) < 2
 
 
 def _spoils(before: Float[np.ndarray, "ways nv blocks"], after: Float[np.ndarray, "ways nv blocks"]) -> bool:

@@ -64,6 +64,7 @@ ALL_BUT = 0.1  # of the squares that a cause removes: what smooth functions may 
 MARGIN = 4.0  # times what is needed, of t, gain and modulation together (each of them as much at the most)
 SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
 WEIGHTLESS = 2.0  # standard deviations below zero of what a link weighs with its cause: above, the cause is none
+COUPLED = 2.0  # standard deviations of a part of a coupling (inertia, damping, friction), of which two must be there
 MASS = 3.0  # standard deviations of a body's mass: below, what moves is the link that carries it
 BESIDE_SMOOTH = 0.05  # gain of a cause of the whole robot beside smooth functions at every joint, or in their place
 
