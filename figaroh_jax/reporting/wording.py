@@ -35,32 +35,45 @@ __all__ = [
     "place",
     "rest",
     "sentence",
+    "undecided",
     "unit",
 ]
 
 _NORMAL_95 = 1.96  # standard deviations on each side of a 95 % interval
+_SURE = 0.05  # p-value below which it stands beside what is not noise alone
 
 
 def sentence(diagnosis: Diagnosis, robot: str) -> str:
     """The verdict in one sentence, e.g. "The simulation of tx40 is missing rotor inertia at joint_3: ..."."""
     subject = f"The simulation of {robot}"
-    if diagnosis.verdict == "nothing" and diagnosis.rest.tolerated:
-        return (
-            f"{subject} agrees with the data: no missing effect is detectable. The residual is not noise alone"
-            f" ({p_value(diagnosis.p_value)}), but {diagnosis.rest.tolerated}"
-            f" (error on held-out data {error(diagnosis.holdout.before, diagnosis.holdout.unit)})."
-        )
     if diagnosis.verdict == "nothing":
-        return (
-            f"{subject} agrees with the data: no missing effect is detectable, and the residual is consistent with"
-            f" noise (error on held-out data {error(diagnosis.holdout.before, diagnosis.holdout.unit)})."
-        )
+        told = f"(error on held-out data {error(diagnosis.holdout.before, diagnosis.holdout.unit)})."
+        if diagnosis.rest.undecided:
+            return (
+                f"No effect can be named that the simulation of {robot} is missing, but these data do not show that it"
+                f" is right: {undecided(diagnosis)} {told}"
+            )
+        agrees = f"{subject} agrees with the data: no missing effect is detectable"
+        if not diagnosis.rest.tolerated:
+            return f"{agrees}, and the residual is consistent with noise {told}"
+        surely = f" ({p_value(diagnosis.p_value)})" if diagnosis.p_value < _SURE else ""
+        return f"{agrees}. The residual is not noise alone{surely}, but {diagnosis.rest.tolerated} {told}"
     fall = _fall(diagnosis)
     if diagnosis.verdict == "unknown":
         found = f" Adding {_list(diagnosis.causes)} is not enough: {fall}." if diagnosis.causes else ""
         return f"{subject} has an error that no effect in the catalogue explains.{found}"
     rest = ". Part of the residual remains unexplained" if diagnosis.verdict == "named+rest" else ""
     return f"{subject} is missing {_list(diagnosis.causes)}: {fall}{rest}."
+
+
+def undecided(diagnosis: Diagnosis) -> str:
+    """How much may be left at which joint where the data do not tell it from noise, and why they do not; else empty."""
+    left = diagnosis.rest
+    if not left.undecided:
+        return ""
+    worst = max(range(len(left.relative)), key=lambda k: left.relative[k])
+    size = error(float(left.relative[worst]), "relative RMS")
+    return f"up to {size} of the torque of {diagnosis.joints[worst]} is left, and {left.undecided}"
 
 
 def rest(diagnosis: Diagnosis) -> list[str]:
