@@ -70,6 +70,15 @@ def test_what_is_more_than_noise_is_not_called_noise_where_it_does_not_count():
     assert "consistent with noise" not in sentence(told, "tx40")
 
 
+@pytest.mark.parametrize(("variant", "said"), [("partly", "joint_2, 0.4 N m"), ("unknown", "joint_4: 0.31 N m")])
+def test_a_rest_is_told_with_its_size_on_page_and_terminal(variant: str, said: str, tmp_path: Path):
+    whole = f"2.4 % of the torque of joint_2; {said}"  # where most is left, then what else is known
+    console = Console(width=300, record=True, file=io.StringIO())
+    console.print(summary(VARIANTS[variant], "tx40"))
+    assert f"Unexplained residual: {whole}" in console.export_text()
+    assert whole in _own(_written(VARIANTS[variant], tmp_path)).replace("\xa0", " ")
+
+
 def test_what_data_cannot_tell_from_noise_is_not_called_agreement(tmp_path: Path):
     quiet = VARIANTS["nothing"]
     relative = np.array([0.0, 0.013, 0.0, 0.104, 0.0, 0.0])

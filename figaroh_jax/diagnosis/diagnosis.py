@@ -367,7 +367,7 @@ def _judged(
         errors = reader.errors(problem, joint.step.state, generator)
         read = errors is not None and only_read(problem, joint.step.state, noise, relative, tolerance, errors)
         rest = not read
-    text = left.rest.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
+    text = (left.rest.text or ("" if relative.any() else _LESS_THAN_NOISE)) if rest else ""
     told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
     if rest and named:
         squares = (joint.step.linear.residual**2).sum(1)
@@ -527,6 +527,7 @@ def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judge
     )
 
 
+_LESS_THAN_NOISE = "less is left than the noise is estimated to be, so part of that estimate is an error of the model"
 _AT_REST = (
     "at rest the torque differs from the model, as dry friction allows: there it can take any value up to its limit,"
     " which no law of velocity predicts; where the joints move, the residual is within the tolerance"

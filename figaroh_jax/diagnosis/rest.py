@@ -187,7 +187,7 @@ def significance(
     worst, text = int(np.argmax(own)), ""
     there = bool((repeats or (scored and (repeated or predicted))) and not tolerable)
     if there:
-        text = f"mostly at {joints[worst]} ({own[worst]:.2g} times the noise power)"
+        text = f"relative to the noise it is largest at {joints[worst]} ({own[worst]:.2g} times the noise power)"
         if flexible.p < REST_P:
             text += f"; strongest dependence: {flexible.strongest.effect} at {flexible.strongest.at[0]}"
     if vibrates:

@@ -105,6 +105,7 @@ def _page(diagnosis: Diagnosis, title: str, folder: Path | None = None) -> str:
         anatomy=_anatomy(diagnosis),
         badge=_UNDECIDED if diagnosis.rest.undecided else _BADGES[diagnosis.verdict],
         undecided=_glued(wording.undecided(diagnosis)),
+        unexplained=_glued(wording.unexplained(diagnosis)) if diagnosis.verdict in ("named+rest", "unknown") else "",
         sentence=_glued(wording.sentence(diagnosis, title)),
         largest=max(_finite(gain.before), _finite(gain.after)),
         joints=_joints(diagnosis),

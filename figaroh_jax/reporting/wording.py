@@ -36,6 +36,7 @@ __all__ = [
     "rest",
     "sentence",
     "undecided",
+    "unexplained",
     "unit",
 ]
 
@@ -68,22 +69,29 @@ def sentence(diagnosis: Diagnosis, robot: str) -> str:
 
 def undecided(diagnosis: Diagnosis) -> str:
     """How much may be left at which joint where the data do not tell it from noise, and why they do not; else empty."""
+    why = diagnosis.rest.undecided
+    return f"up to {_largest(diagnosis)} is left, and {why}" if why else ""
+
+
+def unexplained(diagnosis: Diagnosis) -> str:
+    """How large what no cause explains is at the joint with most of it, and what is known of it; may be empty."""
     left = diagnosis.rest
-    if not left.undecided:
-        return ""
-    worst = max(range(len(left.relative)), key=lambda k: left.relative[k])
-    size = error(float(left.relative[worst]), "relative RMS")
-    return f"up to {size} of the torque of {diagnosis.joints[worst]} is left, and {left.undecided}"
+    size = _largest(diagnosis) if len(left.relative) and max(left.relative) > 0 else ""
+    return "; ".join(text for text in (size, left.text) if text)
+
+
+def _largest(diagnosis: Diagnosis) -> str:
+    """What is left at the joint with most of it: "4.0 % of the torque of elbow"."""
+    relative = diagnosis.rest.relative
+    worst = max(range(len(relative)), key=lambda k: relative[k])
+    what = "motion" if diagnosis.of_positions else "torque"
+    return f"{error(float(relative[worst]), 'relative RMS')} of the {what} of {diagnosis.joints[worst]}"
 
 
 def rest(diagnosis: Diagnosis) -> list[str]:
     """What no cause explains, in sentences: how large and where, what it goes with, which causes came near."""
-    left, out = diagnosis.rest, []
-    if len(left.relative) and max(left.relative) > 0:
-        worst = max(range(len(left.relative)), key=lambda k: left.relative[k])
-        what = "motion" if diagnosis.of_positions else "torque"
-        size = f"Unexplained residual: {error(float(left.relative[worst]), 'relative RMS')} of the {what} of"
-        out.append(f"{size} {diagnosis.joints[worst]}{f'; {left.text}' if left.text else ''}.")
+    left = diagnosis.rest
+    out = [f"Unexplained residual: {told}."] if (told := unexplained(diagnosis)) else []
     for joint in dict.fromkeys(part.at for part in left.parts):
         own = [part for part in left.parts if part.at == joint]
         shares = ", ".join(f"{dependence(part)} ({100 * part.share:.0f} %)" for part in own)
