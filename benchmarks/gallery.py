@@ -99,8 +99,8 @@ ROBOTS = {
         "torque sensors at the joints at 1 kHz; 15 s fitted, 6 s held out",
         hidden("panda"),
         "The simulation is within 1.2 % before anything is named, but not within the noise: what was found lowers the"
-        " error of the last 6 s at all joints. None of it can be named: the amplitude of a spring at joint 6 varies with"
-        " the motion, and a gain at joint 5 is not significant on held-out data.",
+        " error of the last 6 s at all joints. None of it can be named: the amplitude of a spring at joint 6 varies"
+        " with the motion, and a gain at joint 5 is not significant on held-out data.",
     ),
     "kuka": Robot(
         "KUKA LWR4+",
