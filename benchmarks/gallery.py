@@ -90,7 +90,8 @@ ROBOTS = {
         "motor currents and positions at 100 Hz, two motions fitted, one held out; constants as published",
         hidden("ur10e"),
         "Rotors of the wrist are named after the large causes and gain little: they may stand for what the constants of"
-        " the currents or the inertials of the URDF have wrong. Rest at standstill is friction that holds.",
+        " the currents or the inertials of the URDF have wrong. The power law's numbers are hardly known: the data do"
+        " not tell how much of it is viscous friction. Rest at standstill is friction that holds.",
     ),
     "panda": Robot(
         "Franka Emika Panda",
@@ -153,7 +154,7 @@ ROBOTS = {
             },
             TALOS,
         ),
-        "Offsets of the joints alone leave 1.9 mm held out; which part is geometry of links and which offsets, 61"
+        "Offsets of the joints alone leave 1.6 mm held out; which part is geometry of links and which offsets, 61"
         " postures of one point do not tell apart, so the names at the shoulder are one reading of several.",
     ),
     "tiago_mocap": Robot(
