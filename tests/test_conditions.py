@@ -45,6 +45,7 @@ def test_what_few_rows_cannot_tell_from_slow_noise_is_not_called_agreement(tmp_p
     """16 s with a torque of 15 % hidden at the elbow: no effect has it, and a rich model takes it for slow noise."""
     make(tmp_path, 9310010, "foreign")
     found = fj.diagnose_task(fj.load_task(str(tmp_path / "task.yaml")))
+    assert isinstance(found, fj.Diagnosis)
     assert (found.verdict, int(np.argmax(found.rest.relative))) == ("nothing", 1)
     assert found.rest.relative[1] > 0.03 and "not enough to tell that from slow noise" in found.rest.undecided
     assert "of the torque of elbow is left" in sentence(found, "two") and "agrees" not in sentence(found, "two")
@@ -54,6 +55,7 @@ def test_what_few_rows_cannot_tell_from_slow_noise_is_not_called_agreement(tmp_p
 def test_as_few_rows_of_a_right_model_agree_with_it(tmp_path: Path) -> None:
     make(tmp_path, 6633519, "clean")  # 8 s
     found = fj.diagnose_task(fj.load_task(str(tmp_path / "task.yaml")))
+    assert isinstance(found, fj.Diagnosis)
     assert (found.verdict, found.rest.undecided, found.experiment) == ("nothing", "", None)
     assert "agrees with the data" in sentence(found, "two")
 
