@@ -103,6 +103,7 @@ class Rest:
     nearest: tuple[Nearest, ...] = ()
     text: str = ""  # where it is more than noise, in words; empty where it is not
     tolerated: str = ""  # why what is surely more than noise does not count, in words
+    undecided: str = ""  # why more than is tolerable can be told neither from noise nor from an error, in words
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import figaroh_jax as fj
-from benchmarks.conditions import Strange, draw, graded, motion, moved
+from benchmarks.conditions import Strange, draw, graded, make, motion, moved
+from figaroh_jax.reporting.wording import sentence
 
 
 @pytest.mark.parametrize(
@@ -38,6 +39,25 @@ def test_a_right_model_is_told_so(seed: int, strange: bool) -> None:
 def test_a_rotor_is_named_where_slow_noise_and_steps_are_asked_for() -> None:
     told = graded(6002, "rotor")
     assert (told["grade"], told["names"]) == ("named", ["rotor_inertia at elbow"]), told
+
+
+def test_what_few_rows_cannot_tell_from_slow_noise_is_not_called_agreement(tmp_path: Path) -> None:
+    """16 s with a torque of 15 % hidden at the elbow: no effect has it, and a rich model takes it for slow noise."""
+    make(tmp_path, 9310010, "foreign")
+    found = fj.diagnose_task(fj.load_task(str(tmp_path / "task.yaml")))
+    assert isinstance(found, fj.Diagnosis)
+    assert (found.verdict, int(np.argmax(found.rest.relative))) == ("nothing", 1)
+    assert found.rest.relative[1] > 0.03 and "not enough to tell that from slow noise" in found.rest.undecided
+    assert "of the torque of elbow is left" in sentence(found, "two") and "agrees" not in sentence(found, "two")
+    assert found.experiment is not None and "s of such motion in all" in found.experiment.text
+
+
+def test_as_few_rows_of_a_right_model_agree_with_it(tmp_path: Path) -> None:
+    make(tmp_path, 6633519, "clean")  # 8 s
+    found = fj.diagnose_task(fj.load_task(str(tmp_path / "task.yaml")))
+    assert isinstance(found, fj.Diagnosis)
+    assert (found.verdict, found.rest.undecided, found.experiment) == ("nothing", "", None)
+    assert "agrees with the data" in sentence(found, "two")
 
 
 @pytest.mark.parametrize("pause", [0.0, 0.25])

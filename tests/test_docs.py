@@ -103,7 +103,7 @@ def test_every_yaml_block_holds_keys_that_are_read(place: str, text: str, tmp_pa
 @pytest.mark.parametrize(("place", "text"), blocks("console"), ids=[place for place, _ in blocks("console")])
 def test_every_command_in_a_console_block_is_one_with_its_options(place: str, text: str) -> None:
     for line in text.splitlines():
-        words = shlex.split(line.removeprefix("$ "), comments=True)
+        words = shlex.split(line.removeprefix("$ "), comments=True) if line.startswith("$") else []
         if line.startswith("$ figaroh-jax"):
             cli._parser().parse_args(words[1:])
         elif line.startswith("$ make"):
@@ -176,7 +176,7 @@ def test_every_console_block_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     done = set[str]()
     for place, text in blocks("console"):
         for line in text.splitlines():
-            words = shlex.split(line.removeprefix("$ "), comments=True)
+            words = shlex.split(line.removeprefix("$ "), comments=True) if line.startswith("$") else []
             if not line.startswith("$ figaroh-jax") or words[1] == "view" or " ".join(words) in done:
                 continue  # `view` serves until it is interrupted
             done.add(" ".join(words))

@@ -77,9 +77,11 @@ def test_repeats_share_a_label(made, tmp_path: Path):
     for run in runs:
         files.append(tmp_path / f"{run['name']}.npz")
         np.savez(files[-1], t=run["time"], q=run["position"], tau=run["torque"])
-    keys = yaml.safe_load(draft_task(urdf, files).text)
-    labels = [entry.get("repeat") for entry in keys["data"]]
+    draft = draft_task(urdf, files)
+    labels = [entry.get("repeat") for entry in yaml.safe_load(draft.text)["data"]]
     assert labels[0] == labels[1] != labels[2] == labels[3]
+    for pair in (files[:2], files[2:4]):
+        assert any(f"{pair[0]} and {pair[1]} repeat one motion" in line for line in draft.assumed)
 
 
 def test_swapped_columns_without_names_are_refused(made, tmp_path: Path):

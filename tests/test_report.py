@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import importlib.util
+import io
 import json
 import re
 import xml.etree.ElementTree as ElementTree
@@ -16,14 +17,16 @@ import browser
 import fake_diagnosis
 import numpy as np
 import pytest
+from rich.console import Console
 
 from figaroh_jax import DEMO
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.reporting import report
 from figaroh_jax.reporting.picture import robot_picture
 from figaroh_jax.reporting.provenance import provenance
+from figaroh_jax.reporting.terminal import summary
 from figaroh_jax.reporting.wording import error, fall, interval, phrase, sentence
-from figaroh_jax.results import Diagnosis, Estimate, Gain, Name, Nearest, Part, Rest
+from figaroh_jax.results import Diagnosis, Estimate, Experiment, Gain, Name, Nearest, Part, Rest
 
 LAPTOP, PHONE = (1280, 800), (390, 844)
 VARIANTS = {name: getattr(fake_diagnosis, name)() for name in ("named", "partly", "unknown", "nothing")}
@@ -65,6 +68,33 @@ def test_what_is_more_than_noise_is_not_called_noise_where_it_does_not_count():
     told = replace(quiet, p_value=0.0025, rest=replace(quiet.rest, tolerated="it is small"))
     assert "not noise alone (p < 0.01), but it is small" in sentence(told, "tx40")
     assert "consistent with noise" not in sentence(told, "tx40")
+
+
+@pytest.mark.parametrize(("variant", "said"), [("partly", "joint_2, 0.4 N m"), ("unknown", "joint_4: 0.31 N m")])
+def test_a_rest_is_told_with_its_size_on_page_and_terminal(variant: str, said: str, tmp_path: Path):
+    whole = f"2.4 % of the torque of joint_2; {said}"  # where most is left, then what else is known
+    console = Console(width=300, record=True, file=io.StringIO())
+    console.print(summary(VARIANTS[variant], "tx40"))
+    assert f"Unexplained residual: {whole}" in console.export_text()
+    assert whole in _own(_written(VARIANTS[variant], tmp_path)).replace("\xa0", " ")
+
+
+def test_what_data_cannot_tell_from_noise_is_not_called_agreement(tmp_path: Path):
+    quiet = VARIANTS["nothing"]
+    relative = np.array([0.0, 0.013, 0.0, 0.104, 0.0, 0.0])
+    left = Rest(relative, undecided="16 s of motion without repeats (702 rows a joint) are not enough to tell that")
+    told = replace(quiet, rest=left, experiment=Experiment("about 70 s of such motion in all"))
+    said = sentence(told, "tx40")
+    assert "agrees with the data" not in said and "consistent with noise" not in said
+    assert "up to 10.4 % of the torque of joint_4 is left, and 16 s of motion" in said
+    console = Console(width=300, record=True, file=io.StringIO())
+    console.print(summary(told, "tx40"))
+    shown = console.export_text()
+    assert said in shown and "Measure next: about 70 s of such motion in all" in shown
+    page = _own(_written(told, tmp_path)).replace("\xa0", " ")
+    assert "nothing can be named" in page and "nothing missing" not in page
+    assert "agrees with the data" not in page and "consistent with noise" not in page
+    assert "Up to 10.4 % of the torque of joint_4 is left" in page and "About 70 s of such motion" in page
 
 
 @pytest.mark.parametrize(

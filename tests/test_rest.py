@@ -361,9 +361,9 @@ def test_a_rest_without_repeats_counts_where_smooth_functions_predict_it() -> No
 
 
 def test_what_is_more_than_noise_and_still_nothing_says_why() -> None:
-    assert "at most 0.6% of any joint's torque" in tolerated(0.006, 0.01, False)
+    assert "at most 0.6 % of any joint's torque, within the tolerance of 1.0 %" in tolerated(0.006, 0.01, False)
     assert "at rest" in tolerated(0.1, 0.01, True)
-    assert "than the noise has" in tolerated(0.1, 0.01, False)
+    assert not tolerated(0.1, 0.01, False)  # a tenth of a torque is no small matter, however little is known of it
 
 
 def test_a_coupling_turned_by_parts_of_opposite_signs_is_none() -> None:

@@ -22,7 +22,7 @@ from ..effects.plausibility import implausible
 from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Signals
-from ..results import Cause, Diagnosis, Name, Nearest, Rest, Verdict
+from ..results import Cause, Diagnosis, Experiment, Name, Nearest, Rest, Verdict
 from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
 from ..simulators.native import as_backend
@@ -32,7 +32,7 @@ from .estimates import amplitude_places, estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p
-from .floor import foretold, noise_rms, short, sober_spectrum, told_too_large
+from .floor import foretold, noise_rms, short, sober_spectrum, told_too_large, undecided
 from .gaining import Fall, Gaining, beside_all, foretells, predicts_better, without_losses
 from .gates import physical_sign
 from .holdout import residual_rms, traces
@@ -154,6 +154,7 @@ class _Judged(NamedTuple):
     rest: Rest
     sticks: bool  # whether what is left is that of joints at rest
     here: Setting  # with the weights of the answer's fit
+    more: str = ""  # data that would tell what is left from noise, in words, where these do not
 
 
 def _searched(
@@ -313,18 +314,20 @@ def _judged(
     nearest = [Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name]]
     noise = noise_rms(problem, here.spectrum)
     relative = relative_rest(problem, joint.step.state, noise)
-    shown = left.rest.there or ((bool(nearest) or doubted) and float(relative.max()) > tolerance)
+    large = float(relative.max()) > tolerance
+    shown = left.rest.there or ((bool(nearest) or doubted) and large)
     if shown and not named and not left.rest.there and not doubted and short(problem, joint.step.state):
         sober = sober_spectrum(problem, joint.step.state, forbid)
         shown = chance_beside(problem, joint.step, sober, here.whitening, forbid, generator) < REST_P
     law = any(strong(one) and against[one.name] for one in each)  # it moves, whatever it is
-    sticks = shown and not law and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
+    sticks = (shown or (large and not named)) and not law
+    sticks = sticks and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
     rest, read = shown and not sticks, False
     if rest and not named and left.line[0] >= LINE_P:  # a line is none of what reading a motion leaves
         errors = reader.errors(problem, joint.step.state, generator)
         read = errors is not None and only_read(problem, joint.step.state, noise, relative, tolerance, errors)
         rest = not read
-    text = left.rest.text or f"mostly at {problem.model.joint_names[int(np.argmax(relative))]}" if rest else ""
+    text = (left.rest.text or ("" if relative.any() else _LESS_THAN_NOISE)) if rest else ""
     told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
     if rest and named:
         squares = (joint.step.linear.residual**2).sum(1)
@@ -333,9 +336,13 @@ def _judged(
         gaining = gaining._replace(joint=joint)
     parts = parts_of(problem, told, whitening, left.line, [s.name for s in reader.signals])
     nearest.sort(key=lambda one: -one.share)
-    quiet = not rest and not named and searched.search.p_value < alpha
+    quiet = not rest and not named and (large or searched.search.p_value < alpha)
     why = tolerated(float(relative.max()), tolerance, sticks, read) if quiet or read else ""
-    return _Judged(verdict(bool(named), rest), gaining, Rest(relative, parts, tuple(nearest), text, why), sticks, here)
+    unsure, more = "", ""
+    if quiet and not why:  # asked of the rows that the second opinions were asked of
+        unsure, more = undecided(searched.here.problem, searched.joint.step.state)
+    told_rest = Rest(relative, parts, tuple(nearest), text, why, unsure)
+    return _Judged(verdict(bool(named), rest), gaining, told_rest, sticks, here, more)
 
 
 class _KeptOut:
@@ -554,7 +561,9 @@ def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judge
         noise=noise,
         holdout=holdout,
         holdout_scheme=_scheme(signals),
-        experiment=next_experiment(judged.word, found, problem, here.start, causes, here.whitening),
+        experiment=Experiment(judged.more)
+        if judged.more
+        else next_experiment(judged.word, found, problem, here.start, causes, here.whitening),
         candidates=explain(seen.rows, seen.linear, search.shown, noise),
         traces=traces(problem, signals, first.state, last.state, joint.causes, named),
         baseline=fitted_model(problem, first.state, []),
@@ -565,6 +574,7 @@ def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judge
     )
 
 
+_LESS_THAN_NOISE = "less is left than the noise is estimated to be, so part of that estimate is an error of the model"
 _AT_REST = (
     "at rest the torque differs from the model, as dry friction allows: there it can take any value up to its limit,"
     " which no law of velocity predicts; where the joints move, the residual is within the tolerance"

@@ -19,7 +19,16 @@ from .state import State, plain_rows, solved, whitened
 from .step import stand
 from .thresholds import LOWEST_FREQUENCY, LOWEST_RESOLVED, T_REST
 
-__all__ = ["foretold", "kept_columns", "noise_floor", "noise_rms", "short", "sober_spectrum", "told_too_large"]
+__all__ = [
+    "foretold",
+    "kept_columns",
+    "noise_floor",
+    "noise_rms",
+    "short",
+    "sober_spectrum",
+    "told_too_large",
+    "undecided",
+]
 
 ROUNDS = 2  # of the rich model's fit and the spectrum in turn
 RICHNESS = 10  # groups of columns in the rich model
@@ -62,6 +71,28 @@ def sober_spectrum(problem: Problem, state: State, forbid: Collection[str] = ())
 def short(problem: Problem, state: State) -> bool:
     """Whether the data have no repeats and too few rows to tell slow noise by its spectrum from a misfit."""
     return not problem.layout.repeats and _rows_a_joint(plain_rows(problem, state)) < ENOUGH
+
+
+def undecided(problem: Problem, state: State) -> tuple[str, str]:
+    """Why these data cannot tell what is left from noise, and which would, both in words.
+
+    Rows are asked for as seconds of motion, `ENOUGH` rows at twice the cutoff: what more rows of the same seconds say
+    is not independent.
+    """
+    if problem.layout.repeats:
+        return "what repeats of it is not surely more than chance", "more repeats of the same motion"
+    rows, records = _rows_a_joint(plain_rows(problem, state)), problem.records
+    if rows >= ENOUGH:
+        return "without repeats the level of the noise is an estimate, which may be too low", "the same motion repeated"
+    fitted = np.any(records.fitted, axis=2)
+    spans = [at.rows for at in records.spans if fitted[at.slot, at.row : at.row + at.rows].any()]
+    seconds = sum(spans) / float(records.rate)
+    enough = max(0.5 * float(records.rate) / float(records.cutoff), 1.0) * ENOUGH / rows * seconds
+    now, wanted = (f"{float(f'{x:.2g}'):g} s" for x in (seconds, enough))
+    return (
+        f"{now} of motion without repeats ({rows} rows a joint) are not enough to tell that from slow noise",
+        f"the same motion repeated, or about {wanted} of such motion in all",
+    )
 
 
 def foretold(problem: Problem, state: State, forbid: Collection[str] = ()) -> Bool[np.ndarray, " nv"]:

@@ -129,7 +129,7 @@ def _of_all(one: Standing, tolerance: float) -> Iterator[tuple[bool, str]]:
     yield (one.gain > 0, f"it does not improve the prediction of held-out data (gain {one.gain:.2g})")
     yield (
         one.share >= tolerance,
-        f"its torque is {one.share:.2%} of the joint's, below the tolerance of {tolerance:.2%}",
+        f"its torque is {100 * one.share:.3g} % of the joint's, below the tolerance of {100 * tolerance:.3g} %",
     )
     yield (
         one.modulation_held_out <= (ALL_BUT if one.varies and strict_law else MODULATION_HELD_OUT),
@@ -161,12 +161,18 @@ def _of_those_beside_rest(
         one.t >= one.t_needed or certain(one.name),
         f"its gain on held-out data is not significant: t = {one.t:.1f}, {one.t_needed:.1f} needed",
     )
-    yield (one.gain >= least, f"it removes {one.gain:.0%} of the held-out error where it acts, {least:.0%} needed")
+    yield (
+        one.gain >= least,
+        f"it removes {100 * one.gain:.0f} % of the held-out error where it acts, {100 * least:.0f} % needed",
+    )
     yield (
         one.modulation <= most or (one.modulation <= MODULATION_HELD_OUT and certain(one.name)),
         f"{_VARIES} {one.modulation:.2f} of its gain)",
     )
-    yield (one.share >= SHARE_NAMED, f"its torque is {one.share:.1%} of the joint's, {SHARE_NAMED:.0%} needed")
+    yield (
+        one.share >= SHARE_NAMED,
+        f"its torque is {100 * one.share:.2g} % of the joint's, {100 * SHARE_NAMED:.0f} % needed",
+    )
     yield (not one.everywhere, "a law of the whole robot explains as much where it acts, and more is left")
     yield (not one.cancels, "it cancels most of the joint's torque, as no gain beside another cause does")
     yield (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion explain as much")

@@ -187,7 +187,7 @@ def significance(
     worst, text = int(np.argmax(own)), ""
     there = bool((repeats or (scored and (repeated or predicted))) and not tolerable)
     if there:
-        text = f"mostly at {joints[worst]} ({own[worst]:.2g} times the noise power)"
+        text = f"relative to the noise it is largest at {joints[worst]} ({own[worst]:.2g} times the noise power)"
         if flexible.p < REST_P:
             text += f"; strongest dependence: {flexible.strongest.effect} at {flexible.strongest.at[0]}"
     if vibrates:
@@ -297,14 +297,18 @@ def wrong_law(at: tuple[str, ...], drop: float, flexible: Smooth) -> bool:
 
 
 def tolerated(largest: float, tolerance: float, sticks: bool, read: bool = False) -> str:
-    """Why a misfit that noise does not explain is no rest, in words; `largest` is that of any joint over its torque."""
+    """Why a misfit that noise does not explain is no rest, in words; empty where there is no such reason.
+
+    `largest` is that of any joint over its torque.
+    """
     if read:
         return "the steps of the encoders and the time between samples leave as much of a model that is right"
     if sticks:
         return "it stands where joints are at rest, as dry friction allows"
-    if largest <= tolerance:
-        return f"it is at most {largest:.1%} of any joint's torque, within the tolerance of {tolerance:.1%}"
-    return "no more power is left than the noise has"
+    if largest > tolerance:
+        return ""
+    share, most = (f"{100 * x:.1f} %" for x in (largest, tolerance))
+    return f"it is at most {share} of any joint's torque, within the tolerance of {most}"
 
 
 def verdict(named: bool, rest: bool) -> Verdict:

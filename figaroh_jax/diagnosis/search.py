@@ -125,14 +125,14 @@ def find_causes(
     failed: dict[Name, float] = {}  # share of its joints' squares that a candidate scored when it last failed
     fitted: dict[Name, Effect] = {}  # position sensors as they were last fitted exactly
     while len(found) < MOST_CAUSES and not (found and enough(found)):
-        progress("screening the catalogue", len(found) / MOST_CAUSES)
+        progress("screening the catalogue", 0.1 + 0.7 * len(found) / MOST_CAUSES)
         groups = catalogue(problem, step.state, step.rows, whitening, forbid, groups)
         screened = screen(step.rows, step.linear, groups, screened)
         p_values.append(_chance(step, screened, null, alpha, generator, not found))
         shown = shown or screened.shown()
         if p_values[-1] > alpha:
             break
-        progress("comparing causes on held-out data", len(found) / MOST_CAUSES)
+        progress("comparing causes on held-out data", 0.1 + 0.7 * len(found) / MOST_CAUSES)
         contenders = _contenders(problem, step, screened, whitening, failed, fitted)
         contenders = [c for c in contenders if not _told_already(c, found)]
         chosen = _chosen(problem, step, contenders, found, alpha / len(groups))

@@ -80,7 +80,7 @@ def draft_task(
     said += more
     said += _refuse_what_is_wrong(robot, reads, signs, stated=constants is not None)
     labels = _repeats(reads)
-    assumed += [*motors, _unit_said(unit, robot), *said]
+    assumed += [*motors, _unit_said(unit, robot), *said, *_repeats_said(reads, labels)]
     text = _text(model, robot, whole, reads, unit, signs, labels, assumed, drives, gears)
     return Draft(text, tuple(assumed))
 
@@ -361,6 +361,18 @@ def _repeats(reads: Sequence[Columns]) -> list[str | None]:
                 labels[i] = labels[j]
                 break
     return labels
+
+
+def _repeats_said(reads: Sequence[Columns], labels: Sequence[str | None]) -> list[str]:
+    """Which files repeat one motion, a line for each label."""
+    alike = {
+        label: [str(read.file) for read, own in zip(reads, labels, strict=True) if own == label] for label in labels
+    }
+    return [
+        f"{', '.join(files[:-1])} and {files[-1]} repeat one motion (repeat: {label})"
+        for label, files in alike.items()
+        if label is not None
+    ]
 
 
 def _shape(read: Columns) -> Float[np.ndarray, " _"]:

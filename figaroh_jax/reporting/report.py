@@ -35,6 +35,7 @@ _BADGES = {
     "named+rest": "cause named, a rest stays",
     "unknown": "wrong, cause unknown",
 }
+_UNDECIDED = "nothing can be named"
 
 
 class _Joint(NamedTuple):
@@ -102,7 +103,9 @@ def _page(diagnosis: Diagnosis, title: str, folder: Path | None = None) -> str:
         robot=title,
         picture=Markup(_picture(diagnosis)),
         anatomy=_anatomy(diagnosis),
-        badge=_BADGES[diagnosis.verdict],
+        badge=_UNDECIDED if diagnosis.rest.undecided else _BADGES[diagnosis.verdict],
+        undecided=_glued(wording.undecided(diagnosis)),
+        unexplained=_glued(wording.unexplained(diagnosis)) if diagnosis.verdict in ("named+rest", "unknown") else "",
         sentence=_glued(wording.sentence(diagnosis, title)),
         largest=max(_finite(gain.before), _finite(gain.after)),
         joints=_joints(diagnosis),

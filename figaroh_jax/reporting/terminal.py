@@ -84,7 +84,8 @@ def summary(diagnosis: Diagnosis, robot: str = "the robot", *, verbose: bool = F
 
     The notes on the data are counted; `verbose` shows them.
     """
-    head = Text.assemble((diagnosis.verdict, _STYLE[diagnosis.verdict]), f"  {wording.sentence(diagnosis, robot)}")
+    style = "yellow" if diagnosis.rest.undecided else _STYLE[diagnosis.verdict]
+    head = Text.assemble((diagnosis.verdict, style), f"  {wording.sentence(diagnosis, robot)}")
     parts: list[RenderableType] = [head]
     parts += [_cause(number, cause) for number, cause in enumerate(diagnosis.causes, 1)]
     if diagnosis.verdict in ("named+rest", "unknown"):

@@ -35,26 +35,30 @@ __all__ = [
     "place",
     "rest",
     "sentence",
+    "undecided",
+    "unexplained",
     "unit",
 ]
 
 _NORMAL_95 = 1.96  # standard deviations on each side of a 95 % interval
+_SURE = 0.05  # p-value below which it stands beside what is not noise alone
 
 
 def sentence(diagnosis: Diagnosis, robot: str) -> str:
     """The verdict in one sentence, e.g. "The simulation of tx40 is missing rotor inertia at joint_3: ..."."""
     subject = f"The simulation of {robot}"
-    if diagnosis.verdict == "nothing" and diagnosis.rest.tolerated:
-        return (
-            f"{subject} agrees with the data: no missing effect is detectable. The residual is not noise alone"
-            f" ({p_value(diagnosis.p_value)}), but {diagnosis.rest.tolerated}"
-            f" (error on held-out data {error(diagnosis.holdout.before, diagnosis.holdout.unit)})."
-        )
     if diagnosis.verdict == "nothing":
-        return (
-            f"{subject} agrees with the data: no missing effect is detectable, and the residual is consistent with"
-            f" noise (error on held-out data {error(diagnosis.holdout.before, diagnosis.holdout.unit)})."
-        )
+        told = f"(error on held-out data {error(diagnosis.holdout.before, diagnosis.holdout.unit)})."
+        if diagnosis.rest.undecided:
+            return (
+                f"No effect can be named that the simulation of {robot} is missing, but these data do not show that it"
+                f" is right: {undecided(diagnosis)} {told}"
+            )
+        agrees = f"{subject} agrees with the data: no missing effect is detectable"
+        if not diagnosis.rest.tolerated:
+            return f"{agrees}, and the residual is consistent with noise {told}"
+        surely = f" ({p_value(diagnosis.p_value)})" if diagnosis.p_value < _SURE else ""
+        return f"{agrees}. The residual is not noise alone{surely}, but {diagnosis.rest.tolerated} {told}"
     fall = _fall(diagnosis)
     if diagnosis.verdict == "unknown":
         found = f" Adding {_list(diagnosis.causes)} is not enough: {fall}." if diagnosis.causes else ""
@@ -63,14 +67,31 @@ def sentence(diagnosis: Diagnosis, robot: str) -> str:
     return f"{subject} is missing {_list(diagnosis.causes)}: {fall}{rest}."
 
 
+def undecided(diagnosis: Diagnosis) -> str:
+    """How much may be left at which joint where the data do not tell it from noise, and why they do not; else empty."""
+    why = diagnosis.rest.undecided
+    return f"up to {_largest(diagnosis)} is left, and {why}" if why else ""
+
+
+def unexplained(diagnosis: Diagnosis) -> str:
+    """How large what no cause explains is at the joint with most of it, and what is known of it; may be empty."""
+    left = diagnosis.rest
+    size = _largest(diagnosis) if len(left.relative) and max(left.relative) > 0 else ""
+    return "; ".join(text for text in (size, left.text) if text)
+
+
+def _largest(diagnosis: Diagnosis) -> str:
+    """What is left at the joint with most of it: "4.0 % of the torque of elbow"."""
+    relative = diagnosis.rest.relative
+    worst = max(range(len(relative)), key=lambda k: relative[k])
+    what = "motion" if diagnosis.of_positions else "torque"
+    return f"{error(float(relative[worst]), 'relative RMS')} of the {what} of {diagnosis.joints[worst]}"
+
+
 def rest(diagnosis: Diagnosis) -> list[str]:
     """What no cause explains, in sentences: how large and where, what it goes with, which causes came near."""
-    left, out = diagnosis.rest, []
-    if len(left.relative) and max(left.relative) > 0:
-        worst = max(range(len(left.relative)), key=lambda k: left.relative[k])
-        what = "motion" if diagnosis.of_positions else "torque"
-        size = f"Unexplained residual: {error(float(left.relative[worst]), 'relative RMS')} of the {what} of"
-        out.append(f"{size} {diagnosis.joints[worst]}{f'; {left.text}' if left.text else ''}.")
+    left = diagnosis.rest
+    out = [f"Unexplained residual: {told}."] if (told := unexplained(diagnosis)) else []
     for joint in dict.fromkeys(part.at for part in left.parts):
         own = [part for part in left.parts if part.at == joint]
         shares = ", ".join(f"{dependence(part)} ({100 * part.share:.0f} %)" for part in own)
