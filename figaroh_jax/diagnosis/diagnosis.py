@@ -469,9 +469,11 @@ def _answered(
 
 
 def _told_size(joint: Joint, which: int, here: Setting) -> str:
-    """A cause's parameters with their deviations, in words."""
+    """A cause's parameters with their intervals, in words; an angle that may be any says nothing of a size."""
     each = estimates(joint.causes[which], joint.fitted, joint.fitted.places[which], here.problem.model)
-    return ", ".join(f"{name} {e.value:.3g} +- {1.96 * e.std:.2g} {e.unit}".rstrip() for name, e in each.items())
+    told = [(name, e.value, 1.96 * e.std, e.unit) for name, e in each.items()]
+    sizes = [one for one in told if not (one[3] == "rad" and one[2] > 2 * np.pi)] or told
+    return ", ".join(f"{name} {value:.3g} +- {half:.2g} {unit}".rstrip() for name, value, half, unit in sizes)
 
 
 def _sticks(here: Setting, joint: Joint, tolerance: float) -> bool:
