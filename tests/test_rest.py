@@ -17,6 +17,7 @@ from figaroh_jax.diagnosis.naming import (
     Standing,
     _spoils,
     _turns_against_itself,
+    behind_joints,
     beside_rest,
     of_its_own,
     reason_against,
@@ -249,11 +250,33 @@ RIGHT = Standing(
         ({"whole": True, "gain": 0.05}, ""),
         ({"whole": True, "gain": 0.05, "massless": True}, "mass is not surely"),
         ({"whole": True, "gain": 0.05, "beside_smooth": 0.0}, "smooth functions"),
+        ({"whole": True, "contested": True}, "another law of the whole robot"),
+        ({"one_part": True}, "no more than one"),
     ],
 )
 def test_beside_a_rest_a_cause_is_named_by_what_it_alone_explains(changes: dict[str, float], word: str) -> None:
     reason = reason_against(replace(RIGHT, **changes), True, 0.01)
     assert word in reason and bool(word) == bool(reason)
+
+
+@pytest.mark.parametrize(
+    ("whole", "reason", "behind"),
+    [
+        ({}, "its sign", True),
+        ({}, "", False),  # it has a name: what is left at the joint is another cause
+        ({"gain": 0.2}, "its sign", False),
+        ({"t": 2.0}, "its sign", False),
+        ({"static": False}, "its sign", False),  # late torque is none of the posture
+    ],
+)
+def test_a_spring_may_be_part_of_a_law_of_the_whole_robot_without_a_name(
+    whole: dict[str, Any], reason: str, behind: bool
+) -> None:
+    spring = replace(RIGHT, name=Name("joint_spring", ("pan",)), static=True)
+    tilt = replace(RIGHT, name=Name("gravity_tilt", ()), whole=True, static=True)
+    each = [spring, RIGHT, replace(tilt, **whole)]
+    told = behind_joints(each, {spring.name: "", RIGHT.name: "", tilt.name: reason})
+    assert list(told) == ([spring.name] if behind else [])
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,17 @@ from .gates import physical_sign
 from .holdout import residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_rest
 from .layout import describe_folds
-from .naming import Standing, beside_rest, beyond_simpler, of_its_own, reason_against, standings, stands_alone, strong
+from .naming import (
+    Standing,
+    behind_joints,
+    beside_rest,
+    beyond_simpler,
+    of_its_own,
+    reason_against,
+    standings,
+    stands_alone,
+    strong,
+)
 from .reading import Reader, only_read
 from .rest import (
     Significance,
@@ -410,7 +420,8 @@ def _reasons(
     weighed = left_weighed(here.problem, joint.step.state, noise)  # rows at reversals say nothing of a law
     rests = beside_rest(each, [f.joints for f in found], strict, np.minimum(beyond, weighed), tolerance)
     asked = (tolerance, kept_out.certain, searched.fading)
-    return {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
+    against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
+    return against | behind_joints([one for one, rest in zip(each, rests, strict=True) if rest], against)
 
 
 def _as_slow_noise(

@@ -7,7 +7,7 @@ vary with position, speed, load or time stands for another law.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import NamedTuple
@@ -54,6 +54,7 @@ from .thresholds import (
 
 __all__ = [
     "Standing",
+    "behind_joints",
     "beside_rest",
     "beyond_simpler",
     "cause_torque",
@@ -79,6 +80,7 @@ class Standing:
     t: float
     t_needed: float  # by the number of blocks
     share: float  # RMS torque over that of the joint, where it is largest
+    static: bool = False  # whether it may be a torque that depends on the posture alone, at a joint or at all of them
     modulation: float = 0.0  # squares that an amplitude which varies gains, over those of the cause
     modulation_held_out: float = 0.0
     varies: bool = False  # whether left-out squares surely fall by it
@@ -196,6 +198,18 @@ def _of_those_beside_rest(
     )
 
 
+def behind_joints(each: Sequence[Standing], against: Mapping[Name, str]) -> dict[Name, str]:
+    """Laws of one joint's posture beside a law of the whole robot that surely takes much and has no name; and why.
+
+    Whatever that law stands for acts at all joints. What it does at one of them is a constant, or a spring, over the
+    postures that were seen: where the whole is not understood, its part is not a cause of its own.
+    """
+    if not any(one.static and one.whole and _much(one) and against[one.name] for one in each):
+        return {}
+    told = "a law of the whole robot that has no name takes much of the same misfit: at this joint it may be that law"
+    return {one.name: told for one in each if one.static and not one.whole and not against[one.name]}
+
+
 def strong(one: Standing) -> bool:
     """Whether it surely explains much of what its joints leave, as a law that exists would, whatever speaks against its
     name: then what is left is more than sticks, which no law explains."""
@@ -282,6 +296,7 @@ def standings(
             Standing(
                 name=one.name,
                 whole=whole,
+                static=effect.of_position or (whole and kind(effect) == "columns"),
                 physical=physical_sign(effect)
                 and not (coupled and _turns_against_itself(effect, joint.fitted, at))
                 and not (effect.acts_on == "link" and _weighs_less_than_nothing(problem, effect, joint.fitted, at)),

@@ -32,6 +32,7 @@ class TorqueOffset(JointEffect):
     """Constant torque: an offset of the sensor, the drive or a preload."""
 
     name, title = "torque_offset", "torque offset"
+    of_position = True
     equation = "offset"
     separated_by = "a dwell of {at} with the brake on or the motor unloaded"
     in_rollouts = InRollouts((("offset", "offset"),), lambda scale: ((0.0,),), constant=True)

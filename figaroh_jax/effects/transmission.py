@@ -122,6 +122,7 @@ class JointSpring(JointEffect):
 
     name, title = "joint_spring", "joint spring"
     contains = ("torque_offset",)
+    of_position = True
     equation = "stiffness (q - rest)"
     separated_by = "motion of {at} over a larger range, or with the base turned"
     in_rollouts = InRollouts(
