@@ -23,7 +23,7 @@ from .alone import separable
 from .arm import search_arm
 from .causes import BASELINE
 from .data import Run, Stretch, noise_of, regular, windows
-from .fit import Fit, standard_errors
+from .fit import Fit
 from .loop import Loop
 from .own import amplitudes, left_out
 from .parameters import UNITS, put
@@ -32,6 +32,7 @@ from .rest import nearest_of, parts_of, relative_rest
 from .search import Named, Search, search
 from .sensitivity import predicted
 from .setting import Setting, Structure, residuals, setting
+from .sizes import told_errors
 
 if TYPE_CHECKING:
     from ..formats.config import Task
@@ -294,11 +295,7 @@ def _gain(held: dict[str, tuple[np.ndarray, np.ndarray]], runs: Sequence[Run], f
 
 def _cause(one: Named, found: Search, here: Setting) -> Cause:
     structure, fitted = found.structure, found.last
-    weight = np.asarray(structure.data.weight)
-    level = max(1.0, fitted.squares / (weight > 0).sum())
-    errors = standard_errors(fitted, structure.data, level)
-    if found.spread is not None:
-        errors = np.fmax(errors, found.spread)
+    errors = told_errors(structure, fitted, found.spread)
     parameters = {}
     for name, entry in zip(one.candidate.reported, one.candidate.entries, strict=True):
         column = int(np.flatnonzero(fitted.free == entry)[0])
