@@ -2,8 +2,9 @@
 
 Gates ask whether rows that were not fitted are predicted better. Where more than noise is left they may be, by a cause
 that makes up for a little of what is missing; its size, told with what is left (chi2/N) or by how recordings differ,
-is then as likely none. Friction, damping and rotors are excepted: no joint is without them, so that an interval which
-holds zero says that the data do not tell how large they are, not that they may not be there.
+is then as likely none. Two kinds are excepted, for an interval that holds zero says of them not that they may not be
+there, but that the data do not tell how large they are: friction, damping and rotors, without which no joint is, and
+limits of drives whose gains are fitted, for all torques are then known up to a factor, and none is an infinite limit.
 """
 
 from __future__ import annotations
@@ -19,7 +20,16 @@ from .parameters import BOUNDS, UNITS, values
 from .setting import Setting, Structure
 from .thresholds import TOLD
 
-__all__ = ["fitted_without", "least_sure", "possible", "simpler", "told_errors", "why_nothing"]
+__all__ = [
+    "fitted_without",
+    "is_excepted",
+    "is_open",
+    "least_sure",
+    "possible",
+    "simpler",
+    "told_errors",
+    "why_nothing",
+]
 
 _LATE = 30  # iterations
 
@@ -38,11 +48,23 @@ def possible(name: str) -> float:
 def least_sure(
     causes: Sequence[Candidate], structure: Structure, last: Fit, spread: np.ndarray | None = None
 ) -> Candidate | None:
-    """Of the causes that not every joint has the one whose size is least clear of none; None where all are clear."""
+    """Of the causes that are not excepted the one whose told size is the least clear of none, unless all are clear."""
     errors = told_errors(structure, last, spread)
-    asked = [c for c in causes if not c.kind.usual]
+    asked = [c for c in causes if not is_excepted(c, structure, last)]
     clear = [_clear(c, structure, last, errors) for c in asked]
     return asked[int(np.argmin(clear))] if clear and min(clear) < TOLD else None
+
+
+def is_excepted(c: Candidate, structure: Structure, last: Fit) -> bool:
+    """Whether a cause is named although its interval may hold zero."""
+    drive = structure.table[c.entries[0]].at
+    fitted = any(structure.table[k].name == "scale" and structure.table[k].at == drive for k in last.free if k >= 0)
+    return c.kind.usual or (c.kind.limit and fitted)
+
+
+def is_open(c: Candidate, structure: Structure, last: Fit, spread: np.ndarray | None = None) -> bool:
+    """Whether the interval of its size, as it is told, holds no effect."""
+    return _clear(c, structure, last, told_errors(structure, last, spread)) < TOLD
 
 
 def why_nothing(c: Candidate, structure: Structure, last: Fit, spread: np.ndarray | None = None) -> str:
