@@ -32,7 +32,7 @@ from .rest import nearest_of, parts_of, relative_rest
 from .search import Named, Search, search
 from .sensitivity import predicted
 from .setting import Setting, Structure, residuals, setting
-from .sizes import is_open, possible, told_errors
+from .sizes import is_excepted, is_open, possible, told_errors
 
 if TYPE_CHECKING:
     from ..formats.config import Task
@@ -330,7 +330,8 @@ def _open_sizes(found: Search) -> list[str]:
     """Why a cause is named although its interval holds zero: what the data tell of it, and what they do not."""
     told = []
     for one in found.named:
-        if is_open(one.candidate, found.structure, found.last, found.spread):
+        at = one.candidate, found.structure, found.last
+        if is_excepted(*at) and is_open(*at, found.spread):
             why = "every joint has some" if one.candidate.kind.usual else "torques are known up to the drive's gain"
             told.append(
                 f"{Name(one.candidate.effect, one.candidate.at)} is named because recordings that were not fitted are"
