@@ -38,11 +38,12 @@ class Name(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Value and one standard deviation (inf: not determined), in `unit`."""
+    """Value and one standard deviation (inf: not determined), in `unit`; `least`: below which it cannot be."""
 
     value: float
     std: float
     unit: str
+    least: float = float("-inf")
 
 
 @dataclass(frozen=True)

@@ -208,6 +208,7 @@ def effect_equation(effect: str) -> str:
 def interval(estimate: Estimate) -> str:
     """Value with its 95 % interval and unit: "0.0113 ± 0.0004 kg m²"; without an interval where there is none.
 
+    Where half of it would be below what the number can be, it is cut there: "0.42 (0 to 1.6) N m".
     An angle that may lie anywhere on the turn has no value: where a spring rests, beside a free torque offset.
     """
     half = _NORMAL_95 * estimate.std
@@ -215,6 +216,9 @@ def interval(estimate: Estimate) -> str:
         return "not determined by this data"
     if not (math.isfinite(half) and half > 0.0):
         return _with_unit(number(estimate.value), estimate.unit)
+    if estimate.value - half < estimate.least:
+        ends = f"{number(estimate.least)} to {number(estimate.value + half, 2)}"
+        return _with_unit(f"{number(estimate.value, 2)} ({ends})", estimate.unit)
     power = math.floor(math.log10(half))
     decimals, large = max(0, 1 - power), max(abs(estimate.value), half)
     scale = math.floor(math.log10(large))

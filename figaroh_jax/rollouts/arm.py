@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from scipy.special import ndtr
 
-from ..results import Name
+from ..results import Name, Verdict
 from .alike import instead, names, rivals
 from .causes import Candidate
 from .faults import Fault, faults, without
@@ -26,6 +26,7 @@ from .search import Model, Named, Search, Tried, judged_by_colour, sized, t_of
 from .sensitivity import predicted
 from .setting import Setting, Structure, begins_of, begun, by_recording, evened, free_entries, level_of, thinned
 from .shared import at_all_joints
+from .sizes import fitted_without, least_sure, simpler, why_nothing
 from .table import on_table
 from .thresholds import NEAR, NO_CHOICE, T_BESIDE_REST, UNTOLD
 
@@ -133,11 +134,40 @@ def _searched(
     if even:
         now, spread = alike_by_recording(here, now)
         steps.append(("recordings that are equally informative", _level(here, now.model.fit)))
+    doubtful = list[tuple[Name, float, str]]()
+    while slight is None and _verdict(here, now, found) in ("named", "named+rest"):
+        gone = least_sure([n.candidate for n in found], now.model.structure, now.model.fit, spread)
+        if gone is None:
+            break
+        (one,) = (n for n in found if n.candidate is gone)
+        why = why_nothing(gone, now.model.structure, now.model.fit, spread)
+        doubtful.append((Name(gone.effect, gone.at), max(one.gain, 0.0), why))
+        found, now, spread = _without(here, now, [n for n in found if n is not one], gone, even, forbid)
+        steps.append((f"without {doubtful[-1][0]}", _level(here, now.model.fit)))
+        held.append(rms_of(here, now.held))
     result = Search(
         "nothing", found, now.model.structure, first, now.model.fit, p_value, [], nearest, steps, held, fits,
-        begin.model.structure, here, [*wrong, *resting], spread,
+        begin.model.structure, here, [*wrong, *resting], spread, doubtful,
     )  # fmt: skip
     return _judged(here, result, now, slight)
+
+
+def _without(
+    here: Setting, now: Standing, found: list[Named], gone: Candidate, even: bool, forbid: Sequence[str]
+) -> tuple[list[Named], Standing, np.ndarray | None]:
+    """The model without a cause that may be nothing, or with what it contains where that holds on rows left out."""
+    old = now.model
+    structure, last, free = fitted_without(here, old.structure, old.fit, old.free, gone, ROUGH)
+    less = simpler(here, old.structure, old.fit, old.free, gone, forbid)
+    now = standing(here, structure, last, free)
+    if less is not None:
+        candidate, one, kept = less
+        state = Model(old.structure, one, kept, 0.0)
+        new = _named(here, now, {}, [Tried(candidate, state, outputs(here, one.sums.cost))], found)
+        found, now = (found, now) if new is None else ([*found, *new[0]], new[1])
+    if not even or now.excess.max() < 1.0:
+        return found, now, None
+    return found, *alike_by_recording(here, now)
 
 
 def _started(here: Setting, first: Fit) -> Fit:
@@ -228,13 +258,16 @@ def _judged(here: Setting, result: Search, now: Standing, slight: Slight | None 
         result.verdict, result.beside = "named+rest", slight.fit
         result.nearest = [(Name(one.effect, one.at), max(slight.cause.gain, 0.0), why)]
         return result
-    if now.excess.max() < 1.0:
-        result.verdict = "named" if found else "nothing"
-    elif found and by_recording(here) and found[0].t > T_BESIDE_REST:
-        result.verdict = "named+rest"
-    else:
-        result.verdict, result.proxy, result.named = "unknown", found, []
+    result.verdict = _verdict(here, now, found)
+    if result.verdict == "unknown":
+        result.proxy, result.named = found, []
     return result
+
+
+def _verdict(here: Setting, now: Standing, found: Sequence[Named]) -> Verdict:
+    if now.excess.max() < 1.0:
+        return "named" if found else "nothing"
+    return "named+rest" if found and by_recording(here) and found[0].t > T_BESIDE_REST else "unknown"
 
 
 def _sound(here: Setting, first: Fit) -> tuple[Setting, list[Fault]]:

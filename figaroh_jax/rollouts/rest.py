@@ -57,10 +57,11 @@ def parts_of(
 
 
 def nearest_of(found: Search) -> tuple[Nearest, ...]:
-    """Causes that were looked at last and are not named."""
+    """Causes that are not named: those whose size may be none, then those that were looked at last."""
     named = {n.candidate.effect + str(n.candidate.at) for n in found.named}
+    named |= {name.effect + str(name.at) for name, _, _ in found.doubtful}
     sought = [(name, gain, why) for name, gain, why in found.nearest if name.effect + str(name.at) not in named]
-    best = sorted(sought, key=lambda one: -one[1])[:3]
+    best = [*found.doubtful, *sorted(sought, key=lambda one: -one[1])][:3]
     return tuple(Nearest(name, gain, why) for name, gain, why in best if gain > 0)
 
 

@@ -13,7 +13,7 @@ from ..results import Name, Verdict
 from .causes import Candidate, elastic_loop, springs
 from .colour import colour_of
 from .faults import Fault
-from .fit import Fit, System, fit, held_out, refitted_without, standard_errors
+from .fit import Fit, System, fit, held_out, refitted_without, spread_of_recordings, standard_errors
 from .parameters import Entry
 from .setting import (
     Setting,
@@ -29,6 +29,7 @@ from .setting import (
     start_values,
     whitened,
 )
+from .sizes import fitted_without, least_sure, simpler, why_nothing
 from .starting import shown, suggested
 from .thresholds import (
     CLEAR_OF_NOTHING,
@@ -100,6 +101,7 @@ class Search:
     setting: Setting | None = None  # where rows were left out: without them
     faults: list[Fault] = field(default_factory=list)  # why they were
     spread: np.ndarray | None = None  # (columns of `last`,) by recordings: half of each 95 % interval over 1.96
+    doubtful: list[tuple[Name, float, str]] = field(default_factory=list)  # of no sure size, left out, with their gain
     beside: Fit | None = None  # where a cause that is too slight to be named is left out: with it noise alone is left
 
 
@@ -176,9 +178,46 @@ def _searched(
         steps.append((str(Name(best[0].candidate.effect, best[0].candidate.at)), level_of(now.fit, weight)))
         if now.excess < 1.0:
             break
+    held = [_rms(here, held_out(first, structure.data, here.folds)), *(n.after for n in found)]
+    found, now, doubtful = _of_sure_size(here, now, found, forbid)
+    for one, model in doubtful:
+        stood.append(model)
+        steps.append((f"without {one[0]}", level_of(model.fit, weight)))
+        held.append(_rms(here, _held_out(here, model, [])[1]))
     result = _judged(here, stood[0], now, found, p_value, steps, nearest)
+    result.held, result.doubtful, result.spread = held, [one for one, _ in doubtful], _spread(here, now)
     result.fits, result.origin = [one.fit for one in stood[1:]], stood[0].structure
     return result
+
+
+def _of_sure_size(
+    here: Setting, now: Model, found: list[Named], forbid: Sequence[str]
+) -> tuple[list[Named], Model, list[tuple[tuple[Name, float, str], Model]]]:
+    """The causes that would be told without those whose told interval holds no effect, least sure first; and these."""
+    doubtful = list[tuple[tuple[Name, float, str], Model]]()
+    while _verdict(here, now.excess, found) in ("named", "named+rest"):
+        spread = _spread(here, now)
+        gone = least_sure([n.candidate for n in found], now.structure, now.fit, spread)
+        if gone is None:
+            break
+        (one,) = (n for n in found if n.candidate is gone)
+        told = Name(gone.effect, gone.at), max(one.gain, 0.0), why_nothing(gone, now.structure, now.fit, spread)
+        less = simpler(here, now.structure, now.fit, now.free, gone, forbid)
+        found, old = [n for n in found if n is not one], now.structure
+        structure, last, free = fitted_without(here, old, now.fit, now.free, gone)
+        now = Model(structure, last, free, excess(whitened(structure, last), np.asarray(structure.data.weight)))
+        if less is not None:
+            best, _ = _best(here, now, [_tried_one(here, old, less[0], *less[1:])], [])
+            found, now = (found, now) if best is None else ([*found, best[0]], best[1])
+        doubtful.append((told, now))
+    return found, now, doubtful
+
+
+def _spread(here: Setting, now: Model) -> np.ndarray | None:
+    """How differently recordings tell each number where more than noise is left, (columns of the fit,)."""
+    if now.excess < 1.0 or not by_recording(here):
+        return None
+    return spread_of_recordings(now.structure.table, now.fit, here.folds)
 
 
 class Tried(NamedTuple):
@@ -523,17 +562,19 @@ def _top_speed(here: Setting, coordinate: int) -> float:
     )
 
 
+def _verdict(here: Setting, beyond: float, found: Sequence[Named]) -> Verdict:
+    """`named` where the rest is noise; `named+rest` where the names hold without each of three recordings or more."""
+    if beyond < 1.0:
+        return "named" if found else "nothing"
+    return "named+rest" if found and by_recording(here) and found[0].t > T_BESIDE_REST else "unknown"
+
+
 def _judged(
     here: Setting, begin: Model, now: Model, found: list[Named], p_value: float, steps: list, nearest: list
 ) -> Search:
-    """`named` where the rest is noise; `named+rest` where the names hold without each of three recordings or more."""
-    held = [_rms(here, held_out(begin.fit, begin.structure.data, here.folds)), *(n.after for n in found)]
-    result = Search("nothing", found, now.structure, begin.fit, now.fit, p_value, [], list(nearest), steps, held)
-    if now.excess < 1.0:
-        result.verdict = "named" if found else "nothing"
-        return result
-    if found and by_recording(here) and all(n.t > T_BESIDE_REST for n in found[:1]):
-        result.verdict = "named+rest"
-        return result
-    result.verdict, result.proxy, result.named = "unknown", found, []
+    """The answer; causes that have no name are the best proxy."""
+    result = Search("nothing", found, now.structure, begin.fit, now.fit, p_value, [], list(nearest), steps)
+    result.verdict = _verdict(here, now.excess, found)
+    if result.verdict == "unknown":
+        result.proxy, result.named = found, []
     return result

@@ -23,7 +23,7 @@ from .alone import separable
 from .arm import search_arm
 from .causes import BASELINE
 from .data import Run, Stretch, noise_of, regular, windows
-from .fit import Fit, standard_errors
+from .fit import Fit
 from .loop import Loop
 from .own import amplitudes, left_out
 from .parameters import UNITS, put
@@ -32,6 +32,7 @@ from .rest import nearest_of, parts_of, relative_rest
 from .search import Named, Search, search
 from .sensitivity import predicted
 from .setting import Setting, Structure, residuals, setting
+from .sizes import is_excepted, is_open, possible, told_errors
 
 if TYPE_CHECKING:
     from ..formats.config import Task
@@ -200,7 +201,12 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
         baseline=extended_of(start),
         model=model,
         rest=_rest(found, before if not named else after, here.spread, loop, traces),
-        notes=(*notes, *colour_notes(here), *implausible(loop.robot, model, task.robot.trust)),
+        notes=(
+            *notes,
+            *colour_notes(here),
+            *(_open_sizes(found) if named else ()),
+            *implausible(loop.robot, model, task.robot.trust),
+        ),
         prismatic=tuple(j.kind == "prismatic" for j in loop.robot.joints if not j.follows),
         of_positions=True,
     )
@@ -294,11 +300,7 @@ def _gain(held: dict[str, tuple[np.ndarray, np.ndarray]], runs: Sequence[Run], f
 
 def _cause(one: Named, found: Search, here: Setting) -> Cause:
     structure, fitted = found.structure, found.last
-    weight = np.asarray(structure.data.weight)
-    level = max(1.0, fitted.squares / (weight > 0).sum())
-    errors = standard_errors(fitted, structure.data, level)
-    if found.spread is not None:
-        errors = np.fmax(errors, found.spread)
+    errors = told_errors(structure, fitted, found.spread)
     parameters = {}
     for name, entry in zip(one.candidate.reported, one.candidate.entries, strict=True):
         column = int(np.flatnonzero(fitted.free == entry)[0])
@@ -308,7 +310,8 @@ def _cause(one: Named, found: Search, here: Setting) -> Cause:
             stiffness = float(fitted.theta[one.candidate.entries[0]])
             name, value, error, unit = "rest", -value / stiffness, error / abs(stiffness), "rad"
         value -= one.candidate.kind.neutral
-        parameters[name] = Estimate(value, error, unit)
+        bound = possible(structure.table[entry].name) if name != "rest" else -np.inf
+        parameters[name] = Estimate(value, error, unit, bound - one.candidate.kind.neutral)
     first = structure.table[one.candidate.entries[0]]
     if first.name == "pair_inertia" and here.loop.pairs is not None:
         parameters["sign"] = Estimate(float(here.loop.pairs.at[first.at[0]][2]), 0.0, "")
@@ -321,6 +324,20 @@ def _cause(one: Named, found: Search, here: Setting) -> Cause:
     sure = 1.0 / (1 + len(one.alike)) * (0.98 if found.verdict == "named" else 0.8)
     gain = Gain(one.before, one.after, "rad")
     return Cause(Name(one.candidate.effect, at), parameters, sure, gain, one.alike, note=one.candidate.kind.looks_like)
+
+
+def _open_sizes(found: Search) -> list[str]:
+    """Why a cause is named although its interval holds zero: what the data tell of it, and what they do not."""
+    told = []
+    for one in found.named:
+        at = one.candidate, found.structure, found.last
+        if is_excepted(*at) and is_open(*at, found.spread):
+            why = "every joint has some" if one.candidate.kind.usual else "torques are known up to the drive's gain"
+            told.append(
+                f"{Name(one.candidate.effect, one.candidate.at)} is named because recordings that were not fitted are"
+                f" predicted better with it; how large it is they do not tell (its 95 % interval reaches 0): {why}"
+            )
+    return told
 
 
 def _experiment(found: Search) -> Experiment | None:

@@ -23,6 +23,7 @@ COST_OF_A_MISSED = 0.1  # of the squares, by which a cause that is surely missed
 FITTED_FOR_HELD = 0.7  # of the t that a name needs: what it must have on the rows that it was fitted to
 OF_ITS_SIZE = 0.5  # standard deviation of a size that is known, of numbers that cannot be negative
 CLEAR_OF_NOTHING = 3.0  # standard deviations of a size from no effect, of numbers of either sign
+TOLD = 1.96  # standard deviations, as they are told, of a size from no effect: the interval beside a name holds no zero
 
 # Which of several (`search`, `arm`, `screening`)
 USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
