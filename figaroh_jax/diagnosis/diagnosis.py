@@ -36,7 +36,7 @@ from .floor import foretold, noise_rms, short, sober_spectrum, told_too_large, u
 from .gaining import Fall, Gaining, beside_all, foretells, predicts_better, without_losses
 from .gates import physical_sign
 from .holdout import residual_rms, traces
-from .joint import Joint, least_sure, opened, polished, sized, with_rest
+from .joint import Joint, least_sure, least_told, opened, polished, sized, with_rest
 from .layout import describe_folds
 from .naming import (
     Standing,
@@ -340,10 +340,7 @@ def _judged(
     text = (left.rest.text or ("" if relative.any() else _LESS_THAN_NOISE)) if rest else ""
     told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
     if rest and named:
-        squares = (joint.step.linear.residual**2).sum(1)
-        left_over = squares - noise_squares(problem, here.spectrum, here.whitening)
-        joint = with_rest(problem, joint, here.whitening, [f.joints for f in named], left_over)
-        gaining = gaining._replace(joint=joint)
+        gaining = gaining._replace(joint=_beside_rest(here, named, joint))
     parts = parts_of(problem, told, whitening, left.line, [s.name for s in reader.signals])
     nearest.sort(key=lambda one: -one.share)
     quiet = not rest and not named and (large or searched.search.p_value < alpha)
@@ -471,12 +468,22 @@ def _answered(
             gaining = gaining._replace(joint=as_weighed_otherwise(here, searched.here.problem, gaining.joint))
         by_speed = by_speed if len(first) == len(named) else together(searched.here, named)
         first, moving = named, as_weighed_in_motion(searched.here, by_speed) if named else by_speed
-        least = least_sure(named, moving)
+        least, by = least_sure(named, moving), moving
+        if least is None and searched.strict and named:
+            by = _beside_rest(here, named, gaining.joint)
+            least = least_told(by)
         if least is None:
             return here, gaining._replace(named=opened(named, gaining.joint, forbid)), by_speed, against
-        against[named[least].name] = f"its size is not surely above zero: {_told_size(moving, least, here)}"
+        against[named[least].name] = f"its size is not surely above zero: {_told_size(by, least, here)}"
         named = [f for f in named if f is not named[least]]
         joint = together(here, named)
+
+
+def _beside_rest(here: Setting, named: Sequence[Found], joint: Joint) -> Joint:
+    """The answer's fit with what its intervals owe to a rest that stays."""
+    squares = (joint.step.linear.residual**2).sum(1)
+    left_over = squares - noise_squares(here.problem, here.spectrum, here.whitening)
+    return with_rest(here.problem, joint, here.whitening, [f.joints for f in named], left_over)
 
 
 def _told_size(joint: Joint, which: int, here: Setting) -> str:
