@@ -64,7 +64,7 @@ def test_friction_that_fades_more_slowly_than_it_is_seen_is_judged_at_its_time()
 
 
 def least_of(*causes: tuple[str, list[float], float, dict[str, float]], told: bool = False) -> int | None:
-    """Which cause (name, deviations, correlation of the first two parameters, values) is least sure, or least `told`."""
+    """Which cause (name, deviations, correlation of the first two, values) is least sure, or least `told`."""
     effects, blocks, places, first = [], [], [], 0
     for name, deviation, correlation, values in causes:
         effects.append(find(name)(np.array([0]), **{key: np.float64(value) for key, value in values.items()}))
