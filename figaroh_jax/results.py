@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 __all__ = [
+    "BoundedEstimate",
     "Candidate",
     "Cause",
     "Diagnosis",
@@ -38,12 +39,22 @@ class Name(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Value and one standard deviation (inf: not determined), in `unit`; `least`: below which it cannot be."""
+    """Value and one standard deviation (inf: not determined), in `unit`."""
 
     value: float
     std: float
     unit: str
-    least: float = float("-inf")
+
+
+class BoundedEstimate(Estimate):
+    """An estimate of what cannot be below `least`: its interval is told as cut there."""
+
+    least: float
+
+    def __new__(cls, value: float, std: float, unit: str, least: float = float("-inf")) -> BoundedEstimate:
+        one = super().__new__(cls, value, std, unit)
+        one.least = least
+        return one
 
 
 @dataclass(frozen=True)

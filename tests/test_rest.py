@@ -12,7 +12,7 @@ import pytest
 from figaroh_jax.diagnosis import rest as rests
 from figaroh_jax.diagnosis.estimates import Fitted
 from figaroh_jax.diagnosis.flexible import Smooth
-from figaroh_jax.diagnosis.joint import Joint, has_size, least_sure, least_told
+from figaroh_jax.diagnosis.joint import Joint, has_size, least_sure
 from figaroh_jax.diagnosis.naming import (
     Standing,
     _spoils,
@@ -63,8 +63,8 @@ def test_friction_that_fades_more_slowly_than_it_is_seen_is_judged_at_its_time()
     assert not has_size(drift, Fitted(np.zeros(3), share * np.outer(deviation, deviation), ()), (0, 1, 2))
 
 
-def least_of(*causes: tuple[str, list[float], float, dict[str, float]], told: bool = False) -> int | None:
-    """Which cause (name, deviations, correlation of the first two, values) is least sure, or least `told`."""
+def least_of(*causes: tuple[str, list[float], float, dict[str, float]]) -> int | None:
+    """Which of some causes (name, deviations, correlation of the first two parameters, values) is least sure."""
     effects, blocks, places, first = [], [], [], 0
     for name, deviation, correlation, values in causes:
         effects.append(find(name)(np.array([0]), **{key: np.float64(value) for key, value in values.items()}))
@@ -79,8 +79,7 @@ def least_of(*causes: tuple[str, list[float], float, dict[str, float]], told: bo
     for place, block in zip(places, blocks, strict=True):
         covariance[np.ix_(place, place)] = block
     none: Any = [None] * len(causes)
-    joint = Joint(none, effects, Fitted(np.zeros(first), covariance, tuple(places)))
-    return least_told(joint) if told else least_sure(none, joint)
+    return least_sure(none, Joint(none, effects, Fitted(np.zeros(first), covariance, tuple(places))))
 
 
 def test_a_cause_whose_told_interval_holds_zero_is_the_first_to_go() -> None:
@@ -93,15 +92,6 @@ def test_a_cause_whose_told_interval_holds_zero_is_the_first_to_go() -> None:
     assert least_of(poorer, good, poor) == 0  # 1.58 deviations, 1.67
     assert least_of(("torque_delay", [0.002], 0.0, {"delay": 0.003})) == 0  # a size that is no amplitude
     assert least_of(("torque_delay", [0.001], 0.0, {"delay": 0.003})) is None
-
-
-def test_by_told_intervals_friction_and_rotors_are_not_asked() -> None:
-    rotor, friction = ("rotor_inertia", "inertia"), ("load_dependent_friction", "ratio")
-    usual = [(name, [1.0], 0.0, {number: 0.5}) for name, number in (rotor, friction)]
-    assert least_of(*usual, told=True) is None
-    assert least_of(*usual) == 0
-    assert least_of(*usual, ("torque_gain", [0.05], 0.0, {"gain": 0.09}), told=True) == 2
-    assert least_of(*usual, ("torque_gain", [0.05], 0.0, {"gain": 0.10}), told=True) is None  # 2 deviations
 
 
 def test_a_law_of_the_speed_is_judged_at_its_shape() -> None:

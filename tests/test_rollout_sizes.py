@@ -12,7 +12,7 @@ from generators import servo_arm
 from scipy import stats
 
 from figaroh_jax.reporting import wording
-from figaroh_jax.results import Estimate, Name
+from figaroh_jax.results import BoundedEstimate, Estimate, Name
 from figaroh_jax.rollouts.data import Run
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.rest import nearest_of
@@ -83,6 +83,6 @@ def test_a_size_that_recordings_tell_alike_keeps_its_name_and_friction_keeps_it_
 
 
 def test_an_interval_is_cut_where_the_number_cannot_be():
-    assert wording.interval(Estimate(0.424, 0.66, "N m", 0.0)) == "0.42 (0 to 1.7) N m"
+    assert wording.interval(BoundedEstimate(0.424, 0.66, "N m", 0.0)) == "0.42 (0 to 1.7) N m"
     assert wording.interval(Estimate(0.424, 0.66, "N m")) == "0.4 ± 1.3 N m"
-    assert wording.interval(Estimate(0.424, 0.1, "N m", 0.0)) == "0.42 ± 0.20 N m"
+    assert wording.interval(BoundedEstimate(0.424, 0.1, "N m", 0.0)) == "0.42 ± 0.20 N m"

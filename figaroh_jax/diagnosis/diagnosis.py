@@ -36,7 +36,7 @@ from .floor import foretold, noise_rms, short, sober_spectrum, told_too_large, u
 from .gaining import Fall, Gaining, beside_all, foretells, predicts_better, without_losses
 from .gates import physical_sign
 from .holdout import residual_rms, traces
-from .joint import Joint, least_sure, least_told, opened, polished, sized, with_rest
+from .joint import Joint, least_sure, opened, polished, sized, with_rest
 from .layout import describe_folds
 from .naming import (
     Standing,
@@ -468,13 +468,10 @@ def _answered(
             gaining = gaining._replace(joint=as_weighed_otherwise(here, searched.here.problem, gaining.joint))
         by_speed = by_speed if len(first) == len(named) else together(searched.here, named)
         first, moving = named, as_weighed_in_motion(searched.here, by_speed) if named else by_speed
-        least, by = least_sure(named, moving), moving
-        if least is None and searched.strict and named:
-            by = _beside_rest(here, named, gaining.joint)
-            least = least_told(by)
+        least = least_sure(named, moving)
         if least is None:
             return here, gaining._replace(named=opened(named, gaining.joint, forbid)), by_speed, against
-        against[named[least].name] = f"its size is not surely above zero: {_told_size(by, least, here)}"
+        against[named[least].name] = f"its size is not surely above zero: {_told_size(moving, least, here)}"
         named = [f for f in named if f is not named[least]]
         joint = together(here, named)
 

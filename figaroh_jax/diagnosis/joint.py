@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -27,7 +27,6 @@ __all__ = [
     "has_size",
     "joint_fit",
     "least_sure",
-    "least_told",
     "moved",
     "opened",
     "polished",
@@ -337,24 +336,11 @@ def least_sure(found: list[Found], joint: Joint) -> int | None:
     Of a law of the speed whose shape is open the amplitude is judged at that shape: the same friction comes of many
     pairs of strength and exponent, none of them surely, and of no strength at none. So it is with friction that fades.
     """
-    return _least(joint, lambda effect: True)
-
-
-def least_told(joint: Joint) -> int | None:
-    """The same by the answer's intervals, which count what is left at the causes' joints, of what need not be there.
-
-    Friction over speed and load and rotors are excepted: every joint has them, so where a rest leaves open how large
-    they are, it does not say that they are not there.
-    """
-    return _least(joint, lambda effect: not (effect.in_rollouts.usual or effect.dissipative or effect.speed_law))
-
-
-def _least(joint: Joint, asked: Callable[[Effect], bool]) -> int | None:
     shares = []
     for effect, place in zip(joint.causes, joint.fitted.places, strict=True):
         own = _amplitudes(effect) if kind(effect) == "columns" else list(range(len(place)))
         given = _shape_places(effect, place) if effect.speed_law or effect.fades else ()
-        shares.append(_beyond_zero(effect, joint.fitted, place, own, given) if own and asked(effect) else np.inf)
+        shares.append(_beyond_zero(effect, joint.fitted, place, own, given) if own else np.inf)
     least = int(np.argmin(shares)) if shares else 0
     return least if shares and shares[least] <= 1 else None
 

@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..results import Cause, Diagnosis, Estimate, Name, Nearest, Part
+from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, Name, Nearest, Part
 from .rollout_effects import ROLLOUT_EFFECTS
 
 if TYPE_CHECKING:
@@ -216,7 +216,7 @@ def interval(estimate: Estimate) -> str:
         return "not determined by this data"
     if not (math.isfinite(half) and half > 0.0):
         return _with_unit(number(estimate.value), estimate.unit)
-    if estimate.value - half < estimate.least:
+    if isinstance(estimate, BoundedEstimate) and estimate.value - half < estimate.least:
         ends = f"{number(estimate.least)} to {number(estimate.value + half, 2)}"
         return _with_unit(f"{number(estimate.value, 2)} ({ends})", estimate.unit)
     power = math.floor(math.log10(half))

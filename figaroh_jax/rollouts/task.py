@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..formats.config import robot_options
 from ..formats.files import USD
 from ..recordings.dataset import Recording, read_recordings
-from ..results import Cause, Diagnosis, Estimate, Experiment, Gain, Name, Rest, Trace, Verdict
+from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, Experiment, Gain, Name, Rest, Trace, Verdict
 from .alone import separable
 from .arm import search_arm
 from .causes import BASELINE
@@ -311,7 +311,7 @@ def _cause(one: Named, found: Search, here: Setting) -> Cause:
             name, value, error, unit = "rest", -value / stiffness, error / abs(stiffness), "rad"
         value -= one.candidate.kind.neutral
         bound = possible(structure.table[entry].name) if name != "rest" else -np.inf
-        parameters[name] = Estimate(value, error, unit, bound - one.candidate.kind.neutral)
+        parameters[name] = BoundedEstimate(value, error, unit, bound - one.candidate.kind.neutral)
     first = structure.table[one.candidate.entries[0]]
     if first.name == "pair_inertia" and here.loop.pairs is not None:
         parameters["sign"] = Estimate(float(here.loop.pairs.at[first.at[0]][2]), 0.0, "")
