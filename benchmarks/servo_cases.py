@@ -4,7 +4,8 @@
 
 Each case is made by MuJoCo C (`tests/generators/servo_arm.py`, no code shared with the library) and diagnosed with
 a model whose armature, damping and frictionloss are 1.6 times too large. `--forbid` leaves the true effect out of the
-catalogue: the answer must be `unknown` then. One line a run; a table at the end.
+catalogue, and what is the same torque in this arm: the answer must be `unknown` then. One line a run; a table at the
+end.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ EFFECT = {
     "encoder_offset": {"reading": 0.03},
     "payload": {"payload": 0.3},
 }
+# Left out with the true effect: beside a constant torque a tilt of one joint's gravity is an offset of its encoder.
+EQUIVALENT = {"encoder_offset": ("gravity_tilt",)}
 
 
 def run(case: str, seed: int, *, forbid: bool) -> tuple[str, Search, float]:
@@ -45,7 +48,7 @@ def run(case: str, seed: int, *, forbid: bool) -> tuple[str, Search, float]:
         file.flush()
         loop, _ = load_loop(file.name)
     start = time.process_time()
-    left_out = (case,) if forbid else ()
+    left_out = (case, *EQUIVALENT.get(case, ())) if forbid else ()
     t, u, q, dq = (recording[k] for k in ("t", "u", "q", "dq"))
     here = setting(loop, [Run(case, t, u, q, dq)], forbid=left_out)
     found = search(here, forbid=left_out)
