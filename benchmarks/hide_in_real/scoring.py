@@ -27,6 +27,8 @@ def score(cases: dict[str, Case], out: Path, modes: Iterable[str]) -> str:
             own = [r for r in rows if r["mode"] == mode and r["visible"] is shown]
             if own:
                 lines += ["", f"{mode}, {title}:", *_table(own, TITLE[mode] | {"failed": "failed"})]
+            if own and shown and mode == "named":
+                lines += ["", "by what the robot leaves of its own:", *_beside_rest(own)]
     return "\n".join([*lines, "", *_detail(rows)])
 
 
@@ -46,12 +48,32 @@ def _rows(name: str, case: Case, out: Path, modes: Iterable[str]) -> list[dict[s
             | {"grade": graded.grade, "new": graded.new, "false": graded.false, "size_errors": graded.sizes}
             | {
                 "borne_out": case.get("oracle", {}).get("sure"),
+                "beside_rest": _over_rest(case, twin),
                 "inside": graded.inside,
                 "verdict": answer["verdict"] if answer else None,
                 "cpu_s": ran["cpu_s"],
             }
         )
     return found
+
+
+def _over_rest(case: Case, twin: dict[str, Any] | None) -> float:
+    """What the baseline cannot take of the effect, over what the twin leaves unexplained at its joints (largest)."""
+    told = (twin or {}).get("rest", {}).get("relative", ())
+    left = dict(zip(case["task"]["robot"].get("joints", ()), told, strict=False))
+    at = [joint for joint in case["truth"][0]["at"] if joint in left]  # a link or the whole robot: any joint
+    own = max([left[joint] for joint in at or left], default=np.nan)
+    return case["size"] * case["left"] ** 0.5 / max(own, 1e-6)
+
+
+def _beside_rest(rows: list[dict[str, Any]]) -> list[str]:
+    """Markdown: how many are right, by how large they are beside what the untouched robot leaves unexplained there."""
+    lines = ["| effect over the twin's rest | cases | right, also with another |", "|---|---|---|"]
+    for low, high, title in ((2, np.inf, "more than 2"), (1, 2, "1 to 2"), (0, 1, "below 1")):
+        own = [r for r in rows if low <= r["beside_rest"] < high]
+        right = sum(r["grade"] in ("right", "more") for r in own)
+        lines.append(f"| {title} | {len(own)} | {right}{f' ({100 * right / len(own):.0f} %)' if own else ''} |")
+    return lines
 
 
 def _table(rows: list[dict[str, Any]], titles: dict[str, str]) -> list[str]:
