@@ -49,7 +49,7 @@ class Estimate(NamedTuple):
 class BoundedEstimate(Estimate):
     """An estimate of what cannot be below `least`: its interval is told as cut there."""
 
-    least: float
+    least: float = float("-inf")
 
     def __new__(cls, value: float, std: float, unit: str, least: float = float("-inf")) -> BoundedEstimate:
         one = super().__new__(cls, value, std, unit)

@@ -15,6 +15,7 @@ TITLE = {  # what a grade is called where the truth may be named, and where it i
     "named": {"right": "right", "more": "right + another", "set": "in the set", "wrong": "wrong", "silent": "silent"},
     "forbidden": {"silent": "no new name", "wrong": "a new name"},
 }
+NEVER = "never came near"  # of an effect of which the answer says nothing
 
 
 def score(cases: dict[str, Case], out: Path, modes: Iterable[str]) -> str:
@@ -49,6 +50,7 @@ def _rows(name: str, case: Case, out: Path, modes: Iterable[str]) -> list[dict[s
             | {
                 "borne_out": case.get("oracle", {}).get("sure"),
                 "beside_rest": _over_rest(case, twin),
+                "why_not": _why_not(case, answer),
                 "inside": graded.inside,
                 "verdict": answer["verdict"] if answer else None,
                 "cpu_s": ran["cpu_s"],
@@ -66,6 +68,14 @@ def _over_rest(case: Case, twin: dict[str, Any] | None) -> float:
     return case["size"] * case["left"] ** 0.5 / max(own, 1e-6)
 
 
+def _why_not(case: Case, answer: dict[str, Any] | None) -> str:
+    """Why the tool does not name the effect, in its words; that it never came near where it says nothing of it."""
+    truth = case["truth"][0]
+    near = (answer or {}).get("rest", {}).get("nearest", ())
+    told = [one["why_not"] for one in near if (one["effect"], one["at"]) == (truth["effect"], truth["at"])]
+    return told[0] if told else NEVER
+
+
 def _beside_rest(rows: list[dict[str, Any]]) -> list[str]:
     """Markdown: how many are right, by how large they are beside what the untouched robot leaves unexplained there."""
     lines = ["| effect over the twin's rest | cases | right, also with another |", "|---|---|---|"]
@@ -73,7 +83,10 @@ def _beside_rest(rows: list[dict[str, Any]]) -> list[str]:
         own = [r for r in rows if low <= r["beside_rest"] < high]
         right = sum(r["grade"] in ("right", "more") for r in own)
         lines.append(f"| {title} | {len(own)} | {right}{f' ({100 * right / len(own):.0f} %)' if own else ''} |")
-    return lines
+    unknown = sum(np.isnan(r["beside_rest"]) for r in rows)
+    lines += [f"| the tool tells no rest | {unknown} | |"] * bool(unknown)
+    silent = [r for r in rows if r["grade"] == "silent"]
+    return [*lines, "", f"of {len(silent)} silent ones {sum(r['why_not'] == NEVER for r in silent)} {NEVER}"]
 
 
 def _table(rows: list[dict[str, Any]], titles: dict[str, str]) -> list[str]:
@@ -112,5 +125,6 @@ def _detail(rows: list[dict[str, Any]]) -> list[str]:
             f"{r['case']:<48} {r['mode']:<9} {'visible ' if r['visible'] else 'absorbed'} {shown:<18} "
             f"{borne:<13} {r['grade']:<7} {r['verdict'] or '-':<10} new: {new or '-'}"
             + (f"   size off by {size}" if size else "")
+            + (f"   {r['why_not']}" if r["mode"] == "named" and r["grade"] == "silent" else "")
         )
     return lines

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
 
 from ..compiled.memory import give_back_holes
 from ..effects.base import place
@@ -33,25 +32,15 @@ from .experiment import next_experiment
 from .explain import explain
 from .flexible import flexible_p
 from .floor import foretold, noise_rms, short, sober_spectrum, told_too_large, undecided
-from .gaining import Fall, Gaining, beside_all, foretells, predicts_better, without_losses
+from .gaining import Gaining, beside_all, predicts_better, without_losses
 from .gates import physical_sign
 from .holdout import residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_rest
+from .judgement import KeptOut, Left, Searched, as_slow_noise, doubted_rest, reasons_against, standings_of, sticks_alone
 from .layout import describe_folds
-from .naming import (
-    Standing,
-    behind_joints,
-    beside_rest,
-    beyond_simpler,
-    of_its_own,
-    reason_against,
-    standings,
-    stands_alone,
-    strong,
-)
+from .naming import beyond_simpler, strong
 from .reading import Reader, only_read
 from .rest import (
-    Significance,
     beyond_noise,
     excess,
     lines,
@@ -67,9 +56,9 @@ from .rest import (
 from .screening import noise_squares
 from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without
 from .setting import Setting, prepared_signals, setting_of
-from .standstill import left_moving, left_weighed, only_sticks, resting
+from .standstill import left_moving, resting
 from .step import Step, stand, with_causes
-from .thresholds import ALL_BUT, ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, LINE_P, NO_REST, REST_P, SURE_DROP
+from .thresholds import ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, LINE_P, NO_REST, REST_P
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess, Task
@@ -129,33 +118,6 @@ def diagnose(
         return replace(_answer(searched.here, signals, searched.search, judged), slowed=slowed)
 
 
-class _Left(NamedTuple):
-    """What all causes together leave, and whether it is more than noise."""
-
-    rest: Significance
-    p_value: float  # of the whole catalogue on it
-    excess: float  # over the noise
-    line: tuple[float, float, int]  # the strongest in its spectrum
-    more: Float[np.ndarray, " nv"]  # squares by which smooth functions of each joint find more in it than chance gives
-    beyond: Float[np.ndarray, " nv"]  # each joint's squares, moving, beyond those of noise, where they surely are
-    misfit: Bool[np.ndarray, " nv"]  # whether, without any cause, they are, or are more than is tolerable
-    followed: Float[np.ndarray, " nv"]  # `more` where such functions surely predict what was not fitted, else zero
-    moved: Bool[np.ndarray, " nv"]  # `misfit` of the rows in which the joint moves
-
-
-class _Searched(NamedTuple):
-    """What a search has found, all of it in one fit, and what that leaves."""
-
-    before: Setting  # as it was set out with
-    here: Setting  # with the width of friction that the causes leave
-    search: Search
-    found: list[Found]
-    joint: Joint
-    left: _Left
-    strict: bool  # whether a rest stays, beside which a cause must show more to be named
-    fading: tuple[Name, ...] = ()  # causes that were there and are gone in recordings kept out
-
-
 class _Judged(NamedTuple):
     """What the diagnosis stands by."""
 
@@ -174,7 +136,7 @@ def _searched(
     tolerance: float,
     progress: Callable[[str, float], None],
     generator: np.random.Generator,
-) -> _Searched:
+) -> Searched:
     """The causes that the data show; where a rest stays, without the laws of one joint that any rest looks like.
 
     Beside a rest those (`Effect.beside_rest`) are not named, and take the place of causes that could be: the search is
@@ -184,7 +146,7 @@ def _searched(
     found, that is known before they are in one fit.
     """
 
-    def ended(before: Setting, search: Search) -> _Searched:
+    def ended(before: Setting, search: Search) -> Searched:
         here = before._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
         found, joint = _told_apart(here, *_fitted_together(here, search.found, forbid, tolerance))
@@ -194,7 +156,7 @@ def _searched(
             found, joint = kept, together(here, kept)
             left = _left(here, search, found, joint, forbid, tolerance, generator)
             strict = left.rest.there or left.excess > NO_REST
-        return _Searched(before, here, search, found, joint, left, strict)
+        return Searched(before, here, search, found, joint, left, strict)
 
     like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
 
@@ -294,7 +256,7 @@ def _simple(here: Setting, found: list[Found], joint: Joint, forbid: Sequence[st
 
 
 def _judged(
-    searched: _Searched,
+    searched: Searched,
     reader: Reader,
     forbid: Sequence[str],
     tolerance: float,
@@ -307,12 +269,12 @@ def _judged(
     """
     before, here, _, found, joint, left, *_ = searched
     problem, whitening = here.problem, here.whitening
-    each = _standings(searched)
-    kept_out = _KeptOut(searched, {one.name: one.gain for one in each})
-    doubted = _doubted(searched, forbid, generator)
-    against = _reasons(searched, each, kept_out, doubted, tolerance)
+    each = standings_of(searched)
+    kept_out = KeptOut(searched, {one.name: one.gain for one in each})
+    doubted = doubted_rest(searched, forbid, generator)
+    against = reasons_against(searched, each, kept_out, doubted, tolerance)
     named = [f for f in found if not against[f.name]]
-    if named and (chance := _as_slow_noise(searched, named, forbid, generator)) is not None:
+    if named and (chance := as_slow_noise(searched, named, forbid, generator)) is not None:
         against |= {f.name: f"noise as slow as the motion scores as much by chance (p = {chance:.2g})" for f in named}
         named = []
     settings = [here] if before.problem is here.problem else [here, before]
@@ -331,7 +293,7 @@ def _judged(
         shown = chance_beside(problem, joint.step, sober, here.whitening, forbid, generator) < REST_P
     law = any(strong(one) and against[one.name] for one in each)  # it moves, whatever it is
     sticks = (shown or (large and not named)) and not law
-    sticks = sticks and (_sticks(here, joint, tolerance) or _sticks(searched.here, by_speed, tolerance))
+    sticks = sticks and (sticks_alone(here, joint, tolerance) or sticks_alone(searched.here, by_speed, tolerance))
     rest, read = shown and not sticks, False
     if rest and not named and left.line[0] >= LINE_P:  # a line is none of what reading a motion leaves
         errors = reader.errors(problem, joint.step.state, generator)
@@ -352,96 +314,8 @@ def _judged(
     return _Judged(verdict(bool(named), rest), gaining, told_rest, sticks, here, more)
 
 
-class _KeptOut:
-    """What recordings kept out say of single causes beside all that was found; each answer costs a fit, made once."""
-
-    def __init__(self, searched: _Searched, claims: Mapping[Name, float]) -> None:
-        self.searched, self.claims = searched, claims
-        self.falls: dict[Name, Fall] = {}
-
-    def borne_out(self, name: Name) -> bool:
-        """Whether they surely show the cause, which may have no name alone."""
-        return self.fall(name).surely(self.claims[name])
-
-    def certain(self, name: Name) -> bool:
-        """Whether they show it beyond doubt; never where nothing is kept out."""
-        return bool(self.searched.here.problem.held.any()) and self.fall(name).certainly(self.claims[name])
-
-    def fall(self, name: Name) -> Fall:
-        if name not in self.falls:
-            here, found, step = self.searched.here, self.searched.found, self.searched.joint.step
-            one = next(f for f in found if f.name == name)
-            self.falls[name] = beside_all(here.problem, here.start, here.whitening, found, step, one)
-        return self.falls[name]
-
-
-def _standings(searched: _Searched) -> list[Standing]:
-    """What the data say of each cause, with what is left at its joints."""
-    _, here, _, found, joint, left, *_ = searched
-    each = standings(here.problem, here.start, found, joint, here.whitening)
-    return [
-        replace(
-            one,
-            complete=bool(left.more[list(f.joints)].max() <= ALL_BUT * (f.cost[0] - f.cost[1])),
-            leaves=of_its_own(left.beyond, f.joints, one.taken),
-            alone=stands_alone(left.misfit, f.joints),
-            followed=of_its_own(left.followed, f.joints, one.taken),
-            unmoved=stands_alone(left.moved, f.joints),
-        )
-        for one, f in zip(each, found, strict=True)
-    ]
-
-
-def _doubted(searched: _Searched, forbid: Sequence[str], generator: np.random.Generator) -> bool:
-    """Whether the catalogue still scores more than noise on what is left, though nothing in it passes."""
-    here, step, left = searched.here, searched.joint.step, searched.left
-    problem, whitening = here.problem, here.whitening
-    doubted = left.p_value < REST_P
-    if not doubted or left.rest.there or not short(problem, step.state):
-        return doubted
-    sober = sober_spectrum(problem, step.state, forbid)
-    if foretells(problem, stand(problem, here.start, whitening), step, sober):
-        return True
-    return chance_beside(problem, step, sober, whitening, forbid, generator) < REST_P
-
-
-def _reasons(
-    searched: _Searched, each: Sequence[Standing], kept_out: _KeptOut, doubted: bool, tolerance: float
-) -> dict[Name, str]:
-    """Why each cause that was found is not named; empty where it is."""
-    here, found, joint, strict = searched.here, searched.found, searched.joint, searched.strict
-    noise = noise_rms(here.problem, here.spectrum)
-    beyond = relative_rest(here.problem, joint.step.state, noise)
-    if found and doubted and float(beyond.max()) > tolerance:  # a rest of the answer is one for its names
-        strict = strict or not _sticks(here, joint, tolerance)
-    weighed = left_weighed(here.problem, joint.step.state, noise)  # rows at reversals say nothing of a law
-    rests = beside_rest(each, [f.joints for f in found], strict, np.minimum(beyond, weighed), tolerance)
-    asked = (tolerance, kept_out.certain, searched.fading)
-    against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
-    return against | behind_joints([one for one, rest in zip(each, rests, strict=True) if rest], against)
-
-
-def _as_slow_noise(
-    searched: _Searched, named: list[Found], forbid: Sequence[str], generator: np.random.Generator
-) -> float | None:
-    """How often noise as slow as the motion scores as much as the catalogue does, where the named causes may be that.
-
-    None where they are not: repeats tell noise apart, much is removed, such noise seldom does as much, or recordings
-    kept out surely want the causes, for the noise of one recording says nothing of another.
-    """
-    here, joint = searched.here, searched.joint
-    problem, whitening = here.problem, here.whitening
-    if problem.layout.repeats or max(f.cost[0] - f.cost[1] for f in named) >= SURE_DROP:
-        return None
-    sober, bare = sober_spectrum(problem, joint.step.state, forbid), stand(problem, here.start, whitening)
-    chance = chance_beside(problem, bare, sober, whitening, forbid, generator)
-    if chance < REST_P or foretells(problem, bare, together(here, named).step, sober):
-        return None
-    return chance
-
-
 def _answered(
-    searched: _Searched,
+    searched: Searched,
     settings: Sequence[Setting],
     named: list[Found],
     borne_out: Callable[[Name], bool],
@@ -491,15 +365,6 @@ def _told_size(joint: Joint, which: int, here: Setting) -> str:
     return ", ".join(f"{name} {value:.3g} +- {half:.2g} {unit}".rstrip() for name, value, half, unit in sizes)
 
 
-def _sticks(here: Setting, joint: Joint, tolerance: float) -> bool:
-    """Whether what is left beside the causes of a fit is that of joints at rest.
-
-    A fit that is also asked for slow rows gives part of their sticks to the friction of the joints that move.
-    """
-    state, noise = joint.step.state, noise_rms(here.problem, here.spectrum)
-    return only_sticks(here.problem, state, noise, relative_rest(here.problem, state, noise), tolerance)
-
-
 def _left(
     here: Setting,
     search: Search,
@@ -508,7 +373,7 @@ def _left(
     forbid: Sequence[str],
     tolerance: float,
     generator: np.random.Generator,
-) -> _Left:
+) -> Left:
     """What all causes together leave."""
     problem, start, spectrum, whitening, _ = here
     first = stand(problem, start, whitening)
@@ -547,7 +412,7 @@ def _left(
     misfit = (alone > 0) | (relative_rest(problem, first.state, noise) > tolerance)
     followed = flexible.each * (predicted and flexible.p < REST_P)
     moved = (alone > 0) | (left_moving(problem, first.state, noise) > tolerance)
-    return _Left(left._replace(there=there), p_left, now[0], line, flexible.each, beyond, misfit, followed, moved)
+    return Left(left._replace(there=there), p_left, now[0], line, flexible.each, beyond, misfit, followed, moved)
 
 
 def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:

@@ -135,21 +135,31 @@ def _searched(
         now, spread = alike_by_recording(here, now)
         steps.append(("recordings that are equally informative", _level(here, now.model.fit)))
     doubtful = list[tuple[Name, float, str]]()
-    while slight is None and _verdict(here, now, found) in ("named", "named+rest"):
-        gone = least_sure([n.candidate for n in found], now.model.structure, now.model.fit, spread)
-        if gone is None:
-            break
-        (one,) = (n for n in found if n.candidate is gone)
-        why = why_nothing(gone, now.model.structure, now.model.fit, spread)
-        doubtful.append((Name(gone.effect, gone.at), max(one.gain, 0.0), why))
-        found, now, spread = _without(here, now, [n for n in found if n is not one], gone, even, forbid)
-        steps.append((f"without {doubtful[-1][0]}", _level(here, now.model.fit)))
+    while slight is None and (less := _of_sure_size(here, now, found, spread, even, forbid)) is not None:
+        gone, found, now, spread = less
+        doubtful.append(gone)
+        steps.append((f"without {gone[0]}", _level(here, now.model.fit)))
         held.append(rms_of(here, now.held))
     result = Search(
         "nothing", found, now.model.structure, first, now.model.fit, p_value, [], nearest, steps, held, fits,
         begin.model.structure, here, [*wrong, *resting], spread, doubtful,
     )  # fmt: skip
     return _judged(here, result, now, slight)
+
+
+def _of_sure_size(
+    here: Setting, now: Standing, found: list[Named], spread: np.ndarray | None, even: bool, forbid: Sequence[str]
+) -> tuple[tuple[Name, float, str], list[Named], Standing, np.ndarray | None] | None:
+    """What is told of the least sure cause whose told interval holds no effect, and the model without it; else None."""
+    if _verdict(here, now, found) not in ("named", "named+rest"):
+        return None
+    gone = least_sure([n.candidate for n in found], now.model.structure, now.model.fit, spread)
+    if gone is None:
+        return None
+    (one,) = (n for n in found if n.candidate is gone)
+    why = why_nothing(gone, now.model.structure, now.model.fit, spread)
+    told = Name(gone.effect, gone.at), max(one.gain, 0.0), why
+    return told, *_without(here, now, [n for n in found if n is not one], gone, even, forbid)
 
 
 def _without(

@@ -1,0 +1,158 @@
+"""Why each cause that a search has found is named, or is not: what left-out and kept-out data, noise and a rest say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..results import Name
+from .answer_fit import together
+from .floor import noise_rms, short, sober_spectrum
+from .gaining import Fall, beside_all, foretells
+from .joint import Joint
+from .naming import Standing, behind_joints, beside_rest, of_its_own, reason_against, standings, stands_alone
+from .rest import Significance, relative_rest
+from .search import Found, Search, chance_beside
+from .setting import Setting
+from .standstill import left_weighed, only_sticks
+from .step import stand
+from .thresholds import ALL_BUT, REST_P, SURE_DROP
+
+__all__ = [
+    "KeptOut",
+    "Left",
+    "Searched",
+    "as_slow_noise",
+    "doubted_rest",
+    "reasons_against",
+    "standings_of",
+    "sticks_alone",
+]
+
+
+class Left(NamedTuple):
+    """What all causes together leave, and whether it is more than noise."""
+
+    rest: Significance
+    p_value: float  # of the whole catalogue on it
+    excess: float  # over the noise
+    line: tuple[float, float, int]  # the strongest in its spectrum
+    more: Float[np.ndarray, " nv"]  # squares by which smooth functions of each joint find more in it than chance gives
+    beyond: Float[np.ndarray, " nv"]  # each joint's squares, moving, beyond those of noise, where they surely are
+    misfit: Bool[np.ndarray, " nv"]  # whether, without any cause, they are, or are more than is tolerable
+    followed: Float[np.ndarray, " nv"]  # `more` where such functions surely predict what was not fitted, else zero
+    moved: Bool[np.ndarray, " nv"]  # `misfit` of the rows in which the joint moves
+
+
+class Searched(NamedTuple):
+    """What a search has found, all of it in one fit, and what that leaves."""
+
+    before: Setting  # as it was set out with
+    here: Setting  # with the width of friction that the causes leave
+    search: Search
+    found: list[Found]
+    joint: Joint
+    left: Left
+    strict: bool  # whether a rest stays, beside which a cause must show more to be named
+    fading: tuple[Name, ...] = ()  # causes that were there and are gone in recordings kept out
+
+
+class KeptOut:
+    """What recordings kept out say of single causes beside all that was found; each answer costs a fit, made once."""
+
+    def __init__(self, searched: Searched, claims: Mapping[Name, float]) -> None:
+        self.searched, self.claims = searched, claims
+        self.falls: dict[Name, Fall] = {}
+
+    def borne_out(self, name: Name) -> bool:
+        """Whether they surely show the cause, which may have no name alone."""
+        return self.fall(name).surely(self.claims[name])
+
+    def certain(self, name: Name) -> bool:
+        """Whether they show it beyond doubt; never where nothing is kept out."""
+        return bool(self.searched.here.problem.held.any()) and self.fall(name).certainly(self.claims[name])
+
+    def fall(self, name: Name) -> Fall:
+        if name not in self.falls:
+            here, found, step = self.searched.here, self.searched.found, self.searched.joint.step
+            one = next(f for f in found if f.name == name)
+            self.falls[name] = beside_all(here.problem, here.start, here.whitening, found, step, one)
+        return self.falls[name]
+
+
+def standings_of(searched: Searched) -> list[Standing]:
+    """What the data say of each cause, with what is left at its joints."""
+    _, here, _, found, joint, left, *_ = searched
+    each = standings(here.problem, here.start, found, joint, here.whitening)
+    return [
+        replace(
+            one,
+            complete=bool(left.more[list(f.joints)].max() <= ALL_BUT * (f.cost[0] - f.cost[1])),
+            leaves=of_its_own(left.beyond, f.joints, one.taken),
+            alone=stands_alone(left.misfit, f.joints),
+            followed=of_its_own(left.followed, f.joints, one.taken),
+            unmoved=stands_alone(left.moved, f.joints),
+        )
+        for one, f in zip(each, found, strict=True)
+    ]
+
+
+def doubted_rest(searched: Searched, forbid: Sequence[str], generator: np.random.Generator) -> bool:
+    """Whether the catalogue still scores more than noise on what is left, though nothing in it passes."""
+    here, step, left = searched.here, searched.joint.step, searched.left
+    problem, whitening = here.problem, here.whitening
+    doubted = left.p_value < REST_P
+    if not doubted or left.rest.there or not short(problem, step.state):
+        return doubted
+    sober = sober_spectrum(problem, step.state, forbid)
+    if foretells(problem, stand(problem, here.start, whitening), step, sober):
+        return True
+    return chance_beside(problem, step, sober, whitening, forbid, generator) < REST_P
+
+
+def reasons_against(
+    searched: Searched, each: Sequence[Standing], kept_out: KeptOut, doubted: bool, tolerance: float
+) -> dict[Name, str]:
+    """Why each cause that was found is not named; empty where it is."""
+    here, found, joint, strict = searched.here, searched.found, searched.joint, searched.strict
+    noise = noise_rms(here.problem, here.spectrum)
+    beyond = relative_rest(here.problem, joint.step.state, noise)
+    if found and doubted and float(beyond.max()) > tolerance:  # a rest of the answer is one for its names
+        strict = strict or not sticks_alone(here, joint, tolerance)
+    weighed = left_weighed(here.problem, joint.step.state, noise)  # rows at reversals say nothing of a law
+    rests = beside_rest(each, [f.joints for f in found], strict, np.minimum(beyond, weighed), tolerance)
+    asked = (tolerance, kept_out.certain, searched.fading)
+    against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
+    return against | behind_joints([one for one, rest in zip(each, rests, strict=True) if rest], against)
+
+
+def as_slow_noise(
+    searched: Searched, named: list[Found], forbid: Sequence[str], generator: np.random.Generator
+) -> float | None:
+    """How often noise as slow as the motion scores as much as the catalogue does, where the named causes may be that.
+
+    None where they are not: repeats tell noise apart, much is removed, such noise seldom does as much, or recordings
+    kept out surely want the causes, for the noise of one recording says nothing of another.
+    """
+    here, joint = searched.here, searched.joint
+    problem, whitening = here.problem, here.whitening
+    if problem.layout.repeats or max(f.cost[0] - f.cost[1] for f in named) >= SURE_DROP:
+        return None
+    sober, bare = sober_spectrum(problem, joint.step.state, forbid), stand(problem, here.start, whitening)
+    chance = chance_beside(problem, bare, sober, whitening, forbid, generator)
+    if chance < REST_P or foretells(problem, bare, together(here, named).step, sober):
+        return None
+    return chance
+
+
+def sticks_alone(here: Setting, joint: Joint, tolerance: float) -> bool:
+    """Whether what is left beside the causes of a fit is that of joints at rest.
+
+    A fit that is also asked for slow rows gives part of their sticks to the friction of the joints that move.
+    """
+    state, noise = joint.step.state, noise_rms(here.problem, here.spectrum)
+    return only_sticks(here.problem, state, noise, relative_rest(here.problem, state, noise), tolerance)
