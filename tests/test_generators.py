@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -22,6 +23,7 @@ from generators import (
     observable,
     robots,
     scene,
+    servo_arm,
 )
 from generators.laws import FAMILIES
 from generators.motion import TRACKING
@@ -309,3 +311,24 @@ def test_answers_are_judged_by_name_place_and_set(answer: SimpleNamespace, grade
 
 def test_bound_of_no_failure_in_thirty_is_that_of_the_books():
     assert upper_bound(0, 30) == pytest.approx(1 - 0.05 ** (1 / 30), abs=1e-9)  # Clopper and Pearson 1934
+
+
+def test_an_encoder_offset_of_one_joint_is_a_constant_torque_and_a_tilt():
+    """Why `benchmarks/servo_cases.py --forbid` leaves out both: what the encoder reads is the same, in MuJoCo C."""
+    offset, stiffness = 0.03, 60.0
+    _, command = servo_arm.command()
+
+    def read(start: float, reading: float, torque: float, tilt: float) -> np.ndarray:
+        model = mujoco.MjModel.from_xml_string(servo_arm.model_text())
+        data = mujoco.MjData(model)
+        model.opt.gravity[:] = -9.81 * np.sin(tilt), 0.0, -9.81 * np.cos(tilt)
+        data.qpos[0], data.qfrc_applied[0], told = start, torque, []
+        for wanted in command[:2000]:
+            told.append(data.qpos[0] + reading)
+            data.ctrl[0] = wanted
+            mujoco.mj_step(model, data)
+        return np.array(told)
+
+    truth = read(0.0, offset, 0.0, 0.0)
+    np.testing.assert_allclose(read(offset, 0.0, stiffness * offset, offset), truth, rtol=0, atol=1e-12)
+    assert np.abs(read(offset, 0.0, stiffness * offset, 0.0) - truth).max() > 1e-3  # the torque alone is another
