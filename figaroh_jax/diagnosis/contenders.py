@@ -27,7 +27,7 @@ from .state import State, extended_state, link_motion, solved
 from .step import Step, stand
 from .thresholds import BEST_OF_A_PLACE, GAIN, SHARE_OF_BEST, SHIFTS, SHORTLIST
 
-__all__ = ["Contender", "acting", "contend", "for_refit", "shortlist"]
+__all__ = ["Contender", "acting", "contend", "for_refit", "next_shape", "shortlist"]
 
 TURNS, RESPONSE_TURNS = 3, 6  # of Gauss-Newton on a shift of the position; on a response of the torque
 SMALL = 1e-5  # step of a derivative, relative
@@ -129,6 +129,22 @@ def contend(
         effect = with_shape(effect, names, list(verdicts.theta[-len(names) :]))
     free = None if effect.inertial else free
     return Contender(group.name, effect, verdicts, acting(effect, len(step.rows.y), group.columns.joints), free)
+
+
+def next_shape(group: Group, best: Contender) -> np.ndarray:
+    """The grid point that explains most of what the best one leaves, where that could pass for a gain; or none.
+
+    A ripple so slow that the motion shows it no better than any smooth law may lie over one of many periods, which is
+    another cause.
+    """
+    joints, grid = list(group.columns.joints), len(group.columns.Z)
+    if grid < 2 or kind(group.effect) != "columns":
+        return np.zeros(0, int)
+    Z, rest = group.columns.Z.reshape(grid, -1, best.verdicts.residual[joints].size), best.verdicts.residual[joints]
+    pull, inverse = Z @ rest.ravel(), np.linalg.pinv(Z @ np.swapaxes(Z, 1, 2), hermitian=True)
+    explained = np.einsum("gk,gkl,gl->g", pull, inverse, pull)
+    least = max(0.5 * GAIN * (rest**2).sum(), Z.shape[1] * np.log(rest.size) + 2 * np.log(grid))
+    return np.argsort(-explained)[: int(explained.max() > least)]
 
 
 def _to_first_order(step: Step, base: Ground, group: Group, point: int) -> Contender:

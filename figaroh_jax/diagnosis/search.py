@@ -16,7 +16,7 @@ from ..estimation.rows import Prior
 from ..results import Name
 from .believed import believed
 from .comparison import Hypothesis, Verdicts, fewer_sums, ground, judge, overlap, shares_of_wins, t_value
-from .contenders import Contender, acting, contend, for_refit, shortlist
+from .contenders import Contender, acting, contend, for_refit, next_shape, shortlist
 from .design import kind
 from .estimates import amplitude_places, with_amplitudes
 from .evidence import block_scores
@@ -224,6 +224,8 @@ def _contenders(
         if share <= SHARE_AGAIN * failed.get(group.name, 0.0):
             continue
         one = contend(problem, step, whitening, base, ready, group, order, fitted)
+        if not exists(problem, one.effect) and len(order := next_shape(group, one)):
+            one = contend(problem, step, whitening, base, ready, group, order, fitted)
         if exists(problem, one.effect):
             out.append(one)
         else:

@@ -1,8 +1,8 @@
 """Causes that the joints of an arm share: asked of all of them at once where none shows enough of it by itself.
 
 Joints driven by one kind of servo have the same kinds of friction and rotor. Beside a rest that no model explains, a
-cause at one joint must be large, for a smaller one may make up for what is missing. One that lowers what each of three
-encoders or more shows, in nearly all recordings that were not fitted, and by as much at all of them, need not be.
+cause at one joint must be large, for a smaller one may make up for what is missing. One that surely lowers what each of
+three encoders or more shows need not be, where nearly all recordings that were not fitted bear all of them out.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from .gates import rms_of, standing
 from .screening import LATE, ROUGH, Standing, joint_of
 from .search import Named, Tried, sized, t_of_recordings
 from .setting import Setting, by_recording, free_entries, start_values
-from .thresholds import FEWEST_JOINTS, GAIN, HOPEFUL, T_BESIDE_REST
+from .thresholds import CONFIDENT, FEWEST_JOINTS, GAIN, HOPEFUL, T_BESIDE_REST
 
 __all__ = ["at_all_joints"]
 
@@ -97,7 +97,8 @@ def _borne_out(here: Setting, now: Standing, ones: Sequence[Candidate], begin: F
             gains[c] = min(1 - x[..., j].sum() / max(y[..., j].sum(), 1e-300)
                            for x, y in ((new.held, before), (new.squares, now.squares)))  # fmt: skip
             ts[c] = t_of_recordings(before[..., j], new.held[..., j], runs)
-        good = [c for c in ones if gains[c] > GAIN and ts[c] > 0 and sized(here, Tried(c, new.model, new.squares))]
+        sure = [c for c in ones if gains[c] > GAIN and ts[c] > CONFIDENT]
+        good = [c for c in sure if sized(here, Tried(c, new.model, new.squares))]
         if len(good) < FEWEST_JOINTS:
             return [], now
         if len(good) == len(ones):
