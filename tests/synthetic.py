@@ -52,6 +52,7 @@ def made_signals(
         torque=np.zeros_like(here) if torque is None else torque,
         dt=DT,
         cutoff=CUTOFF,
+        bands=np.full(here.shape[1], CUTOFF),
         rows=eqx.tree_at(lambda r: r.weight, rows, weight),
         load=None,
         notes=(),

@@ -75,3 +75,22 @@ def test_a_spring_that_a_recording_kept_out_shows_is_no_slow_noise(data_dir: Pat
     found = diagnose_task(load_task(path))
     (spring,) = [c for c in found.causes if c.name.effect == "joint_spring" and c.name.at == ("panda_joint1",)]
     assert spring.parameters["stiffness"].value == pytest.approx(stiffness, rel=0.15)
+
+
+@pytest.mark.slow
+def test_a_ripple_of_many_periods_is_found_beside_a_slow_misfit_of_its_joint(data_dir: Path, tmp_path: Path) -> None:
+    """A KUKA's last joint, where a ripple so slow that the motion shows no period of it explains more."""
+    from benchmarks.hide_in_real.recordings import SETS as REAL
+
+    cases, run = tmp_path / "cases", tmp_path / "run"
+    run.mkdir()
+    order, phase = np.random.default_rng().uniform((18.0, -np.pi), (22.5, np.pi))
+    path = blackbox.write_task(cases, run, twin_of(cases, REAL["kuka"]()))
+    for file in run.glob("*.npz"):
+        with np.load(file) as read:
+            arrays = dict(read)
+        arrays["tau"][:, 6] += 0.2 * np.sin(order * arrays["q"][:, 6] + phase)
+        np.savez(file, **arrays)
+    found = diagnose_task(load_task(path))
+    (ripple,) = [c for c in found.causes if c.name.effect == "torque_ripple" and c.name.at == ("lwr_6_joint",)]
+    assert ripple.parameters["order"].value == pytest.approx(order, abs=0.6)

@@ -80,6 +80,7 @@ class Standing:
     t: float
     t_needed: float  # by the number of blocks
     share: float  # RMS torque over that of the joint, where it is largest
+    acting: float = 0.0  # the same while it acts, of an effect that acts for moments
     static: bool = False  # whether it may be a torque that depends on the posture alone, at a joint or at all of them
     modulation: float = 0.0  # squares that an amplitude which varies gains, over those of the cause
     modulation_held_out: float = 0.0
@@ -172,7 +173,7 @@ def _of_those_beside_rest(
         f"{_VARIES} {one.modulation:.2f} of its gain)",
     )
     yield (
-        one.share >= SHARE_NAMED,
+        max(one.share, one.acting) >= SHARE_NAMED,
         f"its torque is {100 * one.share:.2g} % of the joint's, {100 * SHARE_NAMED:.0f} % needed",
     )
     yield (not one.everywhere, "a law of the whole robot explains as much where it acts, and more is left")
@@ -218,7 +219,7 @@ def strong(one: Standing) -> bool:
 
 def _much(one: Standing) -> bool:
     """Whether it surely takes much of what its joints leave, with much torque."""
-    return one.gain >= GAIN_NAMED and one.share >= SHARE_NAMED and one.t >= one.t_needed
+    return one.gain >= GAIN_NAMED and max(one.share, one.acting) >= SHARE_NAMED and one.t >= one.t_needed
 
 
 def _without_chance(fitted: float, held_out: float) -> float:
@@ -291,7 +292,7 @@ def standings(
         torque = cause_torque(problem, full.state, effect, place)
         varying = _taken(full.state, without) if effect.speed_law else torque
         modulation = _modulation(grown, effect, varying, without, one.joints, whole)
-        share = _share_of_torque(problem, full.state, torque, effect)
+        share, acting = _shares_of_torque(problem, full.state, torque, effect)
         out.append(
             Standing(
                 name=one.name,
@@ -306,6 +307,7 @@ def standings(
                 t=t_value(worse, better),
                 t_needed=t_needed(len(worse), T_NAMED),
                 share=share,
+                acting=acting if effect.abrupt else share,
                 cancels=bool(type(effect).follows_total) and not whole and share > 1,
                 modulation=modulation[0],
                 modulation_held_out=modulation[1],
@@ -388,15 +390,22 @@ def beyond_simpler(problem: Problem, state: State, effect: Effect, place: list[i
     return float(np.sqrt((left**2).sum() / max(float((torque**2).sum()), 1e-300)))
 
 
-def _share_of_torque(problem: Problem, state: State, torque: np.ndarray, effect: Effect) -> float:
+def _shares_of_torque(problem: Problem, state: State, torque: np.ndarray, effect: Effect) -> tuple[float, float]:
+    """RMS torque of a cause over that of the joint, where it is largest: over all rows, and while it acts.
+
+    The latter is the RMS in which each row counts as much as the cause's square there: a play that is crossed for some
+    hundredths of a second is nothing at all other times.
+    """
     response = state.response(problem.records.omega)
     if kind(effect) == "response":
         own = sensor_response({effect.name: batched(effect)}, problem.records.omega)[effect.name][0]
         response = response * (1 - 1 / own)
     fitted = np.asarray(problem.records.judged)
     rows = open_rows(problem.records, torque, response) * fitted
-    size, whole = ((x**2).sum((0, 1)) for x in (rows, problem.torque * fitted))
-    return float(np.sqrt((size / np.maximum(whole, 1e-12 * whole.max())).max()))
+    (size, fourth), whole = ((rows**k).sum((0, 1)) for k in (2, 4)), ((problem.torque * fitted) ** 2).sum((0, 1))
+    own = fitted.sum((0, 1)) * fourth / np.maximum(size, 1e-300)
+    shares = [float(np.sqrt((x / np.maximum(whole, 1e-12 * whole.max())).max())) for x in (size, own)]
+    return shares[0], shares[1]
 
 
 def _modulation(

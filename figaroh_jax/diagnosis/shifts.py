@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from ..effects.base import Effect, Motion, changed
 from ..recordings.rowfilter import low_pass
+from ..recordings.signals import let_through
 from ..recordings.stacked import Records
 from ..rigid.dynamics import torques_on_host
 from ..rigid.model import Leaf, RobotModel
@@ -224,7 +225,7 @@ def _read_beside(effect: Effect, motion: Motion, records: Records) -> Float[np.n
     load = _steady_load(motion, records)
     doubt = IN_DOUBT * np.sqrt(np.mean(load**2, 0))
     each = [type(effect).position_error(effect, changed(motion, load=load + k * doubt)) for k in DOUBTS]
-    return _low(records, np.mean(each, axis=0)[:, None], float(records.cutoff))[:, 0]
+    return _let_through(records, np.mean(each, axis=0), int(effect.at[0]))
 
 
 def _steady_load(motion: Motion, records: Records) -> Float[np.ndarray, "nN nv"]:
@@ -236,6 +237,16 @@ def _steady_load(motion: Motion, records: Records) -> Float[np.ndarray, "nN nv"]
     band = max(BAND * most / (samples * float(records.dt)), 2 / (samples * float(records.dt)))
     load = np.asarray(motion.load)
     return load if band >= float(records.cutoff) else _low(records, load, band)
+
+
+def _let_through(records: Records, signal: Float[np.ndarray, " nN"], joint: int) -> Float[np.ndarray, " nN"]:
+    """What a joint's positions have kept of a part of them: each recording has a band of its own."""
+    out, dt, cutoff = signal.reshape(records.shape[:2]).copy(), float(records.dt), float(records.cutoff)
+    bands = np.full(len(records.spans), cutoff) if records.bands is None else np.asarray(records.bands)[:, joint]
+    for at, band in zip(records.spans, bands, strict=True):
+        own = slice(at.sample, at.sample + at.samples)
+        out[at.slot, own] = let_through(out[at.slot, own, None], dt, cutoff, np.array([band]))[:, 0]
+    return out.reshape(-1)
 
 
 def _low(records: Records, signal: Float[np.ndarray, "nN cols"], cutoff: float) -> Float[np.ndarray, "nN cols"]:

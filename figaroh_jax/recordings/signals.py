@@ -40,6 +40,7 @@ __all__ = [
     "common_rows",
     "filter_rows",
     "frequencies",
+    "let_through",
     "prepare",
     "prepare_all",
     "to_recording_times",
@@ -71,6 +72,7 @@ class Signals:
     torque: Float[np.ndarray, "samples nv"] | None  # not low-passed: `rows` does it
     dt: float
     cutoff: float  # Hz
+    bands: Float[np.ndarray, " nv"]  # Hz, up to which each position was let through, `cutoff` at most
     rows: RowFilter
     load: Load | None  # known payload carried
     notes: tuple[str, ...]
@@ -162,14 +164,13 @@ def prepare(
             f" after {trim} s are cut at both ends, at least {FEWEST_ROWS} are needed"
         )
     if grouped is None:
-        position = (
-            _motion(columns[0], dt, rates.cutoff, raw, rate) if slowed else low_pass(columns[0], dt, rates.cutoff)
-        )
+        bands = _bands(columns[0], dt, rates.cutoff, raw, rate) if slowed else np.full(nv, rates.cutoff)
+        position = let_through(columns[0], dt, rates.cutoff, bands)
         moves = np.ptp(position, axis=0) > STILL * (1 + np.abs(position).max(axis=0))
         position[:, ~moves] = position[0, ~moves]  # dry friction would see the sign of rounding
         velocity, acceleration = (differentiate(position, dt, order=order) * moves for order in (1, 2))
     else:
-        position = normalised(grouped, low_pass(columns[0], dt, rates.cutoff))
+        position, bands = normalised(grouped, low_pass(columns[0], dt, rates.cutoff)), np.full(nv, rates.cutoff)
         velocity, acceleration = group_rates(grouped, position, dt)
     weight = _weight(recording, preprocess, rows, velocity, gaps, rates.cutoff)
     weight *= ~near(rows.row_times, masked, 0.5 / rates.cutoff)
@@ -185,6 +186,7 @@ def prepare(
         torque=None if torque is None else columns[1],
         dt=dt,
         cutoff=rates.cutoff,
+        bands=bands,
         rows=eqx.tree_at(lambda r: r.weight, rows, weight),
         load=recording.load,
         notes=recording.notes + _gap_notes(recording, gaps, rates.cutoff),
@@ -208,18 +210,24 @@ def _refuse_endless(recording: Recording, time: Float[np.ndarray, " samples"], r
     )
 
 
-def _motion(
+def _bands(
     position: Float[np.ndarray, "samples nv"], dt: float, cutoff: float, raw: Float[np.ndarray, "read nv"], rate: float
-) -> Float[np.ndarray, "samples nv"]:
-    """The position of each joint without what lies above its cutoff, or above its motion where that is slower.
+) -> Float[np.ndarray, " nv"]:
+    """The band of each joint's motion, Hz, at most its `cutoff`.
 
     `raw` are the samples as they were read, at `rate` (Hz): they show the steps of the encoder.
     """
+    steps = [encoder_step(column) for column in raw.T]
+    return np.array([motion_band(x, dt, cutoff, step, rate) for x, step in zip(position.T, steps, strict=True)])
+
+
+def let_through(
+    position: Float[np.ndarray, "samples nv"], dt: float, cutoff: float, bands: Float[np.ndarray, " nv"]
+) -> Float[np.ndarray, "samples nv"]:
+    """The position of each joint without what lies above the cutoff, or above its band where that is below (Hz)."""
     out = low_pass(position, dt, cutoff)
-    for joint, column in enumerate(position.T):
-        band = motion_band(column, dt, cutoff, encoder_step(raw[:, joint]), rate)
-        if band < cutoff:
-            out[:, joint] = smoothed(column, dt, band)
+    for joint in np.flatnonzero(bands < cutoff):
+        out[:, joint] = smoothed(position[:, joint], dt, float(bands[joint]))
     return out
 
 

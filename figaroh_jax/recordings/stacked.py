@@ -57,6 +57,7 @@ class Records(eqx.Module):
     dt: Float[Leaf, ""] | float  # s, of the samples
     rate: Float[Leaf, ""] | float  # Hz, of the rows
     cutoff: Float[Leaf, ""] | float  # Hz
+    bands: Float[Leaf, "recordings nv"] | None = None  # Hz, up to which positions were let through where not the cutoff
     carried: Float[Leaf, "n links 10"] | None = None  # known bodies on the links, at and in their joint frames
     spans: tuple[Span, ...] = eqx.field(static=True, default=())  # of the recordings in their order
 
@@ -196,6 +197,7 @@ def stack(signals: Sequence[Signals], model: RobotModel | None = None, joined: b
         dt=first.dt,
         rate=1 / (first.dt * first.rows.step),
         cutoff=first.cutoff,
+        bands=np.stack([s.bands for s in signals]),
         carried=carried,
         spans=tuple(spans),
     )
