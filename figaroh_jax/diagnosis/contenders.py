@@ -10,26 +10,27 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..effects.base import Effect
+from ..effects.base import Effect, exact
 from ..estimation.priors import physical_body
 from ..estimation.rows import UNKNOWN, Rows
 from ..recordings.stacked import filtered_rows
 from ..results import Name
 from .believed import believed
 from .comparison import Ground, Hypothesis, Verdicts, grown_sums, judge, judge_grown, last_coefficient, sums_of
-from .design import BATCH, kind, shapes, with_shape
+from .design import BATCH, kind, shapes, unit_rows, units, with_shape
 from .estimates import torque_slope
 from .problem import Problem
 from .refit import Whitened, refit, refit_shift
 from .screening import Group, Screen
 from .shifts import torque_change
-from .state import State, extended_state, link_motion, solved
+from .state import State, batched, extended_state, link_motion, solved
 from .step import Step, stand
 from .thresholds import BEST_OF_A_PLACE, GAIN, SHARE_OF_BEST, SHIFTS, SHORTLIST
 
 __all__ = ["Contender", "acting", "contend", "for_refit", "next_shape", "shortlist"]
 
 TURNS, RESPONSE_TURNS = 3, 6  # of Gauss-Newton on a shift of the position; on a response of the torque
+EXPANSIONS, SMALL_MOVE = 8, 0.003  # of an effect about its size; a relative move of that after which it has settled
 SMALL = 1e-5  # step of a derivative, relative
 NEAR_ENOUGH = 0.1  # of its standard deviation: a step that moves the size by less is not taken
 
@@ -117,6 +118,8 @@ def contend(
         one = _position_contender(problem, step, base, ready, group, fitted.get(group.name))
         fitted[group.name] = one.effect
         return one
+    if group.effect.about:
+        return _expanded_contender(problem, step, base, ready, group)
     if group.effect.one_rotor:
         order = _as_one_rotor(step, base, group, order)
     effect, Z = _exact_columns(problem, step, ready, group, order)
@@ -280,6 +283,24 @@ def _position_contender(
     held = prior if loose is None else believed(problem, loose, sums)
     verdicts = judge(rows, Hypothesis(rows.X, held, change), sums)
     return Contender(group.name, effect, verdicts, acting(effect, len(rows.y), group.columns.joints), free)
+
+
+def _expanded_contender(problem: Problem, step: Step, base: Ground, ready: Whitened, group: Group) -> Contender:
+    """An effect that is linear about its size alone: fitted about zero, then about what that gave, until it settles."""
+    effect, Z = jax.tree.map(lambda x: x[0], group.effect), group.columns.Z[0]
+    (where, name), last = group.effect.about, np.inf
+    bounds = effect.parameters()[where]
+    for _ in range(EXPANSIONS):
+        verdicts, free = _judged_beside(problem, step, base, group.columns.joints, Z)
+        size = np.clip(verdicts.theta[-1], bounds.lower, bounds.upper)
+        if abs(size - last) < SMALL_MOVE * abs(size):
+            break
+        last, effect = size, exact(with_shape(effect, [name], [np.float64(size)]))
+        motion = solved(problem, step.state, verdicts.theta[:-1]).motion  # its torque without the effect
+        fresh = units({group.name.effect: batched(effect)}, motion, problem.records)[group.name.effect]
+        Z = unit_rows(fresh, problem.records, ready.whitening)[0].reshape(*Z.shape)
+    effect = with_shape(effect, [name], [np.float64(verdicts.theta[-1])])
+    return Contender(group.name, effect, verdicts, acting(effect, len(step.rows.y), group.columns.joints), free)
 
 
 def _shift(

@@ -5,15 +5,17 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..effects.base import Motion
+from ..effects.base import Motion, changed
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Rows, fit
 from ..recordings.stacked import filtered_rows
 from ..results import Dependence, Name
 from .bank import Columns
+from .design import with_shape
 from .problem import Problem
 from .screening import Group, Null, family_p, screen
 from .state import FRICTION_PRECISION, State, whitened
@@ -129,10 +131,16 @@ def _coulomb_column(problem: Problem, state: State, joint: int) -> int | None:
 def _with_width(
     problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], width: float
 ) -> Float[np.ndarray, "nv T"]:
-    """Whitened rows of every joint's dry friction with another width."""
+    """Whitened rows of every joint's dry friction with another width, as sensors that follow all torque read it."""
     motion = eqx.tree_at(lambda m: m.width, state.motion, np.full(problem.model.nv, width))
+    direction, before = np.asarray(motion.direction), np.asarray(state.motion.direction)
+    for term in (t for t in state.terms if t.about):
+        where, size = term.about
+        one = jax.tree.map(lambda x: np.asarray(x)[0], term)
+        one = with_shape(one, [size], [getattr(one, where)])
+        direction = direction + np.asarray(one.torque_error(changed(motion, total=direction - before)))
     response = whitening * state.response(problem.records.omega)[:, None]
-    return filtered_rows(problem.records, np.asarray(motion.direction), response)
+    return filtered_rows(problem.records, direction, response)
 
 
 def _replaced(G: np.ndarray, b: np.ndarray, column: int, cross: np.ndarray, square: float, right: float):

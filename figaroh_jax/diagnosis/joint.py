@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..effects.base import Effect
+from ..effects.base import Effect, exact
 from ..effects.catalogue import CATALOGUE, find
 from ..estimation.rows import Rows, block_sums
 from ..results import Name
@@ -273,7 +273,8 @@ def _places(problem: Problem, state: State, causes: list[Effect]) -> tuple[tuple
 
 
 def moved(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> Effect:
-    """The cause with its shapes after the step, kept in their bounds."""
+    """The cause with its shapes after the step, kept in their bounds, and linear about its new size (`exact`)."""
+    effect = exact(effect)
     names = shapes(type(effect))
     values = fitted.value[list(place[len(place) - len(names) :])] if names else []
     kept = []

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..compiled.memory import give_back_holes
-from ..effects.base import Effect
+from ..effects.base import Effect, exact
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Prior
 from ..results import Name
@@ -142,17 +142,17 @@ def find_causes(
         for best in chosen[: MOST_CAUSES - len(found)]:
             found.append(_found(problem, before, contenders, best, screened, p_values[-1], generator))
             step = with_cause(problem, step, best.effect, whitening)
-        ways = {kind(best.effect) for best in chosen}
+        ways = {"late" if best.effect.about else kind(best.effect) for best in chosen}
         # their rows and columns are large; there is a best one, since some were chosen
         del before, contenders, chosen, best  # pyright: ignore[reportPossiblyUnboundVariable]
-        if len(found) > 1 and any(type(f.effect).follows_total for f in found):
-            screened = None
-            step = _refreshed(problem, state, step, found, whitening)
         if ways != {"columns"}:
             give_back_holes()
             known, problem, screened = problem, friction_width(problem, step.state, whitening), None
             groups = None if problem is not known or "response" in ways else groups
             step = step if problem is known else stand(problem, with_width(problem, step.state), whitening)
+        if any(type(f.effect).follows_total for f in found):
+            screened = None
+            step = _refreshed(problem, state, step, found, whitening)
     begun = solved(problem, with_width(problem, state), step.state.theta[: len(state.theta)])
     return Search(problem, begun, found, p_values[0], p_values[-1], shown)
 
@@ -176,7 +176,8 @@ def _refreshed(
 ) -> Step:
     """The step with what follows all torque together evaluated at that of all causes so far."""
     begun = solved(problem, with_width(problem, start), step.state.theta[: len(start.theta)])
-    return with_causes(problem, begun, with_amplitudes(step.state, [f.effect for f in found], problem.model), whitening)
+    causes = with_amplitudes(step.state, [f.effect for f in found], problem.model)
+    return with_causes(problem, begun, [exact(one) for one in causes], whitening)
 
 
 def _chance(

@@ -237,7 +237,20 @@ def with_width(problem: Problem, state: State) -> State:
     if state.measured is problem.motion:
         return state
     moved = replace(state, measured=problem.motion)
-    return replace(moved, parts=(state.rigid, *(_term_columns(problem, moved, term) for term in state.terms)))
+    pairs = list(zip(state.terms, state.parts[1:], strict=True))
+    parts = [part if term.follows_total else _term_columns(problem, moved, term) for term, part in pairs]
+    moved = replace(moved, parts=(state.rigid, *parts))
+    if not any(term.follows_total for term in state.terms):
+        return moved
+    others = [
+        np.zeros(part.width) if t.follows_total else own
+        for (t, part), own in zip(pairs, moved._of_terms(state.theta), strict=True)
+    ]
+    alone = replace(moved, theta=np.concatenate([state.theta[: state.rigid.width], *others]))
+    parts = [
+        _term_columns(problem, alone, t) if t.follows_total else own for t, own in zip(state.terms, parts, strict=True)
+    ]
+    return replace(moved, parts=(state.rigid, *parts))
 
 
 def link_motion(problem: Problem, state: State) -> Motion:

@@ -46,6 +46,7 @@ __all__ = [
     "Place",
     "amplitude",
     "changed",
+    "exact",
     "fixed",
     "joint_unit",
     "movable",
@@ -141,6 +142,20 @@ class Motion(eqx.Module):
         inside = abs(space.roll(t, -2) - space.roll(t, 2) - 4 * dt) < dt / 2
         inside = inside.reshape(-1, *(1 for _ in x.shape[1:]))
         return space.where(inside, slope / space.where(dt > 0, 12 * dt, 1.0), 0.0)
+
+    def later(
+        self, signal: Float[Leaf, "samples rows"], delay: Float[Leaf, " samples"]
+    ) -> Float[Array, "samples rows"]:
+        """What a signal is a `delay` (s, of each sample) later in the same record, straight between its samples; at
+        its ends it stands still."""
+        x, dt, here = jnp.asarray(signal), jnp.asarray(self.dt), jnp.arange(len(self.time))
+        begins = self.begins
+        first = jax.lax.cummax(jnp.where(begins, here, 0))
+        last = jax.lax.cummin(jnp.where(jnp.append(begins[1:], True), here, len(here)), reverse=True)
+        place = jnp.clip(here + delay / jnp.where(dt > 0, dt, jnp.inf), first, last)
+        low = jnp.clip(jnp.floor(place).astype(int), first, jnp.maximum(last - 1, first))
+        share = (place - low)[:, None]
+        return x[low] * (1 - share) + x[jnp.minimum(low + 1, last)] * share
 
     def reversal(
         self, velocity: Float[Array, " samples"], acceleration: Float[Array, " samples"], width: Float[Array, ""]
@@ -286,6 +301,7 @@ class Effect(eqx.Module):
     of_position: ClassVar[bool] = False  # whether it follows the position of its joint alone, as weight may
     beside_rest: ClassVar[bool] = True  # whether it can be told from a rest that stays; no law of what any rest does
     fades: ClassVar[bool] = False  # whether it goes by the time since the start: another recording has it no more
+    about: ClassVar[tuple[str, str] | None] = None  # a shape about which its torque is linear in an amplitude: `exact`
     abrupt: ClassVar[bool] = False  # whether its `position_error` steps where the load changes its side
     one_rotor: ClassVar[
         tuple[str, ...]
@@ -489,6 +505,14 @@ def fixed(effect: Effect) -> Effect:
 def movable(effect: Effect) -> Effect:
     """The effect with its place an array: programs then serve every place, and `jax.vmap` maps over places."""
     return eqx.tree_at(lambda e: e.at, effect, effect.places) if isinstance(effect.at, Place) else effect
+
+
+def exact(effect: T) -> T:
+    """The effect with its torque linear about its own size, where that matters (`Effect.about`)."""
+    if not isinstance(effect, Effect) or effect.about is None:
+        return effect
+    where, size = effect.about
+    return changed(effect, **{where: getattr(effect, size)})
 
 
 def joint_unit(unit: str, prismatic: bool) -> str:

@@ -25,7 +25,7 @@ from ..errors import InputError, check_real
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.kinematics import states
 from ..rigid.model import RobotModel
-from .base import Effect, Motion, fixed, movable
+from .base import Effect, Motion, exact, fixed, movable
 
 __all__ = [
     "ExtendedModel",
@@ -235,7 +235,7 @@ def read_torque(effects: tuple[Effect, ...], motion: Motion) -> Float[Array, "sa
     torque = motion.total
     for effect in effects:
         if effect.has("torque_error"):
-            torque = torque + _joint_torque_error(movable(effect), dataclasses.replace(motion, total=torque))
+            torque = torque + _joint_torque_error(exact(movable(effect)), dataclasses.replace(motion, total=torque))
         if effect.has("torque_response"):
             answer = _respond(movable(effect), torque, motion.dt)
             seen = effect.places if effect.acts_on in ("joint", "pair") else jnp.arange(torque.shape[1])

@@ -26,6 +26,8 @@ __all__ = [
     "TorqueSaturation",
 ]
 
+NEAR = 1e-3  # samples between two times that count as one
+
 
 @register
 class TorqueOffset(JointEffect):
@@ -138,13 +140,32 @@ class ClockError(Effect):
     name, title, acts_on = "clock_error", "drift between the clocks of position and torque", "robot"
     follows_torque = follows_total = True
     beside_rest = False  # whatever is late in one part of a recording and not in another looks like it
-    equation = "rate t p tau_hat"
+    about = ("expansion", "rate")
+    equation = "tau_hat(t + rate t) - tau_hat(t)"
     separated_by = "a longer recording: the lag at its end against the lag at its start"
     rate: Scalar = amplitude("s/s", lower=-0.02, upper=0.02)
+    expansion: Scalar = shape("s/s", (0.0,), (-0.02, 0.02), choice=True)
 
     def torque_error(self, motion: Motion) -> Float[Array, "samples nv"]:
-        """rate t d(tau)/dt (samples, nv), N m or N: a lag that grows with the time t since the record began."""
-        return self.rate * motion.elapsed[:, None] * motion.rate(motion.total)
+        """tau(t + rate t) - tau(t) (samples, nv), N m or N: a lag that grows with the time t since the record began.
+
+        Linear in the rate, and exact where the expansion is the rate: the mean of d(tau)/dt from t to t + expansion t,
+        times rate t. Steps of dry friction are read at their place, which no derivative at a few points would do.
+        """
+        total, elapsed, dt = jnp.asarray(motion.total), motion.elapsed, jnp.asarray(motion.dt)
+        ahead = self.expansion * elapsed
+        apart = jnp.abs(ahead) > NEAR * dt
+        secant = (motion.later(total, ahead) - total) / jnp.where(apart, ahead, 1.0)[:, None]
+        return (self.rate * elapsed)[:, None] * jnp.where(apart[:, None], secant, motion.rate(motion.total))
+
+    def physical(self) -> dict[str, Scalar]:
+        """The rate alone: the expansion is the same number."""
+        return {"rate": self.rate}
+
+    @classmethod
+    def units(cls) -> dict[str, str]:
+        """That of `physical`."""
+        return {"rate": "s/s"}
 
 
 @register
