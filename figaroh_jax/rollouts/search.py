@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,10 +15,11 @@ from .causes import Candidate, elastic_loop, springs
 from .colour import colour_of
 from .faults import Fault
 from .fit import Fit, System, fit, held_out, refitted_without, spread_of_recordings, standard_errors
-from .parameters import Entry
+from .parameters import Entry, values
 from .setting import (
     Setting,
     Structure,
+    begins_of,
     begun,
     by_recording,
     coloured,
@@ -240,18 +242,41 @@ def _tried(here: Setting, now: Model, named: Sequence[Candidate], forbid: Sequen
         left = _screened(here, now, left) if left else []
     best = _best_starts(here, now, left)
     thetas, free, owner = [], [], []
+    anew, key = _anew(here, now), []
     for c in left:
-        for start in best.get(c.entries, c.starts):
-            thetas.append(start_values(now.fit.theta, c, start))
+        for begin, start in product([now.fit.theta, *(anew if c.kind.limit else ())], best.get(c.entries, c.starts)):
+            thetas.append(start_values(begin, c, start))
             free.append(free_entries(now.free, c.entries))
             owner.append(c)
-    found = []
-    for k, best in _raced(here, now, np.array(thetas), free, [(c.effect, c.at) for c in owner]):
-        found.append(_tried_one(here, now.structure, owner[k], best, free[k]))
+            key.append((c.effect, c.at, begin is now.fit.theta))
+    ends: dict[tuple[int, ...], Tried] = {}
+    for k, end in _raced(here, now, np.array(thetas), free, key):
+        one = _tried_one(here, now.structure, owner[k], end, free[k])
+        known = ends.get(one.candidate.entries)
+        if known is None or one.state.fit.cost < known.state.fit.cost:
+            ends[one.candidate.entries] = one
+    found = list(ends.values())
     rigid = len(now.structure.table) == len(here.known.table)
     first = here.loop.carried is None or not named  # a spring competes with the first cause of a joint of an arm
     if here.loop.robot.nv == 1 and rigid and first and all(one.state.excess >= 1.0 for one in found):
         found += _elastic(here, now, forbid)
+    return found
+
+
+def _anew(here: Setting, now: Model) -> list[np.ndarray]:
+    """Where the fit of a drive's limit starts beside the present optimum: at gains no lower than the model's.
+
+    A drive at its limit looks soft and heavy. A baseline whose gains are free has settled there, and no step from it
+    leads back.
+    """
+    model, found = values(here.loop, here.known.table), list[np.ndarray]()
+    gains = [k for k in here.baseline if here.known.table[k].name == "scale"]
+    if here.loop.robot.nv > 1 or not gains:
+        return found
+    for begin in begins_of(here, model):
+        if (begin[gains] >= model[gains]).all():
+            found.append(now.fit.theta.copy())
+            found[-1][list(here.baseline)] = begin[list(here.baseline)]
     return found
 
 
@@ -448,8 +473,7 @@ def _best(
         return None, 1.0
     p = float(max(ndtr(-4 * now.excess), 1e-12))
     sure = CONFIDENT if now.excess >= 1.0 else T_WITHOUT_REST
-    several = here.loop.carried is not None and by_recording(here)
-    beside = [several and one.state.excess >= 1.0 for one in tried]  # a rest, of an arm: more is asked
+    beside = [by_recording(here) and one.state.excess >= 1.0 for one in tried]  # a rest: more is asked
     common = [t.candidate.kind.usual and g > GAIN_BESIDE_REST for t, g in zip(tried, gains, strict=True)]
     needs = [T_BESIDE_REST if rest and not usual else sure for rest, usual in zip(beside, common, strict=True)]
     worth = [GAIN_BESIDE_REST if r and not t.candidate.kind.usual else GAIN for r, t in zip(beside, tried, strict=True)]
@@ -460,7 +484,8 @@ def _best(
     if not passing:
         return None, p
     k = max(passing, key=lambda k: gains[k])
-    if tried[k].state.excess >= 1.0:  # more is to come: what every joint has before what few have
+    if tried[k].state.excess >= 1.0:  # more is to come: what surely gains; what every joint has before what few have
+        k = max(passing, key=lambda k: gains[k] * (1 - CONFIDENT / max(ts[k], CONFIDENT)))
         usual = [j for j in passing if tried[j].candidate.kind.usual and gains[j] > USUAL * gains[k]]
         first = tried[k].candidate
         usual += [j for j in passing if tried[j].candidate[:2] == (first.kind.adds_to, first.at)]
