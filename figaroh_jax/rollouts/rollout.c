@@ -613,8 +613,10 @@ INLINE void stepped(const Given *g, Work *w, const int n, const int carried, con
     const double *way = g->way + d * n;
     if (w->slope[d] == 0) continue;
     damped = 1;
-    for (int j = 0; j < n; j++)
+    for (int j = 0; j < n; j++) {
+      if (way[j] == 0) continue;
       for (int k = 0; k < n; k++) w->D[j * n + k] -= way[j] * way[k] * w->slope[d];
+    }
   }
   if (!damped && !want) {
     memcpy(w->moved, w->a, sizeof(double) * n);
@@ -965,25 +967,31 @@ WIDE void collected(const Given *g, const Work *w, const int n, const long windo
   }
 }
 
-WIDE void carried_on(const Given *g, const int n, const long width, const double *by, double *S, double *old) {
+/* the sensitivities after the step, eight columns at a time, which stay in registers */
+WIDE void carried_on(const Given *g, const int n, const long width, const double *by, double *S) {
   const double dt = g->dt;
-  memcpy(old, S, sizeof(double) * 2 * n * width);
+  double f[2 * n * n], more[n * width];
+  memset(more, 0, sizeof more);
   for (int j = 0; j < n; j++) {
-    double *restrict v = S + (n + j) * width, *restrict q = S + j * width;
-    for (int k = 0; k < 2 * n; k++) {
-      const double f = dt * BY(k);
-      const double *restrict from = old + k * width;
-      for (long c = 0; c < width; c++) v[c] += f * from[c];
+    for (int k = 0; k < 2 * n; k++) f[j * 2 * n + k] = dt * BY(k);
+    for (long c = 0; c < g->columns; c++) more[j * width + c] = dt * BY(2 * n + c);
+  }
+  for (long c = 0; c < width; c += 8) {
+    V old[2 * n];
+    for (int k = 0; k < 2 * n; k++) old[k] = *(V *)(S + k * width + c);
+    for (int j = 0; j < n; j++) {
+      V v = old[n + j] + *(V *)(more + j * width + c);
+      for (int k = 0; k < 2 * n; k++) v += f[j * 2 * n + k] * old[k];
+      *(V *)(S + (n + j) * width + c) = v;
+      *(V *)(S + j * width + c) = old[j] + dt * v;
     }
-    for (long c = 0; c < g->columns; c++) v[c] += dt * BY(2 * n + c);
-    for (long c = 0; c < width; c++) q[c] += dt * v[c];
   }
 }
 
 INLINE void window_of(const Given *g, const int n, const int carried, const int want, const long window, const double *mobile, Work *w) {
   const long wide = g->ny * (g->rates ? 2 : 1), total = g->columns + 2 * n, width = (total + 7) / 8 * 8;
   const long blocks = g->rows / g->block;
-  double S[want ? 2 * n * width : 1] __attribute__((aligned(64))), old[want ? 2 * n * width : 1] __attribute__((aligned(64)));
+  double S[want ? 2 * n * width : 1] __attribute__((aligned(64)));
   double gradient[want ? width : 1], matrix[want ? width * width : 1] __attribute__((aligned(64))), cost[ROWS];
   double kept[want ? KEPT * width : 1] __attribute__((aligned(64)));
   long waiting = 0;
@@ -1012,7 +1020,7 @@ INLINE void window_of(const Given *g, const int n, const int carried, const int 
       for (long k = 0; k < g->substeps; k++) {
         commanded(g, w, window, (row + g->lead) * g->substeps + k, b * g->block * g->substeps);
         stepped(g, w, n, carried, want);
-        if (want) linearised(g, w, n, carried, mobile, by), carried_on(g, n, width, by, S, old);
+        if (want) linearised(g, w, n, carried, mobile, by), carried_on(g, n, width, by, S);
         for (int j = 0; j < n; j++) w->v[j] += g->dt * w->moved[j], w->q[j] += g->dt * w->v[j];
       }
     }
@@ -1049,7 +1057,7 @@ INLINE void all_windows(const Given *g, const int n, const int carried, const in
 
 long most_coordinates(void) { return MOST; }
 
-/* SIZE: coordinates where they are one or two, else 0; ONE: a joint carried by a measured arm */
+/* SIZE: coordinates where they are few, else 0; ONE: a joint carried by a measured arm */
 void rolled(const Given *g) {
   const int n = SIZE ? SIZE : (int)g->n;
   if (g->cost) all_windows(g, n, ONE, 1);
