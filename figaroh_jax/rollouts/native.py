@@ -272,9 +272,8 @@ _NARROW = ("-mprefer-vector-width=256",) if platform.machine() in ("x86_64", "AM
 def _code(size: int, one: bool) -> Any:
     """The compiled function, or None."""
     source = (Path(__file__).parent / "rollout.c").read_text()
-    level = ["-O3"]
-    if is_gnu() and not 0 < size <= 2:  # functions that take the time say -O3: half of the compilation
-        level = ["-O2", "-fvect-cost-model=dynamic"] if size else ["-O1"]
+    level = ["-O2", "-fvect-cost-model=dynamic"] if size else ["-O1"]  # functions that take the time say -O3
+    level = level if is_gnu() else ["-O3"]
     found = library(source, f"-DSIZE={size}", f"-DONE={int(one)}", *level, *_NARROW)
     if found is None:
         return None
