@@ -1153,6 +1153,5 @@ long most_coordinates(void) { return MOST; }
 /* SIZE: coordinates where they are few, else 0; ONE: a joint carried by a measured arm */
 void rolled(const Given *g) {
   const int n = SIZE ? SIZE : (int)g->n;
-  if (g->cost) all_windows(g, n, ONE, 1);
-  else all_windows(g, n, ONE, 0);
+  all_windows(g, n, ONE, g->cost != 0);
 }
