@@ -49,6 +49,7 @@ _ARRAYS = (
     "weight", "load", "begin", "pole", "cost", "gradient", "matrix", "read",
 )  # fmt: skip
 _MOST, _MOST_COLUMNS, _MOST_PAIRS = 32, 500, 64
+_KNOWN = 8  # coordinates up to which each count has code of its own: an arm of seven joints with a spring
 
 
 class _Given(ctypes.Structure):
@@ -194,7 +195,8 @@ def _unit_payloads(loop: Loop) -> np.ndarray:
 
 
 def _size(loop: Loop) -> int:
-    return loop.robot.nv if loop.robot.nv <= 2 else 0
+    """How many coordinates the compiler is told: all loops then have a known length, a quarter off an arm's seconds."""
+    return loop.robot.nv if loop.robot.nv <= _KNOWN else 0
 
 
 def _fits(loop: Loop, table: Table, data: Windows) -> bool:
@@ -270,8 +272,9 @@ _NARROW = ("-mprefer-vector-width=256",) if platform.machine() in ("x86_64", "AM
 def _code(size: int, one: bool) -> Any:
     """The compiled function, or None."""
     source = (Path(__file__).parent / "rollout.c").read_text()
-    level = "-O3" if size or not is_gnu() else "-O1"  # functions that take the time say -O3: a third of the compilation
-    found = library(source, f"-DSIZE={size}", f"-DONE={int(one)}", level, *_NARROW)
+    level = ["-O2", "-fvect-cost-model=dynamic"] if size else ["-O1"]  # functions that take the time say -O3
+    level = level if is_gnu() else ["-O3"]
+    found = library(source, f"-DSIZE={size}", f"-DONE={int(one)}", *level, *_NARROW)
     if found is None:
         return None
     function = found["rolled"]

@@ -1,4 +1,4 @@
-/* Rollouts of a loop and their exact derivatives, one window of time after the other: `loop.py` and `sensitivity.py`
+/* Rollouts of a loop and their exact derivatives, a few windows of time side by side: `loop.py` and `sensitivity.py`
    as machine code, for trees of turning and sliding joints and for one joint that is carried by a measured arm.
 
    A step is solved (rigid body, drives, dry friction and limits as soft constraints), then linearised where it stands,
@@ -8,9 +8,20 @@
 
 #include <math.h>
 #include <stddef.h>
+#include <stdlib.h>
 #include <string.h>
 
-#define MOST 32 /* coordinates, drives */
+#if SIZE /* coordinates, where they are few and known */
+#define MOST SIZE
+#else
+#define MOST 32
+#endif
+#define ACTING 32 /* drives */
+#if SIZE == 1 || SIZE == 2
+#define LANES 2 /* windows that are simulated side by side, their rigid bodies at once: a servo has often one alone */
+#else
+#define LANES 8
+#endif
 #define ROWS 64 /* numbers that are read at an instant: positions and rates */
 #define PAIRS 64 /* couplings of two coordinates that act */
 #define TURNS 60 /* Newton steps of the constraints; 1 to 4 are used */
@@ -49,12 +60,25 @@ typedef struct {
   double *cost, *gradient, *matrix, *read;   /* sums, or what is read alone where `cost` is none */
 } Given;
 
+typedef double D __attribute__((vector_size(8 * LANES))); /* a number of each of the windows side by side */
+
 typedef struct {
-  double R[9], p[3], S[6], V[6], A[6], T[6]; /* T: V of the parent x S */
-  double m, h[3], J[6];                      /* of the link, then of all that it carries: xx xy yy xz yz zz */
-  double own[10];                            /* of the link: m, h, J */
-  double F[6], P[6], B[9];                   /* force, momentum, the upper left part of 2 B */
+  D R[9], p[3], S[6], V[6], A[6], T[6]; /* T: V of the parent x S */
+  double m, mass;                       /* of the link, then of all that it carries; of the link */
+  D h[3], J[6];                         /* the same: xx xy yy xz yz zz */
+  D own[9];                             /* of the link: h, J */
+  D F[6], P[6], B[9];                   /* force, momentum, the upper left part of 2 B */
 } Body;
+
+typedef struct { /* the rigid bodies of the windows side by side */
+  Body body[MOST];
+  int lanes;
+  D q[MOST], v[MOST], a[MOST], moved[MOST]; /* a: of the constraints; moved: of the integrator less a */
+  D M[MOST * MOST], bias[MOST];
+  D by_q[MOST * MOST], by_v[MOST * MOST], second[MOST * MOST]; /* slopes of the torques at a, and of those at moved */
+  D idle_q[MOST * MOST], idle_v[MOST * MOST];                  /* of the bias, where friction follows the load */
+  D *unit;                                                     /* (many, 3, n) torques of a unit: at a, at moved, of the bias */
+} Rigid;
 
 typedef struct { /* a joint limit: force (pull - a) / soft where it acts, with derivatives by distance and rate */
   double pull, soft, by, by_rate, log_soft;
@@ -68,46 +92,43 @@ typedef struct {
   double level[MOST], peak[MOST], pull[MOST], soft[MOST], weight[MOST];
   Side side[2][MOST];
   int slip[MOST], within[MOST];
-  double u[MOST], faster[MOST], by_length[MOST], by_rate[MOST], by_u[MOST], slope[MOST], length[MOST], rate[MOST];
-  double part[MOST], often; /* of a delay in steps */
-  int whole[MOST];
+  double u[ACTING], faster[ACTING], by_length[ACTING], by_rate[ACTING], by_u[ACTING], slope[ACTING], length[ACTING], rate[ACTING];
+  double part[ACTING], often; /* of a delay in steps */
+  int whole[ACTING];
   int pairs, one[PAIRS], two[PAIRS], held[PAIRS]; /* couplings that act; held: 0, or the sign of the friction that slips */
   long which[PAIRS];
   double way[PAIRS], pair_level[PAIRS], pair_pull[PAIRS], pair_soft[PAIRS], pair_weight[PAIRS];
-  double by_scale[MOST], by_gain[MOST], by_band[MOST];
-  int volt[MOST], limit[MOST], inside[MOST];
+  double by_scale[ACTING], by_gain[ACTING], by_band[ACTING];
+  int volt[ACTING], limit[ACTING], inside[ACTING];
   double mass, base, steep, at;                               /* of a carried joint */
   const double *more;
-  Body body[MOST];
 } Work;
 
-INLINE void cross(const double *a, const double *b, double *c) {
+INLINE void cross(const D *a, const D *b, D *c) {
   c[0] = a[1] * b[2] - a[2] * b[1];
   c[1] = a[2] * b[0] - a[0] * b[2];
   c[2] = a[0] * b[1] - a[1] * b[0];
 }
-INLINE double dot3(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-INLINE double dot6(const double *a, const double *b) { return dot3(a, b) + dot3(a + 3, b + 3); }
-INLINE void turned(const double *R, const double *x, double *y) {
-  for (int i = 0; i < 3; i++) y[i] = R[3 * i] * x[0] + R[3 * i + 1] * x[1] + R[3 * i + 2] * x[2];
-}
+INLINE D dot3(const D *a, const D *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+INLINE D dot6(const D *a, const D *b) { return dot3(a, b) + dot3(a + 3, b + 3); }
+#define TURNED(R, x, y) for (int i = 0; i < 3; i++) (y)[i] = (R)[3 * i] * (x)[0] + (R)[3 * i + 1] * (x)[1] + (R)[3 * i + 2] * (x)[2]
 /* motion x motion, motion x force */
-INLINE void crossed(const double *V, const double *S, double *out) {
-  double x[3], y[3];
+INLINE void crossed(const D *V, const D *S, D *out) {
+  D x[3], y[3];
   cross(V, S, out);
   cross(V, S + 3, x);
   cross(V + 3, S, y);
   for (int k = 0; k < 3; k++) out[3 + k] = x[k] + y[k];
 }
-INLINE void crossed_force(const double *V, const double *F, double *out) {
-  double x[3], y[3];
+INLINE void crossed_force(const D *V, const D *F, D *out) {
+  D x[3], y[3];
   cross(V, F, x);
   cross(V + 3, F + 3, y);
   cross(V, F + 3, out + 3);
   for (int k = 0; k < 3; k++) out[k] = x[k] + y[k];
 }
-INLINE void inertial(double m, const double *h, const double *J, const double *V, double *F) {
-  double x[3], y[3];
+INLINE void inertial(double m, const D *h, const D *J, const D *V, D *F) {
+  D x[3], y[3];
   cross(h, V + 3, x);
   cross(h, V, y);
   F[0] = J[0] * V[0] + J[1] * V[1] + J[3] * V[2] + x[0];
@@ -117,16 +138,16 @@ INLINE void inertial(double m, const double *h, const double *J, const double *V
 }
 
 /* ten numbers of a link in its own axes at its own origin -> at the world's */
-APART void placed(const double *ten, const double *R, const double *p, double *m, double *h, double *J) {
+APART void placed(const double *ten, const D *R, const D *p, double *m, D *h, D *J) {
   const double I[9] = {ten[4], ten[5], ten[7], ten[5], ten[6], ten[8], ten[7], ten[8], ten[9]};
-  double RI[9], W[9], s[3];
+  D RI[9], W[9], s[3];
   *m = ten[0];
-  turned(R, ten + 1, s);
+  TURNED(R, ten + 1, s);
   for (int i = 0; i < 3; i++)
     for (int j = 0; j < 3; j++) RI[3 * i + j] = R[3 * i] * I[j] + R[3 * i + 1] * I[3 + j] + R[3 * i + 2] * I[6 + j];
   for (int i = 0; i < 3; i++)
     for (int j = 0; j <= i; j++) {
-      double x = RI[3 * i] * R[3 * j] + RI[3 * i + 1] * R[3 * j + 1] + RI[3 * i + 2] * R[3 * j + 2];
+      D x = RI[3 * i] * R[3 * j] + RI[3 * i + 1] * R[3 * j + 1] + RI[3 * i + 2] * R[3 * j + 2];
       x -= p[i] * s[j] + s[i] * p[j] + *m * p[i] * p[j];
       if (i == j) x += 2 * dot3(p, s) + *m * dot3(p, p);
       W[3 * i + j] = x;
@@ -136,27 +157,29 @@ APART void placed(const double *ten, const double *R, const double *p, double *m
 }
 
 /* poses, velocities, accelerations without those of the joints, masses and bias */
-APART void posed(const Given *g, Work *w, const int n, const double *q, const double *v) {
-  static const double one[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1}, zero[6] = {0};
-  double ground[6] = {0, 0, 0, -g->gravity[0], -g->gravity[1], -g->gravity[2]};
+APART void posed(const Given *g, Rigid *w, const int n, const D *q, const D *v) {
+  const D none = {0}, zero[6] = {none}, one[9] = {none + 1, none, none, none, none + 1, none, none, none, none + 1};
+  const D ground[6] = {none, none, none, none - g->gravity[0], none - g->gravity[1], none - g->gravity[2]};
   for (int i = 0; i < n; i++) {
     Body *b = w->body + i;
     const long up = g->parent[i], c = g->coordinate[i];
-    const double *R0 = up < 0 ? one : w->body[up].R, *p0 = up < 0 ? zero : w->body[up].p;
-    const double *V0 = up < 0 ? zero : w->body[up].V, *A0 = up < 0 ? ground : w->body[up].A;
+    const D *R0 = up < 0 ? one : w->body[up].R, *p0 = up < 0 ? zero : w->body[up].p;
+    const D *V0 = up < 0 ? zero : w->body[up].V, *A0 = up < 0 ? ground : w->body[up].A;
     const double *H = g->placement + 16 * i, *e = g->axis + 3 * i;
-    double C[9], x[3];
+    D C[9], x[3];
     for (int r = 0; r < 3; r++) {
       for (int k = 0; k < 3; k++) C[3 * r + k] = R0[3 * r] * H[k] + R0[3 * r + 1] * H[4 + k] + R0[3 * r + 2] * H[8 + k];
       b->p[r] = p0[r] + R0[3 * r] * H[3] + R0[3 * r + 1] * H[7] + R0[3 * r + 2] * H[11];
     }
-    turned(C, e, x);
+    TURNED(C, e, x);
     if (g->slides[i]) {
       memcpy(b->R, C, sizeof C);
-      for (int k = 0; k < 3; k++) b->p[k] += x[k] * q[c], b->S[k] = 0, b->S[3 + k] = x[k];
+      for (int k = 0; k < 3; k++) b->p[k] += x[k] * q[c], b->S[k] = none, b->S[3 + k] = x[k];
     } else {
-      const double s = sin(q[c]), k = cos(q[c]), r = 1 - k;
-      const double E[9] = {k + r * e[0] * e[0], r * e[0] * e[1] - s * e[2], r * e[0] * e[2] + s * e[1],
+      D s = none, k = none;
+      for (int l = 0; l < w->lanes; l++) s[l] = sin(q[c][l]), k[l] = cos(q[c][l]);
+      const D r = 1 - k;
+      const D E[9] = {k + r * e[0] * e[0], r * e[0] * e[1] - s * e[2], r * e[0] * e[2] + s * e[1],
                            r * e[1] * e[0] + s * e[2], k + r * e[1] * e[1], r * e[1] * e[2] - s * e[0],
                            r * e[2] * e[0] - s * e[1], r * e[2] * e[1] + s * e[0], k + r * e[2] * e[2]};
       for (int i2 = 0; i2 < 3; i2++)
@@ -167,9 +190,9 @@ APART void posed(const Given *g, Work *w, const int n, const double *q, const do
     crossed(V0, b->S, b->T);
     for (int k = 0; k < 6; k++) b->V[k] = V0[k] + b->S[k] * v[c], b->A[k] = A0[k] + b->T[k] * v[c];
     placed(g->inertia + 10 * i, b->R, b->p, &b->m, b->h, b->J);
-    b->own[0] = b->m, memcpy(b->own + 1, b->h, sizeof b->h), memcpy(b->own + 4, b->J, sizeof b->J);
+    b->mass = b->m, memcpy(b->own, b->h, sizeof b->h), memcpy(b->own + 3, b->J, sizeof b->J);
     inertial(b->m, b->h, b->J, b->V, b->P);
-    double f[6];
+    D f[6];
     inertial(b->m, b->h, b->J, b->A, b->F);
     crossed_force(b->V, b->P, f);
     for (int k = 0; k < 6; k++) b->F[k] += f[k];
@@ -177,20 +200,20 @@ APART void posed(const Given *g, Work *w, const int n, const double *q, const do
 }
 
 APART void momentum_slope(Body *b) { /* the upper left part of 2 B = V x* I - I V x + (I V) x* */
-  const double *w = b->V, *v = b->V + 3, *h = b->h, *J = b->J, *n = b->P;
-  const double W[9] = {0, -w[2], w[1], w[2], 0, -w[0], -w[1], w[0], 0};
-  const double I[9] = {J[0], J[1], J[3], J[1], J[2], J[4], J[3], J[4], J[5]};
-  const double N[9] = {0, -n[2], n[1], n[2], 0, -n[0], -n[1], n[0], 0};
+  const D *w = b->V, *v = b->V + 3, *h = b->h, *J = b->J, *n = b->P;
+  const D o = {0}, W[9] = {o, -w[2], w[1], w[2], o, -w[0], -w[1], w[0], o};
+  const D I[9] = {J[0], J[1], J[3], J[1], J[2], J[4], J[3], J[4], J[5]};
+  const D N[9] = {o, -n[2], n[1], n[2], o, -n[0], -n[1], n[0], o};
   for (int i = 0; i < 3; i++)
     for (int j = 0; j < 3; j++) {
-      double x = -N[3 * i + j] - (v[j] * h[i] + h[j] * v[i]);
+      D x = -N[3 * i + j] - (v[j] * h[i] + h[j] * v[i]);
       for (int k = 0; k < 3; k++) x += W[3 * i + k] * I[3 * k + j] - I[3 * i + k] * W[3 * k + j];
       if (i == j) x += 2 * dot3(v, h);
       b->B[3 * i + j] = x;
     }
 }
 
-APART void summed_up(const Given *g, Work *w, const int n, const int all) {
+APART void summed_up(const Given *g, Rigid *w, const int n, const int all) {
   for (int i = n - 1; i >= 0; i--) {
     Body *b = w->body + i;
     if (g->parent[i] < 0) continue;
@@ -235,11 +258,11 @@ INLINE void inverted(double *A, const int n) {
   A[0] = A[3] * one, A[1] *= -one, A[2] *= -one, A[3] = a * one;
 }
 
-APART void masses(const Given *g, Work *w, const int n, double *M) {
-  memset(M, 0, sizeof(double) * n * n);
+APART void masses(const Given *g, Rigid *w, const int n, D *M) {
+  memset(M, 0, sizeof(D) * n * n);
   for (int i = 0; i < n; i++) {
     Body *b = w->body + i;
-    double z[6];
+    D z[6];
     inertial(b->m, b->h, b->J, b->S, z);
     for (long j = i; j >= 0; j = g->parent[j]) {
       const long a = g->coordinate[i], c = g->coordinate[j];
@@ -249,21 +272,22 @@ APART void masses(const Given *g, Work *w, const int n, double *M) {
 }
 
 /* torques of a unit of the rigid body's unknown `k` at accelerations A of the bodies; `rigid`: without velocities */
-APART void unit_torques(const Given *g, const Work *w, const int n, const long k, double A[][6], int rigid, double *out) {
-  memset(out, 0, sizeof(double) * n);
+APART void unit_torques(const Given *g, const Rigid *w, const int n, const long k, D A[][6], int rigid, D *out) {
+  memset(out, 0, sizeof(D) * n);
   if (g->kind[k] == PULL) {
     if (rigid) return;
-    double F[MOST][6];
+    D F[MOST][6];
     for (int i = n - 1; i >= 0; i--) {
-      double a[6] = {0};
-      a[3 + g->place[k]] = -1;
+      D a[6] = {{0}};
+      a[3 + g->place[k]] -= 1;
       inertial(w->body[i].m, w->body[i].h, w->body[i].J, a, F[i]); /* of all that it carries */
       out[g->coordinate[i]] = dot6(w->body[i].S, F[i]);
     }
     return;
   }
   const long i = g->place[k];
-  double m, h[3], J[6], F[6], P[6], f[6];
+  double m;
+  D h[3], J[6], F[6], P[6], f[6];
   placed(g->ten + 10 * k, w->body[i].R, w->body[i].p, &m, h, J);
   inertial(m, h, J, A[i], F);
   if (!rigid) {
@@ -279,15 +303,17 @@ APART void unit_torques(const Given *g, const Work *w, const int n, const long k
 #define PN(name) (g->pair[(name) * g->pairs + w->which[k]])
 
 /* softness of the constraints, and the logarithm's derivative by each unknown */
-APART void mobility(const Given *g, Work *w, const int n, double *by) {
-  double M[MOST * MOST], zero[MOST] = {0};
+APART void mobility(const Given *g, Rigid *rigid, Work *w, const int n, double *by) {
+  double M[MOST * MOST];
+  rigid->lanes = 1; /* it is the same in all windows */
   if (g->carried) {
     for (int k = 0; k < n * n; k++) M[k] = g->resting[0];
   } else {
-    posed(g, w, n, g->start, zero);
-    for (int i = 0; i < n; i++) memset(w->body[i].B, 0, sizeof w->body[i].B);
-    summed_up(g, w, n, 1);
-    masses(g, w, n, M);
+    for (int j = 0; j < n; j++) rigid->q[j][0] = g->start[j];
+    posed(g, rigid, n, rigid->q, rigid->v);
+    summed_up(g, rigid, n, 1);
+    masses(g, rigid, n, rigid->M);
+    for (int k = 0; k < n * n; k++) M[k] = rigid->M[k][0];
   }
   for (int j = 0; j < n; j++) M[j * n + j] += JN(ARMATURE);
   for (int k = 0; k < w->pairs; k++) {
@@ -314,14 +340,15 @@ APART void mobility(const Given *g, Work *w, const int n, double *by) {
     }
     if (g->kind[k] != BODY) continue;
     for (int c = 0; c < n; c++) {
-      double A[MOST][6];
+      D A[MOST][6], torque[MOST];
       for (int i = 0; i < n; i++) {
         for (int r = 0; r < 6; r++) {
-          A[i][r] = g->parent[i] < 0 ? 0 : A[g->parent[i]][r];
-          if (g->coordinate[i] == c) A[i][r] += w->body[i].S[r];
+          A[i][r] = g->parent[i] < 0 ? (D){0} : A[g->parent[i]][r];
+          if (g->coordinate[i] == c) A[i][r] += rigid->body[i].S[r];
         }
       }
-      unit_torques(g, w, n, k, A, 1, dM + c * n);
+      unit_torques(g, rigid, n, k, A, 1, torque);
+      for (int r = 0; r < n; r++) dM[c * n + r] = torque[r][0];
     }
     for (int j = 0; j < n; j++) {
       double x = 0;
@@ -579,20 +606,26 @@ INLINE void settled(const Given *g, Work *w, const int n) {
   }
 }
 
+/* masses and bias of the rigid bodies at q, v */
+APART void weighed(const Given *g, Rigid *r, const int n, const int want) {
+  posed(g, r, n, r->q, r->v);
+  if (want)
+    for (int i = 0; i < n; i++) momentum_slope(r->body + i);
+  summed_up(g, r, n, 1);
+  for (int i = 0; i < n; i++) r->bias[g->coordinate[i]] = dot6(r->body[i].S, r->body[i].F);
+  masses(g, r, n, r->M);
+}
+
 /* one step from q, v: `want` keeps what the derivatives need */
-INLINE void stepped(const Given *g, Work *w, const int n, const int carried, const int want) {
+INLINE void stepped(const Given *g, const Rigid *rigid, const int lane, Work *w, const int n, const int carried, const int want) {
   if (carried) {
     double q = 0;
     for (int j = 0; j < n; j++) q += w->q[j];
     for (int j = 0; j < n; j++) w->bias[j] = w->base + w->steep * (q - w->at);
     for (int k = 0; k < n * n; k++) w->M[k] = w->mass;
   } else {
-    posed(g, w, n, w->q, w->v);
-    if (want)
-      for (int i = 0; i < n; i++) momentum_slope(w->body + i);
-    summed_up(g, w, n, 1);
-    for (int i = 0; i < n; i++) w->bias[g->coordinate[i]] = dot6(w->body[i].S, w->body[i].F);
-    masses(g, w, n, w->M);
+    for (int j = 0; j < n; j++) w->bias[j] = rigid->bias[j][lane];
+    for (int k = 0; k < n * n; k++) w->M[k] = rigid->M[k][lane];
   }
   for (int j = 0; j < n; j++) w->M[j * n + j] += JN(ARMATURE);
   for (int k = 0; k < w->pairs; k++) {
@@ -613,8 +646,10 @@ INLINE void stepped(const Given *g, Work *w, const int n, const int carried, con
     const double *way = g->way + d * n;
     if (w->slope[d] == 0) continue;
     damped = 1;
-    for (int j = 0; j < n; j++)
+    for (int j = 0; j < n; j++) {
+      if (way[j] == 0) continue;
       for (int k = 0; k < n; k++) w->D[j * n + k] -= way[j] * way[k] * w->slope[d];
+    }
   }
   if (!damped && !want) {
     memcpy(w->moved, w->a, sizeof(double) * n);
@@ -634,36 +669,37 @@ INLINE void stepped(const Given *g, Work *w, const int n, const int carried, con
 }
 
 /* derivatives of the rigid body's torques by q and v at accelerations A (those of the base included where `moving`) */
-APART void slopes(const Given *g, const Work *w, const int n, double A[][6], double F[][6], int moving, double *by_q, double *by_v) {
-  const double ground[6] = {0, 0, 0, -g->gravity[0], -g->gravity[1], -g->gravity[2]}, zero[6] = {0};
-  double U[MOST][6];
-  memset(by_q, 0, sizeof(double) * n * n);
-  if (by_v) memset(by_v, 0, sizeof(double) * n * n);
+APART void slopes(const Given *g, const Rigid *w, const int n, D A[][6], D F[][6], int moving, D *by_q, D *by_v) {
+  const D none = {0}, zero[6] = {none};
+  const D ground[6] = {none, none, none, none - g->gravity[0], none - g->gravity[1], none - g->gravity[2]};
+  D U[MOST][6];
+  memset(by_q, 0, sizeof(D) * n * n);
+  if (by_v) memset(by_v, 0, sizeof(D) * n * n);
   for (int i = 0; i < n; i++) {
     const long up = g->parent[i];
     crossed(up < 0 ? (moving ? ground : zero) : A[up], w->body[i].S, U[i]);
     if (!moving) continue;
-    double x[6];
+    D x[6];
     crossed(up < 0 ? zero : w->body[up].V, w->body[i].T, x);
     for (int k = 0; k < 6; k++) U[i][k] += x[k];
   }
   for (int i = 0; i < n; i++) {
     const Body *b = w->body + i;
-    const double *f = b->P + 3;
-    double z[6], y[6], x[6], t[3], y2[6];
+    const D *f = b->P + 3;
+    D z[6], y[6], x[6], t[3], y2[6];
     inertial(b->m, b->h, b->J, b->S, z);
     inertial(b->m, b->h, b->J, U[i], y);
     crossed_force(b->S, F[i], x);
     for (int k = 0; k < 6; k++) y[k] += x[k];
     if (moving) {
-      turned(b->B, b->T, x);
+      TURNED(b->B, b->T, x);
       cross(f, b->T, x + 3);
       for (int k = 0; k < 3; k++) y[k] += x[k], y[3 + k] -= 2 * x[3 + k];
       cross(f, b->S + 3, t);
       for (int k = 0; k < 3; k++) t[k] = 2 * t[k] + b->B[k] * b->S[0] + b->B[3 + k] * b->S[1] + b->B[6 + k] * b->S[2];
       if (by_v) {
         inertial(b->m, b->h, b->J, b->T, y2);
-        turned(b->B, b->S, x);
+        TURNED(b->B, b->S, x);
         cross(f, b->S, x + 3);
         for (int k = 0; k < 3; k++) y2[k] = 2 * y2[k] + x[k], y2[3 + k] = 2 * (y2[3 + k] - x[3 + k]);
       }
@@ -672,7 +708,7 @@ APART void slopes(const Given *g, const Work *w, const int n, double A[][6], dou
     for (long j = i; j >= 0; j = g->parent[j]) {
       const long c = g->coordinate[j];
       const Body *o = w->body + j;
-      by_q[r * n + c] = dot6(z, U[j]) + (moving ? dot3(t, o->T) : 0);
+      by_q[r * n + c] = dot6(z, U[j]) + (moving ? dot3(t, o->T) : none);
       if (j != i) by_q[c * n + r] = dot6(o->S, y);
       if (!by_v) continue;
       by_v[r * n + c] = 2 * dot6(z, o->T) + dot3(t, o->S);
@@ -682,24 +718,44 @@ APART void slopes(const Given *g, const Work *w, const int n, double A[][6], dou
 }
 
 /* accelerations of the bodies from those of the joints, and the forces that they take, with all that is carried */
-APART void spread(const Given *g, const Work *w, const int n, const double *a, double A[][6], double F[][6]) {
+APART void spread(const Given *g, const Rigid *w, const int n, const D *a, D A[][6], D F[][6]) {
   for (int i = 0; i < n; i++) {
     const Body *b = w->body + i;
-    for (int k = 0; k < 6; k++) A[i][k] = (g->parent[i] < 0 ? 0 : A[g->parent[i]][k]) + b->S[k] * a[g->coordinate[i]];
-    inertial(b->own[0], b->own + 1, b->own + 4, A[i], F[i]);
+    for (int k = 0; k < 6; k++) A[i][k] = (g->parent[i] < 0 ? (D){0} : A[g->parent[i]][k]) + b->S[k] * a[g->coordinate[i]];
+    inertial(b->mass, b->own, b->own + 3, A[i], F[i]);
   }
   for (int i = n - 1; i >= 0; i--)
     if (g->parent[i] >= 0)
       for (int k = 0; k < 6; k++) F[g->parent[i]][k] += F[i][k];
 }
 
+/* slopes of the rigid bodies' torques, and those of a unit of each of its unknowns; `loaded`: friction follows the load */
+APART void sloped(const Given *g, Rigid *r, const int n, const int loaded) {
+  D A[MOST][6], F[MOST][6], X[MOST][6], G[MOST][6], idle[MOST][6];
+  spread(g, r, n, r->a, A, F);
+  for (int i = 0; i < n; i++)
+    for (int k = 0; k < 6; k++) idle[i][k] = r->body[i].A[k], A[i][k] += r->body[i].A[k], F[i][k] += r->body[i].F[k];
+  slopes(g, r, n, A, F, 1, r->by_q, r->by_v);
+  spread(g, r, n, r->moved, X, G);
+  slopes(g, r, n, X, G, 0, r->second, 0);
+  if (loaded) {
+    for (int i = 0; i < n; i++) memcpy(F[i], r->body[i].F, sizeof F[i]);
+    slopes(g, r, n, idle, F, 1, r->idle_q, r->idle_v);
+  }
+  for (long k = 0; k < g->many; k++) {
+    if (g->kind[k] < BODY) continue;
+    unit_torques(g, r, n, k, A, 0, r->unit + 3 * k * n);
+    unit_torques(g, r, n, k, X, 1, r->unit + (3 * k + 1) * n);
+    if (loaded) unit_torques(g, r, n, k, idle, 0, r->unit + (3 * k + 2) * n);
+  }
+}
+
 #define BY(c) by[(c) * n + j] /* columns first */
 
 /* derivatives of the step's acceleration by q, v and the unknowns: (2 n + many, n) */
-INLINE void linearised(const Given *g, Work *w, const int n, const int carried, const double *mobile, double *by) {
+INLINE void linearised(const Given *g, const Rigid *rigid, const int lane, Work *w, const int n, const int carried, const double *mobile, double *by) {
   const int two = 2 * n, total = two + (int)g->many;
   double first[MOST * MOST * 2], second[MOST * MOST], own[MOST * MOST], W[MOST * MOST], x[MOST], load[MOST], sign[MOST];
-  double A[MOST][6], F[MOST][6], X[MOST][6], G[MOST][6], idle[MOST][6];
   int loaded = 0;
   for (int j = 0; j < n; j++) {
     x[j] = w->moved[j] - w->a[j];
@@ -714,19 +770,9 @@ INLINE void linearised(const Given *g, Work *w, const int n, const int carried, 
     for (int j = 0; j < n; j++)
       for (int k = 0; k < n; k++) by_q[j * n + k] -= sign[j] * w->steep;
   } else {
-    spread(g, w, n, w->a, A, F);
-    for (int i = 0; i < n; i++)
-      for (int k = 0; k < 6; k++) idle[i][k] = w->body[i].A[k], A[i][k] += w->body[i].A[k], F[i][k] += w->body[i].F[k];
-    slopes(g, w, n, A, F, 1, by_q, by_v);
-    spread(g, w, n, x, X, G);
-    slopes(g, w, n, X, G, 0, second, 0);
-    if (loaded) {
-      double rest[MOST][6], bias_v[MOST * MOST];
-      for (int i = 0; i < n; i++) memcpy(rest[i], w->body[i].F, sizeof rest[i]);
-      slopes(g, w, n, idle, rest, 1, own, bias_v);
-      for (int j = 0; j < n; j++)
-        for (int k = 0; k < n; k++) by_q[j * n + k] -= sign[j] * own[j * n + k], by_v[j * n + k] -= sign[j] * bias_v[j * n + k];
-    }
+    for (int k = 0; k < n * n; k++) by_q[k] = rigid->by_q[k][lane], by_v[k] = rigid->by_v[k][lane], second[k] = rigid->second[k][lane];
+    for (int j = 0; j < n && loaded; j++)
+      for (int k = j * n; k < (j + 1) * n; k++) by_q[k] -= sign[j] * rigid->idle_q[k][lane], by_v[k] -= sign[j] * rigid->idle_v[k][lane];
   }
   for (long d = 0; d < g->nu; d++) {
     const double *way = g->way + d * n;
@@ -797,12 +843,8 @@ INLINE void linearised(const Given *g, Work *w, const int n, const int carried, 
       const double mass = w->more[3 * at * g->windows];
       for (int j = 0; j < n; j++) one[j] = mass * a + bias * (1 - sign[j]), more[j] = mass * s;
     } else if (kind >= BODY) {
-      unit_torques(g, w, n, p, A, 0, one);
-      if (loaded) {
-        unit_torques(g, w, n, p, idle, 0, more);
-        for (int j = 0; j < n; j++) one[j] -= sign[j] * more[j];
-      }
-      unit_torques(g, w, n, p, X, 1, more);
+      const D *unit = rigid->unit + 3 * p * n;
+      for (int j = 0; j < n; j++) one[j] = unit[j][lane] - (loaded ? sign[j] * unit[2 * n + j][lane] : 0), more[j] = unit[n + j][lane];
     }
     if (all) {
       for (int j = 0; j < n; j++) { /* the constraints' softness follows the masses */
@@ -965,71 +1007,113 @@ WIDE void collected(const Given *g, const Work *w, const int n, const long windo
   }
 }
 
-WIDE void carried_on(const Given *g, const int n, const long width, const double *by, double *S, double *old) {
+/* the sensitivities after the step, eight columns at a time, which stay in registers */
+WIDE void carried_on(const Given *g, const int n, const long width, const double *by, double *S) {
   const double dt = g->dt;
-  memcpy(old, S, sizeof(double) * 2 * n * width);
+  double f[2 * n * n], more[n * width];
+  memset(more, 0, sizeof more);
   for (int j = 0; j < n; j++) {
-    double *restrict v = S + (n + j) * width, *restrict q = S + j * width;
-    for (int k = 0; k < 2 * n; k++) {
-      const double f = dt * BY(k);
-      const double *restrict from = old + k * width;
-      for (long c = 0; c < width; c++) v[c] += f * from[c];
+    for (int k = 0; k < 2 * n; k++) f[j * 2 * n + k] = dt * BY(k);
+    for (long c = 0; c < g->columns; c++) more[j * width + c] = dt * BY(2 * n + c);
+  }
+  for (long c = 0; c < width; c += 8) {
+    V old[2 * n];
+    for (int k = 0; k < 2 * n; k++) old[k] = *(V *)(S + k * width + c);
+    for (int j = 0; j < n; j++) {
+      V v = old[n + j] + *(V *)(more + j * width + c);
+      for (int k = 0; k < 2 * n; k++) v += f[j * 2 * n + k] * old[k];
+      *(V *)(S + (n + j) * width + c) = v;
+      *(V *)(S + j * width + c) = old[j] + dt * v;
     }
-    for (long c = 0; c < g->columns; c++) v[c] += dt * BY(2 * n + c);
-    for (long c = 0; c < width; c++) q[c] += dt * v[c];
   }
 }
 
-INLINE void window_of(const Given *g, const int n, const int carried, const int want, const long window, const double *mobile, Work *w) {
-  const long wide = g->ny * (g->rates ? 2 : 1), total = g->columns + 2 * n, width = (total + 7) / 8 * 8;
-  const long blocks = g->rows / g->block;
-  double S[want ? 2 * n * width : 1] __attribute__((aligned(64))), old[want ? 2 * n * width : 1] __attribute__((aligned(64)));
-  double gradient[want ? width : 1], matrix[want ? width * width : 1] __attribute__((aligned(64))), cost[ROWS];
-  double kept[want ? KEPT * width : 1] __attribute__((aligned(64)));
-  long waiting = 0;
-  double past[want && g->pole ? wide * width : 1];
-  Before before = {.slope = past};
-  double by[want ? (2 * n + g->many) * n : 1];
-  for (int j = 0; j < n; j++) w->q[j] = g->begin[j * g->windows + window], w->v[j] = g->begin[(n + j) * g->windows + window], w->a[j] = 0;
-  if (want) {
-    memset(S, 0, sizeof S);
-    for (int k = 0; k < 2 * n; k++) S[k * width + g->columns + k] = 1;
+typedef struct { /* a window with its sums and sensitivities */
+  Work w;
+  long window, end, waiting; /* end: of the rows that count; waiting: rows of `kept` */
+  int lost, on;
+  double cost[ROWS], *S, *by, *gradient, *matrix, *kept;
+  Before before;
+} Lane;
+
+INLINE void begun(const Given *g, const int n, const int want, const long width, const Work *first, const long window, Lane *one) {
+  const long wide = g->ny * (g->rates ? 2 : 1);
+  one->w = *first, one->window = window, one->end = g->rows, one->waiting = one->lost = 0;
+  for (int j = 0; j < n; j++) one->w.q[j] = g->begin[j * g->windows + window], one->w.v[j] = g->begin[(n + j) * g->windows + window];
+  if (!want) return;
+  memset(one->S, 0, sizeof(double) * 2 * n * width);
+  memset(one->before.had, 0, sizeof one->before.had);
+  for (int k = 0; k < 2 * n; k++) one->S[k * width + g->columns + k] = 1;
+  for (int none = 1; none && one->end > 0; one->end -= none) /* shorter windows are padded */
+    for (long y = 0; y < wide; y++) none &= g->weight[((one->end - 1) * wide + y) * g->windows + window] == 0;
+}
+
+/* the sums of a block, to where they are asked for */
+WIDE void told(const Given *g, const int n, const long width, const long b, Lane *one) {
+  const long wide = g->ny * (g->rates ? 2 : 1), total = g->columns + 2 * n, at = b * g->windows + one->window;
+  multiplied(width, one->waiting, one->kept, one->matrix), one->waiting = 0;
+  for (long y = 0; y < wide; y++) g->cost[at * wide + y] = one->lost ? NAN : one->cost[y];
+  double *gradient = g->gradient + at * total, *matrix = g->matrix + at * total * total;
+  for (long c = 0; c < total; c++) {
+    gradient[c] = one->lost ? NAN : one->gradient[c];
+    for (long r = c; r < total; r++) matrix[c * total + r] = matrix[r * total + c] = one->lost ? NAN : one->matrix[c * width + r];
   }
-  int lost = 0;
-  long end = g->rows; /* of what counts: shorter windows are padded */
-  for (int none = 1; want && none && end > 0; end -= none)
-    for (long y = 0; y < wide; y++) none &= g->weight[((end - 1) * wide + y) * g->windows + window] == 0;
-  for (long b = 0; b < blocks; b++) {
-    memset(cost, 0, sizeof cost);
-    if (want) memset(gradient, 0, sizeof gradient), memset(matrix, 0, sizeof matrix);
+  memset(one->cost, 0, sizeof one->cost);
+  memset(one->gradient, 0, sizeof(double) * width), memset(one->matrix, 0, sizeof(double) * width * width);
+}
+
+INLINE void row_of(const Given *g, const int n, const int carried, const int want, const long width, const long row, Lane *one) {
+  const long wide = g->ny * (g->rates ? 2 : 1);
+  Work *w = &one->w;
+  for (int j = 0; j < n; j++) one->lost |= !(fabs(w->v[j]) < 1e12);
+  one->on = row < one->end && !one->lost;
+  if (!want)
+    for (long y = 0; y < wide; y++) g->read[(row * wide + y) * g->windows + one->window] = one->lost ? NAN : seen(g, w, n, y);
+  if (!one->on) return;
+  if (want)
+    collected(g, w, n, one->window, row, width, one->S, one->cost, one->gradient, one->matrix, one->kept, &one->waiting, &one->before);
+  if (carried) carrying(g, w, one->window, row);
+}
+
+/* windows side by side */
+INLINE void windows_of(const Given *g, const int n, const int carried, const int want, const long width, const double *mobile, Rigid *rigid, Lane *lanes) {
+  const int many = rigid->lanes;
+  int loaded = 0;
+  for (int j = 0; j < n; j++) loaded |= JN(RATIO) != 0;
+  long end = 0;
+  for (int l = 0; l < many; l++) end = lanes[l].end > end ? lanes[l].end : end;
+  for (long b = 0; b < g->rows / g->block; b++) {
     for (long row = b * g->block; row < (b + 1) * g->block && row < end; row++) {
-      for (int j = 0; j < n; j++) lost |= !(fabs(w->v[j]) < 1e12);
-      if (want && !lost) collected(g, w, n, window, row, width, S, cost, gradient, matrix, kept, &waiting, &before);
-      if (!want)
-        for (long y = 0; y < wide; y++) g->read[(row * wide + y) * g->windows + window] = lost ? NAN : seen(g, w, n, y);
-      if (lost) continue;
-      if (carried) carrying(g, w, window, row);
+      for (int l = 0; l < many; l++) row_of(g, n, carried, want, width, row, lanes + l);
       for (long k = 0; k < g->substeps; k++) {
-        commanded(g, w, window, (row + g->lead) * g->substeps + k, b * g->block * g->substeps);
-        stepped(g, w, n, carried, want);
-        if (want) linearised(g, w, n, carried, mobile, by), carried_on(g, n, width, by, S, old);
-        for (int j = 0; j < n; j++) w->v[j] += g->dt * w->moved[j], w->q[j] += g->dt * w->v[j];
+        for (int l = 0; l < many && !carried; l++)
+          for (int j = 0; j < n; j++) rigid->q[j][l] = lanes[l].w.q[j], rigid->v[j][l] = lanes[l].w.v[j];
+        if (!carried) weighed(g, rigid, n, want);
+        for (int l = 0; l < many; l++) {
+          Work *w = &lanes[l].w;
+          if (!lanes[l].on) continue;
+          commanded(g, w, lanes[l].window, (row + g->lead) * g->substeps + k, b * g->block * g->substeps);
+          stepped(g, rigid, l, w, n, carried, want);
+          for (int j = 0; j < n && want && !carried; j++) rigid->a[j][l] = w->a[j], rigid->moved[j][l] = w->moved[j] - w->a[j];
+        }
+        if (want && !carried) sloped(g, rigid, n, loaded);
+        for (int l = 0; l < many; l++) {
+          Work *w = &lanes[l].w;
+          if (!lanes[l].on) continue;
+          if (want) linearised(g, rigid, l, w, n, carried, mobile, lanes[l].by), carried_on(g, n, width, lanes[l].by, lanes[l].S);
+          for (int j = 0; j < n; j++) w->v[j] += g->dt * w->moved[j], w->q[j] += g->dt * w->v[j];
+        }
       }
     }
-    if (!want) continue;
-    multiplied(width, waiting, kept, matrix), waiting = 0;
-    for (long y = 0; y < wide; y++) g->cost[(b * g->windows + window) * wide + y] = lost ? NAN : cost[y];
-    double *one = g->gradient + (b * g->windows + window) * total, *two = g->matrix + (b * g->windows + window) * total * total;
-    for (long c = 0; c < total; c++) {
-      one[c] = lost ? NAN : gradient[c];
-      for (long r = c; r < total; r++) two[c * total + r] = two[r * total + c] = lost ? NAN : matrix[c * width + r];
-    }
+    for (int l = 0; l < many && want; l++) told(g, n, width, b, lanes + l);
   }
 }
 
 INLINE void all_windows(const Given *g, const int n, const int carried, const int want) {
   Work w; /* no static one: its address would be asked for at each use */
-  memset(&w, 0, sizeof w);
+  Rigid rigid;
+  Lane lanes[LANES];
+  memset(&w, 0, sizeof w), memset(&rigid, 0, sizeof rigid);
   for (long k = 0; k < g->pairs && w.pairs < PAIRS; k++) {
     int acts = g->pair[TOGETHER * g->pairs + k] != 0 || g->pair[DRAG * g->pairs + k] != 0 || g->pair[RUB * g->pairs + k] != 0;
     for (long p = 0; p < g->many; p++) acts |= g->kind[p] >= PAIR && g->kind[p] <= PAIR + RUB && g->place[p] == k;
@@ -1038,20 +1122,36 @@ INLINE void all_windows(const Given *g, const int n, const int carried, const in
     w.way[w.pairs] = (double)g->joined[3 * k + 2], w.which[w.pairs++] = k;
   }
   double mobile[(n + w.pairs) * g->many + 1];
-  mobility(g, &w, n, mobile);
+  mobility(g, &rigid, &w, n, mobile);
   w.often = 1 / g->dt;
   for (long d = 0; d < g->nu; d++) {
     const double late = (DN(DELAY) > 0 ? DN(DELAY) : 0) / g->dt;
     w.whole[d] = late < 1e9 ? (int)late : 1000000000, w.part[d] = late - floor(late);
   }
-  for (long k = 0; k < g->windows; k++) window_of(g, n, carried, want, k, mobile, &w);
+  const long wide = g->ny * (g->rates ? 2 : 1), width = (g->columns + 2 * n + 7) / 8 * 8, side = g->windows < LANES ? g->windows : LANES;
+  const long sizes[] = {2 * n * width, width, width * width, KEPT * width, wide * width, (2 * n + g->many) * n};
+  long all = 0;
+  for (int k = 0; k < 6; k++) all += (sizes[k] + 7) / 8 * 8;
+  double *room = want ? aligned_alloc(64, sizeof(double) * (side * all + 3 * LANES * g->many * n)) : 0, *next = room;
+  if (want) memset(room, 0, sizeof(double) * side * all);
+  for (long l = 0; l < side && want; l++) {
+    double **parts[] = {&lanes[l].S, &lanes[l].gradient, &lanes[l].matrix, &lanes[l].kept, &lanes[l].before.slope, &lanes[l].by};
+    memset(lanes[l].cost, 0, sizeof lanes[l].cost);
+    for (int k = 0; k < 6; k++) *parts[k] = next, next += (sizes[k] + 7) / 8 * 8;
+  }
+  rigid.unit = (D *)next;
+  for (long k = 0; k < g->windows; k += LANES) {
+    rigid.lanes = g->windows - k < LANES ? g->windows - k : LANES;
+    for (int l = 0; l < rigid.lanes; l++) begun(g, n, want, width, &w, k + l, lanes + l);
+    windows_of(g, n, carried, want, width, mobile, &rigid, lanes);
+  }
+  free(room);
 }
 
 long most_coordinates(void) { return MOST; }
 
-/* SIZE: coordinates where they are one or two, else 0; ONE: a joint carried by a measured arm */
+/* SIZE: coordinates where they are few, else 0; ONE: a joint carried by a measured arm */
 void rolled(const Given *g) {
   const int n = SIZE ? SIZE : (int)g->n;
-  if (g->cost) all_windows(g, n, ONE, 1);
-  else all_windows(g, n, ONE, 0);
+  all_windows(g, n, ONE, g->cost != 0);
 }
