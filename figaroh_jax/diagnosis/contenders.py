@@ -288,17 +288,18 @@ def _position_contender(
 def _expanded_contender(problem: Problem, step: Step, base: Ground, ready: Whitened, group: Group) -> Contender:
     """An effect that is linear about its size alone: fitted about zero, then about what that gave, until it settles."""
     effect, Z = jax.tree.map(lambda x: x[0], group.effect), group.columns.Z[0]
-    (where, name), last = group.effect.about, np.inf
+    where, name = group.effect.about
     bounds = effect.parameters()[where]
+    verdicts, free = _judged_beside(problem, step, base, group.columns.joints, Z)
     for _ in range(EXPANSIONS):
-        verdicts, free = _judged_beside(problem, step, base, group.columns.joints, Z)
-        size = np.clip(verdicts.theta[-1], bounds.lower, bounds.upper)
+        last, size = float(getattr(effect, where)), np.clip(verdicts.theta[-1], bounds.lower, bounds.upper)
         if abs(size - last) < SMALL_MOVE * abs(size):
             break
-        last, effect = size, exact(with_shape(effect, [name], [np.float64(size)]))
+        effect = exact(with_shape(effect, [name], [np.float64(size)]))
         motion = solved(problem, step.state, verdicts.theta[:-1]).motion  # its torque without the effect
         fresh = units({group.name.effect: batched(effect)}, motion, problem.records)[group.name.effect]
         Z = unit_rows(fresh, problem.records, ready.whitening)[0].reshape(*Z.shape)
+        verdicts, free = _judged_beside(problem, step, base, group.columns.joints, Z)
     effect = with_shape(effect, [name], [np.float64(verdicts.theta[-1])])
     return Contender(group.name, effect, verdicts, acting(effect, len(step.rows.y), group.columns.joints), free)
 

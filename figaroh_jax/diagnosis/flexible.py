@@ -134,8 +134,7 @@ def _with_width(
     """Whitened rows of every joint's dry friction with another width, as sensors that follow all torque read it."""
     motion = eqx.tree_at(lambda m: m.width, state.motion, np.full(problem.model.nv, width))
     direction, before = np.asarray(motion.direction), np.asarray(state.motion.direction)
-    for term in (t for t in state.terms if t.about):
-        where, size = term.about
+    for term, (where, size) in ((term, term.about) for term in state.terms if term.about is not None):
         one = jax.tree.map(lambda x: np.asarray(x)[0], term)
         one = with_shape(one, [size], [getattr(one, where)])
         direction = direction + np.asarray(one.torque_error(changed(motion, total=direction - before)))
