@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -15,7 +14,7 @@ from ..estimation.rows import Rows, fit
 from ..recordings.stacked import filtered_rows
 from ..results import Dependence, Name
 from .bank import Columns
-from .design import with_shape
+from .design import units
 from .problem import Problem
 from .screening import Group, Null, family_p, screen
 from .state import FRICTION_PRECISION, State, whitened
@@ -134,10 +133,9 @@ def _with_width(
     """Whitened rows of every joint's dry friction with another width, as sensors that follow all torque read it."""
     motion = eqx.tree_at(lambda m: m.width, state.motion, np.full(problem.model.nv, width))
     direction, before = np.asarray(motion.direction), np.asarray(state.motion.direction)
-    for term, (where, size) in ((term, term.about) for term in state.terms if term.about is not None):
-        one = jax.tree.map(lambda x: np.asarray(x)[0], term)
-        one = with_shape(one, [size], [getattr(one, where)])
-        direction = direction + np.asarray(one.torque_error(changed(motion, total=direction - before)))
+    for term, (where, _) in ((term, term.about) for term in state.terms if term.about is not None):
+        read = units({term.name: term}, changed(motion, total=direction - before), problem.records)[term.name]
+        direction = direction + getattr(term, where)[0] * read.torque[0, 0].T
     response = whitening * state.response(problem.records.omega)[:, None]
     return filtered_rows(problem.records, direction, response)
 
