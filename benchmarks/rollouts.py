@@ -1,6 +1,6 @@
 """Diagnosis of rollouts: what real robots' commands and positions show.
 
-    python benchmarks/rollouts.py servo_miuzei      # a hobby servo with a weight: train, test and all other runs
+    python benchmarks/rollouts.py servo_miuzei [--runs 1::4 ...]  # a hobby servo: train, test and all other runs
     python benchmarks/rollouts.py dfki_double_pendulum --window 0.3
     python benchmarks/rollouts.py so101_sage [--third K] [--again] [--uncut]  # a 6-joint servo arm
     python benchmarks/rollouts.py so101_thirds [--processes 4]  # all of it, and without each third of the recordings
@@ -56,13 +56,16 @@ def miuzei_runs() -> list[Run]:
     return found
 
 
-def servo_miuzei(law: str = "hard") -> None:
-    """Every fourth run is fitted, every fourth from the second is the test."""
+def servo_miuzei(law: str = "hard", fitted: str = "0::4") -> None:
+    """Every fourth run is fitted and every fourth from the second the test, or of others all that are not fitted."""
     file = DATA / "servo_miuzei" / "servo_meshfree.xml"
     loop, _ = load_loop(file, {"servo": {"kind": "position", "kp": 25.0, "kd": 5.0}}, law=law, dt=0.005)
     runs = miuzei_runs()
-    train, test = runs[::4], runs[1::4]
-    other = [r for k, r in enumerate(runs) if k % 4 > 1]
+    first, every = map(int, fitted.split("::"))
+    train, unseen = runs[first::every], [r for k, r in enumerate(runs) if k % every != first]
+    groups = {"train": train, "unseen": unseen}
+    if (first, every) == (0, 4):
+        groups = {"train": train, "test": runs[1::4], "other": [r for k, r in enumerate(runs) if k % 4 > 1]}
     here = setting(
         loop, train, baseline=("rotor_inertia", "friction_loss"), gains_known=False,
         more=[("actuator_gain", "servo"), ("joint_damping", "servo")], block=0.24,
@@ -73,7 +76,7 @@ def servo_miuzei(law: str = "hard") -> None:
     print(f"verdict {found.verdict}, {time.process_time() - start:.0f} CPU s, {len(train)} runs fitted")
     show(found, [n.candidate.effect for n in (found.named or found.proxy)])
     loop0 = here.loop
-    for name, group in (("train", train), ("test", test), ("other", other)):
+    for name, group in groups.items():
         models = {
             "model file": loop0,
             "baseline": put(loop0, here.known.table, found.first.theta),
@@ -433,6 +436,7 @@ if __name__ == "__main__":
     )
     parser.add_argument("--window", type=float, default=0.3, help="s, of the double pendulum")
     parser.add_argument("--law", choices=["hard", "soft"], default="hard")
+    parser.add_argument("--runs", nargs="+", default=["0::4"], metavar="FIRST::EVERY", help="of the Miuzei, fitted")
     parser.add_argument("--every", type=int, default=1, help="takes one window of so many")
     parser.add_argument("--third", type=int, choices=[0, 1, 2], help="of the arm's recordings, left out of the fit")
     parser.add_argument("--most", type=float, default=999.0, help="s of each of the arm's recordings that are fitted")
@@ -455,6 +459,8 @@ if __name__ == "__main__":
     elif args.data == "so101_sage":
         so101_sage(args.motions, args.third, args.most, args.unseen, args.forbid, args.again, args.uncut)
     elif args.data == "servo_miuzei":
-        servo_miuzei(args.law)
+        for fitted in args.runs:
+            print(f"runs {fitted}")
+            servo_miuzei(args.law, fitted)
     else:
         dfki_double_pendulum(args.window, args.every)

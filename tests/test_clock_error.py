@@ -18,7 +18,7 @@ DT, RATE = 0.005, 0.008
 
 
 def test_a_clock_ahead_by_half_a_second_reads_the_torque_of_then() -> None:
-    """1 Hz over 60 s, twice: half a period ahead at the end. To first order the error would be three times as large."""
+    """1 Hz over 60 s, twice: half a period ahead at the end, where the first order is off by the torque itself."""
     t = np.tile(DT * np.arange(12000), 2)
     tau = np.sin(2 * np.pi * t)[:, None] * (1 + 0.3 * (np.arange(24000) >= 12000))[:, None]
     still = np.zeros_like(tau)
@@ -28,7 +28,7 @@ def test_a_clock_ahead_by_half_a_second_reads_the_torque_of_then() -> None:
     known = (t > 0.1) & (t < 59)  # later than that the record ends before what is read then
     error, first = (np.asarray(c.torque_error(motion)) for c in (exact(clock), clock))
     assert np.abs(error - (ahead - tau))[known].max() < 2e-3
-    assert np.abs(first - (ahead - tau))[known].max() > 0.5
+    assert np.abs(first - (ahead - tau))[known].max() > 1.0
 
 
 @pytest.mark.slow

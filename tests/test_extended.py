@@ -367,7 +367,7 @@ def test_sensors_that_err_are_in_the_predicted_reading(rod: RobotModel):
     }
     for name, (parameters, expected) in cases.items():
         np.testing.assert_allclose(predicted(name, **parameters)[inside], expected[inside], rtol=0, atol=1e-6)
-    late = t * (1 + 0.02)  # the torque is that of a time that runs ahead: by 32 ms in the end
+    late = t * 1.02  # the torque is that of a time that runs ahead: in the end of one behind the record
     expected = reading(0.8 * np.sin(3 * late), -7.2 * np.sin(3 * late))
     np.testing.assert_allclose(predicted("clock_error", rate=0.02)[10:-30], expected[10:-30], rtol=0, atol=1e-5)
 

@@ -77,6 +77,7 @@ class KeptOut:
         return bool(self.searched.here.problem.held.any()) and self.fall(name).certainly(self.claims[name])
 
     def fall(self, name: Name) -> Fall:
+        """By how much the error on what is kept out falls with the cause in, beside all others."""
         if name not in self.falls:
             here, found, step = self.searched.here, self.searched.found, self.searched.joint.step
             one = next(f for f in found if f.name == name)

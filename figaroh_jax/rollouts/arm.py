@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -76,25 +77,22 @@ def _by_colour(here: Setting, white: Search, forbid: Sequence[str]) -> Search:
     return new
 
 
-def _searched(
-    here: Setting, progress: Callable[[str, float], None], forbid: Sequence[str], *, told: bool = False
-) -> Search:
-    """The search in rows that count; `told`: those in which the end rests on a table are left out already."""
-    progress("fitting the baseline", 0.05)
-    whole, here = here, thinned(here)
-    first, wrong = _begun(here), list[Fault]()
-    if here.pole is None:  # a colour is told from sound rows
-        whole, wrong = _sound(whole, first if whole is here else _started(whole, first))
-    if wrong:
-        here = thinned(whole)
-        first = _begun(here)
-    now = begin = standing(here, Structure(here.loop, here.known.table, here.data), first, here.baseline)
-    found: list[Named] = []
-    held, steps, fits = [rms_of(here, begin.held)], [("baseline", _level(here, first))], list[Fit]()
+class _Course(NamedTuple):
+    """How a search went: chi2/N, held-out RMS (rad or m) and fit after each round; the baseline's come first."""
+
+    steps: list[tuple[str, float]]
+    held: list[float]
+    fits: list[Fit]  # of the rounds alone
+
+
+def _rounds(
+    here: Setting, begin: Standing, forbid: Sequence[str], progress: Callable[[str, float], None]
+) -> tuple[list[Named], Standing, list[tuple[Name, float, str]], _Course]:
+    """Causes round after round until none comes in or noise alone is left: these, the model, and what came near."""
+    found, now, known = list[Named](), begin, Known()
     nearest: list[tuple[Name, float, str]] = []
-    known: Known = {}
-    p_value = 1.0 if not np.isfinite(first.cost) else float(max(ndtr(-4 * begin.excess.max()), 1e-12))
-    while np.isfinite(first.cost):
+    steps, held, fits = course = _Course([("baseline", _level(here, begin.model.fit))], [rms_of(here, begin.held)], [])
+    while np.isfinite(begin.model.fit.cost):
         number = len(steps)
         progress(f"searching for causes, round {number}", min(0.1 + 0.12 * number, 0.9))
         new, now, nearest = _round(here, now, found, forbid, nearest, known)
@@ -110,6 +108,24 @@ def _searched(
         fits.append(now.model.fit)
         if now.excess.max() < 1.0:
             break
+    return found, now, nearest, course
+
+
+def _searched(
+    here: Setting, progress: Callable[[str, float], None], forbid: Sequence[str], *, told: bool = False
+) -> Search:
+    """The search in rows that count; `told`: those in which the end rests on a table are left out already."""
+    progress("fitting the baseline", 0.05)
+    whole, here = here, thinned(here)
+    first, wrong = _begun(here), list[Fault]()
+    if here.pole is None:  # a colour is told from sound rows
+        whole, wrong = _sound(whole, first if whole is here else _started(whole, first))
+    if wrong:
+        here = thinned(whole)
+        first = _begun(here)
+    begin = standing(here, Structure(here.loop, here.known.table, here.data), first, here.baseline)
+    p_value = 1.0 if not np.isfinite(first.cost) else float(max(ndtr(-4 * begin.excess.max()), 1e-12))
+    found, now, nearest, (steps, held, fits) = _rounds(here, begin, forbid, progress)
     progress("judging", 0.9)
     found, now, slight = still_needed(here, found, now, begin)
     found, now = _alike(here, found, now) if slight is None else (found, now)

@@ -2,7 +2,8 @@
 
 Joints driven by one kind of servo have the same kinds of friction and rotor. Beside a rest that no model explains, a
 cause at one joint must be large, for a smaller one may make up for what is missing. One that surely lowers what each of
-three encoders or more shows need not be, where nearly all recordings that were not fitted bear all of them out.
+three encoders or more shows need not be, where nearly all recordings that were not fitted bear all of them out; joints
+that show less of it have it too then.
 """
 
 from __future__ import annotations
@@ -97,9 +98,8 @@ def _borne_out(here: Setting, now: Standing, ones: Sequence[Candidate], begin: F
             gains[c] = min(1 - x[..., j].sum() / max(y[..., j].sum(), 1e-300)
                            for x, y in ((new.held, before), (new.squares, now.squares)))  # fmt: skip
             ts[c] = t_of_recordings(before[..., j], new.held[..., j], runs)
-        sure = [c for c in ones if gains[c] > GAIN and ts[c] > CONFIDENT]
-        good = [c for c in sure if sized(here, Tried(c, new.model, new.squares))]
-        if len(good) < FEWEST_JOINTS:
+        good = [c for c in ones if gains[c] > GAIN and ts[c] > 0 and sized(here, Tried(c, new.model, new.squares))]
+        if sum(ts[c] > CONFIDENT for c in good) < FEWEST_JOINTS:
             return [], now
         if len(good) == len(ones):
             break
