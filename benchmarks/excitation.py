@@ -767,7 +767,7 @@ def ranking(triples: int = 200) -> None:
         z = np.load(file)
         try:
             run = fj.recording(q=z["q"], tau=z["i"] * gains, time=z["t"], name=file.stem)
-            signals = prepare_all((run,), fj.Preprocess(cutoff=5), slowed=False, model=model)
+            signals = prepare_all((run,), fj.Preprocess(cutoff=5), band=None, model=model)
             data.append(condense(Regression(NativeBackend(model), learned.terms, np.zeros(6), signals), used))
         except fj.InputError as refused:
             print(f"left out: {refused}")

@@ -181,7 +181,7 @@ class Diagnosis(Selection):
     rest: Rest = field(default_factory=lambda: Rest(np.zeros(0)))
     notes: tuple[str, ...] = ()  # what was dropped or assumed while reading the data
     prismatic: tuple[bool, ...] = ()  # per joint; empty: every joint is revolute
-    slowed: bool = False  # positions were taken down to the band of their own motion: predictions want the same
+    band: float | None = None  # Hz, that positions were taken down to (`prepare`): predictions want the same
     of_positions: bool = False  # a rollout: residuals and traces are positions, not torques
 
     @property

@@ -7,6 +7,7 @@ another, until nothing is gained. What is left decides between `named`, `named+r
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -106,16 +107,17 @@ def diagnose(
     with jax.enable_x64(True):
         progress("preparing signals", 0.03)
         backend = as_backend(model)
-        signals, slowed, begun = prepared_signals(backend, recordings, preprocess, known, trust)
+        signals, band, begun = prepared_signals(backend, recordings, preprocess, known, trust)
         here = setting_of(*begun, forbid, progress)
         generator = np.random.default_rng(seed)
         give_back_holes()
         searched = _searched(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
         give_back_holes()
         ordered = sorted(recordings, key=lambda r: r.role == "holdout")
-        judged = _judged(searched, Reader(ordered, signals, preprocess, slowed), forbid, tolerance, alpha, generator)
+        judged = _judged(searched, Reader(ordered, signals, preprocess, band), forbid, tolerance, alpha, generator)
         progress("measuring the gain", 0.9)
-        return replace(_answer(searched.here, signals, searched.search, judged), slowed=slowed)
+        answer = _answer(searched.here, signals, searched.search, judged)
+        return replace(answer, band=band, notes=(*answer.notes, *_band_note(band)))
 
 
 class _Judged(NamedTuple):
@@ -461,6 +463,15 @@ _AT_REST = (
     "at rest the torque differs from the model, as dry friction allows: there it can take any value up to its limit,"
     " which no law of velocity predicts; where the joints move, the residual is within the tolerance"
 )
+
+
+def _band_note(band: float | None) -> list[str]:
+    if band is None or math.isinf(band):
+        return []
+    return [
+        f"positions are smoothed to {band:.3g} Hz: faster motion in them changes the model's torque, but the measured"
+        " torque does not follow it, so it is taken for an error of the position sensors"
+    ]
 
 
 def _scheme(signals: Sequence[Signals]) -> str:

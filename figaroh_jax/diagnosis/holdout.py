@@ -35,7 +35,8 @@ __all__ = [
     "whitened_wanted",
 ]
 
-BLOCK, FEWEST = 1.0, 8  # s; blocks of a recording
+BLOCK, FEWEST, MANY = 1.0, 8, 16  # s; blocks of a recording: at least, and as many as it has independent ones
+APART = 4.0  # periods of the cutoff from which blocks are taken for independent
 
 
 class Held(NamedTuple):
@@ -152,13 +153,14 @@ def _error(problem: Problem, step: Step) -> Float[np.ndarray, "n M nv"]:
 
 def _blocks(problem: Problem) -> Int[np.ndarray, "n M"]:
     """Which block of the data not fitted a row belongs to, -1 for others: of about a second, at least `FEWEST` in a
-    recording."""
+    recording, and more in a short one where the filter does not make them alike."""
     kept = np.any(_kept_out(problem) > 0, axis=2)
     block, first, rate = np.full(kept.shape, -1), 0, float(problem.records.rate)
+    apart = APART * rate / float(problem.records.cutoff)
     for at in problem.records.spans:
         here = (at.slot, slice(at.row, at.row + at.rows))
         if kept[here].any():
-            width = max(1.0, min(BLOCK * rate, at.rows / FEWEST))
+            width = max(1.0, min(BLOCK * rate, at.rows / FEWEST, max(apart, at.rows / MANY)))
             number = (np.arange(at.rows) // width).astype(int)
             block[here] = np.where(kept[here], first + number, -1)
             first += int(number[-1]) + 1

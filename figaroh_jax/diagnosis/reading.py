@@ -42,7 +42,7 @@ class Reader:
     recordings: Sequence[Recording]
     signals: Sequence[Signals]
     preprocess: Preprocess
-    slowed: bool
+    band: float | None
 
     def errors(
         self, problem: Problem, state: State, generator: np.random.Generator
@@ -63,7 +63,7 @@ class Reader:
                 _read(recording, signals, torque[at.slot, at.sample : at.sample + at.samples], generator)
                 for recording, signals, at in zip(self.recordings, self.signals, problem.records.spans, strict=True)
             ]
-            records = stack(prepare_all(read, self.preprocess, slowed=self.slowed), problem.model, joined=True)
+            records = stack(prepare_all(read, self.preprocess, band=self.band), problem.model, joined=True)
             if records.spans != problem.records.spans:
                 return None
             records = eqx.tree_at(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -20,7 +21,7 @@ from .layout import checked_repeats, held_rows, layout
 from .problem import Problem
 from .state import State, baseline, stated_effects, with_width
 from .step import stand
-from .thresholds import WEIGHT_ROUNDS
+from .thresholds import SLOWER, SLOWER_AT_COST, WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -39,23 +40,58 @@ class Setting(NamedTuple):
     white: bool  # whether the rows are weighted by their joint's residual, not by the noise's spectrum
 
 
+class _Read(NamedTuple):
+    """The recordings as they are prepared with one `band` of positions, and what the baseline then leaves."""
+
+    signals: list[Signals]  # holdout recordings behind the others
+    band: float | None  # as for `prepare_all`
+    begun: tuple[Problem, State]
+    squares: Float[np.ndarray, " nv"]
+
+    def moves_as(self, signals: Sequence[Signals]) -> bool:
+        """Whether its positions are those of other signals."""
+        return all(np.array_equal(a.position, b.position) for a, b in zip(self.signals, signals, strict=True))
+
+
 def prepared_signals(
     backend: Backend, recordings: Sequence[Recording], preprocess: Preprocess, known: Baseline | None, trust: float
-) -> tuple[list[Signals], bool, tuple[Problem, State]]:
-    """The recordings prepared, holdout recordings behind the others, whether their positions are slowed, the baseline.
+) -> tuple[list[Signals], float | None, tuple[Problem, State]]:
+    """The recordings prepared, holdout recordings behind the others, the `band` of their positions, the baseline.
 
     Each position is taken down to the band of its own motion only where the baseline then predicts left-out parts
     better: coarse encoders need it, and it takes the abrupt parts of a fine one away. Every joint counts alike, by the
     ratio of its errors, so that one with a cause in it does not decide for all.
+
+    Where that does no harm, positions may hold errors as fast as no white noise tells (a sensor that shakes, stamps
+    that jitter): what moves the model's torque above some frequency and not the measured one. So all are taken down by
+    half octaves for as long as each step lowers the errors, at all joints: where motion is lost, or friction sticks,
+    some are predicted better and some worse.
     """
     resampled: Resampled = {}
-    prepared = (prepare_all(recordings, preprocess, slowed=slowed, resampled=resampled) for slowed in (False, True))
-    plain, slow = both = [sorted(checked_repeats(each), key=lambda s: s.role == "holdout") for each in prepared]
-    if all(np.array_equal(a.position, b.position) for a, b in zip(plain, slow, strict=True)):
-        return plain, False, _begun(backend, plain, known, trust)
-    first, second = (_begun(backend, signals, known, trust) for signals in both)
-    slower = np.mean(np.log(_baseline_squares(*second) / _baseline_squares(*first))) < 0
-    return (slow, True, second) if slower else (plain, False, first)
+
+    def read(band: float | None, like: _Read | None = None) -> _Read:
+        prepared = prepare_all(recordings, preprocess, band=band, resampled=resampled)
+        signals = sorted(checked_repeats(prepared), key=lambda s: s.role == "holdout")
+        if like and like.moves_as(signals):
+            return like
+        begun = _begun(backend, signals, known, trust)
+        return _Read(signals, band, begun, _baseline_squares(*begun))
+
+    plain = read(None)
+    best = read(math.inf, like=plain)
+    if np.mean(_fall(plain, best)) < 0:
+        return plain.signals, plain.band, plain.begun
+    while True:
+        slower = read(max(s.bands.max() for s in best.signals) / np.sqrt(2))
+        fall = _fall(best, slower)
+        if np.mean(fall) < SLOWER or min(fall) < -SLOWER_AT_COST * np.mean(fall):
+            return best.signals, best.band, best.begun
+        best = slower
+
+
+def _fall(before: _Read, after: _Read) -> Float[np.ndarray, " nv"]:
+    """By how much lower each joint's squares are with another way to read, as a logarithm."""
+    return np.log(before.squares / after.squares)
 
 
 def _baseline_squares(problem: Problem, start: State) -> Float[np.ndarray, " nv"]:

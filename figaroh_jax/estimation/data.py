@@ -226,7 +226,7 @@ def torque_data(
     lacking = next((one for one in fitted if one.torque is None), None)
     if not fitted or lacking is not None:
         raise InputError(f"{lacking.file} has no torque" if lacking else "no recording to fit: all have role holdout")
-    signals = prepare_all(tuple(fitted), preprocess or Preprocess(), slowed=False, model=robot)
+    signals = prepare_all(tuple(fitted), preprocess or Preprocess(), band=None, model=robot)
     records = stack(signals, robot)
     places = records.source.shape[1]
     if places > PLACES:

@@ -33,7 +33,7 @@ def with_recordings(
             raise InputError(f"{one.file}: no torque; recordings of `excite` say what is already known of the dynamics")
     with jax.enable_x64(True):
         terms = friction_terms(robot, known)
-        signals = prepare_all(tuple(recordings), task.preprocess, slowed=False, model=robot)
+        signals = prepare_all(tuple(recordings), task.preprocess, band=None, model=robot)
         regression = Regression(NativeBackend(robot), terms, np.zeros(robot.nv), signals)
         used = np.asarray(np.abs(structural_columns(robot, terms)).max(axis=0) > 0)
         data = condense(regression, used)

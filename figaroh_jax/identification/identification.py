@@ -267,7 +267,7 @@ def _regression(
 ) -> tuple[Regression, list[str]]:
     """The rows of the recordings, and what is left out of them, in words."""
     # the cutoff alone: a band guessed from the motion costs accuracy where friction makes the motion sharp
-    signals = prepare_all(tuple(recordings), preprocess, slowed=False, model=backend.robot)
+    signals = prepare_all(tuple(recordings), preprocess, band=None, model=backend.robot)
     refused, notes = _refused(backend.robot, recordings, joints)
     terms = friction_terms(backend.robot, known)
     return Regression(backend, terms, np.zeros(backend.robot.nv), signals, refused), notes

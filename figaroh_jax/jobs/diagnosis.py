@@ -22,7 +22,7 @@ def diagnose(task: Task, out: Path, progress: Progress, backend: str) -> Done:
     progress("writing the report", 1.0)
     with run_folder(task, out, "diagnose", backend) as folder:
         (folder / ANSWER).write_text(to_json(found), encoding="utf-8")
-        write_predictions(folder / "predictions.npz", predictions(task, found.model, slowed=found.slowed))
+        write_predictions(folder / "predictions.npz", predictions(task, found.model, band=found.band))
         write_report(found, folder / REPORT, found.model.robot.name)
         write_model(found.model, folder / "model", found.causes)
     name = found.model.robot.name

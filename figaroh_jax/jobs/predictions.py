@@ -14,12 +14,12 @@ __all__ = ["predictions"]
 
 
 def predictions(
-    task: Task, extended: ExtendedModel, *, identified: bool = False, slowed: bool = False
+    task: Task, extended: ExtendedModel, *, identified: bool = False, band: float | None = None
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Time (s) and the extended model's torque (N m or N) of each holdout recording, on its own time stamps.
 
-    The recording's motion is prepared as for the fit (`slowed`: positions taken down to the band of their own motion),
-    but over its whole length, whatever window the fit kept. Where the model is an identified one, a known payload is
+    The recording's motion is prepared as for the fit (`band` as for `prepare`), but over its whole length, whatever
+    window the fit kept. Where the model is an identified one, a known payload is
     carried in addition.
     """
     if all(entry.role == "fit" for entry in task.data):
@@ -30,7 +30,7 @@ def predictions(
     found = {}
     for recording in recordings:
         if recording.role == "holdout":
-            motion = prepare(recording, whole, rates, slowed=slowed, model=extended.robot)
+            motion = prepare(recording, whole, rates, band=band, model=extended.robot)
             carrying = _carrying(extended, recording.load if identified else None)
             state = motion.position, motion.velocity, motion.acceleration
             if extended.robot.nq == extended.robot.nv:

@@ -10,6 +10,7 @@ not used: controllers filter it with a delay that nobody states.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -99,25 +100,25 @@ def prepare_all(
     recordings: Sequence[Recording],
     preprocess: Preprocess,
     *,
-    slowed: bool = True,
+    band: float | None = math.inf,
     model: RobotModel | None = None,
     resampled: Resampled | None = None,
 ) -> tuple[Signals, ...]:
     """`prepare` every recording at the same rates, and repeats of one excitation on grids that meet.
 
     Row k of a repeat's first recording is then row k + `align(first, repeat)` of the repeat, to a fiftieth of a row.
-    `slowed`, `model` and `resampled` as for `prepare`.
+    `band`, `model` and `resampled` as for `prepare`.
     """
     rates = choose_rates(recordings, preprocess)
     prepared: list[Signals] = []
     leaders: dict[str, Signals] = {}
     for recording in recordings:
-        signals = prepare(recording, preprocess, rates, slowed=slowed, model=model, resampled=resampled)
+        signals = prepare(recording, preprocess, rates, band=band, model=model, resampled=resampled)
         leader = leaders.setdefault(recording.repeat, signals) if recording.repeat else signals
         late = _late_rows(leader, signals) if leader is not signals else 0.0
         off = (late - round(late)) * rates.row
         if abs(off) >= rates.row / 50:
-            more = {"slowed": slowed, "model": model, "resampled": resampled}
+            more = {"band": band, "model": model, "resampled": resampled}
             signals = prepare(recording, preprocess, rates, shift=off, **more)
         prepared.append(signals)
     return tuple(prepared)
@@ -129,16 +130,17 @@ def prepare(
     rates: Rates | None = None,
     *,
     shift: float = 0.0,
-    slowed: bool = True,
+    band: float | None = math.inf,
     model: RobotModel | None = None,
     resampled: Resampled | None = None,
 ) -> Signals:
     """Even, low-passed, differentiated signals of one recording and the filter that makes its rows.
 
     `rates` are those of `choose_rates`, by default for this recording alone; `shift` (s, less than a row) moves the
-    grid; `slowed` takes a position down to the band of its own motion where that is below the cutoff. A `model` with
-    quaternions in q takes the rates on its group (`groupmotion`). `resampled` holds what calls that differ in `slowed`
-    alone have in common: an empty dictionary at first. Raises `InputError` where the window, the cutoff or
+    grid. A position is taken down to the band of its own motion where that is below the cutoff, and to `band` (Hz) at
+    the most; None leaves it at the cutoff. A `model` with quaternions in q takes the rates on its group
+    (`groupmotion`). `resampled` holds what calls that differ in `band` alone have in common: an empty dictionary at
+    first. Raises `InputError` where the window, the cutoff or
     the rate do not fit the recording, or it is too short.
     """
     rates, key = rates or choose_rates((recording,), preprocess), (id(recording), shift)
@@ -164,7 +166,7 @@ def prepare(
             f" after {trim} s are cut at both ends, at least {FEWEST_ROWS} are needed"
         )
     if grouped is None:
-        bands = _bands(columns[0], dt, rates.cutoff, raw, rate) if slowed else np.full(nv, rates.cutoff)
+        bands = np.full(nv, rates.cutoff) if band is None else _bands(columns[0], dt, rates.cutoff, raw, rate, band)
         position = let_through(columns[0], dt, rates.cutoff, bands)
         moves = np.ptp(position, axis=0) > STILL * (1 + np.abs(position).max(axis=0))
         position[:, ~moves] = position[0, ~moves]  # dry friction would see the sign of rounding
@@ -211,14 +213,20 @@ def _refuse_endless(recording: Recording, time: Float[np.ndarray, " samples"], r
 
 
 def _bands(
-    position: Float[np.ndarray, "samples nv"], dt: float, cutoff: float, raw: Float[np.ndarray, "read nv"], rate: float
+    position: Float[np.ndarray, "samples nv"],
+    dt: float,
+    cutoff: float,
+    raw: Float[np.ndarray, "read nv"],
+    rate: float,
+    most: float,
 ) -> Float[np.ndarray, " nv"]:
-    """The band of each joint's motion, Hz, at most its `cutoff`.
+    """The band of each joint's motion, Hz, at most its `cutoff` and `most`.
 
     `raw` are the samples as they were read, at `rate` (Hz): they show the steps of the encoder.
     """
     steps = [encoder_step(column) for column in raw.T]
-    return np.array([motion_band(x, dt, cutoff, step, rate) for x, step in zip(position.T, steps, strict=True)])
+    own = [motion_band(x, dt, cutoff, step, rate) for x, step in zip(position.T, steps, strict=True)]
+    return np.minimum(own, most)
 
 
 def let_through(
