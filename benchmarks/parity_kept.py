@@ -135,8 +135,8 @@ def slowed(cases: Path) -> None:
         try:
             fj.diagnose_task(fj.load_task(file))
         except Chosen as chosen:
-            if len(seen) == 2:
-                slow, plain = seen
+            if len(seen) > 1:
+                plain, slow = seen[:2]
                 whole, each = np.log(slow.sum() / plain.sum()) / 2, np.mean(np.log(slow / plain)) / 2
                 print(
                     f"{file.parent.name}: {chosen.args[0]}, together {whole:+.4f}, joint by joint {each:+.4f}",

@@ -7,7 +7,6 @@ another, until nothing is gained. What is left decides between `named`, `named+r
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -19,6 +18,7 @@ from ..compiled.memory import give_back_holes
 from ..effects.base import place
 from ..effects.catalogue import CATALOGUE, find, related
 from ..effects.plausibility import implausible
+from ..recordings.bandwidth import note_on
 from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Signals
@@ -117,7 +117,7 @@ def diagnose(
         judged = _judged(searched, Reader(ordered, signals, preprocess, band), forbid, tolerance, alpha, generator)
         progress("measuring the gain", 0.9)
         answer = _answer(searched.here, signals, searched.search, judged)
-        return replace(answer, band=band, notes=(*answer.notes, *_band_note(band)))
+        return replace(answer, band=band, notes=(*answer.notes, *note_on(band)))
 
 
 class _Judged(NamedTuple):
@@ -463,15 +463,6 @@ _AT_REST = (
     "at rest the torque differs from the model, as dry friction allows: there it can take any value up to its limit,"
     " which no law of velocity predicts; where the joints move, the residual is within the tolerance"
 )
-
-
-def _band_note(band: float | None) -> list[str]:
-    if band is None or math.isinf(band):
-        return []
-    return [
-        f"positions are smoothed to {band:.3g} Hz: faster motion in them changes the model's torque, but the measured"
-        " torque does not follow it, so it is taken for an error of the position sensors"
-    ]
 
 
 def _scheme(signals: Sequence[Signals]) -> str:

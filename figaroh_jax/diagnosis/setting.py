@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..estimation.noise import Spectrum
+from ..recordings.bandwidth import as_slow_as_torque
 from ..recordings.dataset import Recording
 from ..recordings.signals import Resampled, Signals, prepare_all
 from ..recordings.stacked import stack
@@ -21,7 +22,7 @@ from .layout import checked_repeats, held_rows, layout
 from .problem import Problem
 from .state import State, baseline, stated_effects, with_width
 from .step import stand
-from .thresholds import SLOWER, SLOWER_AT_COST, WEIGHT_ROUNDS
+from .thresholds import WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -48,6 +49,10 @@ class _Read(NamedTuple):
     begun: tuple[Problem, State]
     squares: Float[np.ndarray, " nv"]
 
+    @property
+    def highest(self) -> float:
+        return float(max(one.bands.max() for one in self.signals))
+
     def moves_as(self, signals: Sequence[Signals]) -> bool:
         """Whether its positions are those of other signals."""
         return all(np.array_equal(a.position, b.position) for a, b in zip(self.signals, signals, strict=True))
@@ -62,10 +67,7 @@ def prepared_signals(
     better: coarse encoders need it, and it takes the abrupt parts of a fine one away. Every joint counts alike, by the
     ratio of its errors, so that one with a cause in it does not decide for all.
 
-    Where that does no harm, positions may hold errors as fast as no white noise tells (a sensor that shakes, stamps
-    that jitter): what moves the model's torque above some frequency and not the measured one. So all are taken down by
-    half octaves for as long as each step lowers the errors, at all joints: where motion is lost, or friction sticks,
-    some are predicted better and some worse.
+    Where that does no harm, all are taken down further for as long as the torque follows better (`as_slow_as_torque`).
     """
     resampled: Resampled = {}
 
@@ -78,20 +80,9 @@ def prepared_signals(
         return _Read(signals, band, begun, _baseline_squares(*begun))
 
     plain = read(None)
-    best = read(math.inf, like=plain)
-    if np.mean(_fall(plain, best)) < 0:
-        return plain.signals, plain.band, plain.begun
-    while True:
-        slower = read(max(s.bands.max() for s in best.signals) / np.sqrt(2))
-        fall = _fall(best, slower)
-        if np.mean(fall) < SLOWER or min(fall) < -SLOWER_AT_COST * np.mean(fall):
-            return best.signals, best.band, best.begun
-        best = slower
-
-
-def _fall(before: _Read, after: _Read) -> Float[np.ndarray, " nv"]:
-    """By how much lower each joint's squares are with another way to read, as a logarithm."""
-    return np.log(before.squares / after.squares)
+    own = read(math.inf, like=plain)
+    best = plain if np.mean(np.log(own.squares / plain.squares)) > 0 else as_slow_as_torque(own, read)
+    return best.signals, best.band, best.begun
 
 
 def _baseline_squares(problem: Problem, start: State) -> Float[np.ndarray, " nv"]:

@@ -8,10 +8,6 @@ from __future__ import annotations
 
 __all__: list[str] = []
 
-# How fast positions are read (`setting`)
-SLOWER = 0.05  # fall of the baseline's squares on parts left out (mean logarithm) that half an octave less must bring
-SLOWER_AT_COST = 1 / 3  # of that fall: what the error of no joint may rise by
-
 # Weights of rows by speed (`weights`)
 REVERSAL = 0.25  # periods of the cutoff around a change of the velocity's sign in which a joint's rows are left out
 REVERSALS_AT_MOST = 1 / 3  # of a joint's rows; a joint that mostly stands still keeps them

@@ -26,9 +26,10 @@ from ..estimation.intervals import coloured_covariance
 from ..estimation.least_squares import Solution, WeightedByJoint, solve
 from ..estimation.priors import rigid_prior
 from ..estimation.regression import Condensed, Regression, condense
+from ..recordings.bandwidth import as_slow_as_torque, note_on
 from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
-from ..recordings.signals import prepare_all
+from ..recordings.signals import Resampled, prepare_all
 from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
 from ..simulators.native import as_backend
@@ -181,12 +182,14 @@ def identify(
     warned = check_recordings(None, model, recordings) if check else ()
     with jax.enable_x64(True):
         progress("preparing signals", 0.05)
-        regression, left_out = _regression(backend, recordings, preprocess or Preprocess(), known or Baseline(), joints)
-        structure = structural_columns(model, regression.terms)
+        refused, left_out = _refused(model, recordings, joints)
+        terms = friction_terms(model, known or Baseline())
+        structure = structural_columns(model, terms)
         used = np.asarray(np.abs(structure).max(axis=0) > 0)
-        structural = base_parameters(structure.reshape(-1, structure.shape[2]), regression.names)
         progress("condensing the recordings", 0.15)
-        regression, data, base, start = _condensed(regression, used)
+        read = _read(backend, recordings, preprocess or Preprocess(), terms, refused, used)
+        structural = base_parameters(structure.reshape(-1, structure.shape[2]), read.regression.names)
+        regression, data, base, start = _condensed(read, used)
         progress("covariance of coloured residuals", 0.5)
         covariance = coloured_covariance(regression, start.parameters, base.independent, start.weight)
         problem = _problem(regression, data, base, start, covariance, trust, fit, bounds)
@@ -194,8 +197,8 @@ def identify(
         last = _best(problem, trust)
         progress("judging", 0.85)
         found = _judged(problem, regression, start.parameters, covariance, last, trust, structural.rank)
-    notes = [*warned, *left_out, *found.notes, *dropped(regression.signals, model)]
-    return replace(found, notes=(*notes, *(note for one in regression.signals for note in one.notes)))
+    notes = [*warned, *left_out, *found.notes, *dropped(regression.signals, model), *note_on(read.band)]
+    return replace(found, band=read.band, notes=(*notes, *(note for one in regression.signals for note in one.notes)))
 
 
 _LOOSENED = (
@@ -258,19 +261,53 @@ def _judged(
     )
 
 
-def _regression(
+class _Read(NamedTuple):
+    """The recordings as they are prepared with one `band` of positions, condensed, and their first fit."""
+
+    band: float | None  # as for `prepare_all`
+    regression: Regression
+    wide: Condensed  # with the columns of all reversal widths
+    base: BaseParameters
+    first: Solution
+
+    @property
+    def highest(self) -> float:
+        return float(max(one.bands.max() for one in self.regression.signals))
+
+    @property
+    def squares(self) -> Float[np.ndarray, " fitted"]:
+        """Of the joints whose torque is fitted; none is less than 1e-12 of their sum."""
+        theta = np.zeros(len(self.wide.names))
+        theta[: len(self.first.parameters)] = self.first.parameters
+        squares = self.wide.squares(theta)[self.wide.rows > 0]
+        return np.maximum(squares, max(1e-12 * squares.sum(), 1e-300))
+
+
+def _read(
     backend: Backend,
     recordings: Sequence[Recording],
     preprocess: Preprocess,
-    known: Baseline,
-    joints: Sequence[str] | None,
-) -> tuple[Regression, list[str]]:
-    """The rows of the recordings, and what is left out of them, in words."""
-    # the cutoff alone: a band guessed from the motion costs accuracy where friction makes the motion sharp
-    signals = prepare_all(tuple(recordings), preprocess, band=None, model=backend.robot)
-    refused, notes = _refused(backend.robot, recordings, joints)
-    terms = friction_terms(backend.robot, known)
-    return Regression(backend, terms, np.zeros(backend.robot.nv), signals, refused), notes
+    terms: Sequence[Effect],
+    refused: frozenset[str],
+    used: Bool[np.ndarray, "nv columns"],
+) -> _Read:
+    """The rows of the recordings.
+
+    Positions keep all below the cutoff unless the torque says otherwise: a band guessed from the motion alone costs
+    accuracy where friction makes the motion sharp.
+    """
+    resampled: Resampled = {}
+
+    def read(band: float | None) -> _Read:
+        signals = prepare_all(tuple(recordings), preprocess, band=band, model=backend.robot, resampled=resampled)
+        regression = Regression(backend, terms, np.zeros(backend.robot.nv), signals, refused)
+        wide = condense(regression, used, widths=widths_to_try(regression))
+        data = wide.restricted(range(len(regression.names)))
+        base = _base(data)
+        return _Read(band, regression, wide, base, solve(data, WeightedByJoint(), kept=base.independent))
+
+    whole = read(None)
+    return as_slow_as_torque(whole, read) if backend.robot.nq == backend.robot.nv else whole
 
 
 def _refused(
@@ -302,19 +339,16 @@ def _refused(
 
 
 def _condensed(
-    regression: Regression, used: Bool[np.ndarray, "nv columns"]
+    read: _Read, used: Bool[np.ndarray, "nv columns"]
 ) -> tuple[Regression, Condensed, BaseParameters, Solution]:
     """The regression with its reversal widths, condensed; its base parameters and their weighted fit."""
-    wide = condense(regression, used, widths=widths_to_try(regression))
-    data = wide.restricted(range(len(regression.names)))
-    base = _base(data)
-    first = solve(data, WeightedByJoint(), kept=base.independent)
+    _, regression, wide, base, first = read
     widened = with_reversal_widths(regression, wide, base.independent, first.weight)
-    if (widened.width != regression.width).any():
-        regression, data = widened, condense(widened, used)
-        base = _base(data)
-        first = solve(data, WeightedByJoint(), kept=base.independent)
-    return regression, data, base, first
+    if (widened.width == regression.width).all():
+        return regression, wide.restricted(range(len(regression.names))), base, first
+    data = condense(widened, used)
+    base = _base(data)
+    return widened, data, base, solve(data, WeightedByJoint(), kept=base.independent)
 
 
 def _base(data: Condensed) -> BaseParameters:

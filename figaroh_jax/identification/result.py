@@ -96,6 +96,7 @@ class Identification:
     correlations: tuple[tuple[str, str, float], ...] = ()  # of base parameters, the strongest
     notes: tuple[str, ...] = ()
     prismatic: tuple[bool, ...] = field(default=())
+    band: float | None = None  # Hz, that positions were taken down to (`prepare`): predictions want the same
 
     @property
     def model(self) -> ExtendedModel:

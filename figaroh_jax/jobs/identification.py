@@ -30,7 +30,7 @@ def identify(task: Task, out: Path, progress: Progress, backend: str) -> Done:
     name = found.model.robot.name
     with run_folder(task, out, "identify", backend) as folder:
         (folder / RESULT).write_text(to_json(found), encoding="utf-8")
-        write_predictions(folder / "predictions.npz", predictions(task, found.model, identified=True))
+        write_predictions(folder / "predictions.npz", predictions(task, found.model, identified=True, band=found.band))
         write_parameters(found, folder)
         write_identification(found, folder / REPORT, name, model_written=not wrong)
         if not wrong:

@@ -1,0 +1,109 @@
+"""Positions with errors that no white noise tells: a sensor that shakes within the filter's band, seen in no torque."""
+
+from __future__ import annotations
+
+import math
+import secrets
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from generators import robots
+from generators.case import Case
+from generators.inverse import make_case
+
+import figaroh_jax as fj
+from figaroh_jax.recordings.bandwidth import as_slow_as_torque
+
+LOWEST, HIGHEST = 6.0, 14.0  # Hz, of the shaking; recordings are low-passed at 15 Hz, the robot moves below 2 Hz
+needs_robots = pytest.mark.skipif(not robots.available("tx40"), reason="FIGAROH_JAX_DATA has no staubli_tx40")
+
+
+def shaken(case: Case, rms: float, seed: int) -> Case:
+    """The case with an error of every position (rad), another one in each recording."""
+    rng, out = np.random.default_rng(seed), []
+    for one in case.recordings:
+        position = one["position"]
+        frequency = np.fft.rfftfreq(len(position), float(one["time"][1] - one["time"][0]))
+        wave = rng.standard_normal((2, len(frequency), position.shape[1]))
+        wave *= ((frequency > LOWEST) & (frequency < HIGHEST))[:, None]
+        error = np.fft.irfft(wave[0] + 1j * wave[1], len(position), axis=0)
+        out.append({**one, "position": position + rms * error / error.std(0)})
+    return replace(case, recordings=tuple(out))
+
+
+def asked(case: Case, job: Callable[[fj.Task], object]) -> object:
+    with tempfile.TemporaryDirectory() as folder:
+        return job(fj.load_task(case.write(Path(folder))))
+
+
+@cache
+def drawn(effect: str = "") -> tuple[Case, Case, int]:
+    """A clean recording or one with an effect of a tenth, the same with sensors that shake, and what they grew from."""
+    seed = secrets.randbits(31)
+    case = make_case([(effect, 0.1)] if effect else [], robot="tx40", repeats=1, trajectories=2, seed=seed)
+    return case, shaken(case, float(np.random.default_rng(seed).uniform(1e-4, 3e-4)), seed), seed
+
+
+@needs_robots
+def test_positions_that_shake_are_no_error_of_the_model():
+    """Left in the model's torque they were `unknown`, a residual of two to six times the noise."""
+    case, bad, seed = drawn()
+    sound, found = (asked(one, fj.diagnose_task) for one in (case, bad))
+    assert isinstance(sound, fj.Diagnosis) and isinstance(found, fj.Diagnosis)
+    assert sound.band is None or math.isinf(sound.band), seed
+    assert found.band is not None and found.band < LOWEST, seed
+    assert found.verdict == "nothing", seed
+    assert (found.before < 1.3 * sound.before).all(), seed
+
+
+@needs_robots
+def test_what_is_hidden_beside_positions_that_shake_is_named():
+    _, bad, seed = drawn("rotor_inertia")
+    found = asked(bad, fj.diagnose_task)
+    assert isinstance(found, fj.Diagnosis)
+    (truth,) = bad.truth
+    assert [tuple(cause.name) for cause in found.causes] == [(truth.effect, truth.at)], seed
+    (size,) = truth.parameters.values()
+    told = found.causes[0].parameters["inertia"].value
+    assert abs(told - size) < 0.1 * size, seed
+
+
+@needs_robots
+def test_positions_that_shake_cost_an_identification_little():
+    case, bad, seed = drawn()
+    sound, found = (asked(one, fj.identify_task) for one in (case, bad))
+    assert isinstance(sound, fj.Identification) and isinstance(found, fj.Identification)
+    assert found.band is not None and found.band < LOWEST, seed
+    assert (found.fit.rms < 1.3 * sound.fit.rms).all(), seed
+
+
+@dataclass
+class Told:
+    """A reading whose squares are given by its band."""
+
+    highest: float
+    squares: np.ndarray
+
+
+def chosen(*squares: list[float]) -> int:
+    """How many half octaves recordings of 16 Hz are taken down, that leave these squares at each."""
+
+    def read(band: float) -> Told:
+        return Told(band, np.array(squares[round(2 * math.log2(16 / band))]))
+
+    return round(2 * math.log2(16 / as_slow_as_torque(read(16.0), read).highest))
+
+
+def test_positions_go_down_for_as_long_as_every_joint_is_predicted_better():
+    assert chosen([4.0, 4.0], [3.0, 3.0], [2.0, 2.5], [1.9, 2.4], [0.1, 0.1]) == 2
+    assert chosen([4.0, 4.0], [3.9, 3.9]) == 0
+
+
+def test_friction_that_sticks_is_no_error_of_a_position():
+    """Of some joints more is explained where its slips are smoothed away, of others less."""
+    assert chosen([4.0, 4.0, 4.0], [1.0, 3.9, 5.6], [0.5, 3.8, 8.0]) == 0
