@@ -17,6 +17,7 @@ from generators.case import Case
 from generators.inverse import make_case
 
 import figaroh_jax as fj
+from figaroh_jax.identification.result import Identification
 from figaroh_jax.recordings.bandwidth import as_slow_as_torque
 
 LOWEST, HIGHEST = 6.0, 14.0  # Hz, of the shaking; recordings are low-passed at 15 Hz, the robot moves below 2 Hz
@@ -77,7 +78,7 @@ def test_what_is_hidden_beside_positions_that_shake_is_named():
 def test_positions_that_shake_cost_an_identification_little():
     case, bad, seed = drawn()
     sound, found = (asked(one, fj.identify_task) for one in (case, bad))
-    assert isinstance(sound, fj.Identification) and isinstance(found, fj.Identification)
+    assert isinstance(sound, Identification) and isinstance(found, Identification)
     assert found.band is not None and found.band < LOWEST, seed
     assert (found.fit.rms < 1.3 * sound.fit.rms).all(), seed
 
