@@ -262,7 +262,7 @@ def _through(records: Records, part: Part, response: np.ndarray) -> Float[np.nda
     """A part through the row filter and the response, the zeros filled in."""
     n, samples, count, nv = records.shape
     series = part.series.reshape(len(part.series), n, samples)
-    rows = filter_rows(records, series, response.T[part.joint], fitted=True)
+    rows = filter_rows(records, series, response.T, fitted=True, of=part.joint)
     block = np.zeros((nv, n * count, part.width))
     block[part.joint, :, part.column] = rows.reshape(len(rows), n * count)
     return block
