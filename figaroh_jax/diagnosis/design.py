@@ -130,7 +130,8 @@ def unit_rows(given: Units, records: Records, whitening: Complex[np.ndarray, "F 
         rows = filter_rows(records, torque, whitening.T, fitted=True, of=of)
     else:
         rows = filter_rows(records, torque, whitening.T[of] * given.response[:, None, None], fitted=True)
-    return rows * np.moveaxis(np.asarray(records.weight), 2, 0)[given.joints][:, None]
+    rows *= np.moveaxis(np.asarray(records.weight), 2, 0)[of]
+    return rows
 
 
 def units_and_slopes(

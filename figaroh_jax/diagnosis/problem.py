@@ -34,13 +34,13 @@ T = TypeVar("T")
 __all__ = ["Layout", "Part", "Problem", "family_of", "without_factor"]
 
 # cached, and the same for all weights of the rows
-_OF_THE_MOTION = ("torque", "gain", "passed", "motion", "families", "fixed", "plain", "_terms")
+_OF_THE_MOTION = ("torque", "reached", "gain", "passed", "motion", "families", "fixed", "plain", "_terms")
 KEPT = 110 << 20  # bytes of filtered columns that are held: two responses of an arm in 18 recordings of half a minute
 AT_ONCE = 6  # effects with a shape that are evaluated at once along long recordings
 MOST_SUMS = 12  # models whose normal equations are held
 MOST_BEGUN, MOST_JUDGED = 4, 16
 MOST_TERMS = 48  # terms of models whose columns are held
-ROWS = 512  # that are put side by side and weighted at once
+ROWS = 128  # that are put side by side and weighted at once: those of all joints stay in the cache
 TURNED = 128  # samples that are turned at once: they stay in the processor's cache
 
 
@@ -339,6 +339,12 @@ class Problem:
         return open_rows(self.records, self.records.flat(self.records.torque), np.ones(len(self.records.omega)))
 
     @cached_property
+    def reached(self) -> tuple[Float[np.ndarray, " nq"], Float[np.ndarray, " nq"]]:
+        """The lowest and the highest of each position, rad or m."""
+        position = np.asarray(self.records.position)
+        return position.min((0, 1)), position.max((0, 1))
+
+    @cached_property
     def gain(self) -> Float[np.ndarray, " F"]:
         """Power gain of the row filter."""
         return np.asarray(self.records.low_pass) ** 2
@@ -447,7 +453,8 @@ class Problem:
     def with_width(self, width: Float[np.ndarray, " nv"]) -> Problem:
         """The problem with another width of the friction's reversal, which no candidate's place and grid depends on."""
         other = replace(self, width=width)
-        other.__dict__.update({k: v for k, v in self.__dict__.items() if k in ("torque", "gain", "families")})
+        same = ("torque", "reached", "gain", "families")
+        other.__dict__.update({k: v for k, v in self.__dict__.items() if k in same})
         return other
 
 
