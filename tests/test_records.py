@@ -7,7 +7,8 @@ import pytest
 from scipy.signal import butter, sosfiltfilt
 from synthetic import CUTOFF, DT, STEP, made_signals
 
-from figaroh_jax.recordings.rowfilter import frequencies, on_host, row_filter
+from figaroh_jax.recordings import rowfilter
+from figaroh_jax.recordings.rowfilter import frequencies, in_machine_code, on_host, row_filter
 from figaroh_jax.recordings.stacked import Records, filter_rows, stack
 
 SECONDS = 12.0
@@ -49,6 +50,32 @@ def test_rows_far_apart_are_those_of_the_whole_record(step: int) -> None:
     np.testing.assert_allclose(
         on_host(np.asarray(rows.source), place)(signal, delay), whole[..., place], rtol=0, atol=1e-12
     )
+
+
+@pytest.mark.parametrize(("length", "step"), [(1296, 4), (810, 5), (480, 1), (225, 15), (600, 3), (128, 8)])
+def test_rows_in_machine_code_are_those_of_whole_records(
+    length: int, step: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rowfilter, "FROM", 0)
+    generator, slots = np.random.default_rng(length), np.array([0, 2])
+    source = generator.integers(0, 100, (3, length))
+    place = np.array([[5], [2], [9]]) + step * np.arange(100 // step)
+    run = in_machine_code(source, place)
+    if run is None:
+        pytest.skip("no C compiler")
+    signal, of = generator.standard_normal((41, 3, 100)), generator.integers(0, 4, 41)
+    response = generator.standard_normal((4, length // 2 + 1)) + 1j * generator.standard_normal((4, length // 2 + 1))
+    found = np.full((41, 3, place.shape[1]), 7.0)
+    run(signal, response, of, slots, found)
+    assert (found[:, 1] == 7.0).all()
+    for slot in slots:
+        whole = np.fft.irfft(np.fft.rfft(signal[:, slot, source[slot]]) * response[of], length)
+        np.testing.assert_allclose(found[:, slot], whole[:, place[slot]], rtol=0, atol=1e-12)
+
+
+def test_a_record_whose_length_has_large_factors_is_not_for_machine_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rowfilter, "FROM", 0)
+    assert in_machine_code(np.zeros((1, 7 * 64), int), np.arange(10)[None]) is None
 
 
 def test_rows_of_an_uneven_index_are_taken_one_by_one() -> None:

@@ -125,11 +125,13 @@ def units(batches: Mapping[str, Effect], motion: Motion, records: Records) -> di
 def unit_rows(given: Units, records: Records, whitening: Complex[np.ndarray, "F nv"]) -> Float[np.ndarray, "e k r n M"]:
     """Whitened rows of the units (effects, k, rows, n, M), with the weight of each joint's rows."""
     n, samples, _, _ = records.shape
-    response = whitening.T[given.joints][:, None]
-    if given.response is not None:
-        response = response * given.response[:, None, None]
-    rows = filter_rows(records, given.torque.reshape(*given.torque.shape[:3], n, samples), response, fitted=True)
-    return rows * np.moveaxis(np.asarray(records.weight), 2, 0)[given.joints][:, None]
+    torque, of = given.torque.reshape(*given.torque.shape[:3], n, samples), given.joints[:, None]
+    if given.response is None:
+        rows = filter_rows(records, torque, whitening.T, fitted=True, of=of)
+    else:
+        rows = filter_rows(records, torque, whitening.T[of] * given.response[:, None, None], fitted=True)
+    rows *= np.moveaxis(np.asarray(records.weight), 2, 0)[of]
+    return rows
 
 
 def units_and_slopes(

@@ -22,8 +22,7 @@ def exists(problem: Problem, effect: Effect) -> bool:
 
     A wrong sign (`physical_sign`) does not count here: such an effect is no cause, but it may stand in the fit.
     """
-    position = np.asarray(problem.records.position)
-    if not effect.shown_by(position.min((0, 1)), position.max((0, 1))):
+    if not effect.shown_by(*problem.reached):
         return False
     values = {name: float(getattr(effect, name)) for name in effect.parameters()}
     if effect.body and values["mass"] > float(np.asarray(problem.model.inertia)[:, 0].sum()):

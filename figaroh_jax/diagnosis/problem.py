@@ -34,13 +34,12 @@ T = TypeVar("T")
 __all__ = ["Layout", "Part", "Problem", "family_of", "without_factor"]
 
 # cached, and the same for all weights of the rows
-_OF_THE_MOTION = ("torque", "gain", "passed", "motion", "families", "fixed", "plain", "_terms")
+_OF_THE_MOTION = ("torque", "reached", "gain", "passed", "motion", "families", "fixed", "plain", "_terms")
 KEPT = 110 << 20  # bytes of filtered columns that are held: two responses of an arm in 18 recordings of half a minute
 AT_ONCE = 6  # effects with a shape that are evaluated at once along long recordings
 MOST_SUMS = 12  # models whose normal equations are held
 MOST_BEGUN, MOST_JUDGED = 4, 16
 MOST_TERMS = 48  # terms of models whose columns are held
-ROWS = 512  # that are put side by side and weighted at once
 TURNED = 128  # samples that are turned at once: they stay in the processor's cache
 
 
@@ -137,11 +136,11 @@ class Part:
     ) -> None:
         """Add the torque of the coefficients to a `torque`, at the joints that have any of it."""
         series = self.series[:, rows]
-        for joint, own in self._stretches:
+        for joint, own in self.stretches:
             torque[:, joint] += theta[self.column[own]] @ series[own]
 
     @cached_property
-    def _stretches(self) -> list[tuple[int, slice]]:
+    def stretches(self) -> list[tuple[int, slice]]:
         """The joints that have any of `series`, and where these stand."""
         ends = np.searchsorted(self.joint, np.arange(self.nv + 1)).tolist()
         return [(joint, slice(a, b)) for joint, (a, b) in enumerate(pairwise(ends)) if b > a]
@@ -203,7 +202,7 @@ class Filtered:
         code += np.asarray(records.weight).any((1, 2)).tobytes()
         blocks = [self._block(records, part, response, code) for part in parts]
         weight = (np.moveaxis(np.asarray(records.weight), 2, 0) * factor[:, None, None]).reshape(len(factor), -1, 1)
-        X = _beside(blocks, weight)
+        X = _beside(parts, blocks, weight)
         self._last = ref(X), [ref(block) for block in blocks], ref(records.weight), factor
         return X
 
@@ -238,16 +237,15 @@ class Filtered:
 
 
 def _beside(
-    blocks: Sequence[Float[np.ndarray, "nv T _"]], weight: Float[np.ndarray, "nv T 1"]
+    parts: Sequence[Part], blocks: Sequence[Float[np.ndarray, "nv T _"]], weight: Float[np.ndarray, "nv T 1"]
 ) -> Float[np.ndarray, "nv T P"]:
-    """The blocks side by side, each row times its weight, a few rows at a time while they are in the cache."""
-    ends, (joints, rows, _) = np.cumsum([block.shape[2] for block in blocks]), weight.shape
-    X = np.empty((joints, rows, ends[-1]))
-    for start in range(0, rows, ROWS):
-        few = slice(start, start + ROWS)
-        for block, end in zip(blocks, ends, strict=True):
-            X[:, few, end - block.shape[2] : end] = block[:, few]
-        X[:, few] *= weight[:, few]
+    """The filtered parts side by side, each row times its weight; a tree leaves most of them zero."""
+    ends = np.cumsum([part.width for part in parts])
+    X = np.zeros((*weight.shape[:2], ends[-1]))
+    for part, block, end in zip(parts, blocks, ends, strict=True):
+        for joint, own in part.stretches:
+            few = slice(part.column[own].min(), part.column[own].max() + 1)
+            np.multiply(block[joint, :, few], weight[joint], out=X[joint, :, end - part.width : end][:, few])
     return X
 
 
@@ -262,7 +260,7 @@ def _through(records: Records, part: Part, response: np.ndarray) -> Float[np.nda
     """A part through the row filter and the response, the zeros filled in."""
     n, samples, count, nv = records.shape
     series = part.series.reshape(len(part.series), n, samples)
-    rows = filter_rows(records, series, response.T[part.joint], fitted=True)
+    rows = filter_rows(records, series, response.T, fitted=True, of=part.joint)
     block = np.zeros((nv, n * count, part.width))
     block[part.joint, :, part.column] = rows.reshape(len(rows), n * count)
     return block
@@ -337,6 +335,12 @@ class Problem:
     def torque(self) -> Float[np.ndarray, "n M nv"]:
         """Rows of the measured torque, not whitened, also those that are not fitted, N m or N."""
         return open_rows(self.records, self.records.flat(self.records.torque), np.ones(len(self.records.omega)))
+
+    @cached_property
+    def reached(self) -> tuple[Float[np.ndarray, " nq"], Float[np.ndarray, " nq"]]:
+        """The lowest and the highest of each position, rad or m."""
+        position = np.asarray(self.records.position)
+        return position.min((0, 1)), position.max((0, 1))
 
     @cached_property
     def gain(self) -> Float[np.ndarray, " F"]:
@@ -447,7 +451,8 @@ class Problem:
     def with_width(self, width: Float[np.ndarray, " nv"]) -> Problem:
         """The problem with another width of the friction's reversal, which no candidate's place and grid depends on."""
         other = replace(self, width=width)
-        other.__dict__.update({k: v for k, v in self.__dict__.items() if k in ("torque", "gain", "families")})
+        same = ("torque", "reached", "gain", "families")
+        other.__dict__.update({k: v for k, v in self.__dict__.items() if k in same})
         return other
 
 

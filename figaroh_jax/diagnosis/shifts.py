@@ -228,15 +228,22 @@ def _read_beside(effect: Effect, motion: Motion, records: Records) -> Float[np.n
     return _let_through(records, np.mean(each, axis=0), int(effect.at[0]))
 
 
+_STEADY: list[tuple[Any, Any, Any, np.ndarray]] = []  # the last one: all sensors of a motion share it
+
+
 def _steady_load(motion: Motion, records: Records) -> Float[np.ndarray, "nN nv"]:
     """The load without what lies above the band of the motion."""
-    n, samples, _, nv = records.shape
-    velocity = np.asarray(motion.velocity).reshape(n, samples, nv)
-    power = (np.abs(np.fft.rfft(velocity, axis=1)) ** 2).sum((0, 2))
-    most = int(np.searchsorted(np.cumsum(power), OF_THE_MOTION * power.sum()))
-    band = max(BAND * most / (samples * float(records.dt)), 2 / (samples * float(records.dt)))
-    load = np.asarray(motion.load)
-    return load if band >= float(records.cutoff) else _low(records, load, band)
+    asked = motion.load, motion.velocity, records
+    if not any(all(a is b for a, b in zip(asked, known, strict=False)) for known in _STEADY):
+        n, samples, _, nv = records.shape
+        velocity = np.asarray(motion.velocity).reshape(n, samples, nv)
+        power = (np.abs(np.fft.rfft(velocity, axis=1)) ** 2).sum((0, 2))
+        most = int(np.searchsorted(np.cumsum(power), OF_THE_MOTION * power.sum()))
+        band = max(BAND * most / (samples * float(records.dt)), 2 / (samples * float(records.dt)))
+        load = np.asarray(motion.load)
+        steady = load if band >= float(records.cutoff) else _low(records, load, band)
+        _STEADY[:] = [(*asked, steady)]
+    return _STEADY[0][3]
 
 
 def _let_through(records: Records, signal: Float[np.ndarray, " nN"], joint: int) -> Float[np.ndarray, " nN"]:

@@ -7,7 +7,10 @@ bilinear-transformed filter, so it equals `scipy.signal.sosfiltfilt` away from t
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -17,6 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Int, Shaped
 
 from ..compiled.batching import traced
+from ..compiled.machine_code import library
 
 __all__ = [
     "RowFilter",
@@ -26,6 +30,7 @@ __all__ = [
     "filtered",
     "frequencies",
     "gain",
+    "in_machine_code",
     "low_pass",
     "on_host",
     "reach",
@@ -36,6 +41,7 @@ ORDER = 4
 REACH = 12.0  # impulse response that is kept beyond each end, in 1/cutoff
 LATEST = 0.5  # s: at least as much, so that a delay or lag of tens of milliseconds stays inside the extension as well
 MOST_STRETCHES = 64  # of an index that is followed stretch by stretch
+FROM = 16_384  # places of all extended records from which machine code is worth its compilation
 END = 2.0  # part of a record at each end that is not used, in 1/cutoff
 
 
@@ -132,6 +138,93 @@ def on_host(
     return run
 
 
+_SIZES = ("count", "step", "samples", "slots", "rows", "responses", "used")
+_ARRAYS = ("radix", "order", "row", "frequency", "root", "turn", "response", "first", "series", "slot", "signal", "out")
+
+
+class _Given(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_long) for name in _SIZES] + [(name, ctypes.c_void_p) for name in _ARRAYS]
+
+
+@lru_cache(maxsize=1)
+def _code() -> Any:
+    """The compiled function of `rowfilter.c`, or None."""
+    found = library((Path(__file__).parent / "rowfilter.c").read_text(), "-O3")
+    if found is None:
+        return None
+    function = found["filtered"]
+    function.restype, function.argtypes = ctypes.c_int, [ctypes.c_void_p]
+    return function
+
+
+def in_machine_code(
+    source: Int[np.ndarray, "n L"], place: Int[np.ndarray, "n M"]
+) -> Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray], None] | None:
+    """`filtered` of many series by `rowfilter.c`: `run(signal, response, of, slots, out)`; None where it cannot be.
+
+    `signal` (series, n, N) goes through `response[of[series]]` into `out` (series, n, M), of the records `slots` alone.
+    """
+    slots, length = source.shape
+    step = int(np.gcd.reduce((place - place[:, :1]).reshape(-1), initial=length))
+    count, first = length // step, place[:, :1] % step if place.size else np.zeros((slots, 1), int)
+    radix = _radices(count)
+    code = None if source.size < FROM or radix is None else _code()
+    if code is None or radix is None:
+        return None
+    rolled = source[np.arange(slots)[:, None], (np.arange(length) + first) % length]
+    turns = np.arange(step)[:, None] * np.arange(length) % length
+    root = np.exp(-2j * np.pi * np.arange(length) / length)
+    known = {
+        "radix": np.array([*radix, 1]),
+        "order": np.swapaxes(rolled.reshape(slots, count, step), 1, 2),
+        "row": place // step,
+        "frequency": _left_at(radix),
+        "root": root,
+        "turn": root[turns] / length,
+    }
+    known = {name: np.ascontiguousarray(x) for name, x in known.items()}
+    sizes = {"count": count, "step": step, "slots": slots, "rows": place.shape[1]}
+
+    def run(
+        signal: Float[np.ndarray, "series n N"],
+        response: Complex[np.ndarray, "responses F"],
+        of: Int[np.ndarray, " series"],
+        used: Int[np.ndarray, " used"],
+        out: Float[np.ndarray, "series n M"],
+    ) -> None:
+        given, series = _Given(), np.argsort(of, kind="stable")
+        first = np.searchsorted(of[series], np.arange(len(response) + 1))
+        own = {"signal": np.ascontiguousarray(signal, float), "response": np.ascontiguousarray(response, complex)}
+        arrays = known | own | {"first": first, "series": series, "slot": used, "out": out}
+        for name, x in arrays.items():
+            setattr(given, name, x.ctypes.data)
+        more = {"samples": signal.shape[2], "responses": len(response), "used": len(used)}
+        for name, size in (sizes | more).items():
+            setattr(given, name, size)
+        if not code(ctypes.byref(given)):
+            raise MemoryError(f"{length} places of a record")
+
+    return run
+
+
+def _radices(count: int) -> list[int] | None:
+    """Factors of a transform, each from two to five; None where there are others."""
+    out = []
+    for factor in (4, 2, 3, 5):
+        while count % factor == 0 and count > 1:
+            count //= factor
+            out.append(factor)
+    return out if count == 1 else None
+
+
+def _left_at(radix: list[int]) -> Int[np.ndarray, " count"]:
+    """The frequency that a transform in place leaves at each place, its stages going apart."""
+    out = np.zeros(1, int)
+    for factor in reversed(radix):
+        out = (np.arange(factor)[:, None] + factor * out).reshape(-1)
+    return out
+
+
 def _folded(spectrum: Complex[np.ndarray, "*series freqs"], step: int, count: int) -> Complex[np.ndarray, "*series _"]:
     """Spectrum of every `step`th number, `count` in all: the mean of what it cannot tell apart."""
     if step == 1:
@@ -188,6 +281,7 @@ def low_pass(
     return np.fft.irfft(spectrum, n=length)[:, pad : pad + len(x)].T
 
 
+@lru_cache(maxsize=256)
 def fast_length(least: int) -> int:
     """The smallest length from `least` that a real FFT is quick at: a product of twos, threes and fives."""
     odd = (3**i * 5**k for i in range(20) for k in range(14))

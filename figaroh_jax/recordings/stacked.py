@@ -17,7 +17,7 @@ from jaxtyping import Float, Inexact, Int, Shaped
 
 from ..rigid.model import Leaf, RobotModel
 from .dataset import carried_body
-from .rowfilter import extension, fast_length, gain, on_host, reach
+from .rowfilter import extension, fast_length, gain, in_machine_code, on_host, reach
 from .signals import Signals
 
 __all__ = ["Records", "filter_rows", "filtered_rows", "open_rows", "stack"]
@@ -93,41 +93,49 @@ def filter_rows(
     torque: Float[np.ndarray, "*series n N"],
     response: Shaped[np.ndarray, "... F"] | None = None,
     fitted: bool = False,
+    of: Int[np.ndarray, "..."] | None = None,
 ) -> Float[np.ndarray, "*series n M"]:
     """Rows of torques or columns: low-passed without phase, times `response`, at the rows' samples.
 
-    `response` (real or complex, over `records.omega`) may lack series, or hold one for all of an axis. On the host:
-    the filter is linear, so that derivatives of a column pass it as columns do. `fitted`: rows of a recording of which
-    none has a weight are zero.
+    `response` (real or complex, over `records.omega`) may lack series, or hold one for all of an axis; or it is a table
+    (responses, F), and `of` says which of them each series has. On the host: the filter is linear, so that derivatives
+    of a column pass it as columns do. `fitted`: rows of a recording of which none has a weight are zero.
     """
     series = torque.shape[:-2]
     factor = np.asarray(records.low_pass) if response is None else np.asarray(records.low_pass) * response
     count = int(np.prod(series))
     flat, out = torque.reshape(count, *torque.shape[-2:]), np.empty((count, *records.kept.shape))
     factors = factor.reshape(-1, factor.shape[-1])
-    which = np.broadcast_to(np.arange(len(factors)).reshape(factor.shape[:-1]), series).reshape(count)
+    of = np.arange(len(factors)).reshape(factor.shape[:-1]) if of is None else of
+    which = np.broadcast_to(of, series).reshape(count)
     used = np.any(records.weight, axis=(1, 2)) if fitted else np.ones(len(records.kept), bool)
     out[:, ~used] = 0.0
+    at_once, each = _filters(records.source, records.kept)
+    if at_once is not None:
+        at_once(flat, factors, which, np.flatnonzero(used), out)
+        return out.reshape(*series, *records.kept.shape)
     few = max(1, AT_ONCE // records.source.shape[1])
-    filters = [(k, run) for k, run in enumerate(_filters(records.source, records.kept)) if used[k]]
     for part in (slice(start, start + few) for start in range(0, count, few)):
         own = factors[which[part] if len(factors) > 1 else 0].astype(complex)
-        for k, run in filters:
-            out[part, k] = run(flat[part, k], own)
+        for k in np.flatnonzero(used):
+            out[part, k] = each[k](flat[part, k], own)
     return out.reshape(*series, *records.kept.shape)
 
 
-_FILTERS: list[tuple[Any, Any, list[Callable[[np.ndarray, np.ndarray], np.ndarray]]]] = []  # of the last records
+_Filters = tuple[Callable[..., None] | None, list[Callable[[np.ndarray, np.ndarray], np.ndarray]]]
+_FILTERS: list[tuple[Any, Any, _Filters]] = []  # of the last records
 
 
-def _filters(source: Int[Leaf, "n L"], kept: Int[Leaf, "n M"]) -> list[Callable[[np.ndarray, np.ndarray], np.ndarray]]:
-    """What filters a recording, for each of them; the recordings stay the same over a thousand calls."""
+def _filters(source: Int[Leaf, "n L"], kept: Int[Leaf, "n M"]) -> _Filters:
+    """What filters all recordings at once, or else each of them; they stay the same over a thousand calls."""
     for known in _FILTERS:
         if known[0] is source and known[1] is kept:
             return known[2]
-    made = [on_host(*each) for each in zip(np.asarray(source), np.asarray(kept), strict=True)]
-    _FILTERS[:] = [(source, kept, made), *_FILTERS[:1]]
-    return made
+    at_once, each = in_machine_code(np.asarray(source), np.asarray(kept)), []
+    if at_once is None:
+        each = [on_host(*one) for one in zip(np.asarray(source), np.asarray(kept), strict=True)]
+    _FILTERS[:] = [(source, kept, (at_once, each)), *_FILTERS[:1]]
+    return at_once, each
 
 
 def open_rows(
