@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import secrets
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from figaroh_jax.diagnosis.screening import Null
 from figaroh_jax.estimation import noise
 
 RATE, COUNT, CUTOFF = 66.0, 2000, 20.0
@@ -95,6 +98,50 @@ def test_redrawn_spectra_scatter_as_fits_to_new_data_do() -> None:
     drawn = np.log(fits[0].drawn(band, 400, rng)).std(axis=0)
     # a Hann window makes neighbouring bins follow one another: fits scatter by up to sqrt(2) more
     assert np.all((scatter / drawn > 0.7) & (scatter / drawn < 2.0)), scatter / drawn
+
+
+def slow_spectrum(rng: np.random.Generator, truth: np.ndarray) -> noise.Spectrum:
+    """From .2 Hz on, of four recordings of 10 s at 50 Hz; `truth` is their power at the frequencies of 80 s."""
+    white = np.fft.rfft(rng.standard_normal((4, 4000, 3)), axis=1)
+    rows = np.fft.irfft(white * np.sqrt(truth)[:, None], 4000, axis=1)[:, :500]
+    powers = [noise.periodogram(one, 50.0, level=True) for one in rows]
+    told = powers[0][0] >= 0.2
+    power, flat = np.mean([p for _, p in powers], axis=0)[told], np.ones(told.sum())
+    return noise.fit_spectrum(powers[0][0][told], power, flat, 4 * flat, 25.0, 0.2)
+
+
+def test_below_what_a_fit_has_seen_noise_goes_on_as_it_is_above() -> None:
+    rng, frequency, zero = np.random.default_rng(7), np.fft.rfftfreq(4000, 1 / 50.0), np.zeros(1)
+
+    def found(truth: np.ndarray) -> list[noise.Spectrum]:
+        return [slow_spectrum(rng, truth) for _ in range(20)]
+
+    def expected(spectra: list[noise.Spectrum]) -> float:
+        return float(np.exp(np.mean([np.log(s.power(zero) * s.rise(zero)) for s in spectra])))
+
+    pink = 2.0 / np.maximum(frequency, 0.05)
+    spectra = found(0.4 + pink)
+    np.testing.assert_allclose(np.log(expected(spectra) / 40.4), 0.0, rtol=0, atol=np.log(1.5))
+    held = np.exp(np.mean([np.log(s.power(zero)) for s in spectra]))
+    assert held < 40.4 / 3  # what rows are weighted by: constant below .2 Hz
+    np.testing.assert_allclose(expected(found(np.full(2001, 3.0))), 3.0, rtol=0, atol=0.3)
+    for steep in found(pink**2):  # no more than 1/f: it may be a misfit
+        np.testing.assert_allclose(steep.rise(np.array([0.0, 0.1, 0.2])), [[5.0] * 3, [5 / 3] * 3, [1.0] * 3])
+    for falling in found(1e-3 + frequency**2):
+        np.testing.assert_array_equal(falling.rise(frequency), np.ones((2001, 3)))
+
+
+def test_candidates_are_scored_on_noise_that_goes_on_rising() -> None:
+    frequency = np.fft.rfftfreq(4000, 1 / 50.0)
+    spectrum = slow_spectrum(np.random.default_rng(8), 0.4 + 2.0 / np.maximum(frequency, 0.05))
+    records = {"shape": (4, 500, 500, 3), "rate": 50.0, "omega": 2 * np.pi * frequency, "low_pass": np.ones(2001)}
+    problem = cast(Any, SimpleNamespace(records=SimpleNamespace(**records, fitted=np.ones((4, 500, 3)))))
+    null = Null(problem, spectrum, np.ones((2001, 3)), np.random.default_rng(9))
+    rows = np.concatenate([null.rows(part) for part in range(8)]).reshape(-1, 3, 4, 500)
+    told = (spectrum.power(np.zeros(1)) * spectrum.rise(np.zeros(1)))[0]
+    means = 500 * (rows.mean(-1) ** 2).mean((0, 2))
+    # each draw has a spectrum of its own, whose mean is larger than its median
+    np.testing.assert_allclose(means / told, 1.2, rtol=0, atol=0.3)
 
 
 def test_a_projection_takes_the_share_of_white_noise_that_leverage_says() -> None:

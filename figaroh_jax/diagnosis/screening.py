@@ -199,7 +199,7 @@ class Null:
         whitening: Float[np.ndarray, "F nv"],
         generator: np.random.Generator,
     ) -> None:
-        self._draw = partial(draw_noise, problem, spectrum, whitening, CHUNK)
+        self._draw = partial(draw_noise, problem, spectrum, whitening, CHUNK, slow=True)
         self._seed = int(generator.integers(2**62))
         self._rows: dict[int, np.ndarray] = {}
         self._products: dict[int, dict[int, tuple[Columns, np.ndarray]]] = {}
@@ -284,15 +284,19 @@ def draw_noise(
     whitening: Float[np.ndarray, "F nv"],
     draws: int,
     generator: np.random.Generator,
+    slow: bool = False,
 ) -> Float[np.ndarray, "draws nv T"]:
     """Whitened rows of noise with what the spectrum may be, drawn anew for each draw (single precision).
 
-    Rows of little weight have the noise of all others: their weight stands for what is beyond it there.
+    Rows of little weight have the noise of all others: their weight stands for what is beyond it there. `slow`: below
+    what the spectrum knows, noise rises as it is expected to (`Spectrum.rise`). The few frequencies there are next to
+    nothing of the power, and most of what an offset, a spring or a tilt is told by.
     """
     records = problem.records
     n, _, count, nv = records.shape
     frequency, response = _row_response(problem, whitening)
-    shape = np.sqrt(np.swapaxes(spectrum.drawn(frequency, draws, generator), 1, 2)) * response
+    power = spectrum.drawn(frequency, draws, generator)
+    shape = np.sqrt(np.swapaxes(power * spectrum.rise(frequency) if slow else power, 1, 2)) * response
     # what `rfft` makes of white noise: equal real and imaginary parts, but for the two ends, which are real
     shape *= np.sqrt(count / 2)
     shape[..., [0, -1] if count % 2 == 0 else [0]] *= np.sqrt(2)

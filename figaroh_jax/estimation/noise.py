@@ -20,6 +20,8 @@ FLOOR = 0.05  # of the median power between 1 Hz and the cutoff: bounds what whi
 PASSED = 0.1  # power gain of the row filter: where it passes less, what leaks from elsewhere is as large as the noise
 LEVEL = 16  # independent bins whose mean is as certain as the median of 41 bins of a Hann periodogram
 LOWEST = 0.3  # Hz: below, the spectrum follows a power of the frequency alone
+SHIFT = 0.05  # Hz, added to the frequency of that power: noise levels off, and its power at 0 is finite
+STEEPEST = 1.0  # power of 1/f to which noise is expected to rise below what a fit has seen
 NEIGHBOURS = 1 + 2 * (4 / 9 + 1 / 36)  # bins of a Hann periodogram that tell as much as one: squared correlations
 SMOOTHNESS = 10.0 ** np.arange(-3, 3.1)  # weights of the bending that are compared: rough to straight
 ALIKE = 10.0 ** np.arange(-1, 4.1)  # the same of a joint's distance from the others: squared in log S, over its mean
@@ -55,6 +57,17 @@ class Spectrum(NamedTuple):
         basis = _basis(np.clip(frequency, self.known, self.nyquist), self.nyquist)
         return np.exp(basis @ (self.coefficients + off))
 
+    def rise(self, frequency: Float[np.ndarray, " freqs"]) -> Float[np.ndarray, "freqs nv"]:
+        """Power that noise is expected to have, over what `drawn` gives it; 1 but below `known`.
+
+        There the fitted curve goes on, though no lower than at `known`, and no steeper than 1/f (`STEEPEST`): what is
+        steeper may be a misfit, and the noise of a torque sensor does not fall towards 0.
+        """
+        below = np.minimum(frequency, self.known)
+        curve = (_basis(below, self.nyquist) - _basis(np.array([self.known]), self.nyquist)) @ self.coefficients
+        most = STEEPEST * np.log((self.known + SHIFT) / (below + SHIFT))
+        return np.exp(np.clip(curve, 0.0, most[:, None]))
+
     def louder(self, times: Float[np.ndarray, " nv"]) -> Spectrum:
         """The same spectrum of so many times the power at each joint."""
         coefficients = self.coefficients.copy()
@@ -86,7 +99,7 @@ def fit_spectrum(
 ) -> Spectrum:
     """Smooth spectrum of noise that has passed a filter of power gain `gain`.
 
-    Gamma GLM with log link: log S = log gain + a0 + a1 log(f + .05) + Legendre polynomials 2 to 5 of log f above
+    Gamma GLM with log link: log S = log gain + a0 + a1 log(f + .05 Hz) + Legendre polynomials 2 to 5 of log f above
     .3 Hz, less their value and slope there, by iteratively reweighted least squares. `degrees` counts the independent
     Hann periodograms averaged at each frequency. Below `lowest` the fit serves `drawn` alone.
 
@@ -214,7 +227,7 @@ def _basis(frequency: Shaped[np.ndarray, " freqs"], nyquist: float) -> Float[np.
     x = 2 * np.log(np.maximum(frequency, LOWEST) / LOWEST) / np.log(nyquist / LOWEST) - 1
     x = np.clip(x, -1, 1)
     bent = [p(x) - p(-1) - p.deriv()(-1) * (x + 1) for p in _POLYNOMIALS]
-    return np.column_stack([np.ones_like(x), np.log(frequency + 0.05), *bent])
+    return np.column_stack([np.ones_like(x), np.log(frequency + SHIFT), *bent])
 
 
 def _bending() -> Float[np.ndarray, "polynomials polynomials"]:
