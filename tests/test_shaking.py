@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -17,8 +18,9 @@ from generators.case import Case
 from generators.inverse import make_case
 
 import figaroh_jax as fj
+from figaroh_jax.formats.config import Preprocess
 from figaroh_jax.identification.result import Identification
-from figaroh_jax.recordings.bandwidth import as_slow_as_torque
+from figaroh_jax.recordings.signals import Signals, as_slow_as_torque, prepare
 
 LOWEST, HIGHEST = 6.0, 14.0  # Hz, of the shaking; recordings are low-passed at 15 Hz, the robot moves below 2 Hz
 needs_robots = pytest.mark.skipif(not robots.available("tx40"), reason="FIGAROH_JAX_DATA has no staubli_tx40")
@@ -87,17 +89,31 @@ def test_positions_that_shake_cost_an_identification_little():
 class Told:
     """A reading whose squares are given by its band."""
 
-    highest: float
+    signals: tuple[Signals, ...]
     squares: np.ndarray
 
 
-def chosen(*squares: list[float]) -> int:
-    """How many half octaves recordings of 16 Hz are taken down, that leave these squares at each."""
+@cache
+def moved(joints: int) -> Signals:
+    wave = np.sin(np.arange(400) / 20)[:, None] * np.ones(joints)
+    return prepare(fj.recording(q=wave, rate=100, joints=list("abc"[:joints])), Preprocess(cutoff=16))
+
+
+def chosen(*squares: list[float], kept_out: float = 1.0) -> int:
+    """How many half octaves recordings of 16 Hz are taken down, that leave these squares at each.
+
+    Each takes 1 rad/s^2 of the fitted one's acceleration and `kept_out` of another's.
+    """
+    joints = len(squares[0])
 
     def read(band: float) -> Told:
-        return Told(band, np.array(squares[round(2 * math.log2(16 / band))]))
+        step, bands = round(2 * math.log2(16 / band)), np.full(joints, band)
+        roles: tuple[tuple[Literal["fit", "holdout"], float], ...] = (("fit", 1.0), ("holdout", kept_out))
+        one = moved(joints)
+        both = (replace(one, role=r, bands=bands, acceleration=one.acceleration - step * x) for r, x in roles)
+        return Told(tuple(both), np.array(squares[step]))
 
-    return round(2 * math.log2(16 / as_slow_as_torque(read(16.0), read).highest))
+    return round(2 * math.log2(16 / as_slow_as_torque(read(16.0), read).signals[0].bands[0]))
 
 
 def test_positions_go_down_for_as_long_as_every_joint_is_predicted_better():
@@ -108,3 +124,8 @@ def test_positions_go_down_for_as_long_as_every_joint_is_predicted_better():
 def test_friction_that_sticks_is_no_error_of_a_position():
     """Of some joints more is explained where its slips are smoothed away, of others less."""
     assert chosen([4.0, 4.0, 4.0], [1.0, 3.9, 5.6], [0.5, 3.8, 8.0]) == 0
+
+
+def test_a_faster_motion_that_is_kept_out_keeps_its_band():
+    assert chosen([4.0, 4.0], [2.0, 2.0], [2.0, 2.0], kept_out=1.1) == 1
+    assert chosen([4.0, 4.0], [2.0, 2.0], [2.0, 2.0], kept_out=1.5) == 0

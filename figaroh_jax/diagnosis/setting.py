@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..estimation.noise import Spectrum
-from ..recordings.bandwidth import as_slow_as_torque
 from ..recordings.dataset import Recording
-from ..recordings.signals import Resampled, Signals, prepare_all
+from ..recordings.signals import Resampled, Signals, as_slow_as_torque, prepare_all
 from ..recordings.stacked import stack
 from ..simulators.contract import Backend
 from .flexible import friction_width
@@ -49,10 +48,6 @@ class _Read(NamedTuple):
     begun: tuple[Problem, State]
     squares: Float[np.ndarray, " nv"]
 
-    @property
-    def highest(self) -> float:
-        return float(max(one.bands.max() for one in self.signals))
-
     def moves_as(self, signals: Sequence[Signals]) -> bool:
         """Whether its positions are those of other signals."""
         return all(np.array_equal(a.position, b.position) for a, b in zip(self.signals, signals, strict=True))
@@ -81,7 +76,8 @@ def prepared_signals(
 
     plain = read(None)
     own = read(math.inf, like=plain)
-    best = plain if np.mean(np.log(own.squares / plain.squares)) > 0 else as_slow_as_torque(own, read)
+    better = own is plain or np.mean(np.log(own.squares / plain.squares)) < 0
+    best = as_slow_as_torque(own, read) if better else plain
     return best.signals, best.band, best.begun
 
 

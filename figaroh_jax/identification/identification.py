@@ -26,10 +26,10 @@ from ..estimation.intervals import coloured_covariance
 from ..estimation.least_squares import Solution, WeightedByJoint, solve
 from ..estimation.priors import rigid_prior
 from ..estimation.regression import Condensed, Regression, condense
-from ..recordings.bandwidth import as_slow_as_torque, note_on
+from ..recordings.bandwidth import note_on
 from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
-from ..recordings.signals import Resampled, prepare_all
+from ..recordings.signals import Resampled, Signals, as_slow_as_torque, prepare_all
 from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
 from ..simulators.native import as_backend
@@ -271,8 +271,8 @@ class _Read(NamedTuple):
     first: Solution
 
     @property
-    def highest(self) -> float:
-        return float(max(one.bands.max() for one in self.regression.signals))
+    def signals(self) -> Sequence[Signals]:
+        return self.regression.signals
 
     @property
     def squares(self) -> Float[np.ndarray, " fitted"]:
@@ -287,7 +287,7 @@ def _read(
     backend: Backend,
     recordings: Sequence[Recording],
     preprocess: Preprocess,
-    terms: Sequence[Effect],
+    terms: tuple[Effect, ...],
     refused: frozenset[str],
     used: Bool[np.ndarray, "nv columns"],
 ) -> _Read:

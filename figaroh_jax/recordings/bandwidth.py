@@ -6,19 +6,17 @@ once, and clean data look as if they had a cause (errors in variables). So the b
 acceleration is in error least: by what the smoothing takes off the motion and by what it leaves of the noise.
 
 Errors that are no white noise (a sensor that shakes, stamps that jitter) look like motion. The torque tells them apart:
-what moves the model's torque above some frequency and not the measured one is none (`as_slow_as_torque`).
+what moves the model's torque above some frequency and not the measured one is none (`signals.as_slow_as_torque`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["Read", "as_slow_as_torque", "encoder_step", "motion_band", "note_on", "smoothed"]
+__all__ = ["encoder_step", "motion_band", "note_on", "smoothed"]
 
 ORDER = 3  # of the differences that smoothing holds small: gain 1 / (1 + (f / band)^(2 ORDER))
 STEPS = 2.0 ** (-np.arange(13) / 2)  # bands tried, as shares of the cutoff
@@ -30,46 +28,10 @@ FELT = 0.1  # of the noise's power: steps of less are lost in it
 FEW_VALUES = 20  # of a position: fewer are steps
 LINE = 3  # bins to either side to which the window spreads a line
 READINGS = 4  # of a motion by an encoder, each with its steps at another place
-HALF_OCTAVE = 2**-0.5
-WORTH_A_STEP = 0.1  # fall of the squares that a model leaves of the torque (mean logarithm) for half an octave less
-AT_COST = 1 / 3  # of that fall: what the squares of no joint may rise by
-
-
-@runtime_checkable
-class Read(Protocol):
-    """Recordings whose positions are taken down to some band, and what a model of the robot leaves of their torque."""
-
-    @property
-    def highest(self) -> float:
-        """The largest band of a joint's motion, Hz."""
-        ...
-
-    @property
-    def squares(self) -> Float[np.ndarray, " nv"]:
-        """What the model leaves of each joint's torque, squared."""
-        ...
-
-
-R = TypeVar("R", bound=Read)
-
-
-def as_slow_as_torque(best: R, read: Callable[[float], R]) -> R:
-    """The recordings with positions in the smallest band (Hz) to which the torque follows them.
-
-    `read` takes all positions down to a band. They go down by half octaves for as long as each step lowers what the
-    model leaves of the torque, at all joints: where motion is lost, or where friction sticks, some joints are predicted
-    better and some worse.
-    """
-    while True:
-        slower = read(best.highest * HALF_OCTAVE)
-        fall = np.log(best.squares / slower.squares)
-        if np.mean(fall) < WORTH_A_STEP or min(fall) < -AT_COST * np.mean(fall):
-            return best
-        best = slower
 
 
 def note_on(band: float | None) -> tuple[str, ...]:
-    """What is told of positions that `as_slow_as_torque` has taken down."""
+    """What is told of positions that `signals.as_slow_as_torque` has taken down."""
     if band is None or math.isinf(band):
         return ()
     return (

@@ -11,9 +11,9 @@ not used: controllers filter it with a delay that nobody states.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import numpy as np
@@ -33,10 +33,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Rates",
+    "Read",
     "Resampled",
     "RowFilter",
     "Signals",
     "align",
+    "as_slow_as_torque",
     "choose_rates",
     "common_rows",
     "filter_rows",
@@ -56,6 +58,10 @@ FEWEST_ROWS = 10
 STALE = 0.1  # of the samples: more that repeat the one before are those of a robot that stands
 MOST_STALE = 3  # of them in a row
 STILL = 1e-12  # of rad or m: what a joint that stands still moves by rounding
+HALF_OCTAVE = 2**-0.5
+WORTH_A_STEP = 0.1  # fall of the squares that a model leaves of the torque (mean logarithm) for half an octave less
+AT_COST = 1 / 3  # of that fall: what the squares of no joint may rise by
+MOVES_MORE = 1.25  # times the acceleration that such a step takes of fitted recordings: more is motion, no error
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +199,50 @@ def prepare(
         load=recording.load,
         notes=recording.notes + _gap_notes(recording, gaps, rates.cutoff),
     )
+
+
+@runtime_checkable
+class Read(Protocol):
+    """Recordings whose positions are taken down to some band, and what a model of the robot leaves of their torque."""
+
+    @property
+    def signals(self) -> Sequence[Signals]:
+        """Of all recordings."""
+        ...
+
+    @property
+    def squares(self) -> Float[np.ndarray, " fitted"]:
+        """What the model leaves of the torque of each joint that is fitted, squared."""
+        ...
+
+
+R = TypeVar("R", bound=Read)
+
+
+def as_slow_as_torque(best: R, read: Callable[[float], R]) -> R:
+    """The recordings with positions in the smallest band (Hz) to which the torque follows them.
+
+    `read` takes all positions down to a band. They go down by half octaves for as long as each step lowers what the
+    model leaves of the torque, at all joints: where motion is lost, or where friction sticks, some joints are predicted
+    better and some worse. What a step takes of recordings kept out must be no more than of those that decide: they may
+    move faster.
+    """
+    while True:
+        slower = read(HALF_OCTAVE * max(float(one.bands.max()) for one in best.signals))
+        fall = np.log(best.squares / slower.squares)
+        small = np.mean(fall) < WORTH_A_STEP or min(fall) < -AT_COST * np.mean(fall)
+        if small or _takes_motion(best.signals, slower.signals):
+            return best
+        best = slower
+
+
+def _takes_motion(before: Sequence[Signals], after: Sequence[Signals]) -> bool:
+    """Whether a smaller band takes more of the accelerations of recordings kept out than of any that is fitted."""
+    taken: dict[bool, list[np.ndarray]] = {True: [], False: []}
+    for a, b in zip(before, after, strict=True):
+        taken[a.role == "fit"].append(np.sqrt(np.mean((a.acceleration - b.acceleration) ** 2, axis=0)))
+    held, fitted = (np.max(taken[own], axis=0, initial=0.0) for own in (False, True))
+    return bool(np.any(held > MOVES_MORE * fitted))
 
 
 def _refuse_endless(recording: Recording, time: Float[np.ndarray, " samples"], rates: Rates) -> None:
