@@ -120,16 +120,19 @@ def contend(
         return one
     if group.effect.about:
         return _expanded_contender(problem, step, base, ready, group)
+    parts = None
     if group.effect.one_rotor:
-        order = _as_one_rotor(step, base, group, order)
+        order, parts = _as_one_rotor(step, base, group, order)
     effect, Z = _exact_columns(problem, step, ready, group, order)
     free = None
     if effect.body:
         effect, verdicts = _body_verdicts(problem, step, base, effect, Z)
     else:
-        verdicts, free = _judged_beside(problem, step, base, group.columns.joints, Z)
         names = [n for n, p in effect.parameters().items() if p.linear]
-        effect = with_shape(effect, names, list(verdicts.theta[-len(names) :]))
+        parts = range(len(names)) if parts is None else parts
+        verdicts, free = _judged_beside(problem, step, base, group.columns.joints, Z[list(parts)])
+        values = dict(zip(parts, verdicts.theta[-len(parts) :], strict=True)) if len(parts) else {}
+        effect = with_shape(effect, names, [np.float64(values.get(k, 0.0)) for k in range(len(names))])
     free = None if effect.inertial else free
     return Contender(group.name, effect, verdicts, acting(effect, len(step.rows.y), group.columns.joints), free)
 
@@ -175,31 +178,34 @@ def _exact_columns(
     return effect, Z.reshape(*Z.shape[:2], -1)
 
 
-def _as_one_rotor(step: Step, base: Ground, group: Group, order: np.ndarray) -> np.ndarray:
-    """The grid points of a coupling, first that which explains most with no part below zero.
+def _as_one_rotor(step: Step, base: Ground, group: Group, order: np.ndarray) -> tuple[np.ndarray, tuple[int, ...]]:
+    """The grid points of a coupling, first that which explains most with no part below zero; and the parts it then has.
 
     One rotor that turns the sum of two joints, or their difference, has inertia, damping and friction of that sign.
-    Inertia and damping of the two signs are mirror images, so that a free fit of the wrong one may be the better.
+    Inertia and damping of the two signs are mirror images, so that a free fit of the wrong one may be the better. And a
+    part below zero follows some other misfit: with it the coupling would take the place of what explains that.
     """
-    rows, joints, gains = step.rows, list(group.columns.joints), []
+    rows, joints, found = step.rows, list(group.columns.joints), []
     for point in order:
         Z = group.columns.Z[point]
         cross = np.sum(
             [rows.X[joint].T @ own.T for joint, own in zip(joints, np.swapaxes(Z, 0, 1), strict=True)], axis=0
         )
         G = np.tensordot(Z, Z, ((1, 2), (1, 2))) - cross.T @ base.inverse[-1] @ cross
-        gains.append(_drop_of_none_below_zero(G, np.tensordot(Z, base.verdicts.residual[joints], 2)))
-    return order[np.argsort(-np.array(gains), kind="stable")]
+        found.append(_none_below_zero(G, np.tensordot(Z, base.verdicts.residual[joints], 2)))
+    best = np.argsort([-gain for gain, _ in found], kind="stable")
+    return order[best], found[best[0]][1]
 
 
-def _drop_of_none_below_zero(G: Float[np.ndarray, "k k"], pull: Float[np.ndarray, " k"]) -> float:
-    """Squares that k columns explain with coefficients of zero or more: the least of x'Gx - 2 pull'x, negative."""
-    best = 0.0
+def _none_below_zero(G: Float[np.ndarray, "k k"], pull: Float[np.ndarray, " k"]) -> tuple[float, tuple[int, ...]]:
+    """Squares that k columns explain with coefficients of zero or more (the least of x'Gx - 2 pull'x, negative), and
+    the columns whose coefficients are not zero."""
+    best = 0.0, ()
     for some in product((False, True), repeat=len(pull)):
         at = np.flatnonzero(some)
         own = np.linalg.lstsq(G[np.ix_(at, at)], pull[at], rcond=None)[0] if len(at) else np.zeros(0)
         if (own >= 0).all():
-            best = max(best, float(own @ pull[at]))
+            best = max(best, (float(own @ pull[at]), tuple(int(k) for k in at)))
     return best
 
 
