@@ -17,7 +17,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Complex, Float, Int, Shaped
+from jaxtyping import Array, Complex, Float, Inexact, Int, Shaped
 
 from ..compiled.batching import traced
 from ..compiled.machine_code import library
@@ -187,7 +187,7 @@ def in_machine_code(
 
     def run(
         signal: Float[np.ndarray, "series n N"],
-        response: Complex[np.ndarray, "responses F"],
+        response: Inexact[np.ndarray, "responses F"],
         of: Int[np.ndarray, " series"],
         used: Int[np.ndarray, " used"],
         out: Float[np.ndarray, "series n M"],
