@@ -89,6 +89,7 @@ def test_positions_that_shake_cost_an_identification_little():
 class Told:
     """A reading whose squares are given by its band."""
 
+    band: float
     signals: tuple[Signals, ...]
     squares: np.ndarray
 
@@ -107,13 +108,13 @@ def chosen(*squares: list[float], kept_out: float = 1.0) -> int:
     joints = len(squares[0])
 
     def read(band: float) -> Told:
-        step, bands = round(2 * math.log2(16 / band)), np.full(joints, band)
+        step = round(2 * math.log2(16 / band))
         roles: tuple[tuple[Literal["fit", "holdout"], float], ...] = (("fit", 1.0), ("holdout", kept_out))
         one = moved(joints)
-        both = (replace(one, role=r, bands=bands, acceleration=one.acceleration - step * x) for r, x in roles)
-        return Told(tuple(both), np.array(squares[step]))
+        both = (replace(one, role=r, acceleration=one.acceleration - step * x) for r, x in roles)
+        return Told(band, tuple(both), np.array(squares[step]))
 
-    return round(2 * math.log2(16 / as_slow_as_torque(read(16.0), read).signals[0].bands[0]))
+    return round(2 * math.log2(16 / as_slow_as_torque(read(16.0), read).band))
 
 
 def test_positions_go_down_for_as_long_as_every_joint_is_predicted_better():

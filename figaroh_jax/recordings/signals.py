@@ -143,8 +143,8 @@ def prepare(
     """Even, low-passed, differentiated signals of one recording and the filter that makes its rows.
 
     `rates` are those of `choose_rates`, by default for this recording alone; `shift` (s, less than a row) moves the
-    grid. A position is taken down to the band of its own motion where that is below the cutoff, and to `band` (Hz) at
-    the most; None leaves it at the cutoff. A `model` with quaternions in q takes the rates on its group
+    grid. A position is taken down to the band of its own motion where that is below the cutoff, else to `band` (Hz);
+    None leaves all at the cutoff. A `model` with quaternions in q takes the rates on its group
     (`groupmotion`). `resampled` holds what calls that differ in `band` alone have in common: an empty dictionary at
     first. Raises `InputError` where the window, the cutoff or
     the rate do not fit the recording, or it is too short.
@@ -206,6 +206,11 @@ class Read(Protocol):
     """Recordings whose positions are taken down to some band, and what a model of the robot leaves of their torque."""
 
     @property
+    def band(self) -> float | None:
+        """As for `prepare`."""
+        ...
+
+    @property
     def signals(self) -> Sequence[Signals]:
         """Of all recordings."""
         ...
@@ -222,13 +227,13 @@ R = TypeVar("R", bound=Read)
 def as_slow_as_torque(best: R, read: Callable[[float], R]) -> R:
     """The recordings with positions in the smallest band (Hz) to which the torque follows them.
 
-    `read` takes all positions down to a band. They go down by half octaves for as long as each step lowers what the
-    model leaves of the torque, at all joints: where motion is lost, or where friction sticks, some joints are predicted
-    better and some worse. What a step takes of recordings kept out must be no more than of those that decide: they may
-    move faster.
+    `read` takes positions down to a band, those whose own shows no noise below the cutoff. They go down by half octaves
+    for as long as each step lowers what the model leaves of the torque, at all joints: where motion is lost, or where
+    friction sticks, some joints are predicted better and some worse. What a step takes of recordings kept out must be
+    no more than of those that decide: they may move faster.
     """
     while True:
-        slower = read(HALF_OCTAVE * max(float(one.bands.max()) for one in best.signals))
+        slower = read(HALF_OCTAVE * min(best.band or math.inf, best.signals[0].cutoff))
         fall = np.log(best.squares / slower.squares)
         small = np.mean(fall) < WORTH_A_STEP or min(fall) < -AT_COST * np.mean(fall)
         if small or _takes_motion(best.signals, slower.signals):
@@ -270,13 +275,13 @@ def _bands(
     rate: float,
     most: float,
 ) -> Float[np.ndarray, " nv"]:
-    """The band of each joint's motion, Hz, at most its `cutoff` and `most`.
+    """The band of each joint's motion, Hz; `most`, where it does not show below the `cutoff`.
 
     `raw` are the samples as they were read, at `rate` (Hz): they show the steps of the encoder.
     """
     steps = [encoder_step(column) for column in raw.T]
-    own = [motion_band(x, dt, cutoff, step, rate) for x, step in zip(position.T, steps, strict=True)]
-    return np.minimum(own, most)
+    own = np.array([motion_band(x, dt, cutoff, step, rate) for x, step in zip(position.T, steps, strict=True)])
+    return np.where(own < cutoff, own, min(cutoff, most))
 
 
 def let_through(
