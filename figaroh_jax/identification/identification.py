@@ -64,6 +64,7 @@ TRUSTS = (1.0, 3.0, 10.0, 100.0)  # multiples of the stated trust that cross-val
 MOST_UNSEEN = 2.0  # relative sigma of a link beyond which nothing is let go that no torque shows
 CLEARLY = 0.05  # of the squares left out: what letting go of all that no torque shows must gain
 DRIVE_PRECISION = 1e-6  # of friction and rotors: as good as free
+SHAKES = 0.5  # fall of the logarithm of the squares from which the first half octave is no motion but errors of sensors
 DEAD = 0.5  # share of samples at one single value: such a torque is not measured
 
 
@@ -307,7 +308,7 @@ def _read(
         return _Read(band, regression, wide, base, solve(data, WeightedByJoint(), kept=base.independent))
 
     whole = read(None)
-    return as_slow_as_torque(whole, read) if backend.robot.nq == backend.robot.nv else whole
+    return as_slow_as_torque(whole, read, first=SHAKES) if backend.robot.nq == backend.robot.nv else whole
 
 
 def _refused(

@@ -224,21 +224,22 @@ class Read(Protocol):
 R = TypeVar("R", bound=Read)
 
 
-def as_slow_as_torque(best: R, read: Callable[[float], R]) -> R:
+def as_slow_as_torque(best: R, read: Callable[[float], R], first: float = WORTH_A_STEP) -> R:
     """The recordings with positions in the smallest band (Hz) to which the torque follows them.
 
     `read` takes positions down to a band, those whose own shows no noise below the cutoff. They go down by half octaves
     for as long as each step lowers what the model leaves of the torque, at all joints: where motion is lost, or where
     friction sticks, some joints are predicted better and some worse. What a step takes of recordings kept out must be
-    no more than of those that decide: they may move faster.
+    no more than of those that decide: they may move faster. `first` is what the first step must bring.
     """
+    least = first
     while True:
         slower = read(HALF_OCTAVE * min(best.band or math.inf, best.signals[0].cutoff))
         fall = np.log(best.squares / slower.squares)
-        small = np.mean(fall) < WORTH_A_STEP or min(fall) < -AT_COST * np.mean(fall)
+        small = np.mean(fall) < least or min(fall) < -AT_COST * np.mean(fall)
         if small or _takes_motion(best.signals, slower.signals):
             return best
-        best = slower
+        best, least = slower, WORTH_A_STEP
 
 
 def _takes_motion(before: Sequence[Signals], after: Sequence[Signals]) -> bool:
