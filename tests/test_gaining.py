@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from figaroh_jax.diagnosis import gaining
+from figaroh_jax.diagnosis import gaining, holdout
 from figaroh_jax.diagnosis.gaining import Fall, beside_all, kept_squares, predicts_better, surely_less, without_losses
 from figaroh_jax.diagnosis.holdout import Held
 
@@ -252,3 +252,18 @@ def stood_by(
     problem: Any = SimpleNamespace(model=SimpleNamespace(joint_names=("one",)))
     start, whitening, sure = cast(Any, None), np.zeros((1, 1)), cast(Any, borne_out.__contains__)
     return without_losses(problem, start, whitening, found, joint(causes), strict, sure, cast(Any, claims or {}))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "cutoff", "blocks"),
+    [(6.0, 15.0, 16), (6.0, 5.0, 8), (4.0, 2.0, 8), (30.0, 15.0, 30)],
+    ids=["as many as are independent", "alike through the filter", "at least eight", "of a second"],
+)
+def test_a_short_recording_kept_out_has_as_many_blocks_as_the_filter_leaves(seconds: float, cutoff: float, blocks: int):
+    rate, rows = 50.0, round(seconds * 50)
+    span = SimpleNamespace(slot=0, row=0, rows=rows)
+    records = SimpleNamespace(rate=rate, cutoff=cutoff, spans=(span,), judged=np.ones((1, rows, 1)))
+    problem: Any = SimpleNamespace(records=records, held=np.ones((1, rows, 1)))
+    block = holdout._blocks(problem)  # pyright: ignore[reportPrivateUsage]
+    assert block.max() + 1 == blocks
+    assert np.bincount(block[0]).min() >= min(rows / blocks, rate) - 1

@@ -122,6 +122,10 @@ def test_positions_go_down_for_as_long_as_every_joint_is_predicted_better():
     assert chosen([4.0, 4.0], [3.9, 3.9]) == 0
 
 
+def test_squares_that_are_no_numbers_end_the_search():
+    assert chosen([4.0, 4.0], [math.nan, 2.0]) == 0
+
+
 def test_friction_that_sticks_is_no_error_of_a_position():
     """Of some joints more is explained where its slips are smoothed away, of others less."""
     assert chosen([4.0, 4.0, 4.0], [1.0, 3.9, 5.6], [0.5, 3.8, 8.0]) == 0

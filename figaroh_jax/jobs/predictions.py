@@ -19,8 +19,7 @@ def predictions(
     """Time (s) and the extended model's torque (N m or N) of each holdout recording, on its own time stamps.
 
     The recording's motion is prepared as for the fit (`band` as for `prepare`), but over its whole length, whatever
-    window the fit kept. Where the model is an identified one, a known payload is
-    carried in addition.
+    window the fit kept. Where the model is an identified one, a known payload is carried in addition.
     """
     if all(entry.role == "fit" for entry in task.data):
         return {}

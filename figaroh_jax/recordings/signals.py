@@ -144,10 +144,9 @@ def prepare(
 
     `rates` are those of `choose_rates`, by default for this recording alone; `shift` (s, less than a row) moves the
     grid. A position is taken down to the band of its own motion where that is below the cutoff, else to `band` (Hz);
-    None leaves all at the cutoff. A `model` with quaternions in q takes the rates on its group
-    (`groupmotion`). `resampled` holds what calls that differ in `band` alone have in common: an empty dictionary at
-    first. Raises `InputError` where the window, the cutoff or
-    the rate do not fit the recording, or it is too short.
+    None leaves all at the cutoff. A `model` with quaternions in q takes the rates on its group (`groupmotion`).
+    `resampled` holds what calls that differ in `band` alone have in common: an empty dictionary at first. Raises
+    `InputError` where the window, the cutoff or the rate do not fit the recording, or it is too short.
     """
     rates, key = rates or choose_rates((recording,), preprocess), (id(recording), shift)
     recording, masked = without_untrusted(recording)
@@ -236,8 +235,8 @@ def as_slow_as_torque(best: R, read: Callable[[float], R], first: float = WORTH_
     while True:
         slower = read(HALF_OCTAVE * min(best.band or math.inf, best.signals[0].cutoff))
         fall = np.log(best.squares / slower.squares)
-        small = np.mean(fall) < least or min(fall) < -AT_COST * np.mean(fall)
-        if small or _takes_motion(best.signals, slower.signals):
+        worth = np.mean(fall) >= least and min(fall) >= -AT_COST * np.mean(fall)  # not so where a square is no number
+        if not worth or _takes_motion(best.signals, slower.signals):
             return best
         best, least = slower, WORTH_A_STEP
 
