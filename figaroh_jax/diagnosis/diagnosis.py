@@ -2,7 +2,8 @@
 
 The noise comes from repeats or a rich model, never from the baseline's residual. The catalogue is screened with the
 baseline projected out, the best are refitted exactly and compared on data they were not fitted to, one cause after
-another, until nothing is gained. What is left decides between `named`, `named+rest`, `nothing` and `unknown`.
+another, until nothing is gained; anew where that shows a cause to have passed for noise. What is left decides between
+`named`, `named+rest`, `nothing` and `unknown`.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ from .rest import (
 )
 from .screening import noise_squares
 from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without
-from .setting import Setting, prepared_signals, setting_of
+from .setting import Setting, prepared_signals, setting_beside, setting_of
 from .standstill import left_moving, resting
 from .step import Step, stand, with_causes
 from .thresholds import ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, LINE_P, NO_REST, REST_P
@@ -113,6 +114,10 @@ def diagnose(
         give_back_holes()
         searched = _searched(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
         give_back_holes()
+        if searched.found and (anew := setting_beside(searched.here, searched.joint.step.state, forbid)):
+            del searched  # its rows and columns are large
+            searched = _searched(anew, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
+            give_back_holes()
         ordered = sorted(recordings, key=lambda r: r.role == "holdout")
         judged = _judged(searched, Reader(ordered, signals, preprocess, band), forbid, tolerance, alpha, generator)
         progress("measuring the gain", 0.9)

@@ -28,6 +28,7 @@ __all__ = [
     "sober_spectrum",
     "told_too_large",
     "undecided",
+    "whitening_of",
 ]
 
 ROUNDS = 2  # of the rich model's fit and the spectrum in turn
@@ -49,12 +50,12 @@ def noise_floor(
     rows, scale, count = _alike(problem, state)
     if not problem.layout.repeats:
         spectrum = _from_rich_model(problem, state, scale, forbid, count)
-        return spectrum, _whitening(problem, spectrum)
+        return spectrum, whitening_of(problem, spectrum)
     response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
     for _ in range(ROUNDS):
         state = solved(problem, state, fit(whitened(problem, state, response), state.prior).theta)
         spectrum = _from_repeats(problem, rows, state)
-        response = _whitening(problem, spectrum)
+        response = whitening_of(problem, spectrum)
     return spectrum, response  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
 
 
@@ -161,7 +162,8 @@ def _weighted(rows: Rows, prior: Prior, scale: Float[np.ndarray, " nv"]) -> Floa
     return np.linalg.solve(X.T @ X + np.diag(prior.precision + 1e-12), X.T @ y + prior.precision * prior.mean)
 
 
-def _whitening(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, "F nv"]:
+def whitening_of(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, "F nv"]:
+    """The response that makes noise with the spectrum white, joint by joint."""
     frequency = np.asarray(problem.records.omega) / (2 * np.pi)
     return noise.whitening(spectrum, frequency, problem.gain, float(problem.records.cutoff))
 

@@ -15,19 +15,19 @@ from ..recordings.signals import Resampled, Signals, as_slow_as_torque, prepare_
 from ..recordings.stacked import stack
 from ..simulators.contract import Backend
 from .flexible import friction_width
-from .floor import noise_floor
+from .floor import noise_floor, noise_rms, whitening_of
 from .holdout import fold_squares, residual_rms
 from .layout import checked_repeats, held_rows, layout
 from .problem import Problem
 from .state import State, baseline, stated_effects, with_width
 from .step import stand
-from .thresholds import WEIGHT_ROUNDS
+from .thresholds import PASSED_FOR_NOISE, PASSED_FOR_RESIDUAL, WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess
 
-__all__ = ["Setting", "prepared_signals", "setting_of"]
+__all__ = ["Setting", "prepared_signals", "setting_beside", "setting_of"]
 
 
 class Setting(NamedTuple):
@@ -118,3 +118,29 @@ def setting_of(
         spectrum, whitening = noise_floor(problem, start, forbid)
     whitening, white = white_where_better(problem, start, whitening)
     return Setting(problem.within_trust(), start, spectrum, whitening, white)
+
+
+def setting_beside(here: Setting, state: State, forbid: Sequence[str]) -> Setting | None:
+    """The setting with new noise and weights at the joints where a cause has passed for noise; None without any.
+
+    What no group of the rich model follows, as a ripple of many periods, counts as noise until it is known, and weights
+    by the baseline's residual hold every cause. The rows of such a joint then say too little of what it shares with
+    the others: links and laws of the whole robot follow these alone. The `state` holds all that was found; the other
+    joints keep what they have, so that what is told of them does not hang on a cause elsewhere.
+    """
+    problem, residual = here.problem, residual_rms(here.problem, state)
+    spectrum, _ = noise_floor(problem, state, forbid)
+    passed = noise_rms(problem, spectrum) < PASSED_FOR_NOISE * noise_rms(problem, here.spectrum)
+    if here.white:
+        passed |= residual * here.whitening[0] < PASSED_FOR_RESIDUAL
+    if not passed.any():
+        return None
+    spectrum = here.spectrum._replace(
+        coefficients=np.where(passed, spectrum.coefficients, here.spectrum.coefficients),
+        covariance=np.where(passed[:, None, None], spectrum.covariance, here.spectrum.covariance),
+    )
+    own = 1 / np.maximum(residual, 1e-12 * residual.max()) if here.white else whitening_of(problem, spectrum)
+    whitening = np.where(passed, own, here.whitening)
+    even = problem.weighted(problem.records.fitted)
+    weight = np.where(passed, weighted_by_speed(even, state, whitening).records.weight, problem.records.weight)
+    return here._replace(problem=problem.weighted(weight), spectrum=spectrum, whitening=whitening)
