@@ -60,7 +60,7 @@ from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_
 from .setting import Setting, prepared_signals, setting_beside, setting_of
 from .standstill import left_moving, resting
 from .step import Step, stand, with_causes
-from .thresholds import ALPHA_OF_A_NAME, FEW_CAUSES, FOR_SURE, LINE_P, NO_REST, REST_P
+from .thresholds import ALPHA_OF_A_NAME, AS_WELL, FEW_CAUSES, FOR_SURE, LINE_P, NO_REST, REST_P
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess, Task
@@ -110,18 +110,24 @@ def diagnose(
         backend = as_backend(model)
         signals, band, begun = prepared_signals(backend, recordings, preprocess, known, trust)
         here = setting_of(*begun, forbid, progress)
-        generator = np.random.default_rng(seed)
-        give_back_holes()
-        searched = _searched(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
-        give_back_holes()
-        if searched.found and (anew := setting_beside(searched.here, searched.joint.step.state, forbid)):
-            del searched  # its rows and columns are large
-            searched = _searched(anew, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
-            give_back_holes()
         ordered = sorted(recordings, key=lambda r: r.role == "holdout")
-        judged = _judged(searched, Reader(ordered, signals, preprocess, band), forbid, tolerance, alpha, generator)
-        progress("measuring the gain", 0.9)
-        answer = _answer(searched.here, signals, searched.search, judged)
+        reader, generator = Reader(ordered, signals, preprocess, band), np.random.default_rng(seed)
+
+        def answered(here: Setting) -> tuple[Diagnosis, Setting | None]:
+            """The answer, and the setting anew where a cause that was found has passed for noise."""
+            give_back_holes()
+            searched = _searched(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
+            give_back_holes()
+            again = setting_beside(searched.here, searched.joint.step.state, forbid) if searched.found else None
+            judged = _judged(searched, reader, forbid, tolerance, alpha, generator)
+            progress("measuring the gain", 0.9)
+            return _answer(searched.here, signals, searched.search, judged), again
+
+        answer, again = answered(here)
+        if again:
+            other, _ = answered(again)
+            if other.holdout.after <= min(AS_WELL * answer.holdout.after, answer.holdout.before):
+                answer = other
         return replace(answer, band=band, notes=(*answer.notes, *note_on(band)))
 
 

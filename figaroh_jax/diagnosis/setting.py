@@ -21,7 +21,7 @@ from .layout import checked_repeats, held_rows, layout
 from .problem import Problem
 from .state import State, baseline, stated_effects, with_width
 from .step import stand
-from .thresholds import PASSED_FOR_NOISE, PASSED_FOR_RESIDUAL, WEIGHT_ROUNDS
+from .thresholds import MOST_OF_RESIDUAL, PASSED_FOR_NOISE, WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -123,16 +123,21 @@ def setting_of(
 def setting_beside(here: Setting, state: State, forbid: Sequence[str]) -> Setting | None:
     """The setting with new noise and weights at the joints where a cause has passed for noise; None without any.
 
-    What no group of the rich model follows, as a ripple of many periods, counts as noise until it is known, and weights
-    by the baseline's residual hold every cause. The rows of such a joint then say too little of what it shares with
-    the others: links and laws of the whole robot follow these alone. The `state` holds all that was found; the other
-    joints keep what they have, so that what is told of them does not hang on a cause elsewhere.
+    What no group of the rich model follows, as a ripple of many periods, counts as noise until it is known (not where
+    repeats tell the noise), and weights by the baseline's residual hold every cause. The rows of such a joint then say
+    too little of what it shares with the others: links and laws of the whole robot follow these alone. The `state`
+    holds all that was found; the other joints keep what they have, so that what is told of them does not hang on a
+    cause elsewhere.
     """
-    problem, residual = here.problem, residual_rms(here.problem, state)
+    problem, first = here.problem, stand(here.problem, here.start, here.whitening)
+    before, residual = residual_rms(problem, first.state), residual_rms(problem, state)
+    most = residual < MOST_OF_RESIDUAL * before
+    if not most.any():
+        return None
     spectrum, _ = noise_floor(problem, state, forbid)
-    passed = noise_rms(problem, spectrum) < PASSED_FOR_NOISE * noise_rms(problem, here.spectrum)
-    if here.white:
-        passed |= residual * here.whitening[0] < PASSED_FOR_RESIDUAL
+    passed = most & (noise_rms(problem, spectrum) < PASSED_FOR_NOISE * noise_rms(problem, here.spectrum))
+    if here.white and not problem.layout.repeats:
+        passed = most
     if not passed.any():
         return None
     spectrum = here.spectrum._replace(

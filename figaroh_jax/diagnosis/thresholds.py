@@ -23,8 +23,9 @@ LOWEST_RESOLVED = 2.0  # periods in a recording: below that frequency the spectr
 LOWEST_FREQUENCY = 0.02  # Hz, the same for long recordings
 WHITE_GAIN = 0.02  # relative fall of the folds' error in N m from which rows are weighted by their residual alone
 FEWER = (2.0, 4.0, 8.0, 16.0)  # rows of the answer's fit that may count as one beside what is believed of the links
-PASSED_FOR_NOISE = 0.45  # of the RMS that noise was told: less beside what was found, and a cause had passed for noise
-PASSED_FOR_RESIDUAL = 0.5  # the same of the baseline's residual, where rows are weighted by it
+MOST_OF_RESIDUAL = 0.5  # of a joint's residual (RMS): below, what was found there was most of it
+PASSED_FOR_NOISE = 0.45  # of the RMS that noise was told: below, beside what was found, that had passed for noise
+AS_WELL = 1.05  # times the error on held-out data: the answer with such weights anew may not predict worse
 SAME_MOTION = 0.05  # of a joint's range (standard deviation): repeats that differ by more are none
 
 # The search (`contenders`, `gates`, `search`)
