@@ -56,6 +56,16 @@ def test_right_recordings_pass_in_silence(seed: int, tmp_path: Path):
     assert said(Base("run", robot, arrays, entry), None, tmp_path) == ("silent", "")
 
 
+def test_a_gap_that_the_stamps_tell_is_no_jump(base: Base, tmp_path: Path):
+    q = np.asarray(base.arrays["q"])
+    joint = int(np.argmax(np.ptp(q[:, :2], axis=0)))
+    first, last = sorted((int(np.argmin(q[:, joint])), int(np.argmax(q[:, joint]))))
+    assert abs(q[last, joint] - q[first, joint]) > 1.0 and last - first < 0.6 * len(q)
+    arrays = {key: np.delete(value, slice(first + 1, last), axis=0) for key, value in base.arrays.items()}
+    what, text = said(Base("run", base.robot, arrays, base.entry, pair=base.pair), None, tmp_path)
+    assert "jumps" not in text, (what, text)
+
+
 def test_an_absolute_value_is_refused_as_a_torque(tmp_path: Path):
     """The size of the torques of an arm of three joints; the same without the rows near zero may be gravity's."""
     case = make_case(robot="small", repeats=1, trajectories=1, seed=2)

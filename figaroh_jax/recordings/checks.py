@@ -211,14 +211,15 @@ def _jumps(look: Look) -> Iterator[Finding]:
     """Single wild rows and turns of 2 pi that the encoder lost."""
     position, time = look.position, look.recording.time
     steps, dt = np.diff(position, axis=0), np.diff(time)[:, None]
+    each = np.abs(steps) / np.maximum(np.round(dt / np.median(dt)), 1.0)  # a gap in the stamps is no jump
     _, _, speed, _ = _limits(look.model)
     low, high, *_ = _limits(look.model)
     usual = np.percentile(np.abs(steps), 98, axis=0) + 1e-9
     allowed = np.where(np.isfinite(speed), 5 * speed * dt, np.inf)
     turns = ~np.array(prismatic(look.model))
     least = np.where(turns, 0.1, 0.01)
-    wild = (np.abs(steps) > 20 * usual) & (np.abs(steps) > least)
-    wild &= (np.abs(steps) > allowed) | (np.abs(steps) > 1.0) | (np.abs(steps) > 200 * usual)
+    wild = (each > 20 * usual) & (np.abs(steps) > least)
+    wild &= (np.abs(steps) > allowed) | (np.abs(steps) > 1.0) | (each > 200 * usual)
     for j in np.flatnonzero(wild.any(axis=0)).tolist():
         rows = np.flatnonzero(wild[:, j]) + 1
         biggest = steps[rows - 1, j]
