@@ -159,6 +159,7 @@ def page_template(name: str, folder: Path | None = None) -> Any:
     environment = Environment(loader=pages, autoescape=True, undefined=StrictUndefined)
     environment.filters |= {
         "aside": wording.aside,
+        "both": lambda gain: [*map(_glued, wording.fall(gain.before, gain.after, gain.unit))],
         "equation": wording.effect_equation,
         "error": lambda value, unit: _glued(wording.error(value, unit)),
         "fall": lambda gain: " → ".join(map(_glued, wording.fall(gain.before, gain.after, gain.unit))),
