@@ -187,6 +187,28 @@ def test_measured_postures_are_told_what_to_write(made, tmp_path: Path):
     shown = shown.replace("MODEL", str(urdf)).replace("BASE", "base").replace("TOOL", "tool0")
     (tmp_path / "task.yaml").write_text(shown)
     assert load_task(tmp_path / "task.yaml").data[0].measurement is not None
+    assert load_task(tmp_path / "task.yaml").robot.joints is None
+
+
+def test_the_task_of_postures_lists_the_joints_that_the_file_holds(made, tmp_path: Path):
+    """Else the columns are fewer than the robot's joints, and the task is refused."""
+    urdf, joints, (run, *_) = made
+    columns = {f"{axis}1": run["torque"][:30, k] for k, axis in enumerate("xyz")}
+    columns |= {joint: run["position"][:30, j] for j, joint in enumerate(joints[:2])}
+    with pytest.raises(InputError, match="a task for `calibrate`") as caught:
+        draft_task(urdf, [table(tmp_path / "postures.csv", columns)])
+    assert f"robot: {{model: MODEL, joints: [{joints[0]}, {joints[1]}]}}" in str(caught.value)
+
+
+def test_fewer_columns_than_joints_are_told_how_to_name_theirs(made, tmp_path: Path):
+    urdf, _, (run, *_) = made
+    np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"][:, :2], tau=run["torque"][:, :2])
+    (tmp_path / "task.yaml").write_text(
+        f"robot: {{model: {urdf}}}\ndata: [{{file: run.npz, time: t, position: q, torque: tau}}]"
+    )
+    task = load_task(tmp_path / "task.yaml")
+    with pytest.raises(InputError, match="list the joints of the columns in robot.joints"):
+        read_recordings(task, load_robot(task))
 
 
 def test_a_clock_of_another_name_and_rows_that_were_written_twice(made, tmp_path: Path):

@@ -180,7 +180,10 @@ def _refuse_postures(table: Table, model: RobotModel) -> None:
     units = {key: unit for key, unit in (("position", "deg"), ("measurement", "mm")) if unit in words}
     frames = {"base_frame": "BASE", "tool_frame": "TOOL", "unknown": ["base_frame", "tool_frame"]}
     entry = {"file": table.file.name, "position": position, **({"units": units} if units else {})}
-    task = {"robot": {"model": "MODEL"}, "data": [entry | {"measurement": {kind: shown, **frames}}]}
+    robot: dict[str, Any] = {"model": "MODEL"}
+    if named and named != list(model.joint_names):
+        robot["joints"] = [*named]  # a copy, which YAML writes out
+    task = {"robot": robot, "data": [entry | {"measurement": {kind: shown, **frames}}]}
     written = yaml.safe_dump(task, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10**6).strip()
     raise InputError(
         f"{table.file}: {', '.join(measured[:6])} look like measured poses or points. Postures are a task for"
