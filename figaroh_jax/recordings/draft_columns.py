@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from jaxtyping import Float
 
 from ..errors import InputError
@@ -167,6 +166,8 @@ def without_sign(*torques: Float[np.ndarray, "samples joints"]) -> bool:
 
 def _refuse_postures(table: Table, model: RobotModel) -> None:
     """Measured postures are a task of `calibrate`, which needs frames that no file names: the message shows it."""
+    from ..formats.export import dump_yaml
+
     kinds = _kinds(table, None)
     measured = [n for n in table.names if _MEASURED.search(n) and not _holds_any(n, model.joint_names)]
     if not measured or any(kind in kinds for kind in ("torque", "current", "command", "velocity")):
@@ -184,7 +185,7 @@ def _refuse_postures(table: Table, model: RobotModel) -> None:
     if named and named != list(model.joint_names):
         robot["joints"] = [*named]  # a copy, which YAML writes out
     task = {"robot": robot, "data": [entry | {"measurement": {kind: shown, **frames}}]}
-    written = yaml.safe_dump(task, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10**6).strip()
+    written = dump_yaml(task, line=True).strip()
     raise InputError(
         f"{table.file}: {', '.join(measured[:6])} look like measured poses or points. Postures are a task for"
         " `calibrate`; `new` drafts motions only. The task is\n"

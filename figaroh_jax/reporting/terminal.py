@@ -18,6 +18,7 @@ from . import wording
 
 if TYPE_CHECKING:
     from ..calibration.calibrated import Calibration
+    from ..calibration.kinematic_diagnosis import PoseDiagnosis
     from ..identification.result import FittedEffect, Identification
 
 __all__ = [
@@ -103,15 +104,18 @@ def summary(diagnosis: Diagnosis, robot: str = "the robot", *, verbose: bool = F
     return Group(*parts)
 
 
-def show_calibration(calibration: Calibration, verdict: str = "", *, verbose: bool = False) -> None:
-    """Print the summary of a calibration, or of a diagnosis of poses with its verdict, on standard output."""
-    Console(file=sys.stdout).print(calibration_summary(calibration, verdict, verbose=verbose))
+def show_calibration(calibration: Calibration, found: PoseDiagnosis | None = None, *, verbose: bool = False) -> None:
+    """Print the summary of a calibration, or of the diagnosis of poses that it belongs to, on standard output."""
+    Console(file=sys.stdout).print(calibration_summary(calibration, found, verbose=verbose))
 
 
-def calibration_summary(calibration: Calibration, verdict: str = "", *, verbose: bool = False) -> RenderableType:
+def calibration_summary(
+    calibration: Calibration, found: PoseDiagnosis | None = None, *, verbose: bool = False
+) -> RenderableType:
     """The calibration in a few lines: how much better, why this level, outliers and causes, what to know."""
-    word = (verdict, _STYLE[verdict]) if verdict else (calibration.level, "bold blue")
-    head = Text.assemble(word, f"  {wording.calibration_sentence(calibration)}\n")
+    word = (calibration.level, "bold blue") if found is None else (found.verdict, _STYLE[found.verdict])
+    said = "" if found is None else f"{wording.pose_sentence(found, calibration.model.name)} "
+    head = Text.assemble(word, f"  {said}{wording.calibration_sentence(calibration)}\n")
     table = Table(box=None, pad_edge=False, header_style="dim")
     table.add_column("held-out RMS error")
     errors = [error for error in (calibration.position, calibration.orientation) if error is not None]

@@ -15,6 +15,7 @@ from .rollout_effects import ROLLOUT_EFFECTS
 
 if TYPE_CHECKING:
     from ..calibration.calibrated import Calibration
+    from ..calibration.kinematic_diagnosis import PoseDiagnosis
 
 __all__ = [
     "aside",
@@ -33,6 +34,7 @@ __all__ = [
     "p_value",
     "phrase",
     "place",
+    "pose_sentence",
     "rest",
     "sentence",
     "undecided",
@@ -125,6 +127,17 @@ def calibration_sentence(calibration: Calibration) -> str:
     found = level(calibration.level)
     told = f"the error on held-out postures falls from {before} (base and tool frames only) to {after}"
     return f"With {found}, {told}."
+
+
+def pose_sentence(diagnosis: PoseDiagnosis, robot: str) -> str:
+    """The verdict on measured postures in one sentence."""
+    subject = f"The postures of {robot} show"
+    if diagnosis.verdict == "nothing":
+        return f"{subject} no error of its kinematics beyond the tolerance."
+    if diagnosis.verdict == "unknown":
+        return f"{subject} an error that no effect in the catalogue explains."
+    rest = "; part of the error remains unexplained" if diagnosis.verdict == "named+rest" else ""
+    return f"{subject} {_list(diagnosis.causes)}{rest}."
 
 
 def distances(calibration: Calibration) -> str:
