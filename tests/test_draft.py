@@ -10,10 +10,12 @@ import pytest
 import yaml
 from generators import make_case
 
+import figaroh_jax as fj
 from figaroh_jax import cli
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.config import load_task
 from figaroh_jax.formats.robotfile import load_robot
+from figaroh_jax.recordings.checks import check_recordings
 from figaroh_jax.recordings.dataset import read_recordings
 from figaroh_jax.recordings.draft import draft_task
 from figaroh_jax.recordings.draft_columns import Undecided
@@ -335,3 +337,42 @@ def test_stated_constants_are_taken_where_the_model_contradicts_them(made, tmp_p
     (line,) = [line for line in draft.assumed if "does not match the motion as read" in line]
     assert "nothing confirms them" in line
     assert yaml.safe_load(draft.text)["transmission"]["torque"] == [-1.0, -1.0, -1.0]
+
+
+LINK = (
+    '<link name="{}"><inertial><origin xyz="0.1 0 0"/><mass value="{}"/>'
+    '<inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+)
+JOINT = '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/><axis xyz="{}"/>{}</joint>'
+LIMIT = '<limit lower="-3" upper="3" velocity="4" effort="99"/>'
+
+
+def test_a_wheel_may_turn_for_ever(tmp_path: Path):
+    """Twenty-five turns of a joint without limits are no degrees, though degrees would fit; nor are they refused."""
+    parts = [LINK.format("base", 5), LINK.format("wheel", 2), LINK.format("arm", 3)]
+    parts += [JOINT.format("w", "continuous", "base", "wheel", "0 0 1", "")]
+    parts += [JOINT.format("a", "revolute", "base", "arm", "0 1 0", LIMIT)]
+    urdf = tmp_path / "cart.urdf"
+    urdf.write_text(f'<robot name="cart">{"".join(parts)}</robot>')
+    t = np.arange(4000) / 200
+    q = np.column_stack([8 * t, 0.7 + 1.5 * np.sin(2 * t) + 0.5 * np.cos(3 * t)])
+    v, a = np.gradient(q, t, axis=0), np.gradient(np.gradient(q, t, axis=0), t, axis=0)
+    tau = np.asarray(fj.inverse_dynamics(fj.load_urdf(urdf), q, v, a)) + 0.3 * np.sign(v)
+    np.savez(tmp_path / "run.npz", t=t, q=q, tau=tau)
+    draft = draft_task(urdf, [tmp_path / "run.npz"])
+    task, model, (recording,) = read_back(draft.text, tmp_path)
+    np.testing.assert_allclose(recording.position, q, rtol=0, atol=1e-12)
+    assert not [text for text in check_recordings(task, model, [recording]) if "position" in text]
+    np.savez(tmp_path / "run.npz", t=t, q=np.rad2deg(q), tau=tau)
+    assert "position: deg" in draft_task(urdf, [tmp_path / "run.npz"]).text
+
+
+@pytest.mark.parametrize("kind", ["planar", "floating"])
+def test_joints_of_several_degrees_of_freedom_are_refused_by_name(kind: str, tmp_path: Path):
+    parts = [LINK.format("base", 5), LINK.format("arm", 3), JOINT.format("a", kind, "base", "arm", "0 1 0", LIMIT)]
+    urdf = tmp_path / "robot.urdf"
+    urdf.write_text(f'<robot name="r">{"".join(parts)}</robot>')
+    t = np.arange(400) / 200
+    np.savez(tmp_path / "run.npz", t=t, q=np.sin(t)[:, None], tau=np.cos(t)[:, None])
+    with pytest.raises(InputError, match="joint a of several degrees of freedom"):
+        draft_task(urdf, [tmp_path / "run.npz"])

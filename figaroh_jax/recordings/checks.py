@@ -32,6 +32,7 @@ __all__ = ["Finding", "check_recording", "check_recordings", "position_findings"
 DEGREE = np.pi / 180
 STILL = 1e-3  # rad or m: a joint that stays within it stands
 HARD = 20.0  # times a limit: no robot does that
+WHEEL = 20.0  # rad/s of a joint without limits: faster than wheels turn; 0.35 rad/s in degrees read as rad
 
 
 def check_recordings(task: Task | None, model: RobotModel, recordings: Sequence[Recording]) -> tuple[str, ...]:
@@ -72,7 +73,7 @@ def check_recording(recording: Recording, model: RobotModel, entry: RecordingEnt
         return []
     motion = sampled(recording.time, recording.position, recording.torque)
     unit = entry.units.position if entry is not None else "rad"
-    look = Look(recording.position, recording.joints, model, unit, recording, entry, motion)
+    look = Look(recording.position, recording.joints, model, unit, recording, entry, motion, recording.time)
     found: list[Finding] = []
     for check in (_clock, _unit_without_joint, _ranges, _jumps, _zero_rows, _torque_values):
         found += check(look)
@@ -85,9 +86,14 @@ def check_recording(recording: Recording, model: RobotModel, entry: RecordingEnt
     return found
 
 
-def position_findings(position: Float[np.ndarray, "rows nv"], model: RobotModel, unit: str) -> list[Finding]:
-    """What looks wrong about positions that have no order in time: unit and range."""
-    look = Look(position, model.dof_names, model, unit)
+def position_findings(
+    position: Float[np.ndarray, "rows nv"],
+    model: RobotModel,
+    unit: str,
+    time: Float[np.ndarray, " rows"] | None = None,
+) -> list[Finding]:
+    """What looks wrong about positions by themselves: unit and range; `time` (s) where they are a motion."""
+    look = Look(position, model.dof_names, model, unit, time=time)
     return [finding for check in (_unit_without_joint, _ranges) for finding in check(look)]
 
 
@@ -170,7 +176,11 @@ def _ranges(look: Look) -> Iterator[Finding]:
     room = np.where(np.isfinite(high - low), high - low, 4 * np.pi)
     over = np.maximum(np.maximum(low - bottom, top - high), 0.0)
     free = ~np.isfinite(high - low) & turns
-    over = np.where(free, np.maximum(np.abs(look.position).max(axis=0) - 16 * np.pi, 0.0), over)
+    wound = np.maximum(np.abs(look.position).max(axis=0) - 16 * np.pi, 0.0)
+    if look.time is not None:  # a wheel may turn for ever, but not at the speed of degrees or counts read as rad
+        top = np.percentile(np.abs(np.diff(look.position, axis=0)) / np.diff(look.time)[:, None], 98, axis=0)
+        wound = np.where(top > np.where(np.isfinite(speed), SOFT * speed, WHEEL), wound, 0.0)
+    over = np.where(free, wound, over)
     far = over > np.maximum(room, np.where(turns, np.pi, 0.05))
     if far.any():
         yield from _far(look, far, over)

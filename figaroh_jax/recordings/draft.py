@@ -17,7 +17,7 @@ from ..errors import InputError, nearest
 from ..formats.config import RecordingEntry
 from ..formats.files import USD
 from ..formats.robotfile import read_robot
-from ..rigid.model import RobotModel, prismatic
+from ..rigid.model import DOF_NAMES, RobotModel, prismatic
 from .checks import DEGREE, Finding, check_recording, position_findings
 from .dataset import Recording
 from .draft_columns import Columns, Undecided, read_columns, without_sign
@@ -66,6 +66,12 @@ def draft_task(
     if len({read.joints for read in reads}) > 1:
         raise InputError("the recordings hold different joints; draft a task for each kind")
     robot = read_robot(model, reads[0].joints)
+    many = [joint.name for joint in robot.joints if len(DOF_NAMES[joint.kind]) > 1]
+    if many:
+        raise InputError(
+            f"{model}: joint{'s' * (len(many) > 1)} {', '.join(many)} of several degrees of freedom: `new` drafts for"
+            " joints of one; lock them (--joints names the others), or write the task by hand"
+        )
     assumed = [*dict.fromkeys(_clock_said(reads))]
     _doubt_percent(reads, unit)
     for option, given in (("--constants", constants), ("--gears", gears)):
@@ -145,19 +151,26 @@ def _unit_of_position(robot: RobotModel, reads: Sequence[Columns]) -> str:
     straight = np.array(prismatic(robot))
     wide = {"rad": every, "deg": every * np.where(straight, 1.0, DEGREE), "mm": every * np.where(straight, 1e-3, 1.0)}
     kinds = ["rad", *(["deg"] if not straight.all() else []), *(["mm"] if straight.all() else [])]
-    fits = [u for u in kinds if not position_findings(wide[u], robot, "rad")]
+    ends = np.cumsum([len(read.position) for read in reads])[:-1]
+
+    def doubts(one: np.ndarray) -> list[Finding]:
+        parts = zip(np.split(one, ends), reads, strict=True)
+        return [finding for part, read in parts for finding in position_findings(part, robot, "rad", read.time)]
+
+    fits = [u for u in kinds if not doubts(wide[u])]
     if len(fits) == 1:
         return fits[0]
     if not fits:
-        text = "; ".join(finding.text for finding in position_findings(every, robot, "rad"))
+        text = "; ".join(dict.fromkeys(finding.text for finding in doubts(every)))
         raise InputError(f"{reads[0].file}: in no unit do the positions fit the model: {text}")
     with_torque = [read for read in reads if read.torque is not None]
     misfit = {unit: float(np.mean([_unlike(robot, read, unit) for read in with_torque] or [0.0])) for unit in fits}
     best, other = sorted(fits, key=misfit.__getitem__)[:2]
     span = float(np.ptp(every, axis=0).max())
+    held = np.isfinite(np.ptp(np.asarray(robot.position_limit), axis=1))  # what has no limits may turn for ever
     if misfit[best] < 0.7 * misfit[other] or (best == "rad" and span < 2 * np.pi and misfit[best] <= misfit[other]):
         return best
-    if span > 20:
+    if held.any() and np.ptp(every[:, held], axis=0).max() > 20:
         return "deg"
     raise Undecided(
         "unit",
