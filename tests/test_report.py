@@ -25,7 +25,7 @@ from figaroh_jax.reporting import report
 from figaroh_jax.reporting.picture import robot_picture
 from figaroh_jax.reporting.provenance import provenance
 from figaroh_jax.reporting.terminal import summary
-from figaroh_jax.reporting.wording import error, fall, interval, phrase, sentence
+from figaroh_jax.reporting.wording import error, fall, interval, number, phrase, sentence
 from figaroh_jax.results import Diagnosis, Estimate, Experiment, Gain, Name, Nearest, Part, Rest
 
 LAPTOP, PHONE = (1280, 800), (390, 844)
@@ -195,6 +195,11 @@ def test_packing_keeps_a_channel_to_a_thirty_thousandth_of_its_range():
     kept = np.isfinite(values)
     back = packed["o"] + packed["s"] * steps[kept]
     np.testing.assert_allclose(back, values[kept], rtol=0, atol=np.ptp(values[kept]) / 60_000)
+
+
+@pytest.mark.parametrize(("value", "told"), [(99.6, "100"), (-123.4, "−120"), (0.0123, "0.012"), (3.2e9, "3.2e+09")])
+def test_numbers_of_a_few_digits_are_written_out(value: float, told: str):
+    assert number(value, 2) == told
 
 
 def test_page_tells_errors_that_are_nearly_alike_by_the_digits_of_its_headline(tmp_path: Path):

@@ -274,7 +274,8 @@ def number(value: float, digits: int = 4) -> str:
     """A number with `digits` significant digits, never more than a reader needs."""
     if not math.isfinite(value):
         return "–" if math.isnan(value) else _minus(f"{value:.0f}".replace("inf", "∞"))
-    return _minus(f"{value:.{digits}g}")
+    text = f"{value:.{digits}g}"
+    return _minus(f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text)  # 100, not 1e+02
 
 
 def p_value(value: float) -> str:
