@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+import poses
 import pytest
 from generators import make_case
 from spoiled import KINDS, Base, said
@@ -24,6 +25,11 @@ from figaroh_jax.recordings.likeness import Sampled, frame_poses, rigid_torque, 
 
 # its slide takes mm
 NOT_HERE = {"mm on a revolute arm"}
+
+
+def quaternions(T: np.ndarray) -> np.ndarray:
+    """Matrices as x y z qx qy qz qw."""
+    return np.hstack([T[:, :3, 3], [pin.Quaternion(R).coeffs() for R in T[:, :3, :3]]])
 
 
 @pytest.fixture(scope="module")
@@ -176,3 +182,31 @@ def test_recordings_from_arrays_are_checked_too(job: Any):
     still = fj.recording(q=np.broadcast_to(q[:1], q.shape), tau=torque, time=t)
     with pytest.raises(InputError, match="no joint moves"):
         job(robot, [still])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (None, ""),
+        (lambda T: quaternions(T)[:, [0, 1, 2, 6, 3, 4, 5]], "refused: .*they do as w x y z, or transposed"),
+        (quaternions, ""),
+        (lambda T: T.transpose(0, 2, 1), r"refused: .*the last row of the matrix is .*the matrices are transposed"),
+        (np.linalg.inv, "warned: .*they would with every pose inverted"),
+        (
+            lambda T: np.concatenate([np.concatenate([T[:, :3, :3].swapaxes(1, 2), T[:, :3, 3:]], 2), T[:, 3:]], 1),
+            "refused: .*they do as w x y z, or transposed",
+        ),
+    ],
+)
+def test_poses_in_another_convention_are_told(spoil: Any, words: str, tmp_path: Path):
+    """The angle between two quaternions is the same in any order of their numbers: the axes of rotations tell."""
+    rng = np.random.default_rng(12)
+    (tmp_path / "robot.urdf").write_text(poses.urdf())
+    q, real = poses.postures(rng, 40), poses.truth(rng)
+    there = np.array([pose.homogeneous for pose in poses.tool_poses(tmp_path / "robot.urdf", q, real)])
+    measurement = {"pose": "T", "base_frame": "base", "tool_frame": "tool0", "unknown": ["base_frame", "tool_frame"]}
+    arrays = {"q": q, "T": there if spoil is None else spoil(there)}
+    entry = {"position": "q", "measurement": measurement}
+    robot = {"model": str(tmp_path / "robot.urdf"), "joints": list(poses.JOINTS)}
+    what, text = said(Base("run", robot, arrays, entry), None, tmp_path)
+    assert (what == "silent") if not words else re.search(words, f"{what}: {text}"), (what, text)

@@ -121,8 +121,8 @@ def calibration_sentence(calibration: Calibration) -> str:
     before, after = (_with_unit(number(x, 3), error.unit) for x in (error.validated_before, error.validated_after))
     if calibration.level == "frames":
         return (
-            f"The nominal kinematics are as accurate as these measurements can show: {after} on held-out postures with"
-            " only the base and tool frames fitted; no correction of the robot predicts better."
+            f"No correction of the robot predicts better than the nominal kinematics with base and tool frames fitted:"
+            f" {after} on held-out postures."
         )
     found = level(calibration.level)
     told = f"the error on held-out postures falls from {before} (base and tool frames only) to {after}"
