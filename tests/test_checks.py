@@ -210,3 +210,16 @@ def test_poses_in_another_convention_are_told(spoil: Any, words: str, tmp_path: 
     robot = {"model": str(tmp_path / "robot.urdf"), "joints": list(poses.JOINTS)}
     what, text = said(Base("run", robot, arrays, entry), None, tmp_path)
     assert (what == "silent") if not words else re.search(words, f"{what}: {text}"), (what, text)
+
+
+@pytest.mark.parametrize("factor", [1 / 7, 1000.0])
+def test_a_torque_in_another_unit_is_not_told_as_a_wrong_clock_too(base: Base, factor: float, tmp_path: Path):
+    arrays = base.arrays | {"tau": np.asarray(base.arrays["tau"]) * factor}
+    what, text = said(Base("run", base.robot, arrays, base.entry, pair=base.pair), None, tmp_path)
+    assert "times what the model needs" in text and "clock" not in text, (what, text)
+
+
+def test_several_things_that_cannot_be_right_stay_apart_on_one_line(base: Base, tmp_path: Path):
+    still = {key: np.full_like(base.arrays[key], 0.3) for key in ("q", "tau")}
+    what, text = said(Base("run", base.robot, base.arrays | still, base.entry, pair=base.pair), None, tmp_path)
+    assert what == "refused" and "; run.npz: no joint moves" in " ".join(text.split())

@@ -61,7 +61,7 @@ def report_findings(found: Sequence[tuple[str, Finding]]) -> tuple[str, ...]:
     texts = [(finding.wrong, f"{', '.join(names)}: {finding.text}") for finding, names in files.items()]
     wrong = [text for bad, text in texts if bad]
     if wrong:
-        raise InputError("\n  ".join(wrong) if len(wrong) == 1 else "\n  ".join(["", *wrong]))
+        raise InputError(wrong[0] if len(wrong) == 1 else "\n  " + ";\n  ".join(wrong))
     for _, text in texts:
         logging.getLogger("figaroh_jax").warning("check: %s", text)
     return tuple(f"check: {text}" for _, text in texts)

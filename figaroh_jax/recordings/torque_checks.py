@@ -56,7 +56,10 @@ def torque_findings(look: Look, motion: Sampled) -> Iterator[Finding]:
             " controller adds to its gravity compensation? Record the torque or current of the drives",
         )
         return
-    yield from _scale(look, fit, like)
+    scale = [*_scale(look, fit, like)]
+    yield from scale
+    if scale:  # a torque n times as large looks like a clock the root of n times as fast
+        return
     stretch, error = stretch_of_time(look.model, motion)
     if error < 0.15 and abs(np.log(stretch)) > max(np.log(1.5), 3 * error):
         yield Finding(
