@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -376,3 +377,18 @@ def test_joints_of_several_degrees_of_freedom_are_refused_by_name(kind: str, tmp
     np.savez(tmp_path / "run.npz", t=t, q=np.sin(t)[:, None], tau=np.cos(t)[:, None])
     with pytest.raises(InputError, match="joint a of several degrees of freedom"):
         draft_task(urdf, [tmp_path / "run.npz"])
+
+
+def test_interactive_asks_until_the_answer_can_be_meant(made, tmp_path: Path, monkeypatch, capsys):
+    """What the recording cannot decide is asked for; a slip is asked again and costs no answer before it."""
+    urdf, _, (run, *_) = made
+    noise = np.random.default_rng(1).normal(size=run["torque"].shape)
+    np.savez(tmp_path / "run.npz", q=run["position"], tau=noise)
+    command = ["new", str(urdf), str(tmp_path / "run.npz"), "--interactive"]
+    monkeypatch.setattr("sys.stdin", io.StringIO("fast\n250\n1;1;1\n1,1,1\n"))
+    assert cli.main(command) == 0
+    told = capsys.readouterr()
+    assert yaml.safe_load(told.out)["data"][0]["rate"] == 250.0
+    assert "--rate fast: expected" in told.err and "--constants 1;1;1: expected" in told.err
+    monkeypatch.setattr("sys.stdin", io.StringIO("250\n"))
+    assert cli.main(command) == 2  # no answer gives up
