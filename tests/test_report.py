@@ -24,7 +24,7 @@ from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.reporting import report
 from figaroh_jax.reporting.picture import robot_picture
 from figaroh_jax.reporting.provenance import provenance
-from figaroh_jax.reporting.terminal import summary
+from figaroh_jax.reporting.terminal import show, summary
 from figaroh_jax.reporting.wording import error, fall, interval, number, phrase, sentence
 from figaroh_jax.results import Diagnosis, Estimate, Experiment, Gain, Name, Nearest, Part, Rest
 
@@ -200,6 +200,13 @@ def test_packing_keeps_a_channel_to_a_thirty_thousandth_of_its_range():
 @pytest.mark.parametrize(("value", "told"), [(99.6, "100"), (-123.4, "−120"), (0.0123, "0.012"), (3.2e9, "3.2e+09")])
 def test_numbers_of_a_few_digits_are_written_out(value: float, told: str):
     assert number(value, 2) == told
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_lines_of_the_summary_end_in_no_space(variant: str, capsys):
+    show(VARIANTS[variant], "tx40")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) > 5 and not [line for line in lines if line != line.rstrip()]
 
 
 def test_page_tells_errors_that_are_nearly_alike_by_the_digits_of_its_headline(tmp_path: Path):

@@ -69,7 +69,18 @@ class Progress:
 
 def show(diagnosis: Diagnosis, robot: str = "the robot", *, verbose: bool = False) -> None:
     """Print the summary on standard output."""
-    Console(file=sys.stdout).print(summary(diagnosis, robot, verbose=verbose))
+    _print(summary(diagnosis, robot, verbose=verbose))
+
+
+def _print(shown: RenderableType) -> None:
+    """On standard output; in a pipe or a file without the spaces that fill lines up."""
+    console = Console(file=sys.stdout)
+    if console.is_terminal:
+        console.print(shown)
+        return
+    with console.capture() as text:
+        console.print(shown)
+    sys.stdout.write("\n".join(line.rstrip() for line in text.get().split("\n")))
 
 
 def _notes(notes: Sequence[str], verbose: bool) -> list[RenderableType]:
@@ -106,7 +117,7 @@ def summary(diagnosis: Diagnosis, robot: str = "the robot", *, verbose: bool = F
 
 def show_calibration(calibration: Calibration, found: PoseDiagnosis | None = None, *, verbose: bool = False) -> None:
     """Print the summary of a calibration, or of the diagnosis of poses that it belongs to, on standard output."""
-    Console(file=sys.stdout).print(calibration_summary(calibration, found, verbose=verbose))
+    _print(calibration_summary(calibration, found, verbose=verbose))
 
 
 def calibration_summary(
@@ -188,7 +199,7 @@ def _plain(text: str) -> str:
 
 def show_identification(found: Identification, robot: str = "the robot", *, verbose: bool = False) -> None:
     """Print the summary of an identification on standard output."""
-    Console(file=sys.stdout).print(identification_summary(found, robot, verbose=verbose))
+    _print(identification_summary(found, robot, verbose=verbose))
 
 
 def identification_summary(found: Identification, robot: str = "the robot", *, verbose: bool = False) -> RenderableType:
