@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
-import jax
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..effects.extended import ExtendedModel
@@ -80,7 +80,7 @@ class Fit(eqx.Module):
         the change from what was given. Of one fit, outside of `jit` and `grad`: in there, and of a batch, `values`
         and `covariance` stand in the order of `free.names`.
         """
-        if isinstance(self.values, jax.core.Tracer) or np.ndim(self.values) != 1:
+        if isinstance(self.values, Tracer) or np.ndim(self.values) != 1:
             raise InputError(
                 "Fit.parameters are plain numbers of one fit: under jit, grad or vmap, and of a batch, take `values`,"
                 " whose names are `free.names`"

@@ -173,11 +173,12 @@ def _refuse_postures(table: Table, model: RobotModel) -> None:
     if not measured or any(kind in kinds for kind in ("torque", "current", "command", "velocity")):
         return
     named = [n for n in table.names if n in model.joint_names]
-    position = named or (kinds.get("position") or ["JOINTS"])[0]
+    columns = named or (kinds.get("position") or ["JOINTS"])[:1]
+    position = named or columns[0]
     whole = table.file.suffix.lower() in (".npz", ".mat", ".h5")
     shown = measured[0] if whole else measured[:12]
     kind = "pose" if "pose" in measured[0].lower() or measured[0].startswith("T_") else "position"
-    words = {word for name in (*(named or [position]), *measured) for word in _words(name)}
+    words = {word for name in (*columns, *measured) for word in _words(name)}
     units = {key: unit for key, unit in (("position", "deg"), ("measurement", "mm")) if unit in words}
     frames = {"base_frame": "BASE", "tool_frame": "TOOL", "unknown": ["base_frame", "tool_frame"]}
     entry = {"file": table.file.name, "position": position, **({"units": units} if units else {})}
