@@ -274,7 +274,12 @@ def _parser() -> argparse.ArgumentParser:
     again = commands.add_parser("rerun", parents=[common], help="repeat the command that made a run directory")
     again.add_argument("run", type=Path, metavar="DIR")
     _add_tools(commands)
-    export = commands.add_parser("export", parents=[common], help="write a rollout's model for a simulator")
+    export = commands.add_parser("export", help="write a rollout's model for a simulator")
+    export.add_argument("--out", type=Path, metavar="DIR", help="write it there too, beside what the folder holds")
+    export.add_argument("--traceback", action="store_true", help="show where an error was raised")
+    for unused in ("--json", "--quiet", "--verbose", "--no-cache"):  # what is printed is JSON, and nothing else
+        export.add_argument(unused, action="store_true", help=argparse.SUPPRESS)
+    export.add_argument("--backend", help=argparse.SUPPRESS)
     export.add_argument("task", type=Path, metavar="MODEL_DIR", help="`model` of a run directory")
     export.add_argument("--for", dest="simulator", required=True, metavar="NAME", help="mujoco, newton, isaaclab, ...")
     demo = commands.add_parser("demo", parents=[common], help="the main job on an embedded recording, no file needed")

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
+import figaroh_jax as fj
 from figaroh_jax.calibration.calibrated import Calibration
 from figaroh_jax.calibration.calibration import Run, calibrate
 from figaroh_jax.calibration.kinematic_diagnosis import diagnose_poses
@@ -140,3 +142,18 @@ def test_known_distances_are_fitted_though_the_last_recording_is_held_out(data_d
     measured = Run(model, recordings, (), lambda phase, share: None).measured
     assert (measured.posture == -1).sum() == 2  # one of each tool position that is fitted
     assert measured.fitted[measured.posture == -1].all()
+
+
+def test_a_posture_that_a_diagnosis_leaves_out_is_told_where_it_has_no_name(data_dir: Path, tmp_path: Path):
+    """Posture 9 of TIAGo is 60 mm off (README of the set); beside a joint that seems to play it is not named."""
+    joints = ["torso_lift_joint", *(f"arm_{k}_joint" for k in range(1, 8))]
+    points = [f"{axis}{marker}" for marker in range(1, 5) for axis in "xyz"]  # as the file has them, one twice
+    frames = {"base_frame": "base_link", "tool_frame": "arm_7_link", "unknown": ["base_frame", "tool_frame"]}
+    folder = data_dir / "tiago_mocap"
+    entry = {"file": str(folder / "qualysis_base_hand_calibration.csv"), "position": joints}
+    robot = {"model": str(folder / "tiago_no_hand.urdf"), "joints": joints}
+    task = {"robot": robot, "data": [entry | {"measurement": {"position": points, **frames}}]}
+    (tmp_path / "task.yaml").write_text(yaml.safe_dump(task))
+    found = fj.diagnose_task(fj.load_task(tmp_path / "task.yaml"))
+    named = any(cause.name.effect == "outlier" for cause in found.causes)
+    assert named or any("row 9 of" in note and "left out" in note for note in found.calibration.notes)

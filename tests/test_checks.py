@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+import poses
 import pytest
 from generators import make_case
 from spoiled import KINDS, Base, said
@@ -24,6 +25,11 @@ from figaroh_jax.recordings.likeness import Sampled, frame_poses, rigid_torque, 
 
 # its slide takes mm
 NOT_HERE = {"mm on a revolute arm"}
+
+
+def quaternions(T: np.ndarray) -> np.ndarray:
+    """Matrices as x y z qx qy qz qw."""
+    return np.hstack([T[:, :3, 3], [pin.Quaternion(R).coeffs() for R in T[:, :3, :3]]])
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +60,16 @@ def test_right_recordings_pass_in_silence(seed: int, tmp_path: Path):
     robot: dict[str, Any] = {"model": str(tmp_path / "robot.urdf"), "joints": list(case.joints)}
     entry = {"time": "t", "position": "q", "torque": "tau"}
     assert said(Base("run", robot, arrays, entry), None, tmp_path) == ("silent", "")
+
+
+def test_a_gap_that_the_stamps_tell_is_no_jump(base: Base, tmp_path: Path):
+    q = np.asarray(base.arrays["q"])
+    joint = int(np.argmax(np.ptp(q[:, :2], axis=0)))
+    first, last = sorted((int(np.argmin(q[:, joint])), int(np.argmax(q[:, joint]))))
+    assert abs(q[last, joint] - q[first, joint]) > 1.0 and last - first < 0.6 * len(q)
+    arrays = {key: np.delete(value, slice(first + 1, last), axis=0) for key, value in base.arrays.items()}
+    what, text = said(Base("run", base.robot, arrays, base.entry, pair=base.pair), None, tmp_path)
+    assert "jumps" not in text, (what, text)
 
 
 def test_an_absolute_value_is_refused_as_a_torque(tmp_path: Path):
@@ -166,3 +182,44 @@ def test_recordings_from_arrays_are_checked_too(job: Any):
     still = fj.recording(q=np.broadcast_to(q[:1], q.shape), tau=torque, time=t)
     with pytest.raises(InputError, match="no joint moves"):
         job(robot, [still])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (None, ""),
+        (lambda T: quaternions(T)[:, [0, 1, 2, 6, 3, 4, 5]], "refused: .*they do as w x y z, or transposed"),
+        (quaternions, ""),
+        (lambda T: T.transpose(0, 2, 1), r"refused: .*the last row of the matrix is .*the matrices are transposed"),
+        (np.linalg.inv, "warned: .*they would with every pose inverted"),
+        (
+            lambda T: np.concatenate([np.concatenate([T[:, :3, :3].swapaxes(1, 2), T[:, :3, 3:]], 2), T[:, 3:]], 1),
+            "refused: .*they do as w x y z, or transposed",
+        ),
+    ],
+)
+def test_poses_in_another_convention_are_told(spoil: Any, words: str, tmp_path: Path):
+    """The angle between two quaternions is the same in any order of their numbers: the axes of rotations tell."""
+    rng = np.random.default_rng(12)
+    (tmp_path / "robot.urdf").write_text(poses.urdf())
+    q, real = poses.postures(rng, 40), poses.truth(rng)
+    there = np.array([pose.homogeneous for pose in poses.tool_poses(tmp_path / "robot.urdf", q, real)])
+    measurement = {"pose": "T", "base_frame": "base", "tool_frame": "tool0", "unknown": ["base_frame", "tool_frame"]}
+    arrays = {"q": q, "T": there if spoil is None else spoil(there)}
+    entry = {"position": "q", "measurement": measurement}
+    robot = {"model": str(tmp_path / "robot.urdf"), "joints": list(poses.JOINTS)}
+    what, text = said(Base("run", robot, arrays, entry), None, tmp_path)
+    assert (what == "silent") if not words else re.search(words, f"{what}: {text}"), (what, text)
+
+
+@pytest.mark.parametrize("factor", [1 / 7, 1000.0])
+def test_a_torque_in_another_unit_is_not_told_as_a_wrong_clock_too(base: Base, factor: float, tmp_path: Path):
+    arrays = base.arrays | {"tau": np.asarray(base.arrays["tau"]) * factor}
+    what, text = said(Base("run", base.robot, arrays, base.entry, pair=base.pair), None, tmp_path)
+    assert "times what the model needs" in text and "clock" not in text, (what, text)
+
+
+def test_several_things_that_cannot_be_right_stay_apart_on_one_line(base: Base, tmp_path: Path):
+    still = {key: np.full_like(base.arrays[key], 0.3) for key in ("q", "tau")}
+    what, text = said(Base("run", base.robot, base.arrays | still, base.entry, pair=base.pair), None, tmp_path)
+    assert what == "refused" and "; run.npz: no joint moves" in " ".join(text.split())

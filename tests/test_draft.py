@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,12 @@ import pytest
 import yaml
 from generators import make_case
 
+import figaroh_jax as fj
 from figaroh_jax import cli
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.config import load_task
 from figaroh_jax.formats.robotfile import load_robot
+from figaroh_jax.recordings.checks import check_recordings
 from figaroh_jax.recordings.dataset import read_recordings
 from figaroh_jax.recordings.draft import draft_task
 from figaroh_jax.recordings.draft_columns import Undecided
@@ -183,10 +186,32 @@ def test_measured_postures_are_told_what_to_write(made, tmp_path: Path):
     columns |= {joint: run["position"][:30, j] for j, joint in enumerate(joints)}
     with pytest.raises(InputError, match="a task for `calibrate`") as caught:
         draft_task(urdf, [table(tmp_path / "postures.csv", columns)])
-    shown = "\n".join(line for line in str(caught.value).splitlines() if line.startswith("  "))
+    shown = " ".join(str(caught.value).split()).partition("The task is ")[2].partition(" where MODEL")[0]  # as shown
     shown = shown.replace("MODEL", str(urdf)).replace("BASE", "base").replace("TOOL", "tool0")
     (tmp_path / "task.yaml").write_text(shown)
     assert load_task(tmp_path / "task.yaml").data[0].measurement is not None
+    assert load_task(tmp_path / "task.yaml").robot.joints is None
+
+
+def test_the_task_of_postures_lists_the_joints_that_the_file_holds(made, tmp_path: Path):
+    """Else the columns are fewer than the robot's joints, and the task is refused."""
+    urdf, joints, (run, *_) = made
+    columns = {f"{axis}1": run["torque"][:30, k] for k, axis in enumerate("xyz")}
+    columns |= {joint: run["position"][:30, j] for j, joint in enumerate(joints[:2])}
+    with pytest.raises(InputError, match="a task for `calibrate`") as caught:
+        draft_task(urdf, [table(tmp_path / "postures.csv", columns)])
+    assert f"robot: {{model: MODEL, joints: [{joints[0]}, {joints[1]}]}}" in str(caught.value)
+
+
+def test_fewer_columns_than_joints_are_told_how_to_name_theirs(made, tmp_path: Path):
+    urdf, _, (run, *_) = made
+    np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"][:, :2], tau=run["torque"][:, :2])
+    (tmp_path / "task.yaml").write_text(
+        f"robot: {{model: {urdf}}}\ndata: [{{file: run.npz, time: t, position: q, torque: tau}}]"
+    )
+    task = load_task(tmp_path / "task.yaml")
+    with pytest.raises(InputError, match="list the joints of the columns in robot.joints"):
+        read_recordings(task, load_robot(task))
 
 
 def test_a_clock_of_another_name_and_rows_that_were_written_twice(made, tmp_path: Path):
@@ -216,3 +241,154 @@ def test_parts_of_a_time_are_told_what_to_write(made, tmp_path: Path):
     np.savez(tmp_path / "run.npz", q=run["position"], tau=run["torque"], **stamps)
     with pytest.raises(Undecided, match="secs, nsecs are parts of a time"):
         draft_task(urdf, [tmp_path / "run.npz"])
+
+
+def test_columns_numbered_by_joints_called_j_are_read(made, tmp_path: Path):
+    """`j1_pos` holds a position though many logs write torque as J; `current_position` holds no current."""
+    urdf, joints, (run, *_) = made
+    renamed = tmp_path / "renamed.urdf"
+    text = urdf.read_text()
+    for j, joint in enumerate(joints):
+        text = text.replace(f'"{joint}"', f'"j{j + 1}"')
+    renamed.write_text(text)
+    for word in ("pos", "current_position"):
+        columns = {"time": run["time"]} | {f"j{j + 1}_{word}": run["position"][:, j] for j in range(3)}
+        columns |= {f"j{j + 1}_torque": run["torque"][:, j] for j in range(3)}
+        _, _, (recording,) = read_back(draft_task(renamed, [table(tmp_path / f"{word}.csv", columns)]).text, tmp_path)
+        np.testing.assert_allclose(recording.position, run["position"], rtol=0, atol=1e-9)
+        assert recording.torque is not None
+        np.testing.assert_allclose(recording.torque, run["torque"], rtol=0, atol=1e-9)
+
+
+def test_a_turned_position_is_not_taken_for_a_turned_torque(made, tmp_path: Path):
+    urdf, _, (run, *_) = made
+    np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"] * [1.0, -1.0, 1.0], tau=run["torque"])
+    with pytest.raises(Undecided, match=r"position of \w+ seems to have the opposite sign.*--gears 1,-1,1") as caught:
+        draft_task(urdf, [tmp_path / "run.npz"])
+    assert caught.value.option == "gears"
+    draft = draft_task(urdf, [tmp_path / "run.npz"], gears=[1.0, -1.0, 1.0])
+    _, _, (recording,) = read_back(draft.text, tmp_path)
+    np.testing.assert_allclose(recording.position, run["position"], rtol=0, atol=1e-12)
+
+
+def test_a_draft_says_which_joints_it_locks_and_what_told_the_order(made, tmp_path: Path):
+    urdf, joints, (run, *_) = made
+    np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"][:, :2], tau=run["torque"][:, :2])
+    draft = draft_task(urdf, [tmp_path / "run.npz"], joints=joints[:2], unit="rad", constants=[1.0, 1.0])
+    assert any(f"no column holds {joints[2]}: locked" in line for line in draft.assumed)
+    assert "by the order of --joints" in draft.text
+    assert any(line.endswith("as stated") for line in draft.assumed)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"constants": [1.0, float("nan"), 1.0]}, "--constants: expected finite numbers other than zero"),
+        ({"constants": [1.0, 0.0, 1.0]}, "--constants: expected finite numbers other than zero"),
+        ({"gears": [1.0, float("inf"), 1.0]}, "--gears: expected finite numbers other than zero"),
+        ({"joints": (0, 0, 1)}, "is named twice"),
+    ],
+)
+def test_options_that_cannot_be_meant_are_refused_by_their_name(made, options: dict[str, Any], said: str, tmp_path):
+    urdf, joints, (run, *_) = made
+    np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"], tau=run["torque"])
+    if "joints" in options:
+        options = {"joints": [joints[j] for j in options["joints"]]}
+    with pytest.raises(InputError, match=said):
+        draft_task(urdf, [tmp_path / "run.npz"], **options)
+
+
+def test_units_that_no_joint_has_are_refused_and_m_is_the_unit_of_sliding_joints(tmp_path: Path):
+    link = '<link name="{0}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    link += "</inertial></link>"
+    joint = (
+        '<joint name="{0}" type="{1}"><parent link="{2}"/><child link="{3}"/><axis xyz="0 0 1"/>'
+        '<limit lower="-9" upper="9" velocity="9" effort="99"/></joint>'
+    )
+    t = np.arange(2000) / 200
+    q = 0.3 * np.sin(np.outer(t, [2.0]))
+    tau = -0.3 * 4.0 * np.sin(np.outer(t, [2.0])) + 9.81
+    np.savez(tmp_path / "run.npz", t=t, q=q, tau=tau)
+    for kind, right, wrong in (("prismatic", "m", "deg"), ("revolute", "rad", "mm")):
+        urdf = tmp_path / f"{kind}.urdf"
+        parts = [link.format("base"), link.format("tip"), joint.format("j", kind, "base", "tip")]
+        urdf.write_text(f'<robot name="r">{"".join(parts)}</robot>')
+        with pytest.raises(InputError, match=f"--unit {wrong}: every joint of 'r'"):
+            draft_task(urdf, [tmp_path / "run.npz"], unit=wrong)
+        draft = draft_task(urdf, [tmp_path / "run.npz"], unit=right, constants=[1.0])
+        assert f"positions are in {right}: as stated" in draft.assumed
+        np.testing.assert_allclose(read_back(draft.text, tmp_path)[2][0].position, q, rtol=0, atol=1e-12)
+
+
+def test_recordings_that_are_too_short_or_transposed_are_told_so(made, tmp_path: Path):
+    urdf, _, (run, *_) = made
+    np.savez(tmp_path / "short.npz", t=run["time"][:5], q=run["position"][:5], tau=run["torque"][:5])
+    with pytest.raises(InputError, match="5 samples are too few"):
+        draft_task(urdf, [tmp_path / "short.npz"])
+    np.savez(tmp_path / "turned.npz", t=run["time"], q=run["position"].T, tau=run["torque"].T)
+    with pytest.raises(InputError, match="samples are rows; transpose it"):
+        draft_task(urdf, [tmp_path / "turned.npz"])
+
+
+def test_stated_constants_are_taken_where_the_model_contradicts_them(made, tmp_path: Path):
+    """The words of the documentation; a zero that the log does not share makes right ones look wrong (the TX40)."""
+    urdf, _, (run, *_) = made
+    np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"], tau=run["torque"])
+    draft = draft_task(urdf, [tmp_path / "run.npz"], constants=[-1.0, -1.0, -1.0])
+    (line,) = [line for line in draft.assumed if "does not match the motion as read" in line]
+    assert "nothing confirms them" in line
+    assert yaml.safe_load(draft.text)["transmission"]["torque"] == [-1.0, -1.0, -1.0]
+
+
+LINK = (
+    '<link name="{}"><inertial><origin xyz="0.1 0 0"/><mass value="{}"/>'
+    '<inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+)
+JOINT = '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/><axis xyz="{}"/>{}</joint>'
+LIMIT = '<limit lower="-3" upper="3" velocity="4" effort="99"/>'
+
+
+def test_a_wheel_may_turn_for_ever(tmp_path: Path):
+    """Twenty-five turns of a joint without limits are no degrees, though degrees would fit; nor are they refused."""
+    parts = [LINK.format("base", 5), LINK.format("wheel", 2), LINK.format("arm", 3)]
+    parts += [JOINT.format("w", "continuous", "base", "wheel", "0 0 1", "")]
+    parts += [JOINT.format("a", "revolute", "base", "arm", "0 1 0", LIMIT)]
+    urdf = tmp_path / "cart.urdf"
+    urdf.write_text(f'<robot name="cart">{"".join(parts)}</robot>')
+    t = np.arange(4000) / 200
+    q = np.column_stack([8 * t, 0.7 + 1.5 * np.sin(2 * t) + 0.5 * np.cos(3 * t)])
+    v, a = np.gradient(q, t, axis=0), np.gradient(np.gradient(q, t, axis=0), t, axis=0)
+    tau = np.asarray(fj.inverse_dynamics(fj.load_urdf(urdf), q, v, a)) + 0.3 * np.sign(v)
+    np.savez(tmp_path / "run.npz", t=t, q=q, tau=tau)
+    draft = draft_task(urdf, [tmp_path / "run.npz"])
+    task, model, (recording,) = read_back(draft.text, tmp_path)
+    np.testing.assert_allclose(recording.position, q, rtol=0, atol=1e-12)
+    assert not [text for text in check_recordings(task, model, [recording]) if "position" in text]
+    np.savez(tmp_path / "run.npz", t=t, q=np.rad2deg(q), tau=tau)
+    assert "position: deg" in draft_task(urdf, [tmp_path / "run.npz"]).text
+
+
+@pytest.mark.parametrize("kind", ["planar", "floating"])
+def test_joints_of_several_degrees_of_freedom_are_refused_by_name(kind: str, tmp_path: Path):
+    parts = [LINK.format("base", 5), LINK.format("arm", 3), JOINT.format("a", kind, "base", "arm", "0 1 0", LIMIT)]
+    urdf = tmp_path / "robot.urdf"
+    urdf.write_text(f'<robot name="r">{"".join(parts)}</robot>')
+    t = np.arange(400) / 200
+    np.savez(tmp_path / "run.npz", t=t, q=np.sin(t)[:, None], tau=np.cos(t)[:, None])
+    with pytest.raises(InputError, match="joint a of several degrees of freedom"):
+        draft_task(urdf, [tmp_path / "run.npz"])
+
+
+def test_interactive_asks_until_the_answer_can_be_meant(made, tmp_path: Path, monkeypatch, capsys):
+    """What the recording cannot decide is asked for; a slip is asked again and costs no answer before it."""
+    urdf, _, (run, *_) = made
+    noise = np.random.default_rng(1).normal(size=run["torque"].shape)
+    np.savez(tmp_path / "run.npz", q=run["position"], tau=noise)
+    command = ["new", str(urdf), str(tmp_path / "run.npz"), "--interactive"]
+    monkeypatch.setattr("sys.stdin", io.StringIO("fast\n250\n1;1;1\n1,1,1\n"))
+    assert cli.main(command) == 0
+    told = capsys.readouterr()
+    assert yaml.safe_load(told.out)["data"][0]["rate"] == 250.0
+    assert "--rate fast: expected" in told.err and "--constants 1;1;1: expected" in told.err
+    monkeypatch.setattr("sys.stdin", io.StringIO("250\n"))
+    assert cli.main(command) == 2  # no answer gives up

@@ -109,6 +109,14 @@ def test_a_mistake_in_the_block_is_named_with_its_key(tmp_path: Path, keys: str,
     assert message in str(error.value), error.value
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_motion_that_shows_nothing_says_so(tmp_path: Path):
+    """In a twentieth of a second within 8 rad/s^2 joints move by 5 mrad at most; the condition number is infinite."""
+    found = excite_task(load_task(task_of(tmp_path, "duration: 0.05, limits: {acceleration: 8.0}")))
+    assert not np.isfinite(found.scaled_condition)
+    assert any("do not show at all in this motion" in note for note in found.notes)
+
+
 def test_a_task_without_recordings_is_for_excite_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     file = task_of(tmp_path, "duration: 4")
     assert main(["identify", str(file), "--out", str(tmp_path / "run"), "--quiet"]) == 2

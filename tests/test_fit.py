@@ -100,6 +100,7 @@ def test_limits_hold_and_a_prior_pulls(robot: fj.RobotModel, tracked: tuple[fj.P
         ("joint_offsets", "'joint_offsets' — did you mean|nothing is called 'joint_offsets'"),
         ({"joint_offset": ["knee"]}, "none at"),
         ("friction", "the model and the data have none"),
+        ((), "nothing is named"),
     ],
 )
 def test_what_is_not_there_cannot_be_free(free, message: str, robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...]):
@@ -194,6 +195,16 @@ def test_fits_of_many_runs_and_of_robots_of_one_structure_are_mapped(rubbing: fj
     both = jax.jit(jax.vmap(friction))(models, data)
     single = [friction(model, run) for model, run in zip(robots, runs, strict=True)]
     np.testing.assert_allclose(both, single, rtol=1e-8, atol=0)
+
+
+def test_numbers_by_name_are_those_of_one_fit(rubbing: fj.ExtendedModel):
+    """Under a transformation, and of a batch, one message says what to take instead."""
+    runs = jax.tree.map(lambda *x: jnp.stack(x), *(moved_arm(rubbing, 0.1 * k) for k in range(2)))
+    batch = jax.vmap(lambda run: fj.fit(rubbing, run, "friction"))(runs)
+    with pytest.raises(fj.InputError, match="take `values`, whose names are `free.names`"):
+        _ = batch.parameters
+    with pytest.raises(fj.InputError, match="take `values`"):
+        jax.jit(lambda run: fj.fit(rubbing, run, "friction").parameters)(moved_arm(rubbing, 0.1))
 
 
 def test_plain_gradients_by_all_of_the_data_are_those_of_refits(

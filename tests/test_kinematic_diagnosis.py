@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from schema import matches
 from figaroh_jax import cli
 from figaroh_jax.calibration.kinematic_diagnosis import _has_size
 from figaroh_jax.effects.kinematic import CATALOGUE
+from figaroh_jax.reporting.calibration_report import write_calibration_report
 from figaroh_jax.results import Cause, Estimate, Gain, Name
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -133,6 +135,13 @@ def test_random_play_of_a_joint_is_unknown_with_a_word_on_where(folder: Path):
     _, found, _ = answered(folder, "arm6", "random_play", 3.0, 45)
     assert (found.verdict, found.causes) == ("unknown", ())
     assert any("between postures" in note for note in found.calibration.notes)
+    write_calibration_report(
+        found.calibration, folder / "unknown.html", found
+    )  # the verdict, not the calibration's gain
+    page = (folder / "unknown.html").read_text()
+    assert (
+        "wrong, cause unknown</span>" in page and "show an error that no effect in the catalogue explains.</h1>" in page
+    )
 
 
 def test_a_robot_built_within_its_tolerance_gets_nothing(folder: Path):
@@ -149,7 +158,13 @@ def test_offsets_are_named_by_the_command_with_the_answer_of_the_contract(folder
     task = tasks.write(tmp_path, q, poses.points(poses.tool_poses(urdf, q, real), real, rng))
     out = tmp_path / "run"
     assert cli.main(["diagnose", str(task), "--out", str(out), "--quiet"]) == 0
-    assert capsys.readouterr().out.startswith("named")
+    said = " ".join(capsys.readouterr().out.split())
+    assert (
+        said.startswith("named The postures of ")
+        and " encoder zero offset at j5 and encoder zero offset at j3." in said
+    )
+    page = (out / "report.html").read_text()
+    assert "cause named</span>" in page and re.search('id="verdict">The postures of .* show encoder zero offset', page)
     answer = json.loads((out / "answer.json").read_text())
     matches("diagnose", answer)
     assert {(c["effect"], *c["at"]) for c in answer["causes"]} == {("joint_offset", "j3"), ("joint_offset", "j5")}

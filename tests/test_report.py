@@ -24,8 +24,8 @@ from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.reporting import report
 from figaroh_jax.reporting.picture import robot_picture
 from figaroh_jax.reporting.provenance import provenance
-from figaroh_jax.reporting.terminal import summary
-from figaroh_jax.reporting.wording import error, fall, interval, phrase, sentence
+from figaroh_jax.reporting.terminal import show, summary
+from figaroh_jax.reporting.wording import error, fall, interval, number, phrase, sentence
 from figaroh_jax.results import Diagnosis, Estimate, Experiment, Gain, Name, Nearest, Part, Rest
 
 LAPTOP, PHONE = (1280, 800), (390, 844)
@@ -197,6 +197,30 @@ def test_packing_keeps_a_channel_to_a_thirty_thousandth_of_its_range():
     np.testing.assert_allclose(back, values[kept], rtol=0, atol=np.ptp(values[kept]) / 60_000)
 
 
+@pytest.mark.parametrize(("value", "told"), [(99.6, "100"), (-123.4, "−120"), (0.0123, "0.012"), (3.2e9, "3.2e+09")])
+def test_numbers_of_a_few_digits_are_written_out(value: float, told: str):
+    assert number(value, 2) == told
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_lines_of_the_summary_end_in_no_space(variant: str, capsys):
+    show(VARIANTS[variant], "tx40")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) > 5 and not [line for line in lines if line != line.rstrip()]
+
+
+def test_page_tells_errors_that_are_nearly_alike_by_the_digits_of_its_headline(tmp_path: Path):
+    near = replace(VARIANTS["partly"], holdout=Gain(0.0274, 0.0266))
+    own = _own(_written(near, tmp_path)).replace("\xa0", " ")
+    assert "<b>2.74 %</b>" in own and "<b>2.66 %</b>" in own
+
+
+def test_page_that_leaves_a_rest_does_not_say_that_nothing_is_open(tmp_path: Path):
+    sure = replace(VARIANTS["partly"], experiment=None)
+    own = _own(_written(sure, tmp_path))
+    assert "no ambiguity is left" not in own and "for the rest, look at the plots below" in own
+
+
 @pytest.fixture(scope="module")
 def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[browser.Page]:
     if browser.find() is None:
@@ -218,6 +242,18 @@ def test_browser_shows_the_finding_on_the_first_screen(
         assert 0 < bottom <= size[1], f"{part} ends at {bottom}"
     assert tab.value("document.documentElement.scrollWidth") <= size[0]
     assert tab.problems == []
+
+
+def test_browser_keeps_the_names_of_joints_whole_on_a_phone(tab: browser.Page, tmp_path: Path):
+    """On one line each, in every table of joints, beside whatever the residual varies with."""
+    joints = tuple(f"lwr_{k}_joint" for k in range(6))
+    parts = tuple(replace(part, at=(joints[1],)) for part in VARIANTS["partly"].rest.parts)
+    rest = replace(VARIANTS["partly"].rest, parts=parts)
+    tab.open(_written(replace(VARIANTS["partly"], joints=joints, rest=rest), tmp_path), *PHONE, phone=True)
+    names = "[...document.querySelectorAll('table.joints tbody th, table.anatomy tbody th')]"
+    tab.value(f"{names}.forEach((th) => {{ th.innerHTML = `<span>${{th.textContent}}</span>`; }})")
+    lines = tab.value(f"{names}.map((th) => th.firstChild.getClientRects().length)")
+    assert len(lines) == 18 and set(lines) == {1}
 
 
 @pytest.mark.parametrize(

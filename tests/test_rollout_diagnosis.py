@@ -175,6 +175,20 @@ def test_identify_gives_the_joints_numbers_with_their_intervals(tmp_path: Path):
         assert abs(one["value"] - truth) < 4 * one["std"]
 
 
+def test_identify_says_where_it_leaves_more_than_noise(tmp_path: Path):
+    """A position that wanders by 20 mrad is no number of the fit, and its intervals do not count it."""
+    record = servo_arm.record("none", 7)
+    slow = record | {"q": record["q"] + 0.02 * np.sin(0.7 * record["t"]).reshape(record["q"].shape)}
+    for name, one, said in (("clean", record, False), ("off", slow, True)):
+        folder = tmp_path / name
+        folder.mkdir()
+        path = task(folder, "none")
+        np.savez(folder / "seen.npz", **one)  # pyright: ignore[reportArgumentType]
+        assert main(["identify", str(path), "--out", str(folder / "run"), "--quiet"]) == 0
+        notes = json.loads((folder / "run" / "result.json").read_text())["notes"]
+        assert any("times the encoder's noise at joint" in note for note in notes) == said, notes
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -19,6 +19,7 @@ import yaml
 from figaroh_jax import DEMO, cli
 from figaroh_jax.reporting.provenance import provenance
 from figaroh_jax.reporting.run_directory import MARKER, check_directory, whole_directory
+from figaroh_jax.reporting.side_by_side import _values_of
 
 CAUSE = {
     "effect": "torque_offset",
@@ -110,6 +111,19 @@ def test_an_identification_and_a_calibration_against_limits(tmp_path: Path):
     limits = "position_mm: 0.5\norientation_deg: 0.1\nfk_parity: 1.0e-9\nverdict: [named]"
     code, checks = verified(run(tmp_path / "calibrated", result=CALIBRATION), limits)
     assert code == 1 and list(checks.values()) == ["fail", "pass", "skipped", "pass"]
+
+
+def test_a_line_says_on_which_side_of_its_limit_a_figure_passes(tmp_path: Path, capsys):
+    limits = "verdict: [nothing]\nforbidden_causes: [torque_delay]\np_value: 0.3\nholdout_relative: 0.05\nrank: 40"
+    verified(run(tmp_path / "run", answer=ANSWER), limits)
+    told = {line.split()[1]: line.partition("(limit: ")[2] for line in capsys.readouterr().out.splitlines()}
+    assert told == {
+        "verdict": "one of nothing)",
+        "forbidden_causes": "none of torque_delay)",
+        "p_value": "at least 0.3)",
+        "holdout_relative": "at most 0.05)",
+        "rank": "at least 40)",
+    }
 
 
 def test_junit_counts_what_failed_and_what_was_skipped(tmp_path: Path):
@@ -327,3 +341,22 @@ def test_no_line_is_longer_than_the_terminal(tmp_path: Path):
     os.close(leader)
     assert done.returncode == 0
     assert max(map(len, text.decode().splitlines())) <= 48 and "torque_offset" in text.decode()
+
+
+def test_rounding_is_no_change_of_a_link():
+    assert _values_of((0.01, 0.03, 0.03), (0.01, 0.03, 0.03 + 1e-17)) == "0.01 0.03 0.03"
+    assert _values_of((20.5, 10.0, 150.0), (20.0, 10.0 + 1e-14, 150.0)) == "20.5 10 150 (+0.5 0 0)"
+    assert _values_of((6e-13, -60.0, 130.0), None) == "0 -60 130"
+
+
+def test_the_export_of_another_run_says_what_to_take(tmp_path: Path, capsys):
+    """A run of torques has no loop: its files are named; a run's folder is not its model."""
+    model = tmp_path / "run" / "model"
+    model.mkdir(parents=True)
+    for name in ("robot.urdf", "effects.yaml"):
+        (model / name).write_text("")
+    assert cli.main(["export", str(model), "--for", "mujoco"]) == 2
+    assert "the model of this run is in its robot.urdf, effects.yaml" in capsys.readouterr().err
+    (model / "loop.json").write_text("{}")
+    assert cli.main(["export", str(tmp_path / "run"), "--for", "mujoco"]) == 2
+    assert f"name {model}" in capsys.readouterr().err

@@ -145,6 +145,7 @@ def test_a_gap_is_reported_and_its_rows_have_no_weight():
     t = np.concatenate([t[:1500], t[1600:]])
     prepared = signals.prepare(recording(t, motion(t), motion(t)), Preprocess(cutoff=10))
     assert "1 gap" in prepared.notes[0] and "0.404 s at 5.996 s" in prepared.notes[0]
+    assert prepared.notes[0].endswith("; rows near it are left out")
     dropped = prepared.rows.row_times[prepared.rows.weight[:, 0] == 0]
     assert dropped.min() == pytest.approx(5.996 - 0.05, abs=0.05)
     assert dropped.max() == pytest.approx(6.4 + 0.05, abs=0.05)

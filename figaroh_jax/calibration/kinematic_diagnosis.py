@@ -95,7 +95,8 @@ def diagnose_poses(
         if plays:
             what = "backlash, or poor repeatability"
             note = f"the true position of {joint} varies about its reading between postures: {what}"
-            calibration = replace(calibration, notes=(*calibration.notes, note))
+            aside = [f"{c.note}, not named beside {what}" for c in calibration.causes if c.name.effect == "outlier"]
+            calibration = replace(calibration, notes=(*calibration.notes, note, *aside))
         rest = run.history or plays or p_rest < thresholds.OF_ALPHA * alpha or _beyond_accuracy(recordings, calibration)
         rest = rest or (found and not (geometry or effects))
         return _answer(calibration, causes, p_value, rest)

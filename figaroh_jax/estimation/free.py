@@ -126,6 +126,8 @@ def chosen_of(model: ExtendedModel, data: Sequence[Data], free: Any) -> Free:
     wanted: dict[str, Any] = dict(free) if isinstance(free, Mapping) else {}
     if not wanted:
         wanted = {kind: True for kind in ([free] if isinstance(free, str) else free)}
+    if not wanted:
+        raise InputError(f"free: nothing is named that is to be fitted; known: {', '.join(KINDS)}")
     parts: list[Part] = []
     for kind, places in wanted.items():
         if kind not in KINDS:

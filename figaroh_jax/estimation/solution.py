@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..effects.extended import ExtendedModel
+from ..errors import InputError
 from ..results import Estimate
 from .free import Free, Part
 
@@ -75,8 +77,14 @@ class Fit(eqx.Module):
         """Each number by its name: value, one sigma, unit.
 
         Of effects, links and gravity the value is the fitted one; of joint offsets, geometry, frames and drives it is
-        the change from what was given.
+        the change from what was given. Of one fit, outside of `jit` and `grad`: in there, and of a batch, `values`
+        and `covariance` stand in the order of `free.names`.
         """
+        if isinstance(self.values, Tracer) or np.ndim(self.values) != 1:
+            raise InputError(
+                "Fit.parameters are plain numbers of one fit: under jit, grad or vmap, and of a batch, take `values`,"
+                " whose names are `free.names`"
+            )
         values = self.free.held(self.model, np.asarray(self.values))
         each = zip(self.free.names, values, self.std, self.free.units, strict=True)
         return {name: Estimate(float(value), float(std), unit) for name, value, std, unit in each}

@@ -284,7 +284,9 @@ def quadratic_step(
     M = lapack("trtrs")(L, A.T, lower=1)[0]
     size = np.sqrt((M * M).sum(axis=0)) + 1e-300
     M /= size
-    dual = _Dual(M, room / size + M.T @ own, max(1.0, float(np.abs(own).max())))
+    with np.errstate(over="ignore"):  # a row of zeros with room holds at any distance: inf
+        far = room / size
+    dual = _Dual(M, far + M.T @ own, max(1.0, float(np.abs(own).max())))
     dual.begin([] if warm is None else list(warm))
     if not dual.run():
         return None

@@ -101,6 +101,11 @@ def excite_task(
         rate=asked.rate,
         progress=progress,
     )
+    if not np.isfinite(found.scaled_condition):
+        said.append(
+            "some parameters do not show at all in this motion: within these limits it is too short or too slow, or the"
+            " basis too small"
+        )
     return replace(found, notes=(*said, *found.notes))
 
 

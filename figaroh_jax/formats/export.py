@@ -45,9 +45,10 @@ class _Dumper(yaml.SafeDumper):
 _Dumper.add_representer(np.ndarray, lambda dumper, array: dumper.represent_list(array.tolist()))
 
 
-def dump_yaml(content: Mapping[str, Any]) -> str:
-    """The mapping as YAML, in its order, numbers in full and lists of numbers on one line."""
-    return yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None)
+def dump_yaml(content: Mapping[str, Any], *, line: bool = False) -> str:
+    """The mapping as YAML, in its order, numbers in full and lists of numbers on one line, or all of it (`line`)."""
+    width, flow = (float("inf"), True) if line else (120, None)
+    return yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, width=width, default_flow_style=flow)
 
 
 def write_model(extended: ExtendedModel, directory: str | Path, causes: Sequence[Cause] = ()) -> None:

@@ -27,7 +27,7 @@ def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
     try:
         content = json.loads((model / LOOP).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
-        raise InputError(f"{model}: no readable {LOOP}; name the `model` directory of a rollout's run") from None
+        raise InputError(f"{model}: no readable {LOOP}; {_advice(model)}") from None
     with as_written(model / LOOP):
         text = json.dumps(for_simulator(content, simulator), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
         files = {f"{simulator}.json": text}
@@ -38,6 +38,16 @@ def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
     if out is not None:
         _write_files(out, files)
     return text
+
+
+def _advice(model: Path) -> str:
+    """What to name instead of a directory that holds no loop."""
+    if (model / "model" / LOOP).is_file():
+        return f"name {model / 'model'}"
+    if (model / "effects.yaml").is_file():
+        files = ", ".join(name for name in ("robot.urdf", "robot.xml", "effects.yaml") if (model / name).is_file())
+        return f"only rollouts (a command, no torque) have one; the model of this run is in its {files}"
+    return "name the `model` directory of a rollout's run"
 
 
 def _write_files(out: Path, files: Mapping[str, str]) -> None:

@@ -19,11 +19,11 @@ def diagnose(task: Task, out: Path, progress: Progress) -> Done:
     found = diagnose_pose_task(task, progress)
     progress("writing the report", 1.0)
     with run_folder(task, out, "diagnose") as folder:
-        write_calibration(found.calibration, folder, task.robot.model)
+        write_calibration(found.calibration, folder, task.robot.model, found)
         (folder / ANSWER).write_text(pose_answer_json(found), encoding="utf-8")
 
     def show(verbose: bool) -> None:
-        show_calibration(found.calibration, found.verdict, verbose=verbose)
+        show_calibration(found.calibration, found, verbose=verbose)
 
     return Done(found, lambda: pose_answer_json(found), show)
 

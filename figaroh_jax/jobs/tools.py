@@ -81,11 +81,21 @@ def _asked(args: argparse.Namespace, drafted: Callable[[], Draft]) -> Draft:
             if not answer:
                 raise
             try:
-                setattr(args, question.option, float(answer) if question.option == "rate" else answer)
-            except ValueError:
-                raise InputError(f"--rate {answer}: expected a positive number of Hz") from None
-            if question.option == "unit" and answer not in ("rad", "deg", "m", "mm"):
-                raise InputError(f"--unit {answer}: expected rad, deg, m or mm") from None
+                setattr(args, question.option, _answered(question.option, answer))
+            except InputError as error:  # a slip costs none of the answers before it
+                print(f"{error}", file=sys.stderr)
+
+
+def _answered(option: str, answer: str) -> str | float:
+    """An answer as the option holds it; raises `InputError` for one that cannot be meant."""
+    if option in ("constants", "kp", "gears"):
+        _numbers(answer, f"--{option}")
+    if option == "unit" and answer not in ("rad", "deg", "m", "mm"):
+        raise InputError(f"--unit {answer}: expected rad, deg, m or mm")
+    try:
+        return float(answer) if option == "rate" else answer
+    except ValueError:
+        raise InputError(f"--rate {answer}: expected a positive number of Hz") from None
 
 
 def _numbers(text: str | None, option: str) -> tuple[float, ...] | None:

@@ -32,6 +32,7 @@ __all__ = ["Finding", "check_recording", "check_recordings", "position_findings"
 DEGREE = np.pi / 180
 STILL = 1e-3  # rad or m: a joint that stays within it stands
 HARD = 20.0  # times a limit: no robot does that
+WHEEL = 20.0  # rad/s of a joint without limits: faster than wheels turn; 0.35 rad/s in degrees read as rad
 
 
 def check_recordings(task: Task | None, model: RobotModel, recordings: Sequence[Recording]) -> tuple[str, ...]:
@@ -60,7 +61,7 @@ def report_findings(found: Sequence[tuple[str, Finding]]) -> tuple[str, ...]:
     texts = [(finding.wrong, f"{', '.join(names)}: {finding.text}") for finding, names in files.items()]
     wrong = [text for bad, text in texts if bad]
     if wrong:
-        raise InputError("\n  ".join(wrong) if len(wrong) == 1 else "\n  ".join(["", *wrong]))
+        raise InputError(wrong[0] if len(wrong) == 1 else "\n  " + ";\n  ".join(wrong))
     for _, text in texts:
         logging.getLogger("figaroh_jax").warning("check: %s", text)
     return tuple(f"check: {text}" for _, text in texts)
@@ -72,7 +73,7 @@ def check_recording(recording: Recording, model: RobotModel, entry: RecordingEnt
         return []
     motion = sampled(recording.time, recording.position, recording.torque)
     unit = entry.units.position if entry is not None else "rad"
-    look = Look(recording.position, recording.joints, model, unit, recording, entry, motion)
+    look = Look(recording.position, recording.joints, model, unit, recording, entry, motion, recording.time)
     found: list[Finding] = []
     for check in (_clock, _unit_without_joint, _ranges, _jumps, _zero_rows, _torque_values):
         found += check(look)
@@ -85,9 +86,14 @@ def check_recording(recording: Recording, model: RobotModel, entry: RecordingEnt
     return found
 
 
-def position_findings(position: Float[np.ndarray, "rows nv"], model: RobotModel, unit: str) -> list[Finding]:
-    """What looks wrong about positions that have no order in time: unit and range."""
-    look = Look(position, model.dof_names, model, unit)
+def position_findings(
+    position: Float[np.ndarray, "rows nv"],
+    model: RobotModel,
+    unit: str,
+    time: Float[np.ndarray, " rows"] | None = None,
+) -> list[Finding]:
+    """What looks wrong about positions by themselves: unit and range; `time` (s) where they are a motion."""
+    look = Look(position, model.dof_names, model, unit, time=time)
     return [finding for check in (_unit_without_joint, _ranges) for finding in check(look)]
 
 
@@ -170,7 +176,11 @@ def _ranges(look: Look) -> Iterator[Finding]:
     room = np.where(np.isfinite(high - low), high - low, 4 * np.pi)
     over = np.maximum(np.maximum(low - bottom, top - high), 0.0)
     free = ~np.isfinite(high - low) & turns
-    over = np.where(free, np.maximum(np.abs(look.position).max(axis=0) - 16 * np.pi, 0.0), over)
+    wound = np.maximum(np.abs(look.position).max(axis=0) - 16 * np.pi, 0.0)
+    if look.time is not None:  # a wheel may turn for ever, but not at the speed of degrees or counts read as rad
+        top = np.percentile(np.abs(np.diff(look.position, axis=0)) / np.diff(look.time)[:, None], 98, axis=0)
+        wound = np.where(top > np.where(np.isfinite(speed), SOFT * speed, WHEEL), wound, 0.0)
+    over = np.where(free, wound, over)
     far = over > np.maximum(room, np.where(turns, np.pi, 0.05))
     if far.any():
         yield from _far(look, far, over)
@@ -211,14 +221,15 @@ def _jumps(look: Look) -> Iterator[Finding]:
     """Single wild rows and turns of 2 pi that the encoder lost."""
     position, time = look.position, look.recording.time
     steps, dt = np.diff(position, axis=0), np.diff(time)[:, None]
+    each = np.abs(steps) / np.maximum(np.round(dt / np.median(dt)), 1.0)  # a gap in the stamps is no jump
     _, _, speed, _ = _limits(look.model)
     low, high, *_ = _limits(look.model)
     usual = np.percentile(np.abs(steps), 98, axis=0) + 1e-9
     allowed = np.where(np.isfinite(speed), 5 * speed * dt, np.inf)
     turns = ~np.array(prismatic(look.model))
     least = np.where(turns, 0.1, 0.01)
-    wild = (np.abs(steps) > 20 * usual) & (np.abs(steps) > least)
-    wild &= (np.abs(steps) > allowed) | (np.abs(steps) > 1.0) | (np.abs(steps) > 200 * usual)
+    wild = (each > 20 * usual) & (np.abs(steps) > least)
+    wild &= (np.abs(steps) > allowed) | (np.abs(steps) > 1.0) | (each > 200 * usual)
     for j in np.flatnonzero(wild.any(axis=0)).tolist():
         rows = np.flatnonzero(wild[:, j]) + 1
         biggest = steps[rows - 1, j]

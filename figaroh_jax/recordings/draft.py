@@ -17,11 +17,12 @@ from ..errors import InputError, nearest
 from ..formats.config import RecordingEntry
 from ..formats.files import USD
 from ..formats.robotfile import read_robot
-from ..rigid.model import RobotModel, prismatic
+from ..rigid.model import DOF_NAMES, RobotModel, prismatic
 from .checks import DEGREE, Finding, check_recording, position_findings
 from .dataset import Recording
 from .draft_columns import Columns, Undecided, read_columns, without_sign
-from .likeness import Sampled, likeness, rigid_torque, sampled
+from .likeness import FEWEST, Sampled, likeness, rigid_torque, sampled
+from .torque_checks import TURNED_POSITION
 
 __all__ = ["Draft", "Undecided", "draft_task"]
 
@@ -59,29 +60,39 @@ def draft_task(
     for name in joints or ():
         if name not in whole.joint_names:
             raise InputError(f"--joints: robot '{whole.name}' has no joint '{name}'{nearest(name, whole.joint_names)}")
+        if list(joints or ()).count(name) > 1:
+            raise InputError(f"--joints: '{name}' is named twice")
     reads = read_columns(files, whole, joints, rate, topic)
     if len({read.joints for read in reads}) > 1:
         raise InputError("the recordings hold different joints; draft a task for each kind")
     robot = read_robot(model, reads[0].joints)
+    many = [joint.name for joint in robot.joints if len(DOF_NAMES[joint.kind]) > 1]
+    if many:
+        raise InputError(
+            f"{model}: joint{'s' * (len(many) > 1)} {', '.join(many)} of several degrees of freedom: `new` drafts for"
+            " joints of one; lock them (--joints names the others), or write the task by hand"
+        )
     assumed = [*dict.fromkeys(_clock_said(reads))]
     _doubt_percent(reads, unit)
     for option, given in (("--constants", constants), ("--gears", gears)):
-        if given is not None and len(given) != robot.nv:
-            raise InputError(f"{option}: {len(given)} numbers, expected one for each of {', '.join(robot.dof_names)}")
+        _check_factors(option, given, robot)
     reads, motors = _joint_side(robot, reads, gears)
-    unit = unit or _unit_of_position(robot, reads)
+    stated, unit = unit is not None, _unit_of_position(robot, reads) if unit is None else _stated_unit(robot, unit)
     factor = np.where(np.array(prismatic(robot)), {"deg": 1.0, "mm": 1e-3}.get(unit, 1.0), _degrees(unit))
     reads = [
         read._replace(position=read.position * factor, command=None if read.command is None else read.command * factor)
         for read in reads
     ]
     signs, said = _torques(robot, reads) if constants is None else ([*constants], ["torque constants as given"])
+    if constants is None and signs is not None:
+        _refuse_turned_positions(robot, reads, gears)
     drives, more = _drives(model, robot, reads, gains)
     said += more
     said += _refuse_what_is_wrong(robot, reads, signs, stated=constants is not None)
     labels = _repeats(reads)
-    assumed += [*motors, _unit_said(unit, robot), *said, *_repeats_said(reads, labels)]
-    text = _text(model, robot, whole, reads, unit, signs, labels, assumed, drives, gears)
+    assumed += [*_locked_said(robot, whole), *motors, _unit_said(unit, robot, reads, stated)]
+    assumed += [*said, *_repeats_said(reads, labels)]
+    text = _text(model, robot, whole, reads, unit, signs, labels, assumed, drives, gears, joints is not None)
     return Draft(text, tuple(assumed))
 
 
@@ -106,8 +117,6 @@ def _joint_side(
                 f" with their signs, in the order {names} (1 where a column is on the joint side already)",
             )
         return [*reads], []
-    if not np.isfinite(gears).all() or not np.all(gears):
-        raise InputError(f"--gears: expected numbers other than zero for {names}")
     ratio = np.asarray(gears)
     turned = [
         read._replace(position=read.position / ratio, command=None if read.command is None else read.command / ratio)
@@ -119,25 +128,49 @@ def _joint_side(
     ]
 
 
+def _check_factors(option: str, given: Sequence[float] | None, robot: RobotModel) -> None:
+    names = ", ".join(robot.dof_names)
+    if given is not None and len(given) != robot.nv:
+        raise InputError(f"{option}: {len(given)} numbers, expected one for each of {names}")
+    if given is not None and not (np.isfinite(given).all() and np.all(given)):
+        raise InputError(f"{option}: expected finite numbers other than zero for {names}")
+
+
+def _stated_unit(robot: RobotModel, unit: str) -> str:
+    """The unit that the user states, as the task says it; rad and m are the same there."""
+    straight = prismatic(robot)
+    if (unit in ("m", "mm") and not any(straight)) or (unit in ("rad", "deg") and all(straight)):
+        kind, right = ("slides", "m or mm") if all(straight) else ("turns", "rad or deg")
+        raise InputError(f"--unit {unit}: every joint of '{robot.name}' {kind}; expected {right}")
+    return "rad" if unit == "m" else unit
+
+
 def _unit_of_position(robot: RobotModel, reads: Sequence[Columns]) -> str:
     """rad or deg (m or mm) that fits the model's limits and, where both do, the torque."""
     every = np.concatenate([read.position for read in reads])
     straight = np.array(prismatic(robot))
     wide = {"rad": every, "deg": every * np.where(straight, 1.0, DEGREE), "mm": every * np.where(straight, 1e-3, 1.0)}
     kinds = ["rad", *(["deg"] if not straight.all() else []), *(["mm"] if straight.all() else [])]
-    fits = [u for u in kinds if not position_findings(wide[u], robot, "rad")]
+    ends = np.cumsum([len(read.position) for read in reads])[:-1]
+
+    def doubts(one: np.ndarray) -> list[Finding]:
+        parts = zip(np.split(one, ends), reads, strict=True)
+        return [finding for part, read in parts for finding in position_findings(part, robot, "rad", read.time)]
+
+    fits = [u for u in kinds if not doubts(wide[u])]
     if len(fits) == 1:
         return fits[0]
     if not fits:
-        text = "; ".join(finding.text for finding in position_findings(every, robot, "rad"))
+        text = "; ".join(dict.fromkeys(finding.text for finding in doubts(every)))
         raise InputError(f"{reads[0].file}: in no unit do the positions fit the model: {text}")
     with_torque = [read for read in reads if read.torque is not None]
     misfit = {unit: float(np.mean([_unlike(robot, read, unit) for read in with_torque] or [0.0])) for unit in fits}
     best, other = sorted(fits, key=misfit.__getitem__)[:2]
     span = float(np.ptp(every, axis=0).max())
+    held = np.isfinite(np.ptp(np.asarray(robot.position_limit), axis=1))  # what has no limits may turn for ever
     if misfit[best] < 0.7 * misfit[other] or (best == "rad" and span < 2 * np.pi and misfit[best] <= misfit[other]):
         return best
-    if span > 20:
+    if held.any() and np.ptp(every[:, held], axis=0).max() > 20:
         return "deg"
     raise Undecided(
         "unit",
@@ -187,6 +220,9 @@ def _torques(robot: RobotModel, reads: Sequence[Columns]) -> tuple[list[float] |
     motions = [sampled(read.time, read.position, read.torque) for read in reads if read.torque is not None]
     motions = [motion for motion in motions if motion is not None]
     if not motions:
+        short = next((read for read in reads if read.torque is not None), None)
+        if short is not None:
+            raise InputError(f"{short.file}: {len(short.time)} samples are too few to draft from; at least {FEWEST}")
         return None, _without_torque(robot, reads)
     if without_sign(*(read.torque for read in reads if read.torque is not None)):
         raise InputError(f"{reads[0].file}: no joint's torque changes its sign: an absolute value has no direction")
@@ -203,10 +239,10 @@ def _torques(robot: RobotModel, reads: Sequence[Columns]) -> tuple[list[float] |
             raise Undecided(
                 "constants",
                 f"{reads[0].file}: the torque columns are not in N m, and the motion does not show the constants of"
-                f" {', '.join(open_joints)}; those found: {_constants(names, scales)} N m a unit. Give all of them"
+                f" {', '.join(open_joints)}; {_constants(names, scales)}. Give all of them"
                 " by --constants (data sheet: torque constant times gear ratio), N m a unit in the order of the joints",
             )
-        said = [f"torque constants by the model's gravity, no surer than its masses: {_constants(names, scales)}"]
+        said = [f"torque constants by the model's gravity, no surer than its masses; {_constants(names, scales)}"]
         return [s.value for s in scales], said
     turned = [n for n, s in zip(names, scales, strict=True) if s.value < 0 and s.told]
     unknown = [n for n, s in zip(names, scales, strict=True) if not s.told]
@@ -239,9 +275,10 @@ def _without_torque(robot: RobotModel, reads: Sequence[Columns]) -> list[str]:
 
 
 def _constants(names: Sequence[str], scales: Sequence[_Scale]) -> str:
-    return ", ".join(
+    shown = [
         f"{n} {s.value:.3g} ± {1.96 * s.error:.2g}" for n, s in zip(names, scales, strict=True) if s.told == "gravity"
-    )
+    ]
+    return f"those found: {', '.join(shown)} N m a unit" if shown else "none was found"
 
 
 def _scale(robot: RobotModel, motions: Sequence[Sampled], joint: int) -> _Scale:
@@ -314,12 +351,30 @@ def _explained(robot: RobotModel, motion: Sampled) -> Float[np.ndarray, "nv nv"]
     return out
 
 
+def _refuse_turned_positions(robot: RobotModel, reads: Sequence[Columns], gears: Sequence[float] | None) -> None:
+    """Refuse a torque that seems to be turned where its joint's position is: the other joints' torques tell."""
+    for read in reads if robot.nv > 1 else ():
+        recording = Recording(read.file.stem, read.file, robot.dof_names, read.time, read.position, torque=read.torque)
+        found = check_recording(recording, robot, RecordingEntry(file=read.file, position="q", rate=1.0))
+        texts = [finding.text for finding in found]
+        for j, name in enumerate(robot.dof_names):
+            if any(text.endswith(f"the opposite sign of the position of {name} {TURNED_POSITION}") for text in texts):
+                ratio = [1.0] * robot.nv if gears is None else [*gears]
+                ratio[j] = -ratio[j]
+                raise Undecided(
+                    "gears",
+                    f"{read.file}: the position of {name} seems to have the opposite sign: with it turned, the torque"
+                    f" of all joints follows the model as it stands. Turn it by --gears"
+                    f" {','.join(f'{x:g}' for x in ratio)}, or take the torque as it is by --constants",
+                )
+
+
 def _refuse_what_is_wrong(
     robot: RobotModel, reads: Sequence[Columns], signs: list[float] | None, *, stated: bool
 ) -> list[str]:
     """The check of recordings on the draft's own reading: a draft that it would warn of is not written.
 
-    Where the user has `stated` signs and constants, a torque that does not follow the model is said, and no more.
+    Where the user has `stated` signs and constants, what the model says against the torque is said, and no more.
     """
     factor, said = np.ones(robot.nv) if signs is None else np.array(signs), list[str]()
     for read in reads:
@@ -327,15 +382,16 @@ def _refuse_what_is_wrong(
         recording = Recording(read.file.stem, read.file, robot.dof_names, read.time, read.position, torque=torque)
         entry = RecordingEntry(file=read.file, position="q", rate=1.0)
         grave = [f for f in check_recording(recording, robot, entry) if f.wrong or _decides(f)]
-        doubts = [f for f in grave if not f.wrong and f.text.startswith("torque") and _UNLIKE in f.text]
+        doubts = [f for f in grave if not f.wrong and f.text.startswith("torque")]
         if grave and doubts != grave:
             raise InputError(f"{read.file}: {'; '.join(finding.text for finding in grave)}")
         text = "; ".join(finding.text for finding in doubts)
+        text += "" if text.endswith("?") else "."
         if doubts and not stated:
             raise Undecided(
                 "constants",
-                f"{read.file}: {text} If it is, confirm that with --constants (N m per unit, in the order of the"
-                " joints; 1 for N m), and the torque is taken as it is",
+                f"{read.file}: {text} If the columns are right, confirm that with --constants (N m per unit, in the"
+                " order of the joints; 1 for N m), and the torque is taken as it is",
             )
         said += [f"{read.file.name}: {text} Signs and constants are as given; nothing confirms them"] if doubts else []
     return said
@@ -346,7 +402,8 @@ _UNLIKE = "does not follow"
 
 def _decides(finding: Finding) -> bool:
     """Whether a warning is about how the columns are read, not about the motion or its quality."""
-    return any(word in finding.text for word in ("does not belong", _UNLIKE, "clock", "times what", "outside the"))
+    words = ("does not belong", "as read", _UNLIKE, "clock", "times what", "outside the")
+    return any(word in finding.text for word in words)
 
 
 def _repeats(reads: Sequence[Columns]) -> list[str | None]:
@@ -417,9 +474,19 @@ def _clock_said(reads: Sequence[Columns]) -> Iterator[str]:
         yield f"{read.file.name}: {rate:.5g} Hz, stamps in {unit}, {read.time[-1]:.4g} s"
 
 
-def _unit_said(unit: str, robot: RobotModel) -> str:
-    text = {"rad": "rad (and m)", "deg": "degrees", "mm": "mm"}[unit]
-    return f"positions are in {text}: that fits the limits of {robot.name} and its torque"
+def _locked_said(robot: RobotModel, whole: RobotModel) -> list[str]:
+    """The joints that no column holds, and where the task has them stand."""
+    names = [name for name in whole.joint_names if name not in robot.joint_names]
+    said = "no column holds {}: locked at the neutral position; robot.posture names another one"
+    return [said.format(", ".join(names))] if names else []
+
+
+def _unit_said(unit: str, robot: RobotModel, reads: Sequence[Columns], stated: bool) -> str:
+    straight = prismatic(robot)
+    plain = "m" if all(straight) else "rad and m" if any(straight) else "rad"
+    text = {"rad": plain, "deg": "degrees", "mm": "mm"}[unit]
+    torque = " and its torque" if any(read.torque is not None for read in reads) else ""
+    return f"positions are in {text}: {'as stated' if stated else f'that fits the limits of {robot.name}{torque}'}"
 
 
 def _geared(robot: RobotModel, reads: Sequence[Columns], signs: list[float] | None) -> bool:
@@ -467,6 +534,7 @@ def _text(
     assumed: Sequence[str],
     drives: dict[str, Any],
     gears: Sequence[float] | None = None,
+    listed: bool = False,
 ) -> str:
     from ..formats.export import dump_yaml
 
@@ -475,7 +543,8 @@ def _text(
         robot_keys["joints"] = list(robot.joint_names)
     data = [_entry(read, unit, label, signs is not None) for read, label in zip(reads, labels, strict=True)]
     parts = ["# Drafted by `figaroh-jax new`. What was assumed:", *(f"#   {line}" for line in assumed)]
-    order = "the columns' names" if all(read.named for read in reads) else "the order of the model's joints"
+    unnamed = "the order of --joints" if listed else "the order of the model's joints"
+    order = "the columns' names" if all(read.named for read in reads) else unnamed
     parts += [f"#   columns belong to joints by {order}", ""]
     parts += [dump_yaml({"robot": robot_keys}), "# `role: holdout` keeps a recording out of the fit and predicts it."]
     parts += [dump_yaml({"data": data})]

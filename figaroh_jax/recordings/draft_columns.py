@@ -37,7 +37,7 @@ _WORDS = {
     },
     "velocity": {"dq", "qd", "vel", "velocity", "velocities", "speed", "qdot", "v"},
     "current": {"i", "current", "currents", "cur", "amp", "amps", "percent", "load"},
-    "torque": {"tau", "torque", "torques", "effort", "efforts", "eff", "trq", "moment", "moments", "force", "j"},
+    "torque": {"tau", "torque", "torques", "effort", "efforts", "eff", "trq", "moment", "moments", "force"},
     "position": {"q", "pos", "position", "positions", "angle", "angles", "theta", "state"},
 }
 _FEW_STEPS, _ALIKE = 20, 0.9  # rows of a clock, and the share of its steps that are alike
@@ -120,7 +120,8 @@ def _read(
     if "position" not in kinds:
         raise InputError(
             f"{table.file}: no column looks like a position (q, pos, position, angle...); its columns are"
-            f" {', '.join(table.names[:12])}{'...' if len(table.names) > 12 else ''}"
+            f" {', '.join(table.names[:12])}{'...' if len(table.names) > 12 else ''}; rename those of the position, or"
+            " write a task whose `position` names them"
         )
     names, sources, named = _of_joints(table, kinds["position"], model, joints, "position")
     position = _matrix(table, sources, names, "position")
@@ -165,24 +166,33 @@ def without_sign(*torques: Float[np.ndarray, "samples joints"]) -> bool:
 
 def _refuse_postures(table: Table, model: RobotModel) -> None:
     """Measured postures are a task of `calibrate`, which needs frames that no file names: the message shows it."""
+    from ..formats.export import dump_yaml
+
     kinds = _kinds(table, None)
     measured = [n for n in table.names if _MEASURED.search(n) and not _holds_any(n, model.joint_names)]
     if not measured or any(kind in kinds for kind in ("torque", "current", "command", "velocity")):
         return
     named = [n for n in table.names if n in model.joint_names]
-    position = f"[{', '.join(named)}]" if named else (kinds.get("position") or ["JOINTS"])[0]
+    columns = named or (kinds.get("position") or ["JOINTS"])[:1]
+    position = named or columns[0]
     whole = table.file.suffix.lower() in (".npz", ".mat", ".h5")
-    shown = measured[0] if whole else f"[{', '.join(measured[:12])}]"
+    shown = measured[0] if whole else measured[:12]
     kind = "pose" if "pose" in measured[0].lower() or measured[0].startswith("T_") else "position"
-    words = {word for name in (position, *measured) for word in _words(name)}
+    words = {word for name in (*columns, *measured) for word in _words(name)}
     units = {key: unit for key, unit in (("position", "deg"), ("measurement", "mm")) if unit in words}
-    unit = f"    units: {{{', '.join(f'{k}: {u}' for k, u in units.items())}}}\n" if units else ""
+    frames = {"base_frame": "BASE", "tool_frame": "TOOL", "unknown": ["base_frame", "tool_frame"]}
+    entry = {"file": table.file.name, "position": position, **({"units": units} if units else {})}
+    robot: dict[str, Any] = {"model": "MODEL"}
+    if named and named != list(model.joint_names):
+        robot["joints"] = [*named]  # a copy, which YAML writes out
+    task = {"robot": robot, "data": [entry | {"measurement": {kind: shown, **frames}}]}
+    written = dump_yaml(task, line=True).strip()
     raise InputError(
         f"{table.file}: {', '.join(measured[:6])} look like measured poses or points. Postures are a task for"
-        " `calibrate`; `new` drafts motions only. Write the task as\n"
-        f"  robot: {{model: MODEL}}\n  data:\n  - file: {table.file.name}\n    position: {position}\n{unit}"
-        f"    measurement: {{{kind}: {shown}, base_frame: BASE, tool_frame: TOOL, unknown: [base_frame, tool_frame]}}\n"
-        "BASE and TOOL are frames of the robot; the measurement is a `pose`, `position`, `plane`, `socket` or `camera`."
+        " `calibrate`; `new` drafts motions only. The task is\n"
+        f"  {written}\n"
+        "where MODEL is the robot's file, and BASE and TOOL are frames of it; the measurement is a `pose`, `position`,"
+        " `plane`, `socket` or `camera`."
     )
 
 
@@ -292,16 +302,16 @@ def _kinds(table: Table, clock: str | None) -> dict[str, list[str]]:
     """Columns or arrays by what their names say that they hold."""
     found: dict[str, list[str]] = {}
     for name in table.names:
-        words = _words(name)
-        kind = next(
-            (k for k, known in _WORDS.items() if known & set(words) and not (k == "torque" and words == ["j"])), None
-        )
+        words = set(_PRESENT.sub("", " ".join(_words(name))).split())
+        kind = next((k for k, known in _WORDS.items() if known & words), None)
         kind = name.partition(".")[0] if name.partition(".")[0] in _OF_BAGS else kind
         if name != clock and kind is not None and not name.startswith("/") and not _has_parts(name, table.names):
             found.setdefault("torque" if kind == "effort" else kind, []).append(name)
     return {kind: _plainest(names) for kind, names in found.items()}
 
 
+_OTHERS = "|".join(sorted(_WORDS["position"] | _WORDS["velocity"] | _WORDS["torque"]))
+_PRESENT = re.compile(rf"\bcurrent (?=(?:{_OTHERS})\b)")  # `current_position` is where the joint is now, not a current
 _OF_BAGS = ("position", "velocity", "effort", "command")
 
 
@@ -333,7 +343,9 @@ def _of_joints(
             raise Undecided("joints", text)
         return names, [by_name[joint] for joint in names], True
     if len(columns) == 1 and table.read(columns[0]).ndim == 2:
-        count, source = table.read(columns[0]).shape[1], columns[0]
+        (rows, count), source = table.read(columns[0]).shape, columns[0]
+        if rows == len(wanted) != count and count > rows:
+            raise InputError(f"{table.file}: '{source}' has shape ({rows}, {count}): samples are rows; transpose it")
     else:
         numbered = sorted(columns, key=_number)
         prefixes = {re.sub(r"\d+", "#", name) for name in columns}

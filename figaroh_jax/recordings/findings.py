@@ -41,6 +41,7 @@ class Look:
     series: Recording | None = None
     entry: RecordingEntry | None = None
     motion: Sampled | None = None
+    time: Float[np.ndarray, " samples"] | None = None  # s; None: the positions have no order in time
 
     @property
     def recording(self) -> Recording:

@@ -211,8 +211,24 @@ def poses(values: np.ndarray, table: Any, key: str) -> np.ndarray:
         row = np.flatnonzero(seen)[np.argmax(off > _LOOSE)]
         what = "quaternion x y z w of length 1" if given.ndim == 2 else "rotation matrix"
         raise InputError(f"{table.file}: {key}, row {row} (from 0): the orientation is no {what}")
+    if values.ndim == 3:
+        _check_last_row(values, table, key)
     found[seen, :3, :3] = matrices
     return found
+
+
+def _check_last_row(values: np.ndarray, table: Any, key: str) -> None:
+    """`InputError` where a matrix does not end in 0 0 0 1."""
+    last = values[:, 3]
+    odd = np.isfinite(last).all(axis=1) & (np.abs(last - [0.0, 0.0, 0.0, 1.0]) > _LOOSE).any(axis=1)
+    if odd.any():
+        row = int(np.argmax(odd))
+        column = np.abs(values[row, :, 3] - [0.0, 0.0, 0.0, 1.0]).max() < _LOOSE
+        raise InputError(
+            f"{table.file}: {key}, row {row} (from 0): the last row of the matrix is"
+            f" [{', '.join(f'{x:.4g}' for x in last[row])}], expected [0, 0, 0, 1]"
+            f"{': the matrices are transposed' if column else ''}"
+        )
 
 
 def _numbers(table: Table, source: str | tuple[str, ...] | None, key: str, samples: int) -> np.ndarray:

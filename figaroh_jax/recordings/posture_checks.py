@@ -28,6 +28,7 @@ __all__ = ["check_pose_recording", "check_pose_recordings"]
 
 OFF = 0.12  # share of the points' spread that no calibration leaves
 FEWEST = 8
+TURNED = 0.15  # rad between orientations that no calibration leaves
 
 
 def check_pose_recordings(task: Task, model: RobotModel, recordings: Sequence[PoseRecording]) -> tuple[str, ...]:
@@ -69,7 +70,7 @@ def _against_model(recording: PoseRecording, model: RobotModel, unit: str, measu
         return
     q, points = recording.position[seen], points[seen]
 
-    def overlay(position: np.ndarray) -> _Overlay:
+    def overlay(position: np.ndarray, points: np.ndarray = points) -> _Overlay:
         turned, origin = frame_poses(model, position, recording.tool_frame)
         base_turned, base = frame_poses(model, position, recording.base_frame)
         origin = np.einsum("nji,nj->ni", base_turned, origin - base)
@@ -77,7 +78,14 @@ def _against_model(recording: PoseRecording, model: RobotModel, unit: str, measu
 
     own = overlay(q)
     if own.left > OFF:
-        yield _odd(own, [(text, overlay(other)) for text, other in _readings(q, model, unit)])
+        others = [(text, overlay(other)) for text, other in _readings(q, model, unit)]
+        if recording.kind == "pose":
+            turned = recording.values[seen][:, :3, :3]
+            back = -np.einsum("nji,nj->ni", turned, points)
+            if np.isfinite(back).all():
+                text = "they would with every pose inverted: that of the marker in the device's frame is expected"
+                others.append((text, overlay(q, back)))
+        yield _odd(own, others)
     elif not 0.5 < own.scale < 2.0:
         thousand = 500 < own.scale < 2000
         advice = "they look like mm: add units: {measurement: mm}" if thousand else "what unit are they in?"
@@ -136,27 +144,45 @@ def _readings(q: np.ndarray, model: RobotModel, unit: str) -> Iterator[tuple[str
 
 
 def _orientations(recording: PoseRecording, model: RobotModel, seen: np.ndarray) -> Iterator[Finding]:
-    """Angles between measured orientations against the model's: another order of the quaternion's numbers."""
-    from scipy.spatial.transform import Rotation
-
+    """Rotations between measured orientations against the model's: a quaternion in another order, or the inverse."""
     measured = recording.values[seen][:, :3, :3]
     whole = np.isfinite(measured).all(axis=(1, 2))
     if whole.sum() < FEWEST:
         return
     turned, _ = frame_poses(model, recording.position[seen][whole], recording.tool_frame)
     base, _ = frame_poses(model, recording.position[seen][whole], recording.base_frame)
-    own = _angles(base.swapaxes(1, 2) @ turned)
-    if np.median(np.abs(_angles(measured[whole]) - own)) < 0.15:
+    own = _turns(base.swapaxes(1, 2) @ turned)
+    if _unlike(own, _turns(measured[whole])) < TURNED:
         return
-    numbers = Rotation.from_matrix(measured[whole]).as_quat()
-    first = Rotation.from_quat(np.roll(numbers, -1, axis=1)).as_matrix()  # w x y z read as x y z w
-    advice = "another order of columns, or another frame?"
-    if np.median(np.abs(_angles(first) - own)) < 0.15:
-        advice = "they look like w x y z; name the columns in the order x y z qx qy qz qw"
-    yield Finding(False, f"the measured orientations do not turn as the model's do; {advice}")
+    # w x y z read as x y z w is the inverse orientation between two other frames: a roll and a conjugation of the four
+    # numbers make a rotation of their space, and such a one is a product with a quaternion on each side
+    inverse = _unlike(own, _turns(measured[whole].swapaxes(1, 2))) < TURNED
+    advice = (
+        "they do as w x y z, or transposed: quaternions are x y z w (name the columns in that order), and the"
+        " orientation is that of the marker in the device's frame"
+    )
+    yield Finding(
+        inverse,
+        "the measured orientations do not turn as the model's do; "
+        + (advice if inverse else "another order of columns, or another frame?"),
+    )
 
 
-def _angles(turned: Float[np.ndarray, "rows 3 3"]) -> Float[np.ndarray, " _"]:
-    """Angle from each orientation to the next, rad."""
-    relative = turned[:-1].swapaxes(1, 2) @ turned[1:]
-    return np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1.0, 1.0))
+def _turns(orientation: Float[np.ndarray, "rows 3 3"]) -> Float[np.ndarray, "_ 3"]:
+    """Rotation from each orientation to the next, in the axes of the first of the two, rad."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(orientation[:-1].swapaxes(1, 2) @ orientation[1:]).as_rotvec()
+
+
+def _unlike(one: Float[np.ndarray, "_ 3"], other: Float[np.ndarray, "_ 3"]) -> float:
+    """Median distance of rotations from each other, rad, after the one rotation of the tool that fits best (Kabsch).
+
+    Angles alone do not tell: that of two quaternions is the same in any order of their numbers.
+    """
+    near = np.maximum(np.linalg.norm(one, axis=1), np.linalg.norm(other, axis=1)) < 2.5  # short of the turn of sign
+    if near.sum() < FEWEST - 2:
+        return 0.0
+    u, _, vt = np.linalg.svd(one[near].T @ other[near])
+    rotation = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return float(np.median(np.linalg.norm(other[near] - one[near] @ rotation, axis=1)))

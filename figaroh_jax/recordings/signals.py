@@ -390,10 +390,15 @@ def _gap_notes(recording: Recording, gaps, cutoff: float) -> tuple[str, ...]:
     if not gaps:
         return ()
     begin, end = max(gaps, key=lambda gap: gap[1] - gap[0])
-    left_out = len(_long(gaps, cutoff))
+    left_out, one = len(_long(gaps, cutoff)), len(gaps) == 1
+    said = f"rows near {left_out} of them are left out, the others are bridged"
+    if left_out == 0:
+        said = f"{'it is' if one else 'all are'} bridged"
+    elif left_out == len(gaps):
+        said = f"rows near {'it' if one else 'them'} are left out"
     return (
         f"{recording.name}: {len(gaps)} gap{'s' * (len(gaps) > 1)} in the time stamps, the longest {end - begin:.3g} s"
-        f" at {begin:.4g} s; rows near {left_out} of them are left out, the others are bridged",
+        f" at {begin:.4g} s; {said}",
     )
 
 

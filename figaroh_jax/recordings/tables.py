@@ -30,6 +30,9 @@ class Source(NamedTuple):
     episode: int | None = None  # of a LeRobot folder
 
 
+_OTHERS_STAND = "; list the joints of the columns in robot.joints, and all others stand still"
+
+
 class Table(NamedTuple):
     """Names in a recording file and a function that reads one of them."""
 
@@ -59,7 +62,10 @@ class Table(NamedTuple):
                 raise InputError(f"{self.file}: the columns of {key} differ in length: {[len(part) for part in parts]}")
             values = np.stack(parts, axis=1)
         if values.ndim != 2 or values.shape[1] != len(joints):
-            raise InputError(f"{self.file}: {_text(source)} ({key}) has shape {values.shape}, {expected}")
+            fewer = values.ndim == 2 and values.shape[1] < len(joints)
+            raise InputError(
+                f"{self.file}: {_text(source)} ({key}) has shape {values.shape}, {expected}{_OTHERS_STAND * fewer}"
+            )
         return values
 
     def _columns(self, source: str | Sequence[str], joints: Sequence[str], key: str) -> list[str]:
@@ -79,6 +85,7 @@ class Table(NamedTuple):
             raise InputError(
                 f"{self.file}: prefix '{source}' ({key}) matches {len(found)} columns ({', '.join(found)}),"
                 f" expected {len(joints)}, one for each of {', '.join(joints)}"
+                f"{_OTHERS_STAND * (len(found) < len(joints))}"
             )
         return sorted(found, key=found.__getitem__)
 

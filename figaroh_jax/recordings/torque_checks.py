@@ -13,10 +13,11 @@ from ..rigid.model import RobotModel, prismatic
 from .findings import LIKE, SOFT, UNLIKE, Finding, Look, named
 from .likeness import Likeness, Sampled, likeness, matrix_of_likeness, rigid_torque, share_of_gravity, stretch_of_time
 
-__all__ = ["torque_findings"]
+__all__ = ["TURNED_POSITION", "torque_findings"]
 
 DEGREE = np.pi / 180
 LIGHT = 4.0  # times too small: a nominal model may well be three times too heavy
+TURNED_POSITION = "(-1 in transmission.position)"  # ends a finding, by which a draft knows it
 HEAVY = 0.2  # share of a torque's spread that the rigid body should make up before its absence means anything
 
 
@@ -55,7 +56,10 @@ def torque_findings(look: Look, motion: Sampled) -> Iterator[Finding]:
             " controller adds to its gravity compensation? Record the torque or current of the drives",
         )
         return
-    yield from _scale(look, fit, like)
+    scale = [*_scale(look, fit, like)]
+    yield from scale
+    if scale:  # a torque n times as large looks like a clock the root of n times as fast
+        return
     stretch, error = stretch_of_time(look.model, motion)
     if error < 0.15 and abs(np.log(stretch)) > max(np.log(1.5), 3 * error):
         yield Finding(
@@ -186,7 +190,7 @@ def _turned(joints: Sequence[str], motion: Sampled, torque: np.ndarray) -> Itera
         text = f"torque of {name} has the opposite sign of what the model needs (-1 in transmission.torque)"
         yield text, replace(motion, torque=torque * sign)
         turned = motion.scaled(sign)
-        yield f"it would with the opposite sign of the position of {name} (-1 in transmission.position)", turned
+        yield f"it would with the opposite sign of the position of {name} {TURNED_POSITION}", turned
         text = f"it would with the opposite sign of position and torque of {name} (-1 in both matrices of transmission)"
         yield text, replace(turned, torque=torque * sign)
 

@@ -35,10 +35,13 @@ __all__ = ["corrected_urdf", "origin_changes", "pose_answer_json", "result", "to
 _PARITY = 1e-9  # m and entries of the rotation, between the model and the file read back
 
 
-def write_calibration(calibration: Calibration, folder: Path, source: Path) -> None:
-    """Write everything that the contract asks of a calibration; `source` is the robot's own URDF."""
+def write_calibration(calibration: Calibration, folder: Path, source: Path, found: PoseDiagnosis | None = None) -> None:
+    """Write everything that the contract asks of a calibration; `source` is the robot's own URDF.
 
-    write_calibration_report(calibration, folder / "report.html")
+    The page begins with the verdict of the diagnosis `found` that the calibration belongs to.
+    """
+
+    write_calibration_report(calibration, folder / "report.html", found)
     model = folder / "model"
     model.mkdir()
     (model / "calibration.yaml").write_text(dump_yaml(_corrections(calibration)), encoding="utf-8")

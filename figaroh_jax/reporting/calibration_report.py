@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,13 +13,16 @@ from ..calibration.calibrated import Calibration, Shown, quality_of
 from . import wording
 from .calibration_view import nominal_of
 from .picture import robot_picture
-from .report import page_template, plotly_source
+from .report import BADGES, page_template, plotly_source
+
+if TYPE_CHECKING:
+    from ..calibration.kinematic_diagnosis import PoseDiagnosis
 
 __all__ = ["write_calibration_report"]
 
 
-def write_calibration_report(calibration: Calibration, path: Path) -> None:
-    """Write the page, one file that needs no network."""
+def write_calibration_report(calibration: Calibration, path: Path, found: PoseDiagnosis | None = None) -> None:
+    """Write the page, one file that needs no network; with the verdict of a diagnosis, where it belongs to one."""
     from markupsafe import Markup
 
     page = resources.files("figaroh_jax") / "page"
@@ -29,6 +32,9 @@ def write_calibration_report(calibration: Calibration, path: Path) -> None:
         c=calibration,
         robot=calibration.model.name,
         sentence=wording.calibration_sentence(calibration),
+        found=found,
+        badge=wording.level(calibration.level) if found is None else BADGES[found.verdict],
+        verdict="" if found is None else wording.pose_sentence(found, calibration.model.name),
         level=wording.level,
         distances=wording.distances(calibration),
         errors=[error for error in (calibration.position, calibration.orientation) if error is not None],

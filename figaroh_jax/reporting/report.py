@@ -23,13 +23,13 @@ from . import wording
 from .picture import robot_picture
 from .provenance import read_provenance
 
-__all__ = ["page_template", "plot_data", "plotly_source", "write_report"]
+__all__ = ["BADGES", "page_template", "plot_data", "plotly_source", "write_report"]
 
 _POINTS = 1500  # of a trace at most: more cannot be told apart on a screen
 _PAGE_POINTS = 45_000  # of all traces of a channel together, so that a humanoid's page stays light
 _STEPS = 32767  # of a channel's range on each side of its middle; finer than any plot shows
 
-_BADGES = {
+BADGES = {
     "nothing": "nothing missing",
     "named": "cause named",
     "named+rest": "cause named, a rest stays",
@@ -103,7 +103,7 @@ def _page(diagnosis: Diagnosis, title: str, folder: Path | None = None) -> str:
         robot=title,
         picture=Markup(_picture(diagnosis)),
         anatomy=_anatomy(diagnosis),
-        badge=_UNDECIDED if diagnosis.rest.undecided else _BADGES[diagnosis.verdict],
+        badge=_UNDECIDED if diagnosis.rest.undecided else BADGES[diagnosis.verdict],
         undecided=_glued(wording.undecided(diagnosis)),
         unexplained=_glued(wording.unexplained(diagnosis)) if diagnosis.verdict in ("named+rest", "unknown") else "",
         sentence=_glued(wording.sentence(diagnosis, title)),
@@ -159,6 +159,7 @@ def page_template(name: str, folder: Path | None = None) -> Any:
     environment = Environment(loader=pages, autoescape=True, undefined=StrictUndefined)
     environment.filters |= {
         "aside": wording.aside,
+        "both": lambda gain: [*map(_glued, wording.fall(gain.before, gain.after, gain.unit))],
         "equation": wording.effect_equation,
         "error": lambda value, unit: _glued(wording.error(value, unit)),
         "fall": lambda gain: " → ".join(map(_glued, wording.fall(gain.before, gain.after, gain.unit))),

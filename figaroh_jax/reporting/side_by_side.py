@@ -201,10 +201,16 @@ def _values_of(values: tuple[float, ...] | None, first: tuple[float, ...] | None
     """Numbers of a model, with their change against the first run's."""
     if values is None:
         return "-"
-    text = " ".join(f"{x:.4g}" for x in values)
-    if first is None or values is first or np.allclose(values, first, rtol=1e-9, atol=0):
+    least = 1e-9 * max(map(abs, [*values, *(first or ())]))  # beside the others of its kind it is rounding
+
+    def plain(x: float, form: str) -> str:
+        return f"{x:{form}}" if abs(x) > least else "0"
+
+    text = " ".join(plain(x, ".4g") for x in values)
+    changes = [0.0] * len(values) if first is None else [x - y for x, y in zip(values, first, strict=True)]
+    if max(map(abs, changes)) <= least:
         return text
-    return f"{text} ({' '.join(f'{x - y:+.2g}' for x, y in zip(values, first, strict=True))})"
+    return f"{text} ({' '.join(plain(x, '+.2g') for x in changes)})"
 
 
 def _made(folders: Sequence[Path]) -> Iterator[tuple[str, ...]]:

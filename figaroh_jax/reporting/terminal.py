@@ -18,6 +18,7 @@ from . import wording
 
 if TYPE_CHECKING:
     from ..calibration.calibrated import Calibration
+    from ..calibration.kinematic_diagnosis import PoseDiagnosis
     from ..identification.result import FittedEffect, Identification
 
 __all__ = [
@@ -68,7 +69,18 @@ class Progress:
 
 def show(diagnosis: Diagnosis, robot: str = "the robot", *, verbose: bool = False) -> None:
     """Print the summary on standard output."""
-    Console(file=sys.stdout).print(summary(diagnosis, robot, verbose=verbose))
+    _print(summary(diagnosis, robot, verbose=verbose))
+
+
+def _print(shown: RenderableType) -> None:
+    """On standard output; in a pipe or a file without the spaces that fill lines up."""
+    console = Console(file=sys.stdout)
+    if console.is_terminal:
+        console.print(shown)
+        return
+    with console.capture() as text:
+        console.print(shown)
+    sys.stdout.write("\n".join(line.rstrip() for line in text.get().split("\n")))
 
 
 def _notes(notes: Sequence[str], verbose: bool) -> list[RenderableType]:
@@ -103,15 +115,18 @@ def summary(diagnosis: Diagnosis, robot: str = "the robot", *, verbose: bool = F
     return Group(*parts)
 
 
-def show_calibration(calibration: Calibration, verdict: str = "", *, verbose: bool = False) -> None:
-    """Print the summary of a calibration, or of a diagnosis of poses with its verdict, on standard output."""
-    Console(file=sys.stdout).print(calibration_summary(calibration, verdict, verbose=verbose))
+def show_calibration(calibration: Calibration, found: PoseDiagnosis | None = None, *, verbose: bool = False) -> None:
+    """Print the summary of a calibration, or of the diagnosis of poses that it belongs to, on standard output."""
+    _print(calibration_summary(calibration, found, verbose=verbose))
 
 
-def calibration_summary(calibration: Calibration, verdict: str = "", *, verbose: bool = False) -> RenderableType:
+def calibration_summary(
+    calibration: Calibration, found: PoseDiagnosis | None = None, *, verbose: bool = False
+) -> RenderableType:
     """The calibration in a few lines: how much better, why this level, outliers and causes, what to know."""
-    word = (verdict, _STYLE[verdict]) if verdict else (calibration.level, "bold blue")
-    head = Text.assemble(word, f"  {wording.calibration_sentence(calibration)}\n")
+    word = (calibration.level, "bold blue") if found is None else (found.verdict, _STYLE[found.verdict])
+    said = "" if found is None else f"{wording.pose_sentence(found, calibration.model.name)} "
+    head = Text.assemble(word, f"  {said}{wording.calibration_sentence(calibration)}\n")
     table = Table(box=None, pad_edge=False, header_style="dim")
     table.add_column("held-out RMS error")
     errors = [error for error in (calibration.position, calibration.orientation) if error is not None]
@@ -184,7 +199,7 @@ def _plain(text: str) -> str:
 
 def show_identification(found: Identification, robot: str = "the robot", *, verbose: bool = False) -> None:
     """Print the summary of an identification on standard output."""
-    Console(file=sys.stdout).print(identification_summary(found, robot, verbose=verbose))
+    _print(identification_summary(found, robot, verbose=verbose))
 
 
 def identification_summary(found: Identification, robot: str = "the robot", *, verbose: bool = False) -> RenderableType:

@@ -19,6 +19,11 @@ __all__ = ["DEFAULT_LIMITS", "JUNIT", "VERIFICATION", "Check", "figures", "junit
 
 VERIFICATION = "verification.json"
 JUNIT = 'name="figaroh-jax verify '  # by which such a file is known
+_SIDES = {
+    "verdict": "one of",
+    "forbidden_causes": "none of",
+    **dict.fromkeys(("gain", "p_value", "rank"), "at least"),
+}
 DEFAULT_LIMITS: dict[str, Any] = {"verdict": ["nothing", "named"], "consistent": True, "fk_parity": 1e-9}
 
 
@@ -34,7 +39,13 @@ class Check(NamedTuple):
     def line(self) -> str:
         """As `verify` prints it."""
         figure = "not measured" if self.figure is None else _text(self.figure)
-        return f"{self.status:<8} {self.limit:<24} {figure}   (limit {_text(self.bound)})"
+        return f"{self.status:<8} {self.limit:<24} {figure}   (limit: {self.allowed})"
+
+    @property
+    def allowed(self) -> str:
+        """The bound in words: which side of it passes."""
+        name, bound = self.limit.split(" ")[0], _text(self.bound)
+        return bound if name == "consistent" else f"{_SIDES.get(name, 'at most')} {bound}"
 
 
 def verify(folder: Path, limits: Limits, *, write: bool = True) -> tuple[Check, ...]:
@@ -140,7 +151,7 @@ def _judged(name: str, bound: Any, found: dict[str, Any]) -> Iterator[Check]:
         yield _check(name, figure, list(bound), lambda x: x in bound)
     elif name == "consistent":
         yield _check(name, figure, bound, lambda x: x or not bound)
-    elif name in ("gain", "p_value", "rank"):
+    elif _SIDES.get(name) == "at least":
         yield _check(name, figure, bound, lambda x: x >= bound)
     else:
         yield _check(name, figure, bound, lambda x: x <= bound)
@@ -169,7 +180,7 @@ def junit(folder: Path, checks: tuple[Check, ...]) -> str:
     for check in checks:
         case = ElementTree.SubElement(suite, "testcase", {"classname": folder.name, "name": check.limit})
         if check.status == "fail":
-            text = f"{_text(check.figure)} against the limit {_text(check.bound)}"
+            text = f"{_text(check.figure)} against the limit: {check.allowed}"
             ElementTree.SubElement(case, "failure", {"message": text}).text = check.line
         elif check.status == "skipped":
             ElementTree.SubElement(case, "skipped", {"message": "the run did not measure it"})

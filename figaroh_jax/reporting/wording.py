@@ -15,6 +15,7 @@ from .rollout_effects import ROLLOUT_EFFECTS
 
 if TYPE_CHECKING:
     from ..calibration.calibrated import Calibration
+    from ..calibration.kinematic_diagnosis import PoseDiagnosis
 
 __all__ = [
     "aside",
@@ -33,6 +34,7 @@ __all__ = [
     "p_value",
     "phrase",
     "place",
+    "pose_sentence",
     "rest",
     "sentence",
     "undecided",
@@ -119,12 +121,23 @@ def calibration_sentence(calibration: Calibration) -> str:
     before, after = (_with_unit(number(x, 3), error.unit) for x in (error.validated_before, error.validated_after))
     if calibration.level == "frames":
         return (
-            f"The nominal kinematics are as accurate as these measurements can show: {after} on held-out postures with"
-            " only the base and tool frames fitted; no correction of the robot predicts better."
+            f"No correction of the robot predicts better than the nominal kinematics with base and tool frames fitted:"
+            f" {after} on held-out postures."
         )
     found = level(calibration.level)
     told = f"the error on held-out postures falls from {before} (base and tool frames only) to {after}"
     return f"With {found}, {told}."
+
+
+def pose_sentence(diagnosis: PoseDiagnosis, robot: str) -> str:
+    """The verdict on measured postures in one sentence."""
+    subject = f"The postures of {robot} show"
+    if diagnosis.verdict == "nothing":
+        return f"{subject} no error of its kinematics beyond the tolerance."
+    if diagnosis.verdict == "unknown":
+        return f"{subject} an error that no effect in the catalogue explains."
+    rest = "; part of the error remains unexplained" if diagnosis.verdict == "named+rest" else ""
+    return f"{subject} {_list(diagnosis.causes)}{rest}."
 
 
 def distances(calibration: Calibration) -> str:
@@ -261,7 +274,8 @@ def number(value: float, digits: int = 4) -> str:
     """A number with `digits` significant digits, never more than a reader needs."""
     if not math.isfinite(value):
         return "–" if math.isnan(value) else _minus(f"{value:.0f}".replace("inf", "∞"))
-    return _minus(f"{value:.{digits}g}")
+    text = f"{value:.{digits}g}"
+    return _minus(f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text)  # 100, not 1e+02
 
 
 def p_value(value: float) -> str:

@@ -30,6 +30,7 @@ __all__ = ["RolloutIdentification", "identify_rollout_task"]
 
 _LOOSE = 0.5  # relative standard deviation beyond which a number is not identified
 _FAR = 1e3  # rad or m: a simulation that gets there has diverged
+_NOT_NOISE = 3.0  # times the noise of the encoder: what is left is the model's error
 _TRADE = 0.95  # correlation beyond which two numbers trade off
 
 
@@ -132,7 +133,7 @@ def _result(
         "effects": [],
         "fit": {"rms": rms.tolist(), "relative": _relative(here, rms), "noise": here.spread.tolist()},
         "holdout": {name: _held(run, read) for name, (run, read) in held.items()},
-        "notes": [*notes, *_trades([names[free.index(k)] for k in told], correlation)],
+        "notes": [*notes, *_left(here, rms), *_trades([names[free.index(k)] for k in told], correlation)],
         "unit": "rad",
     }
 
@@ -177,6 +178,19 @@ def _held(run: Run, read: np.ndarray) -> dict[str, list[float]]:
     error, spread = np.sqrt(((run.position - read) ** 2).mean(0)), run.position.std(0)
     share = error / np.maximum(spread, 1e-12)
     return {"rms": error.tolist(), "relative": share.tolist(), "r2": (1 - share**2).tolist()}
+
+
+def _left(here: Setting, rms: np.ndarray) -> list[str]:
+    """Where the fit leaves much more than the encoders' noise, and what that means for the numbers beside it."""
+    share = rms / np.maximum(here.spread, 1e-12)
+    worst = int(np.argmax(share))
+    if share[worst] < _NOT_NOISE:
+        return []
+    joint = here.loop.robot.dof_names[here.loop.measured[worst]]
+    return [
+        f"the fit leaves {share[worst]:.0f} times the encoder's noise at {joint}: the loop lacks something, which"
+        " `diagnose` looks for, and the intervals do not count it"
+    ]
 
 
 def _trades(names: list[str], correlation: np.ndarray) -> list[str]:
