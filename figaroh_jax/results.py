@@ -116,6 +116,7 @@ class Rest:
     text: str = ""  # where it is more than noise, in words; empty where it is not
     tolerated: str = ""  # why what is surely more than noise does not count, in words
     undecided: str = ""  # why more than is tolerable can be told neither from noise nor from an error, in words
+    contradicts: tuple[str, ...] = ()  # what of recordings, or of links as fitted, cannot be: nothing is named then
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 from .errors import InputError
 from .formats.config import Preprocess
-from .recordings.checks import check_recordings
+from .recordings.checks import Checked, checked_recordings
 from .simulators.native import as_backend
 
 if TYPE_CHECKING:
@@ -114,10 +114,11 @@ def diagnose(
     from .diagnosis.diagnosis import diagnose as of_torques
 
     torques: Any = recordings
-    notes = _checked(model, torques)
+    warnings, contradictions = _checked(model, torques)
+    options = {"contradictions": contradictions} | options
     settings = {"trust": trust, "forbid": forbid, "alpha": alpha, "progress": progress, **options}
     found = of_torques(model, torques, preprocess or Preprocess(), known, **settings)
-    return replace(found, notes=(*notes, *found.notes))
+    return replace(found, notes=(*warnings, *found.notes))
 
 
 def identify_task(
@@ -148,6 +149,6 @@ def _native_alone(backend: str, what: str) -> None:
         raise InputError(f"backend '{backend}': {what} with 'native' alone")
 
 
-def _checked(model: RobotModel | Backend, recordings: Sequence[Recording]) -> tuple[str, ...]:
+def _checked(model: RobotModel | Backend, recordings: Sequence[Recording]) -> Checked:
     """Warnings about the recordings; `InputError` where one cannot be right."""
-    return check_recordings(None, as_backend(model).robot, recordings)
+    return checked_recordings(None, as_backend(model).robot, recordings)

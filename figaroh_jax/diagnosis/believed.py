@@ -9,14 +9,18 @@ also predict better beside links that may move, for many follow them some of the
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
+import numpy as np
+from jaxtyping import Float
+
+from ..effects.base import Effect
 from ..estimation.rows import Prior
 from .comparison import FoldSums, coefficients, told
 from .problem import Problem
-from .thresholds import BEYOND_TRUST
+from .thresholds import BEYOND_ANY, BEYOND_TRUST, IMPOSSIBLE
 
-__all__ = ["believed", "let_go"]
+__all__ = ["believed", "impossible_links", "let_go"]
 
 TIGHTEST, HALVINGS = 1e8, 30  # times the stated precision; of its logarithm
 
@@ -52,3 +56,38 @@ def let_go(problem: Problem, prior: Prior) -> Prior | None:
     if not problem.bounded or prior.precision[0] <= problem.believed[0]:
         return None
     return prior._replace(precision=np.append(problem.believed, prior.precision[len(problem.believed) :]))
+
+
+def impossible_links(
+    problem: Problem,
+    causes: Sequence[Effect],
+    theta: Float[np.ndarray, " P"],
+    covariance: Float[np.ndarray, "parameters parameters"],
+) -> tuple[str, ...]:
+    """What cannot be of the links as fitted, in words: masses below zero, and links far beyond any stated trust.
+
+    `theta` and its covariance begin with the links' ten parameters each. A payload heavier than the robot counts too.
+    """
+    nominal, one_sigma = np.asarray(problem.model.inertia, float), 1 / np.sqrt(problem.believed).reshape(-1, 10)
+    count = nominal.size
+    fitted = theta[:count].reshape(-1, 10)
+    std = np.sqrt(np.maximum(np.diag(covariance)[:count], 0.0)).reshape(-1, 10)
+    far = (np.abs(fitted - nominal) / one_sigma).max(axis=1)
+    check = "check unit and sign of the torque, the clock and robot.gravity"
+    out = []
+    for name, mass, deviation, times in zip(problem.model.link_names, fitted[:, 0], std[:, 0], far, strict=True):
+        if mass < -IMPOSSIBLE * deviation:
+            out.append(
+                f"the torque asks for a mass of {mass:.3g} +- {1.96 * deviation:.2g} kg of {name}, which no body has:"
+                f" {check}"
+            )
+        elif times > BEYOND_ANY:
+            out.append(
+                f"the torque asks for a link {name} that is {times:.0f} times as far from the model as robot.trust"
+                f" ({problem.trust:.0%}) lets expect: {check}, or say how far the model's inertials are to be trusted"
+            )
+    weight = float(nominal[:, 0].sum())
+    for effect in causes:
+        if effect.name == "payload" and float(getattr(effect, "mass", 0.0)) > weight:
+            out.append(f"the torque asks for a payload that is heavier than the robot ({weight:.3g} kg): {check}")
+    return tuple(out)

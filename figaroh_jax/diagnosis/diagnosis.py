@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -20,7 +20,7 @@ from ..effects.base import place
 from ..effects.catalogue import CATALOGUE, find, related
 from ..effects.plausibility import implausible
 from ..recordings.bandwidth import note_on
-from ..recordings.checks import check_recordings
+from ..recordings.checks import checked_recordings
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Signals
 from ..results import Cause, Diagnosis, Experiment, Name, Nearest, Rest, Verdict
@@ -29,6 +29,7 @@ from ..simulators.contract import Backend
 from ..simulators.native import as_backend
 from ..simulators.registry import backend as make_backend
 from .answer_fit import as_predicts_best, as_weighed_in_motion, as_weighed_otherwise, together
+from .believed import impossible_links
 from .estimates import amplitude_places, estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
@@ -77,8 +78,14 @@ def diagnose_task(
     progress("reading", 0.0)
     model, (known, notes) = load_robot(task), stated_baseline(task)
     recordings = read_recordings(task, model)
-    notes = (*notes, *check_recordings(task, model, recordings))
-    options = {"trust": task.robot.trust, "forbid": task.diagnose.forbid, "alpha": task.diagnose.alpha}
+    checked = checked_recordings(task, model, recordings)
+    notes = (*notes, *checked.warnings)
+    options: dict[str, Any] = {
+        "contradictions": checked.contradictions,
+        "trust": task.robot.trust,
+        "forbid": task.diagnose.forbid,
+        "alpha": task.diagnose.alpha,
+    }
     options["tolerance"] = task.diagnose.tolerance.torque
     robot = make_backend(backend, model)
     found = diagnose(robot, recordings, task.preprocess, known, progress=progress, **options)
@@ -97,6 +104,7 @@ def diagnose(
     tolerance: float = 0.01,
     progress: Callable[[str, float], None] = lambda phase, share: None,
     seed: int = 0,
+    contradictions: Sequence[str] = (),
 ) -> Diagnosis:
     """What the robot's model gets wrong in the recordings (joint side, SI units), named where it can be.
 
@@ -104,6 +112,8 @@ def diagnose(
     far the nominal inertials are believed (relative one-sigma), `known` what the baseline contains,
     `forbid` names effects left out of the catalogue, `alpha` is the level of the test for the whole catalogue, and
     `tolerance` is the share of each joint's RMS torque below which a misfit is good enough to be `nothing`.
+    `contradictions` say, in words, what of the recordings contradicts the model (`checked_recordings`): with any, or
+    where the links as fitted cannot be, nothing is named.
     """
     with jax.enable_x64(True):
         progress("preparing signals", 0.03)
@@ -119,16 +129,20 @@ def diagnose(
             searched = _searched(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
             give_back_holes()
             again = setting_beside(searched.here, searched.joint.step.state, forbid) if searched.found else None
-            judged = _judged(searched, reader, forbid, tolerance, alpha, generator)
+            asked = (searched, reader, forbid, tolerance, alpha, generator)
+            judged = _judged(*asked, contradictions)
+            if not contradictions and (cannot_be := _impossible(judged)):
+                judged = _judged(*asked, cannot_be)
             progress("measuring the gain", 0.9)
             return _answer(searched.here, signals, searched.search, judged), again
 
         answer, again = answered(here)
-        if again:
+        if again and not contradictions:
             other, _ = answered(again)
             if other.holdout.after <= min(AS_WELL * answer.holdout.after, answer.holdout.before):
                 answer = other
-        return replace(answer, band=band, notes=(*answer.notes, *note_on(band)))
+        cannot_be = [f"impossible: {text}" for text in answer.rest.contradicts if text not in contradictions]
+        return replace(answer, band=band, notes=(*cannot_be, *answer.notes, *note_on(band)))
 
 
 class _Judged(NamedTuple):
@@ -275,10 +289,13 @@ def _judged(
     tolerance: float,
     alpha: float,
     generator: np.random.Generator,
+    contradictions: Sequence[str] = (),
 ) -> _Judged:
     """The verdict by what is left beside all causes; of these, the ones that stand beside it are named.
 
-    What is not named is no part of the answer's model: the others are fitted anew without it.
+    What is not named is no part of the answer's model: the others are fitted anew without it. Where recordings and
+    model contradict each other, or the links of the answer cannot be, that is `unknown`, whatever has been found: a
+    cause stands for what is wrong with them as well as for itself.
     """
     before, here, _, found, joint, left, *_ = searched
     problem, whitening = here.problem, here.whitening
@@ -286,6 +303,11 @@ def _judged(
     kept_out = KeptOut(searched, {one.name: one.gain for one in each})
     doubted = doubted_rest(searched, forbid, generator)
     against = reasons_against(searched, each, kept_out, doubted, tolerance)
+    if contradictions:
+        against = {
+            name: why or f"nothing is named before this is settled: {contradictions[0]}"
+            for name, why in against.items()
+        }
     named = [f for f in found if not against[f.name]]
     if named and (chance := as_slow_noise(searched, named, forbid, generator)) is not None:
         against |= {f.name: f"noise as slow as the motion scores as much by chance (p = {chance:.2g})" for f in named}
@@ -313,6 +335,8 @@ def _judged(
         read = errors is not None and only_read(problem, joint.step.state, noise, relative, tolerance, errors)
         rest = not read
     text = (left.rest.text or ("" if relative.any() else _LESS_THAN_NOISE)) if rest else ""
+    if contradictions:
+        rest, sticks, read = True, False, False
     told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
     if rest and named:
         gaining = gaining._replace(joint=_beside_rest(here, named, joint))
@@ -323,8 +347,17 @@ def _judged(
     unsure, more = "", ""
     if quiet and not why:  # asked of the rows that the second opinions were asked of
         unsure, more = undecided(searched.here.problem, searched.joint.step.state)
-    told_rest = Rest(relative, parts, tuple(nearest), text, why, unsure)
+    if contradictions:
+        more = _SETTLE_FIRST
+    told_rest = Rest(relative, parts, tuple(nearest), text, why, unsure, tuple(contradictions))
     return _Judged(verdict(bool(named), rest), gaining, told_rest, sticks, here, more)
+
+
+def _impossible(judged: _Judged) -> tuple[str, ...]:
+    """What cannot be of the links as the answer's fit has them, in words."""
+    problem, joint = judged.here.problem, judged.causes.joint
+    fitted = joint.fitted
+    return impossible_links(problem, joint.causes, joint.step.state.theta, fitted.covariance)
 
 
 def _answered(
@@ -469,6 +502,7 @@ def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judge
     )
 
 
+_SETTLE_FIRST = "none before what looks wrong is settled: put it right in the task or the recording, and diagnose again"
 _LESS_THAN_NOISE = "less is left than the noise is estimated to be, so part of that estimate is an error of the model"
 _AT_REST = (
     "at rest the torque differs from the model, as dry friction allows: there it can take any value up to its limit,"

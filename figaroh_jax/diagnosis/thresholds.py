@@ -73,6 +73,9 @@ BESIDE_SMOOTH = 0.05  # gain of a cause of the whole robot beside smooth functio
 
 # Links that are well known (`believed`)
 TRUSTED = 0.05  # stated trust in the inertials (relative) up to which the links move no further than that
+IMPOSSIBLE = 3.0  # standard deviations below zero of a link's mass: no such body exists
+BEYOND_ANY = 30.0  # times its stated one sigma that a fit moves a link's parameter: the recordings are of another robot
+# (or unit); UR10e's moments move by 18, the other public sets' by 10
 BEYOND_TRUST = 0.01  # p-value of the squares of their deviations: below, they are not as believed
 
 # The rest (`rest`)

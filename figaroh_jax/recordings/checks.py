@@ -8,8 +8,9 @@ wrong_recordings.py` measures both sides).
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -27,7 +28,15 @@ if TYPE_CHECKING:
     from ..formats.config import RecordingEntry, Task
 
 
-__all__ = ["Finding", "check_recording", "check_recordings", "position_findings", "report_findings"]
+__all__ = [
+    "Checked",
+    "Finding",
+    "check_recording",
+    "check_recordings",
+    "checked_recordings",
+    "position_findings",
+    "report_findings",
+]
 
 DEGREE = np.pi / 180
 STILL = 1e-3  # rad or m: a joint that stays within it stands
@@ -35,10 +44,26 @@ HARD = 20.0  # times a limit: no robot does that
 WHEEL = 20.0  # rad/s of a joint without limits: faster than wheels turn; 0.35 rad/s in degrees read as rad
 
 
+class Checked(NamedTuple):
+    """What the check says of recordings that were not refused."""
+
+    warnings: tuple[str, ...]
+    contradictions: tuple[str, ...]  # those by which recordings and model contradict each other: nothing is named
+
+
 def check_recordings(task: Task | None, model: RobotModel, recordings: Sequence[Recording]) -> tuple[str, ...]:
     """Warnings about recordings of torque, of a task or from arrays, also sent to the log `figaroh_jax`.
 
     Raises `InputError` with every finding that cannot be right.
+    """
+    return checked_recordings(task, model, recordings).warnings
+
+
+def checked_recordings(task: Task | None, model: RobotModel, recordings: Sequence[Recording]) -> Checked:
+    """The same, with those of the warnings that contradict the model gravely.
+
+    These are a torque of another size, sign, column or clock, or gravity along another axis, in any recording; and a
+    joint's torque that does not follow the model in most of the recordings that are fitted.
     """
     entries: dict[Path | Memory, RecordingEntry] = {entry.place: entry for entry in task.data} if task else {}
     found = [
@@ -50,21 +75,31 @@ def check_recordings(task: Task | None, model: RobotModel, recordings: Sequence[
     if fitted and all(_stands(recording) for recording in fitted):
         names = ", ".join(recording.file.name for recording in fitted)
         found.append((names, Finding(True, "no joint moves: a fit needs motion of every joint that it is to identify")))
-    return report_findings(found)
+    warnings = report_findings(found)
+    names = [recording.file.name for recording in fitted if recording.torque is not None]
+    unlike = Counter(joint for name, finding in found if name in names for joint in finding.unlike)
+    most = {joint for joint, count in unlike.items() if count > len(names) / 2}
+    grave = [(name, finding) for name, finding in found if finding.grave or most.intersection(finding.unlike)]
+    return Checked(warnings, _texts(grave))
+
+
+def _texts(found: Sequence[tuple[str, Finding]]) -> tuple[str, ...]:
+    """Findings, each once with the files that it is about."""
+    files: dict[Finding, list[str]] = {}
+    for name, finding in found:
+        files.setdefault(finding, []).append(name)
+    return tuple(f"{', '.join(names)}: {finding.text}" for finding, names in files.items())
 
 
 def report_findings(found: Sequence[tuple[str, Finding]]) -> tuple[str, ...]:
     """Warnings, one a text with the files that it is about; raises `InputError` with what cannot be right."""
-    files: dict[Finding, list[str]] = {}
-    for name, finding in found:
-        files.setdefault(finding, []).append(name)
-    texts = [(finding.wrong, f"{', '.join(names)}: {finding.text}") for finding, names in files.items()]
-    wrong = [text for bad, text in texts if bad]
+    wrong = _texts([one for one in found if one[1].wrong])
     if wrong:
         raise InputError(wrong[0] if len(wrong) == 1 else "\n  " + ";\n  ".join(wrong))
-    for _, text in texts:
+    texts = _texts(found)
+    for text in texts:
         logging.getLogger("figaroh_jax").warning("check: %s", text)
-    return tuple(f"check: {text}" for _, text in texts)
+    return tuple(f"check: {text}" for text in texts)
 
 
 def check_recording(recording: Recording, model: RobotModel, entry: RecordingEntry | None = None) -> list[Finding]:
@@ -154,6 +189,7 @@ def _unit_without_joint(look: Look) -> Iterator[Finding]:
             False,
             f"units: {{position: deg}}, but no joint moves by more than {look.span[~straight].max() / DEGREE:.3g}"
             " degrees: it looks like rad; remove units: {position: deg}",
+            grave=True,
         )
 
 
@@ -352,14 +388,16 @@ def _velocity_said(look: Look, slope: np.ndarray, like: np.ndarray, at: np.ndarr
         return
     time = look.recording.time
     rate = (len(time) - 1) / (time[-1] - time[0])
+    clock = False
     if abs(factor * DEGREE - 1) < 0.2:
         text = "it looks like degrees: add units: {velocity: deg/s}, or units: {position: deg} if both are"
     elif abs(factor / DEGREE - 1) < 0.2:
         text = "the position looks like degrees: add units: {position: deg, velocity: rad/s}"
     else:
         text = f"the clock looks wrong: a rate of {rate * factor:.4g} Hz instead of {rate:.4g} Hz would fit"
+        clock = True
     hard = factor > 300 or factor < 1 / 300
-    yield Finding(bool(hard), f"velocity is {factor:.4g} times the position's rate; {text}")
+    yield Finding(bool(hard), f"velocity is {factor:.4g} times the position's rate; {text}", grave=clock)
 
 
 def _speeds(look: Look) -> Iterator[Finding]:

@@ -24,10 +24,17 @@ SOFT = 3.0  # times a limit, or what the model needs: worth a word
 
 
 class Finding(NamedTuple):
-    """Something about a recording; `wrong` is refused, else it is a warning."""
+    """Something about a recording; `wrong` is refused, else it is a warning.
+
+    A `grave` one contradicts the robot's model, so that no fit of this recording says what the model lacks. Where a
+    torque merely does not follow the model, one recording says little of it: the joints of which that is so are
+    `unlike`, and most recordings must say it of one of them.
+    """
 
     wrong: bool
     text: str
+    grave: bool = False
+    unlike: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,6 +30,8 @@ __all__ = [
 
 ROWS = 400  # evenly spread over the recording: more do not change a correlation
 CUTOFF = 5.0  # Hz, the band in which gravity and inertia stand above noise
+LINKS_OFF = 0.3  # of the inertial torque of a joint: what nominal links may be off
+FEWEST_JOINTS = 1.5  # that must tell of the clock, each counted by its weight
 FEWEST = 16  # samples that a filter and five columns need
 
 
@@ -253,26 +255,33 @@ def share_of_gravity(
 def stretch_of_time(model: RobotModel, motion: Sampled) -> tuple[float, float]:
     """By what the clock is too fast, and the standard error of its logarithm; infinite where the torque does not tell.
 
-    Gravity needs no clock and the inertial torque goes with its square: their ratio in the measured torque, where the
-    joint's own rotor is left aside, is one if the clock is right.
+    Gravity needs no clock and the inertial torque goes with its square: its share of the measured torque, where the
+    joint's own rotor is left aside, is one if the clock is right. Each joint counts by how well it is known and by how
+    far its nominal links may be off; a single one tells nothing, and where they differ by more, all of it is less sure.
     """
     if motion.torque is None:
         return 1.0, np.inf
     nominal, still = rigid_torque(model, motion), rigid_torque(model, motion.scaled(time=1e6))
-    weights, values = [], []
+    found = []
     for j in range(model.nv):
         gravity, moving = still[:, j] - still[:, j].mean(), nominal[:, j] - still[:, j]
         others = _drive(motion, j)
         if np.std(gravity) > 0.05 * np.std(moving):
             others.append(gravity)
         slope, error, explained = _last_slope(np.column_stack([*others, moving]), motion.torque[:, j])
-        if explained > 0.8 and 0 < error < 0.2 * slope:
-            values.append(np.log(slope))
-            weights.append((slope / error) ** 2)
-    if not weights:
+        if explained > 0.8 and 0 < error < np.inf:
+            found.append((slope, error))
+    if len(found) < 2:
         return 1.0, np.inf
-    spread = np.sqrt(1 / np.sum(weights)) + (np.std(values) / np.sqrt(len(values)) if len(values) > 1 else 0.35)
-    return float(np.exp(np.median(values) / 2)), float(spread / 2)
+    slope, error = np.array(found).T
+    middle, weight = 0.0, 1 / error**2
+    for _ in range(3):  # what the links are off grows with the share itself
+        middle = float(weight @ slope / weight.sum())
+        weight = 1 / (error**2 + (LINKS_OFF * middle) ** 2)
+    if middle <= 0 or weight.sum() ** 2 < FEWEST_JOINTS * (weight @ weight):
+        return 1.0, np.inf
+    scatter = max(1.0, float(weight @ (slope - middle) ** 2) / (len(slope) - 1))
+    return float(np.sqrt(middle)), float(np.sqrt(scatter / weight.sum()) / middle / 2)
 
 
 def _drive(motion: Sampled, joint: int) -> list[Float[np.ndarray, " rows"]]:

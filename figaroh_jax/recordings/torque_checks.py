@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -18,6 +19,7 @@ __all__ = ["TURNED_POSITION", "torque_findings"]
 DEGREE = np.pi / 180
 LIGHT = 4.0  # times too small: a nominal model may well be three times too heavy
 TURNED_POSITION = "(-1 in transmission.position)"  # ends a finding, by which a draft knows it
+STANDARD = 9.81  # m/s2
 HEAVY = 0.2  # share of a torque's spread that the rigid body should make up before its absence means anything
 
 
@@ -27,6 +29,7 @@ class _Fit(NamedTuple):
     own: list[Likeness]
     nominal: Float[np.ndarray, "rows nv"]
     heavy: np.ndarray  # joints whose torque should show the rigid body
+    spread: Float[np.ndarray, " nv"]  # standard deviation of the measured torque
 
 
 def torque_findings(look: Look, motion: Sampled) -> Iterator[Finding]:
@@ -34,7 +37,7 @@ def torque_findings(look: Look, motion: Sampled) -> Iterator[Finding]:
     assert motion.torque is not None
     fit = _fit(look.model, motion)
     like = np.array([one.correlation for one in fit.own])
-    if (fit.heavy & (like < 0.9)).any():
+    if (fit.heavy & (like < 0.9)).any() or not np.any(np.asarray(look.model.gravity)):
         found = _other_reading(look, motion)
         if found is not None:
             yield found
@@ -46,6 +49,7 @@ def torque_findings(look: Look, motion: Sampled) -> Iterator[Finding]:
             f"torque of {named(look, lacks)} does not follow what the model needs for this motion (correlation"
             f" {', '.join(f'{r:.2f}' for r in like[lacks])}): is it measured torque or current with its sign, with"
             " gravity in it, of this robot, at these columns and stamps?",
+            unlike=tuple(name for name, at in zip(look.joints, lacks, strict=True) if at),
         )
         return
     weightless = _weightless(look.model, motion) & (like < 0.9)  # alike but small is a unit
@@ -54,6 +58,7 @@ def torque_findings(look: Look, motion: Sampled) -> Iterator[Finding]:
             False,
             f"torque of {named(look, weightless)} holds none of the gravity that the model needs there: is it what a"
             " controller adds to its gravity compensation? Record the torque or current of the drives",
+            grave=True,
         )
         return
     scale = [*_scale(look, fit, like)]
@@ -66,6 +71,7 @@ def torque_findings(look: Look, motion: Sampled) -> Iterator[Finding]:
             False,
             f"the clock looks wrong: the inertial torque fits a clock {stretch:.2g} times as fast,"
             f" {motion.rate * stretch:.4g} Hz instead of {motion.rate:.4g} Hz (+-{100 * error:.0f} %)",
+            grave=True,
         )
 
 
@@ -75,7 +81,7 @@ def _fit(model: RobotModel, motion: Sampled, nominal: Float[np.ndarray, "rows nv
     nominal, torque = rigid_torque(model, motion) if nominal is None else nominal, motion.torque
     columns = zip(nominal.T, torque.T, motion.velocity.T, motion.acceleration.T, strict=True)
     own = [likeness(*each) for each in columns]
-    return _Fit(own, nominal, _heavy(own, torque))
+    return _Fit(own, nominal, _heavy(own, torque), np.std(torque, axis=0))
 
 
 def _heavy(own: Sequence[Likeness], torque: np.ndarray) -> np.ndarray:
@@ -97,8 +103,9 @@ def _scale(look: Look, fit: _Fit, like: np.ndarray) -> Iterator[Finding]:
     """Torque in another unit: the model's gravity says how large it should be."""
     slopes = np.array([one.slope for one in fit.own])
     sure = (like > LIKE) & fit.heavy
-    if not sure.any():  # a torque that is read far too large leaves no joint heavy
-        sure = (like > LIKE) & (slopes > 20)
+    if not sure.any():  # a torque that is read too large leaves no joint heavy
+        share = slopes * np.array([one.expected for one in fit.own]) / np.maximum(fit.spread, 1e-300)
+        sure = (like > LIKE) & (slopes > SOFT) & (share > HEAVY)
     if not sure.any():
         return
     slopes = slopes[sure]
@@ -108,7 +115,7 @@ def _scale(look: Look, fit: _Fit, like: np.ndarray) -> Iterator[Finding]:
     names = ", ".join(f"{look.joints[j]} {slope:.3g}" for j, slope in zip(np.flatnonzero(sure), slopes, strict=True))
     guess = next((f"it looks like {u}" for u, s in _TORQUE_UNITS if 0.5 < middle / s < 2), None)
     guess = guess or "a current or a share of the rated torque needs its constant (transmission.torque)"
-    yield Finding(False, f"torque is {middle:.3g} times what the model needs ({names}): {guess}")
+    yield Finding(False, f"torque is {middle:.3g} times what the model needs ({names}): {guess}", grave=True)
 
 
 _TORQUE_UNITS = (("mN m", 1e3), ("N cm", 1e2), ("kN m", 1e-3))
@@ -125,7 +132,10 @@ def _other_reading(look: Look, motion: Sampled) -> Finding | None:
     position, velocity, acceleration = (np.concatenate(each) for each in signals)
     together = Sampled(position, velocity, acceleration, None, motion.rate)  # one call for all
     nominal = np.split(rigid_torque(look.model, together), len(readings))
-    for (said, other), own in zip(readings, nominal, strict=True):
+    turned = [(said, motion, rigid_torque(model, motion)) for said, model in _gravities(look.model)]
+    read = [(said, other, own) for (said, other), own in zip(readings, nominal, strict=True)]
+    first = 2 if look.model.nv > 1 else 1  # a unit, or the sign of all torques, is simpler
+    for said, other, own in [*read[:first], *turned, *read[first:]]:
         fit = _fit(look.model, other, own)
         heavy = given.heavy | fit.heavy
         gain = _misfit(given.own, heavy) - _misfit(fit.own, heavy)
@@ -133,7 +143,7 @@ def _other_reading(look: Look, motion: Sampled) -> Finding | None:
             best, text = gain, said
     if best < np.log(5.0):
         return None
-    return Finding(False, f"torque does not match the motion as read; {text}")
+    return Finding(False, f"torque does not match the motion as read; {text}", grave=True)
 
 
 def _belongs(fit: _Fit, heavy: np.ndarray) -> bool:
@@ -180,6 +190,20 @@ def _readings(look: Look, motion: Sampled, nominal: np.ndarray) -> Iterator[tupl
             offset[j] = quarter * np.pi / 2
             text = f"it would with {offset[j]:+.4f} rad added to the position of {joints[j]} (transmission.offset)"
             yield text, motion.moved(offset)
+
+
+def _gravities(model: RobotModel) -> Iterator[tuple[str, RobotModel]]:
+    """The robot with gravity along each other axis of its base."""
+    given = np.asarray(model.gravity, float)
+    size = float(np.linalg.norm(given)) or STANDARD
+    for axis in (2, 0, 1):
+        for sign in (-1.0, 1.0):
+            other = sign * size * np.eye(3)[axis]
+            if other @ given > 0.9 * size**2:  # it is the one given
+                continue
+            there, here = (", ".join(f"{x:g}" for x in vector + 0.0) for vector in (other, given))
+            text = f"it would with robot.gravity: [{there}] in place of [{here}]"
+            yield text, eqx.tree_at(lambda m: m.gravity, model, other)
 
 
 def _turned(joints: Sequence[str], motion: Sampled, torque: np.ndarray) -> Iterator[tuple[str, Sampled]]:
