@@ -144,6 +144,51 @@ def test_random_play_of_a_joint_is_unknown_with_a_word_on_where(folder: Path):
     )
 
 
+def test_a_posture_too_far_off_for_the_play_of_a_joint_is_an_outlier(folder: Path):
+    """The play of a joint drawn now, and a posture drawn now that is moved by ten times what it does."""
+    seed = int(np.random.SeedSequence().generate_state(1)[0])
+    rng = np.random.default_rng(seed)
+    arm = study().arm("arm6", folder)
+    case = postures.hide(arm, "random_play", 3.0, rng)
+    row, way = int(rng.integers(len(case.recordings[0].q))), rng.normal(size=3)
+    case.recordings[0].seen[row] += 60.0 * postures.NOISE * np.sqrt(3.0) * way / np.linalg.norm(way)
+    found = study().diagnose(arm, case)
+    assert [cause.name.effect for cause in found.causes] == ["outlier"], (seed, found.causes)
+    assert f"row {row} of" in found.causes[0].note, seed
+    assert found.verdict == "named+rest", seed
+
+
+@pytest.mark.parametrize("robot", ["arm6", "panda"])
+def test_an_offset_of_a_robot_whose_links_are_all_off_is_not_called_a_link(robot: str, folder: Path, data_dir: Path):
+    """The offset and the links are drawn now: four tolerances of all links are no reason to name one of them."""
+    seed = int(np.random.SeedSequence().generate_state(1)[0])
+    arm = study().arm(robot, folder)
+    case = postures.hide(arm, "joint_offset", 20.0, np.random.default_rng(seed), count=40, off=4.0)
+    found = study().diagnose(arm, case)
+    assert found.verdict in ("named+rest", "unknown"), (seed, found.verdict)
+    for cause in found.causes:
+        assert {cause.name, *cause.ambiguous_with} & case.right, (seed, case.right, found.causes)
+    assert any("geometry is off beyond its tolerance" in note for note in found.calibration.notes), seed
+    assert found.causes or found.rest.nearest, seed
+
+
+def test_what_nothing_determines_is_said_and_has_no_value(folder: Path):
+    """A turn of the second link about the first axis moves with the base, which is unknown."""
+    arm = study().arm("arm6", folder)
+    rng = np.random.default_rng(48)
+    real = poses.truth(rng, twists={"j2": np.array([0.0, 0.0, 0.0, 0.02, 0.0, 0.0])})
+    q = poses.postures(rng, 60)
+    seen = poses.points(poses.tool_poses(arm.path, q, real), real, rng, noise=5e-5)
+    right = frozenset({("link_geometry", ("j2",)), ("joint_offset", ("j2",))})
+    recordings = (postures.Recording(np.arange(60.0), q, seen, False),)
+    case = postures.Hidden("link_geometry", right, ("base_frame", "tool_frame"), recordings)
+    found = study().diagnose(arm, case)
+    for cause in found.causes:
+        for name, value in cause.parameters.items():
+            assert value.std < (0.005 if value.unit == "m" else 0.01), (cause, name)
+    assert any("not determined" in cause.note for cause in found.causes), found.causes
+
+
 def test_a_robot_built_within_its_tolerance_gets_nothing(folder: Path):
     _, found, _ = answered(folder, "arm6", None, 0.0, 33)
     assert (found.verdict, found.causes) == ("nothing", ())
@@ -171,7 +216,8 @@ def test_offsets_are_named_by_the_command_with_the_answer_of_the_contract(folder
     for cause, value in zip(answer["causes"], (-0.03, 0.02), strict=True):
         found = cause["parameters"]["offset"]
         assert abs(found["value"] - value) < 4.0 * found["std"] + 1e-4
-    assert set(answer) == {"verdict", "causes", "p_value", "residual", "next_experiment"}
+    assert set(answer) == {"verdict", "causes", "p_value", "residual", "rest", "next_experiment", "notes"}
+    assert set(answer["rest"]) == {"relative", "parts", "nearest"} and len(answer["rest"]["relative"]) == 1
     assert (out / "model" / "robot.urdf").is_file() and (out / "report.html").is_file()
 
 

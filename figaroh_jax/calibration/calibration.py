@@ -101,6 +101,7 @@ class Run:
     """One calibration, step by step; `finish` does them all, and what it found on the way stays readable."""
 
     outliers: tuple[Outlier, ...]
+    aside: tuple[int, ...]  # the outliers' postures
     used: Bool[np.ndarray, " rows"]
     blocks: tuple[Block, ...]
     effects: levels.Effects | None
@@ -152,6 +153,7 @@ class Run:
             Outlier(str(self.recordings[measured.recording[k]].file.name), int(measured.row[k]), size)
             for k, size in sizes.items()
         )
+        self.aside = tuple(sizes)
         self.used = everything & ~np.isin(measured.posture, list(sizes))
         if sizes:
             choice = levels.choose(measured, self.used, self.effects, self.level)

@@ -3,13 +3,14 @@ r"""Diagnosis at kinematic level: what is wrong with the robot, the device or th
 Two routes to a name. Geometry (offsets, links) by its score against a stated tolerance, and by what postures that were
 left out lose without it; effects by what they gain on postures left out of everything that chose them
 (`levels.nested`). Both must beat the largest score that noise alone gives over the whole catalogue. Where the robot
-that was found predicts held-out postures no better than the frames alone, nothing is named.
+that was found predicts held-out postures no better than the frames alone, nothing is named. Geometry that other
+corrections, or links that are all a little off, explain as well is told as such (`kinematic_evidence`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -19,13 +20,15 @@ from ..effects.kinematic import CATALOGUE, HISTORY
 from ..estimation import marginal
 from ..recordings.poses import PoseRecording, read_pose_recordings
 from ..recordings.posture_checks import check_pose_recordings
-from ..results import Cause, Estimate, Experiment, Gain, Name, Selection, Verdict
+from ..results import Cause, Estimate, Experiment, Gain, Name, Nearest, Rest, Selection, Verdict
 from ..rigid.model import RobotModel
 from . import levels, thresholds
 from .calibrated import Calibration
 from .calibration import Run
 from .candidates import GEOMETRY, moved_rows, moves, twist_rows
+from .kinematic_evidence import Evidence, weigh
 from .kinematic_scores import Scores, row_noise, score_blocks, score_jitter, score_waves
+from .outliers import playing_joints, still_outliers
 
 if TYPE_CHECKING:
     from ..formats.config import Task
@@ -45,6 +48,7 @@ class PoseDiagnosis(Selection):
     noise: tuple[float | None, float | None]
     experiment: Experiment | None
     calibration: Calibration
+    rest: Rest = field(default_factory=lambda: Rest(np.zeros(0)))  # of position, orientation; over that of the frames
 
 
 def diagnose_pose_task(task: Task, progress: Callable[[str, float], None] = lambda phase, share: None) -> PoseDiagnosis:
@@ -71,35 +75,61 @@ def diagnose_poses(
         run = Run(model, recordings, forbid, progress)
         calibration = run.finish()
         progress("testing", 0.92)
-        geometry, p_geometry = _geometry(run, calibration, alpha)
+        own = _geometry(run, calibration, alpha)
         p_effects, p_rest = _effect_scores(run)
         effects = [c for c in calibration.causes if c.name.effect not in (*GEOMETRY, "outlier")]
-        p_play, joint = _play(run)
-        plays = p_play < thresholds.OF_ALPHA * alpha
+        play = _play(run, alpha)
+        aside: list[tuple[Cause, str]] = []
         if p_effects > alpha:
+            aside += [(c, "noise alone brings such a gain") for c in effects]
             effects = []
-        elif plays:  # a law that leaves its own joint erring at random is not the right one
-            effects = [cause for cause in effects if cause.name.at != (joint,)]
+        elif play.found:  # a law that leaves its own joint erring at random is not the right one
+            why = "its joint varies between postures beside it"
+            aside += [(c, why) for c in effects if c.name.at in play.places]
+            effects = [c for c in effects if c.name.at not in play.places]
+        aside += [(c, "its size may be zero") for c in effects if not _has_size(c)]
         effects = [cause for cause in effects if _has_size(cause)]
-        geometry = [c for c in geometry if c.name.effect not in forbid]
+        geometry = [replace(c, ambiguous_with=_allowed(c, forbid)) for c in own.causes if c.name.effect not in forbid]
         found = bool(geometry or effects)
+        notes = [*calibration.notes, *own.notes]
         if found and not _better(calibration):
-            geometry, effects = [], []
             note = "held-out postures are predicted no better than by the frames alone: nothing that was found is named"
-            calibration = replace(calibration, notes=(*calibration.notes, note))
+            notes.append(note)
+            aside += [(c, "held-out postures are predicted no better than by the frames alone") for c in effects]
+            geometry, effects = [], []
         outliers = [c for c in calibration.causes if c.name.effect == "outlier"]
-        if plays:  # the postures that a joint's play moves farthest are no errors of their own
-            outliers = []
+        if play.found:  # the postures that a joint's play moves farthest are no errors of their own
+            notes.append(play.note)
+            still = [k in play.outliers for k in run.aside]
+            within = [c for c, s in zip(outliers, still, strict=True) if not s]
+            notes += [f"{c.note}, no farther than a joint that varies so may move it" for c in within]
+            outliers = [c for c, s in zip(outliers, still, strict=True) if s]
         causes = tuple([*outliers, *geometry, *_with_rivals(effects, run)])
-        p_value = min(1.0, 2.0 * min(p_geometry, p_effects))
-        if plays:
-            what = "backlash, or poor repeatability"
-            note = f"the true position of {joint} varies about its reading between postures: {what}"
-            aside = [f"{c.note}, not named beside {what}" for c in calibration.causes if c.name.effect == "outlier"]
-            calibration = replace(calibration, notes=(*calibration.notes, note, *aside))
-        rest = run.history or plays or p_rest < thresholds.OF_ALPHA * alpha or _beyond_accuracy(recordings, calibration)
-        rest = rest or (found and not (geometry or effects))
-        return _answer(calibration, causes, p_value, rest)
+        p_value = min(1.0, 2.0 * min(own.p_value, p_effects))
+        rest = own.rest or run.history or play.found or p_rest < thresholds.OF_ALPHA * alpha
+        rest = rest or _beyond_accuracy(recordings, calibration)
+        rest = rest or (found and not (geometry or effects)) or len(own.causes) > len(geometry)
+        nearest = [*own.nearest, *(Nearest(c.name, _share(c.gain), why) for c, why in aside)]
+        left = _left(calibration, run)
+        return _answer(replace(calibration, notes=tuple(notes)), causes, p_value, rest, nearest, left)
+
+
+def _allowed(cause: Cause, forbid: Sequence[str]) -> tuple[Name, ...]:
+    return tuple(name for name in cause.ambiguous_with if name.effect not in forbid)
+
+
+def _share(gain: Gain) -> float:
+    return max(1.0 - gain.after / gain.before, 0.0) if gain.before > 0.0 else 0.0
+
+
+class _Named(NamedTuple):
+    """Causes of the geometry, the p-value of the first, and what is beyond tolerance but has no place."""
+
+    causes: list[Cause]
+    p_value: float
+    rest: bool
+    notes: list[str]
+    nearest: list[Nearest]
 
 
 class _Geometry(NamedTuple):
@@ -144,37 +174,92 @@ def _geometry_of(run: Run) -> _Geometry:
     return _Geometry(linear, list(places), list(places.values()), columns, width)
 
 
-def _geometry(run: Run, calibration: Calibration, alpha: float) -> tuple[list[Cause], float]:
-    """Offsets and links beyond their stated tolerance, the most evident first, and the p-value of the first one."""
+def _geometry(run: Run, calibration: Calibration, alpha: float) -> _Named:
+    """Offsets and links beyond their stated tolerance that postures tell from all others, the most evident first."""
     linear, names, places, columns, width = _geometry_of(run)
     noise = row_noise(linear, run.fit[2])
+    stated = width.copy()
     named: list[int] = []
     first = 1.0
-    free = np.ones(len(width), bool)
-    at, covariance = linear.at, np.zeros((len(width),) * 2)
+    size = np.zeros(len(places), int)
     while len(named) < thresholds.MOST_GEOMETRY:
-        at, covariance = _posterior_mode(linear, noise, run.used, width)
-        here = linear._replace(residual=linear.residual + linear.jacobian @ (at - linear.at), at=at)
-        blocks = [linear.jacobian[:, p] if k not in named else np.zeros((len(noise), 0)) for k, p in enumerate(places)]
-        scores = score_blocks(here, noise, run.used, width**-2.0, blocks, free, seed=len(named))
-        first = scores.p_value if not named else first
+        scores = _beyond(linear, noise, run.used, width, places, named)
+        if not named:
+            first, size = scores.p_value, scores.size
         if scores.p_value > thresholds.OF_ALPHA * alpha:
             break
         named.append(_simplest(scores))
         width[places[named[-1]]] = _WIDE
+    if not named:
+        return _Named([], first, False, [], [])
+    kept = _needed(linear, noise, run.used, places, named)
+    told, same, dropped = weigh(Evidence(linear, noise, run.used, stated, places, kept), kept, size.tolist())
+    at, covariance = _posterior_mode(linear, noise, run.used, told.width)
     gain, twins = _gain(calibration), _twins(run)
-    named = _needed(linear, noise, run.used, places, named)
     causes = []
-    for k in named:
-        values = {
-            columns[i][0]: Estimate(
-                float(at[i] * columns[i][2]), float(np.sqrt(covariance[i, i]) * columns[i][2]), columns[i][1]
-            )
-            for i in places[k]
-        }
-        same = tuple(name for twin in twins if names[k] in twin for name in twin if name != names[k])
-        causes.append(Cause(names[k], values, 1.0 - first, gain, ambiguous_with=same))
-    return causes, first
+    for k in told.chosen:
+        values, unknown = {}, []
+        for i in places[k]:
+            std = float(np.sqrt(covariance[i, i]))
+            if std > thresholds.KNOWN * told.width[i]:
+                unknown.append(columns[i][0])
+            else:
+                values[columns[i][0]] = Estimate(float(at[i]) * columns[i][2], std * columns[i][2], columns[i][1])
+        others = [names[j] for j in same[k]]
+        others += [name for twin in twins if names[k] in twin for name in twin if name != names[k]]
+        note = f"{', '.join(unknown)}: not determined by these postures" if unknown else ""
+        causes.append(
+            Cause(names[k], values, 1.0 - first, gain, ambiguous_with=tuple(dict.fromkeys(others)), note=note)
+        )
+    beside = stated.copy()
+    for k in told.chosen:
+        beside[places[k]] = _WIDE
+    scores = _beyond(linear, noise, run.used, beside, places, told.chosen)
+    rest = scores.p_value <= thresholds.OF_ALPHA * alpha
+    near = _not_told(linear, noise, run.used, told.width, places, names, dropped) if rest else []
+    return _Named(causes, first, rest, [_grown(told.growth)] if rest else [], near)
+
+
+def _beyond(
+    linear: marginal.Linear,
+    noise: np.ndarray,
+    used: np.ndarray,
+    width: np.ndarray,
+    places: Sequence[np.ndarray],
+    named: Sequence[int],
+) -> Scores:
+    """Scores of all corrections that are not `named` beside a robot within the widths."""
+    at, _ = _posterior_mode(linear, noise, used, width)
+    here = linear._replace(residual=linear.residual + linear.jacobian @ (at - linear.at), at=at)
+    blocks = [linear.jacobian[:, p] if k not in named else np.zeros((len(noise), 0)) for k, p in enumerate(places)]
+    return score_blocks(here, noise, used, width**-2.0, blocks, np.ones(len(width), bool), seed=len(named))
+
+
+def _grown(growth: tuple[float, float]) -> str:
+    """A note on geometry that is off in a way that no single correction tells."""
+    stated = thresholds.TOLERANCE[1:3]
+    sizes = [size * scale for size, scale in zip(stated, growth, strict=True)]
+    what = "the geometry is off beyond its tolerance in a way that these postures do not place"
+    if max(growth) < 1.4:
+        return what
+    return (
+        f"{what}: all links off by some {sizes[0]:.1f} mm and {sizes[1]:.1f} mrad explain it"
+        f" (tolerance {stated[0]:g} mm and {stated[1]:g} mrad)"
+    )
+
+
+def _not_told(
+    linear: marginal.Linear, noise, used, width, places, names: Sequence[Name], dropped: Sequence[int]
+) -> list[Nearest]:
+    """Corrections found and not named, and the share of the error on postures left out that each takes."""
+    now, found = np.sqrt(_left_out_squares(linear, noise, used, width).mean()), []
+    for k in dropped:
+        wide = width.copy()
+        wide[places[k]] = _WIDE
+        share = 1.0 - np.sqrt(_left_out_squares(linear, noise, used, wide).mean()) / now
+        why = "links that are all a little off explain the postures as well"
+        found.append(Nearest(names[k], max(float(share), 0.0), why))
+    return found
 
 
 def _needed(
@@ -269,14 +354,41 @@ def _effect_scores(run: Run) -> tuple[float, float]:
     return found[0], found[1]
 
 
-def _play(run: Run) -> tuple[float, str]:
-    """p-value of the joint that looks most as if it moved at random from posture to posture, and its name."""
+class _Play(NamedTuple):
+    """Whether postures err beyond noise in all their rows together, which joints may do it, and the outliers beside."""
+
+    found: bool
+    places: tuple[tuple[str], ...]  # one of these joints; none: the device may err so as well
+    outliers: tuple[int, ...]  # postures left out that are too far off for it
+    note: str
+
+
+def _play(run: Run, alpha: float) -> _Play:
+    """Errors at random from posture to posture as if a joint moved."""
     final, linear, posterior, _ = run.fit
     joints = [(c.at[0], k) for k, c in enumerate(final.columns) if c.effect == "joint_offset"]
     free = levels.free_at(run.choice.level, linear.prior)
-    ways = linear.jacobian[:, [k for _, k in joints]]
-    p_value, worst = score_jitter(linear, row_noise(linear, posterior), run.used, posterior.precision, ways, free)
-    return p_value, joints[worst][0]
+    ways, noise = linear.jacobian[:, [k for _, k in joints]], row_noise(linear, posterior)
+    p_value, worst = score_jitter(linear, noise, run.used, posterior.precision, ways, free)
+    if p_value >= thresholds.OF_ALPHA * alpha:
+        return _Play(False, (), run.aside, "")
+    first = len(final.columns)
+    base = [first + k for k, (name, _) in enumerate(final.own) if name.split()[0] == "base_frame"]
+    level = posterior.noise[linear.channel]  # a posture that varies much counts in full
+    which = playing_joints(linear, level, run.used, ways, linear.jacobian[:, base])
+    outliers = still_outliers(linear, posterior, run.used, ways[:, which[0] if which else worst], run.aside)
+    names = [joints[k][0] for k in which]
+    one = f"{', '.join(names[:-1])} or {names[-1]}" if len(names) > 1 else "".join(names)
+    note = (
+        f"the true position of {one} varies about its reading between postures: backlash, or poor repeatability;"
+        " or the device errs as if it did"
+    )
+    if not names:
+        note = (
+            "the rows of a posture err together, at random between postures: the device does, or a joint with backlash"
+            f" or poor repeatability ({joints[worst][0]} would explain most)"
+        )
+    return _Play(True, tuple((name,) for name in names), tuple(outliers), note)
 
 
 def _has_size(cause: Cause) -> bool:
@@ -320,7 +432,9 @@ def _gain(calibration: Calibration) -> Gain:
     return Gain(error.validated_before, error.validated_after, error.unit)
 
 
-def _answer(calibration: Calibration, causes: tuple[Cause, ...], p_value: float, rest: bool) -> PoseDiagnosis:
+def _answer(
+    calibration: Calibration, causes: tuple[Cause, ...], p_value: float, rest: bool, nearest: Sequence[Nearest], left
+) -> PoseDiagnosis:
     verdict: Verdict = ("named+rest" if rest else "named") if causes else ("unknown" if rest else "nothing")
     errors = (calibration.position, calibration.orientation)
     scale = (1e3, 180.0 / np.pi)
@@ -345,4 +459,18 @@ def _answer(calibration: Calibration, causes: tuple[Cause, ...], p_value: float,
         ),
         experiment=experiment,
         calibration=replace(calibration, verdict=verdict, causes=causes),
+        rest=Rest(left, nearest=tuple(nearest)),
     )
+
+
+def _left(calibration: Calibration, run: Run) -> np.ndarray:
+    """What the causes leave beyond the noise, of position and orientation as far as measured, over the error before."""
+    found, measured = [], run.measured
+    sizes = zip((calibration.position, calibration.orientation), calibration.noise, (1e3, 180.0 / np.pi), strict=True)
+    for c, (error, noise, scale) in enumerate(sizes):
+        if error is not None:
+            rows = measured.measured & (measured.channel == c)
+            numbers = rows.sum() / len(np.unique(measured.item[rows]))  # of one point or one orientation
+            beyond = error.after**2 - numbers * (scale * noise) ** 2
+            found.append(np.sqrt(max(beyond, 0.0)) / max(error.before, 1e-300))
+    return np.array(found)

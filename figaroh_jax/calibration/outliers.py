@@ -2,18 +2,24 @@ r"""Postures that no model explains: found one after the other by what the other
 
 The error of posture i is predicted by a robust fit without it, $e_i$ of `marginal.left_out`, whose covariance is
 $(I - w_i H_i)^{-1}$. Its size is the root of the mean square of $e_i$ in that covariance, $\sqrt{r_i' e_i / n}$.
+Postures may also err together in all their rows: a joint that plays, or the device (`playing_joints`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from ..estimation import marginal
 from ..estimation.marginal import Linear, Posterior
 from . import thresholds
 
-__all__ = ["find_outliers"]
+__all__ = ["find_outliers", "playing_joints", "still_outliers"]
+
+Array = np.ndarray
+_STEPS = np.concatenate([[0.0], 10.0 ** np.arange(-1.5, 2.51, 0.25)])  # standard deviations that are tried
 
 
 def find_outliers(
@@ -53,3 +59,101 @@ def _sizes(linear: Linear, posterior: Posterior, used: np.ndarray) -> tuple[np.n
     square = residual[rows] * predicted[rows] / posterior.noise[linear.channel[rows]] ** 2
     counts = np.bincount(which)
     return postures, np.sqrt(np.maximum(np.bincount(which, square) / counts, 1e-24)), counts
+
+
+def still_outliers(
+    linear: Linear,
+    posterior: Posterior,
+    used: Bool[Array, " rows"],
+    way: Float[Array, " rows"],
+    suspects: Sequence[int],
+) -> list[int]:
+    """Those of the postures `suspects`, left out of the fit, that a joint which varies along `way` does not explain.
+
+    The variance of the joint is that over the postures `used`; all sizes are taken again with it in the covariance.
+    """
+    whitened = way / posterior.noise[linear.channel]
+    residual = (linear.residual + linear.jacobian @ (posterior.unknowns - linear.at)) / posterior.noise[linear.channel]
+    inside = np.flatnonzero(used & (linear.posture >= 0))
+    postures = linear.posture[inside]
+    square, along = np.bincount(postures, whitened[inside] ** 2), np.bincount(postures, (whitened * residual)[inside])
+    weight = np.where(square > 0.0, square, 0.0)  # a posture counts as far as it shows the joint
+    variance = max(float(np.sum(along**2 - square) / max(np.sum(weight**2), 1e-300)), 0.0)
+    sizes, counts = {}, {}
+    for k in (*np.unique(postures).tolist(), *suspects):
+        rows = np.flatnonzero(linear.posture == k)
+        rows = rows[used[rows]] if k not in suspects else rows[linear.residual[rows] != 0.0]  # 0: not measured
+        G = linear.jacobian[rows] / posterior.noise[linear.channel[rows], None]
+        spread = G @ posterior.covariance @ G.T
+        g, e = whitened[rows], residual[rows]
+        own = np.eye(len(rows))
+        if k not in suspects:  # its own rows took part in the fit
+            w = posterior.weight[k]
+            own, spread = np.linalg.inv(own - w * spread), np.zeros_like(spread)
+            e = own @ e
+        sizes[k] = np.sqrt(e @ np.linalg.solve(own + spread + variance * np.outer(g, g), e) / len(rows))
+        counts[k] = len(rows)
+    others = np.log([max(size, 1e-12) for k, size in sizes.items() if k not in suspects])
+    return [k for k in suspects if sizes[k] >= _limit(others, counts[k])]
+
+
+def playing_joints(
+    linear: Linear,
+    noise: Float[Array, " rows"],
+    used: Bool[Array, " rows"],
+    ways: Float[Array, "rows joints"],
+    device: Float[Array, "rows six"],
+) -> list[int]:
+    """The joints one of which varies from posture to posture beside a device that errs; none where it need not.
+
+    Likelihood of normal errors with three components: all rows, the measured body's place and its rotation (as the
+    columns `device` of the pose of its base move it; none: no such component), and one joint. A joint must be told from
+    none, and those are given that are not told from the best.
+    """
+    rows = np.flatnonzero(used & (linear.posture >= 0))
+    e = linear.residual[rows] / noise[rows]
+    _, member = np.unique(linear.posture[rows], return_inverse=True)
+    parts = [np.flatnonzero(member == k) for k in range(member.max() + 1)]
+    turned = np.zeros((len(rows), 0))
+    if device.shape[1] == 6:
+        D = device[rows] / noise[rows, None]
+        turned = D.copy()
+        for part in parts:  # a rotation about the middle of what is measured
+            turned[part, 3:] -= D[part, :3] @ np.linalg.lstsq(D[part, :3], D[part, 3:], rcond=None)[0]
+    groups = np.array([0, 0, 0, 1, 1, 1, 2])[7 - turned.shape[1] - 1 :]
+    found = []
+    for way in (np.zeros(len(linear.residual)), *ways.T):
+        U = np.column_stack([turned, way[rows] / noise[rows]])
+        size = np.array([np.sqrt(np.mean(U[:, groups == g] ** 2)) for g in range(3)])
+        U = U / np.where(size > 0.0, size, 1.0)[groups]
+        A, b = np.array([U[p].T @ U[p] for p in parts]), np.array([U[p].T @ e[p] for p in parts])
+        found.append(_likelihood(A, b, float(e @ e), len(e), groups))
+    best = max(found[1:])
+    if best - found[0] < thresholds.TOLD:
+        return []
+    return [k for k, value in enumerate(found[1:]) if best - value < thresholds.TOLD]
+
+
+def _likelihood(A: Array, b: Array, square: float, count: int, groups: Array) -> float:
+    """Largest log likelihood over the deviations of the components and of all rows; A, b: inner products by posture."""
+    deviation = np.zeros(3)
+
+    def value() -> float:
+        s = deviation[groups]
+        M = np.eye(len(s)) + s[:, None] * A * s
+        sb = b * s
+        fit = square - float(np.sum(sb * np.linalg.solve(M, sb[..., None])[..., 0]))
+        return -0.5 * (count * np.log(max(fit, 1e-300) / count) + float(np.linalg.slogdet(M)[1].sum()))
+
+    best = value()
+    for _ in range(5):
+        before = best
+        for g in np.unique(groups):
+            tried = []
+            for step in _STEPS:
+                deviation[g] = step
+                tried.append(value())
+            deviation[g], best = _STEPS[int(np.argmax(tried))], max(tried)
+        if best - before < 1e-3:
+            break
+    return best

@@ -24,7 +24,7 @@ from ..formats.urdf import load_urdf
 from ..formats.urdf_text import roll_pitch_yaw
 from ..formats.xmlfile import read_xml
 from ..rigid.kinematics import forward_kinematics
-from .answer import cause
+from .answer import cause, rest as rest_of
 from .calibration_report import write_calibration_report
 
 if TYPE_CHECKING:
@@ -99,7 +99,10 @@ def _json(content: dict[str, Any]) -> str:
 
 
 def pose_answer_json(diagnosis: PoseDiagnosis) -> str:
-    """The text of `answer.json` of a diagnosis of poses; residuals are RMS in mm and deg, as far as measured."""
+    """The text of `answer.json` of a diagnosis of poses; residuals are RMS in mm and deg, as far as measured.
+
+    `rest.relative` is what is left of each beyond the noise, over the RMS of the frames alone.
+    """
 
     experiment = diagnosis.experiment
     answer = {
@@ -109,8 +112,10 @@ def pose_answer_json(diagnosis: PoseDiagnosis) -> str:
         "residual": {
             key: [_number(x) for x in getattr(diagnosis, key) if x is not None] for key in ("before", "after", "noise")
         },
+        "rest": rest_of(diagnosis.rest),
         "next_experiment": experiment
         and {"text": experiment.text, "separates": [list(pair) for pair in experiment.separates]},
+        "notes": list(diagnosis.calibration.notes),
     }
     return json.dumps(answer, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 

@@ -139,11 +139,15 @@ def calibration_summary(
     parts: list[RenderableType] = [head, table]
     for number, cause in enumerate(calibration.causes, 1):
         values = ", ".join(f"{key} {wording.interval(value)}" for key, value in cause.parameters.items())
-        parts.append(Text.assemble(f"\n{number}. ", (wording.phrase(cause.name), "bold"), f"  {cause.note or values}"))
+        told = cause.note if cause.name.effect == "outlier" else "; ".join(filter(None, (values, cause.note)))
+        parts.append(Text.assemble(f"\n{number}. ", (wording.phrase(cause.name), "bold"), f"  {told}"))
         if cause.ambiguous_with:
             parts.append(
                 Text(f"   not distinguishable from {wording.aside(cause.name, cause.ambiguous_with)}", style="yellow")
             )
+    if found is not None and found.rest.nearest:
+        parts.append(Text("\nConsidered, but not named:"))
+        parts += [Padding(Text(wording.nearest(near)), (0, 0, 0, 3), expand=False) for near in found.rest.nearest]
     parts.append(Text(f"\nHeld out: {calibration.scheme}. {wording.distances(calibration)}".rstrip(), style="dim"))
     return Group(*parts, *_notes(calibration.notes, verbose))
 

@@ -95,10 +95,11 @@ def hide(
     rng: np.random.Generator,
     count: int = 80,
     orders: tuple[float, float] = (2.5, 11.0),
+    off: float = BUILT,
 ) -> Hidden:
     """A case with `effect` of `size` sigmas at a place drawn at random; None hides nothing.
 
-    `orders` is the range of a gear error's order.
+    `orders` is the range of a gear error's order; the links are `off` tolerances off everywhere.
     """
     n = len(arm.joints)
     loaded = np.arange(count) >= (count // 2 if effect == "payload_deflection" else count)
@@ -106,7 +107,7 @@ def hide(
     built = np.concatenate(
         [TOLERANCE["m"] * rng.normal(size=(n, 3)), TOLERANCE["rad"] * rng.normal(size=(n, 3))], axis=1
     )
-    built *= BUILT
+    built *= off
     device = pin.SE3(pin.exp3(rng.normal(size=3)), rng.normal(size=3))
     posed = effect in ("base_frame", "tool_frame")
     frames = {"base_frame": pin.SE3.Identity() if effect == "base_frame" else device, "tool_frame": pin.SE3.Identity()}
