@@ -49,11 +49,12 @@ _SURE = 0.05  # p-value below which it stands beside what is not noise alone
 def sentence(diagnosis: Diagnosis, robot: str) -> str:
     """The verdict in one sentence, e.g. "The simulation of tx40 is missing rotor inertia at joint_3: ..."."""
     subject = f"The simulation of {robot}"
-    if wrong := diagnosis.rest.contradicts:
-        more = f" (the notes say {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+    if diagnosis.rest.contradicts:
+        first, *others = diagnosis.rest.contradicts
+        more = f" (the notes say {len(others)} more)" if others else ""
         return (
             f"First settle what looks wrong: recordings and model of {robot} contradict each other, so that no effect"
-            f" can be named. {wrong[0]}{more}"
+            f" can be named. {first}{more}"
         )
     if diagnosis.verdict == "nothing":
         told = f"(error on held-out data {error(diagnosis.holdout.before, diagnosis.holdout.unit)})."
