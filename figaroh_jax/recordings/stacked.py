@@ -104,12 +104,13 @@ def filter_rows(
     series = torque.shape[:-2]
     factor = np.asarray(records.low_pass) if response is None else np.asarray(records.low_pass) * response
     count = int(np.prod(series))
-    flat, out = torque.reshape(count, *torque.shape[-2:]), np.zeros((count, *records.kept.shape))
+    flat, out = torque.reshape(count, *torque.shape[-2:]), np.empty((count, *records.kept.shape))
     phases = _phases(records)
     of = np.arange(factor[..., 0].size).reshape(factor.shape[:-1]) if of is None else of
     needed, which = np.unique(np.broadcast_to(of, series), return_inverse=True)
     factors, which = phases.factors(factor.reshape(-1, factor.shape[-1])[needed])[:, None], which.reshape(count)
-    used = np.flatnonzero(np.any(records.weight, axis=(1, 2))) if fitted else np.arange(len(records.kept))
+    fits = np.any(records.weight, axis=(1, 2)) if fitted else np.ones(len(records.kept), bool)
+    used, out[:, ~fits] = np.flatnonzero(fits), 0.0
     few = max(1, AT_ONCE // max(1, len(used) * records.source.shape[1]))
     for part in (slice(start, start + few) for start in range(0, count, few)):
         spectra = phases.spectra(flat[part], used)
