@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
 from synthetic import CUTOFF, DT, STEP, made_signals
 
-from figaroh_jax.recordings import rowfilter
-from figaroh_jax.recordings.rowfilter import frequencies, in_machine_code, on_host, row_filter
+from figaroh_jax.recordings import stacked
+from figaroh_jax.recordings.rowfilter import filtered, frequencies, row_filter
 from figaroh_jax.recordings.stacked import Records, filter_rows, stack
 
 SECONDS = 12.0
@@ -47,35 +48,39 @@ def test_rows_far_apart_are_those_of_the_whole_record(step: int) -> None:
     delay = np.exp(-0.004j * frequencies(rows)) * rows.gain
     whole = np.fft.irfft(np.fft.rfft(signal[..., rows.source]) * delay, len(rows.source))
     place = rows.pad + rows.index
-    np.testing.assert_allclose(
-        on_host(np.asarray(rows.source), place)(signal, delay), whole[..., place], rtol=0, atol=1e-12
-    )
+    np.testing.assert_allclose(filtered(signal, rows.source, place, delay), whole[..., place], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(("length", "step"), [(1296, 4), (810, 5), (480, 1), (225, 15), (600, 3), (128, 8)])
-def test_rows_in_machine_code_are_those_of_whole_records(
-    length: int, step: int, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("length", "step"), [(1296, 4), (810, 5), (480, 1), (225, 15), (448, 2), (128, 8)])
+@pytest.mark.parametrize("at_once", [1, 5000, stacked.AT_ONCE])
+def test_rows_of_many_series_are_those_of_whole_records(
+    length: int, step: int, at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rowfilter, "FROM", 0)
-    generator, slots = np.random.default_rng(length), np.array([0, 2])
+    monkeypatch.setattr(stacked, "AT_ONCE", at_once)
+    generator = np.random.default_rng(length)
+    records = stack([made_signals(SECONDS)])
     source = generator.integers(0, 100, (3, length))
     place = np.array([[5], [2], [9]]) + step * np.arange(100 // step)
-    run = in_machine_code(source, place)
-    if run is None:
-        pytest.skip("no C compiler")
+    weight = np.ones((*place.shape, 1)) * np.array([1, 0, 1])[:, None, None]
+    given = {"source": source, "kept": place, "weight": weight, "time": np.zeros((3, 100)), "low_pass": 1.0}
+    records = eqx.tree_at(lambda r: [getattr(r, name) for name in given], records, list(given.values()))
     signal, of = generator.standard_normal((41, 3, 100)), generator.integers(0, 4, 41)
-    response = generator.standard_normal((4, length // 2 + 1)) + 1j * generator.standard_normal((4, length // 2 + 1))
-    found = np.full((41, 3, place.shape[1]), 7.0)
-    run(signal, response, of, slots, found)
-    assert (found[:, 1] == 7.0).all()
-    for slot in slots:
-        whole = np.fft.irfft(np.fft.rfft(signal[:, slot, source[slot]]) * response[of], length)
-        np.testing.assert_allclose(found[:, slot], whole[:, place[slot]], rtol=0, atol=1e-12)
+    for complex_part in (0, 1j, 2j):  # another response of the same size each time
+        response = generator.standard_normal((4, length // 2 + 1))
+        response = response + complex_part * generator.standard_normal((4, length // 2 + 1))
+        found = filter_rows(records, signal, response, fitted=True, of=of)
+        assert (found[:, 1] == 0).all()
+        for slot in (0, 2):
+            whole = np.fft.irfft(np.fft.rfft(signal[:, slot, source[slot]]) * response[of], length)
+            np.testing.assert_allclose(found[:, slot], whole[:, place[slot]], rtol=0, atol=1e-12)
 
 
-def test_a_record_whose_length_has_large_factors_is_not_for_machine_code(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rowfilter, "FROM", 0)
-    assert in_machine_code(np.zeros((1, 7 * 64), int), np.arange(10)[None]) is None
+def test_no_series_have_no_rows_and_records_without_weight_have_zeros() -> None:
+    records = stack([made_signals(SECONDS)])
+    unweighted = eqx.tree_at(lambda r: r.weight, records, np.zeros_like(records.weight))
+    signal = np.random.default_rng(0).standard_normal((4, 1, records.shape[1]))
+    assert filter_rows(records, signal[:0]).shape == (0, 1, records.shape[2])
+    assert not filter_rows(unweighted, signal, fitted=True).any()
 
 
 def test_rows_of_an_uneven_index_are_taken_one_by_one() -> None:
@@ -86,9 +91,7 @@ def test_rows_of_an_uneven_index_are_taken_one_by_one() -> None:
     )
     whole = np.fft.irfft(np.fft.rfft(signal[:, source]) * rows.gain, len(source))
     place = np.sort(np.random.default_rng(2).choice(len(source), 90, replace=False))
-    np.testing.assert_allclose(
-        on_host(source, place)(signal, np.asarray(rows.gain)), whole[:, place], rtol=0, atol=1e-12
-    )
+    np.testing.assert_allclose(filtered(signal, source, place, rows.gain), whole[:, place], rtol=0, atol=1e-12)
 
 
 def test_rows_are_every_fourth_sample() -> None:

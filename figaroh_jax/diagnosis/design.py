@@ -18,7 +18,7 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from ..compiled.batching import CPU_OPTIONS, DRAFT_OPTIONS
 from ..compiled.executable_cache import Program
@@ -58,6 +58,12 @@ class Units(NamedTuple):
     torque: Float[np.ndarray, "effects k rows nN"]
     joints: Int[np.ndarray, "effects rows"]
     response: Complex[np.ndarray, "effects F"] | None = None
+
+    def of(self, which: Bool[np.ndarray, " effects"]) -> Units:
+        """Some of the effects."""
+        if np.all(which):
+            return self
+        return Units(self.torque[which], self.joints[which], None if self.response is None else self.response[which])
 
 
 def kind(effect: Effect | type[Effect]) -> Literal["columns", "position", "response"]:

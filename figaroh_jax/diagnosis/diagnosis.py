@@ -33,7 +33,7 @@ from .believed import impossible_links
 from .estimates import amplitude_places, estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
-from .flexible import flexible_p
+from .flexible import families, flexible_p
 from .floor import foretold, noise_rms, short, sober_spectrum, told_too_large, undecided
 from .gaining import Gaining, beside_all, predicts_better, without_losses
 from .gates import physical_sign
@@ -425,11 +425,13 @@ def _left(
     first = stand(problem, start, whitening)
     before, *_ = excess(problem, first.rows, first.linear.residual, spectrum, whitening)
     now = excess(problem, joint.step.rows, joint.step.linear.residual, spectrum, whitening)
-    flexible = flexible_p(problem, joint.step.state, joint.step.rows, spectrum, whitening, generator)
+    smooth = families(problem, joint.step.state, whitening)
+    flexible = flexible_p(problem, joint.step, smooth, spectrum, whitening, generator)
     line = lines(problem, joint.step.linear.residual)
     noise = noise_rms(problem, spectrum)
     size = float(relative_rest(problem, joint.step.state, noise).max())
-    predicted = predictable(problem, joint.step, whitening)
+    predicted = predictable(joint.step, smooth)
+    del smooth  # their rows are large
     p_left = search.p_left
     if len(found) < len(search.found):  # it was asked beside causes that have gone
         p_left = chance_beside(problem, joint.step, spectrum, whitening, forbid, generator)

@@ -12,7 +12,7 @@ from ..effects.extended import ExtendedModel, extend
 from ..recordings.stacked import filtered_rows
 from ..results import Estimate
 from ..rigid.model import RobotModel, prismatic
-from .design import kind, local, sensor_response, shapes, with_shape
+from .design import Units, kind, local, sensor_response, shapes, unit_rows, with_shape
 from .problem import Problem
 from .shifts import torque_change
 from .state import State, unit_slopes
@@ -126,10 +126,13 @@ def torque_slopes(
         return [torque_slope(problem, state, effect, name, whitening) for name in names]
     response = state.response(problem.records.omega)[:, None] * whitening
     amplitudes, out = [float(getattr(effect, n)) for n, p in effect.parameters().items() if p.linear], []
+    n, _, count, nv = problem.records.shape
+    joints = np.asarray(effect.at) if local(effect) else np.arange(nv)
     for slope in unit_slopes(problem, state, effect, _without(state, effect)):
-        torque = np.zeros((slope.shape[-1], problem.model.nv))
-        torque[:, np.asarray(effect.at) if local(effect) else slice(None)] = np.tensordot(amplitudes, slope, 1).T
-        out.append(filtered_rows(problem.records, torque, response))
+        own = Units(np.tensordot(amplitudes, slope, 1)[None, None], joints[None])
+        rows = np.zeros((nv, n * count))
+        rows[joints] = unit_rows(own, problem.records, response).reshape(len(joints), -1)
+        out.append(rows)
     return out
 
 

@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from ..effects.base import Motion, changed
 from ..estimation.noise import Spectrum
-from ..estimation.rows import Rows, fit
 from ..recordings.stacked import filtered_rows
 from ..results import Dependence, Name
 from .bank import Columns
@@ -18,6 +17,7 @@ from .design import units
 from .problem import Problem
 from .screening import Group, Null, family_p, screen
 from .state import FRICTION_PRECISION, State, whitened
+from .step import Step
 
 __all__ = ["Smooth", "dependences", "families", "flexible_p", "friction_width", "smooth_functions"]
 
@@ -37,18 +37,17 @@ class Smooth(NamedTuple):
 
 def flexible_p(
     problem: Problem,
-    state: State,
-    rows: Rows,
+    step: Step,
+    groups: list[Group],
     spectrum: Spectrum,
     whitening: Float[np.ndarray, "F nv"],
     generator: np.random.Generator,
 ) -> Smooth:
-    """What the smooth families of each joint (`families`) say of what a fit leaves.
+    """What the smooth families of each joint, `groups` (`families`), say of what a fit leaves.
 
     They test and describe; they are never named as a cause.
     """
-    groups = families(problem, state, whitening)
-    linear = fit(rows, state.prior)
+    rows, linear = step.rows, step.linear
     found = screen(rows, linear, groups)
     p = family_p(rows, linear, found, Null(problem, spectrum, whitening, generator), generator)
     best = int(np.argmax([result.z.max() for result in found.scores]))

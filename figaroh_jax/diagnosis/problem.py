@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
@@ -14,7 +14,7 @@ from weakref import ref
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from ..effects.base import Effect, Motion
 from ..effects.catalogue import CATALOGUE
@@ -34,8 +34,8 @@ T = TypeVar("T")
 __all__ = ["Layout", "Part", "Problem", "family_of", "without_factor"]
 
 # cached, and the same for all weights of the rows
-_OF_THE_MOTION = ("torque", "reached", "gain", "passed", "motion", "families", "fixed", "plain", "_terms")
-KEPT = 110 << 20  # bytes of filtered columns that are held: two responses of an arm in 18 recordings of half a minute
+_OF_THE_MOTION = ("torque", "read", "reached", "gain", "passed", "motion", "families", "fixed", "plain", "_terms")
+KEPT = 64 << 20  # bytes of filtered columns that are held: three responses of an arm in 18 recordings of half a minute
 AT_ONCE = 6  # effects with a shape that are evaluated at once along long recordings
 MOST_SUMS = 12  # models whose normal equations are held
 MOST_BEGUN, MOST_JUDGED = 4, 16
@@ -145,6 +145,16 @@ class Part:
         ends = np.searchsorted(self.joint, np.arange(self.nv + 1)).tolist()
         return [(joint, slice(a, b)) for joint, (a, b) in enumerate(pairwise(ends)) if b > a]
 
+    @cached_property
+    def spans(self) -> list[tuple[int, slice, slice]]:
+        """Side by side, each joint's columns from its first to its last: the joint, their places, the columns."""
+        out, end = [], 0
+        for joint, own in self.stretches:
+            first, last = int(self.column[own].min()), int(self.column[own].max())
+            out.append((joint, slice(end, end + last + 1 - first), slice(first, last + 1)))
+            end = out[-1][1].stop
+        return out
+
     def dense(self, columns: range) -> Float[np.ndarray, "k nv nN"]:
         """Some of the columns in the rows of all joints."""
         out = np.zeros((len(columns), self.nv, self.samples))
@@ -166,7 +176,7 @@ def _of_blocks(blocks: Float[np.ndarray, "pairs 10 nN"], where: Int[np.ndarray, 
 class _Made(NamedTuple):
     """Of which filtered columns rows were made, with what weights, and their products fold by fold."""
 
-    blocks: list[ref[np.ndarray]]
+    blocks: list[tuple[ref[np.ndarray], int]]  # and the columns of each part
     weight: ref[Any]
     factor: Float[np.ndarray, " nv"]
     fold: ref[np.ndarray]
@@ -177,10 +187,10 @@ class _Made(NamedTuple):
         if self.weight() is not other.weight() or self.fold() is not other.fold():
             return 0
         count = 0
-        for own, its in zip(self.blocks, other.blocks, strict=False):
+        for (own, width), (its, _) in zip(self.blocks, other.blocks, strict=False):
             if own() is None or own() is not its():
                 break
-            count += own().shape[2]  # pyright: ignore[reportOptionalMemberAccess]
+            count += width
         return count if np.array_equal(self.factor, other.factor) else 0
 
 
@@ -188,7 +198,7 @@ class Filtered:
     """Parts of regressors through the row filter and a response, kept while they are used: most stay the same."""
 
     def __init__(self) -> None:
-        self._last: tuple[ref[np.ndarray], list[ref[np.ndarray]], ref[Any], np.ndarray] | None = None
+        self._last: tuple[ref[np.ndarray], list[tuple[ref[np.ndarray], int]], ref[Any], np.ndarray] | None = None
         self._sums: list[_Made] = []  # the last few
         # filtered columns by the addresses of the series and of the filter, as long as these live, and by the response
         self._kept: OrderedDict[tuple[int, int, bytes], tuple[ref[Any], ref[Any], np.ndarray]] = OrderedDict()
@@ -203,7 +213,8 @@ class Filtered:
         blocks = [self._block(records, part, response, code) for part in parts]
         weight = (np.moveaxis(np.asarray(records.weight), 2, 0) * factor[:, None, None]).reshape(len(factor), -1, 1)
         X = _beside(parts, blocks, weight)
-        self._last = ref(X), [ref(block) for block in blocks], ref(records.weight), factor
+        made = [(ref(block), part.width) for block, part in zip(blocks, parts, strict=True)]
+        self._last = ref(X), made, ref(records.weight), factor
         return X
 
     def sums(self, rows: Rows) -> FoldSums:
@@ -220,7 +231,7 @@ class Filtered:
         self._sums = [made._replace(gram=sums.gram), *self._sums[: MOST_SUMS - 1]]
         return sums
 
-    def _block(self, records: Records, part: Part, response: np.ndarray, code: bytes) -> Float[np.ndarray, "nv T k"]:
+    def _block(self, records: Records, part: Part, response: np.ndarray, code: bytes) -> Float[np.ndarray, "T places"]:
         source = np.asarray(records.source)
         key = (id(part.series), id(source), code)
         known = self._kept.pop(key, None)
@@ -237,15 +248,14 @@ class Filtered:
 
 
 def _beside(
-    parts: Sequence[Part], blocks: Sequence[Float[np.ndarray, "nv T _"]], weight: Float[np.ndarray, "nv T 1"]
+    parts: Sequence[Part], blocks: Sequence[Float[np.ndarray, "T _"]], weight: Float[np.ndarray, "nv T 1"]
 ) -> Float[np.ndarray, "nv T P"]:
     """The filtered parts side by side, each row times its weight; a tree leaves most of them zero."""
     ends = np.cumsum([part.width for part in parts])
     X = np.zeros((*weight.shape[:2], ends[-1]))
     for part, block, end in zip(parts, blocks, ends, strict=True):
-        for joint, own in part.stretches:
-            few = slice(part.column[own].min(), part.column[own].max() + 1)
-            np.multiply(block[joint, :, few], weight[joint], out=X[joint, :, end - part.width : end][:, few])
+        for joint, own, columns in part.spans:
+            np.multiply(block[:, own], weight[joint], out=X[joint, :, end - part.width : end][:, columns])
     return X
 
 
@@ -256,13 +266,17 @@ def without_factor(response: np.ndarray) -> tuple[np.ndarray, Float[np.ndarray, 
     return np.ones_like(response), response[0]
 
 
-def _through(records: Records, part: Part, response: np.ndarray) -> Float[np.ndarray, "nv T k"]:
-    """A part through the row filter and the response, the zeros filled in."""
+def _through(records: Records, part: Part, response: np.ndarray) -> Float[np.ndarray, "T places"]:
+    """A part through the row filter and the response, each series at its place in `Part.spans`."""
     n, samples, count, nv = records.shape
-    series = part.series.reshape(len(part.series), n, samples)
-    rows = filter_rows(records, series, response.T, fitted=True, of=part.joint)
-    block = np.zeros((nv, n * count, part.width))
-    block[part.joint, :, part.column] = rows.reshape(len(rows), n * count)
+    rows = filter_rows(
+        records, part.series.reshape(len(part.series), n, samples), response.T, fitted=True, of=part.joint
+    )
+    first = np.zeros(nv, int)
+    for joint, own, columns in part.spans:
+        first[joint] = own.start - columns.start
+    block = np.zeros((n * count, part.spans[-1][1].stop if part.spans else 0))
+    block[:, first[part.joint] + part.column] = rows.reshape(len(rows), n * count).T
     return block
 
 
@@ -337,6 +351,11 @@ class Problem:
         return open_rows(self.records, self.records.flat(self.records.torque), np.ones(len(self.records.omega)))
 
     @cached_property
+    def read(self) -> Part:
+        """The measured torque at all samples as one column."""
+        return Part.of(self.records.flat(self.records.torque).T[:, None])
+
+    @cached_property
     def reached(self) -> tuple[Float[np.ndarray, " nq"], Float[np.ndarray, " nq"]]:
         """The lowest and the highest of each position, rad or m."""
         position = np.asarray(self.records.position)
@@ -409,19 +428,26 @@ class Problem:
             return {n: self.following(n, motion) for n in self.families[name]}
         return units({n: flattened(b) for n, b in self.families[name].items()}, motion, self.records)
 
-    def shaped_in_parts(self) -> Iterator[dict[str, Units]]:
+    def shaped_in_parts(
+        self, wanted: Mapping[str, Bool[np.ndarray, " effects"]] | None = None
+    ) -> Iterator[dict[str, Units]]:
         """Unit torques of the effects with a shape: all at once, of long recordings a few of one effect at a time.
 
-        The torque of all grid points at all samples would be the largest thing in memory by far.
+        The torque of all grid points at all samples would be the largest thing in memory by far. `wanted` are the ones
+        asked for, on one axis of places and grid points; all of them by default.
         """
+        batches = self.families["shaped"]
+        wanted = {n: np.ones(np.size(b.at[..., 0]), bool) for n, b in batches.items()} if wanted is None else wanted
         if len(self.motion.time) <= SHORT:
-            yield self.family("shaped", self.motion)
+            every = self.family("shaped", self.motion)
+            yield {name: own.of(wanted[name]) for name, own in every.items() if wanted[name].any()}
             return
-        for name, batch in self.families["shaped"].items():
+        for name, batch in batches.items():
             whole = flattened(batch)
-            for start in range(0, len(whole.at), AT_ONCE):
-                few = jax.tree.map(lambda x, start=start: np.asarray(x)[start : start + AT_ONCE], whole)
-                yield units({name: few}, self.motion, self.records)
+            for part in (slice(start, start + AT_ONCE) for start in range(0, len(whole.at), AT_ONCE)):
+                if wanted[name][part].any():
+                    few = jax.tree.map(lambda x, part=part: np.asarray(x)[part], whole)
+                    yield {name: units({name: few}, self.motion, self.records)[name].of(wanted[name][part])}
 
     def following(self, effect: str, motion: Motion) -> Units:
         """Unit torques of one effect that follows the torque of the current model."""
@@ -451,7 +477,7 @@ class Problem:
     def with_width(self, width: Float[np.ndarray, " nv"]) -> Problem:
         """The problem with another width of the friction's reversal, which no candidate's place and grid depends on."""
         other = replace(self, width=width)
-        same = ("torque", "reached", "gain", "families")
+        same = ("torque", "read", "reached", "gain", "families")
         other.__dict__.update({k: v for k, v in self.__dict__.items() if k in same})
         return other
 

@@ -14,10 +14,10 @@ from ..estimation.rows import Linear, Rows, tall
 from ..recordings.stacked import filter_rows
 from ..results import Dependence, Part, Verdict
 from .comparison import ground, judge_grown, t_value
-from .flexible import Smooth, dependences, families
+from .flexible import Smooth, dependences
 from .holdout import residual_rms
 from .problem import Problem
-from .screening import CHUNK, draw_noise, noise_squares
+from .screening import CHUNK, Group, draw_noise, noise_squares
 from .state import State
 from .step import Step
 from .thresholds import (
@@ -195,10 +195,10 @@ def significance(
     return Significance(there or vibrates, text)
 
 
-def predictable(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"]) -> bool:
-    """Whether smooth functions of the motion predict what is left at some joint on data they were not fitted to."""
+def predictable(step: Step, groups: Sequence[Group]) -> bool:
+    """Whether smooth `families` of the motion predict what is left at some joint on data they were not fitted to."""
     base = ground(step.verdicts, step.state.prior, step.folded)
-    for group in families(problem, step.state, whitening):
+    for group in groups:
         joints = group.columns.joints
         own = judge_grown(step.rows, base, joints, group.columns.Z[0])
         worse, better = (v.own(step.rows, joints) for v in (step.verdicts, own))

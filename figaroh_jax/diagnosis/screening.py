@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..effects.base import Effect
 from ..effects.catalogue import CATALOGUE, related
@@ -20,7 +20,7 @@ from ..estimation.rows import Linear, Rows
 from ..results import Name
 from ..rigid.model import RobotModel
 from .bank import Bank, Columns, bank
-from .design import Units, flattened, kind, unit_rows, units
+from .design import Units, flattened, kind, local, unit_rows, units
 from .evidence import Score, block_scores, largest, other_scores, projection, pulled, scores
 from .problem import Problem, without_factor
 from .state import State
@@ -95,11 +95,13 @@ def catalogue(
     whitening: Float[np.ndarray, "F nv"],
     forbid: Collection[str],
     before: list[Group] | None = None,
+    turned: Collection[int] = (),
 ) -> list[Group]:
     """Whitened columns of every effect that may be named, at every place and grid point.
 
-    `before` are the groups of an earlier state of the same problem with the same sensors: columns that do not follow
-    the torque are kept.
+    `before` are the groups of an earlier state of the same problem with the same response: columns that do not follow
+    the torque are kept. Where the friction of the joints `turned` reverses over another width since then, what acts
+    there, or at all joints, is evaluated anew, and all sensors.
     """
     taken = {(type(e).name, at) for term in state.terms for e, at in _places_of(term)}
     taken |= {(effect.name, tuple(int(i) for i in np.asarray(effect.at))) for effect in state.sensors}
@@ -107,7 +109,7 @@ def catalogue(
     wanted = [n for n in CATALOGUE if n not in forbid and n not in closed]
     batches = {n: b for family in problem.families.values() for n, b in family.items()}
     old = {group.name: group for group in before or ()}
-    fresh = _fresh_columns(problem, state, whitening, wanted, everything=before is None)
+    fresh = _fresh_columns(problem, state, whitening, wanted, None if before is None else turned)
     groups, joints, links = [], problem.model.joint_names, problem.model.link_names
     for name in (n for n in wanted if n in batches):
         own = links if batches[name].acts_on == "link" else joints
@@ -116,7 +118,7 @@ def catalogue(
             if (name, tuple(at)) in taken:
                 continue
             known = old.get(title)
-            columns = fresh[name][place] if name in fresh else known.columns if known else None
+            columns = fresh.get(name, {}).get(place, known.columns if known else None)
             if columns is None and batches[name].inertial:
                 columns = _link_columns(rows, at[0], problem.model)
             if columns is not None and np.abs(columns.Z).max() > 0:
@@ -126,47 +128,71 @@ def catalogue(
 
 
 def _fresh_columns(
-    problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], wanted: Collection[str], everything: bool
-) -> dict[str, list[Columns]]:
-    """Whitened columns by place: of all wanted effects, or of those whose columns follow the torque of the state."""
+    problem: Problem,
+    state: State,
+    whitening: Float[np.ndarray, "F nv"],
+    wanted: Collection[str],
+    turned: Collection[int] | None,
+) -> dict[str, dict[int, Columns]]:
+    """Whitened columns by place: of all wanted effects, or of those whose columns follow the torque of the state or
+    the width of the friction of the joints `turned`."""
     response = whitening * state.response(problem.records.omega)[:, None]
     batches = {n: b for family in problem.families.values() for n, b in family.items()}
     weight, out = np.moveaxis(np.asarray(problem.records.weight), 2, 0), {}
     parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
 
+    measured = {n: b for family in ("fixed", "shaped") for n, b in problem.families[family].items()}
+    asked = {n: np.arange(len(b.at)) for n, b in batches.items()}
+    asked |= {n: np.flatnonzero(_turned(b, turned)) for n, b in measured.items() if turned is not None}
+
     def placed(name: str, rows: np.ndarray, at: np.ndarray) -> None:
-        places, grid = batches[name].at.shape[:2]
+        places, grid = asked[name].tolist(), batches[name].at.shape[1]
         parts.setdefault(name, []).append((rows, at))
-        if sum(len(joints) for _, joints in parts[name]) < places * grid:
+        if sum(len(joints) for _, joints in parts[name]) < len(places) * grid:
             return
         known = parts.pop(name)
         rows, at = known[0] if len(known) == 1 else (np.concatenate([part[k] for part in known]) for k in (0, 1))
-        rows = rows.reshape(places, grid, *rows.shape[1:3], -1)
-        out[name] = [Columns(tuple(joints), Z) for joints, Z in zip(at[::grid].tolist(), rows, strict=True)]
+        rows = rows.reshape(len(places), grid, *rows.shape[1:3], -1)
+        each = zip(places, at[::grid].tolist(), rows, strict=True)
+        out[name] = {place: Columns(tuple(joints), Z) for place, joints, Z in each}
 
     coloured, factor = without_factor(response)
-    plain = everything and bool((coloured == 1).all())
+    plain = turned is None and bool((coloured == 1).all())
     for name, (rows, at) in (problem.plain if plain else {}).items():
         if name in wanted:
             placed(name, rows * (weight * factor[:, None, None])[at][:, None], at)
-    for family in _fresh_families(problem, state, wanted, everything, plain):  # samples of one family at a time
+    everything = turned is None or len(turned) > 0
+    masks = {n: np.repeat(np.isin(np.arange(len(b.at)), asked[n]), b.at.shape[1]) for n, b in measured.items()}
+    masks = masks if everything and not plain else {}
+    for family in _fresh_families(problem, state, wanted, everything, masks):  # samples of one family at a time
         for name in (n for n in family if n in wanted):
             placed(name, unit_rows(family[name], problem.records, response), family[name].joints)
     return out
 
 
 def _fresh_families(
-    problem: Problem, state: State, wanted: Collection[str], everything: bool, plain: bool
+    problem: Problem,
+    state: State,
+    wanted: Collection[str],
+    everything: bool,
+    measured: Mapping[str, Bool[np.ndarray, " effects"]],
 ) -> Iterator[Mapping[str, Units]]:
-    """Unit torques at all samples, a family after another; those of the measured motion alone not where `plain`."""
+    """Unit torques at all samples, a family after another; of the effects of the measured motion alone those that are
+    named in `measured`, on one axis of places and grid points."""
     yield problem.family("following", state.motion)
-    if everything and not plain:
-        yield problem.fixed
-        yield from problem.shaped_in_parts()
+    if measured:
+        yield {name: own.of(measured[name]) for name, own in problem.fixed.items() if measured[name].any()}
+        yield from problem.shaped_in_parts(measured)
     sensors = {n: b for n, b in problem.families["sensor"].items() if n in wanted and (everything or b.follows_torque)}
     late = [n for n in sensors if kind(sensors[n]) == "response"]  # one program
     for names in [late, *([n] for n in sensors if n not in late)]:
         yield units({n: flattened(sensors[n]) for n in names}, state.motion, problem.records)
+
+
+def _turned(batch: Effect, joints: Collection[int]) -> Bool[np.ndarray, " places"]:
+    """At which places an effect of the measured motion follows how the friction of the `joints` reverses."""
+    at = np.asarray(batch.at)[:, 0]
+    return np.isin(at, list(joints)).any(1) if local(batch) else np.full(len(at), len(joints) > 0)
 
 
 def place_names(model: RobotModel, effect: Effect | type[Effect], at: tuple[int, ...]) -> tuple[str, ...]:

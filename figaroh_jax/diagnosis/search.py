@@ -121,12 +121,12 @@ def find_causes(
         step = with_causes(problem, state, [f.effect for f in after.found], whitening)
         found, p_values, shown = list(after.found), [after.p_value], after.shown
     null = Null(problem, spectrum, whitening, generator)
-    screened, groups = None, None
+    screened, groups, turned = None, None, ()
     failed: dict[Name, float] = {}  # share of its joints' squares that a candidate scored when it last failed
     fitted: dict[Name, Effect] = {}  # position sensors as they were last fitted exactly
     while len(found) < MOST_CAUSES and not (found and enough(found)):
         progress("screening the catalogue", 0.1 + 0.7 * len(found) / MOST_CAUSES)
-        groups = catalogue(problem, step.state, step.rows, whitening, forbid, groups)
+        groups, turned = catalogue(problem, step.state, step.rows, whitening, forbid, groups, turned), ()
         screened = screen(step.rows, step.linear, groups, screened)
         p_values.append(_chance(step, screened, null, alpha, generator, not found))
         shown = shown or screened.shown()
@@ -148,7 +148,10 @@ def find_causes(
         if ways != {"columns"}:
             give_back_holes()
             known, problem, screened = problem, friction_width(problem, step.state, whitening), None
-            groups = None if problem is not known or "response" in ways else groups
+            groups, turned = (
+                None if "response" in ways else groups,
+                np.flatnonzero(problem.width != known.width).tolist(),
+            )
             step = step if problem is known else stand(problem, with_width(problem, step.state), whitening)
         if any(type(f.effect).follows_total for f in found):
             screened = None

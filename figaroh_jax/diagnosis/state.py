@@ -368,11 +368,11 @@ def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"
     """Whitened rows of the measured torque and of the state's regressor, with their instruments."""
     layout = problem.layout
     response = whitening * state.response(problem.records.omega)[:, None]
+    y = _unexplained(problem, state, whitening, response)
     X = problem.filtered.rows(problem.records, state.parts, response)
     Xi = X
     if layout.repeats:
         Xi = np.stack([instruments(x.T, layout.partner, p).T for x, p in zip(X, layout.paired, strict=True)])
-    y = _unexplained(problem, state, whitening, response)
     return Rows(y, X, np.ascontiguousarray(Xi), *_row_layout(layout))
 
 
@@ -385,7 +385,7 @@ def _unexplained(
     problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], response: Complex[np.ndarray, "F nv"]
 ) -> Float[np.ndarray, "nv T"]:
     """Rows of the measured torque, less what the sensors read of a known load."""
-    rows = filtered_rows(problem.records, problem.records.flat(problem.records.torque), whitening)
+    rows = problem.filtered.rows(problem.records, [problem.read], whitening)[..., 0]
     return rows if state.carried is None else rows - filtered_rows(problem.records, state.known, response)
 
 

@@ -6,7 +6,7 @@ Everything that is compared with the measured torque (the torque itself, each re
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -17,14 +17,14 @@ from jaxtyping import Float, Inexact, Int, Shaped
 
 from ..rigid.model import Leaf, RobotModel
 from .dataset import carried_body
-from .rowfilter import extension, fast_length, gain, in_machine_code, on_host, reach
+from .rowfilter import Phases, extension, fast_length, gain, reach
 from .signals import Signals
 
 __all__ = ["Records", "filter_rows", "filtered_rows", "open_rows", "stack"]
 
 FEW_SLOTS = 8  # more of them may be longer than the longest recording, where less is padded then
 LONGER = (1.1, 1.15, 1.2, 1.3, 1.4, 1.5)  # times the longest recording
-AT_ONCE = 100_000  # numbers of series that are filtered at once: their spectra stay in the processor's cache
+AT_ONCE = 200_000  # numbers of series that are filtered at once: with fewer calls cost more, more win nothing
 
 
 class Span(NamedTuple):
@@ -105,37 +105,32 @@ def filter_rows(
     factor = np.asarray(records.low_pass) if response is None else np.asarray(records.low_pass) * response
     count = int(np.prod(series))
     flat, out = torque.reshape(count, *torque.shape[-2:]), np.empty((count, *records.kept.shape))
-    factors = factor.reshape(-1, factor.shape[-1])
-    of = np.arange(len(factors)).reshape(factor.shape[:-1]) if of is None else of
-    which = np.broadcast_to(of, series).reshape(count)
-    used = np.any(records.weight, axis=(1, 2)) if fitted else np.ones(len(records.kept), bool)
-    out[:, ~used] = 0.0
-    at_once, each = _filters(records.source, records.kept)
-    if at_once is not None:
-        at_once(flat, factors, which, np.flatnonzero(used), out)
-        return out.reshape(*series, *records.kept.shape)
-    few = max(1, AT_ONCE // records.source.shape[1])
+    phases = _phases(records)
+    of = np.arange(factor[..., 0].size).reshape(factor.shape[:-1]) if of is None else of
+    needed, which = np.unique(np.broadcast_to(of, series), return_inverse=True)
+    factors, which = phases.factors(factor.reshape(-1, factor.shape[-1])[needed])[:, None], which.reshape(count)
+    fits = np.any(records.weight, axis=(1, 2)) if fitted else np.ones(len(records.kept), bool)
+    used, out[:, ~fits] = np.flatnonzero(fits), 0.0
+    few = max(1, AT_ONCE // max(1, len(used) * records.source.shape[1]))
     for part in (slice(start, start + few) for start in range(0, count, few)):
-        own = factors[which[part] if len(factors) > 1 else 0].astype(complex)
-        for k in np.flatnonzero(used):
-            out[part, k] = each[k](flat[part, k], own)
+        spectra = phases.spectra(flat[part], used)
+        spectra *= factors[which[part] if len(factors) > 1 else 0]
+        out[part, used] = phases.rows(spectra, used)
     return out.reshape(*series, *records.kept.shape)
 
 
-_Filters = tuple[Callable[..., None] | None, list[Callable[[np.ndarray, np.ndarray], np.ndarray]]]
-_FILTERS: list[tuple[Any, Any, _Filters]] = []  # of the last records
+_PHASES: list[tuple[Any, Any, Phases]] = []  # of the last records
 
 
-def _filters(source: Int[Leaf, "n L"], kept: Int[Leaf, "n M"]) -> _Filters:
-    """What filters all recordings at once, or else each of them; they stay the same over a thousand calls."""
-    for known in _FILTERS:
+def _phases(records: Records) -> Phases:
+    """What filters the recordings; it stays the same over a thousand calls."""
+    source, kept = records.source, records.kept
+    for known in _PHASES:
         if known[0] is source and known[1] is kept:
             return known[2]
-    at_once, each = in_machine_code(np.asarray(source), np.asarray(kept)), []
-    if at_once is None:
-        each = [on_host(*one) for one in zip(np.asarray(source), np.asarray(kept), strict=True)]
-    _FILTERS[:] = [(source, kept, (at_once, each)), *_FILTERS[:1]]
-    return at_once, each
+    phases = Phases(np.asarray(source), np.asarray(kept), records.time.shape[1])
+    _PHASES[:] = [(source, kept, phases), *_PHASES[:1]]
+    return phases
 
 
 def open_rows(
@@ -248,7 +243,7 @@ def _length(least: int, step: int) -> int:
 def _starts(signals: Sequence[Signals], members: Sequence[int], pad: int) -> list[int]:
     """Where the recordings of a slot begin in its extended record.
 
-    Their rows stand a whole number of steps apart: then only these are transformed back (`rowfilter.on_host`).
+    Their rows stand a whole number of steps apart: then only these are transformed back (`rowfilter.Phases`).
     """
     first, starts = signals[members[0]].rows, [0]
     for before, k in pairwise(members):
