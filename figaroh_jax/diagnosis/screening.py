@@ -192,7 +192,7 @@ def _fresh_families(
 def _turned(batch: Effect, joints: Collection[int]) -> Bool[np.ndarray, " places"]:
     """At which places an effect of the measured motion follows how the friction of the `joints` reverses."""
     at = np.asarray(batch.at)[:, 0]
-    return np.isin(at, list(joints)).any(1) if local(batch) else np.full(len(at), len(joints) > 0)
+    return np.asarray(np.isin(at, list(joints)).any(axis=1)) if local(batch) else np.full(len(at), len(joints) > 0)
 
 
 def place_names(model: RobotModel, effect: Effect | type[Effect], at: tuple[int, ...]) -> tuple[str, ...]:
