@@ -19,6 +19,7 @@ __all__ = ["TURNED_POSITION", "torque_findings"]
 DEGREE = np.pi / 180
 LIGHT = 4.0  # times too small: a nominal model may well be three times too heavy
 TURNED_POSITION = "(-1 in transmission.position)"  # ends a finding, by which a draft knows it
+SURELY_OFF = 1.3  # times: a clock that is off by as much within two standard errors is no question of links or noise
 STANDARD = 9.81  # m/s2
 HEAVY = 0.2  # share of a torque's spread that the rigid body should make up before its absence means anything
 
@@ -71,7 +72,7 @@ def torque_findings(look: Look, motion: Sampled) -> Iterator[Finding]:
             False,
             f"the clock looks wrong: the inertial torque fits a clock {stretch:.2g} times as fast,"
             f" {motion.rate * stretch:.4g} Hz instead of {motion.rate:.4g} Hz (+-{100 * error:.0f} %)",
-            grave=True,
+            grave=abs(np.log(stretch)) - 2 * error > np.log(SURELY_OFF),
         )
 
 
