@@ -304,10 +304,7 @@ def _judged(
     doubted = doubted_rest(searched, forbid, generator)
     against = reasons_against(searched, each, kept_out, doubted, tolerance)
     if contradictions:
-        against = {
-            name: why or f"nothing is named before this is settled: {contradictions[0]}"
-            for name, why in against.items()
-        }
+        against = {name: why or "nothing is named before what looks wrong is settled" for name, why in against.items()}
     named = [f for f in found if not against[f.name]]
     if named and (chance := as_slow_noise(searched, named, forbid, generator)) is not None:
         against |= {f.name: f"noise as slow as the motion scores as much by chance (p = {chance:.2g})" for f in named}
