@@ -128,7 +128,8 @@ def diagnose(
             give_back_holes()
             searched = _searched(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
             give_back_holes()
-            again = setting_beside(searched.here, searched.joint.step.state, forbid) if searched.found else None
+            asks = bool(searched.found) and not contradictions  # where nothing may be named, once is enough
+            again = setting_beside(searched.here, searched.joint.step.state, forbid) if asks else None
             asked = (searched, reader, forbid, tolerance, alpha, generator)
             judged = _judged(*asked, contradictions)
             if not contradictions and (cannot_be := _impossible(judged)):
@@ -137,7 +138,7 @@ def diagnose(
             return _answer(searched.here, signals, searched.search, judged), again
 
         answer, again = answered(here)
-        if again and not contradictions:
+        if again:
             other, _ = answered(again)
             if other.holdout.after <= min(AS_WELL * answer.holdout.after, answer.holdout.before):
                 answer = other
