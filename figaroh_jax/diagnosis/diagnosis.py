@@ -34,7 +34,7 @@ from .estimates import amplitude_places, estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
 from .flexible import families, flexible_p
-from .floor import foretold, noise_rms, short, sober_spectrum, told_too_large, undecided
+from .floor import foretold, noise_rms, short, sober_spectrum, undecided
 from .gaining import Gaining, beside_all, predicts_better, without_losses
 from .gates import physical_sign
 from .holdout import residual_rms, traces
@@ -441,10 +441,10 @@ def _left(
     few = short(problem, joint.step.state)
     if loud.any() and not there and not tolerable:  # of few rows a rich model's residual is less than the noise
         there = not few or bool((foretold(problem, joint.step.state, forbid) & (loud > 0)).any())
-    if quiet.any() and not there and few and not found:
-        fitted, large = (joint.step.rows, joint.step.linear), told_too_large(problem, spectrum, generator)
-        fair = spectrum.louder(1 / np.maximum(large, 1.0))
-        quiet = beyond_noise(problem, fitted[1].residual, fair, whitening, generator, fitted=fitted)[1]
+    if quiet.any() and not there and not found:  # rows of little weight have less than noise
+        rows, linear = joint.step.rows, joint.step.linear
+        full = np.moveaxis(problem.records.weight >= problem.records.fitted, 2, 0).reshape(rows.y.shape)
+        quiet = beyond_noise(problem, linear.residual, spectrum, whitening, generator, full, (rows, linear))[1]
     if not problem.layout.repeats and not found:  # what is left is then no noise, nor is it known how much of it is
         there = there or bool((quiet & (relative_rest(problem, joint.step.state, 0 * noise) > tolerance)).any())
     moves = np.moveaxis(~resting(problem), 2, 0).reshape(joint.step.rows.y.shape)

@@ -14,7 +14,7 @@ from .comparison import ground, judge_grown, t_value
 from .evidence import Score
 from .flexible import families
 from .problem import Problem
-from .screening import Group, catalogue, draw_noise, screen
+from .screening import Group, catalogue, screen
 from .state import State, plain_rows, solved, whitened
 from .step import stand
 from .thresholds import LOWEST_FREQUENCY, LOWEST_RESOLVED, T_REST
@@ -26,11 +26,12 @@ __all__ = [
     "noise_rms",
     "short",
     "sober_spectrum",
-    "told_too_large",
     "undecided",
     "whitening_of",
 ]
 
+LEAKS = 10  # times at most that what leaks into a band from others, through rows left out, is told anew
+LEAK_SETTLED = 0.03  # log of a leak that changes by less
 ROUNDS = 2  # of the rich model's fit and the spectrum in turn
 RICHNESS = 10  # groups of columns in the rich model
 RICH_CUT = 1e-9  # of the unit-diagonal Gram of the rich model
@@ -114,20 +115,6 @@ def foretold(problem: Problem, state: State, forbid: Collection[str] = ()) -> Bo
             worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, own))
             out[joint] = t_value(worse, better) > T_REST
     return out
-
-
-def told_too_large(
-    problem: Problem, spectrum: Spectrum, generator: np.random.Generator, draws: int = 8
-) -> Float[np.ndarray, " nv"]:
-    """By how much the power that is told of noise with the spectrum is larger than it is: rows left out within a
-    recording carry power to where the row filter lets none pass."""
-    n, _, count, nv = problem.records.shape
-    if not _resolved(problem):
-        return np.ones(nv)
-    flat = np.ones((len(np.asarray(problem.records.omega)), nv))
-    drawn = draw_noise(problem, spectrum, flat, draws, generator)
-    told = [noise_rms(problem, _fit(problem, one.astype(float), None)) ** 2 for one in drawn]
-    return np.mean(told, axis=0) / noise_rms(problem, spectrum) ** 2
 
 
 def _resolved(problem: Problem) -> bool:
@@ -291,8 +278,8 @@ def _fit(problem: Problem, rows: Float[np.ndarray, "nv T"], taken: np.ndarray | 
     n, _, count, nv = records.shape
     rate = float(records.rate)
     frequency = np.fft.rfftfreq(count, 1 / rate)
-    power, left = np.zeros((len(frequency), nv)), np.zeros((len(frequency), nv))
-    weights = 0
+    power, left, kept = np.zeros((3, len(frequency), nv))
+    masks: list[Bool[np.ndarray, "rows nv"]] = []
     for at in records.spans:
         here = slice(at.row, at.row + at.rows)
         series = rows.reshape(nv, n, count)[:, at.slot, here].T
@@ -302,17 +289,33 @@ def _fit(problem: Problem, rows: Float[np.ndarray, "nv T"], taken: np.ndarray | 
         inside = slice(used[0], used[-1] + 1)
         own, p = noise.periodogram(series[inside], rate, level=True)
         power += len(used) * _onto(frequency, own, p)
-        left += len(used) * (series[inside] != 0).mean(0)
+        masks.append(series[inside] != 0)
+        kept += len(used) * masks[-1].mean(0)
         if taken is not None:
             left -= len(used) * _onto(frequency, own, noise.leverage(taken[at.slot][here][inside]))
-        weights += len(used)
-    power, left = power / weights, np.maximum(left / weights, 0.1)
+    sizes = [int(mask.any(1).sum()) for mask in masks]
+    weights = sum(sizes)
+    power, left, kept = power / weights, np.maximum((left + kept) / weights, 0.1), kept / weights
     gain = np.interp(frequency, np.asarray(records.omega) / (2 * np.pi), problem.gain)
     degrees = np.full(len(frequency), max(1.0, weights / count)) * left.mean(1) * news
     degrees[0] /= 2  # one real number
     lowest = min(max(LOWEST_RESOLVED * rate / count, LOWEST_FREQUENCY), rate / 8)
     told = frequency >= (lowest if taken is not None else 0.0)  # what a model misses at low frequency is no noise
-    return noise.fit_spectrum(frequency[told], (power / left)[told], gain[told], degrees[told], rate / 2, lowest)
+
+    def fitted(leaked: Float[np.ndarray, "freqs nv"] | float) -> Spectrum:
+        shown = (power / left / leaked)[told]
+        return noise.fit_spectrum(frequency[told], shown, gain[told], degrees[told], rate / 2, lowest)
+
+    spectrum, leaked = fitted(1.0), np.ones_like(power)
+    for _ in range(LEAKS):
+        through = np.where(told[:, None], gain[:, None] * spectrum.power(frequency) * left, power) / kept
+        seen = [_onto(frequency, *noise.seen_through(mask, rate, frequency, through)) for mask in masks]
+        before, leaked = leaked, sum(size * one for size, one in zip(sizes, seen, strict=True)) / weights
+        leaked = np.maximum(leaked / (kept * through), 1e-12)
+        spectrum = fitted(leaked)
+        if np.abs(np.log(leaked / before))[gain > noise.PASSED].max(initial=0.0) < LEAK_SETTLED:
+            break
+    return spectrum
 
 
 def _onto(wanted: np.ndarray, own: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -45,6 +45,7 @@ __all__ = [
     "parts_of",
     "predictable",
     "relative_rest",
+    "repeated_power",
     "repeating",
     "significance",
     "tolerated",
@@ -52,7 +53,6 @@ __all__ = [
     "wrong_law",
 ]
 
-SURE = 0.6  # of the cutoff: below, the row filter passes noise as it is
 POWER_DRAWS = 200  # of noise, whose power is compared with what is left
 
 _Share = tuple[float, Dependence, tuple[float, float] | None, str | None]  # share, kind, band in Hz, file
@@ -78,21 +78,33 @@ def excess(
 ) -> tuple[float, float, Float[np.ndarray, " nv"]]:
     """Excess of the residual over the noise, its one-sided p-value, and the excess of each joint.
 
-    With repeats the power that repeats (products of the two residuals; p from blocks); else the mean square less that
-    of noise with the estimated spectrum (no p of its own: 1).
+    With repeats the power that repeats; else the mean square less that of noise with the estimated spectrum (no p of
+    its own: 1).
     """
     level = noise_squares(problem, spectrum, whitening)
     if not problem.layout.repeats:
         own = (residual**2).sum(1) - level
         return float(own.sum() / level.sum()), 1.0, own / level
-    other = np.stack([rows.instrument(residual[j], j) for j in range(len(residual))])
-    products = residual * other
-    blocks = np.bincount(rows.block[rows.block >= 0], products.sum(0)[rows.block >= 0])
-    t, used = blocks.sum() / np.sqrt((blocks**2).sum() + 1e-300), np.count_nonzero(blocks)
+    products, p = repeated_power(rows, residual)
     share = rows.paired.mean(1) * level
+    return float(products.sum() / share.sum()), p, products / share
+
+
+def repeated_power(rows: Rows, residual: Float[np.ndarray, "nv T"]) -> tuple[Float[np.ndarray, " nv"], float]:
+    """Squares of each joint's residual that repeats have in common, and the one-sided p-value of their sum.
+
+    By blocks of the motion: products of a row and its repeat are those of the repeat and the row, and tell it once.
+    """
+    products = residual * np.stack([rows.instrument(residual[j], j) for j in range(len(residual))])
+    first = np.arange(len(rows.block))  # of all repeats of a row
+    for partner in rows.partner:
+        first = np.where(partner >= 0, np.minimum(first, partner), first)
+    motion = np.where(rows.block >= 0, rows.block[first], -1)
+    blocks = np.bincount(motion[motion >= 0], products.sum(0)[motion >= 0])
+    t, used = blocks.sum() / np.sqrt((blocks**2).sum() + 1e-300), np.count_nonzero(blocks)
     from scipy.special import stdtr  # scipy is slow to import
 
-    return float(products.sum() / share.sum()), float(stdtr(max(used - 1, 1), -t)), products.sum(1) / share
+    return products.sum(1), float(stdtr(max(used - 1, 1), -t))
 
 
 def beyond_noise(
@@ -107,9 +119,8 @@ def beyond_noise(
     """Squares that each joint's residual has beyond those of noise, where chance gives no joint so many, else zero; and
     whether it has fewer than chance gives any joint.
 
-    Of some rows of each joint, or of all. With a `fitted` model, of what it leaves of the noise (of slow noise it takes
-    much), and only below `SURE` of the cutoff: above, the power of the noise is what a smooth curve says of a band that
-    the row filter empties.
+    Of some rows of each joint, or of all. With a `fitted` model, of what it leaves of the noise: of slow noise it takes
+    much.
 
     Noise is drawn with all that its spectrum may be, and a joint's power counted in deviations of what noise has there:
     one draw in a hundred has a joint with as much. What no function of the motion predicts is a misfit too, if it is
@@ -120,10 +131,7 @@ def beyond_noise(
     parts = (draw_noise(problem, spectrum, whitening, CHUNK, generator) for _ in range(POWER_DRAWS // CHUNK))
     left = parts
     if fitted is not None:
-        left, residual = (
-            (_surely_passed(problem, _left_of(part, *fitted)) for part in parts),
-            _surely_passed(problem, residual),
-        )
+        left = (_left_of(part, *fitted) for part in parts)
     noise = np.concatenate([(part**2 * counted).sum(2) for part in left]).astype(float)
     mean, deviation = noise.mean(0), np.maximum(noise.std(0), 1e-12 * noise.mean(0) + 1e-300)
     drawn, own = (noise - mean) / deviation, (residual**2 * counted).sum(1) - mean
@@ -132,15 +140,6 @@ def beyond_noise(
         for side, most in ((1, drawn.max(1)), (-1, -drawn.min(1)))
     )
     return np.where(p < REST_P, np.maximum(own, 0.0), 0.0), q < REST_P
-
-
-def _surely_passed(problem: Problem, rows: Float[np.ndarray, "*draws T"]) -> Float[np.ndarray, "*draws T"]:
-    """The part of whitened rows below `SURE` of the cutoff."""
-    records = problem.records
-    n, _, count, _ = records.shape
-    spectrum = np.fft.rfft(rows.reshape(*rows.shape[:-1], n, count), axis=-1)
-    spectrum[..., np.fft.rfftfreq(count, 1 / float(records.rate)) > SURE * float(records.cutoff)] = 0.0
-    return np.fft.irfft(spectrum, count, axis=-1).reshape(rows.shape)
 
 
 def _left_of(noise: Float[np.ndarray, "draws nv T"], rows: Rows, linear: Linear) -> Float[np.ndarray, "draws nv T"]:
@@ -183,7 +182,7 @@ def significance(
     repeats = p_repeat < REST_P and size > max(REPEATED, REPEATED_SHARE * first)
     p = min(flexible.p, p_catalogue) if repeated else flexible.p
     scored = p < REST_P and largest > max(FITTED if repeated else UNREPEATED, FITTED_SHARE * first)
-    vibrates = line[0] < LINE_P
+    vibrates = line[0] < LINE_P and not tolerable
     worst, text = int(np.argmax(own)), ""
     there = bool((repeats or (scored and (repeated or predicted))) and not tolerable)
     if there:

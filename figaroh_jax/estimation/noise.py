@@ -11,10 +11,20 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Shaped
 from numpy.polynomial import Legendre
 
-__all__ = ["Spectrum", "fit_spectrum", "leverage", "periodogram", "spectral_line", "white", "whitening"]
+__all__ = [
+    "PASSED",
+    "Spectrum",
+    "fit_spectrum",
+    "leverage",
+    "periodogram",
+    "seen_through",
+    "spectral_line",
+    "white",
+    "whitening",
+]
 
 FLOOR = 0.05  # of the median power between 1 Hz and the cutoff: bounds what whitening amplifies
 PASSED = 0.1  # power gain of the row filter: where it passes less, what leaks from elsewhere is as large as the noise
@@ -68,12 +78,6 @@ class Spectrum(NamedTuple):
         most = STEEPEST * np.log((self.known + SHIFT) / (below + SHIFT))
         return np.exp(np.clip(curve, 0.0, most[:, None]))
 
-    def louder(self, times: Float[np.ndarray, " nv"]) -> Spectrum:
-        """The same spectrum of so many times the power at each joint."""
-        coefficients = self.coefficients.copy()
-        coefficients[0] += np.log(times)
-        return self._replace(coefficients=coefficients)
-
 
 def periodogram(
     rows: Float[np.ndarray, "samples *series"], rate: float, level: bool = False
@@ -87,6 +91,29 @@ def periodogram(
     spectrum = np.fft.rfft((rows if level else rows - rows.mean(0)) * window, axis=0)
     power, first = np.abs(spectrum) ** 2 / (window**2).sum(), 0 if level else 1
     return np.fft.rfftfreq(count, 1 / rate)[first:], power[first:]
+
+
+def seen_through(
+    mask: Bool[np.ndarray, "samples nv"],
+    rate: float,
+    frequency: Float[np.ndarray, " freqs"],
+    power: Float[np.ndarray, "freqs nv"],
+) -> tuple[Float[np.ndarray, " own"], Float[np.ndarray, "own nv"]]:
+    """Frequencies (Hz) and the mean of the Hann periodogram of noise of this power in the rows of the mask, the others
+    zero.
+
+    The Fourier transform of the noise's covariance times the autocorrelation of window and mask: the expected
+    periodogram of the debiased Whittle likelihood (Sykulski et al., Biometrika 106, 2019). Rows that are left out carry
+    power from where there is much to where the row filter lets little pass.
+    """
+    count = len(mask)
+    window = np.hanning(count + 2)[1:-1, None]
+    lags = np.fft.irfft(np.abs(np.fft.rfft(window * mask, 2 * count, axis=0)) ** 2, 2 * count, axis=0)
+    fine = np.fft.rfftfreq(2 * count, 1 / rate)
+    own = np.stack([np.interp(fine, frequency, column) for column in power.T], axis=1)
+    covariance = np.fft.irfft(own, 2 * count, axis=0)
+    seen = np.fft.rfft(lags * covariance, axis=0).real[::2] / (window**2).sum()
+    return np.fft.rfftfreq(count, 1 / rate), np.maximum(seen, 0.0)
 
 
 def fit_spectrum(
