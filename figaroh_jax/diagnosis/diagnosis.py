@@ -437,10 +437,10 @@ def _left(
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
     loud, quiet = beyond_noise(problem, joint.step.linear.residual, spectrum, whitening, generator)
-    there = left.there or (wrong and not tolerable)
-    few = short(problem, joint.step.state)
-    if loud.any() and not there and not tolerable:  # of few rows a rich model's residual is less than the noise
-        there = not few or bool((foretold(problem, joint.step.state, forbid) & (loud > 0)).any())
+    there, sure = left.there, not (problem.layout.repeats or short(problem, joint.step.state))
+    if not there and not tolerable and (wrong or loud.any()):
+        # of few rows a rich model's residual is less than the noise, and what repeats do not repeat is no misfit
+        there = sure or bool((foretold(problem, joint.step.state, forbid) & (wrong | (loud > 0))).any())
     if quiet.any() and not there and not found:  # rows of little weight have less than noise
         rows, linear = joint.step.rows, joint.step.linear
         full = np.moveaxis(problem.records.weight >= problem.records.fitted, 2, 0).reshape(rows.y.shape)

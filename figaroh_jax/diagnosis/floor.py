@@ -182,18 +182,22 @@ def _from_rich_model(
     misfit passes for noise.
     """
     response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
-    long = count >= ENOUGH or (richness == 1 and _resolved(problem))
-    rows, _ = _rich(problem, state, response, forbid, count >= ENOUGH and richness > 1, richness)
-    basis = _orthonormal(rows)
-    y = rows.y.reshape(-1)
-    residual = (y - basis @ (basis.T @ y)).reshape(rows.y.shape) * scale[:, None]
-    if not long:
-        independent = count * problem.passed
-        degrees = independent - (basis.reshape(len(rows.y), -1, basis.shape[1]) ** 2).sum((1, 2))
-        degrees = np.maximum(degrees, independent / 4)
-        return noise.white((residual**2).sum(1) / degrees, float(problem.records.rate) / 2, degrees)
-    n, _, length, nv = problem.records.shape
-    return _fit(problem, residual, np.moveaxis(basis.reshape(nv, n, length, -1), 0, 2))
+    long, smooth = count >= ENOUGH or (richness == 1 and _resolved(problem)), count >= ENOUGH and richness > 1
+    for _ in range(ROUNDS):
+        rows, _ = _rich(problem, state, response, forbid, smooth, richness)
+        basis, y = _orthonormal(rows), rows.y.reshape(-1)
+        residual = (y - basis @ (basis.T @ y)).reshape(rows.y.shape)
+        if not long:
+            independent = count * problem.passed
+            degrees = independent - (basis.reshape(len(rows.y), -1, basis.shape[1]) ** 2).sum((1, 2))
+            degrees = np.maximum(degrees, independent / 4)
+            squares = ((residual * scale[:, None]) ** 2).sum(1)
+            return noise.white(squares / degrees, float(problem.records.rate) / 2, degrees)
+        n, _, length, nv = problem.records.shape
+        taken = np.moveaxis(basis.reshape(nv, n, length, -1), 0, 2)
+        spectrum = _fit(problem, residual, taken, response=response)
+        response = whitening_of(problem, spectrum)
+    return spectrum  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
 
 
 def _rich(
@@ -269,7 +273,13 @@ def _orthonormal(rows: Rows) -> Float[np.ndarray, "nvT columns"]:
     return tall @ (vectors[:, keep] / np.sqrt(values[keep]))
 
 
-def _fit(problem: Problem, rows: Float[np.ndarray, "nv T"], taken: np.ndarray | None, news: float = 1.0) -> Spectrum:
+def _fit(
+    problem: Problem,
+    rows: Float[np.ndarray, "nv T"],
+    taken: np.ndarray | None,
+    news: float = 1.0,
+    response: Float[np.ndarray, "F nv"] | None = None,
+) -> Spectrum:
     """Spectrum of unwhitened noise rows, of which a share `news` is independent.
 
     `taken` is an orthonormal basis of what a model has removed from them.
@@ -296,19 +306,22 @@ def _fit(problem: Problem, rows: Float[np.ndarray, "nv T"], taken: np.ndarray | 
     sizes = [int(mask.any(1).sum()) for mask in masks]
     weights = sum(sizes)
     power, left, kept = power / weights, np.maximum((left + kept) / weights, 0.1), kept / weights
-    gain = np.interp(frequency, np.asarray(records.omega) / (2 * np.pi), problem.gain)
+    known = np.asarray(records.omega) / (2 * np.pi)
+    gain = np.interp(frequency, known, problem.gain)
+    white = np.ones_like(power) if response is None else _onto(frequency, known, response) ** 2
     degrees = np.full(len(frequency), max(1.0, weights / count)) * left.mean(1) * news
     degrees[0] /= 2  # one real number
     lowest = min(max(LOWEST_RESOLVED * rate / count, LOWEST_FREQUENCY), rate / 8)
     told = frequency >= (lowest if taken is not None else 0.0)  # what a model misses at low frequency is no noise
 
     def fitted(leaked: Float[np.ndarray, "freqs nv"] | float) -> Spectrum:
-        shown = (power / left / leaked)[told]
+        shown = (power / white / left / leaked)[told]
         return noise.fit_spectrum(frequency[told], shown, gain[told], degrees[told], rate / 2, lowest)
 
     spectrum, leaked = fitted(1.0), np.ones_like(power)
     for _ in range(LEAKS):
-        through = np.where(told[:, None], gain[:, None] * spectrum.power(frequency) * left, power) / kept
+        through = white * gain[:, None] * spectrum.power(frequency)
+        through = np.where(told[:, None], through * left, power) / kept
         seen = [_onto(frequency, *noise.seen_through(mask, rate, frequency, through)) for mask in masks]
         before, leaked = leaked, sum(size * one for size, one in zip(sizes, seen, strict=True)) / weights
         leaked = np.maximum(leaked / (kept * through), 1e-12)

@@ -91,7 +91,8 @@ def excess(
 
 
 def repeated_power(rows: Rows, residual: Float[np.ndarray, "nv T"]) -> tuple[Float[np.ndarray, " nv"], float]:
-    """Squares of each joint's residual that repeats have in common, and the one-sided p-value of their sum.
+    """Squares of each joint's residual that repeats have in common, and the one-sided p-value of as much, of all joints
+    together or of the one that has most for its noise.
 
     By blocks of the motion: products of a row and its repeat are those of the repeat and the row, and tell it once.
     """
@@ -100,11 +101,13 @@ def repeated_power(rows: Rows, residual: Float[np.ndarray, "nv T"]) -> tuple[Flo
     for partner in rows.partner:
         first = np.where(partner >= 0, np.minimum(first, partner), first)
     motion = np.where(rows.block >= 0, rows.block[first], -1)
-    blocks = np.bincount(motion[motion >= 0], products.sum(0)[motion >= 0])
-    t, used = blocks.sum() / np.sqrt((blocks**2).sum() + 1e-300), np.count_nonzero(blocks)
+    told = [*products, products.sum(0)]
+    blocks = np.stack([np.bincount(motion[motion >= 0], one[motion >= 0]) for one in told])
+    t, used = blocks.sum(1) / np.sqrt((blocks**2).sum(1) + 1e-300), np.count_nonzero(blocks, axis=1)
     from scipy.special import stdtr  # scipy is slow to import
 
-    return products.sum(1), float(stdtr(max(used - 1, 1), -t))
+    *own, together = stdtr(np.maximum(used - 1, 1), -t)
+    return products.sum(1), float(min(1.0, 2 * min(together, len(own) * min(own))))
 
 
 def beyond_noise(

@@ -6,8 +6,8 @@ import equinox as eqx
 import numpy as np
 
 from ..effects.extended import ExtendedModel, predict
-from ..formats.config import Load, Task
-from ..recordings.dataset import carried_body, read_recordings
+from ..formats.config import Task
+from ..recordings.dataset import carrying, read_recordings
 from ..recordings.signals import choose_rates, prepare, to_recording_times
 
 __all__ = ["predictions"]
@@ -30,21 +30,12 @@ def predictions(
     for recording in recordings:
         if recording.role == "holdout":
             motion = prepare(recording, whole, rates, band=band, model=extended.robot)
-            carrying = _carrying(extended, recording.load if identified else None)
+            robot = carrying(extended.robot, recording.load if identified else None)
+            loaded = eqx.tree_at(lambda m: m.robot, extended, robot)
             state = motion.position, motion.velocity, motion.acceleration
             if extended.robot.nq == extended.robot.nv:
-                torque = predict(carrying, motion.time, *state, motion.dt)
+                torque = predict(loaded, motion.time, *state, motion.dt)
             else:
-                torque = carrying.inverse_dynamics(*state)
+                torque = loaded.inverse_dynamics(*state)
             found[recording.name] = recording.time, to_recording_times(motion.time, np.asarray(torque), recording.time)
     return found
-
-
-def _carrying(extended: ExtendedModel, load: Load | None) -> ExtendedModel:
-    """The model with a known payload at its link."""
-    if load is None:
-        return extended
-    link, ten = carried_body(extended.robot, load)
-    inertia = np.array(extended.robot.inertia, float)
-    inertia[link] += ten
-    return eqx.tree_at(lambda m: m.robot.inertia, extended, inertia)

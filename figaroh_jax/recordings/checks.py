@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from jaxtyping import Float
 
 from ..errors import InputError
 from ..rigid.model import RobotModel, prismatic
-from .dataset import Memory, Recording
+from .dataset import Memory, Recording, carrying
 from .findings import LIKE, SOFT, UNLIKE, Finding, Look, and_more, effort_unit, named, unit_of
 from .likeness import sampled
 from .torque_checks import torque_findings
@@ -117,7 +118,7 @@ def check_recording(recording: Recording, model: RobotModel, entry: RecordingEnt
     for check in (_velocity, _speeds, _held_samples, _coarse, _clipped):
         found += check(look)
     if motion is not None and recording.torque is not None and not _stands(recording):
-        found += torque_findings(look, motion)
+        found += torque_findings(replace(look, model=carrying(model, recording.load)), motion)
     return found
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -30,6 +31,7 @@ __all__ = [
     "Memory",
     "Recording",
     "carried_body",
+    "carrying",
     "joint_columns",
     "read_recordings",
     "read_time",
@@ -141,6 +143,16 @@ def carried_body(model: RobotModel, load: Load) -> tuple[int, Float[np.ndarray, 
         raise InputError(f"load.frame '{load.frame}' does not move: no torque shows what it carries")
     point = from_com(load.mass, np.asarray(load.com, float), np.zeros((3, 3)))
     return link, np.asarray(transform(point, place_of))
+
+
+def carrying(model: RobotModel, load: Load | None) -> RobotModel:
+    """The robot with a known payload at its link."""
+    if load is None:
+        return model
+    link, ten = carried_body(model, load)
+    inertia = np.array(model.inertia, float)
+    inertia[link] += ten
+    return eqx.tree_at(lambda m: m.inertia, model, inertia)
 
 
 class Drive:
