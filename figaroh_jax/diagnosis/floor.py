@@ -30,8 +30,7 @@ __all__ = [
     "whitening_of",
 ]
 
-LEAKS = 10  # times at most that what leaks into a band from others, through rows left out, is told anew
-LEAK_SETTLED = 0.03  # log of a leak that changes by less
+MOST_LEAKED = 4.0  # times the power, that what leaks through rows left out is told of a band at once
 ROUNDS = 2  # of the rich model's fit and the spectrum in turn
 RICHNESS = 10  # groups of columns in the rich model
 RICH_CUT = 1e-9  # of the unit-diagonal Gram of the rich model
@@ -48,14 +47,15 @@ def noise_floor(
     From the differences of repeats where there are some; the baseline is fitted in between, so that its weights are
     right. Else from the residual of a rich model, white where the data are short.
     """
-    rows, scale, count = _alike(problem, state)
+    _, scale, count = _alike(problem, state)
     if not problem.layout.repeats:
         spectrum = _from_rich_model(problem, state, scale, forbid, count)
         return spectrum, whitening_of(problem, spectrum)
     response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
     for _ in range(ROUNDS):
-        state = solved(problem, state, fit(whitened(problem, state, response), state.prior).theta)
-        spectrum = _from_repeats(problem, rows, state)
+        rows = whitened(problem, state, response)
+        state = solved(problem, state, fit(rows, state.prior).theta)
+        spectrum = _from_repeats(problem, rows, state, response)
         response = whitening_of(problem, spectrum)
     return spectrum, response  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
 
@@ -155,13 +155,14 @@ def whitening_of(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, "F n
     return noise.whitening(spectrum, frequency, problem.gain, float(problem.records.cutoff))
 
 
-def _from_repeats(problem: Problem, rows: Rows, state: State) -> Spectrum:
+def _from_repeats(problem: Problem, rows: Rows, state: State, response: Float[np.ndarray, "F nv"]) -> Spectrum:
     residual = rows.y - rows.X @ state.theta
     other = _mean_of_partners(rows, residual)
     partners = np.maximum((rows.partner >= 0).sum(0), 1)
     difference = (residual - other) / np.sqrt(1 + 1 / partners)
     # the differences of one excitation's repeats sum to zero: one of them is no news
-    return _fit(problem, np.where(rows.paired > 0, difference, 0.0), None, 1 - 1 / (1 + partners[partners > 0].mean()))
+    news = 1 - 1 / (1 + partners[partners > 0].mean())
+    return _fit(problem, np.where(rows.paired > 0, difference, 0.0), response, news=news)
 
 
 def _mean_of_partners(rows: Rows, residual: Float[np.ndarray, "nv T"]) -> Float[np.ndarray, "nv T"]:
@@ -195,7 +196,7 @@ def _from_rich_model(
             return noise.white(squares / degrees, float(problem.records.rate) / 2, degrees)
         n, _, length, nv = problem.records.shape
         taken = np.moveaxis(basis.reshape(nv, n, length, -1), 0, 2)
-        spectrum = _fit(problem, residual, taken, response=response)
+        spectrum = _fit(problem, residual, response, taken)
         response = whitening_of(problem, spectrum)
     return spectrum  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
 
@@ -276,9 +277,9 @@ def _orthonormal(rows: Rows) -> Float[np.ndarray, "nvT columns"]:
 def _fit(
     problem: Problem,
     rows: Float[np.ndarray, "nv T"],
-    taken: np.ndarray | None,
+    response: Float[np.ndarray, "F nv"],
+    taken: Float[np.ndarray, "n M nv k"] | None = None,
     news: float = 1.0,
-    response: Float[np.ndarray, "F nv"] | None = None,
 ) -> Spectrum:
     """Spectrum of unwhitened noise rows, of which a share `news` is independent.
 
@@ -308,7 +309,7 @@ def _fit(
     power, left, kept = power / weights, np.maximum((left + kept) / weights, 0.1), kept / weights
     known = np.asarray(records.omega) / (2 * np.pi)
     gain = np.interp(frequency, known, problem.gain)
-    white = np.ones_like(power) if response is None else _onto(frequency, known, response) ** 2
+    white = _onto(frequency, known, response) ** 2
     degrees = np.full(len(frequency), max(1.0, weights / count)) * left.mean(1) * news
     degrees[0] /= 2  # one real number
     lowest = min(max(LOWEST_RESOLVED * rate / count, LOWEST_FREQUENCY), rate / 8)
@@ -318,17 +319,12 @@ def _fit(
         shown = (power / white / left / leaked)[told]
         return noise.fit_spectrum(frequency[told], shown, gain[told], degrees[told], rate / 2, lowest)
 
-    spectrum, leaked = fitted(1.0), np.ones_like(power)
-    for _ in range(LEAKS):
-        through = white * gain[:, None] * spectrum.power(frequency)
-        through = np.where(told[:, None], through * left, power) / kept
-        seen = [_onto(frequency, *noise.seen_through(mask, rate, frequency, through)) for mask in masks]
-        before, leaked = leaked, sum(size * one for size, one in zip(sizes, seen, strict=True)) / weights
-        leaked = np.maximum(leaked / (kept * through), 1e-12)
-        spectrum = fitted(leaked)
-        if np.abs(np.log(leaked / before))[gain > noise.PASSED].max(initial=0.0) < LEAK_SETTLED:
-            break
-    return spectrum
+    spectrum = fitted(1.0)
+    through = white * gain[:, None] * spectrum.power(frequency)
+    through = np.where((told & (gain > noise.PASSED))[:, None], through * left, power) / kept
+    seen = [_onto(frequency, *noise.seen_through(mask, rate, frequency, through)) for mask in masks]
+    leaked = sum(size * one for size, one in zip(sizes, seen, strict=True)) / weights / (kept * through)
+    return fitted(np.clip(leaked, 1 / MOST_LEAKED, MOST_LEAKED))
 
 
 def _onto(wanted: np.ndarray, own: np.ndarray, values: np.ndarray) -> np.ndarray:
