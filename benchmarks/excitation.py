@@ -596,7 +596,7 @@ class _Runs:
             noise = np.random.default_rng([3, side, repeats, k])
             y = self.X @ (spread @ noise.standard_normal(links)) + Z @ amplitude
             y = y + noise.standard_normal((repeats, len(y))).mean(0)
-            (a, sse_a), (b, sse_b) = (_best(some, y, repeats) for some in fits)
+            (a, sse_a), (b, sse_b) = (_best(some, y) for some in fits)
             right, sure = right + (a > b), sure + (a > b + 4)
             better.append(sse_b - sse_a)
         own, other = fits[0][0], fits[1][0]
@@ -641,7 +641,7 @@ class _Fit:
         return self.volume - 0.5 * squares, squares
 
 
-def _best(fits: list[_Fit], y: np.ndarray, repeats: int) -> tuple[float, float]:
+def _best(fits: list[_Fit], y: np.ndarray) -> tuple[float, float]:
     """Evidence over the shapes, and the smallest squares among them."""
     told = [fit(y) for fit in fits]
     most = max(evidence for evidence, _ in told)

@@ -133,14 +133,14 @@ def sysid(rows: int, folder: Path) -> None:
             flush=True,
         )
     for _ in range(2):
-        theta, wall, spent = _timed(lambda: _peer(rows, seen, truth))
+        theta, wall, spent = _timed(lambda: _peer(rows, seen))
         print(
             f"mujoco.sysid: {wall:.2f} s, {spent:.2f} CPU s; median error {_wrong(theta, truth)}, peak {_peak()}",
             flush=True,
         )
 
 
-def _peer(rows: int, seen: list[tuple[np.ndarray, ...]], truth: np.ndarray) -> np.ndarray:
+def _peer(rows: int, seen: list[tuple[np.ndarray, ...]]) -> np.ndarray:
     """The fit of mujoco.sysid: its sensors hold positions, then rates, each divided by its noise."""
     from mujoco import sysid as peer
 

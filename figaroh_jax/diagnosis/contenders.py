@@ -282,7 +282,7 @@ def _position_contender(
         if abs(value - size) < NEAR_ENOUGH / np.sqrt(own):
             break
         effect = with_shape(effect, [name], [np.float64(value)])
-        state = solved(problem, step.state, theta - taken * move)
+        state = solved(step.state, theta - taken * move)
         change, slope = _shift(problem, state, effect, name, ready.whitening)
     sums, loose = sums_of(rows, step.folded, rows.y - change), step.loose
     free = None if loose is None else judge(rows, Hypothesis(rows.X, loose, change), sums)
@@ -302,7 +302,7 @@ def _expanded_contender(problem: Problem, step: Step, base: Ground, ready: White
         if abs(size - last) < SMALL_MOVE * abs(size):
             break
         effect = exact(with_shape(effect, [name], [np.float64(size)]))
-        motion = solved(problem, step.state, verdicts.theta[:-1]).motion  # its torque without the effect
+        motion = solved(step.state, verdicts.theta[:-1]).motion  # its torque without the effect
         fresh = units({group.name.effect: batched(effect)}, motion, problem.records)[group.name.effect]
         Z = unit_rows(fresh, problem.records, ready.whitening)[0].reshape(*Z.shape)
         verdicts, free = _judged_beside(problem, step, base, group.columns.joints, Z)

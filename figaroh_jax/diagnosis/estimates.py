@@ -31,16 +31,16 @@ class Fitted(eqx.Module):
     at_shapes: Float[np.ndarray, "parameters parameters"] | None = None  # the covariance at each cause's shapes as told
 
 
-def with_amplitudes(state: State, causes: list[Effect], model: RobotModel) -> list[Effect]:
+def with_amplitudes(state: State, causes: list[Effect]) -> list[Effect]:
     """The causes with the amplitudes that the state has found for them."""
     out = []
-    for effect, place in zip(causes, amplitude_places(state, causes, model), strict=True):
+    for effect, place in zip(causes, amplitude_places(state, causes), strict=True):
         names = [name for name, p in effect.parameters().items() if p.linear]
         out.append(with_shape(effect, names, [state.theta[i] for i in place]) if names else effect)
     return out
 
 
-def amplitude_places(state: State, causes: list[Effect], model: RobotModel) -> list[list[int]]:
+def amplitude_places(state: State, causes: list[Effect]) -> list[list[int]]:
     """Columns of each cause's amplitudes in the state; causes with columns are its last terms, in order."""
     counts = [sum(p.linear for p in e.parameters().values()) if kind(e) == "columns" else 0 for e in causes]
     first = len(state.theta) - sum(counts)
@@ -101,7 +101,7 @@ def fitted_model(problem: Problem, state: State, causes: list[Effect]) -> Extend
             column += len(names)
             if (term.name, tuple(one.at)) not in known:
                 effects.append(with_shape(one, names, values))
-    return extend(robot, *effects, *with_amplitudes(state, causes, problem.model), width=problem.width)
+    return extend(robot, *effects, *with_amplitudes(state, causes), width=problem.width)
 
 
 def _without(state: State, effect: Effect) -> Motion:

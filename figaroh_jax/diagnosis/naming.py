@@ -279,7 +279,7 @@ def standings(
     """Each cause's standing in the fit of all of them."""
     if not found:
         return []
-    full, places = joint.step, amplitude_places(joint.step.state, joint.causes, problem.model)
+    full, places = joint.step, amplitude_places(joint.step.state, joint.causes)
     size = residual_rms(problem, stand(problem, start, whitening).state)
     grown = _Grown(problem, full, whitening, ground(full.verdicts, full.state.prior, full.folded), size)
     out = []

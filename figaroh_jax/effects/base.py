@@ -520,13 +520,6 @@ def joint_unit(unit: str, prismatic: bool) -> str:
     return unit.replace("N m", "N").replace("rad", "m") if prismatic else unit
 
 
-def zeros_like(effect: Effect) -> Effect:
-    """The effect with every amplitude zero and its shape kept."""
-    names = [name for name, parameter in effect.parameters().items() if parameter.linear]
-    blank = [jnp.zeros_like(jnp.asarray(getattr(effect, name))) for name in names]
-    return eqx.tree_at(lambda e: [getattr(e, name) for name in names], effect, blank) if names else effect
-
-
 def columns(effect: Effect, motion: Motion) -> Float[Array, "amplitudes samples *rows"]:
     """Torque (read or added) of a unit of each amplitude: the exact columns of the regressor, for the given shape."""
     names = [name for name, parameter in effect.parameters().items() if parameter.linear]

@@ -116,7 +116,7 @@ def _check_counts(path: Path, root: Any) -> None:
     waiting, seen, parts = [root], {path.resolve()}, 0
     while waiting:
         for element in waiting.pop().iter(*_COUNTS, "body", "include"):
-            parts += _copies(path, element) if element.tag in ("body", "replicate") else 0
+            parts += _copies(element) if element.tag in ("body", "replicate") else 0
             refuse_many(str(path), "bodies", parts)
             for attribute in _COUNTS.get(element.tag, ()):
                 _check_count(path, element, attribute)
@@ -138,7 +138,7 @@ def _check_count(path: Path, element: Any, attribute: str) -> None:
             )
 
 
-def _copies(path: Path, element: Any) -> int:
+def _copies(element: Any) -> int:
     """How often an element is there once those around it are replicated."""
     total = 1
     for around in (element, *element.iterancestors("replicate")):

@@ -103,7 +103,7 @@ def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbi
         table += [Entry(number, (k,)) for number in _PAIR_ENTRIES]
         candidates += _wanted(kinds, "pair", (names[i], names[j]), k, Scale(0.0, 0.0))
     for k, effect in enumerate(loop.effects):
-        ordered = sorted(effect.parameters(), key=lambda name: name not in amplitudes(type(effect)))  # noqa: B023
+        ordered = sorted(effect.parameters(), key=lambda name: name not in amplitudes(type(effect)))
         table += [Entry(f"{effect.name}.{name}", (k,)) for name in ordered]
         mine = kind_of(type(effect))
         if effect.acts_on == "joint" and effect.name not in forbid and not mine.numbers:

@@ -65,7 +65,7 @@ class Answers(NamedTuple):
     matrix: np.ndarray
 
 
-class native:  # noqa: N801  (used as a function that keeps what it has prepared)
+class native:
     """`native(loop, table, data)`: the loop as machine code; `usable` says whether it can be."""
 
     def __init__(self, loop: Loop, table: Table, data: Windows):

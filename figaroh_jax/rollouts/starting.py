@@ -54,7 +54,7 @@ def suggested(here: Setting, structure: Structure, now: Fit, wanted: Sequence[Ca
             points = [x for x in c.starts if _effect(here.loop, c, x).shown_by(low, high)]
             if len(points) > _FEW:
                 points = _best(here, servos[j], c, points, motion, left[:, column], weight[:, column])
-            c = c._replace(starts=tuple(points))  # noqa: PLW2901
+            c = c._replace(starts=tuple(points))
         found.append(c)
     return found
 

@@ -101,7 +101,7 @@ def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
             "actuator: {joint_1: {kind: position, kp: 20.0, kd: 0.5}}"
         )
     recordings = read_recordings(task, loop.robot, rollouts=True)
-    runs = tuple(_run(task, loop, r) for r in recordings)
+    runs = tuple(_run(loop, r) for r in recordings)
     periods = {regular(str(r.file), r.time) for r in recordings}
     if max(periods) > 1.02 * min(periods):
         raise InputError(f"{task.file}: data: the periods of the recordings differ ({sorted(periods)} s)")
@@ -113,7 +113,7 @@ def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
     return loop, runs, tuple(notes)
 
 
-def _run(task: Task, loop: Loop, recording: Recording) -> Run:
+def _run(loop: Loop, recording: Recording) -> Run:
     if recording.command is None:
         raise InputError(f"{recording.file}: a rollout needs `command`")
     way = np.abs(np.asarray(loop.drives.transmission))
