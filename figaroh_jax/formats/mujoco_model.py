@@ -120,7 +120,7 @@ def drift(t: Translation, q: Float[Any, "*batch nq"], v: Float[Any, "*batch nv"]
 
 
 def spatial_inertias(
-    t: Translation, poses: Float[Any, "*batch nj 4 4"], about: Float[Any, "*batch nj 3"]
+    poses: Float[Any, "*batch nj 4 4"], about: Float[Any, "*batch nj 3"]
 ) -> Float[Any, "*batch nj 10 10"]:
     """MuJoCo's spatial inertia (`cinert`: about a point, in world axes) of each link for a unit of each of our ten.
 
