@@ -3,8 +3,8 @@
 The model is built from the robot's arrays and replicated, so that a batch is one launch of Newton's kernels on the CPU
 or, where Warp finds one, on the GPU. Newton computes in single precision: answers agree with Pinocchio's to about 1e-5
 of the largest torque (`Capabilities.precision`). Only its functions of rigid bodies are called (`eval_fk`,
-`eval_jacobian`, `eval_mass_matrix`, `eval_inverse_dynamics_passive`, `eval_inverse_dynamics_force`), with armature
-zero: contacts, limits, drives and damping never enter. It gives no derivatives of inverse dynamics.
+`eval_jacobian`, `eval_inverse_dynamics_passive`, `eval_inverse_dynamics_force`), with armature zero: contacts, limits,
+drives and damping never enter. It gives no derivatives of inverse dynamics.
 
 `simulator` is the `newton.Model` that Newton's own importer makes of the file (URDF, MJCF, USD), with its contacts and
 drives; where there is no file, the one built from the arrays. `step` integrates that of the arrays by

@@ -1,4 +1,4 @@
-"""Links that can exist: why one cannot, and fits whose links all can.
+"""Physically consistent links: why one is not, and fits whose links all are.
 
 A body has a positive semidefinite pseudo-inertia (Wensing, Kim, Slotine 2018): positive mass and principal inertias of
 which none exceeds the sum of the others. Two fits keep to that. `physical_fit` solves the convex problem and so
