@@ -394,7 +394,7 @@ def _play(run: Run, alpha: float) -> _Play:
 def _has_size(cause: Cause) -> bool:
     """Whether some amplitude of an effect is surely not zero: a cause may have come in for what another explains."""
     entry = CATALOGUE.get(cause.name.effect)
-    linear = {n for n, p in entry.parameters().items() if p.linear} if entry else set()
+    linear = entry.amplitudes() if entry else []
     sizes = [value for name, value in cause.parameters.items() if name in linear]
     return not sizes or any(abs(one.value) > thresholds.SIZE_SIGMAS * one.std for one in sizes)
 

@@ -128,7 +128,7 @@ def contend(
     if effect.body:
         effect, verdicts = _body_verdicts(problem, step, base, effect, Z)
     else:
-        names = [n for n, p in effect.parameters().items() if p.linear]
+        names = effect.amplitudes()
         parts = range(len(names)) if parts is None else parts
         verdicts, free = _judged_beside(problem, step, base, group.columns.joints, Z[list(parts)])
         values = dict(zip(parts, verdicts.theta[-len(parts) :], strict=True)) if len(parts) else {}

@@ -14,7 +14,7 @@ from ..effects.catalogue import CATALOGUE, find
 from ..estimation.rows import Rows, block_sums
 from ..results import Name
 from .comparison import fold_sums
-from .design import kind, shapes, with_shape
+from .design import fitted_fields, kind, shapes, with_shape
 from .estimates import Fitted, amplitude_places, torque_slopes, with_amplitudes
 from .problem import Problem, family_of
 from .search import Found
@@ -348,9 +348,8 @@ def least_sure(joint: Joint) -> int | None:
 
 def _amplitudes(effect: Effect) -> list[int]:
     """Which of an effect's amplitudes no simpler effect has."""
-    names = [n for n, p in effect.parameters().items() if p.linear]
     simpler = {name for inside in type(effect).contains for name in find(inside).parameters()}
-    return [k for k, name in enumerate(names) if name not in simpler]
+    return [k for k, name in enumerate(effect.amplitudes()) if name not in simpler]
 
 
 def _shape_places(effect: Effect, place: tuple[int, ...]) -> Sequence[int]:
@@ -365,8 +364,7 @@ def _beyond_zero(
     95 % region."""
     from scipy.special import chdtri  # scipy is slow to import
 
-    names = [n for n, p in effect.parameters().items() if p.linear and kind(effect) == "columns"]
-    names += shapes(type(effect))
+    names = fitted_fields(effect)
     at, known = np.array(place)[list(own)], np.array(place)[list(given)].astype(int)
     value = np.array([float(getattr(effect, names[k])) for k in own])
     covariance = fitted.covariance[np.ix_(at, at)]

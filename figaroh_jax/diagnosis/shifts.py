@@ -346,7 +346,7 @@ def shift_torques(effects: Effect, motion: Motion, records: Records) -> Float[np
     With errors e of joint j it is -(K_j e + D_j e' + M_j e''), the derivatives of inverse dynamics in the position, the
     velocity and the acceleration of the joint: the same for all sensors.
     """
-    names = [name for name, p in effects.parameters().items() if p.linear]
+    names = effects.amplitudes()
     errors = _unit_errors(effects, motion, records).reshape(len(effects.at), len(names), *records.position.shape[:2])
     rates = difference(errors, float(records.dt))
     pushes = difference(rates, float(records.dt))
@@ -379,7 +379,7 @@ def _load_slopes(motion: Motion, records: Records) -> Float[np.ndarray, "3 nv nv
 
 def _unit_errors(effects: Effect, motion: Motion, records: Records) -> Float[np.ndarray, "effects k nN"]:
     """What each sensor reads beside the truth with a unit of each of its amplitudes."""
-    names, out = [name for name, p in effects.parameters().items() if p.linear], []
+    names, out = effects.amplitudes(), []
     for one in range(len(effects.at)):
         effect = jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects)
         for unit in np.eye(len(names)):

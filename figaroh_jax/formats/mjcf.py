@@ -17,7 +17,18 @@ from jaxtyping import Float
 from ..errors import InputError
 from ..rigid import inertia
 from ..rigid.model import Kind, RobotModel
-from .assembly import ROOT_JOINT, FramePart, JointPart, LinkPart, Posture, Root, assemble, displacement, refuse_many
+from .assembly import (
+    ROOT_JOINT,
+    FramePart,
+    JointPart,
+    LinkPart,
+    Posture,
+    Root,
+    assemble,
+    displacement,
+    refuse_many,
+    translation,
+)
 from .xmlfile import find_in_packages, read_xml
 
 __all__ = [
@@ -275,7 +286,7 @@ def _parts(mj: Any, root: Root | None) -> tuple[list[LinkPart], list[JointPart],
             if j != own[-1]:
                 links.append(LinkPart(link, np.zeros(10)))
             joints.append(_joint(mj, j, names[j], (carrier, link), pose, followers.get(names[j])))
-            carrier, pose = link, _shift(-mj.jnt_pos[j])
+            carrier, pose = link, translation(-mj.jnt_pos[j])
         if not own:
             joints.append(JointPart(bodies[b], "fixed", carrier, bodies[b], pose, np.zeros(3)))
             pose = np.eye(4)
@@ -301,12 +312,6 @@ def _parts(mj: Any, root: Root | None) -> tuple[list[LinkPart], list[JointPart],
     return links, joints, frames
 
 
-def _shift(way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    pose = np.eye(4)
-    pose[:3, 3] = way
-    return pose
-
-
 def _joint(
     mj: Any, j: int, name: str, ends: tuple[str, str], body: np.ndarray, follow: tuple[str, float, float] | None
 ) -> JointPart:
@@ -316,7 +321,7 @@ def _joint(
     if kind == "free":
         neutral = (*at_zero[:3], *np.roll(at_zero[3:], -1))
         return JointPart(name, kind, *ends, np.eye(4), np.zeros(3), neutral=tuple(map(float, neutral)))
-    placement = body @ _shift(mj.jnt_pos[j])
+    placement = body @ translation(mj.jnt_pos[j])
     if kind == "spherical":
         last = mj.body_jntadr[mj.jnt_bodyid[j]] + mj.body_jntnum[mj.jnt_bodyid[j]] - 1
         if j != last:

@@ -1,4 +1,4 @@
-"""Fit a robot's dynamics to recordings: base parameters, links that can exist, friction, and what can be trusted.
+"""Fit a robot's dynamics to recordings: base parameters, consistent links, friction, and what can be trusted.
 
 The recordings become one condensed regression (`regression`). Its rank is decided once; the base parameters' weighted
 fit gives weights and covariance; the nominal inertials complete what no motion shows, believed as far as cross-
@@ -399,11 +399,7 @@ def _least(terms: Sequence[Effect]) -> Float[np.ndarray, " drives"]:
     """Least physical value of each drive column: friction and rotor inertia take no energy out of nothing."""
     out: list[float] = []
     for term in terms:
-        for parameter in (p for p in term.parameters().values() if p.linear):
-            out.append(parameter.lower)
-        if len(term.at) > 1:
-            count = sum(p.linear for p in term.parameters().values())
-            out += out[-count:] * (len(term.at) - 1)
+        out += [term.parameters()[name].lower for name in term.amplitudes()] * len(term.at)
     return np.array(out)
 
 

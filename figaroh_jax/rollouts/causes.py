@@ -15,7 +15,7 @@ from ..effects.catalogue import ROLLOUTS, find
 from ..effects.loops import InRollouts, Scale
 from ..rigid.model import Frame, Joint, RobotModel
 from .loop import Joints, Loop, Pairs
-from .own import amplitudes, is_own, starts_of
+from .own import is_own, starts_of
 from .parameters import Entry, Table
 
 __all__ = ["BASELINE", "Candidate", "Catalogue", "catalogue", "elastic_loop", "kind_of", "springs", "with_pairs"]
@@ -40,7 +40,7 @@ def kind_of(effect: type[Effect]) -> InRollouts:
     )
     if own.numbers:
         return plain._replace(signed=own.signed is not False)
-    count = len(amplitudes(effect))
+    count = len(effect.amplitudes())
     signed = not effect.dissipative if own.signed is None else own.signed
     together = count if signed else 1
     return plain._replace(signed=signed, together=together, shapes=tuple(range(count, len(parameters))))
@@ -103,7 +103,7 @@ def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbi
         table += [Entry(number, (k,)) for number in _PAIR_ENTRIES]
         candidates += _wanted(kinds, "pair", (names[i], names[j]), k, Scale(0.0, 0.0))
     for k, effect in enumerate(loop.effects):
-        ordered = sorted(effect.parameters(), key=lambda name: name not in amplitudes(type(effect)))
+        ordered = sorted(effect.parameters(), key=lambda name: name not in effect.amplitudes())
         table += [Entry(f"{effect.name}.{name}", (k,)) for name in ordered]
         mine = kind_of(type(effect))
         if effect.acts_on == "joint" and effect.name not in forbid and not mine.numbers:

@@ -25,7 +25,7 @@ from .causes import BASELINE
 from .data import Run, Stretch, noise_of, regular, windows
 from .fit import Fit
 from .loop import Loop
-from .own import amplitudes, left_out
+from .own import left_out
 from .parameters import UNITS, put
 from .reading import load_loop
 from .rest import nearest_of, parts_of, relative_rest
@@ -400,8 +400,9 @@ def extended_of(loop: Loop) -> ExtendedModel:
                 numbers["offset"] -= numbers["stiffness"] * float(np.asarray(loop.joints.rest)[k])
             if effect == "torque_offset" and np.asarray(loop.joints.stiffness)[k]:
                 continue  # the spring holds it
-            if any(numbers[name] for name in amplitudes(find(effect)) if name != "offset" or effect == "torque_offset"):
-                own.append(place(find(effect), robot, [name], **numbers))
+            kind = find(effect)
+            if any(numbers[key] for key in kind.amplitudes() if key != "offset" or effect == "torque_offset"):
+                own.append(place(kind, robot, [name], **numbers))
     for k, (i, j, sign) in enumerate(loop.pairs.at if loop.pairs is not None else ()):
         numbers = {
             field: float(np.asarray(getattr(loop.pairs, field))[k]) for field in ("inertia", "damping", "friction")
@@ -409,5 +410,5 @@ def extended_of(loop: Loop) -> ExtendedModel:
         if any(numbers.values()):
             pair = [robot.dof_names[i], robot.dof_names[j]]
             own.append(place(find("coupled_transmission"), robot, pair, **numbers, sign=float(sign)))
-    own += [e for e in loop.effects if any(float(getattr(e, name)) for name in amplitudes(type(e)))]
+    own += [e for e in loop.effects if any(float(getattr(e, name)) for name in e.amplitudes())]
     return extend(robot, *own)
