@@ -32,7 +32,7 @@ from figaroh_jax.formats.xmlfile import read_xml
 from figaroh_jax.rigid.inertia import from_com, to_com
 from figaroh_jax.rigid.model import RobotModel
 from figaroh_jax.simulators.contract import Capabilities, file_format, host_samples
-from figaroh_jax.simulators.from_torques import FromTorques
+from figaroh_jax.simulators.host import HostBackend
 from figaroh_jax.simulators.parent_axes import numbers, rates, refuse_inner_free_joints, unit_inertias, unit_regressor
 
 __all__ = ["GenesisBackend"]
@@ -41,7 +41,7 @@ _ENVIRONMENTS = int(os.environ.get("FIGAROH_JAX_GENESIS_ENVIRONMENTS", "64"))  #
 _LEAST = 1e-12  # kg, kg m^2: Genesis takes no link without a mass
 
 
-class GenesisBackend(FromTorques):
+class GenesisBackend(HostBackend):
     """A robot of Genesis; `simulator` is its `genesis.Scene`.
 
     Mass matrix by `get_mass_mat`, torques `M a + bias` by the terms of its forward dynamics, poses by `get_links_pos`

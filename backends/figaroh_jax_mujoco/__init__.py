@@ -32,7 +32,7 @@ from figaroh_jax.formats.mujoco_model import (
 )
 from figaroh_jax.rigid.model import RobotModel
 from figaroh_jax.simulators.contract import Capabilities, host_samples
-from figaroh_jax.simulators.from_torques import FromTorques
+from figaroh_jax.simulators.host import HostBackend
 
 __all__ = ["MujocoBackend"]
 
@@ -42,7 +42,7 @@ _CHUNK = 64  # samples of a task: what they need stays in the cache
 _MANY_BODIES = 16
 
 
-class MujocoBackend(FromTorques):
+class MujocoBackend(HostBackend):
     """A `mujoco.MjModel`: `simulator` is the user's own, with contacts and all, where an MJCF file was given.
 
     The model is compiled from the file where that is MJCF, else built from the robot's arrays. Mass matrix by `mj_crb`,

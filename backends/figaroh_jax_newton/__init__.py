@@ -30,7 +30,7 @@ from figaroh_jax.errors import InputError
 from figaroh_jax.rigid.inertia import from_com, to_com
 from figaroh_jax.rigid.model import RobotModel
 from figaroh_jax.simulators.contract import Capabilities, file_format, host_samples
-from figaroh_jax.simulators.from_torques import FromTorques
+from figaroh_jax.simulators.host import HostBackend
 from figaroh_jax.simulators.parent_axes import numbers, rates, refuse_inner_free_joints, unit_inertias, unit_regressor
 
 __all__ = ["NewtonBackend"]
@@ -70,7 +70,7 @@ class _Worlds:
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
 
-class NewtonBackend(FromTorques):
+class NewtonBackend(HostBackend):
     """A robot of Newton; `simulator` is its `newton.Model`.
 
     Mass matrix by `newton.eval_inverse_dynamics_passive`, torques by `newton.eval_inverse_dynamics_force`, poses by

@@ -19,6 +19,7 @@ from ..compiled.memory import give_back_holes
 from ..effects.base import place
 from ..effects.catalogue import CATALOGUE, find, related
 from ..effects.plausibility import implausible
+from ..formats.robotfile import load_robot, stated_baseline
 from ..recordings.bandwidth import note_on
 from ..recordings.checks import checked_recordings
 from ..recordings.dataset import Recording, read_recordings
@@ -73,8 +74,6 @@ def diagnose_task(
     task: Task, progress: Callable[[str, float], None] = lambda phase, share: None, backend: str = "native"
 ) -> Diagnosis:
     """Diagnose what a task file describes, by the named backend; `InputError` before any work where it is wrong."""
-    from ..formats.robotfile import load_robot, stated_baseline
-
     progress("reading", 0.0)
     model, (known, notes) = load_robot(task), stated_baseline(task)
     recordings = read_recordings(task, model)

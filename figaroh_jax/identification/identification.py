@@ -26,6 +26,7 @@ from ..estimation.intervals import coloured_covariance
 from ..estimation.least_squares import Solution, WeightedByJoint, solve
 from ..estimation.priors import rigid_prior
 from ..estimation.regression import Condensed, Regression, condense
+from ..formats.robotfile import load_robot, stated_baseline
 from ..recordings.bandwidth import note_on
 from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
@@ -125,8 +126,6 @@ def identify_task(
     task: Task, progress: Callable[[str, float], None] = lambda phase, share: None, backend: str = "native"
 ) -> Identification:
     """Identify what a task file of torques describes, by the named backend; see `tasks.identify_task`."""
-    from ..formats.robotfile import load_robot, stated_baseline
-
     progress("reading", 0.0)
     model, (known, notes) = load_robot(task), stated_baseline(task)
     recordings = read_recordings(task, model, floating=True)

@@ -16,10 +16,10 @@ from ..rigid.derivatives import coriolis_from_bias
 from ..rigid.model import RobotModel
 from .contract import Backend, Reference, as_reference, file_format, host_samples
 
-__all__ = ["FromTorques"]
+__all__ = ["HostBackend"]
 
 
-class FromTorques(Backend):
+class HostBackend(Backend):
     """A backend of a robot and the file it was read from, whose underscored functions answer for samples of the host,
     q (samples, nq), v and a (samples, nv).
     """
