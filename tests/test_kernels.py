@@ -258,7 +258,7 @@ class _ByHand:
             ref[int(row) + k] = x
 
 
-def launch_by_hand(kernel: Any, arrays: Any, shapes: list[tuple[int, int]], interpret: bool = False) -> Any:
+def launch_by_hand(kernel: Any, arrays: Any, shapes: list[tuple[int, int]]) -> Any:
     outs = [np.full(shape, np.nan) for shape in shapes]
     with jax.disable_jit():
         kernel(_ByHand(outs), *map(np.asarray, arrays))

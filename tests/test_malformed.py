@@ -118,15 +118,12 @@ def test_nobody_waits_for_a_pipe(tmp_path: Path, suffix: str):
     refused(lambda: readers.get(suffix, lambda file: read_table(file, "data"))(link), "a device")
 
 
-def _npz(file: Path, header: bytes | None = None, **arrays: np.ndarray) -> Path:
+def _npz(file: Path, **arrays: np.ndarray) -> Path:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, array in arrays.items():
             memory = io.BytesIO()
             np.lib.format.write_array(memory, array)
-            data = (
-                memory.getvalue() if header is None else memory.getvalue().replace(b"(4,)" + b" " * len(header), header)
-            )
-            archive.writestr(f"{name}.npy", data)
+            archive.writestr(f"{name}.npy", memory.getvalue())
     return file
 
 

@@ -225,7 +225,7 @@ def joint_fit(problem: Problem, step: Step, causes: list[Effect], whitening: Flo
     values = [float(getattr(e, n)) for e in causes for n in shapes(type(e))]
     covariance = inverse @ (_scatter(rows, slopes, residual) + np.diag(precision)) @ inverse
     covariance = _widened(covariance, inverse, rows, residual, len(A))
-    return Fitted(np.append(state.theta, values) + move, covariance, _places(problem, state, causes))
+    return Fitted(np.append(state.theta, values) + move, covariance, _places(state, causes))
 
 
 def _inverse(A: Float[np.ndarray, "P P"]) -> Float[np.ndarray, "P P"]:
@@ -262,7 +262,7 @@ def _scatter(
     return scores @ scores.T * blocks / max(blocks - 1, 1)
 
 
-def _places(problem: Problem, state: State, causes: list[Effect]) -> tuple[tuple[int, ...], ...]:
+def _places(state: State, causes: list[Effect]) -> tuple[tuple[int, ...], ...]:
     """Where each cause's amplitudes and shapes stand among the parameters."""
     places, first = [], len(state.theta)
     for effect, amplitude in zip(causes, amplitude_places(state, causes), strict=True):

@@ -121,17 +121,14 @@ def _bounded(body: Body, entry: Mapping) -> Body:
 
 
 def physical_fit(
-    factor: Float[np.ndarray, "n k"],
-    links: Sequence[Body],
-    lower: Float[np.ndarray, " columns"] | None = None,
-    upper: Float[np.ndarray, " columns"] | None = None,
+    factor: Float[np.ndarray, "n k"], links: Sequence[Body], lower: Float[np.ndarray, " columns"] | None = None
 ) -> Float[np.ndarray, " columns"]:
-    """Least squares of `factor @ [x, -1]` over parameters whose links are bodies, within bounds: the one optimum.
+    """Least squares of `factor @ [x, -1]` over parameters whose links are bodies, none below `lower`: the one optimum.
 
     A prior belongs into the factor (`least_squares.with_prior`). Raises `InputError` where that fails.
     """
     scale = _scales(factor.shape[1] - 1, links)
-    return constrained(factor, Constraints(links, lower, upper), scale)
+    return constrained(factor, Constraints(links, lower), scale)
 
 
 def _scales(columns: int, links: Sequence[Body]) -> Float[np.ndarray, " columns"]:
