@@ -433,7 +433,7 @@ def separation(names: Sequence[str] = tuple(PAIRS), seed: int = 0, starts: int =
             return np.array([one.sigmas for one in separated(given, G, np.asarray(learned.prior))])
 
         since = time.process_time()
-        options = {"starts": starts, "seed": seed}
+        options: dict[str, Any] = {"starts": starts, "seed": seed}
         found = fj.excite(model, basis, bounds, learned, objective="separate", separate=[pair], **options)
         cpu = spent(since)
         usual, best = np.median([both(motion) for motion in states], axis=0), both(most)

@@ -97,7 +97,7 @@ def friction_rows(v: np.ndarray) -> np.ndarray:
 
 def test_information_is_the_log_determinant_of_pinocchios_rows(arm: RobotModel):
     learned, motion = info.learn(arm, noise={"turn": 0.02, "bend": 0.01}), a_motion(arm)
-    q, v, a = motion.states(20.0)
+    q, v, a = map(np.asarray, motion.states(20.0))
     rows = np.concatenate([reference.regressor(arm, q, v, a), friction_rows(v)], axis=2) / np.array([1.2, 0.2])[:, None]
     kept = rows.reshape(-1, rows.shape[2])[:, list(learned.independent)]
     assert np.linalg.matrix_rank(rows.reshape(-1, rows.shape[2])) == learned.rank
