@@ -226,7 +226,7 @@ def _judged_beside(
 def _body_verdicts(
     problem: Problem, step: Step, base: Ground, effect: Effect, Z: Float[np.ndarray, "10 nv T"]
 ) -> tuple[Effect, Verdicts]:
-    """An effect that is a body, with the parameters of the nearest body that can exist."""
+    """An effect that is a body, with the parameters of the nearest physically consistent body."""
     rows, full = step.rows, np.moveaxis(Z, 0, 2)
     free, _ = _judged_beside(problem, step, base, range(len(rows.y)), Z)
     body = physical_body(free.theta[-10:], _information(rows, base, full))

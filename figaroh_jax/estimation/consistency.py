@@ -205,13 +205,13 @@ def log_cholesky_fit(
         while not settled and steps < max_steps:
             value, theta, squares, count = _search(solver, value, arguments, ROUND)
             steps += int(count)
-            # at the border of what can exist the search creeps without end: the cost decides, not the step
+            # at the border of what is consistent the search creeps without end: the cost decides, not the step
             settled, cost = bool(cost < (1 + SETTLED) * float(squares)), float(squares)
         return LogCholeskyFit(np.asarray(theta), 0.5 * unit**2 * cost, settled, steps)
 
 
 def _interior(inertia: Float[np.ndarray, "links 10"]) -> Float[np.ndarray, "links 10"]:
-    """The links moved off the border of what can exist: Cholesky's factor must exist."""
+    """The links moved off the border of what is consistent: Cholesky's factor must exist."""
     P = pseudo_inertia(inertia)
     values, vectors = np.linalg.eigh(P)
     mass = np.maximum(inertia[:, 0], 1e-3 * max(float(inertia[:, 0].max(initial=0.0)), 1e-3))
