@@ -25,16 +25,14 @@ import jax.numpy as jnp
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from generators import servo_arm6  # noqa: E402
+from generators import servo_arm6
 
-import figaroh_jax as fj  # noqa: E402
-from figaroh_jax.rollouts.arm import search_arm  # noqa: E402
-from figaroh_jax.rollouts.data import Run, Stretch  # noqa: E402
-from figaroh_jax.rollouts.reading import load_loop  # noqa: E402
-from figaroh_jax.rollouts.search import Named, search  # noqa: E402
-from figaroh_jax.rollouts.setting import setting  # noqa: E402
-
-LINKS = 5  # the last link carries the payload
+import figaroh_jax as fj
+from figaroh_jax.rollouts.arm import search_arm
+from figaroh_jax.rollouts.data import Run, Stretch
+from figaroh_jax.rollouts.reading import load_loop
+from figaroh_jax.rollouts.search import Named, search
+from figaroh_jax.rollouts.setting import setting
 
 
 class Detent(fj.JointEffect):

@@ -199,9 +199,9 @@ def _word(name: Name) -> str:
     return f"{name[0]} ({', '.join(name[1])})"
 
 
-def same_effect(a: str, b: str, more: Sequence[set[str]] = ()) -> bool:
+def same_effect(a: str, b: str) -> bool:
     """Whether two names are one, or cannot be told apart by any torque."""
-    return a == b or any({a, b} <= names for names in (*EQUIVALENT, *more))
+    return a == b or any({a, b} <= names for names in EQUIVALENT)
 
 
 def accepts(truth: dict[str, Any], name: Name) -> bool:

@@ -100,10 +100,10 @@ def cost(command: list[str], environment: dict[str, str] | None = None) -> tuple
     return used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
 
 
-def cpu_seconds(command: list[str], environment: dict[str, str] | None = None) -> float:
+def cpu_seconds(command: list[str]) -> float:
     """User and system seconds of a process and all that it started; raises `CalledProcessError` where it failed."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
 

@@ -2,8 +2,8 @@
 
 `python benchmarks/excitation.py` prints CPU seconds of one thread, cold (a fresh process, programs compiled) and warm.
 The problem of FIGAROH 1.0.2 (`examples/ur10`): quintic pieces through five waypoints, 8 s, rows at 20 Hz, its limits
-with 2 x soft_lim, unweighted rows of the base columns that it keeps. The peer's own result is quoted: its IPOPT has no
-wheel, so it does not run here.
+with 2 x soft_lim, unweighted rows of the base columns that it keeps. The peer's own result is quoted; `peer_motion.py`
+runs it.
 """
 
 from __future__ import annotations
@@ -21,11 +21,15 @@ from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import figaroh_jax as fj  # without JAX, which begins below
+
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "backends"))
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", ROOT.parent / "shared" / "data"))
 SOFT = 0.1  # soft_lim
 SAME_OPTIMUM = 1e-6  # of a log determinant: steps are the same but for rounding, optima are tenths apart
-PEER = {"condition": 22.69, "logdet": 283.45, "CPU s": 18.5}  # its result, evaluated by us in a study; not run here
+PEER = {"condition": 22.69, "logdet": 283.45, "CPU s": 18.5}  # its result, evaluated by us in a study
 # joint: origin and roll of the joint, mass of the link, its centre, moments about it, effort, range, speed
 UR10 = {
     "shoulder_pan": ((0, 0, 0.1807), 0, 7.778, (0, 0, 0), (0.03147, 0.03147, 0.02188), 330, 2 * np.pi, 2 * np.pi / 3),
@@ -64,16 +68,12 @@ def urdf() -> str:
 
 def peer_problem() -> tuple[Any, Any, Any, Any]:
     """Model, basis, limits and what is learned in FIGAROH's problem."""
-    from figaroh_jax.excitation.information import learn
     from figaroh_jax.excitation.limits import Limits
-    from figaroh_jax.excitation.motions import quintic
-    from figaroh_jax.formats.config import Baseline
-    from figaroh_jax.formats.urdf import load_urdf
 
     with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
         file.write(urdf())
         file.flush()
-        model = load_urdf(file.name)
+        model = fj.load_urdf(file.name)
     low, high = (np.array(model.position_limit)[:, k] for k in (0, 1))
     high = high - SOFT * (high - low)  # the second takes its share of what the first has left, as the peer does
     low = low + SOFT * (high - low)
@@ -86,8 +86,19 @@ def peer_problem() -> tuple[Any, Any, Any, Any]:
     )
     # its order of a link's columns: Ixx Ixy Ixz Iyy Iyz Izz mx my mz m
     order = [10 * k + i for k in range(6) for i in (4, 5, 7, 6, 8, 9, 1, 2, 3, 0)]
-    learned = learn(model, Baseline(viscous=False, coulomb=False), sigma=np.ones(6), trust=None, order=order)
-    return model, quintic(5, 8.0), limits, learned
+    learned = fj.learn(model, fj.Baseline(viscous=False, coulomb=False), sigma=np.ones(6), trust=None, order=order)
+    return model, fj.quintic(5, 8.0), limits, learned
+
+
+def searched(learned: Any, basis: Any, bounds: Any, start: np.ndarray | None = None) -> Any:
+    """The problem of a motion of most information, as a design searches it."""
+    from figaroh_jax.excitation.objectives import information_objective
+    from figaroh_jax.excitation.sampling import Sampler
+    from figaroh_jax.excitation.solvers import Problem
+
+    sampler = Sampler(learned.robot, learned.terms, np.asarray(learned.width))
+    objective, kept = information_objective(np.asarray(learned.prior)), np.array(learned.independent)
+    return Problem(learned, sampler, objective, kept, basis, bounds, start)
 
 
 def spent(since: float) -> float:
@@ -96,12 +107,10 @@ def spent(since: float) -> float:
 
 def on_peer_problem(starts: int, objective: str = "information", seed: int = 0) -> tuple[Any, float]:
     """A design on FIGAROH's problem and its CPU seconds."""
-    from figaroh_jax.excitation.design import excite
-
     model, basis, limits, learned = peer_problem()
     since = time.process_time()
     posture = POSTURE
-    found = excite(model, basis, limits, learned, objective=objective, start=posture, starts=starts, seed=seed)  # pyright: ignore
+    found = fj.excite(model, basis, limits, learned, objective=objective, start=posture, starts=starts, seed=seed)  # pyright: ignore
     return found, spent(since)
 
 
@@ -116,19 +125,15 @@ def told(name: str, found: Any, cpu: float) -> None:
 
 def arms() -> dict[str, Any]:
     """UR10e and Panda (fingers locked)."""
-    from figaroh_jax.formats.urdf import load_urdf
-
     ur10, panda = DATA / "ur10e_innopolis" / "ur10e.urdf", DATA / "panda_gaz2019" / "panda.urdf"
     joints = [f"panda_joint{k}" for k in range(1, 8)]
-    return {"UR10e": load_urdf(ur10), "Panda": load_urdf(panda, joints=joints)}
+    return {"UR10e": fj.load_urdf(ur10), "Panda": fj.load_urdf(panda, joints=joints)}
 
 
 def torso_and_arm() -> Any:
     """TALOS' torso and left arm, nine joints."""
-    from figaroh_jax.formats.urdf import load_urdf
-
     names = ["torso_1_joint", "torso_2_joint", *(f"arm_left_{k}_joint" for k in range(1, 8))]
-    return load_urdf(DATA / "talos_contact" / "talos_full_v2.urdf", joints=names)
+    return fj.load_urdf(DATA / "talos_contact" / "talos_full_v2.urdf", joints=names)
 
 
 MESHES = os.environ.get("FIGAROH_JAX_MESHES")  # `robots` of the package example-robot-data, whose URDF have meshes
@@ -144,12 +149,7 @@ def clearance(seed: int | None = None, cold: bool = False) -> None:
     `cold`: the first of these alone.
     """
     from figaroh_jax.excitation.clearance import clearance_of
-    from figaroh_jax.excitation.design import excite
-    from figaroh_jax.excitation.information import learn
-    from figaroh_jax.excitation.limits import limits_of
-    from figaroh_jax.excitation.motions import fourier, spline
     from figaroh_jax.formats.collision import read_shapes
-    from figaroh_jax.formats.urdf import load_urdf
 
     if MESHES is None:
         print("FIGAROH_JAX_MESHES does not say where robots with meshes are: left out")
@@ -157,14 +157,14 @@ def clearance(seed: int | None = None, cold: bool = False) -> None:
     files = {"UR10": "ur_description/urdf/ur10_robot.urdf", "Panda": "panda_description/urdf/panda.urdf"}
     for name, file in list(files.items())[: 1 if cold else None]:
         joints = None if name == "UR10" else [f"panda_joint{k}" for k in range(1, 8)]
-        model = load_urdf(Path(MESHES) / file, joints=joints)
+        model = fj.load_urdf(Path(MESHES) / file, joints=joints)
         shapes, _ = read_shapes(Path(MESHES) / file)
         kept = clearance_of(model, shapes, margin=0.02, ignore=TOUCHING[name], floor=-0.05)
-        learned, bounds = learn(model, trust=None), limits_of(model, acceleration=8.0, clearance=kept)
-        for basis in (fourier(5, 0.1, 10.0), spline(9, 10.0))[: 1 if cold else None]:
+        learned, bounds = fj.learn(model, trust=None), fj.limits_of(model, acceleration=8.0, clearance=kept)
+        for basis in (fj.fourier(5, 0.1, 10.0), fj.spline(9, 10.0))[: 1 if cold else None]:
             for k in ([0] if cold else range(3)) if seed is None else [seed]:
                 since = time.process_time()
-                found = excite(model, basis, bounds, learned, starts=1, seed=k)
+                found = fj.excite(model, basis, bounds, learned, starts=1, seed=k)
                 told(f"{name} {basis.kind} seed {k}", found, spent(since))
                 q = np.asarray(found.stages[0].motion.at(np.arange(0, 10, 0.2))[0])
                 near = kept.exact_distances(q, kept.pairs)
@@ -189,19 +189,12 @@ def ipopt(iterations: int = 300, seed: int = 0, starts: int = 4, robots: Sequenc
 
 def _beside_ipopt(minimize_ipopt: Any, name: str, model: Any, options: tuple[int, int, int]) -> None:
     seed, starts, iterations = options
-    from figaroh_jax.excitation.design import excite
-    from figaroh_jax.excitation.information import learn
-    from figaroh_jax.excitation.limits import limits_of
-    from figaroh_jax.excitation.motions import fourier
-    from figaroh_jax.excitation.objectives import information_objective
-    from figaroh_jax.excitation.sampling import Sampler
     from figaroh_jax.excitation.search import random_motion
-    from figaroh_jax.excitation.solvers import Problem
 
-    learned, bounds, basis = learn(model, trust=None), limits_of(model, acceleration=8.0), fourier(5, 0.1, 10.0)
-    sampler, theta = Sampler(model, learned.terms, np.asarray(learned.width)), np.asarray(learned.theta)
-    objective, kept = information_objective(np.asarray(learned.prior)), np.array(learned.independent)
-    problem = Problem(learned, sampler, objective, kept, basis, bounds, None)
+    learned, bounds = fj.learn(model, trust=None), fj.limits_of(model, acceleration=8.0)
+    basis = fj.fourier(5, 0.1, 10.0)
+    problem, theta = searched(learned, basis, bounds), np.asarray(learned.theta)
+    sampler = problem.sampler
     A, b = problem.linear_matrix({})
 
     def room(x: np.ndarray) -> np.ndarray:
@@ -220,11 +213,11 @@ def _beside_ipopt(minimize_ipopt: Any, name: str, model: Any, options: tuple[int
         flat = out.reshape(-1, len(x))
         return np.concatenate([-A, -flat, flat])
 
-    excite(model, basis, bounds, learned, starts=1, seed=9)
+    fj.excite(model, basis, bounds, learned, starts=1, seed=9)
     ours = []
     for own in range(seed, seed + 3):
         since = time.process_time()
-        ours.append(excite(model, basis, bounds, learned, starts=1, seed=own))
+        ours.append(fj.excite(model, basis, bounds, learned, starts=1, seed=own))
         told(f"{name}: ours, one start, seed {own}", ours[-1], spent(since))
     found = min(ours, key=lambda one: one.logdet)
     generator = np.random.default_rng([seed, 0])
@@ -250,17 +243,12 @@ def limits(robots: Sequence[str] = ("UR10e", "Panda"), seed: int = 0, starts: in
 
     Three seeds from `seed` on.
     """
-    from figaroh_jax.excitation.design import excite
-    from figaroh_jax.excitation.information import learn
-    from figaroh_jax.excitation.limits import limits_of
-    from figaroh_jax.excitation.motions import fourier, spline
-
     for name, model in ((name, arms()[name]) for name in robots):
-        learned, bounds = learn(model, trust=None), limits_of(model, acceleration=8.0)
-        for basis in (fourier(5, 0.1, 10.0), spline(9, 10.0)):
+        learned, bounds = fj.learn(model, trust=None), fj.limits_of(model, acceleration=8.0)
+        for basis in (fj.fourier(5, 0.1, 10.0), fj.spline(9, 10.0)):
             for own in range(seed, seed + 3):
                 since = time.process_time()
-                found = excite(model, basis, bounds, learned, starts=starts, seed=own)
+                found = fj.excite(model, basis, bounds, learned, starts=starts, seed=own)
                 told(f"{name} {basis.kind} seed {own}", found, spent(since))
 
 
@@ -270,21 +258,14 @@ def descents(robots: Sequence[str] = ("UR10e", "Panda"), seed: int = 5, starts: 
     The Hessian of the first of both knows six steps, and three and 25 besides.
     """
     from figaroh_jax.excitation import interior
-    from figaroh_jax.excitation.information import learn
-    from figaroh_jax.excitation.limits import limits_of
-    from figaroh_jax.excitation.motions import fourier
-    from figaroh_jax.excitation.objectives import information_objective
-    from figaroh_jax.excitation.sampling import Sampler
     from figaroh_jax.excitation.search import random_motion
-    from figaroh_jax.excitation.solvers import STEPS, Problem, polished, within
+    from figaroh_jax.excitation.solvers import STEPS, polished, within
 
     for name, remembered in itertools.product(robots, (6, 3, 25)):
         interior.REMEMBERED = remembered
         model = arms()[name]
-        learned, bounds = learn(model, trust=None), limits_of(model, acceleration=8.0)
-        sampler = Sampler(model, learned.terms, np.asarray(learned.width))
-        objective, kept = information_objective(np.asarray(learned.prior)), np.array(learned.independent)
-        problem = Problem(learned, sampler, objective, kept, fourier(5, 0.1, 10.0), bounds, None)
+        learned, bounds = fj.learn(model, trust=None), fj.limits_of(model, acceleration=8.0)
+        problem = searched(learned, fj.fourier(5, 0.1, 10.0), bounds)
         ends, since = [], time.process_time()
         for k in range(starts):
             before = problem.evaluations
@@ -303,14 +284,13 @@ def descents(robots: Sequence[str] = ("UR10e", "Panda"), seed: int = 5, starts: 
 
 def sequence() -> None:
     """Four motions one after another on FIGAROH's problem, weighted, with friction: worth how many repeats."""
-    from figaroh_jax.excitation.design import excite, gram_of
-    from figaroh_jax.excitation.information import learn
+    from figaroh_jax.excitation.design import gram_of
     from figaroh_jax.excitation.sampling import Sampler
 
     model, basis, bounds, _ = peer_problem()
-    learned = learn(model, trust=None)
+    learned = fj.learn(model, trust=None)
     since = time.process_time()
-    found = excite(model, basis, bounds, learned, trajectories=4, starts=6, start=POSTURE)
+    found = fj.excite(model, basis, bounds, learned, trajectories=4, starts=6, start=POSTURE)
     cpu = spent(since)
     sampler = Sampler(model, learned.terms, np.asarray(learned.width))
     gram = gram_of(learned, sampler, found.stages[0].motion.states(20.0))
@@ -323,7 +303,7 @@ def sequence() -> None:
 
 def postures() -> None:
     """30 postures of 500 candidates, moved; the bound is that of 5000 others."""
-    from figaroh_jax.excitation.postures import Instrument, _Calibrated, certified_bound, excite_postures
+    from figaroh_jax.excitation.postures import _Calibrated, certified_bound
 
     cases = {
         "UR10e": ("base", "wrist_3_link"),
@@ -331,10 +311,10 @@ def postures() -> None:
         "TALOS": ("base_link", "arm_left_7_link"),
     }
     for name, model in {**arms(), "TALOS": torso_and_arm()}.items():
-        device = Instrument("pose", *cases[name])
-        excite_postures(model, device)
+        device = fj.Instrument("pose", *cases[name])
+        fj.excite_postures(model, device)
         since = time.process_time()
-        found = excite_postures(model, device)
+        found = fj.excite_postures(model, device)
         cpu = spent(since)
         low, high = np.clip(np.array(model.position_limit), -2 * np.pi, 2 * np.pi).T
         q = np.random.default_rng(0).uniform(low, high, (500, model.nv))
@@ -357,16 +337,13 @@ def fresh(draws: int = 8) -> None:
     """
     import equinox as eqx
 
-    import figaroh_jax as fj
-    from figaroh_jax.excitation.postures import Instrument, excite_postures
-
     def poses(robot: Any, q: np.ndarray, base: str, tool: str) -> np.ndarray:
         return np.linalg.solve(fj.frame_placement(robot, q, base), fj.frame_placement(robot, q, tool))
 
     frames = {"UR10e": ("base", "wrist_3_link"), "Panda": ("panda_link0", "panda_link7")}
     for name, model in arms().items():
         base, tool = frames[name]
-        designed = excite_postures(model, Instrument("pose", base, tool, ())).position
+        designed = fj.excite_postures(model, fj.Instrument("pose", base, tool, ())).position
         low, high = np.clip(np.array(model.position_limit), -2 * np.pi, 2 * np.pi).T
         errors: dict[str, list[tuple[float, float]]] = {"designed": [], "random": []}
         for k in range(draws):
@@ -407,17 +384,17 @@ def views() -> None:
 
     The camera looks at a board on the table at 0.2 to 1 m, within 0.35 rad of its axis and 0.9 rad of the normal.
     """
-    from figaroh_jax.excitation.postures import Instrument, View, excite_postures
+    from figaroh_jax.excitation.postures import View
 
     board = View((0.5, 0.0, 0.0), (0.0, 0.0, 1.0), "hand", cone=0.35, tilt=0.9, near=0.2, far=1.0)
     cases = {
-        "TALOS": (torso_and_arm(), Instrument("pose", "base_link", "arm_left_7_link")),
-        "Panda, camera": (arms()["Panda"], Instrument("pose", "panda_link0", "panda_link7", view=board)),
+        "TALOS": (torso_and_arm(), fj.Instrument("pose", "base_link", "arm_left_7_link")),
+        "Panda, camera": (arms()["Panda"], fj.Instrument("pose", "panda_link0", "panda_link7", view=board)),
     }
     for name, (model, device) in cases.items():
-        excite_postures(model, device)
+        fj.excite_postures(model, device)
         since = time.process_time()
-        found = excite_postures(model, device)
+        found = fj.excite_postures(model, device)
         print(
             f"{name}: {len(found.parameters)} parameters, {found.candidates} candidates; of their bound: random"
             f" {found.random_efficiency:.3f}, chosen {found.chosen_efficiency:.4f}, moved {found.efficiency:.4f};"
@@ -439,29 +416,15 @@ PAIRS = {
 
 def separation(names: Sequence[str] = tuple(PAIRS), seed: int = 0, starts: int = 2) -> None:
     """Pairs of causes at the UR10e's elbow, 10 s: sigmas of random, D-optimal and designed motions, both ways."""
-    from figaroh_jax.excitation.design import excite, gram_of
-    from figaroh_jax.excitation.information import learn
-    from figaroh_jax.excitation.limits import limits_of
-    from figaroh_jax.excitation.motions import fourier
-    from figaroh_jax.excitation.objectives import information_objective
-    from figaroh_jax.excitation.sampling import Sampler
+    from figaroh_jax.excitation.design import gram_of
     from figaroh_jax.excitation.search import random_motion
     from figaroh_jax.excitation.separation import causes, separated
-    from figaroh_jax.excitation.solvers import Problem
 
     model = arms()["UR10e"]
-    learned, bounds, basis = learn(model), limits_of(model, acceleration=8.0), fourier(10, 0.1, 10.0)
-    problem = Problem(
-        learned,
-        Sampler(model, learned.terms, np.asarray(learned.width)),
-        information_objective(np.asarray(learned.prior)),
-        np.array(learned.independent),
-        basis,
-        bounds,
-        None,
-    )
+    learned, bounds, basis = fj.learn(model), fj.limits_of(model, acceleration=8.0), fj.fourier(10, 0.1, 10.0)
+    problem = searched(learned, basis, bounds)
     states = [problem.states(random_motion(problem, np.random.default_rng(k))) for k in range(11)]
-    most = excite(model, basis, bounds, learned, starts=2).stages[0].motion.states(20.0)
+    most = fj.excite(model, basis, bounds, learned, starts=2).stages[0].motion.states(20.0)
     for pair in (PAIRS[name] for name in names):
         given = causes(learned, [pair], states[0])
 
@@ -470,7 +433,8 @@ def separation(names: Sequence[str] = tuple(PAIRS), seed: int = 0, starts: int =
             return np.array([one.sigmas for one in separated(given, G, np.asarray(learned.prior))])
 
         since = time.process_time()
-        found = excite(model, basis, bounds, learned, objective="separate", separate=[pair], starts=starts, seed=seed)
+        options: dict[str, Any] = {"starts": starts, "seed": seed}
+        found = fj.excite(model, basis, bounds, learned, objective="separate", separate=[pair], **options)
         cpu = spent(since)
         usual, best = np.median([both(motion) for motion in states], axis=0), both(most)
         for k, one in enumerate(found.separated):
@@ -490,17 +454,12 @@ def chooser(
     at 50 Hz. Both causes are fitted with all links (believed within 10 %) and friction by least squares in NumPy, and
     the larger evidence names. Sigmas measured: root of the mean difference of the penalised squares, freedoms counted.
     """
-    from figaroh_jax.excitation.design import excite
-    from figaroh_jax.excitation.information import learn
-    from figaroh_jax.excitation.limits import limits_of
-    from figaroh_jax.excitation.motions import fourier
-
     model = arms()["UR10e"]
-    learned, bounds, basis = learn(model), limits_of(model, acceleration=8.0), fourier(harmonics, 0.1, 10.0)
+    learned, bounds, basis = fj.learn(model), fj.limits_of(model, acceleration=8.0), fj.fourier(harmonics, 0.1, 10.0)
     for name, pair in ((name, PAIRS[name]) for name in names):
         since = time.process_time()
         options = {"starts": starts, "rate": 50.0, "seed": seed}
-        found = excite(model, basis, bounds, learned, objective="separate", separate=[pair], **options)
+        found = fj.excite(model, basis, bounds, learned, objective="separate", separate=[pair], **options)
         cpu = spent(since)
         runs = _Runs(model, learned, found.stages[0].motion, pair)
         said = []
@@ -520,7 +479,6 @@ class _Runs:
     """Simulated runs of a motion and the fits of two causes to them, without any code of the library."""
 
     def __init__(self, model: Any, learned: Any, motion: Any, pair: Any) -> None:
-        sys.path.insert(0, str(ROOT / "backends"))
         from figaroh_jax_pinocchio import PinocchioBackend
 
         self.robot, self.pair = PinocchioBackend.build(model), pair
@@ -596,7 +554,7 @@ class _Runs:
             noise = np.random.default_rng([3, side, repeats, k])
             y = self.X @ (spread @ noise.standard_normal(links)) + Z @ amplitude
             y = y + noise.standard_normal((repeats, len(y))).mean(0)
-            (a, sse_a), (b, sse_b) = (_best(some, y, repeats) for some in fits)
+            (a, sse_a), (b, sse_b) = (_best(some, y) for some in fits)
             right, sure = right + (a > b), sure + (a > b + 4)
             better.append(sse_b - sse_a)
         own, other = fits[0][0], fits[1][0]
@@ -641,7 +599,7 @@ class _Fit:
         return self.volume - 0.5 * squares, squares
 
 
-def _best(fits: list[_Fit], y: np.ndarray, repeats: int) -> tuple[float, float]:
+def _best(fits: list[_Fit], y: np.ndarray) -> tuple[float, float]:
     """Evidence over the shapes, and the smallest squares among them."""
     told = [fit(y) for fit in fits]
     most = max(evidence for evidence, _ in told)
@@ -660,24 +618,15 @@ def pays(draws: int = 60, seed: int = 0, starts: int = 8, peer: str | None = Non
     The truth is Pinocchio's, with Coulomb and viscous friction, 30 % more Coulomb friction at rest (Stribeck), torque
     noise of 1 % of the largest torque and an encoder error of 2 mrad; the fit is plain weighted least squares in NumPy.
     """
-    sys.path.insert(0, str(ROOT / "backends"))
     from figaroh_jax_pinocchio import PinocchioBackend
 
-    from figaroh_jax.excitation.design import excite
-    from figaroh_jax.excitation.information import learn
-    from figaroh_jax.excitation.objectives import information_objective
-    from figaroh_jax.excitation.sampling import Sampler
     from figaroh_jax.excitation.search import random_motion
-    from figaroh_jax.excitation.solvers import Problem
 
     model, basis, bounds, plain = peer_problem()
-    learned, robot = learn(model, trust=None), PinocchioBackend.build(model)
+    learned, robot = fj.learn(model, trust=None), PinocchioBackend.build(model)
     sigma = 1 / np.sqrt(np.asarray(learned.weight))
     kept = np.array(learned.independent)
-    sampler = Sampler(model, learned.terms, np.asarray(learned.width))
-    problem = Problem(
-        learned, sampler, information_objective(np.asarray(learned.prior)), kept, basis, bounds, np.array(POSTURE)
-    )
+    problem = searched(learned, basis, bounds, np.array(POSTURE))
     generator = np.random.default_rng(7)
     randoms = [problem.states(random_motion(problem, generator)) for _ in range(25)]
     unseen, randoms = randoms[:10], randoms[10:]
@@ -717,9 +666,9 @@ def pays(draws: int = 60, seed: int = 0, starts: int = 8, peer: str | None = Non
     seen = [tuple(motion) for motion in randoms]  # motions of the kind that matters, none of them judged on
     same = {"start": POSTURE, "starts": starts, "seed": seed}
     designs = {
-        "condition": excite(model, basis, bounds, plain, objective="condition", **same),
-        "information": excite(model, basis, bounds, learned, **same),
-        "prediction": excite(model, basis, bounds, learned, objective="prediction", predict=seen, **same),
+        "condition": fj.excite(model, basis, bounds, plain, objective="condition", **same),
+        "information": fj.excite(model, basis, bounds, learned, **same),
+        "prediction": fj.excite(model, basis, bounds, learned, objective="prediction", predict=seen, **same),
     }
     motions = {name: np.stack(found.stages[0].motion.states(20.0)) for name, found in designs.items()}
     against = "condition"
@@ -746,7 +695,6 @@ def ranking(triples: int = 200) -> None:
     """
     from scipy.stats import spearmanr
 
-    import figaroh_jax as fj
     from figaroh_jax.estimation.base_parameters import base_parameters
     from figaroh_jax.estimation.columns import structural_columns
     from figaroh_jax.estimation.regression import Regression, condense
@@ -838,16 +786,13 @@ def gpu(starts: int = 256, outer: int = 5, inner: int = 100, compared: int = 4) 
     import jax
     import jax.numpy as jnp
 
-    from figaroh_jax.excitation.objectives import information_objective
-    from figaroh_jax.excitation.sampling import Sampler
     from figaroh_jax.excitation.search import random_motion
-    from figaroh_jax.excitation.solvers import Problem, solve
+    from figaroh_jax.excitation.solvers import solve
     from figaroh_jax.rigid.regressor import joint_torque_regressor
 
     model, basis, bounds, learned = peer_problem()
     kept, start = np.array(learned.independent), np.array(POSTURE)
-    sampler = Sampler(model, learned.terms, np.asarray(learned.width))
-    problem = Problem(learned, sampler, information_objective(np.asarray(learned.prior)), kept, basis, bounds, start)
+    problem = searched(learned, basis, bounds, start)
     A, b = problem.linear_matrix({})
     generator = np.random.default_rng(0)
     x0 = np.stack([random_motion(problem, generator) for _ in range(starts)])
@@ -947,6 +892,7 @@ def main() -> None:
     parser.add_argument("--peer", help="FIGAROH's motion, of `peer_motion.py`, that `pays` compares with")
     parser.add_argument("--names", nargs="+", choices=list(PAIRS), help="pairs of causes, where a part takes them")
     args = parser.parse_args()
+    assert fj.excite  # loaded before any clock starts
     if args.cold:
         if "clearance" in args.parts:
             clearance(args.seed, cold=True)
@@ -968,7 +914,6 @@ if __name__ == "__main__":
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
-    sys.path.insert(0, str(ROOT))
     import jax
 
     jax.config.update("jax_enable_x64", True)

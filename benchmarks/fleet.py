@@ -83,7 +83,7 @@ def main() -> None:
             f" {at_once} robots at once",
             flush=True,
         )
-    _judge(found, base, np.asarray(fleet.inertia), drives)
+    _judge(found, base, drives)
     memory = jax.devices()[0].memory_stats() or {}
     print(f"peak of the device's memory: {memory.get('peak_bytes_in_use', 0) / 1e9:.2f} GB", flush=True)
     few = jax.tree.map(lambda x, yes: x[:COMPARED] if yes else x, jax.device_get(fleet), axes)
@@ -188,7 +188,7 @@ def _recordings(fleet: RobotModel, drives: Any, samples: int) -> tuple[Any, ...]
     return q, v, a, rigid + viscous * v + coulomb * jnp.sign(v) + rotor * a + offset + noise
 
 
-def _judge(found: BatchFit, base: BaseParameters, inertia: np.ndarray, drives: np.ndarray) -> None:
+def _judge(found: BatchFit, base: BaseParameters, drives: np.ndarray) -> None:
     """Errors in standard deviations, and what the robots have in common. The mean robot's lengths name the groups."""
     kept = base.independent
     values, std = found.parameters[:, kept], found.std[:, kept]

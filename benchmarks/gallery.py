@@ -27,7 +27,6 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", ROOT.parent / "shared" / "data"))
 BOTH = ["base_frame", "tool_frame"]
-PANDA = [f"panda_joint{k}" for k in range(1, 8)]
 TIAGO = ["torso_lift_joint", *(f"arm_{k}_joint" for k in range(1, 8))]
 TALOS = ["torso_1_joint", "torso_2_joint", *(f"arm_left_{k}_joint" for k in range(1, 8))]
 
@@ -50,12 +49,12 @@ def hidden(name: str) -> Callable[[Path], dict[str, Any]]:
         from benchmarks.hide_in_real.generate import twin_of
         from benchmarks.hide_in_real.recordings import SETS
 
-        return twin_of(folder, SETS[name]())["task"] | {"robot": _robot(folder, name, SETS[name]())}
+        return twin_of(folder, SETS[name]())["task"] | {"robot": _robot(name, SETS[name]())}
 
     return write
 
 
-def _robot(folder: Path, name: str, real: Any) -> dict[str, Any]:
+def _robot(name: str, real: Any) -> dict[str, Any]:
     return real.task["robot"] | {"model": f"{name}/robot.urdf"}
 
 

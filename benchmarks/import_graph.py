@@ -14,7 +14,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 
-def imports(path: Path, root: Path, modules: set[str], types: bool = False) -> Iterator[tuple[str, bool]]:
+def imports(path: Path, root: Path, modules: set[str]) -> Iterator[tuple[str, bool]]:
     """Modules of the package that a file imports, and whether inside a function; `TYPE_CHECKING` is left out."""
     package = list(path.relative_to(root).parts[:-1])
     waiting: list[tuple[ast.AST, bool]] = [(ast.parse(path.read_text(encoding="utf-8")), False)]

@@ -23,7 +23,7 @@ from mujoco import sysid as peer
 from mujoco.sysid.report.sections.insights import AutomatedInsights
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from generators import servo_arm, servo_arm6  # noqa: E402
+from generators import servo_arm, servo_arm6
 
 mujoco: Any = engine
 WORDS = ("armature", "damping", "frictionloss")

@@ -26,12 +26,12 @@ import jax
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from generators import people as simulated  # noqa: E402
+from generators import people as simulated
 
-import figaroh_jax as fj  # noqa: E402
-from figaroh_jax.estimation import markers  # noqa: E402
-from figaroh_jax.identification import people  # noqa: E402
-from figaroh_jax.rigid.inertia import to_com  # noqa: E402
+import figaroh_jax as fj
+from figaroh_jax.estimation import markers
+from figaroh_jax.identification import people
+from figaroh_jax.rigid.inertia import to_com
 
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 URDF = DATA / "human_model" / "human.urdf"

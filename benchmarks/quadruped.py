@@ -108,7 +108,7 @@ def soft(seconds: float, seed: int, folder: Path) -> None:
     (folder / "swinging.xml").write_text(model_text(1.6, base=SOFT))
     loop, _ = load_loop(folder / "swinging.xml")
     places = tuple(loop.robot.dof_names.index(name) for name in JOINTS)
-    loop = dataclasses.replace(loop, measured=places, summed=(-1,) * len(places))
+    loop = dataclasses.replace(loop, measured=places)
     made = [record(seed, k, seconds, soft=True) for k in range(3)]
     runs = [Run(f"run {k}", r["t"], r["u"], r["q"], None) for k, r in enumerate(made)]
     effects = {"rotor_inertia": "armature", "joint_damping": "damping", "friction_loss": "friction"}

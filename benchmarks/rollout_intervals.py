@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from generators import servo_arm6  # noqa: E402
+from generators import servo_arm6
 
-from figaroh_jax.rollouts.arm import alike_by_recording  # noqa: E402
-from figaroh_jax.rollouts.data import Run, Stretch  # noqa: E402
-from figaroh_jax.rollouts.gates import standing  # noqa: E402
-from figaroh_jax.rollouts.reading import load_loop  # noqa: E402
-from figaroh_jax.rollouts.setting import Structure, begun, setting  # noqa: E402
+from figaroh_jax.rollouts.arm import alike_by_recording
+from figaroh_jax.rollouts.data import Run, Stretch
+from figaroh_jax.rollouts.gates import standing
+from figaroh_jax.rollouts.reading import load_loop
+from figaroh_jax.rollouts.setting import Structure, begun, setting
 
 DIFFER = 0.1  # of the mean, one standard deviation
 

@@ -33,7 +33,7 @@ from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.sensitivity import linear_sums
 
 mujoco: Any = engine
-DATA = Path(os.environ.get("FIGAROH_JAX_DATA", "/data"))
+DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 KP, KV = (600.0, 600.0, 500.0, 400.0, 150.0, 120.0, 60.0), (30.0, 30.0, 25.0, 20.0, 7.0, 6.0, 3.0)
 TRUTH = {
     "armature": (0.2, 0.2, 0.15, 0.15, 0.1, 0.1, 0.06),
@@ -133,14 +133,14 @@ def sysid(rows: int, folder: Path) -> None:
             flush=True,
         )
     for _ in range(2):
-        theta, wall, spent = _timed(lambda: _peer(rows, seen, truth))
+        theta, wall, spent = _timed(lambda: _peer(rows, seen))
         print(
             f"mujoco.sysid: {wall:.2f} s, {spent:.2f} CPU s; median error {_wrong(theta, truth)}, peak {_peak()}",
             flush=True,
         )
 
 
-def _peer(rows: int, seen: list[tuple[np.ndarray, ...]], truth: np.ndarray) -> np.ndarray:
+def _peer(rows: int, seen: list[tuple[np.ndarray, ...]]) -> np.ndarray:
     """The fit of mujoco.sysid: its sensors hold positions, then rates, each divided by its noise."""
     from mujoco import sysid as peer
 

@@ -41,7 +41,7 @@ from figaroh_jax.rollouts.setting import Setting, setting
 from figaroh_jax.rollouts.table import on_table
 from figaroh_jax.rollouts.task import simulated
 
-DATA = Path(os.environ.get("FIGAROH_JAX_DATA", "/data"))
+DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
 
 def miuzei_runs() -> list[Run]:

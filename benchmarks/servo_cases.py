@@ -19,13 +19,13 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from generators import servo_arm  # noqa: E402
+from generators import servo_arm
 
-from figaroh_jax.rollouts.data import Run  # noqa: E402
-from figaroh_jax.rollouts.fit import standard_errors  # noqa: E402
-from figaroh_jax.rollouts.reading import load_loop  # noqa: E402
-from figaroh_jax.rollouts.search import Search, search  # noqa: E402
-from figaroh_jax.rollouts.setting import setting  # noqa: E402
+from figaroh_jax.rollouts.data import Run
+from figaroh_jax.rollouts.fit import standard_errors
+from figaroh_jax.rollouts.reading import load_loop
+from figaroh_jax.rollouts.search import Search, search
+from figaroh_jax.rollouts.setting import setting
 
 TRUTH = {"armature": 0.05, "damping": 0.4, "friction": 0.3}
 EFFECT = {

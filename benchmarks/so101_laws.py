@@ -28,7 +28,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 mujoco: Any = importlib.import_module("mujoco")  # its stubs name half of it
-DATA = Path(os.environ.get("FIGAROH_JAX_DATA", "/data")) / "so101_sage"
+DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "so101_sage"
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 PERIOD, STEPS = 0.02006, 4
 COUNT = 4.4e-4  # rad, rounding to a count of the encoder: no motion is told better

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
@@ -23,6 +24,7 @@ __all__ = [
     "Selection",
     "Trace",
     "Verdict",
+    "finite",
 ]
 
 Verdict = Literal["nothing", "named", "named+rest", "unknown"]
@@ -191,3 +193,9 @@ class Diagnosis(Selection):
         if self.of_positions:
             return tuple("m" if straight else "rad" for straight in self.prismatic or (False,) * len(self.joints))
         return tuple("N" if straight else "N m" for straight in self.prismatic or (False,) * len(self.joints))
+
+
+def finite(value: Any) -> float | None:
+    """A number as JSON takes it: a plain one, None where it is infinite or none."""
+    plain = float(value)
+    return plain if math.isfinite(plain) else None

@@ -10,8 +10,8 @@ from pathlib import Path
 # less time in all). `make test-slow` and the benchmarks run what users run.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
-import jax  # noqa: E402
-import pytest  # noqa: E402
+import jax
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 QUICK = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"

@@ -23,7 +23,6 @@ from figaroh_jax.results import (
 JOINTS = tuple(f"joint_{number}" for number in range(1, 7))
 COUPLING = Name("coupled_transmission", ("joint_5", "joint_6"))
 ROTOR = Name("rotor_inertia", ("joint_3",))
-STRIBECK = Name("stribeck_friction", ("joint_3",))
 _SCALE = np.array([30.0, 25.0, 12.0, 4.0, 3.0, 2.0])  # torque of each joint, N m
 
 

@@ -125,7 +125,6 @@ CYCLE = """<robot name="ring"><link name="a"/><link name="b"/><link name="root"/
 <joint name="there" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint>
 <joint name="back" type="revolute"><parent link="b"/><child link="a"/><axis xyz="0 0 1"/></joint></robot>"""
 HEADER = b"t,q1,q2,q3,tau1,tau2,tau3\n"
-PREFIX = {"data.0.file": "run.csv"}
 
 TASKS: dict[str, tuple[Spoil, list[str]]] = {
     "unknown key at the top": (key("preproces", {}), ["task.yaml", "'preproces'", "'preprocess'"]),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,8 @@ from figaroh_jax import cli
 from figaroh_jax.calibration.calibrated import Calibration
 from figaroh_jax.calibration.calibration import calibrate_task
 from figaroh_jax.formats.config import load_task
+from figaroh_jax.reporting.calibration_report import nominal_of
+from figaroh_jax.reporting.picture import segments
 
 OFFSET = np.array([0.01, -0.03, 0.05, 0.04, -0.06, 0.02])
 BAD_ROW = 17
@@ -166,17 +167,13 @@ def test_the_level_that_is_asked_for_is_the_one_that_is_fitted(
     assert "no level 'offset' of calibration; did you mean 'joint_offset'?" in capsys.readouterr().err
 
 
-def test_the_view_moves_the_nominal_and_the_calibrated_robot(calibrated: Calibration, wrong: tuple[Path, poses.Truth]):
-    from figaroh_jax.reporting.calibration_view import nominal_of, segments, show
-
+def test_the_nominal_robot_is_that_before_the_corrections(calibrated: Calibration, wrong: tuple[Path, poses.Truth]):
     robot = pin.buildModelFromUrdf(str(wrong[0].parent / "robot.urdf"))
     q, data = poses.postures(np.random.default_rng(3), 1)[0], robot.createData()
     pin.forwardKinematics(robot, data, q)
     tips = np.array([data.oMi[k].translation for k in range(1, 7)])
     np.testing.assert_allclose(segments(nominal_of(calibrated), q)[:, 1], tips, rtol=0, atol=1e-12)
     assert np.abs(segments(calibrated.model, q)[:, 1] - tips).max() > 1e-3
-    if importlib.util.find_spec("viser") is not None:
-        show(calibrated, port=18080).stop()
 
 
 def test_a_robot_that_is_already_good_gets_nothing(tmp_path: Path):

@@ -12,9 +12,11 @@ import pytest
 import reference
 import robots
 
+from figaroh_jax.effects.kinematic import CATALOGUE, Postures, columns_of
 from figaroh_jax.errors import InputError
 from figaroh_jax.estimation.gravity import gravity_moments, without_far_masses
 from figaroh_jax.rigid.chain import chain_between, chain_pose, joint_response
+from figaroh_jax.rigid.kinematics import forward_kinematics
 from figaroh_jax.rigid.lie import log_so3
 
 pose_of = jax.jit(chain_pose)
@@ -87,3 +89,19 @@ def test_a_centre_of_mass_far_outside_the_robot_is_left_out_and_said(tmp_path: P
     model, notes = without_far_masses(robots.load(far, tmp_path))
     assert len(notes) == 1 and "link b" in notes[0]
     np.testing.assert_array_equal(np.asarray(model.inertia)[1], 0.0)
+
+
+def test_derivative_by_an_offset_is_the_column_of_the_calibration(tmp_path: Path):
+    model = robots.load(robots.ARM, tmp_path)
+    chain, q = chain_between(model, "base", "b"), np.random.default_rng(0).uniform(-1.0, 1.0, 2)
+    none = np.zeros((1, 0))
+    postures = Postures(q[None], q[None], none, none, none, np.zeros(1), 1.0)
+    by_joint = jax.jit(jax.jacfwd(lambda q: forward_kinematics(model, q)[1, :3, 3]))(jnp.asarray(q))
+    along = jax.jit(
+        lambda t, d: jax.jvp(lambda t: chain_pose(chain, jnp.asarray(q[:, None]), t).p[:, 0], (t,), (d,))[1]
+    )
+    for joint in range(2):
+        (column,) = columns_of(CATALOGUE["joint_offset"], model, (joint,))
+        ((_, field),) = column.pieces
+        step = jnp.zeros((2, 6, 1)).at[joint].set(field(postures))
+        np.testing.assert_allclose(by_joint[:, joint], along(0 * step, step), rtol=0, atol=1e-13)

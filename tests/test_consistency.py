@@ -1,4 +1,4 @@
-"""Links that can exist: reasons, projections, and two fits that must meet."""
+"""Physically consistent links: reasons, projections, and two fits that must meet."""
 
 from __future__ import annotations
 

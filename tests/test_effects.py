@@ -210,7 +210,7 @@ def test_torque_equals_the_equation(name: str, model: RobotModel):
 @pytest.mark.parametrize("name", TORQUES)
 def test_columns_are_the_torque_of_a_unit_of_each_amplitude(name: str, model: RobotModel):
     motion, effect = moving(model), made(name, model)
-    linear = [key for key, parameter in effect.parameters().items() if parameter.linear]
+    linear = effect.amplitudes()
     found = columns(effect, motion)
     assert found.shape[0] == len(linear)
     for key, column in zip(linear, found, strict=True):

@@ -90,21 +90,21 @@ def test_gradient_by_the_regressor_is_that_of_pinocchios_regressor(text: str, tm
         assert slope[at] == pytest.approx((total(state + step) - total(state - step)) / (2 * h), rel=1e-6, abs=1e-6)
 
 
+def friction_rows(v: np.ndarray) -> np.ndarray:
+    """Viscous and Coulomb friction of the arm's two joints, (samples, 2, 4)."""
+    return np.concatenate([np.eye(2) * v[:, None], np.eye(2) * np.tanh(v / (info.SMOOTH + 1e-9))[:, None]], axis=2)
+
+
 def test_information_is_the_log_determinant_of_pinocchios_rows(arm: RobotModel):
     learned, motion = info.learn(arm, noise={"turn": 0.02, "bend": 0.01}), a_motion(arm)
-    q, v, a = motion.states(20.0)
-    friction = np.zeros((len(q), 2, 4))
-    for joint in range(2):
-        friction[:, joint, joint] = v[:, joint]
-        friction[:, joint, 2 + joint] = np.tanh(v[:, joint] / (info.SMOOTH + 1e-9))
-    rows = np.concatenate([reference.regressor(arm, q, v, a), friction], axis=2) / np.array([1.2, 0.2])[:, None]
+    q, v, a = map(np.asarray, motion.states(20.0))
+    rows = np.concatenate([reference.regressor(arm, q, v, a), friction_rows(v)], axis=2) / np.array([1.2, 0.2])[:, None]
     kept = rows.reshape(-1, rows.shape[2])[:, list(learned.independent)]
     assert np.linalg.matrix_rank(rows.reshape(-1, rows.shape[2])) == learned.rank
     expected = np.linalg.slogdet(kept.T @ kept + learned.prior)[1]
     assert float(info.information(arm, motion, learned)) == pytest.approx(expected, rel=1e-9)
     std = np.sqrt(np.diag(np.linalg.inv(kept.T @ kept + learned.prior)))
     np.testing.assert_allclose(info.expected_std(learned, motion), std, rtol=1e-6)
-    assert float(info.condition(learned, motion)) == pytest.approx(np.linalg.cond(kept), rel=1e-6)
 
 
 def test_prior_is_the_covariance_that_trust_gives_the_base_parameters(arm: RobotModel):
@@ -308,8 +308,9 @@ def test_an_identification_from_the_designed_motion_predicts_better_than_from_ra
 
     def rows(states: np.ndarray) -> np.ndarray:
         q, v, a = states
-        friction = np.concatenate([np.eye(2) * v[:, None], np.eye(2) * np.tanh(v / info.SMOOTH)[:, None]], axis=2)
-        return (np.concatenate([reference.regressor(arm, q, v, a), friction], axis=2)[:, :, kept]) / sigma[:, None]
+        return (
+            np.concatenate([reference.regressor(arm, q, v, a), friction_rows(v)], axis=2)[:, :, kept] / sigma[:, None]
+        )
 
     def torque(states: np.ndarray) -> np.ndarray:
         q, v, a = states

@@ -30,7 +30,7 @@ def setting(tmp_path_factory: pytest.TempPathFactory) -> tuple[Problem, State, n
     held = held_rows(signals, records)
     problem = Problem(NativeBackend(model), records, layout(signals, records), 0.1, np.zeros(2), held)
     state = baseline(problem, ["viscous_friction", "coulomb_friction"])
-    return problem, solved(problem, state, state.prior.mean), np.ones((len(records.omega), 1)) / NOISE
+    return problem, solved(state, state.prior.mean), np.ones((len(records.omega), 1)) / NOISE
 
 
 def friction(problem: Problem) -> Effect:

@@ -147,6 +147,15 @@ def test_two_causes_that_show_only_beside_each_other_stay_when_a_third_goes(monk
     assert kept.holdout.after == pytest.approx(np.sqrt(0.5) * kept.holdout.before)
 
 
+def to_other(base: np.ndarray, other: np.ndarray) -> Any:
+    """Every cause brings the squares from `base` to `other`."""
+
+    def by_gain(problem: Any, start: Any, whitening: Any, causes: Sequence[str], later: Sequence[bool]) -> Any:
+        return list(range(len(causes))), in_turn(base, *[other for _ in causes]), base.sum(1)
+
+    return by_gain
+
+
 def test_causes_that_raise_the_error_of_all_rows_by_chance_are_not_handed_over(monkeypatch: pytest.MonkeyPatch):
     """The joint is predicted better while it moves, worse where it stands: all rows are what users see."""
     moving = squares(np.random.default_rng(7), 1.0)[1]
@@ -156,10 +165,7 @@ def test_causes_that_raise_the_error_of_all_rows_by_chance_are_not_handed_over(m
     base, other = np.stack([standing + moving, moving]), np.stack([standing * moved + 0.5 * moving, 0.5 * moving])
     assert fall(base, other, [0]).gains
 
-    def by_gain(problem: Any, start: Any, whitening: Any, causes: Sequence[str], later: Sequence[bool]) -> Any:
-        return list(range(len(causes))), in_turn(base, *[other for _ in causes]), base.sum(1)
-
-    assert stood_by(monkeypatch, by_gain, "a").worse == ["a"]
+    assert stood_by(monkeypatch, to_other(base, other), "a").worse == ["a"]
 
 
 @pytest.mark.parametrize(("moved", "strict", "kept"), [(0.97, True, True), (0.97, False, False), (1.01, True, False)])
@@ -173,11 +179,8 @@ def test_a_cause_that_is_sure_beside_what_has_no_name_is_named_where_it_does_not
     other *= moved * base.sum() / other.sum()
     assert not fall(base, other, [0]).gains
 
-    def by_gain(problem: Any, start: Any, whitening: Any, causes: Sequence[str], later: Sequence[bool]) -> Any:
-        return list(range(len(causes))), in_turn(base, *[other for _ in causes]), base.sum(1)
-
-    assert stood_by(monkeypatch, by_gain, "a").worse == ["a"]
-    assert stood_by(monkeypatch, by_gain, "a", strict, borne_out="a").worse == ([] if kept else ["a"])
+    assert stood_by(monkeypatch, to_other(base, other), "a").worse == ["a"]
+    assert stood_by(monkeypatch, to_other(base, other), "a", strict, borne_out="a").worse == ([] if kept else ["a"])
 
 
 @pytest.mark.parametrize(("left", "claim", "sure"), [(0.7, 0.6, True), (0.8, 0.95, False), (0.97, 0.02, False)])
@@ -225,12 +228,8 @@ def test_what_any_rest_looks_like_must_keep_a_part_of_what_it_takes_in_slices(
     claim: float | None, kept: bool, monkeypatch: pytest.MonkeyPatch
 ):
     base = squares(np.random.default_rng(3), 4.0)
-
-    def by_gain(problem: Any, start: Any, whitening: Any, causes: Sequence[str], later: Sequence[bool]) -> Any:
-        return list(range(len(causes))), in_turn(base, *[0.95 * base for _ in causes]), base.sum(1)
-
     claims = {} if claim is None else {"a": claim}
-    assert stood_by(monkeypatch, by_gain, "a", claims=claims).worse == ([] if kept else ["a"])
+    assert stood_by(monkeypatch, to_other(base, 0.95 * base), "a", claims=claims).worse == ([] if kept else ["a"])
 
 
 def stood_by(

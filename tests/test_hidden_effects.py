@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 import yaml
-from generators import Case, available, make_case, make_closed_loop_case
+from generators import CLOSED_LOOP_EFFECTS, Case, available, make_case, make_closed_loop_case
 from generators.scoring import Score, judge, named, table
 
 from figaroh_jax.formats import config
@@ -27,22 +27,7 @@ needs_robots = pytest.mark.skipif(
     not all(available(name) for name in ROBOTS),
     reason="the models of the robots are not on this machine (FIGAROH_JAX_DATA names their folder)",
 )
-HIDDEN = (
-    "rotor_inertia",
-    "torque_offset",
-    "coupled_transmission",
-    "asymmetric_viscous_friction",
-    "stribeck_friction",
-    "power_law_friction",
-    "load_dependent_friction",
-    "position_dependent_friction",
-    "torque_ripple",
-    "joint_spring",
-    "gravity_tilt",
-    "payload",
-    "torque_delay",
-    "asymmetric_coulomb_friction",
-)
+HIDDEN = (*(name for name in CLOSED_LOOP_EFFECTS if name != "torque_gain"), "asymmetric_coulomb_friction")
 LEFT_OUT = (
     "stribeck_friction",
     "coupled_transmission",

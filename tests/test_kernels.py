@@ -164,7 +164,7 @@ def test_accesses_of_a_long_kernel_share_no_constant(tmp_path: Path, monkeypatch
         arrays = [jnp.asarray(x) for x in states(model, samples)]
 
         def kernel(*arrays: Any) -> Any:
-            return launch(program, constants, arrays, shape, columns, torques.last, interpret=True)  # noqa: B023
+            return launch(program, constants, arrays, shape, columns, torques.last, interpret=True)
 
         (call,) = (e for e in jax.make_jaxpr(kernel)(*arrays).jaxpr.eqns if e.primitive.name == "pallas_call")
         loops = [e.params["body_jaxpr"].jaxpr for e in call.params["jaxpr"].eqns if e.primitive.name == "while"]
@@ -258,7 +258,7 @@ class _ByHand:
             ref[int(row) + k] = x
 
 
-def launch_by_hand(kernel: Any, arrays: Any, shapes: list[tuple[int, int]], interpret: bool = False) -> Any:
+def launch_by_hand(kernel: Any, arrays: Any, shapes: list[tuple[int, int]]) -> Any:
     outs = [np.full(shape, np.nan) for shape in shapes]
     with jax.disable_jit():
         kernel(_ByHand(outs), *map(np.asarray, arrays))

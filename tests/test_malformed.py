@@ -118,15 +118,12 @@ def test_nobody_waits_for_a_pipe(tmp_path: Path, suffix: str):
     refused(lambda: readers.get(suffix, lambda file: read_table(file, "data"))(link), "a device")
 
 
-def _npz(file: Path, header: bytes | None = None, **arrays: np.ndarray) -> Path:
+def _npz(file: Path, **arrays: np.ndarray) -> Path:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, array in arrays.items():
             memory = io.BytesIO()
             np.lib.format.write_array(memory, array)
-            data = (
-                memory.getvalue() if header is None else memory.getvalue().replace(b"(4,)" + b" " * len(header), header)
-            )
-            archive.writestr(f"{name}.npy", data)
+            archive.writestr(f"{name}.npy", memory.getvalue())
     return file
 
 
@@ -183,7 +180,7 @@ def test_csv_headers_of_any_kind(tmp_path: Path):
     file.write_bytes(b"t,q\xff1\n0,1\n1,2\n")
     refused(lambda: read_table(file, "data"), "run.csv", "UTF-8")
     file.write_text(",".join(f"column_{k}_" + "x" * 90 for k in range(9000)) + "\n" + ",".join("0" * 9000) + "\n")
-    assert "did you mean" in refused(lambda: read_table(file, "data").read("x") if False else _missing(file), "run.csv")
+    assert "did you mean" in refused(lambda: _missing(file), "run.csv")
     file.write_text(",".join(f"c{k}" for k in range(20_000)) + "\n" + ",".join("0" * 20_000) + "\n")
     refused(lambda: read_table(file, "data"), "20000 columns")
     file.write_text("x" * (1 << 20) + "\n1\n")

@@ -32,7 +32,7 @@ def stood(value: list[float], deviation: list[float], at_shape: float = 1.0) -> 
 def fitted_beside(monkeypatch: pytest.MonkeyPatch, *others: Any) -> Fitted:
     """The fit of values (1, 2) with deviations (.1, .2), beside others by other weights."""
     own, left = stood([1.0, 2.0], [0.1, 0.2]), list(others)
-    monkeypatch.setattr(fits, "solved", lambda problem, start, theta: start)
+    monkeypatch.setattr(fits, "solved", lambda start, theta: start)
     monkeypatch.setattr(fits, "_together", lambda problem, base, causes, whitening: left.pop(0))
     problem: Any = SimpleNamespace(weighted=lambda weight: problem)
     start, nothing = cast(Any, SimpleNamespace(theta=np.zeros(2))), np.zeros(1)
@@ -74,8 +74,8 @@ def test_an_amplitude_is_known_at_its_shape_as_far_as_it_moves_there(monkeypatch
     np.testing.assert_allclose(found[0, 0], given + 0.05**2, rtol=1e-9)
     told = Fitted(np.array([1.0, 2.0]), np.diag([9.0, 9.0]), ((0, 1),), found)
     none: Any = None
-    assert least_sure([none], Joint(none, [law()], told)) is None
-    assert least_sure([none], Joint(none, [law()], Fitted(told.value, told.covariance, told.places))) == 0
+    assert least_sure(Joint(none, [law()], told)) is None
+    assert least_sure(Joint(none, [law()], Fitted(told.value, told.covariance, told.places))) == 0
 
 
 def test_values_are_as_unsure_as_parts_of_the_data_disagree():

@@ -55,7 +55,7 @@ def test_a_mass_within_what_was_trusted_or_nearly_the_same_is_not(robot: RobotMo
 )
 def test_drives_beyond_the_effort_limit_are_named(robot: RobotModel, effect: str, values, said: str | None):
     kind: type[Effect] = find(effect)
-    names = [name for name, parameter in kind.parameters().items() if parameter.linear]
+    names = kind.amplitudes()
     placed = place(kind, robot, ["elbow"], **dict(zip(names, values.values(), strict=False)))
     notes = implausible(robot, extend(robot, placed), 0.1)
     assert notes == () if said is None else said.split(": ")[-1].split(" ", 1)[1] in notes[0]

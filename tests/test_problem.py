@@ -151,7 +151,7 @@ def test_torque_of_the_baseline_is_pinocchios_plus_the_friction(model: RobotMode
     signals = made_signals(6.0)
     problem = problem_of(model, signals)
     state = baseline(problem, ["viscous_friction", "torque_offset"])
-    state = solved(problem, state, np.append(np.asarray(model.inertia).reshape(-1), [2.0, 0.5, -1.0, 3.0]))
+    state = solved(state, np.append(np.asarray(model.inertia).reshape(-1), [2.0, 0.5, -1.0, 3.0]))
     load = rigid_torque(model, signals)
     np.testing.assert_allclose(state.motion.load, load, rtol=0, atol=1e-10)
     expected = load + [2.0, 0.5] * signals.velocity + [-1.0, 3.0]

@@ -18,8 +18,8 @@ from figaroh_jax.identification.identification import identify_task
 pytest.importorskip("pinocchio")  # the sets are written with it
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 
-from benchmarks import blackbox  # noqa: E402
-from benchmarks.hide_in_real.generate import twin_of  # noqa: E402
+from benchmarks import blackbox
+from benchmarks.hide_in_real.generate import twin_of
 
 SETS = {  # the relative error that causes leave at most, with what it was when this was written
     "ur10e": 0.050,  # .0467

@@ -19,9 +19,6 @@ from figaroh_jax.recordings.draft_columns import Undecided
 from figaroh_jax.recordings.progress import listener
 from figaroh_jax.recordings.reading import read_table
 
-NAMES = ("lift", "swing", "slide")
-ROBOTS: dict[str, Any] = {}
-
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[str, ...], dict[str, Any]]:

@@ -96,7 +96,7 @@ def least_of(*causes: tuple[str, list[float], float, dict[str, float]]) -> int |
     for place, block in zip(places, blocks, strict=True):
         covariance[np.ix_(place, place)] = block
     none: Any = [None] * len(causes)
-    return least_sure(none, Joint(none, effects, Fitted(np.zeros(first), covariance, tuple(places))))
+    return least_sure(Joint(none, effects, Fitted(np.zeros(first), covariance, tuple(places))))
 
 
 def test_a_cause_whose_told_interval_holds_zero_is_the_first_to_go() -> None:

@@ -169,7 +169,7 @@ def test_a_base_that_swings_unmeasured_is_simulated_and_the_leg_identified(tmp_p
         mujoco.mj_step(theirs, state, 5)  # pyright: ignore[reportAttributeAccessIssue]
     assert np.ptp(swing) > 0.1
     (tmp_path / "leg.xml").write_text(SWING.format(**{name: 1.6 * value for name, value in truth.items()}))
-    loop = dataclasses.replace(load_loop(tmp_path / "leg.xml")[0], measured=(1,), summed=(-1,))
+    loop = dataclasses.replace(load_loop(tmp_path / "leg.xml")[0], measured=(1,))
     noisy = q + 2e-4 * np.random.default_rng(0).normal(size=rows)
     more = [(effect, "leg") for effect in ("rotor_inertia", "joint_damping", "friction_loss")]
     here = setting(loop, [Run("swing", t, u[:, None], noisy[:, None], None)], baseline=(), more=more)

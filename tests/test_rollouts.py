@@ -14,7 +14,7 @@ import pytest
 
 from figaroh_jax.errors import InputError
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.simulation import delayed, held, rollout
+from figaroh_jax.rollouts.simulation import delayed, rollout
 
 OPTION = (
     '<compiler angle="radian"/><option timestep="{dt}" integrator="{integrator}"><flag contact="disable"/></option>'
@@ -177,9 +177,6 @@ def test_a_delay_is_the_mean_of_the_held_command():
         with jax.enable_x64(True):
             found = delayed(jnp.asarray(command), jnp.asarray([late]), 0.2)[:, 0, 0]
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(
-        held(np.array([0.0, 0.1]), np.array([4.0, 5.0]), np.array([0.0, 0.05, 0.1])), [4, 4, 5]
-    )
 
 
 def test_a_command_of_another_shape_and_a_loop_that_diverges_are_told(tmp_path: Path):

@@ -10,7 +10,7 @@ import pytest
 import reference
 import robots
 from jaxtyping import Array, Float
-from test_excitation import ARM, a_motion
+from test_excitation import ARM, a_motion, friction_rows
 
 from figaroh_jax.effects.base import JointEffect, Motion, Scalar, amplitude
 from figaroh_jax.effects.catalogue import register
@@ -44,12 +44,8 @@ def test_separation_is_what_least_squares_leaves_of_the_cause_and_its_gradient_t
     forth, back = separated(given, G, np.asarray(learned.prior))
     q, v, a = states
     W = reference.regressor(arm, q, v, a)
-    friction = np.zeros((len(q), 2, 4))
-    for joint in range(2):
-        friction[:, joint, joint] = v[:, joint]
-        friction[:, joint, 2 + joint] = np.tanh(v[:, joint] / (info.SMOOTH + 1e-9))
     root = np.sqrt(np.asarray(learned.weight))[:, None]
-    X = (np.concatenate([W, friction], axis=2) * root).reshape(2 * len(q), -1)[:, list(learned.independent)]
+    X = (np.concatenate([W, friction_rows(v)], axis=2) * root).reshape(2 * len(q), -1)[:, list(learned.independent)]
     link = (W[:, :, :10] * root).reshape(-1, 10)
     rotor = (np.stack([a[:, 0], 0 * a[:, 0]], 1) * root[:, 0]).reshape(-1, 1)
     prior = np.linalg.cholesky(learned.prior).T
@@ -94,12 +90,8 @@ def test_an_effect_of_ones_own_takes_part_and_its_repeats_are_those_of_rows_repe
     given = causes(learned, [pair], states, 0.1)
     forth, back = separated(given, gram_of(learned, given.sampler, states, given.columns), learned.prior)
     q, v, a = states
-    friction = np.zeros((len(q), 2, 4))
-    for joint in range(2):
-        friction[:, joint, joint] = v[:, joint]
-        friction[:, joint, 2 + joint] = np.tanh(v[:, joint] / (info.SMOOTH + 1e-9))
     root = np.sqrt(np.asarray(learned.weight))[:, None]
-    W = np.concatenate([reference.regressor(arm, q, v, a), friction], axis=2) * root
+    W = np.concatenate([reference.regressor(arm, q, v, a), friction_rows(v)], axis=2) * root
     X = W.reshape(2 * len(q), -1)[:, list(learned.independent)]
     prior = np.linalg.cholesky(learned.prior).T
 

@@ -71,7 +71,7 @@ def recorded(
         NativeBackend(model), records, layout([signals], records), 0.1, turned, held_rows([signals], records)
     )
     state = baseline(problem, ["coulomb_friction"])
-    return problem, solved(problem, state, np.append(state.theta[: -len(SLIDING)], SLIDING))
+    return problem, solved(state, np.append(state.theta[: -len(SLIDING)], SLIDING))
 
 
 def pushed(v: np.ndarray, top: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -28,12 +28,11 @@ import genesis as gs
 from genesis.utils.misc import qd_to_torch
 
 from figaroh_jax.errors import InputError, NotSupported
-from figaroh_jax.formats.mujoco_model import frame_poses
 from figaroh_jax.formats.xmlfile import read_xml
 from figaroh_jax.rigid.inertia import from_com, to_com
 from figaroh_jax.rigid.model import RobotModel
-from figaroh_jax.simulators.contract import Capabilities, Reference, as_reference, file_format, host_samples
-from figaroh_jax.simulators.from_torques import FromTorques
+from figaroh_jax.simulators.contract import Capabilities, file_format, host_samples
+from figaroh_jax.simulators.host import HostBackend
 from figaroh_jax.simulators.parent_axes import numbers, rates, refuse_inner_free_joints, unit_inertias, unit_regressor
 
 __all__ = ["GenesisBackend"]
@@ -42,11 +41,11 @@ _ENVIRONMENTS = int(os.environ.get("FIGAROH_JAX_GENESIS_ENVIRONMENTS", "64"))  #
 _LEAST = 1e-12  # kg, kg m^2: Genesis takes no link without a mass
 
 
-class GenesisBackend(FromTorques):
+class GenesisBackend(HostBackend):
     """A robot of Genesis; `simulator` is its `genesis.Scene`.
 
-    Mass matrix by `get_mass_mat`, torques `M a + bias` by the terms of its forward
-    dynamics.
+    Mass matrix by `get_mass_mat`, torques `M a + bias` by the terms of its forward dynamics, poses by `get_links_pos`
+    and `get_links_quat`, Jacobians by `get_jacobian`.
     """
 
     name: ClassVar[str] = "genesis"
@@ -56,17 +55,7 @@ class GenesisBackend(FromTorques):
 
     def __init__(self, robot: RobotModel, source: Path | None = None) -> None:
         refuse_inner_free_joints(robot, self.name)
-        self._robot, self._source = robot, source
-
-    @classmethod
-    def build(cls, robot: RobotModel, source: Path | None = None) -> GenesisBackend:
-        """The backend of a robot, from its arrays."""
-        return cls(robot, source)
-
-    @property
-    def robot(self) -> RobotModel:
-        """The robot."""
-        return self._robot
+        super().__init__(robot, source)
 
     @property
     def simulator(self) -> Any:
@@ -92,11 +81,6 @@ class GenesisBackend(FromTorques):
             raise InputError(f"{self._source}: Genesis does not read it: {error}") from error
 
     @property
-    def model_format(self) -> str:
-        """Format of the file that the robot was read from."""
-        return file_format(self._source)
-
-    @property
     def inertias(self) -> Float[np.ndarray, "links 10"]:
         """Inertial parameters of the links in Genesis's model."""
         _, entity, links = self._scene
@@ -104,38 +88,18 @@ class GenesisBackend(FromTorques):
         parts = [np.asarray(one().cpu(), float)[links] for one in read]
         return np.stack([from_com(*link) for link in zip(*parts, strict=True)])
 
-    def frame_placements(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch frames 4 4"]:
-        """`get_links_pos` and `get_links_quat`."""
-        samples = host_samples(self, q=q)
-        return samples.restore(frame_poses(self._robot, self._poses(samples[0])))
-
-    def frame_jacobian(
-        self, q: Float[ArrayLike, "*batch nq"], frame: str, reference: Reference = "local_world_aligned"
-    ) -> Float[np.ndarray, "*batch 6 nv"]:
-        """`get_jacobian` of the link, moved to the frame's origin or the world's.
-
-        Raises `NotSupported` for a robot with a spherical joint, whose columns Genesis leaves zero.
-        """
+    def _point_jacobian(self, q: np.ndarray, joint: int, joints: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Genesis's is of the link's origin; moved to the points. It leaves the columns of spherical joints zero."""
         if round := [joint.name for joint in self._robot.joints if joint.kind == "spherical"]:
             raise NotSupported(
                 f"backend 'genesis' has no frame_jacobian of spherical joints ('{round[0]}'); backends that do: "
                 "native, mujoco, pinocchio"
             )
-        index, axes, samples = self.frame_id(frame), as_reference(reference), host_samples(self, q=q)
-        q, parent = samples[0], self._robot.frames[index].parent
-        if parent < 0:
-            return samples.restore(np.zeros((len(q), 6, self.nv)))
-        joints = self._poses(q)
-        pose = frame_poses(self._robot, joints)[:, index]
         _, entity, links = self._scene
-        own = self._each(lambda: _numpy(entity.get_jacobian(entity.links[links[parent]])), q)[..., self._back]
+        own = self._each(lambda: _numpy(entity.get_jacobian(entity.links[links[joint]])), q)[..., self._back]
         own = own @ rates(self._robot, q, np.zeros((len(q), self.nv))).share  # its own: turning in the parent's axes
-        point = np.zeros((len(q), 3)) if axes == "world" else pose[:, :3, 3]
-        own[:, :3] += np.cross(own[:, 3:], (point - joints[:, parent, :3, 3])[:, :, None], axis=1)
-        if axes == "local":
-            back = np.swapaxes(pose[:, None, :3, :3], -1, -2)
-            own = (back @ own.reshape(-1, 2, 3, self.nv)).reshape(own.shape)
-        return samples.restore(own)
+        own[:, :3] += np.cross(own[:, 3:], (points - joints[:, joint, :3, 3])[:, :, None], axis=1)
+        return own
 
     def joint_torque_regressor(
         self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
@@ -270,7 +234,7 @@ class GenesisBackend(FromTorques):
         force = (terms[:, :-1] @ qdd[..., None])[..., 0] + terms[:, -1]
         return (force[:, None] @ share)[:, 0]
 
-    def _poses(self, q: np.ndarray) -> np.ndarray:
+    def _joint_poses(self, q: np.ndarray) -> np.ndarray:
         _, entity, links = self._scene
 
         def read() -> np.ndarray:

@@ -268,7 +268,7 @@ def _regressor(backend: MjxBackend, q: Array, v: Array, a: Array) -> Array:
     none = jnp.zeros_like(data._impl.cinert)
     rows = jax.vmap(jax.vjp(forces, none)[1])(jnp.eye(model.nv))[0][:, t.body]
     about = data.subtree_com[np.asarray(model.body_rootid)[t.body]]
-    units = spatial_inertias(t, joint_poses(t, data.xmat, data.xpos), about)
+    units = spatial_inertias(joint_poses(t, data.xmat, data.xpos), about)
     dofs = jnp.einsum("dlc,lkc->dlk", rows, units, precision=jax.lax.Precision.HIGHEST)
     return jnp.asarray(rates(t, q)).T @ dofs.reshape(model.nv, -1)
 

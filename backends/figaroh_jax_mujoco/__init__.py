@@ -24,7 +24,6 @@ from jaxtyping import Float
 from figaroh_jax.formats.mujoco_model import (
     compiled,
     drift,
-    frame_poses,
     joint_poses,
     link_inertias,
     positions,
@@ -32,8 +31,8 @@ from figaroh_jax.formats.mujoco_model import (
     spatial_inertias,
 )
 from figaroh_jax.rigid.model import RobotModel
-from figaroh_jax.simulators.contract import Capabilities, Reference, as_reference, file_format, host_samples
-from figaroh_jax.simulators.from_torques import FromTorques
+from figaroh_jax.simulators.contract import Capabilities, host_samples
+from figaroh_jax.simulators.host import HostBackend
 
 __all__ = ["MujocoBackend"]
 
@@ -43,10 +42,11 @@ _CHUNK = 64  # samples of a task: what they need stays in the cache
 _MANY_BODIES = 16
 
 
-class MujocoBackend(FromTorques):
+class MujocoBackend(HostBackend):
     """A `mujoco.MjModel`: `simulator` is the user's own, with contacts and all, where an MJCF file was given.
 
-    Mass matrix by `mj_crb`, torques by `mj_rne`.
+    The model is compiled from the file where that is MJCF, else built from the robot's arrays. Mass matrix by `mj_crb`,
+    torques by `mj_rne`, poses by `mj_kinematics`, Jacobians by `mj_jac`.
     """
 
     name: ClassVar[str] = "mujoco"
@@ -55,8 +55,8 @@ class MujocoBackend(FromTorques):
     )
 
     def __init__(self, robot: RobotModel, source: Path | None = None) -> None:
-        self._robot, self._source = robot, source
-        self._simulator, self._translation, self._from_file = compiled(robot, source)
+        super().__init__(robot, source)
+        self._simulator, self._translation, _ = compiled(robot, source)
         self._rigid = copy.copy(self._simulator)
         self._rigid.dof_armature[:] = 0.0
         bodies = np.eye(self._rigid.nbody)
@@ -64,56 +64,15 @@ class MujocoBackend(FromTorques):
             bodies[self._rigid.body_parentid[body], body] -= 1.0
         self._own_wrench = bodies[self._translation.body]  # what a body carries, less what its children carry
 
-    @classmethod
-    def build(cls, robot: RobotModel, source: Path | None = None) -> MujocoBackend:
-        """The backend of a robot; of the model compiled from `source` where that is MJCF."""
-        return cls(robot, source)
-
-    @property
-    def robot(self) -> RobotModel:
-        """The robot."""
-        return self._robot
-
     @property
     def simulator(self) -> Any:
         """The `mujoco.MjModel`."""
         return self._simulator
 
     @property
-    def model_format(self) -> str:
-        """Format of the file that the robot was read from."""
-        return file_format(self._source)
-
-    @property
     def inertias(self) -> Float[np.ndarray, "links 10"]:
         """Inertial parameters of the links in MuJoCo's model."""
         return link_inertias(self._translation, self._simulator)
-
-    def frame_placements(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch frames 4 4"]:
-        """`mj_kinematics`."""
-        samples = host_samples(self, q=q)
-        return samples.restore(frame_poses(self._robot, self._joint_poses(samples[0])))
-
-    def frame_jacobian(
-        self, q: Float[ArrayLike, "*batch nq"], frame: str, reference: Reference = "local_world_aligned"
-    ) -> Float[np.ndarray, "*batch 6 nv"]:
-        """`mj_jac` of the frame's origin, or of the world's."""
-        index, axes, samples = self.frame_id(frame), as_reference(reference), host_samples(self, q=q)
-        poses = frame_poses(self._robot, self._joint_poses(samples[0]))[:, index]
-        points = np.zeros((len(poses), 3)) if axes == "world" else poses[:, :3, 3]
-        parent = self._robot.frames[index].parent
-        body = int(self._translation.body[parent]) if parent >= 0 else 0
-
-        def one(data: Any, out: np.ndarray, point: np.ndarray) -> None:
-            mujoco.mj_jac(self._rigid, data, out[:3], out[3:], point, body)
-
-        jacobian = self._each(one, (6, self._rigid.nv), samples[0], more=(points,)) @ rates(
-            self._translation, samples[0]
-        )
-        if axes == "local":
-            back = np.swapaxes(poses[:, None, :3, :3], -1, -2)
-            jacobian = (back @ jacobian.reshape(-1, 2, 3, self.nv)).reshape(jacobian.shape)
-        return samples.restore(jacobian)
 
     def joint_torque_regressor(
         self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
@@ -143,7 +102,7 @@ class MujocoBackend(FromTorques):
             bodies[sample, :, 3], bodies[sample, :, 4] = data.xpos, data.subtree_com[model.body_rootid]
         poses = joint_poses(t, bodies[:, :, :3], bodies[:, :, 3])
         inertias = np.zeros((len(q), 10, model.nbody, 10))
-        inertias[:, :, t.body] = np.swapaxes(spatial_inertias(t, poses, bodies[:, t.body, 4]), 1, 2)
+        inertias[:, :, t.body] = np.swapaxes(spatial_inertias(poses, bodies[:, t.body, 4]), 1, 2)
         for sample, _ in enumerate(self._states(data, q, v, a)):
             axes[sample], own = data.cdof, data.cinert
             for k in range(10):
@@ -168,6 +127,14 @@ class MujocoBackend(FromTorques):
 
         share = rates(self._translation, q)
         return np.swapaxes(share, -1, -2) @ self._each(one, (self._rigid.nv, self._rigid.nv), q) @ share
+
+    def _point_jacobian(self, q: np.ndarray, joint: int, joints: np.ndarray, points: np.ndarray) -> np.ndarray:
+        body = int(self._translation.body[joint])
+
+        def one(data: Any, out: np.ndarray, point: np.ndarray) -> None:
+            mujoco.mj_jac(self._rigid, data, out[:3], out[3:], point, body)
+
+        return self._each(one, (6, self._rigid.nv), q, more=(points,)) @ rates(self._translation, q)
 
     def _joint_poses(self, q: np.ndarray) -> np.ndarray:
         def one(data: Any, out: np.ndarray) -> None:

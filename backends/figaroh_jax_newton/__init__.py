@@ -3,8 +3,8 @@
 The model is built from the robot's arrays and replicated, so that a batch is one launch of Newton's kernels on the CPU
 or, where Warp finds one, on the GPU. Newton computes in single precision: answers agree with Pinocchio's to about 1e-5
 of the largest torque (`Capabilities.precision`). Only its functions of rigid bodies are called (`eval_fk`,
-`eval_jacobian`, `eval_mass_matrix`, `eval_inverse_dynamics_passive`, `eval_inverse_dynamics_force`), with armature
-zero: contacts, limits, drives and damping never enter. It gives no derivatives of inverse dynamics.
+`eval_jacobian`, `eval_inverse_dynamics_passive`, `eval_inverse_dynamics_force`), with armature zero: contacts, limits,
+drives and damping never enter. It gives no derivatives of inverse dynamics.
 
 `simulator` is the `newton.Model` that Newton's own importer makes of the file (URDF, MJCF, USD), with its contacts and
 drives; where there is no file, the one built from the arrays. `step` integrates that of the arrays by
@@ -27,11 +27,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from figaroh_jax.errors import InputError
-from figaroh_jax.formats.mujoco_model import frame_poses
 from figaroh_jax.rigid.inertia import from_com, to_com
 from figaroh_jax.rigid.model import RobotModel
-from figaroh_jax.simulators.contract import Capabilities, Reference, as_reference, file_format, host_samples
-from figaroh_jax.simulators.from_torques import FromTorques
+from figaroh_jax.simulators.contract import Capabilities, file_format, host_samples
+from figaroh_jax.simulators.host import HostBackend
 from figaroh_jax.simulators.parent_axes import numbers, rates, refuse_inner_free_joints, unit_inertias, unit_regressor
 
 __all__ = ["NewtonBackend"]
@@ -71,11 +70,11 @@ class _Worlds:
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
 
-class NewtonBackend(FromTorques):
+class NewtonBackend(HostBackend):
     """A robot of Newton; `simulator` is its `newton.Model`.
 
-    Mass matrix by `newton.eval_inverse_dynamics_passive`, torques by
-    `newton.eval_inverse_dynamics_force`.
+    Mass matrix by `newton.eval_inverse_dynamics_passive`, torques by `newton.eval_inverse_dynamics_force`, poses by
+    `newton.eval_fk`, Jacobians by `newton.eval_jacobian`.
     """
 
     name: ClassVar[str] = "newton"
@@ -85,18 +84,8 @@ class NewtonBackend(FromTorques):
 
     def __init__(self, robot: RobotModel, source: Path | None = None) -> None:
         refuse_inner_free_joints(robot, self.name)
-        self._robot, self._source = robot, source
+        super().__init__(robot, source)
         self._worlds: dict[int, _Worlds] = {}
-
-    @classmethod
-    def build(cls, robot: RobotModel, source: Path | None = None) -> NewtonBackend:
-        """The backend of a robot, from its arrays."""
-        return cls(robot, source)
-
-    @property
-    def robot(self) -> RobotModel:
-        """The robot."""
-        return self._robot
 
     @property
     def simulator(self) -> Any:
@@ -119,46 +108,11 @@ class NewtonBackend(FromTorques):
             raise InputError(f"{self._source}: Newton's importer does not read it: {error}") from error
 
     @property
-    def model_format(self) -> str:
-        """Format of the file that the robot was read from."""
-        return file_format(self._source)
-
-    @property
     def inertias(self) -> Float[np.ndarray, "links 10"]:
         """Inertial parameters of the links in Newton's model: float32."""
         model = self._of(1).model
         mass, com, about = (x.numpy().astype(float) for x in (model.body_mass, model.body_com, model.body_inertia))
         return np.stack([from_com(*link) for link in zip(mass, com, about, strict=True)])
-
-    def frame_placements(self, q: Float[ArrayLike, "*batch nq"]) -> Float[np.ndarray, "*batch frames 4 4"]:
-        """`newton.eval_fk`."""
-        samples = host_samples(self, q=q)
-        return samples.restore(frame_poses(self._robot, self._poses(samples[0])))
-
-    def frame_jacobian(
-        self, q: Float[ArrayLike, "*batch nq"], frame: str, reference: Reference = "local_world_aligned"
-    ) -> Float[np.ndarray, "*batch 6 nv"]:
-        """`newton.eval_jacobian`, which is of the centre of mass, moved to the frame's origin or the world's."""
-        index, axes, samples = self.frame_id(frame), as_reference(reference), host_samples(self, q=q)
-        q, parent = samples[0], self._robot.frames[index].parent
-        joints = self._poses(q)
-        pose = frame_poses(self._robot, joints)[:, index]
-        if parent < 0:
-            return samples.restore(np.zeros((len(q), 6, self.nv)))
-
-        def link(worlds: _Worlds, rows: int) -> np.ndarray:
-            whole = newton.eval_jacobian(worlds.model, worlds.state).numpy()[:rows]
-            return whole[:, 6 * parent : 6 * parent + 6, : self._robot.nd].astype(float)
-
-        own = self._each(link, q) @ rates(self._robot, q, np.zeros((len(q), self.nv)), True).share
-        centre = np.concatenate([to_com(np.asarray(self._robot.inertia[parent], float))[1], [1.0]])
-        point = np.zeros((len(q), 3)) if axes == "world" else pose[:, :3, 3]
-        way = point - (joints[:, parent] @ centre)[:, :3]
-        own[:, :3] += np.cross(own[:, 3:], way[:, :, None], axis=1)
-        if axes == "local":
-            back = np.swapaxes(pose[:, None, :3, :3], -1, -2)
-            own = (back @ own.reshape(-1, 2, 3, self.nv)).reshape(own.shape)
-        return samples.restore(own)
 
     def joint_torque_regressor(
         self, q: Float[ArrayLike, "*batch nq"], v: Float[ArrayLike, "*batch nv"], a: Float[ArrayLike, "*batch nv"]
@@ -257,7 +211,20 @@ class NewtonBackend(FromTorques):
 
         return (self._each(torques, q, qd, qdd)[:, None] @ share)[:, 0]
 
-    def _poses(self, q: np.ndarray) -> np.ndarray:
+    def _point_jacobian(self, q: np.ndarray, joint: int, joints: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Newton's is of the centre of mass; moved to the points."""
+
+        def link(worlds: _Worlds, rows: int) -> np.ndarray:
+            whole = newton.eval_jacobian(worlds.model, worlds.state).numpy()[:rows]
+            return whole[:, 6 * joint : 6 * joint + 6, : self._robot.nd].astype(float)
+
+        own = self._each(link, q) @ rates(self._robot, q, np.zeros((len(q), self.nv)), True).share
+        centre = np.concatenate([to_com(np.asarray(self._robot.inertia[joint], float))[1], [1.0]])
+        way = points - (joints[:, joint] @ centre)[:, :3]
+        own[:, :3] += np.cross(own[:, 3:], way[:, :, None], axis=1)
+        return own
+
+    def _joint_poses(self, q: np.ndarray) -> np.ndarray:
         def poses(worlds: _Worlds, rows: int) -> np.ndarray:
             flat = worlds.state.body_q.numpy().reshape(worlds.count, -1, 7)[:rows].astype(float)
             return _matrices(flat)

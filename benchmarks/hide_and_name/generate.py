@@ -17,7 +17,6 @@ from .. import blackbox
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
-KINDS = ("inverse", "closed_loop", "kinematic")
 ROBOTS = ("tx40", "panda", "ur10e")
 ARMS = ("arm6", "panda")
 # those of the contract that `generators` calls foreign to nothing: families that a catalogue should hold

@@ -39,7 +39,6 @@ __all__ = [
 ]
 
 GEOMETRY = ("joint_offset", "link_geometry")
-Array = np.ndarray
 _STEP = 1e-3  # rad or m
 _STILL = 1e-9  # rad or m per unit: the effect does nothing
 _HIGHEST = 400.0  # order of a gear error that is looked for: two periods a turn of a motor behind 200 : 1

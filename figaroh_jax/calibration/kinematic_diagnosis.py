@@ -27,7 +27,7 @@ from .calibrated import Calibration
 from .calibration import Run
 from .candidates import GEOMETRY, moved_rows, moves, twist_rows
 from .kinematic_evidence import Evidence, weigh
-from .kinematic_scores import Scores, row_noise, score_blocks, score_jitter, score_waves
+from .kinematic_scores import Scores, Tested, row_noise, score_blocks, score_jitter, score_waves
 from .outliers import playing_joints, still_outliers
 
 if TYPE_CHECKING:
@@ -232,7 +232,7 @@ def _beyond(
     at, _ = _posterior_mode(linear, noise, used, width)
     here = linear._replace(residual=linear.residual + linear.jacobian @ (at - linear.at), at=at)
     blocks = [linear.jacobian[:, p] if k not in named else np.zeros((len(noise), 0)) for k, p in enumerate(places)]
-    return score_blocks(here, noise, used, width**-2.0, blocks, np.ones(len(width), bool), seed=len(named))
+    return score_blocks(Tested(here, noise, used, width**-2.0, np.ones(len(width), bool)), blocks, len(named))
 
 
 def _grown(growth: tuple[float, float]) -> str:
@@ -347,9 +347,8 @@ def _effect_scores(run: Run) -> tuple[float, float]:
         Z = run.effects.jacobian(at, grid)
         blocks = [Z[:, s] for k, s in slices.items() if k not in (run.named if fit[0] is run.fit[1] else ())]
         free = levels.free_at(run.choice.level, fit[0].prior)
-        beside = fit[0], row_noise(*fit), run.used, fit[1].precision
-        p_grid = score_blocks(*beside, blocks, free).p_value
-        p_high = score_waves(*beside, run.effects.waves(at), free)
+        tested = Tested(fit[0], row_noise(*fit), run.used, fit[1].precision, free)
+        p_grid, p_high = score_blocks(tested, blocks).p_value, score_waves(tested, run.effects.waves(at))
         found.append(min(p_grid, p_high) if p_high == 1.0 else min(1.0, 2.0 * min(p_grid, p_high)))
     return found[0], found[1]
 
@@ -368,8 +367,9 @@ def _play(run: Run, alpha: float) -> _Play:
     final, linear, posterior, _ = run.fit
     joints = [(c.at[0], k) for k, c in enumerate(final.columns) if c.effect == "joint_offset"]
     free = levels.free_at(run.choice.level, linear.prior)
-    ways, noise = linear.jacobian[:, [k for _, k in joints]], row_noise(linear, posterior)
-    p_value, worst = score_jitter(linear, noise, run.used, posterior.precision, ways, free)
+    tested = Tested(linear, row_noise(linear, posterior), run.used, posterior.precision, free)
+    ways = linear.jacobian[:, [k for _, k in joints]]
+    p_value, worst = score_jitter(tested, ways)
     if p_value >= thresholds.OF_ALPHA * alpha:
         return _Play(False, (), run.aside, "")
     first = len(final.columns)
@@ -394,7 +394,7 @@ def _play(run: Run, alpha: float) -> _Play:
 def _has_size(cause: Cause) -> bool:
     """Whether some amplitude of an effect is surely not zero: a cause may have come in for what another explains."""
     entry = CATALOGUE.get(cause.name.effect)
-    linear = {n for n, p in entry.parameters().items() if p.linear} if entry else set()
+    linear = entry.amplitudes() if entry else []
     sizes = [value for name, value in cause.parameters.items() if name in linear]
     return not sizes or any(abs(one.value) > thresholds.SIZE_SIGMAS * one.std for one in sizes)
 

@@ -19,13 +19,23 @@ from jaxtyping import Bool, Float, Int
 from ..estimation.marginal import FLAT, Linear, Posterior
 from . import thresholds
 
-__all__ = ["Scores", "row_noise", "score_blocks", "score_jitter", "score_waves", "waves_shown"]
+__all__ = ["Scores", "Tested", "row_noise", "score_blocks", "score_jitter", "score_waves", "waves_shown"]
 
 _CUT = 1e-7  # of a column's length, that must be left beside the fit
 _DRAWS = 400
 _WAVE_DRAWS = 200
 
 Array = np.ndarray
+
+
+class Tested(NamedTuple):
+    """A fit, beside which columns are scored."""
+
+    linear: Linear
+    noise: Float[Array, " rows"]  # one sigma, m or rad
+    used: Bool[Array, " rows"]
+    precision: Float[Array, " unknowns"]  # of the prior
+    free: Bool[Array, " unknowns"]
 
 
 class Scores(NamedTuple):
@@ -38,19 +48,11 @@ class Scores(NamedTuple):
     level: float  # mean square of the whitened rows: 1 where the noise is right
 
 
-def score_blocks(
-    linear: Linear,
-    noise: Float[Array, " rows"],
-    used: Bool[Array, " rows"],
-    precision: Float[Array, " unknowns"],
-    blocks: Sequence[Float[Array, "rows _"]],
-    free: Bool[Array, " unknowns"],
-    seed: int = 0,
-) -> Scores:
-    """Scores of `blocks` beside the fit of the `free` unknowns with the given noise and prior precision."""
-    rows = np.flatnonzero(used)
-    e, basis, freedom = _left(linear, noise, rows, precision, free)
-    bases = [_basis(_above(Z[rows] / noise[rows, None], len(e)), basis) for Z in blocks]
+def score_blocks(fit: Tested, blocks: Sequence[Float[Array, "rows _"]], seed: int = 0) -> Scores:
+    """Scores of `blocks` beside the fit."""
+    rows = np.flatnonzero(fit.used)
+    e, basis, freedom = _left(fit, rows)
+    bases = [_basis(_above(Z[rows] / fit.noise[rows, None], len(e)), basis) for Z in blocks]
     size = np.array([b.shape[1] for b in bases])
     whole = np.hstack(bases) if size.sum() else np.zeros((len(e), 0))
     level = float(e @ e / freedom)
@@ -59,7 +61,7 @@ def score_blocks(
     z = _scale(q, size)
     top = z.max(initial=-np.inf)
     p_value = 0.0
-    for null in (draws, _flipped(e, linear.posture[rows], draws)):
+    for null in (draws, _flipped(e, fit.linear.posture[rows], draws)):
         square = np.sum(null**2, axis=1) - np.sum((null @ basis) ** 2, axis=1)
         scores = _sums((null @ whole) ** 2, size) / (square / freedom)[:, None]
         largest = _scale(scores, size).max(axis=1, initial=-np.inf)
@@ -86,29 +88,21 @@ class Waves(NamedTuple):
         return self.motion[:, None] * self.sine[posture], self.motion[:, None] * self.cosine[posture]
 
 
-def score_waves(
-    linear: Linear,
-    noise: Float[Array, " rows"],
-    used: Bool[Array, " rows"],
-    precision: Float[Array, " unknowns"],
-    waves: Iterable[Waves],
-    free: Bool[Array, " unknowns"],
-    seed: int = 0,
-) -> float:
+def score_waves(fit: Tested, waves: Iterable[Waves], seed: int = 0) -> float:
     r"""Family-wise p-value of the largest wave (sine and cosine of an order of a joint) beside the fit.
 
     A periodogram of what the fit leaves: with Q what a wave takes of the sum of squares S, white noise of f degrees of
     freedom exceeds it with probability $(1 - Q/S)^{f/2}$ in one wave, m times that in m of them; and postures with
     flipped signs are drawn as in `score_blocks`. The larger of both counts.
     """
-    rows = np.flatnonzero(used)
-    e, basis, freedom = _left(linear, noise, rows, precision, free)
+    rows = np.flatnonzero(fit.used)
+    e, basis, freedom = _left(fit, rows)
     draws = np.random.default_rng(seed).normal(size=(_WAVE_DRAWS, len(e)))
-    null = _flipped(e, linear.posture[rows], draws)
+    null = _flipped(e, fit.linear.posture[rows], draws)
     total = np.sum(null**2, axis=1) - np.sum((null @ basis) ** 2, axis=1)
-    count, found, largest, scale = 0, 0.0, np.zeros(_WAVE_DRAWS), noise[rows, None]
+    count, found, largest, scale = 0, 0.0, np.zeros(_WAVE_DRAWS), fit.noise[rows, None]
     for one in waves:
-        sine, cosine = one.columns(linear.posture)
+        sine, cosine = one.columns(fit.linear.posture)
         first, second = _orthonormal(sine[rows] / scale, cosine[rows] / scale, basis)
         count += len(one.blocks)
         found = max(found, float(_taken(e[None], first, second).max(initial=0.0)))
@@ -121,14 +115,7 @@ def score_waves(
 
 
 def waves_shown(
-    linear: Linear,
-    noise: Float[Array, " rows"],
-    used: Bool[Array, " rows"],
-    precision: Float[Array, " unknowns"],
-    waves: Iterable[Waves],
-    free: Bool[Array, " unknowns"],
-    beside: Float[Array, "rows _"],
-    parts: Sequence[Bool[Array, " rows"]] = (),
+    fit: Tested, waves: Iterable[Waves], beside: Float[Array, "rows _"], parts: Sequence[Bool[Array, " rows"]]
 ) -> list[int]:
     """The blocks of the largest wave of each joint beside the fit and the columns `beside`, where noise is unlikely.
 
@@ -136,7 +123,7 @@ def waves_shown(
     is found with rows which are left out later would be judged by them.
     """
     waves = list(waves)
-    whole = _spectra(linear, noise, used, precision, waves, free, beside)
+    whole = _spectra(fit, waves, beside)
     best, count = [int(np.argmax(share)) for share, _ in whole], sum(len(share) for share, _ in whole)
     shown = [
         k
@@ -144,22 +131,20 @@ def waves_shown(
         if count * (1.0 - min(share[best[k]], 1.0)) ** (0.5 * (freedom - 2)) < thresholds.WAVE
     ]
     for rows in parts if shown else ():
-        found = _spectra(linear, noise, rows, precision, [waves[k] for k in shown], free, beside)
+        found = _spectra(fit._replace(used=rows), [waves[k] for k in shown], beside)
         shown = [k for k, (share, _) in zip(shown, found, strict=True) if abs(int(np.argmax(share)) - best[k]) <= 2]
     return [int(waves[k].blocks[best[k]]) for k in shown]
 
 
-def _spectra(
-    linear: Linear, noise: Array, used: Array, precision: Array, waves: Sequence[Waves], free: Array, beside: Array
-) -> list[tuple[Array, int]]:
+def _spectra(fit: Tested, waves: Sequence[Waves], beside: Array) -> list[tuple[Array, int]]:
     """What each order of each joint takes of the squares that the fit leaves, as a share, and the fit's freedom."""
-    rows = np.flatnonzero(used)
-    e, basis, freedom = _left(linear, noise, rows, precision, free)
+    rows, posture, noise = np.flatnonzero(fit.used), fit.linear.posture, fit.noise
+    e, basis, freedom = _left(fit, rows)
     if beside.shape[1]:
         basis = np.hstack([basis, _basis(_above(beside[rows] / noise[rows, None], len(e)), basis)])
         e = e - basis @ (basis.T @ e)
-    found, inside = [], rows[linear.posture[rows] >= 0]
-    left, member = e[: len(rows)][linear.posture[rows] >= 0], linear.posture[inside]
+    found, inside = [], rows[posture[rows] >= 0]
+    left, member = e[: len(rows)][posture[rows] >= 0], posture[inside]
     for one in waves:
         motion = one.motion[inside] / noise[inside]
         pull, square = (np.bincount(member, x, minlength=len(one.sine)) for x in (motion * left, motion**2))
@@ -199,25 +184,17 @@ def _taken(e: Array, first: Array, second: Array) -> Array:
     return (e @ first) ** 2 + (e @ second) ** 2
 
 
-def score_jitter(
-    linear: Linear,
-    noise: Float[Array, " rows"],
-    used: Bool[Array, " rows"],
-    precision: Float[Array, " unknowns"],
-    ways: Float[Array, "rows joints"],
-    free: Bool[Array, " unknowns"],
-    seed: int = 0,
-) -> tuple[float, int]:
+def score_jitter(fit: Tested, ways: Float[Array, "rows joints"]) -> tuple[float, int]:
     r"""Family-wise p-value that no joint errs at random from posture to posture, and the joint that most looks so.
 
     With g the rows of one posture by a motion of the joint, `ways`, the statistic is $\sum (g' e)^2 / \sum g' g$ over
     the postures, the score of a variance component; the null draws e as `score_blocks` does.
     """
-    rows = np.flatnonzero(used)
-    e, basis, freedom = _left(linear, noise, rows, precision, free)
-    G = _above(ways[rows] / noise[rows, None], len(e))
+    rows = np.flatnonzero(fit.used)
+    e, basis, freedom = _left(fit, rows)
+    G = _above(ways[rows] / fit.noise[rows, None], len(e))
     posture = np.full(len(e), -1)
-    posture[: len(rows)] = linear.posture[rows]
+    posture[: len(rows)] = fit.linear.posture[rows]
     member = (posture[:, None] == np.unique(posture[posture >= 0])).astype(float)
 
     def statistic(left: Array) -> Array:
@@ -225,7 +202,7 @@ def score_jitter(
         sums = np.stack([np.sum(((left * g) @ member) ** 2, axis=1) / max(g @ g, 1e-300) for g in G.T], axis=1)
         return sums / (np.sum(left**2, axis=1) / freedom)[:, None]
 
-    draws = np.random.default_rng(seed).normal(size=(_DRAWS, len(e)))
+    draws = np.random.default_rng(0).normal(size=(_DRAWS, len(e)))
     null = statistic(draws - (draws @ basis) @ basis.T)
     middle, spread = null.mean(axis=0), null.std(axis=0) + 1e-300
     found = (statistic(e[None])[0] - middle) / spread
@@ -247,8 +224,9 @@ def _flipped(e: Array, posture: Array, draws: Array) -> Array:
     return found
 
 
-def _left(linear: Linear, noise: Array, rows: Array, precision: Array, free: Array) -> tuple[Array, Array, int]:
+def _left(fit: Tested, rows: Array) -> tuple[Array, Array, int]:
     """What the fit leaves of its rows and prior rows, whitened; an orthonormal basis of its columns; its freedom."""
+    linear, noise, _, precision, free = fit
     G = linear.jacobian[rows][:, free] / noise[rows, None]
     root = np.sqrt(np.where(linear.prior[free] == FLAT, 0.0, precision[free]))
     A = np.vstack([G, np.diag(root)])

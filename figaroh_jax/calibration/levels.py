@@ -21,7 +21,7 @@ from ..estimation.marginal import FLAT, Linear, Posterior
 from ..estimation.posegroups import Measured
 from ..estimation.posesolver import solve
 from . import thresholds
-from .kinematic_scores import Waves, row_noise, waves_shown
+from .kinematic_scores import Tested, Waves, row_noise, waves_shown
 
 __all__ = [
     "EFFECT",
@@ -225,7 +225,7 @@ def _forward(
         (marginal.fit(linear, rows, free, robust=True, start=posterior, iterations=15), rows, fold)
         for rows, fold in _inner_folds(measured, used)
     ]
-    noise = row_noise(linear, posterior)
+    tested = Tested(linear, row_noise(linear, posterior), used, posterior.precision, free)
 
     def joined(which: Sequence[int]) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...], dict[str, float]]:
         Z = effects.jacobian(linear.at, which)
@@ -235,7 +235,7 @@ def _forward(
     def shown(beside: Sequence[int]) -> list[int]:
         columns = effects.jacobian(linear.at, beside)
         waves, parts = effects.waves(linear.at), [rows for _, rows, _ in inner]
-        return waves_shown(linear, noise, used, posterior.precision, waves, free, columns, parts)
+        return waves_shown(tested, waves, columns, parts)
 
     which = [*range(effects.grid), *shown(())]
     chosen, rivals, found = joined(which)

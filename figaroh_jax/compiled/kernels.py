@@ -540,7 +540,7 @@ def lanes_of(number: Number, lanes: Lanes) -> Array:
 
 
 def launch_over(
-    kernel: Callable[..., None], arrays: Sequence[Array], shapes: Sequence[tuple[int, int]], interpret: bool = False
+    kernel: Callable[..., None], arrays: Sequence[Array], shapes: Sequence[tuple[int, int]]
 ) -> list[Float[Array, "rows samples"]]:
     """What `kernel(lanes, *refs)` writes into arrays of these shapes, called once for each block of samples."""
     from jax.experimental import pallas as pl
@@ -556,7 +556,6 @@ def launch_over(
         grid=(ceil(samples / LANES),),
         in_specs=[anywhere] * len(arrays),
         out_specs=[anywhere] * len(shapes),
-        compiler_params=None if interpret else triton.CompilerParams(num_warps=1, num_stages=1),
-        interpret=interpret,
+        compiler_params=triton.CompilerParams(num_warps=1, num_stages=1),
         name="looped_rows",
     )(*arrays)

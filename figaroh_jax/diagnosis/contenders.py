@@ -128,7 +128,7 @@ def contend(
     if effect.body:
         effect, verdicts = _body_verdicts(problem, step, base, effect, Z)
     else:
-        names = [n for n, p in effect.parameters().items() if p.linear]
+        names = effect.amplitudes()
         parts = range(len(names)) if parts is None else parts
         verdicts, free = _judged_beside(problem, step, base, group.columns.joints, Z[list(parts)])
         values = dict(zip(parts, verdicts.theta[-len(parts) :], strict=True)) if len(parts) else {}
@@ -226,7 +226,7 @@ def _judged_beside(
 def _body_verdicts(
     problem: Problem, step: Step, base: Ground, effect: Effect, Z: Float[np.ndarray, "10 nv T"]
 ) -> tuple[Effect, Verdicts]:
-    """An effect that is a body, with the parameters of the nearest body that can exist."""
+    """An effect that is a body, with the parameters of the nearest physically consistent body."""
     rows, full = step.rows, np.moveaxis(Z, 0, 2)
     free, _ = _judged_beside(problem, step, base, range(len(rows.y)), Z)
     body = physical_body(free.theta[-10:], _information(rows, base, full))
@@ -282,7 +282,7 @@ def _position_contender(
         if abs(value - size) < NEAR_ENOUGH / np.sqrt(own):
             break
         effect = with_shape(effect, [name], [np.float64(value)])
-        state = solved(problem, step.state, theta - taken * move)
+        state = solved(step.state, theta - taken * move)
         change, slope = _shift(problem, state, effect, name, ready.whitening)
     sums, loose = sums_of(rows, step.folded, rows.y - change), step.loose
     free = None if loose is None else judge(rows, Hypothesis(rows.X, loose, change), sums)
@@ -302,7 +302,7 @@ def _expanded_contender(problem: Problem, step: Step, base: Ground, ready: White
         if abs(size - last) < SMALL_MOVE * abs(size):
             break
         effect = exact(with_shape(effect, [name], [np.float64(size)]))
-        motion = solved(problem, step.state, verdicts.theta[:-1]).motion  # its torque without the effect
+        motion = solved(step.state, verdicts.theta[:-1]).motion  # its torque without the effect
         fresh = units({group.name.effect: batched(effect)}, motion, problem.records)[group.name.effect]
         Z = unit_rows(fresh, problem.records, ready.whitening)[0].reshape(*Z.shape)
         verdicts, free = _judged_beside(problem, step, base, group.columns.joints, Z)

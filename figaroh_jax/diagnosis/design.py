@@ -32,6 +32,7 @@ __all__ = [
     "Units",
     "batch_size",
     "candidates",
+    "fitted_fields",
     "flattened",
     "kind",
     "local",
@@ -81,6 +82,11 @@ def _kind(effect: type[Effect]) -> Literal["columns", "position", "response"]:
 def shapes(effect: type[Effect]) -> list[str]:
     """Parameters that enter nonlinearly and may take any value between their bounds."""
     return [name for name, p in effect.parameters().items() if not p.linear and not p.choice]
+
+
+def fitted_fields(effect: Effect) -> list[str]:
+    """The effect's fields among the parameters of a fit, in order: amplitudes that have a column, then shapes."""
+    return (effect.amplitudes() if kind(effect) == "columns" else []) + shapes(type(effect))
 
 
 def batch_size(effect: Effect | type[Effect]) -> int:
@@ -222,8 +228,7 @@ def _changed_torques(batch: Effect, motion: Motion, records: Records) -> Float[n
     q, v, a = motion.position, motion.velocity, motion.acceleration
     before, robot = links_torque(motion.model, q, v, a, records), jax.tree.structure(motion.model)
     models = _changed(batch, motion.model)
-    amplitudes = sum(p.linear for p in batch.parameters().values())
-    out = np.empty((len(batch.at), amplitudes, *before.shape[::-1]))
+    out = np.empty((len(batch.at), len(batch.amplitudes()), *before.shape[::-1]))
     for one, amplitude in np.ndindex(out.shape[:2]):
         changed = jax.tree.unflatten(robot, [np.asarray(x)[one, amplitude] for x in models])
         out[one, amplitude] = (links_torque(changed, q, v, a, records) - before).T
@@ -232,10 +237,6 @@ def _changed_torques(batch: Effect, motion: Motion, records: Records) -> Float[n
 
 def _rows_first(torque: Float[np.ndarray, "*lead k nN rows"]) -> Float[np.ndarray, "*lead k rows nN"]:
     return np.moveaxis(torque, -1, -2)
-
-
-def _amplitudes(effect: Effect) -> list[str]:
-    return [name for name, p in effect.parameters().items() if p.linear]
 
 
 def _all_unit_torques(batches: dict[str, Effect], motion: Motion) -> dict[str, Float[Array, "effects k nN *rows"]]:
@@ -271,7 +272,7 @@ def _responses(batches: dict[str, Effect], omega: Array) -> dict[str, Complex[Ar
 @partial(Program, options=CPU_OPTIONS)
 def _changed(effects: Effect, model: RobotModel) -> list[Float[Array, "effects amplitudes *rest"]]:
     """Leaves of the robot with a unit of each amplitude of each effect."""
-    names = _amplitudes(effects)
+    names = effects.amplitudes()
 
     def change(effect: Effect, unit: Array) -> RobotModel:
         return with_shape(effect, names, list(unit)).change(model)

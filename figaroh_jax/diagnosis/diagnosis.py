@@ -19,6 +19,7 @@ from ..compiled.memory import give_back_holes
 from ..effects.base import place
 from ..effects.catalogue import CATALOGUE, find, related
 from ..effects.plausibility import implausible
+from ..formats.robotfile import load_robot, stated_baseline
 from ..recordings.bandwidth import note_on
 from ..recordings.checks import checked_recordings
 from ..recordings.dataset import Recording, read_recordings
@@ -73,8 +74,6 @@ def diagnose_task(
     task: Task, progress: Callable[[str, float], None] = lambda phase, share: None, backend: str = "native"
 ) -> Diagnosis:
     """Diagnose what a task file describes, by the named backend; `InputError` before any work where it is wrong."""
-    from ..formats.robotfile import load_robot, stated_baseline
-
     progress("reading", 0.0)
     model, (known, notes) = load_robot(task), stated_baseline(task)
     recordings = read_recordings(task, model)
@@ -272,7 +271,7 @@ def _possible(found: list[Found], joint: Joint) -> list[Found]:
 def _simple(here: Setting, found: list[Found], joint: Joint, forbid: Sequence[str], tolerance: float) -> list[Found]:
     """The causes, each as the simpler effect that it contains where it adds to that no more than is tolerable."""
     problem, state, out = here.problem, joint.step.state, []
-    for one, effect, at in zip(found, joint.causes, amplitude_places(state, joint.causes, problem.model), strict=True):
+    for one, effect, at in zip(found, joint.causes, amplitude_places(state, joint.causes), strict=True):
         inside = next((n for n in type(effect).contains if n not in forbid), None)
         if inside and beyond_simpler(problem, state, effect, at) < tolerance:
             where = one.name.at
@@ -386,7 +385,7 @@ def _answered(
             gaining = gaining._replace(joint=as_weighed_otherwise(here, searched.here.problem, gaining.joint))
         by_speed = by_speed if len(first) == len(named) else together(searched.here, named)
         first, moving = named, as_weighed_in_motion(searched.here, by_speed) if named else by_speed
-        least = least_sure(named, moving)
+        least = least_sure(moving)
         if least is None:
             return here, gaining._replace(named=opened(named, gaining.joint, forbid)), by_speed, against
         against[named[least].name] = f"its size is not surely above zero: {_told_size(moving, least, here)}"

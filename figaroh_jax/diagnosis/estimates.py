@@ -12,7 +12,7 @@ from ..effects.extended import ExtendedModel, extend
 from ..recordings.stacked import filtered_rows
 from ..results import Estimate
 from ..rigid.model import RobotModel, prismatic
-from .design import Units, kind, local, sensor_response, shapes, unit_rows, with_shape
+from .design import Units, fitted_fields, kind, local, sensor_response, shapes, unit_rows, with_shape
 from .problem import Problem
 from .shifts import torque_change
 from .state import State, unit_slopes
@@ -31,18 +31,18 @@ class Fitted(eqx.Module):
     at_shapes: Float[np.ndarray, "parameters parameters"] | None = None  # the covariance at each cause's shapes as told
 
 
-def with_amplitudes(state: State, causes: list[Effect], model: RobotModel) -> list[Effect]:
+def with_amplitudes(state: State, causes: list[Effect]) -> list[Effect]:
     """The causes with the amplitudes that the state has found for them."""
     out = []
-    for effect, place in zip(causes, amplitude_places(state, causes, model), strict=True):
-        names = [name for name, p in effect.parameters().items() if p.linear]
+    for effect, place in zip(causes, amplitude_places(state, causes), strict=True):
+        names = effect.amplitudes()
         out.append(with_shape(effect, names, [state.theta[i] for i in place]) if names else effect)
     return out
 
 
-def amplitude_places(state: State, causes: list[Effect], model: RobotModel) -> list[list[int]]:
+def amplitude_places(state: State, causes: list[Effect]) -> list[list[int]]:
     """Columns of each cause's amplitudes in the state; causes with columns are its last terms, in order."""
-    counts = [sum(p.linear for p in e.parameters().values()) if kind(e) == "columns" else 0 for e in causes]
+    counts = [len(e.amplitudes()) if kind(e) == "columns" else 0 for e in causes]
     first = len(state.theta) - sum(counts)
     starts = first + np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int) if counts else []
     return [list(range(s, s + c)) for s, c in zip(starts, counts, strict=True)]
@@ -50,9 +50,7 @@ def amplitude_places(state: State, causes: list[Effect], model: RobotModel) -> l
 
 def estimates(effect: Effect, fitted: Fitted, place: tuple[int, ...], model: RobotModel) -> dict[str, Estimate]:
     """What an engineer reads of the effect, with one sigma (first order in the fitted parameters)."""
-    names = [n for n, p in effect.parameters().items() if p.linear and kind(effect) == "columns"]
-    names += shapes(type(effect))
-    found, slope = _physical(effect, names)
+    found, slope = _physical(effect, fitted_fields(effect))
     covariance = fitted.covariance[np.ix_(place, place)]
     straight = effect.acts_on == "joint" and prismatic(model)[int(effect.at[0])]
     units = {**{n: p.unit for n, p in effect.parameters().items()}, **effect.units()}
@@ -94,14 +92,14 @@ def fitted_model(problem: Problem, state: State, causes: list[Effect]) -> Extend
     effects, column = [], 10 * links
     known = {(type(e).name, tuple(np.asarray(e.at))) for e in causes}
     for term in state.terms:
-        names = [name for name, p in term.parameters().items() if p.linear]
+        names = term.amplitudes()
         for place in range(term.at.shape[0]):
             one = jax.tree.map(lambda x, k=place: np.asarray(x)[k], term)
             values = [np.float64(v) for v in state.theta[column : column + len(names)]]
             column += len(names)
             if (term.name, tuple(one.at)) not in known:
                 effects.append(with_shape(one, names, values))
-    return extend(robot, *effects, *with_amplitudes(state, causes, problem.model), width=problem.width)
+    return extend(robot, *effects, *with_amplitudes(state, causes), width=problem.width)
 
 
 def _without(state: State, effect: Effect) -> Motion:
@@ -125,7 +123,7 @@ def torque_slopes(
     if not names or kind(effect) != "columns":
         return [torque_slope(problem, state, effect, name, whitening) for name in names]
     response = state.response(problem.records.omega)[:, None] * whitening
-    amplitudes, out = [float(getattr(effect, n)) for n, p in effect.parameters().items() if p.linear], []
+    amplitudes, out = [float(getattr(effect, n)) for n in effect.amplitudes()], []
     n, _, count, nv = problem.records.shape
     joints = np.asarray(effect.at) if local(effect) else np.arange(nv)
     for slope in unit_slopes(problem, state, effect, _without(state, effect)):

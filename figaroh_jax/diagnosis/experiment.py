@@ -75,7 +75,7 @@ def _designed(one: Found) -> str:
     """The command that designs a motion for the pair, where such a design knows both causes."""
     for name in (one.name, *one.ambiguous):
         effect = find(name.effect)
-        shaped = sum(not parameter.linear for parameter in effect.parameters().values())
+        shaped = len(effect.parameters()) - len(effect.amplitudes())
         known = any(effect.has(form) for form in ("torque", "torque_error", "change", "torque_response"))
         if shaped > 1 or not known:
             return ""
@@ -212,9 +212,7 @@ def _products(
     """Products of all columns in each recording: of the model, the effect's torque, the rivals at all their shapes."""
     n, _, count, nv = problem.records.shape
     X = whitened(problem, state, whitening).X.reshape(nv, n, count, -1)
-    sizes = [float(getattr(effect, name)) for name, p in effect.parameters().items() if p.linear] or [
-        float(getattr(effect, name)) for name in effect.parameters()
-    ]
+    sizes = [float(getattr(effect, name)) for name in effect.amplitudes() or effect.parameters()]
     z = _rows(problem, state, batched(effect), whitening)[0]
     blocks = [X, np.tensordot(sizes, z, 1)[..., None]]
     for rival in rivals:
@@ -268,5 +266,5 @@ def _everywhere(problem: Problem, name: Name) -> Effect:
 
 def _columns(batch: Effect) -> tuple[int, int]:
     """Shapes of a batch, and columns of each."""
-    own = sum(p.linear for p in batch.parameters().values()) if kind(batch) == "columns" else 1
+    own = len(batch.amplitudes()) if kind(batch) == "columns" else 1
     return len(batch.at), own

@@ -179,9 +179,8 @@ class _Shown(NamedTuple):
 
 
 def _can_be_screened(effect: type[Effect]) -> bool:
-    linear = any(p.linear for p in effect.parameters().values())
     return effect.acts_on in ("joint", "pair", "robot") and (
-        (linear and not effect.inertial and kind(effect) == "columns") or effect.name == _DELAY
+        (bool(effect.amplitudes()) and not effect.inertial and kind(effect) == "columns") or effect.name == _DELAY
     )
 
 
@@ -191,7 +190,7 @@ _DELAY = "torque_delay"
 def _numbers(batch: Effect, nv: int) -> int:
     """Numbers of a sample of all candidates of an effect."""
     rows = batch.at.shape[2] if _local(batch) else nv
-    return prod(batch.at.shape[:2]) * rows * max(1, sum(p.linear for p in batch.parameters().values()))
+    return prod(batch.at.shape[:2]) * rows * max(1, len(batch.amplitudes()))
 
 
 def _local(batch: Effect) -> bool:
@@ -260,7 +259,7 @@ def _unit(effect: Effect, motion: Motion) -> Float[Array, "k samples rows"]:
         return -motion.rate(motion.total)[None]
     if not effect.has("position_error"):
         return columns(effect, motion).reshape(-1, samples, 1 if effect.acts_on == "joint" else _rows(effect, motion))
-    names = [name for name, p in effect.parameters().items() if p.linear]
+    names = effect.amplitudes()
 
     def shifted(amplitudes: Array) -> Array:
         error = eqx.tree_at(lambda e: [getattr(e, n) for n in names], effect, list(amplitudes)).position_error(motion)
@@ -281,7 +280,7 @@ def _rows(effect: Effect, motion: Motion) -> int:
 def _causes(model: RobotModel, batches: dict[str, Effect], found: dict[str, _Shown]) -> Iterator[CauseInFleet]:
     for name, batch in batches.items():
         kind_of, shown = CATALOGUE[name], found[name]
-        linear = tuple(n for n, p in kind_of.parameters().items() if p.linear) or tuple(kind_of.parameters())
+        linear = tuple(kind_of.amplitudes() or kind_of.parameters())
         for place, at in enumerate(np.asarray(batch.at)[:, 0].tolist()):
             best = int(shown.squares[:, place].sum(0).argmax())
             shapes = [n for n in kind_of.parameters() if n not in linear]

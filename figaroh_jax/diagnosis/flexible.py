@@ -19,7 +19,7 @@ from .screening import Group, Null, family_p, screen
 from .state import FRICTION_PRECISION, State, whitened
 from .step import Step
 
-__all__ = ["Smooth", "dependences", "families", "flexible_p", "friction_width", "smooth_functions"]
+__all__ = ["Smooth", "dependences", "families", "flexible_p", "friction_width", "smooth_functions", "to_unit"]
 
 DEGREES = 6  # of the polynomials in a joint's position; of the cosines over time one less
 WIDTHS = (0.0, 0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # rad/s or m/s
@@ -118,7 +118,7 @@ def _coulomb_column(problem: Problem, state: State, joint: int) -> int | None:
     """Column of the joint's Coulomb friction in the regressor, if the model has one."""
     column = 10 * len(problem.model.joints)
     for term in state.terms:
-        amplitudes = sum(p.linear for p in term.parameters().values())
+        amplitudes = len(term.amplitudes())
         for at in np.asarray(term.at):
             if term.name == "coulomb_friction" and at[0] == joint:
                 return column
@@ -175,7 +175,7 @@ def families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"
 
 def _posture(motion: Motion) -> list[Float[np.ndarray, " nN"]]:
     """First and second degree in all positions: near to any torque that follows the posture alone."""
-    x = [_unit(q) for q in np.asarray(motion.position).T]
+    x = [to_unit(q) for q in np.asarray(motion.position).T]
     return [*x, *(x[i] * x[k] for i in range(len(x)) for k in range(i + 1))]
 
 
@@ -184,7 +184,7 @@ def smooth_functions(motion: Motion) -> list[Float[np.ndarray, "k nN"]]:
     out, loads = [], np.asarray(motion.load)
     for joint in range(loads.shape[1]):
         own = _smooth(motion, joint)
-        speed, load = _unit(np.abs(np.asarray(motion.velocity)[:, joint])), _unit(loads[:, joint])
+        speed, load = to_unit(np.abs(np.asarray(motion.velocity)[:, joint])), to_unit(loads[:, joint])
         s = np.asarray(motion.direction)[:, joint]
         more = [speed, 2 * speed**2 - 1, load, 2 * load**2 - 1, s * load, s * (2 * load**2 - 1), np.ones_like(s)]
         out.append(np.stack([*own["position"], *own["friction"], *more]))
@@ -193,8 +193,8 @@ def smooth_functions(motion: Motion) -> list[Float[np.ndarray, "k nN"]]:
 
 def dependences(motion: Motion, joint: int) -> dict[Dependence, list[Float[np.ndarray, " nN"]]]:
     """Smooth functions of what a rest of the joint may go with: position, velocity, load, time."""
-    own, load = _smooth(motion, joint), _unit(np.asarray(motion.load)[:, joint])
-    s, speed = np.asarray(motion.direction)[:, joint], _unit(np.abs(np.asarray(motion.velocity)[:, joint]))
+    own, load = _smooth(motion, joint), to_unit(np.asarray(motion.load)[:, joint])
+    s, speed = np.asarray(motion.direction)[:, joint], to_unit(np.abs(np.asarray(motion.velocity)[:, joint]))
     return {
         "position": own["position"],
         "velocity": [*own["friction"][:4], speed, 2 * speed**2 - 1],
@@ -206,7 +206,7 @@ def dependences(motion: Motion, joint: int) -> dict[Dependence, list[Float[np.nd
 def _smooth(motion: Motion, joint: int) -> dict[str, list[Float[np.ndarray, " nN"]]]:
     q, v = np.asarray(motion.position)[:, joint], np.asarray(motion.velocity)[:, joint]
     t, s = np.asarray(motion.time), np.asarray(motion.direction)[:, joint]
-    x, u, w = _unit(q), _unit(np.abs(v)), _unit(t)
+    x, u, w = to_unit(q), to_unit(np.abs(v)), to_unit(t)
     powers = [np.polynomial.chebyshev.chebval(x, np.eye(DEGREES + 1)[k]) for k in range(1, DEGREES + 1)]
     speeds = [np.polynomial.chebyshev.chebval(u, np.eye(4)[k]) for k in range(4)]
     return {
@@ -216,6 +216,7 @@ def _smooth(motion: Motion, joint: int) -> dict[str, list[Float[np.ndarray, " nN
     }
 
 
-def _unit(x: Float[np.ndarray, " nN"]) -> Float[np.ndarray, " nN"]:
+def to_unit(x: Float[np.ndarray, " nN"]) -> Float[np.ndarray, " nN"]:
+    """The values brought to between -1 and 1."""
     low, high = x.min(), x.max()
     return 2 * (x - low) / max(high - low, 1e-9) - 1

@@ -54,7 +54,7 @@ def noise_floor(
     response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
     for _ in range(ROUNDS):
         rows = whitened(problem, state, response)
-        state = solved(problem, state, fit(rows, state.prior).theta)
+        state = solved(state, fit(rows, state.prior).theta)
         spectrum = _from_repeats(problem, rows, state, response)
         response = whitening_of(problem, spectrum)
     return spectrum, response  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
@@ -211,7 +211,7 @@ def _rich(
 ) -> tuple[Rows, list[Float[np.ndarray, "nv T k"]]]:
     """Rows of the state with the columns that a forward selection takes, and these; `smooth` families among them."""
     rows = whitened(problem, state, response)
-    state = solved(problem, state, fit(rows, state.prior).theta)
+    state = solved(state, fit(rows, state.prior).theta)
     groups = catalogue(problem, state, rows, response, forbid)
     if smooth:
         groups += families(problem, state, response, still=True)

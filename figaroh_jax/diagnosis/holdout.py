@@ -194,7 +194,7 @@ def traces(
 ) -> tuple[Trace, ...]:
     """Each recording's rows: measured torque, the model's before and after, the share of each cause."""
     before, after = predicted(problem, first), predicted(problem, last)
-    places = amplitude_places(last, causes, problem.model)
+    places = amplitude_places(last, causes)
     shares = [_share(problem, last, e, at) for e, at in zip(causes, places, strict=True)]
     out = []
     for one, at in zip(signals, problem.records.spans, strict=True):

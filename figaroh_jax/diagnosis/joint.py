@@ -14,7 +14,7 @@ from ..effects.catalogue import CATALOGUE, find
 from ..estimation.rows import Rows, block_sums
 from ..results import Name
 from .comparison import fold_sums
-from .design import kind, shapes, with_shape
+from .design import fitted_fields, kind, shapes, with_shape
 from .estimates import Fitted, amplitude_places, torque_slopes, with_amplitudes
 from .problem import Problem, family_of
 from .search import Found
@@ -66,7 +66,7 @@ def polished(problem: Problem, start: State, causes: list[Effect], whitening: Fl
             share = np.where(move * before < -BACK * before**2, share / 2, share)
         goal = replace(joint.fitted, value=joint.fitted.value - (1 - share) * move)
         causes = [moved(e, goal, at) for e, at in zip(joint.causes, goal.places, strict=True)]
-        base = solved(problem, start, joint.step.state.theta[: len(start.theta)])
+        base = solved(start, joint.step.state.theta[: len(start.theta)])
         before, last, joint = move, joint.fitted, _together(problem, base, causes, whitening)
         if np.all(np.abs(joint.fitted.value - last.value) <= SETTLED * np.sqrt(np.diag(joint.fitted.covariance))):
             break
@@ -93,7 +93,7 @@ def with_misfit(
     amplitudes = np.zeros_like(shaped)
     for weight, whitening in weights:
         other = problem.weighted(weight)
-        base = solved(other, start, theta[: len(start.theta)])
+        base = solved(start, theta[: len(start.theta)])
         one = _together(other, base, joint.causes, whitening)
         moves += _moves(fitted.covariance, one.fitted.covariance, one.fitted.value - fitted.value)
         alone = np.append(one.step.state.theta - theta, np.zeros(len(fitted.value) - len(theta)))
@@ -204,14 +204,14 @@ def _settled(effect: Effect) -> bool:
 
 def _together(problem: Problem, base: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> Joint:
     step = stand(problem, assembled(problem, base, causes), whitening)
-    causes = with_amplitudes(step.state, causes, problem.model)
+    causes = with_amplitudes(step.state, causes)
     return Joint(step, causes, joint_fit(problem, step, causes, whitening))
 
 
 def joint_fit(problem: Problem, step: Step, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> Fitted:
     """Gauss-Newton step of all coefficients and shapes at once, and a covariance from the scores of the blocks."""
     state, rows = step.state, step.rows
-    causes = with_amplitudes(state, causes, problem.model)
+    causes = with_amplitudes(state, causes)
     each = [slope for e in causes for slope in torque_slopes(problem, state, e, whitening)]
     slopes = np.stack(each) if each else np.zeros((0, *rows.y.shape))
     precision = np.append(state.prior.precision, np.zeros(len(slopes)))
@@ -225,7 +225,7 @@ def joint_fit(problem: Problem, step: Step, causes: list[Effect], whitening: Flo
     values = [float(getattr(e, n)) for e in causes for n in shapes(type(e))]
     covariance = inverse @ (_scatter(rows, slopes, residual) + np.diag(precision)) @ inverse
     covariance = _widened(covariance, inverse, rows, residual, len(A))
-    return Fitted(np.append(state.theta, values) + move, covariance, _places(problem, state, causes))
+    return Fitted(np.append(state.theta, values) + move, covariance, _places(state, causes))
 
 
 def _inverse(A: Float[np.ndarray, "P P"]) -> Float[np.ndarray, "P P"]:
@@ -262,10 +262,10 @@ def _scatter(
     return scores @ scores.T * blocks / max(blocks - 1, 1)
 
 
-def _places(problem: Problem, state: State, causes: list[Effect]) -> tuple[tuple[int, ...], ...]:
+def _places(state: State, causes: list[Effect]) -> tuple[tuple[int, ...], ...]:
     """Where each cause's amplitudes and shapes stand among the parameters."""
     places, first = [], len(state.theta)
-    for effect, amplitude in zip(causes, amplitude_places(state, causes, problem.model), strict=True):
+    for effect, amplitude in zip(causes, amplitude_places(state, causes), strict=True):
         count = len(shapes(type(effect)))
         places.append((*amplitude, *range(first, first + count)))
         first += count
@@ -331,7 +331,7 @@ def has_size(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
     return not own or kind(effect) != "columns" or _beyond_zero(effect, fitted, place, own, given) > 1
 
 
-def least_sure(found: list[Found], joint: Joint) -> int | None:
+def least_sure(joint: Joint) -> int | None:
     """Which of the causes is least surely there by the intervals that are told, of those that are not; else None.
 
     Of a law of the speed whose shape is open the amplitude is judged at that shape: the same friction comes of many
@@ -348,9 +348,8 @@ def least_sure(found: list[Found], joint: Joint) -> int | None:
 
 def _amplitudes(effect: Effect) -> list[int]:
     """Which of an effect's amplitudes no simpler effect has."""
-    names = [n for n, p in effect.parameters().items() if p.linear]
     simpler = {name for inside in type(effect).contains for name in find(inside).parameters()}
-    return [k for k, name in enumerate(names) if name not in simpler]
+    return [k for k, name in enumerate(effect.amplitudes()) if name not in simpler]
 
 
 def _shape_places(effect: Effect, place: tuple[int, ...]) -> Sequence[int]:
@@ -365,8 +364,7 @@ def _beyond_zero(
     95 % region."""
     from scipy.special import chdtri  # scipy is slow to import
 
-    names = [n for n, p in effect.parameters().items() if p.linear and kind(effect) == "columns"]
-    names += shapes(type(effect))
+    names = fitted_fields(effect)
     at, known = np.array(place)[list(own)], np.array(place)[list(given)].astype(int)
     value = np.array([float(getattr(effect, names[k])) for k in own])
     covariance = fitted.covariance[np.ix_(at, at)]

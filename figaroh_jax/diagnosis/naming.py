@@ -21,9 +21,9 @@ from ..estimation.rows import Prior
 from ..recordings.stacked import filter_rows, filtered_rows, open_rows
 from ..results import Name
 from .comparison import Ground, Hypothesis, Verdicts, fold_sums, ground, judge, judge_grown, t_needed, t_value
-from .design import kind, sensor_response, shapes
+from .design import fitted_fields, kind, sensor_response
 from .estimates import Fitted, amplitude_places, torque_slope
-from .flexible import smooth_functions
+from .flexible import smooth_functions, to_unit
 from .gates import physical_sign
 from .holdout import residual_rms
 from .joint import Joint
@@ -279,7 +279,7 @@ def standings(
     """Each cause's standing in the fit of all of them."""
     if not found:
         return []
-    full, places = joint.step, amplitude_places(joint.step.state, joint.causes, problem.model)
+    full, places = joint.step, amplitude_places(joint.step.state, joint.causes)
     size = residual_rms(problem, stand(problem, start, whitening).state)
     grown = _Grown(problem, full, whitening, ground(full.verdicts, full.state.prior, full.folded), size)
     out = []
@@ -371,7 +371,7 @@ def beyond_simpler(problem: Problem, state: State, effect: Effect, place: list[i
 
     Of a spring that rests far away all but a little is a constant. 1 for effects that contain none.
     """
-    names = [n for n, p in effect.parameters().items() if p.linear]
+    names = effect.amplitudes()
     simpler = {n for inside in type(effect).contains for n in find(inside).parameters()}
     own = [n not in simpler for n in names]
     if effect.acts_on != "joint" or kind(effect) != "columns" or all(own) or not any(own):
@@ -444,7 +444,7 @@ def _varied_joint(grown: _Grown, torque: np.ndarray, joints: tuple[int, ...]) ->
     q, v, load = (np.asarray(x) for x in (motion.angle, motion.velocity, motion.load))
     out = []
     for joint in joints:
-        varying = [_unit(x) for x in (q[:, joint], np.abs(v[:, joint]), load[:, joint], np.asarray(motion.time))]
+        varying = [to_unit(x) for x in (q[:, joint], np.abs(v[:, joint]), load[:, joint], np.asarray(motion.time))]
         columns = np.stack([torque[:, joint] * f for x in varying for f in (x, 2 * x**2 - 1)])
         rows = filter_rows(records, columns.reshape(-1, n, samples), grown.response[:, joint][None], fitted=True)
         out.append((rows * np.asarray(problem.records.weight)[:, :, joint]).reshape(len(varying), 2, -1))
@@ -459,7 +459,7 @@ def _varied_robot(grown: _Grown, effect: Effect, torque: np.ndarray) -> Float[np
         rows = torque_slope(problem, state, effect, name, grown.whitening)
     else:
         rows = filtered_rows(problem.records, torque, grown.response)
-    time = _unit(
+    time = to_unit(
         np.take_along_axis(np.asarray(problem.records.time), problem.records.row_samples(), axis=1).reshape(-1)
     )
     felt = [k for k in range(len(rows)) if np.any(rows[k])]
@@ -559,11 +559,6 @@ def _turns_against_itself(effect: Effect, fitted: Fitted, place: tuple[int, ...]
 
 def _deviations(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> dict[str, float]:
     """Each parameter in its standard deviations."""
-    names = [n for n, p in effect.parameters().items() if p.linear] + shapes(type(effect))
+    names = fitted_fields(effect)
     std = np.sqrt(np.maximum(np.diag(fitted.covariance)[list(place)], 1e-300))
     return {name: float(getattr(effect, name)) / float(s) for name, s in zip(names, std, strict=True)}
-
-
-def _unit(x: np.ndarray) -> np.ndarray:
-    low, high = x.min(), x.max()
-    return 2 * (x - low) / max(high - low, 1e-9) - 1

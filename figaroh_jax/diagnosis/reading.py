@@ -24,7 +24,7 @@ from ..recordings.signals import Signals, prepare_all
 from ..recordings.stacked import stack
 from .holdout import predicted
 from .problem import Problem
-from .standstill import held, resting, stands
+from .standstill import held, resting, rms_of, stands
 from .state import State, on_motion
 from .thresholds import CARRIED, ENOUGH_MOVING, LEAST_MOVING
 
@@ -90,17 +90,17 @@ def only_read(
     a joint that stands still at times the rows at rest only have to stay within what its dry friction can hold.
     """
     judged = np.asarray(problem.records.judged) > 0
-    left, torque = problem.torque - predicted(problem, state), _rms(problem.torque, judged)
+    left, torque = problem.torque - predicted(problem, state), rms_of(problem.torque, judged)
     still = judged & resting(problem) & stands(problem)
     used, squares = judged & ~still, (errors**2).mean(0)
     reach = int(np.ceil(CARRIED / float(problem.records.cutoff) * float(problem.records.rate)))
     spread = np.stack([_largest_near(one, reach) for one in np.moveaxis(squares, 2, 0)], axis=2)
     quiet = used & (spread < (QUIET * noise) ** 2)
-    beyond, rest = (_rms(left, rows) ** 2 - noise**2 for rows in (used, quiet))
+    beyond, rest = (rms_of(left, rows) ** 2 - noise**2 for rows in (used, quiet))
     enough = np.minimum(LEAST_MOVING * judged.sum((0, 1)), ENOUGH_MOVING / problem.passed)
-    told = (beyond <= AS_MUCH * _rms(np.sqrt(squares), used) ** 2) & (quiet.sum((0, 1)) >= enough)
+    told = (beyond <= AS_MUCH * rms_of(np.sqrt(squares), used) ** 2) & (quiet.sum((0, 1)) >= enough)
     told &= rest <= (tolerance * torque) ** 2
-    told |= _rms(left - errors.mean(0), used) ** 2 - noise**2 <= (tolerance * torque) ** 2
+    told |= rms_of(left - errors.mean(0), used) ** 2 - noise**2 <= (tolerance * torque) ** 2
     told &= held(state, left, still)
     large = relative > tolerance
     return bool(large.any() and told[large].all())
@@ -142,7 +142,3 @@ def _at(
 def _largest_near(rows: Float[np.ndarray, "n M"], reach: int) -> Float[np.ndarray, "n M"]:
     padded = np.pad(rows, ((0, 0), (reach, reach)))
     return np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=1).max(-1)
-
-
-def _rms(rows: Float[np.ndarray, "n M nv"], used: np.ndarray) -> Float[np.ndarray, " nv"]:
-    return np.sqrt(((rows * used) ** 2).sum((0, 1)) / np.maximum(used.sum((0, 1)), 1))

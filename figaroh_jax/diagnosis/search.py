@@ -156,7 +156,7 @@ def find_causes(
         if any(type(f.effect).follows_total for f in found):
             screened = None
             step = _refreshed(problem, state, step, found, whitening)
-    begun = solved(problem, with_width(problem, state), step.state.theta[: len(state.theta)])
+    begun = solved(with_width(problem, state), step.state.theta[: len(state.theta)])
     return Search(problem, begun, found, p_values[0], p_values[-1], shown)
 
 
@@ -178,8 +178,8 @@ def _refreshed(
     problem: Problem, start: State, step: Step, found: list[Found], whitening: Float[np.ndarray, "F nv"]
 ) -> Step:
     """The step with what follows all torque together evaluated at that of all causes so far."""
-    begun = solved(problem, with_width(problem, start), step.state.theta[: len(start.theta)])
-    causes = with_amplitudes(step.state, [f.effect for f in found], problem.model)
+    begun = solved(with_width(problem, start), step.state.theta[: len(start.theta)])
+    causes = with_amplitudes(step.state, [f.effect for f in found])
     return with_causes(problem, begun, [exact(one) for one in causes], whitening)
 
 
@@ -376,7 +376,7 @@ def judged_without(
         about = start, whitening, *(f.effect for f in found if f is not one)
         known = problem.judged.get(*about)
         return known or problem.judged.put(stood_without(problem, start, found, one, whitening).verdicts, *about)
-    place = amplitude_places(full.state, [f.effect for f in found], problem.model)[found.index(one)]
+    place = amplitude_places(full.state, [f.effect for f in found])[found.index(one)]
     prior, kept = full.state.prior, np.delete(np.arange(len(full.state.theta)), place)
     fewer = believed(problem, Prior(prior.mean[kept], prior.precision[kept]), fewer_sums(full.folded, place))
     precision = prior.precision.copy()

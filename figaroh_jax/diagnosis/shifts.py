@@ -151,7 +151,7 @@ def _compliances(
     unit = (more - here).mean(1)
     joints = np.asarray(effects.at)[:, 0]
     few, (once, place) = _Few.of(motion, records), np.unique(joints, return_inverse=True)
-    slopes = few.slopes(motion.model, once, lambda q, v, a: links_torque(motion.model, q, v, a, records))
+    slopes = few.slopes(once, lambda q, v, a: links_torque(motion.model, q, v, a, records))
     own = few.between(np.stack([slopes[k, :, :, j] for k, j in enumerate(once)]))[place]  # (sensors, 3, n, N)
     dt, out = float(records.dt), []
     for K, D, M in unit[:, None, None, None] * own:
@@ -182,7 +182,7 @@ class _Few(NamedTuple):
         return cls(at, samples, tuple(x.reshape(n, samples, nv)[:, at].reshape(-1, nv) for x in _state(motion)))
 
     def slopes(
-        self, model: RobotModel, joints: Int[np.ndarray, " joints"], torque: Callable[..., np.ndarray]
+        self, joints: Int[np.ndarray, " joints"], torque: Callable[..., np.ndarray]
     ) -> Float[np.ndarray, "joints 3 n_few nv"]:
         """Derivatives of the torque in position, velocity and acceleration of the joints, by central differences."""
         moved = [np.broadcast_to(x, (len(joints), 3, 2, *x.shape)).copy() for x in self.state]
@@ -346,7 +346,7 @@ def shift_torques(effects: Effect, motion: Motion, records: Records) -> Float[np
     With errors e of joint j it is -(K_j e + D_j e' + M_j e''), the derivatives of inverse dynamics in the position, the
     velocity and the acceleration of the joint: the same for all sensors.
     """
-    names = [name for name, p in effects.parameters().items() if p.linear]
+    names = effects.amplitudes()
     errors = _unit_errors(effects, motion, records).reshape(len(effects.at), len(names), *records.position.shape[:2])
     rates = difference(errors, float(records.dt))
     pushes = difference(rates, float(records.dt))
@@ -371,7 +371,7 @@ def _load_slopes(motion: Motion, records: Records) -> Float[np.ndarray, "3 nv nv
     model, inertia = motion.model, np.asarray(motion.model.inertia)
     if not any(position is motion.position and np.array_equal(known, inertia) for position, known, _ in _SLOPES):
         few = _Few.of(motion, records)
-        slopes = few.slopes(model, np.arange(records.shape[3]), lambda q, v, a: rigid_torque(model, q, v, a))
+        slopes = few.slopes(np.arange(records.shape[3]), lambda q, v, a: rigid_torque(model, q, v, a))
         full = few.between(np.moveaxis(slopes, (1, 3), (0, 2)))  # (3, joint, torque of, n, N)
         _SLOPES[:] = [(motion.position, inertia, full.reshape(*full.shape[:3], -1))]
     return _SLOPES[0][2]
@@ -379,7 +379,7 @@ def _load_slopes(motion: Motion, records: Records) -> Float[np.ndarray, "3 nv nv
 
 def _unit_errors(effects: Effect, motion: Motion, records: Records) -> Float[np.ndarray, "effects k nN"]:
     """What each sensor reads beside the truth with a unit of each of its amplitudes."""
-    names, out = [name for name, p in effects.parameters().items() if p.linear], []
+    names, out = effects.amplitudes(), []
     for one in range(len(effects.at)):
         effect = jax.tree.map(lambda x, i=one: np.asarray(x)[i], effects)
         for unit in np.eye(len(names)):

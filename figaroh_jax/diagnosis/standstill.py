@@ -18,7 +18,7 @@ from .state import State
 from .thresholds import CARRIED, ENOUGH_MOVING, LAW_AT_REST, LAW_WIDTHS, LEAST_MOVING, STANDSTILL
 from .weights import relative_speed
 
-__all__ = ["beyond_sliding", "held", "left_moving", "left_weighed", "only_sticks", "resting", "stands"]
+__all__ = ["beyond_sliding", "held", "left_moving", "left_weighed", "only_sticks", "resting", "rms_of", "stands"]
 
 PASSED = 1 / 8  # of the band of slow rows
 TURNED = 0.1  # of the way to its limit: below, what friction a joint needs to slide is taken from the samples around
@@ -55,8 +55,8 @@ def _left_of(
     problem: Problem, state: State, noise: Float[np.ndarray, " nv"], rows: Bool[np.ndarray, "n M nv"]
 ) -> Float[np.ndarray, " nv"]:
     left, judged = problem.torque - predicted(problem, state), np.asarray(problem.records.judged) > 0
-    torque = _rms(problem.torque, judged)
-    beyond = np.sqrt(np.maximum(_rms(left, judged & rows) ** 2 - noise**2, 0.0))
+    torque = rms_of(problem.torque, judged)
+    beyond = np.sqrt(np.maximum(rms_of(left, judged & rows) ** 2 - noise**2, 0.0))
     return beyond / np.maximum(torque, 1e-9 * max(float(torque.max()), 1e-300))
 
 
@@ -74,7 +74,7 @@ def only_sticks(
     """
     left, judged = problem.torque - predicted(problem, state), np.asarray(problem.records.judged) > 0
     still = resting(problem) & judged
-    torque = _rms(problem.torque, judged)
+    torque = rms_of(problem.torque, judged)
     moving = left_moving(problem, state, noise)
     looked_at = np.flatnonzero(relative > tolerance)
     if not len(looked_at) or np.any(moving[looked_at] > tolerance):
@@ -85,7 +85,7 @@ def only_sticks(
     seen = rows >= np.minimum(LEAST_MOVING * judged.sum((0, 1)), ENOUGH_MOVING / problem.passed)
     if not np.all((seen & held(state, left, still))[looked_at]):
         return False
-    beyond = np.sqrt(np.maximum(_rms(beyond_sliding(problem, state, left), still) ** 2 - noise**2, 0.0))
+    beyond = np.sqrt(np.maximum(rms_of(beyond_sliding(problem, state, left), still) ** 2 - noise**2, 0.0))
     slides = [joint for joint in looked_at.tolist() if beyond[joint] > tolerance * torque[joint]]
     return not any(_law_of_velocity(problem, state, left, still, joint) for joint in slides)
 
@@ -93,7 +93,7 @@ def only_sticks(
 def held(state: State, left: Float[np.ndarray, "n M nv"], still: Bool[np.ndarray, "n M nv"]) -> Bool[np.ndarray, " nv"]:
     """Whether what the state has `left` of each joint's rows at rest is no more than its dry friction from one limit to
     the other."""
-    return _rms(left, still) <= 2 * np.sqrt((_friction(state) ** 2).mean(0))
+    return rms_of(left, still) <= 2 * np.sqrt((_friction(state) ** 2).mean(0))
 
 
 def stands(problem: Problem) -> Bool[np.ndarray, " nv"]:
@@ -137,7 +137,8 @@ def _friction(state: State) -> Float[np.ndarray, "nN nv"]:
     return friction
 
 
-def _rms(rows: Float[np.ndarray, "n M nv"], used: Bool[np.ndarray, "n M nv"]) -> Float[np.ndarray, " nv"]:
+def rms_of(rows: Float[np.ndarray, "n M nv"], used: Bool[np.ndarray, "n M nv"]) -> Float[np.ndarray, " nv"]:
+    """Of each joint's `used` rows, zero where there are none."""
     return np.sqrt(((rows * used) ** 2).sum((0, 1)) / np.maximum(used.sum((0, 1)), 1))
 
 

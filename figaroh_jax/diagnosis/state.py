@@ -170,7 +170,7 @@ def stated_effects(model: RobotModel, known: Baseline | None) -> tuple[list[str]
     given = []
     for entry in known.effects:
         effect = find(entry.effect)
-        if not any(p.linear for p in effect.parameters().values()):
+        if not effect.amplitudes():
             raise InputError(f"baseline.effects: '{entry.effect}' cannot be fitted as part of the baseline")
         given.append(place(effect, model, entry.at))
     return known.everywhere(), given
@@ -196,9 +196,9 @@ def assembled(
 
 def with_size(problem: Problem, state: State, effect: Effect) -> State:
     """The state with one more cause at its size."""
-    linear = [n for n, p in effect.parameters().items() if p.linear and kind(effect) == "columns"]
+    linear = effect.amplitudes() if kind(effect) == "columns" else []
     theta = np.append(state.theta, [float(getattr(effect, n)) for n in linear])
-    return solved(problem, extended_state(problem, state, effect), theta)
+    return solved(extended_state(problem, state, effect), theta)
 
 
 def _rearranged(state: State, order: list[int]) -> State:
@@ -264,7 +264,7 @@ def link_motion(problem: Problem, state: State) -> Motion:
     return motion
 
 
-def solved(problem: Problem, state: State, theta: Float[np.ndarray, " P"]) -> State:
+def solved(state: State, theta: Float[np.ndarray, " P"]) -> State:
     """The state with coefficients `theta`, from which its load and its torque follow."""
     return replace(state, theta=theta)
 

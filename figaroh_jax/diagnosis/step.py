@@ -58,7 +58,7 @@ def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], 
     else:
         folded = problem.filtered.sums(rows)
     state = replace(state, prior=believed(problem, state.prior, folded))
-    solution = solved(problem, state, coefficients(folded, state.prior))
+    solution = solved(state, coefficients(folded, state.prior))
     return Step(solution, rows, folded, let_go(problem, state.prior))
 
 
@@ -67,7 +67,7 @@ def with_cause(problem: Problem, step: Step, effect: Effect, whitening: Float[np
     grown = stand(problem, extended_state(problem, step.state, effect), whitening, step)
     if kind(effect) != "position":
         return grown
-    base = solved(problem, step.state, grown.state.theta)
+    base = solved(step.state, grown.state.theta)
     del grown  # its rows and columns are large
     return stand(problem, extended_state(problem, base, effect), whitening)
 

@@ -386,6 +386,11 @@ class Effect(eqx.Module):
         return dict(_declared(cls))
 
     @classmethod
+    def amplitudes(cls) -> list[str]:
+        """Names of the parameters that its torque is linear in, in order: without them it does nothing."""
+        return [name for name, parameter in _declared(cls).items() if parameter.linear]
+
+    @classmethod
     def units(cls) -> dict[str, str]:
         """Units of `physical()`, for a revolute joint."""
         return {name: parameter.unit for name, parameter in cls.parameters().items()}
@@ -520,16 +525,9 @@ def joint_unit(unit: str, prismatic: bool) -> str:
     return unit.replace("N m", "N").replace("rad", "m") if prismatic else unit
 
 
-def zeros_like(effect: Effect) -> Effect:
-    """The effect with every amplitude zero and its shape kept."""
-    names = [name for name, parameter in effect.parameters().items() if parameter.linear]
-    blank = [jnp.zeros_like(jnp.asarray(getattr(effect, name))) for name in names]
-    return eqx.tree_at(lambda e: [getattr(e, name) for name in names], effect, blank) if names else effect
-
-
 def columns(effect: Effect, motion: Motion) -> Float[Array, "amplitudes samples *rows"]:
     """Torque (read or added) of a unit of each amplitude: the exact columns of the regressor, for the given shape."""
-    names = [name for name, parameter in effect.parameters().items() if parameter.linear]
+    names = effect.amplitudes()
 
     def torque(values: Float[Array, " amplitudes"]) -> Float[Array, "samples *rows"]:
         one = eqx.tree_at(lambda e: [getattr(e, n) for n in names], effect, list(values))

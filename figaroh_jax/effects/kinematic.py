@@ -424,7 +424,7 @@ def twists_of(effects: Sequence[Effect], model: RobotModel, postures: Postures) 
     """
     total = jnp.zeros((len(model.joints), 6, len(postures.q)))
     for effect in effects:
-        sizes = [getattr(effect, name) for name, parameter in effect.parameters().items() if parameter.linear]
+        sizes = [getattr(effect, name) for name in effect.amplitudes()]
         if sizes and effect.has("twist"):
             curved = getattr(effect, shape_of(type(effect))[0], 0.0)
             columns = effect.twist(model, tuple(int(k) for k in effect.at), curved)

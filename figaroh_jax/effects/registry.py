@@ -34,7 +34,7 @@ def register(effect: type[Effect]) -> type[Effect]:
         raise InputError(f"an effect called '{effect.name}' is registered already")
     if "torque" in effect.levels:
         (CATALOGUE if effect.searched else _OTHERS)[effect.name] = effect
-    linear = effect.has("position_error") and any(p.linear for p in effect.parameters().values())
+    linear = effect.has("position_error") and bool(effect.amplitudes())
     if "pose" in effect.levels and effect.searched and (effect.has("twist") or linear):
         POSES[effect.name] = effect
     acts = bool(effect.in_rollouts.numbers) or (effect.acts_on == "joint" and effect.has("torque") and effect.searched)

@@ -20,7 +20,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
-from ..compiled.batching import CPU_OPTIONS, aligned, program
+from ..compiled.batching import CPU_OPTIONS, program, reused
 from ..compiled.machine_code import machine_code
 from ..compiled.precision import in_float64
 from ..effects.base import Effect
@@ -322,12 +322,7 @@ def _coded(
     states: States, code: Callable[..., np.ndarray], q: np.ndarray, v: np.ndarray, a: np.ndarray, tau: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Rows of the links and of the terms, and torques, samples last, a chunk at a time; the next overwrites them."""
-    memory, width = np.empty(0), np.broadcast_to(np.asarray(states.width, float), (states.model.nv,))
-
-    def room(shape: tuple[int, ...], fill: float | None) -> np.ndarray:
-        nonlocal memory
-        memory = memory if memory.shape == shape else aligned(shape, fill)
-        return memory
+    room, width = reused(), np.broadcast_to(np.asarray(states.width, float), (states.model.nv,))
 
     side, samples = np.empty((0, 0)), len(q)
     for start in range(0, samples, CODE_CHUNK):

@@ -62,7 +62,7 @@ def friction_terms(model: RobotModel, known: Baseline) -> tuple[Effect, ...]:
         terms.append(effect(joints, **{p: np.zeros(len(driven)) for p in effect.parameters()}))
     for entry in known.effects:
         effect = find(entry.effect)
-        if not any(p.linear for p in effect.parameters().values()):
+        if not effect.amplitudes():
             raise InputError(f"baseline.effects: '{entry.effect}' has no parameter in which the torque is linear")
         terms.append(jax.tree.map(lambda x: np.asarray(x)[None], place(effect, model, entry.at)))
     return tuple(terms)
@@ -85,7 +85,7 @@ def column_names(model: RobotModel, terms: Sequence[Effect]) -> tuple[str, ...]:
     """
     names = list(inertial_names(model))
     for term in terms:
-        amplitudes = [name for name, parameter in term.parameters().items() if parameter.linear]
+        amplitudes = term.amplitudes()
         for at in np.asarray(term.at):
             where = "_".join(str(k + 1) for k in at)
             short = SHORT_NAMES.get(term.name)
@@ -218,7 +218,7 @@ def term_places(model: RobotModel, terms: tuple[Effect, ...]) -> Int[np.ndarray,
     """Coordinate and column (behind those of the links) of each of `term_rows`."""
     places, first = [np.zeros((0, 2), int)], 0
     for term in terms:
-        amplitudes = sum(parameter.linear for parameter in term.parameters().values())
+        amplitudes = len(term.amplitudes())
         for at in np.asarray(term.at):
             rows = np.arange(model.nv) if term.acts_on in ("link", "robot") else np.asarray(at)
             grid = np.meshgrid(rows, first + np.arange(amplitudes), indexing="ij")

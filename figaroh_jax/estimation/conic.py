@@ -1,7 +1,7 @@
 """Least squares under convex constraints, by the interior-point solver Clarabel (Goulart and Chen, 2024).
 
-The squares stand as the triangular factor of their rows, so the size of a problem is that of its parameters. Bodies
-that can exist are those whose pseudo-inertia is positive semidefinite (Wensing, Kim, Slotine 2018): a convex set.
+The squares stand as the triangular factor of their rows, so the size of a problem is that of its parameters. A body is
+physically consistent where its pseudo-inertia is positive semidefinite (Wensing, Kim, Slotine 2018): a convex set.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class NotConverged(InputError):
 
 @dataclass(frozen=True)
 class Body:
-    """Ten columns, in Pinocchio's order, that shall be those of a body that can exist."""
+    """Ten columns, in Pinocchio's order, that shall be those of a physically consistent body."""
 
     name: str
     columns: Sequence[int]

@@ -1,4 +1,4 @@
-"""Links that can exist: why one cannot, and fits whose links all can.
+"""Physically consistent links: why one is not, and fits whose links all are.
 
 A body has a positive semidefinite pseudo-inertia (Wensing, Kim, Slotine 2018): positive mass and principal inertias of
 which none exceeds the sum of the others. Two fits keep to that. `physical_fit` solves the convex problem and so
@@ -121,17 +121,14 @@ def _bounded(body: Body, entry: Mapping) -> Body:
 
 
 def physical_fit(
-    factor: Float[np.ndarray, "n k"],
-    links: Sequence[Body],
-    lower: Float[np.ndarray, " columns"] | None = None,
-    upper: Float[np.ndarray, " columns"] | None = None,
+    factor: Float[np.ndarray, "n k"], links: Sequence[Body], lower: Float[np.ndarray, " columns"] | None = None
 ) -> Float[np.ndarray, " columns"]:
-    """Least squares of `factor @ [x, -1]` over parameters whose links are bodies, within bounds: the one optimum.
+    """Least squares of `factor @ [x, -1]` over parameters whose links are bodies, none below `lower`: the one optimum.
 
     A prior belongs into the factor (`least_squares.with_prior`). Raises `InputError` where that fails.
     """
     scale = _scales(factor.shape[1] - 1, links)
-    return constrained(factor, Constraints(links, lower, upper), scale)
+    return constrained(factor, Constraints(links, lower), scale)
 
 
 def _scales(columns: int, links: Sequence[Body]) -> Float[np.ndarray, " columns"]:
@@ -208,13 +205,13 @@ def log_cholesky_fit(
         while not settled and steps < max_steps:
             value, theta, squares, count = _search(solver, value, arguments, ROUND)
             steps += int(count)
-            # at the border of what can exist the search creeps without end: the cost decides, not the step
+            # at the border of what is consistent the search creeps without end: the cost decides, not the step
             settled, cost = bool(cost < (1 + SETTLED) * float(squares)), float(squares)
         return LogCholeskyFit(np.asarray(theta), 0.5 * unit**2 * cost, settled, steps)
 
 
 def _interior(inertia: Float[np.ndarray, "links 10"]) -> Float[np.ndarray, "links 10"]:
-    """The links moved off the border of what can exist: Cholesky's factor must exist."""
+    """The links moved off the border of what is consistent: Cholesky's factor must exist."""
     P = pseudo_inertia(inertia)
     values, vectors = np.linalg.eigh(P)
     mass = np.maximum(inertia[:, 0], 1e-3 * max(float(inertia[:, 0].max(initial=0.0)), 1e-3))

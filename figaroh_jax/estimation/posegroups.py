@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Int
@@ -70,8 +71,6 @@ def postures_of(model: RobotModel, recordings: Sequence[PoseRecording]) -> tuple
 
 
 def _loaded(model: RobotModel, recording: PoseRecording) -> RobotModel:
-    import equinox as eqx
-
     load = recording.load
     assert load is not None
     frame = model.frame_index(load.frame)

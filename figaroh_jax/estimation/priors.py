@@ -1,4 +1,4 @@
-"""What is believed of inertial parameters before the data: how far, and which bodies can exist."""
+"""What is believed of inertial parameters before the data: how far, and which bodies are consistent."""
 
 from __future__ import annotations
 

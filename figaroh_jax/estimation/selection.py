@@ -190,7 +190,7 @@ def _screened(
         step = np.linalg.lstsq(mine, rows, rcond=1e-9)[0]
         drop = float(np.sum(rows**2) - np.sum((rows - mine @ step) ** 2)) if mine.any() else 0.0
         if drop > best.get(k, (0.0, one))[0]:
-            names = [key for key, p in one.parameters().items() if p.linear]
+            names = one.amplitudes()
             began = eqx.tree_at(lambda e: [getattr(e, n) for n in names], one, [np.float64(-x) for x in step])  # noqa: B023
             best[k] = drop, began
     ranked = sorted(best, key=lambda k: -best[k][0])[:TRIED]

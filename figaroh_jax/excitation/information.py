@@ -32,7 +32,7 @@ from .sampling import Sampler, term_blocks
 if TYPE_CHECKING:
     from ..formats.config import Baseline
 
-__all__ = ["Learned", "condition", "expected_std", "information", "information_matrix", "learn"]
+__all__ = ["Learned", "expected_std", "information", "information_matrix", "learn"]
 
 SMOOTH = 0.03  # rad/s or m/s: half width of dry friction's reversal, so that its columns have a gradient
 UNKNOWN_DRIVE = 1e-6  # precision of what nothing is known of, 1/(N m)^2 and the like
@@ -167,7 +167,7 @@ def _drives(terms: Sequence[Effect], effects: Sequence[Effect]) -> Float[np.ndar
     for term in terms:
         for at in np.asarray(term.at):
             same = [e for e in effects if type(e) is type(term) and np.array_equal(np.asarray(e.at), at)]
-            linear = [name for name, parameter in term.parameters().items() if parameter.linear]
+            linear = term.amplitudes()
             values += [sum(float(getattr(e, name)) for e in same) for name in linear]
     return np.array(values)
 
@@ -218,16 +218,6 @@ def information(
     """
     matrix = information_matrix(learn(model) if learned is None else learned, motion, rate)
     return 2.0 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(matrix))))
-
-
-@in_float64
-def condition(learned: Learned, motion: Trajectory | States, rate: float = 20.0) -> Float[Array, ""]:
-    """Condition number of the weighted rows of the base parameters, without the prior.
-
-    It hangs on units and on which columns were kept: good for comparison with others, not as an objective.
-    """
-    values = jnp.linalg.eigvalsh(_gram(learned, *(jnp.asarray(x) for x in _states(motion, rate))))
-    return jnp.sqrt(values[-1] / values[0])
 
 
 @in_float64

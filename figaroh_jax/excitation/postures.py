@@ -36,7 +36,6 @@ __all__ = [
     "PostureDesign",
     "View",
     "certified_bound",
-    "choose",
     "excite_postures",
     "exchanged",
     "greedy",
@@ -578,9 +577,3 @@ def in_order(
                     order[i : j + 1] = order[i : j + 1][::-1]
                     better = True
     return np.array(order)
-
-
-def choose(J: Float[np.ndarray, "candidates rows p"], count: int) -> tuple[Int[np.ndarray, " count"], float]:
-    """The best `count` of candidates by their weighted Jacobians, of any device, and the share of the bound."""
-    chosen = exchanged(J, greedy(J, count))
-    return chosen, float(np.exp((_logdet(J[chosen]) - certified_bound(J, count, chosen)) / J.shape[2]))

@@ -1,9 +1,9 @@
 """The rows of a motion and the gradient of any function of them, on the host.
 
 All that a design asks for (information, prediction, torque) is a function of the rows: its gradient by them goes back
-through the reverse of their machine code, or without a C compiler through the closed form of `regressor_pullback` in
-chunks of fixed size, so that one program of a robot serves all lengths, bases, objectives and limits; that of the
-effects' columns goes through JAX, but for the usual friction, whose columns and slopes are written out here.
+through the reverse of their machine code, or without a C compiler through `rigid.regressor_gradient` in chunks of fixed
+size, so that one program of a robot serves all lengths, bases, objectives and limits; that of the effects' columns goes
+through JAX, but for the usual friction, whose columns and slopes are written out here.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ class Sampler:
         self.columns, other = self.own, []
         for term in terms:
             at = np.asarray(term.at)
-            count = len(at) * sum(p.linear for p in term.parameters().values())
+            count = len(at) * len(term.amplitudes())
             where = range(self.columns, self.columns + count)
             if type(term) in _PLAIN:
                 rows = zip(where, at[:, 0].tolist(), strict=True)

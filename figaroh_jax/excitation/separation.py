@@ -96,7 +96,7 @@ class _Cause:
 
     def __init__(self, learned: Learned, effect: Effect, size: Mapping[str, float], first: int, trust: float) -> None:
         robot, kind = learned.robot, type(effect)
-        self.linear = [name for name, p in kind.parameters().items() if p.linear]
+        self.linear = kind.amplitudes()
         shapes = [name for name, p in kind.parameters().items() if not p.linear]
         if len(shapes) > 1:
             raise InputError(f"separate: '{effect.name}' has several shapes, which no design searches yet")

@@ -28,6 +28,7 @@ __all__ = [
     "assemble",
     "displacement",
     "refuse_many",
+    "translation",
 ]
 
 Posture = Mapping[str, float | Sequence[float]]  # a number for a revolute or prismatic joint, its part of q for others
@@ -393,6 +394,13 @@ def _numbers(joint: JointPart, given: float | Sequence[float]) -> Float[np.ndarr
     return numbers
 
 
+def translation(way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    """Pose without a rotation."""
+    pose = np.eye(4)
+    pose[:3, 3] = way
+    return pose
+
+
 def displacement(kind: str, axis: Float[np.ndarray, "3"], position: Float[np.ndarray, " numbers"]) -> np.ndarray:
     """Pose of a joint that has moved to `position` (its part of q) in the pose that it had at zero."""
     pose = np.eye(4)
@@ -403,8 +411,7 @@ def displacement(kind: str, axis: Float[np.ndarray, "3"], position: Float[np.nda
         return pose
     axis = axis / np.linalg.norm(axis)
     if kind == "prismatic":
-        pose[:3, 3] = position[0] * axis
-        return pose
+        return translation(position[0] * axis)
     if kind == "planar":
         pose[:3, 3] = _plane(axis)[:, :2] @ position[:2]
     half = position[-1] / 2

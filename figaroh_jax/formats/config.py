@@ -181,7 +181,7 @@ class Identify(Keys):
     fit: Literal["physical", "log_cholesky", "unconstrained"] = "physical"
     joints: tuple[str, ...] | None = None  # whose torque is fitted; None: all
     bounds: dict[str, Bound] = {}  # by link
-    infeasible: Literal["refuse", "write"] = "refuse"  # whether `model/` is written with links that cannot exist
+    infeasible: Literal["refuse", "write"] = "refuse"  # whether `model/` is written with inconsistent links
 
 
 class Task(Keys):

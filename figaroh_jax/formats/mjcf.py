@@ -17,7 +17,18 @@ from jaxtyping import Float
 from ..errors import InputError
 from ..rigid import inertia
 from ..rigid.model import Kind, RobotModel
-from .assembly import ROOT_JOINT, FramePart, JointPart, LinkPart, Posture, Root, assemble, displacement, refuse_many
+from .assembly import (
+    ROOT_JOINT,
+    FramePart,
+    JointPart,
+    LinkPart,
+    Posture,
+    Root,
+    assemble,
+    displacement,
+    refuse_many,
+    translation,
+)
 from .xmlfile import find_in_packages, read_xml
 
 __all__ = [
@@ -116,7 +127,7 @@ def _check_counts(path: Path, root: Any) -> None:
     waiting, seen, parts = [root], {path.resolve()}, 0
     while waiting:
         for element in waiting.pop().iter(*_COUNTS, "body", "include"):
-            parts += _copies(path, element) if element.tag in ("body", "replicate") else 0
+            parts += _copies(element) if element.tag in ("body", "replicate") else 0
             refuse_many(str(path), "bodies", parts)
             for attribute in _COUNTS.get(element.tag, ()):
                 _check_count(path, element, attribute)
@@ -138,7 +149,7 @@ def _check_count(path: Path, element: Any, attribute: str) -> None:
             )
 
 
-def _copies(path: Path, element: Any) -> int:
+def _copies(element: Any) -> int:
     """How often an element is there once those around it are replicated."""
     total = 1
     for around in (element, *element.iterancestors("replicate")):
@@ -275,7 +286,7 @@ def _parts(mj: Any, root: Root | None) -> tuple[list[LinkPart], list[JointPart],
             if j != own[-1]:
                 links.append(LinkPart(link, np.zeros(10)))
             joints.append(_joint(mj, j, names[j], (carrier, link), pose, followers.get(names[j])))
-            carrier, pose = link, _shift(-mj.jnt_pos[j])
+            carrier, pose = link, translation(-mj.jnt_pos[j])
         if not own:
             joints.append(JointPart(bodies[b], "fixed", carrier, bodies[b], pose, np.zeros(3)))
             pose = np.eye(4)
@@ -301,12 +312,6 @@ def _parts(mj: Any, root: Root | None) -> tuple[list[LinkPart], list[JointPart],
     return links, joints, frames
 
 
-def _shift(way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    pose = np.eye(4)
-    pose[:3, 3] = way
-    return pose
-
-
 def _joint(
     mj: Any, j: int, name: str, ends: tuple[str, str], body: np.ndarray, follow: tuple[str, float, float] | None
 ) -> JointPart:
@@ -316,7 +321,7 @@ def _joint(
     if kind == "free":
         neutral = (*at_zero[:3], *np.roll(at_zero[3:], -1))
         return JointPart(name, kind, *ends, np.eye(4), np.zeros(3), neutral=tuple(map(float, neutral)))
-    placement = body @ _shift(mj.jnt_pos[j])
+    placement = body @ translation(mj.jnt_pos[j])
     if kind == "spherical":
         last = mj.body_jntadr[mj.jnt_bodyid[j]] + mj.body_jntnum[mj.jnt_bodyid[j]] - 1
         if j != last:

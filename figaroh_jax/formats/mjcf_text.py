@@ -15,7 +15,9 @@ from numpy.typing import ArrayLike
 
 from ..rigid.inertia import to_com, transform
 from ..rigid.model import RobotModel
+from .assembly import translation
 from .native import Drives, physical_inertia
+from .xmlfile import as_text
 
 __all__ = ["mjcf_text"]
 
@@ -28,12 +30,12 @@ def mjcf_text(robot: RobotModel, drives: Drives) -> tuple[str, tuple[str, ...]]:
     root = ET.Element("mujoco", model=robot.name)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
     gravity = np.asarray(robot.gravity)
-    ET.SubElement(root, "option", gravity=_text(gravity), timestep="0.001", integrator="implicitfast")
+    ET.SubElement(root, "option", gravity=as_text(gravity), timestep="0.001", integrator="implicitfast")
     bodies = {-1: ET.SubElement(root, "worldbody")}
     anchor = {-1: np.zeros(3)} | {index: _anchor(robot, index) for index in range(len(robot.joints))}
     warnings = []
     for index, joint in enumerate(robot.joints):
-        placement = _shift(anchor[joint.parent]) @ np.asarray(robot.placement[index]) @ _shift(-anchor[index])
+        placement = translation(anchor[joint.parent]) @ np.asarray(robot.placement[index]) @ translation(-anchor[index])
         attributes = {"name": joint.link} | _pose(placement)
         if drives.gravcomp[index]:
             attributes["gravcomp"] = repr(float(drives.gravcomp[index]))
@@ -41,11 +43,11 @@ def mjcf_text(robot: RobotModel, drives: Drives) -> tuple[str, tuple[str, ...]]:
         inertia, warning = physical_inertia(np.asarray(robot.inertia[index]), "mjcf")
         if warning:
             warnings.append(f"robot.xml: link {joint.link} {warning}")
-        ET.SubElement(body, "inertial", _inertial(transform(inertia, _shift(anchor[index]))))
+        ET.SubElement(body, "inertial", _inertial(transform(inertia, translation(anchor[index]))))
         for attributes in _joints(robot, index, drives):
-            ET.SubElement(body, "joint", attributes | {"pos": _text(anchor[index])})
+            ET.SubElement(body, "joint", attributes | {"pos": as_text(anchor[index])})
     for frame, placement in zip(robot.frames, robot.frame_placement, strict=True):
-        pose = _pose(_shift(anchor[frame.parent]) @ np.asarray(placement))
+        pose = _pose(translation(anchor[frame.parent]) @ np.asarray(placement))
         ET.SubElement(bodies[frame.parent], "site", {"name": frame.name} | pose)
     _tendons(root, robot, drives)
     warnings += _followers(root, robot)
@@ -60,13 +62,9 @@ def mjcf_text(robot: RobotModel, drives: Drives) -> tuple[str, tuple[str, ...]]:
     return ET.tostring(root, encoding="unicode") + "\n", tuple(warnings)
 
 
-def _text(numbers: ArrayLike) -> str:
-    return " ".join(repr(float(x)) for x in np.ravel(np.asarray(numbers)))
-
-
 def _pose(pose: ArrayLike) -> dict[str, str]:
     placement = np.asarray(pose)
-    return {"pos": _text(placement[:3, 3]), "quat": _text(_quaternion(placement[:3, :3]))}
+    return {"pos": as_text(placement[:3, 3]), "quat": as_text(_quaternion(placement[:3, :3]))}
 
 
 def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
@@ -78,12 +76,6 @@ def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
     matrix[1:, 1:] = r + r.T - np.trace(r) * np.eye(3)
     q = np.linalg.eigh(matrix)[1][:, -1]
     return q if q[0] >= 0 else -q
-
-
-def _shift(way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    pose = np.eye(4)
-    pose[:3, 3] = way
-    return pose
 
 
 def _anchor(robot: RobotModel, index: int) -> Float[np.ndarray, "3"]:
@@ -98,7 +90,7 @@ def _anchor(robot: RobotModel, index: int) -> Float[np.ndarray, "3"]:
 
 def _inertial(parameters: Float[np.ndarray, "10"]) -> dict[str, str]:
     mass, com, inertia = to_com(parameters)
-    return {"mass": repr(float(mass)), "pos": _text(com), "fullinertia": _text(inertia[_FULL])}
+    return {"mass": repr(float(mass)), "pos": as_text(com), "fullinertia": as_text(inertia[_FULL])}
 
 
 def _joints(robot: RobotModel, index: int, drives: Drives) -> list[dict[str, str]]:
@@ -123,18 +115,18 @@ def _joint(robot: RobotModel, index: int, joint: tuple[str, str], dof: int, driv
     name, kind = joint
     element = {"name": name, "type": kind}
     if kind in ("hinge", "slide"):
-        element["axis"] = _text(robot.axis[dof])
+        element["axis"] = as_text(robot.axis[dof])
     if robot.joints[index].follows:
         return element  # its drive is that of the joint that it follows
     column = robot.dofs.column[dof]
     limit = np.asarray(robot.position_limit[column])
     if kind in ("hinge", "slide") and np.isfinite(limit).any() and limit[0] < limit[1]:
-        element["range"] = _text(np.clip(limit, -1e10, 1e10))
+        element["range"] = as_text(np.clip(limit, -1e10, 1e10))
     for attribute in ("armature", "damping", "frictionloss", "stiffness", "springref"):
         if (value := getattr(drives, attribute)[column]) != 0:
             element[attribute] = repr(float(value))
     if drives.damping2[column] or drives.damping3[column]:  # MuJoCo's damping is of v, v |v| and v^3
-        element["damping"] = _text([drives.damping[column], drives.damping2[column], drives.damping3[column]])
+        element["damping"] = as_text([drives.damping[column], drives.damping2[column], drives.damping3[column]])
     return element
 
 
@@ -142,9 +134,9 @@ def _motor(name: str, limit: float, bias: float) -> dict[str, str]:
     """A torque motor; a torque of the drive that does not reach the joint is taken off."""
     element = {"name": name, "joint": name, "gainprm": "1"}
     if 0 < limit < np.inf:
-        element["ctrlrange"] = _text(np.array([-limit, limit]))
+        element["ctrlrange"] = as_text(np.array([-limit, limit]))
     if bias != 0:
-        element |= {"biastype": "affine", "biasprm": _text(np.array([-bias, 0.0, 0.0]))}
+        element |= {"biastype": "affine", "biasprm": as_text(np.array([-bias, 0.0, 0.0]))}
     return element
 
 
@@ -170,6 +162,6 @@ def _followers(root: ET.Element, robot: RobotModel) -> list[str]:
         joint = robot.joints[index]
         polynomial = np.array([robot.offset[index], robot.ratio[index], 0, 0, 0], float)
         leader = robot.dof_names[joint.coordinate]
-        ET.SubElement(group, "joint", joint1=joint.name, joint2=leader, polycoef=_text(polynomial))
+        ET.SubElement(group, "joint", joint1=joint.name, joint2=leader, polycoef=as_text(polynomial))
     names = ", ".join(robot.joints[index].name for index in followers)
     return [f"robot.xml: {names} follow other joints by equality constraints, which MuJoCo keeps softly"]

@@ -30,6 +30,7 @@ __all__ = [
     "joint_poses",
     "link_inertias",
     "positions",
+    "quaternion_matrix",
     "rates",
     "spatial_inertias",
 ]
@@ -120,7 +121,7 @@ def drift(t: Translation, q: Float[Any, "*batch nq"], v: Float[Any, "*batch nv"]
 
 
 def spatial_inertias(
-    t: Translation, poses: Float[Any, "*batch nj 4 4"], about: Float[Any, "*batch nj 3"]
+    poses: Float[Any, "*batch nj 4 4"], about: Float[Any, "*batch nj 3"]
 ) -> Float[Any, "*batch nj 10 10"]:
     """MuJoCo's spatial inertia (`cinert`: about a point, in world axes) of each link for a unit of each of our ten.
 
@@ -175,7 +176,9 @@ def link_inertias(t: Translation, model: Any) -> Float[Any, "nj 10"]:
 
 def _pose(position: Float[Any, "n 3"], quaternion: Float[Any, "n 4"]) -> Float[Any, "n 4 4"]:
     xp = position.__array_namespace__()
-    rotation = _matrix(quaternion[:, [1, 2, 3, 0]] / xp.linalg.vector_norm(quaternion, axis=-1, keepdims=True))
+    rotation = quaternion_matrix(
+        quaternion[:, [1, 2, 3, 0]] / xp.linalg.vector_norm(quaternion, axis=-1, keepdims=True)
+    )
     bottom = xp.broadcast_to(xp.asarray([[0.0, 0.0, 0.0, 1.0]]), (len(position), 1, 4))
     return xp.concatenate([xp.concatenate([rotation, position[..., None]], -1), bottom], -2)
 
@@ -186,10 +189,11 @@ def _rotation(joint: _Turned, q: Float[Any, "*batch nq"]) -> Float[Any, "*batch 
         angle = q[..., joint.at.stop - 1]
         c, s = xp.cos(angle), xp.sin(angle)
         return xp.stack([xp.stack([c, -s], -1), xp.stack([s, c], -1)], -2)
-    return _matrix(q[..., joint.at.stop - 4 : joint.at.stop])
+    return quaternion_matrix(q[..., joint.at.stop - 4 : joint.at.stop])
 
 
-def _matrix(quaternion: Float[Any, "*batch 4"]) -> Float[Any, "*batch 3 3"]:
+def quaternion_matrix(quaternion: Float[Any, "*batch 4"]) -> Float[Any, "*batch 3 3"]:
+    """Rotation of a quaternion x y z w of length one."""
     xp = quaternion.__array_namespace__()
     x, y, z, w = (quaternion[..., k] for k in range(4))
     rows = [

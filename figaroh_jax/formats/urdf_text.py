@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from ..rigid.inertia import to_com
 from ..rigid.model import Frame, RobotModel
 from .native import Drives, physical_inertia
+from .xmlfile import as_text
 
 __all__ = ["roll_pitch_yaw", "urdf_text"]
 
@@ -85,7 +86,7 @@ def _link(root: ET.Element, name: str, parameters: Float[np.ndarray, "10"]) -> N
         return
     mass, com, inertia = to_com(parameters)
     inertial = ET.SubElement(link, "inertial")
-    ET.SubElement(inertial, "origin", xyz=_text(com), rpy="0 0 0")
+    ET.SubElement(inertial, "origin", xyz=as_text(com), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=repr(float(mass)))
     ET.SubElement(inertial, "inertia", {name: repr(float(inertia[place])) for name, place in _MOMENTS.items()})
 
@@ -99,7 +100,7 @@ def _moving(root: ET.Element, robot: RobotModel, index: int, parent: str, drives
     element = _joint(root, joint.name, kind, (parent, joint.link), np.asarray(robot.placement[index]))
     first = robot.dofs.first[index]
     if not several or joint.kind == "planar":
-        ET.SubElement(element, "axis", xyz=_text(robot.axis[first + 2 if several else first]))
+        ET.SubElement(element, "axis", xyz=as_text(robot.axis[first + 2 if several else first]))
     bounds = {} if unbounded else {"lower": _bound(limit[0]), "upper": _bound(limit[1])}
     velocity, effort = robot.velocity_limit[joint.coordinate], robot.effort_limit[joint.coordinate]
     ET.SubElement(element, "limit", bounds | {"velocity": _bound(velocity), "effort": _bound(effort)})
@@ -117,7 +118,7 @@ def _joint(
     root: ET.Element, name: str, kind: str, ends: tuple[str, str], placement: Float[np.ndarray, "4 4"]
 ) -> ET.Element:
     joint = ET.SubElement(root, "joint", name=name, type=kind)
-    ET.SubElement(joint, "origin", xyz=_text(placement[:3, 3]), rpy=_text(roll_pitch_yaw(placement[:3, :3])))
+    ET.SubElement(joint, "origin", xyz=as_text(placement[:3, 3]), rpy=as_text(roll_pitch_yaw(placement[:3, :3])))
     ET.SubElement(joint, "parent", link=ends[0])
     ET.SubElement(joint, "child", link=ends[1])
     return joint
@@ -137,7 +138,3 @@ def roll_pitch_yaw(r: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
 
 def _bound(value: ArrayLike) -> str:
     return repr(float(np.clip(np.asarray(value), -_NO_LIMIT, _NO_LIMIT)))
-
-
-def _text(numbers: ArrayLike) -> str:
-    return " ".join(repr(float(x)) for x in np.ravel(np.asarray(numbers)))

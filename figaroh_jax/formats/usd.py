@@ -17,7 +17,7 @@ from jaxtyping import Float
 from ..errors import InputError
 from ..rigid import inertia
 from ..rigid.model import RobotModel
-from .assembly import ROOT_JOINT, FramePart, JointPart, LinkPart, Posture, Root, assemble, displacement
+from .assembly import ROOT_JOINT, FramePart, JointPart, LinkPart, Posture, Root, assemble, displacement, translation
 from .usd_stage import DEGREE, ROTATIONS, TRANSLATIONS, Edge, Stage, body_inertia, name_of, reading, schemas, value
 from .xmlfile import find_in_packages
 
@@ -101,7 +101,7 @@ def _parts(stage: Stage, root: Root | None) -> tuple[list[LinkPart], list[JointP
     offset = {"": np.eye(4)} | {path: np.eye(4) for path in inside}
     for edge in edges:
         if edge.ends[0] or edge.kind != "fixed":  # the frame of a link is that of its last joint, in the body's axes
-            offset[edge.ends[1]] = _shift(-edge.frames[1][:3, 3])
+            offset[edge.ends[1]] = translation(-edge.frames[1][:3, 3])
     names = {path: stage.bodies[path].name for path in inside}
     names[""] = "world" if "world" not in names.values() else "world_of_the_stage"
     start, edges = _start(stage, base, edges, root, names)
@@ -251,19 +251,13 @@ def _joints(
             if edge is not chain[-1]:
                 inner.append(LinkPart(link, np.zeros(10)))
             turn, shift, ref = edge.frames[1][:3, :3], edge.frames[1][:3, 3], _reference(stage, edge)
-            axis, placement = turn @ edge.axis, pose @ _shift(shift)
+            axis, placement = turn @ edge.axis, pose @ translation(shift)
             if ref:
                 placement = placement @ displacement(edge.kind, axis, np.array([-ref]))
             limit, mimic, neutral = _limit(stage, edge), _mimic(stage, edge, leaders), (ref,) if ref else ()
             parts.append(JointPart(edge.name, edge.kind, carrier, link, placement, axis, limit, mimic, neutral))  # pyright: ignore[reportArgumentType]
-            carrier, pose = link, _shift(-shift)
+            carrier, pose = link, translation(-shift)
     return parts, inner
-
-
-def _shift(way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    pose = np.eye(4)
-    pose[:3, 3] = way
-    return pose
 
 
 def _unit(stage: Stage, edge: Edge) -> float:

@@ -79,7 +79,7 @@ def _pxr() -> Any:
         import pxr.Tf
         import pxr.Usd
         import pxr.UsdGeom
-        import pxr.UsdPhysics  # noqa: F401
+        import pxr.UsdPhysics
     except ImportError:
         raise InputError("USD is read by usd-core; install it: pip install 'figaroh-jax[usd]'") from None
     return pxr

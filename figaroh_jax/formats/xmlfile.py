@@ -1,4 +1,4 @@
-"""XML of a robot model read from a file that nobody has vouched for: no entities, no network, a limited size."""
+"""XML of robot models: read from a file that nobody has vouched for (no entities, no network, a limited size)."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from ..errors import InputError
 from .files import read_file
 
-__all__ = ["find_in_packages", "read_xml"]
+__all__ = ["as_text", "find_in_packages", "read_xml"]
 
 _PACKAGE = "package:/"  # a Path keeps one slash of the two
 _LARGEST = 20_000_000  # bytes; robot models without their meshes stay far below
@@ -35,6 +38,11 @@ def read_xml(path: str | Path, root: str | None) -> Any:
     if root is not None and element.tag != root:
         raise InputError(f"{path}: the root element is <{element.tag}>; a <{root}> is expected")
     return element
+
+
+def as_text(numbers: ArrayLike) -> str:
+    """Numbers as an attribute has them, to the last digit."""
+    return " ".join(repr(float(x)) for x in np.ravel(np.asarray(numbers)))
 
 
 def find_in_packages(path: str | Path, packages: Sequence[str | Path]) -> Path:

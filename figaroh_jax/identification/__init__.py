@@ -1,6 +1,5 @@
-"""Parameters of links and drives from torques: base parameters, least squares, links that can exist, intervals.
+"""Parameters of links and drives from torques: base parameters, physically consistent links, friction.
 
-In order: `columns`, `regression` (rows), `states` (`devices`; `wrenches`, `acceleration_free` and `payloads` for other
-rows), `base_parameters`, `least_squares` (`instruments`), `consistency` (`conic`), `intervals`, `judgement` (a word on
-each parameter), `result`.
+In order: `reversal`, `judgement` (a word on each parameter), `result`, `identification`; rows of other kinds:
+`wrenches`, `plates`, `payloads`, `acceleration_free`, `instruments`; `people`. What fits stands in `estimation`.
 """

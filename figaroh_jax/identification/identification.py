@@ -1,4 +1,4 @@
-"""Fit a robot's dynamics to recordings: base parameters, links that can exist, friction, and what can be trusted.
+"""Fit a robot's dynamics to recordings: base parameters, consistent links, friction, and what can be trusted.
 
 The recordings become one condensed regression (`regression`). Its rank is decided once; the base parameters' weighted
 fit gives weights and covariance; the nominal inertials complete what no motion shows, believed as far as cross-
@@ -26,6 +26,7 @@ from ..estimation.intervals import coloured_covariance
 from ..estimation.least_squares import Solution, WeightedByJoint, solve
 from ..estimation.priors import rigid_prior
 from ..estimation.regression import Condensed, Regression, condense
+from ..formats.robotfile import load_robot, stated_baseline
 from ..recordings.bandwidth import note_on
 from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
@@ -125,8 +126,6 @@ def identify_task(
     task: Task, progress: Callable[[str, float], None] = lambda phase, share: None, backend: str = "native"
 ) -> Identification:
     """Identify what a task file of torques describes, by the named backend; see `tasks.identify_task`."""
-    from ..formats.robotfile import load_robot, stated_baseline
-
     progress("reading", 0.0)
     model, (known, notes) = load_robot(task), stated_baseline(task)
     recordings = read_recordings(task, model, floating=True)
@@ -399,11 +398,7 @@ def _least(terms: Sequence[Effect]) -> Float[np.ndarray, " drives"]:
     """Least physical value of each drive column: friction and rotor inertia take no energy out of nothing."""
     out: list[float] = []
     for term in terms:
-        for parameter in (p for p in term.parameters().values() if p.linear):
-            out.append(parameter.lower)
-        if len(term.at) > 1:
-            count = sum(p.linear for p in term.parameters().values())
-            out += out[-count:] * (len(term.at) - 1)
+        out += [term.parameters()[name].lower for name in term.amplitudes()] * len(term.at)
     return np.array(out)
 
 

@@ -162,7 +162,7 @@ def fitted_effects(terms: Sequence[Effect], values: Float[np.ndarray, " drives"]
     """The effects, one at each place, with their amplitudes."""
     out, start = [], 0
     for term in terms:
-        names = [name for name, parameter in term.parameters().items() if parameter.linear]
+        names = term.amplitudes()
         for k in range(len(term.at)):
             amplitudes = [np.float64(x) for x in values[start : start + len(names)]]
             start += len(names)
@@ -224,7 +224,7 @@ def described_effects(
     """The effects with names, values, standard deviations and units."""
     out, start = [], 0
     for effect in fitted_effects(terms, values):
-        linear = [name for name, parameter in effect.parameters().items() if parameter.linear]
+        linear = effect.amplitudes()
         spread = dict(zip(linear, sigma[start : start + len(linear)], strict=True))
         start += len(linear)
         slides = effect.acts_on == "joint" and bool(prismatic_columns(model)[int(effect.at[0])])

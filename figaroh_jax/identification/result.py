@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from ..effects.extended import ExtendedModel
 from ..estimation.solution import Fit
-from ..results import Estimate, Name, Trace
+from ..results import Estimate, Name, Trace, finite
 
 __all__ = ["BaseParameter", "FittedEffect", "Identification", "Link", "Parameter", "Quality", "Status", "to_json"]
 
@@ -119,19 +119,19 @@ def result(found: Identification) -> dict[str, Any]:
     return {
         "rank": found.rank,
         "structural_rank": found.structural_rank,
-        "condition": _number(found.condition),
-        "scaled_condition": _number(found.scaled_condition),
+        "condition": finite(found.condition),
+        "scaled_condition": finite(found.scaled_condition),
         "joints": list(found.joints),
         "method": found.method,
         "converged": not found.solution.failure,
-        "trust": _number(found.trust),
+        "trust": finite(found.trust),
         "base_parameters": [
-            {"expression": b.expression, "value": _number(b.value), "std": _number(b.std), "status": b.status}
+            {"expression": b.expression, "value": finite(b.value), "std": finite(b.std), "status": b.status}
             for b in found.base
         ],
         "essential": list(found.essential),
         "parameters": [
-            {"name": p.name, "value": _number(p.value), "std": _number(p.std), "status": p.status}
+            {"name": p.name, "value": finite(p.value), "std": finite(p.std), "status": p.status}
             | {"absorbed_in": list(p.absorbed_in)}
             | ({"null_direction": p.null_direction} if p.null_direction else {})
             for p in found.parameters
@@ -147,7 +147,7 @@ def result(found: Identification) -> dict[str, Any]:
                 "effect": e.name.effect,
                 "at": list(e.name.at),
                 "parameters": {
-                    name: {"value": _number(x.value), "std": _number(x.std), "unit": x.unit}
+                    name: {"value": finite(x.value), "std": finite(x.std), "unit": x.unit}
                     for name, x in e.parameters.items()
                 },
             }
@@ -159,7 +159,7 @@ def result(found: Identification) -> dict[str, Any]:
         "cross_validation": _quality(found.validated),
         "holdout": {file: _quality(quality) for file, quality in found.holdout.items()},
         "reversal_width": _numbers(found.width),
-        "correlations": [{"between": [a, b], "value": _number(c)} for a, b, c in found.correlations],
+        "correlations": [{"between": [a, b], "value": finite(c)} for a, b, c in found.correlations],
         "notes": list(found.notes),
     }
 
@@ -174,9 +174,4 @@ def _quality(quality: Quality) -> dict[str, list[float | None]]:
 
 
 def _numbers(values: Any) -> list[float | None]:
-    return [_number(value) for value in values]
-
-
-def _number(value: Any) -> float | None:
-    plain = float(value)
-    return plain if math.isfinite(plain) else None
+    return [finite(value) for value in values]

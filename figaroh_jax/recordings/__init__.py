@@ -1,1 +1,1 @@
-"""From files of numbers to signals of equal spacing: `tables` -> `dataset` -> `resampling` -> `signals`."""
+"""From files of numbers to signals of equal spacing: `tables`, `dataset`, `resampling`, `signals`, `stacked`."""

@@ -241,9 +241,9 @@ def unit_factors(
     return out
 
 
-def joint_columns(table: Table, source, model: RobotModel, key: str, samples: int | None = None):
-    """Columns of the joints in their order, finite and with `samples` rows; `InputError` names file, key and row."""
-    return _columns(table, source, model.joint_names, key, samples)
+def joint_columns(table: Table, source, model: RobotModel, key: str):
+    """Columns of the joints in their order, finite; `InputError` names file, key and row."""
+    return _columns(table, source, model.joint_names, key)
 
 
 def _columns(table: Table, source, names: Sequence[str], key: str, samples: int | None = None):

@@ -86,7 +86,6 @@ def sampled(
     time: Float[np.ndarray, " samples"],
     position: Float[np.ndarray, "samples nv"],
     torque: Float[np.ndarray, "samples columns"] | None = None,
-    cutoff: float = CUTOFF,
 ) -> Sampled | None:
     """Rows of a recording on an even grid, low-passed without phase; None where it is too short."""
     if len(time) < FEWEST:
@@ -96,12 +95,12 @@ def sampled(
 
     def smooth(x: np.ndarray) -> np.ndarray:
         even = np.column_stack([np.interp(grid, time, column) for column in x.T])
-        return low_pass(even, 1 / rate, min(cutoff, 0.1 * rate), order=2)
+        return low_pass(even, 1 / rate, min(CUTOFF, 0.1 * rate), order=2)
 
     q = smooth(position)
     v = np.gradient(q, 1 / rate, axis=0)
     a = np.gradient(v, 1 / rate, axis=0)
-    edge = min(len(time) // 20, int(rate / cutoff) + 1)
+    edge = min(len(time) // 20, int(rate / CUTOFF) + 1)
     rows = np.unique(np.linspace(edge, len(time) - 1 - edge, min(ROWS, len(time) - 2 * edge)).astype(int))
     return Sampled(q[rows], v[rows], a[rows], None if torque is None else smooth(torque)[rows], rate)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..results import Cause, Diagnosis, Estimate, Name, Rest
+from ..results import Cause, Diagnosis, Estimate, Name, Rest, finite
 
 __all__ = ["answer", "cause", "holdout", "rest", "to_json", "write_predictions"]
 
@@ -21,11 +20,11 @@ def answer(diagnosis: Diagnosis) -> dict[str, Any]:
     return {
         "verdict": diagnosis.verdict,
         "causes": [cause(found) for found in diagnosis.causes],
-        "p_value": _number(diagnosis.p_value),
+        "p_value": finite(diagnosis.p_value),
         "residual": {
-            "before": [_number(value) for value in diagnosis.before],
-            "after": [_number(value) for value in diagnosis.after],
-            "noise": [_number(value) for value in diagnosis.noise],
+            "before": [finite(value) for value in diagnosis.before],
+            "after": [finite(value) for value in diagnosis.after],
+            "noise": [finite(value) for value in diagnosis.noise],
         },
         "rest": rest(diagnosis.rest),
         "holdout": holdout(diagnosis),
@@ -42,8 +41,8 @@ def holdout(diagnosis: Diagnosis) -> dict[str, Any]:
         measured = np.concatenate([np.asarray(trace.measured)[:, j] for trace in held])
         after = np.concatenate([np.asarray(trace.after)[:, j] for trace in held])
         size = float(np.sqrt(np.mean(measured**2)))
-        joints[name] = _number(np.sqrt(np.mean((measured - after) ** 2)) / size) if size > 0 else None
-    return {"before": _number(gain.before), "after": _number(gain.after), "unit": gain.unit, "joints": joints}
+        joints[name] = finite(np.sqrt(np.mean((measured - after) ** 2)) / size) if size > 0 else None
+    return {"before": finite(gain.before), "after": finite(gain.after), "unit": gain.unit, "joints": joints}
 
 
 def to_json(diagnosis: Diagnosis) -> str:
@@ -82,8 +81,8 @@ def cause(found: Cause) -> dict[str, Any]:
         **_name(found.name),
         "parameters": {name: _estimate(estimate) for name, estimate in found.parameters.items()},
         "found": found.found,
-        "confidence": _number(found.confidence),
-        "gain": {"holdout_before": _number(gain.before), "holdout_after": _number(gain.after), "unit": gain.unit},
+        "confidence": finite(found.confidence),
+        "gain": {"holdout_before": finite(gain.before), "holdout_after": finite(gain.after), "unit": gain.unit},
         "ambiguous_with": [_name(other) for other in found.ambiguous_with],
     }
 
@@ -92,13 +91,13 @@ def rest(left: Rest) -> dict[str, Any]:
     """What no cause explains, as it stands in `answer.json`."""
     parts = []
     for part in left.parts:
-        where = {} if part.band is None else {"band": [_number(edge) for edge in part.band]}
+        where = {} if part.band is None else {"band": [finite(edge) for edge in part.band]}
         where |= {} if part.file is None else {"file": part.file}
-        parts.append({"kind": part.kind, "at": list(part.at), "share": _number(part.share), **where})
+        parts.append({"kind": part.kind, "at": list(part.at), "share": finite(part.share), **where})
     return {
-        "relative": [_number(value) for value in left.relative],
+        "relative": [finite(value) for value in left.relative],
         "parts": parts,
-        "nearest": [{**_name(o.name), "share": _number(o.share), "why_not": o.why_not} for o in left.nearest],
+        "nearest": [{**_name(o.name), "share": finite(o.share), "why_not": o.why_not} for o in left.nearest],
     }
 
 
@@ -107,7 +106,7 @@ def _name(name: Name) -> dict[str, Any]:
 
 
 def _estimate(estimate: Estimate) -> dict[str, Any]:
-    return {"value": _number(estimate.value), "std": _number(estimate.std), "unit": estimate.unit}
+    return {"value": finite(estimate.value), "std": finite(estimate.std), "unit": estimate.unit}
 
 
 def _experiment(diagnosis: Diagnosis) -> dict[str, Any] | None:
@@ -115,8 +114,3 @@ def _experiment(diagnosis: Diagnosis) -> dict[str, Any] | None:
     if experiment is None:
         return None
     return {"text": experiment.text, "separates": [list(pair) for pair in experiment.separates]}
-
-
-def _number(value: float | np.floating[Any]) -> float | None:
-    plain = float(value)  # numpy's scalars are not JSON
-    return plain if math.isfinite(plain) else None

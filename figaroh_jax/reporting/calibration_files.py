@@ -23,6 +23,7 @@ from ..formats.export import dump_yaml, model_files
 from ..formats.urdf import load_urdf
 from ..formats.urdf_text import roll_pitch_yaw
 from ..formats.xmlfile import read_xml
+from ..results import finite
 from ..rigid.kinematics import forward_kinematics
 from .answer import cause, rest as rest_of
 from .calibration_report import write_calibration_report
@@ -60,14 +61,14 @@ def result(calibration: Calibration) -> dict[str, Any]:
     return {
         "level": calibration.level,
         "parameters": [
-            {"name": p.name, "value": _number(p.value), "std": _number(p.std), "unit": p.unit, "status": p.status}
+            {"name": p.name, "value": finite(p.value), "std": finite(p.std), "unit": p.unit, "status": p.status}
             for p in calibration.parameters
         ],
         "position": _error(calibration.position),
         "orientation": _error(calibration.orientation),
         "distances": [
             {"recording": d.recording, "role": d.role, "unit": "mm"}
-            | {key: _number(1e3 * value) for key, value in zip(("stated", "before", "after"), d[2:], strict=True)}
+            | {key: finite(1e3 * value) for key, value in zip(("stated", "before", "after"), d[2:], strict=True)}
             for d in calibration.distances
         ],
         "outliers": [{"file": o.file, "row": o.row} for o in calibration.outliers],
@@ -75,15 +76,15 @@ def result(calibration: Calibration) -> dict[str, Any]:
         "causes": [cause(c) for c in calibration.causes],
         "frames": {name: np.asarray(value).tolist() for name, value in calibration.frames.items()},
         "levels": {
-            name: {"position": _number(1e3 * a), "orientation": _number(math.degrees(b))}
+            name: {"position": finite(1e3 * a), "orientation": finite(math.degrees(b))}
             for name, (a, b) in calibration.table.items()
         },
         "held_out": calibration.scheme,
         "rank": calibration.rank,
-        "condition": _number(calibration.condition),
+        "condition": finite(calibration.condition),
         "classes": [list(c) for c in calibration.classes],
-        "correlations": [{"one": a, "other": b, "value": _number(r)} for a, b, r in calibration.correlations],
-        "quality": [q._asdict() | {"r2": _number(q.r2)} for q in quality_of(calibration)],
+        "correlations": [{"one": a, "other": b, "value": finite(r)} for a, b, r in calibration.correlations],
+        "quality": [q._asdict() | {"r2": finite(q.r2)} for q in quality_of(calibration)],
         "converged": calibration.converged,
         "notes": list(calibration.notes),
     }
@@ -108,9 +109,9 @@ def pose_answer_json(diagnosis: PoseDiagnosis) -> str:
     answer = {
         "verdict": diagnosis.verdict,
         "causes": [cause(c) for c in diagnosis.causes],
-        "p_value": _number(diagnosis.p_value),
+        "p_value": finite(diagnosis.p_value),
         "residual": {
-            key: [_number(x) for x in getattr(diagnosis, key) if x is not None] for key in ("before", "after", "noise")
+            key: [finite(x) for x in getattr(diagnosis, key) if x is not None] for key in ("before", "after", "noise")
         },
         "rest": rest_of(diagnosis.rest),
         "next_experiment": experiment
@@ -219,10 +220,5 @@ def _error(error: Error | None) -> dict[str, Any] | None:
     if error is None:
         return None
     return {"unit": error.unit} | {
-        key: _number(getattr(error, key)) for key in ("before", "after", "validated_before", "validated_after")
+        key: finite(getattr(error, key)) for key in ("before", "after", "validated_before", "validated_after")
     }
-
-
-def _number(value: float) -> float | None:
-    plain = float(value)
-    return plain if math.isfinite(plain) else None

@@ -7,18 +7,20 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import equinox as eqx
 import numpy as np
 
 from ..calibration.calibrated import Calibration, Shown, quality_of
+from ..calibration.corrections import twist_pose
+from ..rigid.model import RobotModel
 from . import wording
-from .calibration_view import nominal_of
 from .picture import robot_picture
 from .report import BADGES, page_template, plotly_source
 
 if TYPE_CHECKING:
     from ..calibration.kinematic_diagnosis import PoseDiagnosis
 
-__all__ = ["write_calibration_report"]
+__all__ = ["nominal_of", "write_calibration_report"]
 
 
 def write_calibration_report(calibration: Calibration, path: Path, found: PoseDiagnosis | None = None) -> None:
@@ -50,6 +52,15 @@ def write_calibration_report(calibration: Calibration, path: Path, found: PoseDi
         figure=Markup(_figure(calibration)),
     )
     path.write_text(text, encoding="utf-8")
+
+
+def nominal_of(calibration: Calibration) -> RobotModel:
+    """The robot before its corrections."""
+    placement = np.array(calibration.model.placement)
+    for k, joint in enumerate(calibration.model.joints):
+        if joint.name in calibration.twists:
+            placement[k] = placement[k] @ np.linalg.inv(twist_pose(calibration.twists[joint.name]))
+    return eqx.tree_at(lambda m: m.placement, calibration.model, placement)
 
 
 _MAGNIFY = 20

@@ -18,6 +18,7 @@ from ..excitation.postures import PostureDesign
 from ..excitation.sampling import Sampler
 from ..excitation.search import Stage
 from ..excitation.separation import MOST
+from ..results import finite
 from ..rigid.model import prismatic
 from .report import page_template
 
@@ -43,19 +44,19 @@ def answer(found: Design) -> dict[str, Any]:
         "robot": found.learned.robot.name,
         "joints": list(found.learned.robot.dof_names),
         "objective": found.objective,
-        "logdet": _number(found.logdet),
-        "condition": _number(found.condition),
-        "scaled_condition": _number(found.scaled_condition),
+        "logdet": finite(found.logdet),
+        "condition": finite(found.condition),
+        "scaled_condition": finite(found.scaled_condition),
         "met": found.met,
         "rate": found.rate,
-        "noise": [_number(1 / math.sqrt(w)) for w in np.asarray(found.learned.weight)],
+        "noise": [finite(1 / math.sqrt(w)) for w in np.asarray(found.learned.weight)],
         "trajectories": [_stage(k, stage) for k, stage in enumerate(found.stages)],
         "parameters": [
-            {"expression": name, "std_before": _number(before), "std": _number(after)}
+            {"expression": name, "std_before": finite(before), "std": finite(after)}
             for name, before, after in zip(found.learned.expressions, found.std_before, found.std, strict=True)
         ],
         "separated": [
-            {"cause": s.truth, "rival": s.rival, "size": s.size, "sigmas": _number(s.sigmas), "repeats": s.repeats}
+            {"cause": s.truth, "rival": s.rival, "size": s.size, "sigmas": finite(s.sigmas), "repeats": s.repeats}
             | {"seconds": None if s.repeats is None else s.repeats * sum(one.motion.duration for one in found.stages)}
             for s in found.separated
         ],
@@ -77,14 +78,14 @@ def posture_answer(found: PostureDesign) -> dict[str, Any]:
             "accuracy": list(found.instrument.accuracy),
         },
         "postures": found.position.tolist(),
-        "logdet": _number(found.logdet),
-        "bound": _number(found.bound),
-        "efficiency": _number(found.efficiency),
-        "efficiency_of_candidates": _number(found.chosen_efficiency),
-        "efficiency_of_random": _number(found.random_efficiency),
+        "logdet": finite(found.logdet),
+        "bound": finite(found.bound),
+        "efficiency": finite(found.efficiency),
+        "efficiency_of_candidates": finite(found.chosen_efficiency),
+        "efficiency_of_random": finite(found.random_efficiency),
         "candidates": found.candidates,
         "parameters": [
-            {"parameter": one.name, "unit": one.unit, "std": _number(std)}
+            {"parameter": one.name, "unit": one.unit, "std": finite(std)}
             for one, std in zip(found.parameters, found.std, strict=True)
         ],
         "notes": list(found.notes),
@@ -98,16 +99,16 @@ def _stage(k: int, stage: Stage) -> dict[str, Any]:
     return own | {
         "file": f"trajectory_{k + 1}.csv",
         "duration": stage.motion.duration,
-        "logdet": _number(stage.logdet),
+        "logdet": finite(stage.logdet),
         "basis": {"kind": basis.kind, "number": basis.number, "base": basis.base},
         "start": np.asarray(stage.motion.start).tolist(),
         "weights": np.asarray(stage.motion.weights).tolist(),
         "use_at_1_kHz": [
-            {"limit": u.kind, "joint": u.joint, "share": _number(u.share), "time": u.time, "value": _number(u.value)}
-            | {"allowed": _number(u.limit)}
+            {"limit": u.kind, "joint": u.joint, "share": finite(u.share), "time": u.time, "value": finite(u.value)}
+            | {"allowed": finite(u.limit)}
             for u in stage.uses
         ],
-        "starts": [_number(value) for value in stage.starts],
+        "starts": [finite(value) for value in stage.starts],
     }
 
 
@@ -118,11 +119,6 @@ def nearest_bodies(stage: Stage) -> tuple[np.ndarray, np.ndarray] | None:
         return None
     time = stage.motion.basis.instants(POINTS)
     return time, clearance.distances(np.asarray(stage.motion.at(time)[0])).min(axis=1)
-
-
-def _number(value: Any) -> float | None:
-    plain = float(value)
-    return plain if math.isfinite(plain) else None
 
 
 def failure(found: Design | PostureDesign) -> str | None:

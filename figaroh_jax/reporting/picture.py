@@ -32,16 +32,15 @@ def segments(model: RobotModel, q: Float[np.ndarray, " nv"]) -> Float[np.ndarray
 
 def robot_picture(
     model: RobotModel,
-    q: Float[np.ndarray, " nq"] | None = None,
     affected: Collection[str] = (),
     nominal: RobotModel | None = None,
     magnify: float = 1.0,
 ) -> str:
-    """SVG of the robot at `q` (default: the middle of its range), the joints and links in `affected` in colour.
+    """SVG of the robot in the middle of its range, the joints and links in `affected` in colour.
 
     With `nominal` that robot is drawn behind, and `model` is drawn `magnify` times as far from it as it is.
     """
-    q = middle_posture(model) if q is None else q
+    q = middle_posture(model)
     lines = np.concatenate([segments(model, q), _tips(model, q)])
     behind = None if nominal is None else np.concatenate([segments(nominal, q), _tips(nominal, q)])
     if behind is not None:

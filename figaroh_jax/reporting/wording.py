@@ -10,6 +10,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from ..effects.catalogue import CATALOGUE
 from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, Name, Nearest, Part
 from .rollout_effects import ROLLOUT_EFFECTS
 
@@ -337,8 +338,6 @@ def _superscript(power: int) -> str:
 
 
 def _entry(effect: str) -> Any:
-    from ..effects.catalogue import CATALOGUE
-
     if effect in CATALOGUE:
         return CATALOGUE[effect]
     from ..effects.kinematic import CATALOGUE as OF_POSTURES  # slow to import

@@ -2,7 +2,7 @@ r"""From a base frame to a tool frame along one chain of joints, each with a sma
 
 The chain is $F_b^{-1} \prod_j P_j E(\xi_j) \exp(S_j q_j)\, F_t$: P the placement of the joint in its parent, E a
 translation followed by a rotation in the joint frame before the joint moves, F the two frames on their links. Every
-kinematic error is such a twist, as a function of the posture (`kinematic_effects`). Samples stand on the last axis.
+kinematic error is such a twist, as a function of the posture (`effects.kinematic`). Samples stand on the last axis.
 """
 
 from __future__ import annotations

@@ -112,7 +112,6 @@ def looped_rows(
     arrays: Sequence[Float[Array, "samples _"]],
     rows: Rows,
     side: int = 0,
-    interpret: bool = False,
 ) -> list[Float[Array, "length samples"]]:
     """The columns of the links that each degree of freedom moves, ten a link, the links in the order of the tree.
 
@@ -131,7 +130,6 @@ def looped_rows(
         kernel,
         [constants(model).astype(dtype), jnp.asarray(integers), ratio, *arrays],
         [(length, len(arrays[0])) for length in (*rows.lengths, remembered)],
-        interpret=interpret,
     )
     return found[:-1]
 

@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from ..compiled.batching import BLOCK, CPU_OPTIONS, aligned, chunk_size, in_chunks, on_host, traced, two_axes
+from ..compiled.batching import BLOCK, CPU_OPTIONS, chunk_size, in_chunks, on_host, reused, traced, two_axes
 from ..compiled.executable_cache import Program
 from ..compiled.kernels import Straight, kept_here, known_codes, rounded, straight_answers, usable
 from ..compiled.machine_code import machine_code
@@ -503,13 +503,7 @@ def _coded_rows(
 
     The next one may overwrite them.
     """
-    samples, memory = len(rows.q), np.empty(0)
-
-    def room(shape: tuple[int, ...], fill: float | None) -> np.ndarray:
-        nonlocal memory
-        memory = memory if memory.shape == shape else aligned(shape, fill)
-        return memory
-
+    samples, room = len(rows.q), reused()
     given = [x for x in (rows.extra, rows.tau) if x is not None]
     side = np.concatenate([np.zeros((model.nv, 0, samples)), *(_by_coordinate(x, model.nv) for x in given)], axis=1)
     for start in range(0, samples, AT_ONCE):

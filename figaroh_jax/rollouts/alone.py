@@ -35,7 +35,7 @@ def separable(loop: Loop) -> bool:
     """Whether each drive acts at one joint, and every joint turns or slides and is measured."""
     way, robot = np.asarray(loop.drives.transmission), loop.robot
     plain = all(j.kind in ("revolute", "prismatic") and not j.follows for j in robot.joints)
-    measured = sorted(loop.measured) == list(range(robot.nv)) and all(more < 0 for more in loop.summed)
+    measured = sorted(loop.measured) == list(range(robot.nv))
     return plain and measured and robot.nv > 1 and bool(((way != 0).sum(1) == 1).all())
 
 
@@ -67,7 +67,7 @@ def alone(loop: Loop, runs: Sequence[Run], carried: Sequence[np.ndarray], joint:
     small = Loop(
         robot=_one_joint(loop.robot, joint), drives=own, joints=joints, start=np.asarray(loop.start)[[joint]],
         dt=loop.dt, integrator=loop.integrator, law=loop.law,
-        limited=loop.limited, measured=(0,), summed=(-1,), carried=one,
+        limited=loop.limited, measured=(0,), carried=one,
         effects=tuple(replace(e, at=Place((0,))) for e in loop.effects if tuple(e.places.tolist()) == (joint,)),
     )  # fmt: skip
     mine = tuple(

@@ -15,7 +15,7 @@ from ..effects.catalogue import ROLLOUTS, find
 from ..effects.loops import InRollouts, Scale
 from ..rigid.model import Frame, Joint, RobotModel
 from .loop import Joints, Loop, Pairs
-from .own import amplitudes, is_own, starts_of
+from .own import is_own, starts_of
 from .parameters import Entry, Table
 
 __all__ = ["BASELINE", "Candidate", "Catalogue", "catalogue", "elastic_loop", "kind_of", "springs", "with_pairs"]
@@ -40,7 +40,7 @@ def kind_of(effect: type[Effect]) -> InRollouts:
     )
     if own.numbers:
         return plain._replace(signed=own.signed is not False)
-    count = len(amplitudes(effect))
+    count = len(effect.amplitudes())
     signed = not effect.dissipative if own.signed is None else own.signed
     together = count if signed else 1
     return plain._replace(signed=signed, together=together, shapes=tuple(range(count, len(parameters))))
@@ -103,7 +103,7 @@ def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbi
         table += [Entry(number, (k,)) for number in _PAIR_ENTRIES]
         candidates += _wanted(kinds, "pair", (names[i], names[j]), k, Scale(0.0, 0.0))
     for k, effect in enumerate(loop.effects):
-        ordered = sorted(effect.parameters(), key=lambda name: name not in amplitudes(type(effect)))  # noqa: B023
+        ordered = sorted(effect.parameters(), key=lambda name: name not in effect.amplitudes())
         table += [Entry(f"{effect.name}.{name}", (k,)) for name in ordered]
         mine = kind_of(type(effect))
         if effect.acts_on == "joint" and effect.name not in forbid and not mine.numbers:
@@ -178,36 +178,19 @@ def springs(joint: str, first: int, forbid: Sequence[str] = ()) -> list[Candidat
     ]  # fmt: skip
 
 
-def elastic_loop(loop: Loop, coordinate: int, stiffness: float, damping: float, *, link_side: bool = False) -> Loop:
+def elastic_loop(loop: Loop, coordinate: int, stiffness: float, damping: float) -> Loop:
     """The loop with a spring between motor and link of one joint: the new last coordinate is the spring's twist.
 
-    The motor carries the armature, the friction and the damping of the joint and turns first; its encoder is read,
-    or the link's with `link_side`.
+    The motor carries the armature, the friction and the damping of the joint and turns first; its encoder is read.
     """
     robot = loop.robot
-    n, i = robot.nv, next(i for i, joint in enumerate(robot.joints) if joint.coordinate == coordinate)
+    i = next(i for i, joint in enumerate(robot.joints) if joint.coordinate == coordinate)
     moved = np.asarray(loop.drives.transmission)
     drives = eqx.tree_at(
         lambda d: d.transmission, loop.drives, np.concatenate([moved, np.zeros((len(loop.drives.names), 1))], 1)
     )
-    summed = tuple(
-        n if link_side and k == coordinate else more for k, more in zip(loop.measured, loop.summed, strict=True)
-    )
-    return Loop(
-        robot=_with_motor(robot, i),
-        drives=drives,
-        joints=_with_spring(loop.joints, stiffness, damping),
-        start=np.append(np.asarray(loop.start), 0.0),
-        dt=loop.dt,
-        integrator=loop.integrator,
-        law=loop.law,
-        limited=loop.limited,
-        measured=loop.measured,
-        summed=summed,
-        carried=loop.carried,
-        pairs=loop.pairs,
-        effects=loop.effects,
-    )
+    joints, start = _with_spring(loop.joints, stiffness, damping), np.append(np.asarray(loop.start), 0.0)
+    return replace(loop, robot=_with_motor(robot, i), drives=drives, joints=joints, start=start, linear=None)
 
 
 def _with_motor(robot: RobotModel, i: int) -> RobotModel:

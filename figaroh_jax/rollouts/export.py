@@ -15,8 +15,8 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from ..effects.base import Effect
 from ..errors import InputError, nearest
 from ..formats.xmlfile import read_xml
+from ..results import finite
 from .loop import Loop
-from .own import amplitudes
 from .parameters import UNITS
 
 __all__ = ["SIMULATORS", "described", "described_text", "for_simulator", "with_drives"]
@@ -43,8 +43,8 @@ def described(loop: Loop) -> dict[str, Any]:
             "length": float(scale * bias[1]),
             "kd": float(-bias[2]),
             "constant": float(bias[0]),
-            "force": _finite(np.asarray(loop.drives.force_range)[k, 1]),
-            "voltage": _finite(np.asarray(loop.drives.voltage)[k]),
+            "force": finite(np.asarray(loop.drives.force_range)[k, 1]),
+            "voltage": finite(np.asarray(loop.drives.voltage)[k]),
             "delay": float(np.asarray(loop.drives.delay)[k]),
             "dead_band": float(np.asarray(loop.drives.dead_band)[k]),
             "time_constant": float(np.asarray(loop.drives.time_constant)[k]),
@@ -56,7 +56,7 @@ def described(loop: Loop) -> dict[str, Any]:
     pairs = [_pair(loop, k) for k in range(0 if loop.pairs is None else len(loop.pairs.at))]
     if pairs := [one for one in pairs if any(one["parameters"].values())]:
         content["pairs"] = pairs
-    own = [_effect(loop, e) for e in loop.effects if any(float(getattr(e, name)) for name in amplitudes(type(e)))]
+    own = [_effect(loop, e) for e in loop.effects if any(float(getattr(e, name)) for name in e.amplitudes())]
     return content | ({"effects": own} if own else {})
 
 
@@ -74,10 +74,6 @@ def _pair(loop: Loop, k: int) -> dict[str, Any]:
     i, j, sign = loop.pairs.at[k]
     numbers = {name: float(np.asarray(getattr(loop.pairs, name))[k]) for name in ("inertia", "damping", "friction")}
     return {"at": [loop.robot.dof_names[i], loop.robot.dof_names[j]], "sign": sign, "parameters": numbers}
-
-
-def _finite(value: Any) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def described_text(loop: Loop) -> str:

@@ -86,7 +86,7 @@ def fit(
 class _Lanes:
     """Levenberg-Marquardt of a few lanes that share one compiled program."""
 
-    def __init__(self, loop, table, data, theta, free, start, width, lanes, left=None):  # noqa: ANN001
+    def __init__(self, loop, table, data, theta, free, start, width, lanes, left=None):
         self.left = left or []  # (blocks, windows) of each lane, True: left out of its fit
         self.loop, self.table, self.data, self.lanes = loop, table, data, lanes
         self.theta, self.start = np.array(theta, float), np.array(start, float)
@@ -459,7 +459,7 @@ def _freedom(told: np.ndarray) -> np.ndarray:
     return np.clip(found, min(_LEAST_FREEDOM, many - 1.0), many - 1.0)
 
 
-def held_out(found: Fit, data: Windows, folds: np.ndarray) -> np.ndarray:
+def held_out(found: Fit, folds: np.ndarray) -> np.ndarray:
     """Squares of each block and window as predicted without the fold it is in, (blocks, windows).
 
     `folds` (blocks, windows) numbers them. The estimate without a fold is theta - (H - H_k)^-1 g_k; the residual is

@@ -136,7 +136,7 @@ def needless(here: Setting, new: Standing, chosen: Sequence[Tried], begin: Stand
             continue
         j, entries = joint_of(here, one.candidate), list(one.candidate.entries)
         mine = slice(None) if j < 0 else slice(j, j + 1)
-        if _costs(here, new, entries) > COST_OF_A_MISSED * new.squares[..., mine].sum():
+        if _costs(new, entries) > COST_OF_A_MISSED * new.squares[..., mine].sum():
             continue
         other, _ = _without(here, new, entries)
         if not np.isfinite(other.cost):
@@ -198,7 +198,7 @@ def still_needed(
     return found, now, None
 
 
-def _costs(here: Setting, new: Standing, entries: list[int]) -> float:
+def _costs(new: Standing, entries: list[int]) -> float:
     """Squares by which the fit would be worse without numbers, to second order."""
     structure, last = new.model.structure, new.model.fit
     covariance = System(last.sums, structure.data, last.start).covariance(last.free < 0)

@@ -68,7 +68,6 @@ def known_to_it(loop: Loop, table: Table) -> bool:
         return False
     way = np.asarray(way)
     plain = all(j.kind in ("revolute", "prismatic") and not j.follows for j in robot.joints)
-    plain &= all(k < 0 for k in loop.summed)
     plain &= len(robot.joints) == robot.nv <= _MOST and all(kind == "none" for kind in loop.drives.activation)
     plain &= loop.integrator != "rk4" and not loop.limited and loop.carried is None and loop.linear is None
     plain &= not loop.effects and loop.pairs is None

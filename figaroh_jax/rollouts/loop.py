@@ -175,7 +175,6 @@ class Loop(eqx.Module):
     law: Literal["soft", "hard"] = eqx.field(static=True)
     limited: bool = eqx.field(static=True)  # whether any joint limit acts
     measured: tuple[int, ...] = eqx.field(static=True)  # coordinates that the encoders read
-    summed: tuple[int, ...] = eqx.field(static=True)  # a second coordinate added to each (-1: none)
     carried: Carried | None = None  # in place of the robot's rigid body
     linear: Linear | None = None  # in place of the robot's rigid body, for derivatives
     pairs: Pairs | None = None
@@ -572,9 +571,5 @@ def _runge_kutta(
 
 def observe(loop: Loop, state: State) -> Array:
     """What the encoders read, (measured, samples), rad or m."""
-    angle = _angles(loop, state.q)
-    read = angle[np.array(loop.measured)]
-    if any(k >= 0 for k in loop.summed):
-        more = np.array(loop.summed)
-        read = read + jnp.where((more >= 0)[:, None], angle[more], 0.0)
-    return read + jnp.asarray(loop.joints.reading)[np.array(loop.measured), None]
+    measured = np.array(loop.measured)
+    return _angles(loop, state.q)[measured] + jnp.asarray(loop.joints.reading)[measured, None]

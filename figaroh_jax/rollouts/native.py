@@ -44,7 +44,7 @@ _GAIN, _BIAS, _COMMAND, _FORCE = 4, 7, 10, 12  # rows of a drive's numbers
 _LONGS = ("n", "nu", "links", "ny", "rates", "carried", "hard", "limited", "implicit", "windows", "rows", "lead",
           "substeps", "block", "many", "columns", "pairs")  # fmt: skip
 _ARRAYS = (
-    "measured", "summed", "parent", "coordinate", "slides", "placement", "axis", "inertia", "gravity", "start", "joint",
+    "measured", "parent", "coordinate", "slides", "placement", "axis", "inertia", "gravity", "start", "joint",
     "drive", "way", "payload", "resting", "kind", "place", "column", "ten", "pair", "joined", "command", "reading",
     "weight", "load", "begin", "pole", "cost", "gradient", "matrix", "read",
 )  # fmt: skip
@@ -65,7 +65,7 @@ class Answers(NamedTuple):
     matrix: np.ndarray
 
 
-class native:  # noqa: N801  (used as a function that keeps what it has prepared)
+class native:
     """`native(loop, table, data)`: the loop as machine code; `usable` says whether it can be."""
 
     def __init__(self, loop: Loop, table: Table, data: Windows):
@@ -246,7 +246,6 @@ def _fixed(loop: Loop, data: Windows) -> dict[str, np.ndarray]:
     robot, f = loop.robot, lambda x: np.ascontiguousarray(x, float)
     longs = {
         "measured": loop.measured,
-        "summed": loop.summed,
         "parent": [joint.parent for joint in robot.joints],
         "coordinate": [joint.coordinate for joint in robot.joints],
         "joined": [] if loop.pairs is None else np.array(loop.pairs.at).ravel(),

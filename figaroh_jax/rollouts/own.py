@@ -29,7 +29,6 @@ __all__ = [
     "Acting",
     "acting",
     "after",
-    "amplitudes",
     "begun_memory",
     "bounds_of",
     "everywhere",
@@ -195,15 +194,10 @@ def with_numbers(effects: Sequence[Effect], name: str, at: np.ndarray, new: Any)
     return tuple(own)
 
 
-def amplitudes(effect: type[Effect]) -> list[str]:
-    """Parameters without which the effect does nothing."""
-    return [name for name, p in effect.parameters().items() if p.linear]
-
-
 def silent(effects: Sequence[Effect], numbers: dict[tuple[str, int], float]) -> bool:
     """Whether no effect does anything, with `numbers` of (name, place) in place of its own."""
     for k, effect in enumerate(effects):
-        names = amplitudes(type(effect))
+        names = effect.amplitudes()
         if not names or any(numbers.get((f"{effect.name}.{n}", k), float(getattr(effect, n))) for n in names):
             return False
     return True
@@ -237,4 +231,4 @@ def starts_of(effect: type[Effect]) -> tuple[tuple[float, ...], ...]:
     """Values from which a search over its parameters starts, amplitudes (0) first: points of the grids, thinned."""
     points = list(product(*(p.grid for p in effect.parameters().values() if not p.linear)))
     points = [points[k] for k in np.unique(np.linspace(0, len(points) - 1, min(len(points), _MOST)).astype(int))]
-    return tuple((0.0,) * len(amplitudes(effect)) + one for one in points)
+    return tuple((0.0,) * len(effect.amplitudes()) + one for one in points)

@@ -74,7 +74,6 @@ def load_loop(
         law=law or friction,  # pyright: ignore[reportArgumentType]
         limited=limited,
         measured=tuple(range(robot.nv)),
-        summed=(-1,) * robot.nv,
     )
     return loop, notes
 
@@ -137,14 +136,12 @@ def _driven(robot: RobotModel, path: str | Path) -> list[tuple[Any, UsdJoint]]:
     return [(joint, stated[joint.name]) for joint in single if joint.name in stated]
 
 
-def joint_drives(
-    robot: RobotModel, drives: Mapping[str, Mapping[str, Any]], path: str | Path, *, key: str = "actuator"
-) -> Drives:
+def joint_drives(robot: RobotModel, drives: Mapping[str, Mapping[str, Any]], path: str | Path) -> Drives:
     """One drive for each named joint, in the robot's order; joints without one are passive."""
     for name in drives:
         if name not in robot.joint_names:
             raise InputError(
-                f"{path}: {key}.{name}: robot has no moving joint '{name}'{nearest(name, robot.joint_names)}"
+                f"{path}: actuator.{name}: robot has no moving joint '{name}'{nearest(name, robot.joint_names)}"
             )
     names = [name for name in robot.joint_names if name in drives]
     count = len(names)

@@ -45,7 +45,7 @@ enum unknown { OF_DRIVE = 100, LIMIT = 110, KP, KD, PAIR = 120, BODY = 200, PULL
 typedef struct {
   long n, nu, links, ny, rates, carried, hard, limited, implicit, windows, rows, lead, substeps, block, many, columns, pairs;
   double dt;
-  const long *measured, *summed;             /* (ny) */
+  const long *measured;                      /* (ny) */
   const long *parent, *coordinate, *slides;  /* (n) of each tree joint */
   const double *placement, *axis, *inertia;  /* (n, 16), (n, 3), (n, 10) */
   const double *gravity, *start;             /* (3), (n) */
@@ -939,9 +939,7 @@ INLINE void carrying(const Given *g, Work *w, const long window, const long row)
 /* what is read: positions, then rates */
 INLINE double seen(const Given *g, const Work *w, const int n, const long y) {
   const int j = (int)g->measured[y % g->ny];
-  const long k = g->summed[y % g->ny];
-  const double *x = y < g->ny ? w->q : w->v;
-  return x[j] + (k < 0 ? 0 : x[k]) + (y < g->ny ? JN(READING) : 0);
+  return y < g->ny ? w->q[j] + JN(READING) : w->v[j];
 }
 
 /* rows of weighed sensitivities that wait to be multiplied with themselves */
@@ -991,12 +989,10 @@ WIDE void collected(const Given *g, const Work *w, const int n, const long windo
       continue;
     }
     double error = (g->reading[(row * wide + y) * g->windows + window] - seen(g, w, n, y)) * sure;
-    const long half = y < g->ny ? 0 : n, j = g->measured[y % g->ny], k = g->summed[y % g->ny];
-    const double *own = S + (half + j) * width, *twin = k < 0 ? 0 : S + (half + k) * width;
+    const long half = y < g->ny ? 0 : n, j = g->measured[y % g->ny];
+    const double *own = S + (half + j) * width;
     double *restrict slope = kept + *many * width;
     for (long c = 0; c < width; c++) slope[c] = own[c] * sure;
-    if (twin)
-      for (long c = 0; c < width; c++) slope[c] += twin[c] * sure;
     if (!half)
       for (long p = 0; p < g->many; p++)
         if (g->kind[p] == READING && g->place[p] == j) slope[g->column[p]] += sure;

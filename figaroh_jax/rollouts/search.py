@@ -180,7 +180,7 @@ def _searched(
         steps.append((str(Name(best[0].candidate.effect, best[0].candidate.at)), level_of(now.fit, weight)))
         if now.excess < 1.0:
             break
-    held = [_rms(here, held_out(first, structure.data, here.folds)), *(n.after for n in found)]
+    held = [_rms(here, held_out(first, here.folds)), *(n.after for n in found)]
     found, now, doubtful = _of_sure_size(here, now, found, forbid)
     for one, model in doubtful:
         stood.append(model)
@@ -313,7 +313,7 @@ def _raced(
 def _tried_one(here: Setting, structure: Structure, c: Candidate, best: Fit, free: Sequence[int]) -> Tried:
     weight = np.asarray(structure.data.weight)
     state = Model(structure, best, tuple(free), excess(whitened(structure, best), weight))
-    return Tried(c, state, held_out(best, structure.data, here.folds))
+    return Tried(c, state, held_out(best, here.folds))
 
 
 def _screened(here: Setting, now: Model, left: Sequence[Candidate]) -> list[Candidate]:
@@ -513,7 +513,7 @@ def _held_out(here: Setting, now: Model, tried: Sequence[Tried]) -> tuple[list[T
     """The candidates that fit best, and the squares of the present model, held out by fits without some recordings."""
     tried = list(tried)
     if not by_recording(here) or here.loop.robot.nv > 1:
-        return tried, held_out(now.fit, now.structure.data, here.folds)
+        return tried, held_out(now.fit, here.folds)
     order = sorted(range(len(tried)), key=lambda k: tried[k].state.fit.cost)[:_CHECKED]
     same = [k for k in order if tried[k].state.structure is now.structure]
     fits = [now.fit, *(tried[k].state.fit for k in same)]

@@ -273,12 +273,10 @@ def _looking(loop: Loop, size: int, rates: bool) -> np.ndarray:
     """Rows of what is read by the state, (ny, size)."""
     n, count = loop.robot.nv, len(loop.measured)
     look = np.zeros((count * (2 if rates else 1), size))
-    for k, (first, more) in enumerate(zip(loop.measured, loop.summed, strict=True)):
-        for coordinate in (first, more):
-            if coordinate >= 0:
-                look[k, coordinate] = 1.0
-                if rates:
-                    look[count + k, n + coordinate] = 1.0
+    for k, coordinate in enumerate(loop.measured):
+        look[k, coordinate] = 1.0
+        if rates:
+            look[count + k, n + coordinate] = 1.0
     return look
 
 

@@ -17,7 +17,7 @@ from ..rigid.kinematics import check_shapes
 from . import own
 from .loop import Loop, State, advance, integrated, mobility, observe
 
-__all__ = ["Rollout", "delayed", "held", "rollout"]
+__all__ = ["Rollout", "delayed", "rollout"]
 
 
 class Rollout(eqx.Module):
@@ -102,8 +102,3 @@ def delayed(command: Array, delay: Array, dt: Any) -> Array:
     row = jnp.arange(len(command))[:, None] - whole.astype(int)[None]
     now, before = (jnp.take_along_axis(command, jnp.clip(row - k, 0, None)[..., None], axis=0) for k in (0, 1))
     return (1 - part) * now + part * before
-
-
-def held(time: np.ndarray, command: np.ndarray, instants: np.ndarray) -> np.ndarray:
-    """The zero-order held command at `instants` (s): the row with the last stamp that is not later."""
-    return command[np.clip(np.searchsorted(time, instants + 1e-9, side="right") - 1, 0, len(command) - 1)]

@@ -18,7 +18,6 @@ from ..rigid.model import RobotModel
 from .causes import Candidate
 from .fit import Fit
 from .loop import Loop
-from .own import amplitudes
 from .setting import Setting, Structure, residuals
 
 __all__ = ["shown", "suggested"]
@@ -54,7 +53,7 @@ def suggested(here: Setting, structure: Structure, now: Fit, wanted: Sequence[Ca
             points = [x for x in c.starts if _effect(here.loop, c, x).shown_by(low, high)]
             if len(points) > _FEW:
                 points = _best(here, servos[j], c, points, motion, left[:, column], weight[:, column])
-            c = c._replace(starts=tuple(points))  # noqa: PLW2901
+            c = c._replace(starts=tuple(points))
         found.append(c)
     return found
 
@@ -85,7 +84,7 @@ def _best(
     j = here.loop.robot.dof_names.index(c.at[0])
     q, v = motion.position[:, j], motion.velocity[:, j]
     torques = [np.ones_like(q), q, v, np.sign(v)]
-    names = amplitudes(_class_of(c))
+    names = _class_of(c).amplitudes()
     for x in points:
         effect = _effect(here.loop, c, x)
         for name in names:

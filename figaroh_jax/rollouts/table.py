@@ -303,7 +303,7 @@ def _hints(
     return [(a, b) for a, b in found if run.time[b - 1] - run.time[a] >= _LONG]
 
 
-def _least(squares, height: float) -> tuple[float, np.ndarray]:  # noqa: ANN001
+def _least(squares, height: float) -> tuple[float, np.ndarray]:
     from scipy.optimize import minimize  # scipy is slow to import
 
     first = np.zeros((5, 4))

@@ -25,7 +25,7 @@ from .causes import BASELINE
 from .data import Run, Stretch, noise_of, regular, windows
 from .fit import Fit
 from .loop import Loop
-from .own import amplitudes, left_out
+from .own import left_out
 from .parameters import UNITS, put
 from .reading import load_loop
 from .rest import nearest_of, parts_of, relative_rest
@@ -101,7 +101,7 @@ def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
             "actuator: {joint_1: {kind: position, kp: 20.0, kd: 0.5}}"
         )
     recordings = read_recordings(task, loop.robot, rollouts=True)
-    runs = tuple(_run(task, loop, r) for r in recordings)
+    runs = tuple(_run(loop, r) for r in recordings)
     periods = {regular(str(r.file), r.time) for r in recordings}
     if max(periods) > 1.02 * min(periods):
         raise InputError(f"{task.file}: data: the periods of the recordings differ ({sorted(periods)} s)")
@@ -113,7 +113,7 @@ def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
     return loop, runs, tuple(notes)
 
 
-def _run(task: Task, loop: Loop, recording: Recording) -> Run:
+def _run(loop: Loop, recording: Recording) -> Run:
     if recording.command is None:
         raise InputError(f"{recording.file}: a rollout needs `command`")
     way = np.abs(np.asarray(loop.drives.transmission))
@@ -400,8 +400,9 @@ def extended_of(loop: Loop) -> ExtendedModel:
                 numbers["offset"] -= numbers["stiffness"] * float(np.asarray(loop.joints.rest)[k])
             if effect == "torque_offset" and np.asarray(loop.joints.stiffness)[k]:
                 continue  # the spring holds it
-            if any(numbers[name] for name in amplitudes(find(effect)) if name != "offset" or effect == "torque_offset"):
-                own.append(place(find(effect), robot, [name], **numbers))
+            kind = find(effect)
+            if any(numbers[key] for key in kind.amplitudes() if key != "offset" or effect == "torque_offset"):
+                own.append(place(kind, robot, [name], **numbers))
     for k, (i, j, sign) in enumerate(loop.pairs.at if loop.pairs is not None else ()):
         numbers = {
             field: float(np.asarray(getattr(loop.pairs, field))[k]) for field in ("inertia", "damping", "friction")
@@ -409,5 +410,5 @@ def extended_of(loop: Loop) -> ExtendedModel:
         if any(numbers.values()):
             pair = [robot.dof_names[i], robot.dof_names[j]]
             own.append(place(find("coupled_transmission"), robot, pair, **numbers, sign=float(sign)))
-    own += [e for e in loop.effects if any(float(getattr(e, name)) for name in amplitudes(type(e)))]
+    own += [e for e in loop.effects if any(float(getattr(e, name)) for name in e.amplitudes())]
     return extend(robot, *own)

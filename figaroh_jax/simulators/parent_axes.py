@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
+from ..formats.mujoco_model import quaternion_matrix
 from ..rigid.inertia import from_com
 from ..rigid.model import NUMBERS, RobotModel
 
@@ -73,7 +74,8 @@ def rates(
             drift[:, first : first + 2] = (turn @ np.stack([-w * y, w * x], -1)[..., None])[..., 0]
         turn = np.eye(3)
         if joint.kind in ("free", "spherical"):
-            turn = _rotation(q[:, at.stop - 4 : at.stop])
+            quaternion = q[:, at.stop - 4 : at.stop]
+            turn = quaternion_matrix(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
             width = 6 if joint.kind == "free" else 3
             angular = slice(first + width - 3, first + width), slice(column + width - 3, column + width)
             share[:, *angular] = np.eye(3) if own_turning else turn
@@ -117,13 +119,3 @@ def unit_regressor(
 
 def _cross(x: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return np.array([[0.0, -x[2], x[1]], [x[2], 0.0, -x[0]], [-x[1], x[0], 0.0]])
-
-
-def _rotation(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    x, y, z, w = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
