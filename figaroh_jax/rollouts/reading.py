@@ -60,7 +60,11 @@ def load_loop(
         mj = compile_mjcf(file)
         robot = compiled_robot(str(file), mj, joints, posture, gravity, root)
         own, notes = _mjcf_joints(mj, robot)
-        actuators = joint_drives(robot, drives, path) if drives else _mjcf_drives(mj, robot, str(path))
+        if drives:
+            actuators = joint_drives(robot, drives, path)
+        else:
+            actuators, idle = _mjcf_drives(mj, robot, str(path))
+            notes = (*notes, *(f"actuator '{name}', whose joint stands still" for name in idle))
         start, limited = _start(mj, robot), not disabled(mj, "LIMIT") and bool(np.isfinite(own.limit).any())
         default = (float(mj.opt.timestep), _integrator(mj, path, integrator), "soft", limited)
     step, scheme, friction, limited = default
@@ -272,29 +276,33 @@ def _left_out(mj: Any) -> list[str]:
     return notes
 
 
-def _mjcf_drives(mj: Any, robot: RobotModel, path: str) -> Drives:
-    names = tuple(mj.actuator(a).name or f"actuator {a}" for a in range(mj.nu))
-    way = np.stack([_transmission(mj, robot, a, path, names[a]) for a in range(mj.nu)] or [np.zeros(robot.nv)])
-    way = way[: mj.nu]
-    kinds: tuple[Activation, ...] = tuple(_activation(mj, a, path, names[a]) for a in range(mj.nu))
+def _mjcf_drives(mj: Any, robot: RobotModel, path: str) -> tuple[Drives, list[str]]:
+    """The actuators that act at joints that move, and the names of those whose joints all stand still."""
+    every = tuple(mj.actuator(a).name or f"actuator {a}" for a in range(mj.nu))
+    rows = [_transmission(mj, robot, a, path, every[a]) for a in range(mj.nu)]
+    on = [a for a, row in enumerate(rows) if row is not None]
+    way = np.array([row for row in rows if row is not None]).reshape(len(on), robot.nv)
+    kinds: tuple[Activation, ...] = tuple(_activation(mj, a, path, every[a]) for a in on)
     gain, bias = mj.actuator_gainprm[:, :3].copy(), mj.actuator_biasprm[:, :3].copy()
-    for a in range(mj.nu):
-        _refuse_laws(mj, a, path, names[a])
+    for a in on:
+        _refuse_laws(mj, a, path, every[a])
         gain[a, 1:] *= int(mj.actuator_gaintype[a]) == int(engine().mjtGain.mjGAIN_AFFINE)
         bias[a] *= int(mj.actuator_biastype[a]) == int(engine().mjtBias.mjBIAS_AFFINE)
-    return _drives(
-        names,
+    limited = mj.actuator_ctrllimited & (not disabled(mj, "CLAMPCTRL"))
+    drives = _drives(
+        tuple(every[a] for a in on),
         way,
-        gain,
-        bias,
-        force_range=_range(mj.actuator_forcelimited, mj.actuator_forcerange),
-        command_range=_range(mj.actuator_ctrllimited & (not disabled(mj, "CLAMPCTRL")), mj.actuator_ctrlrange),
-        time=mj.actuator_dynprm[:, 0].copy(),
-        activation_range=_range(mj.actuator_actlimited, mj.actuator_actrange),
-        delay=np.array(mj.actuator_delay, float) if hasattr(mj, "actuator_delay") else None,
+        gain[on],
+        bias[on],
+        force_range=_range(mj.actuator_forcelimited, mj.actuator_forcerange)[on],
+        command_range=_range(limited, mj.actuator_ctrlrange)[on],
+        time=mj.actuator_dynprm[on, 0].copy(),
+        activation_range=_range(mj.actuator_actlimited, mj.actuator_actrange)[on],
+        delay=np.array(mj.actuator_delay, float)[on] if hasattr(mj, "actuator_delay") else None,
         activation=kinds,
-        early=tuple(bool(x) for x in mj.actuator_actearly),
+        early=tuple(bool(mj.actuator_actearly[a]) for a in on),
     )
+    return drives, [name for a, name in enumerate(every) if a not in on]
 
 
 def _range(limited: np.ndarray, limits: np.ndarray) -> np.ndarray:
@@ -322,8 +330,8 @@ def _refuse_laws(mj: Any, a: int, path: str, name: str) -> None:
         raise InputError(f"{path}: actuator '{name}' has gains that are not affine (muscle, dcmotor or user's)")
 
 
-def _transmission(mj: Any, robot: RobotModel, a: int, path: str, name: str) -> np.ndarray:
-    """Row of the transmission of an actuator, gear included."""
+def _transmission(mj: Any, robot: RobotModel, a: int, path: str, name: str) -> np.ndarray | None:
+    """Row of the transmission of an actuator, gear included; None where none of its joints moves."""
     mujoco, row, names = engine(), np.zeros(robot.nv), joint_names(mj)
     kind, target, gear = int(mj.actuator_trntype[a]), int(mj.actuator_trnid[a, 0]), float(mj.actuator_gear[a, 0])
     places = {joint.name: joint for joint in robot.joints}
@@ -340,7 +348,7 @@ def _transmission(mj: Any, robot: RobotModel, a: int, path: str, name: str) -> n
             row[places[joint].coordinate] += share * float(robot.ratio[tree])
         elif joint in places:
             raise InputError(f"{path}: actuator '{name}' drives joint '{joint}', which has several axes")
-    return row
+    return row if parts.keys() & places.keys() else None
 
 
 def _fixed(mj: Any, tendon: int) -> bool:
