@@ -6,17 +6,27 @@ from __future__ import annotations
 import csv
 import datetime
 import json
+import tempfile
 from pathlib import Path
+from typing import Any
 
-import mujoco
+import mujoco as engine
 import numpy as np
 import pytest
 from test_rollout_diagnosis import task
 
 from figaroh_jax.cli import main
+from figaroh_jax.formats.export import write_model
+from figaroh_jax.jobs.export import export_loop
+from figaroh_jax.jobs.rollouts import write_loop
 from figaroh_jax.rollouts.alone import separable
+from figaroh_jax.rollouts.export import described, for_simulator
+from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.simulation import rollout
+from figaroh_jax.rollouts.task import extended_of
+
+mujoco: Any = engine
 
 ARM = """<mujoco model="lamp"><compiler angle="degree"/>
 <option timestep="0.002" integrator="implicitfast"><flag contact="disable"/></option><worldbody>
@@ -106,5 +116,107 @@ def test_numbers_of_the_file_that_the_fit_had_to_change_are_told(tmp_path: Path,
         read.append(data.qpos[0])
         data.ctrl[0] = command
         mujoco.mj_step(model, data)
-    error = 1e3 * np.sqrt(np.mean((np.array(read) - held["q"][:, 0]) ** 2))
-    assert abs(float(note.split("recordings kept out is ")[1].split()[0]) - error) < 0.05 * error
+    error = np.sqrt(np.mean((np.array(read) - held["q"][:, 0]) ** 2))
+    told, unit = note.split("recordings kept out is ")[1].split()[:2]
+    assert abs(float(told) * {"rad": 1.0, "mrad": 1e-3}[unit] - error) < 0.05 * error
+
+
+DRIVES = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast">
+<flag contact="disable"/></option><worldbody>
+<body pos="0 0 1"><joint name="j1" axis="0 1 0" damping=".4" armature=".05" frictionloss=".3" solreffriction=".05 1"
+ solimpfriction=".8 .9 .01 .5 2" range="-.5 .25" limited="true" solreflimit=".06 .7" solimplimit=".7 .9 .02 .4 3" margin=".01"/>
+<inertial pos=".15 0 .02" mass="1" diaginertia=".01 .02 .02"/>
+<body pos=".3 0 0"><joint name="j2" axis="0 1 0" damping=".3" armature=".04" actuatorfrcrange="-1.5 2.5" actuatorfrclimited="true"/>
+<inertial pos=".1 0 0" mass=".6" diaginertia=".004 .006 .006"/>
+<body pos=".2 0 0"><joint name="j3" axis="0 1 0" damping=".1" armature=".02" frictionloss=".05"/>
+<inertial pos=".05 0 0" mass=".2" diaginertia=".001 .001 .001"/></body></body></body></worldbody>
+<tendon><fixed name="both"><joint joint="j2" coef="1"/><joint joint="j3" coef="-.5"/></fixed></tendon>
+<actuator>{}</actuator></mujoco>"""
+POSITION = '<position name="a" joint="j1" gear="2" kp="20" kv=".6" {}/>'
+OTHERS = {
+    "ranges of one side": POSITION.format(
+        'forcerange="-1 9" forcelimited="true" ctrlrange="-.2 .5" ctrllimited="true"'
+    ),
+    "late by a part of a step": POSITION.format('delay=".0031" nsample="6"'),
+    "soon": POSITION.format('delay=".0041" nsample="6" interp="linear"'),
+    "a damper and a motor": '<damper name="a" joint="j1" kv="2" ctrlrange="0 1"/><motor name="b" joint="j2" gear="3"/>',
+    "a tendon": POSITION.format("") + '<position name="b" tendon="both" kp="9" kv=".4" gear="1.5"/>',
+    "a filter": POSITION.format('timeconst=".05"')
+    + '<general name="b" joint="j2" dyntype="filter" dynprm=".04" actrange="-.1 .3" actlimited="true" actearly="true"'
+    ' biastype="affine" gainprm="12" biasprm=".2 -10 -.3"/>',
+    "a velocity": POSITION.format("") + '<velocity name="b" joint="j3" kv=".3" gear="-2"/>',
+}
+
+
+@pytest.mark.parametrize("which", OTHERS)
+def test_what_is_exported_moves_in_mujoco_as_the_users_own_file(which: str, tmp_path: Path):
+    """Drives, limits and friction that are not the plain ones, through `loop.json` and `export`, 1000 steps."""
+    source = DRIVES.format(OTHERS[which])
+    (tmp_path / "arm.xml").write_text(source)
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    write_model(extended_of(loop), tmp_path / "model")
+    write_loop(tmp_path / "model", loop)
+    export_loop(tmp_path / "model", "mujoco", tmp_path / "out")
+    texts = [(tmp_path / "arm.xml"), (tmp_path / "out" / "robot.xml")]
+    both, t = [], 0.002 * np.arange(1000)
+    for file in texts:
+        model = mujoco.MjModel.from_xml_path(str(file))
+        data, q = mujoco.MjData(model), []
+        assert [model.actuator(k).name for k in range(model.nu)] == list(loop.drives.names)
+        for row in np.column_stack([0.4 * np.sin(4 * t) * np.exp(-0.3 * t), 0.6 * np.sin(7 * t + 1)])[:, : model.nu]:
+            q.append(data.qpos.copy())
+            data.ctrl[:] = row
+            mujoco.mj_step(model, data)
+        both.append(q)
+    assert np.ptp(both[0], axis=0).min() > 0.05
+    np.testing.assert_allclose(both[1], both[0], rtol=0, atol=1e-7)
+
+
+def test_other_simulators_are_told_what_a_drive_does_at_its_joint():
+    """By its torque: MuJoCo's actuator force at a state, against gains, target and limit of the joint as exported."""
+    text = DRIVES.format(
+        POSITION.format('forcerange="-5 5" forcelimited="true"')
+        + '<velocity name="b" joint="j2" kv=".3" gear="-2"/><motor name="c" joint="j3" gear="3"/>'
+    )
+    model = mujoco.MjModel.from_xml_string(text)
+    data, state, u = mujoco.MjData(model), np.array([[0.1, -0.2, 0.3], [0.5, 0.7, -0.4]]), [0.35, 0.2, -0.1]
+    data.qpos[:], data.qvel[:], data.ctrl[:] = state[0], state[1], u
+    mujoco.mj_forward(model, data)
+    told = for_simulator(described(_loop(text)), "isaaclab")
+    by = {(one["at"], one["number"]): one["value"] for one in told["values"]}
+    servo = by["j1", "kp"] * (by["j1", "command"] * u[0] - state[0, 0]) - by["j1", "kd"] * state[1, 0]
+    speed = by["j2", "kd"] * (by["j2", "command"] * u[1] - state[1, 1])
+    np.testing.assert_allclose([servo, speed, by["j3", "command"] * u[2]], data.qfrc_actuator, rtol=1e-12)
+    assert by["j1", "force"] == 10.0 and ("j2", "kp") not in by and ("j3", "kp") not in by
+    several = for_simulator(described(_loop(DRIVES.format(OTHERS["a tendon"]))), "gazebo")
+    unsaid = {(one["at"], one["number"]): one["value"] for one in several["unsaid"]}
+    assert unsaid["b", "transmission j2"] == 1.5 and unsaid["b", "transmission j3"] == -0.75 and unsaid["b", "kp"] == 9
+    sides = for_simulator(described(_loop(DRIVES.format(OTHERS["ranges of one side"]))), "genesis")["unsaid"]
+    assert {one["number"] for one in sides} >= {"command_range low", "force_range low"}
+
+
+def _loop(text: str) -> Loop:
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "arm.xml").write_text(text)
+        return load_loop(Path(folder) / "arm.xml")[0]
+
+
+@pytest.mark.slow
+def test_a_payload_that_rests_on_known_gains_says_so(tmp_path: Path):
+    path = task(tmp_path, "payload", "robot: {model: arm.xml, trust: 0.02}\n")
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[1:]))
+    assert main(["diagnose", str(path), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    answer = json.loads((tmp_path / "run" / "answer.json").read_text())
+    assert [one["effect"] for one in answer["causes"]] == ["payload"]
+    assert any("payload at link: the drives' gains are taken as right" in note for note in answer["notes"])
+
+
+def test_identify_says_that_free_gains_are_not_fitted_unless_named(tmp_path: Path):
+    path = task(tmp_path, "none", "actuator: {gains: free}\n")
+    for more, said in (("", True), ("baseline: {effects: [{effect: actuator_gain, at: [joint]}]}\n", False)):
+        (tmp_path / "two.yaml").write_text(path.read_text() + more)
+        assert main(["identify", str(tmp_path / "two.yaml"), "--out", str(tmp_path / f"run{said}"), "--quiet"]) == 0
+        result = json.loads((tmp_path / f"run{said}" / "result.json").read_text())
+        assert any("`identify` fits those that the task names" in note for note in result["notes"]) == said
+        fitted = any(one["expression"].startswith("scale") for one in result["base_parameters"])
+        assert fitted != said

@@ -108,8 +108,8 @@ def _check_names(task: Task, model: RobotModel, floating: bool = False) -> None:
         if joint.kind not in ("revolute", "prismatic") and not free:
             key = f"robot.root is {task.robot.root}" if joint.name == ROOT_JOINT else f"joint '{joint.name}'"
             raise InputError(
-                f"{task.file}: {key}: recordings of joint torques hold one column a joint, and a {joint.kind} joint "
-                "has several; use root: fixed, and name the revolute and prismatic joints under robot.joints"
+                f"{task.file}: {key}: recordings hold one column a joint, and a {joint.kind} joint has several; use"
+                " root: fixed where the base stands still, and name the joints that turn or slide under robot.joints"
             )
     known = {*model.joint_names, *model.link_names, *(frame.name for frame in model.frames)}
     if model.nq != model.nv and task.transmission is not None:

@@ -60,6 +60,11 @@ def identify_rollout_task(
     """
     progress("reading", 0.0)
     loop, runs, notes = read_rollouts(task)
+    if task.actuator.gains == "free" and not any(one.effect == "actuator_gain" for one in task.baseline.effects):
+        notes += (
+            "actuator.gains: free lets `diagnose` look for gains that are off; `identify` fits those that the task"
+            " names, as in baseline: {effects: [{effect: actuator_gain, at: [" + loop.robot.dof_names[0] + "]}]}",
+        )
     here = diagnosis_setting(task, loop, runs)
     with jax.enable_x64(True):
         progress("fitting", 0.2)

@@ -227,7 +227,8 @@ def _mjcf_joints(mj: Any, robot: RobotModel) -> tuple[Joints, tuple[str, ...]]:
     for joint in robot.joints:
         j = names.index(joint.name) if joint.name in names else -1
         if j < 0 or joint.follows:
-            notes += [f"what acts at joint '{joint.name}', which another one drives"] if j >= 0 else []
+            if j >= 0:
+                notes.append(f"what acts at joint '{joint.name}', and the softness by which it follows another one")
             continue
         first = int(mj.jnt_dofadr[j])
         for k in range(len(robot.dofs.column[robot.dofs.joint == robot.joints.index(joint)])):
@@ -298,11 +299,26 @@ def _mjcf_drives(mj: Any, robot: RobotModel, path: str) -> tuple[Drives, list[st
         command_range=_range(limited, mj.actuator_ctrlrange)[on],
         time=mj.actuator_dynprm[on, 0].copy(),
         activation_range=_range(mj.actuator_actlimited, mj.actuator_actrange)[on],
-        delay=np.array(mj.actuator_delay, float)[on] if hasattr(mj, "actuator_delay") else None,
+        delay=_delays(mj, path, every)[on],
         activation=kinds,
         early=tuple(bool(mj.actuator_actearly[a]) for a in on),
     )
     return drives, [name for a, name in enumerate(every) if a not in on]
+
+
+def _delays(mj: Any, path: str, names: Sequence[str]) -> np.ndarray:
+    """Delay of each actuator as its command is late in whole steps, or in parts of one where it is interpolated."""
+    if not hasattr(mj, "actuator_delay"):
+        return np.zeros(mj.nu)
+    found, dt = np.array(mj.actuator_delay, float), float(mj.opt.timestep)
+    for a in np.flatnonzero(found > 0):
+        kind = int(mj.actuator_history[a, 1])
+        if kind > 1:
+            raise InputError(f"{path}: actuator '{names[a]}': interp is cubic; zoh and linear are simulated")
+        found[a] = max(found[a], dt)  # what is commanded in a step is not yet seen in it
+        if kind == 0:  # the command of the last step that is not later
+            found[a] = np.ceil(found[a] / dt - 1e-6) * dt
+    return found
 
 
 def _range(limited: np.ndarray, limits: np.ndarray) -> np.ndarray:

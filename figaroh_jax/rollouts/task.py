@@ -19,7 +19,7 @@ from ..formats.config import robot_options
 from ..formats.files import USD
 from ..recordings.dataset import Recording, read_recordings
 from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, Experiment, Gain, Name, Rest, Trace, Verdict
-from .alone import separable
+from .alone import inseparable, separable
 from .arm import search_arm
 from .causes import BASELINE
 from .data import Run, Stretch, noise_of, regular, windows
@@ -81,6 +81,8 @@ def diagnose_rollout_task(
     notes = (*notes, *left_out(loop.robot, task.diagnose.forbid))
     with jax.enable_x64(True):
         seek = search_arm if separable(loop) else search
+        if loop.robot.nv > 1 and seek is search:
+            progress(f"looking for one cause after another, which takes long: {inseparable(loop)}", 0.0)
         found = seek(here, progress, forbid=task.diagnose.forbid)
         if not np.isfinite(found.first.cost):
             raise InputError(f"{task.robot.model}: {diverged(here, found.first)}")
@@ -208,8 +210,9 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
             *notes,
             *colour_notes(here),
             *(_open_sizes(found) if named else ()),
+            *(_taken_gains(task, found) if named else ()),
             *implausible(loop.robot, model, task.robot.trust),
-            *_refitted_note(here, runs, refitted),
+            *_refitted_note(here, runs, refitted, found.verdict),
         ),
         refitted=refitted,
         prismatic=tuple(j.kind == "prismatic" for j in loop.robot.joints if not j.follows),
@@ -249,7 +252,7 @@ def _refitted(here: Setting, model: tuple[Structure, Fit], spread: np.ndarray | 
     return tuple(text for _, text in sorted(told, reverse=True))
 
 
-def _refitted_note(here: Setting, runs: Sequence[Run], refitted: Sequence[str]) -> tuple[str, ...]:
+def _refitted_note(here: Setting, runs: Sequence[Run], refitted: Sequence[str], verdict: Verdict) -> tuple[str, ...]:
     """What the baseline's fit had to change of the file, and how far off the file's own numbers are."""
     if not refitted:
         return ()
@@ -258,9 +261,11 @@ def _refitted_note(here: Setting, runs: Sequence[Run], refitted: Sequence[str]) 
         squares = np.concatenate([((run.position - simulated(here.loop, run)) ** 2).ravel() for run in asked])
         error = float(np.sqrt(np.mean(squares)))
     what = "recordings kept out" if asked[0].holdout else "the recordings"
-    size = f"{1e3 * error:.3g} m{'m' if all_slide(here.loop) else 'rad'}" if error < _FAR else "without bounds"
+    unit = "m" if all_slide(here.loop) else "rad"
+    size = f"{1e3 * error:.3g} m{unit}" if error < 0.1 else f"{error:.3g} {unit}" if error < _FAR else "without bounds"
+    doubt = "" if verdict in ("nothing", "named") else " and, beside a misfit, may make up for what is missing"
     return (
-        "friction, damping and rotors are fitted before anything is named, and their sizes are no causes:"
+        f"friction, damping and rotors are fitted before anything is named, and their sizes are no causes{doubt}:"
         f" {'; '.join(refitted)}. With the file's own numbers the error on {what} is {size}",
     )
 
@@ -397,6 +402,18 @@ def _open_sizes(found: Search) -> list[str]:
                 f" predicted better with it; how large it is they do not tell (its 95 % interval reaches 0): {why}"
             )
     return told
+
+
+def _taken_gains(task: Task, found: Search) -> list[str]:
+    """That a payload was told from a drive's gain by taking the gains for right."""
+    if task.actuator.gains == "free":
+        return []
+    return [
+        f"payload at {one.candidate.at[0]}: the drives' gains are taken as right (actuator.gains: known); a"
+        " gain that is off may look the same, and gains: free tells both"
+        for one in found.named
+        if one.candidate.effect == "payload"
+    ]
 
 
 def _experiment(found: Search) -> Experiment | None:
