@@ -146,8 +146,8 @@ def open_limits(robot: RobotModel, limits: Limits, given: Mapping[str, Given]) -
         names = [name for name, x in zip(robot.dof_names, limits.of(kind), strict=True) if not np.isfinite(x)]
         if names:
             said.append(
-                f"nothing limits the {kind} of {', '.join(names)} (the model says 0 or nothing): the motion may ask for more"
-                f" than the robot can do; state limits.{kind}"
+                f"nothing limits the {kind} of {', '.join(names)} (the model says 0 or nothing): the motion may ask"
+                f" for more than the robot can do; state limits.{kind}"
             )
     for name, turning, (low, high) in zip(robot.dof_names, turns, limits.position, strict=True):
         if turning and _TURNS < high - low < np.inf:
