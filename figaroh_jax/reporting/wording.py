@@ -139,6 +139,8 @@ def calibration_sentence(calibration: Calibration) -> str:
         )
     found = level(calibration.level)
     told = f"the error on held-out postures falls from {before} (base and tool frames only) to {after}"
+    if not error.validated_after < error.validated_before:
+        told = f"the error on held-out postures is {after}, no less than with base and tool frames only ({before})"
     return f"With {found}, {told}."
 
 
