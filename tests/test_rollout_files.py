@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import datetime
 import json
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,9 @@ import numpy as np
 import pytest
 from test_rollout_diagnosis import task
 
+import figaroh_jax as fj
 from figaroh_jax.cli import main
+from figaroh_jax.errors import InputError
 from figaroh_jax.formats.export import write_model
 from figaroh_jax.jobs.export import export_loop
 from figaroh_jax.jobs.rollouts import write_loop
@@ -220,3 +223,35 @@ def test_identify_says_that_free_gains_are_not_fitted_unless_named(tmp_path: Pat
         assert any("`identify` fits those that the task names" in note for note in result["notes"]) == said
         fitted = any(one["expression"].startswith("scale") for one in result["base_parameters"])
         assert fitted != said
+
+
+@pytest.mark.parametrize(
+    ("drive", "words"),
+    [
+        ({"kind": "postion", "kp": 1.0}, "actuator.yaw.kind: Input should be 'position', 'velocity' or 'torque'"),
+        ({"kp": "stiff"}, "actuator.yaw.kp: Input should be a valid number"),
+        ({"kP": 3.0}, "unknown key 'kP'; did you mean 'kp'?"),
+        ({"kind": "velocity", "kp": 3.0}, "kind velocity needs kd"),
+        ({"kind": "torque", "kp": 3.0}, "kind torque has no kp"),
+        (20.0, "keys and values are expected"),
+    ],
+)
+def test_drives_that_say_nothing_are_refused_in_python_as_in_a_task(drive: Any, words: str, tmp_path: Path, capsys):
+    """A motor with a gain was read as one without, in Python a velocity drive without its own as one that does nothing."""
+    (tmp_path / "arm.xml").write_text(GRIPPING)
+    with pytest.raises(InputError, match=re.escape(words)):
+        load_loop(tmp_path / "arm.xml", {"yaw": drive})
+    if "kind" not in words:
+        return
+    path = task(tmp_path, "none", f"actuator: {{joint: {json.dumps(drive)}}}\n")
+    assert main(["identify", str(path), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    assert "actuator.joint" in capsys.readouterr().err
+
+
+def test_files_of_the_other_format_and_a_run_for_its_model_are_told(tmp_path: Path):
+    (tmp_path / "arm.xml").write_text(GRIPPING)
+    with pytest.raises(InputError, match="it is an MJCF: load_mjcf reads it"):
+        fj.load_urdf(tmp_path / "arm.xml")
+    fj.write_model(fj.extend(fj.load_urdf(fj.DEMO)), tmp_path / "run" / "model")
+    with pytest.raises(InputError, match=f"the model of this run is in {tmp_path / 'run' / 'model'}"):
+        fj.load_model(tmp_path / "run")

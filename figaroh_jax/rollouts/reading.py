@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, nearest
+from ..formats.config import checked_drive
 from ..formats.files import model_format
 from ..formats.mjcf import actuator_of, compile_mjcf, compiled_robot, disabled, engine, joint_names
 from ..formats.robotfile import read_robot, urdf_dynamics
@@ -155,7 +156,7 @@ def joint_drives(
     gain, bias, way = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, robot.nv))
     force = np.full(count, np.inf)
     for k, name in enumerate(names):
-        drive = drives[name]
+        drive = checked_drive(drives[name], f"{path}: {key}.{name}")
         kp, kd = float(drive.get("kp") or 0.0), float(drive.get("kd") or 0.0)
         kind = drive.get("kind", "position")
         gain[k, 0] = {"position": kp, "velocity": kd, "torque": 1.0}[kind]
