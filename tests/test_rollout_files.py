@@ -255,3 +255,24 @@ def test_files_of_the_other_format_and_a_run_for_its_model_are_told(tmp_path: Pa
     fj.write_model(fj.extend(fj.load_urdf(fj.DEMO)), tmp_path / "run" / "model")
     with pytest.raises(InputError, match=f"the model of this run is in {tmp_path / 'run' / 'model'}"):
         fj.load_model(tmp_path / "run")
+
+
+def test_a_joint_that_slides_has_its_own_units_in_file_and_page(tmp_path: Path):
+    """A gripper beside joints that turn: N s/m in its cell, not at the head of the column for all."""
+    slides = GRIPPING.replace('damping="4"', 'damping="4" armature=".05" frictionloss=".5"')
+    (tmp_path / "arm.xml").write_text(slides)
+    t, u, q = moved(slides, 200)
+    noise = np.random.default_rng(1).normal(0, 1, q.shape) * [3e-4, 3e-4, 3e-5]
+    np.savez(tmp_path / "run.npz", t=t, u=u[:, [1, 2, 0]], q=q + noise)
+    (tmp_path / "task.yaml").write_text(
+        "robot: {model: arm.xml}\ndata: [{file: run.npz, time: t, command: u, position: q}]\n"
+    )
+    assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    units = {one["expression"]: one["unit"] for one in result["base_parameters"]}
+    assert (units["damping yaw"], units["damping left"]) == ("N m s/rad", "N s/m")
+    assert (units["friction left"], units["armature left"]) == ("N", "kg")
+    page = (tmp_path / "run" / "report.html").read_text()
+    head = page[page.index("<thead>") : page.index("</thead>")]
+    body = page[page.index("</thead>") : page.index("</table>")]
+    assert "N s/m" not in head and "N m s/rad" not in head and body.count("N s/m") == 1 and body.count("N m s/rad") == 2

@@ -315,8 +315,8 @@ def _delays(mj: Any, path: str, names: Sequence[str]) -> np.ndarray:
     for a in np.flatnonzero(found > 0):
         kind = int(mj.actuator_history[a, 1])
         if kind > 1:
-            raise InputError(f"{path}: actuator '{names[a]}': interp is cubic; zoh and linear are simulated")
-        found[a] = max(found[a], dt)  # what is commanded in a step is not yet seen in it
+            raise InputError(f"{path}: actuator '{names[int(a)]}': interp is cubic; zoh and linear are simulated")
+        found[a] = max(float(found[a]), dt)  # what is commanded in a step is not yet seen in it
         if kind == 0:  # the command of the last step that is not later
             found[a] = np.ceil(found[a] / dt - 1e-6) * dt
     return found
