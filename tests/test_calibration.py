@@ -246,3 +246,32 @@ def test_wrong_measurements_are_refused_with_what_would_be_right(
     assert cli.main(["calibrate", str(task), "--out", str(tmp_path / "run"), "--quiet"]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+def test_no_error_is_said_to_fall_that_does_not(tmp_path: Path, capsys: Any):
+    """Poses that are inverted follow no posture: no level predicts postures better."""
+    rng = np.random.default_rng(5)
+    q, real = poses.postures(rng, 40), poses.truth(rng, offset=np.array([0, 0.02, -0.03, 0, 0, 0]))
+    (tmp_path / "robot.urdf").write_text(poses.urdf())
+    there = np.array([pose.inverse().homogeneous for pose in poses.tool_poses(tmp_path / "robot.urdf", q, real)])
+    np.savez(tmp_path / "run.npz", q=q, T=there)
+    measurement = "{pose: T, base_frame: base, tool_frame: tool0, unknown: [base_frame, tool_frame]}"
+    (tmp_path / "task.yaml").write_text(
+        f"robot: {{model: robot.urdf}}\ndata: [{{file: run.npz, position: q, measurement: {measurement}}}]\n"
+    )
+    said = {}
+    for level in ("joint_offset", "frames"):
+        command = [
+            "calibrate",
+            str(tmp_path / "task.yaml"),
+            "--level",
+            level,
+            "--out",
+            str(tmp_path / level),
+            "--quiet",
+        ]
+        assert cli.main(command) == 0
+        said[level] = " ".join(capsys.readouterr().out.split())
+        told = json.loads((tmp_path / level / "result.json").read_text())["position"]
+        falls = told["validated_after"] < told["validated_before"]
+        assert ("falls from" in said[level]) == (falls and level != "frames"), (said[level], told)

@@ -192,6 +192,9 @@ def test_recordings_from_arrays_are_checked_too(job: Any):
         (quaternions, ""),
         (lambda T: T.transpose(0, 2, 1), r"refused: .*the last row of the matrix is .*the matrices are transposed"),
         (np.linalg.inv, "warned: .*they would with every pose inverted"),
+        (lambda T: T.transpose(1, 2, 0), r"refused: .*the postures stand on its last axis; its shape is \(4, 4, 40\)"),
+        (lambda T: T.reshape(-1, 4), r"refused: .*160 rows.*its matrices are stacked below each other"),
+        (lambda T: np.concatenate(T, 1), r"refused: .*4 rows.*the postures stand on its last axis"),
         (
             lambda T: np.concatenate([np.concatenate([T[:, :3, :3].swapaxes(1, 2), T[:, :3, 3:]], 2), T[:, 3:]], 1),
             "refused: .*they do as w x y z, or transposed",

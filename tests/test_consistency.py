@@ -10,6 +10,7 @@ from robots import REAL, TREE, load
 
 import figaroh_jax as fj
 from figaroh_jax.errors import InputError
+from figaroh_jax.estimation.conic import Body, Constraints, constrained
 from figaroh_jax.estimation.consistency import bodies, inconsistencies, log_cholesky_fit, physical_fit, project
 from figaroh_jax.estimation.priors import rigid_prior
 from figaroh_jax.rigid.inertia import from_com, pseudo_inertia
@@ -128,3 +129,23 @@ def test_log_cholesky_converges_from_perturbed_cad_values(name: str, data_dir: P
         start = project(nominal * (1 + 0.2 * generator.normal(size=nominal.shape)), bodies(model))
         good += log_cholesky_fit(factor, nominal, start.ravel()).cost <= best * (1 + 1e-3)
     assert good >= 98
+
+
+def test_a_fit_whose_long_steps_lead_nowhere_is_found_with_shorter_ones():
+    """The triangular factor of a SCARA's rows (torque made by MuJoCo C) with friction, rotors and the nominal links.
+
+    The free solution satisfies all constraints, so it is the constrained one too.
+    """
+    kept = np.load(Path(__file__).with_name("stalled_fit.npz"))
+    factor = np.zeros((53, 53))
+    factor[np.triu_indices(53)] = kept["factor"]
+    factor *= kept["length"]
+    sizes = ((2.0, 0.1183), (1.5, 0.1693), (1.0, 0.1483), (0.5, 0.1304))  # kg, m
+    links = [Body(f"l{k}", range(10 * k, 10 * k + 10), *size) for k, size in enumerate(sizes)]
+    inertia = [(m, *[2 * m * a] * 3, *[2 * m * a**2] * 6) for m, a in sizes]
+    scale = np.concatenate([*inertia, np.ones(12)])
+    lower = np.concatenate([np.full(40, -np.inf), np.zeros(12)])
+    found = constrained(factor, Constraints(bodies=links, lower=lower), scale)
+    free = np.linalg.lstsq(factor[:, :-1], factor[:, -1], rcond=None)[0]
+    left = [np.linalg.norm(factor @ np.append(x, -1.0)) for x in (found, free)]
+    assert left[0] == pytest.approx(left[1], rel=1e-3) and found[40] == pytest.approx(20, rel=0.02)

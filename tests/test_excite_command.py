@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -244,3 +245,20 @@ def test_a_motion_that_matters_is_read_with_its_derivatives_or_refused_by_name(t
     ):
         with pytest.raises(InputError, match=message):
             read(**wrong)
+
+
+def test_limits_that_nobody_gives_and_ranges_in_degrees_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A file whose velocity and effort are 0, as drawing programs write; what the task states is not asked for."""
+    limits = "{acceleration: 10, velocity: {turn: 2}, position: {turn: [-90, 90]}}"
+    file = task_of(tmp_path, f"{BASIS}, limits: {limits}")
+    text = re.sub(r'(effort|velocity)="[^"]*"', r'\1="0"', ARM)
+    (tmp_path / "robot.urdf").write_text(text)
+    assert main(["excite", str(file), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    said = json.loads((tmp_path / "run" / "excitation.json").read_text())["notes"]
+    assert any("nothing limits the velocity of bend (" in note and "limits.velocity" in note for note in said), said
+    assert any("nothing limits the torque of turn, bend (" in note for note in said)
+    assert any("'turn' may move from -90 to 90 rad: are its limits in degrees?" in note for note in said)
+    file.write_text(file.read_text().replace("velocity: {turn: 2}", "velocity: 20, torque: 1000"))
+    assert main(["excite", str(file), "--out", str(tmp_path / "other"), "--quiet"]) == 0
+    said = json.loads((tmp_path / "other" / "excitation.json").read_text())["notes"]
+    assert not any("nothing limits" in note for note in said)

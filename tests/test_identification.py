@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -97,6 +98,27 @@ def test_a_solver_that_gives_up_is_a_result_with_a_reason(truth: Truth, monkeypa
     found = identify(truth.nominal, [recording(truth, seed=1)], SETTINGS)
     assert found.solution.reason and any("do not trust" in note for note in found.notes)
     assert not json.loads(to_json(found))["converged"]
+
+
+def test_parts_left_out_that_could_not_be_fitted_are_told(truth: Truth, monkeypatch: pytest.MonkeyPatch):
+    """One of many fits gives up: it counted as predicted by the nominal robot, without a word."""
+    from figaroh_jax.estimation.conic import NotConverged
+    from figaroh_jax.identification import identification
+
+    solve, calls = identification.physical_fit, []
+
+    def gives_up_once_each_time(*arguments: Any) -> Any:
+        calls.append(1)
+        if len(calls) % 5 == 2:  # one of the five parts
+            raise NotConverged("the constrained fit did not converge")
+        return solve(*arguments)
+
+    before = identify(truth.nominal, [recording(truth, seed=1)], SETTINGS)
+    monkeypatch.setattr(identification, "physical_fit", gives_up_once_each_time)
+    found = identify(truth.nominal, [recording(truth, seed=1)], SETTINGS)
+    assert any("1 could not be fitted" in note for note in found.notes), found.notes
+    assert not any("could not be fitted" in note for note in before.notes)
+    assert found.validated.total > 2 * before.validated.total
 
 
 def test_result_holds_what_the_contract_asks(found: Identification):

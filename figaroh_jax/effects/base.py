@@ -521,8 +521,8 @@ def exact(effect: T) -> T:
 
 
 def joint_unit(unit: str, prismatic: bool) -> str:
-    """The unit at a prismatic joint: N for N m, m for rad."""
-    return unit.replace("N m", "N").replace("rad", "m") if prismatic else unit
+    """The unit at a prismatic joint: N for N m, m for rad, kg for kg m2."""
+    return unit.replace("N m", "N").replace("rad", "m").replace("kg m2", "kg") if prismatic else unit
 
 
 def columns(effect: Effect, motion: Motion) -> Float[Array, "amplitudes samples *rows"]:

@@ -19,11 +19,23 @@ from .certified import nearest_approaches
 from .clearance import Clearance
 from .motions import Trajectory
 
-__all__ = ["ALLOWED", "CHECK_RATE", "KINDS", "Limits", "Torque", "Use", "checked", "limits_of", "unmeetable"]
+__all__ = [
+    "ALLOWED",
+    "CHECK_RATE",
+    "KINDS",
+    "Limits",
+    "Torque",
+    "Use",
+    "checked",
+    "limits_of",
+    "open_limits",
+    "unmeetable",
+]
 
 KINDS = ("position", "velocity", "acceleration", "torque")
 CHECK_RATE = 1000.0  # Hz
 ALLOWED = 1e-3  # of a limit: what may be exceeded at 1 kHz
+_TURNS = 10 * 2 * np.pi  # rad: a range beyond ten turns is more likely one of degrees
 _SKIPPED = 10  # samples of 1 kHz, between two that are always looked at
 _POSTURES, _FIRST = 512, 64  # at which the torque of standing still is looked at, and how many of them first
 _NEAR, _AROUND, _NEARER = 4, 32, 24  # of these the easiest, postures around each, and how often these come nearer
@@ -112,11 +124,35 @@ def limits_of(
     span = _positions(robot, position)
     for name, (low, high) in zip(robot.dof_names, span, strict=True):
         if not low < high:
-            raise InputError(f"limits.position: '{name}' may move from {low:g} to {high:g}: that leaves no room")
+            raise InputError(
+                f"limits.position: '{name}' may move from {low:g} to {high:g}: that leaves no room"
+                f"; state it, as in limits: {{position: {{{name}: [-1, 1]}}}}"
+            )
     with np.errstate(invalid="ignore"):
         middle, half = span.sum(axis=1, keepdims=True) / 2, np.diff(span) / 2
         scaled = np.where(np.isfinite(span), middle + np.array([-1.0, 1.0]) * half * scale, span)
     return Limits(scaled, **{kind: given[kind] * scale for kind in KINDS[1:]}, clearance=clearance)
+
+
+def open_limits(robot: RobotModel, limits: Limits, given: Mapping[str, Given]) -> tuple[str, ...]:
+    """What is to be said of limits that nobody gives, where the task does not waive them, and of odd ones.
+
+    `given` holds what the task states of position, velocity and torque.
+    """
+    said, turns = [], robot.dofs.turns[np.argsort(robot.dofs.column)]
+    for kind in ("position", "velocity", "torque"):
+        if given.get(kind) is None:
+            continue
+        names = [name for name, x in zip(robot.dof_names, limits.of(kind), strict=True) if not np.isfinite(x)]
+        if names:
+            said.append(
+                f"nothing limits the {kind} of {', '.join(names)} (the model says 0 or nothing): the motion may ask"
+                f" for more than the robot can do; state limits.{kind}"
+            )
+    for name, turning, (low, high) in zip(robot.dof_names, turns, limits.position, strict=True):
+        if turning and _TURNS < high - low < np.inf:
+            said.append(f"'{name}' may move from {low:g} to {high:g} rad: are its limits in degrees?")
+    return tuple(said)
 
 
 def _by_joint(robot: RobotModel, kind: str, given: Any, own: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
@@ -126,7 +162,7 @@ def _by_joint(robot: RobotModel, kind: str, given: Any, own: Float[np.ndarray, "
         return np.where(own > 0, own, np.inf) if kind != "acceleration" else own
     if not isinstance(given, Mapping):
         return np.full(robot.nv, float(given))
-    out = np.array(own, float)
+    out = np.where(own > 0, own, np.inf)  # as `model` has the joints that the map leaves out
     for name, value in given.items():
         out[_dof(robot, kind, name)] = value
     return out

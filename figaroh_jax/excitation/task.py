@@ -20,7 +20,7 @@ from ..rigid.model import RobotModel
 from .clearance import Box, Capsule, Clearance, clearance_of
 from .design import Cause, Design, excite
 from .information import learn
-from .limits import limits_of
+from .limits import limits_of, open_limits
 from .motions import Basis, fourier, quintic, spline
 from .postures import ACCURACY, Instrument, PostureDesign, View, excite_postures
 from .touch import Touch
@@ -73,7 +73,8 @@ def excite_task(
     )
     noise = DEFAULT_NOISE if asked.noise is None else asked.noise
     learned = learn(model, known, noise=noise, trust=task.robot.trust)
-    said = [*notes, *around]
+    stated = {kind: getattr(bounds, kind) for kind in ("position", "velocity", "torque")}
+    said = [*notes, *around, *open_limits(model.robot, limits, stated)]
     if task.data:
         from .known import with_recordings  # the machinery of fits, which a design without recordings does without
 

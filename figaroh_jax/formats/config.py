@@ -6,7 +6,7 @@ file and key. The models can also be built in Python: `Preprocess(cutoff=15)`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -41,6 +41,7 @@ __all__ = [
     "Task",
     "Transmission",
     "Units",
+    "checked_drive",
     "load_limits",
     "load_task",
     "robot_options",
@@ -116,9 +117,28 @@ class JointDrive(Keys):
     def _gains(self) -> JointDrive:
         if self.kind == "position" and self.kp is None:
             raise ValueError("kind position needs kp (N m/rad)")
-        if self.kind == "velocity" and not self.kd:
-            raise ValueError("kind velocity needs kd (N m s/rad)")
+        if self.kind == "velocity" and not self.kd > 0:
+            raise ValueError("kind velocity needs kd (N m s/rad), the gain of its error: torque = kd (u - v)")
+        idle = {"velocity": ("kp",), "torque": ("kp", "kd")}.get(self.kind, ())
+        given = [key for key in idle if getattr(self, key)]
+        if given:
+            raise ValueError(f"kind {self.kind} has no {' and no '.join(given)}")
         return self
+
+
+def checked_drive(drive: Any, place: str) -> dict[str, Any]:
+    """A drive as a task file may state it."""
+    if not isinstance(drive, Mapping):
+        raise InputError(f"{place}: keys and values are expected, as in {{'kind': 'position', 'kp': 20.0, 'kd': 0.5}}")
+    for key in drive:
+        if key not in JointDrive.model_fields:
+            raise InputError(f"{place}: unknown key '{key}'{nearest(str(key), JointDrive.model_fields)}")
+    try:
+        return JointDrive.model_validate(dict(drive)).model_dump()
+    except ValidationError as error:
+        first = error.errors()[0]
+        at = "".join(f".{part}" for part in first["loc"])
+        raise InputError(f"{place}{at}: {first['msg'].removeprefix('Value error, ')}") from None
 
 
 class Actuator(BaseModel):

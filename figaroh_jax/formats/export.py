@@ -207,6 +207,8 @@ def load_model(directory: str | Path) -> ExtendedModel:
     if not directory.is_dir():
         raise InputError(f"{directory} is not a folder; a model folder with effects.yaml and robot.urdf is expected")
     file = directory / "effects.yaml"
+    if not file.is_file() and (directory / "model" / file.name).is_file():
+        raise InputError(f"{file} does not exist; the model of this run is in {directory / 'model'}")
     content = read_yaml(file)
     try:
         robot = _restored(content, directory / "robot.urdf")

@@ -36,7 +36,9 @@ def read_xml(path: str | Path, root: str | None) -> Any:
     if element.getroottree().docinfo.doctype:
         raise InputError(_no_doctype(Path(path)))
     if root is not None and element.tag != root:
-        raise InputError(f"{path}: the root element is <{element.tag}>; a <{root}> is expected")
+        other = {"mujoco": "an MJCF: load_mjcf reads it", "robot": "a URDF: load_urdf reads it"}.get(element.tag, "")
+        said = f"; it is {other}" if other else ""
+        raise InputError(f"{path}: the root element is <{element.tag}>; a <{root}> is expected{said}")
     return element
 
 

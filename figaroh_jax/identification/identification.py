@@ -230,6 +230,7 @@ def _judged(
     loosened = _LOOSENED_EVERYWHERE if last.everywhere else _LOOSENED
     notes = [loosened.format(last.slack * trust, trust)] if last.slack > 1 else []
     notes += [f"{last.fit.failure}: do not trust these values"] if last.fit.failure else []
+    notes += [_UNSOLVED.format(last.unsolved)] if last.unsolved else []
     rows = [np.asarray(t.after) - t.measured for t in traces if t.role == "fit" and t.measured is not None]
     weighted = np.concatenate([(row * np.sqrt(problem.weight)).reshape(-1) for row in rows])
     kept = essential(data.factor(problem.weight)[:, [*base.independent, -1]])
@@ -432,6 +433,12 @@ def _given_links(problem: _Problem) -> Float[np.ndarray, " columns"]:
     return np.append(problem.mean[:own], drives)
 
 
+_UNSOLVED = (
+    "of the parts left out in turn {} could not be fitted, and the nominal robot stands in there: the cross-validated"
+    " error is too large, and the trust in the nominal links may be chosen wrongly"
+)
+
+
 class _Best(NamedTuple):
     """The fit to all rows with the trust that predicts best, and its quality on blocks that were left out."""
 
@@ -439,33 +446,35 @@ class _Best(NamedTuple):
     everywhere: bool  # also where no torque shows it
     validated: Quality
     fit: Solved
+    unsolved: int = 0  # parts left out whose fit gave up, the nominal links in its place
 
 
 def _best(problem: _Problem, trust: float) -> _Best:
     """What cross-validation chooses; what no torque shows is let go only where that predicts clearly better, and never
     beyond `MOST_UNSEEN`: nothing but the nominal holds it."""
     tried = {slack: _left_out(problem, slack) for slack in TRUSTS}
-    cost = {slack: float(squares @ problem.weight) for slack, squares in tried.items()}
+    cost = {slack: float(squares @ problem.weight) for slack, (squares, _) in tried.items()}
     slack = TRUSTS[0]
     for other in TRUSTS[1:]:
         slack = other if cost[other] < cost[slack] * (1 - 1e-3) else slack
-    squares, everywhere = tried[slack], False
+    (squares, unsolved), everywhere = tried[slack], False
     if slack > 1:
         for other in (x for x in TRUSTS[2:] if x * trust <= MOST_UNSEEN):
-            free = _left_out(problem, other, everywhere=True)
+            free, gave_up = _left_out(problem, other, everywhere=True)
             if float(free @ problem.weight) > (1 - CLEARLY) * float(squares @ problem.weight):
                 break
-            slack, squares, everywhere = other, free, True
+            slack, squares, everywhere, unsolved = other, free, True, gave_up
     fit = _fitted(problem, None, slack, everywhere)
-    return _Best(slack, everywhere, quality(problem.data, squares), fit)
+    return _Best(slack, everywhere, quality(problem.data, squares), fit, unsolved)
 
 
-def _left_out(problem: _Problem, slack: float, everywhere: bool = False) -> Float[np.ndarray, " nv"]:
-    """Squares of each joint in blocks that were left out of the fit in turn."""
+def _left_out(problem: _Problem, slack: float, everywhere: bool = False) -> tuple[Float[np.ndarray, " nv"], int]:
+    """Squares of each joint in blocks that were left out of the fit in turn, and in how many the fit gave up."""
     folds = [k for k in range(len(problem.data.factors)) if problem.data.count[k].any()]
-    squares = np.zeros(len(problem.weight))
+    squares, unsolved = np.zeros(len(problem.weight)), 0
     for fold in folds:
         others = [k for k in folds if k != fold]
-        theta = _fitted(problem, others, slack, everywhere).theta if others else problem.mean
-        squares += problem.data.squares(theta, [fold])
-    return squares
+        solved = _fitted(problem, others, slack, everywhere) if others else Solved(problem.mean)
+        unsolved += bool(solved.failure)
+        squares += problem.data.squares(solved.theta, [fold])
+    return squares, unsolved

@@ -87,7 +87,7 @@ def read_recordings(
     >>> runs[0].name, runs[0].torque.shape[1]
     ('first_1', 4)
     """
-    _check_names(task, model, floating)
+    _check_names(task, model, floating, "commands" if rollouts else "joint torques")
     drive = Drive(task, model)
     recordings = tuple(_read(entry, f"data[{k}]", model, drive) for k, entry in enumerate(task.data))
     if rollouts:
@@ -104,14 +104,15 @@ def read_recordings(
     return recordings
 
 
-def _check_names(task: Task, model: RobotModel, floating: bool = False) -> None:
+def _check_names(task: Task, model: RobotModel, floating: bool, what: str) -> None:
     for joint in model.joints:
         free = floating and joint.kind == "free" and joint.parent < 0
         if joint.kind not in ("revolute", "prismatic") and not free:
             key = f"robot.root is {task.robot.root}" if joint.name == ROOT_JOINT else f"joint '{joint.name}'"
             raise InputError(
-                f"{task.file}: {key}: recordings of joint torques hold one column a joint, and a {joint.kind} joint "
-                "has several; use root: fixed, and name the revolute and prismatic joints under robot.joints"
+                f"{task.file}: {key}: recordings of {what} hold one column a joint, and a {joint.kind} joint has"
+                " several; use root: fixed where the base stands still, and name the revolute and prismatic joints"
+                " under robot.joints"
             )
     known = {*model.joint_names, *model.link_names, *(frame.name for frame in model.frames)}
     if model.nq != model.nv and task.transmission is not None:

@@ -339,8 +339,12 @@ def _of_joints(
         names = tuple(joint for joint in model.joint_names if joint in by_name)
         if len(names) < len(columns) and joints is None:
             rest = [c for c in columns if c not in by_name.values()]
-            text = f"{table.file}: {kind}: which joints are {', '.join(rest)}? Name all joints by --joints"
-            raise Undecided("joints", text)
+            left = [joint for joint in model.joint_names if joint not in by_name]
+            raise Undecided(
+                "joints",
+                f"{table.file}: {kind}: which joints are {', '.join(rest)}? Name all joints by --joints, in the order"
+                f" of the columns {', '.join(columns)}; the model's others are {', '.join(left) or 'none'}",
+            )
         return names, [by_name[joint] for joint in names], True
     if len(columns) == 1 and table.read(columns[0]).ndim == 2:
         (rows, count), source = table.read(columns[0]).shape, columns[0]
@@ -349,7 +353,10 @@ def _of_joints(
     else:
         numbered = sorted(columns, key=_number)
         prefixes = {re.sub(r"\d+", "#", name) for name in columns}
-        if len(prefixes) > 1 and len(columns) > 1:
+        if joints is not None and len(columns) == len(wanted) and _one_set(columns):
+            _refuse_misplaced(table, columns, wanted, model)
+            numbered = columns if len(prefixes) > 1 else numbered
+        elif len(prefixes) > 1 and len(columns) > 1:
             raise InputError(f"{table.file}: several sets of columns look like {kind}: {', '.join(columns[:8])}")
         count, source = len(columns), numbered
     if joints is None and count != len(model.joint_names):
@@ -361,6 +368,26 @@ def _of_joints(
     if count != len(wanted):
         raise InputError(f"{table.file}: {count} columns of {kind}, but --joints names {len(wanted)}")
     return tuple(wanted), source, False
+
+
+def _one_set(columns: Sequence[str]) -> bool:
+    """Whether names differ in one word alone, so that they are one quantity of several joints: `state.a`, `state.b`."""
+    parts = [re.split(r"(?<=[._/ \[])|(?=[._/ \]])", name) for name in columns]
+    head = next((k for k, words in enumerate(zip(*parts, strict=False)) if len(set(words)) > 1), 0)
+    back = zip(*(reversed(words) for words in parts), strict=False)
+    tail = next((k for k, words in enumerate(back) if len(set(words)) > 1), 0)
+    return len(set(columns)) == len(columns) and head + tail > 0
+
+
+def _refuse_misplaced(table: Table, columns: Sequence[str], joints: Sequence[str], model: RobotModel) -> None:
+    """Refuse an order of --joints that contradicts the columns that hold a joint's name."""
+    for column, joint in zip(columns, joints, strict=True):
+        own = next((name for name in model.joint_names if _holds(column, name, model.joint_names)), joint)
+        if own != joint:
+            raise InputError(
+                f"{table.file}: --joints names {joint} where the columns have '{column}'; their order is"
+                f" {', '.join(columns)}"
+            )
 
 
 def _holds(column: str, joint: str, names: Sequence[str]) -> bool:

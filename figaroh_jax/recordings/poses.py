@@ -128,7 +128,14 @@ def _values(table: Table, measurement: Measurement, key: str, samples: int, scal
         return kind, _numbers(table, source, where, samples)
     values = _array(table, source, where)
     if len(values) != samples:
-        raise InputError(f"{table.file}: {where} has {len(values)} rows, but position has {samples}")
+        wanted = "(postures, 3)" if kind == "position" else "(postures, 4, 4) or (postures, 7)"
+        shape, stacked = np.shape(values), kind != "position" and len(values) == 4 * samples
+        why = ": its matrices are stacked below each other" if stacked else ""
+        why = why or (": the postures stand on its last axis" if shape[-1] in (samples, 4 * samples) else "")
+        raise InputError(
+            f"{table.file}: {where} has {len(values)} rows, but position has {samples}{why}"
+            + (f"; its shape is {shape}, expected is {wanted}" if why else "")
+        )
     if kind == "position":
         return kind, points(values, table, where) * scale
     found = poses(values, table, where)

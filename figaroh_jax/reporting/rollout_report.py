@@ -121,11 +121,12 @@ def _interval(one: dict[str, Any], unit: str | None = None) -> str:
 
 
 def _table(found: RolloutIdentification) -> dict[str, Any]:
-    """Numbers by joint (rows) and kind (columns) with the kind's unit."""
+    """Numbers by joint (rows) and kind (columns) with their unit; in the cells where only some joints turn."""
     parts = [(*one["expression"].partition(" ")[::2], one) for one in _parameters(found)]
-    kinds = {kind: one["unit"] for kind, _, one in parts}
+    units = {kind: {one["unit"] for other, _, one in parts if other == kind} for kind, _, _ in parts}
+    kinds = {kind: next(iter(each)) if len(each) == 1 else "" for kind, each in units.items()}
     places = list(dict.fromkeys(place for _, place, _ in parts))
-    cells = {(place, kind): _interval(one, "") for kind, place, one in parts}
+    cells = {(place, kind): _interval(one, "" if len(units[kind]) == 1 else None) for kind, place, one in parts}
     return {
         "columns": [(_kind(kind), wording.unit(unit)) for kind, unit in kinds.items()],
         "rows": [(place, [cells.get((place, kind), "") for kind in kinds]) for place in places],

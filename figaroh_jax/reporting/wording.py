@@ -64,7 +64,7 @@ def sentence(diagnosis: Diagnosis, robot: str) -> str:
                 f"No effect can be named that the simulation of {robot} is missing, but these data do not show that it"
                 f" is right: {undecided(diagnosis)} {told}"
             )
-        agrees = f"{subject} agrees with the data: no missing effect is detectable"
+        agrees = f"{subject} agrees with the data{_once(diagnosis.refitted)}: no missing effect is detectable"
         if not diagnosis.rest.tolerated:
             return f"{agrees}, and the residual is consistent with noise {told}"
         surely = f" ({p_value(diagnosis.p_value)})" if diagnosis.p_value < _SURE else ""
@@ -75,6 +75,12 @@ def sentence(diagnosis: Diagnosis, robot: str) -> str:
         return f"{subject} has an error that no effect in the catalogue explains.{found}"
     rest = ". Part of the residual remains unexplained" if diagnosis.verdict == "named+rest" else ""
     return f"{subject} is missing {_list(diagnosis.causes)}: {fall}{rest}."
+
+
+def _once(refitted: Sequence[str]) -> str:
+    """Which numbers of the file had to be others before the simulation agreed; empty where none had to."""
+    more = f" and {len(refitted) - 1} more {'number is' if len(refitted) == 2 else 'numbers are'} fitted"
+    return f" once the {refitted[0]}{more if len(refitted) > 1 else ''}" if refitted else ""
 
 
 def undecided(diagnosis: Diagnosis) -> str:
@@ -134,6 +140,8 @@ def calibration_sentence(calibration: Calibration) -> str:
         )
     found = level(calibration.level)
     told = f"the error on held-out postures falls from {before} (base and tool frames only) to {after}"
+    if not error.validated_after < error.validated_before:
+        told = f"the error on held-out postures is {after}, no less than with base and tool frames only ({before})"
     return f"With {found}, {told}."
 
 

@@ -24,7 +24,7 @@ from .data import Run, regular
 from .loop import Carried, Loop
 from .parameters import unit_payload
 
-__all__ = ["alone", "carried_by", "motion", "separable"]
+__all__ = ["alone", "carried_by", "inseparable", "motion", "separable"]
 
 _SPAN, _ORDER = 0.06, 3  # s over which, and degree of the polynomial by which, motions are differentiated
 _STEP = 1e-4  # rad or m, of the central difference that tells gravity's slope
@@ -33,10 +33,22 @@ _SAMPLES = 1024  # one program takes so many
 
 def separable(loop: Loop) -> bool:
     """Whether each drive acts at one joint, and every joint turns or slides and is measured."""
+    return loop.robot.nv > 1 and not inseparable(loop)
+
+
+def inseparable(loop: Loop) -> str:
+    """Why the joints of an arm cannot be taken one by one, and what would let them; empty where they can."""
     way, robot = np.asarray(loop.drives.transmission), loop.robot
-    plain = all(j.kind in ("revolute", "prismatic") and not j.follows for j in robot.joints)
-    measured = sorted(loop.measured) == list(range(robot.nv))
-    return plain and measured and robot.nv > 1 and bool(((way != 0).sum(1) == 1).all())
+    for j in robot.joints:
+        if j.follows:
+            leader = robot.dof_names[j.coordinate]
+            return f"'{j.name}' follows '{leader}'; leave '{leader}' out of robot.joints where it does not matter"
+        if j.kind not in ("revolute", "prismatic"):
+            return f"'{j.name}' has several axes; hold it (root: fixed) where it does not move"
+    if sorted(loop.measured) != list(range(robot.nv)):
+        return "not every joint is measured"
+    several = [name for name, row in zip(loop.drives.names, way, strict=True) if (row != 0).sum() != 1]
+    return f"drive '{several[0]}' does not act at one joint" if several else ""
 
 
 def alone(loop: Loop, runs: Sequence[Run], carried: Sequence[np.ndarray], joint: int) -> tuple[Loop, tuple[Run, ...]]:

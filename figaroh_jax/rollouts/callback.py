@@ -52,22 +52,28 @@ class Rest:
             place = model.joint(one["at"][0])
             self.own.append((place.qposadr[0], place.dofadr[0], (own or {})[one["effect"]], one["parameters"]))
         self.volts = np.array([np.inf if one["voltage"] is None else one["voltage"] for _, one in drives])
-        self.bent = (self.drives["dead_band"] > 0) | np.isfinite(self.volts)
+        soon = (self.drives["delay"] > 0) & (self.drives["delay"] < model.opt.timestep)
+        self.bent = (self.drives["dead_band"] > 0) | np.isfinite(self.volts) | soon
         stateful = [name for (name, one), bent in zip(drives, self.bent, strict=True) if bent and _has_state(one)]
         if stateful:
             raise ValueError(
-                f"drive {stateful[0]} has a state of its own: its dead band or voltage cannot be said here"
+                f"drive {stateful[0]} has a state of its own: its dead band, voltage or short delay cannot be said here"
             )
         late = self.drives["delay"] * self.bent  # MuJoCo's own delay would be behind what is added here
         model.actuator_delay[self.drive[self.bent]] = 0.0
         self.delay = late / model.opt.timestep
+        self.range = np.tile([-np.inf, np.inf], (len(drives), 1))  # what is added here may leave the range of MuJoCo's
+        for k in np.flatnonzero(self.bent & (model.actuator_ctrllimited[self.drive] != 0)):
+            self.range[k] = model.actuator_ctrlrange[self.drive[k]]
+            model.actuator_ctrllimited[self.drive[k]] = 0
 
     def step(self, data: Any, command: Any) -> None:
         """One step of the model; `command` (drives,) in the order of `loop.json`."""
         import mujoco
 
         engine: Any = mujoco
-        model, data.ctrl[self.drive] = self.model, self._late(np.asarray(command, float))
+        command = np.clip(self._late(np.asarray(command, float)), *self.range.T)
+        model, data.ctrl[self.drive] = self.model, command
         engine.mj_forward(model, data)
         length = data.actuator_length[self.drive]
         u = data.ctrl[self.drive]

@@ -21,9 +21,11 @@ from .parameters import UNITS
 
 __all__ = ["SIMULATORS", "described", "described_text", "for_simulator", "with_drives"]
 
-_NEUTRAL = {"stribeck_speed": None, "ripple_order": None, "friction_rate": None, "friction_share": None, "rest": None}
+_NEUTRAL = ("stribeck_speed", "ripple_order", "friction_rate", "friction_share")  # nothing without what they shape
 _JOINT = ("armature", "damping", "friction", "stribeck_force", "stribeck_speed", "load_ratio", "stiffness", "rest",
-          "play", "offset", "ripple_sine", "ripple_cosine", "ripple_order", "reading")  # fmt: skip
+          "play", "offset", "ripple_sine", "ripple_cosine", "ripple_order", "reading", "friction_rate",
+          "friction_share")  # fmt: skip
+_FAR = 1e10  # what stands in an MJCF for a side without a limit
 
 
 def described(loop: Loop) -> dict[str, Any]:
@@ -39,19 +41,28 @@ def described(loop: Loop) -> dict[str, Any]:
         drives[name] = {
             "joint": loop.robot.dof_names[int(np.abs(way[k]).argmax())],
             "gear": float(way[k][np.abs(way[k]).argmax()]),
+            "transmission": {loop.robot.dof_names[j]: float(way[k, j]) for j in np.flatnonzero(way[k])},
             "kp": float(scale * gain[0]),
+            "gain_of_length": float(scale * gain[1]),
+            "gain_of_rate": float(gain[2]),
             "length": float(scale * bias[1]),
             "kd": float(-bias[2]),
             "constant": float(bias[0]),
+            "command_range": _sides(np.asarray(loop.drives.command_range)[k]),
             "force": finite(np.asarray(loop.drives.force_range)[k, 1]),
+            "force_range": _sides(np.asarray(loop.drives.force_range)[k]),
             "voltage": finite(np.asarray(loop.drives.voltage)[k]),
             "delay": float(np.asarray(loop.drives.delay)[k]),
             "dead_band": float(np.asarray(loop.drives.dead_band)[k]),
             "time_constant": float(np.asarray(loop.drives.time_constant)[k]),
             "activation": loop.drives.activation[k],
+            "activation_range": _sides(np.asarray(loop.drives.activation_range)[k]),
+            "early": loop.drives.early[k],
         }
+    limits = {name: _limits(loop, k) for k, name in enumerate(loop.robot.dof_names)}
     content = {
-        "joints": joints, "drives": drives, "dt": float(loop.dt), "integrator": loop.integrator, "law": loop.law,
+        "joints": joints, "drives": drives, "limits": limits, "dt": float(loop.dt), "integrator": loop.integrator,
+        "law": loop.law,
     }  # fmt: skip
     pairs = [_pair(loop, k) for k in range(0 if loop.pairs is None else len(loop.pairs.at))]
     if pairs := [one for one in pairs if any(one["parameters"].values())]:
@@ -76,6 +87,19 @@ def _pair(loop: Loop, k: int) -> dict[str, Any]:
     return {"at": [loop.robot.dof_names[i], loop.robot.dof_names[j]], "sign": sign, "parameters": numbers}
 
 
+def _limits(loop: Loop, k: int) -> dict[str, Any]:
+    """The limits of a joint and their softness, and of what its drives give together; None where there is none."""
+    j = loop.joints
+    told = {"range": _sides(np.asarray(j.limit)[k]) if loop.limited else None, "margin": float(j.limit_margin[k])}
+    soft = {name: np.asarray(getattr(j, f"limit_{name}"), float)[k].tolist() for name in ("solref", "solimp")}
+    return told | soft | {"torque_range": _sides(np.asarray(j.torque_range)[k])}
+
+
+def _sides(ends: np.ndarray) -> list[float | None] | None:
+    """Both ends of a range, None for an end that is none; None where neither is."""
+    return [finite(x) for x in ends] if np.isfinite(ends).any() else None
+
+
 def described_text(loop: Loop) -> str:
     """`loop.json`."""
     return json.dumps(described(loop), indent=2) + "\n"
@@ -89,26 +113,82 @@ def with_drives(file: Path, content: dict[str, Any]) -> str:
     names = {"euler": "Euler", "implicitfast": "implicitfast", "rk4": "RK4"}
     option.set("timestep", f"{content['dt']:.9g}")
     option.set("integrator", names[content["integrator"]])
+    _with_limits(root, content)
     for old in root.findall("actuator"):
         root.remove(old)
     actuators = etree.SubElement(root, "actuator")
     for name, drive in content["drives"].items():
         prm = f"{drive['constant']:.9g} {drive['length']:.9g} {-drive['kd']:.9g}"
         new = etree.SubElement(
-            actuators, "general", name=name, joint=drive["joint"], gear=f"{drive['gear']:.9g}", biastype="affine",
-            gainprm=f"{drive['kp']:.9g}", biasprm=prm,
-        )  # fmt: skip
-        if drive["force"] is not None:
-            new.set("forcerange", f"{-drive['force']:.9g} {drive['force']:.9g}")
-            new.set("forcelimited", "true")
+            actuators, "general", name=name, **_way(root, name, drive), biastype="affine", biasprm=prm
+        )
+        more = [drive.get("gain_of_length", 0.0), drive.get("gain_of_rate", 0.0)]
+        new.set("gainprm", _text([drive["kp"], *more] if any(more) else [drive["kp"]]))
+        if any(more):
+            new.set("gaintype", "affine")
+        both = (
+            None if drive["force"] is None else [-drive["force"], drive["force"]]
+        )  # of runs before the range was kept
+        for word, key in (("ctrl", "command_range"), ("force", "force_range"), ("act", "activation_range")):
+            _set_range(new, word, drive.get(key, both if word == "force" else None))
         if drive["activation"] != "none":
             new.set("dyntype", drive["activation"])
             new.set("dynprm", f"{drive['time_constant']:.9g}")
-        if drive["delay"] > 0:
+            new.set("actearly", str(bool(drive.get("early"))).lower())
+        if drive["delay"] >= content["dt"]:  # MuJoCo takes no part of a step: `callback.py` does
             new.set("delay", f"{drive['delay']:.9g}")
+            new.set("interp", "linear")  # between two steps, as the loop's is; MuJoCo's own takes the later step
             new.set("nsample", str(int(np.ceil(drive["delay"] / content["dt"])) + 2))
     etree.indent(root)
     return etree.tostring(root, encoding="unicode") + "\n"
+
+
+def _way(root: Any, name: str, drive: dict[str, Any]) -> dict[str, str]:
+    """What an actuator acts on: its joint with the gear, or a fixed tendon over several joints."""
+    way = drive.get("transmission") or {drive["joint"]: drive["gear"]}
+    if len(way) == 1:
+        ((joint, gear),) = way.items()
+        return {"joint": joint, "gear": f"{gear:.9g}"}
+    group = root.find("tendon")
+    group = etree.SubElement(root, "tendon") if group is None else group
+    called = f"drive {name}"
+    for old in [one for one in group if one.get("name") == called]:
+        group.remove(old)
+    fixed = etree.SubElement(group, "fixed", name=called)
+    for joint, share in way.items():
+        etree.SubElement(fixed, "joint", joint=joint, coef=f"{share:.9g}")
+    return {"tendon": called}
+
+
+def _with_limits(root: Any, content: dict[str, Any]) -> None:
+    """Ranges and softness of limits and dry friction at the joints, as the loop has them."""
+    for joint in root.iter("joint"):
+        own, limit = content["joints"].get(joint.get("name")), content.get("limits", {}).get(joint.get("name"))
+        if own is None or limit is None:
+            continue
+        _set_range(joint, "", limit["range"])
+        if limit["range"] is None:
+            joint.set("limited", "false")
+        else:
+            joint.set("margin", _text([limit["margin"]]))
+            joint.set("solreflimit", _text(limit["solref"]))
+            joint.set("solimplimit", _text(limit["solimp"]))
+        _set_range(joint, "actuatorfrc", limit["torque_range"])
+        if content["law"] == "soft" and own.get("friction_rate", 0.0) > 0:
+            impedance = 1.0 / (1.0 + own["friction_share"])  # one that is the same at any depth gives both numbers
+            joint.set("solreffriction", _text([2.0 / (own["friction_rate"] * impedance), 1.0]))
+            joint.set("solimpfriction", _text([impedance, impedance, 0.001, 0.5, 2.0]))
+
+
+def _set_range(element: Any, word: str, ends: list[float | None] | None) -> None:
+    if ends is not None:
+        low, high = ends
+        element.set(f"{word}range", _text([-_FAR if low is None else low, _FAR if high is None else high]))
+        element.set(f"{word}limited", "true")
+
+
+def _text(numbers: list[float]) -> str:
+    return " ".join(f"{x:.17g}" for x in numbers)
 
 
 # (our number: theirs), and what a number means there
@@ -120,7 +200,7 @@ SIMULATORS: dict[str, tuple[dict[str, str], str]] = {
             "friction": "joint frictionloss",
             "stiffness": "joint stiffness",
             "rest": "joint springref",
-            "kp": "general gainprm[0], -biasprm[1]",
+            "kp": "general gainprm[0] (of a servo also -biasprm[1])",
             "kd": "-general biasprm[2]",
             "force": "general forcerange",
             "delay": "general delay",
@@ -177,22 +257,123 @@ SIMULATORS: dict[str, tuple[dict[str, str], str]] = {
 }
 
 
+def _ways(drive: dict[str, Any]) -> dict[str, float]:
+    """How a drive turns with the joints, gear included."""
+    return drive.get("transmission") or {drive["joint"]: drive["gear"]}
+
+
+def _at_the_joint(drive: dict[str, Any]) -> dict[str, Any]:
+    """A drive's numbers at its joint: what it does per rad of the joint, with the torque that arrives there."""
+    gear = drive["gear"]
+    size = {"kp": gear**2, "length": gear**2, "kd": gear**2, "constant": gear}
+    told = drive | {key: drive[key] * factor for key, factor in size.items()}
+    for key in ("force", "voltage"):
+        told[key] = None if drive[key] is None else drive[key] * abs(gear)
+    told["dead_band"] = drive["dead_band"] / abs(gear)
+    follows, brakes = drive["length"] != 0, drive["kd"] != 0
+    told["kind"] = "general"
+    if follows and np.isclose(drive["kp"], -drive["length"], rtol=1e-9):
+        told["kind"] = "position"
+    elif not follows and brakes and np.isclose(drive["kp"], drive["kd"], rtol=1e-9):
+        told["kind"] = "velocity"
+    elif not follows and not brakes:
+        told["kind"] = "torque"
+    return told
+
+
+def _command_words(place: str, told: dict[str, Any]) -> list[dict[str, Any]]:
+    """What becomes of a command where it is not the joint's position itself."""
+    gear, kind = told["gear"], told["kind"]
+    if len(_ways(told)) > 1 or kind == "general":
+        return []
+    share = {"position": 1 / gear, "velocity": 1 / gear, "torque": told["kp"] / gear}[kind]
+    if kind == "position" and share == 1:
+        return []
+    word = {"position": "position target", "velocity": "velocity target", "torque": "joint effort"}[kind]
+    found = [{"at": place, "number": "command", "word": f"{word}, per unit of the command", "value": share}]
+    if kind == "velocity":
+        found.append({"at": place, "number": "kd", "word": "gain of the velocity's error", "value": told["kd"]})
+    if kind != "position" and told["force"] is not None:
+        found.append({"at": place, "number": "force", "word": "limit of the joint's effort", "value": told["force"]})
+    return found
+
+
+def _beyond_words(place: str, told: dict[str, Any], drive: dict[str, Any]) -> list[dict[str, Any]]:
+    """What of a drive none of the simulators' servos has: several joints, gains of its own, states, ranges."""
+    found = []
+    several, general = len(_ways(drive)) > 1, told["kind"] == "general"
+    if several:
+        found += [(f"transmission {joint}", share, "") for joint, share in _ways(drive).items()]
+    if several or general:
+        own = (("kp", "kp"), ("length", "kp"), ("kd", "kd"), ("force", "force_limit"))
+        found += [(key, drive[key], UNITS[unit]) for key, unit in own]
+    if told["kind"] != "position" or several:
+        found += [(key, drive[key], UNITS[key]) for key in ("voltage", "delay", "dead_band")]
+    found += [(key, drive.get(key, 0.0), "") for key in ("gain_of_length", "gain_of_rate")]
+    found.append(("constant", told["constant"], UNITS["offset"]))
+    if drive["activation"] != "none":
+        found.append((f"time_constant of its {drive['activation']}", drive["time_constant"], "s"))
+    for key, unit in (("command_range", "rad"), ("force_range", "N m")):
+        low, high = drive.get(key) or (None, None)
+        if key == "force_range" and (high is None or low == -high):
+            low, high = (low if high is None else None), None
+        found += [(f"{key} {side}", x, unit) for side, x in (("low", low), ("high", high))]
+    return [
+        {"at": place, "number": number, "value": value, "unit": unit}
+        for number, value, unit in found
+        if value is not None and (value != 0 or number.endswith((" low", " high")))
+    ]
+
+
+def _in_mujoco(place: str, drive: dict[str, Any]) -> list[dict[str, Any]]:
+    """What a `general` actuator has beside a servo's gains; all of it stands in `robot.xml`."""
+    told = []
+    if drive["length"] != -drive["kp"]:
+        told.append(("length", "general biasprm[1]", drive["length"]))
+    if drive["constant"]:
+        told.append(("constant", "general biasprm[0]", drive["constant"]))
+    ways = _ways(drive)
+    if len(ways) > 1:
+        told += [(f"transmission {joint}", "fixed tendon's coef", share) for joint, share in ways.items()]
+    elif drive["gear"] != 1:
+        told.append(("gear", "general gear", drive["gear"]))
+    return [{"at": place, "number": number, "word": word, "value": value} for number, word, value in told]
+
+
 def for_simulator(content: dict[str, Any], name: str) -> dict[str, Any]:
-    """The loop's numbers in the words of a simulator: `values`, `meaning`, and `unsaid` with what it cannot say."""
+    """The loop's numbers in the words of a simulator: `values`, `meaning`, and `unsaid` with what it cannot say.
+
+    MuJoCo's are those of its actuators, the others' those of the joint that a drive turns, its gear counted in.
+    """
     if name not in SIMULATORS:
         raise InputError(f"--for {name}: unknown{nearest(name, SIMULATORS)}; known: {', '.join(SIMULATORS)}")
     words, meaning = SIMULATORS[name]
     values, unsaid = [], []
-    for kind in ("joints", "drives"):
-        for place, numbers in content[kind].items():
-            for number, value in numbers.items():
-                if number in ("joint", "gear", "length", "activation") or value is None:
-                    continue
-                if number in words:
-                    values.append({"at": place, "number": number, "word": words[number], "value": value})
-                elif value != 0 and number not in (*_NEUTRAL, "time_constant", "constant"):
-                    unit = UNITS["force_limit" if number == "force" else number]
-                    unsaid.append({"at": place, "number": number, "value": value, "unit": unit})
+
+    def say(place: str, number: str, value: float | None, unit: str) -> None:
+        if value is None or number in _NEUTRAL:
+            return
+        short = name == "mujoco" and number == "delay" and 0 < value < content["dt"]
+        if number in words and not short:
+            values.append({"at": place, "number": number, "word": words[number], "value": value})
+        elif value != 0:
+            unsaid.append({"at": place, "number": number, "value": value, "unit": unit})
+
+    for place, numbers in content["joints"].items():
+        for number, value in numbers.items():
+            if number != "rest" or numbers["stiffness"] != 0:  # without a spring nothing rests
+                say(place, number, value, UNITS.get(number, ""))
+    for place, drive in content["drives"].items():
+        told = drive if name == "mujoco" else _at_the_joint(drive)
+        where = place if name == "mujoco" or len(_ways(drive)) > 1 else drive["joint"]
+        if name == "mujoco" or (told["kind"] == "position" and len(_ways(drive)) == 1):
+            for number in ("kp", "kd", "force", "voltage", "delay", "dead_band"):
+                say(where, number, told[number], UNITS["force_limit" if number == "force" else number])
+        if name == "mujoco":
+            values += _in_mujoco(place, drive)
+            continue
+        values += _command_words(where, told)
+        unsaid += _beyond_words(where, told, drive)
     for one in content.get("pairs", ()):
         place = f"{one['at'][0]} {'+' if one['sign'] > 0 else '-'} {one['at'][1]}"
         for number, value in one["parameters"].items():

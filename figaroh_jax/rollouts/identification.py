@@ -17,10 +17,10 @@ from .data import Run, Stretch, noise_of, windows
 from .fit import Fit, System, fit, standard_errors
 from .loop import Loop
 from .own import is_own
-from .parameters import BOUNDS, OF_DRIVES, UNITS, put
+from .parameters import BOUNDS, OF_DRIVES, put, unit_of
 from .sensitivity import predicted
 from .setting import Setting, Structure, begun, coloured, residuals
-from .task import colour_notes, diagnosis_setting, diverged, extended_of, read_rollouts, simulated
+from .task import all_slide, colour_notes, diagnosis_setting, diverged, extended_of, read_rollouts, simulated
 
 if TYPE_CHECKING:
     from ..effects.extended import ExtendedModel
@@ -60,6 +60,11 @@ def identify_rollout_task(
     """
     progress("reading", 0.0)
     loop, runs, notes = read_rollouts(task)
+    if task.actuator.gains == "free" and not any(one.effect == "actuator_gain" for one in task.baseline.effects):
+        notes += (
+            "actuator.gains: free lets `diagnose` look for gains that are off; `identify` fits those that the task"
+            " names, as in baseline: {effects: [{effect: actuator_gain, at: [" + loop.robot.dof_names[0] + "]}]}",
+        )
     here = diagnosis_setting(task, loop, runs)
     with jax.enable_x64(True):
         progress("fitting", 0.2)
@@ -134,7 +139,7 @@ def _result(
         "fit": {"rms": rms.tolist(), "relative": _relative(here, rms), "noise": here.spread.tolist()},
         "holdout": {name: _held(run, read) for name, (run, read) in held.items()},
         "notes": [*notes, *_left(here, rms), *_trades([names[free.index(k)] for k in told], correlation)],
-        "unit": "rad",
+        "unit": "m" if all_slide(here.loop) else "rad",
     }
 
 
@@ -164,7 +169,7 @@ def _parameter(here: Setting, first: Fit, column: int, error: float) -> dict[str
         "expression": _expression(here, entry),
         "value": value,
         "std": error if np.isfinite(error) else None,
-        "unit": UNITS[name],
+        "unit": unit_of(here.loop, here.known.table[entry]),
         "status": status,
     }
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..effects.base import joint_unit
 from . import own
 from .loop import Loop
 
@@ -30,6 +31,7 @@ __all__ = [
     "current",
     "put",
     "uncoupled",
+    "unit_of",
     "unit_payload",
     "values",
 ]
@@ -89,6 +91,17 @@ BOUNDS = _Known({  # what such a number can be
     "ripple_cosine": _ANY, "gravity_x": (-9.0, 9.0), "gravity_y": (-9.0, 9.0), **dict.fromkeys(_PAIRS, (0.0, 1e4)),
     **dict.fromkeys(TEN, _ANY),
 }, own.bounds_of)  # fmt: skip
+
+
+def unit_of(loop: Loop, entry: Entry) -> str:
+    """The unit of a number where it stands: N and m at a joint that slides, N m and rad at one that turns."""
+    unit, turns = UNITS[entry.name], loop.robot.dofs.turns[np.argsort(loop.robot.dofs.column)]
+    if entry.name in (*OF_SEVERAL, *TEN) or own.is_own(entry.name):
+        return unit
+    place = entry.at[0]
+    if entry.name in OF_DRIVES:
+        place = int(np.abs(np.asarray(loop.drives.transmission)[place]).argmax())
+    return joint_unit(unit, not turns[place])
 
 
 def values(loop: Loop, table: Table) -> np.ndarray:

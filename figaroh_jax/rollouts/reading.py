@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, nearest
+from ..formats.config import checked_drive
 from ..formats.files import model_format
 from ..formats.mjcf import actuator_of, compile_mjcf, compiled_robot, disabled, engine, joint_names
 from ..formats.robotfile import read_robot, urdf_dynamics
@@ -60,7 +61,11 @@ def load_loop(
         mj = compile_mjcf(file)
         robot = compiled_robot(str(file), mj, joints, posture, gravity, root)
         own, notes = _mjcf_joints(mj, robot)
-        actuators = joint_drives(robot, drives, path) if drives else _mjcf_drives(mj, robot, str(path))
+        if drives:
+            actuators = joint_drives(robot, drives, path)
+        else:
+            actuators, idle = _mjcf_drives(mj, robot, str(path))
+            notes = (*notes, *(f"actuator '{name}', whose joint stands still" for name in idle))
         start, limited = _start(mj, robot), not disabled(mj, "LIMIT") and bool(np.isfinite(own.limit).any())
         default = (float(mj.opt.timestep), _integrator(mj, path, integrator), "soft", limited)
     step, scheme, friction, limited = default
@@ -148,7 +153,7 @@ def joint_drives(robot: RobotModel, drives: Mapping[str, Mapping[str, Any]], pat
     gain, bias, way = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, robot.nv))
     force = np.full(count, np.inf)
     for k, name in enumerate(names):
-        drive = drives[name]
+        drive = checked_drive(drives[name], f"{path}: actuator.{name}")
         kp, kd = float(drive.get("kp") or 0.0), float(drive.get("kd") or 0.0)
         kind = drive.get("kind", "position")
         gain[k, 0] = {"position": kp, "velocity": kd, "torque": 1.0}[kind]
@@ -220,7 +225,8 @@ def _mjcf_joints(mj: Any, robot: RobotModel) -> tuple[Joints, tuple[str, ...]]:
     for joint in robot.joints:
         j = names.index(joint.name) if joint.name in names else -1
         if j < 0 or joint.follows:
-            notes += [f"what acts at joint '{joint.name}', which another one drives"] if j >= 0 else []
+            if j >= 0:
+                notes.append(f"what acts at joint '{joint.name}', and the softness by which it follows another one")
             continue
         first = int(mj.jnt_dofadr[j])
         for k in range(len(robot.dofs.column[robot.dofs.joint == robot.joints.index(joint)])):
@@ -269,29 +275,48 @@ def _left_out(mj: Any) -> list[str]:
     return notes
 
 
-def _mjcf_drives(mj: Any, robot: RobotModel, path: str) -> Drives:
-    names = tuple(mj.actuator(a).name or f"actuator {a}" for a in range(mj.nu))
-    way = np.stack([_transmission(mj, robot, a, path, names[a]) for a in range(mj.nu)] or [np.zeros(robot.nv)])
-    way = way[: mj.nu]
-    kinds: tuple[Activation, ...] = tuple(_activation(mj, a, path, names[a]) for a in range(mj.nu))
+def _mjcf_drives(mj: Any, robot: RobotModel, path: str) -> tuple[Drives, list[str]]:
+    """The actuators that act at joints that move, and the names of those whose joints all stand still."""
+    every = tuple(mj.actuator(a).name or f"actuator {a}" for a in range(mj.nu))
+    rows = [_transmission(mj, robot, a, path, every[a]) for a in range(mj.nu)]
+    on = [a for a, row in enumerate(rows) if row is not None]
+    way = np.array([row for row in rows if row is not None]).reshape(len(on), robot.nv)
+    kinds: tuple[Activation, ...] = tuple(_activation(mj, a, path, every[a]) for a in on)
     gain, bias = mj.actuator_gainprm[:, :3].copy(), mj.actuator_biasprm[:, :3].copy()
-    for a in range(mj.nu):
-        _refuse_laws(mj, a, path, names[a])
+    for a in on:
+        _refuse_laws(mj, a, path, every[a])
         gain[a, 1:] *= int(mj.actuator_gaintype[a]) == int(engine().mjtGain.mjGAIN_AFFINE)
         bias[a] *= int(mj.actuator_biastype[a]) == int(engine().mjtBias.mjBIAS_AFFINE)
-    return _drives(
-        names,
+    limited = mj.actuator_ctrllimited & (not disabled(mj, "CLAMPCTRL"))
+    drives = _drives(
+        tuple(every[a] for a in on),
         way,
-        gain,
-        bias,
-        force_range=_range(mj.actuator_forcelimited, mj.actuator_forcerange),
-        command_range=_range(mj.actuator_ctrllimited & (not disabled(mj, "CLAMPCTRL")), mj.actuator_ctrlrange),
-        time=mj.actuator_dynprm[:, 0].copy(),
-        activation_range=_range(mj.actuator_actlimited, mj.actuator_actrange),
-        delay=np.array(mj.actuator_delay, float) if hasattr(mj, "actuator_delay") else None,
+        gain[on],
+        bias[on],
+        force_range=_range(mj.actuator_forcelimited, mj.actuator_forcerange)[on],
+        command_range=_range(limited, mj.actuator_ctrlrange)[on],
+        time=mj.actuator_dynprm[on, 0].copy(),
+        activation_range=_range(mj.actuator_actlimited, mj.actuator_actrange)[on],
+        delay=_delays(mj, path, every)[on],
         activation=kinds,
-        early=tuple(bool(x) for x in mj.actuator_actearly),
+        early=tuple(bool(mj.actuator_actearly[a]) for a in on),
     )
+    return drives, [name for a, name in enumerate(every) if a not in on]
+
+
+def _delays(mj: Any, path: str, names: Sequence[str]) -> np.ndarray:
+    """Delay of each actuator as its command is late in whole steps, or in parts of one where it is interpolated."""
+    if not hasattr(mj, "actuator_delay"):
+        return np.zeros(mj.nu)
+    found, dt = np.array(mj.actuator_delay, float), float(mj.opt.timestep)
+    for a in np.flatnonzero(found > 0):
+        kind = int(mj.actuator_history[a, 1])
+        if kind > 1:
+            raise InputError(f"{path}: actuator '{names[int(a)]}': interp is cubic; zoh and linear are simulated")
+        found[a] = max(float(found[a]), dt)  # what is commanded in a step is not yet seen in it
+        if kind == 0:  # the command of the last step that is not later
+            found[a] = np.ceil(found[a] / dt - 1e-6) * dt
+    return found
 
 
 def _range(limited: np.ndarray, limits: np.ndarray) -> np.ndarray:
@@ -319,8 +344,8 @@ def _refuse_laws(mj: Any, a: int, path: str, name: str) -> None:
         raise InputError(f"{path}: actuator '{name}' has gains that are not affine (muscle, dcmotor or user's)")
 
 
-def _transmission(mj: Any, robot: RobotModel, a: int, path: str, name: str) -> np.ndarray:
-    """Row of the transmission of an actuator, gear included."""
+def _transmission(mj: Any, robot: RobotModel, a: int, path: str, name: str) -> np.ndarray | None:
+    """Row of the transmission of an actuator, gear included; None where none of its joints moves."""
     mujoco, row, names = engine(), np.zeros(robot.nv), joint_names(mj)
     kind, target, gear = int(mj.actuator_trntype[a]), int(mj.actuator_trnid[a, 0]), float(mj.actuator_gear[a, 0])
     places = {joint.name: joint for joint in robot.joints}
@@ -337,7 +362,7 @@ def _transmission(mj: Any, robot: RobotModel, a: int, path: str, name: str) -> n
             row[places[joint].coordinate] += share * float(robot.ratio[tree])
         elif joint in places:
             raise InputError(f"{path}: actuator '{name}' drives joint '{joint}', which has several axes")
-    return row
+    return row if parts.keys() & places.keys() else None
 
 
 def _fixed(mj: Any, tendon: int) -> bool:

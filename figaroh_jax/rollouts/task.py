@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..effects.base import Effect, place
+from ..effects.base import Effect, joint_unit, place
 from ..effects.catalogue import ROLLOUTS, find
 from ..effects.extended import ExtendedModel, extend
 from ..effects.plausibility import implausible
@@ -19,20 +19,21 @@ from ..formats.config import robot_options
 from ..formats.files import USD
 from ..recordings.dataset import Recording, read_recordings
 from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, Experiment, Gain, Name, Rest, Trace, Verdict
-from .alone import separable
+from .alone import inseparable, separable
 from .arm import search_arm
 from .causes import BASELINE
 from .data import Run, Stretch, noise_of, regular, windows
 from .fit import Fit
 from .loop import Loop
 from .own import left_out
-from .parameters import UNITS, put
+from .parameters import put, unit_of, values
 from .reading import load_loop
 from .rest import nearest_of, parts_of, relative_rest
 from .search import Named, Search, search
 from .sensitivity import predicted
 from .setting import Setting, Structure, residuals, setting
 from .sizes import is_excepted, is_open, possible, told_errors
+from .thresholds import REFITTED
 
 if TYPE_CHECKING:
     from ..formats.config import Task
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 __all__ = [
     "EFFECTS",
     "RolloutDiagnosis",
+    "all_slide",
     "colour_notes",
     "diagnose_rollout_task",
     "diagnosis_setting",
@@ -79,6 +81,8 @@ def diagnose_rollout_task(
     notes = (*notes, *left_out(loop.robot, task.diagnose.forbid))
     with jax.enable_x64(True):
         seek = search_arm if separable(loop) else search
+        if loop.robot.nv > 1 and seek is search:
+            progress(f"looking for one cause after another, which takes long: {inseparable(loop)}", 0.0)
         found = seek(here, progress, forbid=task.diagnose.forbid)
         if not np.isfinite(found.first.cost):
             raise InputError(f"{task.robot.model}: {diverged(here, found.first)}")
@@ -185,6 +189,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
     gain = _gain(held, runs, found)
     model = extended_of(final if n == final.robot.nv else start)
     traces = _traces(here, runs, first, found, last, held)
+    refitted = _refitted(here, last, found.spread if named else None)
     diagnosis = Diagnosis(
         verdict=_verdict(found),
         causes=(*_faulty(found, here), *(_cause(one, found, here) for one in (found.named if named else ()))),
@@ -205,13 +210,67 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
             *notes,
             *colour_notes(here),
             *(_open_sizes(found) if named else ()),
+            *(_taken_gains(task, found) if named else ()),
             *implausible(loop.robot, model, task.robot.trust),
+            *_refitted_note(here, runs, refitted, found.verdict),
         ),
+        refitted=refitted,
         prismatic=tuple(j.kind == "prismatic" for j in loop.robot.joints if not j.follows),
         of_positions=True,
     )
     predictions = {run.name: (run.time, held[run.name][1]) for run in runs if run.holdout}
     return RolloutDiagnosis(diagnosis, final, predictions)
+
+
+def _turns(loop: Loop) -> np.ndarray:
+    """Whether each coordinate turns, (nv,)."""
+    return loop.robot.dofs.turns[np.argsort(loop.robot.dofs.column)]
+
+
+def all_slide(loop: Loop) -> bool:
+    """Whether every measured joint slides, so that positions are lengths."""
+    return not _turns(loop)[list(loop.measured)].any()
+
+
+def _refitted(here: Setting, model: tuple[Structure, Fit], spread: np.ndarray | None) -> tuple[str, ...]:
+    """Numbers of the baseline that the file has surely otherwise, in words, those first that are surest."""
+    structure, last = model
+    filed, told = values(here.loop, here.known.table), []
+    for column, error in enumerate(told_errors(structure, last, spread)):
+        k = int(last.free[column])
+        if k not in here.baseline or not (np.isfinite(error) and error > 0):
+            continue
+        entry, value = here.known.table[k], float(last.theta[k])
+        moved = abs(value - filed[k])
+        if entry.name in _SAID and moved > REFITTED[0] * error and moved > REFITTED[1] * abs(value):
+            place = entry.at[0]
+            if entry.name == "scale":
+                place = int(np.abs(np.asarray(here.loop.drives.transmission)[place]).argmax())
+            size = f"{value:.3g} {unit_of(here.loop, entry)}".rstrip()
+            text = f"{_SAID[entry.name]} of {here.loop.robot.dof_names[place]} is {size} ({filed[k]:.3g} in the file)"
+            told.append((moved / error, text))
+    return tuple(text for _, text in sorted(told, reverse=True))
+
+
+def _refitted_note(here: Setting, runs: Sequence[Run], refitted: Sequence[str], verdict: Verdict) -> tuple[str, ...]:
+    """What the baseline's fit had to change of the file, and how far off the file's own numbers are."""
+    if not refitted:
+        return ()
+    asked = [run for run in runs if run.holdout] or [run for run in runs if not run.holdout]
+    with np.errstate(over="ignore", invalid="ignore"):
+        squares = np.concatenate([((run.position - simulated(here.loop, run)) ** 2).ravel() for run in asked])
+        error = float(np.sqrt(np.mean(squares)))
+    what = "recordings kept out" if asked[0].holdout else "the recordings"
+    unit = "m" if all_slide(here.loop) else "rad"
+    size = f"{1e3 * error:.3g} m{unit}" if error < 0.1 else f"{error:.3g} {unit}" if error < _FAR else "without bounds"
+    doubt = "" if verdict in ("nothing", "named") else " and, beside a misfit, may make up for what is missing"
+    return (
+        f"friction, damping and rotors are fitted before anything is named, and their sizes are no causes{doubt}:"
+        f" {'; '.join(refitted)}. With the file's own numbers the error on {what} is {size}",
+    )
+
+
+_SAID = {"friction": "friction", "damping": "damping", "armature": "rotor inertia", "scale": "gain factor"}
 
 
 def _verdict(found: Search) -> Verdict:
@@ -225,6 +284,7 @@ def _verdict(found: Search) -> Verdict:
 def _faulty(found: Search, here: Setting) -> list[Cause]:
     """Rows that were left out of every fit, as causes with their place and time."""
     causes, names = [], here.loop.robot.dof_names
+    of = "m" if all_slide(here.loop) else "rad"
     for one in found.faults:
         at = () if one.kind == "clock_error" else tuple(names[j] for j in one.joints)
         size = ("delay", "s") if one.kind == "clock_error" else ("torque", "N m")
@@ -234,7 +294,7 @@ def _faulty(found: Search, here: Setting) -> list[Cause]:
             "last": Estimate(one.last, 0.5, "s"),
             size[0]: Estimate(one.size, float("inf"), size[1]),
         }
-        gain = Gain(found.held[0], found.held[0], "rad")
+        gain = Gain(found.held[0], found.held[0], of)
         causes.append(Cause(Name(one.kind, at), parameters, 0.9, gain, note=one.text(here.loop, here.runs)))
     return causes
 
@@ -287,15 +347,16 @@ def colour_notes(here: Setting) -> tuple[str, ...]:
 
 def _gain(held: dict[str, tuple[np.ndarray, np.ndarray]], runs: Sequence[Run], found: Search) -> Gain:
     measured = {run.name: run.position for run in runs if run.holdout}
+    of = "m" if all_slide(found.structure.loop) else "rad"
     if measured:
         before, after = (
             float(np.sqrt(np.mean(np.concatenate([((measured[k] - v[i]) ** 2).ravel() for k, v in held.items()]))))
             for i in (0, 1)
         )
-        return Gain(before, after, "rad")
+        return Gain(before, after, of)
     if not found.named:
-        return Gain(found.held[0], found.held[0], "rad")
-    return Gain(found.held[0], found.held[-1], "rad")
+        return Gain(found.held[0], found.held[0], of)
+    return Gain(found.held[0], found.held[-1], of)
 
 
 def _cause(one: Named, found: Search, here: Setting) -> Cause:
@@ -305,10 +366,11 @@ def _cause(one: Named, found: Search, here: Setting) -> Cause:
     for name, entry in zip(one.candidate.reported, one.candidate.entries, strict=True):
         column = int(np.flatnonzero(fitted.free == entry)[0])
         value, error = float(fitted.theta[entry]), float(errors[column])
-        unit = UNITS[structure.table[entry].name]
+        unit = unit_of(structure.loop, structure.table[entry])
         if one.candidate.effect == "joint_spring" and name == "offset":
             stiffness = float(fitted.theta[one.candidate.entries[0]])
-            name, value, error, unit = "rest", -value / stiffness, error / abs(stiffness), "rad"
+            unit = joint_unit("rad", unit == "N")
+            name, value, error = "rest", -value / stiffness, error / abs(stiffness)
         value -= one.candidate.kind.neutral
         bound = possible(structure.table[entry].name) if name != "rest" else -np.inf
         parameters[name] = BoundedEstimate(value, error, unit, bound - one.candidate.kind.neutral)
@@ -322,7 +384,9 @@ def _cause(one: Named, found: Search, here: Setting) -> Cause:
         }  # fmt: skip
     at = one.candidate.at
     sure = 1.0 / (1 + len(one.alike)) * (0.98 if found.verdict == "named" else 0.8)
-    gain = Gain(one.before, one.after, "rad")
+    j = here.loop.robot.dof_names.index(at[0]) if at and at[0] in here.loop.robot.dof_names else -1
+    straight = not _turns(here.loop)[j] if j >= 0 else all_slide(here.loop)
+    gain = Gain(one.before, one.after, "m" if straight else "rad")
     return Cause(Name(one.candidate.effect, at), parameters, sure, gain, one.alike, note=one.candidate.kind.looks_like)
 
 
@@ -338,6 +402,18 @@ def _open_sizes(found: Search) -> list[str]:
                 f" predicted better with it; how large it is they do not tell (its 95 % interval reaches 0): {why}"
             )
     return told
+
+
+def _taken_gains(task: Task, found: Search) -> list[str]:
+    """That a payload was told from a drive's gain by taking the gains for right."""
+    if task.actuator.gains == "free":
+        return []
+    return [
+        f"payload at {one.candidate.at[0]}: the drives' gains are taken as right (actuator.gains: known); a"
+        " gain that is off may look the same, and gains: free tells both"
+        for one in found.named
+        if one.candidate.effect == "payload"
+    ]
 
 
 def _experiment(found: Search) -> Experiment | None:

@@ -25,6 +25,9 @@ OF_ITS_SIZE = 0.5  # standard deviation of a size that is known, of numbers that
 CLEAR_OF_NOTHING = 3.0  # standard deviations of a size from no effect, of numbers of either sign
 TOLD = 1.96  # standard deviations, as they are told, of a size from no effect: the interval beside a name holds no zero
 
+# What the baseline's fit changed of the file (`task`)
+REFITTED = (3.0, 0.1)  # standard deviations as they are told, and share of its size, from which a number is told
+
 # Which of several (`search`, `arm`, `screening`)
 USUAL = 0.5  # share of the best gain from which friction, damping and rotor come first while more is left
 UNTOLD = 1.7  # t below which two causes are alike
