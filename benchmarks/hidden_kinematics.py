@@ -44,7 +44,9 @@ def arm(name: str, folder: Path) -> postures.Arm:
     return postures.load_arm(path, "base", "tool0")
 
 
-def diagnose(robot: postures.Arm, case: postures.Hidden, forbid: tuple[str, ...] = (), held: int = 0) -> Any:
+def diagnose(
+    robot: postures.Arm, case: postures.Hidden, forbid: tuple[str, ...] = (), held: int = 0, **options: Any
+) -> Any:
     """The library's answer to a case, the last `held` of its recordings held out."""
     from figaroh_jax.calibration.kinematic_diagnosis import diagnose_poses
     from figaroh_jax.formats.config import Load
@@ -58,7 +60,7 @@ def diagnose(robot: postures.Arm, case: postures.Hidden, forbid: tuple[str, ...]
         role = "holdout" if k >= len(case.recordings) - held else "fit"
         more = given | {"unknown": case.unknown, "load": load, "role": role}
         recordings.append(PoseRecording(name=f"run{k}", file=Path(f"run{k}"), time=r.time, position=r.q, **more))
-    return diagnose_poses(load_urdf(robot.path, joints=list(robot.joints)), recordings, forbid)
+    return diagnose_poses(load_urdf(robot.path, joints=list(robot.joints)), recordings, forbid, **options)
 
 
 def grade(case: postures.Hidden, found: Any) -> str:

@@ -29,6 +29,11 @@ from figaroh_jax.reporting.wording import sentence
         (21003, False),  # a ripple: 4 s of slow noise
         (21057, False),  # unknown: friction turns between samples 20 ms apart
         (1007, True),  # unknown: 60 Hz with stamps in whole milliseconds
+        (4128483, False),  # unknown: what slow noise carries through rows left out passed for noise at 10 to 20 Hz
+        (971270108, False),  # unknown: slow noise, most of whose power is a hundredth of the band
+        (4128371, False),  # unknown: two repeats of 4 s, whose common power was told twice
+        (4129578, True),  # unknown: repeats with a torque of ten bits, whose steps repeat
+        (971272111, True),  # unknown: a known payload was taken for a wrong clock
     ],
 )
 def test_a_right_model_is_told_so(seed: int, strange: bool) -> None:
@@ -39,6 +44,11 @@ def test_a_right_model_is_told_so(seed: int, strange: bool) -> None:
 def test_a_rotor_is_named_where_slow_noise_and_steps_are_asked_for() -> None:
     told = graded(6002, "rotor")
     assert (told["grade"], told["names"]) == ("named", ["rotor_inertia at elbow"]), told
+
+
+def test_what_repeats_at_one_joint_is_told_beside_the_noise_of_another() -> None:
+    told = graded(971276306, "foreign")  # 1.7 % of the elbow's torque
+    assert (told["grade"], int(np.argmax(told["relative"]))) == ("unknown", 1), told
 
 
 def test_what_few_rows_cannot_tell_from_slow_noise_is_not_called_agreement(tmp_path: Path) -> None:

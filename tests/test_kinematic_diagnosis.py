@@ -77,6 +77,15 @@ def test_a_hidden_effect_is_named_where_it_is_and_nothing_else(effect: str, size
     assert found.p_value < 0.05
 
 
+@pytest.mark.parametrize(("effect", "size"), [("joint_offset", 10.0), ("link_geometry", 10.0)])
+def test_an_error_that_the_task_calls_good_enough_is_nothing(effect: str, size: float, folder: Path):
+    bench = study()
+    arm = bench.arm("arm6", folder)
+    case = postures.hide(arm, effect, size, np.random.default_rng(44))
+    assert bench.grade(case, bench.diagnose(arm, case)) == "right"
+    assert bench.diagnose(arm, case, tolerance=(0.02, 0.02)).verdict == "nothing"
+
+
 def test_an_effect_drawn_now_is_named(folder: Path):
     seed = int(np.random.SeedSequence().generate_state(1)[0])
     effect = SURE[seed % len(SURE)]

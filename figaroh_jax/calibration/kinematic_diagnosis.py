@@ -58,7 +58,9 @@ def diagnose_pose_task(task: Task, progress: Callable[[str, float], None] = lamb
     model = load_robot(task)
     recordings = read_pose_recordings(task, model)
     notes = check_pose_recordings(task, model, recordings)
-    found = diagnose_poses(model, recordings, task.diagnose.forbid, task.diagnose.alpha, progress)
+    stated = task.diagnose.tolerance
+    widths = (stated.offset, stated.geometry)
+    found = diagnose_poses(model, recordings, task.diagnose.forbid, task.diagnose.alpha, progress, tolerance=widths)
     notes = (*notes, *found.calibration.notes)
     return replace(found, calibration=replace(found.calibration, posture=dict(task.robot.posture), notes=notes))
 
@@ -69,13 +71,19 @@ def diagnose_poses(
     forbid: Sequence[str] = (),
     alpha: float = 0.05,
     progress: Callable[[str, float], None] = lambda phase, share: None,
+    *,
+    tolerance: tuple[float, float] = thresholds.TOLERANCE,
 ) -> PoseDiagnosis:
-    """Verdict, causes and calibration from postures and what a device measured at each."""
+    """Verdict, causes and calibration from postures and what a device measured at each.
+
+    `tolerance`: offsets (rad, or m of a joint that slides) and shifts of links (m) that are good enough; a link may be
+    turned by as many mrad as it may be shifted by half millimetres.
+    """
     with jax.enable_x64(True):
         run = Run(model, recordings, forbid, progress)
         calibration = run.finish()
         progress("testing", 0.92)
-        own = _geometry(run, calibration, alpha)
+        own = _geometry(run, calibration, alpha, tolerance)
         p_effects, p_rest = _effect_scores(run)
         effects = [c for c in calibration.causes if c.name.effect not in (*GEOMETRY, "outlier")]
         play = _play(run, alpha)
@@ -142,7 +150,7 @@ class _Geometry(NamedTuple):
     width: np.ndarray  # stated tolerance of each unknown, in its size
 
 
-def _geometry_of(run: Run) -> _Geometry:
+def _geometry_of(run: Run, tolerance: tuple[float, float]) -> _Geometry:
     linear, _ = run.choice.fits["full"]
     measured = run.measured
     known = [b for b in run.blocks if b.effect.name == "base_frame"] if run.effects else []
@@ -151,7 +159,8 @@ def _geometry_of(run: Run) -> _Geometry:
     sizes = np.array([size for block in extra for size in block.sizes])
     scale = np.asarray(measured.problem.scale)
     columns = [(c.parameter, c.unit, float(size)) for c, size in zip(measured.columns, scale, strict=False)]
-    width = np.array(thresholds.TOLERANCE)[np.maximum(linear.prior, 0)]
+    groups = _widths(tolerance)
+    width = groups[np.maximum(linear.prior, 0)]
     names = [Name(c.effect, c.at) for c in measured.columns]
     places = {name: np.array([k for k, n in enumerate(names) if n == name]) for name in names}
     if added:
@@ -164,9 +173,7 @@ def _geometry_of(run: Run) -> _Geometry:
             at=np.concatenate([linear.at, np.zeros(len(added))]),
             prior=np.concatenate([linear.prior, group]),
         )
-        width = np.concatenate(
-            [width, [thresholds.TOLERANCE[1 if c.unit == "m" else 2] for c in added] * (1e-3 / sizes)]
-        )
+        width = np.concatenate([width, [groups[1 if c.unit == "m" else 2] for c in added] * (1e-3 / sizes)])
         columns += [("", "", 1.0)] * (first - len(columns))
         columns += [(c.parameter, c.unit, float(size)) for c, size in zip(added, sizes, strict=True)]
         if known:
@@ -174,9 +181,9 @@ def _geometry_of(run: Run) -> _Geometry:
     return _Geometry(linear, list(places), list(places.values()), columns, width)
 
 
-def _geometry(run: Run, calibration: Calibration, alpha: float) -> _Named:
+def _geometry(run: Run, calibration: Calibration, alpha: float, tolerance: tuple[float, float]) -> _Named:
     """Offsets and links beyond their stated tolerance that postures tell from all others, the most evident first."""
-    linear, names, places, columns, width = _geometry_of(run)
+    linear, names, places, columns, width = _geometry_of(run, tolerance)
     noise = row_noise(linear, run.fit[2])
     stated = width.copy()
     named: list[int] = []
@@ -217,7 +224,7 @@ def _geometry(run: Run, calibration: Calibration, alpha: float) -> _Named:
     scores = _beyond(linear, noise, run.used, beside, places, told.chosen)
     rest = scores.p_value <= thresholds.OF_ALPHA * alpha
     near = _not_told(linear, noise, run.used, told.width, places, names, dropped) if rest else []
-    return _Named(causes, first, rest, [_grown(told.growth)] if rest else [], near)
+    return _Named(causes, first, rest, [_grown(told.growth, tolerance)] if rest else [], near)
 
 
 def _beyond(
@@ -235,9 +242,16 @@ def _beyond(
     return score_blocks(Tested(here, noise, used, width**-2.0, np.ones(len(width), bool)), blocks, len(named))
 
 
-def _grown(growth: tuple[float, float]) -> str:
+def _widths(tolerance: tuple[float, float]) -> np.ndarray:
+    """How far offsets, shifts and turns of links, and what belongs to a device may be off, in mrad and mm."""
+    offset, shift = np.maximum(tolerance, 1e-9)
+    default = thresholds.TOLERANCE
+    return np.array([1e3 * offset, 1e3 * shift, 1e3 * thresholds.TURN * shift / default[1], 1.0, 1.0])
+
+
+def _grown(growth: tuple[float, float], tolerance: tuple[float, float]) -> str:
     """A note on geometry that is off in a way that no single correction tells."""
-    stated = thresholds.TOLERANCE[1:3]
+    stated = _widths(tolerance)[1:3]
     sizes = [size * scale for size, scale in zip(stated, growth, strict=True)]
     what = "the geometry is off beyond its tolerance in a way that these postures do not place"
     if max(growth) < 1.4:

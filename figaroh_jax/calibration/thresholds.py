@@ -26,7 +26,8 @@ OFFSET = 1e-3  # rad or m: what a good zeroing leaves; beyond it an offset is a 
 OFFSET_SIGMAS = 3.0  # of the estimate and of a good zeroing together
 
 # Causes at kinematic level (`kinematic_diagnosis`, `kinematic_scores`)
-TOLERANCE = (1.0, 0.5, 1.0, 1.0, 1.0)  # mrad, mm, mrad: how well a good robot is built and zeroed
+TOLERANCE = (1e-3, 5e-4)  # rad (or m), m: how well a good robot is zeroed and built, where a task does not say
+TURN = 1e-3  # rad that a link may be turned where it may be shifted by as much as that
 MOST_GEOMETRY = 16  # causes of the geometry
 OF_ALPHA = 1 / 5  # share of the error rate of a task that geometry, play and the rest may each spend
 LOSS_SIGMAS = 1.0  # standard errors by which left-out postures must be worse without a named geometry

@@ -329,7 +329,7 @@ def _judged(
     rest, read = shown and not sticks, False
     if rest and not named and left.line[0] >= LINE_P:  # a line is none of what reading a motion leaves
         errors = reader.errors(problem, joint.step.state, generator)
-        read = errors is not None and only_read(problem, joint.step.state, noise, relative, tolerance, errors)
+        read = only_read(problem, joint.step.state, noise, relative, tolerance, errors, reader.rounding)
         rest = not read
     text = (left.rest.text or ("" if relative.any() else _LESS_THAN_NOISE)) if rest else ""
     if contradictions:

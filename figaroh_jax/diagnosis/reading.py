@@ -1,5 +1,5 @@
-"""What the measuring leaves of a model that is right: steps and noise of the encoders, samples between which friction
-turns, a low pass that takes the corners off a motion.
+"""What the measuring leaves of a model that is right: steps and noise of the encoders, steps of the torque, samples
+between which friction turns, a low pass that takes the corners off a motion.
 
 None of it is noise of the torque. It is there again where a motion is repeated, it goes with the motion, and smooth
 functions of the motion predict some of it; so a rest that it explains says nothing of the model. It is found by reading
@@ -44,6 +44,13 @@ class Reader:
     preprocess: Preprocess
     band: float | None
 
+    @property
+    def rounding(self) -> Float[np.ndarray, " nv"]:
+        """RMS of the error that the steps of each joint's torque make, step / sqrt(12) (N m or N); zero without."""
+        torques = [r.torque for r in self.recordings if r.torque is not None and r.role == "fit"]
+        steps = [[encoder_step(own) for own in torque.T] for torque in torques]
+        return np.max(steps, axis=0) / np.sqrt(12.0)
+
     def errors(
         self, problem: Problem, state: State, generator: np.random.Generator
     ) -> Float[np.ndarray, "readings n M nv"] | None:
@@ -80,17 +87,22 @@ def only_read(
     noise: Float[np.ndarray, " nv"],
     relative: Float[np.ndarray, " nv"],
     tolerance: float,
-    errors: Float[np.ndarray, "readings n M nv"],
+    errors: Float[np.ndarray, "readings n M nv"] | None,
+    rounding: Float[np.ndarray, " nv"],
 ) -> bool:
     """Whether what the state leaves beyond the `noise` (N m or N) is no more than readings of a right model leave, and
     no larger than tolerable in the rows where readings leave little; or is what they leave, row by row, but for what is
-    tolerable.
+    tolerable; or no more than the `rounding` of the torque (RMS, N m or N), which repeats with a motion and is asked
+    alone where there are no `errors`.
 
     `relative` is what it leaves of all rows over each joint's torque: a joint below the tolerance is not looked at. Of
     a joint that stands still at times the rows at rest only have to stay within what its dry friction can hold.
     """
     judged = np.asarray(problem.records.judged) > 0
     left, torque = problem.torque - predicted(problem, state), rms_of(problem.torque, judged)
+    large, rounded = relative > tolerance, rms_of(left, judged) ** 2 - noise**2 <= rounding**2
+    if errors is None:
+        return bool(large.any() and rounded[large].all())
     still = judged & resting(problem) & stands(problem)
     used, squares = judged & ~still, (errors**2).mean(0)
     reach = int(np.ceil(CARRIED / float(problem.records.cutoff) * float(problem.records.rate)))
@@ -102,8 +114,7 @@ def only_read(
     told &= rest <= (tolerance * torque) ** 2
     told |= rms_of(left - errors.mean(0), used) ** 2 - noise**2 <= (tolerance * torque) ** 2
     told &= held(state, left, still)
-    large = relative > tolerance
-    return bool(large.any() and told[large].all())
+    return bool(large.any() and (told | rounded)[large].all())
 
 
 def _read(

@@ -107,7 +107,8 @@ def repeated_power(rows: Rows, residual: Float[np.ndarray, "nv T"]) -> tuple[Flo
     from scipy.special import stdtr  # scipy is slow to import
 
     *own, together = stdtr(np.maximum(used - 1, 1), -t)
-    return products.sum(1), float(min(1.0, 2 * min(together, len(own) * min(own))))
+    p = together if len(own) == 1 else 2 * min(together, len(own) * min(own))
+    return products.sum(1), float(min(1.0, p))
 
 
 def beyond_noise(
@@ -304,7 +305,7 @@ def tolerated(largest: float, tolerance: float, sticks: bool, read: bool = False
     `largest` is that of any joint over its torque.
     """
     if read:
-        return "the steps of the encoders and the time between samples leave as much of a model that is right"
+        return "the steps of the sensors and the time between samples leave as much of a model that is right"
     if sticks:
         return "it stands where joints are at rest, as dry friction allows"
     if largest > tolerance:
