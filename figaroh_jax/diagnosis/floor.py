@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..effects.catalogue import CATALOGUE
 from ..estimation import noise
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Prior, Rows, fit, tall
+from ..results import Name
 from .comparison import ground, judge_grown, t_value
 from .evidence import Score
 from .flexible import families
@@ -31,7 +34,7 @@ __all__ = [
 ]
 
 MOST_LEAKED = 4.0  # times the power, that what leaks through rows left out is told of a band at once
-ROUNDS = 2  # of the rich model's fit and the spectrum in turn
+ROUNDS = 2  # of the fit and the spectrum of repeats' differences in turn
 RICHNESS = 10  # groups of columns in the rich model
 RICH_CUT = 1e-9  # of the unit-diagonal Gram of the rich model
 COLUMN_CUT = 1e-8  # of the longest column: below, a column of the rigid body is what rounding leaves of zero
@@ -104,7 +107,7 @@ def foretold(problem: Problem, state: State, forbid: Collection[str] = ()) -> Bo
     """
     _, scale, count = _alike(problem, state)
     response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
-    _, blocks = _rich(problem, state, response, forbid, count >= ENOUGH, RICHNESS)
+    blocks = _rich(problem, state, response, forbid, count >= ENOUGH, RICHNESS).blocks
     step, out = stand(problem, state, response), np.zeros(len(scale), bool)
     base = ground(step.verdicts, step.state.prior, step.folded)
     for joint in range(len(scale)):
@@ -184,21 +187,50 @@ def _from_rich_model(
     """
     response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
     long, smooth = count >= ENOUGH or (richness == 1 and _resolved(problem)), count >= ENOUGH and richness > 1
-    for _ in range(ROUNDS):
-        rows, _ = _rich(problem, state, response, forbid, smooth, richness)
-        basis, y = _orthonormal(rows), rows.y.reshape(-1)
-        residual = (y - basis @ (basis.T @ y)).reshape(rows.y.shape)
-        if not long:
-            independent = count * problem.passed
-            degrees = independent - (basis.reshape(len(rows.y), -1, basis.shape[1]) ** 2).sum((1, 2))
-            degrees = np.maximum(degrees, independent / 4)
-            squares = ((residual * scale[:, None]) ** 2).sum(1)
-            return noise.white(squares / degrees, float(problem.records.rate) / 2, degrees)
-        n, _, length, nv = problem.records.shape
-        taken = np.moveaxis(basis.reshape(nv, n, length, -1), 0, 2)
-        spectrum = _fit(problem, residual, response, taken)
-        response = whitening_of(problem, spectrum)
-    return spectrum  # pyright: ignore[reportPossiblyUnboundVariable]  # the loop runs at least once
+    rich = _rich(problem, state, response, forbid, smooth, richness)
+    basis, theta = _projection(rich.rows)
+    residual = rich.rows.y - rich.rows.X @ theta
+    if not long:
+        independent = count * problem.passed
+        degrees = independent - (basis.reshape(len(scale), -1, basis.shape[1]) ** 2).sum((1, 2))
+        degrees = np.maximum(degrees, independent / 4)
+        squares = ((residual * scale[:, None]) ** 2).sum(1)
+        return noise.white(squares / degrees, float(problem.records.rate) / 2, degrees)
+    n, _, length, nv = problem.records.shape
+    taken = np.moveaxis(basis.reshape(nv, n, length, -1), 0, 2)
+    # what the same model leaves of whitened rows: slow noise there carries little through rows that are left out
+    response = whitening_of(problem, _fit(problem, residual, response, taken))
+    again = _behind(problem, rich, response)
+    return _fit(problem, again.y - again.X @ theta, response, taken)
+
+
+class _Rich(NamedTuple):
+    """The rich model: its rows, the state that its columns are evaluated at, and each group that it took, by name, grid
+    point and what is kept of its columns."""
+
+    rows: Rows
+    state: State
+    taken: list[tuple[Name, int, Float[np.ndarray, "k directions"]]]
+
+    @property
+    def blocks(self) -> list[Float[np.ndarray, "nv T k"]]:
+        """The columns of each group in the rows of all joints."""
+        ends = np.cumsum([kept.shape[1] for *_, kept in self.taken])
+        first = self.rows.X.shape[2] - (ends[-1] if len(ends) else 0)
+        return np.split(self.rows.X[:, :, first:], ends[:-1], axis=2) if self.taken else []
+
+
+def _behind(problem: Problem, rich: _Rich, response: Float[np.ndarray, "F nv"]) -> Rows:
+    """The rows of the rich model behind another response."""
+    rows = whitened(problem, rich.state, response)
+    names = [name for name, *_ in rich.taken]
+    others = [effect for effect in CATALOGUE if effect not in {name.effect for name in names}]
+    groups = catalogue(problem, rich.state, rows, response, others)
+    if not {name.effect for name in names} <= {*CATALOGUE}:
+        groups += families(problem, rich.state, response, still=True)
+    found = {group.name: group for group in groups}
+    more = [_full(rows, found[name], point) @ kept for name, point, kept in rich.taken]
+    return rows._replace(X=np.concatenate([rows.X, *more], axis=2))
 
 
 def _rich(
@@ -208,14 +240,14 @@ def _rich(
     forbid: Collection[str],
     smooth: bool,
     richness: int,
-) -> tuple[Rows, list[Float[np.ndarray, "nv T k"]]]:
-    """Rows of the state with the columns that a forward selection takes, and these; `smooth` families among them."""
+) -> _Rich:
+    """Rows of the state with the columns that a forward selection takes; `smooth` families among them."""
     rows = whitened(problem, state, response)
     state = solved(state, fit(rows, state.prior).theta)
     groups = catalogue(problem, state, rows, response, forbid)
     if smooth:
         groups += families(problem, state, response, still=True)
-    blocks, prior, found, gram = [], state.prior, None, tall(rows.X).T @ tall(rows.X)
+    taken, prior, found, gram = [], state.prior, None, tall(rows.X).T @ tall(rows.X)
     for _ in range(richness):
         found = screen(rows, fit(rows, prior, gram), groups, found)
         scores = found.scores
@@ -226,12 +258,13 @@ def _rich(
         if scores[best].z.max() < _largest_by_chance(scores):
             break  # the best of so many that noise alone would have: without it, the residual would be less than noise
         point = int(np.argmax(scores[best].Q))
-        more = _full(rows, groups[best], point) @ kept_columns(scores[best].root[point])
+        kept = kept_columns(scores[best].root[point])
+        more = _full(rows, groups[best], point) @ kept
         X = np.concatenate([rows.X, more], axis=2)
         gram = _grown_gram(gram, tall(X), tall(more))
         rows, prior = rows._replace(X=X, Xi=X), prior.extended(more.shape[2])
-        blocks.append(more)
-    return rows, blocks
+        taken.append((groups[best].name, point, kept))
+    return _Rich(rows, state, taken)
 
 
 def _grown_gram(
@@ -264,14 +297,18 @@ def kept_columns(root: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k directi
     return root[np.abs(root).max(1) > 0].T
 
 
-def _orthonormal(rows: Rows) -> Float[np.ndarray, "nvT columns"]:
-    tall = rows.X.reshape(rows.y.size, -1)
-    scale = np.sqrt((tall**2).sum(0))
+def _projection(rows: Rows) -> tuple[Float[np.ndarray, "nvT columns"], Float[np.ndarray, " P"]]:
+    """Orthonormal basis of what the rows' columns span, and the coefficients that project the torque on it."""
+    X = rows.X.reshape(rows.y.size, -1)
+    scale = np.sqrt((X**2).sum(0))
     seen = scale > COLUMN_CUT * scale.max()
-    tall = tall[:, seen] / scale[seen]
-    values, vectors = np.linalg.eigh(tall.T @ tall)
+    X = X[:, seen] / scale[seen]
+    values, vectors = np.linalg.eigh(X.T @ X)
     keep = values > RICH_CUT
-    return tall @ (vectors[:, keep] / np.sqrt(values[keep]))
+    directions = vectors[:, keep] / np.sqrt(values[keep])
+    basis, theta = X @ directions, np.zeros(len(scale))
+    theta[seen] = directions @ (basis.T @ rows.y.reshape(-1)) / scale[seen]
+    return basis, theta
 
 
 def _fit(
