@@ -62,7 +62,7 @@ from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_
 from .setting import Setting, prepared_signals, setting_beside, setting_of
 from .standstill import left_moving, resting
 from .step import Step, stand, with_causes
-from .thresholds import ALPHA_OF_A_NAME, AS_WELL, FEW_CAUSES, FOR_SURE, LINE_P, NO_REST, REST_P
+from .thresholds import ALPHA_OF_A_NAME, AS_WELL, FEW_CAUSES, FOR_SURE, LINE_P, NO_REST, OF_REPEATED, REST_P
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess, Task
@@ -436,12 +436,13 @@ def _left(
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
     loud, quiet = beyond_noise(problem, joint.step.linear.residual, spectrum, whitening, generator)
-    there, sure = left.there, not (problem.layout.repeats or short(problem, joint.step.state))
+    there, rows, linear = left.there, joint.step.rows, joint.step.linear
     if not there and not tolerable and (wrong or loud.any()):
         # of few rows a rich model's residual is less than the noise, and what repeats do not repeat is no misfit
-        there = sure or bool((foretold(problem, joint.step.state, forbid) & (wrong | (loud > 0))).any())
+        again = loud <= OF_REPEATED * repeating(problem, rows, linear.residual, np.ones(linear.residual.shape, bool))
+        there = not short(problem, joint.step.state) and bool(wrong or (again & (loud > 0)).any())
+        there = there or bool((foretold(problem, joint.step.state, forbid) & (wrong | (loud > 0))).any())
     if quiet.any() and not there and not found:  # rows of little weight have less than noise
-        rows, linear = joint.step.rows, joint.step.linear
         full = np.moveaxis(problem.records.weight >= problem.records.fitted, 2, 0).reshape(rows.y.shape)
         quiet = beyond_noise(problem, linear.residual, spectrum, whitening, generator, full, (rows, linear))[1]
     if not problem.layout.repeats and not found:  # what is left is then no noise, nor is it known how much of it is
@@ -453,7 +454,7 @@ def _left(
     )
     # what a wrong law leaves shows in all rows too, and is there again in a repeat: what noisy positions make is not
     beyond = np.minimum(beyond, loud)
-    beyond = np.minimum(beyond, repeating(problem, joint.step.rows, joint.step.linear.residual, moves))
+    beyond = np.minimum(beyond, repeating(problem, rows, linear.residual, moves))
     misfit = (alone > 0) | (relative_rest(problem, first.state, noise) > tolerance)
     followed = flexible.each * (predicted and flexible.p < REST_P)
     moved = (alone > 0) | (left_moving(problem, first.state, noise) > tolerance)

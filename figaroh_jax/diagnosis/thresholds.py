@@ -82,6 +82,7 @@ BEYOND_TRUST = 0.01  # p-value of the squares of their deviations: below, they a
 REST_P = 0.01  # p-value of a rest
 LINE_P = 1e-3  # p-value of a line in the spectrum
 REPEATED, REPEATED_SHARE = 0.08, 0.05  # excess that repeats: absolute, and as a share of the first excess
+OF_REPEATED = 2.0  # times the squares that repeats have in common: what is louder than noise by more is of one alone
 FITTED, FITTED_SHARE = 0.03, 0.03  # excess that a flexible model or the catalogue still scores on
 UNREPEATED = 0.01  # the same where no recording repeats another
 T_REST = 2.3  # t of the blocks: that smooth functions predict the rest on data they were not fitted to
