@@ -52,6 +52,7 @@ from .rest import (
     predictable,
     relative_rest,
     repeating,
+    roughly_predictable,
     significance,
     tolerated,
     verdict,
@@ -445,8 +446,9 @@ def _left(
     if quiet.any() and not there and not found:  # rows of little weight have less than noise
         full = np.moveaxis(problem.records.weight >= problem.records.fitted, 2, 0).reshape(rows.y.shape)
         quiet = beyond_noise(problem, linear.residual, spectrum, whitening, generator, full, (rows, linear))[1]
-    if not problem.layout.repeats and not found:  # what is left is then no noise, nor is it known how much of it is
-        there = there or bool((quiet & (relative_rest(problem, joint.step.state, 0 * noise) > tolerance)).any())
+    if not problem.layout.repeats and not found and not there:  # nor is it known how much of what is left is noise
+        large = relative_rest(problem, joint.step.state, 0 * noise) > tolerance
+        there = bool((quiet & large).any()) or roughly_predictable(problem, joint.step, whitening, large)
     moves = np.moveaxis(~resting(problem), 2, 0).reshape(joint.step.rows.y.shape)
     beyond, alone = (
         beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)[0]

@@ -19,9 +19,19 @@ from .screening import Group, Null, family_p, screen
 from .state import FRICTION_PRECISION, State, whitened
 from .step import Step
 
-__all__ = ["Smooth", "dependences", "families", "flexible_p", "friction_width", "smooth_functions", "to_unit"]
+__all__ = [
+    "Smooth",
+    "dependences",
+    "families",
+    "flexible_p",
+    "friction_width",
+    "rough_functions",
+    "smooth_functions",
+    "to_unit",
+]
 
 DEGREES = 6  # of the polynomials in a joint's position; of the cosines over time one less
+FINEST = 24  # periods over the range of a joint: a finer ripple of its position is not looked for
 WIDTHS = (0.0, 0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # rad/s or m/s
 WIDTH_GAIN = 10.0  # whitened squares that a smooth reversal must take away
 
@@ -189,6 +199,17 @@ def smooth_functions(motion: Motion) -> list[Float[np.ndarray, "k nN"]]:
         more = [speed, 2 * speed**2 - 1, load, 2 * load**2 - 1, s * load, s * (2 * load**2 - 1), np.ones_like(s)]
         out.append(np.stack([*own["position"], *own["friction"], *more]))
     return out
+
+
+def rough_functions(motion: Motion, joint: int) -> list[Float[np.ndarray, "k nN"]]:
+    """Functions of the motion that no smooth one follows, in groups: sines of the joint's own position, of each two
+    successive numbers of periods over its range to `FINEST`; and direction, velocity and acceleration of the others."""
+    q = np.asarray(motion.angle)[:, joint]
+    turns = 2 * np.pi * np.arange(1, FINEST + 1)[:, None] * (q - q.min()) / max(float(np.ptp(q)), 1e-12)
+    waves = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    others = [np.asarray(x).T for x in (motion.direction, motion.velocity, motion.acceleration)]
+    beside = np.concatenate([np.delete(x, joint, axis=0) for x in others])
+    return [*(waves[k : k + 2].reshape(4, -1) for k in range(FINEST - 1)), *([beside] if len(beside) else [])]
 
 
 def dependences(motion: Motion, joint: int) -> dict[Dependence, list[Float[np.ndarray, " nN"]]]:

@@ -13,8 +13,8 @@ from ..estimation.noise import Spectrum
 from ..estimation.rows import Linear, Rows, tall
 from ..recordings.stacked import filter_rows
 from ..results import Dependence, Part, Verdict
-from .comparison import ground, judge_grown, t_value
-from .flexible import Smooth, dependences
+from .comparison import ground, judge_grown, t_needed, t_value
+from .flexible import Smooth, dependences, rough_functions
 from .holdout import residual_rms
 from .problem import Problem
 from .screening import CHUNK, Group, draw_noise, noise_squares
@@ -47,6 +47,7 @@ __all__ = [
     "relative_rest",
     "repeated_power",
     "repeating",
+    "roughly_predictable",
     "significance",
     "tolerated",
     "verdict",
@@ -206,6 +207,22 @@ def predictable(step: Step, groups: Sequence[Group]) -> bool:
         own = judge_grown(step.rows, base, joints, group.columns.Z[0])
         worse, better = (v.own(step.rows, joints) for v in (step.verdicts, own))
         if better.sum() < worse.sum() and t_value(worse, better) > T_REST:
+            return True
+    return False
+
+
+def roughly_predictable(
+    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], asked: Bool[np.ndarray, " nv"]
+) -> bool:
+    """Whether functions of the motion that no smooth one follows predict what is left at a joint that is `asked`, on
+    data they were not fitted to: a ripple and a coupling that the catalogue lacks pass for noise without repeats."""
+    base, joints = ground(step.verdicts, step.state.prior, step.folded), np.flatnonzero(asked)
+    each = [(int(joint), columns) for joint in joints for columns in rough_functions(step.state.motion, int(joint))]
+    for joint, columns in each:
+        rows = _rows_at(problem, step.state, columns, whitening, joint)
+        grown = judge_grown(step.rows, base, (joint,), rows[:, None])
+        worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, grown))
+        if better.sum() < worse.sum() and t_value(worse, better) > t_needed(len(worse), T_REST, len(each)):
             return True
     return False
 
