@@ -30,9 +30,12 @@ def loud(case: Case) -> np.ndarray:
 
 
 @needs_robots
-def test_the_noise_beside_a_large_ripple_is_that_of_its_sensor():
-    """It had been told up to eight times too large, and the intervals with it; below 2.2 times it stays."""
-    seed = secrets.randbits(31)
+@pytest.mark.parametrize("seed", [secrets.randbits(31), 1325230507], ids=["drawn", "slow end of a motion"])
+def test_the_noise_beside_a_large_ripple_is_that_of_its_sensor(seed: int):
+    """It had been told up to eight times too large, and the intervals with it; below 2.2 times it stays.
+
+    Where a joint creeps at the end, a wide reversal of its friction had made up for a part of the ripple.
+    """
     hidden = make_case([("torque_ripple", 0.8, ("joint_5",))], repeats=1, trajectories=2, seed=seed)
     without = make_case(repeats=1, trajectories=2, seed=seed)
     clean, found = diagnosed(without), diagnosed(hidden)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -69,8 +70,10 @@ def flexible_p(
     return Smooth(p, found.groups[best].name, float(score.Q.max() - score.rank.max()), more)
 
 
-def friction_width(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> Problem:
-    """The problem with the half width of each joint's dry friction that fits best, from `WIDTHS`.
+def friction_width(
+    problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], joints: Sequence[int] | None = None
+) -> Problem:
+    """The problem with the half width of each joint's dry friction that fits best, from `WIDTHS`; of some `joints`.
 
     A simulator smooths Coulomb friction, a real gear rounds it: taken as a hard sign, the rest would be named Stribeck.
     A joint keeps a width of zero unless another lowers the squares by more than `WIDTH_GAIN`. Smooth functions of
@@ -95,7 +98,7 @@ def friction_width(problem: Problem, state: State, whitening: Float[np.ndarray, 
         b += columns(joint, y[None])[0]
     width = np.array(problem.width)
     signs = [_with_width(problem, state, whitening, w) for w in WIDTHS]
-    for joint in range(problem.model.nv):
+    for joint in range(problem.model.nv) if joints is None else joints:
         column = _coulomb_column(problem, state, joint)
         if column is None:
             continue

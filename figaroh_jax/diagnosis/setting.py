@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..estimation.noise import Spectrum
 from ..recordings.dataset import Recording
@@ -21,7 +21,7 @@ from .layout import checked_repeats, held_rows, layout
 from .problem import Problem
 from .state import State, baseline, stated_effects, with_width
 from .step import stand
-from .thresholds import MOST_OF_RESIDUAL, PASSED_FOR_NOISE, WEIGHT_ROUNDS
+from .thresholds import MOST_OF_RESIDUAL, OF_ANOTHER_WIDTH, PASSED_FOR_NOISE, WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_reversals
 
 if TYPE_CHECKING:
@@ -121,23 +121,27 @@ def setting_of(
 
 
 def setting_beside(here: Setting, state: State, forbid: Sequence[str]) -> Setting | None:
-    """The setting with new noise and weights at the joints where a cause has passed for noise; None without any.
+    """The setting with new noise, weights and width of friction at the joints where a cause has passed for noise, or
+    for such a width; None without any.
 
     What no group of the rich model follows, as a ripple of many periods, counts as noise until it is known (not where
-    repeats tell the noise), and weights by the baseline's residual hold every cause. The rows of such a joint then say
-    too little of what it shares with the others: links and laws of the whole robot follow these alone. The `state`
-    holds all that was found; the other joints keep what they have, so that what is told of them does not hang on a
-    cause elsewhere.
+    repeats tell the noise), weights by the baseline's residual hold every cause, and a wide reversal of the friction
+    makes up for some of it. The rows of such a joint then say too little of what it shares with the others: links and
+    laws of the whole robot follow these alone. The `state` holds all that was found; the other joints keep what they
+    have, so that what is told of them does not hang on a cause elsewhere.
     """
     problem, first = here.problem, stand(here.problem, here.start, here.whitening)
     before, residual = residual_rms(problem, first.state), residual_rms(problem, state)
     most = residual < MOST_OF_RESIDUAL * before
     if not most.any():
         return None
+    turned, problem = _turned_elsewhere(problem, state, here.whitening, residual, most)
+    state = with_width(problem, state)
     spectrum, _ = noise_floor(problem, state, forbid)
     passed = most & (noise_rms(problem, spectrum) < PASSED_FOR_NOISE * noise_rms(problem, here.spectrum))
     if here.white and not problem.layout.repeats:
         passed = most
+    passed |= turned
     if not passed.any():
         return None
     spectrum = here.spectrum._replace(
@@ -148,4 +152,24 @@ def setting_beside(here: Setting, state: State, forbid: Sequence[str]) -> Settin
     whitening = np.where(passed, own, here.whitening)
     even = problem.weighted(problem.records.fitted)
     weight = np.where(passed, weighted_by_speed(even, state, whitening).records.weight, problem.records.weight)
-    return here._replace(problem=problem.weighted(weight), spectrum=spectrum, whitening=whitening)
+    start = with_width(problem, here.start)
+    return here._replace(problem=problem.weighted(weight), start=start, spectrum=spectrum, whitening=whitening)
+
+
+def _turned_elsewhere(
+    problem: Problem,
+    state: State,
+    whitening: Float[np.ndarray, "F nv"],
+    residual: Float[np.ndarray, " nv"],
+    joints: Bool[np.ndarray, " nv"],
+) -> tuple[Bool[np.ndarray, " nv"], Problem]:
+    """The joints whose friction surely reverses over another width beside all that was found, and the problem with it.
+
+    `residual` is what the state leaves (RMS, N m or N).
+    """
+    other = friction_width(problem, state, whitening, np.flatnonzero(joints).tolist())
+    if other is problem:
+        return np.zeros_like(joints), problem
+    now = residual_rms(other, stand(other, with_width(other, state), whitening).state)
+    turned = (other.width != problem.width) & (now < OF_ANOTHER_WIDTH * residual)
+    return turned, problem.with_width(np.where(turned, other.width, problem.width)) if turned.any() else problem

@@ -25,6 +25,7 @@ WHITE_GAIN = 0.02  # relative fall of the folds' error in N m from which rows ar
 FEWER = (2.0, 4.0, 8.0, 16.0)  # rows of the answer's fit that may count as one beside what is believed of the links
 MOST_OF_RESIDUAL = 0.5  # of a joint's residual (RMS): below, what was found there was most of it
 PASSED_FOR_NOISE = 0.45  # of the RMS that noise was told: below, beside what was found, that had passed for noise
+OF_ANOTHER_WIDTH = 0.9  # of a joint's residual: where it falls below, its friction reverses over another width
 AS_WELL = 1.05  # times the error on held-out data: the answer with such weights anew may not predict worse
 SAME_MOTION = 0.05  # of a joint's range (standard deviation): repeats that differ by more are none
 
