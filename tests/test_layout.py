@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,10 @@ import robots
 from synthetic import DT, STEP, made_signals, swing
 
 from figaroh_jax.diagnosis import shifts
-from figaroh_jax.diagnosis.layout import describe_folds, excitations, held_rows, layout
+from figaroh_jax.diagnosis.layout import describe_folds, excitations, held_rows, layout, repeats_not_said
 from figaroh_jax.effects.base import Motion
 from figaroh_jax.effects.sensors import EncoderScale
-from figaroh_jax.recordings.signals import Signals
+from figaroh_jax.recordings.signals import Signals, kept_out_in_vain
 from figaroh_jax.recordings.stacked import Records, open_rows, stack
 
 ROW = STEP * DT
@@ -198,3 +199,25 @@ def test_short_recordings_stand_in_one_slot_and_every_row_is_as_it_was(tmp_path:
     assert all(joined.spans[5].slot != at.slot for at in joined.spans[:5])
     for name, rows in before.items():
         np.testing.assert_allclose(after[name], rows, rtol=0, atol=1e-9 * max(1.0, np.abs(rows).max()), err_msg=name)
+
+
+def test_a_recording_kept_out_that_moves_as_a_fitted_one_is_told():
+    """Also where it is a part of it; not where it moves otherwise, and not of a robot whose torque is not known."""
+    fitted = [made_signals(12.0, name="first", repeat="A"), made_signals(12.0, other, name="second")]
+    same = made_signals(12.0, other, begin=3 * ROW, name="same", role="holdout")
+    part = made_signals(8.0, begin=2.0, name="part", role="holdout")
+    else_ = made_signals(12.0, third, name="else", role="holdout")
+    notes = kept_out_in_vain([*fitted, same, part, else_, replace(same, name="silent", torque=None)])
+    assert [tuple(word for word in note.split() if word in ("same", "part", "first", "second")) for note in notes] == [
+        ("same", "second"),
+        ("part", "first"),
+    ]
+
+
+def test_fitted_recordings_that_repeat_each_other_without_a_label_are_told():
+    first, second = made_signals(12.0, name="first", repeat="A"), made_signals(12.0, name="second", repeat="A")
+    unsaid, moves = made_signals(12.0, begin=2 * ROW, name="unsaid"), made_signals(12.0, other, name="else")
+    assert not repeats_not_said([first, second, moves])
+    (note,) = repeats_not_said([first, moves, unsaid])
+    assert note.startswith("unsaid moves as first does")
+    assert not repeats_not_said([first, moves, replace(unsaid, role="holdout")])

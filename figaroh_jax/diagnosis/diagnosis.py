@@ -23,7 +23,7 @@ from ..formats.robotfile import load_robot, stated_baseline
 from ..recordings.bandwidth import note_on
 from ..recordings.checks import checked_recordings
 from ..recordings.dataset import Recording, read_recordings
-from ..recordings.signals import Signals
+from ..recordings.signals import Signals, kept_out_in_vain
 from ..results import Cause, Diagnosis, Experiment, Name, Nearest, Rest, Verdict
 from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
@@ -41,7 +41,7 @@ from .gates import physical_sign
 from .holdout import residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_rest
 from .judgement import KeptOut, Left, Searched, as_slow_noise, doubted_rest, reasons_against, standings_of, sticks_alone
-from .layout import describe_folds
+from .layout import describe_folds, repeats_not_said
 from .naming import beyond_simpler, strong
 from .reading import Reader, only_read
 from .rest import (
@@ -519,7 +519,7 @@ def _scheme(signals: Sequence[Signals]) -> str:
 
 
 def _notes(signals: Sequence[Signals], here: Setting, last: Step) -> tuple[str, ...]:
-    notes = [note for s in signals for note in s.notes]
+    notes = [*(note for s in signals for note in s.notes), *repeats_not_said(signals), *kept_out_in_vain(signals)]
     if not here.problem.layout.repeats:
         notes.append(
             "no recording repeats another: the noise is estimated from the residual of a flexible model, which is less"

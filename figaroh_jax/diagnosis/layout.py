@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..recordings.signals import Signals, align, common_rows
+from ..recordings.signals import SAME_MOTION, Signals, align, apart, common_rows
 from ..recordings.stacked import Records
 from .problem import Layout
-from .thresholds import SAME_MOTION
 
-__all__ = ["checked_repeats", "describe_folds", "held_rows", "layout"]
+__all__ = ["checked_repeats", "describe_folds", "held_rows", "layout", "repeats_not_said"]
 
 BLOCK, SHORT_BLOCK, SHORT = 1.0, 0.3, 9.99  # s: of a block, of a block in recordings shorter than the third
 FOLDS = 5  # where the excitations are few: blocks go to them in turn
@@ -53,8 +52,8 @@ def checked_repeats(signals: Sequence[Signals]) -> list[Signals]:
         if leader is one:
             out.append(one)
             continue
-        apart, note = _compared(leader, one)
-        if apart > SAME_MOTION:
+        note = _compared(leader, one)
+        if apart(leader, one) > SAME_MOTION:
             text = f"{one.name} does not repeat {leader.name}: {note}; taken as another excitation"
             out.append(replace(one, repeat=None, notes=(*one.notes, text)))
         else:
@@ -62,17 +61,37 @@ def checked_repeats(signals: Sequence[Signals]) -> list[Signals]:
     return out
 
 
-def _compared(first: Signals, second: Signals) -> tuple[float, str]:
-    """Difference of two repeats' positions over the joint's own range (standard deviations), and all of it in words."""
+def repeats_not_said(signals: Sequence[Signals]) -> tuple[str, ...]:
+    """Notes on fitted recordings that move as another one does though no label says so: they could tell the noise."""
+    fitted, notes = [one for one in signals if one.role == "fit"], []
+    for k, one in enumerate(fitted):
+        before = [other for other in fitted[:k] if not (one.repeat and other.repeat) and _as_long_and_far(other, one)]
+        like = next((other for other in before if apart(other, one) <= SAME_MOTION), None)
+        if like is not None:
+            notes.append(
+                f"{one.name} moves as {like.name} does: with the same `repeat` under `data` their differences would"
+                " tell the noise"
+            )
+    return tuple(notes)
+
+
+def _as_long_and_far(first: Signals, second: Signals) -> bool:
+    """Whether two recordings last as long and their joints move as far; without that none repeats the other."""
+    ends = [one.time[-1] - one.time[0] for one in (first, second)]
+    far = [np.ptp(one.position, axis=0) for one in (first, second)]
+    return max(ends) <= 1.2 * min(ends) and bool(np.all(np.abs(far[0] - far[1]) <= 0.2 * np.max(far, axis=0)))
+
+
+def _compared(first: Signals, second: Signals) -> str:
+    """How two repeats differ, in words."""
     own, other = common_rows(first, second)
     q, p = first.position[first.rows.index[own]], second.position[second.rows.index[other]]
-    apart, motion = (q - p).std(axis=0), q.std(axis=0)
     late = 1e3 * float(np.mean(second.rows.row_times[other] - first.rows.row_times[own]))
-    text = f"its clock is {late:+.4g} ms off, positions within {apart.max():.2g} rad (or m)"
+    text = f"its clock is {late:+.4g} ms off, positions within {(q - p).std(axis=0).max():.2g} rad (or m)"
     if first.torque is not None and second.torque is not None:
         torque = first.torque[first.rows.index[own]] - second.torque[second.rows.index[other]]
         text += f", torques within {torque.std(axis=0).max():.2g} N m (or N)"
-    return float((apart / np.maximum(motion, 1e-3 * max(float(motion.max()), 1e-12))).max()), text
+    return text
 
 
 def held_rows(signals: Sequence[Signals], records: Records) -> Float[np.ndarray, "n M nv"]:

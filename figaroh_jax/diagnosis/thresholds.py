@@ -27,7 +27,6 @@ MOST_OF_RESIDUAL = 0.5  # of a joint's residual (RMS): below, what was found the
 PASSED_FOR_NOISE = 0.45  # of the RMS that noise was told: below, beside what was found, that had passed for noise
 OF_ANOTHER_WIDTH = 0.9  # of a joint's residual: where it falls below, its friction reverses over another width
 AS_WELL = 1.05  # times the error on held-out data: the answer with such weights anew may not predict worse
-SAME_MOTION = 0.05  # of a joint's range (standard deviation): repeats that differ by more are none
 
 # The search (`contenders`, `gates`, `search`)
 SHORTLIST = 8  # candidates compared exactly, of the whole robot

@@ -30,7 +30,7 @@ from ..formats.robotfile import load_robot, stated_baseline
 from ..recordings.bandwidth import note_on
 from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
-from ..recordings.signals import Resampled, Signals, as_slow_as_torque, prepare_all
+from ..recordings.signals import Resampled, Signals, as_slow_as_torque, kept_out_in_vain, prepare_all
 from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
 from ..simulators.native import as_backend
@@ -198,7 +198,8 @@ def identify(
         progress("judging", 0.85)
         found = _judged(problem, regression, start.parameters, covariance, last, trust, structural.rank)
     notes = [*warned, *left_out, *found.notes, *dropped(regression.signals, model), *note_on(read.band)]
-    return replace(found, band=read.band, notes=(*notes, *(note for one in regression.signals for note in one.notes)))
+    notes += [*(note for one in regression.signals for note in one.notes), *kept_out_in_vain(regression.signals)]
+    return replace(found, band=read.band, notes=tuple(notes))
 
 
 _LOOSENED = (

@@ -38,11 +38,13 @@ __all__ = [
     "RowFilter",
     "Signals",
     "align",
+    "apart",
     "as_slow_as_torque",
     "choose_rates",
     "common_rows",
     "filter_rows",
     "frequencies",
+    "kept_out_in_vain",
     "let_through",
     "prepare",
     "prepare_all",
@@ -61,6 +63,7 @@ STILL = 1e-12  # of rad or m: what a joint that stands still moves by rounding
 HALF_OCTAVE = 2**-0.5
 WORTH_A_STEP = 0.1  # fall of the squares that a model leaves of the torque (mean logarithm) for half an octave less
 AT_COST = 1 / 3  # of that fall: what the squares of no joint may rise by
+SAME_MOTION = 0.05  # of a joint's range (standard deviation): recordings that differ by more do not repeat each other
 MOVES_MORE = 1.25  # times the acceleration that such a step takes of fitted recordings: more is motion, no error
 
 
@@ -416,6 +419,30 @@ def common_rows(first: Signals, second: Signals) -> tuple[slice, slice]:
     shift = align(first, second)
     begin, end = max(0, -shift), min(first.rows.kept, second.rows.kept - shift)
     return slice(begin, end), slice(begin + shift, end + shift)
+
+
+def apart(first: Signals, second: Signals) -> float:
+    """Difference of two recordings' positions where they belong together, over the joint's range (both as standard
+    deviations), at the joint where it is largest."""
+    own, other = common_rows(first, second)
+    q, p = first.position[first.rows.index[own]], second.position[second.rows.index[other]]
+    motion = q.std(axis=0)
+    return float(((q - p).std(axis=0) / np.maximum(motion, 1e-3 * max(float(motion.max()), 1e-12))).max())
+
+
+def kept_out_in_vain(signals: Sequence[Signals]) -> tuple[str, ...]:
+    """Notes on recordings that are kept out of the fit, but move as a fitted one: they say nothing of other motions."""
+    fitted, notes = [one for one in signals if one.role == "fit"], []
+    for one in signals:
+        like = None
+        if one.role == "holdout" and one.torque is not None:
+            like = next((other for other in fitted if apart(other, one) <= SAME_MOTION), None)
+        if like is not None:
+            notes.append(
+                f"{one.name} is kept out of the fit but moves as {like.name} does: its error shows how well the model"
+                " repeats that motion, not how it predicts others"
+            )
+    return tuple(notes)
 
 
 def _late_rows(first: Signals, second: Signals) -> float:
