@@ -16,7 +16,7 @@ from figaroh_jax.diagnosis import shifts
 from figaroh_jax.diagnosis.layout import describe_folds, excitations, held_rows, layout, repeats_not_said
 from figaroh_jax.effects.base import Motion
 from figaroh_jax.effects.sensors import EncoderScale
-from figaroh_jax.recordings.signals import Signals, kept_out_in_vain
+from figaroh_jax.recordings.signals import Signals, apart, kept_out_in_vain
 from figaroh_jax.recordings.stacked import Records, open_rows, stack
 
 ROW = STEP * DT
@@ -221,3 +221,11 @@ def test_fitted_recordings_that_repeat_each_other_without_a_label_are_told():
     (note,) = repeats_not_said([first, moves, unsaid])
     assert note.startswith("unsaid moves as first does")
     assert not repeats_not_said([first, moves, replace(unsaid, role="holdout")])
+
+
+def test_recordings_that_have_nothing_in_common_are_far_apart():
+    """Of a motion that only drifts no lag is better than the next, so that its minimum lies far outside of both."""
+    first, second = (
+        made_signals(9.0, lambda t, k=k: np.stack([t + k, t**2 / 9 + 3 * k], 1), name="x") for k in (0, 40)
+    )
+    assert apart(first, second) > 0.05

@@ -470,4 +470,5 @@ def _lag(x: Float[np.ndarray, "n nv"], y: Float[np.ndarray, "m nv"]) -> float:
     best = good[np.argmin(np.abs(lags[good]))]
     left, middle, right = distance[best - 1 : best + 2] if 0 < best < len(lags) - 1 else (np.inf,) * 3
     curvature = left - 2 * middle + right
-    return float(lags[best] + (0.5 * (left - right) / curvature if 0 < curvature < np.inf else 0.0))
+    within = 0.5 * (left - right) / curvature if 0 < curvature < np.inf else 0.0
+    return float(lags[best] + np.clip(within, -1.0, 1.0))  # the nearest to no lag need not be the smallest distance
