@@ -196,12 +196,17 @@ def _from_rich_model(
         degrees = np.maximum(degrees, independent / 4)
         squares = ((residual * scale[:, None]) ** 2).sum(1)
         return noise.white(squares / degrees, float(problem.records.rate) / 2, degrees)
-    n, _, length, nv = problem.records.shape
-    taken = np.moveaxis(basis.reshape(nv, n, length, -1), 0, 2)
     # what the same model leaves of whitened rows: slow noise there carries little through rows that are left out
-    response = whitening_of(problem, _fit(problem, residual, response, taken))
+    response = whitening_of(problem, _fit(problem, residual, response, _taken(problem, basis)))
     again = _behind(problem, rich, response)
-    return _fit(problem, again.y - again.X @ theta, response, taken)
+    basis, theta = _projection(again)
+    return _fit(problem, again.y - again.X @ theta, response, _taken(problem, basis))
+
+
+def _taken(problem: Problem, basis: Float[np.ndarray, "nvT columns"]) -> Float[np.ndarray, "n M nv columns"]:
+    """What a projection takes, by recording, row and joint."""
+    n, _, length, nv = problem.records.shape
+    return np.moveaxis(basis.reshape(nv, n, length, -1), 0, 2)
 
 
 class _Rich(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,10 +17,12 @@ from .comparison import fold_sums
 from .design import fitted_fields, kind, shapes, with_shape
 from .estimates import Fitted, amplitude_places, torque_slopes, with_amplitudes
 from .problem import Problem, family_of
-from .search import Found
 from .state import State, assembled, solved
 from .step import Step, stand
 from .thresholds import SIZE_REGION
+
+if TYPE_CHECKING:
+    from .search import Found
 
 __all__ = [
     "Joint",
@@ -41,6 +43,7 @@ PIECES = 10.0  # functions of a joint's motion that what is left at it goes into
 AS_SURE = 2.0  # times the deviation of a fit up to which another one counts in full
 LATE = 4  # turns: most fits have settled by then
 BACK = 0.5  # of its last move: what a shape goes back by where steps overshoot
+WORSE = 1.0  # squares by which the last turn may cost more than the best one
 POLISH, SETTLED = 10, 0.03  # turns at the most; a turn that moves nothing by more of its standard deviation is the last
 
 
@@ -57,8 +60,10 @@ def polished(problem: Problem, start: State, causes: list[Effect], whitening: Fl
 
     Sensor effects follow the load and the torque, so each turn begins with what the last one made of the baseline.
     A shape that late turns send back as far as it came would go on so for ever: it moves half of the way from then on.
+    A limit that a step has moved beyond all torques is nowhere and has no slope to come back by: where the last turn
+    costs more than an earlier one, that one is the fit.
     """
-    joint = _together(problem, start, causes, whitening)
+    joint = least = _together(problem, start, causes, whitening)
     share, before = np.ones_like(joint.fitted.value), np.zeros_like(joint.fitted.value)
     for turn in range(0 if all(map(_settled, causes)) else POLISH):
         move = _move(joint)
@@ -68,9 +73,10 @@ def polished(problem: Problem, start: State, causes: list[Effect], whitening: Fl
         causes = [moved(e, goal, at) for e, at in zip(joint.causes, goal.places, strict=True)]
         base = solved(start, joint.step.state.theta[: len(start.theta)])
         before, last, joint = move, joint.fitted, _together(problem, base, causes, whitening)
+        least = joint if joint.step.verdicts.cost < least.step.verdicts.cost else least
         if np.all(np.abs(joint.fitted.value - last.value) <= SETTLED * np.sqrt(np.diag(joint.fitted.covariance))):
             break
-    return joint
+    return least if least.step.verdicts.cost < joint.step.verdicts.cost - WORSE else joint
 
 
 def with_misfit(

@@ -56,15 +56,16 @@ class Reader:
     ) -> Float[np.ndarray, "readings n M nv"] | None:
         """Rows that each reading of the state's own torque differs by from its prediction, N m or N.
 
-        Dry friction that turns over a width of the velocity turns at once in what is read: samples further apart than
-        that make such a width of it. None for a robot with quaternions, and where the readings' rows would be others.
+        Dry friction that turns over a width of the velocity turns at once in what is read, and is predicted with that
+        width where this predicts the readings better: samples further apart than that make such a width of it, finer
+        ones do not. None for a robot with quaternions, and where the readings' rows would be others.
         """
         if problem.model.nq != problem.model.nv:
             return None
         sharp = problem.with_width(np.zeros_like(problem.width)) if np.any(problem.width) else problem
         true = on_motion(sharp, state) if sharp is not problem else state
         torque = true.torque(true.theta).reshape(*problem.records.velocity.shape)
-        out = []
+        wide, out = [], []
         for _ in range(READINGS):
             read = [
                 _read(recording, signals, torque[at.slot, at.sample : at.sample + at.samples], generator)
@@ -76,9 +77,16 @@ class Reader:
             records = eqx.tree_at(
                 lambda r: (r.weight, r.judged), records, (problem.records.weight, problem.records.judged)
             )
-            again = Problem(problem.backend, records, problem.layout, problem.trust, problem.width, problem.held)
+            again = Problem(problem.backend, records, problem.layout, problem.trust, sharp.width, problem.held)
             out.append(again.torque - predicted(again, on_motion(again, state)))
-        return np.stack(out)
+            if sharp is not problem:
+                again = again.with_width(problem.width)
+                wide.append(again.torque - predicted(again, on_motion(again, state)))
+        if not wide:
+            return np.stack(out)
+        judged = np.asarray(problem.records.judged) > 0
+        turned, widened = (rms_of(np.sqrt((np.stack(x) ** 2).mean(0)), judged) for x in (out, wide))
+        return np.where(widened < turned, np.stack(wide), np.stack(out))
 
 
 def only_read(

@@ -22,6 +22,7 @@ from .estimates import amplitude_places, with_amplitudes
 from .evidence import block_scores
 from .flexible import friction_width
 from .gates import ambiguous, exists, gains, passes, physical_sign, rivals, simpler
+from .joint import polished
 from .problem import Problem
 from .screening import DRAWS, Null, Screen, Shown, catalogue, family_p, place_p, screen
 from .state import State, solved, with_width
@@ -41,6 +42,9 @@ __all__ = [
 ]
 
 NEAR, CLOSER = 4, 800  # times the level: p-values below which few draws cannot tell from it; draws that can
+BROKEN = (
+    0.02  # of what a cause was to lower the squares by: where it lowers them by so much less, its shape is fitted on
+)
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
 
 
@@ -143,6 +147,7 @@ def find_causes(
             found.append(_found(problem, before, contenders, best, screened, p_values[-1], generator))
             step = with_cause(problem, step, best.effect, whitening)
         ways = {"late" if best.effect.about else kind(best.effect) for best in chosen}
+        promised = chosen[-1].verdicts.cost + BROKEN * (before.verdicts.cost - chosen[-1].verdicts.cost)
         # their rows and columns are large; there is a best one, since some were chosen
         del before, contenders, chosen, best  # pyright: ignore[reportPossiblyUnboundVariable]
         if ways != {"columns"}:
@@ -156,6 +161,15 @@ def find_causes(
         if any(type(f.effect).follows_total for f in found):
             screened = None
             step = _refreshed(problem, state, step, found, whitening)
+            if len(ways) == 1 and step.verdicts.cost > promised:
+                joint = polished(
+                    problem,
+                    solved(with_width(problem, state), step.state.theta[: len(state.theta)]),
+                    [f.effect for f in found],
+                    whitening,
+                )
+                found = [replace(f, effect=e) for f, e in zip(found, joint.causes, strict=True)]
+                step = joint.step
     begun = solved(with_width(problem, state), step.state.theta[: len(state.theta)])
     return Search(problem, begun, found, p_values[0], p_values[-1], shown)
 
