@@ -168,7 +168,8 @@ def _replaced(G: np.ndarray, b: np.ndarray, column: int, cross: np.ndarray, squa
 
 def families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], still: bool = False) -> list[Group]:
     """Smooth functions in the rows of each joint: of its position; of its velocity and position, odd in the velocity;
-    of all positions (second degree); a constant; and, unless `still`, of time."""
+    of all positions (second degree); a constant; and of time. `still`: none of time, but even ones of the velocity,
+    friction that drifts, and that of the other joints."""
     nv = problem.model.nv
     joints = [_smooth(state.motion, joint) for joint in range(nv)]
     series = {
@@ -176,14 +177,26 @@ def families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"
     }
     series["constant"] = [np.ones_like(np.asarray(state.motion.position))]
     series["posture"] = [np.repeat(column[:, None], nv, axis=1) for column in _posture(state.motion)]
+    if still:
+        del series["time"]
+        series |= _of_rest(state.motion)
     groups = []
     for title, columns in series.items():
-        if still and title == "time":
-            continue
         rows = np.stack([filtered_rows(problem.records, one, whitening) for one in columns])
         for joint, name in enumerate(problem.model.joint_names):
             groups.append(Group(Name(title, (name,)), None, Columns((joint,), rows[None, :, joint][:, :, None])))
     return groups
+
+
+def _of_rest(motion: Motion) -> dict[str, list[Float[np.ndarray, "nN nv"]]]:
+    """Functions for the rich model alone: what they take is no slow noise, and they are told of no rest."""
+    v, s = np.asarray(motion.velocity), np.asarray(motion.direction)
+    w = to_unit(np.asarray(motion.time))[:, None]
+    speed = np.stack([to_unit(np.abs(own)) for own in v.T], axis=1)
+    out = {"speed": [np.abs(s), speed, 2 * speed**2 - 1], "drift": [w * s, w**2 * s, w * v]}
+    if s.shape[1] > 1:
+        out["neighbours"] = [np.roll(x, k, axis=1) for k in range(1, s.shape[1]) for x in (s, v)]
+    return out
 
 
 def _posture(motion: Motion) -> list[Float[np.ndarray, " nN"]]:
