@@ -166,10 +166,16 @@ def _replaced(G: np.ndarray, b: np.ndarray, column: int, cross: np.ndarray, squa
     return -float(b @ theta), G, b
 
 
-def families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], still: bool = False) -> list[Group]:
+def families(
+    problem: Problem,
+    state: State,
+    whitening: Float[np.ndarray, "F nv"],
+    still: bool = False,
+    few: bool = False,
+) -> list[Group]:
     """Smooth functions in the rows of each joint: of its position; of its velocity and position, odd in the velocity;
     of all positions (second degree); a constant; and of time. `still`: none of time, but even ones of the velocity,
-    friction that drifts, and that of the other joints."""
+    friction that drifts, and that of the other joints; `few`: of these those of few columns."""
     nv = problem.model.nv
     joints = [_smooth(state.motion, joint) for joint in range(nv)]
     series = {
@@ -179,7 +185,8 @@ def families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"
     series["posture"] = [np.repeat(column[:, None], nv, axis=1) for column in _posture(state.motion)]
     if still:
         del series["time"]
-        series |= _of_rest(state.motion)
+        rest = _of_rest(state.motion)
+        series = rest if few else series | rest
     groups = []
     for title, columns in series.items():
         rows = np.stack([filtered_rows(problem.records, one, whitening) for one in columns])
@@ -193,10 +200,13 @@ def _of_rest(motion: Motion) -> dict[str, list[Float[np.ndarray, "nN nv"]]]:
     v, s = np.asarray(motion.velocity), np.asarray(motion.direction)
     w = to_unit(np.asarray(motion.time))[:, None]
     speed = np.stack([to_unit(np.abs(own)) for own in v.T], axis=1)
-    out = {"speed": [np.abs(s), speed, 2 * speed**2 - 1], "drift": [w * s, w**2 * s, w * v]}
-    if s.shape[1] > 1:
-        out["neighbours"] = [np.roll(x, k, axis=1) for k in range(1, s.shape[1]) for x in (s, v)]
-    return out
+    load = np.stack([to_unit(own) for own in np.asarray(motion.load).T], axis=1)
+    out = {
+        "speed": [np.abs(s), speed, 2 * speed**2 - 1],
+        "drift": [w * s, w**2 * s, w * v],
+        "load": [s * load, s * np.abs(load)],
+    }
+    return out | {f"neighbour {k}": [np.roll(x, k, axis=1) for x in (s, v)] for k in range(1, s.shape[1])}
 
 
 def _posture(motion: Motion) -> list[Float[np.ndarray, " nN"]]:

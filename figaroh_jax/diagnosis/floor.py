@@ -250,8 +250,7 @@ def _rich(
     rows = whitened(problem, state, response)
     state = solved(state, fit(rows, state.prior).theta)
     groups = catalogue(problem, state, rows, response, forbid)
-    if smooth:
-        groups += families(problem, state, response, still=True)
+    groups += families(problem, state, response, still=True, few=not smooth)
     taken, prior, found, gram = [], state.prior, None, tall(rows.X).T @ tall(rows.X)
     for _ in range(richness):
         found = screen(rows, fit(rows, prior, gram), groups, found)
