@@ -26,6 +26,7 @@ __all__ = [
     "families",
     "flexible_p",
     "friction_width",
+    "rich_families",
     "rough_functions",
     "smooth_functions",
     "to_unit",
@@ -166,27 +167,27 @@ def _replaced(G: np.ndarray, b: np.ndarray, column: int, cross: np.ndarray, squa
     return -float(b @ theta), G, b
 
 
-def families(
-    problem: Problem,
-    state: State,
-    whitening: Float[np.ndarray, "F nv"],
-    still: bool = False,
-    few: bool = False,
-) -> list[Group]:
+def families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]) -> list[Group]:
     """Smooth functions in the rows of each joint: of its position; of its velocity and position, odd in the velocity;
-    of all positions (second degree); a constant; and of time. `still`: none of time, but even ones of the velocity,
-    friction that drifts, and that of the other joints; `few`: of these those of few columns."""
-    nv = problem.model.nv
-    joints = [_smooth(state.motion, joint) for joint in range(nv)]
-    series = {
-        title: [np.stack([j[title][k] for j in joints], 1) for k in range(len(joints[0][title]))] for title in joints[0]
-    }
-    series["constant"] = [np.ones_like(np.asarray(state.motion.position))]
-    series["posture"] = [np.repeat(column[:, None], nv, axis=1) for column in _posture(state.motion)]
-    if still:
-        del series["time"]
-        rest = _of_rest(state.motion)
-        series = rest if few else series | rest
+    of all positions (second degree); a constant; and of time."""
+    return _groups(problem, _smooth_series(state.motion), whitening)
+
+
+def rich_families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], few: bool) -> list[Group]:
+    """Smooth functions that stand in for what the catalogue lacks in a model of the noise: none of time, which would
+    take slow noise, but even ones of the velocity, friction that drifts or follows the load, and the friction of the
+    other joints. `few`: the latter alone, which have few columns."""
+    series = _few_series(state.motion)
+    if not few:
+        smooth = _smooth_series(state.motion)
+        del smooth["time"]
+        series |= smooth
+    return _groups(problem, series, whitening)
+
+
+def _groups(
+    problem: Problem, series: dict[str, list[Float[np.ndarray, "nN nv"]]], whitening: Float[np.ndarray, "F nv"]
+) -> list[Group]:
     groups = []
     for title, columns in series.items():
         rows = np.stack([filtered_rows(problem.records, one, whitening) for one in columns])
@@ -195,18 +196,28 @@ def families(
     return groups
 
 
-def _of_rest(motion: Motion) -> dict[str, list[Float[np.ndarray, "nN nv"]]]:
-    """Functions for the rich model alone: what they take is no slow noise, and they are told of no rest."""
+def _smooth_series(motion: Motion) -> dict[str, list[Float[np.ndarray, "nN nv"]]]:
+    nv = np.asarray(motion.velocity).shape[1]
+    joints = [_smooth(motion, joint) for joint in range(nv)]
+    series = {
+        title: [np.stack([j[title][k] for j in joints], 1) for k in range(len(joints[0][title]))] for title in joints[0]
+    }
+    series["constant"] = [np.ones_like(np.asarray(motion.position))]
+    series["posture"] = [np.repeat(column[:, None], nv, axis=1) for column in _posture(motion)]
+    return series
+
+
+def _few_series(motion: Motion) -> dict[str, list[Float[np.ndarray, "nN nv"]]]:
     v, s = np.asarray(motion.velocity), np.asarray(motion.direction)
     w = to_unit(np.asarray(motion.time))[:, None]
     speed = np.stack([to_unit(np.abs(own)) for own in v.T], axis=1)
     load = np.stack([to_unit(own) for own in np.asarray(motion.load).T], axis=1)
-    out = {
+    series = {
         "speed": [np.abs(s), speed, 2 * speed**2 - 1],
         "drift": [w * s, w**2 * s, w * v],
         "load": [s * load, s * np.abs(load)],
     }
-    return out | {f"neighbour {k}": [np.roll(x, k, axis=1) for x in (s, v)] for k in range(1, s.shape[1])}
+    return series | {f"neighbour {k}": [np.roll(x, k, axis=1) for x in (s, v)] for k in range(1, s.shape[1])}
 
 
 def _posture(motion: Motion) -> list[Float[np.ndarray, " nN"]]:

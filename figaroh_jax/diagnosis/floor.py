@@ -15,7 +15,7 @@ from ..estimation.rows import Prior, Rows, fit, tall
 from ..results import Name
 from .comparison import ground, judge_grown, t_value
 from .evidence import Score
-from .flexible import families
+from .flexible import rich_families
 from .problem import Problem
 from .screening import Group, catalogue, screen
 from .state import State, plain_rows, solved, whitened
@@ -232,7 +232,7 @@ def _behind(problem: Problem, rich: _Rich, response: Float[np.ndarray, "F nv"]) 
     others = [effect for effect in CATALOGUE if effect not in {name.effect for name in names}]
     groups = catalogue(problem, rich.state, rows, response, others)
     if not {name.effect for name in names} <= {*CATALOGUE}:
-        groups += families(problem, rich.state, response, still=True)
+        groups += rich_families(problem, rich.state, response, few=False)
     found = {group.name: group for group in groups}
     more = [_full(rows, found[name], point) @ kept for name, point, kept in rich.taken]
     return rows._replace(X=np.concatenate([rows.X, *more], axis=2))
@@ -250,7 +250,7 @@ def _rich(
     rows = whitened(problem, state, response)
     state = solved(state, fit(rows, state.prior).theta)
     groups = catalogue(problem, state, rows, response, forbid)
-    groups += families(problem, state, response, still=True, few=not smooth)
+    groups += rich_families(problem, state, response, few=not smooth)
     taken, prior, found, gram = [], state.prior, None, tall(rows.X).T @ tall(rows.X)
     for _ in range(richness):
         found = screen(rows, fit(rows, prior, gram), groups, found)

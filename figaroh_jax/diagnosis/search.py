@@ -42,9 +42,7 @@ __all__ = [
 ]
 
 NEAR, CLOSER = 4, 800  # times the level: p-values below which few draws cannot tell from it; draws that can
-BROKEN = (
-    0.02  # of what a cause was to lower the squares by: where it lowers them by so much less, its shape is fitted on
-)
+BROKEN = 0.02  # of a cause's drop of the squares: where it keeps less of it than the rest, its shape is fitted on
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
 
 
@@ -116,7 +114,9 @@ def find_causes(
     `after` is what it takes over from another one. It ends once there are `enough`.
 
     A sensor that is late or that winds up rounds the reversals of dry friction, so that their width is fitted anew
-    once such a cause is in: the old one would be made up for by a friction that is not there.
+    once such a cause is in: the old one would be made up for by a friction that is not there. What follows all torque
+    finds another one once it is in (a limit, that of clipped torque): where it then takes less than it promised, all
+    shapes are fitted on before the next cause is looked for.
     """
     generator = generator or np.random.default_rng(0)
     if after is None:
@@ -147,7 +147,8 @@ def find_causes(
             found.append(_found(problem, before, contenders, best, screened, p_values[-1], generator))
             step = with_cause(problem, step, best.effect, whitening)
         ways = {"late" if best.effect.about else kind(best.effect) for best in chosen}
-        promised = chosen[-1].verdicts.cost + BROKEN * (before.verdicts.cost - chosen[-1].verdicts.cost)
+        promised = (1 - BROKEN) * chosen[0].verdicts.cost + BROKEN * before.verdicts.cost
+        alone = len(chosen) == 1
         # their rows and columns are large; there is a best one, since some were chosen
         del before, contenders, chosen, best  # pyright: ignore[reportPossiblyUnboundVariable]
         if ways != {"columns"}:
@@ -161,13 +162,9 @@ def find_causes(
         if any(type(f.effect).follows_total for f in found):
             screened = None
             step = _refreshed(problem, state, step, found, whitening)
-            if len(ways) == 1 and step.verdicts.cost > promised:
-                joint = polished(
-                    problem,
-                    solved(with_width(problem, state), step.state.theta[: len(state.theta)]),
-                    [f.effect for f in found],
-                    whitening,
-                )
+            if alone and step.verdicts.cost > promised:
+                base = solved(with_width(problem, state), step.state.theta[: len(state.theta)])
+                joint = polished(problem, base, [f.effect for f in found], whitening)
                 found = [replace(f, effect=e) for f, e in zip(found, joint.causes, strict=True)]
                 step = joint.step
     begun = solved(with_width(problem, state), step.state.theta[: len(state.theta)])
