@@ -169,33 +169,30 @@ def test_a_posture_too_far_off_for_the_play_of_a_joint_is_an_outlier(folder: Pat
 
 def test_an_offset_of_a_robot_whose_links_are_all_off_is_seldom_called_a_link(folder: Path):
     """Four tolerances of all links are no reason to name one of them, which 10 of 12 such robots had been told; now
-    some 5 in 100. Eight are drawn: more than three of these happen once in two thousand runs."""
-    arm, right = study().arm("arm6", folder), []
-    for seed in np.random.SeedSequence().generate_state(8):
+    some 7 in 100 are not told as they should. Ten are drawn: five of these happen once in three thousand runs."""
+    arm, wrong = study().arm("arm6", folder), []
+    for seed in np.random.SeedSequence().generate_state(10):
         case = postures.hide(arm, "joint_offset", 20.0, np.random.default_rng(int(seed)), count=40, off=4.0)
-        found = _off_everywhere(arm, case, int(seed))
-        # one link may indeed be far off for its robot
-        few = len(found.causes) <= 2 and study().grade(case, found).rstrip("+") in ("right", "set", "unknown")
-        right.append((int(seed), few))
-    assert sum(few for _, few in right) >= 5, right
+        if not _told_as_off_everywhere(case, found := study().diagnose(arm, case)):
+            wrong.append((int(seed), found.verdict, case.right, found.causes))
+    assert len(wrong) <= 4, wrong
 
 
 def test_an_offset_of_a_panda_whose_links_are_all_off_is_not_called_a_link(folder: Path, data_dir: Path):
     """A case that is kept: of Pandas 3 in 16 have a wrong name."""
     arm = study().arm("panda", folder)
     case = postures.hide(arm, "joint_offset", 20.0, np.random.default_rng(80), count=40, off=4.0)
-    found = _off_everywhere(arm, case, 80)
-    assert study().grade(case, found).rstrip("+") in ("right", "set", "unknown"), (case.right, found.causes)
-    assert len(found.causes) <= 2, found.causes
-
-
-def _off_everywhere(arm: Any, case: Any, seed: int) -> Any:
-    """The diagnosis of such a robot, which says that its geometry is off, and names something or tells what is near."""
     found = study().diagnose(arm, case)
-    assert found.verdict in ("named+rest", "unknown"), (seed, found.verdict)
-    assert any("geometry is off beyond its tolerance" in note for note in found.calibration.notes), seed
-    assert found.causes or found.rest.nearest, seed
-    return found
+    assert _told_as_off_everywhere(case, found), (found.verdict, case.right, found.causes)
+
+
+def _told_as_off_everywhere(case: Any, found: Any) -> bool:
+    """Whether the answer says that the geometry is off, and names nothing else than what is hidden, one link apart that
+    may indeed be far off for its robot."""
+    right = study().grade(case, found).rstrip("+") in ("right", "set", "unknown") and len(found.causes) <= 2
+    said = any("geometry is off beyond its tolerance" in note for note in found.calibration.notes)
+    near = bool(found.causes or found.rest.nearest)
+    return right and said and near and found.verdict in ("named+rest", "unknown")
 
 
 def test_what_nothing_determines_is_said_and_has_no_value(folder: Path):
