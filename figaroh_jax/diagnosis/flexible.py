@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -173,15 +173,23 @@ def families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"
     return _groups(problem, _smooth_series(state.motion), whitening)
 
 
-def rich_families(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], few: bool) -> list[Group]:
+def rich_families(
+    problem: Problem,
+    state: State,
+    whitening: Float[np.ndarray, "F nv"],
+    few: bool,
+    titles: Collection[str] | None = None,
+) -> list[Group]:
     """Smooth functions that stand in for what the catalogue lacks in a model of the noise: none of time, which would
     take slow noise, but even ones of the velocity, friction that drifts or follows the load, and the friction of the
-    other joints. `few`: the latter alone, which have few columns."""
+    other joints. `few`: the latter alone, which have few columns; `titles`: of these alone."""
     series = _few_series(state.motion)
     if not few:
         smooth = _smooth_series(state.motion)
         del smooth["time"]
         series |= smooth
+    if titles is not None:
+        series = {title: columns for title, columns in series.items() if title in titles}
     return _groups(problem, series, whitening)
 
 

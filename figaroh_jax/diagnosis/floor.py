@@ -231,8 +231,8 @@ def _behind(problem: Problem, rich: _Rich, response: Float[np.ndarray, "F nv"]) 
     names = [name for name, *_ in rich.taken]
     others = [effect for effect in CATALOGUE if effect not in {name.effect for name in names}]
     groups = catalogue(problem, rich.state, rows, response, others)
-    if not {name.effect for name in names} <= {*CATALOGUE}:
-        groups += rich_families(problem, rich.state, response, few=False)
+    if titles := {name.effect for name in names} - {*CATALOGUE}:
+        groups += rich_families(problem, rich.state, response, few=False, titles=titles)
     found = {group.name: group for group in groups}
     more = [_full(rows, found[name], point) @ kept for name, point, kept in rich.taken]
     return rows._replace(X=np.concatenate([rows.X, *more], axis=2))
