@@ -167,32 +167,19 @@ def test_a_posture_too_far_off_for_the_play_of_a_joint_is_an_outlier(folder: Pat
     assert found.verdict == "named+rest", seed
 
 
-def test_an_offset_of_a_robot_whose_links_are_all_off_is_seldom_called_a_link(folder: Path):
-    """Four tolerances of all links are no reason to name one of them, which 10 of 12 such robots had been told; now
-    some 7 in 100 are not told as they should. Ten are drawn: five of these happen once in three thousand runs."""
-    arm, wrong = study().arm("arm6", folder), []
-    for seed in np.random.SeedSequence().generate_state(10):
-        case = postures.hide(arm, "joint_offset", 20.0, np.random.default_rng(int(seed)), count=40, off=4.0)
-        if not _told_as_off_everywhere(case, found := study().diagnose(arm, case)):
-            wrong.append((int(seed), found.verdict, case.right, found.causes))
-    assert len(wrong) <= 4, wrong
-
-
-def test_an_offset_of_a_panda_whose_links_are_all_off_is_not_called_a_link(folder: Path, data_dir: Path):
-    """A case that is kept: of Pandas 3 in 16 have a wrong name."""
-    arm = study().arm("panda", folder)
-    case = postures.hide(arm, "joint_offset", 20.0, np.random.default_rng(80), count=40, off=4.0)
+@pytest.mark.parametrize("robot", ["arm6", "panda"])
+def test_an_offset_of_a_robot_whose_links_are_all_off_is_not_called_a_link(robot: str, folder: Path, data_dir: Path):
+    """Four tolerances of all links are no reason to name one of them. Drawn now; the Panda, where 3 of 16 have a wrong
+    name, is a case that is kept."""
+    seed = 80 if robot == "panda" else int(np.random.SeedSequence().generate_state(1)[0])
+    arm = study().arm(robot, folder)
+    case = postures.hide(arm, "joint_offset", 20.0, np.random.default_rng(seed), count=40, off=4.0)
     found = study().diagnose(arm, case)
-    assert _told_as_off_everywhere(case, found), (found.verdict, case.right, found.causes)
-
-
-def _told_as_off_everywhere(case: Any, found: Any) -> bool:
-    """Whether the answer says that the geometry is off, and names nothing else than what is hidden, one link apart that
-    may indeed be far off for its robot."""
-    right = study().grade(case, found).rstrip("+") in ("right", "set", "unknown") and len(found.causes) <= 2
-    said = any("geometry is off beyond its tolerance" in note for note in found.calibration.notes)
-    near = bool(found.causes or found.rest.nearest)
-    return right and said and near and found.verdict in ("named+rest", "unknown")
+    assert found.verdict in ("named+rest", "unknown"), (seed, found.verdict)
+    assert study().grade(case, found).rstrip("+") in ("right", "set", "unknown"), (seed, case.right, found.causes)
+    assert len(found.causes) <= 2, (seed, found.causes)  # one link may indeed be far off for its robot
+    assert any("geometry is off beyond its tolerance" in note for note in found.calibration.notes), seed
+    assert found.causes or found.rest.nearest, seed
 
 
 def test_what_nothing_determines_is_said_and_has_no_value(folder: Path):

@@ -71,7 +71,7 @@ def test_rows_that_are_left_out_carry_power_into_the_band_that_the_row_filter_em
     rng, frequency = np.random.default_rng(), np.fft.rfftfreq(COUNT, 1 / RATE)
     gain = low_pass(frequency)[:, None] ** 2
     mask = np.ones((COUNT, 2), bool)
-    for joint, share in enumerate((0.1, 0.3)):
+    for joint, share in enumerate((0.2, 0.3)):
         for at in rng.integers(0, COUNT - 8, int(share * COUNT / 8)):
             mask[at : at + 8, joint] = False
     powers = [filtered(simulated(rng), gain[:, 0] ** 0.5) * mask for _ in range(5)]
@@ -82,7 +82,7 @@ def test_rows_that_are_left_out_carry_power_into_the_band_that_the_row_filter_em
     ratio = [d.mean(0) / t.mean(0) for d, t in zip(*parts, strict=True)]
     np.testing.assert_allclose(ratio, 1.0, rtol=0, atol=0.12)  # 5 deviations of 200 series x 25 bins
     above = frequency > 1.5 * CUTOFF
-    assert (told[above].mean(0) > 5 * (gain * truth(frequency))[above].mean(0)).all()
+    assert (told[above].mean(0) > 20 * (gain * truth(frequency))[above].mean(0)).all()
 
 
 def test_whitened_noise_has_a_flat_spectrum_of_power_one_in_the_pass_band() -> None:

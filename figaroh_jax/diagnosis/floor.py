@@ -64,7 +64,7 @@ def noise_floor(
 
 
 def sober_spectrum(problem: Problem, state: State, forbid: Collection[str] = ()) -> Spectrum:
-    """Spectrum of what the state and the one best candidate of the catalogue leave.
+    """Spectrum of what the state and the one best candidate leave: of the catalogue, or a function of few columns.
 
     A rich model takes noise in at the frequencies of the motion, the more the less of the data is independent: slow
     noise in the band of a slow motion looks smaller than it is. One candidate takes little, and all of its own misfit.
@@ -182,8 +182,8 @@ def _from_rich_model(
 ) -> Spectrum:
     """Residual of the baseline with the groups of the catalogue, and smooth families, that a forward selection takes.
 
-    Where the data are long, smooth families stand in for what the catalogue does not hold: what the model misses of a
-    misfit passes for noise.
+    Families stand in for what the catalogue does not hold, those of many columns where the data are long alone: what
+    the model misses of a misfit passes for noise.
     """
     response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
     long, smooth = count >= ENOUGH or (richness == 1 and _resolved(problem)), count >= ENOUGH and richness > 1

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..recordings.signals import SAME_MOTION, Signals, align, apart, common_rows
+from ..recordings.signals import SAME_MOTION, Signals, align, apart, common_rows, moves_as
 from ..recordings.stacked import Records
 from .problem import Layout
 
@@ -63,16 +63,15 @@ def checked_repeats(signals: Sequence[Signals]) -> list[Signals]:
 
 def repeats_not_said(signals: Sequence[Signals]) -> tuple[str, ...]:
     """Notes on fitted recordings that move as another one does though no label says so: they could tell the noise."""
-    fitted, notes = [one for one in signals if one.role == "fit"], []
-    for k, one in enumerate(fitted):
-        before = [other for other in fitted[:k] if not (one.repeat and other.repeat) and _as_long_and_far(other, one)]
-        like = next((other for other in before if apart(other, one) <= SAME_MOTION), None)
-        if like is not None:
-            notes.append(
-                f"{one.name} moves as {like.name} does: with the same `repeat` under `data` their differences would"
-                " tell the noise"
-            )
-    return tuple(notes)
+
+    def before(k: int) -> Iterator[Signals]:
+        one = fitted[k]
+        return (o for o in fitted[:k] if not (one.repeat and o.repeat) and _as_long_and_far(o, one))
+
+    fitted = [one for one in signals if one.role == "fit"]
+    likes = [moves_as(one, before(k)) for k, one in enumerate(fitted)]
+    text = "{} moves as {} does: with the same `repeat` under `data` their differences would tell the noise"
+    return tuple(text.format(one.name, like.name) for one, like in zip(fitted, likes, strict=True) if like)
 
 
 def _as_long_and_far(first: Signals, second: Signals) -> bool:

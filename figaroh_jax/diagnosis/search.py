@@ -115,8 +115,7 @@ def find_causes(
 
     A sensor that is late or that winds up rounds the reversals of dry friction, so that their width is fitted anew
     once such a cause is in: the old one would be made up for by a friction that is not there. What follows all torque
-    finds another one once it is in (a limit, that of clipped torque): where it then takes less than it promised, all
-    shapes are fitted on before the next cause is looked for.
+    finds another one once it is in (`_refreshed`).
     """
     generator = generator or np.random.default_rng(0)
     if after is None:
@@ -148,7 +147,7 @@ def find_causes(
             step = with_cause(problem, step, best.effect, whitening)
         ways = {"late" if best.effect.about else kind(best.effect) for best in chosen}
         promised = (1 - BROKEN) * chosen[0].verdicts.cost + BROKEN * before.verdicts.cost
-        alone = len(chosen) == 1
+        promised = promised if len(chosen) == 1 else np.inf
         # their rows and columns are large; there is a best one, since some were chosen
         del before, contenders, chosen, best  # pyright: ignore[reportPossiblyUnboundVariable]
         if ways != {"columns"}:
@@ -161,12 +160,7 @@ def find_causes(
             step = step if problem is known else stand(problem, with_width(problem, step.state), whitening)
         if any(type(f.effect).follows_total for f in found):
             screened = None
-            step = _refreshed(problem, state, step, found, whitening)
-            if alone and step.verdicts.cost > promised:
-                base = solved(with_width(problem, state), step.state.theta[: len(state.theta)])
-                joint = polished(problem, base, [f.effect for f in found], whitening)
-                found = [replace(f, effect=e) for f, e in zip(found, joint.causes, strict=True)]
-                step = joint.step
+            found, step = _refreshed(problem, state, step, found, whitening, promised)
     begun = solved(with_width(problem, state), step.state.theta[: len(state.theta)])
     return Search(problem, begun, found, p_values[0], p_values[-1], shown)
 
@@ -186,12 +180,26 @@ def chance_beside(
 
 
 def _refreshed(
-    problem: Problem, start: State, step: Step, found: list[Found], whitening: Float[np.ndarray, "F nv"]
-) -> Step:
-    """The step with what follows all torque together evaluated at that of all causes so far."""
+    problem: Problem,
+    start: State,
+    step: Step,
+    found: list[Found],
+    whitening: Float[np.ndarray, "F nv"],
+    promised: float,
+) -> tuple[list[Found], Step]:
+    """The causes, and the step with what follows all torque together evaluated at that of all causes so far.
+
+    Where its penalised squares are then more than the last cause `promised` (a limit is in and finds clipped torque),
+    all shapes are fitted on.
+    """
     begun = solved(with_width(problem, start), step.state.theta[: len(start.theta)])
     causes = with_amplitudes(step.state, [f.effect for f in found])
-    return with_causes(problem, begun, [exact(one) for one in causes], whitening)
+    step = with_causes(problem, begun, [exact(one) for one in causes], whitening)
+    if step.verdicts.cost <= promised:
+        return found, step
+    base = solved(begun, step.state.theta[: len(start.theta)])
+    joint = polished(problem, base, [f.effect for f in found], whitening)
+    return [replace(f, effect=e) for f, e in zip(found, joint.causes, strict=True)], joint.step
 
 
 def _chance(

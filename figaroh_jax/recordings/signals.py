@@ -11,7 +11,7 @@ not used: controllers filter it with a delay that nobody states.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
@@ -46,6 +46,7 @@ __all__ = [
     "frequencies",
     "kept_out_in_vain",
     "let_through",
+    "moves_as",
     "prepare",
     "prepare_all",
     "to_recording_times",
@@ -423,26 +424,30 @@ def common_rows(first: Signals, second: Signals) -> tuple[slice, slice]:
 
 def apart(first: Signals, second: Signals) -> float:
     """Difference of two recordings' positions where they belong together, over the joint's range (both as standard
-    deviations), at the joint where it is largest."""
+    deviations), at the joint where it is largest; infinite where no rows do."""
     own, other = common_rows(first, second)
+    if own.stop <= own.start:
+        return math.inf
     q, p = first.position[first.rows.index[own]], second.position[second.rows.index[other]]
     motion = q.std(axis=0)
     return float(((q - p).std(axis=0) / np.maximum(motion, 1e-3 * max(float(motion.max()), 1e-12))).max())
 
 
+def moves_as(one: Signals, others: Iterable[Signals]) -> Signals | None:
+    """The first of the others that moves as this recording does."""
+    return next((other for other in others if apart(other, one) <= SAME_MOTION), None)
+
+
 def kept_out_in_vain(signals: Sequence[Signals]) -> tuple[str, ...]:
     """Notes on recordings that are kept out of the fit, but move as a fitted one: they say nothing of other motions."""
-    fitted, notes = [one for one in signals if one.role == "fit"], []
-    for one in signals:
-        like = None
-        if one.role == "holdout" and one.torque is not None:
-            like = next((other for other in fitted if apart(other, one) <= SAME_MOTION), None)
-        if like is not None:
-            notes.append(
-                f"{one.name} is kept out of the fit but moves as {like.name} does: its error shows how well the model"
-                " repeats that motion, not how it predicts others"
-            )
-    return tuple(notes)
+    fitted = [one for one in signals if one.role == "fit"]
+    judged = [one for one in signals if one.role == "holdout" and one.torque is not None]
+    return tuple(
+        f"{one.name} is kept out of the fit but moves as {like.name} does: its error shows how well the model repeats"
+        " that motion, not how it predicts others"
+        for one in judged
+        if (like := moves_as(one, fitted)) is not None
+    )
 
 
 def _late_rows(first: Signals, second: Signals) -> float:
