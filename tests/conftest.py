@@ -41,6 +41,18 @@ def own_effects() -> Iterator[None]:
             known.update(old)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def few_mappings() -> Iterator[None]:
+    """Compiled programs are let go before a process has more mappings than Linux allows (65530): JAX crashes there."""
+    yield
+    try:
+        mappings = len(Path("/proc/self/maps").read_bytes().splitlines())
+    except OSError:  # not on Linux
+        return
+    if mappings > 30_000:
+        jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """Folder of the recordings of real robots; tests that need it are skipped where it is absent."""
