@@ -167,11 +167,13 @@ def test_a_posture_too_far_off_for_the_play_of_a_joint_is_an_outlier(folder: Pat
     assert found.verdict == "named+rest", seed
 
 
-@pytest.mark.parametrize("robot", ["arm6", "panda"])
-def test_an_offset_of_a_robot_whose_links_are_all_off_is_not_called_a_link(robot: str, folder: Path, data_dir: Path):
-    """Four tolerances of all links are no reason to name one of them. Drawn now; the Panda, where 3 of 16 have a wrong
-    name, is a case that is kept."""
-    seed = 80 if robot == "panda" else int(np.random.SeedSequence().generate_state(1)[0])
+@pytest.mark.parametrize("robot, kept", [("arm6", None), ("arm6", 3267418522), ("panda", 81)])
+def test_an_offset_of_a_robot_whose_links_are_all_off_is_not_called_a_link(
+    robot: str, kept: int | None, folder: Path, data_dir: Path
+):
+    """Four tolerances of all links are no reason to name one of them, the likeliest of so many. Drawn now; two cases
+    are kept that had a wrong name."""
+    seed = int(np.random.SeedSequence().generate_state(1)[0]) if kept is None else kept
     arm = study().arm(robot, folder)
     case = postures.hide(arm, "joint_offset", 20.0, np.random.default_rng(seed), count=40, off=4.0)
     found = study().diagnose(arm, case)

@@ -28,7 +28,7 @@ __all__ = ["Evidence", "Weighed", "weigh"]
 _OFF = 1e-10  # precision of what has no prior
 _FACTOR = 2.0**0.5  # between the widths that are tried
 _FREE = (10.0**0.5, 100.0)  # widths of a correction that is said to be off, in its tolerance
-_PASSES = 3  # over the set, each of which may change what stands for another
+_PASSES = 3  # over the set: what stands for another may change what is told
 _LINKS = (1, 2)  # prior groups of the links: translations and rotations
 
 Array = np.ndarray
@@ -124,18 +124,15 @@ def weigh(
 ) -> tuple[Weighed, dict[int, tuple[int, ...]], list[int]]:
     """Of the corrections `named` those that the postures tell, what each is not told from, and what was left out.
 
-    Of what is not told apart the one with the fewest `columns` takes the name: an offset rather than a link.
+    Where links far beyond their tolerance explain as well what stays, any correction with `columns` might have been
+    named, each as likely beforehand: the best of so many must be told by the logarithm of their number more. Beside
+    links within their tolerance the scores have counted that. Of what is not told apart the one with the fewest
+    columns takes the name: an offset rather than a link.
     """
-    now, dropped = evidence.of(named), []
-    while now.chosen:
-        fewer = [evidence.of([j for j in now.chosen if j != k], now.growth) for k in now.chosen]
-        least = max(range(len(fewer)), key=lambda i: fewer[i].value)
-        if now.value - fewer[least].value >= thresholds.TOLD:
-            break
-        dropped.append(now.chosen[least])
-        now = fewer[least]
-    same: dict[int, tuple[int, ...]] = {}
+    now, dropped, same = evidence.of(named), [], {}
+    many = float(np.log(max(np.count_nonzero(columns), 1)))
     for _ in range(_PASSES):
+        now = _told(evidence, now, many, dropped)
         before, same = now.chosen, {}
         for k in before:
             now, name, others = _instead(evidence, now, k, columns)
@@ -143,6 +140,19 @@ def weigh(
         if set(now.chosen) == set(before):
             break
     return now, same, [j for j in dropped if j not in now.chosen]
+
+
+def _told(evidence: Evidence, now: Weighed, many: float, dropped: list[int]) -> Weighed:
+    """The set without those that the postures do not tell, which are appended to `dropped`."""
+    while now.chosen:
+        fewer = [evidence.of([j for j in now.chosen if j != k], now.growth) for k in now.chosen]
+        least = max(range(len(fewer)), key=lambda i: fewer[i].value)
+        far = max(fewer[least].growth) > thresholds.FAR_OFF
+        if now.value - fewer[least].value >= thresholds.TOLD + (many if far else 0.0):
+            break
+        dropped.append(now.chosen[least])
+        now = fewer[least]
+    return now
 
 
 def _instead(evidence: Evidence, now: Weighed, k: int, columns: Sequence[int]) -> tuple[Weighed, int, tuple[int, ...]]:
