@@ -17,12 +17,13 @@ from ..effects.plausibility import implausible
 from ..errors import InputError
 from ..formats.config import robot_options
 from ..formats.files import USD
+from ..recordings.checks import check_rollouts
 from ..recordings.dataset import Recording, read_recordings
 from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, Experiment, Gain, Name, Rest, Trace, Verdict
 from .alone import inseparable, separable
 from .arm import search_arm
 from .causes import BASELINE
-from .data import Run, Stretch, noise_of, regular, windows
+from .data import Run, Stretch, ahead_of_command, noise_of, regular, windows
 from .fit import Fit
 from .loop import Loop
 from .own import left_out
@@ -105,6 +106,7 @@ def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
             "actuator: {joint_1: {kind: position, kp: 20.0, kd: 0.5}}"
         )
     recordings = read_recordings(task, loop.robot, rollouts=True)
+    warnings = check_rollouts(task, loop.robot, recordings)
     runs = tuple(_run(loop, r) for r in recordings)
     periods = {regular(str(r.file), r.time) for r in recordings}
     if max(periods) > 1.02 * min(periods):
@@ -114,7 +116,7 @@ def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
     loop = eqx.tree_at(lambda m: m.dt, loop, np.float64(period / steps))
     notes = [f"{task.robot.model.name}: not simulated: {note}" for note in left_out]
     notes.append(f"simulated in steps of {1e3 * period / steps:.3g} ms, {steps} to a sample")
-    return loop, runs, tuple(notes)
+    return loop, runs, (*warnings, *notes)
 
 
 def _run(loop: Loop, recording: Recording) -> Run:
@@ -124,19 +126,33 @@ def _run(loop: Loop, recording: Recording) -> Run:
     columns = way.argmax(1)
     command = recording.command[:, columns]
     gain, bias = np.asarray(loop.drives.gain), np.asarray(loop.drives.bias)
+    follows = (gain[:, 0] != 0) & (bias[:, 1] != 0)
     for k, column in enumerate(columns):
-        follows = gain[k, 0] != 0 and bias[k, 1] != 0
         reach = max(np.abs(recording.position[:, column]).max(), 0.3)
-        if follows and np.abs(command[:, k]).max() > _TURN * reach:
+        if follows[k] and np.abs(command[:, k]).max() > _TURN * reach:
             row = int(np.abs(command[:, k]).argmax())
             raise InputError(
                 f"{recording.file}: the command of joint {loop.robot.dof_names[column]} reaches {command[row, k]:.4g}"
                 f" rad in row {row} (from 0), but the joint never leaves +-{reach:.3g} rad: is it in degrees or counts?"
                 " Say `units: {position: deg}`, or convert it to the unit of the position"
             )
+    _check_order(loop, recording, command[:, follows], columns[follows])
     return Run(
         recording.name, recording.time, command, recording.position, recording.velocity, recording.role == "holdout"
     )
+
+
+def _check_order(loop: Loop, recording: Recording, command: np.ndarray, columns: np.ndarray) -> None:
+    """Refuse a recording in which most joints that follow a command move before it does."""
+    period = regular(str(recording.file), recording.time)
+    moved = [(u, j) for u, j in zip(command.T, columns, strict=True) if np.ptp(u) and np.ptp(recording.position[:, j])]
+    ahead = {loop.robot.dof_names[j]: ahead_of_command(u, recording.position[:, j], period) for u, j in moved}
+    early = [name for name, rows in ahead.items() if rows]
+    if 2 * len(early) > len(moved):
+        raise InputError(
+            f"{recording.file}: the position moves before its command at {', '.join(early)} (by {ahead[early[0]]} rows"
+            f" at {early[0]}): are `command` and `position` swapped, or is the command stamped late?"
+        )
 
 
 def diagnosis_setting(task: Task, loop: Loop, runs: Sequence[Run]) -> Setting:
