@@ -21,7 +21,7 @@ from ..estimation.gravity import without_far_masses
 from ..estimation.posegroups import Measured, assemble, postures_of
 from ..estimation.posesolver import Solution, solve
 from ..recordings.poses import PoseRecording, read_pose_recordings
-from ..recordings.posture_checks import check_pose_recordings
+from ..recordings.posture_checks import check_pose_recordings, spread_of
 from ..rigid.chain import chain_between
 from ..rigid.model import RobotModel
 from . import corrections, levels, thresholds
@@ -248,6 +248,7 @@ class Run:
             noise=(float(posterior.noise[0]), float(posterior.noise[1])),
             scheme=scheme,
             notes=tuple(self.notes),
+            unexplained=_unexplained(position, self.recordings),
             distances=socket_distances(
                 self.recordings, (self.measured, self.choice.fits["frames"][0]), (final, linear)
             ),
@@ -290,6 +291,15 @@ def _enough(measured: Measured, recordings: Sequence[PoseRecording]) -> None:
             f"{names}: {postures} measured postures give {rows} numbers for {unknowns} unknowns of the frames alone;"
             f" measure at least {max(thresholds.FOLDS, unknowns // 2)} postures, better 30 or more"
         )
+
+
+def _unexplained(position: Error | None, recordings: Sequence[PoseRecording]) -> float | None:
+    """Held-out error of position over the spread of the points, where every recording measures points."""
+    spreads = [spread_of(r) for r in recordings]
+    known = [spread for spread in spreads if spread]
+    if position is None or len(known) < len(spreads) or not np.isfinite(position.validated_after):
+        return None
+    return 1e-3 * position.validated_after / float(np.sqrt(np.mean(np.square(known))))
 
 
 def _few(recordings: Sequence[PoseRecording]) -> list[str]:

@@ -254,8 +254,9 @@ def _columns(table: Table, source, names: Sequence[str], key: str, samples: int 
     wrong = np.argwhere(~np.isfinite(values))
     if len(wrong):
         row, column = wrong[0]
+        name = source if isinstance(source, str) else source[column] if len(source) == len(names) else ", ".join(source)
         raise InputError(
-            f"{table.file}: {key} ('{source}') is {values[row, column]} in row {row} (from 0), column {column},"
+            f"{table.file}: {key} ('{name}') is {values[row, column]} in row {row} (from 0), column {column},"
             f" joint {names[column]}; {len(wrong)} such value{'s' if len(wrong) > 1 else ''} in all"
         )
     return values
