@@ -74,6 +74,21 @@ def test_degrees_and_a_turned_sign_are_found(made, tmp_path: Path):
     assert any("opposite sign" in line for line in draft.assumed)
 
 
+def test_rad_that_lie_outside_a_limit_are_no_degrees(made, tmp_path: Path):
+    """Degrees fit every limit where the motion in rad nearly does; a zero offset (or a swap) is what is wrong."""
+    urdf, joints, (run, *_) = made
+    limit = np.asarray(fj.load_urdf(urdf).position_limit)[0]
+    q = run["position"].copy()
+    q[:, 0] += limit[1] + 0.3 * np.ptp(limit) - q[:, 0].max()
+    np.savez(tmp_path / "run.npz", t=run["time"], q=q, tau=run["torque"])
+    with pytest.raises(Undecided, match=f"rad or degrees. In rad, position of {joints[0]} lies outside") as told:
+        draft_task(urdf, [tmp_path / "run.npz"])
+    assert told.value.option == "unit"
+    np.savez(tmp_path / "run.npz", t=run["time"], q=np.rad2deg(q) * [1, 1, np.deg2rad(1)], tau=run["torque"])
+    with pytest.raises(InputError, match="in no unit do the positions fit"):
+        draft_task(urdf, [tmp_path / "run.npz"])
+
+
 def test_repeats_share_a_label(made, tmp_path: Path):
     urdf, _, runs = made
     files = []
