@@ -20,6 +20,7 @@ from figaroh_jax.recordings.checks import check_recordings
 from figaroh_jax.recordings.dataset import read_recordings
 from figaroh_jax.recordings.draft import draft_task
 from figaroh_jax.recordings.draft_columns import Undecided
+from figaroh_jax.recordings.poses import read_pose_recordings
 
 
 @pytest.fixture(scope="module")
@@ -216,6 +217,25 @@ def test_the_task_of_postures_lists_the_joints_that_the_file_holds(made, tmp_pat
     with pytest.raises(InputError, match="a task for `calibrate`") as caught:
         draft_task(urdf, [table(tmp_path / "postures.csv", columns)])
     assert f"robot: {{model: MODEL, joints: [{joints[0]}, {joints[1]}]}}" in str(caught.value)
+
+
+def test_the_task_of_poses_with_quaternions_names_every_column(made, tmp_path: Path):
+    """Joints `q1` to `q3` beside a quaternion `qx` to `qw`: what the message shows is read as it stands."""
+    urdf, joints, (run, *_) = made
+    pose = np.random.default_rng(0).normal(size=(30, 7))
+    pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    columns = {f"q{j + 1}": run["position"][:30, j] for j in range(len(joints))}
+    columns |= {name: pose[:, k] for k, name in enumerate(("x", "y", "z", "qx", "qy", "qz", "qw"))}
+    with pytest.raises(InputError, match="a task for `calibrate`") as caught:
+        draft_task(urdf, [table(tmp_path / "poses.csv", columns)])
+    shown = " ".join(str(caught.value).split()).partition("The task is ")[2].partition(" where MODEL")[0]
+    shown = shown.replace("MODEL", str(urdf)).replace("BASE", joints[0]).replace("TOOL", joints[-1])
+    (tmp_path / "task.yaml").write_text(shown)
+    task = load_task(tmp_path / "task.yaml")
+    (recording,) = read_pose_recordings(task, load_robot(task))
+    assert recording.kind == "pose"
+    np.testing.assert_allclose(recording.position, run["position"][:30], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(recording.values[:, :3, 3], pose[:, :3], rtol=0, atol=1e-9)
 
 
 def test_fewer_columns_than_joints_are_told_how_to_name_theirs(made, tmp_path: Path):
