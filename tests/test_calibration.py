@@ -18,8 +18,10 @@ from figaroh_jax import cli
 from figaroh_jax.calibration.calibrated import Calibration
 from figaroh_jax.calibration.calibration import calibrate_task
 from figaroh_jax.formats.config import load_task
+from figaroh_jax.recordings.posture_checks import OFF
 from figaroh_jax.reporting.calibration_report import nominal_of
 from figaroh_jax.reporting.picture import segments
+from figaroh_jax.reporting.verification import DEFAULT_LIMITS
 
 OFFSET = np.array([0.01, -0.03, 0.05, 0.04, -0.06, 0.02])
 BAD_ROW = 17
@@ -316,6 +318,10 @@ def test_postures_that_belong_to_other_measurements_give_no_model_to_use(tmp_pat
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     spread = np.sqrt((np.std(points[:, 0], axis=0) ** 2).sum())
     assert result["unexplained"] == pytest.approx(1e-3 * result["position"]["validated_after"] / spread, rel=1e-6)
+    assert DEFAULT_LIMITS["unexplained"] == OFF
+    assert cli.main(["verify", str(tmp_path / "run")]) == 1
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "unexplained" in line)
+    assert line.startswith("fail")
 
 
 def test_frames_that_are_swapped_are_one_message_before_any_work(wrong: tuple[Path, poses.Truth], tmp_path: Path):

@@ -276,6 +276,7 @@ class Limits(Keys):
     position_mm: Positive | None = None  # validated, at most
     orientation_deg: Positive | None = None
     fk_parity: Positive | None = None  # m, at most
+    unexplained: Positive | None = None  # calibrate: share of the measured points' spread, at most
 
 
 def load_limits(path: str | Path) -> Limits:

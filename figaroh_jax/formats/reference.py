@@ -160,6 +160,7 @@ LIMITS: dict[str, tuple[str, str, str]] = {
     "position_mm": ("mm", "0.5", "the validated error of position is not judged"),
     "orientation_deg": ("deg", "0.1", "the validated error of orientation is not judged"),
     "fk_parity": ("m", "1.0e-9", "the exported model is not compared with the calibrated one"),
+    "unexplained": ("1", "0.12", "the share of the measured points' spread that the calibration leaves is not judged"),
 }
 _OPEN = {"actuator": ("<joint>", config.JointDrive), "identify.bounds": ("<link>", config.Bound)}
 _WHOLE = ("excite.measurement", "excite.separate")  # whose own keys stand elsewhere
