@@ -9,6 +9,7 @@ import json
 import re
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco as engine
@@ -22,13 +23,18 @@ from figaroh_jax.errors import InputError
 from figaroh_jax.formats.export import write_model
 from figaroh_jax.jobs.export import export_loop
 from figaroh_jax.jobs.rollouts import write_loop
+from figaroh_jax.results import Gain
 from figaroh_jax.rollouts.alone import separable
-from figaroh_jax.rollouts.data import ahead_of_command
+from figaroh_jax.rollouts.data import Run, ahead_of_command
 from figaroh_jax.rollouts.export import described, for_simulator
+from figaroh_jax.rollouts.gates import rms_of
 from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.simulation import rollout
-from figaroh_jax.rollouts.task import extended_of
+from figaroh_jax.rollouts.task import (
+    _gain as gain_of,  # noqa: PLC2701
+    extended_of,
+)
 
 mujoco: Any = engine
 
@@ -322,3 +328,31 @@ def test_only_a_position_that_moves_first_is_ahead_of_its_command(late: int):
     assert ahead_of_command(command, read, t[1]) == 0
     assert ahead_of_command(np.roll(command, 1), q[:, 0], t[1]) == 0
     assert ahead_of_command(read, command, t[1]) > 0
+
+
+def test_one_error_of_a_robot_counts_joints_of_one_kind(tmp_path: Path):
+    """0.02 rad at two joints and 1 mm at the finger; what is named at the finger alone is judged there."""
+    (tmp_path / "arm.xml").write_text(GRIPPING)
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    names = loop.robot.dof_names
+    errors = np.array([1e-3 if name == "left" else 0.02 for name in names])
+    zero = np.zeros((50, 3))
+    run = Run("run", np.arange(50) * 0.02, zero, zero, None, holdout=True)
+    held = {"run": (zero + errors, zero + errors / 2)}
+
+    def told(*at: str) -> Gain:
+        named = [SimpleNamespace(candidate=SimpleNamespace(at=(name,))) for name in at]
+        found: Any = SimpleNamespace(structure=SimpleNamespace(loop=loop), named=named)
+        return gain_of(held, [run], found)
+
+    assert told() == told("yaw") == told("yaw", "left")
+    assert (told().before, told().after, told().unit) == (pytest.approx(0.02), pytest.approx(0.01), "rad")
+    assert (told("left").before, told("left").after, told("left").unit) == (
+        pytest.approx(1e-3),
+        pytest.approx(5e-4),
+        "m",
+    )
+    here: Any = SimpleNamespace(loop=loop, spread=errors, data=SimpleNamespace(weight=np.ones((1, 3, 50))))
+    squares = np.full((1, 1, 3), 50.0)  # whitened: each joint's error is its noise
+    assert rms_of(here, squares) == pytest.approx(0.02)
+    assert rms_of(here, squares, names.index("left")) == pytest.approx(1e-3)

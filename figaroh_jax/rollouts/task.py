@@ -25,7 +25,7 @@ from .arm import search_arm
 from .causes import BASELINE
 from .data import Run, Stretch, ahead_of_command, noise_of, regular, windows
 from .fit import Fit
-from .loop import Loop
+from .loop import Loop, alike
 from .own import left_out
 from .parameters import put, unit_of, values
 from .reading import load_loop
@@ -224,6 +224,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
         rest=_rest(found, before if not named else after, here.spread, loop, traces),
         notes=(
             *notes,
+            *_kinds_note(loop, gain),
             *colour_notes(here),
             *(_open_sizes(found) if named else ()),
             *(_taken_gains(task, found) if named else ()),
@@ -274,8 +275,7 @@ def _refitted_note(here: Setting, runs: Sequence[Run], refitted: Sequence[str], 
         return ()
     asked = [run for run in runs if run.holdout] or [run for run in runs if not run.holdout]
     with np.errstate(over="ignore", invalid="ignore"):
-        squares = np.concatenate([((run.position - simulated(here.loop, run)) ** 2).ravel() for run in asked])
-        error = float(np.sqrt(np.mean(squares)))
+        error = _pooled([run.position - simulated(here.loop, run) for run in asked], alike(here.loop))
     what = "recordings kept out" if asked[0].holdout else "the recordings"
     unit = "m" if all_slide(here.loop) else "rad"
     size = f"{1e3 * error:.3g} m{unit}" if error < 0.1 else f"{error:.3g} {unit}" if error < _FAR else "without bounds"
@@ -361,18 +361,43 @@ def colour_notes(here: Setting) -> tuple[str, ...]:
     return (f"the noise of the positions is white noise behind a low pass, and is judged as that: {text}",)
 
 
+def _slides(loop: Loop, at: Sequence[str]) -> bool:
+    """Whether what stands at these places is about a joint that slides; without a joint, whether all do."""
+    j = loop.robot.dof_names.index(at[0]) if at and at[0] in loop.robot.dof_names else -1
+    return bool(not _turns(loop)[j]) if j >= 0 else all_slide(loop)
+
+
+def _mixed(loop: Loop) -> bool:
+    """Whether some measured joints turn and others slide."""
+    return not alike(loop).all()
+
+
+def _pooled(parts: Sequence[np.ndarray], mine: np.ndarray) -> float:
+    """RMS of errors (rows, joints) over rows and some of the joints."""
+    return float(np.sqrt(np.mean(np.concatenate([part[:, mine].ravel() for part in parts]) ** 2)))
+
+
 def _gain(held: dict[str, tuple[np.ndarray, np.ndarray]], runs: Sequence[Run], found: Search) -> Gain:
-    measured = {run.name: run.position for run in runs if run.holdout}
-    of = "m" if all_slide(found.structure.loop) else "rad"
+    """Over the joints that turn, of a robot with both kinds; over those that slide where all causes stand there."""
+    loop, measured = found.structure.loop, {run.name: run.position for run in runs if run.holdout}
+    slides = all(_slides(loop, one.candidate.at) for one in found.named) if found.named else all_slide(loop)
     if measured:
-        before, after = (
-            float(np.sqrt(np.mean(np.concatenate([((measured[k] - v[i]) ** 2).ravel() for k, v in held.items()]))))
-            for i in (0, 1)
-        )
-        return Gain(before, after, of)
+        mine = alike(loop, slides=slides)
+        before, after = (_pooled([measured[k] - v[i] for k, v in held.items()], mine) for i in (0, 1))
+        return Gain(before, after, "m" if slides else "rad")
+    of = "m" if all_slide(loop) else "rad"
     if not found.named:
         return Gain(found.held[0], found.held[0], of)
     return Gain(found.held[0], found.held[-1], of)
+
+
+def _kinds_note(loop: Loop, gain: Gain) -> tuple[str, ...]:
+    """Which joints the error of the headline counts, where one number cannot hold them all."""
+    if not _mixed(loop):
+        return ()
+    names = np.array([loop.robot.dof_names[k] for k in loop.measured])[alike(loop, slides=gain.unit == "m")]
+    kind = "slide" if gain.unit == "m" else "turn"
+    return (f"the error in {gain.unit} is that of the joints that {kind}: {', '.join(names)}",)
 
 
 def _cause(one: Named, found: Search, here: Setting) -> Cause:
@@ -400,9 +425,7 @@ def _cause(one: Named, found: Search, here: Setting) -> Cause:
         }  # fmt: skip
     at = one.candidate.at
     sure = 1.0 / (1 + len(one.alike)) * (0.98 if found.verdict == "named" else 0.8)
-    j = here.loop.robot.dof_names.index(at[0]) if at and at[0] in here.loop.robot.dof_names else -1
-    straight = not _turns(here.loop)[j] if j >= 0 else all_slide(here.loop)
-    gain = Gain(one.before, one.after, "m" if straight else "rad")
+    gain = Gain(one.before, one.after, "m" if _slides(here.loop, at) else "rad")
     return Cause(Name(one.candidate.effect, at), parameters, sure, gain, one.alike, note=one.candidate.kind.looks_like)
 
 
