@@ -85,6 +85,8 @@ def test_the_run_holds_the_motion_at_1_khz_with_its_torques_and_a_joint_trajecto
         assert one["std"] < one["std_before"]
     page = (tmp_path / "run" / "report.html").read_text()
     assert "within limits" in page and "1 kHz" in page and page.count("<polyline") == 16
+    units = re.findall(r"<td>(position|velocity|acceleration|torque)</td>.*?</td><td>([^<]+)</td>", page)
+    assert set(units) == {("position", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s²"), ("torque", "N\xa0m")}
     moves_in_the_view(tmp_path / "run", monkeypatch)
 
 

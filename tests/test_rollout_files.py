@@ -31,10 +31,7 @@ from figaroh_jax.rollouts.gates import rms_of
 from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.simulation import rollout
-from figaroh_jax.rollouts.task import (
-    _gain as gain_of,  # noqa: PLC2701
-    extended_of,
-)
+from figaroh_jax.rollouts.task import _gain as gain_of, extended_of
 
 mujoco: Any = engine
 

@@ -62,7 +62,7 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[browser.Page]:
 def test_the_summary_says_the_error_first_and_every_number_with_its_interval(capsys: pytest.CaptureFixture[str]):
     show_rollouts(found(), "the arm", verbose=False)
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("identified  Held-out motions are simulated from the command with an error of at most 2 %")
+    assert lines[0].startswith("identified  Held-out motions are simulated from the command with an error of at most 2")
     assert "6 of 8 numbers of the arm are identified" in lines[0]
     assert any(line.split() == ["Coulomb", "friction", "shoulder", "0.400", "±", "0.039", "N", "m"] for line in lines)
     assert any("on its bound" in line for line in lines) and lines[-1].startswith("2 notes")
