@@ -63,7 +63,7 @@ def calibrate_task(
     model = load_robot(task)
     recordings = read_pose_recordings(task, model)
     notes = check_pose_recordings(task, model, recordings)
-    found = calibrate(model, recordings, forbid=task.diagnose.forbid, level=level, priors=priors, progress=progress)
+    found = _calibrated(model, recordings, task.diagnose.forbid, progress, level, priors)
     return replace(found, posture=dict(task.robot.posture), notes=(*notes, *found.notes))
 
 
@@ -91,6 +91,20 @@ def calibrate(
     >>> round(found.solution.parameters["joint_offset shoulder"].value, 4)
     0.02
     """
+    notes = check_pose_recordings(None, model, recordings)
+    found = _calibrated(model, recordings, forbid, progress, level, priors)
+    return replace(found, notes=(*notes, *found.notes))
+
+
+def _calibrated(
+    model: RobotModel,
+    recordings: Sequence[PoseRecording],
+    forbid: Sequence[str],
+    progress: Callable[[str, float], None],
+    level: str | None,
+    priors: bool,
+) -> Calibration:
+    """`calibrate` of recordings that were checked."""
     if level is not None and level not in levels.LEVELS:
         raise InputError(f"no level '{level}' of calibration{nearest(level, levels.LEVELS)}")
     with jax.enable_x64(True):

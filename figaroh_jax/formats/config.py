@@ -303,7 +303,7 @@ def load_task(path: str | Path | Mapping[str, Any]) -> Task:
     """
     if not isinstance(path, (str, Path, Mapping)):
         kind = type(path).__name__
-        raise InputError(f"load_task takes the name of a task file or its keys as a dictionary, not a {kind}")
+        raise InputError(f"load_task takes the name of a task file or its keys as a dictionary, not {kind}")
     chain = given_task(path) if isinstance(path, Mapping) else read_task(Path(path))
     try:
         task = Task.model_validate(merge(chain))

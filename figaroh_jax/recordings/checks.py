@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Checked",
     "Finding",
+    "check_columns",
     "check_recording",
     "check_recordings",
     "check_rollouts",
@@ -69,6 +70,8 @@ def checked_recordings(task: Task | None, model: RobotModel, recordings: Sequenc
     joint's torque that does not follow the model in most of the recordings that are fitted.
     """
     entries: dict[Path | Memory, RecordingEntry] = {entry.place: entry for entry in task.data} if task else {}
+    for recording in recordings:
+        check_columns(recording, model)
     found = [
         (recording.file.name, finding)
         for recording in recordings
@@ -140,6 +143,16 @@ def check_rollouts(task: Task, model: RobotModel, recordings: Sequence[Recording
             told += () if any(finding.wrong for finding in told) else _jumps(look)
             found += [(recording.file.name, finding) for finding in told]
     return report_findings(found)
+
+
+def check_columns(recording: Recording, model: RobotModel) -> None:
+    """Refuse positions of another number of joints than the robot's."""
+    if recording.position.shape[1] != model.nq:
+        raise InputError(
+            f"recording '{recording.name}': q has {recording.position.shape[1]} columns, but robot '{model.name}' has"
+            f" {model.nq} numbers of position ({', '.join(model.joint_names)}); joints that stand still are left out by"
+            " load_urdf(..., joints=[...])"
+        )
 
 
 def position_findings(

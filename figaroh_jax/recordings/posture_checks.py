@@ -31,9 +31,12 @@ FEWEST = 8
 TURNED = 0.15  # rad between orientations that no calibration leaves
 
 
-def check_pose_recordings(task: Task, model: RobotModel, recordings: Sequence[PoseRecording]) -> tuple[str, ...]:
-    """Warnings about recordings of postures, also sent to the log `figaroh_jax`; `InputError` where they are wrong."""
-    entries: dict[Path | Memory, RecordingEntry] = {entry.place: entry for entry in task.data}
+def check_pose_recordings(task: Task | None, model: RobotModel, recordings: Sequence[PoseRecording]) -> tuple[str, ...]:
+    """Warnings about recordings of postures, of a task or from arrays, also sent to the log `figaroh_jax`.
+
+    Raises `InputError` where they are wrong.
+    """
+    entries: dict[Path | Memory, RecordingEntry] = {entry.place: entry for entry in task.data} if task else {}
     found = [(r.file.name, f) for r in recordings for f in check_pose_recording(r, model, entries.get(r.file))]
     return report_findings(found)
 
@@ -42,8 +45,8 @@ def check_pose_recording(
     recording: PoseRecording, model: RobotModel, entry: RecordingEntry | None = None
 ) -> list[Finding]:
     """Everything that looks wrong about one recording of postures, the gravest first."""
-    if model.nq != model.nv:
-        return []
+    if model.nq != model.nv or recording.position.shape[1] != model.nv:
+        return []  # the kinematics refuse another number of joints
     unit = entry.units.position if entry is not None else "rad"
     found = position_findings(recording.position, model, unit)
     if any(finding.wrong for finding in found):
