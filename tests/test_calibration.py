@@ -317,6 +317,8 @@ def test_postures_that_belong_to_other_measurements_give_no_model_to_use(tmp_pat
     assert "Do not use this model" in (tmp_path / "run" / "report.html").read_text()
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     spread = np.sqrt((np.std(points[:, 0], axis=0) ** 2).sum())
+    with pytest.raises(fj.InputError, match=r"that of a calibration, .* robot\.urdf by load_urdf"):
+        fj.load_model(tmp_path / "run" / "model")
     assert result["unexplained"] == pytest.approx(1e-3 * result["position"]["validated_after"] / spread, rel=1e-6)
     assert DEFAULT_LIMITS["unexplained"] == OFF
     assert cli.main(["verify", str(tmp_path / "run")]) == 1
