@@ -259,3 +259,23 @@ def test_postures_of_arrays_are_checked_as_files_are(tmp_path: Path):
             takes(robot, degrees)
     with pytest.raises(InputError, match="they look like mm"):
         fj.calibrate(robot, [fj.postures(q=q, position=1e3 * seen, **frames)])
+
+
+def test_a_rate_that_contradicts_the_stamps_beside_it_is_told(base: Base, tmp_path: Path):
+    """Twice the rate of the file's own clock, whose column the task does not name; a counter of samples is no clock."""
+    t = np.asarray(base.arrays["t"])
+    right = 1 / float(np.median(np.diff(t)))
+    notes = {}
+    for name, rate, stamps in (
+        ("twice", 2 * right, t), ("right", right, 1e3 * t), ("counted", 2 * right, np.arange(len(t)))
+    ):  # fmt: skip
+        np.savez(tmp_path / f"{name}.npz", time=stamps, q=base.arrays["q"], tau=base.arrays["tau"])
+        entry = {"file": f"{tmp_path}/{name}.npz", "rate": rate, "position": "q", "torque": "tau"}
+        task = load_task({"robot": base.robot, "data": [entry]})
+        (recording,) = read_recordings(task, load_robot(task))
+        notes[name] = recording.notes
+    assert notes["right"] == notes["counted"] == ()
+    assert re.search(
+        r"twice.npz: rate is .* Hz, but the column 'time' runs at .* should the task say time: time in",
+        notes["twice"][0],
+    )
