@@ -251,7 +251,7 @@ def test_postures_of_arrays_are_checked_as_files_are(tmp_path: Path):
     robot, rng = load_urdf(tmp_path / "robot.urdf"), np.random.default_rng(0)
     q = poses.postures(rng, 30)
     seen = np.asarray(fj.frame_placement(robot, q, "tool0"))[:, :3, 3]
-    frames = {"base_frame": "base", "tool_frame": "tool0"}
+    frames: dict[str, Any] = {"base_frame": "base", "tool_frame": "tool0"}
     degrees = fj.postures(q=np.rad2deg(q), position=seen, **frames)
     calibrated, diagnosed = (lambda model, one, job=job: job(model, [one]) for job in (fj.calibrate, fj.diagnose))
     for takes in (fj.pose_data, calibrated, diagnosed):

@@ -271,8 +271,8 @@ _NEAR = 0.1  # of the rate: what the stamps may say otherwise
 
 def _clock_beside(table: Table, entry: RecordingEntry, samples: int) -> tuple[str, ...]:
     """A warning where a task states a `rate` and the file holds stamps that say another one; sent to the log too."""
-    name = next((name for name in table.names if name.lower() in _CLOCKS), None)
-    if entry.rate is None or name is None:
+    name, stated = next((name for name in table.names if name.lower() in _CLOCKS), None), entry.rate
+    if stated is None or name is None:
         return ()
     try:
         stamps = table.vector(name, name)
@@ -282,12 +282,12 @@ def _clock_beside(table: Table, entry: RecordingEntry, samples: int) -> tuple[st
     if len(stamps) != samples or not (steps > 0).all() or np.median(steps) == 1.0:  # a counter of samples
         return ()
     rates = {unit: 1 / (float(np.median(steps)) * second) for unit, second in _SECONDS.items()}
-    if any(abs(rate / entry.rate - 1) < _NEAR for rate in rates.values()):
+    if any(abs(rate / stated - 1) < _NEAR for rate in rates.values()):
         return ()
-    unit = min(rates, key=lambda unit: abs(np.log(rates[unit] / entry.rate)))
+    unit = min(rates, key=lambda unit: abs(np.log(rates[unit] / stated)))
     said = f"time: {name}" if unit == "s" else f"time: {name}, units: {{time: {unit}}}"
     other = f"the column '{name}' runs at {rates[unit]:.4g} Hz"
-    text = f"check: {table.file.name}: rate is {entry.rate:g} Hz, but {other}; should the task say {said} in its place?"
+    text = f"check: {table.file.name}: rate is {stated:g} Hz, but {other}; should the task say {said} in its place?"
     logging.getLogger("figaroh_jax").warning(text)
     return (text,)
 
