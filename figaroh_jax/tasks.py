@@ -7,13 +7,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, overload
 
 from .errors import InputError
-from .formats.config import Preprocess
+from .formats.config import Preprocess, Task
 from .recordings.checks import Checked, checked_recordings
+from .recordings.posture_checks import check_pose_recordings
 from .simulators.native import as_backend
 
 if TYPE_CHECKING:
     from .calibration.kinematic_diagnosis import PoseDiagnosis
-    from .formats.config import Baseline, Task
+    from .formats.config import Baseline
     from .identification.result import Identification
     from .recordings.dataset import Recording
     from .recordings.poses import PoseRecording
@@ -38,6 +39,7 @@ def diagnose_task(
     >>> found.verdict, found.causes[0].name.effect
     ('named', 'coupled_transmission')
     """
+    _read(task)
     if task.of_postures:
         from .calibration.kinematic_diagnosis import diagnose_pose_task
 
@@ -110,7 +112,10 @@ def diagnose(
             raise InputError("recordings of torque and postures are diagnosed each by themselves")
         if preprocess is not None or known is not None or options:
             raise InputError("postures have no preprocess, baseline or further options: leave them out")
-        return diagnose_poses(as_backend(model).robot, postures, forbid, alpha, progress)
+        robot = as_backend(model).robot
+        warnings = check_pose_recordings(None, robot, postures)
+        found = diagnose_poses(robot, postures, forbid, alpha, progress)
+        return replace(found, calibration=replace(found.calibration, notes=(*warnings, *found.calibration.notes)))
     from .diagnosis.diagnosis import diagnose as of_torques
 
     torques: Any = recordings
@@ -134,6 +139,7 @@ def identify_task(
     >>> found.rank <= found.structural_rank, found.solution.reason
     (True, '')
     """
+    _read(task)
     if task.of_rollouts:
         from .rollouts.identification import identify_rollout_task
 
@@ -142,6 +148,14 @@ def identify_task(
     from .identification.identification import identify_task as of_torques
 
     return of_torques(task, progress, backend)
+
+
+def _read(task: Any) -> None:
+    """Refuse what no `load_task` made."""
+    if not isinstance(task, Task):
+        raise InputError(
+            f"expected a task as load_task reads it from a file or a dictionary, not {type(task).__name__}"
+        )
 
 
 def _native_alone(backend: str, what: str) -> None:

@@ -18,8 +18,10 @@ from figaroh_jax import cli
 from figaroh_jax.calibration.calibrated import Calibration
 from figaroh_jax.calibration.calibration import calibrate_task
 from figaroh_jax.formats.config import load_task
+from figaroh_jax.recordings.posture_checks import OFF
 from figaroh_jax.reporting.calibration_report import nominal_of
 from figaroh_jax.reporting.picture import segments
+from figaroh_jax.reporting.verification import DEFAULT_LIMITS
 
 OFFSET = np.array([0.01, -0.03, 0.05, 0.04, -0.06, 0.02])
 BAD_ROW = 17
@@ -275,3 +277,60 @@ def test_no_error_is_said_to_fall_that_does_not(tmp_path: Path, capsys: Any):
         told = json.loads((tmp_path / level / "result.json").read_text())["position"]
         falls = told["validated_after"] < told["validated_before"]
         assert ("falls from" in said[level]) == (falls and level != "frames"), (said[level], told)
+
+
+def placed(folder: Path, unknown: list[str], base: pin.SE3, markers: int = 1) -> Path:
+    """A task of postures of the robot as its URDF is, measured by a device at `base`, with `unknown` as stated."""
+    rng = np.random.default_rng(3)
+    real = poses.truth(rng, markers=markers)._replace(base=base)
+    (folder / "robot.urdf").write_text(poses.urdf())
+    q = poses.postures(rng, 40)
+    points = poses.points(poses.tool_poses(folder / "robot.urdf", q, real), real, rng)
+    return write(folder, q, points, unknown=unknown)
+
+
+def test_a_device_that_stands_elsewhere_than_stated_is_told(tmp_path: Path, capsys):
+    """0.8 m beside the base and taken as known: a warning with the key that is missing, and no calibration of it."""
+    beside = pin.SE3(np.eye(3), np.array([0.8, 0.0, 0.1]))
+    task = placed(tmp_path, ["tool_frame"], beside)
+    assert cli.main(["calibrate", str(task), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    (note,) = (note for note in result["notes"] if "base_frame 'base' taken as exactly known" in note)
+    assert "measurement.unknown: [base_frame, tool_frame]" in note
+    doubtful = result["unexplained"] > 0.12
+    for text in (capsys.readouterr().out, (tmp_path / "run" / "report.html").read_text()):
+        assert ("Do not use this model" in " ".join(text.split())) == doubtful
+    task = placed(tmp_path, ["base_frame", "tool_frame"], beside)
+    assert cli.main(["calibrate", str(task), "--out", str(tmp_path / "right"), "--quiet"]) == 0
+    assert json.loads((tmp_path / "right" / "result.json").read_text())["notes"] == []
+    assert "Do not use" not in capsys.readouterr().out
+
+
+def test_postures_that_belong_to_other_measurements_give_no_model_to_use(tmp_path: Path, capsys):
+    """Rows in another order: terminal, report and result.json say how much of the points' spread is left."""
+    task = placed(tmp_path, ["base_frame", "tool_frame"], pin.SE3.Identity())
+    with np.load(tmp_path / "postures.npz") as file:
+        q, points = file["q"], file["points"]
+    np.savez(tmp_path / "postures.npz", q=q, points=points[np.random.default_rng(0).permutation(len(q))])
+    assert cli.main(["calibrate", str(task), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    assert "Do not use this model" in " ".join(capsys.readouterr().out.split())
+    assert "Do not use this model" in (tmp_path / "run" / "report.html").read_text()
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    spread = np.sqrt((np.std(points[:, 0], axis=0) ** 2).sum())
+    with pytest.raises(fj.InputError, match=r"that of a calibration, .* robot\.urdf by load_urdf"):
+        fj.load_model(tmp_path / "run" / "model")
+    assert result["unexplained"] == pytest.approx(1e-3 * result["position"]["validated_after"] / spread, rel=1e-6)
+    assert DEFAULT_LIMITS["unexplained"] == OFF
+    assert cli.main(["verify", str(tmp_path / "run")]) == 1
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "unexplained" in line)
+    assert line.startswith("fail")
+
+
+def test_frames_that_are_swapped_are_one_message_before_any_work(wrong: tuple[Path, poses.Truth], tmp_path: Path):
+    keys = yaml.safe_load(wrong[0].read_text())
+    keys["data"][0]["measurement"] |= {"base_frame": "tool0", "tool_frame": "base"}
+    keys["data"][0]["file"] = str(wrong[0].parent / "postures.npz")
+    keys["robot"]["model"] = str(wrong[0].parent / "robot.urdf")
+    (tmp_path / "task.yaml").write_text(yaml.safe_dump(keys))
+    with pytest.raises(fj.InputError, match=r"task\.yaml: data\[0\]\.measurement: .*; are the two swapped\?"):
+        calibrate_task(load_task(tmp_path / "task.yaml"))

@@ -226,3 +226,56 @@ def test_several_things_that_cannot_be_right_stay_apart_on_one_line(base: Base, 
     still = {key: np.full_like(base.arrays[key], 0.3) for key in ("q", "tau")}
     what, text = said(Base("run", base.robot, base.arrays | still, base.entry, pair=base.pair), None, tmp_path)
     assert what == "refused" and "; run.npz: no joint moves" in " ".join(text.split())
+
+
+def test_arrays_are_checked_as_files_are(base: Base):
+    """Positions in degrees and of another number of joints, wherever arrays of a recording go in."""
+    robot = load_urdf(Path(base.robot["model"]))
+    t, q, tau = (np.asarray(base.arrays[key]) for key in ("t", "q", "tau"))
+    turns = np.array([joint.kind == "revolute" for joint in robot.joints])
+    degrees = fj.recording(q=np.where(turns, np.rad2deg(q), q), tau=tau, time=t)
+    with pytest.raises(InputError, match="cannot be right: .* degrees"):
+        fj.torque_data(robot, degrees)
+    few = fj.recording(q=q[:, :2], tau=tau[:, :2], time=t)
+    for takes in (
+        fj.torque_data,
+        lambda model, one: fj.identify(model, [one]),
+        lambda model, one: fj.diagnose(model, [one]),
+    ):
+        with pytest.raises(InputError, match="q has 2 columns, but robot .* has 3 numbers of position"):
+            takes(robot, few)
+
+
+def test_postures_of_arrays_are_checked_as_files_are(tmp_path: Path):
+    (tmp_path / "robot.urdf").write_text(poses.urdf())
+    robot, rng = load_urdf(tmp_path / "robot.urdf"), np.random.default_rng(0)
+    q = poses.postures(rng, 30)
+    seen = np.asarray(fj.frame_placement(robot, q, "tool0"))[:, :3, 3]
+    frames: dict[str, Any] = {"base_frame": "base", "tool_frame": "tool0"}
+    degrees = fj.postures(q=np.rad2deg(q), position=seen, **frames)
+    calibrated, diagnosed = (lambda model, one, job=job: job(model, [one]) for job in (fj.calibrate, fj.diagnose))
+    for takes in (fj.pose_data, calibrated, diagnosed):
+        with pytest.raises(InputError, match="cannot be right: .* degrees"):
+            takes(robot, degrees)
+    with pytest.raises(InputError, match="they look like mm"):
+        fj.calibrate(robot, [fj.postures(q=q, position=1e3 * seen, **frames)])
+
+
+def test_a_rate_that_contradicts_the_stamps_beside_it_is_told(base: Base, tmp_path: Path):
+    """Twice the rate of the file's own clock, whose column the task does not name; a counter of samples is no clock."""
+    t = np.asarray(base.arrays["t"])
+    right = 1 / float(np.median(np.diff(t)))
+    notes = {}
+    for name, rate, stamps in (
+        ("twice", 2 * right, t), ("right", right, 1e3 * t), ("counted", 2 * right, np.arange(len(t)))
+    ):  # fmt: skip
+        np.savez(tmp_path / f"{name}.npz", time=stamps, q=base.arrays["q"], tau=base.arrays["tau"])
+        entry = {"file": f"{tmp_path}/{name}.npz", "rate": rate, "position": "q", "torque": "tau"}
+        task = load_task({"robot": base.robot, "data": [entry]})
+        (recording,) = read_recordings(task, load_robot(task))
+        notes[name] = recording.notes
+    assert notes["right"] == notes["counted"] == ()
+    assert re.search(
+        r"twice.npz: rate is .* Hz, but the column 'time' runs at .* should the task say time: time in",
+        notes["twice"][0],
+    )

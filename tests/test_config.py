@@ -12,6 +12,7 @@ from figaroh_jax.errors import InputError
 from figaroh_jax.formats.config import Preprocess, Task, load_task
 from figaroh_jax.formats.robotfile import load_robot
 from figaroh_jax.recordings.dataset import read_recordings
+from figaroh_jax.reporting.run_directory import task_inputs
 
 CONTRACT = """
 robot:
@@ -149,3 +150,33 @@ def test_a_free_root_is_loaded_but_refused_where_recordings_hold_joint_torques(t
     assert model.joint_names == ("root_joint", "shoulder", "elbow", "slide") and (model.nq, model.nv) == (10, 9)
     with pytest.raises(InputError, match="robot.root is free_flyer: recordings of joint torques hold one column"):
         read_recordings(read_task, model)
+
+
+def test_keys_are_a_task_as_a_file_of_them_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Paths are those of the working directory; the keys stay as they are; a mistake is named as in a file."""
+    file = write(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    keys = task()
+    assert load_task(keys).model_dump() == load_task(file).model_dump()
+    assert keys == task()
+    keys["robot"]["model"] = Path("robot.urdf")
+    assert load_task(keys).robot.model == tmp_path / "robot.urdf"
+    (tmp_path / "base.yaml").write_text("preprocess: {cutoff: 7}")
+    assert (
+        load_task({**{k: v for k, v in task().items() if k != "preprocess"}, "extends": "base.yaml"}).preprocess.cutoff
+        == 7
+    )
+    with pytest.raises(InputError, match="task: unknown key 'robott'; did you mean 'robot'"):
+        load_task({"robott": {}, "data": task()["data"]})
+
+
+def test_motions_to_predict_stand_beside_their_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """`excite.predict` resolves against the file that says it, from wherever it is read; it is an input of the run."""
+    keys = {"robot": {"model": "robot.urdf"}, "excite": {"objective": "prediction", "predict": ["motion.npz"]}}
+    file = write(tmp_path, keys)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    excite = load_task(file).excite
+    assert excite is not None and excite.predict == (tmp_path / "motion.npz",)
+    (tmp_path / "motion.npz").write_bytes(b"any")
+    assert tmp_path / "motion.npz" in task_inputs(file)

@@ -20,6 +20,7 @@ from figaroh_jax.recordings.checks import check_recordings
 from figaroh_jax.recordings.dataset import read_recordings
 from figaroh_jax.recordings.draft import draft_task
 from figaroh_jax.recordings.draft_columns import Undecided
+from figaroh_jax.recordings.poses import read_pose_recordings
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +73,21 @@ def test_degrees_and_a_turned_sign_are_found(made, tmp_path: Path):
     assert recording.torque is not None
     np.testing.assert_allclose(recording.torque, run["torque"], rtol=0, atol=1e-9)
     assert any("opposite sign" in line for line in draft.assumed)
+
+
+def test_rad_that_lie_outside_a_limit_are_no_degrees(made, tmp_path: Path):
+    """Degrees fit every limit where the motion in rad nearly does; a zero offset (or a swap) is what is wrong."""
+    urdf, joints, (run, *_) = made
+    limit = np.asarray(fj.load_urdf(urdf).position_limit)[0]
+    q = run["position"].copy()
+    q[:, 0] += limit[1] + 0.3 * np.ptp(limit) - q[:, 0].max()
+    np.savez(tmp_path / "run.npz", t=run["time"], q=q, tau=run["torque"])
+    with pytest.raises(Undecided, match=f"rad or degrees. In rad, position of {joints[0]} lies outside") as told:
+        draft_task(urdf, [tmp_path / "run.npz"])
+    assert told.value.option == "unit"
+    np.savez(tmp_path / "run.npz", t=run["time"], q=np.rad2deg(q) * [1, 1, np.deg2rad(1)], tau=run["torque"])
+    with pytest.raises(InputError, match="in no unit do the positions fit"):
+        draft_task(urdf, [tmp_path / "run.npz"])
 
 
 def test_repeats_share_a_label(made, tmp_path: Path):
@@ -201,6 +217,25 @@ def test_the_task_of_postures_lists_the_joints_that_the_file_holds(made, tmp_pat
     with pytest.raises(InputError, match="a task for `calibrate`") as caught:
         draft_task(urdf, [table(tmp_path / "postures.csv", columns)])
     assert f"robot: {{model: MODEL, joints: [{joints[0]}, {joints[1]}]}}" in str(caught.value)
+
+
+def test_the_task_of_poses_with_quaternions_names_every_column(made, tmp_path: Path):
+    """Joints `q1` to `q3` beside a quaternion `qx` to `qw`: what the message shows is read as it stands."""
+    urdf, joints, (run, *_) = made
+    pose = np.random.default_rng(0).normal(size=(30, 7))
+    pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    columns = {f"q{j + 1}": run["position"][:30, j] for j in range(len(joints))}
+    columns |= {name: pose[:, k] for k, name in enumerate(("x", "y", "z", "qx", "qy", "qz", "qw"))}
+    with pytest.raises(InputError, match="a task for `calibrate`") as caught:
+        draft_task(urdf, [table(tmp_path / "poses.csv", columns)])
+    shown = " ".join(str(caught.value).split()).partition("The task is ")[2].partition(" where MODEL")[0]
+    shown = shown.replace("MODEL", str(urdf)).replace("BASE", joints[0]).replace("TOOL", joints[-1])
+    (tmp_path / "task.yaml").write_text(shown)
+    task = load_task(tmp_path / "task.yaml")
+    (recording,) = read_pose_recordings(task, load_robot(task))
+    assert recording.kind == "pose"
+    np.testing.assert_allclose(recording.position, run["position"][:30], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(recording.values[:, :3, 3], pose[:, :3], rtol=0, atol=1e-9)
 
 
 def test_fewer_columns_than_joints_are_told_how_to_name_theirs(made, tmp_path: Path):

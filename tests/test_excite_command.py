@@ -85,6 +85,8 @@ def test_the_run_holds_the_motion_at_1_khz_with_its_torques_and_a_joint_trajecto
         assert one["std"] < one["std_before"]
     page = (tmp_path / "run" / "report.html").read_text()
     assert "within limits" in page and "1 kHz" in page and page.count("<polyline") == 16
+    units = re.findall(r"<td>(position|velocity|acceleration|torque)</td>.*?</td><td>([^<]+)</td>", page)
+    assert set(units) == {("position", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s²"), ("torque", "N\xa0m")}
     moves_in_the_view(tmp_path / "run", monkeypatch)
 
 
@@ -98,10 +100,16 @@ def test_the_run_holds_the_motion_at_1_khz_with_its_torques_and_a_joint_trajecto
         ("objective: separate", "needs `separate`"),
         ("trajectories: 0", "excite.trajectories is 0, expected at least 1"),
         ("noise: -1", "more than 0"),
-        ("limits: {velocity: 0.0}", "excite.limits.velocity is 0.0, expected 'model', more than 0 or keys and values"),
+        (
+            "limits: {velocity: 0.0}",
+            "excite.limits.velocity is 0.0, expected 'model' or 'none', more than 0 or keys and values",
+        ),
         ("limits: {position: {turn: [1, a]}}", "excite.limits.position.turn[1] is 'a', expected a number"),
         ("basis: {fourier: 2.5}", "excite.basis.fourier is 2.5, expected a whole number"),
-        ("limits: {torque: true}", "excite.limits.torque is True, expected 'model', a number or keys and values"),
+        (
+            "limits: {torque: true}",
+            "excite.limits.torque is True, expected 'model' or 'none', a number or keys and values",
+        ),
     ],
 )
 def test_a_mistake_in_the_block_is_named_with_its_key(tmp_path: Path, keys: str, message: str):
@@ -262,3 +270,25 @@ def test_limits_that_nobody_gives_and_ranges_in_degrees_are_said(tmp_path: Path,
     assert main(["excite", str(file), "--out", str(tmp_path / "other"), "--quiet"]) == 0
     said = json.loads((tmp_path / "other" / "excitation.json").read_text())["notes"]
     assert not any("nothing limits" in note for note in said)
+
+
+def test_a_limit_is_waived_by_a_word_and_never_by_an_empty_value(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Without the torque's the motion may pass the model's; a note says so; a joint or key that is wrong has a file."""
+    text = re.sub(r'effort="[^"]*"', 'effort="0.05"', ARM)
+    largest, notes = {}, {}
+    for stated, status in (("model", 0), ("", 2), ("none", 0)):
+        file = task_of(tmp_path, f"{BASIS}, starts: 1, limits: {{acceleration: 10, torque: {stated}}}")
+        out = tmp_path / f"run{stated}"
+        (tmp_path / "robot.urdf").write_text(text)
+        assert main(["excite", str(file), "--out", str(out), "--quiet"]) == status
+        assert out.exists() == (status == 0)
+        if status == 0:
+            notes[stated] = json.loads((out / "excitation.json").read_text())["notes"]
+            largest[stated] = np.abs(np.load(out / "trajectory_1.npz")["torque"]).max()
+    waived = "limits.torque: none: the motion keeps no limit of the torque"
+    assert waived in notes["none"] and waived not in notes["model"]
+    assert largest["model"] < 0.0501 < largest["none"]
+    file = task_of(tmp_path, f"{BASIS}, limits: {{velocity: {{trun: 1}}}}")
+    capsys.readouterr()
+    assert main(["excite", str(file), "--out", str(tmp_path / "other"), "--quiet"]) == 2
+    assert "task.yaml: excite.limits.velocity: no moving joint 'trun'; did you mean 'turn'" in capsys.readouterr().err

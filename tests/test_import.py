@@ -63,5 +63,7 @@ def test_every_public_name_is_there_and_documented(name: str):
 
 
 def test_unknown_name_is_refused():
-    with pytest.raises(AttributeError, match="'figaroh_jax' has no attribute 'nothing'"):
+    with pytest.raises(AttributeError, match="'figaroh_jax' has no attribute 'nothing'") as told:
         _ = fj.nothing
+    found = told.value  # Python shows the nearest name of its object
+    assert found.name == "nothing" and "inverse_dynamics" in dir(found.obj)

@@ -365,6 +365,32 @@ def test_a_picture_shows_the_robot_and_names_what_is_affected():
     assert moved.count('class="nominal"') == len(model.joints) + 1
 
 
+_BOXES = """((s) => [...document.querySelectorAll(s)].map((e) => {
+  const b = e.getBoundingClientRect(); return [b.left, b.top, b.right, b.bottom]; }))"""
+
+
+@pytest.mark.parametrize("affected", [(0,), (1, 2), (0, 1, 2, 3)])
+def test_names_in_a_picture_touch_neither_each_other_nor_the_robot(
+    affected: tuple[int, ...], tab: browser.Page, tmp_path: Path
+):
+    """By the boxes that the browser draws; long names do not leave the picture."""
+    style = Path(report.__file__).parents[1].joinpath("page", "report.css").read_text("utf-8")
+    for longer in ("", "_of_the_left_arm_of_the_robot"):
+        model = load_urdf(DEMO)
+        joints = tuple(joint._replace(name=joint.name + longer) for joint in model.joints)
+        text = robot_picture(replace(model, joints=joints), affected={joints[k].name for k in affected})
+        page = tmp_path / "picture.html"
+        page.write_text(f'<meta charset="utf-8"><style>{style}</style><figure class="robot">{text}</figure>')
+        tab.open(page, *LAPTOP)
+        parts = ("svg text", "svg circle, svg path.link, svg path.hit", "svg")
+        names, others, (whole,) = (tab.value(f"{_BOXES}('{part}')") for part in parts)
+        assert len(names) == len(affected) and len(others) > len(joints)
+        for k, (left, top, right, bottom) in enumerate(names):
+            for a, b, c, d in (*names[:k], *others):
+                assert right <= a or c <= left or bottom <= b or d <= top
+            assert whole[0] <= left and right <= whole[2] and whole[1] <= top and bottom <= whole[3]
+
+
 def test_browser_prints_every_joint(tab: browser.Page, tmp_path: Path):
     tab.open(_written(VARIANTS["named"], tmp_path), *LAPTOP)
     tab.wait("window.Plotly !== undefined")

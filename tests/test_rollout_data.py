@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import equinox as eqx
@@ -93,3 +95,18 @@ def test_one_joint_of_an_arm_is_fitted_by_itself_whatever_the_others_are(tmp_pat
     assert found["rotor_inertia lift inertia"].value == pytest.approx(servo_arm6.ARMATURE[1], rel=0.06)
     with pytest.raises(fj.InputError, match="did you mean 'lift'"):
         fj.rollout_data(loop, run, joint="lfit")
+
+
+def test_a_recording_of_another_clock_unit_or_number_of_joints_is_told_what_fits(tmp_path: Path):
+    (tmp_path / "arm.xml").write_text(servo_arm6.model_text())
+    loop, _ = fj.load_loop(tmp_path / "arm.xml")
+    seen = servo_arm6.record([], 4, 0)
+    t, q, u = seen["t"][:100], seen["q"][:100], seen["u"][:100]
+    with pytest.raises(fj.InputError, match=r"dataclasses.replace\(loop, dt=") as told:
+        fj.rollout_data(loop, fj.recording(time=1.003 * t, q=q, command=u))
+    step = float(re.search(r"dt=([0-9.e-]+)", str(told.value)).group(1))  # pyright: ignore[reportOptionalMemberAccess]
+    fj.rollout_data(replace(loop, dt=step), fj.recording(time=1.003 * t, q=q, command=u))
+    with pytest.raises(fj.InputError, match="q has 2 columns"):
+        fj.rollout_data(loop, fj.recording(time=t, q=q[:, :2], command=u[:, :2]))
+    with pytest.raises(fj.InputError, match="cannot be right"):
+        fj.rollout_data(loop, fj.recording(time=t, q=np.rad2deg(q) + 400, command=u))

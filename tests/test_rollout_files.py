@@ -9,6 +9,7 @@ import json
 import re
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco as engine
@@ -22,12 +23,15 @@ from figaroh_jax.errors import InputError
 from figaroh_jax.formats.export import write_model
 from figaroh_jax.jobs.export import export_loop
 from figaroh_jax.jobs.rollouts import write_loop
+from figaroh_jax.results import Gain
 from figaroh_jax.rollouts.alone import separable
+from figaroh_jax.rollouts.data import Run, ahead_of_command
 from figaroh_jax.rollouts.export import described, for_simulator
+from figaroh_jax.rollouts.gates import rms_of
 from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.simulation import rollout
-from figaroh_jax.rollouts.task import extended_of
+from figaroh_jax.rollouts.task import _gain as gain_of, extended_of
 
 mujoco: Any = engine
 
@@ -276,3 +280,76 @@ def test_a_joint_that_slides_has_its_own_units_in_file_and_page(tmp_path: Path):
     head = page[page.index("<thead>") : page.index("</thead>")]
     body = page[page.index("</thead>") : page.index("</table>")]
     assert "N s/m" not in head and "N m s/rad" not in head and body.count("N s/m") == 1 and body.count("N m s/rad") == 2
+
+
+def stepped(rows: int = 400, steps: int = 10) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time, command and position (rad, joint side) of the arm without its gripper on random steps, by MuJoCo C."""
+    model = mujoco.MjModel.from_xml_string(ARM.format(finger="", first=""))
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-0.4, 0.4, (rows // 20, 2)), 20, axis=0) * [1.0, 2.0]
+    q = []
+    for row in u:
+        q.append(data.qpos.copy())
+        data.ctrl[:] = row
+        mujoco.mj_step(model, data, steps)
+    return np.arange(rows) * steps * 0.002, u, np.array(q)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "advice"),
+    [
+        (lambda u, q: (np.rad2deg(u), np.rad2deg(q)), "looks like degrees: add units: {position: deg}"),
+        (lambda u, q: (q, u), "moves before its command at yaw, lift .*are `command` and `position` swapped"),
+        (lambda u, q: (u, q + np.outer(np.arange(len(q)) > 200, [2 * np.pi, 0])), "yaw jumps by 2 pi in row 201"),
+    ],
+)
+def test_a_rollout_in_another_unit_or_order_is_refused(spoil: Any, advice: str, tmp_path: Path, capsys):
+    """Files that every simulation would fit wrongly in silence: exit status 2, one message, nothing written."""
+    (tmp_path / "arm.xml").write_text(ARM.format(finger="", first=""))
+    t, u, q = stepped()
+    command, position = spoil(u, q)
+    entry = "{file: run.npz, time: t, command: u, position: q}"
+    (tmp_path / "task.yaml").write_text(f"robot: {{model: arm.xml}}\ndata:\n  - {entry}\n")
+    np.savez(tmp_path / "run.npz", t=t, u=command, q=position)
+    assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "run.npz" in said and re.search(advice, said), said
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("late", [0, 3, 12])
+def test_only_a_position_that_moves_first_is_ahead_of_its_command(late: int):
+    """Of MuJoCo's motion, read `late` rows after it was made; a command that is logged one row late is none."""
+    t, u, q = stepped()
+    read, command = np.roll(q[:, 0], late), u[:, 0]
+    assert ahead_of_command(command, read, t[1]) == 0
+    assert ahead_of_command(np.roll(command, 1), q[:, 0], t[1]) == 0
+    assert ahead_of_command(read, command, t[1]) > 0
+
+
+def test_one_error_of_a_robot_counts_joints_of_one_kind(tmp_path: Path):
+    """0.02 rad at two joints and 1 mm at the finger; what is named at the finger alone is judged there."""
+    (tmp_path / "arm.xml").write_text(GRIPPING)
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    names = loop.robot.dof_names
+    errors = np.array([1e-3 if name == "left" else 0.02 for name in names])
+    zero = np.zeros((50, 3))
+    run = Run("run", np.arange(50) * 0.02, zero, zero, None, holdout=True)
+    held = {"run": (zero + errors, zero + errors / 2)}
+
+    def told(*at: str) -> Gain:
+        named = [SimpleNamespace(candidate=SimpleNamespace(at=(name,))) for name in at]
+        found: Any = SimpleNamespace(structure=SimpleNamespace(loop=loop), named=named)
+        return gain_of(held, [run], found)
+
+    assert told() == told("yaw") == told("yaw", "left")
+    assert (told().before, told().after, told().unit) == (pytest.approx(0.02), pytest.approx(0.01), "rad")
+    assert (told("left").before, told("left").after, told("left").unit) == (
+        pytest.approx(1e-3),
+        pytest.approx(5e-4),
+        "m",
+    )
+    here: Any = SimpleNamespace(loop=loop, spread=errors, data=SimpleNamespace(weight=np.ones((1, 3, 50))))
+    squares = np.full((1, 1, 3), 50.0)  # whitened: each joint's error is its noise
+    assert rms_of(here, squares) == pytest.approx(0.02)
+    assert rms_of(here, squares, names.index("left")) == pytest.approx(1e-3)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +62,7 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[browser.Page]:
 def test_the_summary_says_the_error_first_and_every_number_with_its_interval(capsys: pytest.CaptureFixture[str]):
     show_rollouts(found(), "the arm", verbose=False)
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("identified  Held-out motions are simulated from the command within 2 %")
+    assert lines[0].startswith("identified  Held-out motions are simulated from the command with an error of at most 2")
     assert "6 of 8 numbers of the arm are identified" in lines[0]
     assert any(line.split() == ["Coulomb", "friction", "shoulder", "0.400", "±", "0.039", "N", "m"] for line in lines)
     assert any("on its bound" in line for line in lines) and lines[-1].startswith("2 notes")
@@ -107,3 +109,19 @@ def test_what_is_left_goes_with_the_motion_or_a_line():
     assert first["a"].share > 0.9
     assert first["b"].band is not None
     assert first["b"].band[0] < 7 < first["b"].band[1]
+
+
+def test_errors_of_joints_that_turn_and_slide_are_told_apart(tmp_path: Path):
+    """0.01 rad at three joints and 2 mm at the fourth: two numbers, none of both; names of joints stay as they are."""
+    whole = found()
+    far = [replace(t, before=t.measured + np.array([0.01, 0.01, 0.01, 0.002])) for t in whole.traces]
+    names = ("shoulder_pan", *whole.joints[1:])
+    rolled = lambda one: one | {"expression": one["expression"].replace("wrist", "wrist_roll")}  # noqa: E731
+    numbers = [rolled(one) for one in whole.result["base_parameters"]]
+    result = whole.result | {"base_parameters": numbers}
+    mixed = whole._replace(units=("rad", "rad", "rad", "m"), traces=tuple(far), joints=names, result=result)
+    write_rollouts(mixed, tmp_path / "report.html", "arm")
+    text = re.sub(r"(?s)<script.*?</script>", "", (tmp_path / "report.html").read_text("utf-8"))
+    assert "rad or m" not in text and "Joints that turn" in text and "Joints that slide" in text
+    assert "10 mrad" in text and "2 mm" in text
+    assert "wrist_roll (on its bound)" in text and "wrist roll" not in text

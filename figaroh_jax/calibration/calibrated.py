@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..recordings.posture_checks import OFF
 from ..results import Selection
 from ..rigid.model import RobotModel
 
@@ -85,11 +86,17 @@ class Calibration(Selection):
     distances: tuple[SocketDistance, ...] = ()
     correlations: tuple[tuple[str, str, float], ...] = ()  # of identified parameters, the strongest
     posture: dict[str, float] = field(default_factory=dict)  # of the joints that are locked, rad or m
+    unexplained: float | None = None  # held-out error over the measured points' spread; None where no points are seen
 
     @property
     def model(self) -> RobotModel:
         """The robot with corrected placements."""
         return self.solution.model.robot
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether it leaves more of the points' spread than any robot out of calibration: it is no calibration."""
+        return self.unexplained is not None and self.unexplained > OFF
 
     @property
     def converged(self) -> bool:

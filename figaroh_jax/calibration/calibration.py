@@ -21,7 +21,7 @@ from ..estimation.gravity import without_far_masses
 from ..estimation.posegroups import Measured, assemble, postures_of
 from ..estimation.posesolver import Solution, solve
 from ..recordings.poses import PoseRecording, read_pose_recordings
-from ..recordings.posture_checks import check_pose_recordings
+from ..recordings.posture_checks import check_pose_recordings, spread_of
 from ..rigid.chain import chain_between
 from ..rigid.model import RobotModel
 from . import corrections, levels, thresholds
@@ -63,7 +63,7 @@ def calibrate_task(
     model = load_robot(task)
     recordings = read_pose_recordings(task, model)
     notes = check_pose_recordings(task, model, recordings)
-    found = calibrate(model, recordings, forbid=task.diagnose.forbid, level=level, priors=priors, progress=progress)
+    found = _calibrated(model, recordings, task.diagnose.forbid, progress, level, priors)
     return replace(found, posture=dict(task.robot.posture), notes=(*notes, *found.notes))
 
 
@@ -91,6 +91,20 @@ def calibrate(
     >>> round(found.solution.parameters["joint_offset shoulder"].value, 4)
     0.02
     """
+    notes = check_pose_recordings(None, model, recordings)
+    found = _calibrated(model, recordings, forbid, progress, level, priors)
+    return replace(found, notes=(*notes, *found.notes))
+
+
+def _calibrated(
+    model: RobotModel,
+    recordings: Sequence[PoseRecording],
+    forbid: Sequence[str],
+    progress: Callable[[str, float], None],
+    level: str | None,
+    priors: bool,
+) -> Calibration:
+    """`calibrate` of recordings that were checked."""
     if level is not None and level not in levels.LEVELS:
         raise InputError(f"no level '{level}' of calibration{nearest(level, levels.LEVELS)}")
     with jax.enable_x64(True):
@@ -248,6 +262,7 @@ class Run:
             noise=(float(posterior.noise[0]), float(posterior.noise[1])),
             scheme=scheme,
             notes=tuple(self.notes),
+            unexplained=_unexplained(position, self.recordings),
             distances=socket_distances(
                 self.recordings, (self.measured, self.choice.fits["frames"][0]), (final, linear)
             ),
@@ -290,6 +305,15 @@ def _enough(measured: Measured, recordings: Sequence[PoseRecording]) -> None:
             f"{names}: {postures} measured postures give {rows} numbers for {unknowns} unknowns of the frames alone;"
             f" measure at least {max(thresholds.FOLDS, unknowns // 2)} postures, better 30 or more"
         )
+
+
+def _unexplained(position: Error | None, recordings: Sequence[PoseRecording]) -> float | None:
+    """Held-out error of position over the spread of the points, where every recording measures points."""
+    spreads = [spread_of(r) for r in recordings]
+    known = [spread for spread in spreads if spread]
+    if position is None or len(known) < len(spreads) or not np.isfinite(position.validated_after):
+        return None
+    return 1e-3 * position.validated_after / float(np.sqrt(np.mean(np.square(known))))
 
 
 def _few(recordings: Sequence[PoseRecording]) -> list[str]:

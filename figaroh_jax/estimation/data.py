@@ -26,6 +26,7 @@ from ..compiled.precision import in_float64
 from ..effects.extended import ExtendedModel, changed_robot, extend, opened, read_position, read_sensors
 from ..effects.kinematic import PostureMotion, Postures, twists_of
 from ..errors import InputError
+from ..recordings.checks import check_columns, position_findings, report_findings
 from ..recordings.dataset import Recording
 from ..recordings.devices import Device
 from ..recordings.poses import PoseRecording
@@ -226,6 +227,7 @@ def torque_data(
     lacking = next((one for one in fitted if one.torque is None), None)
     if not fitted or lacking is not None:
         raise InputError(f"{lacking.file} has no torque" if lacking else "no recording to fit: all have role holdout")
+    _belong(robot, fitted)
     signals = prepare_all(tuple(fitted), preprocess or Preprocess(), band=None, model=robot)
     records = stack(signals, robot)
     places = records.source.shape[1]
@@ -255,6 +257,17 @@ def torque_data(
     )
 
 
+def _belong(robot: RobotModel, recordings: Sequence[Recording]) -> None:
+    """Refuse positions of another number of joints, or in a unit in which they cannot be this robot's."""
+    found = []
+    for one in recordings:
+        check_columns(one, robot)
+        if robot.nq == robot.nv:
+            findings = position_findings(one.position, robot, "rad", one.time)
+            found += [(one.file.name, finding) for finding in findings]
+    report_findings(found)
+
+
 def pose_data(
     model: RobotModel | ExtendedModel,
     recordings: PoseRecording | Sequence[PoseRecording],
@@ -276,6 +289,10 @@ def pose_data(
     """
     robot = model.robot if isinstance(model, ExtendedModel) else model
     given = [recordings] if isinstance(recordings, PoseRecording) else list(recordings)
+    if robot.nq == robot.nv and all(
+        one.position.shape[1] == robot.nv for one in given
+    ):  # else the kinematics refuse it
+        report_findings([(r.file.name, f) for r in given for f in position_findings(r.position, robot, "rad")])
     found, duration = [], max(sum(float(np.ptp(one.time)) for one in given), 1e-9)
     for members, device, datum, measured in devices_of(robot, given):
         scale = sigma or tuple(given[members[0]].accuracy[k] or 1.0 for k in (0, 1))

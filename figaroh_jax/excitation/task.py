@@ -20,7 +20,7 @@ from ..rigid.model import RobotModel
 from .clearance import Box, Capsule, Clearance, clearance_of
 from .design import Cause, Design, excite
 from .information import learn
-from .limits import limits_of, open_limits
+from .limits import Limits, limits_of, open_limits
 from .motions import Basis, fourier, quintic, spline
 from .postures import ACCURACY, Instrument, PostureDesign, View, excite_postures
 from .touch import Touch
@@ -68,13 +68,12 @@ def excite_task(
     basis = basis_of(asked)
     bounds = asked.limits
     clearance, around = clearance_asked(task, asked, model.robot)
-    limits = limits_of(
-        model.robot, bounds.position, bounds.velocity, bounds.acceleration, bounds.torque, clearance=clearance
-    )
+    stated = {kind: _waived(getattr(bounds, kind)) for kind in ("position", "velocity", "torque")}
+    limits = _limits_of(task, model.robot, **stated, acceleration=bounds.acceleration, clearance=clearance)
     noise = DEFAULT_NOISE if asked.noise is None else asked.noise
     learned = learn(model, known, noise=noise, trust=task.robot.trust)
-    stated = {kind: getattr(bounds, kind) for kind in ("position", "velocity", "torque")}
     said = [*notes, *around, *open_limits(model.robot, limits, stated)]
+    said += [f"limits.{kind}: none: the motion keeps no limit of the {kind}" for kind, x in stated.items() if x is None]
     if task.data:
         from .known import with_recordings  # the machinery of fits, which a design without recordings does without
 
@@ -110,13 +109,26 @@ def excite_task(
     return replace(found, notes=(*said, *found.notes))
 
 
+def _waived(stated: Any) -> Any:
+    """A limit as `limits_of` takes it, where None is none."""
+    return None if isinstance(stated, str) and stated == "none" else stated
+
+
+def _limits_of(task: Task, robot: RobotModel, **stated: Any) -> Limits:
+    """`limits_of`, whose messages name the task."""
+    try:
+        return limits_of(robot, **stated)
+    except InputError as error:
+        raise InputError(f"{task.file}: excite.{error}") from None
+
+
 def clearance_asked(task: Task, asked: Excite, robot: RobotModel) -> tuple[Clearance | None, tuple[str, ...]]:
     """The distances that a task asks for, and what is to be said of them."""
     margin = asked.limits.clearance
     if margin is None:
         return None, ("no limits.clearance is given: distances between bodies are not looked at",)
     shapes, notes = read_shapes(task.robot.model)
-    limits = limits_of(robot, asked.limits.position)
+    limits = _limits_of(task, robot, position=asked.limits.position)
     found = clearance_of(
         robot,
         shapes,
@@ -166,7 +178,7 @@ def _postures(task: Task, asked: Excite, robot: RobotModel, progress: Callable[[
         asked.point,
     )
     clearance, said = clearance_asked(task, asked, robot)
-    limits = limits_of(robot, asked.limits.position)
+    limits = _limits_of(task, robot, position=asked.limits.position)
     found = excite_postures(
         robot,
         instrument,

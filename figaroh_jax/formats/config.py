@@ -17,7 +17,7 @@ from .excite_keys import Excite, MotionBasis, MotionLimits, SizedEffect
 from .fields import Effect, Keys, Number, Positive, Vector
 from .files import USD
 from .recording_keys import Load, Measurement, Preprocess, RecordingEntry, Transmission, Units
-from .taskfile import merge, read_task, where
+from .taskfile import given_task, merge, read_task, where
 
 __all__ = [
     "Actuator",
@@ -276,6 +276,7 @@ class Limits(Keys):
     position_mm: Positive | None = None  # validated, at most
     orientation_deg: Positive | None = None
     fk_parity: Positive | None = None  # m, at most
+    unexplained: Positive | None = None  # calibrate: share of the measured points' spread, at most
 
 
 def load_limits(path: str | Path) -> Limits:
@@ -288,20 +289,28 @@ def load_limits(path: str | Path) -> Limits:
         raise InputError(f"{where(chain, place)}: {text}") from None
 
 
-def load_task(path: str | Path) -> Task:
-    """Read and check a task file; raises `InputError` that names file and key of the first mistake.
+def load_task(path: str | Path | Mapping[str, Any]) -> Task:
+    """Read and check a task file, or its keys as a mapping, whose relative paths are those of the working directory.
+
+    Raises `InputError` that names file and key of the first mistake.
 
     >>> import figaroh_jax as fj
     >>> fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml")).preprocess.cutoff
     15.0
+    >>> run = {"file": "run.npz", "rate": 250, "position": "q", "torque": "tau"}
+    >>> fj.load_task({"robot": {"model": fj.DEMO}, "data": [run]}).robot.trust
+    0.1
     """
-    chain = read_task(Path(path))
+    if not isinstance(path, (str, Path, Mapping)):
+        kind = type(path).__name__
+        raise InputError(f"load_task takes the name of a task file or its keys as a dictionary, not {kind}")
+    chain = given_task(path) if isinstance(path, Mapping) else read_task(Path(path))
     try:
         task = Task.model_validate(merge(chain))
     except ValidationError as error:
         place, text = _mistake(error.errors(include_url=False))
         raise InputError(f"{where(chain, place)}: {text}") from None
-    task._file = Path(path)
+    task._file = chain[-1][0]
     return task
 
 

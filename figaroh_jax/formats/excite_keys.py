@@ -32,12 +32,15 @@ class MotionBasis(Keys):
 
 
 class MotionLimits(Keys):
-    """What a designed motion may use: `model` is what the robot's file says, a number or a map by joint replaces it."""
+    """What a designed motion may use: `model` is what the robot's file says, a number or a map by joint replaces it.
+
+    `none` waives the limit of a model; an empty value, which may be a forgotten one, is refused.
+    """
 
     position: Literal["model"] | Positive | dict[str, Positive | tuple[Number, Number]] = "model"  # rad or m
-    velocity: Literal["model"] | Positive | dict[str, Positive] = "model"
+    velocity: Literal["model", "none"] | Positive | dict[str, Positive] = "model"
     acceleration: Positive | dict[str, Positive] | None = None  # rad/s^2 or m/s^2; None: no limit
-    torque: Literal["model"] | Positive | dict[str, Positive] = "model"  # N m or N
+    torque: Literal["model", "none"] | Positive | dict[str, Positive] = "model"  # N m or N
     clearance: Positive | None = None  # m, between bodies that no joint joins, the floor, boxes; None: not looked at
 
 

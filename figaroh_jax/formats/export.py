@@ -209,6 +209,11 @@ def load_model(directory: str | Path) -> ExtendedModel:
     file = directory / "effects.yaml"
     if not file.is_file() and (directory / "model" / file.name).is_file():
         raise InputError(f"{file} does not exist; the model of this run is in {directory / 'model'}")
+    if not file.is_file() and (directory / "calibration.yaml").is_file():
+        raise InputError(
+            f"{file} does not exist: {directory} is that of a calibration, whose robot has no effects: read its"
+            " robot.urdf by load_urdf, or its robot.xml by load_mjcf"
+        )
     content = read_yaml(file)
     try:
         robot = _restored(content, directory / "robot.urdf")

@@ -18,6 +18,9 @@ def model_format(path: str | Path) -> str:
     suffix = Path(path).suffix.lower()
     known = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf"} | dict.fromkeys(USD, "usd")
     if suffix not in known:
+        near = "" if Path(path).exists() else nearest(Path(path).name, _beside(Path(path), tuple(known)))
+        if near:  # a slip of the fingers in the suffix
+            raise InputError(f"{path} does not exist{near}")
         raise InputError(f"{path}: a robot model is a .urdf or an .xml (MJCF) file, or USD (.usd, .usda, .usdc, .usdz)")
     return known[suffix]
 

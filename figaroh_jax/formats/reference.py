@@ -107,9 +107,9 @@ KEYS: dict[str, tuple[str, str, str]] = {
     "excite.basis.spline": ("points", "9", "no spline"),
     "excite.basis.quintic": ("waypoints", "5", "no waypoints"),
     "excite.limits.position": ("rad, m", "{elbow: [-1, 1]}", "the model's limits hold"),
-    "excite.limits.velocity": ("rad/s, m/s", "1.5", "the model's limits hold"),
+    "excite.limits.velocity": ("rad/s, m/s", "1.5", "the model's limits hold; `none`: no limit of the velocity"),
     "excite.limits.acceleration": ("rad/s², m/s²", "8.0", "the acceleration has no limit of its own"),
-    "excite.limits.torque": ("N m, N", "{elbow: 20}", "the model's limits hold"),
+    "excite.limits.torque": ("N m, N", "{elbow: 20}", "the model's limits hold; `none`: no limit of the torque"),
     "excite.limits.clearance": ("m", "0.02", "distances between bodies are not looked at"),
     "excite.objective": ("", "condition", "the determinant of the information is maximised"),
     "excite.predict": ("", "[motion.npz]", "`objective: prediction` needs it: the motions that matter"),
@@ -160,6 +160,7 @@ LIMITS: dict[str, tuple[str, str, str]] = {
     "position_mm": ("mm", "0.5", "the validated error of position is not judged"),
     "orientation_deg": ("deg", "0.1", "the validated error of orientation is not judged"),
     "fk_parity": ("m", "1.0e-9", "the exported model is not compared with the calibrated one"),
+    "unexplained": ("1", "0.12", "the share of the measured points' spread that the calibration leaves is not judged"),
 }
 _OPEN = {"actuator": ("<joint>", config.JointDrive), "identify.bounds": ("<link>", config.Bound)}
 _WHOLE = ("excite.measurement", "excite.separate")  # whose own keys stand elsewhere

@@ -7,6 +7,8 @@ file they stand in, before files are merged.
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ import yaml
 from ..errors import InputError
 from .files import read_file
 
-__all__ = ["CONTRACT_EFFECTS", "merge", "read_task", "read_yaml", "where"]
+__all__ = ["CONTRACT_EFFECTS", "given_task", "merge", "read_task", "read_yaml", "where"]
 
 # The names that the contract fixes, of every level; a task may forbid one that this version does not look for.
 CONTRACT_EFFECTS = """
@@ -137,13 +139,26 @@ def read_task(file: Path) -> list[tuple[Path, dict[str, Any]]]:
     return chain
 
 
+def given_task(keys: Mapping[str, Any]) -> list[tuple[Path, dict[str, Any]]]:
+    """`read_task` of keys that no file holds: relative paths and `extends` are those of the working directory."""
+    own = copy.deepcopy(dict(keys))
+    parent = own.pop("extends", None)
+    if parent is not None and not isinstance(parent, (str, Path)):
+        raise InputError(f"task: extends is {parent!r}, expected the name of one YAML file")
+    _absolute(own, Path.cwd())
+    return [*([] if parent is None else read_task(Path(parent))), (Path("task"), own)]
+
+
 def _absolute(keys: dict[str, Any], folder: Path) -> None:
-    """Make `robot.model` and `data[].file` absolute, in place."""
+    """Make `robot.model`, `data[].file` and `excite.predict` absolute, in place."""
     entries = keys.get("data")
     files = [(entry, "file") for entry in entries] if isinstance(entries, list) else []
     for holder, key in [(keys.get("robot"), "model"), *files]:
-        if isinstance(holder, dict) and isinstance(holder.get(key), str):
+        if isinstance(holder, dict) and isinstance(holder.get(key), (str, Path)):
             holder[key] = str(folder / holder[key])
+    excite = keys.get("excite")
+    if isinstance(excite, dict) and isinstance(excite.get("predict"), list):
+        excite["predict"] = [str(folder / x) if isinstance(x, (str, Path)) else x for x in excite["predict"]]
 
 
 def merge(chain: list[tuple[Path, dict[str, Any]]]) -> dict[str, Any]:

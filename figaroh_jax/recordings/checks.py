@@ -32,8 +32,10 @@ if TYPE_CHECKING:
 __all__ = [
     "Checked",
     "Finding",
+    "check_columns",
     "check_recording",
     "check_recordings",
+    "check_rollouts",
     "checked_recordings",
     "position_findings",
     "report_findings",
@@ -42,6 +44,7 @@ __all__ = [
 DEGREE = np.pi / 180
 STILL = 1e-3  # rad or m: a joint that stays within it stands
 HARD = 20.0  # times a limit: no robot does that
+FEWEST = 8  # rows of which anything can be said
 WHEEL = 20.0  # rad/s of a joint without limits: faster than wheels turn; 0.35 rad/s in degrees read as rad
 
 
@@ -67,6 +70,8 @@ def checked_recordings(task: Task | None, model: RobotModel, recordings: Sequenc
     joint's torque that does not follow the model in most of the recordings that are fitted.
     """
     entries: dict[Path | Memory, RecordingEntry] = {entry.place: entry for entry in task.data} if task else {}
+    for recording in recordings:
+        check_columns(recording, model)
     found = [
         (recording.file.name, finding)
         for recording in recordings
@@ -105,7 +110,7 @@ def report_findings(found: Sequence[tuple[str, Finding]]) -> tuple[str, ...]:
 
 def check_recording(recording: Recording, model: RobotModel, entry: RecordingEntry | None = None) -> list[Finding]:
     """Everything that looks wrong about one recording (joint side, SI units), the gravest first."""
-    if model.nq != model.nv or len(recording.time) < 8:
+    if model.nq != model.nv or len(recording.time) < FEWEST:
         return []
     motion = sampled(recording.time, recording.position, recording.torque)
     unit = entry.units.position if entry is not None else "rad"
@@ -120,6 +125,34 @@ def check_recording(recording: Recording, model: RobotModel, entry: RecordingEnt
     if motion is not None and recording.torque is not None and not _stands(recording):
         found += torque_findings(replace(look, model=carrying(model, recording.load)), motion)
     return found
+
+
+def check_rollouts(task: Task, model: RobotModel, recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """Warnings about recordings of commands and positions, as `check_recordings`: clock, unit, range, jumps.
+
+    What these say of a motion holds without torque; `InputError` with every finding that cannot be right.
+    """
+    entries: dict[Path | Memory, RecordingEntry] = {entry.place: entry for entry in task.data}
+    found = []
+    for recording in recordings if model.nq == model.nv else ():
+        entry = entries.get(recording.file)
+        unit = entry.units.position if entry is not None else "rad"
+        look = Look(recording.position, recording.joints, model, unit, recording, entry, time=recording.time)
+        if len(recording.time) >= FEWEST and recording.position.shape[1] == model.nv:
+            told = [finding for check in (_clock, _unit_without_joint, _ranges) for finding in check(look)]
+            told += () if any(finding.wrong for finding in told) else _jumps(look)
+            found += [(recording.file.name, finding) for finding in told]
+    return report_findings(found)
+
+
+def check_columns(recording: Recording, model: RobotModel) -> None:
+    """Refuse positions of another number of joints than the robot's."""
+    if recording.position.shape[1] != model.nq:
+        raise InputError(
+            f"recording '{recording.name}': q has {recording.position.shape[1]} columns, but robot '{model.name}' has"
+            f" {model.nq} numbers of position ({', '.join(model.joint_names)}); joints that stand still are left out by"
+            " load_urdf(..., joints=[...])"
+        )
 
 
 def position_findings(

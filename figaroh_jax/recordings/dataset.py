@@ -6,6 +6,7 @@ joint torque = torque @ motor torque; the offset is added to the joint position 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -218,6 +219,7 @@ def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive) -> R
         load=entry.load,
         repeat=entry.repeat,
         role=entry.role,
+        notes=_clock_beside(table, entry, len(position)),
     )
 
 
@@ -254,11 +256,40 @@ def _columns(table: Table, source, names: Sequence[str], key: str, samples: int 
     wrong = np.argwhere(~np.isfinite(values))
     if len(wrong):
         row, column = wrong[0]
+        name = source if isinstance(source, str) else source[column] if len(source) == len(names) else ", ".join(source)
         raise InputError(
-            f"{table.file}: {key} ('{source}') is {values[row, column]} in row {row} (from 0), column {column},"
+            f"{table.file}: {key} ('{name}') is {values[row, column]} in row {row} (from 0), column {column},"
             f" joint {names[column]}; {len(wrong)} such value{'s' if len(wrong) > 1 else ''} in all"
         )
     return values
+
+
+_CLOCKS = ("t", "time", "timestamp", "stamp")  # what a column of stamps is called
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_NEAR = 0.1  # of the rate: what the stamps may say otherwise
+
+
+def _clock_beside(table: Table, entry: RecordingEntry, samples: int) -> tuple[str, ...]:
+    """A warning where a task states a `rate` and the file holds stamps that say another one; sent to the log too."""
+    name, stated = next((name for name in table.names if name.lower() in _CLOCKS), None), entry.rate
+    if stated is None or name is None:
+        return ()
+    try:
+        stamps = table.vector(name, name)
+    except InputError:
+        return ()
+    steps = np.diff(stamps)
+    if len(stamps) != samples or not (steps > 0).all() or np.median(steps) == 1.0:  # a counter of samples
+        return ()
+    rates = {unit: 1 / (float(np.median(steps)) * second) for unit, second in _SECONDS.items()}
+    if any(abs(rate / stated - 1) < _NEAR for rate in rates.values()):
+        return ()
+    unit = min(rates, key=lambda unit: abs(np.log(rates[unit] / stated)))
+    said = f"time: {name}" if unit == "s" else f"time: {name}, units: {{time: {unit}}}"
+    other = f"the column '{name}' runs at {rates[unit]:.4g} Hz"
+    text = f"check: {table.file.name}: rate is {stated:g} Hz, but {other}; should the task say {said} in its place?"
+    logging.getLogger("figaroh_jax").warning(text)
+    return (text,)
 
 
 def read_time(table: Table, entry: RecordingEntry, key: str, samples: int) -> Float[np.ndarray, " samples"]:
@@ -282,4 +313,4 @@ def read_time(table: Table, entry: RecordingEntry, key: str, samples: int) -> Fl
             f"{table.file}: {key}.time {what} in row {row} (from 0): {time[row]:.9g} {unit} after"
             f" {time[row - 1]:.9g} {unit}; the stamps must increase"
         )
-    return time * {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[unit]
+    return time * _SECONDS[unit]

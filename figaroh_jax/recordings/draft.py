@@ -26,6 +26,7 @@ from .torque_checks import TURNED_POSITION
 
 __all__ = ["Draft", "Undecided", "draft_task"]
 
+SMALL = 0.12  # rad: a motion within 7 degrees in all fits any limits, for it is one in rad, read as degrees
 CONFIRMED = 0.5  # of a torque's variance that its own joint explains, before it says anything of the order
 
 
@@ -158,6 +159,8 @@ def _unit_of_position(robot: RobotModel, reads: Sequence[Columns]) -> str:
         return [finding for part, read in parts for finding in position_findings(part, robot, "rad", read.time)]
 
     fits = [u for u in kinds if not doubts(wide[u])]
+    if fits == ["deg"]:
+        _doubt_small_degrees(reads[0].file, np.ptp(wide["deg"][:, ~straight], axis=0), doubts(every))
     if len(fits) == 1:
         return fits[0]
     if not fits:
@@ -176,6 +179,16 @@ def _unit_of_position(robot: RobotModel, reads: Sequence[Columns]) -> str:
         "unit",
         f"{reads[0].file}: positions span {span:.3g}: rad or degrees? Neither limits nor torque decide; give --unit",
     )
+
+
+def _doubt_small_degrees(file: Path, span: Float[np.ndarray, " turning"], as_rad: Sequence[Finding]) -> None:
+    """Positions that are possible as rad, but outside a limit, are no degrees because those fit every limit."""
+    if not any(finding.wrong for finding in as_rad) and span.max() < SMALL:
+        raise Undecided(
+            "unit",
+            f"{file}: rad or degrees? In rad, {'; '.join(dict.fromkeys(finding.text for finding in as_rad))} In degrees"
+            f" no joint moves by more than {span.max() / DEGREE:.3g} degrees. Correct the columns, or give --unit",
+        )
 
 
 def _doubt_percent(reads: Sequence[Columns], unit: str | None) -> None:

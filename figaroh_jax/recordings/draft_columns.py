@@ -173,18 +173,23 @@ def _refuse_postures(table: Table, model: RobotModel) -> None:
     if not measured or any(kind in kinds for kind in ("torque", "current", "command", "velocity")):
         return
     named = [n for n in table.names if n in model.joint_names]
-    columns = named or (kinds.get("position") or ["JOINTS"])[:1]
-    position = named or columns[0]
     whole = table.file.suffix.lower() in (".npz", ".mat", ".h5")
+    columns = named or (kinds.get("position") or ["JOINTS"])[: 1 if whole else None]
+    position = columns if named or len(columns) > 1 else columns[0]
+    turned = [name for axis in "xyzw" for name in table.names if re.fullmatch(rf"q_?{axis}", name, re.IGNORECASE)]
+    if not whole and len(measured) == 3 and len(turned) == 4:
+        measured = [*measured, *turned]
     shown = measured[0] if whole else measured[:12]
-    kind = "pose" if "pose" in measured[0].lower() or measured[0].startswith("T_") else "position"
+    posed = "pose" in measured[0].lower() or measured[0].startswith("T_") or len(measured) == 7
+    kind = "pose" if posed else "position"
     words = {word for name in (*columns, *measured) for word in _words(name)}
     units = {key: unit for key, unit in (("position", "deg"), ("measurement", "mm")) if unit in words}
     frames = {"base_frame": "BASE", "tool_frame": "TOOL", "unknown": ["base_frame", "tool_frame"]}
+    position = position if isinstance(position, str) else [*position]  # a copy, which YAML writes out
     entry = {"file": table.file.name, "position": position, **({"units": units} if units else {})}
     robot: dict[str, Any] = {"model": "MODEL"}
     if named and named != list(model.joint_names):
-        robot["joints"] = [*named]  # a copy, which YAML writes out
+        robot["joints"] = [*named]
     task = {"robot": robot, "data": [entry | {"measurement": {kind: shown, **frames}}]}
     written = dump_yaml(task, line=True).strip()
     raise InputError(

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
+from ..rigid.chain import chain_between
 from ..rigid.model import RobotModel
 from . import dataset
 from .devices import Device
@@ -107,11 +108,24 @@ def _frames(task: Task, measurement: Measurement, key: str, model: RobotModel):
             model.frame_index(frame)
         except InputError as error:
             raise InputError(f"{task.file}: {key}.{name}: {error}") from None
+    try:
+        chain_between(model, base, measurement.tool_frame)
+    except InputError as error:
+        raise InputError(f"{task.file}: {key}: {error}{_swapped(model, base, measurement.tool_frame)}") from None
     unknown, notes = tuple(dict.fromkeys(measurement.unknown)), ()
     if measurement.kind in ("plane", "socket") and "base_frame" in unknown:
         unknown = tuple(name for name in unknown if name != "base_frame")
         notes = (f"{key}: touching a {measurement.kind} at an unknown place shows no base frame; it is left as it is",)
     return base, measurement.tool_frame, unknown, notes
+
+
+def _swapped(model: RobotModel, base: str, tool: str) -> str:
+    """Whether the two frames would do the other way round, as a question."""
+    try:
+        chain_between(model, tool, base)
+    except InputError:
+        return ""
+    return "; are the two swapped?"
 
 
 def _time(table: Table, entry: RecordingEntry, key: str, samples: int) -> Float[np.ndarray, " samples"]:

@@ -24,16 +24,19 @@ if TYPE_CHECKING:
     from ..formats.config import RecordingEntry, Task
     from .dataset import Memory
 
-__all__ = ["check_pose_recording", "check_pose_recordings"]
+__all__ = ["OFF", "check_pose_recording", "check_pose_recordings", "spread_of"]
 
 OFF = 0.12  # share of the points' spread that no calibration leaves
 FEWEST = 8
 TURNED = 0.15  # rad between orientations that no calibration leaves
 
 
-def check_pose_recordings(task: Task, model: RobotModel, recordings: Sequence[PoseRecording]) -> tuple[str, ...]:
-    """Warnings about recordings of postures, also sent to the log `figaroh_jax`; `InputError` where they are wrong."""
-    entries: dict[Path | Memory, RecordingEntry] = {entry.place: entry for entry in task.data}
+def check_pose_recordings(task: Task | None, model: RobotModel, recordings: Sequence[PoseRecording]) -> tuple[str, ...]:
+    """Warnings about recordings of postures, of a task or from arrays, also sent to the log `figaroh_jax`.
+
+    Raises `InputError` where they are wrong.
+    """
+    entries: dict[Path | Memory, RecordingEntry] = {entry.place: entry for entry in task.data} if task else {}
     found = [(r.file.name, f) for r in recordings for f in check_pose_recording(r, model, entries.get(r.file))]
     return report_findings(found)
 
@@ -42,8 +45,8 @@ def check_pose_recording(
     recording: PoseRecording, model: RobotModel, entry: RecordingEntry | None = None
 ) -> list[Finding]:
     """Everything that looks wrong about one recording of postures, the gravest first."""
-    if model.nq != model.nv:
-        return []
+    if model.nq != model.nv or recording.position.shape[1] != model.nv:
+        return []  # the kinematics refuse another number of joints
     unit = entry.units.position if entry is not None else "rad"
     found = position_findings(recording.position, model, unit)
     if any(finding.wrong for finding in found):
@@ -64,7 +67,7 @@ class _Overlay(NamedTuple):
 
 
 def _against_model(recording: PoseRecording, model: RobotModel, unit: str, measured: str) -> Iterator[Finding]:
-    points = recording.values[:, :3, 3] if recording.kind == "pose" else recording.values[:, 0]
+    points = _points(recording)
     seen = np.asarray(np.isfinite(points).all(axis=1))
     if seen.sum() < FEWEST or np.ptp(points[seen], axis=0).max() == 0:
         return
@@ -92,8 +95,65 @@ def _against_model(recording: PoseRecording, model: RobotModel, unit: str, measu
         if 500 < 1 / own.scale < 2000 and measured == "mm":
             advice = "they look like m: remove units: {measurement: mm}"
         yield Finding(True, f"the measured points spread {own.scale:.4g} times as far as the model's; {advice}")
+    else:
+        yield from _stated_frames(recording, model, seen)
     if recording.kind == "pose" and own.left <= OFF:
         yield from _orientations(recording, model, seen)
+
+
+def _points(recording: PoseRecording) -> Float[np.ndarray, "postures 3"]:
+    """What was measured of the marker's place, or of the first of several."""
+    return recording.values[:, :3, 3] if recording.kind == "pose" else recording.values[:, 0]
+
+
+def spread_of(recording: PoseRecording) -> float | None:
+    """RMS distance of the measured points from their mean, m; None for devices that see no points in space."""
+    if recording.kind not in ("pose", "position"):
+        return None
+    points = _points(recording)
+    points = points[np.isfinite(points).all(axis=1)]
+    return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())) if len(points) else None
+
+
+def _stated_frames(recording: PoseRecording, model: RobotModel, seen: np.ndarray) -> Iterator[Finding]:
+    """Frames taken for known (not in `unknown`) that are far from where the measurements have them."""
+    known = [name for name in ("base_frame", "tool_frame") if name not in recording.unknown]
+    if not known:
+        return
+    q, points = recording.position[seen], _points(recording)[seen]
+    turned, origin = frame_poses(model, q, recording.tool_frame)
+    base_turned, base = frame_poses(model, q, recording.base_frame)
+    origin = np.einsum("nji,nj->ni", base_turned, origin - base)
+    turned = np.einsum("nji,njk->nik", base_turned, turned)
+    off = _off(points, turned, origin, recording.unknown)
+    spread = float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    if off <= OFF * spread:
+        return
+    tried = [*((*recording.unknown, name) for name in known), ("base_frame", "tool_frame")]
+    free = next((names for names in tried if _off(points, turned, origin, names) <= OFF * spread), tried[-1])
+    stated = " and ".join(f"{name} '{getattr(recording, name)}'" for name in known)
+    yield Finding(
+        False,
+        f"the measured points lie {1e3 * off:.3g} mm (RMS) from the model's with {stated} taken as exactly known; they"
+        " follow the model where device or marker may stand elsewhere: measurement.unknown:"
+        f" [{', '.join(sorted(free))}]",
+    )
+
+
+def _off(
+    points: Float[np.ndarray, "n 3"],
+    turned: Float[np.ndarray, "n 3 3"],
+    origin: Float[np.ndarray, "n 3"],
+    unknown: Sequence[str],
+) -> float:
+    """RMS distance of the measured points from the model's, m, where only frames in `unknown` may be moved."""
+    if "base_frame" in unknown:
+        spread = np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())
+        return float(_overlaid(points, turned, origin, fixed="tool_frame" not in unknown).left * spread)
+    rest = points - origin
+    if "tool_frame" in unknown:
+        rest = rest - turned @ np.linalg.lstsq(turned.reshape(-1, 3), rest.ravel(), rcond=1e-6)[0]
+    return float(np.sqrt((rest**2).sum(axis=1).mean()))
 
 
 def _odd(own: _Overlay, others: Sequence[tuple[str, _Overlay]]) -> Finding:
@@ -108,12 +168,12 @@ def _odd(own: _Overlay, others: Sequence[tuple[str, _Overlay]]) -> Finding:
     )
 
 
-def _overlaid(points: np.ndarray, turned: np.ndarray, origin: np.ndarray) -> _Overlay:
-    """The best rotation, shift, scale (Umeyama 1991) and tool point, in turns."""
+def _overlaid(points: np.ndarray, turned: np.ndarray, origin: np.ndarray, *, fixed: bool = False) -> _Overlay:
+    """The best rotation, shift, scale (Umeyama 1991) and tool point, in turns; `fixed`: the tool point is known."""
     tool = np.zeros(3)
     middle = points - points.mean(axis=0)
     scale, rotation, mine = 1.0, np.eye(3), origin
-    for _ in range(30):
+    for _ in range(1 if fixed else 30):
         mine = origin + turned @ tool
         centred = mine - mine.mean(axis=0)
         u, s, vt = np.linalg.svd(middle.T @ centred)
@@ -121,7 +181,7 @@ def _overlaid(points: np.ndarray, turned: np.ndarray, origin: np.ndarray) -> _Ov
         rotation, scale = (u * sign) @ vt, float((s * sign).sum() / max((centred**2).sum(), 1e-300))
         wanted = middle @ rotation / max(scale, 1e-12) - (origin - origin.mean(axis=0))
         design = (turned - turned.mean(axis=0)).reshape(-1, 3)
-        tool = np.linalg.lstsq(design, wanted.ravel(), rcond=1e-6)[0]
+        tool = tool if fixed else np.linalg.lstsq(design, wanted.ravel(), rcond=1e-6)[0]
     rest = middle - scale * (mine - mine.mean(axis=0)) @ rotation.T
     return _Overlay(float(np.sqrt((rest**2).sum() / (middle**2).sum())), scale)
 

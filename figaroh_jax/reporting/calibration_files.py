@@ -86,6 +86,7 @@ def result(calibration: Calibration) -> dict[str, Any]:
         "correlations": [{"one": a, "other": b, "value": finite(r)} for a, b, r in calibration.correlations],
         "quality": [q._asdict() | {"r2": finite(q.r2)} for q in quality_of(calibration)],
         "converged": calibration.converged,
+        "unexplained": None if calibration.unexplained is None else finite(calibration.unexplained),
         "notes": list(calibration.notes),
     }
 

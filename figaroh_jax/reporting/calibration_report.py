@@ -14,7 +14,7 @@ from ..calibration.calibrated import Calibration, Shown, quality_of
 from ..calibration.corrections import twist_pose
 from ..rigid.model import RobotModel
 from . import wording
-from .picture import robot_picture
+from .picture import middle_posture, robot_picture, segments
 from .report import BADGES, page_template, plotly_source
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def write_calibration_report(calibration: Calibration, path: Path, found: PoseDi
     page = resources.files("figaroh_jax") / "page"
     text = page_template("calibration.html", path.parent).render(
         picture=Markup(_picture(calibration)),
-        magnify=_MAGNIFY,
+        magnify=_magnified(calibration),
         c=calibration,
         robot=calibration.model.name,
         sentence=wording.calibration_sentence(calibration),
@@ -63,12 +63,23 @@ def nominal_of(calibration: Calibration) -> RobotModel:
     return eqx.tree_at(lambda m: m.placement, calibration.model, placement)
 
 
-_MAGNIFY = 20
+_MAGNIFY = (20, 10, 5, 2, 1)  # times that differences are drawn, the first that leaves the robot to be seen
+_APART = 0.3  # of the robot's size, between the two as drawn
+
+
+def _magnified(calibration: Calibration) -> int:
+    """How many times as large as they are differences of the two robots are drawn."""
+    q = middle_posture(calibration.model)
+    own, nominal = segments(calibration.model, q), segments(nominal_of(calibration), q)
+    size = np.ptp(nominal.reshape(-1, 3), axis=0).max()
+    off = np.linalg.norm(own - nominal, axis=-1).max()
+    return next((times for times in _MAGNIFY if times * off <= _APART * size), _MAGNIFY[-1])
 
 
 def _picture(calibration: Calibration) -> str:
     affected = {name for cause in calibration.causes for name in cause.name.at} | calibration.twists.keys()
-    return robot_picture(calibration.model, affected=affected, nominal=nominal_of(calibration), magnify=float(_MAGNIFY))
+    nominal, times = nominal_of(calibration), float(_magnified(calibration))
+    return robot_picture(calibration.model, affected=affected, nominal=nominal, magnify=times)
 
 
 def _shown(calibration: Calibration) -> list[Shown]:

@@ -259,6 +259,10 @@ def joint_trajectory(joints: tuple[str, ...], stage: Stage) -> str:
     return "\n".join(lines) + "\n"
 
 
+_LINEAR = {"position": "m", "velocity": "m/s", "acceleration": "m/s²", "torque": "N"}
+_ANGULAR = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s²", "torque": "N\N{NO-BREAK SPACE}m"}
+
+
 def _page(found: Design, drawn: list[tuple[np.ndarray, dict[str, np.ndarray]]], folder: Path) -> str:
     from markupsafe import Markup
 
@@ -268,7 +272,7 @@ def _page(found: Design, drawn: list[tuple[np.ndarray, dict[str, np.ndarray]]], 
         d=found,
         robot=found.learned.robot.name,
         joints=list(found.learned.robot.dof_names),
-        units=[("m", "m/s", "m/s²", "N") if slides else ("rad", "rad/s", "rad/s²", "N m") for slides in sliding],
+        units=[_LINEAR if slides else _ANGULAR for slides in sliding],
         open=OPEN,
         seconds=sum(stage.motion.duration for stage in found.stages),
         lines=summary_lines(found),

@@ -18,7 +18,8 @@ from ..rigid.model import RobotModel
 __all__ = ["middle_posture", "robot_picture", "segments"]
 
 _WIDTH, _HEIGHT, _EDGE = 460.0, 300.0, 34.0
-_LABEL = (110.0, 13.0)  # room of a name
+_LETTER, _LINE = 7.0, 16.0  # room of a name: of a letter of 12 px, wide ones counted, and from one to the next
+_LEAST = 240.0  # of the width that the robot itself keeps beside long names
 _AZIMUTHS = np.deg2rad(np.arange(20, 200, 15))
 _ELEVATION = np.deg2rad(18.0)
 
@@ -45,19 +46,25 @@ def robot_picture(
     behind = None if nominal is None else np.concatenate([segments(nominal, q), _tips(nominal, q)])
     if behind is not None:
         lines = behind + magnify * (lines - behind)
-    flat = _projected(lines if behind is None else np.concatenate([lines, behind]))
     count = len(model.joints)
+    hits = [k for k, joint in enumerate(model.joints) if joint.name in affected or joint.link in affected]
+    room = max((_LETTER * len(model.joints[k].name) + _EDGE for k in hits), default=0.0)
+    width, height = max(_WIDTH, _LEAST + room), max(_HEIGHT, _LINE * (len(hits) + 1))
+    flat = _projected(lines if behind is None else np.concatenate([lines, behind]), (width - room, height))
     parts = [_line(line, "nominal") for line in flat[len(lines) :]]
     parts += [_line(line, "link") for line in flat[count : len(lines)]]
     for joint, line in zip(model.joints, flat[:count], strict=True):
         parts.append(_line(line, "hit" if joint.link in affected and joint.name not in affected else "link"))
-    labels: list[tuple[float, float]] = []
-    for joint, line in zip(model.joints, flat[:count], strict=True):
-        hit = joint.name in affected or joint.link in affected
-        parts.append(_joint(joint.name, line[1], hit, _label(line[1], labels) if hit else (0.0, 0.0)))
-    named = ", ".join(joint.name for joint in model.joints if joint.name in affected or joint.link in affected)
+    places = flat[:count, 1]
+    beside = float(flat[..., 0].max()) + _EDGE / 2
+    heights = _heights(places[hits, 1], height)
+    parts += [_leader(places[k], beside, y) for k, y in zip(hits, heights, strict=True)]
+    drawn = sorted(range(count), key=lambda k: k in hits)  # what is named stays to be seen where joints coincide
+    parts += [_joint(model.joints[k].name, places[k], k in hits) for k in drawn]
+    parts += [_name(model.joints[k].name, beside + 4, y) for k, y in zip(hits, heights, strict=True)]
+    named = ", ".join(model.joints[k].name for k in hits)
     text = f"{model.name}, {count} joints; affected: {named or 'none'}"
-    view = f'viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}"'
+    view = f'viewBox="0 0 {width:g} {height:g}"'
     return f'<svg class="robot" {view} role="img" aria-label="{escape(text)}">{"".join(parts)}</svg>'
 
 
@@ -86,8 +93,8 @@ def middle_posture(model: RobotModel) -> Float[np.ndarray, " nq"]:
     return np.clip(middle + 0.35 * np.resize([1.0, -1.0, 1.0], len(middle)), limits[:, 0], limits[:, 1])
 
 
-def _projected(lines: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, "n 2 2"]:
-    """Screen coordinates from the direction in which the robot spreads most."""
+def _projected(lines: Float[np.ndarray, "n 2 3"], size: tuple[float, float]) -> Float[np.ndarray, "n 2 2"]:
+    """Screen coordinates in a field of `size` from the direction in which the robot spreads most."""
     views = []
     for azimuth in _AZIMUTHS:
         across = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
@@ -96,9 +103,9 @@ def _projected(lines: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, "n 2 2"]:
         views.append(np.stack([lines @ across, -(lines @ up)], axis=-1))
     flat = max(views, key=lambda view: float(np.linalg.norm(view[:, 1] - view[:, 0], axis=-1).sum()))
     low, high = flat.min(axis=(0, 1)), flat.max(axis=(0, 1))
-    room = np.array([_WIDTH - 2 * _EDGE - 60.0, _HEIGHT - 2 * _EDGE])
+    room = np.array(size) - 2 * _EDGE
     scale = float(np.min(room / np.maximum(high - low, 1e-9)))
-    shift = np.array([_WIDTH - 60.0, _HEIGHT]) / 2 - scale * (low + high) / 2
+    shift = np.array(size) / 2 - scale * (low + high) / 2
     return scale * flat + shift
 
 
@@ -107,18 +114,28 @@ def _line(line: Float[np.ndarray, "2 2"], kind: str) -> str:
     return f'<path class="{kind}" d="M{a:.1f} {b:.1f}L{c:.1f} {d:.1f}"/>'
 
 
-def _label(at: Float[np.ndarray, "2"], taken: list[tuple[float, float]]) -> tuple[float, float]:
-    """A place for a joint's name beside it, below the names that stand there already."""
-    x, y = float(at[0]) + 10, float(at[1]) - 9
-    while any(abs(x - a) < _LABEL[0] and abs(y - b) < _LABEL[1] for a, b in taken):
-        y += _LABEL[1]
-    taken.append((x, y))
-    return x, y
+def _heights(wanted: Float[np.ndarray, " names"], height: float) -> Float[np.ndarray, " names"]:
+    """Where names stand in their column: each as near its joint as those above and below leave room."""
+    order = np.argsort(wanted, kind="stable")
+    out = np.empty(len(wanted))
+    for k, (low, one) in enumerate(zip(_LINE * (0.75 + np.arange(len(order))), order, strict=True)):
+        out[one] = max(wanted[one], low, out[order[k - 1]] + _LINE if k else low)
+    for k in range(len(order) - 1, -1, -1):
+        end = height - _LINE / 2 if k == len(order) - 1 else out[order[k + 1]] - _LINE
+        out[order[k]] = min(out[order[k]], end)
+    return out
 
 
-def _joint(name: str, at: Float[np.ndarray, "2"], hit: bool, place_of_name: tuple[float, float]) -> str:
+def _leader(at: Float[np.ndarray, "2"], x: float, y: float) -> str:
+    """The line from a joint to its name."""
+    return f'<path class="leader" d="M{at[0]:.1f} {at[1]:.1f}L{x:.1f} {y:.1f}"/>'
+
+
+def _name(name: str, x: float, y: float) -> str:
+    return f'<text x="{x:.1f}" y="{y + 4:.1f}">{escape(name)}</text>'
+
+
+def _joint(name: str, at: Float[np.ndarray, "2"], hit: bool) -> str:
     kind, size = ("hit", 7) if hit else ("joint", 4)
-    x, y = place_of_name
-    label = f'<text x="{x:.1f}" y="{y:.1f}">{escape(name)}</text>' if hit else ""
     place = f'cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="{size}"'
-    return f'<circle class="{kind}" {place}><title>{escape(name)}</title></circle>{label}'
+    return f'<circle class="{kind}" {place}><title>{escape(name)}</title></circle>'

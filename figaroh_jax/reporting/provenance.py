@@ -39,6 +39,9 @@ def provenance(command: str, task: Path, inputs: Iterable[Path], backend: str, o
 def read_provenance(folder: Path) -> dict[str, Any]:
     """What made the run in `folder`; raises `InputError` where that is not said."""
     path = folder / PROVENANCE
+    if not path.is_file():
+        what = f"holds no {PROVENANCE}" if folder.is_dir() else "is not a directory"
+        raise InputError(f"{folder}: {what}; name the directory of a run (--out of diagnose, identify, ...)")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(content, dict) or not {"command", "task", "options"} <= content.keys():

@@ -59,12 +59,10 @@ def write_rollouts(found: RolloutIdentification, path: Path, title: str) -> None
         robot=title,
         sentence=_sentence(found, title),
         held=held,
-        before=_pooled(found, "before"),
-        after=_pooled(found, "after"),
-        unit="rad" if set(found.units) == {"rad"} else "rad or m",
+        errors=[(unit, _pooled(found, "before", unit), _pooled(found, "after", unit)) for unit in _units(found)],
         table=_table(found),
         parameters=[one | {"interval": _interval(one), "title": _title(one)} for one in _parameters(found)],
-        doubtful=[one for one in _parameters(found) if one["status"] != "identified"],
+        doubtful=[one | {"title": _title(one)} for one in _parameters(found) if one["status"] != "identified"],
         trades=[note for note in found.result["notes"] if "trade off" in note],
         notes=[note for note in found.result["notes"] if "trade off" not in note],
         qualities=qualities,
@@ -139,8 +137,8 @@ def _sentence(found: RolloutIdentification, robot: str) -> str:
     worst = 100 * max(max(one["relative"]) for one in judged)
     what = "Held-out motions are" if found.result["holdout"] else "Fitted stretches are"
     return (
-        f"{what} simulated from the command within {wording.number(worst, 2)} % of each joint's motion or better;"
-        f" {good} of {len(_parameters(found))} numbers of {robot} are identified."
+        f"{what} simulated from the command with an error of at most {wording.number(worst, 2)} % of each joint's"
+        f" motion; {good} of {len(_parameters(found))} numbers of {robot} are identified."
     )
 
 
@@ -161,5 +159,12 @@ def _rms(found: RolloutIdentification, which: str, joint: int) -> float:
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
 
-def _pooled(found: RolloutIdentification, which: str) -> float:
-    return float(np.sqrt(np.mean([_rms(found, which, j) ** 2 for j in range(len(found.joints))])))
+def _units(found: RolloutIdentification) -> list[str]:
+    """The units of the joints' positions, each once."""
+    return list(dict.fromkeys(found.units))
+
+
+def _pooled(found: RolloutIdentification, which: str, unit: str) -> float:
+    """Of all joints of one unit: no number holds rad and m."""
+    mine = [j for j, own in enumerate(found.units) if own == unit]
+    return float(np.sqrt(np.mean([_rms(found, which, j) ** 2 for j in mine])))

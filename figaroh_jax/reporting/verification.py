@@ -24,7 +24,14 @@ _SIDES = {
     "forbidden_causes": "none of",
     **dict.fromkeys(("gain", "p_value", "rank"), "at least"),
 }
-DEFAULT_LIMITS: dict[str, Any] = {"verdict": ["nothing", "named"], "consistent": True, "fk_parity": 1e-9}
+DEFAULT_LIMITS: dict[
+    str, Any
+] = {  # `unexplained`: as `recordings.posture_checks.OFF`, which loads more than verify needs
+    "verdict": ["nothing", "named"],
+    "consistent": True,
+    "fk_parity": 1e-9,
+    "unexplained": 0.12,
+}
 
 
 class Check(NamedTuple):
@@ -103,6 +110,7 @@ def figures(run: dict[str, Any]) -> dict[str, Any]:
         "position_mm": _finite((result.get("position") or {}).get("validated_after")),
         "orientation_deg": _finite((result.get("orientation") or {}).get("validated_after")),
         "fk_parity": _finite(result.get("fk_parity")),
+        "unexplained": _finite(result.get("unexplained")),
     }
 
 

@@ -128,7 +128,23 @@ def nearest(near: Nearest) -> str:
 
 
 def calibration_sentence(calibration: Calibration) -> str:
-    """What the calibration gained, in one sentence."""
+    """What the calibration gained, in one sentence; a second one where it explains too little to be used."""
+    return f"{_gained(calibration)}{_doubt(calibration)}"
+
+
+def _doubt(calibration: Calibration) -> str:
+    """That postures and model do not belong together, where that is so."""
+    if not calibration.contradicted or calibration.unexplained is None:
+        return ""
+    assert calibration.position is not None
+    size = _with_unit(number(calibration.position.validated_after, 3), calibration.position.unit)
+    return (
+        f" Do not use this model: {size} is {number(100 * calibration.unexplained, 2)} % of the spread of the measured"
+        " points, and no calibration leaves that much; check files, columns, units and frames."
+    )
+
+
+def _gained(calibration: Calibration) -> str:
     error = calibration.position or calibration.orientation
     if error is None:
         return "nothing was measured"

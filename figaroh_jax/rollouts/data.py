@@ -7,13 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.signal import correlate
 from scipy.special import gammaincinv
 
 from ..errors import InputError
 from .loop import Loop
 from .sensitivity import Windows
+from .thresholds import AHEAD_LIKE, AHEAD_MORE, AHEAD_ROWS, AHEAD_SECONDS
 
-__all__ = ["Run", "Stretch", "noise_of", "regular", "windows"]
+__all__ = ["Run", "Stretch", "ahead_of_command", "noise_of", "regular", "windows"]
 
 _LEAD = 0.2  # s of command kept before a window: no delay is longer
 _KEPT = 0.97334  # variance of a normal variable that never leaves three sigma
@@ -53,6 +55,22 @@ def regular(name: str, time: np.ndarray) -> float:
             f"where the period is {period:.6g} s; cut the recording there, a rollout needs a regular clock"
         )
     return float((time[-1] - time[0]) / (len(time) - 1))
+
+
+def ahead_of_command(command: Float[np.ndarray, " rows"], position: Float[np.ndarray, " rows"], period: float) -> int:
+    """Rows by which a position surely moves before the command that it follows, 0 where it does not.
+
+    Told by the correlation of their steps at every shift: no drive knows its command beforehand.
+    """
+    steps, moves = np.diff(command), np.diff(position)
+    most = min(round(AHEAD_SECONDS / period), len(steps) // 2)
+    size = float(np.sqrt((steps @ steps) * (moves @ moves)))
+    if size == 0 or most < AHEAD_ROWS:
+        return 0
+    like = correlate(moves, steps, method="fft")[len(steps) - 1 - most : len(steps) + most] / size
+    ahead = most - int(like[:most].argmax())
+    best, behind = like[:most].max(), like[most:].max()
+    return ahead if ahead >= AHEAD_ROWS and best > AHEAD_LIKE and best > behind + AHEAD_MORE else 0
 
 
 def noise_of(values: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .fit import Fit, System, fit, refitted_without
+from .loop import alike
 from .parameters import values
 from .screening import LATE, ROUGH, Standing, excess_of, joint_of, outputs
 from .search import Model, Named, Tried, sized, t_of, t_of_places, t_of_recordings
@@ -211,7 +212,11 @@ def _costs(new: Standing, entries: list[int]) -> float:
 
 
 def rms_of(here: Setting, squares: np.ndarray, joint: int = -1) -> float:
-    """Whitened squares (blocks, windows, joints) as an RMS over the rows of a joint, or of all: rad, or m."""
-    mine = squares[..., slice(None) if joint < 0 else [joint]]
-    count = (np.asarray(here.data.weight) > 0).sum() / here.loop.robot.nv * mine.shape[-1]
-    return float(np.sqrt(max(mine.sum(), 0.0) / max(count, 1) * np.mean(here.spread**2)))
+    """Whitened squares (blocks, windows, joints) as an RMS over the rows of a joint, or of all: rad, or m.
+
+    Of a robot with joints of both kinds all are those that turn: no number holds rad and m.
+    """
+    each = np.maximum(squares.reshape(-1, squares.shape[-1]).sum(axis=0), 0.0) * here.spread**2
+    mine = alike(here.loop) if joint < 0 else np.arange(len(each)) == joint
+    count = (np.asarray(here.data.weight) > 0).sum() / here.loop.robot.nv * mine.sum()
+    return float(np.sqrt(each[mine].sum() / max(count, 1)))

@@ -40,6 +40,7 @@ __all__ = [
     "State",
     "Step",
     "advance",
+    "alike",
     "integrated",
     "observe",
 ]
@@ -201,6 +202,16 @@ class Loop(eqx.Module):
             if joint.kind in ("revolute", "prismatic") and not joint.follows:
                 found[joint.coordinate] = at.start
         return found
+
+
+def alike(loop: Loop, *, slides: bool = False) -> np.ndarray:
+    """Which of the measured joints one number counts, (measured,): those that turn, or that slide.
+
+    All where no joint is of that kind: a number of rad and m together is neither.
+    """
+    turns = loop.robot.dofs.turns[np.argsort(loop.robot.dofs.column)][list(loop.measured)]
+    wanted = ~turns if slides else turns
+    return wanted if wanted.any() else np.ones(len(turns), bool)
 
 
 class State(NamedTuple):

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from ..effects.base import Effect
 from ..effects.extended import ExtendedModel, changed_robot
 from ..errors import InputError, nearest
+from ..recordings.checks import position_findings, report_findings
 from ..recordings.dataset import Recording
 from ..rigid.model import Leaf, RobotModel
 from .alone import alone, carried_by, separable
@@ -165,8 +166,18 @@ def _run(loop: Loop, one: Recording) -> Run:
         raise InputError(f"{one.file} has no command: a rollout simulates the drives' setpoints")
     period, steps = regular(str(one.file), one.time), float(loop.dt)
     if abs(period / steps - round(period / steps)) > 1e-3:
-        raise InputError(f"{one.file}: the period is {period:.6g} s, no multiple of the loop's step of {steps:.6g} s")
+        fits = period / max(1, int(np.ceil(period / steps - 1e-6)))
+        raise InputError(
+            f"{one.file}: the period is {period:.6g} s, no multiple of the loop's step of {steps:.6g} s; give it one"
+            f" that fits: dataclasses.replace(loop, dt={fits:.9g})"
+        )
     columns = np.abs(np.asarray(loop.drives.transmission)).argmax(1)
+    if one.position.shape[1] != len(loop.measured):
+        raise InputError(
+            f"{one.file}: q has {one.position.shape[1]} columns, but the loop measures {len(loop.measured)} joints"
+        )
+    if len(loop.measured) == loop.robot.nv == loop.robot.nq:
+        report_findings([(one.file.name, f) for f in position_findings(one.position, loop.robot, "rad", one.time)])
     return Run(one.name, one.time, one.command[:, columns], one.position, None)
 
 

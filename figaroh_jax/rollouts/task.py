@@ -17,14 +17,15 @@ from ..effects.plausibility import implausible
 from ..errors import InputError
 from ..formats.config import robot_options
 from ..formats.files import USD
+from ..recordings.checks import check_rollouts
 from ..recordings.dataset import Recording, read_recordings
 from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, Experiment, Gain, Name, Rest, Trace, Verdict
 from .alone import inseparable, separable
 from .arm import search_arm
 from .causes import BASELINE
-from .data import Run, Stretch, noise_of, regular, windows
+from .data import Run, Stretch, ahead_of_command, noise_of, regular, windows
 from .fit import Fit
-from .loop import Loop
+from .loop import Loop, alike
 from .own import left_out
 from .parameters import put, unit_of, values
 from .reading import load_loop
@@ -105,6 +106,7 @@ def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
             "actuator: {joint_1: {kind: position, kp: 20.0, kd: 0.5}}"
         )
     recordings = read_recordings(task, loop.robot, rollouts=True)
+    warnings = check_rollouts(task, loop.robot, recordings)
     runs = tuple(_run(loop, r) for r in recordings)
     periods = {regular(str(r.file), r.time) for r in recordings}
     if max(periods) > 1.02 * min(periods):
@@ -114,7 +116,7 @@ def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
     loop = eqx.tree_at(lambda m: m.dt, loop, np.float64(period / steps))
     notes = [f"{task.robot.model.name}: not simulated: {note}" for note in left_out]
     notes.append(f"simulated in steps of {1e3 * period / steps:.3g} ms, {steps} to a sample")
-    return loop, runs, tuple(notes)
+    return loop, runs, (*warnings, *notes)
 
 
 def _run(loop: Loop, recording: Recording) -> Run:
@@ -124,19 +126,33 @@ def _run(loop: Loop, recording: Recording) -> Run:
     columns = way.argmax(1)
     command = recording.command[:, columns]
     gain, bias = np.asarray(loop.drives.gain), np.asarray(loop.drives.bias)
+    follows = (gain[:, 0] != 0) & (bias[:, 1] != 0)
     for k, column in enumerate(columns):
-        follows = gain[k, 0] != 0 and bias[k, 1] != 0
         reach = max(np.abs(recording.position[:, column]).max(), 0.3)
-        if follows and np.abs(command[:, k]).max() > _TURN * reach:
+        if follows[k] and np.abs(command[:, k]).max() > _TURN * reach:
             row = int(np.abs(command[:, k]).argmax())
             raise InputError(
                 f"{recording.file}: the command of joint {loop.robot.dof_names[column]} reaches {command[row, k]:.4g}"
                 f" rad in row {row} (from 0), but the joint never leaves +-{reach:.3g} rad: is it in degrees or counts?"
                 " Say `units: {position: deg}`, or convert it to the unit of the position"
             )
+    _check_order(loop, recording, command[:, follows], columns[follows])
     return Run(
         recording.name, recording.time, command, recording.position, recording.velocity, recording.role == "holdout"
     )
+
+
+def _check_order(loop: Loop, recording: Recording, command: np.ndarray, columns: np.ndarray) -> None:
+    """Refuse a recording in which most joints that follow a command move before it does."""
+    period = regular(str(recording.file), recording.time)
+    moved = [(u, j) for u, j in zip(command.T, columns, strict=True) if np.ptp(u) and np.ptp(recording.position[:, j])]
+    ahead = {loop.robot.dof_names[j]: ahead_of_command(u, recording.position[:, j], period) for u, j in moved}
+    early = [name for name, rows in ahead.items() if rows]
+    if 2 * len(early) > len(moved):
+        raise InputError(
+            f"{recording.file}: the position moves before its command at {', '.join(early)} (by {ahead[early[0]]} rows"
+            f" at {early[0]}): are `command` and `position` swapped, or is the command stamped late?"
+        )
 
 
 def diagnosis_setting(task: Task, loop: Loop, runs: Sequence[Run]) -> Setting:
@@ -208,6 +224,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
         rest=_rest(found, before if not named else after, here.spread, loop, traces),
         notes=(
             *notes,
+            *_kinds_note(loop, gain),
             *colour_notes(here),
             *(_open_sizes(found) if named else ()),
             *(_taken_gains(task, found) if named else ()),
@@ -258,8 +275,7 @@ def _refitted_note(here: Setting, runs: Sequence[Run], refitted: Sequence[str], 
         return ()
     asked = [run for run in runs if run.holdout] or [run for run in runs if not run.holdout]
     with np.errstate(over="ignore", invalid="ignore"):
-        squares = np.concatenate([((run.position - simulated(here.loop, run)) ** 2).ravel() for run in asked])
-        error = float(np.sqrt(np.mean(squares)))
+        error = _pooled([run.position - simulated(here.loop, run) for run in asked], alike(here.loop))
     what = "recordings kept out" if asked[0].holdout else "the recordings"
     unit = "m" if all_slide(here.loop) else "rad"
     size = f"{1e3 * error:.3g} m{unit}" if error < 0.1 else f"{error:.3g} {unit}" if error < _FAR else "without bounds"
@@ -345,18 +361,43 @@ def colour_notes(here: Setting) -> tuple[str, ...]:
     return (f"the noise of the positions is white noise behind a low pass, and is judged as that: {text}",)
 
 
+def _slides(loop: Loop, at: Sequence[str]) -> bool:
+    """Whether what stands at these places is about a joint that slides; without a joint, whether all do."""
+    j = loop.robot.dof_names.index(at[0]) if at and at[0] in loop.robot.dof_names else -1
+    return bool(not _turns(loop)[j]) if j >= 0 else all_slide(loop)
+
+
+def _mixed(loop: Loop) -> bool:
+    """Whether some measured joints turn and others slide."""
+    return not alike(loop).all()
+
+
+def _pooled(parts: Sequence[np.ndarray], mine: np.ndarray) -> float:
+    """RMS of errors (rows, joints) over rows and some of the joints."""
+    return float(np.sqrt(np.mean(np.concatenate([part[:, mine].ravel() for part in parts]) ** 2)))
+
+
 def _gain(held: dict[str, tuple[np.ndarray, np.ndarray]], runs: Sequence[Run], found: Search) -> Gain:
-    measured = {run.name: run.position for run in runs if run.holdout}
-    of = "m" if all_slide(found.structure.loop) else "rad"
+    """Over the joints that turn, of a robot with both kinds; over those that slide where all causes stand there."""
+    loop, measured = found.structure.loop, {run.name: run.position for run in runs if run.holdout}
+    slides = all(_slides(loop, one.candidate.at) for one in found.named) if found.named else all_slide(loop)
     if measured:
-        before, after = (
-            float(np.sqrt(np.mean(np.concatenate([((measured[k] - v[i]) ** 2).ravel() for k, v in held.items()]))))
-            for i in (0, 1)
-        )
-        return Gain(before, after, of)
+        mine = alike(loop, slides=slides)
+        before, after = (_pooled([measured[k] - v[i] for k, v in held.items()], mine) for i in (0, 1))
+        return Gain(before, after, "m" if slides else "rad")
+    of = "m" if all_slide(loop) else "rad"
     if not found.named:
         return Gain(found.held[0], found.held[0], of)
     return Gain(found.held[0], found.held[-1], of)
+
+
+def _kinds_note(loop: Loop, gain: Gain) -> tuple[str, ...]:
+    """Which joints the error of the headline counts, where one number cannot hold them all."""
+    if not _mixed(loop):
+        return ()
+    names = np.array([loop.robot.dof_names[k] for k in loop.measured])[alike(loop, slides=gain.unit == "m")]
+    kind = "slide" if gain.unit == "m" else "turn"
+    return (f"the error in {gain.unit} is that of the joints that {kind}: {', '.join(names)}",)
 
 
 def _cause(one: Named, found: Search, here: Setting) -> Cause:
@@ -384,9 +425,7 @@ def _cause(one: Named, found: Search, here: Setting) -> Cause:
         }  # fmt: skip
     at = one.candidate.at
     sure = 1.0 / (1 + len(one.alike)) * (0.98 if found.verdict == "named" else 0.8)
-    j = here.loop.robot.dof_names.index(at[0]) if at and at[0] in here.loop.robot.dof_names else -1
-    straight = not _turns(here.loop)[j] if j >= 0 else all_slide(here.loop)
-    gain = Gain(one.before, one.after, "m" if straight else "rad")
+    gain = Gain(one.before, one.after, "m" if _slides(here.loop, at) else "rad")
     return Cause(Name(one.candidate.effect, at), parameters, sure, gain, one.alike, note=one.candidate.kind.looks_like)
 
 

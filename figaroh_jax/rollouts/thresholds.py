@@ -25,6 +25,12 @@ OF_ITS_SIZE = 0.5  # standard deviation of a size that is known, of numbers that
 CLEAR_OF_NOTHING = 3.0  # standard deviations of a size from no effect, of numbers of either sign
 TOLD = 1.96  # standard deviations, as they are told, of a size from no effect: the interval beside a name holds no zero
 
+# Whether a position moves before its command (`data.ahead_of_command`)
+AHEAD_SECONDS = 1.0  # looked at to both sides: the lag of a servo is a tenth of it
+AHEAD_ROWS = 2  # a logger may write a command one row late
+AHEAD_LIKE = 0.3  # correlation of steps: a servo of 50 Hz has 0.4 to 0.9 on steps and random telegraph signals
+AHEAD_MORE = 0.2  # correlation by which it exceeds that of a lag; right recordings of two servos reach 0.01
+
 # What the baseline's fit changed of the file (`task`)
 REFITTED = (3.0, 0.1)  # standard deviations as they are told, and share of its size, from which a number is told
 
