@@ -96,7 +96,7 @@ def main() -> None:
             robot = arm(name, Path(folder))
             for effect, size, seed in _cases(args):
                 rng = np.random.default_rng(seed + zlib.crc32(f"{effect} {name} {size}".encode()) % 100_000)
-                case = postures.hide(robot, effect, size, rng, orders=tuple(args.orders))
+                case = postures.hide(robot, effect, size, rng, args.postures, tuple(args.orders), args.off)
                 start = time.process_time()
                 found = diagnose(robot, case, (effect,) if effect and args.left_out else ())
                 seconds.append(time.process_time() - start)
@@ -144,6 +144,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--clean", type=int, default=0, metavar="N", help="N robots within their tolerance instead")
     parser.add_argument("--left-out", action="store_true", help="forbid the hidden effect: `unknown` is right")
     parser.add_argument("--orders", nargs=2, type=float, default=[2.5, 11.0], help="range of a gear error's order")
+    parser.add_argument("--off", type=float, default=postures.BUILT, help="tolerances by which all links are off")
+    parser.add_argument("--postures", type=int, default=80)
     parser.add_argument("--cache", type=Path, help="folder of compiled programs")
     return parser.parse_args()
 
