@@ -18,10 +18,9 @@ def model_format(path: str | Path) -> str:
     suffix = Path(path).suffix.lower()
     known = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf"} | dict.fromkeys(USD, "usd")
     if suffix not in known:
+        text = "a robot model is a .urdf or an .xml (MJCF) file, or USD (.usd, .usda, .usdc, .usdz)"
         near = "" if Path(path).exists() else nearest(Path(path).name, _beside(Path(path), tuple(known)))
-        if near:  # a slip of the fingers in the suffix
-            raise InputError(f"{path} does not exist{near}")
-        raise InputError(f"{path}: a robot model is a .urdf or an .xml (MJCF) file, or USD (.usd, .usda, .usdc, .usdz)")
+        raise InputError(f"{path} does not exist{near}; {text}" if near else f"{path}: {text}")
     return known[suffix]
 
 
