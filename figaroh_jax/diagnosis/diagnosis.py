@@ -327,6 +327,9 @@ def _judged(
     law = any(strong(one) and against[one.name] for one in each)  # it moves, whatever it is
     sticks = (shown or (large and not named)) and not law
     sticks = sticks and (sticks_alone(here, joint, tolerance) or sticks_alone(searched.here, by_speed, tolerance))
+    told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
+    if sticks and not named and _rough(problem, told, whitening, tolerance):
+        shown, sticks = True, False  # what sticks, and something that moves and passed for noise
     rest, read = shown and not sticks, False
     if rest and not named and left.line[0] >= LINE_P:  # a line is none of what reading a motion leaves
         errors = reader.errors(problem, joint.step.state, generator)
@@ -335,7 +338,6 @@ def _judged(
     text = (left.rest.text or ("" if relative.any() else _LESS_THAN_NOISE)) if rest else ""
     if contradictions:
         rest, sticks, read = True, False, False
-    told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
     if rest and named:
         gaining = gaining._replace(joint=_beside_rest(here, named, joint))
     parts = parts_of(problem, told, whitening, left.line, [s.name for s in reader.signals])
@@ -448,7 +450,7 @@ def _left(
         quiet = beyond_noise(problem, linear.residual, spectrum, whitening, generator, full, (rows, linear))[1]
     if not problem.layout.repeats and not found and not there:  # nor is it known how much of what is left is noise
         large = relative_rest(problem, joint.step.state, 0 * noise) > tolerance
-        there = bool((quiet & large).any()) or roughly_predictable(problem, joint.step, whitening, large)
+        there = bool((quiet & large).any()) or _rough(problem, joint.step, whitening, tolerance)
     moves = np.moveaxis(~resting(problem), 2, 0).reshape(joint.step.rows.y.shape)
     beyond, alone = (
         beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)[0]
@@ -461,6 +463,14 @@ def _left(
     followed = flexible.each * (predicted and flexible.p < REST_P)
     moved = (alone > 0) | (left_moving(problem, first.state, noise) > tolerance)
     return Left(left._replace(there=there), p_left, now[0], line, flexible.each, beyond, misfit, followed, moved)
+
+
+def _rough(problem: Problem, step: Step, whitening: np.ndarray, tolerance: float) -> bool:
+    """Whether what is told as noise is predicted where it is large; repeats know the noise."""
+    if problem.layout.repeats:
+        return False
+    large = relative_rest(problem, step.state, np.zeros(problem.model.nv)) > tolerance
+    return roughly_predictable(problem, step, whitening, large)
 
 
 def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:

@@ -215,14 +215,18 @@ def roughly_predictable(
     problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], asked: Bool[np.ndarray, " nv"]
 ) -> bool:
     """Whether functions of the motion that no smooth one follows predict what is left at a joint that is `asked`, on
-    data they were not fitted to: a ripple and a coupling that the catalogue lacks pass for noise without repeats."""
+    data they were not fitted to: a ripple and a coupling that the catalogue lacks pass for noise without repeats.
+
+    What is needed counts the joints and not the functions of one: on data left out, columns that say nothing cost more
+    than the best of them gains by chance.
+    """
     base, joints = ground(step.verdicts, step.state.prior, step.folded), np.flatnonzero(asked)
     each = [(int(joint), columns) for joint in joints for columns in rough_functions(step.state.motion, int(joint))]
     for joint, columns in each:
         rows = _rows_at(problem, step.state, columns, whitening, joint)
         grown = judge_grown(step.rows, base, (joint,), rows[:, None])
         worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, grown))
-        if better.sum() < worse.sum() and t_value(worse, better) > t_needed(len(worse), T_REST, len(each)):
+        if better.sum() < worse.sum() and t_value(worse, better) > t_needed(len(worse), T_REST, len(joints)):
             return True
     return False
 
