@@ -43,6 +43,7 @@ from .joint import Joint, least_sure, opened, polished, sized, with_rest
 from .judgement import KeptOut, Left, Searched, as_slow_noise, doubted_rest, reasons_against, standings_of, sticks_alone
 from .layout import describe_folds, repeats_not_said
 from .naming import beyond_simpler, strong
+from .problem import Problem
 from .reading import Reader, only_read
 from .rest import (
     beyond_noise,
