@@ -181,8 +181,9 @@ def rich_families(
     titles: Collection[str] | None = None,
 ) -> list[Group]:
     """Smooth functions that stand in for what the catalogue lacks in a model of the noise: none of time, which would
-    take slow noise, but even ones of the velocity, friction that drifts or follows the load, and the friction of the
-    other joints. `few`: the latter alone, which have few columns; `titles`: of these alone."""
+    take slow noise, but even ones of the velocity, friction that drifts or follows the load, the acceleration, and
+    friction and acceleration of the other joints. `few`: these alone, which have few columns; `titles`: of these alone.
+    """
     series = _few_series(state.motion)
     if not few:
         smooth = _smooth_series(state.motion)
@@ -216,7 +217,7 @@ def _smooth_series(motion: Motion) -> dict[str, list[Float[np.ndarray, "nN nv"]]
 
 
 def _few_series(motion: Motion) -> dict[str, list[Float[np.ndarray, "nN nv"]]]:
-    v, s = np.asarray(motion.velocity), np.asarray(motion.direction)
+    v, s, a = np.asarray(motion.velocity), np.asarray(motion.direction), np.asarray(motion.acceleration)
     w = to_unit(np.asarray(motion.time))[:, None]
     speed = np.stack([to_unit(np.abs(own)) for own in v.T], axis=1)
     load = np.stack([to_unit(own) for own in np.asarray(motion.load).T], axis=1)
@@ -224,8 +225,9 @@ def _few_series(motion: Motion) -> dict[str, list[Float[np.ndarray, "nN nv"]]]:
         "speed": [np.abs(s), speed, 2 * speed**2 - 1],
         "drift": [w * s, w**2 * s, w * v],
         "load": [s * load, s * np.abs(load)],
+        "acceleration": [a],
     }
-    return series | {f"neighbour {k}": [np.roll(x, k, axis=1) for x in (s, v)] for k in range(1, s.shape[1])}
+    return series | {f"neighbour {k}": [np.roll(x, k, axis=1) for x in (s, v, a)] for k in range(1, s.shape[1])}
 
 
 def _posture(motion: Motion) -> list[Float[np.ndarray, " nN"]]:
