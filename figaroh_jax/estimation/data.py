@@ -289,9 +289,8 @@ def pose_data(
     """
     robot = model.robot if isinstance(model, ExtendedModel) else model
     given = [recordings] if isinstance(recordings, PoseRecording) else list(recordings)
-    if robot.nq == robot.nv and all(
-        one.position.shape[1] == robot.nv for one in given
-    ):  # else the kinematics refuse it
+    each_joint = robot.nq == robot.nv and all(one.position.shape[1] == robot.nv for one in given)
+    if each_joint:  # else the kinematics refuse it
         report_findings([(r.file.name, f) for r in given for f in position_findings(r.position, robot, "rad")])
     found, duration = [], max(sum(float(np.ptp(one.time)) for one in given), 1e-9)
     for members, device, datum, measured in devices_of(robot, given):

@@ -24,9 +24,8 @@ _SIDES = {
     "forbidden_causes": "none of",
     **dict.fromkeys(("gain", "p_value", "rank"), "at least"),
 }
-DEFAULT_LIMITS: dict[
-    str, Any
-] = {  # `unexplained`: as `recordings.posture_checks.OFF`, which loads more than verify needs
+# `unexplained`: as `recordings.posture_checks.OFF`, which loads more than verify needs
+DEFAULT_LIMITS: dict[str, Any] = {
     "verdict": ["nothing", "named"],
     "consistent": True,
     "fk_parity": 1e-9,
