@@ -43,7 +43,6 @@ from .joint import Joint, least_sure, opened, polished, sized, with_rest
 from .judgement import KeptOut, Left, Searched, as_slow_noise, doubted_rest, reasons_against, standings_of, sticks_alone
 from .layout import describe_folds, repeats_not_said
 from .naming import beyond_simpler, strong
-from .problem import Problem
 from .reading import Reader, only_read
 from .rest import (
     beyond_noise,
@@ -329,7 +328,7 @@ def _judged(
     sticks = (shown or (large and not named)) and not law
     sticks = sticks and (sticks_alone(here, joint, tolerance) or sticks_alone(searched.here, by_speed, tolerance))
     told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
-    if sticks and not named and _rough(problem, told, whitening, tolerance):
+    if sticks and not named and roughly_predictable(problem, told, whitening, tolerance):
         shown, sticks = True, False  # what sticks, and something that moves and passed for noise
     rest, read = shown and not sticks, False
     if rest and not named and left.line[0] >= LINE_P:  # a line is none of what reading a motion leaves
@@ -451,7 +450,7 @@ def _left(
         quiet = beyond_noise(problem, linear.residual, spectrum, whitening, generator, full, (rows, linear))[1]
     if not problem.layout.repeats and not found and not there:  # nor is it known how much of what is left is noise
         large = relative_rest(problem, joint.step.state, 0 * noise) > tolerance
-        there = bool((quiet & large).any()) or _rough(problem, joint.step, whitening, tolerance)
+        there = bool((quiet & large).any()) or roughly_predictable(problem, joint.step, whitening, tolerance)
     moves = np.moveaxis(~resting(problem), 2, 0).reshape(joint.step.rows.y.shape)
     beyond, alone = (
         beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)[0]
@@ -464,14 +463,6 @@ def _left(
     followed = flexible.each * (predicted and flexible.p < REST_P)
     moved = (alone > 0) | (left_moving(problem, first.state, noise) > tolerance)
     return Left(left._replace(there=there), p_left, now[0], line, flexible.each, beyond, misfit, followed, moved)
-
-
-def _rough(problem: Problem, step: Step, whitening: np.ndarray, tolerance: float) -> bool:
-    """Whether what is told as noise is predicted where it is large; repeats know the noise."""
-    if problem.layout.repeats:
-        return False
-    large = relative_rest(problem, step.state, np.zeros(problem.model.nv)) > tolerance
-    return roughly_predictable(problem, step, whitening, large)
 
 
 def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:

@@ -211,16 +211,18 @@ def predictable(step: Step, groups: Sequence[Group]) -> bool:
     return False
 
 
-def roughly_predictable(
-    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], asked: Bool[np.ndarray, " nv"]
-) -> bool:
-    """Whether functions of the motion that no smooth one follows predict what is left at a joint that is `asked`, on
-    data they were not fitted to: a ripple and a coupling that the catalogue lacks pass for noise without repeats.
+def roughly_predictable(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], tolerance: float) -> bool:
+    """Whether functions of the motion that no smooth one follows predict what is left, noise or not, at a joint where
+    that is more than tolerable, on data they were not fitted to: a ripple and a coupling that the catalogue lacks pass
+    for noise without repeats; repeats know the noise.
 
     What is needed counts the joints and not the functions of one: on data left out, columns that say nothing cost more
     than the best of them gains by chance.
     """
-    base, joints = ground(step.verdicts, step.state.prior, step.folded), np.flatnonzero(asked)
+    if problem.layout.repeats:
+        return False
+    large = relative_rest(problem, step.state, np.zeros(problem.model.nv)) > tolerance
+    base, joints = ground(step.verdicts, step.state.prior, step.folded), np.flatnonzero(large)
     each = [(int(joint), columns) for joint in joints for columns in rough_functions(step.state.motion, int(joint))]
     for joint, columns in each:
         rows = _rows_at(problem, step.state, columns, whitening, joint)
